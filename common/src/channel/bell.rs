@@ -1,0 +1,136 @@
+//! Waking each other: data channels never wake anybody, so whoever waits has a bell, and whoever has news for it rings.
+
+use std::fmt;
+use std::time::Duration;
+
+use iceoryx2::port::listener::Listener;
+use iceoryx2::port::notifier::Notifier;
+use iceoryx2::prelude::*;
+use iceoryx2::service::port_factory::event::PortFactory;
+
+use super::{ChannelError, Domain, Interruption, claim, service_name};
+use crate::report::Role;
+use crate::stop::Stop;
+
+/// Polls before a waiting process blocks. A peer that is at work on another core answers within them; on a shared core
+/// they cost it some microseconds.
+const POLLS: u32 = 200;
+
+/// How long a process blocks before it looks after its connections. Rings can be lost when their hearer restarts.
+const NAP: Duration = Duration::from_millis(50);
+
+/// Where a bell hangs: a role of the run, and which one of that role.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Place(pub Role, pub u32);
+
+impl fmt::Display for Place {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "bell/{}/{}", self.0.name(), self.1)
+    }
+}
+
+/// Hears rings.
+#[derive(Debug)]
+pub struct Bell {
+    listener: Listener<ipc::Service>,
+    place: Place,
+}
+
+/// Rings the bell of another process.
+#[derive(Debug)]
+pub struct Ringer {
+    notifier: Notifier<ipc::Service>,
+}
+
+impl Bell {
+    /// Hangs the bell of this process.
+    ///
+    /// # Errors
+    /// When shared memory cannot be had.
+    pub fn hang(domain: &Domain, place: Place) -> Result<Self, ChannelError> {
+        let channel = place.to_string();
+        let listener = claim(domain, &channel, "listen", || {
+            service(domain, &channel)?
+                .listener_builder()
+                .create()
+                .map_err(|e| ChannelError::new(&channel, "listen", e))
+        })?;
+        Ok(Self { listener, place })
+    }
+
+    /// Blocks until a ring or until `patience` is over; whether there was a ring.
+    ///
+    /// # Errors
+    /// When waiting is impossible.
+    pub fn wait(&self, patience: Duration) -> Result<bool, ChannelError> {
+        let mut rang = false;
+        self.listener
+            .timed_wait(|_| rang = true, patience)
+            .map_err(|cause| ChannelError::new(self.place.to_string(), "wait", cause))?;
+        Ok(rang)
+    }
+}
+
+impl Ringer {
+    /// Holds the cord of the bell at `place`, whether it hangs there yet or not.
+    ///
+    /// # Errors
+    /// When shared memory cannot be had.
+    pub fn new(domain: &Domain, place: Place) -> Result<Self, ChannelError> {
+        let channel = place.to_string();
+        let notifier = claim(domain, &channel, "ring", || {
+            service(domain, &channel)?
+                .notifier_builder()
+                .create()
+                .map_err(|e| ChannelError::new(&channel, "ring", e))
+        })?;
+        Ok(Self { notifier })
+    }
+
+    /// Rings. A ring that finds nobody is no error: the hearer may be restarting, and looks for itself then.
+    pub fn ring(&self) {
+        if let Err(cause) = self.notifier.notify() {
+            tracing::debug!(?cause, "a ring was not heard");
+        }
+    }
+}
+
+/// Waits until `poll` yields something: polls a short while, then sleeps at the bell; after each nap without a ring,
+/// `look_after` may renew connections.
+///
+/// # Errors
+/// [`Interruption::Stopped`] once `stop` is requested, and whatever `poll` or `look_after` fail with.
+pub fn wait_for<T>(
+    bell: &Bell,
+    stop: &Stop,
+    mut poll: impl FnMut() -> Result<Option<T>, ChannelError>,
+    mut look_after: impl FnMut() -> Result<(), ChannelError>,
+) -> Result<T, Interruption> {
+    loop {
+        for _ in 0..POLLS {
+            if let Some(found) = poll()? {
+                return Ok(found);
+            }
+            std::hint::spin_loop();
+        }
+        if stop.requested() {
+            return Err(Interruption::Stopped);
+        }
+        if !bell.wait(NAP)? {
+            look_after()?;
+        }
+    }
+}
+
+fn service(domain: &Domain, channel: &str) -> Result<PortFactory<ipc::Service>, ChannelError> {
+    let parties = 2 * domain.max_actors() + 8;
+    domain
+        .node()
+        .service_builder(&service_name(domain, channel)?)
+        .event()
+        .max_listeners(2)
+        .max_notifiers(parties)
+        .max_nodes(parties)
+        .open_or_create()
+        .map_err(|cause| ChannelError::new(channel, "open", cause))
+}

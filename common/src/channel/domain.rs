@@ -1,0 +1,214 @@
+//! A run's own corner of shared memory. Every run has a root directory and a file prefix of its own, below a directory
+//! that belongs to one user: two runs never meet, two users neither, and what a killed run left behind is known by name.
+
+use std::fs::{DirBuilder, File};
+use std::io;
+use std::os::unix::fs::{DirBuilderExt, MetadataExt};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use iceoryx2::prelude::{
+    CallbackProgression, Config, FileName, Node, NodeBuilder, NodeState, Path as IoxPath, SemanticString,
+    SignalHandlingMode, ipc,
+};
+use rustix::fs::FlockOperation;
+
+const SHARED_MEMORY: &str = "/dev/shm";
+
+/// Membership of a process in a run: what all its channels are opened through.
+#[derive(Debug)]
+pub struct Domain {
+    node: Node<ipc::Service>,
+    run_id: String,
+    max_actors: usize,
+}
+
+/// A run's corner of shared memory cannot be entered or left.
+#[derive(Debug, thiserror::Error)]
+pub enum DomainError {
+    /// The system refused.
+    #[error("cannot {action} {path}: {cause}")]
+    Io {
+        /// What was tried.
+        action: &'static str,
+        /// On what.
+        path: PathBuf,
+        /// The system's reason.
+        cause: io::Error,
+    },
+    /// Somebody else owns the directory that should be ours.
+    #[error("{0} belongs to another user; remove it, or ask its owner to")]
+    Foreign(PathBuf),
+    /// iceoryx2 refused.
+    #[error("cannot join run {run_id} in shared memory: {cause}; is /dev/shm mounted and not full?")]
+    Join {
+        /// The run.
+        run_id: String,
+        /// iceoryx2's reason.
+        cause: String,
+    },
+}
+
+impl Domain {
+    /// Joins the run `run_id`, whose channels are laid out for up to `max_actors` actors.
+    ///
+    /// # Errors
+    /// When the user's directory cannot be made, or shared memory cannot be had.
+    pub fn join(run_id: &str, max_actors: u32) -> Result<Self, DomainError> {
+        let root = user_root()?;
+        // Held until the node exists, so that nobody who looks for abandoned runs takes this one for dead.
+        let _lock = lock(&root)?;
+        let failed = |cause: String| DomainError::Join {
+            run_id: run_id.into(),
+            cause,
+        };
+        let config = iox_config(&root, run_id).map_err(failed)?;
+        let node = NodeBuilder::new()
+            .config(&config)
+            .signal_handling_mode(SignalHandlingMode::Disabled)
+            .create::<ipc::Service>()
+            .map_err(|cause| failed(format!("{cause:?}")))?;
+        Ok(Self {
+            node,
+            run_id: run_id.into(),
+            max_actors: max_actors as usize,
+        })
+    }
+
+    /// The run's name in shared memory.
+    pub fn run_id(&self) -> &str {
+        &self.run_id
+    }
+
+    /// The most actors the run's channels have room for.
+    pub fn max_actors(&self) -> usize {
+        self.max_actors
+    }
+
+    /// The text of the configuration file with which other iceoryx2 programs find this run.
+    ///
+    /// # Errors
+    /// When iceoryx2's configuration cannot be written as TOML.
+    pub fn iox_config(&self) -> Result<String, toml::ser::Error> {
+        toml::to_string(self.node.config())
+    }
+
+    /// Removes from the run's services whatever processes left in them that are no more.
+    pub fn clean(&self) {
+        self.node.blocking_cleanup_dead_nodes(Duration::from_millis(100));
+    }
+
+    pub(super) fn node(&self) -> &Node<ipc::Service> {
+        &self.node
+    }
+
+    /// Leaves the run as its last process, and removes every trace of it from shared memory.
+    ///
+    /// # Errors
+    /// When files cannot be removed.
+    pub fn leave_last(self) -> Result<(), DomainError> {
+        let run_id = self.run_id.clone();
+        drop(self);
+        let root = user_root()?;
+        let _lock = lock(&root)?;
+        remove_if_dead(&root, &run_id)
+    }
+
+    /// Removes what this user's runs left in shared memory that were killed with all their processes.
+    ///
+    /// # Errors
+    /// When the user's directory cannot be read, or files cannot be removed.
+    pub fn remove_abandoned() -> Result<(), DomainError> {
+        let root = user_root()?;
+        let _lock = lock(&root)?;
+        let listing = std::fs::read_dir(&root).map_err(io_error("list", &root))?;
+        for entry in listing.flatten() {
+            if entry.path().is_dir()
+                && let Some(run_id) = entry.file_name().to_str()
+            {
+                remove_if_dead(&root, run_id)?;
+            }
+        }
+        Ok(())
+    }
+}
+
+/// File names of the run in shared memory begin with this.
+pub(super) fn prefix(run_id: &str) -> String {
+    format!("shoal_{run_id}_")
+}
+
+fn iox_config(root: &Path, run_id: &str) -> Result<Config, String> {
+    let directory = root.join(run_id);
+    let root_path = IoxPath::new(directory.as_os_str().as_encoded_bytes()).map_err(|e| format!("{e:?}"))?;
+    let mut config = Config::default();
+    config.global.set_root_path(&root_path);
+    config.global.prefix = FileName::new(prefix(run_id).as_bytes()).map_err(|e| format!("{e:?}"))?;
+    Ok(config)
+}
+
+fn remove_if_dead(root: &Path, run_id: &str) -> Result<(), DomainError> {
+    let failed = |cause: String| DomainError::Join {
+        run_id: run_id.into(),
+        cause,
+    };
+    let config = iox_config(root, run_id).map_err(failed)?;
+    let mut somebody_lives = false;
+    Node::<ipc::Service>::list(&config, |state| {
+        match state {
+            NodeState::Dead(dead) => {
+                // A node that cannot be cleaned one by one goes with the files below.
+                let _ = dead.blocking_remove_stale_resources(Duration::from_secs(1));
+            }
+            _ => somebody_lives = true,
+        }
+        CallbackProgression::Continue
+    })
+    .map_err(|cause| failed(format!("{cause:?}")))?;
+    if somebody_lives {
+        return Ok(());
+    }
+    // No process of the run is left and its name is its own, so these files are nobody's. iceoryx2 itself never removes
+    // the file that counts its nodes.
+    let shared_memory = Path::new(SHARED_MEMORY);
+    let listing = std::fs::read_dir(shared_memory).map_err(io_error("list", shared_memory))?;
+    for entry in listing.flatten() {
+        if entry.file_name().to_string_lossy().starts_with(&prefix(run_id)) {
+            remove(&entry.path(), |path| std::fs::remove_file(path))?;
+        }
+    }
+    remove(&root.join(run_id), |path| std::fs::remove_dir_all(path))
+}
+
+fn remove(path: &Path, how: impl Fn(&Path) -> io::Result<()>) -> Result<(), DomainError> {
+    match how(path) {
+        Err(cause) if cause.kind() != io::ErrorKind::NotFound => Err(io_error("remove", path)(cause)),
+        _ => Ok(()),
+    }
+}
+
+/// `/tmp/shoal-<user id>`, closed to everybody else.
+fn user_root() -> Result<PathBuf, DomainError> {
+    let user = rustix::process::getuid().as_raw();
+    let root = PathBuf::from(format!("/tmp/shoal-{user}"));
+    match DirBuilder::new().mode(0o700).create(&root) {
+        Err(cause) if cause.kind() != io::ErrorKind::AlreadyExists => return Err(io_error("make", &root)(cause)),
+        _ => {}
+    }
+    let metadata = std::fs::symlink_metadata(&root).map_err(io_error("inspect", &root))?;
+    if !metadata.is_dir() || metadata.uid() != user {
+        return Err(DomainError::Foreign(root));
+    }
+    Ok(root)
+}
+
+fn lock(root: &Path) -> Result<File, DomainError> {
+    let file = File::open(root).map_err(io_error("open", root))?;
+    rustix::fs::flock(&file, FlockOperation::LockExclusive).map_err(|errno| io_error("lock", root)(errno.into()))?;
+    Ok(file)
+}
+
+fn io_error(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> DomainError {
+    let path = path.to_owned();
+    move |cause| DomainError::Io { action, path, cause }
+}

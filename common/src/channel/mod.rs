@@ -1,0 +1,82 @@
+//! The typed channels between the processes of a run. Each flow of data is one module: its service's name, payload, header
+//! and limits are declared there once, and both ends are made from that declaration.
+
+use std::fmt::Debug;
+use std::time::{Duration, Instant};
+
+use iceoryx2::prelude::*;
+
+mod bell;
+mod domain;
+pub mod environment;
+pub mod policy;
+mod pulse;
+pub mod reports;
+pub mod transitions;
+
+pub use bell::{Bell, Place, Ringer, wait_for};
+pub use domain::{Domain, DomainError};
+pub use pulse::Pulse;
+
+/// A channel does not work: its service or port cannot be had, or memory is exhausted.
+#[derive(Debug, thiserror::Error)]
+#[error("channel {channel}: cannot {action}: {cause}")]
+pub struct ChannelError {
+    /// Name of the channel within the run.
+    pub channel: String,
+    /// What was tried.
+    pub action: &'static str,
+    /// iceoryx2's reason.
+    pub cause: String,
+}
+
+impl ChannelError {
+    fn new(channel: impl Into<String>, action: &'static str, cause: impl Debug) -> Self {
+        Self {
+            channel: channel.into(),
+            action,
+            cause: format!("{cause:?}"),
+        }
+    }
+}
+
+/// Why a role's loop ends early.
+#[derive(Debug, thiserror::Error)]
+pub enum Interruption {
+    /// The role was asked to end: no failure.
+    #[error("asked to end")]
+    Stopped,
+    /// A channel does not work.
+    #[error(transparent)]
+    Channel(#[from] ChannelError),
+}
+
+/// How long a dead predecessor may occupy a port before we give up.
+const CLAIM_PATIENCE: Duration = Duration::from_secs(5);
+
+/// Opens a service or makes a port. A process that died may still hold the place, and it does so until somebody cleans up
+/// after it; two processes may also make and remove the same service at the same time. So: clean up and try again.
+fn claim<T, E: Debug>(
+    domain: &Domain,
+    channel: &str,
+    action: &'static str,
+    mut attempt: impl FnMut() -> Result<T, E>,
+) -> Result<T, ChannelError> {
+    let deadline = Instant::now() + CLAIM_PATIENCE;
+    loop {
+        match attempt() {
+            Ok(made) => return Ok(made),
+            Err(cause) if Instant::now() >= deadline => return Err(ChannelError::new(channel, action, cause)),
+            Err(_) => {
+                domain.clean();
+                std::thread::sleep(Duration::from_millis(5));
+            }
+        }
+    }
+}
+
+/// The service name of a channel; every process of the run and the ecosystem's tools see it under this name.
+fn service_name(domain: &Domain, channel: &str) -> Result<ServiceName, ChannelError> {
+    let name = format!("shoal/{}/{channel}", domain.run_id());
+    ServiceName::new(&name).map_err(|cause| ChannelError::new(channel, "be named", cause))
+}

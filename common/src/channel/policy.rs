@@ -1,0 +1,174 @@
+//! The policy, from the learner to everyone who acts: the latest wins. Readers evaluate it where it lies, in the learner's
+//! memory, and go on with it when the learner dies.
+
+use iceoryx2::port::publisher::Publisher;
+use iceoryx2::port::subscriber::Subscriber;
+use iceoryx2::port::update_connections::UpdateConnections;
+use iceoryx2::prelude::*;
+use iceoryx2::sample::Sample;
+use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
+
+use super::{ChannelError, Domain, claim, service_name};
+
+const CHANNEL: &str = "policy";
+
+/// What a reader knows of a policy.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ZeroCopySend)]
+#[repr(C)]
+pub struct PolicyHeader {
+    /// The learner's start that published it.
+    pub incarnation: u64,
+    /// Grows with each publication, and goes on from the checkpoint when a learner is restarted.
+    pub version: u64,
+    /// Environment steps it was learned from.
+    pub env_steps: u64,
+    /// Updates it was made by.
+    pub updates: u64,
+    /// Fingerprint of the parameters' layout.
+    pub fingerprint: u64,
+}
+
+/// The learner's end.
+#[derive(Debug)]
+pub struct PolicyPublisher {
+    publisher: Publisher<ipc::Service, [f32], PolicyHeader>,
+}
+
+/// A reader's end, holding on to the newest policy it was given.
+#[derive(Debug)]
+pub struct PolicyReader {
+    subscriber: Subscriber<ipc::Service, [f32], PolicyHeader>,
+    current: Option<Policy>,
+    fingerprint: u64,
+    parameters: usize,
+}
+
+/// A policy in the learner's memory; it stays as it is for as long as this lives, and longer than the learner.
+#[derive(Debug)]
+pub struct Policy {
+    sample: Sample<ipc::Service, [f32], PolicyHeader>,
+}
+
+impl PolicyPublisher {
+    /// The publishing end, for policies of so many parameters.
+    ///
+    /// # Errors
+    /// When shared memory cannot be had, or another learner lives.
+    pub fn open(domain: &Domain, parameters: usize) -> Result<Self, ChannelError> {
+        let publisher = claim(domain, CHANNEL, "publish", || {
+            service(domain)?
+                .publisher_builder()
+                .initial_max_slice_len(parameters)
+                .max_loaned_samples(1)
+                .create()
+                .map_err(|cause| ChannelError::new(CHANNEL, "publish", cause))
+        })?;
+        Ok(Self { publisher })
+    }
+
+    /// Publishes a policy.
+    ///
+    /// # Errors
+    /// When shared memory is exhausted.
+    pub fn publish(&self, parameters: &[f32], header: PolicyHeader) -> Result<(), ChannelError> {
+        let mut loan = self
+            .publisher
+            .loan_slice_uninit(parameters.len())
+            .map_err(|cause| ChannelError::new(CHANNEL, "publish", cause))?;
+        *loan.user_header_mut() = header;
+        loan.write_from_slice(parameters)
+            .send()
+            .map(|_| ())
+            .map_err(|cause| ChannelError::new(CHANNEL, "publish", cause))
+    }
+
+    /// Hands the newest policy to readers that have come since. To be called while waiting.
+    ///
+    /// # Errors
+    /// When the connection cannot be made.
+    pub fn look_after(&self) -> Result<(), ChannelError> {
+        self.publisher
+            .update_connections()
+            .map_err(|cause| ChannelError::new(CHANNEL, "reconnect", cause))
+    }
+}
+
+impl PolicyReader {
+    /// The reading end, for policies whose layout has this fingerprint and number of parameters.
+    ///
+    /// # Errors
+    /// When shared memory cannot be had.
+    pub fn open(domain: &Domain, fingerprint: u64, parameters: usize) -> Result<Self, ChannelError> {
+        let subscriber = claim(domain, CHANNEL, "read", || {
+            service(domain)?
+                .subscriber_builder()
+                .create()
+                .map_err(|cause| ChannelError::new(CHANNEL, "read", cause))
+        })?;
+        Ok(Self {
+            subscriber,
+            current: None,
+            fingerprint,
+            parameters,
+        })
+    }
+
+    /// The newest policy there is; the same again when no newer one has come, `None` before the first.
+    ///
+    /// # Errors
+    /// When the learner's memory cannot be mapped, or its policy has another layout.
+    pub fn latest(&mut self) -> Result<Option<&Policy>, ChannelError> {
+        while let Some(sample) = self
+            .subscriber
+            .receive()
+            .map_err(|cause| ChannelError::new(CHANNEL, "read", cause))?
+        {
+            if sample.user_header().fingerprint != self.fingerprint || sample.payload().len() != self.parameters {
+                return Err(ChannelError::new(
+                    CHANNEL,
+                    "read",
+                    "the learner's networks have another layout",
+                ));
+            }
+            self.current = Some(Policy { sample });
+        }
+        Ok(self.current.as_ref())
+    }
+}
+
+impl PolicyReader {
+    /// The policy that [`latest`](Self::latest) gave last, however old it is by now.
+    pub fn held(&self) -> Option<&Policy> {
+        self.current.as_ref()
+    }
+}
+
+impl Policy {
+    /// What is known of the policy.
+    pub fn header(&self) -> &PolicyHeader {
+        self.sample.user_header()
+    }
+
+    /// Its parameters, in the layout of [`crate::network`].
+    pub fn parameters(&self) -> &[f32] {
+        self.sample.payload()
+    }
+}
+
+fn service(domain: &Domain) -> Result<PortFactory<ipc::Service, [f32], PolicyHeader>, ChannelError> {
+    domain
+        .node()
+        .service_builder(&service_name(domain, CHANNEL)?)
+        .publish_subscribe::<[f32]>()
+        .user_header::<PolicyHeader>()
+        .max_publishers(1)
+        .max_subscribers(domain.max_actors() + 2)
+        .max_nodes(domain.max_actors() + 4)
+        .enable_safe_overflow(true)
+        .history_size(1)
+        .subscriber_max_buffer_size(1)
+        // One in use, and the next one in hand before the first is let go.
+        .subscriber_max_borrowed_samples(2)
+        .open_or_create()
+        .map_err(|cause| ChannelError::new(CHANNEL, "open", cause))
+}

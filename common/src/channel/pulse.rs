@@ -1,0 +1,57 @@
+//! A role's heartbeat.
+
+use std::time::{Duration, Instant};
+
+use super::reports::Reporter;
+use super::{ChannelError, Domain};
+use crate::report::{Activity, Heartbeat, Identity};
+
+const INTERVAL: Duration = Duration::from_millis(500);
+
+/// Tells the launcher that this role lives, how far it is, and what it waits for. The first beat says that it is ready.
+#[derive(Debug)]
+pub struct Pulse {
+    reporter: Reporter<Heartbeat>,
+    heartbeat: Heartbeat,
+    last: Option<Instant>,
+}
+
+impl Pulse {
+    /// The pulse of a role that is not ready yet.
+    ///
+    /// # Errors
+    /// When shared memory cannot be had.
+    pub fn new(domain: &Domain, identity: Identity) -> Result<Self, ChannelError> {
+        Ok(Self {
+            reporter: Reporter::open(domain)?,
+            heartbeat: Heartbeat::new(identity),
+            last: None,
+        })
+    }
+
+    /// Counts `steps` more steps of the role's work.
+    pub fn count(&mut self, steps: u64) {
+        self.heartbeat.steps += steps;
+    }
+
+    /// Says which policy the role uses.
+    pub fn set_policy_version(&mut self, version: u64) {
+        self.heartbeat.policy_version = version;
+    }
+
+    /// Beats if it is time to.
+    pub fn beat(&mut self, activity: Activity) {
+        if self.last.is_none_or(|last| last.elapsed() >= INTERVAL) {
+            self.last = Some(Instant::now());
+            self.heartbeat.set_activity(activity);
+            self.reporter.look_after();
+            self.reporter.send(self.heartbeat);
+        }
+    }
+
+    /// Beats at once: for the last one.
+    pub fn beat_now(&mut self, activity: Activity) {
+        self.last = None;
+        self.beat(activity);
+    }
+}

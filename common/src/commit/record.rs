@@ -1,0 +1,160 @@
+//! The commit record: how far the replay is filled and which chunks are in it.
+
+use std::sync::atomic::{Ordering, fence};
+
+use super::words::{Words, WritableWords};
+
+/// Identifies a chunk of one actor. Ordered: a later incarnation comes after every chunk of the earlier ones.
+///
+/// The default means "none": an incarnation numbers its chunks from 1.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
+pub struct ChunkMark {
+    /// How often the actor has been started before.
+    pub incarnation: u64,
+    /// The chunk's number within the incarnation.
+    pub sequence: u64,
+}
+
+/// What is committed of one actor.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct ActorCommit {
+    /// The last chunk.
+    pub mark: ChunkMark,
+    /// Rows of all its chunks, of all incarnations.
+    pub rows: u64,
+}
+
+/// A commit record. Rows are numbered from 0 in the order they were committed, for the life of the file.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Record {
+    /// Exactly as in a slot: the four fields below, then three words an actor.
+    words: Vec<u64>,
+}
+
+const GENERATION: usize = 0;
+const HEAD: usize = 1;
+const TAIL: usize = 2;
+const ACTORS: usize = 3;
+const ACTOR_WORDS: usize = 3;
+
+const WORD: usize = size_of::<u64>();
+/// A slot's seal while its record is being written. No finished record has it: see `seal`.
+const OPEN: u64 = 0;
+
+impl Record {
+    /// The record of an empty replay.
+    pub fn empty(actors: usize) -> Self {
+        Self {
+            words: vec![0; ACTORS + ACTOR_WORDS * actors],
+        }
+    }
+
+    pub(super) fn words_of(actors: usize) -> Option<usize> {
+        actors.checked_mul(ACTOR_WORDS)?.checked_add(ACTORS)
+    }
+
+    /// Counts the records ever written: the greater one is the newer.
+    pub fn generation(&self) -> u64 {
+        self.words[GENERATION]
+    }
+
+    /// Rows ever committed, which is also the number of the next one.
+    pub fn head(&self) -> u64 {
+        self.words[HEAD]
+    }
+
+    /// The oldest row that can be read: those before it were overwritten or lost.
+    pub fn tail(&self) -> u64 {
+        self.words[TAIL]
+    }
+
+    /// Actors there is room for.
+    pub fn actors(&self) -> usize {
+        (self.words.len() - ACTORS) / ACTOR_WORDS
+    }
+
+    /// What is committed of an actor.
+    ///
+    /// # Panics
+    /// As indexing a slice does: `actor` must be less than `actors()`.
+    pub fn actor(&self, actor: usize) -> ActorCommit {
+        actor_from(|i| self.words[ACTORS + ACTOR_WORDS * actor + i])
+    }
+
+    /// Adds a chunk.
+    ///
+    /// # Panics
+    /// As indexing a slice does: `actor` must be less than `actors()`.
+    pub fn add(&mut self, actor: usize, mark: ChunkMark, rows: u64) {
+        let at = ACTORS + ACTOR_WORDS * actor;
+        self.words[at] = mark.incarnation;
+        self.words[at + 1] = mark.sequence;
+        self.words[at + 2] += rows;
+        self.words[HEAD] += rows;
+    }
+
+    /// Makes it the record of another generation.
+    pub fn set_generation(&mut self, generation: u64) {
+        self.words[GENERATION] = generation;
+    }
+
+    /// Gives up the rows before `tail`.
+    pub fn set_tail(&mut self, tail: u64) {
+        self.words[TAIL] = tail;
+    }
+
+    /// Never `OPEN`, so that a record that was not finished is recognised by more than its checksum.
+    fn seal(&self) -> u64 {
+        1 << 32 | u64::from(crc32fast::hash(bytemuck::cast_slice(&self.words)))
+    }
+
+    /// Reads the record of the slot at `offset`; `None` if it was not finished or is damaged.
+    pub fn load(words: &Words, offset: usize, actors: usize) -> Option<Self> {
+        let mut record = Self::empty(actors);
+        for (i, word) in record.words.iter_mut().enumerate() {
+            *word = words.load(offset + (1 + i) * WORD);
+        }
+        (words.load(offset) == record.seal() && record.tail() <= record.head()).then_some(record)
+    }
+
+    /// Writes the record into the slot at `offset`, which must not be the published one; `step` is called after each of
+    /// the three steps: seal broken, record written, seal set. What is stored afterwards comes after all of it.
+    pub fn store(&self, words: &mut WritableWords, offset: usize, mut step: impl FnMut(usize)) {
+        // SYNC POINT with the second Acquire fence of `CommitReader::consistent`: a reader that has read a word stored
+        // below also sees that the other slot was published before.
+        fence(Ordering::Release);
+        words.store(offset, OPEN);
+        step(0);
+        // These two are for who opens the file after a kill: a sealed slot is a finished one.
+        fence(Ordering::Release);
+        for (i, word) in self.words.iter().enumerate() {
+            words.store(offset + (1 + i) * WORD, *word);
+        }
+        step(1);
+        fence(Ordering::Release);
+        words.store(offset, self.seal());
+        step(2);
+        // SYNC POINT with the first Acquire fence of `CommitReader::consistent`: the caller publishes next.
+        fence(Ordering::Release);
+    }
+}
+
+/// Number of rows committed, by the record in the slot at `offset`.
+pub(super) fn load_head(words: &Words, offset: usize) -> u64 {
+    words.load(offset + (1 + HEAD) * WORD)
+}
+
+/// What is committed of an actor, by the record in the slot at `offset`.
+pub(super) fn load_actor(words: &Words, offset: usize, actor: usize) -> ActorCommit {
+    actor_from(|i| words.load(offset + (1 + ACTORS + ACTOR_WORDS * actor + i) * WORD))
+}
+
+fn actor_from(word: impl Fn(usize) -> u64) -> ActorCommit {
+    ActorCommit {
+        mark: ChunkMark {
+            incarnation: word(0),
+            sequence: word(1),
+        },
+        rows: word(2),
+    }
+}

@@ -1,0 +1,439 @@
+//! The run's configuration, as it stands in `config.toml` once everything is decided. Each section belongs to one part of
+//! the system, and a role is handed the sections it needs, never the whole.
+
+use std::fmt::Display;
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+
+use crate::space::EnvironmentSpec;
+use crate::transition::RowLayout;
+
+/// Everything a run was started with.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    /// Identity and length of the run.
+    pub run: Run,
+    /// What is controlled.
+    pub environment: Environment,
+    /// What the environment says of itself.
+    pub spec: EnvironmentSpec,
+    /// Who explores, and in how large portions.
+    #[serde(default)]
+    pub actors: Actors,
+    /// The exploration noise.
+    #[serde(default)]
+    pub exploration: Exploration,
+    /// What is learned, and how.
+    #[serde(default)]
+    pub ddpg: Ddpg,
+    /// What is remembered, and how often it is used.
+    #[serde(default)]
+    pub replay: Replay,
+    /// How often the policy is judged.
+    #[serde(default)]
+    pub evaluation: Evaluation,
+    /// How often the learner's state is saved.
+    #[serde(default)]
+    pub checkpoint: Checkpoint,
+}
+
+/// Identity and length of the run.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Run {
+    /// Names the run's services and shared memory; chosen when the run directory is made.
+    pub id: String,
+    /// The root of every random stream.
+    pub seed: u64,
+    /// Whether timing may decide anything.
+    pub mode: Mode,
+    /// Environment steps over all actors after which training ends.
+    pub steps: u64,
+}
+
+/// Whether timing may decide anything.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Mode {
+    /// Actors and learner run side by side, within the ratio's tolerance.
+    Free,
+    /// Actors and learner take turns: the same seed and actor count give the same bits.
+    Lockstep,
+}
+
+/// What is controlled: an environment's name, and the parameters that this environment understands.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Environment {
+    /// One of the environments' names.
+    pub name: String,
+    /// The environment's own parameters.
+    #[serde(flatten)]
+    pub parameters: toml::Table,
+}
+
+/// Who explores, and in how large portions.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Actors {
+    /// Actor processes, each with an environment server of its own.
+    pub count: u32,
+    /// Environments an actor steps at once.
+    pub envs: u32,
+    /// Steps of every environment that travel in one chunk: a chunk has `chunk_steps · envs` rows.
+    pub chunk_steps: u32,
+    /// Chunks an actor may have sent that the learner has not yet committed.
+    pub window: u32,
+    /// The most actors the run can be scaled to.
+    pub max: u32,
+}
+
+/// Ornstein-Uhlenbeck noise: x ← x − θ x + σ N(0, 1) at each step, added to the action in units of half its range.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Exploration {
+    /// θ, the pull towards zero.
+    pub theta: f64,
+    /// σ, the size of each step's impulse.
+    pub sigma: f64,
+}
+
+/// Algorithm 4 with the numbers of section 4.3.1.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Ddpg {
+    /// Units of the two hidden layers, of actor and critic alike.
+    pub hidden: [usize; 2],
+    /// γ, the discount of one step.
+    pub gamma: f64,
+    /// τ, how far the target networks follow in one update (equation 3.31).
+    pub tau: f64,
+    /// Adam's step size for the actor, α_μ.
+    pub actor_learning_rate: f64,
+    /// Adam's step size for the critic, α_Q.
+    pub critic_learning_rate: f64,
+    /// N, transitions in a minibatch.
+    pub batch: usize,
+}
+
+/// What is remembered, and how often it is used.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Replay {
+    /// The newest so many transitions are sampled from.
+    pub capacity: u64,
+    /// Transitions collected before the first update.
+    pub warmup: u64,
+    /// Updates for each environment step beyond the warm-up. The thesis: 1.
+    pub updates_per_step: f64,
+    /// Steps the actors may be ahead of that ratio before the learner stops taking transitions.
+    pub tolerance: u64,
+}
+
+/// How often the policy is judged.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Evaluation {
+    /// Environment steps from one evaluation to the next.
+    pub every: u64,
+    /// Episodes of an evaluation, always from the same start states.
+    pub episodes: u32,
+    /// Episodes of the last evaluation, whose mean is the run's result.
+    pub final_episodes: u32,
+}
+
+/// How often the learner's state is saved.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Checkpoint {
+    /// Seconds between checkpoints of a free run.
+    pub every_seconds: f64,
+    /// Updates between checkpoints of a lockstep run.
+    pub every_updates: u64,
+}
+
+impl Default for Run {
+    fn default() -> Self {
+        Self {
+            id: String::new(),
+            seed: 1,
+            mode: Mode::Free,
+            steps: 120_000,
+        }
+    }
+}
+
+impl Default for Actors {
+    fn default() -> Self {
+        Self {
+            count: 2,
+            envs: 1,
+            chunk_steps: 8,
+            window: 8,
+            max: 16,
+        }
+    }
+}
+
+impl Default for Exploration {
+    fn default() -> Self {
+        Self {
+            theta: 0.15,
+            sigma: 0.2,
+        }
+    }
+}
+
+impl Default for Ddpg {
+    fn default() -> Self {
+        Self {
+            hidden: [400, 300],
+            gamma: 0.99,
+            tau: 0.001,
+            actor_learning_rate: 1e-4,
+            critic_learning_rate: 1e-3,
+            batch: 64,
+        }
+    }
+}
+
+impl Default for Replay {
+    fn default() -> Self {
+        Self {
+            capacity: 1_000_000,
+            warmup: 1_000,
+            updates_per_step: 1.0,
+            tolerance: 512,
+        }
+    }
+}
+
+impl Default for Evaluation {
+    fn default() -> Self {
+        Self {
+            every: 2_000,
+            episodes: 10,
+            final_episodes: 100,
+        }
+    }
+}
+
+impl Default for Checkpoint {
+    fn default() -> Self {
+        Self {
+            every_seconds: 5.0,
+            every_updates: 5_000,
+        }
+    }
+}
+
+impl Evaluation {
+    /// The period that a policy learned from so many environment steps falls into. A policy is judged when no policy of
+    /// its period or a later one was.
+    pub fn period(&self, env_steps: u64) -> u64 {
+        env_steps / self.every
+    }
+}
+
+/// Why a configuration cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum ConfigError {
+    /// The file could not be read.
+    #[error("cannot read {path}: {cause}")]
+    Unreadable {
+        /// The file.
+        path: PathBuf,
+        /// The system's reason.
+        cause: std::io::Error,
+    },
+    /// The text is not a configuration.
+    #[error("{origin}: {message}")]
+    Malformed {
+        /// Where the text came from.
+        origin: String,
+        /// What is wrong with it, on one line.
+        message: String,
+    },
+    /// A value is outside what makes sense.
+    #[error("{key} = {value}: must be {expected}")]
+    OutOfRange {
+        /// The key, with its section.
+        key: &'static str,
+        /// The value found.
+        value: String,
+        /// What would be accepted.
+        expected: String,
+    },
+}
+
+impl Config {
+    /// Reads a resolved configuration.
+    ///
+    /// # Errors
+    /// When the file is missing, is not a configuration, or holds a value out of range.
+    pub fn load(path: &Path) -> Result<Self, ConfigError> {
+        let text = std::fs::read_to_string(path).map_err(|cause| ConfigError::Unreadable {
+            path: path.to_owned(),
+            cause,
+        })?;
+        let table = text.parse().map_err(|error| malformed(path.display(), &error))?;
+        Self::from_table(table, path.display())
+    }
+
+    /// A configuration from its sections; `origin` is named when something is wrong with them.
+    ///
+    /// # Errors
+    /// When a key is unknown, of the wrong type, or out of range.
+    pub fn from_table(table: toml::Table, origin: impl Display) -> Result<Self, ConfigError> {
+        let config: Self = table.try_into().map_err(|error| malformed(origin, &error))?;
+        config.validate()?;
+        Ok(config)
+    }
+
+    /// The configuration as the text of `config.toml`.
+    ///
+    /// # Errors
+    /// When a value cannot be written as TOML (a seed beyond 2⁶³).
+    pub fn to_toml(&self) -> Result<String, ConfigError> {
+        toml::to_string(self).map_err(|error| ConfigError::Malformed {
+            origin: "configuration".into(),
+            message: error.to_string(),
+        })
+    }
+
+    /// Rows in a full chunk.
+    pub fn chunk_rows(&self) -> usize {
+        (self.actors.chunk_steps * self.actors.envs) as usize
+    }
+
+    /// Index of the evaluator's environment server; those of the actors have the actors' indices.
+    pub fn evaluation_server(&self) -> u32 {
+        self.actors.max
+    }
+
+    /// Environments that the evaluator steps at once.
+    pub fn evaluation_envs(&self) -> u32 {
+        self.evaluation.episodes.min(64)
+    }
+
+    /// How a transition's row is laid out.
+    pub fn row_layout(&self) -> RowLayout {
+        RowLayout::new(self.spec.observation.width(), self.spec.action.width())
+    }
+
+    /// A number for all that the rows of the replay and the weights of a checkpoint depend on. Length of the run, number
+    /// of actors and intervals are not among it: those may change when a run is resumed.
+    pub fn fingerprint(&self) -> u64 {
+        let identity = format!(
+            "{} {} {:?} {} {:?} {:?} {:?}",
+            self.run.id,
+            self.run.seed,
+            self.run.mode,
+            self.environment.name,
+            self.environment.parameters,
+            self.ddpg,
+            self.exploration
+        );
+        let digest = Sha256::digest(identity.as_bytes());
+        digest.iter().take(8).fold(0, |word, &byte| word << 8 | u64::from(byte))
+    }
+
+    fn validate(&self) -> Result<(), ConfigError> {
+        let Self {
+            run,
+            actors,
+            exploration,
+            ddpg,
+            replay,
+            evaluation,
+            checkpoint,
+            ..
+        } = self;
+        within("run.seed", run.seed, 0, i64::MAX as u64)?;
+        within("run.steps", run.steps, 1, 1_000_000_000_000)?;
+        within("actors.max", actors.max, 1, 256)?;
+        within("actors.count", actors.count, 1, actors.max)?;
+        within("actors.envs", actors.envs, 1, 4_096)?;
+        within("actors.chunk_steps", actors.chunk_steps, 1, 4_096)?;
+        within("actors.window", actors.window, 1, 64)?;
+        within("exploration.theta", exploration.theta, 0.0, 1.0)?;
+        within("exploration.sigma", exploration.sigma, 0.0, 10.0)?;
+        within("ddpg.hidden[0]", ddpg.hidden[0], 1, 8_192)?;
+        within("ddpg.hidden[1]", ddpg.hidden[1], 1, 8_192)?;
+        within("ddpg.gamma", ddpg.gamma, 0.0, 1.0)?;
+        within("ddpg.tau", ddpg.tau, 0.0, 1.0)?;
+        within("ddpg.actor_learning_rate", ddpg.actor_learning_rate, 0.0, 1.0)?;
+        within("ddpg.critic_learning_rate", ddpg.critic_learning_rate, 0.0, 1.0)?;
+        within("ddpg.batch", ddpg.batch, 1, 65_536)?;
+        within("replay.capacity", replay.capacity, ddpg.batch as u64, 1_000_000_000)?;
+        within("replay.warmup", replay.warmup, 1, replay.capacity)?;
+        within("replay.updates_per_step", replay.updates_per_step, 0.0, 1_000.0)?;
+        within("replay.tolerance", replay.tolerance, 1, 1_000_000_000)?;
+        within("evaluation.every", evaluation.every, 1, u64::MAX)?;
+        within("evaluation.episodes", evaluation.episodes, 1, 10_000)?;
+        within("evaluation.final_episodes", evaluation.final_episodes, 1, 100_000)?;
+        within("checkpoint.every_seconds", checkpoint.every_seconds, 0.0, 86_400.0)?;
+        within("checkpoint.every_updates", checkpoint.every_updates, 1, 1_000_000_000)
+    }
+}
+
+fn within<T: PartialOrd + Display>(key: &'static str, value: T, low: T, high: T) -> Result<(), ConfigError> {
+    if low <= value && value <= high {
+        return Ok(());
+    }
+    Err(ConfigError::OutOfRange {
+        key,
+        value: value.to_string(),
+        expected: format!("from {low} to {high}"),
+    })
+}
+
+fn malformed(origin: impl Display, error: &toml::de::Error) -> ConfigError {
+    ConfigError::Malformed {
+        origin: origin.to_string(),
+        message: error.message().replace('\n', " "),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn parse(text: &str) -> Result<Config, ConfigError> {
+        Config::from_table(text.parse().unwrap(), "test")
+    }
+
+    const LEAST: &str = "[run]\n[spec]\ntime_limit = 200\nobservation.discrete.n = 16\naction.box = { low = [-2.0], high = [2.0] }\n\
+        [environment]\nname = \"pendulum\"\n";
+
+    #[test]
+    fn a_resolved_configuration_reads_back() {
+        let config = parse(&format!("{LEAST}start_speed = 1.0\n")).unwrap();
+        assert_eq!(parse(&config.to_toml().unwrap()).unwrap(), config);
+    }
+
+    #[test]
+    fn unknown_keys_and_values_out_of_range_are_named() {
+        let unknown = parse(&format!("{LEAST}[ddpg]\ngama = 0.9\n")).unwrap_err().to_string();
+        assert!(
+            unknown.contains("gama") && unknown.contains("gamma") && !unknown.contains('\n'),
+            "{unknown}"
+        );
+        let range = parse(&format!("{LEAST}[ddpg]\ngamma = 1.5\n")).unwrap_err().to_string();
+        assert_eq!(range, "ddpg.gamma = 1.5: must be from 0 to 1");
+        let nan = parse(&format!("{LEAST}[ddpg]\ntau = nan\n")).unwrap_err().to_string();
+        assert!(nan.contains("ddpg.tau = NaN"), "{nan}");
+    }
+
+    #[test]
+    fn the_fingerprint_follows_what_the_rows_depend_on() {
+        let base = parse(LEAST).unwrap();
+        let mut other = base.clone();
+        other.run.steps += 1;
+        assert_eq!(base.fingerprint(), other.fingerprint());
+        other.environment.parameters.insert("start_speed".into(), 1.0.into());
+        assert_ne!(base.fingerprint(), other.fingerprint());
+    }
+}

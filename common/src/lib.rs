@@ -1,0 +1,14 @@
+//! What crosses a process boundary of Shoal, or is shared by every role.
+
+pub mod channel;
+pub mod commit;
+pub mod config;
+pub mod durable;
+pub mod network;
+pub mod policy_file;
+pub mod report;
+pub mod run_dir;
+pub mod space;
+pub mod stop;
+pub mod stream;
+pub mod transition;

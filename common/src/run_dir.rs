@@ -1,0 +1,216 @@
+//! The run directory: where everything a run leaves behind lies.
+
+use std::fs::{DirBuilder, File};
+use std::io::{self, ErrorKind};
+use std::os::unix::fs::DirBuilderExt;
+use std::path::{Path, PathBuf};
+
+use crate::config::{Config, ConfigError};
+
+/// A run directory that exists.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct RunDir {
+    path: PathBuf,
+}
+
+/// Why a run directory cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum RunDirError {
+    /// A run directory is never overwritten.
+    #[error("{0} exists already; choose another directory with --run, or remove it")]
+    Exists(PathBuf),
+    /// There is no run at this place.
+    #[error("{0} is not a run directory: it has no config.toml")]
+    NotARun(PathBuf),
+    /// Another launcher works in it.
+    #[error("the run in {0} is going on: a launcher holds its lock; end that one first")]
+    Busy(PathBuf),
+    /// The system refused.
+    #[error("cannot {action} {path}: {cause}")]
+    Io {
+        /// What was tried.
+        action: &'static str,
+        /// On what.
+        path: PathBuf,
+        /// The system's reason.
+        cause: io::Error,
+    },
+}
+
+/// Held by the launcher for as long as the run goes on; released by the system when the launcher dies.
+#[derive(Debug)]
+pub struct RunLock {
+    _file: File,
+}
+
+impl RunDir {
+    /// Makes a new, empty run directory, readable by its owner alone.
+    ///
+    /// # Errors
+    /// When something is at `path` already, or it cannot be made.
+    pub fn create(path: &Path) -> Result<Self, RunDirError> {
+        let io = |action, path: &Path| {
+            let path = path.to_owned();
+            move |cause| RunDirError::Io { action, path, cause }
+        };
+        if let Some(parent) = path.parent() {
+            std::fs::create_dir_all(parent).map_err(io("make the directory", parent))?;
+        }
+        DirBuilder::new()
+            .mode(0o700)
+            .create(path)
+            .map_err(|cause| match cause.kind() {
+                ErrorKind::AlreadyExists => RunDirError::Exists(path.to_owned()),
+                _ => io("make the run directory", path)(cause),
+            })?;
+        // Roles are started with this path and may have another working directory.
+        let path = std::fs::canonicalize(path).map_err(io("resolve", path))?;
+        Ok(Self { path })
+    }
+
+    /// Makes the first free one of `<parent>/<name>-1`, `<parent>/<name>-2`, …
+    ///
+    /// # Errors
+    /// When the directory cannot be made.
+    pub fn create_next(parent: &Path, name: &str) -> Result<Self, RunDirError> {
+        let mut n = 1_u64;
+        loop {
+            match Self::create(&parent.join(format!("{name}-{n}"))) {
+                Err(RunDirError::Exists(_)) => n += 1,
+                other => return other,
+            }
+        }
+    }
+
+    /// An existing run directory.
+    ///
+    /// # Errors
+    /// When there is no run in it.
+    pub fn open(path: &Path) -> Result<Self, RunDirError> {
+        if !path.join("config.toml").is_file() {
+            return Err(RunDirError::NotARun(path.to_owned()));
+        }
+        let path = std::fs::canonicalize(path).map_err(|cause| RunDirError::Io {
+            action: "resolve",
+            path: path.to_owned(),
+            cause,
+        })?;
+        Ok(Self { path })
+    }
+
+    /// Claims the run for this process until the lock is dropped.
+    ///
+    /// # Errors
+    /// When another process holds it.
+    pub fn lock(&self) -> Result<RunLock, RunDirError> {
+        let io = |cause| RunDirError::Io {
+            action: "lock",
+            path: self.path.clone(),
+            cause,
+        };
+        let file = File::open(&self.path).map_err(io)?;
+        match rustix::fs::flock(&file, rustix::fs::FlockOperation::NonBlockingLockExclusive) {
+            Ok(()) => Ok(RunLock { _file: file }),
+            Err(rustix::io::Errno::WOULDBLOCK) => Err(RunDirError::Busy(self.path.clone())),
+            Err(errno) => Err(io(errno.into())),
+        }
+    }
+
+    /// The resolved configuration.
+    ///
+    /// # Errors
+    /// When it is missing or damaged.
+    pub fn config(&self) -> Result<Config, ConfigError> {
+        Config::load(&self.config_file())
+    }
+
+    /// The directory itself.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// The directory's own name.
+    pub fn name(&self) -> String {
+        self.path
+            .file_name()
+            .map_or_else(|| "run".into(), |name| name.to_string_lossy().into_owned())
+    }
+
+    /// `config.toml`: the resolved configuration.
+    pub fn config_file(&self) -> PathBuf {
+        self.path.join("config.toml")
+    }
+
+    /// `replay.bin`: the mapped ring of transitions.
+    pub fn replay_file(&self) -> PathBuf {
+        self.path.join("replay.bin")
+    }
+
+    /// `checkpoints/`: the learner's state.
+    pub fn checkpoints(&self) -> PathBuf {
+        self.path.join("checkpoints")
+    }
+
+    /// `checkpoints/best.policy`: the policy with the best evaluation so far.
+    pub fn best_policy(&self) -> PathBuf {
+        self.checkpoints().join("best.policy")
+    }
+
+    /// `checkpoints/last.policy`: the policy the learner ended with.
+    pub fn last_policy(&self) -> PathBuf {
+        self.checkpoints().join("last.policy")
+    }
+
+    /// `episodes.csv`: every exploration episode.
+    pub fn episodes(&self) -> PathBuf {
+        self.path.join("episodes.csv")
+    }
+
+    /// `evaluations.csv`: every evaluation.
+    pub fn evaluations(&self) -> PathBuf {
+        self.path.join("evaluations.csv")
+    }
+
+    /// `learner.csv`: losses, rates and ratio over time.
+    pub fn learner_log(&self) -> PathBuf {
+        self.path.join("learner.csv")
+    }
+
+    /// `tensorboard/`: the same as event files.
+    pub fn tensorboard(&self) -> PathBuf {
+        self.path.join("tensorboard")
+    }
+
+    /// `shoal.log`: what every process had to say.
+    pub fn log(&self) -> PathBuf {
+        self.path.join("shoal.log")
+    }
+
+    /// `learning-curve.svg`: evaluation returns over time.
+    pub fn learning_curve(&self) -> PathBuf {
+        self.path.join("learning-curve.svg")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_run_directory_is_never_overwritten_and_has_one_launcher() {
+        let parent = tempfile::tempdir().unwrap();
+        let first = RunDir::create_next(parent.path(), "pendulum").unwrap();
+        let second = RunDir::create_next(parent.path(), "pendulum").unwrap();
+        assert_eq!(
+            (first.name().as_str(), second.name().as_str()),
+            ("pendulum-1", "pendulum-2")
+        );
+        assert!(matches!(RunDir::create(first.path()), Err(RunDirError::Exists(_))));
+        assert!(matches!(RunDir::open(first.path()), Err(RunDirError::NotARun(_))));
+
+        let lock = first.lock().unwrap();
+        assert!(matches!(first.lock(), Err(RunDirError::Busy(_))));
+        drop(lock);
+        first.lock().unwrap();
+    }
+}

@@ -1,0 +1,50 @@
+//! Random streams. Every random number of a run comes from one of them, and a stream is named by what it is for, so that
+//! no two roles, indices or incarnations ever share numbers and a counter leads back to any point of it.
+
+use rand::SeedableRng;
+pub use rand_chacha::ChaCha8Rng as Stream;
+
+/// What a stream's numbers decide. The discriminants are part of a run's identity: never reuse one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u64)]
+pub enum Purpose {
+    /// Start states and transitions of an environment server's environments.
+    Environment = 1,
+    /// Exploration noise of an actor.
+    Exploration = 2,
+    /// Which rows a minibatch takes.
+    Sampling = 3,
+    /// The networks' first weights.
+    Initialisation = 4,
+    /// Start states of evaluation episodes.
+    Evaluation = 5,
+}
+
+/// The stream of `purpose` for the process `index` in its `incarnation`, under the run's `seed`.
+///
+/// The four words are the generator's key itself; `set_stream` and `set_word_pos` of the result make it a counter-based
+/// generator (ChaCha with 8 rounds: portable, the same on every machine and in every version).
+pub fn stream(seed: u64, purpose: Purpose, index: u64, incarnation: u64) -> Stream {
+    let mut key = [0; 32];
+    for (bytes, word) in key.chunks_exact_mut(8).zip([seed, purpose as u64, index, incarnation]) {
+        bytes.copy_from_slice(&word.to_le_bytes());
+    }
+    Stream::from_seed(key)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::Rng;
+
+    #[test]
+    fn every_word_of_the_name_changes_the_stream() {
+        let first = |seed, purpose, index, incarnation| stream(seed, purpose, index, incarnation).next_u64();
+        let base = first(1, Purpose::Exploration, 2, 3);
+        assert_eq!(base, first(1, Purpose::Exploration, 2, 3));
+        assert_ne!(base, first(2, Purpose::Exploration, 2, 3));
+        assert_ne!(base, first(1, Purpose::Environment, 2, 3));
+        assert_ne!(base, first(1, Purpose::Exploration, 3, 3));
+        assert_ne!(base, first(1, Purpose::Exploration, 2, 4));
+    }
+}
