@@ -1,0 +1,192 @@
+//! What an environment is, and the list of those there are.
+
+mod angle;
+pub mod cart_pole;
+mod error;
+pub mod frozen_lake;
+pub mod pendulum;
+pub mod point_mass;
+
+use serde::{Serialize, de::DeserializeOwned};
+use shoal_common::{space::EnvironmentSpec, stream::Stream};
+
+pub use error::{EnvironmentError, OutOfRange, RequestError};
+
+/// Every environment: its name, and how it is made from its parameters. A new one is its file, its `mod` line above and
+/// its line here.
+const ENVIRONMENTS: &[(&str, Maker)] = &[
+    ("pendulum", |parameters| made(parameters, pendulum::Pendulum::new)),
+    ("point-mass", |parameters| made(parameters, point_mass::PointMass::new)),
+    ("cart-pole", |parameters| made(parameters, cart_pole::CartPole::new)),
+    ("frozen-lake", |parameters| {
+        made(parameters, frozen_lake::FrozenLake::new)
+    }),
+];
+
+/// A controlled system with a start distribution and a reward, in physical units and `f64`.
+///
+/// It knows no time limit but reports one in its `spec`: whoever steps it counts, and truncates.
+/// Before its first `reset` or `reset_to` it stands in an arbitrary valid state.
+pub trait Environment: Send {
+    /// Spaces and time limit. Always the same for one environment.
+    fn spec(&self) -> EnvironmentSpec;
+
+    /// Starts an episode from the start distribution.
+    fn reset(&mut self, rng: &mut Stream);
+
+    /// Starts an episode from a physical state, or says which states it takes and stays as it was.
+    fn reset_to(&mut self, state: &[f64]) -> Result<(), RequestError>;
+
+    /// Writes the observation of the present state: `spec().observation.width()` numbers.
+    fn observe(&self, observation: &mut [f32]);
+
+    /// One step under `action`, `spec().action.width()` numbers. What lies outside a box is clipped to it, and an index
+    /// beyond the last counts as the last. Never panics: a NaN gives some number or NaN.
+    fn step(&mut self, action: &[f64], rng: &mut Stream) -> Step;
+}
+
+/// What a step gave, besides the new state.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Step {
+    /// Reward `r`.
+    pub reward: f64,
+    /// The new state is terminal: nothing comes after it.
+    pub terminated: bool,
+}
+
+/// The names that `make` and `resolve` know.
+pub fn names() -> impl Iterator<Item = &'static str> {
+    ENVIRONMENTS.iter().map(|(name, _)| *name)
+}
+
+/// The environment of this name. Parameters that are not given have their defaults.
+pub fn make(name: &str, parameters: &toml::Table) -> Result<Box<dyn Environment>, EnvironmentError> {
+    find(name, parameters).map(|made| made.environment)
+}
+
+/// All parameters of the environment of this name, defaults filled in: what `make` makes the same environment from.
+pub fn resolve(name: &str, parameters: &toml::Table) -> Result<toml::Table, EnvironmentError> {
+    find(name, parameters).map(|made| made.parameters)
+}
+
+struct Made {
+    environment: Box<dyn Environment>,
+    parameters: toml::Table,
+}
+
+type Maker = fn(&toml::Table) -> Result<Made, String>;
+
+fn find(name: &str, parameters: &toml::Table) -> Result<Made, EnvironmentError> {
+    let Some((environment, maker)) = ENVIRONMENTS.iter().find(|(known, _)| *known == name) else {
+        let (name, known) = (name.to_owned(), names().collect::<Vec<_>>().join(", "));
+        return Err(EnvironmentError::UnknownName { name, known });
+    };
+    maker(parameters).map_err(|reason| EnvironmentError::Parameters { environment, reason })
+}
+
+fn made<P: Serialize + DeserializeOwned, E: Environment + 'static>(
+    parameters: &toml::Table,
+    new: impl FnOnce(P) -> Result<E, OutOfRange>,
+) -> Result<Made, String> {
+    let read: P = parameters.clone().try_into().map_err(|e| error::for_people(&e))?;
+    let parameters = toml::Table::try_from(&read).map_err(|e| e.to_string())?;
+    let environment = Box::new(new(read).map_err(|e| e.to_string())?);
+    Ok(Made {
+        environment,
+        parameters,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use shoal_common::space::Space;
+    use shoal_common::stream::{Purpose, stream};
+
+    fn table(text: &str) -> toml::Table {
+        text.parse().unwrap()
+    }
+
+    fn refusal(name: &str, text: &str) -> String {
+        let message = resolve(name, &table(text)).unwrap_err().to_string();
+        assert!(!message.contains('\n'), "one line: {message}");
+        message
+    }
+
+    #[test]
+    fn every_environment_observes_what_its_spec_says() {
+        for name in names() {
+            let mut environment = make(name, &toml::Table::new()).unwrap();
+            let spec = environment.spec();
+            let mut rng = stream(1, Purpose::Environment, 0, 0);
+            let action = vec![f64::INFINITY; spec.action.width()];
+            let mut observation = vec![f32::NAN; spec.observation.width()];
+            for step in 0..100 {
+                if step % 10 == 0 {
+                    environment.reset(&mut rng);
+                }
+                assert!(environment.step(&action, &mut rng).reward.is_finite(), "{name}");
+                environment.observe(&mut observation);
+                let inside = match &spec.observation {
+                    Space::Box { low, high } => observation
+                        .iter()
+                        .enumerate()
+                        .all(|(i, x)| (low[i]..=high[i]).contains(x)),
+                    Space::Discrete { n } => observation[0] < *n as f32,
+                };
+                assert!(inside, "{name} observed {observation:?}");
+            }
+            environment.step(&vec![f64::NAN; spec.action.width()], &mut rng);
+        }
+    }
+
+    #[test]
+    fn resolved_parameters_are_complete_and_resolve_to_themselves() {
+        for name in names() {
+            let resolved = resolve(name, &toml::Table::new()).unwrap();
+            assert!(resolved.contains_key("time_limit"), "{name}");
+            assert_eq!(resolve(name, &resolved).unwrap(), resolved);
+        }
+        let pendulum = resolve("pendulum", &table("start_speed = 1")).unwrap();
+        assert_eq!(pendulum, table("start_speed = 1.0\ntime_limit = 200"));
+        assert_eq!(make("pendulum", &table("time_limit = 7")).unwrap().spec().time_limit, 7);
+    }
+
+    #[test]
+    fn an_unknown_name_is_told_the_known_ones() {
+        let message = refusal("pendulums", "");
+        assert_eq!(
+            message,
+            "unknown environment `pendulums`: choose one of pendulum, point-mass, cart-pole, frozen-lake"
+        );
+    }
+
+    #[test]
+    fn bad_parameters_are_refused_in_one_line_that_names_them() {
+        let unknown = refusal("pendulum", "star_speed = 1.0");
+        assert!(unknown.contains("pendulum") && unknown.contains("star_speed") && unknown.contains("start_speed"));
+        let wrong_type = refusal("point-mass", "friction = \"much\"");
+        assert!(
+            wrong_type.contains("`friction`") && wrong_type.contains("expected a number"),
+            "{wrong_type}"
+        );
+        let negative = refusal("cart-pole", "time_limit = -1");
+        assert!(
+            negative.contains("`time_limit`") && negative.contains("whole number"),
+            "{negative}"
+        );
+        assert_eq!(
+            refusal("point-mass", "friction = -0.5"),
+            "environment point-mass: `friction` is -0.5: give a number from 0 to 1"
+        );
+        for (name, text) in [
+            ("pendulum", "start_speed = nan"),
+            ("pendulum", "time_limit = 0"),
+            ("point-mass", "stiction_ratio = 0.9"),
+            ("point-mass", "mass = 0.0"),
+            ("frozen-lake", "time_limit = 0"),
+        ] {
+            assert!(refusal(name, text).contains("give a number from"), "{name} {text}");
+        }
+    }
+}

@@ -1,0 +1,208 @@
+//! The slippery 4×4 lake of section 4.1: Gymnasium's FrozenLake-v1.
+
+use rand::RngExt;
+use serde::{Deserialize, Serialize};
+use shoal_common::{
+    space::{EnvironmentSpec, Space},
+    stream::Stream,
+};
+
+use super::{
+    Environment, RequestError, Step,
+    error::{OutOfRange, check_time_limit},
+};
+
+/// Row by row: S the start, F frozen, H a hole, G the goal.
+const MAP: &[u8; STATES] = b"SFFFFHFHFFFHHFFG";
+const SIDE: usize = 4;
+
+/// How many states there are: fields of the lake, numbered row by row.
+pub const STATES: usize = SIDE * SIDE;
+/// How many actions there are: 0 left, 1 down, 2 right, 3 up.
+pub const ACTIONS: usize = 4;
+
+/// What can be set.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Parameters {
+    /// Steps after which an episode is truncated.
+    pub time_limit: u32,
+}
+
+impl Default for Parameters {
+    fn default() -> Self {
+        Self { time_limit: 100 }
+    }
+}
+
+/// One way a step may turn out.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Outcome {
+    /// How likely it is.
+    pub p: f64,
+    /// The state after the step.
+    pub next: usize,
+    /// 1 at the goal, else 0.
+    pub reward: f64,
+    /// The state after the step is a hole or the goal.
+    pub terminated: bool,
+}
+
+/// How `action` may turn out in `state`, in Gymnasium's order: the direction before, the one meant, the one after
+/// (equation 4.1). A hole or the goal is never left: one outcome, without reward.
+///
+/// Panics unless `state < STATES` and `action < ACTIONS`.
+pub fn transitions(state: usize, action: usize) -> impl Iterator<Item = Outcome> {
+    assert!(action < ACTIONS, "action {action} of {ACTIONS}");
+    let ways = if is_terminal(state) { 1 } else { 3 };
+    (0..ways).map(move |slip| outcome(state, slipped(action, slip), 1.0 / f64::from(ways)))
+}
+
+/// The direction before the one meant (`slip` 0), the one meant (1), or the one after (2).
+fn slipped(action: usize, slip: u32) -> usize {
+    (action + ACTIONS - 1 + slip as usize) % ACTIONS
+}
+
+/// What comes of moving in `direction`, which happens with probability `p`.
+fn outcome(state: usize, direction: usize, p: f64) -> Outcome {
+    if is_terminal(state) {
+        return Outcome {
+            p,
+            next: state,
+            reward: 0.0,
+            terminated: true,
+        };
+    }
+    let next = neighbour(state, direction);
+    Outcome {
+        p,
+        next,
+        reward: f64::from(u8::from(MAP[next] == b'G')),
+        terminated: is_terminal(next),
+    }
+}
+
+fn is_terminal(state: usize) -> bool {
+    matches!(MAP[state], b'H' | b'G')
+}
+
+/// The field one step away; at the shore, the field itself.
+fn neighbour(state: usize, direction: usize) -> usize {
+    let (row, column) = (state / SIDE, state % SIDE);
+    let (row, column) = match direction {
+        0 => (row, column.saturating_sub(1)),
+        1 => ((row + 1).min(SIDE - 1), column),
+        2 => (row, (column + 1).min(SIDE - 1)),
+        _ => (row.saturating_sub(1), column),
+    };
+    row * SIDE + column
+}
+
+/// A walk over ice. Observation and action are indices; reward 1 at the goal, where it terminates, as in a hole.
+#[derive(Clone, Debug)]
+pub struct FrozenLake {
+    parameters: Parameters,
+    state: usize,
+}
+
+impl FrozenLake {
+    /// At the start.
+    pub fn new(parameters: Parameters) -> Result<Self, OutOfRange> {
+        check_time_limit(parameters.time_limit)?;
+        Ok(Self { parameters, state: 0 })
+    }
+}
+
+impl Environment for FrozenLake {
+    fn spec(&self) -> EnvironmentSpec {
+        EnvironmentSpec {
+            observation: Space::Discrete { n: STATES as u32 },
+            action: Space::Discrete { n: ACTIONS as u32 },
+            time_limit: self.parameters.time_limit,
+        }
+    }
+
+    fn reset(&mut self, _: &mut Stream) {
+        self.state = 0;
+    }
+
+    fn reset_to(&mut self, state: &[f64]) -> Result<(), RequestError> {
+        match *state {
+            [field] if field.fract() == 0.0 && (0.0..STATES as f64).contains(&field) => {
+                self.state = field as usize;
+                Ok(())
+            }
+            _ => Err(RequestError::State {
+                state: state.to_vec(),
+                expected: "one whole number from 0 to 15",
+            }),
+        }
+    }
+
+    fn observe(&self, observation: &mut [f32]) {
+        observation[0] = self.state as f32;
+    }
+
+    fn step(&mut self, action: &[f64], rng: &mut Stream) -> Step {
+        let action = (action[0] as usize).min(ACTIONS - 1);
+        let Outcome {
+            next,
+            reward,
+            terminated,
+            ..
+        } = outcome(self.state, slipped(action, rng.random_range(0..3)), 1.0 / 3.0);
+        self.state = next;
+        Step { reward, terminated }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use shoal_common::stream::{Purpose, stream};
+
+    #[test]
+    fn the_table_has_equation_4_1() {
+        let third = 1.0 / 3.0;
+        let outcome = |next, terminated| Outcome {
+            p: third,
+            next,
+            reward: 0.0,
+            terminated,
+        };
+        let down_in_1: Vec<_> = transitions(1, 1).collect();
+        assert_eq!(down_in_1, [outcome(0, false), outcome(5, true), outcome(2, false)]);
+        for (state, action) in (0..STATES).flat_map(|s| (0..ACTIONS).map(move |a| (s, a))) {
+            assert!((transitions(state, action).map(|o| o.p).sum::<f64>() - 1.0).abs() < 1e-12);
+        }
+        let goals = transitions(14, 2).filter(|o| o.reward == 1.0 && o.terminated && o.next == 15);
+        assert_eq!(goals.count(), 1);
+    }
+
+    #[test]
+    fn steps_follow_the_table() {
+        let mut lake = FrozenLake::new(Parameters::default()).unwrap();
+        let mut rng = stream(3, Purpose::Environment, 0, 0);
+        let mut visits = [0; STATES];
+        for _ in 0..3000 {
+            lake.reset_to(&[14.0]).unwrap();
+            let step = lake.step(&[2.0], &mut rng);
+            assert_eq!(step.terminated, lake.state == 15);
+            assert_eq!(step.reward, f64::from(u8::from(lake.state == 15)));
+            visits[lake.state] += 1;
+        }
+        assert!(
+            [10, 14, 15].iter().all(|s| (900..1100).contains(&visits[*s])),
+            "{visits:?}"
+        );
+        assert_eq!(visits.iter().sum::<i32>(), visits[10] + visits[14] + visits[15]);
+    }
+
+    #[test]
+    fn only_fields_of_the_lake_are_states() {
+        let mut lake = FrozenLake::new(Parameters::default()).unwrap();
+        for state in [&[16.0][..], &[-1.0], &[0.5], &[f64::NAN], &[], &[1.0, 2.0]] {
+            assert!(lake.reset_to(state).is_err(), "{state:?}");
+        }
+    }
+}

@@ -1,0 +1,341 @@
+//! What can be set of the point mass: flat in TOML, so that one key changes one number; here each reward with its own.
+
+use serde::{Deserialize, Serialize};
+
+use super::{
+    super::error::{OutOfRange, check, check_time_limit},
+    reward::Reward,
+};
+
+/// What can be set. In TOML, `reward` is `"r1"`, `"r2"` or `"r3"` and the reward's parameters stand beside it; those of
+/// another reward are refused.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(try_from = "Flat", into = "Flat")]
+pub struct Parameters {
+    /// m in kg.
+    pub mass: f64,
+    /// Friction coefficient μ of equation (5.6).
+    pub friction: f64,
+    /// F_s / F_c, at least 1.
+    pub stiction_ratio: f64,
+    /// g in m/s².
+    pub gravity: f64,
+    /// Distance in m below which the vehicle is at the goal.
+    pub goal_radius: f64,
+    /// Steps after which an episode is truncated.
+    pub time_limit: u32,
+    /// The reward function.
+    pub reward: Reward,
+}
+
+impl Parameters {
+    /// Refuses what is out of range.
+    pub(super) fn check(&self) -> Result<(), OutOfRange> {
+        check("mass", self.mass, 1e-3..=1e3)?;
+        check("friction", self.friction, 0.0..=1.0)?;
+        check("stiction_ratio", self.stiction_ratio, 1.0..=10.0)?;
+        check("gravity", self.gravity, 0.0..=100.0)?;
+        check("goal_radius", self.goal_radius, 0.0..=10.0)?;
+        check_time_limit(self.time_limit)?;
+        let (Reward::R1 {
+            amplitude,
+            variance,
+            c_d,
+        }
+        | Reward::R2 {
+            amplitude,
+            variance,
+            c_d,
+            ..
+        }
+        | Reward::R3 {
+            amplitude,
+            variance,
+            c_d,
+            ..
+        }) = self.reward;
+        check("amplitude", amplitude, 0.0..=1e3)?;
+        check("variance", variance, 1e-6..=1e3)?;
+        check("c_d", c_d, 0.0..=1e3)?;
+        match self.reward {
+            Reward::R1 { .. } => Ok(()),
+            Reward::R2 {
+                c_theta_dot,
+                c_force_dot,
+                ..
+            } => {
+                check("c_theta_dot", c_theta_dot, 0.0..=1e3)?;
+                check("c_force_dot", c_force_dot, 0.0..=1e3)
+            }
+            Reward::R3 {
+                c_theta_dot, c_force, ..
+            } => {
+                check("c_theta_dot", c_theta_dot, 0.0..=1e3)?;
+                check("c_force", c_force, 0.0..=1e3)
+            }
+        }
+    }
+}
+
+#[derive(Clone, Copy, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+enum Name {
+    R1,
+    R2,
+    R3,
+}
+
+/// The TOML form.
+#[derive(Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+struct Flat {
+    mass: f64,
+    friction: f64,
+    stiction_ratio: f64,
+    gravity: f64,
+    goal_radius: f64,
+    time_limit: u32,
+    reward: Name,
+    amplitude: Option<f64>,
+    variance: Option<f64>,
+    c_d: Option<f64>,
+    c_theta_dot: Option<f64>,
+    c_force_dot: Option<f64>,
+    c_force: Option<f64>,
+}
+
+impl Default for Flat {
+    /// The thesis prints neither m, μ nor F_s; these fit its figures.
+    fn default() -> Self {
+        Self {
+            mass: 1.0,
+            friction: 0.02,
+            stiction_ratio: 1.2,
+            gravity: 9.81,
+            goal_radius: 0.05,
+            time_limit: 200,
+            reward: Name::R3,
+            amplitude: None,
+            variance: None,
+            c_d: None,
+            c_theta_dot: None,
+            c_force_dot: None,
+            c_force: None,
+        }
+    }
+}
+
+impl TryFrom<Flat> for Parameters {
+    type Error = String;
+
+    fn try_from(mut flat: Flat) -> Result<Self, String> {
+        let taken = |given: &mut Option<f64>, default| given.take().unwrap_or(default);
+        let (name, reward) = match flat.reward {
+            Name::R1 => (
+                "r1",
+                Reward::R1 {
+                    amplitude: taken(&mut flat.amplitude, 1.0),
+                    variance: taken(&mut flat.variance, 0.4),
+                    c_d: taken(&mut flat.c_d, 1.0),
+                },
+            ),
+            Name::R2 => (
+                "r2",
+                Reward::R2 {
+                    amplitude: taken(&mut flat.amplitude, 2.0),
+                    variance: taken(&mut flat.variance, 0.1),
+                    c_d: taken(&mut flat.c_d, std::f64::consts::FRAC_1_SQRT_2),
+                    c_theta_dot: taken(&mut flat.c_theta_dot, 0.0015),
+                    c_force_dot: taken(&mut flat.c_force_dot, 0.0),
+                },
+            ),
+            Name::R3 => (
+                "r3",
+                Reward::R3 {
+                    amplitude: taken(&mut flat.amplitude, 2.0),
+                    variance: taken(&mut flat.variance, 0.1),
+                    c_d: taken(&mut flat.c_d, std::f64::consts::FRAC_1_SQRT_2),
+                    c_theta_dot: taken(&mut flat.c_theta_dot, 0.0015),
+                    c_force: taken(&mut flat.c_force, 0.03),
+                },
+            ),
+        };
+        let others = [
+            ("c_theta_dot", flat.c_theta_dot, "r2 or r3"),
+            ("c_force_dot", flat.c_force_dot, "r2"),
+            ("c_force", flat.c_force, "r3"),
+        ];
+        if let Some((key, _, owner)) = others.iter().find(|(_, given, _)| given.is_some()) {
+            return Err(format!(
+                "`{key}` is no parameter of reward {name}: remove it, or set reward to {owner}"
+            ));
+        }
+        let Flat {
+            mass,
+            friction,
+            stiction_ratio,
+            gravity,
+            goal_radius,
+            time_limit,
+            ..
+        } = flat;
+        Ok(Self {
+            mass,
+            friction,
+            stiction_ratio,
+            gravity,
+            goal_radius,
+            time_limit,
+            reward,
+        })
+    }
+}
+
+impl From<Parameters> for Flat {
+    fn from(parameters: Parameters) -> Self {
+        let Parameters {
+            mass,
+            friction,
+            stiction_ratio,
+            gravity,
+            goal_radius,
+            time_limit,
+            reward,
+        } = parameters;
+        let (Reward::R1 {
+            amplitude,
+            variance,
+            c_d,
+        }
+        | Reward::R2 {
+            amplitude,
+            variance,
+            c_d,
+            ..
+        }
+        | Reward::R3 {
+            amplitude,
+            variance,
+            c_d,
+            ..
+        }) = reward;
+        let (name, c_theta_dot, c_force_dot, c_force) = match reward {
+            Reward::R1 { .. } => (Name::R1, None, None, None),
+            Reward::R2 {
+                c_theta_dot,
+                c_force_dot,
+                ..
+            } => (Name::R2, Some(c_theta_dot), Some(c_force_dot), None),
+            Reward::R3 {
+                c_theta_dot, c_force, ..
+            } => (Name::R3, Some(c_theta_dot), None, Some(c_force)),
+        };
+        Self {
+            mass,
+            friction,
+            stiction_ratio,
+            gravity,
+            goal_radius,
+            time_limit,
+            reward: name,
+            amplitude: Some(amplitude),
+            variance: Some(variance),
+            c_d: Some(c_d),
+            c_theta_dot,
+            c_force_dot,
+            c_force,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::super::{make, resolve};
+    use super::*;
+
+    fn parameters(text: &str) -> Parameters {
+        toml::from_str(text).unwrap()
+    }
+
+    #[test]
+    fn each_reward_has_the_numbers_of_its_section() {
+        assert_eq!(
+            parameters("reward = 'r1'").reward,
+            Reward::R1 {
+                amplitude: 1.0,
+                variance: 0.4,
+                c_d: 1.0
+            }
+        );
+        let (amplitude, variance, c_d, c_theta_dot) = (2.0, 0.1, 0.5f64.sqrt(), 0.0015);
+        let r2 = Reward::R2 {
+            amplitude,
+            variance,
+            c_d,
+            c_theta_dot,
+            c_force_dot: 0.0,
+        };
+        assert_eq!(parameters("reward = 'r2'").reward, r2);
+        let r3 = Reward::R3 {
+            amplitude,
+            variance,
+            c_d,
+            c_theta_dot,
+            c_force: 0.03,
+        };
+        assert_eq!(parameters("reward = 'r3'").reward, r3);
+        assert_eq!(parameters("").reward, r3);
+    }
+
+    #[test]
+    fn one_key_changes_one_number() {
+        let changed = parameters("friction = 0.03\nreward = 'r2'\nc_force_dot = 1");
+        assert_eq!((changed.friction, changed.mass), (0.03, 1.0));
+        assert!(matches!(
+            changed.reward,
+            Reward::R2 {
+                c_force_dot: 1.0,
+                c_theta_dot: 0.0015,
+                ..
+            }
+        ));
+    }
+
+    #[test]
+    fn the_resolved_table_holds_the_rewards_own_parameters_and_no_others() {
+        let resolved = |text: &str| resolve("point-mass", &text.parse().unwrap()).unwrap();
+        for (reward, count) in [("r1", 10), ("r2", 12), ("r3", 12)] {
+            let table = resolved(&format!("reward = '{reward}'"));
+            assert_eq!(table.len(), count, "{table}");
+            assert_eq!(resolved(&table.to_string()), table);
+        }
+    }
+
+    #[test]
+    fn wrong_parameters_are_told_apart() {
+        let refusal = |text: &str| make("point-mass", &text.parse().unwrap()).err().unwrap().to_string();
+        let foreign = refusal("reward = 'r1'\nc_force = 0.1");
+        assert!(foreign.contains("`c_force` is no parameter of reward r1"), "{foreign}");
+        let unknown = refusal("reward = 'r4'");
+        assert!(
+            unknown.contains("r4") && unknown.contains("r3") && unknown.contains("`reward`"),
+            "{unknown}"
+        );
+        for key in [
+            "amplitude",
+            "c_d",
+            "c_theta_dot",
+            "c_force",
+            "mass",
+            "gravity",
+            "goal_radius",
+        ] {
+            let message = refusal(&format!("{key} = -1.0"));
+            assert!(
+                message.contains(&format!("`{key}` is -1: give a number from")),
+                "{message}"
+            );
+        }
+        assert!(refusal("variance = 0.0").contains("`variance` is 0"));
+    }
+}

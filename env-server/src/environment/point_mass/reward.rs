@@ -1,0 +1,195 @@
+//! The reward functions of section 5.2, each with its own parameters.
+
+/// Which reward, with its parameters. The defaults of a reward are those of its part of section 5.3.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Reward {
+    /// Equation (5.10): a Gaussian of the distance, and a bonus at the goal.
+    R1 {
+        /// Amplitude a of the Gaussian.
+        amplitude: f64,
+        /// Its variance σ², in m².
+        variance: f64,
+        /// Bonus c_d within the goal radius.
+        c_d: f64,
+    },
+    /// Equation (5.11): progress, a Gaussian at the goal, and penalties on quickly changing inputs.
+    R2 {
+        /// Amplitude a of the Gaussian.
+        amplitude: f64,
+        /// Its variance σ², in m².
+        variance: f64,
+        /// Weight c_d of ḋ outside the goal radius.
+        c_d: f64,
+        /// Weight of θ̇².
+        c_theta_dot: f64,
+        /// Weight of Ḟ_u².
+        c_force_dot: f64,
+    },
+    /// Equation (5.12): as r2, with a penalty on the force instead of its change.
+    R3 {
+        /// Amplitude a of the Gaussian.
+        amplitude: f64,
+        /// Its variance σ², in m².
+        variance: f64,
+        /// Weight c_d of ḋ outside the goal radius.
+        c_d: f64,
+        /// Weight of θ̇².
+        c_theta_dot: f64,
+        /// Weight of F_u².
+        c_force: f64,
+    },
+}
+
+/// What a reward looks at: the state after a step, and the inputs of the step.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Motion {
+    /// Distance d to the goal, in m.
+    pub d: f64,
+    /// ḋ in m/s.
+    pub d_dot: f64,
+    /// θ̇ within [−20, 20]: the wrapped change of direction in half turns, over Δt (section 5.3.2).
+    pub theta_dot: f64,
+    /// F_u in N.
+    pub force: f64,
+    /// Ḟ_u in N/s.
+    pub force_dot: f64,
+}
+
+impl Reward {
+    /// The reward, where the goal's area is `d < goal_radius` (the thesis: 0.05).
+    pub fn of(&self, motion: &Motion, goal_radius: f64) -> f64 {
+        let Motion {
+            d,
+            d_dot,
+            theta_dot,
+            force,
+            force_dot,
+        } = *motion;
+        let at_goal = d < goal_radius;
+        let gaussian = |amplitude: f64, variance: f64| amplitude * (-d.powi(2) / (2.0 * variance)).exp();
+        match *self {
+            Self::R1 {
+                amplitude,
+                variance,
+                c_d,
+            } => gaussian(amplitude, variance) + if at_goal { c_d } else { 0.0 },
+            Self::R2 {
+                amplitude,
+                variance,
+                c_d,
+                c_theta_dot,
+                c_force_dot,
+            } => {
+                -c_force_dot * force_dot.powi(2) - c_theta_dot * theta_dot.powi(2)
+                    + if at_goal {
+                        gaussian(amplitude, variance)
+                    } else {
+                        -c_d * d_dot
+                    }
+            }
+            Self::R3 {
+                amplitude,
+                variance,
+                c_d,
+                c_theta_dot,
+                c_force,
+            } => {
+                -c_force * force.powi(2) - c_theta_dot * theta_dot.powi(2)
+                    + if at_goal {
+                        gaussian(amplitude, variance)
+                    } else {
+                        -c_d * d_dot
+                    }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MOTION: Motion = Motion {
+        d: 0.5,
+        d_dot: -0.6,
+        theta_dot: 10.0,
+        force: 1.5,
+        force_dot: 4.0,
+    };
+
+    fn is(reward: Reward, motion: Motion, by_hand: f64) {
+        let ours = reward.of(&motion, 0.05);
+        assert!(
+            (ours - by_hand).abs() < 1e-12,
+            "{reward:?} gave {ours}, by hand {by_hand}"
+        );
+    }
+
+    #[test]
+    fn r1_by_hand() {
+        let r1 = Reward::R1 {
+            amplitude: 1.0,
+            variance: 0.4,
+            c_d: 1.0,
+        };
+        is(r1, MOTION, (-0.3125f64).exp());
+        is(r1, Motion { d: 0.04, ..MOTION }, (-0.002f64).exp() + 1.0);
+        is(r1, Motion { d: 0.05, ..MOTION }, (-0.003125f64).exp());
+        is(r1, Motion { d: 0.0, ..MOTION }, 2.0);
+    }
+
+    #[test]
+    fn r2_by_hand() {
+        let c_d = 0.5f64.sqrt();
+        let r2 = |c_force_dot| Reward::R2 {
+            amplitude: 2.0,
+            variance: 0.1,
+            c_d,
+            c_theta_dot: 0.0015,
+            c_force_dot,
+        };
+        is(r2(0.0), MOTION, -0.15 + 0.6 * c_d);
+        is(r2(0.01), MOTION, -0.16 - 0.15 + 0.6 * c_d);
+        is(r2(0.0), Motion { d: 0.04, ..MOTION }, -0.15 + 2.0 * (-0.008f64).exp());
+        is(
+            r2(0.0),
+            Motion {
+                theta_dot: 20.0,
+                d_dot: 2.0f64.sqrt(),
+                ..MOTION
+            },
+            -0.6 - 1.0,
+        );
+    }
+
+    #[test]
+    fn r3_by_hand() {
+        let c_d = 0.5f64.sqrt();
+        let r3 = Reward::R3 {
+            amplitude: 2.0,
+            variance: 0.1,
+            c_d,
+            c_theta_dot: 0.0015,
+            c_force: 0.03,
+        };
+        is(r3, MOTION, -0.0675 - 0.15 + 0.6 * c_d);
+        is(
+            r3,
+            Motion {
+                d: 0.0,
+                theta_dot: 0.0,
+                force: 0.0,
+                ..MOTION
+            },
+            2.0,
+        );
+        is(
+            r3,
+            Motion {
+                force_dot: 1e3,
+                ..MOTION
+            },
+            -0.0675 - 0.15 + 0.6 * c_d,
+        );
+    }
+}

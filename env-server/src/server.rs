@@ -1,0 +1,63 @@
+//! The environment server's loop: answers one actor's requests by stepping its environments.
+
+use shoal_common::channel::environment::{Ask, EnvironmentPort};
+use shoal_common::channel::{ChannelError, Interruption, Pulse};
+use shoal_common::report::Activity;
+use shoal_common::stop::Stop;
+
+use crate::vector::{Start, VectorEnvironment};
+
+/// Answers requests until `stop`; evaluation episodes start as `seed` says.
+///
+/// # Errors
+/// When the channel does not work. A request that makes no sense is refused and logged, not an error.
+pub fn serve(
+    environments: &mut VectorEnvironment,
+    port: &EnvironmentPort,
+    seed: u64,
+    mut pulse: Pulse,
+    stop: &Stop,
+) -> Result<(), ChannelError> {
+    let mut started = false;
+    pulse.beat(Activity::WaitingForPeer);
+    loop {
+        let request = match port.next(stop, || pulse.beat(Activity::WaitingForPeer)) {
+            Ok(request) => request,
+            Err(Interruption::Stopped) => return Ok(()),
+            Err(Interruption::Channel(error)) => return Err(error),
+        };
+        let refused = match request.ask() {
+            Some(ask @ (Ask::Reset | Ask::ResetToEvaluation)) => {
+                let start = match ask {
+                    Ask::Reset => Start::Next,
+                    _ => Start::Evaluation {
+                        seed,
+                        first: request.episode(),
+                    },
+                };
+                started = true;
+                request
+                    .answer(|_, blocks| environments.reset(start, blocks.observations))?
+                    .err()
+            }
+            Some(Ask::Step) if started => {
+                pulse.count(environments.count() as u64);
+                pulse.beat(Activity::Working);
+                request
+                    .answer(|actions, blocks| environments.step(actions, blocks))?
+                    .err()
+            }
+            Some(Ask::Step) => {
+                request.not_started()?;
+                None
+            }
+            _ => {
+                request.refuse()?;
+                None
+            }
+        };
+        if let Some(error) = refused {
+            tracing::error!("a request was refused: {error}");
+        }
+    }
+}

@@ -1,0 +1,239 @@
+//! A vector of environments stepped in lockstep, with time limit, autoreset and counted random streams.
+
+use shoal_common::{
+    channel::environment::StepBlocks,
+    space::{EnvironmentSpec, Space},
+    stream::{Purpose, Stream, stream},
+};
+
+use crate::environment::{Environment, EnvironmentError, RequestError, make};
+
+/// Bits of a stream's number that count episodes; the ones above number the environment.
+const EPISODE_BITS: u32 = 40;
+
+/// `count` environments of one kind, each in its own episode.
+///
+/// All random numbers of training episode k of environment e come from stream (e, k) of
+/// `stream(seed, Environment, server, incarnation)`, those of evaluation episode k from `stream(seed, Evaluation, k, 0)`:
+/// an episode is reached by its counters, whatever was run before.
+pub struct VectorEnvironment {
+    spec: EnvironmentSpec,
+    training: Stream,
+    evaluation_seed: Option<u64>,
+    running: Vec<Running>,
+    action: Vec<f64>,
+}
+
+struct Running {
+    environment: Box<dyn Environment>,
+    rng: Stream,
+    steps: u32,
+    next_training: u64,
+    next_evaluation: u64,
+}
+
+/// Where the environments start.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Start<'a> {
+    /// Each in its next training episode. The first is 0; later resets and autoresets count on.
+    Next,
+    /// Environment e in training episode `episodes[e]`, below 2⁴⁰; it counts on from there.
+    Episodes(&'a [u64]),
+    /// Environment e in evaluation episode `first` + e. At its end it goes on with the episode E later (E environments),
+    /// so that the E together run every episode from `first` on once.
+    Evaluation {
+        /// Seed of the evaluation, not necessarily the run's.
+        seed: u64,
+        /// Number of the first episode.
+        first: u64,
+    },
+    /// Environment e in the physical state `states[e]` of E states in a row; at its end it goes on with training episodes.
+    States(&'a [f64]),
+}
+
+impl VectorEnvironment {
+    /// `count` (below 2²⁴) environments that `make` makes of `name` and `parameters`, for the server of this index and
+    /// incarnation. `reset` comes before the first `step`.
+    pub fn new(
+        name: &str,
+        parameters: &toml::Table,
+        count: u32,
+        seed: u64,
+        server: u64,
+        incarnation: u64,
+    ) -> Result<Self, EnvironmentError> {
+        let spec = make(name, parameters)?.spec();
+        let training = stream(seed, Purpose::Environment, server, incarnation);
+        let running = |_| {
+            let environment = make(name, parameters)?;
+            Ok(Running {
+                environment,
+                rng: training.clone(),
+                steps: 0,
+                next_training: 0,
+                next_evaluation: 0,
+            })
+        };
+        Ok(Self {
+            running: (0..count).map(running).collect::<Result<_, _>>()?,
+            action: Vec::with_capacity(spec.action.width()),
+            evaluation_seed: None,
+            spec,
+            training,
+        })
+    }
+
+    /// Spaces and time limit of each environment.
+    pub fn spec(&self) -> &EnvironmentSpec {
+        &self.spec
+    }
+
+    /// How many environments there are: E.
+    pub fn count(&self) -> usize {
+        self.running.len()
+    }
+
+    /// Starts an episode in every environment and writes the E first observations.
+    ///
+    /// After an error over counts nothing has changed. After a refused state the episodes are undefined until the next
+    /// successful reset. Panics unless `observations` has E × observation width numbers.
+    pub fn reset(&mut self, start: Start<'_>, observations: &mut [f32]) -> Result<(), RequestError> {
+        let count = self.running.len();
+        assert_eq!(
+            observations.len(),
+            count * self.spec.observation.width(),
+            "length of `observations`"
+        );
+        self.evaluation_seed = match start {
+            Start::Evaluation { seed, first } => {
+                for (number, running) in (first..).zip(&mut self.running) {
+                    running.next_evaluation = number;
+                }
+                Some(seed)
+            }
+            Start::Episodes(episodes) => {
+                if episodes.len() != count {
+                    return Err(wrong_count("episodes", episodes.len(), count, "one each".to_owned()));
+                }
+                for (running, &episode) in self.running.iter_mut().zip(episodes) {
+                    running.next_training = episode;
+                }
+                None
+            }
+            Start::States(states) if count == 0 || !states.len().is_multiple_of(count) => {
+                return Err(wrong_count("states", states.len(), count, "one state each".to_owned()));
+            }
+            Start::Next | Start::States(_) => None,
+        };
+        let width = self.spec.observation.width();
+        for (e, observation) in observations.chunks_exact_mut(width).enumerate() {
+            self.begin(e);
+            if let Start::States(states) = start {
+                let width = states.len() / count;
+                self.running[e].environment.reset_to(&states[e * width..][..width])?;
+            }
+            self.running[e].environment.observe(observation);
+        }
+        Ok(())
+    }
+
+    /// Takes one action in every environment (E actions in a row), and starts the next episode where one has ended.
+    ///
+    /// An action that is NaN, infinite, or no index of a discrete action is refused before anything has changed: it means
+    /// that a policy diverges, which clipping would hide. A finite one outside its box is clipped by the environment.
+    /// Panics unless the slices of `out` have the lengths that `StepBlocks` gives them.
+    pub fn step(&mut self, actions: &[f32], out: StepBlocks<'_>) -> Result<(), RequestError> {
+        self.check(actions)?;
+        let width = self.spec.observation.width();
+        let StepBlocks {
+            observations,
+            next_observations,
+            rewards,
+            terminated,
+            truncated,
+        } = out;
+        let count = self.running.len();
+        assert_eq!(
+            [observations.len(), next_observations.len()],
+            [count * width; 2],
+            "lengths of observations"
+        );
+        assert_eq!(
+            [rewards.len(), terminated.len(), truncated.len()],
+            [count; 3],
+            "lengths of rewards and flags"
+        );
+        for (e, action) in actions.chunks_exact(self.spec.action.width()).enumerate() {
+            let running = &mut self.running[e];
+            self.action.clear();
+            self.action.extend(action.iter().map(|a| f64::from(*a)));
+            let step = running.environment.step(&self.action, &mut running.rng);
+            running.steps += 1;
+            let out_of_time = !step.terminated && running.steps >= self.spec.time_limit;
+            rewards[e] = step.reward as f32;
+            terminated[e] = f32::from(u8::from(step.terminated));
+            truncated[e] = f32::from(u8::from(out_of_time));
+            let next_observation = &mut next_observations[e * width..][..width];
+            running.environment.observe(next_observation);
+            let observation = &mut observations[e * width..][..width];
+            if step.terminated || out_of_time {
+                self.begin(e);
+                self.running[e].environment.observe(observation);
+            } else {
+                observation.copy_from_slice(next_observation);
+            }
+        }
+        Ok(())
+    }
+
+    /// Starts the next episode of environment `e`.
+    fn begin(&mut self, e: usize) {
+        let stride = self.running.len() as u64;
+        let running = &mut self.running[e];
+        match self.evaluation_seed {
+            Some(seed) => {
+                running.rng = stream(seed, Purpose::Evaluation, running.next_evaluation, 0);
+                running.next_evaluation = running.next_evaluation.wrapping_add(stride);
+            }
+            None => {
+                running.rng.clone_from(&self.training);
+                running
+                    .rng
+                    .set_stream((e as u64) << EPISODE_BITS | running.next_training);
+                running.next_training += 1;
+            }
+        }
+        running.steps = 0;
+        running.environment.reset(&mut running.rng);
+    }
+
+    fn check(&self, actions: &[f32]) -> Result<(), RequestError> {
+        let (count, width) = (self.running.len(), self.spec.action.width());
+        if actions.len() != count * width {
+            return Err(wrong_count("actions", actions.len(), count, format!("{width} each")));
+        }
+        let refused = |action: &f32| match self.spec.action {
+            Space::Box { .. } => !action.is_finite(),
+            Space::Discrete { n } => action.fract() != 0.0 || !(0.0..n as f32).contains(action),
+        };
+        match actions.iter().position(refused) {
+            Some(i) => Err(RequestError::Action {
+                environment: i / width,
+                action: actions[i],
+            }),
+            None => Ok(()),
+        }
+    }
+}
+
+fn wrong_count(what: &'static str, given: usize, environments: usize, expected: String) -> RequestError {
+    RequestError::Count {
+        what,
+        given,
+        environments,
+        expected,
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,274 @@
+use super::*;
+
+/// A vector with the buffers that a server has in shared memory.
+struct Bench {
+    vector: VectorEnvironment,
+    observations: Vec<f32>,
+    next_observations: Vec<f32>,
+    rewards: Vec<f32>,
+    terminated: Vec<f32>,
+    truncated: Vec<f32>,
+}
+
+impl Bench {
+    fn of(name: &str, parameters: &str, count: u32, [seed, server, incarnation]: [u64; 3]) -> Self {
+        let parameters = parameters.parse().unwrap();
+        let vector = VectorEnvironment::new(name, &parameters, count, seed, server, incarnation).unwrap();
+        let width = vector.spec().observation.width();
+        let nans = |n| vec![f32::NAN; count as usize * n];
+        Self {
+            observations: nans(width),
+            next_observations: nans(width),
+            rewards: nans(1),
+            terminated: nans(1),
+            truncated: nans(1),
+            vector,
+        }
+    }
+
+    fn new(name: &str, parameters: &str, count: u32) -> Self {
+        Self::of(name, parameters, count, [1, 0, 0])
+    }
+
+    fn reset(&mut self, start: Start<'_>) -> Vec<f32> {
+        self.vector.reset(start, &mut self.observations).unwrap();
+        self.observations.clone()
+    }
+
+    fn step(&mut self, actions: &[f32]) -> Result<(), RequestError> {
+        let Self {
+            vector,
+            observations,
+            next_observations,
+            rewards,
+            terminated,
+            truncated,
+        } = self;
+        vector.step(
+            actions,
+            StepBlocks {
+                observations,
+                next_observations,
+                rewards,
+                terminated,
+                truncated,
+            },
+        )
+    }
+}
+
+#[test]
+fn the_time_limit_truncates_and_the_next_episode_begins() {
+    let mut bench = Bench::new("pendulum", "time_limit = 3", 2);
+    bench.reset(Start::Next);
+    for step in 1..=7 {
+        bench.step(&[0.5, -0.5]).unwrap();
+        let ended = if step % 3 == 0 { 1.0 } else { 0.0 };
+        assert_eq!(bench.truncated, [ended; 2], "step {step}");
+        assert_eq!(bench.terminated, [0.0; 2]);
+        assert_eq!(
+            bench.observations != bench.next_observations,
+            ended == 1.0,
+            "step {step}"
+        );
+        assert!(bench.rewards.iter().all(|r| *r < 0.0));
+    }
+    let mut from_the_start = Bench::new("pendulum", "", 2);
+    let third = from_the_start.reset(Start::Episodes(&[2, 2]));
+    bench.reset(Start::Episodes(&[1, 1]));
+    for _ in 0..3 {
+        bench.step(&[0.0, 0.0]).unwrap();
+    }
+    assert_eq!(bench.observations, third, "autoreset started the episode that follows");
+}
+
+#[test]
+fn termination_is_no_truncation_even_in_the_last_step() {
+    // Pushed one way from upright, the pole falls in a step of its own.
+    let fall = {
+        let mut bench = Bench::new("cart-pole", "", 1);
+        bench.reset(Start::States(&[0.0; 4]));
+        (1..).find(|_| {
+            bench.step(&[1.0]).unwrap();
+            bench.terminated == [1.0]
+        })
+    }
+    .unwrap();
+    for (time_limit, ended) in [
+        (fall - 1, ([0.0], [1.0])),
+        (fall, ([1.0], [0.0])),
+        (fall + 1, ([1.0], [0.0])),
+    ] {
+        let mut bench = Bench::new("cart-pole", &format!("time_limit = {time_limit}"), 1);
+        bench.reset(Start::States(&[0.0; 4]));
+        for _ in 0..time_limit.min(fall) - 1 {
+            bench.step(&[1.0]).unwrap();
+            assert_eq!((bench.terminated[0], bench.truncated[0]), (0.0, 0.0));
+        }
+        bench.step(&[1.0]).unwrap();
+        assert_eq!(
+            (bench.terminated[..].as_ref(), bench.truncated[..].as_ref()),
+            (&ended.0[..], &ended.1[..])
+        );
+        assert!(
+            bench.next_observations[2].abs() > 0.1,
+            "s' is the state the pole fell into"
+        );
+        assert!(
+            bench.observations.iter().all(|x| x.abs() <= 0.05),
+            "the next episode's start"
+        );
+        bench.step(&[1.0]).unwrap();
+        assert_eq!(
+            (bench.terminated[0], bench.truncated[0]),
+            (0.0, 0.0),
+            "the count starts again"
+        );
+    }
+}
+
+#[test]
+fn every_word_of_the_counters_names_other_starts() {
+    let starts = |name: [u64; 3]| Bench::of("point-mass", "", 3, name).reset(Start::Next);
+    let base = starts([1, 0, 0]);
+    assert_eq!(base, starts([1, 0, 0]));
+    assert!(
+        base[..2] != base[6..8] && base[6..8] != base[12..14],
+        "environments start apart"
+    );
+    for other in [[2, 0, 0], [1, 1, 0], [1, 0, 1]] {
+        assert_ne!(base[..6], starts(other)[..6], "{other:?}");
+    }
+    let mut bench = Bench::new("point-mass", "", 3);
+    assert_eq!(bench.reset(Start::Next), base);
+    let second = bench.reset(Start::Next);
+    assert_ne!(second[..6], base[..6]);
+    assert_eq!(
+        Bench::new("point-mass", "", 3).reset(Start::Episodes(&[1, 1, 1])),
+        second
+    );
+    assert_eq!(bench.reset(Start::Episodes(&[0, 0, 0])), base);
+}
+
+#[test]
+fn an_evaluation_episode_starts_alike_always_and_everywhere() {
+    let evaluation = |first| Start::Evaluation { seed: 9, first };
+    let five = Bench::of("pendulum", "", 5, [1, 0, 0]).reset(evaluation(0));
+    let mut other = Bench::of("pendulum", "time_limit = 2", 2, [2, 3, 4]);
+    other.reset(Start::Next);
+    other.step(&[0.1, 0.2]).unwrap();
+    assert_eq!(other.reset(evaluation(0)), five[..6]);
+    for _ in 0..2 {
+        other.step(&[1.0, -1.0]).unwrap();
+    }
+    assert_eq!(
+        other.observations,
+        five[6..12],
+        "environment e goes on with the episode E later"
+    );
+    assert_eq!(other.reset(evaluation(3)), five[9..]);
+    assert_ne!(other.reset(Start::Evaluation { seed: 8, first: 3 }), five[9..]);
+    assert_ne!(five[..3], five[3..6]);
+}
+
+#[test]
+fn evaluation_does_not_disturb_training_episodes() {
+    let mut bench = Bench::new("pendulum", "", 1);
+    bench.reset(Start::Next);
+    bench.reset(Start::Evaluation { seed: 1, first: 0 });
+    let second = bench.reset(Start::Next);
+    assert_eq!(second, Bench::new("pendulum", "", 1).reset(Start::Episodes(&[1])));
+}
+
+#[test]
+fn a_frozen_lake_episode_slips_alike_when_it_is_run_again() {
+    let walk = |bench: &mut Bench| -> Vec<f32> {
+        let slide = |_| {
+            bench.step(&[2.0]).unwrap();
+            bench.next_observations[0]
+        };
+        (0..20).map(slide).collect()
+    };
+    let mut bench = Bench::new("frozen-lake", "", 1);
+    bench.reset(Start::Next);
+    let first = walk(&mut bench);
+    bench.reset(Start::Episodes(&[0]));
+    assert_eq!(walk(&mut bench), first);
+    bench.reset(Start::Episodes(&[100]));
+    assert_ne!(walk(&mut bench), first);
+}
+
+#[test]
+fn episodes_start_from_given_states() {
+    let mut bench = Bench::new("point-mass", "", 2);
+    let observations = bench.reset(Start::States(&[3.0, 4.0, 0.0, 0.0, -2.0, 0.0, 0.5, 0.0]));
+    assert_eq!(
+        observations,
+        [3.0, 4.0, 0.0, 0.0, 5.0, 0.0, -2.0, 0.0, 0.5, 0.0, 2.0, -0.5]
+    );
+    let mut refusal = |states| {
+        bench
+            .vector
+            .reset(Start::States(states), &mut bench.observations)
+            .unwrap_err()
+    };
+    assert!(matches!(refusal(&[0.0; 7]), RequestError::Count { given: 7, .. }));
+    assert!(matches!(refusal(&[0.0; 6]), RequestError::State { .. }));
+    assert!(matches!(refusal(&[]), RequestError::State { .. }));
+    let outside = refusal(&[0.0, 0.0, 0.0, 0.0, 9.0, 0.0, 0.0, 0.0]).to_string();
+    assert!(
+        outside.contains("9.0") && outside.contains("within -4 to 4 m"),
+        "{outside}"
+    );
+}
+
+#[test]
+fn a_refused_action_changes_nothing() {
+    for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+        let mut bench = Bench::new("pendulum", "", 2);
+        bench.reset(Start::Next);
+        assert!(matches!(
+            bench.step(&[1.0, bad]),
+            Err(RequestError::Action { environment: 1, .. })
+        ));
+        assert!(bench.rewards[0].is_nan(), "nothing was written");
+        bench.step(&[1.0, 1.0]).unwrap();
+        let mut undisturbed = Bench::new("pendulum", "", 2);
+        undisturbed.reset(Start::Next);
+        undisturbed.step(&[1.0, 1.0]).unwrap();
+        assert_eq!(bench.observations, undisturbed.observations);
+    }
+    let mut cart_pole = Bench::new("cart-pole", "", 1);
+    cart_pole.reset(Start::Next);
+    for bad in [2.0, -1.0, 0.5, f32::NAN] {
+        assert!(
+            matches!(cart_pole.step(&[bad]), Err(RequestError::Action { .. })),
+            "{bad}"
+        );
+    }
+    let short = Bench::new("point-mass", "", 2).step(&[0.0; 3]).unwrap_err().to_string();
+    assert_eq!(short, "3 numbers of actions for 2 environments: give 2 each");
+}
+
+#[test]
+fn actions_outside_the_box_are_clipped() {
+    let reward = |action| {
+        let mut bench = Bench::new("pendulum", "", 1);
+        bench.reset(Start::States(&[0.0, 0.0]));
+        bench.step(&[action]).unwrap();
+        (bench.rewards[0], bench.observations)
+    };
+    assert_eq!(reward(2.0), reward(1e30));
+}
+
+#[test]
+fn parameters_are_checked_before_any_environment_runs() {
+    let refused = VectorEnvironment::new("pendulum", &"time_limit = 0".parse().unwrap(), 2, 1, 0, 0);
+    assert!(matches!(
+        refused,
+        Err(EnvironmentError::Parameters {
+            environment: "pendulum",
+            ..
+        })
+    ));
+}
