@@ -1,0 +1,134 @@
+//! Adam (Kingma and Ba 2015) and the soft target update, in one sweep over the parameters.
+
+use crate::aligned::Aligned;
+use pulp::Arch;
+
+const BETA_1: f64 = 0.9;
+const BETA_2: f64 = 0.999;
+const EPSILON: f32 = 1e-8;
+
+/// Moments closer to zero than this become zero. Those of units that get no gradient decay for ever, and soon a
+/// denormal number each, which costs a processor a hundred times a normal one. Their step is then below 1e-18 / ε of the
+/// learning rate: nothing is lost.
+const FIRST_MOMENT_FLOOR: f32 = 1e-18;
+/// As [`FIRST_MOMENT_FLOOR`], for squares: its root is lost beside ε.
+const SECOND_MOMENT_FLOOR: f32 = 1e-30;
+
+/// Adam's memory of a network: running means of its gradient and of the gradient's square.
+#[derive(Clone, Debug)]
+pub struct Adam {
+    learning_rate: f64,
+    pub(crate) first_moment: Aligned,
+    pub(crate) second_moment: Aligned,
+}
+
+impl Adam {
+    /// No step taken yet, for so many parameters.
+    pub fn new(learning_rate: f64, parameters: usize) -> Self {
+        Self {
+            learning_rate,
+            first_moment: Aligned::zeros(parameters, 3),
+            second_moment: Aligned::zeros(parameters, 4),
+        }
+    }
+
+    /// Takes step number `t` (from 1) of `parameters` θ against `gradient`; then `target` ← τ θ + (1 − τ) `target`
+    /// (equation 3.31). All slices are as long as the network has parameters.
+    ///
+    /// Bias correction as in PyTorch: θ ← θ − α / (1 − β₁ᵗ) · m / (√v / √(1 − β₂ᵗ) + ε).
+    pub fn step(&mut self, t: u64, gradient: &[f32], parameters: &mut [f32], tau: f32, target: &mut [f32]) {
+        let step_size = (self.learning_rate / (1.0 - BETA_1.powf(t as f64))) as f32;
+        let correction = (1.0 / (1.0 - BETA_2.powf(t as f64)).sqrt()) as f32;
+        let (fresh_1, fresh_2) = ((1.0 - BETA_1) as f32, (1.0 - BETA_2) as f32);
+        let moments = self.first_moment.iter_mut().zip(self.second_moment.iter_mut());
+        let weights = parameters.iter_mut().zip(target);
+        Arch::new().dispatch(|| {
+            for ((&g, (m, v)), (weight, target)) in gradient.iter().zip(moments).zip(weights) {
+                // A gradient below the floor cannot lift either moment over its own; its square would be denormal.
+                let g = floored(g, FIRST_MOMENT_FLOOR);
+                *m = floored(*m + fresh_1 * (g - *m), FIRST_MOMENT_FLOOR);
+                *v = floored(*v + fresh_2 * (g * g - *v), SECOND_MOMENT_FLOOR);
+                *weight -= step_size * *m / (v.sqrt() * correction + EPSILON);
+                *target += tau * (*weight - *target);
+            }
+        });
+    }
+}
+
+/// `x`, or 0 where it is closer to zero than `floor`.
+#[inline(always)]
+fn floored(x: f32, floor: f32) -> f32 {
+    if x.abs() < floor { 0.0 } else { x }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The algorithm as its paper has it, in `f64`, one number.
+    #[derive(Default)]
+    struct Reference {
+        m: f64,
+        v: f64,
+        t: i32,
+    }
+
+    impl Reference {
+        fn step(&mut self, learning_rate: f64, g: f64, weight: f64) -> f64 {
+            self.t += 1;
+            self.m = 0.9 * self.m + 0.1 * g;
+            self.v = 0.999 * self.v + 0.001 * g * g;
+            let m_hat = self.m / (1.0 - 0.9f64.powi(self.t));
+            let v_hat = self.v / (1.0 - 0.999f64.powi(self.t));
+            weight - learning_rate * m_hat / (v_hat.sqrt() + 1e-8)
+        }
+    }
+
+    #[test]
+    fn it_follows_the_paper_for_a_thousand_steps() {
+        let count = 37;
+        let mut adam = Adam::new(1e-3, count);
+        let (mut weights, mut targets) = (vec![0.5f32; count], vec![-0.5f32; count]);
+        let mut references: Vec<Reference> = (0..count).map(|_| Reference::default()).collect();
+        let (mut expected, mut expected_targets) = (vec![0.5f64; count], vec![-0.5f64; count]);
+        for t in 1..=1000u64 {
+            let gradient: Vec<f32> = (0..count)
+                .map(|i| ((t as f32 * 0.37 + i as f32).sin() + 0.2) * 10f32.powi(i as i32 % 9 - 6))
+                .collect();
+            adam.step(t, &gradient, &mut weights, 0.01, &mut targets);
+            for i in 0..count {
+                expected[i] = references[i].step(1e-3, gradient[i].into(), expected[i]);
+                expected_targets[i] = 0.01 * expected[i] + 0.99 * expected_targets[i];
+                assert!(
+                    (f64::from(weights[i]) - expected[i]).abs() < 1e-5,
+                    "step {t}, weight {i}"
+                );
+                assert!(
+                    (f64::from(targets[i]) - expected_targets[i]).abs() < 1e-5,
+                    "step {t}, target {i}"
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn moments_without_gradient_end_at_zero_and_are_never_denormal() {
+        let mut adam = Adam::new(1e-3, 20);
+        let (mut weights, mut targets) = (vec![0.0; 20], vec![0.0; 20]);
+        adam.step(1, &[1e-9; 20], &mut weights, 0.01, &mut targets);
+        for t in 2..=30_000 {
+            adam.step(
+                t,
+                &[if t < 500 { 1e-22 } else { 0.0 }; 20],
+                &mut weights,
+                0.01,
+                &mut targets,
+            );
+            for moment in adam.first_moment.iter().chain(&*adam.second_moment) {
+                assert!(!moment.is_subnormal(), "step {t}: {moment:e}");
+            }
+        }
+        assert_eq!(*adam.first_moment, [0.0; 20]);
+        assert_eq!(*adam.second_moment, [0.0; 20]);
+    }
+}

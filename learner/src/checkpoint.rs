@@ -1,0 +1,317 @@
+//! Checkpoints: all a learner needs to go on, in one file, and the one before it in another.
+//!
+//! `latest.ckpt` is written under a temporary name and synced before its predecessor becomes `previous.ckpt` and it takes
+//! the name. So at any moment at least one of the two is whole, and the older one is never given up for a damaged one.
+
+use std::fs;
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+
+use bincode::config::{self, Config};
+use serde::{Deserialize, Serialize};
+use shoal_common::durable::{self, Kind, Prepared, SealError, sync_directory_of};
+
+const KIND: Kind = Kind {
+    magic: *b"SHOALCKP",
+    version: 1,
+    name: "a checkpoint",
+};
+const LATEST: &str = "latest.ckpt";
+const PREVIOUS: &str = "previous.ckpt";
+
+/// How far a learner has come.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Counters {
+    /// Updates done.
+    pub updates: u64,
+    /// Environment steps learned from, over all actors.
+    pub env_steps: u64,
+    /// Rows of the replay taken into account: its head as the updates saw it.
+    pub rows: u64,
+    /// Version of the policy last published.
+    pub policy_version: u64,
+    /// How often the learner had been started before the one that wrote this.
+    pub incarnation: u64,
+}
+
+/// A learner's state as read back.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Checkpoint {
+    /// How far it had come.
+    pub counters: Counters,
+    /// Its numbers by name, as they were given to `save`.
+    pub sections: Vec<(String, Vec<f32>)>,
+}
+
+/// A checkpoint is whole and does not hold what the algorithm expects.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("the checkpoint's section `{name}` {reason}; it was written by another version of the program")]
+pub struct SectionError {
+    name: String,
+    reason: String,
+}
+
+impl Checkpoint {
+    /// Takes out a section, which must have `length` numbers.
+    pub fn take(&mut self, name: &str, length: usize) -> Result<Vec<f32>, SectionError> {
+        let error = |reason| SectionError {
+            name: name.into(),
+            reason,
+        };
+        let at = self
+            .sections
+            .iter()
+            .position(|(n, _)| n == name)
+            .ok_or_else(|| error("is missing".into()))?;
+        match self.sections[at].1.len() {
+            found if found == length => Ok(self.sections.swap_remove(at).1),
+            found => Err(error(format!("has {found} numbers instead of {length}"))),
+        }
+    }
+}
+
+/// Why a checkpoint was not written or read. Those on the disk are as they were.
+#[derive(Debug, thiserror::Error)]
+pub enum CheckpointError {
+    /// It could not be written; the last one stands.
+    #[error(
+        "{path}: cannot write the checkpoint: {source}; free some space or check the rights of the directory (the \
+             last checkpoint is intact)"
+    )]
+    Write {
+        /// The file.
+        path: PathBuf,
+        /// The system's reason.
+        source: io::Error,
+    },
+    /// It is of another program or configuration, and whole: not to be overwritten.
+    #[error(
+        "{path}: this checkpoint {reason}; the file was left as it is: resume with the run's own configuration and \
+             program"
+    )]
+    Refused {
+        /// The file.
+        path: PathBuf,
+        /// What differs.
+        reason: String,
+    },
+    /// There are checkpoints, and none of them can be used.
+    #[error(
+        "{directory}: no checkpoint here can be used ({reasons}); the files were left as they are: put back a copy \
+             of one, or move them away to learn anew on the same replay"
+    )]
+    AllDamaged {
+        /// The checkpoints' directory.
+        directory: PathBuf,
+        /// Each file and what is wrong with it.
+        reasons: String,
+    },
+}
+
+/// What `load_newest` found.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Loaded {
+    /// The newest checkpoint that is whole.
+    pub checkpoint: Checkpoint,
+    /// What is wrong with a newer one, for the run's log.
+    pub warnings: Vec<String>,
+}
+
+/// The checkpoints of a run. One process at a time writes them.
+#[derive(Debug)]
+pub struct Checkpoints {
+    directory: PathBuf,
+    fingerprint: u64,
+    /// Whether `latest.ckpt` is there and whole; `None` before anybody has looked.
+    latest_is_sound: Option<bool>,
+}
+
+#[derive(Serialize, Deserialize)]
+struct Header {
+    fingerprint: u64,
+    counters: Counters,
+    /// Name and number count of each section, in the order their numbers follow.
+    sections: Vec<(String, u64)>,
+}
+
+/// What one of the two files turned out to be.
+enum Found {
+    Missing,
+    Whole(Checkpoint),
+    Damaged(String),
+}
+
+impl Checkpoints {
+    /// The checkpoints in `directory` of the configuration that `fingerprint` identifies.
+    pub fn new(directory: &Path, fingerprint: u64) -> Self {
+        Self {
+            directory: directory.into(),
+            fingerprint,
+            latest_is_sound: None,
+        }
+    }
+
+    /// Reads the newest checkpoint that is whole; `None` if there is none at all.
+    pub fn load_newest(&mut self) -> Result<Option<Loaded>, CheckpointError> {
+        let latest = self.read(LATEST)?;
+        self.latest_is_sound = Some(matches!(latest, Found::Whole(_)));
+        let latest_path = self.directory.join(LATEST);
+        let mut warnings = match latest {
+            Found::Whole(checkpoint) => {
+                return Ok(Some(Loaded {
+                    checkpoint,
+                    warnings: vec![],
+                }));
+            }
+            Found::Missing => vec![],
+            Found::Damaged(reason) => vec![format!("{}: {reason}", latest_path.display())],
+        };
+        let previous = self.directory.join(PREVIOUS);
+        match self.read(PREVIOUS)? {
+            Found::Whole(checkpoint) => {
+                if warnings.is_empty() {
+                    warnings.push(format!(
+                        "{}: missing, as after a crash while it was replaced",
+                        latest_path.display()
+                    ));
+                }
+                let used = format!(
+                    "going on from {}, after {} updates",
+                    previous.display(),
+                    checkpoint.counters.updates
+                );
+                warnings.push(used);
+                return Ok(Some(Loaded { checkpoint, warnings }));
+            }
+            Found::Missing => {}
+            Found::Damaged(reason) => warnings.push(format!("{}: {reason}", previous.display())),
+        }
+        if warnings.is_empty() {
+            return Ok(None);
+        }
+        Err(CheckpointError::AllDamaged {
+            directory: self.directory.clone(),
+            reasons: warnings.join("; "),
+        })
+    }
+
+    /// Writes a checkpoint. When this returns it is on the disk, and a power loss leaves it or a later one.
+    pub fn save(&mut self, counters: &Counters, sections: &[(&str, &[f32])]) -> Result<(), CheckpointError> {
+        let prepared = self.prepare(counters, sections)?;
+        self.keep_latest()?;
+        self.publish(prepared)
+    }
+
+    fn prepare(&self, counters: &Counters, sections: &[(&str, &[f32])]) -> Result<Prepared, CheckpointError> {
+        let path = self.directory.join(LATEST);
+        let header = Header {
+            fingerprint: self.fingerprint,
+            counters: *counters,
+            sections: sections
+                .iter()
+                .map(|(name, numbers)| ((*name).to_owned(), numbers.len() as u64))
+                .collect(),
+        };
+        Prepared::write(&path, |file| {
+            durable::seal(KIND, file, |body| {
+                body.write_all(&bincode::serde::encode_to_vec(&header, encoding()).map_err(io::Error::other)?)?;
+                sections
+                    .iter()
+                    .try_for_each(|(_, numbers)| body.write_all(bytemuck::cast_slice(numbers)))
+            })
+        })
+        .map_err(|source| CheckpointError::Write { path, source })
+    }
+
+    /// Makes room for a new `latest.ckpt`: a whole one becomes the previous one, a damaged one is put aside.
+    fn keep_latest(&mut self) -> Result<(), CheckpointError> {
+        let latest = self.directory.join(LATEST);
+        let sound = match self.latest_is_sound {
+            Some(sound) => sound,
+            None => matches!(self.read(LATEST)?, Found::Whole(_)),
+        };
+        let kept = if sound {
+            self.directory.join(PREVIOUS)
+        } else {
+            self.unused_name()
+        };
+        self.latest_is_sound = Some(false);
+        match fs::rename(&latest, kept) {
+            Err(error) if error.kind() != io::ErrorKind::NotFound => Err(CheckpointError::Write {
+                path: latest,
+                source: error,
+            }),
+            // In this order on the disk too: the new one must not replace the old one before that has its other name.
+            _ => sync_directory_of(&latest).map_err(|source| CheckpointError::Write { path: latest, source }),
+        }
+    }
+
+    fn publish(&mut self, prepared: Prepared) -> Result<(), CheckpointError> {
+        prepared.publish().map_err(|source| CheckpointError::Write {
+            path: self.directory.join(LATEST),
+            source,
+        })?;
+        self.latest_is_sound = Some(true);
+        Ok(())
+    }
+
+    fn unused_name(&self) -> PathBuf {
+        let mut number = 0;
+        loop {
+            let path = self.directory.join(format!("damaged-{number}.ckpt"));
+            if !path.exists() {
+                return path;
+            }
+            number += 1;
+        }
+    }
+
+    fn read(&self, name: &str) -> Result<Found, CheckpointError> {
+        let path = self.directory.join(name);
+        let refused = |reason| CheckpointError::Refused {
+            path: path.clone(),
+            reason,
+        };
+        let body = match durable::read_sealed(KIND, &path) {
+            Ok(body) => body,
+            Err(SealError::Io(error)) if error.kind() == io::ErrorKind::NotFound => return Ok(Found::Missing),
+            Err(error @ SealError::Version { .. }) => return Err(refused(error.to_string())),
+            Err(error) => return Ok(Found::Damaged(error.to_string())),
+        };
+        let Some((header, numbers)) = parse(&body) else {
+            return Ok(Found::Damaged("its parts do not fit together".into()));
+        };
+        if header.fingerprint != self.fingerprint {
+            return Err(refused(format!(
+                "was written under another configuration (fingerprint {:016x}, this run's is {:016x})",
+                header.fingerprint, self.fingerprint
+            )));
+        }
+        let sections = header.sections.into_iter().map(|(name, _)| name).zip(numbers).collect();
+        Ok(Found::Whole(Checkpoint {
+            counters: header.counters,
+            sections,
+        }))
+    }
+}
+
+/// Splits a body into its header and the numbers of each section; `None` unless it is used up exactly.
+fn parse(body: &[u8]) -> Option<(Header, Vec<Vec<f32>>)> {
+    let (header, read): (Header, usize) = bincode::serde::decode_from_slice(body, encoding()).ok()?;
+    let (mut rest, odd) = body.get(read..)?.as_chunks::<{ size_of::<f32>() }>();
+    let mut sections = Vec::with_capacity(header.sections.len());
+    for (_, length) in &header.sections {
+        let (numbers, after) = rest.split_at_checked(usize::try_from(*length).ok()?)?;
+        sections.push(numbers.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect());
+        rest = after;
+    }
+    (rest.is_empty() && odd.is_empty()).then_some((header, sections))
+}
+
+/// The limit keeps a count that no checkpoint has from asking for memory.
+fn encoding() -> impl Config {
+    config::standard().with_fixed_int_encoding().with_limit::<{ 1 << 16 }>()
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,244 @@
+use std::os::unix::fs::PermissionsExt;
+
+use proptest::prelude::*;
+use tempfile::TempDir;
+
+use super::*;
+
+const WEIGHTS: [f32; 5] = [1.0, -0.0, f32::MIN_POSITIVE, f32::INFINITY, 1e-40];
+
+fn counters(updates: u64) -> Counters {
+    Counters {
+        updates,
+        env_steps: 2 * updates,
+        rows: 3 * updates,
+        policy_version: 4,
+        incarnation: 5,
+    }
+}
+
+fn save(store: &mut Checkpoints, updates: u64) {
+    store
+        .save(
+            &counters(updates),
+            &[("actor", &WEIGHTS), ("empty", &[]), ("critic", &[updates as f32])],
+        )
+        .unwrap();
+}
+
+/// A directory with `latest.ckpt` after two updates and `previous.ckpt` after one.
+fn two() -> (TempDir, PathBuf, PathBuf) {
+    let directory = TempDir::new().unwrap();
+    let mut store = Checkpoints::new(directory.path(), 7);
+    save(&mut store, 1);
+    save(&mut store, 2);
+    let (latest, previous) = (directory.path().join(LATEST), directory.path().join(PREVIOUS));
+    (directory, latest, previous)
+}
+
+fn load(directory: &TempDir) -> Result<Option<Loaded>, CheckpointError> {
+    Checkpoints::new(directory.path(), 7).load_newest()
+}
+
+fn updates(directory: &TempDir) -> u64 {
+    load(directory).unwrap().unwrap().checkpoint.counters.updates
+}
+
+#[test]
+fn an_empty_directory_has_no_checkpoint() {
+    assert_eq!(load(&TempDir::new().unwrap()).unwrap(), None);
+}
+
+#[test]
+fn what_was_saved_is_loaded_to_the_bit() {
+    let (directory, latest, previous) = two();
+    let Loaded {
+        mut checkpoint,
+        warnings,
+    } = load(&directory).unwrap().unwrap();
+    assert!(warnings.is_empty());
+    assert_eq!(checkpoint.counters, counters(2));
+    let actor = checkpoint.take("actor", 5).unwrap();
+    assert_eq!(actor.map_bits(), WEIGHTS.to_vec().map_bits());
+    assert_eq!(checkpoint.take("empty", 0).unwrap(), []);
+    let error = checkpoint.take("critic", 2).unwrap_err().to_string();
+    assert!(error.contains("`critic` has 1 numbers instead of 2"), "{error}");
+    assert!(
+        checkpoint
+            .take("actor", 5)
+            .unwrap_err()
+            .to_string()
+            .contains("`actor` is missing")
+    );
+    for file in [latest, previous] {
+        assert_eq!(fs::metadata(file).unwrap().permissions().mode() & 0o777, 0o600);
+    }
+}
+
+trait MapBits {
+    fn map_bits(self) -> Vec<u32>;
+}
+
+impl MapBits for Vec<f32> {
+    fn map_bits(self) -> Vec<u32> {
+        self.into_iter().map(f32::to_bits).collect()
+    }
+}
+
+#[test]
+fn a_newest_one_cut_short_anywhere_gives_way_to_the_previous_one() {
+    let (directory, latest, _) = two();
+    let whole = fs::read(&latest).unwrap();
+    for length in 0..whole.len() {
+        fs::write(&latest, &whole[..length]).unwrap();
+        let loaded = load(&directory).unwrap().unwrap();
+        assert_eq!(loaded.checkpoint.counters.updates, 1, "cut to {length} bytes");
+        assert!(loaded.warnings[0].contains("latest.ckpt: is"), "{:?}", loaded.warnings);
+        assert!(
+            loaded.warnings[1].contains("previous.ckpt, after 1 updates"),
+            "{:?}",
+            loaded.warnings
+        );
+    }
+}
+
+#[test]
+fn a_newest_one_changed_anywhere_gives_way_to_the_previous_one() {
+    let (directory, latest, _) = two();
+    let whole = fs::read(&latest).unwrap();
+    for at in 0..whole.len() {
+        let mut damaged = whole.clone();
+        damaged[at] ^= 0x10;
+        fs::write(&latest, damaged).unwrap();
+        assert_eq!(updates(&directory), 1, "byte {at}");
+    }
+}
+
+#[test]
+fn where_all_are_damaged_nothing_is_loaded_and_nothing_touched() {
+    let (directory, latest, previous) = two();
+    fs::write(&latest, "short").unwrap();
+    fs::write(&previous, [0; 4096]).unwrap();
+    let error = load(&directory).unwrap_err();
+    assert!(matches!(error, CheckpointError::AllDamaged { .. }));
+    let line = error.to_string();
+    assert!(
+        line.contains(LATEST) && line.contains(PREVIOUS) && !line.contains('\n'),
+        "{line}"
+    );
+    assert_eq!(fs::read(&latest).unwrap(), b"short");
+    // A run begun anew all the same puts them aside.
+    save(&mut Checkpoints::new(directory.path(), 7), 9);
+    assert_eq!(fs::read(directory.path().join("damaged-0.ckpt")).unwrap(), b"short");
+    assert_eq!(updates(&directory), 9);
+}
+
+#[test]
+fn a_damaged_newest_one_never_replaces_the_previous_one() {
+    for look_first in [true, false] {
+        let (directory, latest, previous) = two();
+        let kept = fs::read(&previous).unwrap();
+        fs::write(&latest, "short").unwrap();
+        let mut store = Checkpoints::new(directory.path(), 7);
+        if look_first {
+            store.load_newest().unwrap();
+        }
+        save(&mut store, 3);
+        assert_eq!(fs::read(&previous).unwrap(), kept);
+        assert_eq!(fs::read(directory.path().join("damaged-0.ckpt")).unwrap(), b"short");
+        save(&mut store, 4);
+        fs::remove_file(&latest).unwrap();
+        assert_eq!(updates(&directory), 3);
+    }
+}
+
+#[test]
+fn killed_between_any_two_steps_of_a_write_one_is_whole_and_the_next_write_works() {
+    for steps in 0..3 {
+        let (directory, latest, _) = two();
+        let mut store = Checkpoints::new(directory.path(), 7);
+        let prepared = store.prepare(&counters(3), &[]).unwrap();
+        if steps > 0 {
+            store.keep_latest().unwrap();
+        }
+        if steps > 1 {
+            store.publish(prepared).unwrap();
+        } else {
+            // A killed process drops nothing: its temporary file stays.
+            std::mem::forget(prepared);
+        }
+        let loaded = load(&directory).unwrap().unwrap();
+        assert_eq!(loaded.checkpoint.counters.updates, [2, 2, 3][steps]);
+        assert_eq!(loaded.warnings.is_empty(), steps != 1, "{:?}", loaded.warnings);
+
+        save(&mut Checkpoints::new(directory.path(), 7), 4);
+        assert_eq!(updates(&directory), 4);
+        fs::remove_file(latest).unwrap();
+        assert_eq!(updates(&directory), [2, 2, 3][steps]);
+    }
+}
+
+#[test]
+fn killed_while_writing_the_last_ones_stand() {
+    let (directory, latest, _) = two();
+    fs::write(latest.with_extension("ckpt.new"), "half").unwrap();
+    assert_eq!(updates(&directory), 2);
+    save(&mut Checkpoints::new(directory.path(), 7), 3);
+    assert_eq!(updates(&directory), 3);
+}
+
+#[test]
+fn one_of_another_configuration_is_refused_and_not_replaced() {
+    let (directory, latest, _) = two();
+    let before = fs::read(&latest).unwrap();
+    let mut other = Checkpoints::new(directory.path(), 8);
+    let error = other.load_newest().unwrap_err().to_string();
+    assert!(
+        error.contains("latest.ckpt") && error.contains("another configuration"),
+        "{error}"
+    );
+    let mut other = Checkpoints::new(directory.path(), 8);
+    assert!(matches!(
+        other.save(&counters(3), &[]),
+        Err(CheckpointError::Refused { .. })
+    ));
+    assert_eq!(fs::read(&latest).unwrap(), before);
+    assert!(!latest.with_extension("ckpt.new").exists());
+}
+
+#[test]
+fn one_of_another_version_is_refused() {
+    let (directory, latest, _) = two();
+    durable::write_atomically(&latest, |file| {
+        durable::seal(Kind { version: 2, ..KIND }, file, |_| Ok(()))
+    })
+    .unwrap();
+    let error = load(&directory).unwrap_err().to_string();
+    assert!(
+        error.contains("format version 2, this program reads version 1"),
+        "{error}"
+    );
+}
+
+#[test]
+fn a_directory_that_is_not_there_is_named() {
+    let directory = TempDir::new().unwrap().path().join("gone");
+    let error = Checkpoints::new(&directory, 7).save(&counters(1), &[]).unwrap_err();
+    assert!(matches!(error, CheckpointError::Write { .. }));
+    assert!(error.to_string().contains("gone/latest.ckpt"), "{error}");
+}
+
+proptest! {
+    #[test]
+    fn whatever_a_body_holds_it_is_read_or_refused(body in prop::collection::vec(any::<u8>(), 0..300)) {
+        let _ = parse(&body);
+    }
+
+    #[test]
+    fn a_body_whose_header_lies_is_refused(length in any::<u64>(), numbers in 0_usize..20) {
+        let header = Header { fingerprint: 0, counters: Counters::default(), sections: vec![("a".into(), length)] };
+        let mut body = bincode::serde::encode_to_vec(&header, encoding()).unwrap();
+        body.resize(body.len() + 4 * numbers, 0);
+        prop_assert_eq!(parse(&body).is_some(), length == numbers as u64);
+    }
+}

@@ -1,0 +1,373 @@
+//! Deep deterministic policy gradient: Algorithm 4 of the thesis (section 3.4.3), after Lillicrap et al. 2015.
+//!
+//! Symbols as there: policy μ with parameters θ_μ, action-value function Q with θ_Q, their slowly following targets μ'
+//! and Q', batch size N, target y, loss L, target rate τ. Lines 1, 2 and 11 to 16 are here; the others run in the actors
+//! and the environment servers.
+
+use crate::adam::Adam;
+use crate::aligned::Aligned;
+use crate::digest::sha256;
+use crate::initialise::initialise;
+use crate::minibatch::Minibatch;
+use crate::pass::Pass;
+use crate::product;
+use nalgebra::{DMatrix, DVector};
+use shoal_common::network::{ActionRange, ActionRangeError, NetworkLayout};
+use shoal_common::space::EnvironmentSpec;
+
+/// What a person may choose about the algorithm. The discount γ is not here: it is in each transition.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DdpgSettings {
+    /// Target rate τ, in (0, 1].
+    pub tau: f64,
+    /// Adam's step for θ_μ.
+    pub actor_learning_rate: f64,
+    /// Adam's step for θ_Q.
+    pub critic_learning_rate: f64,
+    /// Units in the hidden layers of both networks.
+    pub hidden: [usize; 2],
+    /// Transitions in a minibatch, N.
+    pub batch: usize,
+}
+
+/// Why a [`Ddpg`] cannot be made or restored.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum DdpgError {
+    /// The environment's actions are not real numbers in finite ranges.
+    #[error("DDPG cannot control this environment: {0}")]
+    Action(#[from] ActionRangeError),
+    /// A setting is outside its range.
+    #[error("DDPG's {setting} is {value}, but must be {must}")]
+    Setting {
+        /// Its name in [`DdpgSettings`].
+        setting: &'static str,
+        /// What it is.
+        value: f64,
+        /// What it must be.
+        must: &'static str,
+    },
+    /// Numbers to restore belong to networks of other sizes.
+    #[error("{part} holds {found} numbers, but these networks need {expected}")]
+    Length {
+        /// Which of [`DdpgState`]'s parts.
+        part: &'static str,
+        /// Numbers it holds.
+        found: usize,
+        /// Numbers it must hold.
+        expected: usize,
+    },
+}
+
+/// How the networks did on a minibatch, before the step that it led to.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Losses {
+    /// L of line 13: mean of (y − Q(s, a))².
+    pub critic_loss: f32,
+    /// −mean of Q(s, μ(s)), Q after its step.
+    pub actor_loss: f32,
+    /// Mean of Q(s, a), Q before its step.
+    pub q_mean: f32,
+}
+
+/// Everything an update changes, as a checkpoint keeps it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct DdpgState<'a> {
+    /// Updates done.
+    pub updates: u64,
+    /// Flat numbers, in the order of [`DdpgState::PARTS`].
+    pub parts: [&'a [f32]; 8],
+}
+
+impl DdpgState<'_> {
+    /// What each of the parts is.
+    pub const PARTS: [&'static str; 8] = [
+        "actor",
+        "critic",
+        "target actor",
+        "target critic",
+        "actor's first moment",
+        "actor's second moment",
+        "critic's first moment",
+        "critic's second moment",
+    ];
+}
+
+/// A network that learns, the target that follows it, and what its optimiser remembers.
+#[derive(Clone, Debug)]
+struct Learned {
+    layout: NetworkLayout,
+    parameters: Aligned,
+    target: Aligned,
+    adam: Adam,
+    gradient: Aligned,
+}
+
+impl Learned {
+    /// Lines 1 and 2: θ at random, θ' ← θ.
+    fn new(layout: NetworkLayout, learning_rate: f64, seed: u64, index: u64) -> Self {
+        let parameters = initialise(&layout, seed, index);
+        Self {
+            layout,
+            parameters: Aligned::from_slice(&parameters, 0),
+            target: Aligned::from_slice(&parameters, 1),
+            gradient: Aligned::zeros(parameters.len(), 2),
+            adam: Adam::new(learning_rate, parameters.len()),
+        }
+    }
+
+    /// One step of Adam along −gradient, and the target's after it.
+    fn descend(&mut self, t: u64, tau: f32) {
+        self.adam
+            .step(t, &self.gradient, &mut self.parameters, tau, &mut self.target);
+    }
+}
+
+/// The learner of DDPG: both networks, their targets, both optimisers.
+#[derive(Clone, Debug)]
+pub struct Ddpg {
+    range: ActionRange,
+    tau: f32,
+    updates: u64,
+    actor: Learned,
+    critic: Learned,
+    // Room for what an update computes on its way.
+    mu: Pass,
+    q: Pass,
+    actions: DMatrix<f32>,
+    y: DVector<f32>,
+    d_q: DMatrix<f32>,
+    d_mu: DMatrix<f32>,
+}
+
+impl Ddpg {
+    /// New networks, drawn from `seed`.
+    pub fn new(spec: &EnvironmentSpec, settings: &DdpgSettings, seed: u64) -> Result<Self, DdpgError> {
+        check(settings)?;
+        let range = ActionRange::new(&spec.action)?;
+        let (observation, action, batch) = (spec.observation.width(), range.width(), settings.batch);
+        let mu = NetworkLayout::policy(observation, settings.hidden, action);
+        let q = NetworkLayout::critic(observation, settings.hidden, action);
+        Ok(Self {
+            range,
+            tau: settings.tau as f32,
+            updates: 0,
+            actor: Learned::new(mu, settings.actor_learning_rate, seed, 0),
+            critic: Learned::new(q, settings.critic_learning_rate, seed, 1),
+            mu: Pass::new(mu, batch),
+            q: Pass::new(q, batch),
+            actions: DMatrix::zeros(action, batch),
+            y: DVector::zeros(batch),
+            d_q: DMatrix::zeros(1, batch),
+            d_mu: DMatrix::zeros(action, batch),
+        })
+    }
+
+    /// One update from a minibatch of N transitions: lines 12 to 16. Panics when the batch has other dimensions than the
+    /// networks and settings. Nothing is allocated.
+    pub fn update(&mut self, batch: &Minibatch) -> Losses {
+        assert_eq!(batch.size(), self.y.len(), "transitions in the minibatch");
+        let t = self.updates + 1;
+        self.set_targets(batch);
+        let (critic_loss, q_mean) = self.critic_gradient(batch);
+        // Lines 13 and 15 in one sweep: Q' is not read again in this update. Likewise μ' of lines 14 and 16.
+        self.critic.descend(t, self.tau);
+        let actor_loss = self.actor_gradient(&batch.s);
+        self.actor.descend(t, self.tau);
+        self.updates = t;
+        Losses {
+            critic_loss,
+            actor_loss,
+            q_mean,
+        }
+    }
+
+    /// Line 12: y = r + discount · Q'(s', μ'(s')). Nothing is asked of a terminal s', whatever it holds.
+    fn set_targets(&mut self, batch: &Minibatch) {
+        let s_next = batch.s_next.as_slice();
+        act(&mut self.mu, &self.range, &self.actor.target, s_next, &mut self.actions);
+        self.q.forward(&self.critic.target, s_next, self.actions.as_slice());
+        for (i, y) in self.y.iter_mut().enumerate() {
+            let discount = batch.discount[i];
+            *y = batch.r[i]
+                + if discount == 0.0 {
+                    0.0
+                } else {
+                    discount * self.q.output[i]
+                };
+        }
+    }
+
+    /// Line 13: the gradient of L = 1/N Σ (y − Q(s, a))², through ∂L/∂Q = 2/N (Q − y). Returns L and the mean of Q.
+    fn critic_gradient(&mut self, batch: &Minibatch) -> (f32, f32) {
+        let (s, a) = (batch.s.as_slice(), batch.a.as_slice());
+        self.q.forward(&self.critic.parameters, s, a);
+        let scale = 2.0 / batch.size() as f32;
+        for (d, (q, y)) in self.d_q.iter_mut().zip(self.q.output.iter().zip(&self.y)) {
+            *d = scale * (q - y);
+        }
+        self.q
+            .backward(&self.critic.parameters, s, &self.d_q, &mut self.critic.gradient);
+        let loss = mean(self.q.output.iter().zip(&self.y).map(|(q, y)| (y - q) * (y - q)));
+        (loss, mean(self.q.output.iter().copied()))
+    }
+
+    /// Line 14 and equation 3.30: the gradient of −1/N Σ Q(s, μ(s)), which descending ascends Q, through the critic as line
+    /// 13 left it: ∇_a Q · ∇_θμ μ. Returns the loss.
+    fn actor_gradient(&mut self, s: &DMatrix<f32>) -> f32 {
+        let s = s.as_slice();
+        act(&mut self.mu, &self.range, &self.actor.parameters, s, &mut self.actions);
+        self.q.forward(&self.critic.parameters, s, self.actions.as_slice());
+        self.d_q.fill(-1.0 / self.y.len() as f32);
+        self.q
+            .backward_to_late_inputs(&self.critic.parameters, &self.d_q, &mut self.d_mu);
+        // a = centre + half · tanh z, so ∂a/∂z = half · (1 − tanh² z)
+        for (mut d, tanh) in self.d_mu.column_iter_mut().zip(self.mu.output.column_iter()) {
+            for (element, half) in self.range.half().iter().enumerate() {
+                d[element] *= half * (1.0 - tanh[element] * tanh[element]);
+            }
+        }
+        self.mu
+            .backward(&self.actor.parameters, s, &self.d_mu, &mut self.actor.gradient);
+        -mean(self.q.output.iter().copied())
+    }
+
+    /// θ_μ, laid out as [`policy_layout`](Self::policy_layout) says: what actors evaluate.
+    pub fn policy(&self) -> &[f32] {
+        &self.actor.parameters
+    }
+
+    /// The layout of the policy's parameters.
+    pub fn policy_layout(&self) -> &NetworkLayout {
+        &self.actor.layout
+    }
+
+    /// The layout of the critic's parameters.
+    pub fn critic_layout(&self) -> &NetworkLayout {
+        &self.critic.layout
+    }
+
+    /// Updates done.
+    pub fn updates(&self) -> u64 {
+        self.updates
+    }
+
+    /// SHA-256 over actor, critic, target actor and target critic as little-endian `f32`, in hexadecimal.
+    pub fn digest(&self) -> String {
+        sha256(&self.state().parts[..4])
+    }
+
+    /// Floating-point operations of the matrix products of one update.
+    pub fn flop_per_update(&self) -> u64 {
+        product::flop_per_update(&self.actor.layout, &self.critic.layout, self.y.len())
+    }
+
+    /// Everything the next update depends on.
+    pub fn state(&self) -> DdpgState<'_> {
+        let (actor, critic) = (&self.actor, &self.critic);
+        DdpgState {
+            updates: self.updates,
+            parts: [
+                &actor.parameters,
+                &critic.parameters,
+                &actor.target,
+                &critic.target,
+                &actor.adam.first_moment,
+                &actor.adam.second_moment,
+                &critic.adam.first_moment,
+                &critic.adam.second_moment,
+            ],
+        }
+    }
+
+    /// Starts again from given networks (actor, critic, target actor, target critic), with optimisers that took no step.
+    pub fn restart_from(&mut self, networks: [&[f32]; 4]) -> Result<(), DdpgError> {
+        let [actor, critic] =
+            [self.actor.parameters.len(), self.critic.parameters.len()].map(|length| vec![0.0; length]);
+        let [mu, q, target_mu, target_q] = networks;
+        self.restore(&DdpgState {
+            updates: 0,
+            parts: [mu, q, target_mu, target_q, &actor, &actor, &critic, &critic],
+        })
+    }
+
+    /// Goes back to a state, of this or of another [`Ddpg`] with networks of the same sizes. An error changes nothing.
+    pub fn restore(&mut self, state: &DdpgState<'_>) -> Result<(), DdpgError> {
+        for ((part, own), given) in DdpgState::PARTS.into_iter().zip(self.state().parts).zip(state.parts) {
+            if given.len() != own.len() {
+                return Err(DdpgError::Length {
+                    part,
+                    found: given.len(),
+                    expected: own.len(),
+                });
+            }
+        }
+        let (actor, critic) = (&mut self.actor, &mut self.critic);
+        let own = [
+            &mut actor.parameters,
+            &mut critic.parameters,
+            &mut actor.target,
+            &mut critic.target,
+            &mut actor.adam.first_moment,
+            &mut actor.adam.second_moment,
+            &mut critic.adam.first_moment,
+            &mut critic.adam.second_moment,
+        ];
+        for (own, given) in own.into_iter().zip(state.parts) {
+            own.copy_from_slice(given);
+        }
+        self.updates = state.updates;
+        Ok(())
+    }
+}
+
+/// Fills `actions` with the policy's, in environment units, and leaves the tanh they come from in `mu.output`. The
+/// bits are those of [`PolicyNetwork`](shoal_common::network::PolicyNetwork).
+fn act(mu: &mut Pass, range: &ActionRange, parameters: &[f32], s: &[f32], actions: &mut DMatrix<f32>) {
+    mu.forward(parameters, s, &[]);
+    for (mut action, mut z) in actions.column_iter_mut().zip(mu.output.column_iter_mut()) {
+        for element in 0..range.width() {
+            z[element] = z[element].tanh();
+            action[element] = range.action(element, z[element]);
+        }
+    }
+}
+
+fn mean(numbers: impl ExactSizeIterator<Item = f32>) -> f32 {
+    let count = numbers.len() as f32;
+    numbers.sum::<f32>() / count
+}
+
+fn check(settings: &DdpgSettings) -> Result<(), DdpgError> {
+    let rate = |rate: f64| rate.is_finite() && rate > 0.0;
+    let [h1, h2] = settings.hidden;
+    let size = "at least 1";
+    let checks = [
+        (
+            "tau",
+            settings.tau,
+            settings.tau > 0.0 && settings.tau <= 1.0,
+            "above 0 and at most 1",
+        ),
+        (
+            "actor_learning_rate",
+            settings.actor_learning_rate,
+            rate(settings.actor_learning_rate),
+            "above 0",
+        ),
+        (
+            "critic_learning_rate",
+            settings.critic_learning_rate,
+            rate(settings.critic_learning_rate),
+            "above 0",
+        ),
+        ("hidden", h1.min(h2) as f64, h1.min(h2) > 0, size),
+        ("batch", settings.batch as f64, settings.batch > 0, size),
+    ];
+    match checks.into_iter().find(|(_, _, good, _)| !good) {
+        Some((setting, value, _, must)) => Err(DdpgError::Setting { setting, value, must }),
+        None => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests;

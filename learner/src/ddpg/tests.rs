@@ -1,0 +1,297 @@
+use super::*;
+use rand::RngExt;
+use shoal_common::network::PolicyNetwork;
+use shoal_common::space::Space;
+use shoal_common::stream::{Purpose, Stream, stream};
+use shoal_common::transition::{RowLayout, Transition};
+
+const BATCH: usize = 5;
+
+fn spec() -> EnvironmentSpec {
+    EnvironmentSpec {
+        observation: Space::boxed(&[(-1.0, 1.0); 3]),
+        action: Space::boxed(&[(-1.0, 3.0), (-2.0, 2.0)]),
+        time_limit: 200,
+    }
+}
+
+fn settings() -> DdpgSettings {
+    DdpgSettings {
+        tau: 0.01,
+        actor_learning_rate: 1e-3,
+        critic_learning_rate: 1e-2,
+        hidden: [9, 7],
+        batch: BATCH,
+    }
+}
+
+/// Output layers as large as the others, so that every gradient is well above rounding.
+fn learner(seed: u64) -> Ddpg {
+    let mut ddpg = Ddpg::new(&spec(), &settings(), seed).unwrap();
+    let mut numbers = stream(seed, Purpose::Sampling, 0, 0);
+    for network in [&mut ddpg.actor, &mut ddpg.critic] {
+        network
+            .parameters
+            .iter_mut()
+            .for_each(|x| *x = numbers.random_range(-0.7..0.7));
+        network
+            .target
+            .iter_mut()
+            .for_each(|x| *x = numbers.random_range(-0.7..0.7));
+    }
+    ddpg
+}
+
+fn random(numbers: &mut Stream, count: usize) -> Vec<f32> {
+    (0..count).map(|_| numbers.random_range(-2.0..2.0)).collect()
+}
+
+fn minibatch(seed: u64) -> Minibatch {
+    let mut numbers = stream(seed, Purpose::Environment, 0, 0);
+    let mut batch = Minibatch::new(RowLayout::new(3, 2), BATCH);
+    for column in 0..BATCH {
+        let [s, a, s_next] = [3, 2, 3].map(|count| random(&mut numbers, count));
+        let (r, discount) = (numbers.random_range(-1.0..1.0), if column == 2 { 0.0 } else { 0.99 });
+        batch.set(
+            column,
+            &Transition {
+                s: &s,
+                a: &a,
+                r,
+                discount,
+                s_next: &s_next,
+                last: false,
+            },
+        );
+    }
+    batch
+}
+
+/// A network's output for one sample by the definition, in `f64`: the parameters, too.
+fn network(layout: &NetworkLayout, parameters: &[f64], x: &[f64], late: &[f64]) -> Vec<f64> {
+    let mut x = x.to_vec();
+    for (number, range) in layout.layer_ranges().into_iter().enumerate() {
+        if number == 1 {
+            x.extend(late);
+        }
+        let (w, b) = (&parameters[range.weights], &parameters[range.biases]);
+        let z = |i: usize| b[i] + x.iter().enumerate().map(|(j, x)| w[j * b.len() + i] * x).sum::<f64>();
+        x = (0..b.len())
+            .map(|i| if number < 2 { z(i).max(0.0) } else { z(i) })
+            .collect();
+    }
+    x
+}
+
+fn wide(numbers: &[f32]) -> Vec<f64> {
+    numbers.iter().map(|&x| x.into()).collect()
+}
+
+fn policy(ddpg: &Ddpg, parameters: &[f64], s: &[f64]) -> Vec<f64> {
+    let z = network(ddpg.policy_layout(), parameters, s, &[]);
+    let [centre, half] = [[1.0, 0.0], [2.0, 2.0]];
+    z.iter()
+        .enumerate()
+        .map(|(i, z)| centre[i] + half[i] * z.tanh())
+        .collect()
+}
+
+fn critic_loss(ddpg: &Ddpg, theta: &[f64], batch: &Minibatch) -> f64 {
+    let [target_actor, target_critic] = [wide(&ddpg.actor.target), wide(&ddpg.critic.target)];
+    let square = |i: usize| {
+        let [s, a, s_next] = [&batch.s, &batch.a, &batch.s_next].map(|m| wide(m.column(i).as_slice()));
+        let a_next = policy(ddpg, &target_actor, &s_next);
+        let q_next = network(ddpg.critic_layout(), &target_critic, &s_next, &a_next)[0];
+        let y = f64::from(batch.r[i]) + f64::from(batch.discount[i]) * q_next;
+        (y - network(ddpg.critic_layout(), theta, &s, &a)[0]).powi(2)
+    };
+    (0..BATCH).map(square).sum::<f64>() / BATCH as f64
+}
+
+fn actor_loss(ddpg: &Ddpg, theta: &[f64], batch: &Minibatch) -> f64 {
+    let critic = wide(&ddpg.critic.parameters);
+    let value = |i: usize| {
+        let s = wide(batch.s.column(i).as_slice());
+        network(ddpg.critic_layout(), &critic, &s, &policy(ddpg, theta, &s))[0]
+    };
+    -(0..BATCH).map(value).sum::<f64>() / BATCH as f64
+}
+
+/// Compares with central differences of `loss`. A step so small rarely crosses a ReLU's corner, and `f64` bears it.
+fn assert_is_gradient_of(loss: impl Fn(&[f64]) -> f64, gradient: &[f32], parameters: &[f32]) {
+    const STEP: f64 = 1e-6;
+    let mut theta = wide(parameters);
+    assert!(
+        gradient.iter().filter(|g| g.abs() > 1e-3).count() > gradient.len() / 4,
+        "the gradient says something"
+    );
+    for (i, &found) in gradient.iter().enumerate() {
+        let middle = theta[i];
+        let mut at = |x: f64| {
+            theta[i] = x;
+            loss(&theta)
+        };
+        let expected = (at(middle + STEP) - at(middle - STEP)) / (2.0 * STEP);
+        theta[i] = middle;
+        let tolerance = 2e-6 + 2e-5 * expected.abs();
+        assert!(
+            (f64::from(found) - expected).abs() < tolerance,
+            "parameter {i}: {found} for {expected}"
+        );
+    }
+}
+
+#[test]
+fn the_critics_gradient_is_that_of_its_loss() {
+    for seed in 0..10 {
+        let (mut ddpg, batch) = (learner(seed), minibatch(seed));
+        ddpg.set_targets(&batch);
+        let (loss, _) = ddpg.critic_gradient(&batch);
+        let theta = &ddpg.critic.parameters;
+        assert!((f64::from(loss) - critic_loss(&ddpg, &wide(theta), &batch)).abs() < 1e-5);
+        assert_is_gradient_of(|theta| critic_loss(&ddpg, theta, &batch), &ddpg.critic.gradient, theta);
+    }
+}
+
+#[test]
+fn the_actors_gradient_is_that_of_its_loss() {
+    for seed in 0..10 {
+        let (mut ddpg, batch) = (learner(seed), minibatch(seed));
+        let loss = ddpg.actor_gradient(&batch.s);
+        let theta = &ddpg.actor.parameters;
+        assert!((f64::from(loss) - actor_loss(&ddpg, &wide(theta), &batch)).abs() < 1e-5);
+        assert_is_gradient_of(|theta| actor_loss(&ddpg, theta, &batch), &ddpg.actor.gradient, theta);
+    }
+}
+
+#[test]
+fn nothing_is_asked_of_a_terminal_state() {
+    let (mut one, mut other) = (learner(1), learner(1));
+    let (batch, mut changed) = (minibatch(1), minibatch(1));
+    assert_eq!(batch.discount[2], 0.0);
+    changed.s_next.column_mut(2).fill(f32::NAN);
+    assert_eq!(one.update(&batch), other.update(&changed));
+    assert_eq!(one.digest(), other.digest());
+    changed.s_next.column_mut(1).fill(0.5);
+    one.update(&batch);
+    other.update(&changed);
+    assert_ne!(
+        one.digest(),
+        other.digest(),
+        "the state after a step that did not terminate counts"
+    );
+}
+
+#[test]
+fn the_same_seed_gives_the_same_bits() {
+    let run = |seed| {
+        let mut ddpg = Ddpg::new(&spec(), &settings(), seed).unwrap();
+        for t in 0..20 {
+            ddpg.update(&minibatch(t));
+        }
+        ddpg.digest()
+    };
+    assert_eq!(run(1), run(1));
+    assert_ne!(run(1), run(2));
+}
+
+#[test]
+fn targets_start_as_copies_and_follow() {
+    let mut ddpg = Ddpg::new(&spec(), &settings(), 1).unwrap();
+    assert_eq!(*ddpg.actor.parameters, *ddpg.actor.target);
+    assert_eq!(*ddpg.critic.parameters, *ddpg.critic.target);
+    let before = ddpg.critic.clone();
+    ddpg.update(&minibatch(1));
+    for i in 0..before.target.len() {
+        let expected = 0.01 * ddpg.critic.parameters[i] + 0.99 * before.target[i];
+        assert!((ddpg.critic.target[i] - expected).abs() < 1e-7);
+    }
+}
+
+#[test]
+fn a_restored_learner_goes_on_with_the_same_bits() {
+    let mut ddpg = learner(1);
+    for t in 0..3 {
+        ddpg.update(&minibatch(t));
+    }
+    let kept: Vec<Vec<f32>> = ddpg.state().parts.map(<[f32]>::to_vec).into();
+    let parts = std::array::from_fn(|part| kept[part].as_slice());
+    let mut restored = Ddpg::new(&spec(), &settings(), 99).unwrap();
+    restored.restore(&DdpgState { updates: 3, parts }).unwrap();
+    assert_eq!(restored.state(), ddpg.state());
+    assert_eq!(restored.update(&minibatch(7)), ddpg.update(&minibatch(7)));
+    assert_eq!(restored.state(), ddpg.state());
+
+    let mut short = parts;
+    short[5] = &short[5][1..];
+    let error = restored
+        .restore(&DdpgState {
+            updates: 3,
+            parts: short,
+        })
+        .unwrap_err();
+    assert!(error.to_string().starts_with("actor's second moment holds"), "{error}");
+    assert_eq!(restored.state(), ddpg.state(), "an error changes nothing");
+}
+
+#[test]
+fn actors_act_with_the_learners_bits() {
+    let mut ddpg = learner(1);
+    let batch = minibatch(1);
+    let range = ActionRange::new(&spec().action).unwrap();
+    let mut network = PolicyNetwork::new(3, [9, 7], range, BATCH);
+    let mut actions = vec![0.0; 2 * BATCH];
+    network.forward(ddpg.policy(), batch.s.as_slice(), &mut actions);
+    act(
+        &mut ddpg.mu,
+        &ddpg.range,
+        &ddpg.actor.parameters,
+        batch.s.as_slice(),
+        &mut ddpg.actions,
+    );
+    assert_eq!(actions, ddpg.actions.as_slice());
+}
+
+#[test]
+fn what_cannot_work_is_refused() {
+    let discrete = EnvironmentSpec {
+        action: Space::Discrete { n: 4 },
+        ..spec()
+    };
+    let error = Ddpg::new(&discrete, &settings(), 1).unwrap_err();
+    assert!(
+        error.to_string().contains("the action space is discrete (4 actions)"),
+        "{error}"
+    );
+    for (wrong, name) in [
+        (DdpgSettings { tau: 0.0, ..settings() }, "tau"),
+        (
+            DdpgSettings {
+                actor_learning_rate: f64::NAN,
+                ..settings()
+            },
+            "actor_learning_rate",
+        ),
+        (
+            DdpgSettings {
+                critic_learning_rate: -1.0,
+                ..settings()
+            },
+            "critic_learning_rate",
+        ),
+        (
+            DdpgSettings {
+                hidden: [400, 0],
+                ..settings()
+            },
+            "hidden",
+        ),
+        (DdpgSettings { batch: 0, ..settings() }, "batch"),
+    ] {
+        let error = Ddpg::new(&spec(), &wrong, 1).unwrap_err();
+        assert!(
+            matches!(error, DdpgError::Setting { setting, .. } if setting == name),
+            "{error}"
+        );
+    }
+}

@@ -1,0 +1,59 @@
+//! The free run: takes chunks as they come and updates as often as they allow.
+
+use std::time::{Duration, Instant};
+
+use shoal_common::report::Activity;
+
+use crate::learner::{Ended, Learner};
+
+/// Updates from one publication to the next. Publishing copies the actor's weights once: about a thirtieth of an update.
+const PUBLISH_EVERY: u64 = 4;
+
+/// Chunks of an actor that are taken in before updates get their turn.
+const CHUNKS_AT_ONCE: u32 = 8;
+
+/// How long an idle learner sleeps before it looks after its connections.
+const NAP: Duration = Duration::from_millis(50);
+
+pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Ended> {
+    let steps = learner.settings.steps;
+    let ratio = learner.settings.ratio;
+    let every = Duration::from_secs_f64(learner.settings.checkpoint.every_seconds);
+    let mut saved = Instant::now();
+    // After a crash the replay is ahead of the checkpoint: those rows count.
+    learner.rows = learner.replay.head();
+    loop {
+        if learner.stop.requested() {
+            return Err(Ended::Stopped);
+        }
+        let updates = learner.updates();
+        let drained = learner.intake.drain(&mut learner.replay, CHUNKS_AT_ONCE, |replay| {
+            ratio.is_behind(replay.head(), updates)
+        })?;
+        learner.rows = learner.replay.head();
+
+        if updates < ratio.allowed(learner.rows) {
+            learner.update()?;
+            if learner.updates().is_multiple_of(PUBLISH_EVERY) {
+                learner.publish()?;
+            }
+            learner.tell(Activity::Working);
+        } else if learner.rows >= steps {
+            learner.publish()?;
+            return Ok(());
+        } else if !drained {
+            let activity = if learner.rows < ratio.warmup {
+                Activity::WaitingForPeer
+            } else {
+                Activity::WaitingForRatio
+            };
+            if !learner.bell.wait(NAP).map_err(Ended::from)? {
+                learner.look_after(activity)?;
+            }
+        }
+        if saved.elapsed() >= every {
+            learner.save()?;
+            saved = Instant::now();
+        }
+    }
+}

@@ -1,0 +1,55 @@
+//! First weights of a network.
+
+use rand::RngExt;
+use shoal_common::network::NetworkLayout;
+use shoal_common::stream::{Purpose, stream};
+
+/// Bound of the output layer's weights and biases, so that first actions and values are near the middle (Lillicrap et
+/// al. 2015, section 7).
+const OUTPUT_BOUND: f32 = 3e-3;
+
+/// Seeded first weights: hidden layers uniform within ±1/√fan-in (late inputs counted), the output layer within ±3e-3.
+///
+/// `index` tells the networks of one run apart.
+pub fn initialise(layout: &NetworkLayout, seed: u64, index: u64) -> Vec<f32> {
+    let mut stream = stream(seed, Purpose::Initialisation, index, 0);
+    let sizes = layout.layer_sizes();
+    let bounds = [fan_in_bound(sizes[0].0), fan_in_bound(sizes[1].0), OUTPUT_BOUND];
+    let mut parameters = Vec::with_capacity(layout.parameters());
+    for ((inputs, outputs), bound) in sizes.into_iter().zip(bounds) {
+        parameters.extend((0..(inputs + 1) * outputs).map(|_| (2.0 * stream.random::<f32>() - 1.0) * bound));
+    }
+    parameters
+}
+
+fn fan_in_bound(inputs: usize) -> f32 {
+    1.0 / (inputs as f32).sqrt()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_layer_fills_its_bounds_and_keeps_them() {
+        let layout = NetworkLayout::critic(3, [40, 30], 2);
+        let parameters = initialise(&layout, 7, 1);
+        assert_eq!(parameters.len(), layout.parameters());
+        let bounds = [1.0 / 3f32.sqrt(), 1.0 / 42f32.sqrt(), 3e-3];
+        for (range, bound) in layout.layer_ranges().into_iter().zip(bounds) {
+            let layer = &parameters[range.weights.start..range.biases.end];
+            let greatest = layer.iter().fold(0f32, |greatest, x| greatest.max(x.abs()));
+            assert!(greatest <= bound && greatest > 0.9 * bound, "{greatest} for {bound}");
+            let mean = layer.iter().sum::<f32>() / layer.len() as f32;
+            assert!(mean.abs() < 0.3 * bound, "mean {mean} for {bound}");
+        }
+    }
+
+    #[test]
+    fn seed_and_index_name_the_weights() {
+        let layout = NetworkLayout::policy(3, [8, 6], 1);
+        assert_eq!(initialise(&layout, 1, 0), initialise(&layout, 1, 0));
+        assert_ne!(initialise(&layout, 1, 0), initialise(&layout, 2, 0));
+        assert_ne!(initialise(&layout, 1, 0), initialise(&layout, 1, 1));
+    }
+}

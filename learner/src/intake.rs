@@ -1,0 +1,115 @@
+//! Takes the actors' chunks into the replay, each exactly once.
+
+use shoal_common::channel::transitions::{ChunkReceiver, ReceivedChunk};
+use shoal_common::channel::{ChannelError, Domain, Place, Ringer};
+use shoal_common::report::Role;
+use shoal_common::transition::RowLayout;
+
+use crate::replay::{Appended, ChunkError, Replay};
+
+/// Why a chunk was not taken in.
+#[derive(Debug, thiserror::Error)]
+pub enum IntakeError {
+    /// The channel does not work.
+    #[error(transparent)]
+    Channel(#[from] ChannelError),
+    /// The chunk is none of this run.
+    #[error("actor {actor} sent a chunk that is none of this run: {cause}")]
+    Chunk {
+        /// Who sent it.
+        actor: usize,
+        /// What is wrong with it.
+        cause: ChunkError,
+    },
+}
+
+/// The receiving ends of all actors.
+#[derive(Debug)]
+pub struct Intake {
+    sources: Vec<Source>,
+    row: RowLayout,
+    /// Rows after which nothing more is taken.
+    limit: u64,
+}
+
+#[derive(Debug)]
+struct Source {
+    receiver: ChunkReceiver,
+    bell: Ringer,
+}
+
+impl Intake {
+    /// Opens the receiving ends of actors `0 .. actors`; nothing is taken beyond `limit` rows.
+    ///
+    /// # Errors
+    /// When shared memory cannot be had, or another learner lives.
+    pub fn open(domain: &Domain, actors: u32, window: u32, row: RowLayout, limit: u64) -> Result<Self, ChannelError> {
+        let source = |actor| {
+            let receiver = ChunkReceiver::open(domain, actor, window)?;
+            Ok(Source {
+                receiver,
+                bell: Ringer::new(domain, Place(Role::Actor, actor))?,
+            })
+        };
+        Ok(Self {
+            sources: (0..actors).map(source).collect::<Result<_, ChannelError>>()?,
+            row,
+            limit,
+        })
+    }
+
+    /// How many actors there are.
+    pub fn actors(&self) -> usize {
+        self.sources.len()
+    }
+
+    /// Takes chunks in turn, one of each actor at a time, until none is waiting, each actor had `most`, or `enough` says
+    /// so of the replay. Returns whether there was any.
+    ///
+    /// # Errors
+    /// When a channel does not work or a chunk is none of this run.
+    pub fn drain(&self, replay: &mut Replay, most: u32, enough: impl Fn(&Replay) -> bool) -> Result<bool, IntakeError> {
+        let mut any = false;
+        for _ in 0..most {
+            let mut waiting = false;
+            for actor in 0..self.sources.len() {
+                if enough(replay) || replay.head() >= self.limit {
+                    return Ok(any);
+                }
+                waiting |= self.take_from(actor, replay)?.is_some();
+            }
+            if !waiting {
+                break;
+            }
+            any = true;
+        }
+        Ok(any)
+    }
+
+    /// Takes the next chunk of one actor, whether it is new or was committed before.
+    ///
+    /// # Errors
+    /// When the channel does not work or the chunk is none of this run.
+    pub fn take_from(&self, actor: usize, replay: &mut Replay) -> Result<Option<Appended>, IntakeError> {
+        let source = &self.sources[actor];
+        let Some(chunk) = source.receiver.receive(self.row)? else {
+            return Ok(None);
+        };
+        let room = (self.limit - replay.head()).min(chunk.header().rows.into()) as usize * self.row.width();
+        let appended = append(replay, actor, &chunk, room)?;
+        drop(chunk);
+        source.bell.ring();
+        Ok(Some(appended))
+    }
+
+    /// Rings every actor's bell: there is a policy to go on with.
+    pub fn ring_all(&self) {
+        self.sources.iter().for_each(|source| source.bell.ring());
+    }
+}
+
+fn append(replay: &mut Replay, actor: usize, chunk: &ReceivedChunk, room: usize) -> Result<Appended, IntakeError> {
+    replay
+        .append_and_commit(actor, chunk.mark(), &chunk.rows()[..room])
+        .map_err(|cause| IntakeError::Chunk { actor, cause })
+}

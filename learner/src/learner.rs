@@ -1,0 +1,411 @@
+//! The learner's process: what free and lockstep runs share. Their loops are in [`crate::free`] and [`crate::lockstep`].
+//!
+//! ```text
+//! chunks ─▶ replay ─▶ minibatch ─▶ ddpg.update ─▶ policy
+//!           (mapped)                   └─▶ checkpoint
+//! ```
+
+use std::io;
+use std::path::PathBuf;
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use shoal_common::channel::policy::{PolicyHeader, PolicyPublisher};
+use shoal_common::channel::reports::Reporter;
+use shoal_common::channel::{Bell, ChannelError, Domain, Interruption, Place, Pulse, Ringer};
+use shoal_common::config::{self, Mode};
+use shoal_common::policy_file::{PolicyFile, PolicyFileError};
+use shoal_common::report::{Activity, Identity, LearnerReport, Role};
+use shoal_common::space::EnvironmentSpec;
+use shoal_common::stop::Stop;
+
+use crate::checkpoint::{CheckpointError, Checkpoints, Counters, SectionError};
+use crate::ddpg::{Ddpg, DdpgError, DdpgSettings, DdpgState};
+use crate::intake::{Intake, IntakeError};
+use crate::minibatch::Minibatch;
+use crate::ratio::Ratio;
+use crate::replay::{Replay, ReplayError, ReplayLayout, SyncedRows};
+use crate::sampling::Sampler;
+use shoal_common::transition::RowLayout;
+
+const REPORT_INTERVAL: Duration = Duration::from_millis(500);
+
+/// What a learner is told.
+#[derive(Clone, Debug)]
+pub struct Settings {
+    /// Which process this is.
+    pub identity: Identity,
+    /// The run's seed.
+    pub seed: u64,
+    /// Whether to take turns with the actors.
+    pub mode: Mode,
+    /// Environment steps after which training ends.
+    pub steps: u64,
+    /// Actors that take part.
+    pub actors: u32,
+    /// Actors there may ever be.
+    pub max_actors: u32,
+    /// Chunks an actor may have sent and not committed.
+    pub window: u32,
+    /// Rows in a full chunk.
+    pub chunk_rows: usize,
+    /// What is controlled.
+    pub spec: EnvironmentSpec,
+    /// The algorithm's numbers.
+    pub ddpg: DdpgSettings,
+    /// Updates per step.
+    pub ratio: Ratio,
+    /// Transitions that minibatches are sampled from.
+    pub capacity: u64,
+    /// When policies are judged.
+    pub evaluation: config::Evaluation,
+    /// When the state is saved.
+    pub checkpoint: config::Checkpoint,
+    /// Fingerprint of the run's configuration.
+    pub fingerprint: u64,
+    /// Where the replay lies.
+    pub replay: PathBuf,
+    /// Where checkpoints are kept.
+    pub checkpoints: PathBuf,
+    /// Where the policy is left at the end.
+    pub last_policy: PathBuf,
+}
+
+/// Why a learner cannot go on.
+#[derive(Debug, thiserror::Error)]
+pub enum LearnerError {
+    /// A channel does not work.
+    #[error(transparent)]
+    Channel(#[from] ChannelError),
+    /// An actor sent what cannot be used.
+    #[error(transparent)]
+    Intake(#[from] IntakeError),
+    /// The replay cannot be used.
+    #[error(transparent)]
+    Replay(#[from] ReplayError),
+    /// A checkpoint cannot be read or written.
+    #[error(transparent)]
+    Checkpoint(#[from] CheckpointError),
+    /// A checkpoint is of another program.
+    #[error(transparent)]
+    Section(#[from] SectionError),
+    /// The algorithm cannot learn this.
+    #[error(transparent)]
+    Ddpg(#[from] DdpgError),
+    /// The policy cannot be left behind.
+    #[error(transparent)]
+    PolicyFile(#[from] PolicyFileError),
+    /// The weights are no numbers any more.
+    #[error("the losses are no longer finite after {updates} updates: lower the learning rates or the rewards' scale")]
+    Diverged {
+        /// Updates done.
+        updates: u64,
+    },
+    /// A lockstep run needs rows again that the ring has lost.
+    #[error("{path}: the rows before row {needed} are gone, which the checkpoint needs again; start a new run")]
+    RowsLost {
+        /// The replay.
+        path: PathBuf,
+        /// The first row that is needed.
+        needed: u64,
+    },
+}
+
+/// How a loop came to its end.
+pub(crate) enum Ended {
+    Stopped,
+    Failed(LearnerError),
+}
+
+impl From<Interruption> for Ended {
+    fn from(interruption: Interruption) -> Self {
+        match interruption {
+            Interruption::Stopped => Self::Stopped,
+            Interruption::Channel(error) => Self::Failed(error.into()),
+        }
+    }
+}
+
+impl<E: Into<LearnerError>> From<E> for Ended {
+    fn from(error: E) -> Self {
+        Self::Failed(error.into())
+    }
+}
+
+/// Learns until the run's steps are taken and learned from, or until `stop`; either way the state is saved.
+///
+/// # Errors
+/// When a channel, the replay or a checkpoint cannot be used, or learning diverges.
+pub fn learn(domain: &Domain, settings: &Settings, stop: &Stop) -> Result<(), LearnerError> {
+    let mut learner = Learner::new(domain, settings, stop)?;
+    let ended = match settings.mode {
+        Mode::Free => crate::free::run(&mut learner),
+        Mode::Lockstep => crate::lockstep::run(&mut learner, domain),
+    };
+    match ended {
+        Ok(()) | Err(Ended::Stopped) => learner.finish(),
+        Err(Ended::Failed(error)) => Err(error),
+    }
+}
+
+/// A learner at work.
+pub(crate) struct Learner<'a> {
+    pub(crate) settings: &'a Settings,
+    pub(crate) stop: &'a Stop,
+    pub(crate) bell: Bell,
+    pub(crate) replay: Replay,
+    pub(crate) intake: Intake,
+    pub(crate) pulse: Pulse,
+    /// Rows that updates have been allowed by. In a free run, the replay's head; in lockstep, the rows of whole rounds.
+    pub(crate) rows: u64,
+    ddpg: Ddpg,
+    sampler: Sampler,
+    batch: Minibatch,
+    indices: Vec<u64>,
+    row: RowLayout,
+    pub(crate) publisher: PolicyPublisher,
+    evaluator: Ringer,
+    policy_version: u64,
+    checkpoints: Checkpoints,
+    sync: Option<JoinHandle<io::Result<SyncedRows>>>,
+    reporter: Reporter<LearnerReport>,
+    report: LearnerReport,
+    reported: Instant,
+}
+
+impl<'a> Learner<'a> {
+    fn new(domain: &Domain, settings: &'a Settings, stop: &'a Stop) -> Result<Self, LearnerError> {
+        let mut ddpg = Ddpg::new(&settings.spec, &settings.ddpg, settings.seed)?;
+        let bell = Bell::hang(domain, Place(Role::Learner, 0))?;
+        let row = RowLayout::new(settings.spec.observation.width(), settings.spec.action.width());
+
+        let layout = ReplayLayout {
+            row,
+            ring: settings.ring_rows(),
+            actors: settings.max_actors as usize,
+            fingerprint: settings.fingerprint,
+        };
+        let replay = if settings.replay.exists() {
+            Replay::open(&settings.replay, &layout)?
+        } else {
+            Replay::create(&settings.replay, &layout)?
+        };
+        replay.warnings().iter().for_each(|warning| tracing::warn!("{warning}"));
+
+        let mut checkpoints = Checkpoints::new(&settings.checkpoints, settings.fingerprint);
+        let counters = match checkpoints.load_newest()? {
+            None => Counters::default(),
+            Some(mut loaded) => {
+                loaded.warnings.iter().for_each(|warning| tracing::warn!("{warning}"));
+                let lengths = ddpg.state().parts.map(<[f32]>::len);
+                let mut sections = Vec::new();
+                for (name, length) in DdpgState::PARTS.into_iter().zip(lengths) {
+                    sections.push(loaded.checkpoint.take(name, length)?);
+                }
+                let counters = loaded.checkpoint.counters;
+                let parts = std::array::from_fn(|i| sections[i].as_slice());
+                ddpg.restore(&DdpgState {
+                    updates: counters.updates,
+                    parts,
+                })?;
+                tracing::info!(
+                    "going on after {} updates and {} of {} rows",
+                    counters.updates,
+                    counters.rows,
+                    replay.head()
+                );
+                counters
+            }
+        };
+
+        let mut pulse = Pulse::new(domain, settings.identity)?;
+        let learner = Self {
+            publisher: PolicyPublisher::open(domain, ddpg.policy().len())?,
+            evaluator: Ringer::new(domain, Place(Role::Evaluator, 0))?,
+            intake: Intake::open(domain, settings.actors, settings.window, row, settings.steps)?,
+            sampler: Sampler::new(settings.seed),
+            batch: Minibatch::new(row, settings.ddpg.batch),
+            indices: vec![0; settings.ddpg.batch],
+            row,
+            policy_version: counters.policy_version,
+            rows: counters.rows,
+            reporter: Reporter::open(domain)?,
+            report: empty_report(),
+            reported: Instant::now(),
+            sync: None,
+            settings,
+            stop,
+            bell,
+            replay,
+            pulse: {
+                pulse.beat(Activity::WaitingForPeer);
+                pulse
+            },
+            ddpg,
+            checkpoints,
+        };
+        learner.publish_current()?;
+        Ok(learner)
+    }
+
+    /// Updates done.
+    pub(crate) fn updates(&self) -> u64 {
+        self.ddpg.updates()
+    }
+
+    /// Version of the policy published last.
+    pub(crate) fn policy_version(&self) -> u64 {
+        self.policy_version
+    }
+
+    /// Lines 11 to 16 of Algorithm 4, on the replay as it was at `self.rows` rows.
+    pub(crate) fn update(&mut self) -> Result<(), LearnerError> {
+        let window = self.replay.window(self.rows, self.settings.capacity);
+        self.sampler.indices(self.ddpg.updates(), window, &mut self.indices);
+        for (column, &index) in self.indices.iter().enumerate() {
+            self.batch.set(column, &self.row.read(self.replay.row(index)));
+        }
+        let losses = self.ddpg.update(&self.batch);
+        if !(losses.critic_loss.is_finite() && losses.actor_loss.is_finite()) {
+            return Err(LearnerError::Diverged {
+                updates: self.ddpg.updates(),
+            });
+        }
+        self.report.critic_loss += f64::from(losses.critic_loss);
+        self.report.actor_loss += f64::from(losses.actor_loss);
+        self.report.q_mean += f64::from(losses.q_mean);
+        self.report.averaged += 1;
+        self.pulse.count(1);
+        Ok(())
+    }
+
+    /// Publishes the policy as it is now, as a new version.
+    pub(crate) fn publish(&mut self) -> Result<(), LearnerError> {
+        self.policy_version += 1;
+        self.publish_current()
+    }
+
+    fn publish_current(&self) -> Result<(), LearnerError> {
+        let header = PolicyHeader {
+            incarnation: self.settings.identity.incarnation,
+            version: self.policy_version,
+            env_steps: self.rows,
+            updates: self.ddpg.updates(),
+            fingerprint: self.ddpg.policy_layout().fingerprint(),
+        };
+        Ok(self.publisher.publish(self.ddpg.policy(), header)?)
+    }
+
+    /// Wakes everyone who may be waiting for a policy.
+    pub(crate) fn announce(&self) {
+        self.intake.ring_all();
+        self.evaluator.ring();
+    }
+
+    /// Renews connections and lets the launcher know what the learner waits for.
+    pub(crate) fn look_after(&mut self, activity: Activity) -> Result<(), LearnerError> {
+        self.publisher.look_after()?;
+        self.tell(activity);
+        Ok(())
+    }
+
+    /// Reports, if it is time to.
+    pub(crate) fn tell(&mut self, activity: Activity) {
+        self.pulse.set_policy_version(self.policy_version);
+        self.pulse.beat(activity);
+        if self.reported.elapsed() >= REPORT_INTERVAL {
+            self.send_report();
+        }
+    }
+
+    fn send_report(&mut self) {
+        self.reported = Instant::now();
+        let mut report = std::mem::replace(&mut self.report, empty_report());
+        let n = report.averaged.max(1) as f64;
+        report.critic_loss /= n;
+        report.actor_loss /= n;
+        report.q_mean /= n;
+        report.env_steps = self.rows;
+        report.updates = self.ddpg.updates();
+        report.policy_version = self.policy_version;
+        self.reporter.look_after();
+        self.reporter.send(report);
+    }
+
+    /// Saves the state, and has the replay brought to the disk by and by.
+    pub(crate) fn save(&mut self) -> Result<(), LearnerError> {
+        if self.sync.as_ref().is_none_or(JoinHandle::is_finished) {
+            self.end_sync();
+            let pending = self.replay.start_sync()?;
+            self.sync = std::thread::Builder::new()
+                .name("sync".into())
+                .spawn(|| pending.run())
+                .ok();
+        }
+        let state = self.ddpg.state();
+        let sections: Vec<(&str, &[f32])> = DdpgState::PARTS.into_iter().zip(state.parts).collect();
+        let counters = Counters {
+            updates: state.updates,
+            rows: self.rows,
+            policy_version: self.policy_version,
+            ..Counters::default()
+        };
+        Ok(self.checkpoints.save(&counters, &sections)?)
+    }
+
+    fn end_sync(&mut self) {
+        match self.sync.take().map(JoinHandle::join) {
+            Some(Ok(Ok(synced))) => self.replay.finish_sync(synced),
+            Some(Ok(Err(cause))) => tracing::warn!("the replay could not be brought to the disk: {cause}"),
+            Some(Err(_)) | None => {}
+        }
+    }
+
+    fn finish(mut self) -> Result<(), LearnerError> {
+        self.save()?;
+        self.end_sync();
+        self.replay.flush()?;
+        PolicyFile {
+            fingerprint: self.ddpg.policy_layout().fingerprint(),
+            version: self.policy_version,
+            env_steps: self.rows,
+            return_mean: f64::NAN,
+            return_std: f64::NAN,
+            episodes: 0,
+            parameters: self.ddpg.policy().to_vec(),
+        }
+        .write(&self.settings.last_policy)?;
+        self.send_report();
+        self.pulse.beat_now(Activity::Done);
+        Ok(())
+    }
+}
+
+impl Settings {
+    /// Rows the ring holds: the sampling window, and in lockstep the rows of two checkpoint intervals beyond it, because
+    /// a learner that goes on from a checkpoint samples them again.
+    fn ring_rows(&self) -> u64 {
+        let slack = match self.mode {
+            Mode::Free => 0,
+            Mode::Lockstep => {
+                let interval = self.checkpoint.every_updates as f64 / self.ratio.updates_per_step;
+                let round = self.chunk_rows as u64 * u64::from(self.actors);
+                (2.0 * interval).min(self.steps as f64) as u64 + 2 * round
+            }
+        };
+        // A ring must have room for a chunk, however small the window.
+        (self.capacity + slack).max(self.chunk_rows as u64)
+    }
+}
+
+fn empty_report() -> LearnerReport {
+    LearnerReport {
+        env_steps: 0,
+        updates: 0,
+        policy_version: 0,
+        critic_loss: 0.0,
+        actor_loss: 0.0,
+        q_mean: 0.0,
+        averaged: 0,
+    }
+}

@@ -1,0 +1,133 @@
+//! The matrix products of an update: those of the backward pass, and a list of all of them for the benchmark.
+
+use faer::linalg::matmul::matmul;
+use faer::{Accum, Par};
+use nalgebra::DMatrix;
+use shoal_common::network::{NetworkLayout, matrix, matrix_mut};
+
+/// ∂L/∂W = d xᵀ, summed over the batch: `d` is ∂L/∂z of the layer's outputs, `x` its inputs, one column a sample.
+pub fn weight_gradient(d: &DMatrix<f32>, x: &[f32], gradient: &mut [f32]) {
+    let x = matrix(x, x.len() / d.ncols());
+    matmul(
+        matrix_mut(gradient, d.nrows()),
+        Accum::Replace,
+        matrix(d.as_slice(), d.nrows()),
+        x.transpose(),
+        1.0,
+        Par::Seq,
+    );
+}
+
+/// ∂L/∂x = Wᵀ d, column by column: the gradient a layer of weights `w` passes down to its inputs.
+pub fn input_gradient(w: &[f32], d: &DMatrix<f32>, to: &mut DMatrix<f32>) {
+    let inputs = to.nrows();
+    matmul(
+        matrix_mut(to.as_mut_slice(), inputs),
+        Accum::Replace,
+        matrix(w, d.nrows()).transpose(),
+        matrix(d.as_slice(), d.nrows()),
+        1.0,
+        Par::Seq,
+    );
+}
+
+/// Which factor of a product is read transposed (all are stored column-major).
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Transposed {
+    /// W x, forward.
+    Neither,
+    /// Wᵀ d, a gradient passed down.
+    Left,
+    /// d xᵀ, a gradient of weights.
+    Right,
+}
+
+/// The shape of one product: an m × k by a k × n matrix.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub struct Product {
+    /// Rows of the result.
+    pub m: usize,
+    /// What is summed over.
+    pub k: usize,
+    /// Columns of the result.
+    pub n: usize,
+    /// Which factor is read transposed.
+    pub transposed: Transposed,
+}
+
+impl Product {
+    /// Floating-point operations: a multiplication and an addition for each term.
+    pub fn flop(&self) -> u64 {
+        2 * (self.m * self.k * self.n) as u64
+    }
+}
+
+/// Every matrix product of one DDPG update of a batch, in the order they run.
+///
+/// With the thesis's networks, three observations and a batch of 64 their operations come to 140 million, nearly all of
+/// them in nine products of the size 300 × 400 × 64.
+pub fn products_of_update(actor: &NetworkLayout, critic: &NetworkLayout, batch: usize) -> Vec<Product> {
+    let product = |m, k, n, transposed| Product { m, k, n, transposed };
+    let forward = |net: &NetworkLayout| {
+        net.layer_sizes()
+            .map(|(i, o)| product(o, i, batch, Transposed::Neither))
+    };
+    let backward = |net: &NetworkLayout| {
+        let [(inputs_1, h1), (inputs_2, h2), (_, outputs)] = net.layer_sizes();
+        [
+            product(outputs, batch, h2, Transposed::Right),
+            product(h2, outputs, batch, Transposed::Left),
+            product(h2, batch, inputs_2, Transposed::Right),
+            product(h1, h2, batch, Transposed::Left),
+            product(h1, batch, inputs_1, Transposed::Right),
+        ]
+    };
+    let [_, h2] = critic.hidden();
+    let action_gradient = [
+        product(h2, critic.outputs(), batch, Transposed::Left),
+        product(critic.late_inputs(), h2, batch, Transposed::Left),
+    ];
+    let target = [forward(actor), forward(critic)];
+    let ascent = [forward(actor), forward(critic)];
+    (target.into_iter().flatten())
+        .chain(forward(critic))
+        .chain(backward(critic))
+        .chain(ascent.into_iter().flatten())
+        .chain(action_gradient)
+        .chain(backward(actor))
+        .collect()
+}
+
+/// Floating-point operations of the matrix products of one DDPG update: 140 million for Pendulum at batch 64.
+pub fn flop_per_update(actor: &NetworkLayout, critic: &NetworkLayout, batch: usize) -> u64 {
+    products_of_update(actor, critic, batch).iter().map(Product::flop).sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn gradients_are_the_transposed_products() {
+        let d = DMatrix::from_fn(4, 5, |i, j| (i * 5 + j) as f32 - 7.0);
+        let x = DMatrix::from_fn(3, 5, |i, j| (i + 2 * j) as f32 - 3.0);
+        let w = DMatrix::from_fn(4, 3, |i, j| (3 * i + j) as f32 - 5.0);
+        let mut dw = DMatrix::from_element(4, 3, f32::NAN);
+        weight_gradient(&d, x.as_slice(), dw.as_mut_slice());
+        assert_eq!(dw, &d * x.transpose());
+        let mut dx = DMatrix::from_element(3, 5, f32::NAN);
+        input_gradient(w.as_slice(), &d, &mut dx);
+        assert_eq!(dx, w.transpose() * &d);
+    }
+
+    #[test]
+    fn an_update_of_the_thesis_takes_140_million_operations() {
+        let (actor, critic) = (
+            NetworkLayout::policy(3, [400, 300], 1),
+            NetworkLayout::critic(3, [400, 300], 1),
+        );
+        let products = products_of_update(&actor, &critic, 64);
+        assert_eq!(products.iter().filter(|p| p.flop() > 15_000_000).count(), 9);
+        assert_eq!((flop_per_update(&actor, &critic, 64) as f64 / 1e6).round(), 140.0);
+    }
+}

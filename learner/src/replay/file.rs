@@ -1,0 +1,177 @@
+//! Making and opening the file: space, rights, lock, and whether it is the file that is meant.
+
+use std::fs::{self, File, OpenOptions, Permissions, TryLockError};
+use std::io::{self, Write};
+use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
+use std::path::{Path, PathBuf};
+
+use rustix::fs::{CWD, FallocateFlags, RenameFlags, fallocate, renameat_with};
+use rustix::io::Errno;
+use rustix::process::{Resource, getrlimit};
+use shoal_common::commit::{Places, Record, ReplayLayout, Words, WritableWords};
+use shoal_common::durable::sync_directory_of;
+
+use super::ReplayError;
+
+/// Makes an empty replay: under a temporary name, then renamed, so that a file with the replay's name is whole.
+pub(super) fn create(path: &Path, layout: &ReplayLayout) -> Result<(File, Places), ReplayError> {
+    let places = places(path, layout)?;
+    if fs::exists(path).map_err(io(path, "look for"))? {
+        return Err(ReplayError::Exists(path.into()));
+    }
+    let mut temporary = path.as_os_str().to_owned();
+    temporary.push(".new");
+    let temporary = PathBuf::from(temporary);
+
+    let mut options = OpenOptions::new();
+    // Not truncated before the lock says that nobody else is making it.
+    let file = options
+        .read(true)
+        .write(true)
+        .create(true)
+        .truncate(false)
+        .mode(0o600)
+        .open(&temporary);
+    let file = file.map_err(io(path, "create"))?;
+    lock(path, &file)?;
+    let temporary = Temporary(temporary);
+    file.set_len(0)
+        .and_then(|()| file.set_permissions(Permissions::from_mode(0o600)))
+        .map_err(io(path, "create"))?;
+    reserve(path, &file, places.end as u64)?;
+
+    let mut words = WritableWords::map(&file, places.header).map_err(io(path, "map"))?;
+    for (i, word) in layout.identity().into_iter().enumerate() {
+        words.store(i * size_of::<u64>(), word);
+    }
+    let mut record = Record::empty(layout.actors);
+    record.set_generation(1);
+    // As committed, and as synced: whatever a power loss destroys later, this one is a state to fall back to.
+    for slot in [1, 2] {
+        record.store(&mut words, places.slots[slot], |_| ());
+    }
+    words.store(places.selector, record.generation());
+    drop(words);
+
+    file.sync_all().map_err(io(path, "sync"))?;
+    rename_to_new(&temporary.0, path)?;
+    sync_directory_of(path).map_err(io(path, "sync"))?;
+    Ok((file, places))
+}
+
+/// Opens the file and compares it with the layout before anything is mapped for writing.
+pub(super) fn open(path: &Path, layout: &ReplayLayout) -> Result<(File, Places), ReplayError> {
+    let refused = |reason| ReplayError::Refused {
+        path: path.into(),
+        reason,
+    };
+    let places = places(path, layout)?;
+    let file = match OpenOptions::new().read(true).write(true).open(path) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Err(ReplayError::Missing(path.into())),
+        file => file.map_err(io(path, "open"))?,
+    };
+    lock(path, &file)?;
+    let length = file.metadata().map_err(io(path, "open"))?.len();
+    if length < places.header as u64 {
+        return Err(refused(format!(
+            "it is cut short: {length} bytes, and a replay for this run has {}",
+            places.end
+        )));
+    }
+    let words = Words::map(&file, places.header).map_err(io(path, "map"))?;
+    let found = ReplayLayout::read(&words).map_err(|fault| refused(fault.to_string()))?;
+    if let Some(difference) = layout.difference(&found) {
+        return Err(refused(difference));
+    }
+    if length != places.end as u64 {
+        return Err(refused(format!(
+            "it has {length} bytes, and by its header it should have {}",
+            places.end
+        )));
+    }
+    Ok((file, places))
+}
+
+fn places(path: &Path, layout: &ReplayLayout) -> Result<Places, ReplayError> {
+    layout.places().ok_or_else(|| ReplayError::Impossible {
+        path: path.into(),
+        ring: layout.ring,
+        actors: layout.actors,
+    })
+}
+
+/// The lock goes with the open file and its mappings: the kernel drops it when the process is gone, however it went.
+fn lock(path: &Path, file: &File) -> Result<(), ReplayError> {
+    file.try_lock().map_err(|error| match error {
+        TryLockError::WouldBlock => ReplayError::InUse(path.into()),
+        TryLockError::Error(source) => io(path, "lock")(source),
+    })
+}
+
+/// Reserves the space, so that a full disk is an error here and not a SIGBUS at some later row.
+fn reserve(path: &Path, file: &File, bytes: u64) -> Result<(), ReplayError> {
+    let no_space = |source: Errno| ReplayError::NoSpace {
+        path: path.into(),
+        bytes,
+        source: source.into(),
+    };
+    // Asked for first: beyond the limit the kernel sends SIGXFSZ, which ends a process that has not said otherwise.
+    if getrlimit(Resource::Fsize).current.is_some_and(|limit| limit < bytes) {
+        return Err(no_space(Errno::FBIG));
+    }
+    loop {
+        match fallocate(file, FallocateFlags::empty(), 0, bytes) {
+            Ok(()) => return Ok(()),
+            Err(Errno::INTR) => {}
+            Err(error @ (Errno::NOSPC | Errno::DQUOT | Errno::FBIG)) => return Err(no_space(error)),
+            Err(Errno::OPNOTSUPP | Errno::NOSYS) => return fill(path, file, bytes),
+            Err(error) => return Err(io(path, "reserve space for")(error.into())),
+        }
+    }
+}
+
+/// Reserves by writing, where the file system knows no other way.
+fn fill(path: &Path, mut file: &File, bytes: u64) -> Result<(), ReplayError> {
+    static ZEROS: [u8; 1 << 16] = [0; 1 << 16];
+    let mut left = bytes;
+    while left > 0 {
+        let part = left.min(ZEROS.len() as u64);
+        file.write_all(&ZEROS[..part as usize])
+            .map_err(|source| ReplayError::NoSpace {
+                path: path.into(),
+                bytes,
+                source,
+            })?;
+        left -= part;
+    }
+    Ok(())
+}
+
+/// Renames without replacing.
+fn rename_to_new(temporary: &Path, path: &Path) -> Result<(), ReplayError> {
+    match renameat_with(CWD, temporary, CWD, path, RenameFlags::NOREPLACE) {
+        Ok(()) => Ok(()),
+        Err(Errno::EXIST) => Err(ReplayError::Exists(path.into())),
+        // A file system without the flag: `create` has looked, and the temporary name's lock keeps other learners out.
+        Err(Errno::INVAL | Errno::NOSYS) => fs::rename(temporary, path).map_err(io(path, "create")),
+        Err(error) => Err(io(path, "create")(error.into())),
+    }
+}
+
+/// Removes the temporary name on the way out; after a successful rename there is nothing left to remove.
+struct Temporary(PathBuf);
+
+impl Drop for Temporary {
+    fn drop(&mut self) {
+        let _ = fs::remove_file(&self.0);
+    }
+}
+
+fn io(path: &Path, doing: &'static str) -> impl Fn(io::Error) -> ReplayError {
+    let path = path.to_path_buf();
+    move |source| ReplayError::Io {
+        path: path.clone(),
+        doing,
+        source,
+    }
+}

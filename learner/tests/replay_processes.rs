@@ -1,0 +1,296 @@
+//! The replay file with real processes: writers that are killed, readers beside them, limits that are met.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use shoal_common::commit::{CommitReader, OpenError, Record};
+use shoal_common::transition::RowLayout;
+use shoal_learner::checkpoint::{CheckpointError, Checkpoints, Counters};
+use shoal_learner::replay::{ChunkMark, Replay, ReplayError, ReplayLayout};
+use tempfile::TempDir;
+
+const ACTORS: usize = 2;
+/// Names the file to the children: this binary again, one ignored test each.
+const PATH: &str = "SHOAL_TEST_PATH";
+
+fn layout() -> ReplayLayout {
+    ReplayLayout {
+        row: RowLayout::new(1, 1),
+        ring: 4096,
+        actors: ACTORS,
+        fingerprint: 1,
+    }
+}
+
+fn path_of_child() -> PathBuf {
+    std::env::var_os(PATH).expect("the parent test starts this one").into()
+}
+
+fn rows_of(actor: usize, sequence: u64) -> u64 {
+    1 + (sequence * 7 + actor as u64 * 3) % 40
+}
+
+fn append(replay: &mut Replay, actor: usize) {
+    let sequence = replay.committed(actor).mark.sequence + 1;
+    let rows = rows_of(actor, sequence);
+    let row = |i| [actor as f32, sequence as f32, i as f32, rows as f32, -1.0];
+    let numbers: Vec<f32> = (0..rows).flat_map(row).collect();
+    replay
+        .append_and_commit(
+            actor,
+            ChunkMark {
+                incarnation: 0,
+                sequence,
+            },
+            &numbers,
+        )
+        .unwrap();
+}
+
+/// A child that is gone when the test is.
+struct Writer(Child);
+
+impl Writer {
+    fn start(test: &str, path: &Path) -> Self {
+        let mut command = Command::new(std::env::current_exe().unwrap());
+        command
+            .args([test, "--exact", "--ignored"])
+            .env(PATH, path)
+            .stdout(Stdio::null());
+        Self(command.spawn().unwrap())
+    }
+}
+
+impl Drop for Writer {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+#[test]
+#[ignore = "a child of the tests below"]
+fn child_appends_without_end() {
+    let path = path_of_child();
+    let mut replay = match Replay::open(&path, &layout()) {
+        Err(ReplayError::Missing(_)) => Replay::create(&path, &layout()).unwrap(),
+        replay => replay.unwrap(),
+    };
+    assert_eq!(replay.warnings(), &[] as &[String]);
+    for round in 0_u64.. {
+        for actor in 0..ACTORS {
+            append(&mut replay, actor);
+        }
+        if round % 1000 == 999 {
+            replay.flush().unwrap();
+        }
+    }
+}
+
+/// A record is of one moment: the actors' rows add up to its head, and each has the rows of its chunks.
+fn check_record(record: &Record) {
+    let actors = (0..ACTORS).map(|actor| record.actor(actor));
+    assert_eq!(actors.map(|actor| actor.rows).sum::<u64>(), record.head());
+    assert!(record.actor(0).mark.sequence - record.actor(1).mark.sequence <= 1);
+}
+
+/// The rows are those of chunks 1 to the last of each actor, whole and in order, as far back as the ring reaches.
+fn check_rows(replay: &Replay) {
+    for actor in 0..ACTORS {
+        let commit = replay.committed(actor);
+        assert_eq!(
+            commit.rows,
+            (1..=commit.mark.sequence)
+                .map(|sequence| rows_of(actor, sequence))
+                .sum::<u64>()
+        );
+    }
+    let mut expected = (0..ACTORS)
+        .map(|actor| replay.committed(actor).mark.sequence)
+        .zip(0..)
+        .max()
+        .unwrap();
+    // Backwards from the newest chunk: actor 1 always wrote last if it has as many as actor 0.
+    expected.1 = if replay.committed(0).mark == replay.committed(1).mark {
+        1
+    } else {
+        0
+    };
+    let (mut sequence, mut actor) = expected;
+    let mut left = rows_of(actor, sequence);
+    for index in replay.rows().rev() {
+        if left == 0 {
+            (sequence, actor) = if actor == 1 { (sequence, 0) } else { (sequence - 1, 1) };
+            left = rows_of(actor, sequence);
+        }
+        left -= 1;
+        let rows = rows_of(actor, sequence) as f32;
+        assert_eq!(
+            replay.row(index),
+            [actor as f32, sequence as f32, left as f32, rows, -1.0],
+            "row {index}"
+        );
+    }
+}
+
+#[test]
+fn a_learner_killed_again_and_again_loses_nothing_that_was_committed() {
+    let directory = TempDir::new().unwrap();
+    let path = directory.path().join("replay.rows");
+    let mut seen = 0;
+    for kill in 0..40 {
+        let writer = Writer::start("child_appends_without_end", &path);
+        let start = Instant::now();
+        let reader = loop {
+            match CommitReader::open(&path) {
+                Err(OpenError::NotYet { .. }) => assert!(start.elapsed() < Duration::from_secs(20)),
+                reader => break reader.unwrap(),
+            }
+        };
+        // Watch it go on, and for another while of up to 16 ms that no kill shares with another.
+        let before = seen;
+        let mut until = None;
+        while until.is_none_or(|until| Instant::now() < until) {
+            let record = reader.snapshot().unwrap();
+            check_record(&record);
+            assert!(record.head() >= seen, "committed rows never get fewer");
+            seen = record.head();
+            if seen > before && until.is_none() {
+                until = Some(Instant::now() + Duration::from_micros(kill * 397));
+            }
+            assert!(start.elapsed() < Duration::from_secs(20), "the writer goes on");
+        }
+        drop(writer);
+        let replay = Replay::open(&path, &layout()).unwrap();
+        assert_eq!(replay.warnings(), &[] as &[String]);
+        assert!(replay.head() >= seen);
+        seen = replay.head();
+        assert!(
+            replay.rows().end - replay.rows().start >= 4096.min(seen) - 40,
+            "{:?}",
+            replay.rows()
+        );
+        check_rows(&replay);
+    }
+    assert!(seen > 2 * 4096, "the ring went round: {seen}");
+}
+
+#[test]
+fn readers_see_whole_records_that_only_grow() {
+    let directory = TempDir::new().unwrap();
+    let path = directory.path().join("replay.rows");
+    let mut replay = Replay::create(&path, &layout()).unwrap();
+    let done = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        for _ in 0..2 {
+            scope.spawn(|| {
+                let reader = CommitReader::open(&path).unwrap();
+                let (mut head, mut marks) = (0, [ChunkMark::default(); ACTORS]);
+                while !done.load(Ordering::Relaxed) {
+                    let record = reader.snapshot().expect("a published record is never torn");
+                    check_record(&record);
+                    for (actor, mark) in marks.iter_mut().enumerate() {
+                        let now = reader.actor(actor);
+                        assert!(now.mark >= *mark && now.mark >= record.actor(actor).mark);
+                        let rows = (1..=now.mark.sequence).map(|s| rows_of(actor, s));
+                        if now.mark.sequence < 50 {
+                            assert_eq!(now.rows, rows.sum::<u64>());
+                        }
+                        *mark = now.mark;
+                    }
+                    assert!(record.head() >= head && reader.rows() >= record.head());
+                    head = record.head();
+                }
+                assert_eq!(reader.rows(), 40_000 / 40 * (1..=40).sum::<u64>());
+            });
+        }
+        for _ in 0..20_000 {
+            append(&mut replay, 0);
+            append(&mut replay, 1);
+        }
+        done.store(true, Ordering::Relaxed);
+    });
+}
+
+/// Runs an ignored test under a file-size limit of 8 KiB, after `set_up` in the shell.
+fn under_limit(set_up: &str, test: &str, path: &Path) {
+    let status = Command::new("sh")
+        .args(["-c", &format!("{set_up} ulimit -f 16; exec \"$0\" \"$@\"")])
+        .arg(std::env::current_exe().unwrap())
+        .args([test, "--exact", "--ignored"])
+        .env(PATH, path)
+        .stdout(Stdio::null())
+        .status()
+        .unwrap();
+    assert!(status.success(), "{status}");
+}
+
+#[test]
+#[ignore = "a child of the test below"]
+fn child_makes_a_replay_that_is_too_large() {
+    let path = path_of_child();
+    let error = Replay::create(&path, &layout()).unwrap_err();
+    let bytes = layout().places().unwrap().end;
+    assert!(matches!(error, ReplayError::NoSpace { .. }), "{error}");
+    let line = error.to_string();
+    assert!(
+        line.contains("replay.rows") && line.contains(&format!("needs {bytes} bytes")),
+        "{line}"
+    );
+    assert_eq!(fs::read_dir(path.parent().unwrap()).unwrap().count(), 0);
+}
+
+#[test]
+fn a_replay_beyond_the_file_size_limit_is_an_error_and_no_file() {
+    let directory = TempDir::new().unwrap();
+    // SIGXFSZ would end the child: nothing is set up against it.
+    under_limit(
+        "",
+        "child_makes_a_replay_that_is_too_large",
+        &directory.path().join("replay.rows"),
+    );
+}
+
+#[test]
+#[ignore = "a child of the test below"]
+fn child_writes_a_checkpoint_that_is_too_large() {
+    let directory = path_of_child();
+    let mut store = Checkpoints::new(&directory, 1);
+    let error = store
+        .save(
+            &Counters {
+                updates: 2,
+                ..Counters::default()
+            },
+            &[("actor", &[1.0; 5000])],
+        )
+        .unwrap_err();
+    assert!(matches!(error, CheckpointError::Write { .. }), "{error}");
+    assert!(error.to_string().contains("latest.ckpt"), "{error}");
+}
+
+#[test]
+fn a_checkpoint_that_finds_no_room_leaves_the_last_one() {
+    let directory = TempDir::new().unwrap();
+    let mut store = Checkpoints::new(directory.path(), 1);
+    store
+        .save(
+            &Counters {
+                updates: 1,
+                ..Counters::default()
+            },
+            &[("actor", &[1.0; 5000])],
+        )
+        .unwrap();
+    under_limit(
+        "trap '' XFSZ;",
+        "child_writes_a_checkpoint_that_is_too_large",
+        directory.path(),
+    );
+    let loaded = store.load_newest().unwrap().unwrap();
+    assert_eq!((loaded.checkpoint.counters.updates, loaded.warnings.len()), (1, 0));
+    assert_eq!(fs::read_dir(directory.path()).unwrap().count(), 1);
+}
