@@ -1,0 +1,225 @@
+//! The evaluator: runs the newest policy without noise, always from the same start states, and keeps the best one.
+
+use std::path::PathBuf;
+
+use shoal_common::channel::environment::{EnvironmentClient, Stepped};
+use shoal_common::channel::policy::{PolicyHeader, PolicyReader};
+use shoal_common::channel::reports::Reporter;
+use shoal_common::channel::{Bell, Domain, Place, Pulse, Ringer, wait_for};
+use shoal_common::config::Evaluation;
+use shoal_common::network::{ActionRange, PolicyNetwork};
+use shoal_common::policy_file::PolicyFile;
+use shoal_common::report::{Activity, EvaluationReport, Identity, Role};
+use shoal_common::space::EnvironmentSpec;
+use shoal_common::stop::Stop;
+
+use crate::error::{ActorError, Ended};
+use crate::explorer::connect;
+
+/// What an evaluator is told.
+#[derive(Clone, Debug)]
+pub struct Settings {
+    /// Which process this is.
+    pub identity: Identity,
+    /// What the environment server is expected to serve.
+    pub spec: EnvironmentSpec,
+    /// The environment server's index.
+    pub server: u32,
+    /// Environments it steps at once.
+    pub envs: usize,
+    /// How often, and how long.
+    pub evaluation: Evaluation,
+    /// Units of the policy's hidden layers.
+    pub hidden: [usize; 2],
+    /// Where the best policy is kept.
+    pub best: PathBuf,
+}
+
+/// Mean and standard deviation (of the sample; 0 for fewer than two) of returns.
+pub fn mean_and_std(returns: &[f64]) -> (f64, f64) {
+    let n = returns.len() as f64;
+    let mean = returns.iter().sum::<f64>() / n;
+    let squares: f64 = returns.iter().map(|r| (r - mean).powi(2)).sum();
+    (
+        mean,
+        if returns.len() < 2 {
+            0.0
+        } else {
+            (squares / (n - 1.0)).sqrt()
+        },
+    )
+}
+
+/// Judges policies until `stop`.
+///
+/// # Errors
+/// When a channel does not work, the environment is not the expected one, or the best policy cannot be written.
+pub fn evaluate(domain: &Domain, settings: &Settings, stop: &Stop) -> Result<(), ActorError> {
+    let mut evaluator = match Evaluator::new(domain, settings, stop) {
+        Ok(evaluator) => evaluator,
+        Err(ended) => return ended.into_result(),
+    };
+    loop {
+        if let Err(ended) = evaluator.judge_next() {
+            return ended.into_result();
+        }
+    }
+}
+
+struct Evaluator<'a> {
+    settings: &'a Settings,
+    domain: &'a Domain,
+    stop: &'a Stop,
+    bell: Bell,
+    learner: Ringer,
+    client: EnvironmentClient,
+    policy: PolicyReader,
+    network: PolicyNetwork,
+    reports: Reporter<EvaluationReport>,
+    pulse: Pulse,
+    actions: Vec<f32>,
+    /// The period of the policy judged last.
+    judged: Option<u64>,
+    best: Option<f64>,
+}
+
+impl<'a> Evaluator<'a> {
+    fn new(domain: &'a Domain, settings: &'a Settings, stop: &'a Stop) -> Result<Self, Ended> {
+        let range = ActionRange::new(&settings.spec.action)?;
+        let observation = settings.spec.observation.width();
+        let network = PolicyNetwork::new(observation, settings.hidden, range, settings.envs);
+        let bell = Bell::hang(domain, Place(Role::Evaluator, settings.identity.index))?;
+        let mut pulse = Pulse::new(domain, settings.identity)?;
+        let client = connect(domain, &bell, settings.server, &settings.spec, settings.envs, stop)?;
+        let policy = PolicyReader::open(domain, network.layout().fingerprint(), network.layout().parameters())?;
+        let best = if settings.best.exists() {
+            Some(PolicyFile::read(&settings.best, network.layout().fingerprint())?.return_mean)
+        } else {
+            None
+        };
+        pulse.beat(Activity::WaitingForPeer);
+        Ok(Self {
+            settings,
+            domain,
+            stop,
+            learner: Ringer::new(domain, Place(Role::Learner, 0))?,
+            client,
+            policy,
+            reports: Reporter::open(domain)?,
+            pulse,
+            actions: vec![0.0; settings.envs * network.range().width()],
+            network,
+            bell,
+            judged: None,
+            best,
+        })
+    }
+
+    fn judge_next(&mut self) -> Result<(), Ended> {
+        let header = self.await_due_policy()?;
+        let mut returns = Vec::new();
+        while (returns.len() as u32) < self.settings.evaluation.episodes {
+            // A server that dies takes its episodes with it; they are run again.
+            if let Some(some) = self.run_episodes(returns.len() as u64)? {
+                returns.extend(some);
+            }
+        }
+        returns.truncate(self.settings.evaluation.episodes as usize);
+        let (return_mean, return_std) = mean_and_std(&returns);
+        let best = self.best.is_none_or(|best| return_mean > best);
+        if best {
+            self.keep(&header, return_mean, return_std)?;
+            self.best = Some(return_mean);
+        }
+        self.judged = Some(self.settings.evaluation.period(header.env_steps));
+        self.reports.send(EvaluationReport {
+            policy_version: header.version,
+            env_steps: header.env_steps,
+            updates: header.updates,
+            return_mean,
+            return_std,
+            episodes: self.settings.evaluation.episodes,
+            best: best.into(),
+        });
+        self.learner.ring();
+        Ok(())
+    }
+
+    /// Waits for a policy of a period that was not judged yet.
+    fn await_due_policy(&mut self) -> Result<PolicyHeader, Ended> {
+        let Self {
+            policy,
+            judged,
+            settings,
+            bell,
+            stop,
+            pulse,
+            reports,
+            ..
+        } = self;
+        let due = |header: &PolicyHeader| judged.is_none_or(|j| settings.evaluation.period(header.env_steps) > j);
+        let header = wait_for(
+            bell,
+            stop,
+            || Ok(policy.latest()?.map(|policy| *policy.header()).filter(due)),
+            || {
+                pulse.beat(Activity::WaitingForPeer);
+                reports.look_after();
+                Ok(())
+            },
+        )?;
+        self.pulse.set_policy_version(header.version);
+        Ok(header)
+    }
+
+    /// Returns of the episodes from `first` on, one in each environment; `None` when the server was lost over them.
+    fn run_episodes(&mut self, first: u64) -> Result<Option<Vec<f64>>, Ended> {
+        let Self {
+            client,
+            domain,
+            bell,
+            policy,
+            network,
+            pulse,
+            actions,
+            ..
+        } = self;
+        let Some(policy) = policy.held() else { return Ok(None) };
+        let mut current = client.reset(domain, bell, Some(first))?;
+        let mut returns = vec![0.0; self.settings.envs];
+        let mut under_way = vec![true; self.settings.envs];
+        while under_way.contains(&true) {
+            network.forward(policy.parameters(), current.observations(), actions);
+            match client.step(domain, bell, actions)? {
+                Stepped::Taken(next) => current = next,
+                Stepped::Lost => return Ok(None),
+            }
+            for e in (0..self.settings.envs).filter(|&e| under_way[e]).collect::<Vec<_>>() {
+                returns[e] += f64::from(current.reward(e));
+                under_way[e] = !(current.terminated(e) || current.truncated(e));
+            }
+            pulse.count(self.settings.envs as u64);
+            pulse.beat(Activity::Working);
+            if self.stop.requested() {
+                return Err(Ended::Stopped);
+            }
+        }
+        Ok(Some(returns))
+    }
+
+    fn keep(&self, header: &PolicyHeader, return_mean: f64, return_std: f64) -> Result<(), ActorError> {
+        let Some(policy) = self.policy.held() else {
+            return Ok(());
+        };
+        let file = PolicyFile {
+            fingerprint: header.fingerprint,
+            version: header.version,
+            env_steps: header.env_steps,
+            return_mean,
+            return_std,
+            episodes: self.settings.evaluation.episodes.into(),
+            parameters: policy.parameters().to_vec(),
+        };
+        Ok(file.write(&self.settings.best)?)
+    }
+}

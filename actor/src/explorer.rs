@@ -1,0 +1,382 @@
+//! The exploring actor: acts with the newest policy and noise, and writes what happens into chunks for the learner.
+//!
+//! ```text
+//! loop {
+//!     policy  = newest(policy)                     // in lockstep: exactly the one after the last round
+//!     actions = clip(μ(observations) + noise)      // equation 3.32
+//!     next    = environments.step(actions)
+//!     chunk.push(s, a, r, discount, s', last)
+//!     when the chunk is full: wait for room in the window, send it
+//! }
+//! ```
+
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+use shoal_common::channel::environment::{EnvironmentClient, Observed, ResponseLayout, Stepped};
+use shoal_common::channel::policy::PolicyReader;
+use shoal_common::channel::reports::Reporter;
+use shoal_common::channel::transitions::{Chunk, ChunkSender};
+use shoal_common::channel::{Bell, Domain, Interruption, Place, Pulse, Ringer, wait_for};
+use shoal_common::commit::{CommitReader, OpenError};
+use shoal_common::config::{Exploration, Mode};
+use shoal_common::network::{ActionRange, PolicyNetwork};
+use shoal_common::report::{Activity, EpisodeReport, Identity, Role};
+use shoal_common::space::{EnvironmentSpec, Space};
+use shoal_common::stop::Stop;
+use shoal_common::stream::{Purpose, stream};
+use shoal_common::transition::{RowLayout, Transition};
+
+use crate::error::{ActorError, Ended};
+use crate::noise::OrnsteinUhlenbeck;
+
+/// How long an actor that is asked to end waits for its last chunk to be committed.
+const FAREWELL: Duration = Duration::from_secs(1);
+
+/// What an actor is told.
+#[derive(Clone, Debug)]
+pub struct Settings {
+    /// Which process this is.
+    pub identity: Identity,
+    /// The run's seed.
+    pub seed: u64,
+    /// Whether to wait for every policy in turn.
+    pub mode: Mode,
+    /// What the environment server is expected to serve, and how many of it.
+    pub spec: EnvironmentSpec,
+    /// Environments stepped at once.
+    pub envs: usize,
+    /// Rows in a chunk.
+    pub chunk_rows: usize,
+    /// Chunks that may be sent and not committed.
+    pub window: u32,
+    /// The noise.
+    pub exploration: Exploration,
+    /// Units of the policy's hidden layers.
+    pub hidden: [usize; 2],
+    /// γ
+    pub gamma: f64,
+    /// The replay, whose commit record tells what has arrived.
+    pub replay: PathBuf,
+}
+
+/// Explores until `stop`.
+///
+/// # Errors
+/// When a channel does not work, or the environment is not the expected one.
+pub fn explore(domain: &Domain, settings: &Settings, stop: &Stop) -> Result<(), ActorError> {
+    let mut explorer = match Explorer::new(domain, settings, stop) {
+        Ok(explorer) => explorer,
+        Err(ended) => return ended.into_result(),
+    };
+    match explorer.run() {
+        Ended::Stopped => explorer.say_farewell(),
+        failed @ Ended::Failed(_) => failed.into_result(),
+    }
+}
+
+struct Explorer<'a> {
+    settings: &'a Settings,
+    domain: &'a Domain,
+    stop: &'a Stop,
+    bell: Bell,
+    learner: Ringer,
+    client: EnvironmentClient,
+    policy: PolicyReader,
+    network: PolicyNetwork,
+    noise: OrnsteinUhlenbeck,
+    low: Vec<f32>,
+    high: Vec<f32>,
+    sender: ChunkSender,
+    chunk: Option<Chunk>,
+    commits: CommitReader,
+    pulse: Pulse,
+    episodes: Reporter<EpisodeReport>,
+    returns: Vec<f64>,
+    lengths: Vec<u32>,
+    actions: Vec<f32>,
+    /// Steps of every environment since the actor's stream began.
+    step: u64,
+}
+
+impl<'a> Explorer<'a> {
+    fn new(domain: &'a Domain, settings: &'a Settings, stop: &'a Stop) -> Result<Self, Ended> {
+        let Identity { index, incarnation, .. } = settings.identity;
+        let row = RowLayout::new(settings.spec.observation.width(), settings.spec.action.width());
+        let range = ActionRange::new(&settings.spec.action)?;
+        let Space::Box { low, high } = settings.spec.action.clone() else {
+            return Err(Ended::Stopped);
+        };
+        let network = PolicyNetwork::new(row.observation_width(), settings.hidden, range, settings.envs);
+
+        let bell = Bell::hang(domain, Place(Role::Actor, index))?;
+        let mut pulse = Pulse::new(domain, settings.identity)?;
+        let client = connect(domain, &bell, index, &settings.spec, settings.envs, stop)?;
+        let policy = PolicyReader::open(domain, network.layout().fingerprint(), network.layout().parameters())?;
+        pulse.beat(Activity::WaitingForPeer);
+
+        let commits = wait_for_replay(settings, &bell, stop, &mut pulse)?;
+        // In lockstep chunk k belongs to round k whoever sends it, and the noise goes on where the last chunk left it.
+        let (sent, stream_incarnation) = match settings.mode {
+            Mode::Free => (0, incarnation),
+            Mode::Lockstep => (commits.committed(index as usize).sequence, 0),
+        };
+        let sender = ChunkSender::open(
+            domain,
+            index,
+            incarnation,
+            sent,
+            row,
+            settings.chunk_rows,
+            settings.window,
+        )?;
+        let stream = stream(settings.seed, Purpose::Exploration, index.into(), stream_incarnation);
+        Ok(Self {
+            settings,
+            domain,
+            stop,
+            learner: Ringer::new(domain, Place(Role::Learner, 0))?,
+            client,
+            policy,
+            noise: OrnsteinUhlenbeck::new(&settings.exploration, settings.envs, row.action_width(), stream),
+            network,
+            low,
+            high,
+            step: sent * (settings.chunk_rows / settings.envs) as u64,
+            sender,
+            chunk: None,
+            commits,
+            pulse,
+            episodes: Reporter::open(domain)?,
+            returns: vec![0.0; settings.envs],
+            lengths: vec![0; settings.envs],
+            actions: vec![0.0; settings.envs * row.action_width()],
+            bell,
+        })
+    }
+
+    fn run(&mut self) -> Ended {
+        loop {
+            if let Err(ended) = self.run_until_the_server_is_lost() {
+                return ended;
+            }
+            tracing::warn!("the environment server was restarted; the episodes under way are given up");
+        }
+    }
+
+    fn run_until_the_server_is_lost(&mut self) -> Result<(), Ended> {
+        let mut current = self.client.reset(self.domain, &self.bell, None)?;
+        for environment in 0..self.settings.envs {
+            self.begin_episode(environment);
+        }
+        loop {
+            let version = self.await_policy()?;
+            if self.chunk.is_none() {
+                self.chunk = Some(self.sender.begin()?);
+            }
+            self.act(&current);
+            match self.client.step(self.domain, &self.bell, &self.actions)? {
+                Stepped::Taken(next) => {
+                    self.remember(&current, &next, version);
+                    current = next;
+                }
+                Stepped::Lost => return Ok(()),
+            }
+            self.step += 1;
+            self.pulse.count(self.settings.envs as u64);
+            self.pulse.beat(Activity::Working);
+            if self.chunk.as_ref().is_some_and(Chunk::is_full) {
+                self.await_room()?;
+                self.send(version)?;
+            }
+            if self.stop.requested() {
+                return Err(Ended::Stopped);
+            }
+        }
+    }
+
+    /// The version of the policy to act with: the newest, or in lockstep the one after the last round.
+    fn await_policy(&mut self) -> Result<u64, Ended> {
+        let wanted = match self.settings.mode {
+            Mode::Free => 0,
+            Mode::Lockstep => self.sender.sent(),
+        };
+        let Self {
+            policy,
+            pulse,
+            bell,
+            stop,
+            ..
+        } = self;
+        let newest = |policy: &mut PolicyReader| -> Result<Option<u64>, _> {
+            Ok(policy
+                .latest()?
+                .map(|policy| policy.header().version)
+                .filter(|version| *version >= wanted))
+        };
+        let version = match newest(policy)? {
+            Some(version) => version,
+            None => wait_for(
+                bell,
+                stop,
+                || newest(policy),
+                || {
+                    pulse.beat(Activity::WaitingForPeer);
+                    Ok(())
+                },
+            )?,
+        };
+        self.pulse.set_policy_version(version);
+        Ok(version)
+    }
+
+    /// Line 8 of Algorithm 4, for every environment.
+    fn act(&mut self, current: &Observed) {
+        if let Some(policy) = self.policy.held() {
+            self.network
+                .forward(policy.parameters(), current.observations(), &mut self.actions);
+        }
+        self.noise.advance(self.step);
+        self.noise.disturb(&mut self.actions, &self.low, &self.high);
+    }
+
+    /// Line 10 of Algorithm 4, for every environment.
+    fn remember(&mut self, current: &Observed, next: &Observed, version: u64) {
+        let width = self.low.len();
+        for e in 0..self.settings.envs {
+            let (terminated, truncated) = (next.terminated(e), next.truncated(e));
+            let transition = Transition {
+                s: current.observation(e),
+                a: &self.actions[e * width..][..width],
+                r: next.reward(e),
+                discount: if terminated { 0.0 } else { self.settings.gamma as f32 },
+                s_next: next.next_observation(e),
+                last: terminated || truncated,
+            };
+            if let Some(chunk) = &mut self.chunk {
+                chunk.push(&transition);
+            }
+            self.returns[e] += f64::from(transition.r);
+            self.lengths[e] += 1;
+            if transition.last {
+                self.episodes.send(EpisodeReport {
+                    actor: self.settings.identity.index,
+                    environment: e as u32,
+                    steps: self.lengths[e],
+                    terminated: terminated.into(),
+                    episode_return: self.returns[e],
+                    policy_version: version,
+                    env_steps: self.commits.rows(),
+                });
+                self.begin_episode(e);
+            }
+        }
+    }
+
+    fn begin_episode(&mut self, environment: usize) {
+        self.noise.reset(environment);
+        self.returns[environment] = 0.0;
+        self.lengths[environment] = 0;
+    }
+
+    /// Waits until another chunk may be sent.
+    fn await_room(&mut self) -> Result<(), Interruption> {
+        let Self {
+            sender,
+            commits,
+            settings,
+            bell,
+            stop,
+            pulse,
+            ..
+        } = self;
+        let room = || {
+            let committed = commits.committed(settings.identity.index as usize);
+            (sender.in_flight(committed) < u64::from(settings.window)).then_some(())
+        };
+        if room().is_some() {
+            return Ok(());
+        }
+        wait_for(
+            bell,
+            stop,
+            || Ok(room()),
+            || {
+                pulse.beat(Activity::WaitingForRatio);
+                sender.look_after()
+            },
+        )
+    }
+
+    fn send(&mut self, version: u64) -> Result<(), Ended> {
+        if let Some(chunk) = self.chunk.take() {
+            self.sender.send(chunk, version)?;
+            self.learner.ring();
+        }
+        Ok(())
+    }
+
+    /// Sends what was collected and gives the learner a moment to commit it. In lockstep a round is whole or not at all.
+    fn say_farewell(&mut self) -> Result<(), ActorError> {
+        let index = self.settings.identity.index as usize;
+        let begun = Instant::now();
+        let patience = |left: u64| left > 0 && begun.elapsed() < FAREWELL;
+        if self.settings.mode == Mode::Free && self.chunk.as_ref().is_some_and(|chunk| !chunk.is_empty()) {
+            let window = u64::from(self.settings.window);
+            while patience((self.sender.in_flight(self.commits.committed(index)) + 1).saturating_sub(window)) {
+                self.bell.wait(Duration::from_millis(10))?;
+            }
+            if self.sender.in_flight(self.commits.committed(index)) < window {
+                let version = self.policy.latest()?.map_or(0, |policy| policy.header().version);
+                if let Some(chunk) = self.chunk.take() {
+                    self.sender.send(chunk, version)?;
+                    self.learner.ring();
+                }
+            }
+        }
+        while patience(self.sender.in_flight(self.commits.committed(index))) {
+            self.sender.look_after()?;
+            self.bell.wait(Duration::from_millis(10))?;
+        }
+        self.pulse.beat_now(Activity::Done);
+        Ok(())
+    }
+}
+
+/// Opens the conversation with environment server `index` and makes sure that it serves what the run is about.
+pub(crate) fn connect(
+    domain: &Domain,
+    bell: &Bell,
+    index: u32,
+    spec: &EnvironmentSpec,
+    envs: usize,
+    stop: &Stop,
+) -> Result<EnvironmentClient, Ended> {
+    let layout = ResponseLayout::new(envs, spec.observation.width());
+    let client = EnvironmentClient::open(domain, index, layout, spec.action.width(), stop.clone())?;
+    let (served, served_envs) = client.describe(domain, bell)?;
+    if served != *spec || served_envs != envs {
+        let served = format!("{served_envs} times {served:?}");
+        let configured = format!("{envs} times {spec:?}");
+        return Err(Ended::Failed(ActorError::Server {
+            index,
+            served,
+            configured,
+        }));
+    }
+    Ok(client)
+}
+
+fn wait_for_replay(settings: &Settings, bell: &Bell, stop: &Stop, pulse: &mut Pulse) -> Result<CommitReader, Ended> {
+    loop {
+        match CommitReader::open(&settings.replay) {
+            Ok(reader) => return Ok(reader),
+            Err(OpenError::NotYet { .. }) if stop.requested() => return Err(Ended::Stopped),
+            Err(OpenError::NotYet { .. }) => {
+                bell.wait(Duration::from_millis(20))?;
+                pulse.beat(Activity::WaitingForPeer);
+            }
+            Err(error) => return Err(error.into()),
+        }
+    }
+}

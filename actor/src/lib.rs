@@ -1,0 +1,7 @@
+//! Exploration: the policy, its noise and the writing of transitions; the same conversation without noise is the
+//! evaluator's.
+
+pub mod error;
+pub mod evaluator;
+pub mod explorer;
+pub mod noise;

@@ -1,0 +1,114 @@
+//! Ornstein-Uhlenbeck exploration noise (section 4.3.1), one process for each environment and action element.
+
+use rand::RngExt;
+use rand_distr::StandardNormal;
+use shoal_common::config::Exploration;
+use shoal_common::stream::Stream;
+
+/// The noise of one actor's environments. Each step's normal numbers are reached by the step's own number, so that a step
+/// done again gets the same ones.
+#[derive(Clone, Debug)]
+pub struct OrnsteinUhlenbeck {
+    settings: Exploration,
+    /// The process's state, environment after environment.
+    x: Vec<f64>,
+    width: usize,
+    stream: Stream,
+}
+
+impl OrnsteinUhlenbeck {
+    /// Noise at rest for `environments` environments with actions of `width` numbers.
+    pub fn new(settings: &Exploration, environments: usize, width: usize, stream: Stream) -> Self {
+        Self {
+            settings: settings.clone(),
+            x: vec![0.0; environments * width],
+            width,
+            stream,
+        }
+    }
+
+    /// Puts the noise of one environment to rest, as at the start of an episode (line 5 of Algorithm 4).
+    pub fn reset(&mut self, environment: usize) {
+        self.x[environment * self.width..][..self.width].fill(0.0);
+    }
+
+    /// Advances every process by step number `step`: x ← x − θ x + σ N(0, 1).
+    pub fn advance(&mut self, step: u64) {
+        self.stream.set_stream(step);
+        self.stream.set_word_pos(0);
+        let Exploration { theta, sigma } = self.settings;
+        for x in &mut self.x {
+            let normal: f64 = self.stream.sample(StandardNormal);
+            *x += -theta * *x + sigma * normal;
+        }
+    }
+
+    /// Adds the noise to the actions, in units of `half` the range of each action element, and clips the sum to the
+    /// range `centre ± half` (equation 3.32).
+    pub fn disturb(&self, actions: &mut [f32], low: &[f32], high: &[f32]) {
+        for (action, x) in actions
+            .chunks_exact_mut(self.width)
+            .zip(self.x.chunks_exact(self.width))
+        {
+            for (i, a) in action.iter_mut().enumerate() {
+                let half = (high[i] - low[i]) / 2.0;
+                *a = (*a + half * x[i] as f32).clamp(low[i], high[i]);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use shoal_common::stream::{Purpose, stream};
+
+    fn noise(environments: usize) -> OrnsteinUhlenbeck {
+        OrnsteinUhlenbeck::new(
+            &Exploration::default(),
+            environments,
+            1,
+            stream(7, Purpose::Exploration, 0, 0),
+        )
+    }
+
+    #[test]
+    fn a_step_done_again_gets_the_same_numbers() {
+        let (mut straight, mut again) = (noise(3), noise(3));
+        (0..10).for_each(|step| straight.advance(step));
+        (0..5).for_each(|step| again.advance(step));
+        let mut resumed = again.clone();
+        resumed.advance(77);
+        (5..10).for_each(|step| again.advance(step));
+        assert_eq!(straight.x, again.x);
+        assert_ne!(resumed.x, straight.x);
+    }
+
+    #[test]
+    fn it_has_the_stationary_spread_of_the_process_and_its_correlation() {
+        let mut noise = noise(2000);
+        (0..100).for_each(|step| noise.advance(step));
+        let variance = noise.x.iter().map(|x| x * x).sum::<f64>() / 2000.0;
+        // σ² / (1 − (1 − θ)²)
+        let expected = 0.04 / (1.0 - 0.85_f64.powi(2));
+        assert!(
+            (variance / expected - 1.0).abs() < 0.15,
+            "{variance} against {expected}"
+        );
+        let before = noise.x.clone();
+        noise.advance(100);
+        let correlation = before.iter().zip(&noise.x).map(|(a, b)| a * b).sum::<f64>() / 2000.0 / variance;
+        assert!((correlation - 0.85).abs() < 0.06, "{correlation}");
+    }
+
+    #[test]
+    fn the_sum_is_scaled_and_clipped_and_an_episode_starts_at_rest() {
+        let mut noise = noise(2);
+        noise.x = vec![0.5, -3.0];
+        let mut actions = [1.0, 0.5];
+        noise.disturb(&mut actions, &[-2.0], &[2.0]);
+        assert_eq!(actions, [2.0, -2.0]);
+        noise.reset(1);
+        assert_eq!(noise.x, [0.5, 0.0]);
+    }
+}
