@@ -1,0 +1,115 @@
+//! What can be typed. Nothing is decided here.
+
+use std::path::PathBuf;
+
+use clap::{Args, Parser, Subcommand};
+
+use crate::command::bench::Stage;
+use crate::command::eval::WhichPolicy;
+
+/// Shared-memory off-policy actor-learner: distributed reinforcement learning on one machine.
+#[derive(Debug, Parser)]
+#[command(name = "shoal", version, propagate_version = true)]
+pub(crate) struct Cli {
+    #[command(subcommand)]
+    pub(crate) command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum Command {
+    /// Train a policy: starts environment servers, actors, an evaluator and a learner, and ends when it has learned.
+    Train(TrainArgs),
+    /// Judge a run's policy on episodes with fixed starts.
+    Eval(EvalArgs),
+    /// Draw a run's figures.
+    Plot(PlotArgs),
+    /// Measure a stage of the system on this machine.
+    Bench(BenchArgs),
+    #[command(hide = true)]
+    EnvServer(RoleArgs),
+    #[command(hide = true)]
+    Actor(RoleArgs),
+    #[command(hide = true)]
+    Evaluator(RoleArgs),
+    #[command(hide = true)]
+    Learner(RoleArgs),
+}
+
+#[derive(Args, Clone, Debug)]
+pub(crate) struct TrainArgs {
+    /// What to train: pendulum, point-mass-r1, point-mass-r2, point-mass-r3, or a configuration file (FILE.toml).
+    #[arg(value_name = "PRESET|FILE.toml")]
+    pub(crate) what: String,
+    /// Run directory to make [default: runs/<preset>-<n>].
+    #[arg(long, value_name = "DIR")]
+    pub(crate) run: Option<PathBuf>,
+    /// Root of every random stream.
+    #[arg(long)]
+    pub(crate) seed: Option<u64>,
+    /// Actor processes.
+    #[arg(long, value_name = "N")]
+    pub(crate) actors: Option<u32>,
+    /// Environments of each actor.
+    #[arg(long, value_name = "E")]
+    pub(crate) envs: Option<u32>,
+    /// Environment steps over all actors.
+    #[arg(long, value_name = "N")]
+    pub(crate) steps: Option<u64>,
+    /// Take turns: the same seed and actor count give the same bits.
+    #[arg(long)]
+    pub(crate) lockstep: bool,
+    /// Override a key of the configuration, as in --set ddpg.tau=0.005. May be repeated.
+    #[arg(long, value_name = "SECTION.KEY=VALUE")]
+    pub(crate) set: Vec<String>,
+    /// No live line and no table.
+    #[arg(long)]
+    pub(crate) quiet: bool,
+    /// Print one JSON object on standard output at the end, and everything else on standard error.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+#[derive(Args, Clone, Debug)]
+pub(crate) struct EvalArgs {
+    /// Run directory.
+    pub(crate) run: PathBuf,
+    /// Which policy to judge.
+    #[arg(long, value_enum, default_value_t)]
+    pub(crate) policy: WhichPolicy,
+    /// Episodes, from starts that are the same always.
+    #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..))]
+    pub(crate) episodes: u32,
+    /// Other starts than those of the run's own seed.
+    #[arg(long)]
+    pub(crate) seed: Option<u64>,
+    /// Print one JSON object on standard output.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+#[derive(Args, Clone, Debug)]
+pub(crate) struct PlotArgs {
+    /// Run directory.
+    pub(crate) run: PathBuf,
+    /// Where to put the figures [default: the run directory].
+    #[arg(long, value_name = "DIR")]
+    pub(crate) out: Option<PathBuf>,
+}
+
+#[derive(Args, Clone, Debug)]
+pub(crate) struct BenchArgs {
+    /// What to measure.
+    #[arg(value_enum)]
+    pub(crate) stage: Stage,
+    /// Print one JSON object on standard output.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+/// How the launcher starts a role; everything else is in the run directory.
+#[derive(Args, Clone, Debug)]
+pub(crate) struct RoleArgs {
+    pub(crate) run: PathBuf,
+    pub(crate) index: u32,
+    pub(crate) incarnation: u64,
+}

@@ -1,0 +1,245 @@
+//! One diagram: a title, a legend above the data, two axes, and lines.
+
+use std::ops::Range;
+
+use plotters::prelude::*;
+use plotters::style::text_anchor::HPos;
+
+use super::canvas::{Area, FAINT, INK, bold, px, stroke, text, width_of};
+
+const TITLE: f64 = 15.0;
+const LABEL: f64 = 13.0;
+const TICK: f64 = 12.0;
+
+/// Space around the data, in pixels.
+const LEFT: f64 = 64.0;
+const RIGHT: f64 = 18.0;
+const BOTTOM: f64 = 44.0;
+const MARGIN: f64 = 8.0;
+const TITLE_ROW: f64 = 30.0;
+const LEGEND_ROW: f64 = 22.0;
+
+/// An axis: what it shows, with its unit, and from where to where.
+pub(super) struct Axis<'a> {
+    pub(super) label: &'a str,
+    pub(super) range: Range<f64>,
+}
+
+/// How the points of a series are shown.
+#[derive(Clone, Copy)]
+pub(super) enum Look {
+    Line,
+    Dots,
+    Rings,
+    Crosses,
+}
+
+/// Points that belong together. Those that are not finite are left out.
+pub(super) struct Series<'a> {
+    /// Its place in the legend; none where it is empty.
+    pub(super) label: &'a str,
+    pub(super) points: Vec<(f64, f64)>,
+    pub(super) look: Look,
+    pub(super) color: RGBColor,
+    pub(super) opacity: f64,
+    /// Of the line, in pixels.
+    pub(super) width: f64,
+}
+
+impl<'a> Series<'a> {
+    pub(super) fn line(label: &'a str, color: RGBColor, points: Vec<(f64, f64)>) -> Self {
+        Self {
+            label,
+            points,
+            look: Look::Line,
+            color,
+            opacity: 1.0,
+            width: 1.8,
+        }
+    }
+}
+
+/// A diagram.
+pub(super) struct Panel<'a> {
+    pub(super) title: &'a str,
+    /// Said below the title, after the legend.
+    pub(super) note: &'a str,
+    pub(super) x: Axis<'a>,
+    pub(super) y: Axis<'a>,
+    /// Drawn in this order.
+    pub(super) series: Vec<Series<'a>>,
+    /// Widens the x axis, so that both have the same scale.
+    pub(super) equal_scale: bool,
+}
+
+impl Panel<'_> {
+    pub(super) fn draw(mut self, area: &Area<'_>) -> anyhow::Result<()> {
+        let (header, body) = area.split_vertically(px(TITLE_ROW + LEGEND_ROW));
+        header.draw_text(
+            self.title,
+            &bold(TITLE, HPos::Left),
+            (px(MARGIN + LEFT), px(TITLE_ROW / 2.0 + 4.0)),
+        )?;
+        self.draw_legend(&header)?;
+        if self.equal_scale {
+            self.equalise(&body);
+        }
+
+        let mut chart = ChartBuilder::on(&body)
+            .margin_left(px(MARGIN))
+            .margin_right(px(RIGHT))
+            .margin_top(px(MARGIN))
+            .margin_bottom(px(MARGIN))
+            .x_label_area_size(px(BOTTOM))
+            .y_label_area_size(px(LEFT))
+            .build_cartesian_2d(self.x.range.clone(), self.y.range.clone())?;
+        let (width, height) = chart.plotting_area().dim_in_pixel();
+        let y_labels = height / px(42.0) as u32;
+        let x_labels = if self.equal_scale {
+            y_labels * width / height + 1
+        } else {
+            width / px(58.0) as u32
+        };
+        let (x_tick, y_tick) = (Ticks::of(&self.x.range), Ticks::of(&self.y.range));
+        chart
+            .configure_mesh()
+            .light_line_style(TRANSPARENT)
+            .bold_line_style(stroke(FAINT, 1.0, 0.8))
+            .axis_style(stroke(INK, 1.0, 1.0))
+            .set_all_tick_mark_size(px(4.0))
+            .x_labels(x_labels as usize)
+            .y_labels(y_labels as usize)
+            .x_label_formatter(&|x| x_tick.format(*x))
+            .y_label_formatter(&|y| y_tick.format(*y))
+            .label_style(text(TICK, HPos::Center))
+            .axis_desc_style(text(LABEL, HPos::Center))
+            .x_desc(self.x.label)
+            .y_desc(self.y.label)
+            .draw()?;
+
+        for series in &self.series {
+            let finite = series
+                .points
+                .iter()
+                .copied()
+                .filter(|(x, y)| x.is_finite() && y.is_finite());
+            let line = stroke(series.color, series.opacity, series.width);
+            match series.look {
+                Look::Line => chart.draw_series(LineSeries::new(finite, line))?,
+                Look::Dots => {
+                    let fill = series.color.mix(series.opacity).filled();
+                    chart.draw_series(finite.map(|point| Circle::new(point, px(series.width), fill)))?
+                }
+                Look::Rings => chart.draw_series(finite.map(|point| Circle::new(point, px(4.5), line)))?,
+                Look::Crosses => chart.draw_series(finite.map(|point| Cross::new(point, px(4.5), line)))?,
+            };
+        }
+        Ok(())
+    }
+
+    fn draw_legend(&self, header: &Area<'_>) -> anyhow::Result<()> {
+        let middle = px(TITLE_ROW + LEGEND_ROW / 2.0);
+        let mut x = MARGIN + LEFT;
+        for series in self.series.iter().filter(|series| !series.label.is_empty()) {
+            let style = stroke(series.color, series.opacity, series.width);
+            let (left, centre, right) = ((px(x), middle), (px(x + 10.0), middle), (px(x + 20.0), middle));
+            match series.look {
+                Look::Line => header.draw(&PathElement::new([left, right], style))?,
+                Look::Dots => header.draw(&Circle::new(centre, px(series.width), series.color.filled()))?,
+                Look::Rings => header.draw(&Circle::new(centre, px(4.5), style))?,
+                Look::Crosses => header.draw(&Cross::new(centre, px(4.5), style))?,
+            }
+            header.draw_text(series.label, &text(LABEL, HPos::Left), (px(x + 26.0), middle))?;
+            x += 26.0 + width_of(series.label, LABEL) + 16.0;
+        }
+        header.draw_text(self.note, &text(LABEL, HPos::Left), (px(x), middle))?;
+        Ok(())
+    }
+
+    fn equalise(&mut self, body: &Area<'_>) {
+        let (width, height) = body.dim_in_pixel();
+        let width = f64::from(width) - f64::from(px(MARGIN + LEFT + RIGHT));
+        let height = f64::from(height) - f64::from(px(2.0 * MARGIN + BOTTOM));
+        let centre = (self.x.range.start + self.x.range.end) / 2.0;
+        let half = (self.y.range.end - self.y.range.start) / 2.0 * width / height;
+        self.x.range = centre - half..centre + half;
+    }
+}
+
+/// How the numbers along an axis are written: with as many decimals as its length asks for.
+struct Ticks {
+    decimals: usize,
+}
+
+impl Ticks {
+    fn of(range: &Range<f64>) -> Self {
+        // An axis has about four ticks or more, so two decimals follow the first digit of its length at most.
+        let digits = (range.end - range.start).log10().floor();
+        Self {
+            decimals: (1.0 - digits).clamp(0.0, 6.0) as usize,
+        }
+    }
+
+    fn format(&self, value: f64) -> String {
+        let text = format!("{value:.*}", self.decimals);
+        let text = if text.contains('.') {
+            text.trim_end_matches('0').trim_end_matches('.')
+        } else {
+            &text
+        };
+        match text.strip_prefix('-') {
+            Some("0") => "0".into(),
+            Some(size) => format!("\u{2212}{size}"),
+            None => text.into(),
+        }
+    }
+}
+
+/// A range that holds all of `values` with a little room to both sides, whatever they are.
+pub(super) fn range_of(values: impl Iterator<Item = f64>) -> Range<f64> {
+    let finite = values.filter(|value| value.is_finite());
+    let (low, high) = finite.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| {
+        (low.min(v), high.max(v))
+    });
+    if low > high {
+        return 0.0..1.0;
+    }
+    let room = if high > low {
+        0.05 * (high - low)
+    } else {
+        (0.05 * high.abs()).max(0.5)
+    };
+    low - room..high + room
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ticks_are_written_as_people_write_them() {
+        let written = |range, values: &[f64]| values.iter().map(|v| Ticks::of(&range).format(*v)).collect::<Vec<_>>();
+        assert_eq!(
+            written(-1600.0..0.0, &[-1500.0, -500.0, -0.0]),
+            ["\u{2212}1500", "\u{2212}500", "0"]
+        );
+        assert_eq!(written(0.0..3.0, &[0.5, 1.0, 2.5000001]), ["0.5", "1", "2.5"]);
+        assert_eq!(written(-0.1..0.1, &[0.05, -0.000_000_1]), ["0.05", "0"]);
+    }
+
+    #[test]
+    fn a_range_is_never_empty() {
+        for values in [
+            &[][..],
+            &[f64::NAN],
+            &[3.0],
+            &[0.0, 0.0],
+            &[-1600.0, -150.0],
+            &[1e9, 1e9],
+        ] {
+            let range = range_of(values.iter().copied());
+            assert!(range.start < range.end, "{values:?}");
+            assert!(values.iter().all(|v| v.is_nan() || range.contains(v)), "{values:?}");
+        }
+    }
+}

@@ -1,0 +1,273 @@
+//! The vehicle on its way to the goal: test runs as in figures 5.5, 5.7, 5.9 and A.4 to A.11, and all paths in one as in figure 5.10.
+
+use std::f64::consts::PI;
+use std::ops::Range;
+use std::path::Path;
+
+use super::canvas::{Area, BLUE, GREEN, INK, VERMILION, save};
+use super::panel::{Axis, Look, Panel, Series, range_of};
+use crate::rollout::Trajectory;
+
+/// Width and height of a diagram, in pixels.
+const CELL: (u32, u32) = (400, 330);
+
+/// An episode from a chosen start position, at rest.
+pub(crate) struct TestRun {
+    /// (x, y) in m; the goal is the origin.
+    pub(crate) start: [f64; 2],
+    pub(crate) trajectory: Trajectory,
+}
+
+impl TestRun {
+    fn path(&self) -> Vec<(f64, f64)> {
+        self.trajectory
+            .observations
+            .iter()
+            .map(|o| (o[0].into(), o[1].into()))
+            .collect()
+    }
+
+    fn distances(&self) -> Vec<(f64, f64)> {
+        over_steps(self.trajectory.observations.iter().map(|o| o[4].into()))
+    }
+
+    fn final_distance(&self) -> f64 {
+        self.trajectory.observations.last().map_or(f64::NAN, |o| o[4].into())
+    }
+}
+
+/// Draws each run in a row of its own: path, distance, actions, rewards.
+pub(crate) fn test_runs(runs: &[TestRun], path: &Path) -> anyhow::Result<()> {
+    let rewards = range_of(
+        runs.iter()
+            .flat_map(|run| run.trajectory.rewards.iter().copied())
+            .chain([0.0, 1.0]),
+    );
+    let farthest = runs
+        .iter()
+        .flat_map(TestRun::distances)
+        .map(|(_, d)| d)
+        .fold(1.0, f64::max);
+    let size = (4 * CELL.0, (runs.len().max(1) as u32) * CELL.1);
+    save(path, size, |sheet| {
+        let cells = sheet.split_evenly((runs.len().max(1), 4));
+        for (run, row) in runs.iter().zip(cells.chunks_exact(4)) {
+            draw_path(run, &row[0])?;
+            draw_distance(run, farthest, &row[1])?;
+            draw_actions(run, &row[2])?;
+            draw_rewards(run, rewards.clone(), &row[3])?;
+        }
+        Ok(())
+    })
+}
+
+/// Draws the paths of all runs in one diagram, and their distances in another.
+pub(crate) fn trajectories(runs: &[TestRun], path: &Path) -> anyhow::Result<()> {
+    let extent = extent(runs.iter().flat_map(TestRun::path));
+    let thin = |points| Series {
+        opacity: 0.75,
+        width: 1.4,
+        ..Series::line("", BLUE, points)
+    };
+    let mut ways: Vec<_> = runs.iter().map(|run| thin(run.path())).collect();
+    ways.push(starts(runs.iter().map(|run| (run.start[0], run.start[1])).collect()));
+    ways.push(goal());
+    let farthest = runs
+        .iter()
+        .flat_map(TestRun::distances)
+        .map(|(_, d)| d)
+        .fold(1.0, f64::max);
+    let mean = runs.iter().map(TestRun::final_distance).sum::<f64>() / runs.len().max(1) as f64;
+    let note = format!("mean at the end: {mean:.3} m");
+    let paths = Panel {
+        title: "Trajectories",
+        note: "",
+        x: Axis {
+            label: "x (m)",
+            range: extent.clone(),
+        },
+        y: Axis {
+            label: "y (m)",
+            range: extent,
+        },
+        series: ways,
+        equal_scale: true,
+    };
+    let distances = Panel {
+        title: "Distance to goal",
+        note: &note,
+        x: time_steps(runs.iter().map(|run| run.trajectory.actions.len()).max()),
+        y: Axis {
+            label: "distance (m)",
+            range: 0.0..1.05 * farthest,
+        },
+        series: runs.iter().map(|run| thin(run.distances())).collect(),
+        equal_scale: false,
+    };
+    save(path, (1160, 560), |sheet| {
+        let (left, right) = sheet.split_horizontally(sheet.dim_in_pixel().0 / 2);
+        paths.draw(&left)?;
+        distances.draw(&right)
+    })
+}
+
+fn draw_path(run: &TestRun, area: &Area<'_>) -> anyhow::Result<()> {
+    let [x, y] = run.start;
+    let extent = extent(run.path().into_iter());
+    let panel = Panel {
+        title: &format!("From ({x}, {y})").replace('-', "\u{2212}"),
+        note: "",
+        x: Axis {
+            label: "x (m)",
+            range: extent.clone(),
+        },
+        y: Axis {
+            label: "y (m)",
+            range: extent,
+        },
+        series: vec![Series::line("", BLUE, run.path()), starts(vec![(x, y)]), goal()],
+        equal_scale: true,
+    };
+    panel.draw(area)
+}
+
+fn draw_distance(run: &TestRun, farthest: f64, area: &Area<'_>) -> anyhow::Result<()> {
+    let panel = Panel {
+        title: "Distance to goal",
+        note: &format!("{:.3} m at the end", run.final_distance()),
+        x: time_steps(Some(run.trajectory.actions.len())),
+        y: Axis {
+            label: "distance (m)",
+            range: 0.0..1.05 * farthest,
+        },
+        series: vec![Series::line("", BLUE, run.distances())],
+        equal_scale: false,
+    };
+    panel.draw(area)
+}
+
+fn draw_actions(run: &TestRun, area: &Area<'_>) -> anyhow::Result<()> {
+    let direction = over_steps(run.trajectory.actions.iter().map(|a| f64::from(a[0]) / PI));
+    let force = over_steps(run.trajectory.actions.iter().map(|a| a[1].into()));
+    let panel = Panel {
+        title: "Control actions",
+        note: "",
+        x: time_steps(Some(run.trajectory.actions.len())),
+        y: Axis {
+            label: "force (N), direction / π",
+            range: -1.1..2.1,
+        },
+        series: vec![
+            Series {
+                width: 1.4,
+                ..Series::line("force", BLUE, force)
+            },
+            Series {
+                width: 1.4,
+                ..Series::line("direction, scaled to [\u{2212}1, 1]", VERMILION, direction)
+            },
+        ],
+        equal_scale: false,
+    };
+    panel.draw(area)
+}
+
+fn draw_rewards(run: &TestRun, range: Range<f64>, area: &Area<'_>) -> anyhow::Result<()> {
+    let panel = Panel {
+        title: "Rewards",
+        note: &format!("return {:.1}", run.trajectory.episode_return()).replace('-', "\u{2212}"),
+        x: time_steps(Some(run.trajectory.actions.len())),
+        y: Axis { label: "reward", range },
+        series: vec![Series::line(
+            "",
+            GREEN,
+            over_steps(run.trajectory.rewards.iter().copied()),
+        )],
+        equal_scale: false,
+    };
+    panel.draw(area)
+}
+
+fn starts<'a>(points: Vec<(f64, f64)>) -> Series<'a> {
+    Series {
+        look: Look::Rings,
+        ..Series::line("start", INK, points)
+    }
+}
+
+fn goal<'a>() -> Series<'a> {
+    Series {
+        look: Look::Crosses,
+        width: 2.2,
+        ..Series::line("goal", VERMILION, vec![(0.0, 0.0)])
+    }
+}
+
+fn over_steps(values: impl Iterator<Item = f64>) -> Vec<(f64, f64)> {
+    values.enumerate().map(|(t, value)| (t as f64, value)).collect()
+}
+
+fn time_steps<'a>(steps: Option<usize>) -> Axis<'a> {
+    Axis {
+        label: "time step",
+        range: 0.0..steps.unwrap_or(1).max(1) as f64,
+    }
+}
+
+/// A square around the goal that holds all the points.
+fn extent(points: impl Iterator<Item = (f64, f64)>) -> Range<f64> {
+    let reach = points
+        .flat_map(|(x, y)| [x.abs(), y.abs()])
+        .filter(|r| r.is_finite())
+        .fold(0.5, f64::max);
+    -1.15 * reach..1.15 * reach
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn run(start: [f64; 2]) -> TestRun {
+        let position = |t: i32| {
+            let left = (-f64::from(t) / 30.0).exp();
+            let bend = 0.6 * left * (1.0 - left);
+            [start[0] * left - start[1] * bend, start[1] * left + start[0] * bend]
+        };
+        let observation = |t| {
+            let [x, y] = position(t);
+            [x, y, 0.0, 0.0, x.hypot(y), 0.0].map(|v| v as f32).to_vec()
+        };
+        let left = |t: i32| (-t as f32 / 30.0).exp();
+        let trajectory = Trajectory {
+            observations: (0..=200).map(observation).collect(),
+            actions: (0..200)
+                .map(|t| vec![2.5 - left(t) * (t as f32 / 3.0).sin(), 2.0 * left(t)])
+                .collect(),
+            rewards: (0..200)
+                .map(|t| if t < 110 { 0.4 * f64::from(left(t)) } else { 1.95 })
+                .collect(),
+            terminated: false,
+        };
+        TestRun { start, trajectory }
+    }
+
+    #[test]
+    fn runs_make_a_row_of_diagrams_each() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("test-runs.svg");
+        test_runs(&[run([2.0, -2.0]), run([-2.0, 2.0])], &path).unwrap();
+        let svg = std::fs::read_to_string(path).unwrap();
+        for label in ["x (m)", "distance (m)", "force (N), direction / π", "reward"] {
+            assert_eq!(svg.lines().filter(|line| line.trim() == label).count(), 2, "{label}");
+        }
+        assert!(svg.contains("From (2, \u{2212}2)") && svg.contains("From (\u{2212}2, 2)"));
+    }
+
+    #[test]
+    fn many_or_no_paths_make_one_picture() {
+        let dir = tempfile::tempdir().unwrap();
+        let starts = [[3.0, 3.0], [3.0, 0.0], [3.0, -3.0], [0.0, -3.0], [2.0, 2.0]];
+        trajectories(&starts.map(run), &dir.path().join("trajectories.svg")).unwrap();
+        trajectories(&[], &dir.path().join("none.svg")).unwrap();
+    }
+}

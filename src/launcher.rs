@@ -1,0 +1,244 @@
+//! The launcher: starts the roles of a run, watches them, keeps the records, and ends all of them.
+
+mod crew;
+mod log;
+mod process;
+mod progress;
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use anyhow::Context;
+use shoal_common::channel::reports::Reports;
+use shoal_common::channel::{ChannelError, Domain};
+use shoal_common::config::Config;
+use shoal_common::report::{Activity, EpisodeReport, EvaluationReport, Heartbeat, LearnerReport, Role};
+use shoal_common::run_dir::{RunDir, RunLock};
+use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM, SIGXFSZ};
+
+use self::crew::Crew;
+use self::log::Log;
+use self::progress::Progress;
+pub(crate) use self::progress::thousands;
+use crate::recorder::Recorder;
+
+/// How often the launcher looks round.
+const ROUND: Duration = Duration::from_millis(50);
+
+/// How long the evaluator may take over the last policy once the learner is through.
+const LAST_EVALUATION: Duration = Duration::from_secs(5);
+
+/// How a run came to its end.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Ending {
+    /// All its steps are taken and learned from.
+    Finished,
+    /// By this signal; the learner saved its state.
+    Interrupted(i32),
+}
+
+/// What is known of a run when it ends.
+#[derive(Clone, Debug)]
+pub(crate) struct Outcome {
+    pub(crate) ending: Ending,
+    pub(crate) wall: Duration,
+    pub(crate) learner: Option<LearnerReport>,
+    pub(crate) episodes: u64,
+}
+
+/// Runs all roles until the learner is through or a signal comes.
+pub(crate) fn run(config: &Config, run: &RunDir, quiet: bool) -> anyhow::Result<Outcome> {
+    let signals = Signals::register()?;
+    let lock = run.lock()?;
+    Domain::remove_abandoned()?;
+    let domain = Domain::join(&config.run.id, config.actors.max)?;
+    let outcome = Launcher::new(config, run, &domain, signals, quiet, lock).and_then(Launcher::run);
+    // Even where something failed: no role is left by now.
+    let left = domain.leave_last();
+    let outcome = outcome?;
+    left?;
+    Ok(outcome)
+}
+
+/// The signals that end a run.
+struct Signals(Vec<(i32, Arc<AtomicBool>)>);
+
+impl Signals {
+    fn register() -> anyhow::Result<Self> {
+        // A file-size limit shall be an error of the write that meets it, not the end of the process.
+        let _ = signal_hook::flag::register(SIGXFSZ, Arc::default())?;
+        let mut flags = Vec::new();
+        for signal in [SIGINT, SIGTERM, SIGHUP] {
+            let flag = Arc::new(AtomicBool::new(false));
+            signal_hook::flag::register(signal, Arc::clone(&flag)).context("cannot watch for signals")?;
+            flags.push((signal, flag));
+        }
+        Ok(Self(flags))
+    }
+
+    fn received(&self) -> Option<i32> {
+        self.0
+            .iter()
+            .find(|(_, flag)| flag.load(Ordering::Relaxed))
+            .map(|(signal, _)| *signal)
+    }
+}
+
+struct Launcher<'a> {
+    config: &'a Config,
+    domain: &'a Domain,
+    crew: Crew,
+    recorder: Recorder,
+    progress: Progress,
+    signals: Signals,
+    begun: Instant,
+    heartbeats: Reports<Heartbeat>,
+    episode_reports: Reports<EpisodeReport>,
+    evaluation_reports: Reports<EvaluationReport>,
+    learner_reports: Reports<LearnerReport>,
+    learner: Option<LearnerReport>,
+    episodes: u64,
+    evaluated: Option<EvaluationReport>,
+    _lock: RunLock,
+}
+
+impl<'a> Launcher<'a> {
+    fn new(
+        config: &'a Config,
+        run: &'a RunDir,
+        domain: &'a Domain,
+        signals: Signals,
+        quiet: bool,
+        lock: RunLock,
+    ) -> anyhow::Result<Self> {
+        let log = Log::open(&run.log())?;
+        write_iox_config(domain, run)?;
+        std::fs::create_dir_all(run.checkpoints()).context("cannot make the directory for checkpoints")?;
+        let recorder = Recorder::open(run, config.replay.warmup)?;
+        Ok(Self {
+            config,
+            domain,
+            heartbeats: Reports::open(domain)?,
+            episode_reports: Reports::open(domain)?,
+            evaluation_reports: Reports::open(domain)?,
+            learner_reports: Reports::open(domain)?,
+            crew: Crew::new(config, run, log)?,
+            recorder,
+            progress: Progress::new(config, run, quiet),
+            signals,
+            begun: Instant::now(),
+            learner: None,
+            episodes: 0,
+            evaluated: None,
+            _lock: lock,
+        })
+    }
+
+    fn run(mut self) -> anyhow::Result<Outcome> {
+        let ending = self.watch();
+        // Whatever happened, nobody is left behind.
+        self.progress.say("ending");
+        let ended = self.end_crew();
+        self.progress.clear();
+        let ending = ending?;
+        ended?;
+        self.recorder.flush()?;
+        Ok(Outcome {
+            ending,
+            wall: self.begun.elapsed(),
+            learner: self.learner,
+            episodes: self.episodes,
+        })
+    }
+
+    fn watch(&mut self) -> anyhow::Result<Ending> {
+        self.crew.start_all()?;
+        loop {
+            if let Some(signal) = self.signals.received() {
+                return Ok(Ending::Interrupted(signal));
+            }
+            self.read_reports()?;
+            if self.crew.look_after(self.domain)? == crew::State::LearnerDone {
+                self.await_last_evaluation()?;
+                return Ok(Ending::Finished);
+            }
+            self.progress.draw(&self.crew);
+            std::thread::sleep(ROUND);
+        }
+    }
+
+    /// The evaluator may still be at the policy of the last period.
+    fn await_last_evaluation(&mut self) -> anyhow::Result<()> {
+        let evaluation = &self.config.evaluation;
+        let patience = Instant::now();
+        while patience.elapsed() < LAST_EVALUATION && self.signals.received().is_none() {
+            self.read_reports()?;
+            let last = self.learner.map_or(0, |learner| evaluation.period(learner.env_steps));
+            if self
+                .evaluated
+                .is_some_and(|report| evaluation.period(report.env_steps) >= last)
+            {
+                break;
+            }
+            std::thread::sleep(ROUND);
+        }
+        Ok(())
+    }
+
+    fn end_crew(&mut self) -> anyhow::Result<()> {
+        let Self { crew, .. } = self;
+        crew.end_all();
+        self.read_reports()
+    }
+
+    fn read_reports(&mut self) -> anyhow::Result<()> {
+        let wall = self.begun.elapsed();
+        while let Some(heartbeat) = self.heartbeats.receive()? {
+            self.crew.hear(&heartbeat);
+        }
+        each(&self.episode_reports, |report| {
+            self.episodes += 1;
+            Ok(self.recorder.episode(&report, wall)?)
+        })?;
+        each(&self.evaluation_reports, |report| {
+            self.evaluated = Some(report);
+            self.progress.evaluated(&report);
+            Ok(self.recorder.evaluation(&report, wall)?)
+        })?;
+        each(&self.learner_reports, |report| {
+            self.learner = Some(report);
+            self.progress.learned(&report, wall);
+            Ok(self.recorder.learner(&report, wall)?)
+        })
+    }
+}
+
+fn each<R: shoal_common::channel::reports::Report>(
+    reports: &Reports<R>,
+    mut use_it: impl FnMut(R) -> anyhow::Result<()>,
+) -> anyhow::Result<()> {
+    while let Some(report) = reports.receive().map_err(|error: ChannelError| error)? {
+        use_it(report)?;
+    }
+    Ok(())
+}
+
+/// With this file, iceoryx2's own tools find the run's services when they are started in the run directory.
+fn write_iox_config(domain: &Domain, run: &RunDir) -> anyhow::Result<()> {
+    let directory = run.path().join("config");
+    std::fs::create_dir_all(&directory)?;
+    std::fs::write(directory.join("iceoryx2.toml"), domain.iox_config()?)?;
+    Ok(())
+}
+
+/// Who waits for whom, in words, from what actors and learner said last.
+fn waiting(crew: &Crew) -> Option<&'static str> {
+    match (crew.activity(Role::Actor), crew.activity(Role::Learner)) {
+        (Some(Activity::WaitingForRatio), _) => Some("actors wait"),
+        (_, Some(Activity::WaitingForRatio)) => Some("learner waits"),
+        (_, Some(Activity::WaitingForPeer)) => Some("learner waits for rows"),
+        (Some(Activity::WaitingForPeer), _) => Some("actors wait for a policy"),
+        _ => None,
+    }
+}

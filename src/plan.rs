@@ -1,0 +1,248 @@
+//! From what was typed to a run that is decided: presets, files and overrides become one resolved configuration, and
+//! below this line nobody reads options any more.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, bail};
+use shoal_common::config::Config;
+use shoal_common::run_dir::RunDir;
+use shoal_env_server::environment;
+use toml::{Table, Value};
+
+use crate::cli::TrainArgs;
+
+const PRESETS: [(&str, &str); 4] = [
+    ("pendulum", include_str!("../presets/pendulum.toml")),
+    ("point-mass-r1", include_str!("../presets/point-mass-r1.toml")),
+    ("point-mass-r2", include_str!("../presets/point-mass-r2.toml")),
+    ("point-mass-r3", include_str!("../presets/point-mass-r3.toml")),
+];
+
+/// A run that can begin.
+#[derive(Debug)]
+pub(crate) struct Plan {
+    pub(crate) config: Config,
+    pub(crate) run: RunDir,
+}
+
+impl Plan {
+    /// Decides everything, and makes the run directory with its `config.toml` only when nothing is wrong.
+    pub(crate) fn new(args: &TrainArgs) -> anyhow::Result<Self> {
+        let (name, table) = sections(&args.what)?;
+        let config = resolve(table, args, &args.what)?;
+        let run = match &args.run {
+            Some(path) => RunDir::create(path)?,
+            None => RunDir::create_next(Path::new("runs"), &name)?,
+        };
+        let file = run.config_file();
+        std::fs::write(&file, config.to_toml()?).with_context(|| format!("cannot write {}", file.display()))?;
+        Ok(Self { config, run })
+    }
+}
+
+/// The sections of a preset or a file, and the name that a run of it gets.
+fn sections(what: &str) -> anyhow::Result<(String, Table)> {
+    if let Some((name, text)) = PRESETS.into_iter().find(|(name, _)| *name == what) {
+        return Ok((name.into(), text.parse().with_context(|| format!("preset {name}"))?));
+    }
+    let path = PathBuf::from(what);
+    if path.extension().is_none_or(|extension| extension != "toml") {
+        let known: Vec<&str> = PRESETS.iter().map(|(name, _)| *name).collect();
+        bail!(
+            "there is no preset `{what}`: choose {}, or a file that ends in .toml",
+            known.join(", ")
+        );
+    }
+    let text = std::fs::read_to_string(&path).with_context(|| format!("cannot read {what}"))?;
+    let table = text
+        .parse::<Table>()
+        .map_err(|error| anyhow::anyhow!("{what}: {}", one_line(&error)))?;
+    let name = path
+        .file_stem()
+        .map_or_else(|| "run".into(), |stem| stem.to_string_lossy().into_owned());
+    Ok((name, table))
+}
+
+fn resolve(mut table: Table, args: &TrainArgs, origin: &str) -> anyhow::Result<Config> {
+    let mut set = |section: &str, key: &str, value: Value| put(&mut table, &[section, key], value);
+    if let Some(seed) = args.seed {
+        let seed = i64::try_from(seed).context("--seed: must be below 2^63")?;
+        set("run", "seed", seed.into())?;
+    }
+    if let Some(steps) = args.steps {
+        set(
+            "run",
+            "steps",
+            i64::try_from(steps).context("--steps: must be below 2^63")?.into(),
+        )?;
+    }
+    if let Some(actors) = args.actors {
+        set("actors", "count", i64::from(actors).into())?;
+    }
+    if let Some(envs) = args.envs {
+        set("actors", "envs", i64::from(envs).into())?;
+    }
+    if args.lockstep {
+        set("run", "mode", "lockstep".into())?;
+    }
+    for assignment in &args.set {
+        let (key, value) = assignment
+            .split_once('=')
+            .filter(|(key, _)| key.contains('.'))
+            .with_context(|| format!("--set {assignment}: must look like SECTION.KEY=VALUE"))?;
+        let path: Vec<&str> = key.split('.').collect();
+        put(&mut table, &path, value_of(value)).with_context(|| format!("--set {assignment}"))?;
+    }
+    // More actors than a run is usually laid out for: lay it out for them.
+    if let Some(count) = table
+        .get("actors")
+        .and_then(|actors| actors.get("count"))
+        .and_then(Value::as_integer)
+        && count > 16
+        && table.get("actors").is_some_and(|actors| actors.get("max").is_none())
+    {
+        put(&mut table, &["actors", "max"], count.into())?;
+    }
+    // The name in shared memory must not be that of another run, whatever the seed.
+    put(
+        &mut table,
+        &["run", "id"],
+        format!("{:08x}", rand::random::<u32>()).into(),
+    )?;
+    describe_environment(&mut table)?;
+    Ok(Config::from_table(table, origin)?)
+}
+
+/// Fills in every parameter of the environment, and what the environment says of itself.
+fn describe_environment(table: &mut Table) -> anyhow::Result<()> {
+    let Some(Value::Table(section)) = table.get_mut("environment") else {
+        bail!("the section [environment] is missing: it must have a name");
+    };
+    let Some(Value::String(name)) = section.remove("name") else {
+        bail!(
+            "environment.name is missing: it must be one of {}",
+            environment::names().collect::<Vec<_>>().join(", ")
+        );
+    };
+    let mut parameters = environment::resolve(&name, section)?;
+    let spec = environment::make(&name, &parameters)?.spec();
+    parameters.insert("name".into(), name.into());
+    table.insert("environment".into(), parameters.into());
+    table.insert("spec".into(), Value::try_from(spec)?);
+    Ok(())
+}
+
+fn put(table: &mut Table, path: &[&str], value: Value) -> anyhow::Result<()> {
+    match path {
+        [] => Ok(()),
+        [key] => {
+            table.insert((*key).into(), value);
+            Ok(())
+        }
+        [section, rest @ ..] => match table.entry(*section).or_insert_with(|| Table::new().into()) {
+            Value::Table(inner) => put(inner, rest, value),
+            _ => bail!("`{section}` is a value, not a section"),
+        },
+    }
+}
+
+/// A TOML value, or a string where it is none: `reward=r2` needs no quotes.
+fn value_of(text: &str) -> Value {
+    format!("value = {text}")
+        .parse::<Table>()
+        .ok()
+        .and_then(|mut table| table.remove("value"))
+        .unwrap_or_else(|| text.into())
+}
+
+fn one_line(error: &toml::de::Error) -> String {
+    error.message().replace('\n', " ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::Parser;
+
+    fn plan(arguments: &[&str]) -> anyhow::Result<Config> {
+        let cli = crate::cli::Cli::try_parse_from([&["shoal", "train"], arguments].concat())?;
+        let crate::cli::Command::Train(args) = cli.command else {
+            unreachable!()
+        };
+        let (_, table) = sections(&args.what)?;
+        resolve(table, &args, &args.what)
+    }
+
+    #[test]
+    fn every_preset_is_a_configuration() {
+        for (name, _) in PRESETS {
+            let config = plan(&[name]).unwrap();
+            assert_eq!(config.spec.time_limit, 200, "{name}");
+            assert!(
+                config.environment.parameters.len() > 1,
+                "every parameter is filled in: {:?}",
+                config.environment
+            );
+        }
+    }
+
+    #[test]
+    fn options_and_overrides_reach_the_configuration() {
+        let config = plan(&[
+            "point-mass-r3",
+            "--seed",
+            "7",
+            "--steps",
+            "500",
+            "--actors",
+            "3",
+            "--envs",
+            "2",
+            "--lockstep",
+            "--set",
+            "environment.reward=r2",
+            "--set",
+            "environment.friction=0.03",
+            "--set",
+            "ddpg.hidden=[20, 10]",
+        ])
+        .unwrap();
+        assert_eq!(
+            (
+                config.run.seed,
+                config.run.steps,
+                config.actors.count,
+                config.actors.envs
+            ),
+            (7, 500, 3, 2)
+        );
+        assert_eq!(config.environment.parameters["reward"].as_str(), Some("r2"));
+        assert_eq!(config.environment.parameters["friction"].as_float(), Some(0.03));
+        assert_eq!(config.ddpg.hidden, [20, 10]);
+    }
+
+    #[test]
+    fn what_is_wrong_is_said_on_one_line() {
+        for (arguments, part) in [
+            (vec!["pendulums"], "no preset `pendulums`"),
+            (vec!["missing.toml"], "missing.toml"),
+            (vec!["pendulum", "--set", "ddpg.gama=1"], "gama"),
+            (vec!["pendulum", "--set", "dpg.gamma=1"], "dpg"),
+            (vec!["pendulum", "--set", "gamma=1"], "SECTION.KEY=VALUE"),
+            (
+                vec!["pendulum", "--set", "ddpg.gamma=2"],
+                "ddpg.gamma = 2: must be from 0 to 1",
+            ),
+            (vec!["pendulum", "--set", "ddpg.gamma=high"], "high"),
+            (vec!["pendulum", "--set", "environment.start_sped=1"], "start_sped"),
+            (vec!["pendulum", "--set", "environment.name=pendule"], "pendule"),
+            (vec!["pendulum", "--actors", "0"], "actors.count = 0"),
+        ] {
+            let message = format!("{:#}", plan(&arguments).unwrap_err());
+            assert!(
+                message.contains(part) && !message.contains('\n'),
+                "{arguments:?}: {message}"
+            );
+        }
+    }
+}

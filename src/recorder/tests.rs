@@ -1,0 +1,180 @@
+use std::io::Write;
+
+use super::*;
+
+fn run() -> (tempfile::TempDir, RunDir) {
+    let parent = tempfile::tempdir().unwrap();
+    let run = RunDir::create(&parent.path().join("run")).unwrap();
+    (parent, run)
+}
+
+fn episode(env_steps: u64) -> EpisodeReport {
+    EpisodeReport {
+        actor: 1,
+        environment: 0,
+        steps: 200,
+        terminated: 0,
+        episode_return: -1234.5,
+        policy_version: 7,
+        env_steps,
+    }
+}
+
+fn evaluation(env_steps: u64, return_mean: f64) -> EvaluationReport {
+    EvaluationReport {
+        policy_version: 9,
+        env_steps,
+        updates: 1_000,
+        return_mean,
+        return_std: 90.0,
+        episodes: 10,
+        best: 1,
+    }
+}
+
+fn learner(env_steps: u64, updates: u64, averaged: u64) -> LearnerReport {
+    let policy_version = updates / 10;
+    LearnerReport {
+        env_steps,
+        updates,
+        policy_version,
+        critic_loss: 0.5,
+        actor_loss: 20.0,
+        q_mean: -20.0,
+        averaged,
+    }
+}
+
+fn seconds(n: f64) -> Duration {
+    Duration::from_secs_f64(n)
+}
+
+fn text(path: &Path) -> String {
+    std::fs::read_to_string(path).unwrap()
+}
+
+#[test]
+fn every_report_is_a_row() {
+    let (_parent, run) = run();
+    let mut recorder = Recorder::open(&run, 1_000).unwrap();
+    recorder.episode(&episode(200), seconds(0.25)).unwrap();
+    recorder
+        .evaluation(&evaluation(2_000, -1_500.25), seconds(1.0))
+        .unwrap();
+    recorder.learner(&learner(1_000, 0, 0), seconds(1.5)).unwrap();
+    recorder.learner(&learner(2_000, 500, 500), seconds(2.0)).unwrap();
+
+    assert_eq!(
+        text(&run.episodes()),
+        "wall_seconds,env_steps,actor,environment,steps,terminated,return,policy_version\n\
+         0.25,200,1,0,200,0,-1234.5,7\n"
+    );
+    assert_eq!(
+        text(&run.evaluations()),
+        "wall_seconds,env_steps,updates,policy_version,return_mean,return_std,episodes,best\n\
+         1.0,2000,1000,9,-1500.25,90.0,10,1\n"
+    );
+    assert_eq!(
+        text(&run.learner_log()),
+        "wall_seconds,env_steps,updates,policy_version,critic_loss,actor_loss,q_mean,updates_per_second,\
+         env_steps_per_second,ratio\n\
+         1.5,1000,0,0,,,,,,\n\
+         2.0,2000,500,50,0.5,20.0,-20.0,1000.0,2000.0,0.5\n"
+    );
+    let events = std::fs::read_dir(run.tensorboard()).unwrap().next().unwrap().unwrap();
+    assert!(events.metadata().unwrap().len() > 200);
+}
+
+#[test]
+fn a_resumed_run_goes_on_in_the_same_tables() {
+    let (_parent, run) = run();
+    for session in 0..3 {
+        let mut recorder = Recorder::open(&run, 0).unwrap();
+        recorder
+            .evaluation(&evaluation(1_000 * session, -100.0), seconds(1.0))
+            .unwrap();
+        recorder
+            .learner(&learner(1_000 * session, 10, 1), seconds(10.0))
+            .unwrap();
+    }
+    let evaluations = read_evaluations(&run.evaluations()).unwrap();
+    assert_eq!(
+        evaluations.iter().map(|e| e.env_steps).collect::<Vec<_>>(),
+        [0, 1_000, 2_000]
+    );
+    assert_eq!(
+        evaluations.iter().map(|e| e.wall_seconds).collect::<Vec<_>>(),
+        [1.0, 11.0, 21.0]
+    );
+    assert_eq!(
+        text(&run.evaluations()).matches("wall_seconds").count(),
+        1,
+        "one header"
+    );
+    assert_eq!(std::fs::read_dir(run.tensorboard()).unwrap().count(), 3);
+}
+
+#[test]
+fn a_line_cut_short_by_a_crash_is_not_continued() {
+    let (_parent, run) = run();
+    let mut recorder = Recorder::open(&run, 0).unwrap();
+    recorder.evaluation(&evaluation(1_000, -100.0), seconds(1.0)).unwrap();
+    drop(recorder);
+    let mut file = std::fs::OpenOptions::new()
+        .append(true)
+        .open(run.evaluations())
+        .unwrap();
+    file.write_all(b"2.0,2000,10").unwrap();
+    assert_eq!(read_evaluations(&run.evaluations()).unwrap().len(), 1);
+    let mut recorder = Recorder::open(&run, 0).unwrap();
+    recorder.evaluation(&evaluation(3_000, -90.0), seconds(3.0)).unwrap();
+    let evaluations = read_evaluations(&run.evaluations()).unwrap();
+    assert_eq!(
+        evaluations.iter().map(|e| e.env_steps).collect::<Vec<_>>(),
+        [1_000, 3_000]
+    );
+}
+
+#[test]
+fn a_restarted_learner_has_no_rate_rather_than_a_wrong_one() {
+    let (_parent, run) = run();
+    let mut recorder = Recorder::open(&run, 0).unwrap();
+    recorder.learner(&learner(2_000, 500, 1), seconds(1.0)).unwrap();
+    recorder.learner(&learner(2_500, 400, 1), seconds(2.0)).unwrap();
+    let rows: Vec<Learner> = table::rows(&run.learner_log()).unwrap();
+    assert_eq!(
+        (rows[1].updates_per_second, rows[1].env_steps_per_second),
+        (None, Some(500.0))
+    );
+}
+
+#[test]
+fn a_foreign_file_and_a_full_disk_are_errors_in_one_line() {
+    let (_parent, run) = run();
+    std::fs::write(run.evaluations(), "a,b\n1,2\n").unwrap();
+    let message = Recorder::open(&run, 0).unwrap_err().to_string();
+    assert!(
+        message.contains("its columns are a, b, not wall_seconds") && !message.contains('\n'),
+        "{message}"
+    );
+    assert_eq!(text(&run.evaluations()), "a,b\n1,2\n", "left as it was");
+
+    let full = std::fs::OpenOptions::new().write(true).open("/dev/full").unwrap();
+    let mut full = Table::onto(Path::new("/dev/full"), full, true);
+    let error = full
+        .write(&Evaluation::default())
+        .and_then(|()| full.flush())
+        .unwrap_err();
+    assert!(
+        error.to_string().starts_with("cannot write /dev/full: No space left"),
+        "{error}"
+    );
+}
+
+#[test]
+fn no_evaluations_yet_is_no_error() {
+    let (_parent, run) = run();
+    assert_eq!(read_evaluations(&run.evaluations()).unwrap(), []);
+    Recorder::open(&run, 0).unwrap();
+    assert_eq!(read_evaluations(&run.evaluations()).unwrap(), []);
+}

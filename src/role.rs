@@ -1,0 +1,151 @@
+//! One role of a run, in a process of its own: the run directory says everything, this hands each role its part of it.
+
+use anyhow::Context;
+use shoal_actor::{evaluator, explorer};
+use shoal_common::channel::environment::EnvironmentPort;
+use shoal_common::channel::{Domain, Place, Pulse};
+use shoal_common::config::{Config, Mode};
+use shoal_common::report::{Identity, Role};
+use shoal_common::run_dir::RunDir;
+use shoal_common::stop::Stop;
+use shoal_env_server::vector::VectorEnvironment;
+use shoal_learner::ddpg::DdpgSettings;
+use shoal_learner::learner;
+use shoal_learner::ratio::Ratio;
+
+use crate::cli::RoleArgs;
+
+/// Runs a role until it is through, or its standard input closes.
+pub(crate) fn run(role: Role, args: &RoleArgs) -> anyhow::Result<()> {
+    // What is logged goes to the launcher, which may be gone already: then it is lost, and no reason to fail.
+    tracing_subscriber::fmt()
+        .with_writer(std::io::stderr)
+        .with_ansi(false)
+        .with_target(false)
+        .log_internal_errors(false)
+        .init();
+    iceoryx2::prelude::set_log_level(iceoryx2::prelude::LogLevel::Fatal);
+
+    let stop = Stop::when_stdin_closes().context("cannot watch standard input")?;
+    let run = RunDir::open(&args.run)?;
+    let config = run.config()?;
+    let domain = Domain::join(&config.run.id, config.actors.max)?;
+    let identity = Identity {
+        role,
+        index: args.index,
+        incarnation: args.incarnation,
+    };
+    match role {
+        Role::EnvServer => serve(&domain, &config, identity, &stop),
+        Role::Actor => Ok(explorer::explore(
+            &domain,
+            &explorer_settings(&config, &run, identity),
+            &stop,
+        )?),
+        Role::Evaluator => Ok(evaluator::evaluate(
+            &domain,
+            &evaluator_settings(&config, &run, identity),
+            &stop,
+        )?),
+        Role::Learner => Ok(learner::learn(
+            &domain,
+            &learner_settings(&config, &run, identity),
+            &stop,
+        )?),
+    }
+}
+
+fn serve(domain: &Domain, config: &Config, identity: Identity, stop: &Stop) -> anyhow::Result<()> {
+    let Identity { index, incarnation, .. } = identity;
+    let (client, envs) = if index == config.evaluation_server() {
+        (Place(Role::Evaluator, 0), config.evaluation_envs())
+    } else {
+        (Place(Role::Actor, index), config.actors.envs)
+    };
+    // In lockstep nothing may depend on how often a process was started.
+    let stream = if config.run.mode == Mode::Lockstep {
+        0
+    } else {
+        incarnation
+    };
+    let environment = &config.environment;
+    let mut environments = VectorEnvironment::new(
+        &environment.name,
+        &environment.parameters,
+        envs,
+        config.run.seed,
+        index.into(),
+        stream,
+    )?;
+    let port = EnvironmentPort::open(domain, index, environments.spec().clone(), environments.count(), client)?;
+    let pulse = Pulse::new(domain, identity)?;
+    Ok(shoal_env_server::server::serve(
+        &mut environments,
+        &port,
+        config.run.seed,
+        pulse,
+        stop,
+    )?)
+}
+
+pub(crate) fn explorer_settings(config: &Config, run: &RunDir, identity: Identity) -> explorer::Settings {
+    explorer::Settings {
+        identity,
+        seed: config.run.seed,
+        mode: config.run.mode,
+        spec: config.spec.clone(),
+        envs: config.actors.envs as usize,
+        chunk_rows: config.chunk_rows(),
+        window: config.actors.window,
+        exploration: config.exploration.clone(),
+        hidden: config.ddpg.hidden,
+        gamma: config.ddpg.gamma,
+        replay: run.replay_file(),
+    }
+}
+
+fn evaluator_settings(config: &Config, run: &RunDir, identity: Identity) -> evaluator::Settings {
+    evaluator::Settings {
+        identity,
+        spec: config.spec.clone(),
+        server: config.evaluation_server(),
+        envs: config.evaluation_envs() as usize,
+        evaluation: config.evaluation.clone(),
+        hidden: config.ddpg.hidden,
+        best: run.best_policy(),
+    }
+}
+
+pub(crate) fn learner_settings(config: &Config, run: &RunDir, identity: Identity) -> learner::Settings {
+    let ddpg = &config.ddpg;
+    learner::Settings {
+        identity,
+        seed: config.run.seed,
+        mode: config.run.mode,
+        steps: config.run.steps,
+        actors: config.actors.count,
+        max_actors: config.actors.max,
+        window: config.actors.window,
+        chunk_rows: config.chunk_rows(),
+        spec: config.spec.clone(),
+        ddpg: DdpgSettings {
+            tau: ddpg.tau,
+            actor_learning_rate: ddpg.actor_learning_rate,
+            critic_learning_rate: ddpg.critic_learning_rate,
+            hidden: ddpg.hidden,
+            batch: ddpg.batch,
+        },
+        ratio: Ratio {
+            warmup: config.replay.warmup,
+            updates_per_step: config.replay.updates_per_step,
+            tolerance: config.replay.tolerance,
+        },
+        capacity: config.replay.capacity,
+        evaluation: config.evaluation.clone(),
+        checkpoint: config.checkpoint.clone(),
+        fingerprint: config.fingerprint(),
+        replay: run.replay_file(),
+        checkpoints: run.checkpoints(),
+        last_policy: run.last_policy(),
+    }
+}

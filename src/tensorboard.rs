@@ -1,0 +1,193 @@
+//! TensorBoard event files, scalars only. Written here because the crates for it need `protoc` or bring old image crates.
+
+use std::fs::File;
+use std::io::{self, BufWriter, Write};
+use std::path::Path;
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use prost::Message;
+
+/// The part of TensorFlow's `event.proto` that scalars need.
+#[derive(Clone, PartialEq, Message)]
+struct Event {
+    /// Seconds since 1970.
+    #[prost(double, tag = "1")]
+    wall_time: f64,
+    #[prost(int64, tag = "2")]
+    step: i64,
+    #[prost(string, optional, tag = "3")]
+    file_version: Option<String>,
+    #[prost(message, optional, tag = "5")]
+    summary: Option<Summary>,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct Summary {
+    #[prost(message, repeated, tag = "1")]
+    value: Vec<Value>,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct Value {
+    #[prost(string, tag = "1")]
+    tag: String,
+    /// Optional, so that a zero is written too.
+    #[prost(float, optional, tag = "2")]
+    simple_value: Option<f32>,
+}
+
+/// An event file of this process.
+#[derive(Debug)]
+pub(crate) struct EventFile {
+    file: BufWriter<File>,
+}
+
+impl EventFile {
+    /// Begins a new file in `directory`, which is made if need be. TensorBoard reads all files there as one run.
+    pub(crate) fn create(directory: &Path) -> io::Result<Self> {
+        std::fs::create_dir_all(directory)?;
+        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+        // TensorBoard takes the files in the order of their names.
+        let name = format!(
+            "events.out.tfevents.{:010}.{:09}.{}",
+            now.as_secs(),
+            now.subsec_nanos(),
+            std::process::id()
+        );
+        let mut events = Self {
+            file: BufWriter::new(File::create_new(directory.join(name))?),
+        };
+        events.write(&Event {
+            file_version: Some("brain.Event:2".into()),
+            ..Event::default()
+        })?;
+        Ok(events)
+    }
+
+    /// Writes the value of each tag at an environment step. Values that are not finite are left out.
+    pub(crate) fn scalars(&mut self, step: u64, scalars: &[(&str, f64)]) -> io::Result<()> {
+        let finite = scalars.iter().filter(|(_, value)| value.is_finite());
+        let value = finite.map(|(tag, value)| Value {
+            tag: (*tag).into(),
+            simple_value: Some(*value as f32),
+        });
+        let summary = Some(Summary { value: value.collect() });
+        self.write(&Event {
+            step: step as i64,
+            summary,
+            ..Event::default()
+        })
+    }
+
+    /// Hands what was written to the system.
+    pub(crate) fn flush(&mut self) -> io::Result<()> {
+        self.file.flush()
+    }
+
+    fn write(&mut self, event: &Event) -> io::Result<()> {
+        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+        let data = Event {
+            wall_time: now.as_secs_f64(),
+            ..event.clone()
+        }
+        .encode_to_vec();
+        let length = (data.len() as u64).to_le_bytes();
+        // One write, so that a record is in the buffer as a whole or not at all.
+        let parts = [
+            &length[..],
+            &masked_crc(&length).to_le_bytes(),
+            &data,
+            &masked_crc(&data).to_le_bytes(),
+        ];
+        self.file.write_all(&parts.concat())
+    }
+}
+
+/// The checksum of TensorFlow's record files: CRC-32C, rotated and shifted so that a CRC of data with CRCs in it stays good.
+fn masked_crc(data: &[u8]) -> u32 {
+    crc32c::crc32c(data).rotate_right(15).wrapping_add(0xa282_ead8)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn read_back(directory: &Path) -> Vec<Event> {
+        let file = std::fs::read_dir(directory).unwrap().next().unwrap().unwrap().path();
+        let bytes = std::fs::read(file).unwrap();
+        let mut rest = &bytes[..];
+        let mut events = Vec::new();
+        let mut take = |n: usize| {
+            let (taken, left) = rest.split_at(n);
+            rest = left;
+            (taken, left.is_empty())
+        };
+        loop {
+            let (length, _) = take(8);
+            assert_eq!(take(4).0, masked_crc(length).to_le_bytes(), "checksum of the length");
+            let (data, _) = take(u64::from_le_bytes(length.try_into().unwrap()) as usize);
+            let (crc, end) = take(4);
+            assert_eq!(crc, masked_crc(data).to_le_bytes(), "checksum of the data");
+            events.push(Event::decode(data).unwrap());
+            if end {
+                return events;
+            }
+        }
+    }
+
+    #[test]
+    fn scalars_read_back_with_good_checksums() {
+        let dir = tempfile::tempdir().unwrap();
+        let mut events = EventFile::create(&dir.path().join("tensorboard")).unwrap();
+        events.scalars(0, &[("episode/return", 0.0)]).unwrap();
+        let loss = [
+            ("learner/critic_loss", 1.5),
+            ("learner/actor_loss", f64::NAN),
+            ("learner/ratio", 1.0),
+        ];
+        events.scalars(120_000, &loss).unwrap();
+        events.flush().unwrap();
+
+        let events = read_back(&dir.path().join("tensorboard"));
+        assert_eq!(events.len(), 3);
+        assert_eq!(events[0].file_version.as_deref(), Some("brain.Event:2"));
+        let values = |event: &Event| {
+            let values = event.summary.clone().unwrap().value;
+            values
+                .into_iter()
+                .map(|v| (v.tag, v.simple_value.unwrap()))
+                .collect::<Vec<_>>()
+        };
+        assert_eq!(
+            values(&events[1]),
+            [("episode/return".into(), 0.0)],
+            "a zero is a value too"
+        );
+        assert_eq!(events[2].step, 120_000);
+        assert_eq!(
+            values(&events[2]),
+            [("learner/critic_loss".into(), 1.5), ("learner/ratio".into(), 1.0)]
+        );
+        assert!(events.iter().all(|event| event.wall_time > 1.7e9));
+    }
+
+    #[test]
+    fn the_checksum_is_tensorflows() {
+        // CRC-32C of "123456789" is 0xe3069283 (RFC 3720's polynomial); masked as in tsl/lib/hash/crc32c.h.
+        assert_eq!(crc32c::crc32c(b"123456789"), 0xe306_9283);
+        let crc = 0xe306_9283_u32;
+        assert_eq!(
+            masked_crc(b"123456789"),
+            (crc >> 15 | crc << 17).wrapping_add(0xa282_ead8)
+        );
+    }
+
+    #[test]
+    fn every_start_of_a_run_has_its_own_file() {
+        let dir = tempfile::tempdir().unwrap();
+        for _ in 0..3 {
+            EventFile::create(dir.path()).unwrap();
+        }
+        assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 3);
+    }
+}
