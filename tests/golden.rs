@@ -1,0 +1,380 @@
+//! Replays data recorded from Gymnasium and PyTorch: every file of `tests/golden`, or of the directory that
+//! `SHOAL_GOLDEN_DIR` names.
+
+use std::path::{Path, PathBuf};
+
+use serde_json::Value;
+use shoal_common::{
+    network::NetworkLayout,
+    space::{EnvironmentSpec, Space},
+    stream::{Purpose, stream},
+    transition::{RowLayout, Transition},
+};
+use shoal_env_server::environment::{
+    Environment,
+    cart_pole::{self, CartPole},
+    frozen_lake,
+    pendulum::{self, Pendulum},
+};
+use shoal_learner::{
+    ddpg::{Ddpg, DdpgSettings, DdpgState},
+    minibatch::Minibatch,
+};
+
+/// Greatest difference of a number from the recorded one.
+const TOLERANCE: f64 = 1e-5;
+
+/// Why a file does not agree.
+type Failure = String;
+
+#[test]
+fn golden_files_agree() {
+    let directory = match std::env::var_os("SHOAL_GOLDEN_DIR") {
+        Some(directory) => PathBuf::from(directory),
+        None => Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden"),
+    };
+    let failures = check_directory(&directory);
+    assert!(failures.is_empty(), "{}", failures.join("\n"));
+}
+
+#[test]
+fn golden_directory_must_hold_files() {
+    let missing = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden/no such directory");
+    assert_eq!(check_directory(&missing).len(), 1);
+    let empty = Path::new(env!("CARGO_TARGET_TMPDIR")).join("golden-empty");
+    std::fs::create_dir_all(&empty).unwrap();
+    assert_eq!(check_directory(&empty).len(), 1);
+}
+
+#[test]
+fn golden_files_of_unknown_kind_or_wrong_content_fail() {
+    for text in [
+        "",
+        "[]",
+        "{}",
+        r#"{"env": "tetris"}"#,
+        r#"{"env": "pendulum"}"#,
+        r#"{"weights": []}"#,
+    ] {
+        assert!(check_text(text).is_err(), "{text}");
+    }
+    let rollout = |reward: &str, observation: &str| {
+        let observations = format!(r#""observations": [[{observation}]]"#);
+        let rest = format!(r#""actions": [[0.0]], "rewards": [{reward}], "terminated": [false]"#);
+        check_text(&format!(
+            r#"{{"env": "pendulum", "initial_state": [0.0, 0.0], {observations}, {rest}}}"#
+        ))
+    };
+    assert_eq!(rollout("0.0", "1.0, 0.0, 0.0"), Ok(()));
+    assert!(rollout("0.1", "1.0, 0.0, 0.0").is_err(), "wrong reward");
+    assert!(rollout("0.0", "1.0, 0.0, 0.1").is_err(), "wrong observation");
+    assert!(rollout("0.0", "1.0, 0.0").is_err(), "short observation");
+    assert!(rollout("0.0, 0.0", "1.0, 0.0, 0.0").is_err(), "more rewards than steps");
+}
+
+/// One line for each file that does not agree, or one for a directory without files.
+fn check_directory(directory: &Path) -> Vec<Failure> {
+    let entries: Vec<_> = std::fs::read_dir(directory).into_iter().flatten().flatten().collect();
+    if entries.is_empty() {
+        return vec![format!("{} holds no golden files", directory.display())];
+    }
+    let check = |path: PathBuf| {
+        let text = std::fs::read_to_string(&path).map_err(|e| e.to_string());
+        let failure = text.and_then(|text| check_text(&text)).err()?;
+        Some(format!("{}: {failure}", path.display()))
+    };
+    entries.into_iter().filter_map(|entry| check(entry.path())).collect()
+}
+
+/// Tells the kind of a file by its content and checks it.
+fn check_text(text: &str) -> Result<(), Failure> {
+    let file: Value = serde_json::from_str(text).map_err(|e| e.to_string())?;
+    match file.get("env").and_then(Value::as_str) {
+        Some("pendulum") => {
+            let pendulum = Pendulum::new(pendulum::Parameters::default()).map_err(|e| e.to_string())?;
+            rollout(&Rollout::read(&file)?, pendulum, |pendulum| {
+                Some(pendulum.state().to_vec())
+            })
+        }
+        Some("cart_pole") => {
+            let cart_pole = CartPole::new(cart_pole::Parameters::default()).map_err(|e| e.to_string())?;
+            rollout(&Rollout::read(&file)?, cart_pole, |_| None)
+        }
+        Some("frozen_lake") => frozen_lake(&file),
+        None if file.get("hidden").is_some() && file.get("batches").is_some() => ddpg_update(&file),
+        kind => Err(format!("a file of unknown kind: env is {kind:?}")),
+    }
+}
+
+/// The element `key` of a file, by one of the readers below.
+fn read<T>(file: &Value, key: &str, reader: fn(Value) -> serde_json::Result<T>) -> Result<T, Failure> {
+    reader(file[key].clone()).map_err(|e| format!("{key}: {e}"))
+}
+
+const NUMBERS: fn(Value) -> serde_json::Result<Vec<f64>> = serde_json::from_value;
+const ROWS: fn(Value) -> serde_json::Result<Vec<Vec<f64>>> = serde_json::from_value;
+const VALUES: fn(Value) -> serde_json::Result<Vec<Value>> = serde_json::from_value;
+const FLAGS: fn(Value) -> serde_json::Result<Vec<bool>> = serde_json::from_value;
+
+/// An episode recorded from Gymnasium; element i of each list belongs to step i.
+struct Rollout {
+    initial_state: Vec<f64>,
+    actions: Vec<Vec<f64>>,
+    observations: Vec<Vec<f64>>,
+    rewards: Vec<f64>,
+    terminated: Vec<bool>,
+    states: Option<Vec<Vec<f64>>>,
+}
+
+impl Rollout {
+    fn read(file: &Value) -> Result<Self, Failure> {
+        Ok(Self {
+            initial_state: read(file, "initial_state", NUMBERS)?,
+            actions: read(file, "actions", ROWS)?,
+            observations: read(file, "observations", ROWS)?,
+            rewards: read(file, "rewards", NUMBERS)?,
+            terminated: read(file, "terminated", FLAGS)?,
+            states: file.get("states").map(|_| read(file, "states", ROWS)).transpose()?,
+        })
+    }
+}
+
+fn rollout<E: Environment>(
+    recorded: &Rollout,
+    mut environment: E,
+    state: impl Fn(&E) -> Option<Vec<f64>>,
+) -> Result<(), Failure> {
+    let Rollout {
+        initial_state,
+        actions,
+        observations,
+        rewards,
+        terminated,
+        states,
+    } = recorded;
+    let steps = actions.len();
+    let lengths = [
+        observations.len(),
+        rewards.len(),
+        terminated.len(),
+        states.as_ref().map_or(steps, Vec::len),
+    ];
+    if steps == 0 || lengths != [steps; 4] {
+        return Err(format!("{steps} actions, but other lists of lengths {lengths:?}"));
+    }
+    let spec = environment.spec();
+    let mut rng = stream(0, Purpose::Environment, 0, 0);
+    let mut observation = vec![0.0; spec.observation.width()];
+    environment.reset_to(initial_state).map_err(|e| e.to_string())?;
+    for (i, action) in actions.iter().enumerate() {
+        if action.len() != spec.action.width() {
+            return Err(format!("step {i}: {} numbers of action", action.len()));
+        }
+        let step = environment.step(action, &mut rng);
+        environment.observe(&mut observation);
+        let observed: Vec<f64> = observation.iter().map(|x| f64::from(*x)).collect();
+        close(&observed, &observations[i]).map_err(|e| format!("step {i}: observation {e}"))?;
+        close(&[step.reward], &rewards[i..=i]).map_err(|e| format!("step {i}: reward {e}"))?;
+        if step.terminated != terminated[i] {
+            return Err(format!(
+                "step {i}: terminated {}, recorded {}",
+                step.terminated, terminated[i]
+            ));
+        }
+        if let (Some(states), Some(state)) = (states, state(&environment)) {
+            close(&state, &states[i]).map_err(|e| format!("step {i}: state {e}"))?;
+        }
+    }
+    Ok(())
+}
+
+/// Agreement of all numbers within `TOLERANCE`; a NaN agrees with nothing.
+fn close(ours: &[f64], recorded: &[f64]) -> Result<(), Failure> {
+    let agree = ours.len() == recorded.len() && ours.iter().zip(recorded).all(|(a, b)| (a - b).abs() <= TOLERANCE);
+    if agree {
+        Ok(())
+    } else {
+        Err(format!("{ours:?}, recorded {recorded:?}"))
+    }
+}
+
+/// Gymnasium's transition table, `transitions[state][action]`, and the optimal action values at γ = 0.999.
+fn frozen_lake(file: &Value) -> Result<(), Failure> {
+    const TABLE: fn(Value) -> serde_json::Result<Vec<Vec<Vec<Value>>>> = serde_json::from_value;
+    let recorded = read(file, "transitions", TABLE)?;
+    let shape: Vec<_> = recorded.iter().map(Vec::len).collect();
+    if shape != [frozen_lake::ACTIONS; frozen_lake::STATES] {
+        return Err(format!("transitions of {shape:?} actions"));
+    }
+    for (state, actions) in recorded.iter().enumerate() {
+        for (action, recorded) in actions.iter().enumerate() {
+            let ours: Vec<_> = frozen_lake::transitions(state, action).collect();
+            if ours.len() != recorded.len() || !ours.iter().zip(recorded).all(|(a, b)| same_outcome(a, b)) {
+                return Err(format!(
+                    "action {action} in state {state}: {ours:?}, recorded {recorded:?}"
+                ));
+            }
+        }
+    }
+    let recorded = read(file, "q_star_gamma_0_999", ROWS)?;
+    let q_star = value_iteration(0.999);
+    if recorded.len() != q_star.len() {
+        return Err(format!("action values of {} states", recorded.len()));
+    }
+    for (state, (ours, recorded)) in q_star.iter().zip(&recorded).enumerate() {
+        close(ours, recorded).map_err(|e| format!("action values of state {state}: {e}"))?;
+    }
+    Ok(())
+}
+
+fn same_outcome(ours: &frozen_lake::Outcome, recorded: &Value) -> bool {
+    recorded["p"].as_f64().is_some_and(|p| (p - ours.p).abs() <= 1e-9)
+        && recorded["next"].as_u64() == Some(ours.next as u64)
+        && recorded["reward"].as_f64() == Some(ours.reward)
+        && recorded["terminated"].as_bool() == Some(ours.terminated)
+}
+
+/// The lake's optimal action values: Bellman's optimality equation, iterated until nothing changes by 1e-12.
+fn value_iteration(gamma: f64) -> [[f64; frozen_lake::ACTIONS]; frozen_lake::STATES] {
+    let mut q = [[0.0; frozen_lake::ACTIONS]; frozen_lake::STATES];
+    loop {
+        let v = q.map(|values| values.into_iter().fold(f64::NEG_INFINITY, f64::max));
+        let backup = |o: frozen_lake::Outcome| o.p * (o.reward + if o.terminated { 0.0 } else { gamma * v[o.next] });
+        let mut change: f64 = 0.0;
+        for (state, values) in q.iter_mut().enumerate() {
+            for (action, value) in values.iter_mut().enumerate() {
+                let next: f64 = frozen_lake::transitions(state, action).map(backup).sum();
+                change = change.max((next - *value).abs());
+                *value = next;
+            }
+        }
+        if change < 1e-12 {
+            return q;
+        }
+    }
+}
+
+/// Four DDPG updates by PyTorch's autograd and Adam: `initial` networks, `batches`, and the `expected` networks after each.
+fn ddpg_update(file: &Value) -> Result<(), Failure> {
+    if file["adam"] != serde_json::json!({"beta1": 0.9, "beta2": 0.999, "eps": 1e-8}) {
+        return Err(format!("Adam's constants are not the learner's: {}", file["adam"]));
+    }
+    let layout = RowLayout::new(
+        read(file, "obs_dim", serde_json::from_value)?,
+        read(file, "act_dim", serde_json::from_value)?,
+    );
+    let spec = EnvironmentSpec {
+        observation: Space::boxed(&vec![(f32::NEG_INFINITY, f32::INFINITY); layout.observation_width()]),
+        action: Space::Box {
+            low: read(file, "action_low", serde_json::from_value)?,
+            high: read(file, "action_high", serde_json::from_value)?,
+        },
+        time_limit: 1,
+    };
+    let gamma = read(file, "gamma", serde_json::from_value)?;
+    let batches = read(file, "batches", VALUES)?;
+    let batches: Vec<_> = batches
+        .iter()
+        .map(|batch| minibatch(batch, layout, gamma))
+        .collect::<Result<_, _>>()?;
+    let expected = read(file, "expected", VALUES)?;
+    if batches.is_empty() || expected.len() != batches.len() {
+        return Err(format!(
+            "{} batches, {} expected results",
+            batches.len(),
+            expected.len()
+        ));
+    }
+    let settings = DdpgSettings {
+        tau: read(file, "tau", serde_json::from_value)?,
+        actor_learning_rate: read(file, "actor_lr", serde_json::from_value)?,
+        critic_learning_rate: read(file, "critic_lr", serde_json::from_value)?,
+        hidden: read(file, "hidden", serde_json::from_value)?,
+        batch: batches[0].size(),
+    };
+    let mut ddpg = Ddpg::new(&spec, &settings, 0).map_err(|e| e.to_string())?;
+    let initial = networks(&file["initial"], &ddpg)?;
+    ddpg.restart_from(initial.each_ref().map(Vec::as_slice))
+        .map_err(|e| e.to_string())?;
+
+    for (i, (batch, expected)) in batches.iter().zip(&expected).enumerate() {
+        let losses = ddpg.update(batch);
+        for (name, ours) in [("critic_loss", losses.critic_loss), ("actor_loss", losses.actor_loss)] {
+            let recorded = read(expected, name, serde_json::from_value)?;
+            close(&[ours.into()], &[recorded]).map_err(|e| format!("update {i}: {name} {e}"))?;
+        }
+        let recorded = networks(expected, &ddpg)?;
+        for ((name, ours), recorded) in DdpgState::PARTS.into_iter().zip(ddpg.state().parts).zip(&recorded) {
+            for (at, (a, b)) in ours.iter().zip(recorded).enumerate() {
+                close(&[f64::from(*a)], &[f64::from(*b)])
+                    .map_err(|e| format!("update {i}: {name}, parameter {at} {e}"))?;
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Actor, critic, target actor and target critic as the learner lays them out.
+fn networks(recorded: &Value, ddpg: &Ddpg) -> Result<[Vec<f32>; 4], Failure> {
+    let (mu, q) = (ddpg.policy_layout(), ddpg.critic_layout());
+    let network = |name: &str, layout| flat(&recorded[name], layout).map_err(|e| format!("{name}: {e}"));
+    Ok([
+        network("actor", mu)?,
+        network("critic", q)?,
+        network("target_actor", mu)?,
+        network("target_critic", q)?,
+    ])
+}
+
+/// A recorded network's parameters in the learner's order. Its weights are lists of rows, one an output.
+fn flat(network: &Value, layout: &NetworkLayout) -> Result<Vec<f32>, Failure> {
+    let mut parameters = Vec::with_capacity(layout.parameters());
+    for ((inputs, outputs), [w, b]) in layout
+        .layer_sizes()
+        .into_iter()
+        .zip([["w1", "b1"], ["w2", "b2"], ["w3", "b3"]])
+    {
+        let weights: Vec<Vec<f32>> = read(network, w, serde_json::from_value)?;
+        let biases: Vec<f32> = read(network, b, serde_json::from_value)?;
+        if weights.len() != outputs || biases.len() != outputs || weights.iter().any(|row| row.len() != inputs) {
+            return Err(format!("{w} and {b} are not {outputs} × {inputs}"));
+        }
+        parameters.extend((0..inputs).flat_map(|column| weights.iter().map(move |row| row[column])));
+        parameters.extend(biases);
+    }
+    Ok(parameters)
+}
+
+fn minibatch(batch: &Value, layout: RowLayout, gamma: f32) -> Result<Minibatch, Failure> {
+    let [s, a, s_next]: [Vec<Vec<f32>>; 3] = [
+        read(batch, "s", serde_json::from_value)?,
+        read(batch, "a", serde_json::from_value)?,
+        read(batch, "s2", serde_json::from_value)?,
+    ];
+    let r: Vec<f32> = read(batch, "r", serde_json::from_value)?;
+    let terminated = read(batch, "terminated", FLAGS)?;
+    let fits = |rows: &[Vec<f32>], width| rows.len() == r.len() && rows.iter().all(|row| row.len() == width);
+    let (observation, action) = (layout.observation_width(), layout.action_width());
+    if !(fits(&s, observation) && fits(&a, action) && fits(&s_next, observation)) || terminated.len() != r.len() {
+        return Err(format!(
+            "a batch is not {} transitions of {observation} and {action} numbers",
+            r.len()
+        ));
+    }
+    let mut minibatch = Minibatch::new(layout, r.len());
+    for i in 0..r.len() {
+        let (last, discount) = (terminated[i], if terminated[i] { 0.0 } else { gamma });
+        minibatch.set(
+            i,
+            &Transition {
+                s: &s[i],
+                a: &a[i],
+                r: r[i],
+                discount,
+                s_next: &s_next[i],
+                last,
+            },
+        );
+    }
+    Ok(minibatch)
+}
