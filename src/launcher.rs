@@ -55,7 +55,7 @@ pub(crate) fn run(config: &Config, run: &RunDir, quiet: bool) -> anyhow::Result<
     let domain = Domain::join(&config.run.id, config.actors.max)?;
     let outcome = Launcher::new(config, run, &domain, signals, quiet, lock).and_then(Launcher::run);
     // Even where something failed: no role is left by now.
-    let left = domain.leave_last();
+    let left = domain.leave();
     let outcome = outcome?;
     left?;
     Ok(outcome)

@@ -35,23 +35,18 @@ pub(crate) fn run(role: Role, args: &RoleArgs) -> anyhow::Result<()> {
         index: args.index,
         incarnation: args.incarnation,
     };
-    match role {
-        Role::EnvServer => serve(&domain, &config, identity, &stop),
-        Role::Actor => Ok(explorer::explore(
-            &domain,
-            &explorer_settings(&config, &run, identity),
-            &stop,
-        )?),
-        Role::Evaluator => Ok(evaluator::evaluate(
-            &domain,
-            &evaluator_settings(&config, &run, identity),
-            &stop,
-        )?),
-        Role::Learner => Ok(learner::learn(
-            &domain,
-            &learner_settings(&config, &run, identity),
-            &stop,
-        )?),
+    let ended = work(&domain, &config, &run, identity, &stop);
+    let left = domain.leave();
+    ended?;
+    Ok(left?)
+}
+
+fn work(domain: &Domain, config: &Config, run: &RunDir, identity: Identity, stop: &Stop) -> anyhow::Result<()> {
+    match identity.role {
+        Role::EnvServer => serve(domain, config, identity, stop),
+        Role::Actor => Ok(explorer::explore(domain, &explorer_settings(config, run, identity), stop)?),
+        Role::Evaluator => Ok(evaluator::evaluate(domain, &evaluator_settings(config, run, identity), stop)?),
+        Role::Learner => Ok(learner::learn(domain, &learner_settings(config, run, identity), stop)?),
     }
 }
 
@@ -88,7 +83,7 @@ fn serve(domain: &Domain, config: &Config, identity: Identity, stop: &Stop) -> a
     )?)
 }
 
-pub(crate) fn explorer_settings(config: &Config, run: &RunDir, identity: Identity) -> explorer::Settings {
+fn explorer_settings(config: &Config, run: &RunDir, identity: Identity) -> explorer::Settings {
     explorer::Settings {
         identity,
         seed: config.run.seed,
@@ -116,7 +111,7 @@ fn evaluator_settings(config: &Config, run: &RunDir, identity: Identity) -> eval
     }
 }
 
-pub(crate) fn learner_settings(config: &Config, run: &RunDir, identity: Identity) -> learner::Settings {
+fn learner_settings(config: &Config, run: &RunDir, identity: Identity) -> learner::Settings {
     let ddpg = &config.ddpg;
     learner::Settings {
         identity,

@@ -62,7 +62,7 @@ impl<'a> Rollout<'a> {
     }
 
     /// Runs an episode that starts in a physical state of the environment.
-    pub(crate) fn from_state(&mut self, state: &[f64]) -> anyhow::Result<Trajectory> {
+    pub(crate) fn episode_from(&mut self, state: &[f64]) -> anyhow::Result<Trajectory> {
         self.episode(Start::States(state))
     }
 
@@ -139,7 +139,7 @@ pub(crate) mod tests {
     fn an_episode_ends_with_its_time_limit() {
         let (config, parameters) = small("name = \"pendulum\"\ntime_limit = 30");
         let mut rollout = Rollout::new(&config, &parameters).unwrap();
-        let hanging = rollout.from_state(&[std::f64::consts::PI, 0.0]).unwrap();
+        let hanging = rollout.episode_from(&[std::f64::consts::PI, 0.0]).unwrap();
         assert_eq!(
             (hanging.observations.len(), hanging.actions.len(), hanging.rewards.len()),
             (31, 30, 30)

@@ -203,6 +203,7 @@ impl<'a> Explorer<'a> {
         };
         let Self {
             policy,
+            sender,
             pulse,
             bell,
             stop,
@@ -222,7 +223,8 @@ impl<'a> Explorer<'a> {
                 || newest(policy),
                 || {
                     pulse.beat(Activity::WaitingForPeer);
-                    Ok(())
+                    // A new learner may need the last chunks before it can publish anything.
+                    sender.look_after()
                 },
             )?,
         };

@@ -30,6 +30,9 @@ pub struct Intake {
     row: RowLayout,
     /// Rows after which nothing more is taken.
     limit: u64,
+    /// Whose turn it is. Kept from one call to the next: a learner that takes one chunk at a time must not take all of
+    /// them from the first actor.
+    turn: usize,
 }
 
 #[derive(Debug)]
@@ -55,6 +58,7 @@ impl Intake {
             sources: (0..actors).map(source).collect::<Result<_, ChannelError>>()?,
             row,
             limit,
+            turn: 0,
         })
     }
 
@@ -63,25 +67,33 @@ impl Intake {
         self.sources.len()
     }
 
-    /// Takes chunks in turn, one of each actor at a time, until none is waiting, each actor had `most`, or `enough` says
-    /// so of the replay. Returns whether there was any.
+    /// Takes chunks in turn, one of each actor at a time, until none is waiting, there were `most` of each, or `enough`
+    /// says so of the replay. Returns whether there was any.
     ///
     /// # Errors
     /// When a channel does not work or a chunk is none of this run.
-    pub fn drain(&self, replay: &mut Replay, most: u32, enough: impl Fn(&Replay) -> bool) -> Result<bool, IntakeError> {
-        let mut any = false;
-        for _ in 0..most {
-            let mut waiting = false;
-            for actor in 0..self.sources.len() {
-                if enough(replay) || replay.head() >= self.limit {
-                    return Ok(any);
-                }
-                waiting |= self.take_from(actor, replay)?.is_some();
-            }
-            if !waiting {
+    pub fn drain(
+        &mut self,
+        replay: &mut Replay,
+        most: u32,
+        enough: impl Fn(&Replay) -> bool,
+    ) -> Result<bool, IntakeError> {
+        // Even when there is enough: what an actor has sent outlives it only once we are connected to it.
+        for source in &self.sources {
+            source.receiver.look_after()?;
+        }
+        let actors = self.sources.len();
+        let (mut any, mut idle) = (false, 0);
+        for _ in 0..most as usize * actors {
+            if idle == actors || enough(replay) || replay.head() >= self.limit {
                 break;
             }
-            any = true;
+            if self.take_from(self.turn, replay)?.is_some() {
+                (any, idle) = (true, 0);
+            } else {
+                idle += 1;
+            }
+            self.turn = (self.turn + 1) % actors;
         }
         Ok(any)
     }

@@ -13,6 +13,8 @@ use shoal_learner::replay::{ActorCommit, Appended, ChunkError, ChunkMark, Replay
 use tempfile::TempDir;
 
 const ACTORS: usize = 3;
+/// Numbers in a row for observations and actions of one number.
+const WIDTH: usize = 6;
 
 fn layout(ring: u64) -> ReplayLayout {
     ReplayLayout {
@@ -40,6 +42,7 @@ fn chunk(actor: usize, mark: ChunkMark, rows: u64) -> Vec<f32> {
             mark.sequence as f32,
             i as f32,
             rows as f32,
+            -1.0,
         ]
     };
     (0..rows).flat_map(row).collect()
@@ -60,9 +63,9 @@ impl Model {
     }
 
     fn add(&mut self, actor: usize, mark: ChunkMark, numbers: &[f32]) {
-        self.rows.extend(numbers.chunks(5).map(<[f32]>::to_vec));
+        self.rows.extend(numbers.chunks(WIDTH).map(<[f32]>::to_vec));
         self.actors[actor].mark = mark;
-        self.actors[actor].rows += numbers.len() as u64 / 5;
+        self.actors[actor].rows += (numbers.len() / WIDTH) as u64;
     }
 
     fn head(&self) -> u64 {
@@ -139,9 +142,9 @@ proptest! {
                 if step == Step::ReachSet {
                     // Killed within the copy: any part of the places about to be written may be anything.
                     for index in before.head()..after.head() {
-                        let place = places(ring).rows.start + (index % ring) as usize * 20;
+                        let place = places(ring).rows.start + (index % ring) as usize * 4 * WIDTH;
                         if noise >> (index % 32) & 1 == 1 {
-                            image[place + (noise % 20) as usize] ^= 0x55;
+                            image[place + (noise % 24) as usize] ^= 0x55;
                         }
                     }
                 }
@@ -291,17 +294,17 @@ fn what_cannot_be_a_chunk_is_refused_and_nothing_written() {
     let (directory, model) = filled(10, &[(0, 10)]);
     let mut replay = Replay::open(&directory.replay(), &layout(10)).unwrap();
     let mut append = |actor, rows: &[f32]| replay.append_and_commit(actor, mark(9, 9), rows).unwrap_err();
-    assert_eq!(append(3, &[0.0; 5]), ChunkError::Actor { actor: 3, actors: 3 });
+    assert_eq!(append(3, &[0.0; 6]), ChunkError::Actor { actor: 3, actors: 3 });
     assert_eq!(
-        append(0, &[0.0; 6]),
+        append(0, &[0.0; 7]),
         ChunkError::Ragged {
             actor: 0,
-            numbers: 6,
-            width: 5
+            numbers: 7,
+            width: 6
         }
     );
     assert_eq!(
-        append(0, &[0.0; 55]),
+        append(0, &[0.0; 66]),
         ChunkError::TooLong {
             actor: 0,
             rows: 11,
@@ -361,7 +364,7 @@ fn a_torn_newest_record_falls_back_to_the_one_before_and_says_so() {
     assert_eq!(replay.head(), 5);
     assert_eq!(replay.warnings().len(), 1);
     assert!(
-        replay.warnings()[0].contains("is damaged; going on from record"),
+        replay.warnings()[0].contains("is damaged; going on from the newest that is not"),
         "{:?}",
         replay.warnings()
     );
@@ -389,7 +392,7 @@ fn a_torn_newest_record_falls_back_to_the_one_before_and_says_so() {
 fn a_damaged_row_costs_the_rows_before_it() {
     let (directory, model) = filled(100, &[(0, 60), (1, 30)]);
     let mut image = fs::read(directory.replay()).unwrap();
-    image[places(100).rows.start + 20 * 20] ^= 1;
+    image[places(100).rows.start + 20 * 4 * WIDTH] ^= 1;
     let replay = reopen(&directory.replay(), &image, 100).unwrap();
     model.check(&replay);
     assert_eq!(replay.rows(), 21..90);

@@ -1,6 +1,31 @@
 //! `shoal bench`: how fast each stage is on this machine.
 
+mod learner;
+mod peer;
+mod policy;
+mod product;
+mod rows;
+mod scene;
+mod step;
+mod transitions;
+mod window;
+
+use std::io::Write;
+use std::time::Duration;
+
+use anyhow::{Context, bail};
+use comfy_table::Table;
+use comfy_table::presets::UTF8_BORDERS_ONLY;
+use serde::Serialize;
+use shoal_common::stop::Stop;
+use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
+use signal_hook::iterator::Signals;
+
 use crate::cli::BenchArgs;
+
+/// Shortens or lengthens the measurement itself, in seconds: tests care for the form of the answer, not for the numbers.
+const SECONDS: &str = "SHOAL_BENCH_SECONDS";
+const DEFAULT_SECONDS: f64 = 6.0;
 
 /// A stage of the system.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -15,6 +40,70 @@ pub(crate) enum Stage {
     Policy,
 }
 
-pub(crate) fn run(_args: &BenchArgs) -> anyhow::Result<()> {
-    anyhow::bail!("under construction")
+/// What a stage's measurement gave: its fields are those of `--json`.
+trait Figures: Serialize {
+    /// The same for people: what, and how much.
+    fn lines(&self) -> Vec<(&'static str, String)>;
+}
+
+/// How long to measure, and when to give up.
+#[derive(Clone, Debug)]
+struct Patience {
+    length: Duration,
+    stop: Stop,
+}
+
+/// Measures a stage and tells the person, or a script, how fast it is.
+pub(crate) fn run(args: &BenchArgs) -> anyhow::Result<()> {
+    let patience = Patience::new()?;
+    match args.stage {
+        Stage::Learner => tell(&learner::measure(&patience)?, args.json),
+        Stage::Transitions => tell(&transitions::measure(&patience)?, args.json),
+        Stage::Step => tell(&step::measure(&patience)?, args.json),
+        Stage::Policy => tell(&policy::measure(&patience)?, args.json),
+    }
+}
+
+impl Patience {
+    fn new() -> anyhow::Result<Self> {
+        let seconds = match std::env::var(SECONDS) {
+            Ok(text) => text.parse().ok().filter(|seconds| (0.01..=600.0).contains(seconds)),
+            Err(_) => Some(DEFAULT_SECONDS),
+        };
+        let seconds = seconds.with_context(|| format!("{SECONDS} must be a number of seconds from 0.01 to 600"))?;
+        let stop = Stop::default();
+        let flag = stop.clone();
+        let mut signals = Signals::new([SIGINT, SIGTERM, SIGHUP]).context("cannot watch for signals")?;
+        std::thread::Builder::new()
+            .name("signals".into())
+            .spawn(move || signals.forever().for_each(|_| flag.request()))
+            .context("cannot watch for signals")?;
+        Ok(Self {
+            length: Duration::from_secs_f64(seconds),
+            stop,
+        })
+    }
+
+    /// An error once somebody has asked for the end: what was measured is cleared away on the way out.
+    fn check(&self) -> anyhow::Result<()> {
+        if self.stop.requested() {
+            bail!("interrupted");
+        }
+        Ok(())
+    }
+}
+
+fn tell(figures: &impl Figures, json: bool) -> anyhow::Result<()> {
+    let mut table = Table::new();
+    table.load_style(UTF8_BORDERS_ONLY);
+    for (what, how_much) in figures.lines() {
+        table.add_row([what, &how_much]);
+    }
+    if json {
+        writeln!(std::io::stderr().lock(), "{table}")?;
+        writeln!(std::io::stdout().lock(), "{}", serde_json::to_string(figures)?)?;
+    } else {
+        writeln!(std::io::stdout().lock(), "{table}")?;
+    }
+    Ok(())
 }

@@ -59,14 +59,14 @@ fn behaviour(run: &RunDir, config: &Config, out: &Path) -> anyhow::Result<Vec<Pa
     let mut rollout = Rollout::new(config, &policy.parameters)?;
     if name == "pendulum" {
         let path = out.join("swing-up.svg");
-        figure::swing_up(&rollout.from_state(&[PI, 0.0])?, PI, &path)?;
+        figure::swing_up(&rollout.episode_from(&[PI, 0.0])?, PI, &path)?;
         return Ok(vec![path]);
     }
     let mut from = |starts: &[[f64; 2]]| -> anyhow::Result<Vec<TestRun>> {
         let run = |&[x, y]: &[f64; 2]| {
             Ok(TestRun {
                 start: [x, y],
-                trajectory: rollout.from_state(&[x, y, 0.0, 0.0])?,
+                trajectory: rollout.episode_from(&[x, y, 0.0, 0.0])?,
             })
         };
         starts.iter().map(run).collect()

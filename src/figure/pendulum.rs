@@ -3,7 +3,7 @@
 use std::f64::consts::{PI, TAU};
 use std::path::Path;
 
-use super::canvas::{BLUE, VERMILION, save};
+use super::canvas::{BLUE, INK, VERMILION, save};
 use super::panel::{Axis, Panel, Series, range_of};
 use crate::rollout::Trajectory;
 
@@ -40,6 +40,21 @@ pub(crate) fn swing_up(trajectory: &Trajectory, theta: f64, path: &Path) -> anyh
         equal_scale: false,
     };
     let extent = range_of(angle.iter().chain(&velocity).copied().chain([-1.0, 1.0]));
+    let mut series = vec![
+        Series::line("angle", BLUE, over_time(angle)),
+        Series::line("angular velocity", VERMILION, over_time(velocity)),
+    ];
+    let uprights = (-9..=9)
+        .map(|turns| f64::from(turns) * TAU)
+        .filter(|upright| extent.contains(upright));
+    for (upright, label) in uprights.zip(["upright (0 and whole turns)"].into_iter().chain(std::iter::repeat(""))) {
+        let level = Series::line(label, INK, vec![(0.0, upright), (end, upright)]);
+        series.push(Series {
+            opacity: 0.6,
+            width: 0.9,
+            ..level
+        });
+    }
     let motion = Panel {
         title: "Angle and angular velocity",
         note: "",
@@ -48,10 +63,7 @@ pub(crate) fn swing_up(trajectory: &Trajectory, theta: f64, path: &Path) -> anyh
             label: "angle (rad), angular velocity (rad/s)",
             range: extent,
         },
-        series: vec![
-            Series::line("angle (0 upright, 2π a whole turn)", BLUE, over_time(angle)),
-            Series::line("angular velocity", VERMILION, over_time(velocity)),
-        ],
+        series,
         equal_scale: false,
     };
     save(path, (1100, 420), |sheet| {

@@ -3,7 +3,7 @@
 use std::fmt;
 use std::time::Duration;
 
-use iceoryx2::port::listener::Listener;
+use iceoryx2::port::listener::{Listener, ListenerWaitError};
 use iceoryx2::port::notifier::Notifier;
 use iceoryx2::prelude::*;
 use iceoryx2::service::port_factory::event::PortFactory;
@@ -64,9 +64,11 @@ impl Bell {
     /// When waiting is impossible.
     pub fn wait(&self, patience: Duration) -> Result<bool, ChannelError> {
         let mut rang = false;
-        self.listener
-            .timed_wait(|_| rang = true, patience)
-            .map_err(|cause| ChannelError::new(self.place.to_string(), "wait", cause))?;
+        match self.listener.timed_wait(|_| rang = true, patience) {
+            // A process that was stopped and goes on has only been interrupted.
+            Ok(_) | Err(ListenerWaitError::InterruptSignal) => {}
+            Err(cause) => return Err(ChannelError::new(self.place.to_string(), "wait", cause)),
+        }
         Ok(rang)
     }
 }

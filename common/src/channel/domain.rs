@@ -102,11 +102,12 @@ impl Domain {
         &self.node
     }
 
-    /// Leaves the run as its last process, and removes every trace of it from shared memory.
+    /// Leaves the run. Whoever is the last to leave, be it because the launcher was killed, removes every trace of the run
+    /// from shared memory.
     ///
     /// # Errors
     /// When files cannot be removed.
-    pub fn leave_last(self) -> Result<(), DomainError> {
+    pub fn leave(self) -> Result<(), DomainError> {
         let run_id = self.run_id.clone();
         drop(self);
         let root = user_root()?;

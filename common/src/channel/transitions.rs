@@ -211,6 +211,15 @@ impl ChunkReceiver {
         Ok(Self { subscriber, channel })
     }
 
+    /// Connects with an actor that has come anew. From then on, what it sends arrives even if it dies: iceoryx2 delivers
+    /// it before anything of the actor's next start.
+    ///
+    /// # Errors
+    /// When the sender's memory cannot be mapped.
+    pub fn look_after(&self) -> Result<(), ChannelError> {
+        self.subscriber.update_connections().map_err(|cause| ChannelError::new(&self.channel, "reconnect", cause))
+    }
+
     /// The next chunk, if there is one.
     ///
     /// # Errors

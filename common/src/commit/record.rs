@@ -40,6 +40,8 @@ const ACTOR_WORDS: usize = 3;
 const WORD: usize = size_of::<u64>();
 /// A slot's seal while its record is being written. No finished record has it: see `seal`.
 const OPEN: u64 = 0;
+/// More rows and records than any run will write.
+const LIMIT: u64 = 1 << 60;
 
 impl Record {
     /// The record of an empty replay.
@@ -114,7 +116,9 @@ impl Record {
         for (i, word) in record.words.iter_mut().enumerate() {
             *word = words.load(offset + (1 + i) * WORD);
         }
-        (words.load(offset) == record.seal() && record.tail() <= record.head()).then_some(record)
+        // The limit keeps sums of what a file says from overflowing.
+        let possible = record.tail() <= record.head() && record.head().max(record.generation()) < LIMIT;
+        (words.load(offset) == record.seal() && possible).then_some(record)
     }
 
     /// Writes the record into the slot at `offset`, which must not be the published one; `step` is called after each of

@@ -51,7 +51,7 @@ fn minibatch(seed: u64) -> Minibatch {
     let mut batch = Minibatch::new(RowLayout::new(3, 2), BATCH);
     for column in 0..BATCH {
         let [s, a, s_next] = [3, 2, 3].map(|count| random(&mut numbers, count));
-        let (r, discount) = (numbers.random_range(-1.0..1.0), if column == 2 { 0.0 } else { 0.99 });
+        let (r, discount) = (numbers.random_range(-1.0..1.0), [0.99, 0.9, 0.0, 1.0, 0.97][column]);
         batch.set(
             column,
             &Transition {

@@ -17,6 +17,9 @@ pub(super) struct Found {
 
 const NONE_LEFT: &str = "all of its commit records are damaged";
 
+/// A published generation this far beyond all records is no generation: that word is damaged.
+const FAR: u64 = 1 << 48;
+
 /// A record that was written to the end, and the first of the rows before its head that are all intact.
 struct Candidate<'a> {
     slot: usize,
@@ -25,12 +28,20 @@ struct Candidate<'a> {
 }
 
 impl Candidate<'_> {
-    fn kept(&self) -> u64 {
-        self.record.head() - self.tail
+    /// Greater is better. A power loss must not cost a row that was synced: they count first.
+    fn merit(&self, synced: u64, layout: &ReplayLayout) -> (u64, u64, bool, u64) {
+        let of_synced = self.record.head().min(synced).saturating_sub(self.tail);
+        let of_all = self.record.head() - self.tail;
+        (of_synced, of_all, self.whole(layout), self.record.generation())
+    }
+
+    fn whole(&self, layout: &ReplayLayout) -> bool {
+        self.tail == oldest(self.record, layout)
     }
 }
 
-/// Chooses the record with the most rows intact, counted back from its head; of equal ones the newest.
+/// Chooses the newest record if all its rows are intact. Otherwise the one under which most of the synced rows are, and
+/// of those the one with most rows.
 pub(super) fn recover(words: &Words, places: &Places, layout: &ReplayLayout, ring: &Ring) -> Result<Found, String> {
     let slots: [Option<Record>; SLOTS] = places.slots.map(|slot| Record::load(words, slot, layout.actors));
     let published = words.load(places.selector);
@@ -43,24 +54,20 @@ pub(super) fn recover(words: &Words, places: &Places, layout: &ReplayLayout, rin
         .collect();
     records.sort_by_key(|(_, record)| std::cmp::Reverse(record.generation()));
     let &(_, newest) = records.first().ok_or(NONE_LEFT)?;
+    let &(_, synced) = records.iter().find(|(slot, _)| *slot >= 2).unwrap_or(&(0, newest));
 
-    let mut best: Option<Candidate<'_>> = None;
-    for (slot, record) in &records {
-        // Scanned only if it can win: most often the newest record is whole, and its rows are all that is looked at.
-        if best
-            .as_ref()
-            .is_none_or(|best| record.head() - oldest(record, layout) > best.kept())
-        {
-            let candidate = Candidate {
-                slot: *slot,
-                record,
-                tail: intact_from(record, layout, ring),
-            };
-            if best.as_ref().is_none_or(|best| candidate.kept() > best.kept()) {
-                best = Some(candidate);
-            }
+    let mut candidates: Vec<Candidate<'_>> = Vec::new();
+    for &(slot, record) in &records {
+        let tail = intact_from(record, layout, ring);
+        candidates.push(Candidate { slot, record, tail });
+        // No other record can offer more than the newest when that is whole: the older rows are overwritten.
+        if candidates[0].whole(layout) {
+            break;
         }
     }
+    let best = candidates
+        .into_iter()
+        .max_by_key(|candidate| candidate.merit(synced.head(), layout));
     let Candidate {
         slot,
         record: chosen,
@@ -70,7 +77,7 @@ pub(super) fn recover(words: &Words, places: &Places, layout: &ReplayLayout, rin
     let mut warnings = Vec::new();
     if newest.generation() < published {
         warnings.push(format!(
-            "the newest commit record (number {published}) is damaged; going on from record {}",
+            "the commit record published last is damaged; going on from the newest that is not (number {})",
             newest.generation()
         ));
     }
@@ -82,7 +89,9 @@ pub(super) fn recover(words: &Words, places: &Places, layout: &ReplayLayout, rin
         ));
     }
     // Rows that a write under way when the process died was about to replace: nobody misses them.
-    let replaced = reach.min(chosen.head() + layout.ring).saturating_sub(layout.ring);
+    let replaced = reach
+        .min(chosen.head().saturating_add(layout.ring))
+        .saturating_sub(layout.ring);
     if tail > oldest(chosen, layout).max(replaced) {
         warnings.push(format!(
             "row {} is damaged; going on with the {} rows after it",
@@ -91,25 +100,26 @@ pub(super) fn recover(words: &Words, places: &Places, layout: &ReplayLayout, rin
         ));
     }
 
+    let published = if published < newest.generation() + FAR {
+        published
+    } else {
+        0
+    };
     let last = newest.generation().max(published);
     let next_generation = if slot < 2 && (last + 1) % 2 == slot as u64 {
         last + 2
     } else {
         last + 1
     };
-    let synced = |slot: usize| slots[slot].as_ref().map_or(0, Record::generation);
-    let (next_synced, synced_generation) = if synced(2) <= synced(3) {
-        (2, synced(3))
-    } else {
-        (3, synced(2))
-    };
+    let generation = |slot: usize| slots[slot].as_ref().map_or(0, Record::generation);
+    let (older, newer) = if generation(2) <= generation(3) { (2, 3) } else { (3, 2) };
     let mut record = chosen.clone();
     record.set_tail(tail);
     Ok(Found {
         record,
         next_generation,
-        next_synced,
-        synced_generation,
+        next_synced: older,
+        synced_generation: generation(newer),
         warnings,
     })
 }

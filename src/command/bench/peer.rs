@@ -1,0 +1,91 @@
+//! The other process of a measurement: a role as a run has it.
+
+use std::io::{BufRead, BufReader};
+use std::os::unix::process::CommandExt;
+use std::process::{Child, ChildStdin, Command, ExitStatus, Stdio};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, bail};
+use shoal_common::report::Role;
+use shoal_common::run_dir::RunDir;
+
+/// How long a learner may take to bring its replay to the disk.
+const FAREWELL: Duration = Duration::from_secs(15);
+
+/// A role's process. It ends when its standard input closes, be it because this process is no more.
+#[derive(Debug)]
+pub(super) struct Peer {
+    child: Child,
+    /// Held apart from the child: waiting for a child closes its own.
+    stdin: Option<ChildStdin>,
+    /// Gives the last line that the process wrote.
+    listener: Option<JoinHandle<Option<String>>>,
+    role: Role,
+}
+
+impl Peer {
+    /// Starts this program again as `role` 0 of the run.
+    pub(super) fn start(role: Role, run: &RunDir) -> anyhow::Result<Self> {
+        let mut child = Command::new("/proc/self/exe")
+            .arg0("shoal")
+            .arg(role.name())
+            .arg(run.path())
+            .args(["0", "1"])
+            .stdin(Stdio::piped())
+            .stdout(Stdio::null())
+            .stderr(Stdio::piped())
+            // Ctrl-C is for this process, which then ends the other one.
+            .process_group(0)
+            .spawn()
+            .with_context(|| format!("cannot start the {}", role.name()))?;
+        let stdin = child.stdin.take();
+        let listener = child.stderr.take().map(|stderr| {
+            std::thread::spawn(move || BufReader::new(stderr).lines().map_while(Result::ok).last())
+        });
+        Ok(Self {
+            child,
+            stdin,
+            listener,
+            role,
+        })
+    }
+
+    /// An error if the process has ended, with what it said last.
+    pub(super) fn check(&mut self) -> anyhow::Result<()> {
+        match self.child.try_wait()? {
+            Some(status) => self.ended_early(status),
+            None => Ok(()),
+        }
+    }
+
+    /// Asks the process to end, and waits for it.
+    pub(super) fn end(mut self) -> anyhow::Result<()> {
+        self.stdin = None;
+        let deadline = Instant::now() + FAREWELL;
+        loop {
+            match self.child.try_wait()? {
+                Some(status) if status.success() => return Ok(()),
+                Some(status) => return self.ended_early(status),
+                None if Instant::now() >= deadline => bail!("the {} did not end when asked to", self.role.name()),
+                None => std::thread::sleep(Duration::from_millis(2)),
+            }
+        }
+    }
+
+    fn ended_early(&mut self, status: ExitStatus) -> anyhow::Result<()> {
+        let said = self.listener.take().and_then(|listener| listener.join().ok().flatten());
+        let said = said.unwrap_or_else(|| "it said nothing".into());
+        let said = said.strip_prefix("error: ").unwrap_or(&said);
+        bail!("the {} ended ({status}): {said}", self.role.name());
+    }
+}
+
+impl Drop for Peer {
+    fn drop(&mut self) {
+        if !matches!(self.child.try_wait(), Ok(Some(_))) {
+            let _ = self.child.kill();
+            let _ = self.child.wait();
+        }
+    }
+}

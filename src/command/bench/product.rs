@@ -1,0 +1,153 @@
+//! The limit that the learner is held against: single-precision matrix products of an update's own shapes, by the best of
+//! the kernels tried.
+//!
+//! Both kernels read transposed factors through strides, as an update does: nothing is transposed beforehand. The factors
+//! are warm: each product is repeated on the same numbers.
+
+use std::time::Duration;
+
+use faer::linalg::matmul::matmul;
+use faer::{Accum, Par};
+use nalgebra::{DMatrixView, DMatrixViewMut, Dyn};
+use rand::RngExt;
+use shoal_common::network::{matrix, matrix_mut};
+use shoal_common::stream::Stream;
+use shoal_learner::aligned::Aligned;
+use shoal_learner::product::{Product, Transposed};
+
+use super::window;
+
+/// Attempts for each shape and kernel when the kernels are compared; the best counts.
+const ATTEMPTS: usize = 4;
+const ATTEMPT: Duration = Duration::from_millis(4);
+
+/// Who multiplies.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Kernel {
+    /// faer's `matmul`.
+    Faer,
+    /// nalgebra's `gemm`, which is `matrixmultiply::sgemm` where no dimension is tiny.
+    Nalgebra,
+}
+
+impl Kernel {
+    pub(super) const ALL: [Self; 2] = [Self::Faer, Self::Nalgebra];
+
+    pub(super) fn name(self) -> &'static str {
+        match self {
+            Self::Faer => "faer",
+            Self::Nalgebra => "nalgebra (matrixmultiply)",
+        }
+    }
+}
+
+/// A product with numbers to multiply, and the kernel that does it best.
+#[derive(Debug)]
+pub(super) struct Multiplication {
+    pub(super) product: Product,
+    pub(super) kernel: Kernel,
+    a: Aligned,
+    b: Aligned,
+    c: Aligned,
+}
+
+impl Multiplication {
+    /// Random factors, by faer at first.
+    pub(super) fn new(product: Product, random: &mut Stream) -> Self {
+        let Product { m, k, n, .. } = product;
+        let mut numbers = |count: usize| -> Vec<f32> { (0..count).map(|_| 2.0 * random.random::<f32>() - 1.0).collect() };
+        Self {
+            product,
+            kernel: Kernel::Faer,
+            a: Aligned::from_slice(&numbers(m * k), 0),
+            b: Aligned::from_slice(&numbers(k * n), 1),
+            c: Aligned::zeros(m * n, 2),
+        }
+    }
+
+    /// Chooses the kernel; its best rate in GFLOP/s.
+    pub(super) fn choose_kernel(&mut self) -> f64 {
+        let mut best = (0.0, self.kernel);
+        for _ in 0..ATTEMPTS {
+            for kernel in Kernel::ALL {
+                self.kernel = kernel;
+                let rate = self.gflops(ATTEMPT);
+                if rate > best.0 {
+                    best = (rate, kernel);
+                }
+            }
+        }
+        self.kernel = best.1;
+        best.0
+    }
+
+    /// The rate over `length`, in GFLOP/s.
+    pub(super) fn gflops(&mut self, length: Duration) -> f64 {
+        window::rate(length, || self.multiply()) * self.product.flop() as f64 / 1e9
+    }
+
+    pub(super) fn multiply(&mut self) {
+        let Product { m, k, n, transposed } = self.product;
+        match self.kernel {
+            Kernel::Faer => {
+                let a = match transposed {
+                    Transposed::Left => matrix(&self.a, k).transpose(),
+                    _ => matrix(&self.a, m),
+                };
+                let b = match transposed {
+                    Transposed::Right => matrix(&self.b, n).transpose(),
+                    _ => matrix(&self.b, k),
+                };
+                matmul(matrix_mut(&mut self.c, m), Accum::Replace, a, b, 1.0, Par::Seq);
+            }
+            Kernel::Nalgebra => {
+                let a = view(&self.a, m, k, transposed == Transposed::Left);
+                let b = view(&self.b, k, n, transposed == Transposed::Right);
+                DMatrixViewMut::from_slice(&mut self.c, m, n).gemm(1.0, &a, &b, 0.0);
+            }
+        }
+        std::hint::black_box(&mut self.c);
+    }
+
+    /// For people: the shape, and which factor is read transposed.
+    pub(super) fn shape(&self) -> String {
+        let Product { m, k, n, transposed } = self.product;
+        let which = match transposed {
+            Transposed::Neither => "",
+            Transposed::Left => ", left transposed",
+            Transposed::Right => ", right transposed",
+        };
+        format!("{m}x{k} by {k}x{n}{which}")
+    }
+}
+
+/// A column-major matrix, or the transpose of one, as rows × columns.
+fn view(numbers: &[f32], rows: usize, columns: usize, transposed: bool) -> DMatrixView<'_, f32, Dyn, Dyn> {
+    let strides = if transposed { (columns, 1) } else { (1, rows) };
+    DMatrixView::from_slice_with_strides(numbers, rows, columns, strides.0, strides.1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use shoal_common::stream::{Purpose, stream};
+
+    #[test]
+    fn every_kernel_computes_the_same_product() {
+        let mut random = stream(1, Purpose::Exploration, 0, 0);
+        for transposed in [Transposed::Neither, Transposed::Left, Transposed::Right] {
+            for (m, k, n) in [(12, 7, 9), (1, 8, 6), (10, 3, 4)] {
+                let mut multiplication = Multiplication::new(Product { m, k, n, transposed }, &mut random);
+                let results = Kernel::ALL.map(|kernel| {
+                    multiplication.kernel = kernel;
+                    multiplication.c.fill(f32::NAN);
+                    multiplication.multiply();
+                    multiplication.c.to_vec()
+                });
+                for (x, y) in results[0].iter().zip(&results[1]) {
+                    assert!((x - y).abs() < 1e-5, "{transposed:?} {m} {k} {n}: {x} and {y}");
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,90 @@
+//! Real rows to move and to learn from: Pendulums under random actions.
+
+use rand::RngExt;
+use shoal_common::channel::environment::ResponseLayout;
+use shoal_common::config::Config;
+use shoal_common::space::Space;
+use shoal_common::stream::{Purpose, Stream, stream};
+use shoal_common::transition::{RowLayout, Transition};
+use shoal_env_server::vector::{Start, VectorEnvironment};
+
+/// Environments stepped at once: rows come in portions of so many.
+pub(super) const ENVIRONMENTS: usize = 64;
+
+/// A source of rows.
+pub(super) struct Rows {
+    environments: VectorEnvironment,
+    layout: ResponseLayout,
+    row: RowLayout,
+    gamma: f32,
+    random: Stream,
+    bounds: Vec<(f32, f32)>,
+    observations: Vec<f32>,
+    actions: Vec<f32>,
+    response: Vec<f32>,
+}
+
+impl Rows {
+    pub(super) fn new(config: &Config) -> anyhow::Result<Self> {
+        let (name, parameters) = (&config.environment.name, &config.environment.parameters);
+        let mut environments = VectorEnvironment::new(name, parameters, ENVIRONMENTS as u32, config.run.seed, 0, 0)?;
+        let row = config.row_layout();
+        let mut observations = vec![0.0; ENVIRONMENTS * row.observation_width()];
+        environments.reset(Start::Next, &mut observations)?;
+        let layout = ResponseLayout::new(ENVIRONMENTS, row.observation_width());
+        let bounds = match &config.spec.action {
+            Space::Box { low, high } => low.iter().copied().zip(high.iter().copied()).collect(),
+            Space::Discrete { n } => vec![(0.0, *n as f32 - 1.0)],
+        };
+        Ok(Self {
+            environments,
+            layout,
+            row,
+            gamma: config.ddpg.gamma as f32,
+            random: stream(config.run.seed, Purpose::Exploration, 0, 0),
+            bounds,
+            observations,
+            actions: vec![0.0; ENVIRONMENTS * row.action_width()],
+            response: vec![0.0; layout.len()],
+        })
+    }
+
+    /// Observations that the environments show now, one after the other.
+    pub(super) fn observations(&self) -> &[f32] {
+        &self.observations
+    }
+
+    /// One step of every environment, as `ENVIRONMENTS` rows in `out`.
+    pub(super) fn fill(&mut self, out: &mut [f32]) -> anyhow::Result<()> {
+        for action in self.actions.chunks_exact_mut(self.bounds.len()) {
+            for (number, (low, high)) in action.iter_mut().zip(&self.bounds) {
+                *number = low + (high - low) * self.random.random::<f32>();
+            }
+        }
+        let blocks = self.layout.split_mut(&mut self.response);
+        // `split_mut` lends the blocks to be written; they are read back through the same borrow.
+        let lent = shoal_common::channel::environment::StepBlocks {
+            observations: &mut *blocks.observations,
+            next_observations: &mut *blocks.next_observations,
+            rewards: &mut *blocks.rewards,
+            terminated: &mut *blocks.terminated,
+            truncated: &mut *blocks.truncated,
+        };
+        self.environments.step(&self.actions, lent)?;
+        let (width, action_width) = (self.row.observation_width(), self.row.action_width());
+        for (e, row) in out.chunks_exact_mut(self.row.width()).enumerate() {
+            let terminated = blocks.terminated[e] != 0.0;
+            let transition = Transition {
+                s: &self.observations[e * width..][..width],
+                a: &self.actions[e * action_width..][..action_width],
+                r: blocks.rewards[e],
+                discount: if terminated { 0.0 } else { self.gamma },
+                s_next: &blocks.next_observations[e * width..][..width],
+                last: terminated || blocks.truncated[e] != 0.0,
+            };
+            self.row.write(&transition, row);
+        }
+        self.observations.copy_from_slice(blocks.observations);
+        Ok(())
+    }
+}

@@ -1,0 +1,106 @@
+//! How long an environment's step takes from an actor's process and back, through an environment server's.
+
+use std::time::{Duration, Instant};
+
+use anyhow::bail;
+use serde::Serialize;
+use shoal_common::channel::environment::{EnvironmentClient, ResponseLayout, Stepped};
+use shoal_common::channel::{Bell, Domain, Interruption, Place};
+use shoal_common::config::Config;
+use shoal_common::report::Role;
+
+use super::peer::Peer;
+use super::scene::Scene;
+use super::{Figures, Patience};
+
+/// How often the other process is looked after.
+const LOOK: Duration = Duration::from_millis(50);
+
+/// Part of the time that goes before, to warm up.
+const WARM_UP: f64 = 0.1;
+
+/// The fields of `bench step --json`.
+#[derive(Serialize)]
+pub(super) struct StepFigures {
+    median_us: f64,
+    p99_us: f64,
+    least_us: f64,
+    p90_us: f64,
+    round_trips: usize,
+    environments: u32,
+}
+
+pub(super) fn measure(patience: &Patience) -> anyhow::Result<StepFigures> {
+    let scene = Scene::new(&[])?;
+    let mut times = scene.with_peer(Role::EnvServer, |domain, server| {
+        times(&scene.config, domain, server, patience)
+    })?;
+    times.sort_unstable();
+    let microseconds = |quantile: f64| f64::from(times[((times.len() - 1) as f64 * quantile) as usize]) / 1e3;
+    Ok(StepFigures {
+        median_us: microseconds(0.5),
+        p99_us: microseconds(0.99),
+        least_us: microseconds(0.0),
+        p90_us: microseconds(0.9),
+        round_trips: times.len(),
+        environments: scene.config.actors.envs,
+    })
+}
+
+/// Times of round trips, in ns; at least one.
+fn times(config: &Config, domain: &Domain, server: &mut Peer, patience: &Patience) -> anyhow::Result<Vec<u32>> {
+    let (observation, action) = (config.spec.observation.width(), config.spec.action.width());
+    let bell = Bell::hang(domain, Place(Role::Actor, 0))?;
+    let layout = ResponseLayout::new(config.actors.envs as usize, observation);
+    let client = EnvironmentClient::open(domain, 0, layout, action, patience.stop.clone())?;
+    let mut ask = |request: &dyn Fn() -> Result<(), Interruption>| match request() {
+        Ok(()) => Ok(()),
+        Err(Interruption::Stopped) => patience.check(),
+        Err(Interruption::Channel(error)) => server.check().and(Err(error.into())),
+    };
+    ask(&|| client.describe(domain, &bell).map(|_| ()))?;
+    ask(&|| client.reset(domain, &bell, None).map(|_| ()))?;
+
+    let actions = vec![0.5; config.actors.envs as usize * action];
+    let mut times = Vec::new();
+    let warm_up = patience.length.mul_f64(WARM_UP);
+    let (begun, mut looked) = (Instant::now(), Instant::now());
+    loop {
+        let before = Instant::now();
+        match client.step(domain, &bell, &actions) {
+            Ok(Stepped::Taken(_)) => {}
+            Ok(Stepped::Lost) => {
+                server.check()?;
+                bail!("the environment server gave up its episodes");
+            }
+            Err(Interruption::Stopped) => bail!("interrupted"),
+            Err(Interruption::Channel(error)) => return Err(error.into()),
+        }
+        let after = Instant::now();
+        if before.duration_since(begun) >= warm_up {
+            times.push((after - before).as_nanos().try_into().unwrap_or(u32::MAX));
+        }
+        if after - looked >= LOOK {
+            looked = after;
+            patience.check()?;
+        }
+        if !times.is_empty() && after - begun >= patience.length {
+            return Ok(times);
+        }
+    }
+}
+
+impl Figures for StepFigures {
+    fn lines(&self) -> Vec<(&'static str, String)> {
+        vec![
+            ("median", format!("{:.2} µs", self.median_us)),
+            ("90 of 100 within", format!("{:.2} µs", self.p90_us)),
+            ("99 of 100 within", format!("{:.2} µs", self.p99_us)),
+            ("fastest", format!("{:.2} µs", self.least_us)),
+            (
+                "round trips",
+                format!("{}, {} environment each", self.round_trips, self.environments),
+            ),
+        ]
+    }
+}

@@ -1,0 +1,77 @@
+//! Measuring in short windows, so that a disturbance spoils some of them and not the result.
+
+use std::time::{Duration, Instant};
+
+/// Repeats `work` for about `length`; how often a second it was done.
+pub(super) fn rate(length: Duration, mut work: impl FnMut()) -> f64 {
+    // The clock takes 30 ns to read: it is looked at every 20 µs or so, or after each piece of work that takes longer.
+    let begun = Instant::now();
+    work();
+    let stride = (2e-5 / begun.elapsed().as_secs_f64().max(1e-9)).clamp(1.0, 1_000.0) as u32;
+    let begun = Instant::now();
+    let mut done = 0.0;
+    loop {
+        (0..stride).for_each(|_| work());
+        done += f64::from(stride);
+        let elapsed = begun.elapsed();
+        if elapsed >= length {
+            return done / elapsed.as_secs_f64();
+        }
+    }
+}
+
+/// What windows gave: the median stands for all, and the ends show how quiet the machine was.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Windows(Vec<f64>);
+
+impl Windows {
+    pub(super) fn add(&mut self, rate: f64) {
+        let place = self.0.partition_point(|other| *other < rate);
+        self.0.insert(place, rate);
+    }
+
+    /// Panics where there was no window.
+    pub(super) fn median(&self) -> f64 {
+        self.0[self.0.len() / 2]
+    }
+
+    pub(super) fn least(&self) -> f64 {
+        self.0[0]
+    }
+
+    pub(super) fn greatest(&self) -> f64 {
+        self.0[self.0.len() - 1]
+    }
+
+    /// For people: the median, and the ends in brackets, in `unit`s of so many.
+    pub(super) fn show(&self, unit: f64, decimals: usize) -> String {
+        let [median, least, greatest] = [self.median(), self.least(), self.greatest()].map(|rate| rate / unit);
+        format!("{median:.decimals$} ({least:.decimals$} to {greatest:.decimals$})")
+    }
+}
+
+/// How many windows of `window` fit into the `share` of the time that a measurement has; at least one.
+pub(super) fn count(whole: Duration, share: f64, window: Duration) -> usize {
+    (whole.as_secs_f64() * share / window.as_secs_f64()).round().max(1.0) as usize
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_rate_counts_all_the_work() {
+        let mut calls = 0.0;
+        let begun = Instant::now();
+        let rate = rate(Duration::from_millis(20), || calls += 1.0);
+        assert!(rate <= calls / 0.02 && rate >= (calls - 1_001.0) / begun.elapsed().as_secs_f64());
+    }
+
+    #[test]
+    fn the_median_stands_in_the_middle() {
+        let mut windows = Windows::default();
+        [5.0, 1.0, 4.0, 2.0, 3.0].into_iter().for_each(|rate| windows.add(rate));
+        assert_eq!((windows.least(), windows.median(), windows.greatest()), (1.0, 3.0, 5.0));
+        assert_eq!(windows.show(1.0, 1), "3.0 (1.0 to 5.0)");
+    }
+}

@@ -1,0 +1,146 @@
+//! Lockstep: the same seed gives the same bits, whatever the timing and whatever is killed; and with one actor and one
+//! environment they are the bits of Algorithm 4 in a single process.
+
+mod support;
+
+use shoal_actor::noise::OrnsteinUhlenbeck;
+use shoal_common::channel::environment::ResponseLayout;
+use shoal_common::config::Config;
+use shoal_common::network::{ActionRange, PolicyNetwork};
+use shoal_common::space::Space;
+use shoal_common::stream::{Purpose, stream};
+use shoal_common::transition::Transition;
+use shoal_env_server::vector::{Start, VectorEnvironment};
+use shoal_learner::ddpg::{Ddpg, DdpgSettings};
+use shoal_learner::minibatch::Minibatch;
+use shoal_learner::sampling::Sampler;
+use support::{Workplace, parse, until};
+
+#[test]
+fn the_same_seed_and_actors_give_the_same_bits_and_another_seed_others() {
+    let place = Workplace::new();
+    let run = |seed| {
+        let result = place.train(&["pendulum", "--lockstep", "--actors", "3", "--steps", "700", "--seed", seed]);
+        (result["weights_sha256"].clone(), result["env_steps"].clone(), result["updates"].clone())
+    };
+    let first = run("5");
+    assert_eq!((first.1.as_u64(), first.2.as_u64()), (Some(700), Some(636)));
+    assert_eq!(run("5"), first);
+    assert_ne!(run("6").0, first.0);
+}
+
+#[test]
+fn a_learner_killed_in_lockstep_ends_with_the_bits_of_one_that_was_not() {
+    let place = Workplace::new();
+    let arguments = [
+        "--lockstep", "--actors", "2", "--steps", "40000", "--set", "checkpoint.every_updates=700", "--set",
+        "evaluation.every=1500", "--set", "replay.capacity=1500",
+    ];
+    // The same overrides in the same order for both, so that nothing but the kills differs.
+    let finish = |kills: usize, name: &str| {
+        let running = place.start(name, &arguments);
+        for n in 1..=kills {
+            let rows = 8000 * n as u64;
+            until("it has come further", || evaluated_or_learned(&running.run) >= rows);
+            running.kill("learner-0");
+            until("it is replaced", || running.pids("learner-0").len() == n + 1);
+        }
+        let (code, printed, _) = running.wait();
+        assert_eq!(code, Some(0));
+        parse(&printed)["weights_sha256"].clone()
+    };
+    assert_eq!(finish(3, "killed"), finish(0, "whole"));
+}
+
+/// Environment steps that the learner reported last.
+fn evaluated_or_learned(run: &std::path::Path) -> u64 {
+    let learned = std::fs::read_to_string(run.join("learner.csv")).unwrap_or_default();
+    let mut rows = csv::Reader::from_reader(learned.as_bytes());
+    let Some(column) = rows.headers().unwrap().iter().position(|name| name == "env_steps") else { return 0 };
+    rows.records().flatten().filter_map(|row| row.get(column)?.parse().ok()).max().unwrap_or(0)
+}
+
+#[test]
+fn one_actor_in_lockstep_is_algorithm_4_in_a_single_process() {
+    for preset in ["pendulum", "point-mass-r2"] {
+        let place = Workplace::new();
+        let result = place.train(&[
+            preset, "--run", "run", "--lockstep", "--actors", "1", "--envs", "1", "--steps", "900", "--seed", "11",
+            "--set", "actors.chunk_steps=1", "--set", "evaluation.every=300",
+        ]);
+        let config = Config::load(&place.path().join("run/config.toml")).unwrap();
+        assert_eq!(result["weights_sha256"], twin(&config), "{preset}");
+    }
+}
+
+/// Algorithm 4, plainly. Returns the SHA-256 of all the weights it ends with.
+fn twin(config: &Config) -> String {
+    let seed = config.run.seed;
+    let row = config.row_layout();
+    let ddpg = &config.ddpg;
+    let settings = DdpgSettings {
+        tau: ddpg.tau,
+        actor_learning_rate: ddpg.actor_learning_rate,
+        critic_learning_rate: ddpg.critic_learning_rate,
+        hidden: ddpg.hidden,
+        batch: ddpg.batch,
+    };
+    let mut learner = Ddpg::new(&config.spec, &settings, seed).unwrap();
+    let sampler = Sampler::new(seed);
+    let mut batch = Minibatch::new(row, ddpg.batch);
+    let mut indices = vec![0; ddpg.batch];
+
+    let Space::Box { low, high } = &config.spec.action else { panic!("a box") };
+    let range = ActionRange::new(&config.spec.action).unwrap();
+    let mut mu = PolicyNetwork::new(row.observation_width(), ddpg.hidden, range, 1);
+    let exploration = stream(seed, Purpose::Exploration, 0, 0);
+    let mut noise = OrnsteinUhlenbeck::new(&config.exploration, 1, row.action_width(), exploration);
+
+    let environment = &config.environment;
+    let mut environment =
+        VectorEnvironment::new(&environment.name, &environment.parameters, 1, seed, 0, 0).unwrap();
+    let layout = ResponseLayout::new(1, row.observation_width());
+    let mut response = vec![0.0; layout.len()];
+    let mut replay: Vec<Vec<f32>> = Vec::new();
+
+    let mut s = vec![0.0; row.observation_width()];
+    let mut a = vec![0.0; row.action_width()];
+    environment.reset(Start::Next, &mut s).unwrap();
+    for t in 0..config.run.steps {
+        mu.forward(learner.policy(), &s, &mut a);
+        noise.advance(t);
+        noise.disturb(&mut a, low, high);
+
+        environment.step(&a, layout.split_mut(&mut response)).unwrap();
+        let step = layout.split_mut(&mut response);
+        let (terminated, truncated) = (step.terminated[0] != 0.0, step.truncated[0] != 0.0);
+        let mut stored = vec![0.0; row.width()];
+        row.write(
+            &Transition {
+                s: &s,
+                a: &a,
+                r: step.rewards[0],
+                discount: if terminated { 0.0 } else { ddpg.gamma as f32 },
+                s_next: step.next_observations,
+                last: terminated || truncated,
+            },
+            &mut stored,
+        );
+        replay.push(stored);
+        if terminated || truncated {
+            noise.reset(0);
+        }
+        s.copy_from_slice(step.observations);
+
+        // One update for each step beyond the warm-up.
+        if replay.len() as u64 > config.replay.warmup {
+            let rows = replay.len() as u64;
+            sampler.indices(learner.updates(), rows.saturating_sub(config.replay.capacity)..rows, &mut indices);
+            for (column, &index) in indices.iter().enumerate() {
+                batch.set(column, &row.read(&replay[index as usize]));
+            }
+            learner.update(&batch);
+        }
+    }
+    learner.digest()
+}

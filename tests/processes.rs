@@ -1,0 +1,125 @@
+//! Processes of a run: they start, are ready, and end, whatever ends them, and leave nothing behind.
+
+mod support;
+
+use rustix::process::Signal;
+use support::{Workplace, parse, until};
+
+const ENDLESS: [&str; 2] = ["--steps", "100000000"];
+
+#[test]
+fn a_run_ends_by_itself_with_what_it_promised() {
+    let place = Workplace::new();
+    let (code, printed, leftovers) = place.start("run", &["--steps", "1500", "--actors", "2"]).wait();
+    assert_eq!(code, Some(0));
+    let result = parse(&printed);
+    assert_eq!(result["env_steps"], 1500);
+    assert_eq!(result["updates"], 1500 - 64);
+    assert_eq!(result["eval_episodes"], 3);
+    assert!(result["eval_return_mean"].as_f64().unwrap() < 0.0);
+    assert_eq!(result["weights_sha256"].as_str().unwrap().len(), 64);
+    assert_eq!(result["run"], std::fs::canonicalize(place.path().join("run")).unwrap().to_str().unwrap());
+    for file in [
+        "config.toml", "episodes.csv", "evaluations.csv", "learner.csv", "learning-curve.svg", "shoal.log",
+        "checkpoints/latest.ckpt", "checkpoints/last.policy", "replay.bin", "tensorboard",
+    ] {
+        assert!(place.path().join("run").join(file).exists(), "{file}");
+    }
+    assert!(leftovers.processes().is_empty(), "every role was waited for");
+    assert!(leftovers.files().is_empty(), "{:?}", leftovers.files());
+}
+
+#[test]
+fn ctrl_c_and_sigterm_end_a_run_with_its_state_saved() {
+    for (signal, code) in [(Signal::INT, 130), (Signal::TERM, 143)] {
+        let place = Workplace::new();
+        let running = place.start("run", &ENDLESS);
+        until("something is learned", || has_updates(&running.run));
+        running.signal(signal);
+        let run = running.run.clone();
+        let (exit, printed, leftovers) = running.wait();
+        assert_eq!(exit, Some(code));
+        assert!(parse(&printed)["env_steps"].as_u64().unwrap() > 0);
+        assert!(run.join("checkpoints/latest.ckpt").exists());
+        assert!(run.join("checkpoints/last.policy").exists());
+        assert!(leftovers.processes().is_empty());
+        assert!(leftovers.files().is_empty(), "{:?}", leftovers.files());
+    }
+}
+
+#[test]
+fn when_the_launcher_is_killed_the_roles_save_and_end_and_nothing_is_left() {
+    let place = Workplace::new();
+    let running = place.start("run", &ENDLESS);
+    until("something is learned", || has_updates(&running.run));
+    let leftovers = running.leftovers();
+    running.signal(Signal::KILL);
+    leftovers.vanish();
+    assert!(running.run.join("checkpoints/latest.ckpt").exists());
+    assert!(running.run.join("checkpoints/last.policy").exists(), "the learner ended in order");
+}
+
+#[test]
+fn what_a_run_left_whose_processes_were_all_killed_goes_with_the_next_start() {
+    let place = Workplace::new();
+    let running = place.start("killed", &ENDLESS);
+    let leftovers = running.leftovers();
+    // Stopped first, so that no role notices the end of another.
+    let everybody = leftovers.processes();
+    for signal in [Signal::STOP, Signal::KILL] {
+        running.signal(signal);
+        for pid in &everybody {
+            rustix::process::kill_process(rustix::process::Pid::from_raw(*pid).unwrap(), signal).unwrap();
+        }
+    }
+    until("everybody is dead", || leftovers.processes().is_empty());
+    assert!(!leftovers.files().is_empty(), "a killed run cannot clean up: or this test shows nothing");
+    place.start("next", &["--steps", "100"]).wait();
+    assert!(leftovers.files().is_empty(), "{:?}", leftovers.files());
+}
+
+#[test]
+fn a_role_that_is_killed_is_replaced_and_the_run_goes_on_to_its_end() {
+    for who in ["actor-0", "env-server-0", "env-server-16", "evaluator-0", "learner-0"] {
+        let place = Workplace::new();
+        let running = place.start("run", &["--steps", "30000"]);
+        until("something is learned", || has_updates(&running.run));
+        running.kill(who);
+        until("it is replaced", || running.pids(who).len() == 2);
+        let log = running.run.join("shoal.log");
+        let (code, printed, leftovers) = running.wait();
+        let log = std::fs::read_to_string(log).unwrap();
+        assert_eq!(code, Some(0), "{who}: {log}");
+        assert_eq!(parse(&printed)["env_steps"], 30000, "{who}");
+        assert!(leftovers.files().is_empty(), "{who}: {:?}", leftovers.files());
+    }
+}
+
+#[test]
+fn a_role_that_cannot_work_is_given_up_and_its_last_words_are_passed_on() {
+    let place = Workplace::new();
+    let running = place.start("run", &["--steps", "3000000"]);
+    until("something is learned", || has_updates(&running.run));
+    until("there is a checkpoint", || running.run.join("checkpoints/latest.ckpt").exists());
+    for name in ["latest.ckpt", "previous.ckpt"] {
+        let file = running.run.join("checkpoints").join(name);
+        if file.exists() {
+            std::fs::write(file, b"damaged").unwrap();
+        }
+    }
+    running.kill("learner-0");
+    let (code, _, leftovers) = running.wait();
+    assert_eq!(code, Some(1));
+    let said = std::fs::read_to_string(place.path().join("stderr")).unwrap();
+    let last = said.lines().last().unwrap();
+    assert!(last.contains("learner-0 failed 5 times") && last.contains("latest.ckpt"), "{said}");
+    assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
+}
+
+/// Whether the learner has reported updates.
+fn has_updates(run: &std::path::Path) -> bool {
+    let learned = std::fs::read_to_string(run.join("learner.csv")).unwrap_or_default();
+    let mut rows = csv::Reader::from_reader(learned.as_bytes());
+    let updates = rows.headers().unwrap().iter().position(|name| name == "updates");
+    rows.records().flatten().any(|row| updates.is_some_and(|i| row.get(i).is_some_and(|n| n != "0")))
+}

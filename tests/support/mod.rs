@@ -1,0 +1,205 @@
+//! Runs the real program as a person would, in a directory of its own, and knows what it must leave behind.
+
+#![allow(dead_code, reason = "every test file uses its own part of this")]
+
+use std::os::unix::process::CommandExt;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+use rustix::process::{Pid, Signal, kill_process, test_kill_process};
+
+/// After so long a test has failed, however slow the machine.
+const PATIENCE: Duration = Duration::from_secs(120);
+
+/// Settings with which a run is quick: small networks, little warm-up, few episodes to judge by.
+pub const QUICK: [&str; 10] = [
+    "--set",
+    "ddpg.hidden=[24, 16]",
+    "--set",
+    "replay.warmup=64",
+    "--set",
+    "replay.capacity=2000",
+    "--set",
+    "evaluation.episodes=2",
+    "--set",
+    "evaluation.final_episodes=3",
+];
+
+/// A directory to run the program in.
+pub struct Workplace {
+    directory: tempfile::TempDir,
+}
+
+/// A run under way; killed with all its roles when dropped.
+pub struct Running {
+    child: Child,
+    pub run: PathBuf,
+}
+
+impl Workplace {
+    pub fn new() -> Self {
+        Self { directory: tempfile::tempdir().unwrap() }
+    }
+
+    pub fn path(&self) -> &Path {
+        self.directory.path()
+    }
+
+    pub fn shoal(&self, arguments: &[&str]) -> Command {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_shoal"));
+        command.args(arguments).current_dir(self.path()).stdin(Stdio::null());
+        command
+    }
+
+    /// Runs the program to its end.
+    pub fn output(&self, arguments: &[&str]) -> Output {
+        self.shoal(arguments).output().unwrap()
+    }
+
+    /// Trains quickly and returns what `--json` printed.
+    pub fn train(&self, arguments: &[&str]) -> serde_json::Value {
+        let output = self.output(&[&["train"], arguments, &QUICK[..], &["--json"]].concat());
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        json(&output)
+    }
+
+    /// Starts a quick run in `name` and waits until every role is ready.
+    pub fn start(&self, name: &str, arguments: &[&str]) -> Running {
+        let stderr = std::fs::File::create(self.path().join("stderr")).unwrap();
+        let child = self
+            .shoal(&[&["train", "pendulum", "--run", name], arguments, &QUICK[..], &["--json"]].concat())
+            .stdout(Stdio::piped())
+            .stderr(stderr)
+            // A signal to the test runner's group is not for the run.
+            .process_group(0)
+            .spawn()
+            .unwrap();
+        let run = self.path().join(name);
+        let running = Running { child, run };
+        until("every role is ready", || running.log().contains("every role is ready"));
+        running
+    }
+}
+
+impl Running {
+    pub fn log(&self) -> String {
+        std::fs::read_to_string(self.run.join("shoal.log")).unwrap_or_default()
+    }
+
+    /// Process numbers of a role in the order of their starts, like `actor-0`.
+    pub fn pids(&self, who: &str) -> Vec<i32> {
+        pids(&self.log()).into_iter().filter(|(name, _)| name == who).map(|(_, pid)| pid).collect()
+    }
+
+    /// Kills the running process of a role with SIGKILL.
+    pub fn kill(&self, who: &str) {
+        let pid = *self.pids(who).last().unwrap();
+        kill_process(Pid::from_raw(pid).unwrap(), Signal::KILL).unwrap();
+    }
+
+    /// Sends a signal to the launcher.
+    pub fn signal(&self, signal: Signal) {
+        kill_process(Pid::from_child(&self.child), signal).unwrap();
+    }
+
+    /// Waits until the launcher has ended; its exit code, and what it printed.
+    pub fn wait(mut self) -> (Option<i32>, String, Leftovers) {
+        until("the launcher has ended", || self.child.try_wait().unwrap().is_some());
+        let code = self.child.wait().unwrap().code();
+        let mut printed = String::new();
+        std::io::Read::read_to_string(self.child.stdout.as_mut().unwrap(), &mut printed).unwrap();
+        (code, printed, Leftovers::of(&self.run))
+    }
+
+    /// What this run must not leave behind.
+    pub fn leftovers(&self) -> Leftovers {
+        Leftovers::of(&self.run)
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+        for (_, pid) in pids(&self.log()) {
+            if is_ours(pid) {
+                let _ = kill_process(Pid::from_raw(pid).unwrap(), Signal::KILL);
+            }
+        }
+    }
+}
+
+/// Processes and shared memory of a run.
+pub struct Leftovers {
+    run_id: String,
+    pids: Vec<i32>,
+}
+
+impl Leftovers {
+    fn of(run: &Path) -> Self {
+        let config = std::fs::read_to_string(run.join("config.toml")).unwrap();
+        let table: toml::Table = config.parse().unwrap();
+        let log = std::fs::read_to_string(run.join("shoal.log")).unwrap();
+        Self {
+            run_id: table["run"]["id"].as_str().unwrap().into(),
+            pids: pids(&log).into_iter().map(|(_, pid)| pid).collect(),
+        }
+    }
+
+    /// Processes of the run that are still there.
+    pub fn processes(&self) -> Vec<i32> {
+        self.pids.iter().copied().filter(|pid| is_ours(*pid)).collect()
+    }
+
+    /// Files of the run that are still in shared memory.
+    pub fn files(&self) -> Vec<String> {
+        std::fs::read_dir("/dev/shm")
+            .unwrap()
+            .map(|entry| entry.unwrap().file_name().to_string_lossy().into_owned())
+            .filter(|name| name.contains(&self.run_id))
+            .collect()
+    }
+
+    /// Waits until nothing is left.
+    pub fn vanish(&self) {
+        assert!(!self.pids.is_empty());
+        until("no process of the run is left", || self.processes().is_empty());
+        until("no file of the run is left in shared memory", || self.files().is_empty());
+    }
+}
+
+/// The last line of what was printed, as JSON.
+pub fn json(output: &Output) -> serde_json::Value {
+    parse(&String::from_utf8_lossy(&output.stdout))
+}
+
+/// The only line printed, as JSON.
+pub fn parse(printed: &str) -> serde_json::Value {
+    assert_eq!(printed.lines().count(), 1, "exactly one line on standard output: {printed}");
+    serde_json::from_str(printed).unwrap()
+}
+
+/// Waits until something holds.
+pub fn until(what: &str, mut holds: impl FnMut() -> bool) {
+    let begun = Instant::now();
+    while !holds() {
+        assert!(begun.elapsed() < PATIENCE, "waited in vain until {what}");
+        std::thread::sleep(Duration::from_millis(10));
+    }
+}
+
+fn pids(log: &str) -> Vec<(String, i32)> {
+    let started = |line: &str| {
+        let pid = line.split_once("started as process ")?.1.trim().parse().ok()?;
+        Some((line.split_whitespace().next()?.to_owned(), pid))
+    };
+    log.lines().filter_map(started).collect()
+}
+
+/// Whether the process exists and is a role of ours: its number may have been given to somebody else.
+fn is_ours(pid: i32) -> bool {
+    let alive = test_kill_process(Pid::from_raw(pid).unwrap()).is_ok();
+    let command = std::fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
+    alive && command.starts_with(b"shoal\0")
+}
