@@ -15,7 +15,7 @@ use shoal_common::channel::{ChannelError, Domain};
 use shoal_common::config::Config;
 use shoal_common::report::{Activity, EpisodeReport, EvaluationReport, Heartbeat, LearnerReport, Role};
 use shoal_common::run_dir::{RunDir, RunLock};
-use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM, SIGXFSZ};
+use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 use self::crew::Crew;
 use self::log::Log;
@@ -66,8 +66,6 @@ struct Signals(Vec<(i32, Arc<AtomicBool>)>);
 
 impl Signals {
     fn register() -> anyhow::Result<Self> {
-        // A file-size limit shall be an error of the write that meets it, not the end of the process.
-        let _ = signal_hook::flag::register(SIGXFSZ, Arc::default())?;
         let mut flags = Vec::new();
         for signal in [SIGINT, SIGTERM, SIGHUP] {
             let flag = Arc::new(AtomicBool::new(false));

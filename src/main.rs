@@ -12,26 +12,40 @@ mod tensorboard;
 
 use std::io::Write;
 use std::process::ExitCode;
+use std::sync::Arc;
 
 use clap::Parser;
+use iceoryx2::prelude::{LogLevel, set_log_level};
 use shoal_common::report::Role;
 
 use crate::cli::{Cli, Command};
 
 fn main() -> ExitCode {
-    let result = match &Cli::parse().command {
-        Command::Train(args) => command::train::run(args),
-        Command::Eval(args) => command::eval::run(args).map(|()| ExitCode::SUCCESS),
-        Command::Plot(args) => command::plot::run(args).map(|()| ExitCode::SUCCESS),
-        Command::Bench(args) => command::bench::run(args).map(|()| ExitCode::SUCCESS),
-        Command::EnvServer(args) => role::run(Role::EnvServer, args).map(|()| ExitCode::SUCCESS),
-        Command::Actor(args) => role::run(Role::Actor, args).map(|()| ExitCode::SUCCESS),
-        Command::Evaluator(args) => role::run(Role::Evaluator, args).map(|()| ExitCode::SUCCESS),
-        Command::Learner(args) => role::run(Role::Learner, args).map(|()| ExitCode::SUCCESS),
-    };
+    // What goes wrong in shared memory is returned as an error and said once, by us.
+    set_log_level(LogLevel::Fatal);
+    // A file-size limit shall be an error of the write that meets it, not the end of the process.
+    let watched = signal_hook::flag::register(signal_hook::consts::SIGXFSZ, Arc::default());
+    let result = watched.map_err(anyhow::Error::from).and_then(|_| run(&Cli::parse().command));
     result.unwrap_or_else(|error| {
         // Where nobody reads standard error any more, there is nobody to tell.
         let _ = writeln!(std::io::stderr(), "error: {error:#}");
         ExitCode::FAILURE
     })
+}
+
+fn run(command: &Command) -> anyhow::Result<ExitCode> {
+    match command {
+        Command::Train(args) => command::train::run(args),
+        Command::Eval(args) => command::eval::run(args).map(done),
+        Command::Plot(args) => command::plot::run(args).map(done),
+        Command::Bench(args) => command::bench::run(args).map(done),
+        Command::EnvServer(args) => role::run(Role::EnvServer, args).map(done),
+        Command::Actor(args) => role::run(Role::Actor, args).map(done),
+        Command::Evaluator(args) => role::run(Role::Evaluator, args).map(done),
+        Command::Learner(args) => role::run(Role::Learner, args).map(done),
+    }
+}
+
+fn done((): ()) -> ExitCode {
+    ExitCode::SUCCESS
 }

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 use shoal_common::config::Config;
+use shoal_common::network::ActionRange;
 use shoal_common::run_dir::RunDir;
 use shoal_env_server::environment;
 use toml::{Table, Value};
@@ -126,6 +127,7 @@ fn describe_environment(table: &mut Table) -> anyhow::Result<()> {
     };
     let mut parameters = environment::resolve(&name, section)?;
     let spec = environment::make(&name, &parameters)?.spec();
+    ActionRange::new(&spec.action).with_context(|| format!("DDPG cannot control {name}"))?;
     parameters.insert("name".into(), name.into());
     table.insert("environment".into(), parameters.into());
     table.insert("spec".into(), Value::try_from(spec)?);

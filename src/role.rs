@@ -24,7 +24,6 @@ pub(crate) fn run(role: Role, args: &RoleArgs) -> anyhow::Result<()> {
         .with_target(false)
         .log_internal_errors(false)
         .init();
-    iceoryx2::prelude::set_log_level(iceoryx2::prelude::LogLevel::Fatal);
 
     let stop = Stop::when_stdin_closes().context("cannot watch standard input")?;
     let run = RunDir::open(&args.run)?;

@@ -9,7 +9,7 @@ mod reader;
 mod record;
 mod words;
 
-pub use layout::{IdentityFault, Places, ReplayLayout, SLOTS};
+pub use layout::{IdentityFault, Places, ReplayLayout, SLOTS, SYNCED};
 pub use reader::{CommitReader, OpenError};
 pub use record::{ActorCommit, ChunkMark, Record};
 pub use words::{Words, WritableWords};

@@ -1,6 +1,9 @@
 //! The run's configuration, as it stands in `config.toml` once everything is decided. Each section belongs to one part of
 //! the system, and a role is handed the sections it needs, never the whole.
 
+mod defaults;
+mod limits;
+
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
@@ -154,81 +157,6 @@ pub struct Checkpoint {
     pub every_updates: u64,
 }
 
-impl Default for Run {
-    fn default() -> Self {
-        Self {
-            id: String::new(),
-            seed: 1,
-            mode: Mode::Free,
-            steps: 120_000,
-        }
-    }
-}
-
-impl Default for Actors {
-    fn default() -> Self {
-        Self {
-            count: 2,
-            envs: 1,
-            chunk_steps: 8,
-            window: 8,
-            max: 16,
-        }
-    }
-}
-
-impl Default for Exploration {
-    fn default() -> Self {
-        Self {
-            theta: 0.15,
-            sigma: 0.2,
-        }
-    }
-}
-
-impl Default for Ddpg {
-    fn default() -> Self {
-        Self {
-            hidden: [400, 300],
-            gamma: 0.99,
-            tau: 0.001,
-            actor_learning_rate: 1e-4,
-            critic_learning_rate: 1e-3,
-            batch: 64,
-        }
-    }
-}
-
-impl Default for Replay {
-    fn default() -> Self {
-        Self {
-            capacity: 1_000_000,
-            warmup: 1_000,
-            updates_per_step: 1.0,
-            tolerance: 512,
-        }
-    }
-}
-
-impl Default for Evaluation {
-    fn default() -> Self {
-        Self {
-            every: 2_000,
-            episodes: 10,
-            final_episodes: 100,
-        }
-    }
-}
-
-impl Default for Checkpoint {
-    fn default() -> Self {
-        Self {
-            every_seconds: 5.0,
-            every_updates: 5_000,
-        }
-    }
-}
-
 impl Evaluation {
     /// The period that a policy learned from so many environment steps falls into. A policy is judged when no policy of
     /// its period or a later one was.
@@ -339,55 +267,6 @@ impl Config {
         let digest = Sha256::digest(identity.as_bytes());
         digest.iter().take(8).fold(0, |word, &byte| word << 8 | u64::from(byte))
     }
-
-    fn validate(&self) -> Result<(), ConfigError> {
-        let Self {
-            run,
-            actors,
-            exploration,
-            ddpg,
-            replay,
-            evaluation,
-            checkpoint,
-            ..
-        } = self;
-        within("run.seed", run.seed, 0, i64::MAX as u64)?;
-        within("run.steps", run.steps, 1, 1_000_000_000_000)?;
-        within("actors.max", actors.max, 1, 256)?;
-        within("actors.count", actors.count, 1, actors.max)?;
-        within("actors.envs", actors.envs, 1, 4_096)?;
-        within("actors.chunk_steps", actors.chunk_steps, 1, 4_096)?;
-        within("actors.window", actors.window, 1, 64)?;
-        within("exploration.theta", exploration.theta, 0.0, 1.0)?;
-        within("exploration.sigma", exploration.sigma, 0.0, 10.0)?;
-        within("ddpg.hidden[0]", ddpg.hidden[0], 1, 8_192)?;
-        within("ddpg.hidden[1]", ddpg.hidden[1], 1, 8_192)?;
-        within("ddpg.gamma", ddpg.gamma, 0.0, 1.0)?;
-        within("ddpg.tau", ddpg.tau, 0.0, 1.0)?;
-        within("ddpg.actor_learning_rate", ddpg.actor_learning_rate, 0.0, 1.0)?;
-        within("ddpg.critic_learning_rate", ddpg.critic_learning_rate, 0.0, 1.0)?;
-        within("ddpg.batch", ddpg.batch, 1, 65_536)?;
-        within("replay.capacity", replay.capacity, ddpg.batch as u64, 1_000_000_000)?;
-        within("replay.warmup", replay.warmup, 1, replay.capacity)?;
-        within("replay.updates_per_step", replay.updates_per_step, 0.0, 1_000.0)?;
-        within("replay.tolerance", replay.tolerance, 1, 1_000_000_000)?;
-        within("evaluation.every", evaluation.every, 1, u64::MAX)?;
-        within("evaluation.episodes", evaluation.episodes, 1, 10_000)?;
-        within("evaluation.final_episodes", evaluation.final_episodes, 1, 100_000)?;
-        within("checkpoint.every_seconds", checkpoint.every_seconds, 0.0, 86_400.0)?;
-        within("checkpoint.every_updates", checkpoint.every_updates, 1, 1_000_000_000)
-    }
-}
-
-fn within<T: PartialOrd + Display>(key: &'static str, value: T, low: T, high: T) -> Result<(), ConfigError> {
-    if low <= value && value <= high {
-        return Ok(());
-    }
-    Err(ConfigError::OutOfRange {
-        key,
-        value: value.to_string(),
-        expected: format!("from {low} to {high}"),
-    })
 }
 
 fn malformed(origin: impl Display, error: &toml::de::Error) -> ConfigError {

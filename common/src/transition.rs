@@ -46,6 +46,7 @@ impl RowLayout {
     }
 
     /// Reads a row of `width()` numbers.
+    #[inline]
     pub fn read<'a>(&self, row: &'a [f32]) -> Transition<'a> {
         let (s, rest) = row.split_at(self.observation);
         let (a, rest) = rest.split_at(self.action);
@@ -60,6 +61,7 @@ impl RowLayout {
     }
 
     /// Writes a transition into a row of `width()` numbers.
+    #[inline]
     pub fn write(&self, transition: &Transition<'_>, row: &mut [f32]) {
         let (s, rest) = row.split_at_mut(self.observation);
         let (a, rest) = rest.split_at_mut(self.action);

@@ -34,7 +34,7 @@ impl Progress {
             ProgressDrawTarget::stderr()
         };
         let bar = ProgressBar::with_draw_target(Some(config.run.steps), target);
-        if let Ok(style) = ProgressStyle::with_template("{prefix:.bold} {bar:16.cyan/dim} {wide_msg}") {
+        if let Ok(style) = ProgressStyle::with_template("{prefix:.bold} {bar:20.cyan/dim} {msg}") {
             bar.set_style(style.progress_chars("━━─"));
         }
         bar.set_prefix(run.name());
@@ -80,33 +80,30 @@ impl Progress {
         self.bar.set_message(self.line(&learner, crew));
     }
 
+    /// How far it is and how good, and below it how fast and who waits: each fits 80 columns.
     fn line(&self, learner: &LearnerReport, crew: &Crew) -> String {
         let steps = self.bar.length().unwrap_or(0);
-        let mut parts = vec![format!("{}/{} steps", thousands(learner.env_steps), thousands(steps))];
-        parts.push(format!("{} updates", thousands(learner.updates)));
         let rates = self.rates();
-        if let Some((updates, env_steps)) = rates {
-            parts.push(format!("{updates:.0} upd/s {env_steps:.0} steps/s"));
-        }
-        let beyond = learner.env_steps.saturating_sub(self.warmup);
-        let ratio = if beyond > 0 {
-            learner.updates as f64 / beyond as f64
-        } else {
-            0.0
-        };
-        let waits = waiting(crew).map(|who| format!("{who}: ")).unwrap_or_default();
-        parts.push(format!("{waits}ratio {ratio:.2} of {:.2}", self.updates_per_step));
-        if let Some(evaluated) = &self.evaluated {
-            parts.push(format!("eval {:.1}", evaluated.return_mean));
-        }
-        if crew.restarts() > 0 {
-            parts.push(format!("{} restarts", crew.restarts()));
-        }
+        let mut outcome = vec![format!("{}/{} steps", thousands(learner.env_steps), thousands(steps))];
         if let Some((_, env_steps)) = rates.filter(|(_, env_steps)| *env_steps > 0.0) {
             let left = steps.saturating_sub(learner.env_steps) as f64 / env_steps;
-            parts.push(format!("{} left", HumanDuration(Duration::from_secs_f64(left))));
+            outcome.push(format!("{} left", HumanDuration(Duration::from_secs_f64(left))));
         }
-        parts.join(" · ")
+        if let Some(evaluated) = &self.evaluated {
+            outcome.push(format!("eval {:.1}", evaluated.return_mean));
+        }
+        let mut pace = vec![format!("{} updates", thousands(learner.updates))];
+        if let Some((updates, env_steps)) = rates {
+            pace.push(format!("{updates:.0} updates/s · {env_steps:.0} steps/s"));
+        }
+        let beyond = learner.env_steps.saturating_sub(self.warmup);
+        let ratio = if beyond > 0 { learner.updates as f64 / beyond as f64 } else { 0.0 };
+        let waits = waiting(crew).map(|who| format!(" ({who})")).unwrap_or_default();
+        pace.push(format!("ratio {ratio:.2} of {:.2}{waits}", self.updates_per_step));
+        if crew.restarts() > 0 {
+            pace.push(format!("{} restarts", crew.restarts()));
+        }
+        format!("{}\n  {}", outcome.join(" · "), pace.join(" · "))
     }
 
     /// Updates and environment steps a second.

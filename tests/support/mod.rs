@@ -13,7 +13,7 @@ use rustix::process::{Pid, Signal, kill_process, test_kill_process};
 const PATIENCE: Duration = Duration::from_secs(120);
 
 /// Settings with which a run is quick: small networks, little warm-up, few episodes to judge by.
-pub const QUICK: [&str; 10] = [
+pub(crate) const QUICK: [&str; 10] = [
     "--set",
     "ddpg.hidden=[24, 16]",
     "--set",
@@ -27,45 +27,45 @@ pub const QUICK: [&str; 10] = [
 ];
 
 /// A directory to run the program in.
-pub struct Workplace {
+pub(crate) struct Workplace {
     directory: tempfile::TempDir,
 }
 
 /// A run under way; killed with all its roles when dropped.
-pub struct Running {
+pub(crate) struct Running {
     child: Child,
-    pub run: PathBuf,
+    pub(crate) run: PathBuf,
 }
 
 impl Workplace {
-    pub fn new() -> Self {
+    pub(crate) fn new() -> Self {
         Self { directory: tempfile::tempdir().unwrap() }
     }
 
-    pub fn path(&self) -> &Path {
+    pub(crate) fn path(&self) -> &Path {
         self.directory.path()
     }
 
-    pub fn shoal(&self, arguments: &[&str]) -> Command {
+    pub(crate) fn shoal(&self, arguments: &[&str]) -> Command {
         let mut command = Command::new(env!("CARGO_BIN_EXE_shoal"));
         command.args(arguments).current_dir(self.path()).stdin(Stdio::null());
         command
     }
 
     /// Runs the program to its end.
-    pub fn output(&self, arguments: &[&str]) -> Output {
+    pub(crate) fn output(&self, arguments: &[&str]) -> Output {
         self.shoal(arguments).output().unwrap()
     }
 
     /// Trains quickly and returns what `--json` printed.
-    pub fn train(&self, arguments: &[&str]) -> serde_json::Value {
+    pub(crate) fn train(&self, arguments: &[&str]) -> serde_json::Value {
         let output = self.output(&[&["train"], arguments, &QUICK[..], &["--json"]].concat());
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
         json(&output)
     }
 
     /// Starts a quick run in `name` and waits until every role is ready.
-    pub fn start(&self, name: &str, arguments: &[&str]) -> Running {
+    pub(crate) fn start(&self, name: &str, arguments: &[&str]) -> Running {
         let stderr = std::fs::File::create(self.path().join("stderr")).unwrap();
         let child = self
             .shoal(&[&["train", "pendulum", "--run", name], arguments, &QUICK[..], &["--json"]].concat())
@@ -83,28 +83,28 @@ impl Workplace {
 }
 
 impl Running {
-    pub fn log(&self) -> String {
+    pub(crate) fn log(&self) -> String {
         std::fs::read_to_string(self.run.join("shoal.log")).unwrap_or_default()
     }
 
     /// Process numbers of a role in the order of their starts, like `actor-0`.
-    pub fn pids(&self, who: &str) -> Vec<i32> {
+    pub(crate) fn pids(&self, who: &str) -> Vec<i32> {
         pids(&self.log()).into_iter().filter(|(name, _)| name == who).map(|(_, pid)| pid).collect()
     }
 
     /// Kills the running process of a role with SIGKILL.
-    pub fn kill(&self, who: &str) {
+    pub(crate) fn kill(&self, who: &str) {
         let pid = *self.pids(who).last().unwrap();
         kill_process(Pid::from_raw(pid).unwrap(), Signal::KILL).unwrap();
     }
 
     /// Sends a signal to the launcher.
-    pub fn signal(&self, signal: Signal) {
+    pub(crate) fn signal(&self, signal: Signal) {
         kill_process(Pid::from_child(&self.child), signal).unwrap();
     }
 
     /// Waits until the launcher has ended; its exit code, and what it printed.
-    pub fn wait(mut self) -> (Option<i32>, String, Leftovers) {
+    pub(crate) fn wait(mut self) -> (Option<i32>, String, Leftovers) {
         until("the launcher has ended", || self.child.try_wait().unwrap().is_some());
         let code = self.child.wait().unwrap().code();
         let mut printed = String::new();
@@ -113,7 +113,7 @@ impl Running {
     }
 
     /// What this run must not leave behind.
-    pub fn leftovers(&self) -> Leftovers {
+    pub(crate) fn leftovers(&self) -> Leftovers {
         Leftovers::of(&self.run)
     }
 }
@@ -131,7 +131,7 @@ impl Drop for Running {
 }
 
 /// Processes and shared memory of a run.
-pub struct Leftovers {
+pub(crate) struct Leftovers {
     run_id: String,
     pids: Vec<i32>,
 }
@@ -148,12 +148,12 @@ impl Leftovers {
     }
 
     /// Processes of the run that are still there.
-    pub fn processes(&self) -> Vec<i32> {
+    pub(crate) fn processes(&self) -> Vec<i32> {
         self.pids.iter().copied().filter(|pid| is_ours(*pid)).collect()
     }
 
     /// Files of the run that are still in shared memory.
-    pub fn files(&self) -> Vec<String> {
+    pub(crate) fn files(&self) -> Vec<String> {
         std::fs::read_dir("/dev/shm")
             .unwrap()
             .map(|entry| entry.unwrap().file_name().to_string_lossy().into_owned())
@@ -162,7 +162,7 @@ impl Leftovers {
     }
 
     /// Waits until nothing is left.
-    pub fn vanish(&self) {
+    pub(crate) fn vanish(&self) {
         assert!(!self.pids.is_empty());
         until("no process of the run is left", || self.processes().is_empty());
         until("no file of the run is left in shared memory", || self.files().is_empty());
@@ -170,18 +170,18 @@ impl Leftovers {
 }
 
 /// The last line of what was printed, as JSON.
-pub fn json(output: &Output) -> serde_json::Value {
+pub(crate) fn json(output: &Output) -> serde_json::Value {
     parse(&String::from_utf8_lossy(&output.stdout))
 }
 
 /// The only line printed, as JSON.
-pub fn parse(printed: &str) -> serde_json::Value {
+pub(crate) fn parse(printed: &str) -> serde_json::Value {
     assert_eq!(printed.lines().count(), 1, "exactly one line on standard output: {printed}");
     serde_json::from_str(printed).unwrap()
 }
 
 /// Waits until something holds.
-pub fn until(what: &str, mut holds: impl FnMut() -> bool) {
+pub(crate) fn until(what: &str, mut holds: impl FnMut() -> bool) {
     let begun = Instant::now();
     while !holds() {
         assert!(begun.elapsed() < PATIENCE, "waited in vain until {what}");

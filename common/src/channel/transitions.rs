@@ -3,6 +3,9 @@
 //! An actor keeps at most `window` chunks sent but not committed, the service's history holds as many, and the learner's
 //! buffer twice as many (a new learner may find a whole history that it has committed already, and a whole window on top).
 //! So `send` always finds room, and what a dead learner had not committed reaches the next one.
+//!
+//! What a dead actor had sent still arrives, and before anything of its next start, if the learner was connected to it.
+//! Nobody can ask for that, so an actor first sends an empty chunk, and no row before that one is committed.
 
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
@@ -41,7 +44,7 @@ pub struct ChunkSender {
     rows: usize,
     actor: u32,
     incarnation: u64,
-    first: u64,
+    window: u64,
     sent: u64,
 }
 
@@ -70,7 +73,7 @@ pub struct ReceivedChunk {
 
 impl ChunkSender {
     /// The sending end of `actor`, whose chunks have `rows` rows and of which `window` may be uncommitted. The sequence
-    /// goes on after `sent`.
+    /// goes on after `sent`. Incarnations count from 1.
     ///
     /// # Errors
     /// When shared memory cannot be had, or the actor before this one still lives.
@@ -92,16 +95,18 @@ impl ChunkSender {
                 .create()
                 .map_err(|cause| ChannelError::new(&channel, "send", cause))
         })?;
-        Ok(Self {
+        let sender = Self {
             publisher,
             channel,
             layout,
             rows,
             actor,
             incarnation,
-            first: sent,
+            window: window.into(),
             sent,
-        })
+        };
+        sender.deliver(sender.begin()?, 0)?;
+        Ok(sender)
     }
 
     /// Sequence number of the chunk sent last; 0 before the first.
@@ -109,14 +114,14 @@ impl ChunkSender {
         self.sent
     }
 
-    /// Chunks sent that `committed`, the newest mark of this actor in the replay, does not cover.
+    /// Chunks sent that `committed`, the newest mark of this actor in the replay, does not cover; a whole window until the
+    /// learner has taken the empty chunk.
     pub fn in_flight(&self, committed: ChunkMark) -> u64 {
-        let covered = if committed.incarnation == self.incarnation {
-            committed.sequence
+        if committed.incarnation == self.incarnation {
+            self.sent.saturating_sub(committed.sequence)
         } else {
-            self.first
-        };
-        self.sent.saturating_sub(covered)
+            self.window
+        }
     }
 
     /// An empty chunk.
@@ -140,8 +145,12 @@ impl ChunkSender {
     ///
     /// # Errors
     /// When the connection to the learner cannot be made.
-    pub fn send(&mut self, mut chunk: Chunk, policy_version: u64) -> Result<(), ChannelError> {
+    pub fn send(&mut self, chunk: Chunk, policy_version: u64) -> Result<(), ChannelError> {
         self.sent += 1;
+        self.deliver(chunk, policy_version)
+    }
+
+    fn deliver(&self, mut chunk: Chunk, policy_version: u64) -> Result<(), ChannelError> {
         *chunk.sample.user_header_mut() = ChunkHeader {
             incarnation: self.incarnation,
             sequence: self.sent,
@@ -209,15 +218,6 @@ impl ChunkReceiver {
                 .map_err(|cause| ChannelError::new(&channel, "receive", cause))
         })?;
         Ok(Self { subscriber, channel })
-    }
-
-    /// Connects with an actor that has come anew. From then on, what it sends arrives even if it dies: iceoryx2 delivers
-    /// it before anything of the actor's next start.
-    ///
-    /// # Errors
-    /// When the sender's memory cannot be mapped.
-    pub fn look_after(&self) -> Result<(), ChannelError> {
-        self.subscriber.update_connections().map_err(|cause| ChannelError::new(&self.channel, "reconnect", cause))
     }
 
     /// The next chunk, if there is one.

@@ -25,6 +25,8 @@ const IDENTITY_WORDS: usize = 9;
 /// Slots that hold a commit record: two for what is committed (a record of generation g goes to slot g mod 2), then
 /// two for what is known to have reached the disk.
 pub const SLOTS: usize = 4;
+/// The first of the two slots for what has reached the disk.
+pub const SYNCED: usize = 2;
 
 /// What a replay file holds. Two files with equal layouts are interchangeable; a file of another layout is refused.
 #[derive(Clone, Debug, PartialEq, Eq)]

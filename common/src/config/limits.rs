@@ -1,0 +1,56 @@
+//! What each number of a configuration may be.
+
+use std::fmt::Display;
+
+use super::{Config, ConfigError};
+
+impl Config {
+    pub(super) fn validate(&self) -> Result<(), ConfigError> {
+        let Self {
+            run,
+            actors,
+            exploration,
+            ddpg,
+            replay,
+            evaluation,
+            checkpoint,
+            ..
+        } = self;
+        within("run.seed", run.seed, 0, i64::MAX as u64)?;
+        within("run.steps", run.steps, 1, 1_000_000_000_000)?;
+        within("actors.max", actors.max, 1, 256)?;
+        within("actors.count", actors.count, 1, actors.max)?;
+        within("actors.envs", actors.envs, 1, 4_096)?;
+        within("actors.chunk_steps", actors.chunk_steps, 1, 4_096)?;
+        within("actors.window", actors.window, 1, 64)?;
+        within("exploration.theta", exploration.theta, 0.0, 1.0)?;
+        within("exploration.sigma", exploration.sigma, 0.0, 10.0)?;
+        within("ddpg.hidden[0]", ddpg.hidden[0], 1, 8_192)?;
+        within("ddpg.hidden[1]", ddpg.hidden[1], 1, 8_192)?;
+        within("ddpg.gamma", ddpg.gamma, 0.0, 1.0)?;
+        within("ddpg.tau", ddpg.tau, 0.0, 1.0)?;
+        within("ddpg.actor_learning_rate", ddpg.actor_learning_rate, 0.0, 1.0)?;
+        within("ddpg.critic_learning_rate", ddpg.critic_learning_rate, 0.0, 1.0)?;
+        within("ddpg.batch", ddpg.batch, 1, 65_536)?;
+        within("replay.capacity", replay.capacity, ddpg.batch as u64, 1_000_000_000)?;
+        within("replay.warmup", replay.warmup, 1, replay.capacity)?;
+        within("replay.updates_per_step", replay.updates_per_step, 0.0, 1_000.0)?;
+        within("replay.tolerance", replay.tolerance, 1, 1_000_000_000)?;
+        within("evaluation.every", evaluation.every, 1, u64::MAX)?;
+        within("evaluation.episodes", evaluation.episodes, 1, 10_000)?;
+        within("evaluation.final_episodes", evaluation.final_episodes, 1, 100_000)?;
+        within("checkpoint.every_seconds", checkpoint.every_seconds, 0.0, 86_400.0)?;
+        within("checkpoint.every_updates", checkpoint.every_updates, 1, 1_000_000_000)
+    }
+}
+
+fn within<T: PartialOrd + Display>(key: &'static str, value: T, low: T, high: T) -> Result<(), ConfigError> {
+    if low <= value && value <= high {
+        return Ok(());
+    }
+    Err(ConfigError::OutOfRange {
+        key,
+        value: value.to_string(),
+        expected: format!("from {low} to {high}"),
+    })
+}

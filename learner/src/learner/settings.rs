@@ -1,0 +1,114 @@
+//! What a learner is told, and why it may not be able to go on.
+
+use std::path::PathBuf;
+
+use shoal_common::channel::ChannelError;
+use shoal_common::config::{self, Mode};
+use shoal_common::policy_file::PolicyFileError;
+use shoal_common::report::Identity;
+use shoal_common::space::EnvironmentSpec;
+
+use crate::checkpoint::{CheckpointError, SectionError};
+use crate::ddpg::{DdpgError, DdpgSettings};
+use crate::intake::IntakeError;
+use crate::ratio::Ratio;
+use crate::replay::ReplayError;
+
+/// What a learner is told.
+#[derive(Clone, Debug)]
+pub struct Settings {
+    /// Which process this is.
+    pub identity: Identity,
+    /// The run's seed.
+    pub seed: u64,
+    /// Whether to take turns with the actors.
+    pub mode: Mode,
+    /// Environment steps after which training ends.
+    pub steps: u64,
+    /// Actors that take part.
+    pub actors: u32,
+    /// Actors there may ever be.
+    pub max_actors: u32,
+    /// Chunks an actor may have sent and not committed.
+    pub window: u32,
+    /// Rows in a full chunk.
+    pub chunk_rows: usize,
+    /// What is controlled.
+    pub spec: EnvironmentSpec,
+    /// The algorithm's numbers.
+    pub ddpg: DdpgSettings,
+    /// Updates per step.
+    pub ratio: Ratio,
+    /// Transitions that minibatches are sampled from.
+    pub capacity: u64,
+    /// When policies are judged.
+    pub evaluation: config::Evaluation,
+    /// When the state is saved.
+    pub checkpoint: config::Checkpoint,
+    /// Fingerprint of the run's configuration.
+    pub fingerprint: u64,
+    /// Where the replay lies.
+    pub replay: PathBuf,
+    /// Where checkpoints are kept.
+    pub checkpoints: PathBuf,
+    /// Where the policy is left at the end.
+    pub last_policy: PathBuf,
+}
+
+/// Why a learner cannot go on.
+#[derive(Debug, thiserror::Error)]
+pub enum LearnerError {
+    /// A channel does not work.
+    #[error(transparent)]
+    Channel(#[from] ChannelError),
+    /// An actor sent what cannot be used.
+    #[error(transparent)]
+    Intake(#[from] IntakeError),
+    /// The replay cannot be used.
+    #[error(transparent)]
+    Replay(#[from] ReplayError),
+    /// A checkpoint cannot be read or written.
+    #[error(transparent)]
+    Checkpoint(#[from] CheckpointError),
+    /// A checkpoint is of another program.
+    #[error(transparent)]
+    Section(#[from] SectionError),
+    /// The algorithm cannot learn this.
+    #[error(transparent)]
+    Ddpg(#[from] DdpgError),
+    /// The policy cannot be left behind.
+    #[error(transparent)]
+    PolicyFile(#[from] PolicyFileError),
+    /// The weights are no numbers any more.
+    #[error("the losses are no longer finite after {updates} updates: lower the learning rates or the rewards' scale")]
+    Diverged {
+        /// Updates done.
+        updates: u64,
+    },
+    /// A lockstep run needs rows again that the ring has lost.
+    #[error("{path}: the rows before row {needed} are gone, which the checkpoint needs again; start a new run")]
+    RowsLost {
+        /// The replay.
+        path: PathBuf,
+        /// The first row that is needed.
+        needed: u64,
+    },
+}
+
+impl Settings {
+    /// Rows the ring holds: the sampling window, and in lockstep the rows of two checkpoint intervals beyond it, because
+    /// a learner that goes on from a checkpoint samples them again.
+    pub(super) fn ring_rows(&self) -> u64 {
+        let slack = match self.mode {
+            Mode::Free => 0,
+            Mode::Lockstep => {
+                let interval = self.checkpoint.every_updates as f64 / self.ratio.updates_per_step;
+                let round = self.chunk_rows as u64 * u64::from(self.actors);
+                (2.0 * interval).min(self.steps as f64) as u64 + 2 * round
+            }
+        };
+        // A ring must have room for a chunk, however small the window.
+        (self.capacity + slack).max(self.chunk_rows as u64)
+    }
+}
+

@@ -1,0 +1,109 @@
+//! Bad input gets one clear line that says what, where and what to do, a non-zero exit code, and loses nothing.
+
+mod support;
+
+use std::process::Output;
+
+use support::{QUICK, Workplace, until};
+
+/// The one line that a failed command said.
+fn complaint(output: &Output) -> String {
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(!output.status.success(), "{said}");
+    assert!(output.stdout.is_empty());
+    assert_eq!(said.lines().count(), 1, "one line: {said}");
+    said
+}
+
+#[test]
+fn what_cannot_be_trained_is_refused_before_anything_is_made() {
+    let place = Workplace::new();
+    std::fs::write(place.path().join("broken.toml"), "[run\n").unwrap();
+    std::fs::write(place.path().join("strange.toml"), "[environment]\nname = \"pendulum\"\n[lerner]\n").unwrap();
+    for (arguments, part) in [
+        (&["pendulums"][..], "there is no preset `pendulums`: choose pendulum, point-mass-r1"),
+        (&["missing.toml"], "cannot read missing.toml"),
+        (&["broken.toml"], "broken.toml"),
+        (&["strange.toml"], "strange.toml: unknown field `lerner`"),
+        (&["pendulum", "--set", "ddpg.gama=0.9"], "unknown field `gama`, expected one of"),
+        (&["pendulum", "--set", "ddpg.gamma=1.1"], "ddpg.gamma = 1.1: must be from 0 to 1"),
+        (&["pendulum", "--set", "environment.start_sped=1"], "start_sped"),
+        (&["point-mass-r1", "--set", "environment.friction=-1"], "friction"),
+        (&["pendulum", "--set", "environment.name=cart-pole"], "discrete"),
+        (&["pendulum", "--steps", "0"], "run.steps = 0"),
+    ] {
+        let said = complaint(&place.output(&[&["train"], arguments].concat()));
+        assert!(said.starts_with("error: ") && said.contains(part), "{arguments:?}: {said}");
+    }
+    assert!(!place.path().join("runs").exists(), "nothing was made");
+}
+
+#[test]
+fn a_run_directory_that_exists_is_left_as_it_is() {
+    let place = Workplace::new();
+    std::fs::create_dir(place.path().join("mine")).unwrap();
+    std::fs::write(place.path().join("mine/thesis.txt"), "four months of work").unwrap();
+    let said = complaint(&place.output(&["train", "pendulum", "--run", "mine"]));
+    assert!(said.contains("mine exists already"), "{said}");
+    assert_eq!(std::fs::read_dir(place.path().join("mine")).unwrap().count(), 1);
+}
+
+#[test]
+fn what_is_no_run_or_holds_no_policy_is_refused() {
+    let place = Workplace::new();
+    for command in ["eval", "plot"] {
+        let said = complaint(&place.output(&[command, "nowhere"]));
+        assert!(said.contains("nowhere is not a run directory"), "{said}");
+    }
+}
+
+#[test]
+fn a_damaged_policy_is_refused_and_kept() {
+    let place = Workplace::new();
+    place.train(&["pendulum", "--steps", "400", "--run", "run"]);
+    let policy = place.path().join("run/checkpoints/last.policy");
+    let mut bytes = std::fs::read(&policy).unwrap();
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 1;
+    std::fs::write(&policy, &bytes).unwrap();
+    let said = complaint(&place.output(&["eval", "run", "--policy", "last"]));
+    assert!(said.contains("last.policy"), "{said}");
+    assert_eq!(std::fs::read(&policy).unwrap(), bytes);
+}
+
+#[test]
+fn a_disk_that_is_too_small_for_the_replay_is_said_and_ends_the_run() {
+    let place = Workplace::new();
+    // A file-size limit of a few megabytes stands for the full disk: the replay wants forty.
+    let script = format!("ulimit -f 8000; exec {} train pendulum --run run --json", env!("CARGO_BIN_EXE_shoal"));
+    let output = std::process::Command::new("sh").args(["-c", &script]).current_dir(place.path()).output().unwrap();
+    let said = complaint(&output);
+    assert!(said.contains("learner-0") && said.contains("replay.bin"), "{said}");
+    assert!(!place.path().join("run/replay.bin").exists(), "no half-made file is left");
+}
+
+#[test]
+fn json_is_the_only_line_on_standard_output() {
+    let place = Workplace::new();
+    let result = place.train(&["point-mass-r3", "--steps", "400", "--run", "run"]);
+    assert_eq!(result["env_steps"], 400);
+    let judged = support::json(&place.output(&["eval", "run", "--policy", "last", "--episodes", "4", "--json"]));
+    assert_eq!(judged["episodes"], 4);
+    assert!(judged["final_distance_mean"].as_f64().unwrap() >= 0.0);
+    assert!((0.0..=1.0).contains(&judged["reached_fraction"].as_f64().unwrap()));
+    let again = support::json(&place.output(&["eval", "run", "--policy", "last", "--episodes", "4", "--json"]));
+    assert_eq!(again, judged, "always the same starts");
+}
+
+#[test]
+fn two_runs_side_by_side_do_not_touch_each_other() {
+    let place = Workplace::new();
+    let other = Workplace::new();
+    let running = place.start("run", &["--steps", "100000000"]);
+    let before = running.log().lines().count();
+    let output = other.output(&[&["train", "pendulum", "--steps", "300", "--lockstep"], &QUICK[..]].concat());
+    assert!(output.status.success());
+    until("the first run goes on", || running.run.join("checkpoints/latest.ckpt").exists());
+    assert_eq!(running.log().lines().count(), before, "no process of the first run was replaced");
+    assert!(running.leftovers().processes().len() >= 6);
+}
