@@ -1,5 +1,7 @@
 //! Bad input gets one clear line that says what, where and what to do, a non-zero exit code, and loses nothing.
 
+#![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
+
 mod support;
 
 use std::process::Output;

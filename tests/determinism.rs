@@ -1,6 +1,8 @@
 //! Lockstep: the same seed gives the same bits, whatever the timing and whatever is killed; and with one actor and one
 //! environment they are the bits of Algorithm 4 in a single process.
 
+#![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
+
 mod support;
 
 use shoal_actor::noise::OrnsteinUhlenbeck;

@@ -200,8 +200,8 @@ fn close(ours: &[f64], recorded: &[f64]) -> Result<(), Failure> {
 
 /// Gymnasium's transition table, `transitions[state][action]`, and the optimal action values at γ = 0.999.
 fn frozen_lake(file: &Value) -> Result<(), Failure> {
-    const TABLE: fn(Value) -> serde_json::Result<Vec<Vec<Vec<Value>>>> = serde_json::from_value;
-    let recorded = read(file, "transitions", TABLE)?;
+    type Table = Vec<Vec<Vec<Value>>>;
+    let recorded = read(file, "transitions", serde_json::from_value::<Table>)?;
     let shape: Vec<_> = recorded.iter().map(Vec::len).collect();
     if shape != [frozen_lake::ACTIONS; frozen_lake::STATES] {
         return Err(format!("transitions of {shape:?} actions"));

@@ -1,5 +1,7 @@
 //! Processes of a run: they start, are ready, and end, whatever ends them, and leave nothing behind.
 
+#![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
+
 mod support;
 
 use rustix::process::Signal;

@@ -78,10 +78,6 @@ impl Intake {
         most: u32,
         enough: impl Fn(&Replay) -> bool,
     ) -> Result<bool, IntakeError> {
-        // Even when there is enough: what an actor has sent outlives it only once we are connected to it.
-        for source in &self.sources {
-            source.receiver.look_after()?;
-        }
         let actors = self.sources.len();
         let (mut any, mut idle) = (false, 0);
         for _ in 0..most as usize * actors {

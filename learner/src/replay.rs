@@ -108,9 +108,14 @@ impl Replay {
             warnings: found.warnings,
             hook: None,
         };
+        replay.words.store(replay.places.selector, found.selector);
         replay.publish(found.next_generation);
         replay.words.store(replay.places.reach, replay.record.head());
-        replay.ring.forget_from(replay.rows());
+        let forgotten = replay.ring.forget_outside(replay.rows());
+        if forgotten || !replay.warnings.is_empty() {
+            // A later power loss must not bring back what was given up here.
+            replay.file.sync_data().map_err(|source| replay.cannot_sync(source))?;
+        }
         Ok(replay)
     }
 
@@ -177,6 +182,8 @@ impl Replay {
 
     /// Writes `self.record` into the slot of `generation` and makes it the one the readers use.
     fn publish(&mut self, generation: u64) {
+        let published = self.words.read().load(self.places.selector);
+        assert_ne!(generation % 2, published % 2, "the published slot is never written");
         self.record.set_generation(generation);
         let slot = self.places.slots[(generation % 2) as usize];
         let hook = &mut self.hook;

@@ -6,6 +6,7 @@ mod policy;
 mod product;
 mod rows;
 mod scene;
+mod spin;
 mod step;
 mod transitions;
 mod window;

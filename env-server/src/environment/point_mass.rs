@@ -192,12 +192,12 @@ mod tests {
     use super::*;
     use shoal_common::stream::{Purpose, stream};
 
-    /// F_c of the default parameters: μ m g.
+    /// F_c of these tests' vehicle: μ m g.
     const F_C: f64 = 0.02 * 9.81;
     const F_S: f64 = 1.2 * F_C;
 
     fn at(parameters: &str, state: [f64; 4]) -> PointMass {
-        let mut vehicle = PointMass::new(toml::from_str(parameters).unwrap()).unwrap();
+        let mut vehicle = PointMass::new(toml::from_str(&format!("friction = 0.02\n{parameters}")).unwrap()).unwrap();
         vehicle.reset_to(&state).unwrap();
         vehicle
     }

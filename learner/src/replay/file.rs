@@ -4,11 +4,13 @@ use std::fs::{self, File, OpenOptions, Permissions, TryLockError};
 use std::io::{self, Write};
 use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
 use std::path::{Path, PathBuf};
+use std::thread;
+use std::time::{Duration, Instant};
 
 use rustix::fs::{CWD, FallocateFlags, RenameFlags, fallocate, renameat_with};
 use rustix::io::Errno;
 use rustix::process::{Resource, getrlimit};
-use shoal_common::commit::{Places, Record, ReplayLayout, Words, WritableWords};
+use shoal_common::commit::{Places, Record, ReplayLayout, SYNCED, Words, WritableWords};
 use shoal_common::durable::sync_directory_of;
 
 use super::ReplayError;
@@ -47,7 +49,7 @@ pub(super) fn create(path: &Path, layout: &ReplayLayout) -> Result<(File, Places
     let mut record = Record::empty(layout.actors);
     record.set_generation(1);
     // As committed, and as synced: whatever a power loss destroys later, this one is a state to fall back to.
-    for slot in [1, 2] {
+    for slot in [1, SYNCED] {
         record.store(&mut words, places.slots[slot], |_| ());
     }
     words.store(places.selector, record.generation());
@@ -102,10 +104,16 @@ fn places(path: &Path, layout: &ReplayLayout) -> Result<Places, ReplayError> {
 
 /// The lock goes with the open file and its mappings: the kernel drops it when the process is gone, however it went.
 fn lock(path: &Path, file: &File) -> Result<(), ReplayError> {
-    file.try_lock().map_err(|error| match error {
-        TryLockError::WouldBlock => ReplayError::InUse(path.into()),
-        TryLockError::Error(source) => io(path, "lock")(source),
-    })
+    // A process killed a moment ago, or a child forked and not yet executed, may still hold it.
+    let patience = Instant::now() + Duration::from_secs(1);
+    loop {
+        match file.try_lock() {
+            Ok(()) => return Ok(()),
+            Err(TryLockError::Error(source)) => return Err(io(path, "lock")(source)),
+            Err(TryLockError::WouldBlock) if Instant::now() > patience => return Err(ReplayError::InUse(path.into())),
+            Err(TryLockError::WouldBlock) => thread::sleep(Duration::from_millis(5)),
+        }
+    }
 }
 
 /// Reserves the space, so that a full disk is an error here and not a SIGBUS at some later row.

@@ -1,14 +1,16 @@
 //! Which of the file's commit records to believe. After a `kill -9` it is the newest, and nothing is lost. After a power
 //! loss any block of the file may be older than any other, and each record is as good as the rows it can show.
 
-use shoal_common::commit::{Places, Record, ReplayLayout, SLOTS, Words};
+use shoal_common::commit::{Places, Record, ReplayLayout, SLOTS, SYNCED, Words};
 
 use super::ring::Ring;
 
 /// What the file proves.
 pub(super) struct Found {
     pub(super) record: Record,
-    /// For the record the caller publishes: newer than all others, and not in the slot this one was found in.
+    /// The generation to publish first; its slot is as it should be.
+    pub(super) selector: u64,
+    /// For the record that the caller publishes then: newer than all others, and in the other slot.
     pub(super) next_generation: u64,
     pub(super) next_synced: usize,
     pub(super) synced_generation: u64,
@@ -28,100 +30,123 @@ struct Candidate<'a> {
 }
 
 impl Candidate<'_> {
-    /// Greater is better. A power loss must not cost a row that was synced: they count first.
-    fn merit(&self, synced: u64, layout: &ReplayLayout) -> (u64, u64, bool, u64) {
-        let of_synced = self.record.head().min(synced).saturating_sub(self.tail);
-        let of_all = self.record.head() - self.tail;
-        (of_synced, of_all, self.whole(layout), self.record.generation())
+    /// Greater is better. A power loss must not cost a row that was synced: they count first. Rows before `replaced` count
+    /// for nothing.
+    fn merit(&self, replaced: u64, synced: u64, layout: &ReplayLayout) -> (u64, u64, bool, u64) {
+        let (head, tail) = (self.record.head(), self.tail.max(replaced));
+        let of_synced = head.min(synced).saturating_sub(tail);
+        let of_all = head.saturating_sub(tail);
+        (
+            of_synced,
+            of_all,
+            self.whole(replaced, layout),
+            self.record.generation(),
+        )
     }
 
-    fn whole(&self, layout: &ReplayLayout) -> bool {
-        self.tail == oldest(self.record, layout)
+    fn whole(&self, replaced: u64, layout: &ReplayLayout) -> bool {
+        self.tail <= oldest(self.record, layout).max(replaced)
     }
 }
 
-/// Chooses the newest record if all its rows are intact. Otherwise the one under which most of the synced rows are, and
+/// Chooses the newest record if all its rows are intact, but for those that were being replaced. Otherwise the one under which most of the synced rows are, and
 /// of those the one with most rows.
 pub(super) fn recover(words: &Words, places: &Places, layout: &ReplayLayout, ring: &Ring) -> Result<Found, String> {
     let slots: [Option<Record>; SLOTS] = places.slots.map(|slot| Record::load(words, slot, layout.actors));
-    let published = words.load(places.selector);
-    let reach = words.load(places.reach);
+    let newest_of = |from: usize| {
+        let records = slots
+            .iter()
+            .enumerate()
+            .skip(from)
+            .filter_map(|(slot, record)| Some((slot, record.as_ref()?)));
+        records.max_by_key(|(_, record)| record.generation())
+    };
+    let (newest_slot, newest) = newest_of(0).ok_or(NONE_LEFT)?;
 
-    let mut records: Vec<(usize, &Record)> = slots
-        .iter()
-        .enumerate()
-        .filter_map(|(slot, record)| Some((slot, record.as_ref()?)))
-        .collect();
-    records.sort_by_key(|(_, record)| std::cmp::Reverse(record.generation()));
-    let &(_, newest) = records.first().ok_or(NONE_LEFT)?;
-    let &(_, synced) = records.iter().find(|(slot, _)| *slot >= 2).unwrap_or(&(0, newest));
-
-    let mut candidates: Vec<Candidate<'_>> = Vec::new();
-    for &(slot, record) in &records {
-        let tail = intact_from(record, layout, ring);
-        candidates.push(Candidate { slot, record, tail });
-        // No other record can offer more than the newest when that is whole: the older rows are overwritten.
-        if candidates[0].whole(layout) {
-            break;
-        }
-    }
-    let best = candidates
-        .into_iter()
-        .max_by_key(|candidate| candidate.merit(synced.head(), layout));
-    let Candidate {
-        slot,
-        record: chosen,
-        tail,
-    } = best.ok_or(NONE_LEFT)?;
-
-    let mut warnings = Vec::new();
-    if newest.generation() < published {
-        warnings.push(format!(
-            "the commit record published last is damaged; going on from the newest that is not (number {})",
-            newest.generation()
-        ));
-    }
-    if chosen.head() < newest.head() {
-        warnings.push(format!(
-            "the newest {} rows did not reach the disk; going on from the {} rows that did",
-            newest.head() - chosen.head(),
-            chosen.head()
-        ));
-    }
     // Rows that a write under way when the process died was about to replace: nobody misses them.
-    let replaced = reach
-        .min(chosen.head().saturating_add(layout.ring))
+    let replaced = words
+        .load(places.reach)
+        .min(newest.head() + layout.ring)
         .saturating_sub(layout.ring);
-    if tail > oldest(chosen, layout).max(replaced) {
-        warnings.push(format!(
-            "row {} is damaged; going on with the {} rows after it",
-            tail - 1,
-            chosen.head() - tail
-        ));
+    let synced = newest_of(SYNCED).map_or(0, |(_, record)| record.head());
+
+    let candidate = |slot, record| Candidate {
+        slot,
+        record,
+        tail: intact_from(record, layout, ring),
+    };
+    let mut best = candidate(newest_slot, newest);
+    if !best.whole(replaced, layout) {
+        let records = slots
+            .iter()
+            .enumerate()
+            .filter_map(|(slot, record)| Some(candidate(slot, record.as_ref()?)));
+        best = records
+            .chain([best])
+            .max_by_key(|each| each.merit(replaced, synced, layout))
+            .ok_or(NONE_LEFT)?;
     }
 
-    let published = if published < newest.generation() + FAR {
+    let published = words.load(places.selector);
+    let warnings = warnings(&best, newest, published, replaced.max(oldest(best.record, layout)));
+    // Readers may be looking at the published slot: make it the chosen one, where that can be published, and then write
+    // the other.
+    let selector = if best.slot < SYNCED {
+        best.record.generation()
+    } else {
+        published
+    };
+    let last = newest.generation().max(if published < newest.generation() + FAR {
         published
     } else {
         0
-    };
-    let last = newest.generation().max(published);
-    let next_generation = if slot < 2 && (last + 1) % 2 == slot as u64 {
+    });
+    let next_generation = if (last + 1) % 2 == selector % 2 {
         last + 2
     } else {
         last + 1
     };
+
     let generation = |slot: usize| slots[slot].as_ref().map_or(0, Record::generation);
-    let (older, newer) = if generation(2) <= generation(3) { (2, 3) } else { (3, 2) };
-    let mut record = chosen.clone();
-    record.set_tail(tail);
+    let (older, newer) = if generation(SYNCED) <= generation(SYNCED + 1) {
+        (SYNCED, SYNCED + 1)
+    } else {
+        (SYNCED + 1, SYNCED)
+    };
+    let mut record = best.record.clone();
+    record.set_tail(best.tail);
     Ok(Found {
         record,
+        selector,
         next_generation,
         next_synced: older,
         synced_generation: generation(newer),
         warnings,
     })
+}
+
+/// What of the file had to be given up: the record `published`, rows after those of `best`, rows from `expected` on.
+fn warnings(best: &Candidate<'_>, newest: &Record, published: u64, expected: u64) -> Vec<String> {
+    let mut warnings = Vec::new();
+    if newest.generation() < published {
+        let number = newest.generation();
+        warnings.push(format!(
+            "the commit record published last is damaged; going on from the newest that is not (number {number})"
+        ));
+    }
+    let (head, lost) = (best.record.head(), newest.head().saturating_sub(best.record.head()));
+    if lost > 0 {
+        warnings.push(format!(
+            "the newest {lost} rows did not reach the disk; going on from the {head} rows that did"
+        ));
+    }
+    if best.tail > expected {
+        let (damaged, left) = (best.tail - 1, head - best.tail);
+        warnings.push(format!(
+            "row {damaged} is damaged; going on with the {left} rows after it"
+        ));
+    }
+    warnings
 }
 
 /// The first row the ring holds under `record` if none is damaged.

@@ -85,15 +85,18 @@ impl Ring {
         check != check::NONE && check == check::of_row(index, self.row(index))
     }
 
-    /// Makes sure that no place holds a row from `rows.end` on: a row that was written and never committed, or given up
-    /// after a power loss, must not pass for the one that will get its number. The places of `rows` are left alone.
-    pub(super) fn forget_from(&mut self, rows: Range<u64>) {
+    /// Empties the places outside `rows`, so that a row that was written and never committed, or given up after a power
+    /// loss, does not pass for the one that will get its number. True if one was not empty.
+    pub(super) fn forget_outside(&mut self, rows: Range<u64>) -> bool {
+        let mut forgotten = false;
         for index in rows.end..rows.start + self.ring {
-            // Places never written are recognised by their check, and their rows not touched: that would fill memory.
-            if self.holds(index) {
+            // Only the checks: reading the rows of a ring that is not full yet would fill memory with them.
+            if self.check(index) != check::NONE {
                 let place = self.place(index);
                 self.parts().0[place] = check::NONE;
+                forgotten = true;
             }
         }
+        forgotten
     }
 }

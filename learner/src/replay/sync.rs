@@ -7,7 +7,7 @@
 use std::fs::File;
 use std::io;
 
-use shoal_common::commit::Record;
+use shoal_common::commit::{Record, SYNCED};
 
 use super::{Replay, ReplayError, Step, observe, step_of_record};
 
@@ -58,7 +58,7 @@ impl Replay {
             .record
             .store(&mut self.words, slot, |step| observe(hook, step_of_record(step)));
         self.synced_generation = synced.record.generation();
-        self.next_synced = if self.next_synced == 2 { 3 } else { 2 };
+        self.next_synced = if self.next_synced == SYNCED { SYNCED + 1 } else { SYNCED };
         observe(hook, Step::SyncRecorded);
     }
 
@@ -71,7 +71,7 @@ impl Replay {
         self.file.sync_data().map_err(|source| self.cannot_sync(source))
     }
 
-    fn cannot_sync(&self, source: io::Error) -> ReplayError {
+    pub(super) fn cannot_sync(&self, source: io::Error) -> ReplayError {
         ReplayError::Io {
             path: self.path.clone(),
             doing: "sync",

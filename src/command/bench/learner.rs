@@ -24,6 +24,9 @@ const WINDOW: Duration = Duration::from_millis(100);
 /// Updates, the fastest product and all products take turns: each gets a third of the time.
 const SHARE: f64 = 1.0 / 3.0;
 
+/// Attempts at each shape by each kernel, of which the best counts when the kernels and shapes are compared.
+const ATTEMPTS: usize = 10;
+
 /// Part of the time that goes before: until Adam's moments and the caches are as they stay.
 const WARM_UP: f64 = 0.1;
 
@@ -135,10 +138,7 @@ impl Learner {
         let Self { sampler, replay, .. } = self;
         let window = replay.window(replay.head(), self.capacity);
         sampler.indices(self.ddpg.updates(), window, &mut self.indices);
-        let row = replay.layout().row;
-        for (column, &index) in self.indices.iter().enumerate() {
-            self.batch.set(column, &row.read(replay.row(index)));
-        }
+        self.batch.gather(replay, &self.indices);
         std::hint::black_box(self.ddpg.update(&self.batch));
     }
 }
@@ -161,21 +161,26 @@ impl List {
 fn multiplications(config: &Config, ddpg: &Ddpg) -> (List, Multiplication) {
     let mut random = stream(config.run.seed, Purpose::Exploration, 1, 0);
     let (mut distinct, mut order): (Vec<Multiplication>, Vec<usize>) = Default::default();
-    let mut best = (0.0, 0);
     for product in products_of_update(ddpg.policy_layout(), ddpg.critic_layout(), config.ddpg.batch) {
         let known = distinct.iter().position(|known| known.product == product);
         order.push(known.unwrap_or(distinct.len()));
         if known.is_none() {
-            let mut multiplication = Multiplication::new(product, &mut random);
-            let rate = multiplication.choose_kernel();
-            if rate > best.0 {
-                best = (rate, distinct.len());
-            }
-            distinct.push(multiplication);
+            distinct.push(Multiplication::new(product, &mut random));
         }
     }
-    let mut fastest = Multiplication::new(distinct[best.1].product, &mut random);
-    fastest.kernel = distinct[best.1].kernel;
+    // In turn, so that a disturbance does not meet all attempts at one shape.
+    for _ in 0..ATTEMPTS {
+        distinct.iter_mut().for_each(Multiplication::try_kernels);
+    }
+    let best = (0..distinct.len()).fold(0, |best, i| {
+        if distinct[i].best > distinct[best].best {
+            i
+        } else {
+            best
+        }
+    });
+    let mut fastest = Multiplication::new(distinct[best].product, &mut random);
+    fastest.kernel = distinct[best].kernel;
     (List { distinct, order }, fastest)
 }
 

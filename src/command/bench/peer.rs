@@ -40,9 +40,10 @@ impl Peer {
             .spawn()
             .with_context(|| format!("cannot start the {}", role.name()))?;
         let stdin = child.stdin.take();
-        let listener = child.stderr.take().map(|stderr| {
-            std::thread::spawn(move || BufReader::new(stderr).lines().map_while(Result::ok).last())
-        });
+        let listener = child
+            .stderr
+            .take()
+            .map(|stderr| std::thread::spawn(move || BufReader::new(stderr).lines().map_while(Result::ok).last()));
         Ok(Self {
             child,
             stdin,

@@ -17,9 +17,8 @@ use shoal_learner::product::{Product, Transposed};
 
 use super::window;
 
-/// Attempts for each shape and kernel when the kernels are compared; the best counts.
-const ATTEMPTS: usize = 4;
-const ATTEMPT: Duration = Duration::from_millis(4);
+/// Shorter than a time slice: of several attempts, one is not disturbed.
+const ATTEMPT: Duration = Duration::from_millis(2);
 
 /// Who multiplies.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -46,6 +45,8 @@ impl Kernel {
 pub(super) struct Multiplication {
     pub(super) product: Product,
     pub(super) kernel: Kernel,
+    /// The best rate that a kernel was seen to have, in GFLOP/s.
+    pub(super) best: f64,
     a: Aligned,
     b: Aligned,
     c: Aligned,
@@ -55,30 +56,29 @@ impl Multiplication {
     /// Random factors, by faer at first.
     pub(super) fn new(product: Product, random: &mut Stream) -> Self {
         let Product { m, k, n, .. } = product;
-        let mut numbers = |count: usize| -> Vec<f32> { (0..count).map(|_| 2.0 * random.random::<f32>() - 1.0).collect() };
+        let mut numbers =
+            |count: usize| -> Vec<f32> { (0..count).map(|_| 2.0 * random.random::<f32>() - 1.0).collect() };
         Self {
             product,
             kernel: Kernel::Faer,
+            best: 0.0,
             a: Aligned::from_slice(&numbers(m * k), 0),
             b: Aligned::from_slice(&numbers(k * n), 1),
             c: Aligned::zeros(m * n, 2),
         }
     }
 
-    /// Chooses the kernel; its best rate in GFLOP/s.
-    pub(super) fn choose_kernel(&mut self) -> f64 {
-        let mut best = (0.0, self.kernel);
-        for _ in 0..ATTEMPTS {
-            for kernel in Kernel::ALL {
-                self.kernel = kernel;
-                let rate = self.gflops(ATTEMPT);
-                if rate > best.0 {
-                    best = (rate, kernel);
-                }
+    /// Tries every kernel for a moment, and keeps to the one that was ever the fastest.
+    pub(super) fn try_kernels(&mut self) {
+        let mut chosen = self.kernel;
+        for kernel in Kernel::ALL {
+            self.kernel = kernel;
+            let rate = self.gflops(ATTEMPT);
+            if rate > self.best {
+                (self.best, chosen) = (rate, kernel);
             }
         }
-        self.kernel = best.1;
-        best.0
+        self.kernel = chosen;
     }
 
     /// The rate over `length`, in GFLOP/s.

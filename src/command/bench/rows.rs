@@ -1,7 +1,7 @@
 //! Real rows to move and to learn from: Pendulums under random actions.
 
 use rand::RngExt;
-use shoal_common::channel::environment::ResponseLayout;
+use shoal_common::channel::environment::{ResponseLayout, StepBlocks};
 use shoal_common::config::Config;
 use shoal_common::space::Space;
 use shoal_common::stream::{Purpose, Stream, stream};
@@ -62,8 +62,7 @@ impl Rows {
             }
         }
         let blocks = self.layout.split_mut(&mut self.response);
-        // `split_mut` lends the blocks to be written; they are read back through the same borrow.
-        let lent = shoal_common::channel::environment::StepBlocks {
+        let lent = StepBlocks {
             observations: &mut *blocks.observations,
             next_observations: &mut *blocks.next_observations,
             rewards: &mut *blocks.rewards,

@@ -11,6 +11,7 @@ use shoal_common::report::Role;
 
 use super::peer::Peer;
 use super::scene::Scene;
+use super::spin;
 use super::{Figures, Patience};
 
 /// How often the other process is looked after.
@@ -19,6 +20,10 @@ const LOOK: Duration = Duration::from_millis(50);
 /// Part of the time that goes before, to warm up.
 const WARM_UP: f64 = 0.1;
 
+/// Part of the time that goes to the bare spin, half of it before the round trips and half after them: which cores a
+/// virtual machine is given, and how far apart they are, may change in between.
+const SPIN: f64 = 0.1;
+
 /// The fields of `bench step --json`.
 #[derive(Serialize)]
 pub(super) struct StepFigures {
@@ -26,25 +31,36 @@ pub(super) struct StepFigures {
     p99_us: f64,
     least_us: f64,
     p90_us: f64,
+    /// Median of two threads that wait for each other's word in memory.
+    spin_median_us: f64,
     round_trips: usize,
     environments: u32,
 }
 
 pub(super) fn measure(patience: &Patience) -> anyhow::Result<StepFigures> {
     let scene = Scene::new(&[])?;
+    let mut spins = spin::times(patience.length.mul_f64(SPIN / 2.0));
     let mut times = scene.with_peer(Role::EnvServer, |domain, server| {
         times(&scene.config, domain, server, patience)
     })?;
+    spins.extend(spin::times(patience.length.mul_f64(SPIN / 2.0)));
+    spins.sort_unstable();
     times.sort_unstable();
-    let microseconds = |quantile: f64| f64::from(times[((times.len() - 1) as f64 * quantile) as usize]) / 1e3;
+    let microseconds = |quantile| quantile_of(&times, quantile);
     Ok(StepFigures {
         median_us: microseconds(0.5),
         p99_us: microseconds(0.99),
         least_us: microseconds(0.0),
         p90_us: microseconds(0.9),
+        spin_median_us: quantile_of(&spins, 0.5),
         round_trips: times.len(),
         environments: scene.config.actors.envs,
     })
+}
+
+/// In µs; `sorted` are ns, and at least one.
+fn quantile_of(sorted: &[u32], quantile: f64) -> f64 {
+    f64::from(sorted[((sorted.len() - 1) as f64 * quantile) as usize]) / 1e3
 }
 
 /// Times of round trips, in ns; at least one.
@@ -97,6 +113,13 @@ impl Figures for StepFigures {
             ("90 of 100 within", format!("{:.2} µs", self.p90_us)),
             ("99 of 100 within", format!("{:.2} µs", self.p99_us)),
             ("fastest", format!("{:.2} µs", self.least_us)),
+            (
+                "limit",
+                format!(
+                    "{:.2} µs: the median of two threads that spin on a word",
+                    self.spin_median_us
+                ),
+            ),
             (
                 "round trips",
                 format!("{}, {} environment each", self.round_trips, self.environments),

@@ -155,20 +155,15 @@ fn wait_for_replay(run: &RunDir, bell: &Bell, learner: &mut Peer, patience: &Pat
 
 /// Rows a second into minibatches, drawn as the learner draws them.
 fn sample(replay: &Replay, config: &Config, patience: &Patience) -> anyhow::Result<Windows> {
-    let row = config.row_layout();
     let sampler = Sampler::new(config.run.seed);
-    let mut batch = Minibatch::new(row, config.ddpg.batch);
+    let mut batch = Minibatch::new(config.row_layout(), config.ddpg.batch);
     let mut indices = vec![0; config.ddpg.batch];
     let mut update = 0;
-    let touch = std::env::var("TOUCH").is_ok();
     let mut gather = || {
-        let window = replay.window(replay.head(), config.replay.capacity);
-        sampler.indices(update, window, &mut indices);
+        let newest = replay.window(replay.head(), config.replay.capacity);
+        sampler.indices(update, newest, &mut indices);
         update += 1;
-        if touch { let t: f32 = indices.iter().map(|&i| { let r = replay.row(i); r[0] + r[r.len() - 1] }).sum(); std::hint::black_box(t); }
-        for (column, &index) in indices.iter().enumerate() {
-            batch.set(column, &row.read(replay.row(index)));
-        }
+        batch.gather(replay, &indices);
         std::hint::black_box(&mut batch);
     };
     // The mapping is new: its pages come in first.
@@ -190,7 +185,11 @@ impl Figures for TransitionFigures {
             ),
             (
                 "sampled into minibatches",
-                format!("{} million rows a second, batch {}", self.sampled.show(1e6, 2), self.batch),
+                format!(
+                    "{} million rows a second, batch {}",
+                    self.sampled.show(1e6, 2),
+                    self.batch
+                ),
             ),
             (
                 "rows",

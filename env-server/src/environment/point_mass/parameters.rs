@@ -109,7 +109,7 @@ impl Default for Flat {
     fn default() -> Self {
         Self {
             mass: 1.0,
-            friction: 0.02,
+            friction: 0.01,
             stiction_ratio: 1.2,
             gravity: 9.81,
             goal_radius: 0.05,

@@ -1,0 +1,77 @@
+//! What becomes of a chunk, and which rows can be read.
+
+use shoal_learner::replay::{Appended, ChunkError, Replay};
+
+use crate::model::{chunk, filled, layout, mark};
+
+#[test]
+fn a_chunk_is_committed_once_and_an_old_incarnation_no_more() {
+    let (directory, mut model) = filled(100, &[(0, 3), (1, 2), (0, 4)]);
+    let mut replay = Replay::open(&directory.replay(), &layout(100)).unwrap();
+    let mut append = |mark| replay.append_and_commit(0, mark, &chunk(0, mark, 2)).unwrap();
+    assert_eq!(append(mark(0, 1)), Appended::Duplicate);
+    assert_eq!(append(mark(0, 2)), Appended::Duplicate);
+    assert_eq!(append(mark(1, 1)), Appended::Accepted);
+    assert_eq!(append(mark(0, 3)), Appended::Duplicate);
+    assert_eq!(append(mark(1, 1)), Appended::Duplicate);
+    model.add(0, mark(1, 1), &chunk(0, mark(1, 1), 2));
+    model.check(&replay);
+}
+
+#[test]
+fn what_cannot_be_a_chunk_is_refused_and_nothing_written() {
+    let (directory, model) = filled(10, &[(0, 10)]);
+    let mut replay = Replay::open(&directory.replay(), &layout(10)).unwrap();
+    let mut append = |actor, rows: &[f32]| replay.append_and_commit(actor, mark(9, 9), rows).unwrap_err();
+    assert_eq!(append(3, &[0.0; 6]), ChunkError::Actor { actor: 3, actors: 3 });
+    assert_eq!(
+        append(0, &[0.0; 7]),
+        ChunkError::Ragged {
+            actor: 0,
+            numbers: 7,
+            width: 6
+        }
+    );
+    assert_eq!(
+        append(0, &[0.0; 66]),
+        ChunkError::TooLong {
+            actor: 0,
+            rows: 11,
+            ring: 10
+        }
+    );
+    model.check(&replay);
+    assert_eq!(replay.rows(), 0..10);
+}
+
+#[test]
+fn a_chunk_that_was_filled_and_dropped_is_not_committed_and_its_places_are_not_read() {
+    let (directory, model) = filled(10, &[(0, 10)]);
+    let mut replay = Replay::open(&directory.replay(), &layout(10)).unwrap();
+    drop(
+        replay
+            .begin(1, mark(0, 1))
+            .unwrap()
+            .unwrap()
+            .fill(&chunk(1, mark(0, 1), 3))
+            .unwrap(),
+    );
+    model.check(&replay);
+    assert_eq!(replay.rows(), 3..10);
+    drop(replay);
+    let replay = Replay::open(&directory.replay(), &layout(10)).unwrap();
+    model.check(&replay);
+    assert_eq!((replay.rows(), replay.warnings()), (3..10, &[] as &[String]));
+}
+
+#[test]
+fn a_window_is_the_newest_rows_before_its_head() {
+    let (directory, _) = filled(100, &[(0, 60), (1, 60)]);
+    let replay = Replay::open(&directory.replay(), &layout(100)).unwrap();
+    assert_eq!(replay.rows(), 20..120);
+    assert_eq!(replay.window(120, 50), 70..120);
+    assert_eq!(replay.window(90, 50), 40..90);
+    assert_eq!(replay.window(60, 50), 20..60);
+    assert_eq!(replay.window(200, 50), 70..120);
+    assert!(replay.window(10, 50).is_empty());
+}

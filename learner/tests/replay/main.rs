@@ -1,0 +1,13 @@
+//! The replay file, used, crashed and damaged.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    reason = "helpers of tests fail as tests do"
+)]
+
+mod chunks;
+mod crashes;
+mod file;
+mod model;
+mod processes;

@@ -1,0 +1,119 @@
+//! What a replay should hold, and a directory to try it in.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use shoal_common::commit::Places;
+use shoal_common::transition::RowLayout;
+use shoal_learner::replay::{ActorCommit, ChunkMark, Replay, ReplayError, ReplayLayout};
+use tempfile::TempDir;
+
+pub(crate) const ACTORS: usize = 3;
+/// Numbers in a row for observations and actions of one number.
+pub(crate) const WIDTH: usize = 6;
+
+pub(crate) fn layout(ring: u64) -> ReplayLayout {
+    ReplayLayout {
+        row: RowLayout::new(1, 1),
+        ring,
+        actors: ACTORS,
+        fingerprint: 0xF00D,
+    }
+}
+
+pub(crate) fn places(ring: u64) -> Places {
+    layout(ring).places().unwrap()
+}
+
+pub(crate) fn mark(incarnation: u64, sequence: u64) -> ChunkMark {
+    ChunkMark { incarnation, sequence }
+}
+
+/// A chunk whose rows say who they are.
+pub(crate) fn chunk(actor: usize, mark: ChunkMark, rows: u64) -> Vec<f32> {
+    let row = |i| {
+        [
+            actor as f32,
+            mark.incarnation as f32,
+            mark.sequence as f32,
+            i as f32,
+            rows as f32,
+            -1.0,
+        ]
+    };
+    (0..rows).flat_map(row).collect()
+}
+
+/// What the replay should hold: every row ever committed, and the actors' marks.
+#[derive(Clone, Default)]
+pub(crate) struct Model {
+    pub(crate) rows: Vec<Vec<f32>>,
+    pub(crate) actors: [ActorCommit; ACTORS],
+}
+
+impl Model {
+    /// The next chunk of an actor.
+    pub(crate) fn next(&self, actor: usize) -> ChunkMark {
+        let last = self.actors[actor].mark;
+        mark(last.incarnation, last.sequence + 1)
+    }
+
+    pub(crate) fn add(&mut self, actor: usize, mark: ChunkMark, numbers: &[f32]) {
+        self.rows.extend(numbers.chunks(WIDTH).map(<[f32]>::to_vec));
+        self.actors[actor].mark = mark;
+        self.actors[actor].rows += (numbers.len() / WIDTH) as u64;
+    }
+
+    pub(crate) fn head(&self) -> u64 {
+        self.rows.len() as u64
+    }
+
+    /// The replay holds this, and of the rows those that `rows()` says.
+    pub(crate) fn check(&self, replay: &Replay) {
+        assert_eq!(replay.head(), self.head());
+        for (actor, commit) in self.actors.iter().enumerate() {
+            assert_eq!(replay.committed(actor), *commit);
+        }
+        for index in replay.rows() {
+            assert_eq!(replay.row(index), self.rows[index as usize]);
+        }
+    }
+}
+
+pub(crate) struct Directory(pub(crate) TempDir);
+
+impl Directory {
+    pub(crate) fn new() -> Self {
+        Self(TempDir::new().unwrap())
+    }
+
+    pub(crate) fn replay(&self) -> PathBuf {
+        self.0.path().join("replay.rows")
+    }
+
+    pub(crate) fn names(&self) -> Vec<String> {
+        fs::read_dir(&self.0)
+            .unwrap()
+            .map(|entry| entry.unwrap().file_name().into_string().unwrap())
+            .collect()
+    }
+}
+
+pub(crate) fn reopen(path: &Path, bytes: &[u8], ring: u64) -> Result<Replay, ReplayError> {
+    fs::write(path, bytes).unwrap();
+    Replay::open(path, &layout(ring))
+}
+
+/// A closed replay into which `writes` (actor, rows) were written in order.
+pub(crate) fn filled(ring: u64, writes: &[(usize, u64)]) -> (Directory, Model) {
+    let directory = Directory::new();
+    let mut replay = Replay::create(&directory.replay(), &layout(ring)).unwrap();
+    let mut model = Model::default();
+    for &(actor, rows) in writes {
+        let mark = model.next(actor);
+        let numbers = chunk(actor, mark, rows);
+        replay.append_and_commit(actor, mark, &numbers).unwrap();
+        model.add(actor, mark, &numbers);
+    }
+    (directory, model)
+}

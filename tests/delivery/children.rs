@@ -1,0 +1,255 @@
+//! What the child processes do. Each opens its channels, says `ready`, and obeys its standard input until that closes.
+
+use std::cell::Cell;
+use std::io::{BufRead, Write};
+use std::path::PathBuf;
+use std::sync::mpsc::{self, Receiver, TryRecvError};
+use std::time::{Duration, Instant};
+
+use shoal_common::channel::environment::EnvironmentPort;
+use shoal_common::channel::policy::{PolicyHeader, PolicyPublisher};
+use shoal_common::channel::transitions::ChunkSender;
+use shoal_common::channel::{Bell, Domain, Place, Pulse, Ringer, wait_for};
+use shoal_common::commit::{CommitReader, OpenError};
+use shoal_common::report::{Identity, Role};
+use shoal_common::stop::Stop;
+use shoal_env_server::server::serve;
+use shoal_env_server::vector::VectorEnvironment;
+use shoal_learner::intake::Intake;
+use shoal_learner::replay::{Replay, ReplayError, Step};
+
+use crate::chunks::{ROWS, WINDOW, fill, replay_layout, row_layout};
+use crate::process::MARK;
+
+pub(crate) const ROLE: &str = "SHOAL_TEST_ROLE";
+pub(crate) const RUN: &str = "SHOAL_TEST_RUN";
+pub(crate) const DIRECTORY: &str = "SHOAL_TEST_DIRECTORY";
+
+pub(crate) const MAX_ACTORS: u32 = 4;
+/// Environments of a server.
+pub(crate) const ENVS: u32 = 2;
+pub(crate) const PARAMETERS: usize = 5_000;
+pub(crate) const FINGERPRINT: u64 = 77;
+
+const NAP: Duration = Duration::from_millis(50);
+
+pub(crate) fn main() {
+    // Somebody may run the ignored tests by hand.
+    let Ok(role) = std::env::var(ROLE) else { return };
+    iceoryx2::prelude::set_log_level(iceoryx2::prelude::LogLevel::Fatal);
+    let domain = Domain::join(&std::env::var(RUN).unwrap(), MAX_ACTORS).unwrap();
+    let replay = PathBuf::from(std::env::var_os(DIRECTORY).unwrap()).join("replay.rows");
+    let number = |word: &str| word.parse().unwrap();
+    match role.split(' ').collect::<Vec<_>>()[..] {
+        ["actor", index, incarnation] => actor(&domain, &replay, number(index) as u32, number(incarnation)),
+        ["learner", actors] => learner(&domain, &replay, number(actors) as u32, None),
+        ["learner", actors, "stalls-at", step, after] => {
+            learner(&domain, &replay, number(actors) as u32, Some((step, number(after))));
+        }
+        ["policy-publisher", incarnation] => policy_publisher(&domain, number(incarnation)),
+        ["env-server"] => env_server(&domain),
+        ["env-server", "that-never-answers"] => env_server_that_never_answers(&domain),
+        _ => panic!("no such role: {role}"),
+    }
+}
+
+fn say(line: &str) {
+    let mut stdout = std::io::stdout().lock();
+    // The harness has begun a line of its own.
+    write!(stdout, "\n{MARK}{line}\n")
+        .and_then(|()| stdout.flush())
+        .unwrap();
+}
+
+/// Lines of the standard input; closed with it.
+fn commands() -> Receiver<String> {
+    let (sender, commands) = mpsc::channel();
+    std::thread::spawn(move || {
+        let lines = std::io::stdin().lock().lines().map_while(Result::ok);
+        lines.for_each(|line| drop(sender.send(line)));
+    });
+    commands
+}
+
+fn words(command: &str) -> (&str, u64) {
+    let (word, number) = command.split_once(' ').unwrap_or((command, "0"));
+    (word, number.parse().unwrap())
+}
+
+/// Says something and does nothing more until it is killed.
+fn stall(line: &str) -> ! {
+    say(line);
+    loop {
+        std::thread::park();
+    }
+}
+
+/// Commands: `send N` chunks, saying `sending S` after each and `full S` when it first naps before a full window;
+/// `finish`, until all are committed.
+fn actor(domain: &Domain, replay: &std::path::Path, index: u32, incarnation: u64) {
+    let bell = Bell::hang(domain, Place(Role::Actor, index)).unwrap();
+    let learner = Ringer::new(domain, Place(Role::Learner, 0)).unwrap();
+    let commits = loop {
+        match CommitReader::open(replay) {
+            Err(OpenError::NotYet { .. }) => drop(bell.wait(Duration::from_millis(5)).unwrap()),
+            opened => break opened.unwrap(),
+        }
+    };
+    let mut sender = ChunkSender::open(domain, index, incarnation, 0, row_layout(), ROWS, WINDOW).unwrap();
+    say("ready");
+    let mut slowest = Duration::ZERO;
+    let stop = Stop::default();
+    for command in commands() {
+        let (word, count) = words(&command);
+        let most_in_flight = match word {
+            "send" => u64::from(WINDOW) - 1,
+            "finish" => 0,
+            _ => panic!("no such command: {command}"),
+        };
+        for _ in 0..count.max(1) {
+            let waits = Cell::new(false);
+            let committed = || commits.committed(index as usize);
+            wait_for(
+                &bell,
+                &stop,
+                || Ok((sender.in_flight(committed()) <= most_in_flight).then_some(())),
+                || {
+                    if !waits.replace(true) {
+                        say(&format!("full {}", sender.sent()));
+                    }
+                    sender.look_after()
+                },
+            )
+            .unwrap();
+            if word == "send" {
+                let mut chunk = sender.begin().unwrap();
+                fill(&mut chunk, (index, incarnation, sender.sent() + 1));
+                let before = Instant::now();
+                sender.send(chunk, 0).unwrap();
+                slowest = slowest.max(before.elapsed());
+                learner.ring();
+                say(&format!("sending {}", sender.sent()));
+            }
+        }
+        say(&format!("done {} {}", sender.sent(), slowest.as_micros()));
+    }
+}
+
+/// Commands: `take N` more chunks, then says `took`; `crawl`, taking one chunk more each time it has slept a little;
+/// `run`. Takes nothing before its first command, except to stall once `after` chunks have passed a step.
+fn learner(domain: &Domain, path: &std::path::Path, actors: u32, stalls_at: Option<(&str, u64)>) {
+    let bell = Bell::hang(domain, Place(Role::Learner, 0)).unwrap();
+    let mut replay = match Replay::open(path, &replay_layout(MAX_ACTORS)) {
+        Err(ReplayError::Missing(_)) => Replay::create(path, &replay_layout(MAX_ACTORS)).unwrap(),
+        opened => opened.unwrap(),
+    };
+    if let Some((name, after)) = stalls_at {
+        let name = name.to_owned();
+        let mut passed = 0;
+        replay.on_step(move |step: Step| {
+            if format!("{step:?}") == name {
+                passed += 1;
+                if passed > after {
+                    stall("stalled");
+                }
+            }
+        });
+    }
+    let mut intake = Intake::open(domain, actors, WINDOW, row_layout(), u64::MAX).unwrap();
+    say("ready");
+    let commands = commands();
+    let mut quota = if stalls_at.is_some() { u64::MAX } else { replay.head() };
+    let (mut busy, mut crawls) = (false, false);
+    loop {
+        match commands.try_recv().as_deref().map(words) {
+            Ok(("take", chunks)) => (quota, busy) = (replay.head() + chunks * ROWS as u64, true),
+            Ok(("crawl", _)) => crawls = true,
+            Ok(("run", _)) => quota = u64::MAX,
+            Ok((word, _)) => panic!("no such command: {word}"),
+            Err(TryRecvError::Disconnected) => return,
+            Err(TryRecvError::Empty) => {}
+        }
+        if crawls {
+            std::thread::sleep(Duration::from_millis(1));
+            quota += ROWS as u64;
+        }
+        let drained = intake.drain(&mut replay, 8, |replay| replay.head() >= quota).unwrap();
+        if busy && replay.head() >= quota {
+            busy = false;
+            say("took");
+        }
+        if !drained && !crawls {
+            bell.wait(NAP).unwrap();
+        }
+    }
+}
+
+/// Commands: `publish V`, whose parameters are all V; then says `published`.
+fn policy_publisher(domain: &Domain, incarnation: u64) {
+    let publisher = PolicyPublisher::open(domain, PARAMETERS).unwrap();
+    say("ready");
+    let commands = commands();
+    loop {
+        match commands.recv_timeout(NAP).as_deref().map(words) {
+            Ok((_, version)) => {
+                let header = PolicyHeader {
+                    incarnation,
+                    version,
+                    fingerprint: FINGERPRINT,
+                    ..Default::default()
+                };
+                publisher.publish(&[version as f32; PARAMETERS], header).unwrap();
+                say("published");
+            }
+            Err(mpsc::RecvTimeoutError::Timeout) => publisher.look_after().unwrap(),
+            Err(mpsc::RecvTimeoutError::Disconnected) => return,
+        }
+    }
+}
+
+pub(crate) fn pendulums() -> VectorEnvironment {
+    VectorEnvironment::new("pendulum", &toml::Table::new(), ENVS, 1, 0, 0).unwrap()
+}
+
+fn port(domain: &Domain, environments: &VectorEnvironment) -> EnvironmentPort {
+    EnvironmentPort::open(
+        domain,
+        0,
+        environments.spec().clone(),
+        ENVS as usize,
+        Place(Role::Actor, 0),
+    )
+    .unwrap()
+}
+
+fn env_server(domain: &Domain) {
+    let mut environments = pendulums();
+    let port = port(domain, &environments);
+    let identity = Identity {
+        role: Role::EnvServer,
+        index: 0,
+        incarnation: 0,
+    };
+    let pulse = Pulse::new(domain, identity).unwrap();
+    let stop = Stop::when_stdin_closes().unwrap();
+    say("ready");
+    serve(&mut environments, &port, 1, pulse, &stop).unwrap();
+}
+
+/// Says `asked` at the first step.
+fn env_server_that_never_answers(domain: &Domain) {
+    let mut environments = pendulums();
+    let port = port(domain, &environments);
+    say("ready");
+    let stop = Stop::when_stdin_closes().unwrap();
+    while let Ok(request) = port.next(&stop, || ()) {
+        if request.ask() == Some(shoal_common::channel::environment::Ask::Step) {
+            stall("asked");
+        }
+        let start = shoal_env_server::vector::Start::Next;
+        request
+            .answer(|_, blocks| environments.reset(start, blocks.observations))
+            .unwrap()
+            .unwrap();
+    }
+}

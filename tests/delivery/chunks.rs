@@ -1,0 +1,73 @@
+//! The chunks that test actors send: every row says which chunk it belongs to and where it stands in it.
+
+use std::path::Path;
+
+use shoal_common::channel::transitions::Chunk;
+use shoal_common::transition::{RowLayout, Transition};
+use shoal_learner::replay::{Replay, ReplayLayout};
+
+pub(crate) const WINDOW: u32 = 8;
+pub(crate) const ROWS: usize = 4;
+const RING: u64 = 1 << 16;
+
+/// A chunk: actor, incarnation, sequence.
+pub(crate) type Id = (u32, u64, u64);
+
+pub(crate) fn row_layout() -> RowLayout {
+    RowLayout::new(2, 1)
+}
+
+pub(crate) fn replay_layout(actors: u32) -> ReplayLayout {
+    ReplayLayout {
+        row: row_layout(),
+        ring: RING,
+        actors: actors as usize,
+        fingerprint: 1,
+    }
+}
+
+/// Fills a chunk.
+pub(crate) fn fill(chunk: &mut Chunk, (actor, incarnation, sequence): Id) {
+    for row in 0..ROWS {
+        let s = [actor as f32, incarnation as f32];
+        let s_next = [row as f32, -1.0];
+        let [a, r] = [sequence as f32, 0.5];
+        chunk.push(&Transition {
+            s: &s,
+            a: &[a],
+            r,
+            discount: 1.0,
+            s_next: &s_next,
+            last: row + 1 == ROWS,
+        });
+    }
+}
+
+/// The chunks of a replay that nobody writes any more, in the order they were committed.
+pub(crate) fn committed(path: &Path, actors: u32) -> Vec<Id> {
+    let replay = Replay::open(path, &replay_layout(actors)).unwrap();
+    assert_eq!(replay.warnings(), [] as [String; 0]);
+    assert_eq!(replay.rows().start, 0, "the ring has room for the whole test");
+    let rows: Vec<_> = replay
+        .rows()
+        .map(|index| row_layout().read(replay.row(index)))
+        .collect();
+    assert_eq!(rows.len() % ROWS, 0, "every chunk is whole");
+    let id = |chunk: &[Transition<'_>]| {
+        for (i, row) in chunk.iter().enumerate() {
+            assert_eq!(
+                (row.s, row.a),
+                (chunk[0].s, chunk[0].a),
+                "rows of a chunk stay together"
+            );
+            assert_eq!((row.s_next, row.last), (&[i as f32, -1.0][..], i + 1 == ROWS));
+        }
+        (chunk[0].s[0] as u32, chunk[0].s[1] as u64, chunk[0].a[0] as u64)
+    };
+    rows.chunks_exact(ROWS).map(id).collect()
+}
+
+/// Chunks 1 to `last` of an actor's incarnation.
+pub(crate) fn all(actor: u32, incarnation: u64, last: u64) -> Vec<Id> {
+    (1..=last).map(|sequence| (actor, incarnation, sequence)).collect()
+}

@@ -1,0 +1,114 @@
+//! A child process, and the lines spoken with it: commands on its standard input, what it says on its standard output.
+
+use std::io::{BufRead, BufReader, Write};
+use std::path::Path;
+use std::process::{Child, ChildStdin, Command, ExitStatus, Stdio};
+use std::sync::mpsc::{self, Receiver, RecvTimeoutError};
+use std::time::Instant;
+
+use rustix::process::{Pid, Signal, kill_process};
+
+use crate::children::{DIRECTORY, ROLE, RUN};
+use crate::run::{DEADLINE, eventually};
+
+/// Begins a line that a child says, among those of its test harness.
+pub(crate) const MARK: char = '@';
+
+/// Gone, at the latest, when this is.
+pub(crate) struct Process {
+    child: Child,
+    stdin: Option<ChildStdin>,
+    lines: Receiver<String>,
+    role: String,
+}
+
+impl Process {
+    pub(crate) fn launch(role: &str, run: &str, directory: &Path) -> Self {
+        let mut child = Command::new(std::env::current_exe().unwrap())
+            .args(["child", "--exact", "--ignored", "--nocapture"])
+            .envs([(ROLE, role), (RUN, run)])
+            .env(DIRECTORY, directory)
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let (sender, lines) = mpsc::channel();
+        let stdout = BufReader::new(child.stdout.take().unwrap());
+        std::thread::spawn(move || {
+            let said = stdout
+                .lines()
+                .map_while(Result::ok)
+                .filter_map(|line| Some(line.strip_prefix(MARK)?.to_owned()));
+            said.for_each(|line| drop(sender.send(line)));
+        });
+        Self {
+            stdin: child.stdin.take(),
+            child,
+            lines,
+            role: role.into(),
+        }
+    }
+
+    /// Gives a command.
+    pub(crate) fn told(&mut self, command: &str) {
+        writeln!(self.stdin.as_mut().unwrap(), "{command}").unwrap();
+    }
+
+    /// Waits until the child says a line that begins with these words; the numbers after them.
+    pub(crate) fn says(&self, words: &str) -> Vec<u64> {
+        let deadline = Instant::now() + DEADLINE;
+        loop {
+            let line = match self
+                .lines
+                .recv_timeout(deadline.saturating_duration_since(Instant::now()))
+            {
+                Ok(line) => line,
+                Err(RecvTimeoutError::Timeout) => panic!("{} hangs: it does not say `{words}`", self.role),
+                Err(RecvTimeoutError::Disconnected) => panic!("{} ended and did not say `{words}`", self.role),
+            };
+            if let Some(numbers) = line.strip_prefix(words) {
+                return numbers
+                    .split_whitespace()
+                    .map(|number| number.parse().unwrap())
+                    .collect();
+            }
+        }
+    }
+
+    /// Everything said and not yet heard that begins with these words, until the child closes its output.
+    pub(crate) fn last_words(&self, words: &str) -> Option<u64> {
+        let numbers = self
+            .lines
+            .iter()
+            .filter_map(|line| line.strip_prefix(words)?.trim().parse().ok());
+        numbers.last()
+    }
+
+    pub(crate) fn signal(&self, signal: Signal) {
+        kill_process(Pid::from_child(&self.child), signal).unwrap();
+    }
+
+    /// `kill -9`, and waits until it is gone.
+    pub(crate) fn kill(&mut self) {
+        self.child.kill().unwrap();
+        self.child.wait().unwrap();
+    }
+
+    /// Closes the child's standard input and waits until it has ended in good order.
+    pub(crate) fn ends(mut self) {
+        self.stdin = None;
+        let mut status: Option<ExitStatus> = None;
+        eventually(&format!("{} ends", self.role), || {
+            status = self.child.try_wait().unwrap();
+            status.is_some()
+        });
+        assert!(status.unwrap().success(), "{}: {status:?}", self.role);
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}

@@ -1,0 +1,121 @@
+//! A run of a test: its name in shared memory, its directory, its processes.
+
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::mpsc::{self, Sender};
+use std::time::{Duration, Instant};
+
+use shoal_common::channel::Domain;
+use shoal_common::commit::{CommitReader, OpenError};
+use shoal_common::stop::Stop;
+use tempfile::TempDir;
+
+use crate::children::MAX_ACTORS;
+use crate::process::Process;
+
+/// How long anything may take. Nothing takes this long unless it hangs.
+pub(crate) const DEADLINE: Duration = Duration::from_secs(30);
+
+/// Owns everything that the run leaves, and makes sure at its end that nothing is left.
+pub(crate) struct Run {
+    id: String,
+    directory: TempDir,
+}
+
+/// A stop that is requested if the test hangs.
+pub(crate) struct Watchdog {
+    pub(crate) stop: Stop,
+    _bone: Sender<()>,
+}
+
+impl Run {
+    pub(crate) fn new() -> Self {
+        iceoryx2::prelude::set_log_level(iceoryx2::prelude::LogLevel::Fatal);
+        static RUNS: AtomicU32 = AtomicU32::new(0);
+        let id = format!("t{}-{}", std::process::id(), RUNS.fetch_add(1, Ordering::Relaxed));
+        Self {
+            id,
+            directory: TempDir::new().unwrap(),
+        }
+    }
+
+    /// Makes this process one of the run's.
+    pub(crate) fn join(&self) -> Domain {
+        Domain::join(&self.id, MAX_ACTORS).unwrap()
+    }
+
+    /// Starts a process; `role` is what `children::main` understands.
+    pub(crate) fn launch(&self, role: &str) -> Process {
+        Process::launch(role, &self.id, self.directory.path())
+    }
+
+    /// Starts a process and waits until its channels are open.
+    pub(crate) fn start(&self, role: &str) -> Process {
+        let process = self.launch(role);
+        process.says("ready");
+        process
+    }
+
+    pub(crate) fn replay(&self) -> PathBuf {
+        self.directory.path().join("replay.rows")
+    }
+
+    /// The replay's commit record, once a learner has made the replay.
+    pub(crate) fn commits(&self) -> CommitReader {
+        let mut reader = None;
+        eventually("a learner makes the replay", || {
+            reader = match CommitReader::open(&self.replay()) {
+                Err(OpenError::NotYet { .. }) => None,
+                opened => Some(opened.unwrap()),
+            };
+            reader.is_some()
+        });
+        reader.unwrap()
+    }
+
+    /// Every file of the run outside its directory.
+    pub(crate) fn traces(&self) -> Vec<PathBuf> {
+        let prefix = format!("shoal_{}_", self.id);
+        let listing = std::fs::read_dir("/dev/shm").unwrap().flatten();
+        let mut traces: Vec<_> = listing
+            .filter(|entry| entry.file_name().to_string_lossy().starts_with(&prefix))
+            .map(|entry| entry.path())
+            .collect();
+        let user = rustix::process::getuid().as_raw();
+        traces.extend(Some(PathBuf::from(format!("/tmp/shoal-{user}/{}", self.id))).filter(|root| root.exists()));
+        traces
+    }
+}
+
+impl Drop for Run {
+    fn drop(&mut self) {
+        let left = self.join().leave();
+        if !std::thread::panicking() {
+            left.unwrap();
+            assert_eq!(self.traces(), [] as [PathBuf; 0], "left by run {}", self.id);
+        }
+    }
+}
+
+impl Watchdog {
+    pub(crate) fn new() -> Self {
+        let stop = Stop::default();
+        let (bone, bones) = mpsc::channel();
+        let hanging = stop.clone();
+        std::thread::spawn(move || {
+            if bones.recv_timeout(DEADLINE) == Err(mpsc::RecvTimeoutError::Timeout) {
+                hanging.request();
+            }
+        });
+        Self { stop, _bone: bone }
+    }
+}
+
+/// Waits until `holds`.
+pub(crate) fn eventually(what: &str, mut holds: impl FnMut() -> bool) {
+    let start = Instant::now();
+    while !holds() {
+        assert!(start.elapsed() < DEADLINE, "waited in vain: {what}");
+        std::thread::sleep(Duration::from_millis(1));
+    }
+}
