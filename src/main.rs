@@ -25,7 +25,9 @@ fn main() -> ExitCode {
     set_log_level(LogLevel::Fatal);
     // A file-size limit shall be an error of the write that meets it, not the end of the process.
     let watched = signal_hook::flag::register(signal_hook::consts::SIGXFSZ, Arc::default());
-    let result = watched.map_err(anyhow::Error::from).and_then(|_| run(&Cli::parse().command));
+    let result = watched
+        .map_err(anyhow::Error::from)
+        .and_then(|_| run(&Cli::parse().command));
     result.unwrap_or_else(|error| {
         // Where nobody reads standard error any more, there is nobody to tell.
         let _ = writeln!(std::io::stderr(), "error: {error:#}");

@@ -43,8 +43,16 @@ pub(crate) fn run(role: Role, args: &RoleArgs) -> anyhow::Result<()> {
 fn work(domain: &Domain, config: &Config, run: &RunDir, identity: Identity, stop: &Stop) -> anyhow::Result<()> {
     match identity.role {
         Role::EnvServer => serve(domain, config, identity, stop),
-        Role::Actor => Ok(explorer::explore(domain, &explorer_settings(config, run, identity), stop)?),
-        Role::Evaluator => Ok(evaluator::evaluate(domain, &evaluator_settings(config, run, identity), stop)?),
+        Role::Actor => Ok(explorer::explore(
+            domain,
+            &explorer_settings(config, run, identity),
+            stop,
+        )?),
+        Role::Evaluator => Ok(evaluator::evaluate(
+            domain,
+            &evaluator_settings(config, run, identity),
+            stop,
+        )?),
         Role::Learner => Ok(learner::learn(domain, &learner_settings(config, run, identity), stop)?),
     }
 }

@@ -21,21 +21,37 @@ fn complaint(output: &Output) -> String {
 fn what_cannot_be_trained_is_refused_before_anything_is_made() {
     let place = Workplace::new();
     std::fs::write(place.path().join("broken.toml"), "[run\n").unwrap();
-    std::fs::write(place.path().join("strange.toml"), "[environment]\nname = \"pendulum\"\n[lerner]\n").unwrap();
+    std::fs::write(
+        place.path().join("strange.toml"),
+        "[environment]\nname = \"pendulum\"\n[lerner]\n",
+    )
+    .unwrap();
     for (arguments, part) in [
-        (&["pendulums"][..], "there is no preset `pendulums`: choose pendulum, point-mass-r1"),
+        (
+            &["pendulums"][..],
+            "there is no preset `pendulums`: choose pendulum, point-mass-r1",
+        ),
         (&["missing.toml"], "cannot read missing.toml"),
         (&["broken.toml"], "broken.toml"),
         (&["strange.toml"], "strange.toml: unknown field `lerner`"),
-        (&["pendulum", "--set", "ddpg.gama=0.9"], "unknown field `gama`, expected one of"),
-        (&["pendulum", "--set", "ddpg.gamma=1.1"], "ddpg.gamma = 1.1: must be from 0 to 1"),
+        (
+            &["pendulum", "--set", "ddpg.gama=0.9"],
+            "unknown field `gama`, expected one of",
+        ),
+        (
+            &["pendulum", "--set", "ddpg.gamma=1.1"],
+            "ddpg.gamma = 1.1: must be from 0 to 1",
+        ),
         (&["pendulum", "--set", "environment.start_sped=1"], "start_sped"),
         (&["point-mass-r1", "--set", "environment.friction=-1"], "friction"),
         (&["pendulum", "--set", "environment.name=cart-pole"], "discrete"),
         (&["pendulum", "--steps", "0"], "run.steps = 0"),
     ] {
         let said = complaint(&place.output(&[&["train"], arguments].concat()));
-        assert!(said.starts_with("error: ") && said.contains(part), "{arguments:?}: {said}");
+        assert!(
+            said.starts_with("error: ") && said.contains(part),
+            "{arguments:?}: {said}"
+        );
     }
     assert!(!place.path().join("runs").exists(), "nothing was made");
 }
@@ -77,11 +93,21 @@ fn a_damaged_policy_is_refused_and_kept() {
 fn a_disk_that_is_too_small_for_the_replay_is_said_and_ends_the_run() {
     let place = Workplace::new();
     // A file-size limit of a few megabytes stands for the full disk: the replay wants forty.
-    let script = format!("ulimit -f 8000; exec {} train pendulum --run run --json", env!("CARGO_BIN_EXE_shoal"));
-    let output = std::process::Command::new("sh").args(["-c", &script]).current_dir(place.path()).output().unwrap();
+    let script = format!(
+        "ulimit -f 8000; exec {} train pendulum --run run --json",
+        env!("CARGO_BIN_EXE_shoal")
+    );
+    let output = std::process::Command::new("sh")
+        .args(["-c", &script])
+        .current_dir(place.path())
+        .output()
+        .unwrap();
     let said = complaint(&output);
     assert!(said.contains("learner-0") && said.contains("replay.bin"), "{said}");
-    assert!(!place.path().join("run/replay.bin").exists(), "no half-made file is left");
+    assert!(
+        !place.path().join("run/replay.bin").exists(),
+        "no half-made file is left"
+    );
 }
 
 #[test]
@@ -105,7 +131,13 @@ fn two_runs_side_by_side_do_not_touch_each_other() {
     let before = running.log().lines().count();
     let output = other.output(&[&["train", "pendulum", "--steps", "300", "--lockstep"], &QUICK[..]].concat());
     assert!(output.status.success());
-    until("the first run goes on", || running.run.join("checkpoints/latest.ckpt").exists());
-    assert_eq!(running.log().lines().count(), before, "no process of the first run was replaced");
+    until("the first run goes on", || {
+        running.run.join("checkpoints/latest.ckpt").exists()
+    });
+    assert_eq!(
+        running.log().lines().count(),
+        before,
+        "no process of the first run was replaced"
+    );
     assert!(running.leftovers().processes().len() >= 6);
 }

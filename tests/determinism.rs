@@ -22,8 +22,21 @@ use support::{Workplace, parse, until};
 fn the_same_seed_and_actors_give_the_same_bits_and_another_seed_others() {
     let place = Workplace::new();
     let run = |seed| {
-        let result = place.train(&["pendulum", "--lockstep", "--actors", "3", "--steps", "700", "--seed", seed]);
-        (result["weights_sha256"].clone(), result["env_steps"].clone(), result["updates"].clone())
+        let result = place.train(&[
+            "pendulum",
+            "--lockstep",
+            "--actors",
+            "3",
+            "--steps",
+            "700",
+            "--seed",
+            seed,
+        ]);
+        (
+            result["weights_sha256"].clone(),
+            result["env_steps"].clone(),
+            result["updates"].clone(),
+        )
     };
     let first = run("5");
     assert_eq!((first.1.as_u64(), first.2.as_u64()), (Some(700), Some(636)));
@@ -35,8 +48,17 @@ fn the_same_seed_and_actors_give_the_same_bits_and_another_seed_others() {
 fn a_learner_killed_in_lockstep_ends_with_the_bits_of_one_that_was_not() {
     let place = Workplace::new();
     let arguments = [
-        "--lockstep", "--actors", "2", "--steps", "40000", "--set", "checkpoint.every_updates=700", "--set",
-        "evaluation.every=1500", "--set", "replay.capacity=1500",
+        "--lockstep",
+        "--actors",
+        "2",
+        "--steps",
+        "40000",
+        "--set",
+        "checkpoint.every_updates=700",
+        "--set",
+        "evaluation.every=1500",
+        "--set",
+        "replay.capacity=1500",
     ];
     // The same overrides in the same order for both, so that nothing but the kills differs.
     let finish = |kills: usize, name: &str| {
@@ -58,8 +80,14 @@ fn a_learner_killed_in_lockstep_ends_with_the_bits_of_one_that_was_not() {
 fn evaluated_or_learned(run: &std::path::Path) -> u64 {
     let learned = std::fs::read_to_string(run.join("learner.csv")).unwrap_or_default();
     let mut rows = csv::Reader::from_reader(learned.as_bytes());
-    let Some(column) = rows.headers().unwrap().iter().position(|name| name == "env_steps") else { return 0 };
-    rows.records().flatten().filter_map(|row| row.get(column)?.parse().ok()).max().unwrap_or(0)
+    let Some(column) = rows.headers().unwrap().iter().position(|name| name == "env_steps") else {
+        return 0;
+    };
+    rows.records()
+        .flatten()
+        .filter_map(|row| row.get(column)?.parse().ok())
+        .max()
+        .unwrap_or(0)
 }
 
 #[test]
@@ -67,8 +95,22 @@ fn one_actor_in_lockstep_is_algorithm_4_in_a_single_process() {
     for preset in ["pendulum", "point-mass-r2"] {
         let place = Workplace::new();
         let result = place.train(&[
-            preset, "--run", "run", "--lockstep", "--actors", "1", "--envs", "1", "--steps", "900", "--seed", "11",
-            "--set", "actors.chunk_steps=1", "--set", "evaluation.every=300",
+            preset,
+            "--run",
+            "run",
+            "--lockstep",
+            "--actors",
+            "1",
+            "--envs",
+            "1",
+            "--steps",
+            "900",
+            "--seed",
+            "11",
+            "--set",
+            "actors.chunk_steps=1",
+            "--set",
+            "evaluation.every=300",
         ]);
         let config = Config::load(&place.path().join("run/config.toml")).unwrap();
         assert_eq!(result["weights_sha256"], twin(&config), "{preset}");
@@ -92,15 +134,16 @@ fn twin(config: &Config) -> String {
     let mut batch = Minibatch::new(row, ddpg.batch);
     let mut indices = vec![0; ddpg.batch];
 
-    let Space::Box { low, high } = &config.spec.action else { panic!("a box") };
+    let Space::Box { low, high } = &config.spec.action else {
+        panic!("a box")
+    };
     let range = ActionRange::new(&config.spec.action).unwrap();
     let mut mu = PolicyNetwork::new(row.observation_width(), ddpg.hidden, range, 1);
     let exploration = stream(seed, Purpose::Exploration, 0, 0);
     let mut noise = OrnsteinUhlenbeck::new(&config.exploration, 1, row.action_width(), exploration);
 
     let environment = &config.environment;
-    let mut environment =
-        VectorEnvironment::new(&environment.name, &environment.parameters, 1, seed, 0, 0).unwrap();
+    let mut environment = VectorEnvironment::new(&environment.name, &environment.parameters, 1, seed, 0, 0).unwrap();
     let layout = ResponseLayout::new(1, row.observation_width());
     let mut response = vec![0.0; layout.len()];
     let mut replay: Vec<Vec<f32>> = Vec::new();
@@ -137,7 +180,11 @@ fn twin(config: &Config) -> String {
         // One update for each step beyond the warm-up.
         if replay.len() as u64 > config.replay.warmup {
             let rows = replay.len() as u64;
-            sampler.indices(learner.updates(), rows.saturating_sub(config.replay.capacity)..rows, &mut indices);
+            sampler.indices(
+                learner.updates(),
+                rows.saturating_sub(config.replay.capacity)..rows,
+                &mut indices,
+            );
             for (column, &index) in indices.iter().enumerate() {
                 batch.set(column, &row.read(&replay[index as usize]));
             }

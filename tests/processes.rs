@@ -20,10 +20,24 @@ fn a_run_ends_by_itself_with_what_it_promised() {
     assert_eq!(result["eval_episodes"], 3);
     assert!(result["eval_return_mean"].as_f64().unwrap() < 0.0);
     assert_eq!(result["weights_sha256"].as_str().unwrap().len(), 64);
-    assert_eq!(result["run"], std::fs::canonicalize(place.path().join("run")).unwrap().to_str().unwrap());
+    assert_eq!(
+        result["run"],
+        std::fs::canonicalize(place.path().join("run"))
+            .unwrap()
+            .to_str()
+            .unwrap()
+    );
     for file in [
-        "config.toml", "episodes.csv", "evaluations.csv", "learner.csv", "learning-curve.svg", "shoal.log",
-        "checkpoints/latest.ckpt", "checkpoints/last.policy", "replay.bin", "tensorboard",
+        "config.toml",
+        "episodes.csv",
+        "evaluations.csv",
+        "learner.csv",
+        "learning-curve.svg",
+        "shoal.log",
+        "checkpoints/latest.ckpt",
+        "checkpoints/last.policy",
+        "replay.bin",
+        "tensorboard",
     ] {
         assert!(place.path().join("run").join(file).exists(), "{file}");
     }
@@ -58,7 +72,10 @@ fn when_the_launcher_is_killed_the_roles_save_and_end_and_nothing_is_left() {
     running.signal(Signal::KILL);
     leftovers.vanish();
     assert!(running.run.join("checkpoints/latest.ckpt").exists());
-    assert!(running.run.join("checkpoints/last.policy").exists(), "the learner ended in order");
+    assert!(
+        running.run.join("checkpoints/last.policy").exists(),
+        "the learner ended in order"
+    );
 }
 
 #[test]
@@ -75,7 +92,10 @@ fn what_a_run_left_whose_processes_were_all_killed_goes_with_the_next_start() {
         }
     }
     until("everybody is dead", || leftovers.processes().is_empty());
-    assert!(!leftovers.files().is_empty(), "a killed run cannot clean up: or this test shows nothing");
+    assert!(
+        !leftovers.files().is_empty(),
+        "a killed run cannot clean up: or this test shows nothing"
+    );
     place.start("next", &["--steps", "100"]).wait();
     assert!(leftovers.files().is_empty(), "{:?}", leftovers.files());
 }
@@ -102,7 +122,9 @@ fn a_role_that_cannot_work_is_given_up_and_its_last_words_are_passed_on() {
     let place = Workplace::new();
     let running = place.start("run", &["--steps", "3000000"]);
     until("something is learned", || has_updates(&running.run));
-    until("there is a checkpoint", || running.run.join("checkpoints/latest.ckpt").exists());
+    until("there is a checkpoint", || {
+        running.run.join("checkpoints/latest.ckpt").exists()
+    });
     for name in ["latest.ckpt", "previous.ckpt"] {
         let file = running.run.join("checkpoints").join(name);
         if file.exists() {
@@ -114,7 +136,10 @@ fn a_role_that_cannot_work_is_given_up_and_its_last_words_are_passed_on() {
     assert_eq!(code, Some(1));
     let said = std::fs::read_to_string(place.path().join("stderr")).unwrap();
     let last = said.lines().last().unwrap();
-    assert!(last.contains("learner-0 failed 5 times") && last.contains("latest.ckpt"), "{said}");
+    assert!(
+        last.contains("learner-0 failed 5 times") && last.contains("latest.ckpt"),
+        "{said}"
+    );
     assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
 }
 
@@ -123,5 +148,7 @@ fn has_updates(run: &std::path::Path) -> bool {
     let learned = std::fs::read_to_string(run.join("learner.csv")).unwrap_or_default();
     let mut rows = csv::Reader::from_reader(learned.as_bytes());
     let updates = rows.headers().unwrap().iter().position(|name| name == "updates");
-    rows.records().flatten().any(|row| updates.is_some_and(|i| row.get(i).is_some_and(|n| n != "0")))
+    rows.records()
+        .flatten()
+        .any(|row| updates.is_some_and(|i| row.get(i).is_some_and(|n| n != "0")))
 }

@@ -24,14 +24,10 @@ const PREVIOUS: &str = "previous.ckpt";
 pub struct Counters {
     /// Updates done.
     pub updates: u64,
-    /// Environment steps learned from, over all actors.
-    pub env_steps: u64,
-    /// Rows of the replay taken into account: its head as the updates saw it.
+    /// Environment steps learned from, over all actors: the rows of the replay that the updates were allowed by.
     pub rows: u64,
     /// Version of the policy last published.
     pub policy_version: u64,
-    /// How often the learner had been started before the one that wrote this.
-    pub incarnation: u64,
 }
 
 /// A learner's state as read back.

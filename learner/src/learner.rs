@@ -263,7 +263,6 @@ impl<'a> Learner<'a> {
             updates: state.updates,
             rows: self.rows,
             policy_version: self.policy_version,
-            ..Counters::default()
         };
         Ok(self.checkpoints.save(&counters, &sections)?)
     }

@@ -97,7 +97,11 @@ impl Progress {
             pace.push(format!("{updates:.0} updates/s · {env_steps:.0} steps/s"));
         }
         let beyond = learner.env_steps.saturating_sub(self.warmup);
-        let ratio = if beyond > 0 { learner.updates as f64 / beyond as f64 } else { 0.0 };
+        let ratio = if beyond > 0 {
+            learner.updates as f64 / beyond as f64
+        } else {
+            0.0
+        };
         let waits = waiting(crew).map(|who| format!(" ({who})")).unwrap_or_default();
         pace.push(format!("ratio {ratio:.2} of {:.2}{waits}", self.updates_per_step));
         if crew.restarts() > 0 {

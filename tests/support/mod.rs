@@ -39,7 +39,9 @@ pub(crate) struct Running {
 
 impl Workplace {
     pub(crate) fn new() -> Self {
-        Self { directory: tempfile::tempdir().unwrap() }
+        Self {
+            directory: tempfile::tempdir().unwrap(),
+        }
     }
 
     pub(crate) fn path(&self) -> &Path {
@@ -68,7 +70,15 @@ impl Workplace {
     pub(crate) fn start(&self, name: &str, arguments: &[&str]) -> Running {
         let stderr = std::fs::File::create(self.path().join("stderr")).unwrap();
         let child = self
-            .shoal(&[&["train", "pendulum", "--run", name], arguments, &QUICK[..], &["--json"]].concat())
+            .shoal(
+                &[
+                    &["train", "pendulum", "--run", name],
+                    arguments,
+                    &QUICK[..],
+                    &["--json"],
+                ]
+                .concat(),
+            )
             .stdout(Stdio::piped())
             .stderr(stderr)
             // A signal to the test runner's group is not for the run.
@@ -89,7 +99,11 @@ impl Running {
 
     /// Process numbers of a role in the order of their starts, like `actor-0`.
     pub(crate) fn pids(&self, who: &str) -> Vec<i32> {
-        pids(&self.log()).into_iter().filter(|(name, _)| name == who).map(|(_, pid)| pid).collect()
+        pids(&self.log())
+            .into_iter()
+            .filter(|(name, _)| name == who)
+            .map(|(_, pid)| pid)
+            .collect()
     }
 
     /// Kills the running process of a role with SIGKILL.
@@ -165,7 +179,9 @@ impl Leftovers {
     pub(crate) fn vanish(&self) {
         assert!(!self.pids.is_empty());
         until("no process of the run is left", || self.processes().is_empty());
-        until("no file of the run is left in shared memory", || self.files().is_empty());
+        until("no file of the run is left in shared memory", || {
+            self.files().is_empty()
+        });
     }
 }
 
@@ -176,7 +192,11 @@ pub(crate) fn json(output: &Output) -> serde_json::Value {
 
 /// The only line printed, as JSON.
 pub(crate) fn parse(printed: &str) -> serde_json::Value {
-    assert_eq!(printed.lines().count(), 1, "exactly one line on standard output: {printed}");
+    assert_eq!(
+        printed.lines().count(),
+        1,
+        "exactly one line on standard output: {printed}"
+    );
     serde_json::from_str(printed).unwrap()
 }
 

@@ -10,10 +10,8 @@ const WEIGHTS: [f32; 5] = [1.0, -0.0, f32::MIN_POSITIVE, f32::INFINITY, 1e-40];
 fn counters(updates: u64) -> Counters {
     Counters {
         updates,
-        env_steps: 2 * updates,
         rows: 3 * updates,
         policy_version: 4,
-        incarnation: 5,
     }
 }
 

@@ -111,4 +111,3 @@ impl Settings {
         (self.capacity + slack).max(self.chunk_rows as u64)
     }
 }
-

@@ -164,8 +164,15 @@ mod tests {
         blocks.terminated.fill(3.0);
         blocks.truncated.fill(4.0);
         use Block::{NextObservations, Observations, Rewards, Terminated, Truncated};
-        for (value, (block, length)) in
-            [(Observations, 6), (NextObservations, 6), (Rewards, 2), (Terminated, 2), (Truncated, 2)].into_iter().enumerate()
+        for (value, (block, length)) in [
+            (Observations, 6),
+            (NextObservations, 6),
+            (Rewards, 2),
+            (Terminated, 2),
+            (Truncated, 2),
+        ]
+        .into_iter()
+        .enumerate()
         {
             assert_eq!(layout.block(block, &response), vec![value as f32; length]);
         }
