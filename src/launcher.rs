@@ -10,8 +10,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
+use shoal_common::channel::Domain;
 use shoal_common::channel::reports::Reports;
-use shoal_common::channel::{ChannelError, Domain};
 use shoal_common::config::Config;
 use shoal_common::report::{Activity, EpisodeReport, EvaluationReport, Heartbeat, LearnerReport, Role};
 use shoal_common::run_dir::{RunDir, RunLock};
@@ -216,7 +216,7 @@ fn each<R: shoal_common::channel::reports::Report>(
     reports: &Reports<R>,
     mut use_it: impl FnMut(R) -> anyhow::Result<()>,
 ) -> anyhow::Result<()> {
-    while let Some(report) = reports.receive().map_err(|error: ChannelError| error)? {
+    while let Some(report) = reports.receive()? {
         use_it(report)?;
     }
     Ok(())

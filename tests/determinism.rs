@@ -9,7 +9,6 @@ use shoal_actor::noise::OrnsteinUhlenbeck;
 use shoal_common::channel::environment::ResponseLayout;
 use shoal_common::config::Config;
 use shoal_common::network::{ActionRange, PolicyNetwork};
-use shoal_common::space::Space;
 use shoal_common::stream::{Purpose, stream};
 use shoal_common::transition::Transition;
 use shoal_env_server::vector::{Start, VectorEnvironment};
@@ -134,9 +133,6 @@ fn twin(config: &Config) -> String {
     let mut batch = Minibatch::new(row, ddpg.batch);
     let mut indices = vec![0; ddpg.batch];
 
-    let Space::Box { low, high } = &config.spec.action else {
-        panic!("a box")
-    };
     let range = ActionRange::new(&config.spec.action).unwrap();
     let mut mu = PolicyNetwork::new(row.observation_width(), ddpg.hidden, range, 1);
     let exploration = stream(seed, Purpose::Exploration, 0, 0);
@@ -154,7 +150,7 @@ fn twin(config: &Config) -> String {
     for t in 0..config.run.steps {
         mu.forward(learner.policy(), &s, &mut a);
         noise.advance(t);
-        noise.disturb(&mut a, low, high);
+        noise.disturb(&mut a, mu.range());
 
         environment.step(&a, layout.split_mut(&mut response)).unwrap();
         let step = layout.split_mut(&mut response);

@@ -22,7 +22,7 @@ use shoal_common::commit::{CommitReader, OpenError};
 use shoal_common::config::{Exploration, Mode};
 use shoal_common::network::{ActionRange, PolicyNetwork};
 use shoal_common::report::{Activity, EpisodeReport, Identity, Role};
-use shoal_common::space::{EnvironmentSpec, Space};
+use shoal_common::space::EnvironmentSpec;
 use shoal_common::stop::Stop;
 use shoal_common::stream::{Purpose, stream};
 use shoal_common::transition::{RowLayout, Transition};
@@ -85,8 +85,6 @@ struct Explorer<'a> {
     policy: PolicyReader,
     network: PolicyNetwork,
     noise: OrnsteinUhlenbeck,
-    low: Vec<f32>,
-    high: Vec<f32>,
     sender: ChunkSender,
     chunk: Option<Chunk>,
     commits: CommitReader,
@@ -104,9 +102,6 @@ impl<'a> Explorer<'a> {
         let Identity { index, incarnation, .. } = settings.identity;
         let row = RowLayout::new(settings.spec.observation.width(), settings.spec.action.width());
         let range = ActionRange::new(&settings.spec.action)?;
-        let Space::Box { low, high } = settings.spec.action.clone() else {
-            return Err(Ended::Stopped);
-        };
         let network = PolicyNetwork::new(row.observation_width(), settings.hidden, range, settings.envs);
 
         let bell = Bell::hang(domain, Place(Role::Actor, index))?;
@@ -140,8 +135,6 @@ impl<'a> Explorer<'a> {
             policy,
             noise: OrnsteinUhlenbeck::new(&settings.exploration, settings.envs, row.action_width(), stream),
             network,
-            low,
-            high,
             step: sent * (settings.chunk_rows / settings.envs) as u64,
             sender,
             chunk: None,
@@ -239,12 +232,12 @@ impl<'a> Explorer<'a> {
                 .forward(policy.parameters(), current.observations(), &mut self.actions);
         }
         self.noise.advance(self.step);
-        self.noise.disturb(&mut self.actions, &self.low, &self.high);
+        self.noise.disturb(&mut self.actions, self.network.range());
     }
 
     /// Line 10 of Algorithm 4, for every environment.
     fn remember(&mut self, current: &Observed, next: &Observed, version: u64) {
-        let width = self.low.len();
+        let width = self.network.range().width();
         for e in 0..self.settings.envs {
             let (terminated, truncated) = (next.terminated(e), next.truncated(e));
             let transition = Transition {

@@ -3,6 +3,7 @@
 use rand::RngExt;
 use rand_distr::StandardNormal;
 use shoal_common::config::Exploration;
+use shoal_common::network::ActionRange;
 use shoal_common::stream::Stream;
 
 /// The noise of one actor's environments. Each step's normal numbers are reached by the step's own number, so that a step
@@ -43,16 +44,13 @@ impl OrnsteinUhlenbeck {
         }
     }
 
-    /// Adds the noise to the actions, in units of `half` the range of each action element, and clips the sum to the
-    /// range `centre ± half` (equation 3.32).
-    pub fn disturb(&self, actions: &mut [f32], low: &[f32], high: &[f32]) {
-        for (action, x) in actions
-            .chunks_exact_mut(self.width)
-            .zip(self.x.chunks_exact(self.width))
-        {
+    /// Adds the noise to the actions, in units of half the range of each action element, and clips the sum to the range
+    /// (equation 3.32).
+    pub fn disturb(&self, actions: &mut [f32], range: &ActionRange) {
+        let width = range.width();
+        for (action, x) in actions.chunks_exact_mut(width).zip(self.x.chunks_exact(width)) {
             for (i, a) in action.iter_mut().enumerate() {
-                let half = (high[i] - low[i]) / 2.0;
-                *a = (*a + half * x[i] as f32).clamp(low[i], high[i]);
+                *a = range.clip(i, *a + range.half()[i] * x[i] as f32);
             }
         }
     }
@@ -61,6 +59,7 @@ impl OrnsteinUhlenbeck {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use shoal_common::space::Space;
     use shoal_common::stream::{Purpose, stream};
 
     fn noise(environments: usize) -> OrnsteinUhlenbeck {
@@ -106,7 +105,8 @@ mod tests {
         let mut noise = noise(2);
         noise.x = vec![0.5, -3.0];
         let mut actions = [1.0, 0.5];
-        noise.disturb(&mut actions, &[-2.0], &[2.0]);
+        let torque = ActionRange::new(&Space::boxed(&[(-2.0, 2.0)])).unwrap();
+        noise.disturb(&mut actions, &torque);
         assert_eq!(actions, [2.0, -2.0]);
         noise.reset(1);
         assert_eq!(noise.x, [0.5, 0.0]);

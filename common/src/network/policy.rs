@@ -69,6 +69,11 @@ impl ActionRange {
         &self.half
     }
 
+    /// The nearest to `a` that element `element` of an action may be.
+    pub fn clip(&self, element: usize, a: f32) -> f32 {
+        a.clamp(self.action(element, -1.0), self.action(element, 1.0))
+    }
+
     /// Element `element` of an action from the tanh output `t`.
     pub fn action(&self, element: usize, t: f32) -> f32 {
         self.centre[element] + self.half[element] * t

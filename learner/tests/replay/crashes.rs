@@ -219,7 +219,9 @@ fn a_sync_on_another_thread_counts_once_it_is_finished() {
     let new = std::thread::spawn(|| new.run().unwrap()).join().unwrap();
     replay.finish_sync(new);
     // The slower of two counts for nothing.
+    let before = fs::read(directory.replay()).unwrap();
     replay.finish_sync(old.run().unwrap());
+    assert_eq!(fs::read(directory.replay()).unwrap(), before);
     model.add(0, mark(0, 2), &numbers);
     drop(replay);
     let mut image = fs::read(directory.replay()).unwrap();
