@@ -125,12 +125,14 @@ impl<'a> Explorer<'a> {
             settings.chunk_rows,
             settings.window,
         )?;
+        let learner = Ringer::new(domain, Place(Role::Learner, 0))?;
+        learner.ring();
         let stream = stream(settings.seed, Purpose::Exploration, index.into(), stream_incarnation);
         Ok(Self {
             settings,
             domain,
             stop,
-            learner: Ringer::new(domain, Place(Role::Learner, 0))?,
+            learner,
             client,
             policy,
             noise: OrnsteinUhlenbeck::new(&settings.exploration, settings.envs, row.action_width(), stream),
