@@ -61,25 +61,36 @@ pub(crate) fn run(config: &Config, run: &RunDir, quiet: bool) -> anyhow::Result<
     Ok(outcome)
 }
 
-/// The signals that end a run.
-struct Signals(Vec<(i32, Arc<AtomicBool>)>);
+/// The signals that end a run. Once this is dropped they end the process again, as they do everywhere else.
+struct Signals {
+    flags: Vec<(i32, Arc<AtomicBool>)>,
+    over: Arc<AtomicBool>,
+}
 
 impl Signals {
     fn register() -> anyhow::Result<Self> {
-        let mut flags = Vec::new();
+        let (mut flags, over) = (Vec::new(), Arc::new(AtomicBool::new(false)));
         for signal in [SIGINT, SIGTERM, SIGHUP] {
             let flag = Arc::new(AtomicBool::new(false));
-            signal_hook::flag::register(signal, Arc::clone(&flag)).context("cannot watch for signals")?;
+            signal_hook::flag::register_conditional_default(signal, Arc::clone(&over))
+                .and_then(|_| signal_hook::flag::register(signal, Arc::clone(&flag)))
+                .context("cannot watch for signals")?;
             flags.push((signal, flag));
         }
-        Ok(Self(flags))
+        Ok(Self { flags, over })
     }
 
     fn received(&self) -> Option<i32> {
-        self.0
+        self.flags
             .iter()
             .find(|(_, flag)| flag.load(Ordering::Relaxed))
             .map(|(signal, _)| *signal)
+    }
+}
+
+impl Drop for Signals {
+    fn drop(&mut self) {
+        self.over.store(true, Ordering::Relaxed);
     }
 }
 

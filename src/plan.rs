@@ -4,7 +4,7 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
-use shoal_common::config::Config;
+use shoal_common::config::{Actors, Config};
 use shoal_common::network::ActionRange;
 use shoal_common::run_dir::RunDir;
 use shoal_env_server::environment;
@@ -36,7 +36,11 @@ impl Plan {
             None => RunDir::create_next(Path::new("runs"), &name)?,
         };
         let file = run.config_file();
-        std::fs::write(&file, config.to_toml()?).with_context(|| format!("cannot write {}", file.display()))?;
+        if let Err(cause) = std::fs::write(&file, config.to_toml()?) {
+            // An empty directory would be in the way of the next try.
+            let _ = std::fs::remove_dir_all(run.path());
+            return Err(cause).with_context(|| format!("cannot write {}", file.display()));
+        }
         Ok(Self { config, run })
     }
 }
@@ -92,6 +96,9 @@ fn resolve(mut table: Table, args: &TrainArgs, origin: &str) -> anyhow::Result<C
             .filter(|(key, _)| key.contains('.'))
             .with_context(|| format!("--set {assignment}: must look like SECTION.KEY=VALUE"))?;
         let path: Vec<&str> = key.split('.').collect();
+        if path[0] == "spec" || key == "run.id" {
+            bail!("--set {assignment}: {key} is not for choosing: the program fills it in");
+        }
         put(&mut table, &path, value_of(value)).with_context(|| format!("--set {assignment}"))?;
     }
     // More actors than a run is usually laid out for: lay it out for them.
@@ -99,7 +106,7 @@ fn resolve(mut table: Table, args: &TrainArgs, origin: &str) -> anyhow::Result<C
         .get("actors")
         .and_then(|actors| actors.get("count"))
         .and_then(Value::as_integer)
-        && count > 16
+        && count > i64::from(Actors::default().max)
         && table.get("actors").is_some_and(|actors| actors.get("max").is_none())
     {
         put(&mut table, &["actors", "max"], count.into())?;
@@ -111,7 +118,10 @@ fn resolve(mut table: Table, args: &TrainArgs, origin: &str) -> anyhow::Result<C
         format!("{:08x}", rand::random::<u32>()).into(),
     )?;
     describe_environment(&mut table)?;
-    Ok(Config::from_table(table, origin)?)
+    let mut config = Config::from_table(table, origin)?;
+    // Also a short run ends with its policy judged.
+    config.evaluation.every = config.evaluation.every.min(config.run.steps);
+    Ok(config)
 }
 
 /// Fills in every parameter of the environment, and what the environment says of itself.
@@ -231,6 +241,7 @@ mod tests {
             (vec!["pendulum", "--set", "ddpg.gama=1"], "gama"),
             (vec!["pendulum", "--set", "dpg.gamma=1"], "dpg"),
             (vec!["pendulum", "--set", "gamma=1"], "SECTION.KEY=VALUE"),
+            (vec!["pendulum", "--set", "spec.time_limit=50"], "not for choosing"),
             (
                 vec!["pendulum", "--set", "ddpg.gamma=2"],
                 "ddpg.gamma = 2: must be from 0 to 1",

@@ -67,7 +67,7 @@ fn a_run_directory_that_exists_is_left_as_it_is() {
 }
 
 #[test]
-fn what_is_no_run_or_holds_no_policy_is_refused() {
+fn what_is_no_run_is_refused() {
     let place = Workplace::new();
     for command in ["eval", "plot"] {
         let said = complaint(&place.output(&[command, "nowhere"]));

@@ -125,6 +125,8 @@ fn a_role_that_cannot_work_is_given_up_and_its_last_words_are_passed_on() {
     until("there is a checkpoint", || {
         running.run.join("checkpoints/latest.ckpt").exists()
     });
+    // Stopped, so that it cannot save again in between.
+    running.stop("learner-0");
     for name in ["latest.ckpt", "previous.ckpt"] {
         let file = running.run.join("checkpoints").join(name);
         if file.exists() {

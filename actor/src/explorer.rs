@@ -302,7 +302,10 @@ impl<'a> Explorer<'a> {
                 pulse.beat(Activity::WaitingForRatio);
                 sender.look_after()
             },
-        )
+        )?;
+        // A learner that is at work rings before a nap is over, and the launcher is to know of this wait too.
+        pulse.beat(Activity::WaitingForRatio);
+        Ok(())
     }
 
     fn send(&mut self, version: u64) -> Result<(), Ended> {

@@ -41,15 +41,16 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Ended> {
         } else if learner.rows >= steps {
             learner.publish()?;
             return Ok(());
-        } else if !drained {
+        } else {
             let activity = if learner.rows < ratio.warmup {
                 Activity::WaitingForPeer
             } else {
                 Activity::WaitingForRatio
             };
-            if !learner.bell.wait(NAP).map_err(Ended::from)? {
-                learner.look_after(activity)?;
+            if !drained {
+                learner.bell.wait(NAP)?;
             }
+            learner.look_after(activity)?;
         }
         if saved.elapsed() >= every {
             learner.save()?;

@@ -56,8 +56,7 @@ pub(crate) fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
     })
 }
 
-/// The final evaluation: the policy with the best evaluation first, then the last one. A run too short for an evaluation
-/// has the last one only.
+/// The final evaluation: the policy with the best evaluation first, then the last one.
 fn judge(config: &Config, run: &RunDir) -> anyhow::Result<Vec<(&'static str, EvaluationSummary)>> {
     let mut judged = Vec::new();
     for (name, path, which) in [

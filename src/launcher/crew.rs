@@ -21,6 +21,12 @@ const LIMIT: u32 = 5;
 /// The pause before the first restart after a failure; each further one is twice as long.
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
 
+/// How long a process may take to be ready before it counts as stuck.
+const READY: Duration = Duration::from_secs(60);
+
+/// A process that is killed after so long was killed by somebody; one that goes earlier may well be killing itself.
+const SETTLED: Duration = Duration::from_secs(1);
+
 /// A process that has worked for so long has recovered from whatever made its predecessors fail.
 const RECOVERED: Duration = Duration::from_secs(30);
 
@@ -67,7 +73,8 @@ impl Crew {
                 .trim()
                 .parse()
                 .with_context(|| format!("{} is damaged", counter.display()))?,
-            Err(_) => 0,
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => 0,
+            Err(error) => return Err(error).with_context(|| format!("cannot read {}", counter.display())),
         };
         let actors = 0..config.actors.count;
         let members = [
@@ -163,7 +170,14 @@ impl Crew {
                 }
                 continue;
             };
-            let Some(status) = process.exit_status() else { continue };
+            if member.heartbeat.is_none() && member.begun.elapsed() >= READY {
+                self.log
+                    .note(&name(member.identity), "is not ready after a minute, and was killed");
+                process.kill();
+            }
+            let Some(status) = process.exit_status() else {
+                continue;
+            };
             member.process = None;
             let name = name(member.identity);
             if member.identity.role == Role::Learner && status.success() {
@@ -176,8 +190,9 @@ impl Crew {
             if member.begun.elapsed() >= RECOVERED {
                 member.failures = 0;
             }
-            // Killed while it worked is nobody's fault; ending by itself, or before it was ready, is a failure.
-            let pause = if ready && status.signal().is_some() {
+            // Killed while it worked is nobody's fault; ending by itself, or before it has settled, is a failure.
+            let settled = ready && member.begun.elapsed() >= SETTLED;
+            let pause = if settled && status.signal().is_some() {
                 Duration::ZERO
             } else {
                 member.failures += 1;

@@ -11,7 +11,7 @@ use serde::de::DeserializeOwned;
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum RecordError {
     /// The system refused.
-    #[error("cannot write {path}: {cause}; free some space or check the rights of the directory, then resume the run")]
+    #[error("cannot write {path}: {cause}; free some space or check the rights of the directory")]
     Write { path: PathBuf, cause: io::Error },
     /// The system refused.
     #[error("cannot read {path}: {cause}")]

@@ -108,8 +108,17 @@ impl Running {
 
     /// Kills the running process of a role with SIGKILL.
     pub(crate) fn kill(&self, who: &str) {
+        self.signal_role(who, Signal::KILL);
+    }
+
+    /// Stops the running process of a role with SIGSTOP.
+    pub(crate) fn stop(&self, who: &str) {
+        self.signal_role(who, Signal::STOP);
+    }
+
+    fn signal_role(&self, who: &str, signal: Signal) {
         let pid = *self.pids(who).last().unwrap();
-        kill_process(Pid::from_raw(pid).unwrap(), Signal::KILL).unwrap();
+        kill_process(Pid::from_raw(pid).unwrap(), signal).unwrap();
     }
 
     /// Sends a signal to the launcher.

@@ -29,9 +29,7 @@ pub enum OpenError {
         reason: &'static str,
     },
     /// The file is there and waiting will not make it readable.
-    #[error(
-        "{path}: {reason}; the file was left as it is: move it away, or resume the run with the program that wrote it"
-    )]
+    #[error("{path}: {reason}; the file was left as it is: move it away, or use the program that wrote it")]
     Refused {
         /// The replay file.
         path: PathBuf,
