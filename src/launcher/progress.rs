@@ -34,7 +34,7 @@ impl Progress {
             ProgressDrawTarget::stderr()
         };
         let bar = ProgressBar::with_draw_target(Some(config.run.steps), target);
-        if let Ok(style) = ProgressStyle::with_template("{prefix:.bold} {bar:20.cyan/dim} {msg}") {
+        if let Ok(style) = ProgressStyle::with_template("{prefix:.bold} {bar:16.cyan/dim} {msg}") {
             bar.set_style(style.progress_chars("━━─"));
         }
         bar.set_prefix(run.name());
@@ -80,7 +80,7 @@ impl Progress {
         self.bar.set_message(self.line(&learner, crew));
     }
 
-    /// How far it is and how good, and below it how fast and who waits: each fits 80 columns.
+    /// How far it is and how good, below it how fast and who waits, and restarts if there were any: each fits 80 columns.
     fn line(&self, learner: &LearnerReport, crew: &Crew) -> String {
         let steps = self.bar.length().unwrap_or(0);
         let rates = self.rates();
@@ -102,12 +102,13 @@ impl Progress {
         } else {
             0.0
         };
-        let waits = waiting(crew).map(|who| format!(" ({who})")).unwrap_or_default();
+        let waits = waiting(crew).map(|who| format!(", {who}")).unwrap_or_default();
         pace.push(format!("ratio {ratio:.2} of {:.2}{waits}", self.updates_per_step));
+        let mut lines = vec![outcome.join(" · "), pace.join(" · ")];
         if crew.restarts() > 0 {
-            pace.push(format!("{} restarts", crew.restarts()));
+            lines.push(format!("{} restarts; shoal.log says why", crew.restarts()));
         }
-        format!("{}\n  {}", outcome.join(" · "), pace.join(" · "))
+        lines.join("\n  ")
     }
 
     /// Updates and environment steps a second.
