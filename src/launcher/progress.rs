@@ -94,7 +94,8 @@ impl Progress {
         }
         let mut pace = vec![format!("{} updates", thousands(learner.updates))];
         if let Some((updates, env_steps)) = rates {
-            pace.push(format!("{updates:.0} updates/s · {env_steps:.0} steps/s"));
+            pace[0] += &format!(", {updates:.0}/s");
+            pace.push(format!("{env_steps:.0} steps/s"));
         }
         let beyond = learner.env_steps.saturating_sub(self.warmup);
         let ratio = if beyond > 0 {
