@@ -196,8 +196,7 @@ impl<'a> Launcher<'a> {
     }
 
     fn end_crew(&mut self) -> anyhow::Result<()> {
-        let Self { crew, .. } = self;
-        crew.end_all();
+        self.crew.end_all();
         self.read_reports()
     }
 

@@ -64,7 +64,7 @@ fn a_learner_killed_in_lockstep_ends_with_the_bits_of_one_that_was_not() {
         let running = place.start(name, &arguments);
         for n in 1..=kills {
             let rows = 8000 * n as u64;
-            until("it has come further", || env_steps_reported(&running.run) >= rows);
+            until("it has come further", || running.learned("env_steps") >= rows);
             running.kill("learner-0");
             until("it is replaced", || running.pids("learner-0").len() == n + 1);
         }
@@ -73,20 +73,6 @@ fn a_learner_killed_in_lockstep_ends_with_the_bits_of_one_that_was_not() {
         parse(&printed)["weights_sha256"].clone()
     };
     assert_eq!(finish(3, "killed"), finish(0, "whole"));
-}
-
-/// Environment steps that the learner reported last.
-fn env_steps_reported(run: &std::path::Path) -> u64 {
-    let learned = std::fs::read_to_string(run.join("learner.csv")).unwrap_or_default();
-    let mut rows = csv::Reader::from_reader(learned.as_bytes());
-    let Some(column) = rows.headers().unwrap().iter().position(|name| name == "env_steps") else {
-        return 0;
-    };
-    rows.records()
-        .flatten()
-        .filter_map(|row| row.get(column)?.parse().ok())
-        .max()
-        .unwrap_or(0)
 }
 
 #[test]

@@ -50,7 +50,7 @@ fn ctrl_c_and_sigterm_end_a_run_with_its_state_saved() {
     for (signal, code) in [(Signal::INT, 130), (Signal::TERM, 143)] {
         let place = Workplace::new();
         let running = place.start("run", &ENDLESS);
-        until("something is learned", || has_updates(&running.run));
+        until("something is learned", || running.learned("updates") > 0);
         running.signal(signal);
         let run = running.run.clone();
         let (exit, printed, leftovers) = running.wait();
@@ -67,7 +67,7 @@ fn ctrl_c_and_sigterm_end_a_run_with_its_state_saved() {
 fn when_the_launcher_is_killed_the_roles_save_and_end_and_nothing_is_left() {
     let place = Workplace::new();
     let running = place.start("run", &ENDLESS);
-    until("something is learned", || has_updates(&running.run));
+    until("something is learned", || running.learned("updates") > 0);
     let leftovers = running.leftovers();
     running.signal(Signal::KILL);
     leftovers.vanish();
@@ -105,7 +105,7 @@ fn a_role_that_is_killed_is_replaced_and_the_run_goes_on_to_its_end() {
     for who in ["actor-0", "env-server-0", "env-server-16", "evaluator-0", "learner-0"] {
         let place = Workplace::new();
         let running = place.start("run", &["--steps", "30000"]);
-        until("something is learned", || has_updates(&running.run));
+        until("something is learned", || running.learned("updates") > 0);
         running.kill(who);
         until("it is replaced", || running.pids(who).len() == 2);
         let log = running.run.join("shoal.log");
@@ -121,7 +121,7 @@ fn a_role_that_is_killed_is_replaced_and_the_run_goes_on_to_its_end() {
 fn a_role_that_cannot_work_is_given_up_and_its_last_words_are_passed_on() {
     let place = Workplace::new();
     let running = place.start("run", &["--steps", "3000000"]);
-    until("something is learned", || has_updates(&running.run));
+    until("something is learned", || running.learned("updates") > 0);
     until("there is a checkpoint", || {
         running.run.join("checkpoints/latest.ckpt").exists()
     });
@@ -143,14 +143,4 @@ fn a_role_that_cannot_work_is_given_up_and_its_last_words_are_passed_on() {
         "{said}"
     );
     assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
-}
-
-/// Whether the learner has reported updates.
-fn has_updates(run: &std::path::Path) -> bool {
-    let learned = std::fs::read_to_string(run.join("learner.csv")).unwrap_or_default();
-    let mut rows = csv::Reader::from_reader(learned.as_bytes());
-    let updates = rows.headers().unwrap().iter().position(|name| name == "updates");
-    rows.records()
-        .flatten()
-        .any(|row| updates.is_some_and(|i| row.get(i).is_some_and(|n| n != "0")))
 }

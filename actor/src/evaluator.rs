@@ -194,9 +194,11 @@ impl<'a> Evaluator<'a> {
                 Stepped::Taken(next) => current = next,
                 Stepped::Lost => return Ok(None),
             }
-            for e in (0..self.settings.envs).filter(|&e| under_way[e]).collect::<Vec<_>>() {
-                returns[e] += f64::from(current.reward(e));
-                under_way[e] = !(current.terminated(e) || current.truncated(e));
+            for (e, (under_way, total)) in under_way.iter_mut().zip(&mut returns).enumerate() {
+                if *under_way {
+                    *total += f64::from(current.reward(e));
+                    *under_way = !(current.terminated(e) || current.truncated(e));
+                }
             }
             pulse.count(self.settings.envs as u64);
             pulse.beat(Activity::Working);

@@ -97,6 +97,15 @@ impl Running {
         std::fs::read_to_string(self.run.join("shoal.log")).unwrap_or_default()
     }
 
+    /// The highest number that the learner has reported in a column of `learner.csv`; 0 before the first report.
+    pub(crate) fn learned(&self, column: &str) -> u64 {
+        let learned = std::fs::read_to_string(self.run.join("learner.csv")).unwrap_or_default();
+        let mut rows = csv::Reader::from_reader(learned.as_bytes());
+        let column = rows.headers().unwrap().iter().position(|name| name == column);
+        let number = |row: csv::StringRecord| row.get(column?)?.parse().ok();
+        rows.records().flatten().filter_map(number).max().unwrap_or(0)
+    }
+
     /// Process numbers of a role in the order of their starts, like `actor-0`.
     pub(crate) fn pids(&self, who: &str) -> Vec<i32> {
         pids(&self.log())

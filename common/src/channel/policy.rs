@@ -134,9 +134,7 @@ impl PolicyReader {
         }
         Ok(self.current.as_ref())
     }
-}
 
-impl PolicyReader {
     /// The policy that [`latest`](Self::latest) gave last, however old it is by now.
     pub fn held(&self) -> Option<&Policy> {
         self.current.as_ref()

@@ -81,11 +81,11 @@ impl Observed {
 }
 
 impl EnvironmentClient {
-    /// Opens the conversation with environment server `index` and learns what it serves; `place` is who rings back, and
-    /// `environments` with `observation_width` what the server is expected to hold.
+    /// Opens the conversation with environment server `index`, whose responses are expected to have this layout. Whether
+    /// they do, [`describe`](Self::describe) tells. Waiting for an answer ends when `stop` is requested.
     ///
     /// # Errors
-    /// When shared memory cannot be had, or the server serves something else.
+    /// When shared memory cannot be had.
     pub fn open(
         domain: &Domain,
         index: u32,
