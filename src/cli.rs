@@ -19,6 +19,14 @@ pub(crate) struct Cli {
 pub(crate) enum Command {
     /// Train a policy: starts environment servers, actors, an evaluator and a learner, and ends when it has learned.
     Train(TrainArgs),
+    /// Go on with a run that was stopped, or whose processes were killed.
+    Resume(ResumeArgs),
+    /// Show how a run gets on: every role, its rate and restarts, and who waits for whom.
+    Status(StatusArgs),
+    /// Change the number of actors while training goes on.
+    Scale(ScaleArgs),
+    /// End a run in order, so that it can be resumed.
+    Stop(StopArgs),
     /// Judge a run's policy on episodes with fixed starts.
     Eval(EvalArgs),
     /// Draw a run's figures.
@@ -61,12 +69,57 @@ pub(crate) struct TrainArgs {
     /// Override a key of the configuration, as in --set ddpg.tau=0.005. May be repeated.
     #[arg(long, value_name = "SECTION.KEY=VALUE")]
     pub(crate) set: Vec<String>,
+    #[command(flatten)]
+    pub(crate) telling: Telling,
+}
+
+/// What a training run says.
+#[derive(Args, Clone, Debug, Default)]
+pub(crate) struct Telling {
     /// No live line and no table.
     #[arg(long)]
     pub(crate) quiet: bool,
     /// Print one JSON object on standard output at the end, and everything else on standard error.
     #[arg(long)]
     pub(crate) json: bool,
+}
+
+#[derive(Args, Clone, Debug)]
+pub(crate) struct ResumeArgs {
+    /// Run directory.
+    pub(crate) run: PathBuf,
+    /// Environment steps over all actors, those already taken included [default: as before].
+    #[arg(long, value_name = "N")]
+    pub(crate) steps: Option<u64>,
+    #[command(flatten)]
+    pub(crate) telling: Telling,
+}
+
+#[derive(Args, Clone, Debug)]
+pub(crate) struct StatusArgs {
+    /// Run directory.
+    pub(crate) run: PathBuf,
+    /// Print one JSON object on standard output.
+    #[arg(long)]
+    pub(crate) json: bool,
+    /// Again every second, until the run ends.
+    #[arg(long)]
+    pub(crate) watch: bool,
+}
+
+#[derive(Args, Clone, Debug)]
+pub(crate) struct ScaleArgs {
+    /// Run directory.
+    pub(crate) run: PathBuf,
+    /// Actor processes from now on.
+    #[arg(long, value_name = "N")]
+    pub(crate) actors: u32,
+}
+
+#[derive(Args, Clone, Debug)]
+pub(crate) struct StopArgs {
+    /// Run directory.
+    pub(crate) run: PathBuf,
 }
 
 #[derive(Args, Clone, Debug)]

@@ -3,4 +3,9 @@
 pub(crate) mod bench;
 pub(crate) mod eval;
 pub(crate) mod plot;
+pub(crate) mod resume;
+pub(crate) mod scale;
+pub(crate) mod status;
+pub(crate) mod stop;
 pub(crate) mod train;
+mod training;

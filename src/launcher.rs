@@ -1,7 +1,9 @@
 //! The launcher: starts the roles of a run, watches them, keeps the records, and ends all of them.
 
 mod crew;
+mod desk;
 mod log;
+mod member;
 mod process;
 mod progress;
 
@@ -11,9 +13,10 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use shoal_common::channel::Domain;
+use shoal_common::channel::control::{Answer, ControlPort, Question, RunStatus};
 use shoal_common::channel::reports::Reports;
 use shoal_common::config::Config;
-use shoal_common::report::{Activity, EpisodeReport, EvaluationReport, Heartbeat, LearnerReport, Role};
+use shoal_common::report::{EpisodeReport, EvaluationReport, Heartbeat, LearnerReport};
 use shoal_common::run_dir::{RunDir, RunLock};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
@@ -22,6 +25,7 @@ use self::log::Log;
 use self::progress::Progress;
 pub(crate) use self::progress::thousands;
 use crate::recorder::Recorder;
+use crate::status;
 
 /// How often the launcher looks round.
 const ROUND: Duration = Duration::from_millis(50);
@@ -29,11 +33,16 @@ const ROUND: Duration = Duration::from_millis(50);
 /// How long the evaluator may take over the last policy once the learner is through.
 const LAST_EVALUATION: Duration = Duration::from_secs(5);
 
+/// How long the roles of a launcher that was killed may take to end.
+const PREDECESSORS_END: Duration = Duration::from_secs(10);
+
 /// How a run came to its end.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Ending {
     /// All its steps are taken and learned from.
     Finished,
+    /// As somebody asked for; the learner saved its state.
+    Stopped,
     /// By this signal; the learner saved its state.
     Interrupted(i32),
 }
@@ -43,14 +52,17 @@ pub(crate) enum Ending {
 pub(crate) struct Outcome {
     pub(crate) ending: Ending,
     pub(crate) wall: Duration,
+    /// How the run stood when it began.
+    pub(crate) rest: RunStatus,
+    /// What the learner said last.
     pub(crate) learner: Option<LearnerReport>,
     pub(crate) episodes: u64,
 }
 
-/// Runs all roles until the learner is through or a signal comes.
-pub(crate) fn run(config: &Config, run: &RunDir, quiet: bool) -> anyhow::Result<Outcome> {
+/// Runs all roles until the learner is through, a signal comes, or somebody asks for the end.
+pub(crate) fn run(config: Config, run: &RunDir, lock: RunLock, quiet: bool) -> anyhow::Result<Outcome> {
     let signals = Signals::register()?;
-    let lock = run.lock()?;
+    Domain::wait_for_the_last(&config.run.id, PREDECESSORS_END)?;
     Domain::remove_abandoned()?;
     let domain = Domain::join(&config.run.id, config.actors.max)?;
     let outcome = Launcher::new(config, run, &domain, signals, quiet, lock).and_then(Launcher::run);
@@ -95,8 +107,12 @@ impl Drop for Signals {
 }
 
 struct Launcher<'a> {
-    config: &'a Config,
+    config: Config,
+    run: &'a RunDir,
     domain: &'a Domain,
+    control: ControlPort,
+    /// How the run stood when this launcher began.
+    rest: RunStatus,
     crew: Crew,
     recorder: Recorder,
     progress: Progress,
@@ -106,15 +122,12 @@ struct Launcher<'a> {
     episode_reports: Reports<EpisodeReport>,
     evaluation_reports: Reports<EvaluationReport>,
     learner_reports: Reports<LearnerReport>,
-    learner: Option<LearnerReport>,
-    episodes: u64,
-    evaluated: Option<EvaluationReport>,
     _lock: RunLock,
 }
 
 impl<'a> Launcher<'a> {
     fn new(
-        config: &'a Config,
+        config: Config,
         run: &'a RunDir,
         domain: &'a Domain,
         signals: Signals,
@@ -126,20 +139,20 @@ impl<'a> Launcher<'a> {
         std::fs::create_dir_all(run.checkpoints()).context("cannot make the directory for checkpoints")?;
         let recorder = Recorder::open(run, config.replay.warmup)?;
         Ok(Self {
-            config,
+            control: ControlPort::open(domain)?,
+            rest: status::at_rest(&config, run)?,
+            run,
             domain,
             heartbeats: Reports::open(domain)?,
             episode_reports: Reports::open(domain)?,
             evaluation_reports: Reports::open(domain)?,
             learner_reports: Reports::open(domain)?,
-            crew: Crew::new(config, run, log)?,
+            crew: Crew::new(&config, run, log)?,
             recorder,
-            progress: Progress::new(config, run, quiet),
+            progress: Progress::new(&config, run, quiet),
+            config,
             signals,
             begun: Instant::now(),
-            learner: None,
-            episodes: 0,
-            evaluated: None,
             _lock: lock,
         })
     }
@@ -156,8 +169,9 @@ impl<'a> Launcher<'a> {
         Ok(Outcome {
             ending,
             wall: self.begun.elapsed(),
-            learner: self.learner,
-            episodes: self.episodes,
+            learner: self.progress.learner().copied(),
+            rest: self.rest,
+            episodes: self.recorder.episodes(),
         })
     }
 
@@ -168,6 +182,9 @@ impl<'a> Launcher<'a> {
                 return Ok(Ending::Interrupted(signal));
             }
             self.read_reports()?;
+            if self.attend()? {
+                return Ok(Ending::Stopped);
+            }
             if self.crew.look_after(self.domain)? == crew::State::LearnerDone {
                 self.await_last_evaluation()?;
                 return Ok(Ending::Finished);
@@ -177,15 +194,44 @@ impl<'a> Launcher<'a> {
         }
     }
 
+    /// Answers who asks from another terminal; whether somebody asked for the end.
+    fn attend(&mut self) -> anyhow::Result<bool> {
+        let mut to_end = false;
+        let Self {
+            config,
+            run,
+            control,
+            crew,
+            progress,
+            rest,
+            ..
+        } = self;
+        control.attend(|question| -> anyhow::Result<Answer> {
+            match question {
+                Question::Status => Ok(Answer::Status(desk::status(config, run, crew, progress, rest)?)),
+                Question::Scale { actors } => desk::scale(config, run, crew, actors),
+                Question::Stop => {
+                    to_end = true;
+                    Ok(Answer::Accepted)
+                }
+            }
+        })?;
+        Ok(to_end)
+    }
+
     /// The evaluator may still be at the policy of the last period.
     fn await_last_evaluation(&mut self) -> anyhow::Result<()> {
-        let evaluation = &self.config.evaluation;
+        let evaluation = self.config.evaluation.clone();
         let patience = Instant::now();
         while patience.elapsed() < LAST_EVALUATION && self.signals.received().is_none() {
             self.read_reports()?;
-            let last = self.learner.map_or(0, |learner| evaluation.period(learner.env_steps));
+            let last = self
+                .progress
+                .learner()
+                .map_or(0, |learner| evaluation.period(learner.env_steps));
             if self
-                .evaluated
+                .progress
+                .evaluated()
                 .is_some_and(|report| evaluation.period(report.env_steps) >= last)
             {
                 break;
@@ -206,17 +252,14 @@ impl<'a> Launcher<'a> {
             self.crew.hear(&heartbeat);
         }
         each(&self.episode_reports, |report| {
-            self.episodes += 1;
             Ok(self.recorder.episode(&report, wall)?)
         })?;
         each(&self.evaluation_reports, |report| {
-            self.evaluated = Some(report);
-            self.progress.evaluated(&report);
+            self.progress.heard_evaluation(&report);
             Ok(self.recorder.evaluation(&report, wall)?)
         })?;
         each(&self.learner_reports, |report| {
-            self.learner = Some(report);
-            self.progress.learned(&report, wall);
+            self.progress.heard_learner(&report, wall);
             Ok(self.recorder.learner(&report, wall)?)
         })
     }
@@ -238,15 +281,4 @@ fn write_iox_config(domain: &Domain, run: &RunDir) -> anyhow::Result<()> {
     std::fs::create_dir_all(&directory)?;
     std::fs::write(directory.join("iceoryx2.toml"), domain.iox_config()?)?;
     Ok(())
-}
-
-/// Who waits for whom, in words, from what actors and learner said last.
-fn waiting(crew: &Crew) -> Option<&'static str> {
-    match (crew.activity(Role::Actor), crew.activity(Role::Learner)) {
-        (Some(Activity::WaitingForRatio), _) => Some("actors wait"),
-        (_, Some(Activity::WaitingForRatio)) => Some("learner waits"),
-        (_, Some(Activity::WaitingForPeer)) => Some("learner waits for rows"),
-        (Some(Activity::WaitingForPeer), _) => Some("actors wait for a policy"),
-        _ => None,
-    }
 }

@@ -6,8 +6,10 @@ mod figure;
 mod launcher;
 mod plan;
 mod recorder;
+mod remote;
 mod role;
 mod rollout;
+mod status;
 mod tensorboard;
 
 use std::io::Write;
@@ -38,6 +40,10 @@ fn main() -> ExitCode {
 fn run(command: &Command) -> anyhow::Result<ExitCode> {
     match command {
         Command::Train(args) => command::train::run(args),
+        Command::Resume(args) => command::resume::run(args),
+        Command::Status(args) => command::status::run(args),
+        Command::Scale(args) => command::scale::run(args).map(done),
+        Command::Stop(args) => command::stop::run(args).map(done),
         Command::Eval(args) => command::eval::run(args).map(done),
         Command::Plot(args) => command::plot::run(args).map(done),
         Command::Bench(args) => command::bench::run(args).map(done),

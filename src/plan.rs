@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 use shoal_common::config::{Actors, Config};
 use shoal_common::network::ActionRange;
-use shoal_common::run_dir::RunDir;
+use shoal_common::run_dir::{RunDir, RunLock};
 use shoal_env_server::environment;
 use toml::{Table, Value};
 
@@ -24,6 +24,7 @@ const PRESETS: [(&str, &str); 4] = [
 pub(crate) struct Plan {
     pub(crate) config: Config,
     pub(crate) run: RunDir,
+    pub(crate) lock: RunLock,
 }
 
 impl Plan {
@@ -35,13 +36,13 @@ impl Plan {
             Some(path) => RunDir::create(path)?,
             None => RunDir::create_next(Path::new("runs"), &name)?,
         };
-        let file = run.config_file();
-        if let Err(cause) = std::fs::write(&file, config.to_toml()?) {
+        let lock = run.lock()?;
+        if let Err(error) = run.write_config(&config) {
             // An empty directory would be in the way of the next try.
             let _ = std::fs::remove_dir_all(run.path());
-            return Err(cause).with_context(|| format!("cannot write {}", file.display()));
+            return Err(error.into());
         }
-        Ok(Self { config, run })
+        Ok(Self { config, run, lock })
     }
 }
 

@@ -12,14 +12,17 @@ use shoal_env_server::vector::VectorEnvironment;
 use shoal_learner::ddpg::DdpgSettings;
 use shoal_learner::learner;
 use shoal_learner::ratio::Ratio;
+use tracing_subscriber::filter::LevelFilter;
 
 use crate::cli::RoleArgs;
+use crate::recorder::read_evaluations;
 
 /// Runs a role until it is through, or its standard input closes.
 pub(crate) fn run(role: Role, args: &RoleArgs) -> anyhow::Result<()> {
     // What is logged goes to the launcher, which may be gone already: then it is lost, and no reason to fail.
     tracing_subscriber::fmt()
         .with_writer(std::io::stderr)
+        .with_max_level(log_level())
         .with_ansi(false)
         .with_target(false)
         .log_internal_errors(false)
@@ -40,6 +43,12 @@ pub(crate) fn run(role: Role, args: &RoleArgs) -> anyhow::Result<()> {
     Ok(left?)
 }
 
+/// `info`, or what the environment variable `SHOAL_LOG` says: `debug` tells of every chunk that is sent.
+fn log_level() -> LevelFilter {
+    let level = std::env::var("SHOAL_LOG").ok().and_then(|level| level.parse().ok());
+    level.unwrap_or(LevelFilter::INFO)
+}
+
 fn work(domain: &Domain, config: &Config, run: &RunDir, identity: Identity, stop: &Stop) -> anyhow::Result<()> {
     match identity.role {
         Role::EnvServer => serve(domain, config, identity, stop),
@@ -50,10 +59,14 @@ fn work(domain: &Domain, config: &Config, run: &RunDir, identity: Identity, stop
         )?),
         Role::Evaluator => Ok(evaluator::evaluate(
             domain,
-            &evaluator_settings(config, run, identity),
+            &evaluator_settings(config, run, identity, judged(config, run)?),
             stop,
         )?),
-        Role::Learner => Ok(learner::learn(domain, &learner_settings(config, run, identity), stop)?),
+        Role::Learner => Ok(learner::learn(
+            domain,
+            &learner_settings(config, run, identity, judged(config, run)?),
+            stop,
+        )?),
     }
 }
 
@@ -90,6 +103,16 @@ fn serve(domain: &Domain, config: &Config, identity: Identity, stop: &Stop) -> a
     )?)
 }
 
+/// The period of the policy that was judged last, by the run's records: the launcher has them written before it starts
+/// anybody again.
+fn judged(config: &Config, run: &RunDir) -> anyhow::Result<Option<u64>> {
+    let evaluations = read_evaluations(&run.evaluations())?;
+    let periods = evaluations
+        .iter()
+        .map(|evaluation| config.evaluation.period(evaluation.env_steps));
+    Ok(periods.max())
+}
+
 fn explorer_settings(config: &Config, run: &RunDir, identity: Identity) -> explorer::Settings {
     explorer::Settings {
         identity,
@@ -106,7 +129,7 @@ fn explorer_settings(config: &Config, run: &RunDir, identity: Identity) -> explo
     }
 }
 
-fn evaluator_settings(config: &Config, run: &RunDir, identity: Identity) -> evaluator::Settings {
+fn evaluator_settings(config: &Config, run: &RunDir, identity: Identity, judged: Option<u64>) -> evaluator::Settings {
     evaluator::Settings {
         identity,
         spec: config.spec.clone(),
@@ -115,10 +138,11 @@ fn evaluator_settings(config: &Config, run: &RunDir, identity: Identity) -> eval
         evaluation: config.evaluation.clone(),
         hidden: config.ddpg.hidden,
         best: run.best_policy(),
+        judged,
     }
 }
 
-fn learner_settings(config: &Config, run: &RunDir, identity: Identity) -> learner::Settings {
+fn learner_settings(config: &Config, run: &RunDir, identity: Identity, judged: Option<u64>) -> learner::Settings {
     let ddpg = &config.ddpg;
     learner::Settings {
         identity,
@@ -144,6 +168,7 @@ fn learner_settings(config: &Config, run: &RunDir, identity: Identity) -> learne
         },
         capacity: config.replay.capacity,
         evaluation: config.evaluation.clone(),
+        judged,
         checkpoint: config.checkpoint.clone(),
         fingerprint: config.fingerprint(),
         replay: run.replay_file(),

@@ -33,6 +33,8 @@ pub struct Settings {
     pub hidden: [usize; 2],
     /// Where the best policy is kept.
     pub best: PathBuf,
+    /// The period of the policy that an evaluator before this one judged last.
+    pub judged: Option<u64>,
 }
 
 /// Mean and standard deviation (of the sample; 0 for fewer than two) of returns.
@@ -110,7 +112,7 @@ impl<'a> Evaluator<'a> {
             actions: vec![0.0; settings.envs * network.range().width()],
             network,
             bell,
-            judged: None,
+            judged: settings.judged,
             best,
         })
     }

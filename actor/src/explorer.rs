@@ -17,7 +17,7 @@ use shoal_common::channel::environment::{EnvironmentClient, Observed, ResponseLa
 use shoal_common::channel::policy::PolicyReader;
 use shoal_common::channel::reports::Reporter;
 use shoal_common::channel::transitions::{Chunk, ChunkSender};
-use shoal_common::channel::{Bell, Domain, Interruption, Place, Pulse, Ringer, wait_for};
+use shoal_common::channel::{Bell, ChannelError, Domain, Interruption, Place, Pulse, Ringer, wait_for};
 use shoal_common::commit::{CommitReader, OpenError};
 use shoal_common::config::{Exploration, Mode};
 use shoal_common::network::{ActionRange, PolicyNetwork};
@@ -30,7 +30,7 @@ use shoal_common::transition::{RowLayout, Transition};
 use crate::error::{ActorError, Ended};
 use crate::noise::OrnsteinUhlenbeck;
 
-/// How long an actor that is asked to end waits for its last chunk to be committed.
+/// How long an actor waits for its last chunk to be committed when the whole run ends.
 const FAREWELL: Duration = Duration::from_secs(1);
 
 /// What an actor is told.
@@ -111,22 +111,15 @@ impl<'a> Explorer<'a> {
         pulse.beat(Activity::WaitingForPeer);
 
         let commits = wait_for_replay(settings, &bell, stop, &mut pulse)?;
-        // In lockstep chunk k belongs to round k whoever sends it, and the noise goes on where the last chunk left it.
-        let (sent, stream_incarnation) = match settings.mode {
-            Mode::Free => (0, incarnation),
-            Mode::Lockstep => (commits.committed(index as usize).sequence, 0),
-        };
-        let sender = ChunkSender::open(
-            domain,
-            index,
-            incarnation,
-            sent,
-            row,
-            settings.chunk_rows,
-            settings.window,
-        )?;
+        let greeting = ChunkSender::open(domain, index, incarnation, row, settings.chunk_rows, settings.window)?;
         let learner = Ringer::new(domain, Place(Role::Learner, 0))?;
         learner.ring();
+        let sender = greeting.wait(&commits, &bell, stop, || pulse.beat(Activity::WaitingForPeer))?;
+        // In lockstep chunk k belongs to round k whoever sends it, and the noise goes on where the last chunk left it.
+        let (step, stream_incarnation) = match settings.mode {
+            Mode::Free => (0, incarnation),
+            Mode::Lockstep => (sender.sent() * (settings.chunk_rows / settings.envs) as u64, 0),
+        };
         let stream = stream(settings.seed, Purpose::Exploration, index.into(), stream_incarnation);
         Ok(Self {
             settings,
@@ -137,7 +130,7 @@ impl<'a> Explorer<'a> {
             policy,
             noise: OrnsteinUhlenbeck::new(&settings.exploration, settings.envs, row.action_width(), stream),
             network,
-            step: sent * (settings.chunk_rows / settings.envs) as u64,
+            step,
             sender,
             chunk: None,
             commits,
@@ -308,7 +301,7 @@ impl<'a> Explorer<'a> {
         Ok(())
     }
 
-    fn send(&mut self, version: u64) -> Result<(), Ended> {
+    fn send(&mut self, version: u64) -> Result<(), ChannelError> {
         if let Some(chunk) = self.chunk.take() {
             self.sender.send(chunk, version)?;
             self.learner.ring();
@@ -316,30 +309,34 @@ impl<'a> Explorer<'a> {
         Ok(())
     }
 
-    /// Sends what was collected and gives the learner a moment to commit it. In lockstep a round is whole or not at all.
+    /// Sends what was collected and waits until it is committed: for as long as that takes where only this actor retires,
+    /// for a moment where the run ends. In lockstep a round is whole or not at all.
     fn say_farewell(&mut self) -> Result<(), ActorError> {
-        let index = self.settings.identity.index as usize;
-        let begun = Instant::now();
-        let patience = |left: u64| left > 0 && begun.elapsed() < FAREWELL;
-        if self.settings.mode == Mode::Free && self.chunk.as_ref().is_some_and(|chunk| !chunk.is_empty()) {
-            let window = u64::from(self.settings.window);
-            while patience((self.sender.in_flight(self.commits.committed(index)) + 1).saturating_sub(window)) {
-                self.bell.wait(Duration::from_millis(10))?;
-            }
-            if self.sender.in_flight(self.commits.committed(index)) < window {
-                let version = self.policy.latest()?.map_or(0, |policy| policy.header().version);
-                if let Some(chunk) = self.chunk.take() {
-                    self.sender.send(chunk, version)?;
-                    self.learner.ring();
-                }
-            }
+        if self.settings.mode == Mode::Free
+            && self.chunk.as_ref().is_some_and(|chunk| !chunk.is_empty())
+            && self.await_commits(u64::from(self.settings.window) - 1)?
+        {
+            let version = self.policy.held().map_or(0, |policy| policy.header().version);
+            self.send(version)?;
         }
-        while patience(self.sender.in_flight(self.commits.committed(index))) {
+        self.await_commits(0)?;
+        self.pulse.beat_now(Activity::Done);
+        Ok(())
+    }
+
+    /// Waits until no more than `most` chunks are uncommitted; whether that came about.
+    fn await_commits(&mut self, most: u64) -> Result<bool, ChannelError> {
+        let index = self.settings.identity.index as usize;
+        let mut hurried: Option<Instant> = None;
+        while self.sender.in_flight(self.commits.committed(index)) > most {
+            if self.stop.at_once() && hurried.get_or_insert_with(Instant::now).elapsed() >= FAREWELL {
+                return Ok(false);
+            }
+            self.pulse.beat(Activity::WaitingForRatio);
             self.sender.look_after()?;
             self.bell.wait(Duration::from_millis(10))?;
         }
-        self.pulse.beat_now(Activity::Done);
-        Ok(())
+        Ok(true)
     }
 }
 

@@ -216,7 +216,7 @@ impl Config {
     /// When a key is unknown, of the wrong type, or out of range.
     pub fn from_table(table: toml::Table, origin: impl Display) -> Result<Self, ConfigError> {
         let config: Self = table.try_into().map_err(|error| malformed(origin, &error))?;
-        config.validate()?;
+        config.check()?;
         Ok(config)
     }
 

@@ -1,11 +1,17 @@
 //! The run directory: where everything a run leaves behind lies.
 
 use std::fs::{DirBuilder, File};
-use std::io::{self, ErrorKind};
+use std::io::{self, ErrorKind, Write};
 use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use rustix::fs::{FlockOperation, flock};
+use rustix::io::Errno;
 
 use crate::config::{Config, ConfigError};
+use crate::durable::write_atomically;
 
 /// A run directory that exists.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -109,9 +115,32 @@ impl RunDir {
             cause,
         };
         let file = File::open(&self.path).map_err(io)?;
-        match rustix::fs::flock(&file, rustix::fs::FlockOperation::NonBlockingLockExclusive) {
-            Ok(()) => Ok(RunLock { _file: file }),
-            Err(rustix::io::Errno::WOULDBLOCK) => Err(RunDirError::Busy(self.path.clone())),
+        // Somebody who only looks whether the run goes on holds the lock for a moment.
+        let patience = Instant::now() + Duration::from_millis(200);
+        loop {
+            match flock(&file, FlockOperation::NonBlockingLockExclusive) {
+                Ok(()) => return Ok(RunLock { _file: file }),
+                Err(Errno::WOULDBLOCK) if Instant::now() < patience => thread::sleep(Duration::from_millis(5)),
+                Err(Errno::WOULDBLOCK) => return Err(RunDirError::Busy(self.path.clone())),
+                Err(errno) => return Err(io(errno.into())),
+            }
+        }
+    }
+
+    /// Whether a launcher works in it.
+    ///
+    /// # Errors
+    /// When the system refuses to tell.
+    pub fn goes_on(&self) -> Result<bool, RunDirError> {
+        let io = |cause| RunDirError::Io {
+            action: "look at the lock of",
+            path: self.path.clone(),
+            cause,
+        };
+        let file = File::open(&self.path).map_err(io)?;
+        match flock(&file, FlockOperation::NonBlockingLockShared) {
+            Ok(()) => Ok(false),
+            Err(Errno::WOULDBLOCK) => Ok(true),
             Err(errno) => Err(io(errno.into())),
         }
     }
@@ -122,6 +151,20 @@ impl RunDir {
     /// When it is missing or damaged.
     pub fn config(&self) -> Result<Config, ConfigError> {
         Config::load(&self.config_file())
+    }
+
+    /// Writes the configuration, whole or not at all. For the launcher alone.
+    ///
+    /// # Errors
+    /// When it cannot be written.
+    pub fn write_config(&self, config: &Config) -> Result<(), RunDirError> {
+        let io = |cause| RunDirError::Io {
+            action: "write",
+            path: self.config_file(),
+            cause,
+        };
+        let text = config.to_toml().map_err(|error| io(io::Error::other(error)))?;
+        write_atomically(&self.config_file(), |file| file.write_all(text.as_bytes())).map_err(io)
     }
 
     /// The directory itself.

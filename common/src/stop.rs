@@ -1,16 +1,20 @@
-//! How a role learns that it shall end: its standard input closes, because the launcher wants it or because the launcher
-//! is no more. One sign for both, and the system gives it even when the launcher is killed.
+//! How a role learns that it shall end. Its standard input closes when the launcher wants it or is no more: one sign for
+//! both, and the system gives it even when the launcher is killed. A line on standard input before that lets it retire:
+//! the run goes on, and it may take the time to hand over all it has.
 
-use std::io::Read;
+use std::io::{ErrorKind, Read};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicU8, Ordering};
+
+const RETIRE: u8 = 1;
+const END: u8 = 2;
 
 /// The wish to end; every loop of a role looks at it.
 #[derive(Clone, Debug, Default)]
-pub struct Stop(Arc<AtomicBool>);
+pub struct Stop(Arc<AtomicU8>);
 
 impl Stop {
-    /// A stop that is requested once this process's standard input has closed.
+    /// A stop that is requested once this process's standard input says or ends something.
     ///
     /// # Errors
     /// When the watching thread cannot be started.
@@ -20,7 +24,14 @@ impl Stop {
         std::thread::Builder::new().name("stdin".into()).spawn(move || {
             let mut ignored = [0; 64];
             let mut stdin = std::io::stdin().lock();
-            while !matches!(stdin.read(&mut ignored), Ok(0)) {}
+            loop {
+                match stdin.read(&mut ignored) {
+                    Ok(0) => break,
+                    Ok(_) => flag.raise(RETIRE),
+                    Err(error) if error.kind() == ErrorKind::Interrupted => {}
+                    Err(_) => break,
+                }
+            }
             flag.request();
         })?;
         Ok(stop)
@@ -28,11 +39,20 @@ impl Stop {
 
     /// Asks for the end.
     pub fn request(&self) {
-        self.0.store(true, Ordering::Relaxed);
+        self.raise(END);
     }
 
-    /// Whether the end was asked for.
+    /// Whether the end was asked for, at leisure or not.
     pub fn requested(&self) -> bool {
-        self.0.load(Ordering::Relaxed)
+        self.0.load(Ordering::Relaxed) > 0
+    }
+
+    /// Whether the run is ending too, so that nobody may wait for long.
+    pub fn at_once(&self) -> bool {
+        self.0.load(Ordering::Relaxed) >= END
+    }
+
+    fn raise(&self, wish: u8) {
+        self.0.fetch_max(wish, Ordering::Relaxed);
     }
 }

@@ -26,6 +26,7 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Ended> {
         if learner.stop.requested() {
             return Err(Ended::Stopped);
         }
+        learner.call_the_roll()?;
         let updates = learner.updates();
         let drained = learner.intake.drain(&mut learner.replay, CHUNKS_AT_ONCE, |replay| {
             ratio.is_behind(replay.head(), updates)

@@ -28,6 +28,7 @@ pub enum IntakeError {
 pub struct Intake {
     sources: Vec<Source>,
     row: RowLayout,
+    window: u32,
     /// Rows after which nothing more is taken.
     limit: u64,
     /// Whose turn it is. Kept from one call to the next: a learner that takes one chunk at a time must not take all of
@@ -47,19 +48,30 @@ impl Intake {
     /// # Errors
     /// When shared memory cannot be had, or another learner lives.
     pub fn open(domain: &Domain, actors: u32, window: u32, row: RowLayout, limit: u64) -> Result<Self, ChannelError> {
-        let source = |actor| {
-            let receiver = ChunkReceiver::open(domain, actor, window)?;
-            Ok(Source {
-                receiver,
-                bell: Ringer::new(domain, Place(Role::Actor, actor))?,
-            })
-        };
-        Ok(Self {
-            sources: (0..actors).map(source).collect::<Result<_, ChannelError>>()?,
+        let mut intake = Self {
+            sources: Vec::new(),
             row,
+            window,
             limit,
             turn: 0,
-        })
+        };
+        intake.widen(domain, actors)?;
+        Ok(intake)
+    }
+
+    /// Opens the receiving ends of actors `0 .. actors` where they are not open yet. None is ever closed: an actor that
+    /// has retired costs a look, and may come back.
+    ///
+    /// # Errors
+    /// As `open`.
+    pub fn widen(&mut self, domain: &Domain, actors: u32) -> Result<(), ChannelError> {
+        for actor in self.sources.len() as u32..actors {
+            self.sources.push(Source {
+                receiver: ChunkReceiver::open(domain, actor, self.window)?,
+                bell: Ringer::new(domain, Place(Role::Actor, actor))?,
+            });
+        }
+        Ok(())
     }
 
     /// How many actors there are.
@@ -80,7 +92,7 @@ impl Intake {
     ) -> Result<bool, IntakeError> {
         let actors = self.sources.len();
         let (mut any, mut idle) = (false, 0);
-        for _ in 0..most as usize * actors {
+        for _ in 0..u64::from(most) * actors as u64 {
             if idle == actors || enough(replay) || replay.head() >= self.limit {
                 break;
             }
@@ -117,7 +129,8 @@ impl Intake {
 }
 
 fn append(replay: &mut Replay, actor: usize, chunk: &ReceivedChunk, room: usize) -> Result<Appended, IntakeError> {
+    let mark = chunk.mark(replay.committed(actor).mark);
     replay
-        .append_and_commit(actor, chunk.mark(), &chunk.rows()[..room])
+        .append_and_commit(actor, mark, &chunk.rows()[..room])
         .map_err(|cause| IntakeError::Chunk { actor, cause })
 }

@@ -12,11 +12,11 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use shoal_common::channel::policy::{PolicyHeader, PolicyPublisher};
-use shoal_common::channel::reports::Reporter;
+use shoal_common::channel::reports::{Reporter, Reports};
 use shoal_common::channel::{Bell, Domain, Interruption, Place, Pulse, Ringer};
 use shoal_common::config::Mode;
 use shoal_common::policy_file::PolicyFile;
-use shoal_common::report::{Activity, LearnerReport, Role};
+use shoal_common::report::{Activity, Heartbeat, LearnerReport, Role};
 use shoal_common::stop::Stop;
 use shoal_common::transition::RowLayout;
 
@@ -29,6 +29,15 @@ use crate::sampling::Sampler;
 pub use settings::{LearnerError, Settings};
 
 const REPORT_INTERVAL: Duration = Duration::from_millis(500);
+
+/// How often the learner looks whether there are actors that it does not listen to yet.
+const ROLL_CALL: Duration = Duration::from_millis(100);
+
+/// How long nothing must have come before the end for the learner to believe that everything has.
+const QUIET: Duration = Duration::from_millis(200);
+
+/// How long it takes in at most what the actors have sent before the end.
+const LAST_CHUNKS: Duration = Duration::from_secs(2);
 
 /// How a loop came to its end.
 pub(crate) enum Ended {
@@ -59,16 +68,23 @@ pub fn learn(domain: &Domain, settings: &Settings, stop: &Stop) -> Result<(), Le
     let mut learner = Learner::new(domain, settings, stop)?;
     let ended = match settings.mode {
         Mode::Free => crate::free::run(&mut learner),
-        Mode::Lockstep => crate::lockstep::run(&mut learner, domain),
+        Mode::Lockstep => crate::lockstep::run(&mut learner),
     };
     match ended {
-        Ok(()) | Err(Ended::Stopped) => learner.finish(),
+        Ok(()) => learner.finish(),
+        Err(Ended::Stopped) => {
+            if settings.mode == Mode::Free {
+                learner.take_the_last()?;
+            }
+            learner.finish()
+        }
         Err(Ended::Failed(error)) => Err(error),
     }
 }
 
 /// A learner at work.
 pub(crate) struct Learner<'a> {
+    pub(crate) domain: &'a Domain,
     pub(crate) settings: &'a Settings,
     pub(crate) stop: &'a Stop,
     pub(crate) bell: Bell,
@@ -89,10 +105,12 @@ pub(crate) struct Learner<'a> {
     reporter: Reporter<LearnerReport>,
     report: LearnerReport,
     reported: Instant,
+    heartbeats: Reports<Heartbeat>,
+    called: Instant,
 }
 
 impl<'a> Learner<'a> {
-    fn new(domain: &Domain, settings: &'a Settings, stop: &'a Stop) -> Result<Self, LearnerError> {
+    fn new(domain: &'a Domain, settings: &'a Settings, stop: &'a Stop) -> Result<Self, LearnerError> {
         let mut ddpg = Ddpg::new(&settings.spec, &settings.ddpg, settings.seed)?;
         let bell = Bell::hang(domain, Place(Role::Learner, 0))?;
         let row = RowLayout::new(settings.spec.observation.width(), settings.spec.action.width());
@@ -150,6 +168,9 @@ impl<'a> Learner<'a> {
             report: empty_report(),
             reported: Instant::now(),
             sync: None,
+            heartbeats: Reports::open(domain)?,
+            called: Instant::now(),
+            domain,
             settings,
             stop,
             bell,
@@ -211,6 +232,35 @@ impl<'a> Learner<'a> {
         Ok(self.publisher.publish(self.ddpg.policy(), header)?)
     }
 
+    /// Listens to actors that have come since: a run is scaled while it goes on.
+    pub(crate) fn call_the_roll(&mut self) -> Result<(), LearnerError> {
+        if self.called.elapsed() < ROLL_CALL {
+            return Ok(());
+        }
+        self.called = Instant::now();
+        while let Some(heartbeat) = self.heartbeats.receive()? {
+            if heartbeat.role() == Some(Role::Actor) && heartbeat.index < self.settings.max_actors {
+                self.intake.widen(self.domain, heartbeat.index + 1)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Takes in what the actors had sent when the end came, whatever the ratio says: its updates are for who goes on.
+    fn take_the_last(&mut self) -> Result<(), LearnerError> {
+        let begun = Instant::now();
+        let mut quiet = begun;
+        while quiet.elapsed() < QUIET && begun.elapsed() < LAST_CHUNKS {
+            if self.intake.drain(&mut self.replay, u32::MAX, |_| false)? {
+                quiet = Instant::now();
+            } else {
+                self.bell.wait(Duration::from_millis(10))?;
+            }
+        }
+        self.rows = self.replay.head();
+        Ok(())
+    }
+
     /// Wakes everyone who may be waiting for a policy.
     pub(crate) fn announce(&self) {
         self.intake.ring_all();
@@ -247,9 +297,12 @@ impl<'a> Learner<'a> {
         self.reporter.send(report);
     }
 
-    /// Saves the state, and has the replay brought to the disk by and by.
+    /// Saves the state. The replay is brought to the disk by and by, in lockstep before: there the state is worth nothing
+    /// without its rows.
     pub(crate) fn save(&mut self) -> Result<(), LearnerError> {
-        if self.sync.as_ref().is_none_or(JoinHandle::is_finished) {
+        if self.settings.mode == Mode::Lockstep {
+            self.replay.flush()?;
+        } else if self.sync.as_ref().is_none_or(JoinHandle::is_finished) {
             self.end_sync();
             let pending = self.replay.start_sync()?;
             self.sync = std::thread::Builder::new()

@@ -5,14 +5,14 @@
 //! replay and does the same updates again.
 
 use shoal_common::channel::reports::Reports;
-use shoal_common::channel::{ChannelError, Domain, wait_for};
+use shoal_common::channel::{ChannelError, wait_for};
 use shoal_common::report::{Activity, EvaluationReport};
 
 use crate::intake::IntakeError;
 use crate::learner::{Ended, Learner, LearnerError};
 
-pub(crate) fn run(learner: &mut Learner<'_>, domain: &Domain) -> Result<(), Ended> {
-    let evaluations = Reports::<EvaluationReport>::open(domain)?;
+pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Ended> {
+    let evaluations = Reports::<EvaluationReport>::open(learner.domain)?;
     let interval = learner.settings.checkpoint.every_updates;
     let needed = learner.rows.saturating_sub(learner.settings.capacity);
     if learner.replay.rows().start > needed || learner.replay.head() < learner.rows {
@@ -21,10 +21,10 @@ pub(crate) fn run(learner: &mut Learner<'_>, domain: &Domain) -> Result<(), Ende
     }
     if learner.updates() == 0 {
         learner.save()?;
-        // The first policy of all falls into a period of its own.
-        learner.announce();
-        await_evaluation(learner, &evaluations, None)?;
     }
+    learner.announce();
+    let judged = learner.settings.judged;
+    await_evaluation(learner, &evaluations, judged)?;
     while learner.rows < learner.settings.steps {
         let (before, updates) = (learner.rows, learner.updates());
         let mut rows = before;
@@ -40,7 +40,8 @@ pub(crate) fn run(learner: &mut Learner<'_>, domain: &Domain) -> Result<(), Ende
         }
         learner.publish()?;
         learner.announce();
-        await_evaluation(learner, &evaluations, Some(before))?;
+        let judged = Some(learner.settings.evaluation.period(before)).max(learner.settings.judged);
+        await_evaluation(learner, &evaluations, judged)?;
         if learner.updates() / interval > updates / interval {
             learner.save()?;
         }
@@ -82,15 +83,14 @@ fn await_rows(learner: &mut Learner<'_>, actor: usize, rows: u64) -> Result<(), 
     Ok(())
 }
 
-/// Waits until the policy just published is judged, if it is one that must be: the first of its period, where the one
-/// before was learned from `previous` rows.
+/// Waits until the policy just published is judged, if it is one that must be: the first after the period `judged`.
 fn await_evaluation(
     learner: &mut Learner<'_>,
     evaluations: &Reports<EvaluationReport>,
-    previous: Option<u64>,
+    judged: Option<u64>,
 ) -> Result<(), Ended> {
     let evaluation = &learner.settings.evaluation;
-    if previous.is_some_and(|previous| evaluation.period(learner.rows) == evaluation.period(previous)) {
+    if judged.is_some_and(|judged| evaluation.period(learner.rows) <= judged) {
         return Ok(());
     }
     // The actors went on after this round, so its policy was judged: this learner does the round again.

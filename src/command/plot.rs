@@ -33,20 +33,21 @@ pub(crate) fn run(args: &PlotArgs) -> anyhow::Result<()> {
     let config = run.config()?;
     let out = args.out.as_deref().unwrap_or(run.path());
     std::fs::create_dir_all(out).with_context(|| format!("cannot make {}", out.display()))?;
-    let mut pictures = vec![out.join("learning-curve.svg")];
-    learning_curve(&run, &pictures[0])?;
-    pictures.extend(behaviour(&run, &config, out)?);
-
     let mut stdout = std::io::stdout().lock();
-    for picture in pictures {
+    for picture in draw(&run, &config, out)? {
         writeln!(stdout, "{}", picture.display())?;
     }
     Ok(())
 }
 
-/// Draws the evaluations of a run so far.
-pub(crate) fn learning_curve(run: &RunDir, path: &Path) -> anyhow::Result<()> {
-    figure::learning_curve(&read_evaluations(&run.evaluations())?, path)
+/// Draws the evaluations of a run so far, and what its best policy does if there is one yet; gives the files.
+pub(crate) fn draw(run: &RunDir, config: &Config, out: &Path) -> anyhow::Result<Vec<PathBuf>> {
+    let mut pictures = vec![out.join("learning-curve.svg")];
+    figure::learning_curve(&read_evaluations(&run.evaluations())?, &pictures[0])?;
+    if run.best_policy().exists() {
+        pictures.extend(behaviour(run, config, out)?);
+    }
+    Ok(pictures)
 }
 
 /// Draws what the best policy does, and gives the files.

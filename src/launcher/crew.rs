@@ -7,32 +7,22 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use shoal_common::channel::Domain;
+use shoal_common::channel::control::RoleStatus;
 use shoal_common::config::Config;
 use shoal_common::durable::write_atomically;
 use shoal_common::report::{Activity, Heartbeat, Identity, Role};
 use shoal_common::run_dir::RunDir;
 
 use super::log::Log;
+use super::member::{Consequence, LIMIT, Member};
 use super::process::{Process, name};
-
-/// Failures in a row after which a role is given up.
-const LIMIT: u32 = 5;
-
-/// The pause before the first restart after a failure; each further one is twice as long.
-const FIRST_PAUSE: Duration = Duration::from_millis(100);
-
-/// How long a process may take to be ready before it counts as stuck.
-const READY: Duration = Duration::from_secs(60);
-
-/// A process that is killed after so long was killed by somebody; one that goes earlier may well be killing itself.
-const SETTLED: Duration = Duration::from_secs(1);
-
-/// A process that has worked for so long has recovered from whatever made its predecessors fail.
-const RECOVERED: Duration = Duration::from_secs(30);
 
 /// How long actors may take to hand over their last chunks, and the learner to save its state.
 const ACTORS_END: Duration = Duration::from_secs(3);
 const OTHERS_END: Duration = Duration::from_secs(15);
+
+/// How often the dead are cleaned up after whose end the launcher does not see: terminals that asked something.
+const CLEANING: Duration = Duration::from_secs(2);
 
 /// How the crew is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -45,24 +35,16 @@ pub(super) enum State {
 #[derive(Debug)]
 pub(super) struct Crew {
     members: Vec<Member>,
+    /// Actors there are to be, and may ever be.
+    actors: u32,
+    max_actors: u32,
     log: Log,
     run: PathBuf,
     /// Where the number of processes ever started is kept: incarnations are never used twice, not by a resumed run either.
     counter: PathBuf,
     started: u64,
     all_ready: bool,
-}
-
-#[derive(Debug)]
-struct Member {
-    identity: Identity,
-    process: Option<Process>,
-    begun: Instant,
-    /// Failures since the last time it had recovered.
-    failures: u32,
-    restarts: u32,
-    restart_at: Instant,
-    heartbeat: Option<Heartbeat>,
+    cleaned: Instant,
 }
 
 impl Crew {
@@ -76,41 +58,56 @@ impl Crew {
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => 0,
             Err(error) => return Err(error).with_context(|| format!("cannot read {}", counter.display())),
         };
-        let actors = 0..config.actors.count;
         let members = [
             (Role::Learner, 0),
             (Role::EnvServer, config.evaluation_server()),
             (Role::Evaluator, 0),
-        ]
-        .into_iter()
-        .chain(actors.flat_map(|i| [(Role::EnvServer, i), (Role::Actor, i)]))
-        .map(|(role, index)| Member {
-            identity: Identity {
-                role,
-                index,
-                incarnation: 0,
-            },
-            process: None,
-            begun: Instant::now(),
-            failures: 0,
-            restarts: 0,
-            restart_at: Instant::now(),
-            heartbeat: None,
-        })
-        .collect();
+        ];
         Ok(Self {
-            members,
+            members: members.map(|(role, index)| Member::new(role, index)).into(),
+            actors: config.actors.count,
+            max_actors: config.actors.max,
             log,
             run: run.path().into(),
             counter,
             started,
             all_ready: false,
+            cleaned: Instant::now(),
         })
     }
 
     /// Starts everyone.
     pub(super) fn start_all(&mut self) -> anyhow::Result<()> {
-        (0..self.members.len()).try_for_each(|i| self.start(i))
+        (0..self.members.len()).try_for_each(|i| self.start(i))?;
+        self.recruit()
+    }
+
+    /// Goes on with so many actors.
+    pub(super) fn scale(&mut self, actors: u32) -> anyhow::Result<()> {
+        self.log.note(
+            "launcher",
+            &format!("actors: {actors} from now on, {} before", self.actors),
+        );
+        self.actors = actors;
+        self.recruit()
+    }
+
+    /// Actors there are to be.
+    pub(super) fn actors(&self) -> u32 {
+        self.actors
+    }
+
+    /// Makes and fills the places that are missing, each actor's with its environment server's.
+    fn recruit(&mut self) -> anyhow::Result<()> {
+        for index in 0..self.actors {
+            for role in [Role::EnvServer, Role::Actor] {
+                if !self.members.iter().any(|member| member.is(role, index)) {
+                    self.members.push(Member::new(role, index));
+                    self.start(self.members.len() - 1)?;
+                }
+            }
+        }
+        Ok(())
     }
 
     fn start(&mut self, i: usize) -> anyhow::Result<()> {
@@ -123,9 +120,7 @@ impl Crew {
         let process = Process::start(member.identity, &self.run, &self.log)?;
         self.log
             .note(&name(member.identity), &format!("started as process {}", process.pid()));
-        member.process = Some(process);
-        member.begun = Instant::now();
-        member.heartbeat = None;
+        member.begin(process);
         Ok(())
     }
 
@@ -139,10 +134,12 @@ impl Crew {
             } = member.identity;
             (heartbeat.role(), heartbeat.index, heartbeat.incarnation) == (Some(role), index, incarnation)
         });
-        if let Some(member) = member {
-            member.heartbeat = Some(*heartbeat);
+        let Some(member) = member else { return };
+        if let Some(after) = member.hear(heartbeat) {
+            self.log
+                .note(&name(member.identity), &format!("ready after {} ms", after.as_millis()));
         }
-        if !self.all_ready && self.members.iter().all(|member| member.heartbeat.is_some()) {
+        if !self.all_ready && self.members.iter().all(Member::is_ready) {
             self.all_ready = true;
             self.log.note("launcher", "every role is ready");
         }
@@ -151,7 +148,7 @@ impl Crew {
     /// What the members of a role are doing: what the first one says that was heard of.
     pub(super) fn activity(&self, role: Role) -> Option<Activity> {
         let mut of_role = self.members.iter().filter(|member| member.identity.role == role);
-        of_role.find_map(|member| member.heartbeat?.activity())
+        of_role.find_map(Member::activity)
     }
 
     /// How often processes were started again.
@@ -159,64 +156,122 @@ impl Crew {
         self.members.iter().map(|member| member.restarts).sum()
     }
 
+    /// How everyone gets on, where the learner's newest policy is `newest`.
+    pub(super) fn status(&self, newest: u64) -> Vec<RoleStatus> {
+        let mut members: Vec<_> = self.members.iter().collect();
+        members.sort_by_key(|member| (std::cmp::Reverse(member.identity.role), member.identity.index));
+        members.into_iter().map(|member| member.status(newest)).collect()
+    }
+
     /// Notices who has ended, and starts them again when their time has come.
     pub(super) fn look_after(&mut self, domain: &Domain) -> anyhow::Result<State> {
         for i in 0..self.members.len() {
-            let member = &mut self.members[i];
-            let Some(process) = &mut member.process else {
-                if Instant::now() >= member.restart_at {
-                    member.restarts += 1;
-                    self.start(i)?;
-                }
-                continue;
-            };
-            if member.heartbeat.is_none() && member.begun.elapsed() >= READY {
-                self.log
-                    .note(&name(member.identity), "is not ready after a minute, and was killed");
-                process.kill();
-            }
-            let Some(status) = process.exit_status() else {
-                continue;
-            };
-            member.process = None;
-            let name = name(member.identity);
-            if member.identity.role == Role::Learner && status.success() {
-                self.log.note(&name, "done");
+            if self.look_after_one(i, domain)? == State::LearnerDone {
                 return Ok(State::LearnerDone);
             }
-            // Its places in shared memory are free for its successor.
-            domain.clean();
-            let ready = member.heartbeat.is_some();
-            if member.begun.elapsed() >= RECOVERED {
-                member.failures = 0;
-            }
-            // Killed while it worked is nobody's fault; ending by itself, or before it has settled, is a failure.
-            let settled = ready && member.begun.elapsed() >= SETTLED;
-            let pause = if settled && status.signal().is_some() {
-                Duration::ZERO
-            } else {
-                member.failures += 1;
-                FIRST_PAUSE * 2_u32.pow(member.failures.min(LIMIT) - 1)
-            };
-            self.log
-                .note(&name, &format!("{}; starting it again in {pause:?}", ending(status)));
-            if member.failures >= LIMIT {
-                self.give_up(i, status)?;
-            }
-            self.members[i].restart_at = Instant::now() + pause;
+        }
+        self.let_go();
+        self.recruit()?;
+        if self.cleaned.elapsed() >= CLEANING {
+            self.clean(domain);
         }
         Ok(State::AtWork)
     }
 
-    fn give_up(&self, i: usize, status: ExitStatus) -> anyhow::Result<()> {
-        let name = name(self.members[i].identity);
-        let lines = self.log.last_lines(&name);
-        let said = lines
-            .last()
-            .map_or("it said nothing", |line| line.strip_prefix("error: ").unwrap_or(line));
+    fn look_after_one(&mut self, i: usize, domain: &Domain) -> anyhow::Result<State> {
+        let is_wanted = self.is_wanted(&self.members[i]);
+        let member = &mut self.members[i];
+        let stuck = member.is_stuck();
+        let name = name(member.identity);
+        let Some(process) = &mut member.process else {
+            if is_wanted && Instant::now() >= member.restart_at {
+                member.restarts += 1;
+                self.start(i)?;
+            }
+            return Ok(State::AtWork);
+        };
+        if stuck {
+            self.log.note(&name, "is not ready after a minute, and was killed");
+            process.kill();
+        }
+        let Some(status) = process.exit_status() else {
+            return Ok(State::AtWork);
+        };
+        if member.identity.role == Role::Learner && status.success() {
+            member.process = None;
+            self.log.note(&name, "done");
+            return Ok(State::LearnerDone);
+        }
+        if member.retires {
+            member.process = None;
+            member.restart_at = Instant::now();
+            self.log.note(&name, &format!("retired: {}", ending(status)));
+            self.clean(domain);
+            return Ok(State::AtWork);
+        }
+        match member.ended(status) {
+            Consequence::Restart(pause) => {
+                member.restart_at = Instant::now() + pause;
+                self.log
+                    .note(&name, &format!("{}; starting it again in {pause:?}", ending(status)));
+                // Its places in shared memory are free for its successor.
+                self.clean(domain);
+                if pause.is_zero() {
+                    return self.look_after_one(i, domain);
+                }
+                Ok(State::AtWork)
+            }
+            Consequence::GiveUp => self.give_up(&name, status),
+        }
+    }
+
+    fn clean(&mut self, domain: &Domain) {
+        domain.clean();
+        self.cleaned = Instant::now();
+    }
+
+    /// Lets actors retire that are too many, and when they are gone their environment servers.
+    fn let_go(&mut self) {
+        let serves_nobody = |members: &[Member], member: &Member| {
+            member.identity.role == Role::EnvServer
+                && !members.iter().any(|actor| actor.is(Role::Actor, member.identity.index))
+        };
+        for i in 0..self.members.len() {
+            if self.is_wanted(&self.members[i]) || self.members[i].retires {
+                continue;
+            }
+            let may_end =
+                self.members[i].identity.role == Role::Actor || serves_nobody(&self.members, &self.members[i]);
+            let member = &mut self.members[i];
+            if let Some(process) = member.process.as_mut().filter(|_| may_end) {
+                member.retires = true;
+                process.ask_to_retire();
+            }
+        }
+        let mut members = std::mem::take(&mut self.members);
+        members.retain(|member| member.process.is_some() || self.is_wanted(member));
+        self.members = members;
+    }
+
+    /// Whether it is not an actor, or an actor's environment server, of which there are enough.
+    fn is_wanted(&self, member: &Member) -> bool {
+        let Identity { role, index, .. } = member.identity;
+        // The evaluator's server comes after those of all actors there may be.
+        !matches!(role, Role::Actor | Role::EnvServer) || !(self.actors..self.max_actors).contains(&index)
+    }
+
+    fn give_up(&self, name: &str, status: ExitStatus) -> anyhow::Result<State> {
+        let mut lines = self.log.last_lines(name);
+        lines.dedup();
+        let said = match lines.split_last() {
+            None => "it said nothing".into(),
+            Some((last, [])) => last.strip_prefix("error: ").unwrap_or(last).to_owned(),
+            Some(_) => format!("it said last\n  {}", lines.join("\n  ")),
+        };
         bail!(
-            "{name} failed {LIMIT} times and is given up ({}): {said}",
-            ending(status)
+            "{name} failed {LIMIT} times and is given up ({}); when its reason is gone, `shoal resume {}` goes on; {said}",
+            ending(status),
+            self.run.display()
         );
     }
 

@@ -1,6 +1,6 @@
 //! One role's process: started, listened to, ended.
 
-use std::io::{BufRead, BufReader, Read};
+use std::io::{BufRead, BufReader, Read, Write};
 use std::os::unix::process::CommandExt;
 use std::path::Path;
 use std::process::{Child, ChildStdin, Command, ExitStatus, Stdio};
@@ -60,6 +60,14 @@ impl Process {
             let _ = listener.join();
         }
         Some(status)
+    }
+
+    /// Asks it to hand over what it has, and then to end.
+    pub(super) fn ask_to_retire(&mut self) {
+        if let Some(stdin) = &mut self.stdin {
+            // Who does not hear it has ended.
+            let _ = stdin.write_all(b"retire\n");
+        }
     }
 
     /// Asks it to end.

@@ -8,7 +8,7 @@ use shoal_common::report::{EvaluationReport, LearnerReport};
 use shoal_common::run_dir::RunDir;
 
 use super::crew::Crew;
-use super::waiting;
+use super::desk::waiting;
 
 /// Rates are taken over so long.
 const SPAN: Duration = Duration::from_secs(5);
@@ -23,6 +23,8 @@ pub(super) struct Progress {
     /// Reports of the last [`SPAN`].
     recent: std::collections::VecDeque<(Duration, LearnerReport)>,
     evaluated: Option<EvaluationReport>,
+    /// When the learner's last report came.
+    heard: Instant,
     drawn: Instant,
 }
 
@@ -46,19 +48,31 @@ impl Progress {
             learner: None,
             recent: [].into(),
             evaluated: None,
+            heard: Instant::now(),
             drawn: Instant::now(),
         }
     }
 
-    pub(super) fn learned(&mut self, report: &LearnerReport, wall: Duration) {
+    /// What the learner said last.
+    pub(super) fn learner(&self) -> Option<&LearnerReport> {
+        self.learner.as_ref()
+    }
+
+    /// What the evaluator said last.
+    pub(super) fn evaluated(&self) -> Option<&EvaluationReport> {
+        self.evaluated.as_ref()
+    }
+
+    pub(super) fn heard_learner(&mut self, report: &LearnerReport, wall: Duration) {
         self.learner = Some(*report);
+        self.heard = Instant::now();
         self.recent.push_back((wall, *report));
         while self.recent.front().is_some_and(|(then, _)| wall - *then > SPAN) {
             self.recent.pop_front();
         }
     }
 
-    pub(super) fn evaluated(&mut self, report: &EvaluationReport) {
+    pub(super) fn heard_evaluation(&mut self, report: &EvaluationReport) {
         self.evaluated = Some(*report);
     }
 
@@ -112,8 +126,11 @@ impl Progress {
         lines.join("\n  ")
     }
 
-    /// Updates and environment steps a second.
-    fn rates(&self) -> Option<(f64, f64)> {
+    /// Updates and environment steps a second; `None` while the learner is not heard of.
+    pub(super) fn rates(&self) -> Option<(f64, f64)> {
+        if self.heard.elapsed() > SPAN {
+            return None;
+        }
         let ((then, old), (now, new)) = (self.recent.front()?, self.recent.back()?);
         let seconds = (*now - *then).as_secs_f64();
         let rate = |new: u64, old: u64| new.saturating_sub(old) as f64 / seconds;

@@ -26,6 +26,7 @@ pub(crate) enum RecordError {
 pub(super) struct Table {
     path: PathBuf,
     rows: csv::Writer<File>,
+    len: u64,
 }
 
 impl Table {
@@ -42,7 +43,7 @@ impl Table {
             .truncate(false)
             .open(path)
             .map_err(write)?;
-        let end = end_of_whole_lines(&file).map_err(write)?;
+        let (end, lines) = whole_lines(&file).map_err(write)?;
         file.set_len(end)
             .and_then(|()| file.seek(SeekFrom::End(0)))
             .map_err(write)?;
@@ -57,21 +58,30 @@ impl Table {
                 });
             }
         }
-        Ok(Self::onto(path, file, end == 0))
+        Ok(Self::onto(path, file, lines))
     }
 
-    pub(super) fn onto(path: &Path, file: File, with_header: bool) -> Self {
-        let rows = csv::WriterBuilder::new().has_headers(with_header).from_writer(file);
+    /// Onto a file that has so many whole lines, its header included.
+    pub(super) fn onto(path: &Path, file: File, lines: u64) -> Self {
+        let rows = csv::WriterBuilder::new().has_headers(lines == 0).from_writer(file);
         Self {
             path: path.to_owned(),
             rows,
+            len: lines.saturating_sub(1),
         }
+    }
+
+    /// Rows in the table.
+    pub(super) fn len(&self) -> u64 {
+        self.len
     }
 
     pub(super) fn write(&mut self, row: &impl Serialize) -> Result<(), RecordError> {
         self.rows
             .serialize(row)
-            .map_err(|error| record_error(&self.path, error))
+            .map_err(|error| record_error(&self.path, error))?;
+        self.len += 1;
+        Ok(())
     }
 
     pub(super) fn flush(&mut self) -> Result<(), RecordError> {
@@ -104,16 +114,18 @@ pub(super) fn last<Row: DeserializeOwned>(path: &Path) -> Result<Option<Row>, Re
     rows(path).map(|mut rows: Vec<Row>| rows.pop())
 }
 
-fn end_of_whole_lines(file: &File) -> io::Result<u64> {
-    let (mut end, mut line) = (0, Vec::new());
+/// Where the whole lines end, and how many they are.
+fn whole_lines(file: &File) -> io::Result<(u64, u64)> {
+    let (mut end, mut lines, mut line) = (0, 0, Vec::new());
     let mut reader = BufReader::with_capacity(1 << 16, file);
     loop {
         line.clear();
         let read = reader.read_until(b'\n', &mut line)?;
         if line.last() != Some(&b'\n') {
-            return Ok(end);
+            return Ok((end, lines));
         }
         end += read as u64;
+        lines += 1;
     }
 }
 

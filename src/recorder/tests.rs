@@ -160,7 +160,7 @@ fn a_foreign_file_and_a_full_disk_are_errors_in_one_line() {
     assert_eq!(text(&run.evaluations()), "a,b\n1,2\n", "left as it was");
 
     let full = std::fs::OpenOptions::new().write(true).open("/dev/full").unwrap();
-    let mut full = Table::onto(Path::new("/dev/full"), full, true);
+    let mut full = Table::onto(Path::new("/dev/full"), full, 0);
     let error = full
         .write(&Evaluation::default())
         .and_then(|()| full.flush())

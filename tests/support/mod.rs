@@ -68,27 +68,53 @@ impl Workplace {
 
     /// Starts a quick run in `name` and waits until every role is ready.
     pub(crate) fn start(&self, name: &str, arguments: &[&str]) -> Running {
-        let stderr = std::fs::File::create(self.path().join("stderr")).unwrap();
+        self.launch(
+            name,
+            &[&["train", "pendulum", "--run", name], arguments, &QUICK[..]].concat(),
+        )
+    }
+
+    /// Goes on with the run in `name` and waits until every role is ready.
+    pub(crate) fn resume(&self, name: &str, arguments: &[&str]) -> Running {
+        self.launch(name, &[&["resume", name], arguments].concat())
+    }
+
+    /// Starts a command that trains in the run directory `name`, and waits until every role is ready.
+    pub(crate) fn launch(&self, name: &str, arguments: &[&str]) -> Running {
+        let run = self.path().join(name);
+        let log = || std::fs::read_to_string(run.join("shoal.log")).unwrap_or_default();
+        let ready = || log().matches("every role is ready").count();
+        let before = ready();
         let child = self
-            .shoal(
-                &[
-                    &["train", "pendulum", "--run", name],
-                    arguments,
-                    &QUICK[..],
-                    &["--json"],
-                ]
-                .concat(),
-            )
+            .shoal(&[arguments, &["--json"]].concat())
             .stdout(Stdio::piped())
-            .stderr(stderr)
+            .stderr(std::fs::File::create(self.path().join("stderr")).unwrap())
+            // So that the log says which chunks were sent.
+            .env("SHOAL_LOG", "debug")
             // A signal to the test runner's group is not for the run.
             .process_group(0)
             .spawn()
             .unwrap();
-        let run = self.path().join(name);
-        let running = Running { child, run };
-        until("every role is ready", || running.log().contains("every role is ready"));
+        let mut running = Running {
+            child,
+            run: run.clone(),
+        };
+        until("every role is ready", || {
+            let ended = running.child.try_wait().unwrap();
+            assert!(ended.is_none(), "{}", self.said());
+            ready() > before
+        });
         running
+    }
+
+    /// What the launcher started last wrote to standard error.
+    pub(crate) fn said(&self) -> String {
+        std::fs::read_to_string(self.path().join("stderr")).unwrap_or_default()
+    }
+
+    /// What `shoal status --json` prints of the run in `name`.
+    pub(crate) fn status(&self, name: &str) -> serde_json::Value {
+        json(&self.output(&["status", name, "--json"]))
     }
 }
 
@@ -201,6 +227,26 @@ impl Leftovers {
             self.files().is_empty()
         });
     }
+}
+
+/// Rows that an actor has sent in all its starts, by the log of a run started with `SHOAL_LOG=debug`.
+pub(crate) fn sent(run: &Path, actor: u32) -> u64 {
+    let log = std::fs::read_to_string(run.join("shoal.log")).unwrap();
+    let number = |line: &str, name: &str| -> u64 {
+        let from = line.split_once(&format!("{name}=")).unwrap().1;
+        from.split_whitespace().next().unwrap().parse().unwrap()
+    };
+    let who = format!("actor-{actor} ");
+    let chunks = log
+        .lines()
+        .filter(|line| line.starts_with(&who) && line.contains("sent a chunk"));
+    chunks.map(|line| number(line, "rows")).sum()
+}
+
+/// Rows of an actor that are in the replay.
+pub(crate) fn committed(run: &Path, actor: usize) -> u64 {
+    let commits = shoal_common::commit::CommitReader::open(&run.join("replay.bin")).unwrap();
+    commits.actor(actor).rows
 }
 
 /// The last line of what was printed, as JSON.

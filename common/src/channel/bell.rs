@@ -49,7 +49,7 @@ impl Bell {
     /// When shared memory cannot be had.
     pub fn hang(domain: &Domain, place: Place) -> Result<Self, ChannelError> {
         let channel = place.to_string();
-        let listener = claim(domain, &channel, "listen", || {
+        let listener = claim(&channel, "listen", || {
             service(domain, &channel)?
                 .listener_builder()
                 .create()
@@ -80,7 +80,7 @@ impl Ringer {
     /// When shared memory cannot be had.
     pub fn new(domain: &Domain, place: Place) -> Result<Self, ChannelError> {
         let channel = place.to_string();
-        let notifier = claim(domain, &channel, "ring", || {
+        let notifier = claim(&channel, "ring", || {
             service(domain, &channel)?
                 .notifier_builder()
                 .create()

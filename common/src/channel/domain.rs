@@ -5,7 +5,7 @@ use std::fs::{DirBuilder, File};
 use std::io;
 use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use iceoryx2::prelude::{
     CallbackProgression, Config, FileName, Node, NodeBuilder, NodeState, Path as IoxPath, SemanticString,
@@ -39,6 +39,14 @@ pub enum DomainError {
     /// Somebody else owns the directory that should be ours.
     #[error("{0} belongs to another user; remove it, or ask its owner to")]
     Foreign(PathBuf),
+    /// Processes of the run's last launcher are still there.
+    #[error("run {run_id} cannot go on: processes of it are still alive and do not end (stopped?): kill -9 {pids}")]
+    StillAlive {
+        /// The run.
+        run_id: String,
+        /// Their numbers.
+        pids: String,
+    },
     /// iceoryx2 refused.
     #[error("cannot join run {run_id} in shared memory: {cause}; is /dev/shm mounted and not full?")]
     Join {
@@ -93,7 +101,8 @@ impl Domain {
         toml::to_string(self.node.config())
     }
 
-    /// Removes from the run's services whatever processes left in them that are no more.
+    /// Removes from the run's services whatever processes left in them that are no more. For the launcher alone, whenever
+    /// it has seen a process end.
     pub fn clean(&self) {
         self.node.blocking_cleanup_dead_nodes(Duration::from_millis(100));
     }
@@ -113,6 +122,32 @@ impl Domain {
         let root = user_root()?;
         let _lock = lock(&root)?;
         remove_if_dead(&root, &run_id)
+    }
+
+    /// Waits until no process of an earlier launcher is left in the run `run_id`: whose launcher was killed, they are about
+    /// to end. Whoever calls this holds the run's lock.
+    ///
+    /// # Errors
+    /// When some are still there after `patience`, as one that is stopped is.
+    pub fn wait_for_the_last(run_id: &str, patience: Duration) -> Result<(), DomainError> {
+        let root = user_root()?;
+        let deadline = Instant::now() + patience;
+        loop {
+            let left = {
+                let _lock = lock(&root)?;
+                living(&root, run_id)?
+            };
+            if left.is_empty() {
+                return Ok(());
+            }
+            if Instant::now() >= deadline {
+                return Err(DomainError::StillAlive {
+                    run_id: run_id.into(),
+                    pids: left.iter().map(i32::to_string).collect::<Vec<_>>().join(" "),
+                });
+            }
+            std::thread::sleep(Duration::from_millis(20));
+        }
     }
 
     /// Removes what this user's runs left in shared memory that were killed with all their processes.
@@ -143,30 +178,45 @@ fn iox_config(root: &Path, run_id: &str) -> Result<Config, String> {
     let directory = root.join(run_id);
     let root_path = IoxPath::new(directory.as_os_str().as_encoded_bytes()).map_err(|e| format!("{e:?}"))?;
     let mut config = Config::default();
+    // Cleaning up after the dead is the launcher's. iceoryx2 0.10 does not survive it everywhere when whoever cleans up is
+    // killed over it: then a port stays occupied for good. The launcher's death ends the run anyway.
+    config.global.node.cleanup_dead_nodes_on_creation = false;
+    config.global.node.cleanup_dead_nodes_on_destruction = false;
+    config.global.service.cleanup_dead_nodes_on_open = false;
     config.global.set_root_path(&root_path);
     config.global.prefix = FileName::new(prefix(run_id).as_bytes()).map_err(|e| format!("{e:?}"))?;
     Ok(config)
 }
 
-fn remove_if_dead(root: &Path, run_id: &str) -> Result<(), DomainError> {
+/// Process numbers of those in the run that live, stopped ones included.
+fn living(root: &Path, run_id: &str) -> Result<Vec<i32>, DomainError> {
     let failed = |cause: String| DomainError::Join {
         run_id: run_id.into(),
         cause,
     };
     let config = iox_config(root, run_id).map_err(failed)?;
-    let mut somebody_lives = false;
+    let mut living = Vec::new();
     Node::<ipc::Service>::list(&config, |state| {
-        match state {
-            NodeState::Dead(dead) => {
-                // A node that cannot be cleaned one by one goes with the files below.
-                let _ = dead.blocking_remove_stale_resources(Duration::from_secs(1));
+        let pid = state.node_id().pid::<ipc::Service>().map_or(0, |pid| pid.value());
+        let lives = match state {
+            NodeState::Dead(_) => false,
+            NodeState::Alive(_) => true,
+            // As one is that was killed while it joined.
+            NodeState::Inaccessible(_) | NodeState::Undefined(_) => {
+                rustix::process::Pid::from_raw(pid).is_some_and(|pid| rustix::process::test_kill_process(pid).is_ok())
             }
-            _ => somebody_lives = true,
+        };
+        if lives {
+            living.push(pid);
         }
         CallbackProgression::Continue
     })
     .map_err(|cause| failed(format!("{cause:?}")))?;
-    if somebody_lives {
+    Ok(living)
+}
+
+fn remove_if_dead(root: &Path, run_id: &str) -> Result<(), DomainError> {
+    if !living(root, run_id)?.is_empty() {
         return Ok(());
     }
     // No process of the run is left and its name is its own, so these files are nobody's. iceoryx2 itself never removes

@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 use iceoryx2::prelude::*;
 
 mod bell;
+pub mod control;
 mod domain;
 pub mod environment;
 pub mod policy;
@@ -54,10 +55,9 @@ pub enum Interruption {
 /// How long a dead predecessor may occupy a port before we give up.
 const CLAIM_PATIENCE: Duration = Duration::from_secs(5);
 
-/// Opens a service or makes a port. A process that died may still hold the place, and it does so until somebody cleans up
-/// after it; two processes may also make and remove the same service at the same time. So: clean up and try again.
+/// Opens a service or makes a port. A process that died may still hold the place until the launcher has cleaned up after
+/// it; two processes may also make and remove the same service at the same time. So: try again for a while.
 fn claim<T, E: Debug>(
-    domain: &Domain,
     channel: &str,
     action: &'static str,
     mut attempt: impl FnMut() -> Result<T, E>,
@@ -67,10 +67,7 @@ fn claim<T, E: Debug>(
         match attempt() {
             Ok(made) => return Ok(made),
             Err(cause) if Instant::now() >= deadline => return Err(ChannelError::new(channel, action, cause)),
-            Err(_) => {
-                domain.clean();
-                std::thread::sleep(Duration::from_millis(5));
-            }
+            Err(_) => std::thread::sleep(Duration::from_millis(5)),
         }
     }
 }

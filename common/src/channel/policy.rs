@@ -55,7 +55,7 @@ impl PolicyPublisher {
     /// # Errors
     /// When shared memory cannot be had, or another learner lives.
     pub fn open(domain: &Domain, parameters: usize) -> Result<Self, ChannelError> {
-        let publisher = claim(domain, CHANNEL, "publish", || {
+        let publisher = claim(CHANNEL, "publish", || {
             service(domain)?
                 .publisher_builder()
                 .initial_max_slice_len(parameters)
@@ -99,7 +99,7 @@ impl PolicyReader {
     /// # Errors
     /// When shared memory cannot be had.
     pub fn open(domain: &Domain, fingerprint: u64, parameters: usize) -> Result<Self, ChannelError> {
-        let subscriber = claim(domain, CHANNEL, "read", || {
+        let subscriber = claim(CHANNEL, "read", || {
             service(domain)?
                 .subscriber_builder()
                 .create()

@@ -64,7 +64,7 @@ impl<R: Report> Reporter<R> {
     /// # Errors
     /// When shared memory cannot be had.
     pub fn open(domain: &Domain) -> Result<Self, ChannelError> {
-        let publisher = claim(domain, R::CHANNEL, "report", || {
+        let publisher = claim(R::CHANNEL, "report", || {
             service::<R>(domain)?
                 .publisher_builder()
                 .create()
@@ -94,7 +94,7 @@ impl<R: Report> Reports<R> {
     /// # Errors
     /// When shared memory cannot be had.
     pub fn open(domain: &Domain) -> Result<Self, ChannelError> {
-        let subscriber = claim(domain, R::CHANNEL, "read", || {
+        let subscriber = claim(R::CHANNEL, "read", || {
             service::<R>(domain)?
                 .subscriber_builder()
                 .create()

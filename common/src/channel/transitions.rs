@@ -5,7 +5,8 @@
 //! So `send` always finds room, and what a dead learner had not committed reaches the next one.
 //!
 //! What a dead actor had sent still arrives, and before anything of its next start, if the learner was connected to it.
-//! Nobody can ask for that, so an actor first sends an empty chunk, and no row before that one is committed.
+//! Nobody can ask for that, so an actor first sends an empty chunk, its [`Greeting`], and no row before that one is
+//! committed. By then it is certain what of its predecessor is in the replay, and its sequence goes on after that.
 
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
@@ -15,8 +16,9 @@ use iceoryx2::sample::Sample;
 use iceoryx2::sample_mut::SampleMut;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 
-use super::{ChannelError, Domain, claim, service_name};
-use crate::commit::ChunkMark;
+use super::{Bell, ChannelError, Domain, Interruption, claim, service_name, wait_for};
+use crate::commit::{ChunkMark, CommitReader};
+use crate::stop::Stop;
 use crate::transition::{RowLayout, Transition};
 
 /// What a chunk's receiver knows of it.
@@ -25,7 +27,7 @@ use crate::transition::{RowLayout, Transition};
 pub struct ChunkHeader {
     /// The actor's start that collected the rows.
     pub incarnation: u64,
-    /// Counts the actor's chunks, from 1.
+    /// Counts the chunks of this actor, from 1 and over all its starts; 0 for a greeting.
     pub sequence: u64,
     /// Version of the policy that the last row was collected with.
     pub policy_version: u64,
@@ -44,9 +46,12 @@ pub struct ChunkSender {
     rows: usize,
     actor: u32,
     incarnation: u64,
-    window: u64,
     sent: u64,
 }
+
+/// An actor's end that has said that it is there, and may send no row before that is committed.
+#[derive(Debug)]
+pub struct Greeting(ChunkSender);
 
 /// A chunk being filled, in the memory it will be sent in.
 #[derive(Debug)]
@@ -71,9 +76,39 @@ pub struct ReceivedChunk {
     width: usize,
 }
 
+impl Greeting {
+    /// Waits until the greeting is committed; `idle` is called at each pause.
+    ///
+    /// # Errors
+    /// When interrupted.
+    pub fn wait(
+        self,
+        commits: &CommitReader,
+        bell: &Bell,
+        stop: &Stop,
+        mut idle: impl FnMut(),
+    ) -> Result<ChunkSender, Interruption> {
+        let Self(mut sender) = self;
+        let newest = wait_for(
+            bell,
+            stop,
+            || {
+                let newest = commits.committed(sender.actor as usize);
+                Ok((newest.incarnation == sender.incarnation).then_some(newest))
+            },
+            || {
+                idle();
+                sender.look_after()
+            },
+        )?;
+        sender.sent = newest.sequence;
+        Ok(sender)
+    }
+}
+
 impl ChunkSender {
-    /// The sending end of `actor`, whose chunks have `rows` rows and of which `window` may be uncommitted. The sequence
-    /// goes on after `sent`. Incarnations count from 1.
+    /// The sending end of `actor`, whose chunks have `rows` rows and of which `window` may be uncommitted. Incarnations
+    /// count from 1.
     ///
     /// # Errors
     /// When shared memory cannot be had, or the actor before this one still lives.
@@ -81,13 +116,12 @@ impl ChunkSender {
         domain: &Domain,
         actor: u32,
         incarnation: u64,
-        sent: u64,
         layout: RowLayout,
         rows: usize,
         window: u32,
-    ) -> Result<Self, ChannelError> {
+    ) -> Result<Greeting, ChannelError> {
         let channel = name(actor);
-        let publisher = claim(domain, &channel, "send", || {
+        let publisher = claim(&channel, "send", || {
             service(domain, &channel, window)?
                 .publisher_builder()
                 .initial_max_slice_len(rows * layout.width())
@@ -102,11 +136,10 @@ impl ChunkSender {
             rows,
             actor,
             incarnation,
-            window: window.into(),
-            sent,
+            sent: 0,
         };
         sender.deliver(sender.begin()?, 0)?;
-        Ok(sender)
+        Ok(Greeting(sender))
     }
 
     /// Sequence number of the chunk sent last; 0 before the first.
@@ -114,14 +147,9 @@ impl ChunkSender {
         self.sent
     }
 
-    /// Chunks sent that `committed`, the newest mark of this actor in the replay, does not cover; a whole window until the
-    /// learner has taken the empty chunk.
+    /// Chunks sent that `committed`, the newest mark of this actor in the replay, does not cover.
     pub fn in_flight(&self, committed: ChunkMark) -> u64 {
-        if committed.incarnation == self.incarnation {
-            self.sent.saturating_sub(committed.sequence)
-        } else {
-            self.window
-        }
+        self.sent.saturating_sub(committed.sequence)
     }
 
     /// An empty chunk.
@@ -159,11 +187,13 @@ impl ChunkSender {
             rows: chunk.filled as u32,
             actor: self.actor,
         };
+        let rows = chunk.filled;
         chunk
             .sample
             .send()
-            .map(|_| ())
-            .map_err(|cause| ChannelError::new(&self.channel, "send", cause))
+            .map_err(|cause| ChannelError::new(&self.channel, "send", cause))?;
+        tracing::debug!(self.incarnation, self.sent, rows, "sent a chunk");
+        Ok(())
     }
 
     /// Hands what is not committed to a learner that has come anew. To be called while waiting.
@@ -210,7 +240,7 @@ impl ChunkReceiver {
     /// When shared memory cannot be had, or another learner lives.
     pub fn open(domain: &Domain, actor: u32, window: u32) -> Result<Self, ChannelError> {
         let channel = name(actor);
-        let subscriber = claim(domain, &channel, "receive", || {
+        let subscriber = claim(&channel, "receive", || {
             service(domain, &channel, window)?
                 .subscriber_builder()
                 .buffer_size(buffer(window))
@@ -253,11 +283,16 @@ impl ReceivedChunk {
         self.sample.user_header()
     }
 
-    /// Where the chunk stands in its actor's sequence.
-    pub fn mark(&self) -> ChunkMark {
+    /// Where the chunk stands in its actor's sequence, of which `committed` is the newest. A greeting takes no place of its
+    /// own: it says who goes on after it.
+    pub fn mark(&self, committed: ChunkMark) -> ChunkMark {
+        let ChunkHeader {
+            incarnation, sequence, ..
+        } = *self.header();
+        let is_greeting = sequence == 0;
         ChunkMark {
-            incarnation: self.header().incarnation,
-            sequence: self.header().sequence,
+            incarnation,
+            sequence: if is_greeting { committed.sequence } else { sequence },
         }
     }
 

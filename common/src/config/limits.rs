@@ -5,7 +5,11 @@ use std::fmt::Display;
 use super::{Config, ConfigError};
 
 impl Config {
-    pub(super) fn validate(&self) -> Result<(), ConfigError> {
+    /// Whether every number is one that makes sense.
+    ///
+    /// # Errors
+    /// For the first that does not.
+    pub fn check(&self) -> Result<(), ConfigError> {
         let Self {
             run,
             actors,

@@ -43,6 +43,8 @@ pub struct Settings {
     pub capacity: u64,
     /// When policies are judged.
     pub evaluation: config::Evaluation,
+    /// The period of the policy that was judged last.
+    pub judged: Option<u64>,
     /// When the state is saved.
     pub checkpoint: config::Checkpoint,
     /// Fingerprint of the run's configuration.
@@ -102,9 +104,11 @@ impl Settings {
         let slack = match self.mode {
             Mode::Free => 0,
             Mode::Lockstep => {
+                // Without updates there are no checkpoints to go back to.
                 let interval = self.checkpoint.every_updates as f64 / self.ratio.updates_per_step;
+                let rows = if interval.is_finite() { 2.0 * interval } else { 0.0 };
                 let round = self.chunk_rows as u64 * u64::from(self.actors);
-                (2.0 * interval).min(self.steps as f64) as u64 + 2 * round
+                rows as u64 + 2 * round
             }
         };
         // A ring must have room for a chunk, however small the window.

@@ -9,7 +9,7 @@ use shoal_common::run_dir::RunDir;
 use tempfile::TempDir;
 
 use super::peer::Peer;
-use crate::cli::TrainArgs;
+use crate::cli::{Telling, TrainArgs};
 use crate::plan::Plan;
 
 /// A run that exists until this is dropped.
@@ -27,7 +27,7 @@ impl Scene {
             .prefix("shoal-bench-")
             .tempdir()
             .context("cannot make a temporary directory")?;
-        let Plan { config, run } = Plan::new(&TrainArgs {
+        let Plan { config, run, .. } = Plan::new(&TrainArgs {
             what: "pendulum".into(),
             run: Some(directory.path().join("run")),
             seed: Some(1),
@@ -36,8 +36,7 @@ impl Scene {
             steps: None,
             lockstep: false,
             set: set.iter().map(|assignment| (*assignment).into()).collect(),
-            quiet: true,
-            json: false,
+            telling: Telling::default(),
         })?;
         std::fs::create_dir(run.checkpoints()).context("cannot make the directory for checkpoints")?;
         Ok(Self { config, run, directory })

@@ -94,7 +94,7 @@ impl EnvironmentClient {
         stop: Stop,
     ) -> Result<Self, ChannelError> {
         let channel = name(index);
-        let client = claim(domain, &channel, "ask", || {
+        let client = claim(&channel, "ask", || {
             service(domain, &channel)?
                 .client_builder()
                 .initial_max_slice_len(layout.environments * action_width)

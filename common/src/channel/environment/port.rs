@@ -44,7 +44,7 @@ impl EnvironmentPort {
         let channel = name(index);
         let layout = ResponseLayout::new(environments, spec.observation.width());
         let described = 2 * (spec.observation.width() + spec.action.width());
-        let server = claim(domain, &channel, "answer", || {
+        let server = claim(&channel, "answer", || {
             service(domain, &channel)?
                 .server_builder()
                 .initial_max_slice_len(layout.len().max(described))

@@ -1,0 +1,162 @@
+//! Control of a run, from any other terminal: questions to its launcher, and the launcher's answers.
+
+use std::time::{Duration, Instant};
+
+use iceoryx2::port::server::Server;
+use iceoryx2::prelude::*;
+use iceoryx2::service::port_factory::request_response::PortFactory;
+
+pub use self::message::{Answer, Question, RoleState, RoleStatus, RunStatus};
+use self::message::{VERSION, decode, encode};
+use super::{ChannelError, Domain, claim, service_name};
+
+mod message;
+
+const CHANNEL: &str = "control";
+
+/// Terminals that may ask at the same time.
+const CLIENTS: usize = 8;
+
+/// Bytes of an answer at first; it grows with the number of roles.
+const ANSWER: usize = 4096;
+
+/// How long the asker sleeps between looks. The launcher looks twenty times a second.
+const NAP: Duration = Duration::from_millis(5);
+
+/// The launcher's end.
+#[derive(Debug)]
+pub struct ControlPort {
+    server: Server<ipc::Service, [u8], ControlHeader, [u8], ControlHeader>,
+}
+
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ZeroCopySend)]
+#[repr(C)]
+struct ControlHeader {
+    version: u32,
+    reserved: u32,
+}
+
+/// Why a launcher's answer was not had.
+#[derive(Debug, thiserror::Error)]
+pub enum ControlError {
+    /// The channel does not work.
+    #[error(transparent)]
+    Channel(#[from] ChannelError),
+    /// Nobody answers.
+    #[error("the launcher does not answer; is it stopped?")]
+    Silence,
+    /// The answer cannot be read.
+    #[error("the launcher's answer cannot be read: {0}; is it another version of this program?")]
+    Unreadable(String),
+}
+
+impl ControlPort {
+    /// The answering end.
+    ///
+    /// # Errors
+    /// When shared memory cannot be had.
+    pub fn open(domain: &Domain) -> Result<Self, ChannelError> {
+        let server = claim(CHANNEL, "answer", || {
+            service(domain)?
+                .server_builder()
+                .initial_max_slice_len(ANSWER)
+                .allocation_strategy(AllocationStrategy::PowerOfTwo)
+                .create()
+                .map_err(|cause| ChannelError::new(CHANNEL, "answer", cause))
+        })?;
+        Ok(Self { server })
+    }
+
+    /// Answers everything that was asked since the last call.
+    ///
+    /// # Errors
+    /// When the channel does not work, or `answer` fails.
+    pub fn attend<E: From<ChannelError>>(
+        &self,
+        mut answer: impl FnMut(Question) -> Result<Answer, E>,
+    ) -> Result<(), E> {
+        let received = || {
+            self.server
+                .receive()
+                .map_err(|cause| ChannelError::new(CHANNEL, "hear a question", cause))
+        };
+        while let Some(request) = received()? {
+            let answer = match decode(request.user_header().version, request.payload()) {
+                Ok(question) => answer(question)?,
+                Err(reason) => Answer::Refused(format!("the question cannot be read: {reason}")),
+            };
+            // An asker that has gone, or has no memory left, is no reason for the launcher to fail.
+            let bytes = encode(&answer);
+            let sent = request.loan_slice(bytes.len()).map(|mut response| {
+                response.payload_mut().copy_from_slice(&bytes);
+                response.user_header_mut().version = VERSION;
+                response.send()
+            });
+            if !matches!(sent, Ok(Ok(()))) {
+                tracing::debug!(?sent, "a question went without an answer");
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Asks the launcher of the run.
+///
+/// # Errors
+/// When there is no answer within `patience`, or none that can be read.
+pub fn ask(domain: &Domain, question: Question, patience: Duration) -> Result<Answer, ControlError> {
+    let failed = |cause: String| ChannelError {
+        channel: CHANNEL.into(),
+        action: "ask",
+        cause,
+    };
+    let client = claim(CHANNEL, "ask", || {
+        service(domain)?
+            .client_builder()
+            .initial_max_slice_len(64)
+            .create()
+            .map_err(|cause| ChannelError::new(CHANNEL, "ask", cause))
+    })?;
+    let deadline = Instant::now() + patience;
+    let ask = |bytes: &[u8]| {
+        let mut request = client.loan_slice(bytes.len()).map_err(|e| format!("{e:?}"))?;
+        request.payload_mut().copy_from_slice(bytes);
+        request.user_header_mut().version = VERSION;
+        request.send().map_err(|e| format!("{e:?}"))
+    };
+    let question = encode(&question);
+    let mut pending = ask(&question).map_err(failed)?;
+    loop {
+        let received = pending.receive().map_err(|cause| failed(format!("{cause:?}")))?;
+        if let Some(response) = received {
+            return decode(response.user_header().version, response.payload()).map_err(ControlError::Unreadable);
+        }
+        if Instant::now() >= deadline {
+            return Err(ControlError::Silence);
+        }
+        std::thread::sleep(NAP);
+        // The launcher may have opened its end only now.
+        if pending.number_of_server_connections() == 0 {
+            pending = ask(&question).map_err(failed)?;
+        }
+    }
+}
+
+type ControlService = PortFactory<ipc::Service, [u8], ControlHeader, [u8], ControlHeader>;
+
+fn service(domain: &Domain) -> Result<ControlService, ChannelError> {
+    domain
+        .node()
+        .service_builder(&service_name(domain, CHANNEL)?)
+        .request_response::<[u8], [u8]>()
+        .request_user_header::<ControlHeader>()
+        .response_user_header::<ControlHeader>()
+        .max_servers(1)
+        .max_clients(CLIENTS)
+        .max_nodes(2 * CLIENTS)
+        .max_active_requests_per_client(2)
+        .max_response_buffer_size(1)
+        .max_borrowed_responses_per_pending_response(1)
+        .open_or_create()
+        .map_err(|cause| ChannelError::new(CHANNEL, "open", cause))
+}

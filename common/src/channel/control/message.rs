@@ -1,0 +1,185 @@
+//! What travels between a terminal and a run's launcher.
+
+use bincode::config::{self, Config};
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+
+/// The form of the messages. Raise it with every change: launcher and asker may be of different builds.
+pub(super) const VERSION: u32 = 1;
+
+/// What can be asked of a launcher.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Question {
+    /// How the run gets on.
+    Status,
+    /// Go on with so many actors.
+    Scale {
+        /// How many.
+        actors: u32,
+    },
+    /// End the run in order.
+    Stop,
+}
+
+/// What a launcher answers.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub enum Answer {
+    /// How the run gets on.
+    Status(RunStatus),
+    /// It is being done.
+    Accepted,
+    /// It cannot be done, and why.
+    Refused(String),
+}
+
+/// How a run gets on.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct RunStatus {
+    /// Every process of the run.
+    pub roles: Vec<RoleStatus>,
+    /// Environment steps learned from.
+    pub env_steps: u64,
+    /// Environment steps after which training ends.
+    pub steps: u64,
+    /// Updates done.
+    pub updates: u64,
+    /// Rows committed to the replay over the whole run.
+    pub replay_rows: u64,
+    /// Actors the run is to have.
+    pub actors: u32,
+    /// Updates for each step beyond the warm-up, so far.
+    pub ratio: f64,
+    /// The ratio agreed on.
+    pub updates_per_step: f64,
+    /// Version of the policy published last.
+    pub policy_version: u64,
+    /// Updates a second.
+    pub updates_per_second: f64,
+    /// Environment steps a second.
+    pub env_steps_per_second: f64,
+    /// Mean return of the last evaluation.
+    pub eval_return_mean: Option<f64>,
+    /// Who waits for whom; `None` where nobody waits.
+    pub waiting: Option<String>,
+}
+
+/// How a process of a run gets on.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct RoleStatus {
+    /// What it is for.
+    pub role: String,
+    /// Which one of that role.
+    pub index: u32,
+    /// Its process, if there is one.
+    pub pid: Option<u32>,
+    /// What it does.
+    pub state: RoleState,
+    /// How often it was started again.
+    pub restarts: u32,
+    /// Environment steps a second, or updates of a learner.
+    pub rate: f64,
+    /// Version of the policy it uses or publishes; `None` for an environment server.
+    pub policy_version: Option<u64>,
+    /// Versions that its policy is behind the learner's.
+    pub policy_lag: Option<u64>,
+}
+
+/// What a process of a run does.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum RoleState {
+    /// Started, and not ready yet.
+    Starting,
+    /// At work.
+    Working,
+    /// Waiting for another role to appear or to answer.
+    WaitingForPeer,
+    /// Waiting for the other side of the ratio.
+    WaitingForRatio,
+    /// Has not been heard of for seconds: stopped, or stuck.
+    Silent,
+    /// Handing over what it has, to end for good.
+    Retiring,
+    /// Ended, and about to be started again.
+    Restarting,
+    /// Through with everything.
+    Done,
+}
+
+/// A message as bytes.
+pub(super) fn encode(message: &impl Serialize) -> Vec<u8> {
+    // Only a type that cannot be serialised at all would fail, and an empty message is refused where it arrives.
+    bincode::serde::encode_to_vec(message, encoding()).unwrap_or_default()
+}
+
+/// The message that the bytes are, or what is wrong with them.
+pub(super) fn decode<T: DeserializeOwned>(version: u32, bytes: &[u8]) -> Result<T, String> {
+    if version != VERSION {
+        return Err(format!("it is of form {version}, this program's is {VERSION}"));
+    }
+    match bincode::serde::decode_from_slice(bytes, encoding()) {
+        Ok((message, used)) if used == bytes.len() => Ok(message),
+        Ok((_, used)) => Err(format!("{} bytes are left over", bytes.len() - used)),
+        Err(error) => Err(error.to_string()),
+    }
+}
+
+/// The limit keeps a length that no message has from asking for memory.
+fn encoding() -> impl Config {
+    config::standard().with_limit::<{ 1 << 20 }>()
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn status() -> RunStatus {
+        RunStatus {
+            roles: vec![RoleStatus {
+                role: "actor".into(),
+                index: 3,
+                pid: Some(77),
+                state: RoleState::WaitingForRatio,
+                restarts: 2,
+                rate: 0.5,
+                policy_version: Some(9),
+                policy_lag: None,
+            }],
+            waiting: Some("actors wait".into()),
+            eval_return_mean: Some(-140.0),
+            ..Default::default()
+        }
+    }
+
+    #[test]
+    fn a_message_arrives_as_it_was_and_another_builds_is_refused() {
+        let answer = Answer::Status(status());
+        assert_eq!(decode(VERSION, &encode(&answer)), Ok(answer.clone()));
+        assert!(
+            decode::<Answer>(VERSION + 1, &encode(&answer))
+                .unwrap_err()
+                .contains("form")
+        );
+        assert!(decode::<Answer>(VERSION, &[]).is_err());
+    }
+
+    proptest! {
+        #[test]
+        fn any_bytes_are_a_message_or_an_error(bytes in proptest::collection::vec(any::<u8>(), 0..300)) {
+            let _ = decode::<Question>(VERSION, &bytes);
+            let _ = decode::<Answer>(VERSION, &bytes);
+        }
+
+        #[test]
+        fn a_changed_message_is_a_message_or_an_error(at in any::<prop::sample::Index>(), by in 1_u8.., cut in any::<prop::sample::Index>()) {
+            let mut bytes = encode(&Answer::Status(status()));
+            let at = at.index(bytes.len());
+            bytes[at] ^= by;
+            let _ = decode::<Answer>(VERSION, &bytes);
+            bytes.truncate(cut.index(bytes.len()));
+            prop_assert!(decode::<Answer>(VERSION, &bytes).is_err() || !bytes.is_empty());
+        }
+    }
+}

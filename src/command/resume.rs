@@ -1,0 +1,32 @@
+//! `shoal resume`: a run that was stopped, or whose processes were killed, goes on.
+
+use std::process::ExitCode;
+
+use anyhow::{Context, bail};
+use shoal_common::run_dir::RunDir;
+
+use super::training::conduct;
+use crate::cli::ResumeArgs;
+use crate::status;
+
+/// Goes on with the run's own replay, counters and noise, to the steps it was to take or to others.
+pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
+    let run = RunDir::open(&args.run)?;
+    let mut config = run.config()?;
+    // Only who holds the lock may change the configuration.
+    let lock = run.lock()?;
+    let here = args.run.display();
+    let taken = status::at_rest(&config, &run)
+        .with_context(|| format!("cannot resume {here}"))?
+        .env_steps;
+    let steps = args.steps.unwrap_or(config.run.steps);
+    if taken >= steps {
+        bail!("{here} has taken {taken} of {steps} steps already: give it more with --steps");
+    }
+    if steps != config.run.steps {
+        config.run.steps = steps;
+        config.check()?;
+        run.write_config(&config)?;
+    }
+    conduct(config, &run, lock, &args.telling)
+}

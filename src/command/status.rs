@@ -1,0 +1,159 @@
+//! `shoal status`: how a run gets on.
+
+use std::io::{IsTerminal, Write};
+use std::process::ExitCode;
+use std::time::Duration;
+
+use comfy_table::presets::UTF8_HORIZONTAL_ONLY;
+use comfy_table::{CellAlignment, Table};
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use serde::Serialize;
+use shoal_common::channel::control::{RoleState, RunStatus};
+
+use crate::cli::StatusArgs;
+use crate::launcher::thousands;
+use crate::remote::Remote;
+use crate::status::at_rest;
+
+/// From one look to the next.
+const EVERY: Duration = Duration::from_secs(1);
+
+/// The exit code that says that nothing runs.
+const NOTHING_RUNS: u8 = 3;
+
+/// What `--json` prints.
+#[derive(Serialize)]
+struct Printed<'a> {
+    running: bool,
+    #[serde(flatten)]
+    status: &'a RunStatus,
+}
+
+/// Shows how the run gets on, once or until it ends.
+pub(crate) fn run(args: &StatusArgs) -> anyhow::Result<ExitCode> {
+    let remote = Remote::open(&args.run)?;
+    let Some(mut status) = remote.status()? else {
+        return rest(args, &remote);
+    };
+    if !args.watch {
+        show(args, &status, &mut std::io::stdout().lock())?;
+        return Ok(ExitCode::SUCCESS);
+    }
+    let screen = screen();
+    loop {
+        if args.json || !std::io::stdout().is_terminal() {
+            show(args, &status, &mut std::io::stdout().lock())?;
+        } else {
+            screen.set_message(table(&status));
+        }
+        std::thread::sleep(EVERY);
+        match remote.status()? {
+            Some(newer) => status = newer,
+            None => break,
+        }
+    }
+    screen.finish_and_clear();
+    rest(args, &remote)?;
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Shows how a run stands that does not go on.
+fn rest(args: &StatusArgs, remote: &Remote) -> anyhow::Result<ExitCode> {
+    let status = at_rest(&remote.config, &remote.run)?;
+    let mut stdout = std::io::stdout().lock();
+    let here = args.run.display();
+    if args.json {
+        let printed = Printed {
+            running: false,
+            status: &status,
+        };
+        writeln!(stdout, "{}", serde_json::to_string(&printed)?)?;
+    } else if status.env_steps < status.steps {
+        writeln!(
+            stdout,
+            "nothing runs in {here}; {}; to go on: shoal resume {here}",
+            progress(&status)
+        )?;
+    } else {
+        writeln!(stdout, "nothing runs in {here}; {}: it is done", progress(&status))?;
+    }
+    Ok(ExitCode::from(NOTHING_RUNS))
+}
+
+fn show(args: &StatusArgs, status: &RunStatus, to: &mut impl Write) -> anyhow::Result<()> {
+    if args.json {
+        let printed = Printed { running: true, status };
+        writeln!(to, "{}", serde_json::to_string(&printed)?)?;
+    } else {
+        writeln!(to, "{}", table(status))?;
+    }
+    Ok(())
+}
+
+/// A place on the terminal that is drawn anew each time.
+fn screen() -> ProgressBar {
+    let screen = ProgressBar::with_draw_target(None, ProgressDrawTarget::stdout());
+    if let Ok(style) = ProgressStyle::with_template("{msg}") {
+        screen.set_style(style);
+    }
+    screen
+}
+
+fn progress(status: &RunStatus) -> String {
+    format!(
+        "{} of {} steps, {} updates",
+        thousands(status.env_steps),
+        thousands(status.steps),
+        thousands(status.updates)
+    )
+}
+
+fn table(status: &RunStatus) -> String {
+    let mut table = Table::new();
+    table.load_style(UTF8_HORIZONTAL_ONLY);
+    table.set_header(["role", "pid", "state", "restarts", "rate", "policy", "lag"]);
+    for role in &status.roles {
+        let or_none = |number: Option<u64>| number.map_or_else(String::new, thousands);
+        table.add_row([
+            format!("{} {}", role.role, role.index),
+            role.pid.map_or_else(String::new, |pid| pid.to_string()),
+            in_words(role.state).into(),
+            role.restarts.to_string(),
+            format!("{:.0}/s", role.rate),
+            or_none(role.policy_version),
+            or_none(role.policy_lag),
+        ]);
+    }
+    for column in [1, 3, 4, 5, 6] {
+        if let Some(column) = table.column_mut(column) {
+            column.set_cell_alignment(CellAlignment::Right);
+        }
+    }
+    let evaluated = status
+        .eval_return_mean
+        .map_or_else(String::new, |mean| format!(", eval {mean:.1}"));
+    let waiting = status.waiting.as_deref().unwrap_or("nobody waits");
+    format!(
+        "{table}\n{}, {} rows, {} actors{evaluated}\n{:.0} updates/s, {:.0} steps/s, ratio {:.2} of {:.2}; {waiting}",
+        progress(status),
+        thousands(status.replay_rows),
+        status.actors,
+        status.updates_per_second,
+        status.env_steps_per_second,
+        status.ratio,
+        status.updates_per_step,
+    )
+}
+
+fn in_words(state: RoleState) -> &'static str {
+    match state {
+        RoleState::Starting => "starting",
+        RoleState::Working => "working",
+        RoleState::WaitingForPeer => "waits for a peer",
+        RoleState::WaitingForRatio => "waits (ratio)",
+        RoleState::Silent => "silent (stopped?)",
+        RoleState::Retiring => "retiring",
+        RoleState::Restarting => "restarting",
+        RoleState::Done => "done",
+    }
+}

@@ -1,0 +1,167 @@
+//! From a run that is decided to its result: what `train` and `resume` share.
+
+use std::io::Write;
+use std::process::ExitCode;
+
+use comfy_table::Table;
+use comfy_table::presets::UTF8_BORDERS_ONLY;
+use serde::Serialize;
+use shoal_common::channel::control::RunStatus;
+use shoal_common::config::Config;
+use shoal_common::run_dir::{RunDir, RunLock};
+use shoal_learner::checkpoint::Checkpoints;
+use shoal_learner::ddpg::DdpgState;
+use shoal_learner::digest;
+
+use super::eval::{EvaluationSummary, WhichPolicy, evaluate};
+use super::plot;
+use crate::cli::Telling;
+use crate::launcher::{self, Ending, Outcome};
+
+/// What `--json` prints.
+#[derive(Serialize)]
+struct Summary {
+    run: String,
+    env_steps: u64,
+    updates: u64,
+    episodes: u64,
+    wall_seconds: f64,
+    /// Since this launcher began.
+    updates_per_second: f64,
+    env_steps_per_second: f64,
+    /// Of the best policy, as `shoal eval` judges it; none where the run was interrupted.
+    eval_return_mean: Option<f64>,
+    eval_return_std: Option<f64>,
+    eval_episodes: Option<u32>,
+    weights_sha256: Option<String>,
+}
+
+/// Trains until the run's end or an earlier one, judges what was learned, draws it, and tells the person.
+pub(crate) fn conduct(config: Config, run: &RunDir, lock: RunLock, telling: &Telling) -> anyhow::Result<ExitCode> {
+    let outcome = launcher::run(config.clone(), run, lock, telling.quiet)?;
+    let judged = match outcome.ending {
+        Ending::Finished => judge(&config, run)?,
+        Ending::Stopped | Ending::Interrupted(_) => Vec::new(),
+    };
+    plot::draw(run, &config, run.path())?;
+    let summary = Summary::new(&config, run, &outcome, judged.first().map(|(_, summary)| summary))?;
+    if !telling.quiet {
+        tell(&mut std::io::stderr().lock(), run, &outcome, &summary, &judged)?;
+    }
+    if telling.json {
+        writeln!(std::io::stdout().lock(), "{}", serde_json::to_string(&summary)?)?;
+    }
+    Ok(match outcome.ending {
+        Ending::Finished | Ending::Stopped => ExitCode::SUCCESS,
+        // As a shell reports a process that the signal ended.
+        Ending::Interrupted(signal) => ExitCode::from(128 + signal as u8),
+    })
+}
+
+/// The final evaluation: the policy with the best evaluation first, then the last one.
+fn judge(config: &Config, run: &RunDir) -> anyhow::Result<Vec<(&'static str, EvaluationSummary)>> {
+    let mut judged = Vec::new();
+    for (name, path, which) in [
+        ("best policy", run.best_policy(), WhichPolicy::Best),
+        ("last policy", run.last_policy(), WhichPolicy::Last),
+    ] {
+        if path.exists() {
+            let parameters = which.read(run, config)?.parameters;
+            judged.push((
+                name,
+                evaluate(config, &parameters, config.evaluation.final_episodes, config.run.seed)?,
+            ));
+        }
+    }
+    Ok(judged)
+}
+
+impl Summary {
+    fn new(
+        config: &Config,
+        run: &RunDir,
+        outcome: &Outcome,
+        judged: Option<&EvaluationSummary>,
+    ) -> anyhow::Result<Self> {
+        let wall_seconds = outcome.wall.as_secs_f64();
+        let RunStatus { env_steps, updates, .. } = outcome.rest;
+        let (env_steps, updates, done, taken) = outcome.learner.map_or((env_steps, updates, 0, 0), |last| {
+            let since = |now: u64, before: u64| now.saturating_sub(before);
+            (
+                last.env_steps,
+                last.updates,
+                since(last.updates, updates),
+                since(last.env_steps, env_steps),
+            )
+        });
+        Ok(Self {
+            run: run.path().display().to_string(),
+            env_steps,
+            updates,
+            episodes: outcome.episodes,
+            wall_seconds,
+            updates_per_second: done as f64 / wall_seconds,
+            env_steps_per_second: taken as f64 / wall_seconds,
+            eval_return_mean: judged.map(|judged| judged.return_mean),
+            eval_return_std: judged.map(|judged| judged.return_std),
+            eval_episodes: judged.map(|judged| judged.episodes),
+            weights_sha256: weights_sha256(config, run)?,
+        })
+    }
+}
+
+/// SHA-256 of actor, critic and both targets in the newest checkpoint.
+fn weights_sha256(config: &Config, run: &RunDir) -> anyhow::Result<Option<String>> {
+    let loaded = Checkpoints::new(&run.checkpoints(), config.fingerprint()).load_newest()?;
+    Ok(loaded.map(|loaded| {
+        let section = |name| loaded.checkpoint.sections.iter().find(|(found, _)| found == name);
+        let networks = DdpgState::PARTS.iter().take(4).filter_map(section);
+        digest::sha256(&networks.map(|(_, numbers)| numbers.as_slice()).collect::<Vec<_>>())
+    }))
+}
+
+fn tell(
+    to: &mut impl Write,
+    run: &RunDir,
+    outcome: &Outcome,
+    summary: &Summary,
+    judged: &[(&str, EvaluationSummary)],
+) -> std::io::Result<()> {
+    let mut table = Table::new();
+    table.load_style(UTF8_BORDERS_ONLY);
+    table.add_row(["environment steps", &launcher::thousands(summary.env_steps)]);
+    table.add_row(["updates", &launcher::thousands(summary.updates)]);
+    table.add_row(["episodes", &launcher::thousands(summary.episodes)]);
+    table.add_row(["time", &format!("{:.1} s", summary.wall_seconds)]);
+    table.add_row([
+        "rates",
+        &format!(
+            "{:.0} updates/s, {:.0} steps/s",
+            summary.updates_per_second, summary.env_steps_per_second
+        ),
+    ]);
+    for (name, judged) in judged {
+        let mut text = format!(
+            "return {:.1} ± {:.1} over {} episodes",
+            judged.return_mean, judged.return_std, judged.episodes
+        );
+        if let (Some(distance), Some(reached)) = (judged.final_distance_mean, judged.reached_fraction) {
+            text += &format!(
+                "; ends {distance:.3} m from the goal, reaches it in {:.0} %",
+                100.0 * reached
+            );
+        }
+        table.add_row([*name, &text]);
+    }
+    writeln!(to, "{table}")?;
+    let here = run.path().display();
+    if outcome.ending != Ending::Finished {
+        writeln!(to, "The learner's state is saved; to go on: shoal resume {here}")?;
+    }
+    writeln!(to, "{here}")?;
+    writeln!(
+        to,
+        "  learning-curve.svg, evaluations.csv, episodes.csv, learner.csv, tensorboard/, checkpoints/, shoal.log"
+    )?;
+    writeln!(to, "  figures: shoal plot {here}    judge again: shoal eval {here}")
+}

@@ -1,0 +1,72 @@
+//! What the launcher says and does when somebody asks from another terminal.
+
+use shoal_common::channel::control::{Answer, RunStatus};
+use shoal_common::config::{Config, Mode};
+use shoal_common::report::{Activity, Role};
+use shoal_common::run_dir::RunDir;
+
+use super::crew::Crew;
+use super::progress::Progress;
+use crate::status;
+
+/// How the run gets on, which stood at `rest` when it began.
+pub(super) fn status(
+    config: &Config,
+    run: &RunDir,
+    crew: &Crew,
+    progress: &Progress,
+    rest: &RunStatus,
+) -> anyhow::Result<RunStatus> {
+    let mut status = RunStatus {
+        replay_rows: status::replay_rows(run)?,
+        actors: crew.actors(),
+        ..rest.clone()
+    };
+    if let Some(learner) = progress.learner() {
+        status.env_steps = learner.env_steps;
+        status.updates = learner.updates;
+        status.policy_version = learner.policy_version;
+        status.ratio = status::ratio(&status, config.replay.warmup);
+    }
+    (status.updates_per_second, status.env_steps_per_second) = progress.rates().unwrap_or_default();
+    status.eval_return_mean = progress.evaluated().map(|report| report.return_mean);
+    status.roles = crew.status(status.policy_version);
+    status.waiting = waiting(crew).map(|who| {
+        let (ratio, agreed) = (status.ratio, status.updates_per_step);
+        format!("{who}: ratio {ratio:.2} of {agreed:.2}")
+    });
+    Ok(status)
+}
+
+/// Goes on with so many actors, from now on and when the run is resumed.
+pub(super) fn scale(config: &mut Config, run: &RunDir, crew: &mut Crew, actors: u32) -> anyhow::Result<Answer> {
+    if config.run.mode == Mode::Lockstep {
+        let reason = "a lockstep run keeps the actors it began with: its numbers depend on them";
+        return Ok(Answer::Refused(reason.into()));
+    }
+    let max = config.actors.max;
+    if !(1..=max).contains(&actors) {
+        let reason = format!("this run has room for 1 to {max} actors (actors.max, chosen when it began)");
+        return Ok(Answer::Refused(reason));
+    }
+    let mut scaled = config.clone();
+    scaled.actors.count = actors;
+    // First, so that a learner that is started now knows of all of them.
+    if let Err(error) = run.write_config(&scaled) {
+        return Ok(Answer::Refused(error.to_string()));
+    }
+    *config = scaled;
+    crew.scale(actors)?;
+    Ok(Answer::Accepted)
+}
+
+/// Who waits for whom, in words, from what actors and learner said last.
+pub(super) fn waiting(crew: &Crew) -> Option<&'static str> {
+    match (crew.activity(Role::Actor), crew.activity(Role::Learner)) {
+        (Some(Activity::WaitingForRatio), _) => Some("actors wait"),
+        (_, Some(Activity::WaitingForRatio)) => Some("learner waits"),
+        (_, Some(Activity::WaitingForPeer)) => Some("learner waits for rows"),
+        (Some(Activity::WaitingForPeer), _) => Some("actors wait for a policy"),
+        _ => None,
+    }
+}

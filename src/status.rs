@@ -1,0 +1,44 @@
+//! How a run stands, as far as its directory tells.
+
+use shoal_common::channel::control::RunStatus;
+use shoal_common::commit::{CommitReader, OpenError};
+use shoal_common::config::Config;
+use shoal_common::run_dir::RunDir;
+use shoal_learner::checkpoint::Checkpoints;
+
+/// How a run stands that nobody works on: what a learner would go on from.
+pub(crate) fn at_rest(config: &Config, run: &RunDir) -> anyhow::Result<RunStatus> {
+    let counters = Checkpoints::new(&run.checkpoints(), config.fingerprint())
+        .load_newest()?
+        .map(|loaded| loaded.checkpoint.counters)
+        .unwrap_or_default();
+    let mut status = RunStatus {
+        env_steps: counters.rows,
+        steps: config.run.steps,
+        updates: counters.updates,
+        replay_rows: replay_rows(run)?,
+        actors: config.actors.count,
+        updates_per_step: config.replay.updates_per_step,
+        policy_version: counters.policy_version,
+        ..Default::default()
+    };
+    status.ratio = ratio(&status, config.replay.warmup);
+    Ok(status)
+}
+
+/// Rows committed to a run's replay; 0 before there is one.
+pub(crate) fn replay_rows(run: &RunDir) -> Result<u64, OpenError> {
+    match CommitReader::open(&run.replay_file()) {
+        Ok(reader) => Ok(reader.rows()),
+        Err(OpenError::NotYet { .. }) => Ok(0),
+        Err(error) => Err(error),
+    }
+}
+
+/// Updates for each environment step beyond the warm-up.
+pub(crate) fn ratio(status: &RunStatus, warmup: u64) -> f64 {
+    match status.env_steps.saturating_sub(warmup) {
+        0 => 0.0,
+        beyond => status.updates as f64 / beyond as f64,
+    }
+}

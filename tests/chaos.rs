@@ -1,0 +1,248 @@
+//! A person with a fixed seed kills a random process every second or so and scales the actors up and down; in the end
+//! everything that was sent is in the replay, once, and the run can go on and learn what it was to learn.
+
+#![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
+
+mod support;
+
+use std::collections::HashSet;
+use std::path::Path;
+use std::time::{Duration, Instant, SystemTime};
+
+use rand::{RngExt, SeedableRng};
+use rustix::process::{Pid, Signal, kill_process};
+use serde_json::Value;
+use shoal_common::config::Config;
+use shoal_common::stream::Stream;
+use shoal_learner::replay::{Replay, ReplayLayout};
+use support::{Running, Workplace, committed, parse, sent};
+
+const MAX_ACTORS: u32 = 4;
+
+/// A process that was killed.
+struct Kill {
+    who: String,
+    pid: i64,
+    at: f64,
+}
+
+/// What the chaos came to.
+struct Figures {
+    kills: usize,
+    /// Seconds from a kill to the successor's being ready, ascending.
+    recoveries: Vec<f64>,
+    rows: u64,
+    rows_lost: u64,
+    scalings: usize,
+}
+
+fn now() -> f64 {
+    SystemTime::UNIX_EPOCH.elapsed().unwrap().as_secs_f64()
+}
+
+/// Kills and scales for so long.
+fn rage(place: &Workplace, running: &Running, rng: &mut Stream, length: Duration) -> (Vec<Kill>, usize) {
+    let (begun, mut kills, mut scalings) = (Instant::now(), Vec::new(), 0);
+    while begun.elapsed() < length {
+        std::thread::sleep(Duration::from_millis(rng.random_range(300..1500)));
+        if rng.random_bool(0.2) {
+            let actors = rng.random_range(1..=MAX_ACTORS).to_string();
+            let output = place.output(&["scale", "run", "--actors", &actors]);
+            assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+            scalings += 1;
+            continue;
+        }
+        let status = place.status("run");
+        let roles = status["roles"].as_array().unwrap();
+        let victim = &roles[rng.random_range(0..roles.len())];
+        let who = format!("{}-{}", victim["role"].as_str().unwrap(), victim["index"]);
+        let Some(pid) = victim["pid"].as_i64() else { continue };
+        // It may have ended, or been replaced, since it was asked for.
+        if running.pids(&who).last().is_some_and(|last| i64::from(*last) == pid)
+            && kill_process(Pid::from_raw(pid as i32).unwrap(), Signal::KILL).is_ok()
+        {
+            kills.push(Kill { who, pid, at: now() });
+        }
+    }
+    (kills, scalings)
+}
+
+/// The launcher's lines about a process, with their times.
+fn notes(log: &str, who: &str) -> Vec<(f64, String)> {
+    let of = |line: &str| {
+        let (name, rest) = line.split_once(' ')?;
+        let (time, said) = rest.trim_start().split_once(' ')?;
+        Some((time.parse().ok()?, said.to_owned())).filter(|_| name == who)
+    };
+    log.lines().filter_map(of).collect()
+}
+
+/// When the process after `kill` was ready, if there was to be one.
+fn ready_again(log: &str, kill: &Kill) -> Option<f64> {
+    let notes = notes(log, &kill.who);
+    let started = format!("started as process {}", kill.pid);
+    let killed = notes.iter().position(|(_, said)| *said == started)?;
+    let after = &notes[killed + 1..];
+    // Who was retiring, or was made to retire before its successor was ready, has none.
+    let (ended, _) = after.iter().find(|(_, said)| said.contains("killed by signal 9"))?;
+    let ready = after.iter().find(|(_, said)| said.starts_with("ready after"))?;
+    (ready.0 >= *ended).then_some(ready.0)
+}
+
+/// Whether no learner was ready at some moment of the half second around `time`.
+fn learner_was_away(log: &str, kills: &[Kill], time: f64) -> bool {
+    kills.iter().filter(|kill| kill.who == "learner-0").any(|kill| {
+        let back = ready_again(log, kill).unwrap_or(f64::INFINITY);
+        time > kill.at - 0.5 && time < back + 0.5
+    })
+}
+
+/// Everything that was sent is in the replay, but for what may be lost.
+fn account(run: &Path, config: &Config, kills: &[Kill]) -> (u64, u64) {
+    let log = std::fs::read_to_string(run.join("shoal.log")).unwrap();
+    let chunk = config.chunk_rows() as u64;
+    let (mut rows, mut lost) = (0, 0);
+    for actor in 0..MAX_ACTORS {
+        let (sent, committed) = (sent(run, actor), committed(run, actor as usize));
+        let own = kills.iter().filter(|kill| kill.who == format!("actor-{actor}"));
+        let (alone, with_learner): (Vec<_>, Vec<_>) = own.partition(|kill| !learner_was_away(&log, kills, kill.at));
+        // An actor may be killed after it has sent a chunk and before it has said so.
+        let unsaid = chunk * (alone.len() + with_learner.len()) as u64;
+        let windows = chunk * u64::from(config.actors.window) * with_learner.len() as u64;
+        assert!(
+            (sent.saturating_sub(windows)..=sent + unsaid).contains(&committed),
+            "actor {actor} sent {sent} rows and {committed} are in the replay; it was killed {} times with a learner and {} without",
+            alone.len(),
+            with_learner.len()
+        );
+        rows += committed;
+        lost += sent.saturating_sub(committed);
+    }
+    (rows, lost)
+}
+
+/// Every row of the replay is there once, whole, and none is taken for a terminal one: the pendulum has no end.
+fn inspect(run: &Path, config: &Config, rows: u64) {
+    let layout = ReplayLayout {
+        row: config.row_layout(),
+        ring: config.replay.capacity,
+        actors: config.actors.max as usize,
+        fingerprint: config.fingerprint(),
+    };
+    let replay = Replay::open(&run.join("replay.bin"), &layout).unwrap();
+    assert_eq!(replay.warnings(), [] as [String; 0]);
+    assert_eq!(replay.head(), rows, "rows of all actors");
+    let mut seen = HashSet::new();
+    for index in replay.rows() {
+        let row = replay.row(index);
+        let transition = layout.row.read(row);
+        assert_eq!(transition.discount, config.ddpg.gamma as f32);
+        assert!(
+            seen.insert(row.iter().map(|x| x.to_bits()).collect::<Vec<_>>()),
+            "row {index} is there twice"
+        );
+    }
+}
+
+/// A learner is never ahead of the ratio, and takes nothing while the actors are ahead by more than is agreed.
+fn ratio_is_kept(run: &Path, config: &Config) {
+    #[derive(serde::Deserialize)]
+    struct Row {
+        env_steps: u64,
+        updates: u64,
+    }
+    let rows: Vec<Row> = csv::Reader::from_path(run.join("learner.csv"))
+        .unwrap()
+        .into_deserialize()
+        .collect::<Result<_, _>>()
+        .unwrap();
+    assert!(rows.len() > 10);
+    let beyond = |row: &Row| row.env_steps.saturating_sub(config.replay.warmup);
+    // The last one tells of what was taken in when the run was stopped.
+    for two in rows[..rows.len() - 1].windows(2) {
+        assert!(two[1].updates <= beyond(&two[1]), "ahead of the ratio");
+        let took = two[1].env_steps > two[0].env_steps && two[1].updates >= two[0].updates;
+        let agreed = config.replay.tolerance + config.chunk_rows() as u64;
+        assert!(
+            !took || beyond(&two[1]) <= two[1].updates + agreed,
+            "{} rows were taken with {} updates done",
+            two[1].env_steps,
+            two[1].updates
+        );
+    }
+}
+
+/// Chaos for so long over a run started with `arguments`; the run's end, when it has gone on to `steps`.
+fn chaos(seed: u64, length: Duration, arguments: &[&str], steps: u64) -> (Figures, Value) {
+    let place = Workplace::new();
+    let begin = ["train", "pendulum", "--run", "run", "--steps", "100000000"];
+    let running = place.launch("run", &[&begin[..], arguments].concat());
+    let run = running.run.clone();
+    let mut rng = Stream::seed_from_u64(seed);
+    let (kills, scalings) = rage(&place, &running, &mut rng, length);
+
+    let stopped = place.output(&["stop", "run"]);
+    assert!(stopped.status.success(), "{}", String::from_utf8_lossy(&stopped.stderr));
+    let (code, _, leftovers) = running.wait();
+    let log = std::fs::read_to_string(run.join("shoal.log")).unwrap();
+    assert_eq!(code, Some(0), "{}\n{log}", place.said());
+    assert!(leftovers.processes().is_empty(), "{:?}", leftovers.processes());
+    assert!(leftovers.files().is_empty(), "{:?}", leftovers.files());
+    let config = Config::load(&run.join("config.toml")).unwrap();
+    let (rows, rows_lost) = account(&run, &config, &kills);
+    inspect(&run, &config, rows);
+    ratio_is_kept(&run, &config);
+
+    let steps = steps.max(rows + 1000).to_string();
+    let (code, printed, leftovers) = place.resume("run", &["--steps", &steps]).wait();
+    assert_eq!(code, Some(0), "{}", place.said());
+    assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
+    let mut recoveries: Vec<_> = kills
+        .iter()
+        .filter_map(|kill| Some(ready_again(&log, kill)? - kill.at))
+        .collect();
+    recoveries.sort_by(f64::total_cmp);
+    let figures = Figures {
+        kills: kills.len(),
+        recoveries,
+        rows,
+        rows_lost,
+        scalings,
+    };
+    (figures, parse(&printed))
+}
+
+impl std::fmt::Display for Figures {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let n = self.recoveries.len();
+        write!(
+            f,
+            "{} kills, {} scalings, {n} recoveries (median {:.3} s, p99 {:.3} s, longest {:.3} s), {} rows, {} of them lost",
+            self.kills,
+            self.scalings,
+            self.recoveries[n / 2],
+            self.recoveries[(n - 1) * 99 / 100],
+            self.recoveries[n - 1],
+            self.rows,
+            self.rows_lost
+        )
+    }
+}
+
+#[test]
+fn whatever_is_killed_every_row_that_was_sent_is_in_the_replay_once() {
+    let arguments = [&support::QUICK[..], &["--set", "replay.capacity=200000"]].concat();
+    let (figures, result) = chaos(20, Duration::from_secs(20), &arguments, 0);
+    eprintln!("{figures}");
+    assert!(figures.kills >= 5 && figures.scalings >= 1 && figures.recoveries.len() >= 4);
+    assert_eq!(result["updates"], result["env_steps"].as_u64().unwrap() - 64);
+}
+
+#[test]
+#[ignore = "takes minutes"]
+fn a_minute_of_chaos_and_the_pendulum_still_swings_up() {
+    let (figures, result) = chaos(60, Duration::from_secs(60), &[], 30_000);
+    eprintln!("{figures}");
+    assert!(figures.kills >= 20 && figures.scalings >= 3);
+    assert!(result["eval_return_mean"].as_f64().unwrap() > -250.0, "{result}");
+}

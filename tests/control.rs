@@ -1,0 +1,227 @@
+//! A run seen and led from another terminal: status, scale, stop, resume.
+
+#![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
+
+mod support;
+
+use std::process::Output;
+
+use serde_json::Value;
+use support::{Running, Workplace, json, parse, until};
+
+const ENDLESS: [&str; 2] = ["--steps", "100000000"];
+
+fn said(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+fn roles<'a>(status: &'a Value, name: &str) -> Vec<&'a Value> {
+    let all = status["roles"].as_array().unwrap().iter();
+    all.filter(|role| role["role"] == name).collect()
+}
+
+fn learns(running: &Running) {
+    let before = running.learned("updates");
+    until("something more is learned", || running.learned("updates") > before);
+}
+
+#[test]
+fn status_shows_every_role_while_a_run_goes_on_and_says_so_when_nothing_runs() {
+    let place = Workplace::new();
+    let running = place.start("run", &[&ENDLESS[..], &["--actors", "2"]].concat());
+    learns(&running);
+    let status = place.status("run");
+    assert_eq!(status["running"], true);
+    for (role, count) in [("learner", 1), ("evaluator", 1), ("actor", 2), ("env-server", 3)] {
+        let found = roles(&status, role);
+        assert_eq!(found.len(), count, "{role}: {status}");
+        for role in found {
+            let pids = running.pids(&format!("{}-{}", role["role"].as_str().unwrap(), role["index"]));
+            assert_eq!(role["pid"].as_i64(), pids.last().map(|pid| i64::from(*pid)));
+            assert_eq!(role["restarts"], 0);
+        }
+    }
+    assert!(status["env_steps"].as_u64().unwrap() > 0 && status["updates"].as_u64().unwrap() > 0);
+    assert!(status["replay_rows"].as_u64() >= status["env_steps"].as_u64());
+    assert_eq!(status["actors"], 2);
+    assert!(status["ratio"].as_f64().unwrap() <= 1.0);
+    assert!(status["waiting"].is_string() || status["waiting"].is_null());
+
+    let table = place.output(&["status", "run"]);
+    let table = String::from_utf8_lossy(&table.stdout).into_owned();
+    for part in ["learner 0", "actor 1", "env-server 16", "ratio"] {
+        assert!(table.contains(part), "{table}");
+    }
+
+    running.kill("actor-1");
+    until("the restart is counted", || {
+        roles(&place.status("run"), "actor")[1]["restarts"] == 1
+    });
+
+    assert!(place.output(&["stop", "run"]).status.success());
+    running.wait();
+    let output = place.output(&["status", "run", "--json"]);
+    assert_eq!(output.status.code(), Some(3));
+    let rest = json(&output);
+    assert_eq!(
+        (&rest["running"], &rest["roles"]),
+        (&false.into(), &Value::Array(vec![]))
+    );
+    assert!(rest["updates"].as_u64() > status["updates"].as_u64());
+    let output = place.output(&["status", "run"]);
+    assert_eq!(output.status.code(), Some(3));
+    assert!(String::from_utf8_lossy(&output.stdout).contains("shoal resume run"));
+}
+
+#[test]
+fn a_watching_terminal_sees_the_run_to_its_end() {
+    let place = Workplace::new();
+    let running = place.start("run", &ENDLESS);
+    let mut watch = place
+        .shoal(&["status", "run", "--watch", "--json"])
+        .stdout(std::process::Stdio::piped())
+        .spawn()
+        .unwrap();
+    std::thread::sleep(std::time::Duration::from_millis(1500));
+    assert!(place.output(&["stop", "run"]).status.success());
+    running.wait();
+    until("the terminal notices", || watch.try_wait().unwrap().is_some());
+    let output = watch.wait_with_output().unwrap();
+    assert!(output.status.success());
+    let lines: Vec<Value> = String::from_utf8_lossy(&output.stdout)
+        .lines()
+        .map(|line| serde_json::from_str(line).unwrap())
+        .collect();
+    assert!(lines.len() >= 2 && lines[0]["running"] == true && lines[lines.len() - 1]["running"] == false);
+}
+
+#[test]
+fn actors_come_and_go_while_training_goes_on_and_none_of_their_rows_is_lost() {
+    let place = Workplace::new();
+    let running = place.start("run", &[&ENDLESS[..], &["--actors", "1"]].concat());
+    for actors in [4, 2, 3, 1] {
+        let output = place.output(&["scale", "run", "--actors", &actors.to_string()]);
+        assert!(output.status.success(), "{}", said(&output));
+        let status = place.status("run");
+        assert_eq!(status["actors"], actors);
+        assert_eq!(roles(&status, "actor").len(), actors, "{status}");
+        until("the retired actors' environment servers have ended", || {
+            roles(&place.status("run"), "env-server").len() == actors + 1
+        });
+        learns(&running);
+    }
+    for (actors, part) in [("0", "room for 1 to 16"), ("17", "room for 1 to 16")] {
+        let output = place.output(&["scale", "run", "--actors", actors]);
+        assert!(
+            !output.status.success() && said(&output).contains(part),
+            "{}",
+            said(&output)
+        );
+    }
+    assert_eq!(place.status("run")["actors"], 1);
+    let run = running.run.clone();
+    let stopped = place.output(&["stop", "run"]);
+    assert!(stopped.status.success(), "{}", said(&stopped));
+    let (code, _, leftovers) = running.wait();
+    assert_eq!(code, Some(0));
+    assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
+    for actor in 0..4 {
+        assert_eq!(
+            support::sent(&run, actor as u32),
+            support::committed(&run, actor),
+            "actor {actor}"
+        );
+        assert!(support::committed(&run, actor) > 0, "actor {actor}");
+    }
+}
+
+#[test]
+fn a_stopped_run_goes_on_where_it_was() {
+    let place = Workplace::new();
+    let running = place.start("run", &ENDLESS);
+    learns(&running);
+    assert!(place.output(&["scale", "run", "--actors", "3"]).status.success());
+    let run = running.run.clone();
+    let stopped = place.output(&["stop", "run"]);
+    assert!(String::from_utf8_lossy(&stopped.stdout).contains("shoal resume run"));
+    let (code, printed, leftovers) = running.wait();
+    assert_eq!(code, Some(0));
+    assert!(leftovers.files().is_empty());
+    let before = parse(&printed);
+    for file in [
+        "learning-curve.svg",
+        "checkpoints/latest.ckpt",
+        "checkpoints/last.policy",
+    ] {
+        assert!(run.join(file).exists(), "{file}");
+    }
+    let stop_again = place.output(&["stop", "run"]);
+    assert!(!stop_again.status.success() && said(&stop_again).contains("nothing runs"));
+
+    let steps = before["env_steps"].as_u64().unwrap() + 3000;
+    let running = place.resume("run", &["--steps", &steps.to_string()]);
+    assert_eq!(
+        roles(&place.status("run"), "actor").len(),
+        3,
+        "as scaled before the stop"
+    );
+    let busy = place.output(&["resume", "run"]);
+    assert!(
+        !busy.status.success() && said(&busy).contains("is going on"),
+        "{}",
+        said(&busy)
+    );
+    let pids = running.pids("learner-0").len();
+    let (code, printed, _) = running.wait();
+    assert_eq!((code, pids), (Some(0), 2));
+    let after = parse(&printed);
+    assert_eq!(after["env_steps"], steps);
+    assert_eq!(
+        after["updates"],
+        steps - 64,
+        "the updates of both parts, and none twice"
+    );
+    assert!(after["episodes"].as_u64() > before["episodes"].as_u64());
+
+    for (arguments, part) in [
+        (&["resume", "run"][..], "give it more with --steps"),
+        (&["resume", "run", "--steps", "10"], "give it more with --steps"),
+        (&["resume", "nowhere"], "nowhere is not a run directory"),
+        (&["status", "nowhere"], "nowhere is not a run directory"),
+        (&["scale", "run", "--actors", "2"], "nothing runs"),
+    ] {
+        let output = place.output(arguments);
+        assert_eq!(output.status.code(), Some(1));
+        assert!(
+            said(&output).contains(part) && said(&output).lines().count() == 1,
+            "{}",
+            said(&output)
+        );
+    }
+}
+
+#[test]
+fn a_lockstep_run_keeps_its_actors() {
+    let place = Workplace::new();
+    let running = place.start("run", &[&ENDLESS[..], &["--lockstep"]].concat());
+    let output = place.output(&["scale", "run", "--actors", "3"]);
+    assert!(
+        !output.status.success() && said(&output).contains("lockstep"),
+        "{}",
+        said(&output)
+    );
+    assert_eq!(place.status("run")["actors"], 2);
+    drop(running);
+}
+
+#[test]
+fn a_launcher_that_does_not_answer_is_said_to_be_silent() {
+    let place = Workplace::new();
+    let running = place.start("run", &ENDLESS);
+    running.signal(rustix::process::Signal::STOP);
+    let output = place.output(&["status", "run"]);
+    running.signal(rustix::process::Signal::CONT);
+    assert_eq!(output.status.code(), Some(1));
+    assert!(said(&output).contains("does not answer"), "{}", said(&output));
+    learns(&running);
+}
