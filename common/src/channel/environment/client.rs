@@ -142,6 +142,7 @@ impl EnvironmentClient {
                     observation,
                     action,
                     time_limit: header.time_limit,
+                    state_width: header.state_width as usize,
                 };
                 Ok((spec, header.environments as usize))
             }

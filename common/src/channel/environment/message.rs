@@ -65,7 +65,8 @@ pub struct ResponseHeader {
     pub action_width: u32,
     /// Steps after which an episode is truncated.
     pub time_limit: u32,
-    pub(super) reserved: u32,
+    /// Numbers in an environment's state; 0 where it cannot be said.
+    pub state_width: u32,
 }
 
 /// Where the blocks of a response lie, each of them environment after environment.

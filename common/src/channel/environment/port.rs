@@ -176,7 +176,7 @@ impl Request<'_> {
             discrete_actions: discrete(&spec.action),
             action_width: spec.action.width() as u32,
             time_limit: spec.time_limit,
-            reserved: 0,
+            state_width: spec.state_width as u32,
         };
         response
             .send()
