@@ -4,6 +4,7 @@ use anyhow::{Context, ensure};
 use shoal_common::channel::environment::StepBlocks;
 use shoal_common::config::Config;
 use shoal_common::network::{ActionRange, PolicyNetwork};
+use shoal_common::space::EnvironmentSpec;
 use shoal_env_server::vector::{Start, VectorEnvironment};
 
 /// An episode of T steps.
@@ -45,8 +46,13 @@ impl<'a> Rollout<'a> {
         );
         let environment = environment_of(config)?;
         let name = &config.environment.name;
+        // Here no state is saved, and runs of older builds do not know its width.
+        let said = EnvironmentSpec {
+            state_width: config.spec.state_width,
+            ..environment.spec().clone()
+        };
         ensure!(
-            environment.spec() == &config.spec,
+            said == config.spec,
             "config.toml: [spec] is not what environment {name} says of itself"
         );
         Ok(Self {

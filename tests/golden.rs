@@ -270,6 +270,7 @@ fn ddpg_update(file: &Value) -> Result<(), Failure> {
             high: read(file, "action_high", serde_json::from_value)?,
         },
         time_limit: 1,
+        state_width: 0,
     };
     let gamma = read(file, "gamma", serde_json::from_value)?;
     let batches = read(file, "batches", VALUES)?;

@@ -13,7 +13,7 @@
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use shoal_common::channel::environment::{EnvironmentClient, Observed, ResponseLayout, Stepped};
+use shoal_common::channel::environment::{EnvironmentClient, Observed, Stepped};
 use shoal_common::channel::policy::PolicyReader;
 use shoal_common::channel::reports::Reporter;
 use shoal_common::channel::transitions::{Chunk, ChunkSender};
@@ -349,8 +349,7 @@ pub(crate) fn connect(
     envs: usize,
     stop: &Stop,
 ) -> Result<EnvironmentClient, Ended> {
-    let layout = ResponseLayout::new(envs, spec.observation.width());
-    let client = EnvironmentClient::open(domain, index, layout, spec.action.width(), stop.clone())?;
+    let client = EnvironmentClient::open(domain, index, spec, envs, stop.clone())?;
     let (served, served_envs) = client.describe(domain, bell)?;
     if served != *spec || served_envs != envs {
         let served = format!("{served_envs} times {served:?}");

@@ -291,6 +291,7 @@ mod tests {
     fn a_resolved_configuration_reads_back() {
         let config = parse(&format!("{LEAST}start_speed = 1.0\n")).unwrap();
         assert_eq!(parse(&config.to_toml().unwrap()).unwrap(), config);
+        assert_eq!(config.spec.state_width, 0, "where it is not written");
     }
 
     #[test]

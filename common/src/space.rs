@@ -47,4 +47,35 @@ pub struct EnvironmentSpec {
     pub action: Space,
     /// Steps after which an episode is truncated.
     pub time_limit: u32,
+    /// Numbers (`f64`) in the environment's state, as it can be said and restored; 0 where the environment cannot say it.
+    #[serde(default)]
+    pub state_width: usize,
+}
+
+impl EnvironmentSpec {
+    /// Words in the snapshot of so many environments: for each the number of its episode, the steps taken in it, the
+    /// position in its random stream, and the state. 0 where the environment cannot say its state: there are no snapshots.
+    pub fn snapshot_words(&self, environments: usize) -> usize {
+        const COUNTERS: usize = 3;
+        match self.state_width {
+            0 => 0,
+            state => environments * (COUNTERS + state),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_environment_that_cannot_say_its_state_has_no_snapshots() {
+        let lake = |state_width| EnvironmentSpec {
+            observation: Space::Discrete { n: 16 },
+            action: Space::Discrete { n: 4 },
+            time_limit: 100,
+            state_width,
+        };
+        assert_eq!([0, 1, 2].map(|state| lake(state).snapshot_words(5)), [0, 20, 25]);
+    }
 }

@@ -26,9 +26,9 @@ const ENVIRONMENTS: &[(&str, Maker)] = &[
 /// A controlled system with a start distribution and a reward, in physical units and `f64`.
 ///
 /// It knows no time limit but reports one in its `spec`: whoever steps it counts, and truncates.
-/// Before its first `reset` or `reset_to` it stands in an arbitrary valid state.
+/// Before its first `reset`, `reset_to` or `restore` it stands in an arbitrary valid state.
 pub trait Environment: Send {
-    /// Spaces and time limit. Always the same for one environment.
+    /// Spaces, time limit and the width of the state. Always the same for one environment.
     fn spec(&self) -> EnvironmentSpec;
 
     /// Starts an episode from the start distribution.
@@ -43,6 +43,17 @@ pub trait Environment: Send {
     /// One step under `action`, `spec().action.width()` numbers. What lies outside a box is clipped to it, and an index
     /// beyond the last counts as the last. Never panics: a NaN gives some number or NaN.
     fn step(&mut self, action: &[f64], rng: &mut Stream) -> Step;
+
+    /// Writes the present state: `spec().state_width` numbers from which `restore` makes the same future, bit for bit,
+    /// under the same actions and random numbers. An environment that cannot say its state has width 0, and nothing to do.
+    fn save(&self, _state: &mut [f64]) {}
+
+    /// Goes on within an episode, from a state that `save` wrote for an environment made alike. What cannot be such a
+    /// state is refused whatever the present one is, and that is kept. This one suits where `reset_to` knows of
+    /// everything that the future depends on. (A state that a NaN action led to may be refused.)
+    fn restore(&mut self, state: &[f64]) -> Result<(), RequestError> {
+        self.reset_to(state)
+    }
 }
 
 /// What a step gave, besides the new state.

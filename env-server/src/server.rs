@@ -47,9 +47,18 @@ pub fn serve(
                     .answer(|actions, blocks| environments.step(actions, blocks))?
                     .err()
             }
-            Some(Ask::Step) => {
+            Some(Ask::Snapshot) if started => request.answer_snapshot(|words| environments.snapshot(words))?.err(),
+            Some(Ask::Step | Ask::Snapshot) => {
                 request.not_started()?;
                 None
+            }
+            Some(Ask::Restore) => {
+                let words = request.words();
+                let refused = request
+                    .answer(|_, blocks| environments.restore(&words, blocks.observations))?
+                    .err();
+                started |= refused.is_none();
+                refused
             }
             _ => {
                 request.refuse()?;

@@ -1,4 +1,7 @@
-//! A vector of environments stepped in lockstep, with time limit, autoreset and counted random streams.
+//! A vector of environments stepped in lockstep, with time limit, autoreset, counted random streams and
+//! snapshots.
+
+mod snapshot;
 
 use shoal_common::{
     channel::environment::StepBlocks,
@@ -22,6 +25,8 @@ pub struct VectorEnvironment {
     evaluation_seed: Option<u64>,
     running: Vec<Running>,
     action: Vec<f64>,
+    /// Takes restored states first, so that a refused one changes nothing.
+    trial: Box<dyn Environment>,
 }
 
 struct Running {
@@ -62,7 +67,8 @@ impl VectorEnvironment {
         server: u64,
         incarnation: u64,
     ) -> Result<Self, EnvironmentError> {
-        let spec = make(name, parameters)?.spec();
+        let trial = make(name, parameters)?;
+        let spec = trial.spec();
         let training = stream(seed, Purpose::Environment, server, incarnation);
         let running = |_| {
             let environment = make(name, parameters)?;
@@ -80,6 +86,7 @@ impl VectorEnvironment {
             evaluation_seed: None,
             spec,
             training,
+            trial,
         })
     }
 
@@ -196,10 +203,7 @@ impl VectorEnvironment {
                 running.next_evaluation = running.next_evaluation.wrapping_add(stride);
             }
             None => {
-                running.rng.clone_from(&self.training);
-                running
-                    .rng
-                    .set_stream((e as u64) << EPISODE_BITS | running.next_training);
+                running.rng = training_stream(&self.training, e, running.next_training);
                 running.next_training += 1;
             }
         }
@@ -224,6 +228,13 @@ impl VectorEnvironment {
             None => Ok(()),
         }
     }
+}
+
+/// Stream (e, episode) of a server's environments.
+fn training_stream(server: &Stream, e: usize, episode: u64) -> Stream {
+    let mut stream = server.clone();
+    stream.set_stream((e as u64) << EPISODE_BITS | episode);
+    stream
 }
 
 fn wrong_count(what: &'static str, given: usize, environments: usize, expected: String) -> RequestError {

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use std::sync::mpsc::{self, Receiver, TryRecvError};
 use std::time::{Duration, Instant};
 
-use shoal_common::channel::environment::EnvironmentPort;
+use shoal_common::channel::environment::{Ask, EnvironmentPort};
 use shoal_common::channel::policy::{PolicyHeader, PolicyPublisher};
 use shoal_common::channel::transitions::ChunkSender;
 use shoal_common::channel::{Bell, Domain, Place, Pulse, Ringer, wait_for};
@@ -236,14 +236,14 @@ fn env_server(domain: &Domain) {
     serve(&mut environments, &port, 1, pulse, &stop).unwrap();
 }
 
-/// Says `asked` at the first step.
+/// Says `asked` at the first step or snapshot.
 fn env_server_that_never_answers(domain: &Domain) {
     let mut environments = pendulums();
     let port = port(domain, &environments);
     say("ready");
     let stop = Stop::when_stdin_closes().unwrap();
     while let Ok(request) = port.next(&stop, || ()) {
-        if request.ask() == Some(shoal_common::channel::environment::Ask::Step) {
+        if matches!(request.ask(), Some(Ask::Step | Ask::Snapshot)) {
             stall("asked");
         }
         let start = shoal_env_server::vector::Start::Next;

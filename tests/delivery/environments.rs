@@ -3,8 +3,8 @@
 use std::time::Duration;
 
 use rustix::process::Signal;
-use shoal_common::channel::environment::{EnvironmentClient, Observed, ResponseLayout, Stepped};
-use shoal_common::channel::{Bell, Domain, Place};
+use shoal_common::channel::environment::{EnvironmentClient, Observed, Snapshot, Stepped};
+use shoal_common::channel::{Bell, Domain, Interruption, Place};
 use shoal_common::report::Role;
 
 use crate::children::{ENVS, pendulums};
@@ -23,13 +23,13 @@ struct Asker<'a> {
 impl<'a> Asker<'a> {
     fn new(domain: &'a Domain) -> Self {
         let watchdog = Watchdog::new();
-        let layout = ResponseLayout::new(ENVS as usize, pendulums().spec().observation.width());
+        let environments = pendulums();
         let bell = Bell::hang(domain, Place(Role::Actor, 0)).unwrap();
-        let client = EnvironmentClient::open(domain, 0, layout, 1, watchdog.stop.clone()).unwrap();
+        let client = EnvironmentClient::open(domain, 0, environments.spec(), ENVS as usize, watchdog.stop.clone());
         Self {
             domain,
             bell,
-            client,
+            client: client.unwrap(),
             _watchdog: watchdog,
         }
     }
@@ -40,6 +40,38 @@ impl<'a> Asker<'a> {
 
     fn step(&self) -> Stepped {
         self.client.step(self.domain, &self.bell, &ACTIONS).expect("no hang")
+    }
+
+    fn snapshot(&self) -> Snapshot {
+        self.client.snapshot(self.domain, &self.bell).expect("no hang")
+    }
+
+    fn taken(&self) -> Vec<u64> {
+        match self.snapshot() {
+            Snapshot::Taken(words) => words,
+            Snapshot::Lost => panic!("the server lives and was reset"),
+        }
+    }
+
+    fn restore(&self, words: &[u64]) -> Result<Observed, Interruption> {
+        self.client.restore(self.domain, &self.bell, words)
+    }
+
+    /// All that comes of so many steps, as bits.
+    fn future(&self, steps: u32) -> Vec<u32> {
+        let mut seen = Vec::new();
+        for _ in 0..steps {
+            let Stepped::Taken(observed) = self.step() else {
+                panic!("the server lives and was reset")
+            };
+            for e in 0..ENVS as usize {
+                seen.extend(observed.observation(e).iter().map(|x| x.to_bits()));
+                seen.extend(observed.next_observation(e).iter().map(|x| x.to_bits()));
+                seen.push(observed.reward(e).to_bits());
+                seen.push(u32::from(observed.terminated(e)) << 1 | u32::from(observed.truncated(e)));
+            }
+        }
+        seen
     }
 
     fn steps(&self, count: u32) {
@@ -135,4 +167,79 @@ fn a_server_that_is_stopped_for_a_while_answers_when_it_goes_on() {
     let server = waker.join().unwrap();
     asker.steps(3);
     server.ends();
+}
+
+/// Steps beyond the ends of two episodes.
+const FUTURE: u32 = 450;
+
+#[test]
+fn a_new_server_goes_on_where_a_killed_one_was_bit_for_bit() {
+    let run = Run::new();
+    let domain = run.join();
+    let mut server = run.start("env-server");
+    let asker = Asker::new(&domain);
+    assert_eq!(asker.snapshot(), Snapshot::Lost, "no episode is under way");
+    asker.reset();
+    asker.steps(237);
+    let words = asker.taken();
+    let whole = asker.future(FUTURE);
+    server.kill();
+    assert_eq!(asker.snapshot(), Snapshot::Lost);
+    let _server = run.start("env-server");
+    assert_eq!(asker.snapshot(), Snapshot::Lost, "the new server knows no episode");
+    assert!(matches!(asker.step(), Stepped::Lost));
+    let observed = asker.restore(&words).unwrap().observations().to_vec();
+    assert_eq!(asker.taken(), words);
+    assert_eq!(asker.future(FUTURE), whole);
+    let again = asker.restore(&words).unwrap();
+    assert_eq!(again.observations(), observed, "the same server can go back too");
+    assert_eq!(asker.future(FUTURE), whole);
+}
+
+#[test]
+fn a_snapshot_whose_server_is_killed_before_it_answers_is_lost_and_a_restore_waits_for_the_next() {
+    let run = Run::new();
+    let domain = run.join();
+    let asker = Asker::new(&domain);
+    let mut server = run.start("env-server");
+    asker.reset();
+    asker.steps(10);
+    let words = asker.taken();
+    let whole = asker.future(10);
+    server.kill();
+    let mut doomed = run.start("env-server that-never-answers");
+    asker.reset();
+    std::thread::scope(|scope| {
+        let killer = scope.spawn(|| {
+            doomed.says("asked");
+            doomed.kill();
+        });
+        assert_eq!(asker.snapshot(), Snapshot::Lost);
+        killer.join().unwrap();
+        let starter = scope.spawn(|| {
+            std::thread::sleep(Duration::from_millis(200));
+            run.start("env-server")
+        });
+        asker.restore(&words).unwrap();
+        let _server = starter.join().unwrap();
+        assert_eq!(asker.future(10), whole);
+    });
+}
+
+#[test]
+fn words_that_are_no_snapshot_are_refused_and_the_server_goes_on() {
+    let run = Run::new();
+    let domain = run.join();
+    let _server = run.start("env-server");
+    let asker = Asker::new(&domain);
+    let garbage = [u64::MAX; ENVS as usize * 5];
+    let refusal = |words: &[u64]| asker.restore(words).unwrap_err().to_string();
+    assert!(refusal(&garbage).contains("refused"));
+    assert!(matches!(asker.step(), Stepped::Lost), "what is refused starts nothing");
+    asker.reset();
+    let words = asker.taken();
+    assert!(refusal(&garbage).contains("refused"));
+    assert!(refusal(&garbage[1..]).contains("9 words for a snapshot of 10"));
+    assert_eq!(asker.taken(), words);
+    asker.steps(3);
 }

@@ -1,5 +1,6 @@
 //! The conversation between one actor and its environment server. A request carries one action for each environment, a
-//! response what came of them; observations are read where the server wrote them.
+//! response what came of them; observations are read where the server wrote them. A snapshot of the episodes under way
+//! comes back as words, from which any server of this environment goes on.
 
 use iceoryx2::prelude::*;
 use iceoryx2::service::port_factory::request_response::PortFactory;
@@ -10,7 +11,7 @@ mod client;
 mod message;
 mod port;
 
-pub use client::{EnvironmentClient, Observed, Stepped};
+pub use client::{EnvironmentClient, Observed, Snapshot, Stepped};
 pub use message::{Ask, RequestHeader, ResponseHeader, ResponseLayout, StepBlocks};
 pub use port::{EnvironmentPort, Request};
 

@@ -71,6 +71,7 @@ impl Environment for CartPole {
             observation: Space::boxed(&[(-x, x), any, (-theta, theta), any]),
             action: Space::Discrete { n: 2 },
             time_limit: self.parameters.time_limit,
+            state_width: self.state.len(),
         }
     }
 
@@ -116,6 +117,10 @@ impl Environment for CartPole {
             reward: 1.0,
             terminated,
         }
+    }
+
+    fn save(&self, state: &mut [f64]) {
+        state.copy_from_slice(&self.state);
     }
 }
 

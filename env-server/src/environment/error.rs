@@ -36,8 +36,8 @@ pub struct OutOfRange {
 /// A request that a running environment refuses.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum RequestError {
-    /// `reset_to` with a state that the environment cannot be in.
-    #[error("no episode can start from state {state:?}: give {expected}")]
+    /// `reset_to` or `restore` with a state that the environment cannot be in.
+    #[error("the environment cannot be in state {state:?}: give {expected}")]
     State {
         /// The state asked for.
         state: Vec<f64>,
@@ -47,7 +47,7 @@ pub enum RequestError {
     /// Not as many numbers as the environments together take.
     #[error("{given} numbers of {what} for {environments} environments: give {expected}")]
     Count {
-        /// Actions, states or episodes.
+        /// Actions, states, episodes or snapshot.
         what: &'static str,
         /// How many came.
         given: usize,
@@ -63,6 +63,20 @@ pub enum RequestError {
         environment: usize,
         /// The offending number.
         action: f32,
+    },
+    /// A snapshot of environments that cannot say their state.
+    #[error("this environment cannot say its state: there are no snapshots of it")]
+    Unsayable,
+    /// A snapshot while no training episodes are under way.
+    #[error("no training episodes are under way: reset or restore first")]
+    NoTraining,
+    /// Words that say what no episode can come to.
+    #[error("no snapshot: environment {environment} cannot have this {what}")]
+    Snapshot {
+        /// Which environment of the vector.
+        environment: usize,
+        /// Which part of its words.
+        what: &'static str,
     },
 }
 

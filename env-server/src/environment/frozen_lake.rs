@@ -119,6 +119,7 @@ impl Environment for FrozenLake {
             observation: Space::Discrete { n: STATES as u32 },
             action: Space::Discrete { n: ACTIONS as u32 },
             time_limit: self.parameters.time_limit,
+            state_width: 1,
         }
     }
 
@@ -153,6 +154,10 @@ impl Environment for FrozenLake {
         } = outcome(self.state, slipped(action, rng.random_range(0..3)), 1.0 / 3.0);
         self.state = next;
         Step { reward, terminated }
+    }
+
+    fn save(&self, state: &mut [f64]) {
+        state[0] = self.state as f64;
     }
 }
 

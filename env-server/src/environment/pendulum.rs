@@ -82,6 +82,7 @@ impl Environment for Pendulum {
             observation: Space::boxed(&[(-1.0, 1.0), (-1.0, 1.0), (-speed, speed)]),
             action: Space::boxed(&[(-torque, torque)]),
             time_limit: self.parameters.time_limit,
+            state_width: self.state().len(),
         }
     }
 
@@ -120,6 +121,10 @@ impl Environment for Pendulum {
             reward,
             terminated: false,
         }
+    }
+
+    fn save(&self, state: &mut [f64]) {
+        state.copy_from_slice(&self.state());
     }
 }
 

@@ -36,6 +36,9 @@ pub struct PointMass {
     before: Option<(f64, f64)>,
 }
 
+/// Stands in a saved state for the action before an episode's first: no clipped action is infinite.
+const NO_ACTION: (f64, f64) = (f64::INFINITY, f64::INFINITY);
+
 /// One coordinate's motion.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 struct Axis {
@@ -99,6 +102,13 @@ impl PointMass {
         (self.x.position * self.x.velocity + self.y.position * self.y.velocity) / d
     }
 
+    /// x, y, ẋ, ẏ, and the action before.
+    fn saved(&self) -> [f64; 6] {
+        let Self { x, y, .. } = self;
+        let (theta, force) = self.before.unwrap_or(NO_ACTION);
+        [x.position, y.position, x.velocity, y.velocity, theta, force]
+    }
+
     fn start(&mut self, x: Axis, y: Axis) {
         (self.x, self.y, self.before) = (x, y, None);
     }
@@ -113,6 +123,7 @@ impl Environment for PointMass {
             observation: Space::boxed(&[wall, wall, speed, speed, (-10.0, 10.0), any]),
             action: Space::boxed(&[(-PI as f32, PI as f32), (0.0, MAX_FORCE as f32)]),
             time_limit: self.parameters.time_limit,
+            state_width: self.saved().len(),
         }
     }
 
@@ -182,6 +193,29 @@ impl Environment for PointMass {
             reward: reward.of(&motion, goal_radius),
             terminated: false,
         }
+    }
+
+    fn save(&self, state: &mut [f64]) {
+        state.copy_from_slice(&self.saved());
+    }
+
+    /// `reset_to` knows of no action before.
+    fn restore(&mut self, state: &[f64]) -> Result<(), RequestError> {
+        let before = match *state {
+            [_, _, _, _, theta, force] if (theta, force) == NO_ACTION => None,
+            [_, _, _, _, theta, force] if theta.abs() <= PI && (0.0..=MAX_FORCE).contains(&force) => {
+                Some((theta, force))
+            }
+            _ => {
+                return Err(RequestError::State {
+                    state: state.to_vec(),
+                    expected: "six numbers: x and y, their velocities, and the action before or twice infinity",
+                });
+            }
+        };
+        self.reset_to(&state[..4])?;
+        self.before = before;
+        Ok(())
     }
 }
 

@@ -1,17 +1,17 @@
 use super::*;
 
 /// A vector with the buffers that a server has in shared memory.
-struct Bench {
-    vector: VectorEnvironment,
-    observations: Vec<f32>,
-    next_observations: Vec<f32>,
-    rewards: Vec<f32>,
-    terminated: Vec<f32>,
-    truncated: Vec<f32>,
+pub(super) struct Bench {
+    pub(super) vector: VectorEnvironment,
+    pub(super) observations: Vec<f32>,
+    pub(super) next_observations: Vec<f32>,
+    pub(super) rewards: Vec<f32>,
+    pub(super) terminated: Vec<f32>,
+    pub(super) truncated: Vec<f32>,
 }
 
 impl Bench {
-    fn of(name: &str, parameters: &str, count: u32, [seed, server, incarnation]: [u64; 3]) -> Self {
+    pub(super) fn of(name: &str, parameters: &str, count: u32, [seed, server, incarnation]: [u64; 3]) -> Self {
         let parameters = parameters.parse().unwrap();
         let vector = VectorEnvironment::new(name, &parameters, count, seed, server, incarnation).unwrap();
         let width = vector.spec().observation.width();
@@ -26,16 +26,16 @@ impl Bench {
         }
     }
 
-    fn new(name: &str, parameters: &str, count: u32) -> Self {
+    pub(super) fn new(name: &str, parameters: &str, count: u32) -> Self {
         Self::of(name, parameters, count, [1, 0, 0])
     }
 
-    fn reset(&mut self, start: Start<'_>) -> Vec<f32> {
+    pub(super) fn reset(&mut self, start: Start<'_>) -> Vec<f32> {
         self.vector.reset(start, &mut self.observations).unwrap();
         self.observations.clone()
     }
 
-    fn step(&mut self, actions: &[f32]) -> Result<(), RequestError> {
+    pub(super) fn step(&mut self, actions: &[f32]) -> Result<(), RequestError> {
         let Self {
             vector,
             observations,

@@ -12,6 +12,7 @@ fn spec() -> EnvironmentSpec {
         observation: Space::boxed(&[(-1.0, 1.0); 3]),
         action: Space::boxed(&[(-1.0, 3.0), (-2.0, 2.0)]),
         time_limit: 200,
+        state_width: 0,
     }
 }
 

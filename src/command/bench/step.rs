@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::bail;
 use serde::Serialize;
-use shoal_common::channel::environment::{EnvironmentClient, ResponseLayout, Stepped};
+use shoal_common::channel::environment::{EnvironmentClient, Stepped};
 use shoal_common::channel::{Bell, Domain, Interruption, Place};
 use shoal_common::config::Config;
 use shoal_common::report::Role;
@@ -65,10 +65,9 @@ fn quantile_of(sorted: &[u32], quantile: f64) -> f64 {
 
 /// Times of round trips, in ns; at least one.
 fn times(config: &Config, domain: &Domain, server: &mut Peer, patience: &Patience) -> anyhow::Result<Vec<u32>> {
-    let (observation, action) = (config.spec.observation.width(), config.spec.action.width());
+    let environments = config.actors.envs as usize;
     let bell = Bell::hang(domain, Place(Role::Actor, 0))?;
-    let layout = ResponseLayout::new(config.actors.envs as usize, observation);
-    let client = EnvironmentClient::open(domain, 0, layout, action, patience.stop.clone())?;
+    let client = EnvironmentClient::open(domain, 0, &config.spec, environments, patience.stop.clone())?;
     let mut ask = |request: &dyn Fn() -> Result<(), Interruption>| match request() {
         Ok(()) => Ok(()),
         Err(Interruption::Stopped) => patience.check(),
@@ -77,7 +76,7 @@ fn times(config: &Config, domain: &Domain, server: &mut Peer, patience: &Patienc
     ask(&|| client.describe(domain, &bell).map(|_| ()))?;
     ask(&|| client.reset(domain, &bell, None).map(|_| ()))?;
 
-    let actions = vec![0.5; config.actors.envs as usize * action];
+    let actions = vec![0.5; environments * config.spec.action.width()];
     let mut times = Vec::new();
     let warm_up = patience.length.mul_f64(WARM_UP);
     let (begun, mut looked) = (Instant::now(), Instant::now());

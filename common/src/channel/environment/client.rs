@@ -5,7 +5,9 @@ use iceoryx2::port::client::Client;
 use iceoryx2::prelude::*;
 use iceoryx2::response::Response;
 
-use super::message::{Ask, Block, RequestHeader, ResponseHeader, ResponseLayout, Verdict};
+use super::message::{
+    Ask, Block, NUMBERS_OF_A_WORD, RequestHeader, ResponseHeader, ResponseLayout, Verdict, numbers_of, words_of,
+};
 use super::{name, service};
 use crate::channel::{Bell, ChannelError, Domain, Interruption, Place, Ringer, claim, wait_for};
 use crate::report::Role;
@@ -17,6 +19,16 @@ use crate::stop::Stop;
 pub enum Stepped {
     /// Every environment took the step.
     Taken(Observed),
+    /// The server died, and another one has taken its place: the episodes under way are lost.
+    Lost,
+}
+
+/// What an environment server can say when a snapshot is asked for.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Snapshot {
+    /// The words to restore from: as many as
+    /// [`EnvironmentSpec::snapshot_words`](crate::space::EnvironmentSpec::snapshot_words) counts.
+    Taken(Vec<u64>),
     /// The server died, and another one has taken its place: the episodes under way are lost.
     Lost,
 }
@@ -35,6 +47,7 @@ pub struct EnvironmentClient {
     channel: String,
     ringer: Ringer,
     layout: ResponseLayout,
+    snapshot_words: usize,
     stop: Stop,
 }
 
@@ -81,23 +94,25 @@ impl Observed {
 }
 
 impl EnvironmentClient {
-    /// Opens the conversation with environment server `index`, whose responses are expected to have this layout. Whether
-    /// they do, [`describe`](Self::describe) tells. Waiting for an answer ends when `stop` is requested.
+    /// Opens the conversation with environment server `index`, which is expected to step so many environments of this
+    /// kind. Whether it does, [`describe`](Self::describe) tells. Waiting for an answer ends when `stop` is requested.
     ///
     /// # Errors
     /// When shared memory cannot be had.
     pub fn open(
         domain: &Domain,
         index: u32,
-        layout: ResponseLayout,
-        action_width: usize,
+        spec: &EnvironmentSpec,
+        environments: usize,
         stop: Stop,
     ) -> Result<Self, ChannelError> {
         let channel = name(index);
+        let snapshot_words = spec.snapshot_words(environments);
+        let longest = (environments * spec.action.width()).max(NUMBERS_OF_A_WORD * snapshot_words);
         let client = claim(&channel, "ask", || {
             service(domain, &channel)?
                 .client_builder()
-                .initial_max_slice_len(layout.environments * action_width)
+                .initial_max_slice_len(longest)
                 .create()
                 .map_err(|cause| ChannelError::new(&channel, "ask", cause))
         })?;
@@ -106,7 +121,8 @@ impl EnvironmentClient {
             client,
             channel,
             ringer,
-            layout,
+            layout: ResponseLayout::new(environments, spec.observation.width()),
+            snapshot_words,
             stop,
         })
     }
@@ -116,7 +132,7 @@ impl EnvironmentClient {
     /// # Errors
     /// When interrupted.
     pub fn describe(&self, domain: &Domain, bell: &Bell) -> Result<(EnvironmentSpec, usize), Interruption> {
-        let response = self.insist(domain, bell, Ask::Describe, 0)?;
+        let response = self.insist(domain, bell, Ask::Describe, 0, &[])?;
         let header = response.user_header();
         let (observation, action) = (header.observation_width as usize, header.action_width as usize);
         let payload = response.payload();
@@ -142,6 +158,7 @@ impl EnvironmentClient {
                     observation,
                     action,
                     time_limit: header.time_limit,
+                    state_width: header.state_width as usize,
                 };
                 Ok((spec, header.environments as usize))
             }
@@ -156,8 +173,8 @@ impl EnvironmentClient {
     /// When interrupted.
     pub fn reset(&self, domain: &Domain, bell: &Bell, evaluation: Option<u64>) -> Result<Observed, Interruption> {
         let response = match evaluation {
-            None => self.insist(domain, bell, Ask::Reset, 0),
-            Some(episode) => self.insist(domain, bell, Ask::ResetToEvaluation, episode),
+            None => self.insist(domain, bell, Ask::Reset, 0, &[]),
+            Some(episode) => self.insist(domain, bell, Ask::ResetToEvaluation, episode, &[]),
         }?;
         self.observed(response).map_err(Interruption::from)
     }
@@ -167,23 +184,44 @@ impl EnvironmentClient {
     /// # Errors
     /// When interrupted, or the server refuses the actions.
     pub fn step(&self, domain: &Domain, bell: &Bell, actions: &[f32]) -> Result<Stepped, Interruption> {
-        let pending = self.send(Ask::Step, 0, actions)?;
-        let Some(response) = self.answer(domain, bell, &pending)? else {
-            return Ok(Stepped::Lost);
-        };
-        if response.user_header().verdict == Verdict::NotStarted as u32 {
-            return Ok(Stepped::Lost);
+        match self.ask_within_episodes(domain, bell, Ask::Step, actions)? {
+            Some(response) => Ok(Stepped::Taken(self.observed(response)?)),
+            None => Ok(Stepped::Lost),
         }
-        Ok(Stepped::Taken(self.observed(response)?))
+    }
+
+    /// Asks for the training episodes under way, which stay as they are.
+    ///
+    /// # Errors
+    /// When interrupted, or the server refuses: its environments cannot say their state, or run evaluation episodes.
+    pub fn snapshot(&self, domain: &Domain, bell: &Bell) -> Result<Snapshot, Interruption> {
+        let Some(response) = self.ask_within_episodes(domain, bell, Ask::Snapshot, &[])? else {
+            return Ok(Snapshot::Lost);
+        };
+        let words = words_of(self.answered(&response)?);
+        if words.len() != self.snapshot_words {
+            return Err(self.refused().into());
+        }
+        Ok(Snapshot::Taken(words))
+    }
+
+    /// Every environment goes on with its training episode of a snapshot; what to act on next is the answer, as after
+    /// [`reset`](Self::reset).
+    ///
+    /// # Errors
+    /// When interrupted, or the server refuses the words; it stays as it was then.
+    pub fn restore(&self, domain: &Domain, bell: &Bell, words: &[u64]) -> Result<Observed, Interruption> {
+        if words.len() != self.snapshot_words {
+            let cause = format!("{} words for a snapshot of {}", words.len(), self.snapshot_words);
+            return Err(ChannelError::new(&self.channel, "restore", cause).into());
+        }
+        let response = self.insist(domain, bell, Ask::Restore, 0, numbers_of(words))?;
+        self.observed(response).map_err(Interruption::from)
     }
 
     fn observed(&self, response: Answer) -> Result<Observed, ChannelError> {
-        if response.user_header().verdict != Verdict::Answered as u32 || response.payload().len() != self.layout.len() {
-            return Err(ChannelError::new(
-                &self.channel,
-                "ask",
-                "the environment server refused the request",
-            ));
+        if self.answered(&response)?.len() != self.layout.len() {
+            return Err(self.refused());
         }
         Ok(Observed {
             response,
@@ -191,17 +229,50 @@ impl EnvironmentClient {
         })
     }
 
+    /// The payload of what is no refusal.
+    fn answered<'a>(&self, response: &'a Answer) -> Result<&'a [f32], ChannelError> {
+        if response.user_header().verdict == Verdict::Answered as u32 {
+            Ok(response.payload())
+        } else {
+            Err(self.refused())
+        }
+    }
+
+    fn refused(&self) -> ChannelError {
+        ChannelError::new(&self.channel, "ask", "the environment server refused the request")
+    }
+
+    /// Asks once: for requests about the episodes under way. `None` when the server that ran them is no more.
+    fn ask_within_episodes(
+        &self,
+        domain: &Domain,
+        bell: &Bell,
+        ask: Ask,
+        payload: &[f32],
+    ) -> Result<Option<Answer>, Interruption> {
+        let pending = self.send(ask, 0, payload)?;
+        let answer = self.answer(domain, bell, &pending)?;
+        Ok(answer.filter(|response| response.user_header().verdict != Verdict::NotStarted as u32))
+    }
+
     /// Asks until some server answers: for requests that may be asked twice.
-    fn insist(&self, domain: &Domain, bell: &Bell, ask: Ask, episode: u64) -> Result<Answer, Interruption> {
+    fn insist(
+        &self,
+        domain: &Domain,
+        bell: &Bell,
+        ask: Ask,
+        episode: u64,
+        payload: &[f32],
+    ) -> Result<Answer, Interruption> {
         loop {
-            let pending = self.send(ask, episode, &[])?;
+            let pending = self.send(ask, episode, payload)?;
             if let Some(response) = self.answer(domain, bell, &pending)? {
                 return Ok(response);
             }
         }
     }
 
-    fn send(&self, ask: Ask, episode: u64, actions: &[f32]) -> Result<Pending, ChannelError> {
+    fn send(&self, ask: Ask, episode: u64, payload: &[f32]) -> Result<Pending, ChannelError> {
         let failed = |cause: String| ChannelError {
             channel: self.channel.clone(),
             action: "ask",
@@ -209,11 +280,11 @@ impl EnvironmentClient {
         };
         let mut request = self
             .client
-            .loan_slice_uninit(actions.len())
+            .loan_slice_uninit(payload.len())
             .map_err(|cause| failed(format!("{cause:?}")))?;
         *request.user_header_mut() = RequestHeader::new(ask, episode);
         let pending = request
-            .write_from_slice(actions)
+            .write_from_slice(payload)
             .send()
             .map_err(|cause| failed(format!("{cause:?}")))?;
         self.ringer.ring();

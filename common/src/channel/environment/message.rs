@@ -14,9 +14,25 @@ pub enum Ask {
     ResetToEvaluation = 2,
     /// Every environment takes a step with its action.
     Step = 3,
+    /// The training episodes under way, as words.
+    Snapshot = 4,
+    /// The environments go on with the training episodes of a snapshot.
+    Restore = 5,
 }
 
-/// Header of a request; its payload is the actions, environment after environment, for [`Ask::Step`], and empty otherwise.
+impl Ask {
+    pub(super) const ALL: [Self; 6] = [
+        Self::Describe,
+        Self::Reset,
+        Self::ResetToEvaluation,
+        Self::Step,
+        Self::Snapshot,
+        Self::Restore,
+    ];
+}
+
+/// Header of a request. Its payload is the actions, environment after environment, for [`Ask::Step`], the words of the
+/// snapshot for [`Ask::Restore`], and empty otherwise.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ZeroCopySend)]
 #[repr(C)]
 pub struct RequestHeader {
@@ -41,14 +57,14 @@ impl RequestHeader {
 #[repr(u32)]
 pub(super) enum Verdict {
     Answered = 0,
-    /// A step before a reset: the server is not the one that the episode began with.
+    /// A step or a snapshot before a reset or a restore: the server is not the one that the episode began with.
     NotStarted = 1,
-    /// The request has the wrong length, or is of an unknown kind.
+    /// The request has the wrong length, says what cannot be, or is of an unknown kind.
     Refused = 2,
 }
 
 /// Header of a response. The payload answers [`Ask::Describe`] with the least and greatest values of an observation and of
-/// an action (for boxes), and everything else with the blocks of [`ResponseLayout`].
+/// an action (for boxes), [`Ask::Snapshot`] with its words, and everything else with the blocks of [`ResponseLayout`].
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ZeroCopySend)]
 #[repr(C)]
 pub struct ResponseHeader {
@@ -65,7 +81,8 @@ pub struct ResponseHeader {
     pub action_width: u32,
     /// Steps after which an episode is truncated.
     pub time_limit: u32,
-    pub(super) reserved: u32,
+    /// Numbers in an environment's state; 0 where it cannot be said.
+    pub state_width: u32,
 }
 
 /// Where the blocks of a response lie, each of them environment after environment.
@@ -85,7 +102,7 @@ pub(super) enum Block {
     Truncated,
 }
 
-/// The blocks of a response to [`Ask::Step`], to be written. A reset fills `observations` alone.
+/// The blocks of a response to [`Ask::Step`], to be written. A reset or restore fills `observations` alone.
 #[derive(Debug)]
 pub struct StepBlocks<'a> {
     /// What to act on next: where an episode has ended, the first observation of the next one.
@@ -149,9 +166,32 @@ impl ResponseLayout {
     }
 }
 
+/// Numbers that carry the bits of a word.
+pub(super) const NUMBERS_OF_A_WORD: usize = 2;
+
+/// Words as they travel.
+pub(super) fn numbers_of(words: &[u64]) -> &[f32] {
+    bytemuck::cast_slice(words)
+}
+
+/// The words whose bits came, wherever in memory they lie.
+pub(super) fn words_of(numbers: &[f32]) -> Vec<u64> {
+    let (words, _) = numbers.as_chunks::<NUMBERS_OF_A_WORD>();
+    words.iter().map(|numbers| bytemuck::cast(*numbers)).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn words_come_as_they_went() {
+        let words = [0, u64::MAX, 0x7FA0_0001_FFA0_0001, f64::NAN.to_bits(), 1];
+        assert_eq!(words_of(numbers_of(&words)), words);
+        let mut shifted = vec![0.0];
+        shifted.extend(numbers_of(&words));
+        assert_eq!(words_of(&shifted[1..]), words, "f32 is aligned more loosely");
+    }
 
     #[test]
     fn what_is_written_into_a_block_is_read_from_it() {

@@ -4,7 +4,9 @@ use iceoryx2::active_request::ActiveRequest;
 use iceoryx2::port::server::Server;
 use iceoryx2::prelude::*;
 
-use super::message::{Ask, RequestHeader, ResponseHeader, ResponseLayout, StepBlocks, Verdict};
+use super::message::{
+    Ask, NUMBERS_OF_A_WORD, RequestHeader, ResponseHeader, ResponseLayout, StepBlocks, Verdict, numbers_of, words_of,
+};
 use super::{name, service};
 use crate::channel::{Bell, ChannelError, Domain, Interruption, Place, Ringer, claim, wait_for};
 use crate::report::Role;
@@ -44,10 +46,11 @@ impl EnvironmentPort {
         let channel = name(index);
         let layout = ResponseLayout::new(environments, spec.observation.width());
         let described = 2 * (spec.observation.width() + spec.action.width());
+        let snapshot = NUMBERS_OF_A_WORD * spec.snapshot_words(environments);
         let server = claim(&channel, "answer", || {
             service(domain, &channel)?
                 .server_builder()
-                .initial_max_slice_len(layout.len().max(described))
+                .initial_max_slice_len(layout.len().max(described).max(snapshot))
                 .create()
                 .map_err(|cause| ChannelError::new(&channel, "answer", cause))
         })?;
@@ -96,9 +99,7 @@ impl Request<'_> {
     /// What is asked; `None` for what this build does not know.
     pub fn ask(&self) -> Option<Ask> {
         let code = self.request.user_header().ask;
-        [Ask::Describe, Ask::Reset, Ask::ResetToEvaluation, Ask::Step]
-            .into_iter()
-            .find(|ask| *ask as u32 == code)
+        Ask::ALL.into_iter().find(|ask| *ask as u32 == code)
     }
 
     /// The evaluation episode that environment 0 shall begin.
@@ -126,6 +127,33 @@ impl Request<'_> {
             }
         })?;
         Ok(result)
+    }
+
+    /// The words of the snapshot to go on from.
+    pub fn words(&self) -> Vec<u64> {
+        words_of(self.request.payload())
+    }
+
+    /// Answers with the snapshot that `write` writes; where it fails, the request is refused, and the failure returned.
+    ///
+    /// # Errors
+    /// When shared memory is exhausted.
+    pub fn answer_snapshot<E>(
+        self,
+        write: impl FnOnce(&mut [u64]) -> Result<(), E>,
+    ) -> Result<Result<(), E>, ChannelError> {
+        let EnvironmentPort { spec, layout, .. } = self.port;
+        let mut words = vec![0; spec.snapshot_words(layout.environments)];
+        if let Err(error) = write(&mut words) {
+            self.refuse()?;
+            return Ok(Err(error));
+        }
+        let numbers = numbers_of(&words);
+        self.respond(numbers.len(), |payload| {
+            payload.copy_from_slice(numbers);
+            Verdict::Answered
+        })?;
+        Ok(Ok(()))
     }
 
     /// Answers that no episode is under way.
@@ -176,7 +204,7 @@ impl Request<'_> {
             discrete_actions: discrete(&spec.action),
             action_width: spec.action.width() as u32,
             time_limit: spec.time_limit,
-            reserved: 0,
+            state_width: spec.state_width as u32,
         };
         response
             .send()
