@@ -70,7 +70,6 @@ pub fn evaluate(domain: &Domain, settings: &Settings, stop: &Stop) -> Result<(),
 
 struct Evaluator<'a> {
     settings: &'a Settings,
-    domain: &'a Domain,
     stop: &'a Stop,
     bell: Bell,
     learner: Ringer,
@@ -86,7 +85,7 @@ struct Evaluator<'a> {
 }
 
 impl<'a> Evaluator<'a> {
-    fn new(domain: &'a Domain, settings: &'a Settings, stop: &'a Stop) -> Result<Self, Ended> {
+    fn new(domain: &Domain, settings: &'a Settings, stop: &'a Stop) -> Result<Self, Ended> {
         let range = ActionRange::new(&settings.spec.action)?;
         let observation = settings.spec.observation.width();
         let network = PolicyNetwork::new(observation, settings.hidden, range, settings.envs);
@@ -102,7 +101,6 @@ impl<'a> Evaluator<'a> {
         pulse.beat(Activity::WaitingForPeer);
         Ok(Self {
             settings,
-            domain,
             stop,
             learner: Ringer::new(domain, Place(Role::Learner, 0))?,
             client,
@@ -178,7 +176,6 @@ impl<'a> Evaluator<'a> {
     fn run_episodes(&mut self, first: u64) -> Result<Option<Vec<f64>>, Ended> {
         let Self {
             client,
-            domain,
             bell,
             policy,
             network,
@@ -187,12 +184,12 @@ impl<'a> Evaluator<'a> {
             ..
         } = self;
         let Some(policy) = policy.held() else { return Ok(None) };
-        let mut current = client.reset(domain, bell, Some(first))?;
+        let mut current = client.reset(bell, Some(first))?;
         let mut returns = vec![0.0; self.settings.envs];
         let mut under_way = vec![true; self.settings.envs];
         while under_way.contains(&true) {
             network.forward(policy.parameters(), current.observations(), actions);
-            match client.step(domain, bell, actions)? {
+            match client.step(bell, actions)? {
                 Stepped::Taken(next) => current = next,
                 Stepped::Lost => return Ok(None),
             }

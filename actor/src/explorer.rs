@@ -77,7 +77,6 @@ pub fn explore(domain: &Domain, settings: &Settings, stop: &Stop) -> Result<(), 
 
 struct Explorer<'a> {
     settings: &'a Settings,
-    domain: &'a Domain,
     stop: &'a Stop,
     bell: Bell,
     learner: Ringer,
@@ -98,7 +97,7 @@ struct Explorer<'a> {
 }
 
 impl<'a> Explorer<'a> {
-    fn new(domain: &'a Domain, settings: &'a Settings, stop: &'a Stop) -> Result<Self, Ended> {
+    fn new(domain: &Domain, settings: &'a Settings, stop: &'a Stop) -> Result<Self, Ended> {
         let Identity { index, incarnation, .. } = settings.identity;
         let row = RowLayout::new(settings.spec.observation.width(), settings.spec.action.width());
         let range = ActionRange::new(&settings.spec.action)?;
@@ -123,7 +122,6 @@ impl<'a> Explorer<'a> {
         let stream = stream(settings.seed, Purpose::Exploration, index.into(), stream_incarnation);
         Ok(Self {
             settings,
-            domain,
             stop,
             learner,
             client,
@@ -153,7 +151,7 @@ impl<'a> Explorer<'a> {
     }
 
     fn run_until_the_server_is_lost(&mut self) -> Result<(), Ended> {
-        let mut current = self.client.reset(self.domain, &self.bell, None)?;
+        let mut current = self.client.reset(&self.bell, None)?;
         for environment in 0..self.settings.envs {
             self.begin_episode(environment);
         }
@@ -163,7 +161,7 @@ impl<'a> Explorer<'a> {
                 self.chunk = Some(self.sender.begin()?);
             }
             self.act(&current);
-            match self.client.step(self.domain, &self.bell, &self.actions)? {
+            match self.client.step(&self.bell, &self.actions)? {
                 Stepped::Taken(next) => {
                     self.remember(&current, &next, version);
                     current = next;
@@ -350,7 +348,7 @@ pub(crate) fn connect(
     stop: &Stop,
 ) -> Result<EnvironmentClient, Ended> {
     let client = EnvironmentClient::open(domain, index, spec, envs, stop.clone())?;
-    let (served, served_envs) = client.describe(domain, bell)?;
+    let (served, served_envs) = client.describe(bell)?;
     if served != *spec || served_envs != envs {
         let served = format!("{served_envs} times {served:?}");
         let configured = format!("{envs} times {spec:?}");

@@ -249,7 +249,13 @@ impl Crew {
             }
         }
         let mut members = std::mem::take(&mut self.members);
-        members.retain(|member| member.process.is_some() || self.is_wanted(member));
+        members.retain(|member| {
+            let stays = member.process.is_some() || self.is_wanted(member);
+            if !stays {
+                self.log.note(&name(member.identity), "not needed any more");
+            }
+            stays
+        });
         self.members = members;
     }
 

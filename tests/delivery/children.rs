@@ -95,11 +95,22 @@ fn actor(domain: &Domain, replay: &std::path::Path, index: u32, incarnation: u64
             opened => break opened.unwrap(),
         }
     };
-    let mut sender = ChunkSender::open(domain, index, incarnation, 0, row_layout(), ROWS, WINDOW).unwrap();
+    let greeting = ChunkSender::open(domain, index, incarnation, row_layout(), ROWS, WINDOW).unwrap();
     say("ready");
     let mut slowest = Duration::ZERO;
     let stop = Stop::default();
-    for command in commands() {
+    let commands = commands();
+    // What it says counts from its own start.
+    let full = |waits: &Cell<bool>, sent: u64| {
+        if !waits.replace(true) {
+            say(&format!("full {sent}"));
+        }
+    };
+    let Ok(first) = commands.recv() else { return };
+    let waits = Cell::new(false);
+    let mut sender = greeting.wait(&commits, &bell, &stop, || full(&waits, 0)).unwrap();
+    let before = sender.sent();
+    for command in std::iter::once(first).chain(commands) {
         let (word, count) = words(&command);
         let most_in_flight = match word {
             "send" => u64::from(WINDOW) - 1,
@@ -114,24 +125,22 @@ fn actor(domain: &Domain, replay: &std::path::Path, index: u32, incarnation: u64
                 &stop,
                 || Ok((sender.in_flight(committed()) <= most_in_flight).then_some(())),
                 || {
-                    if !waits.replace(true) {
-                        say(&format!("full {}", sender.sent()));
-                    }
+                    full(&waits, sender.sent() - before);
                     sender.look_after()
                 },
             )
             .unwrap();
             if word == "send" {
                 let mut chunk = sender.begin().unwrap();
-                fill(&mut chunk, (index, incarnation, sender.sent() + 1));
-                let before = Instant::now();
+                fill(&mut chunk, (index, incarnation, sender.sent() + 1 - before));
+                let begun = Instant::now();
                 sender.send(chunk, 0).unwrap();
-                slowest = slowest.max(before.elapsed());
+                slowest = slowest.max(begun.elapsed());
                 learner.ring();
-                say(&format!("sending {}", sender.sent()));
+                say(&format!("sending {}", sender.sent() - before));
             }
         }
-        say(&format!("done {} {}", sender.sent(), slowest.as_micros()));
+        say(&format!("done {} {}", sender.sent() - before, slowest.as_micros()));
     }
 }
 

@@ -13,21 +13,19 @@ use crate::run::{Run, Watchdog};
 const ACTIONS: [f32; ENVS as usize] = [0.5; ENVS as usize];
 
 /// An actor's end of the conversation.
-struct Asker<'a> {
-    domain: &'a Domain,
+struct Asker {
     bell: Bell,
     client: EnvironmentClient,
     _watchdog: Watchdog,
 }
 
-impl<'a> Asker<'a> {
-    fn new(domain: &'a Domain) -> Self {
+impl Asker {
+    fn new(domain: &Domain) -> Self {
         let watchdog = Watchdog::new();
         let environments = pendulums();
         let bell = Bell::hang(domain, Place(Role::Actor, 0)).unwrap();
         let client = EnvironmentClient::open(domain, 0, environments.spec(), ENVS as usize, watchdog.stop.clone());
         Self {
-            domain,
             bell,
             client: client.unwrap(),
             _watchdog: watchdog,
@@ -35,15 +33,15 @@ impl<'a> Asker<'a> {
     }
 
     fn reset(&self) -> Observed {
-        self.client.reset(self.domain, &self.bell, None).expect("no hang")
+        self.client.reset(&self.bell, None).expect("no hang")
     }
 
     fn step(&self) -> Stepped {
-        self.client.step(self.domain, &self.bell, &ACTIONS).expect("no hang")
+        self.client.step(&self.bell, &ACTIONS).expect("no hang")
     }
 
     fn snapshot(&self) -> Snapshot {
-        self.client.snapshot(self.domain, &self.bell).expect("no hang")
+        self.client.snapshot(&self.bell).expect("no hang")
     }
 
     fn taken(&self) -> Vec<u64> {
@@ -54,7 +52,7 @@ impl<'a> Asker<'a> {
     }
 
     fn restore(&self, words: &[u64]) -> Result<Observed, Interruption> {
-        self.client.restore(self.domain, &self.bell, words)
+        self.client.restore(&self.bell, words)
     }
 
     /// All that comes of so many steps, as bits.

@@ -51,7 +51,6 @@ fn a_policy_stays_as_it_is_when_its_learner_is_killed_and_the_next_learners_foll
     let mut late = reader(&domain);
     reads(&mut late, 0, 7);
     learner.kill();
-    domain.clean();
     for reader in [&mut early, &mut late] {
         assert!(is(reader.latest().unwrap().unwrap(), 0, 7));
     }
@@ -77,7 +76,6 @@ fn a_policy_published_between_a_readers_looks_is_found_though_its_learner_died()
     reads(&mut reader, 0, 1);
     publishes(&mut learner, 2);
     learner.kill();
-    domain.clean();
     reads(&mut reader, 0, 2);
     for incarnation in 1..=4 {
         let mut learner = run.start(&format!("policy-publisher {incarnation}"));

@@ -7,8 +7,9 @@ use std::sync::mpsc::{self, Receiver, RecvTimeoutError};
 use std::time::Instant;
 
 use rustix::process::{Pid, Signal, kill_process};
+use shoal_common::channel::Domain;
 
-use crate::children::{DIRECTORY, ROLE, RUN};
+use crate::children::{DIRECTORY, MAX_ACTORS, ROLE, RUN};
 use crate::run::{DEADLINE, eventually};
 
 /// Begins a line that a child says, among those of its test harness.
@@ -20,6 +21,7 @@ pub(crate) struct Process {
     stdin: Option<ChildStdin>,
     lines: Receiver<String>,
     role: String,
+    run: String,
 }
 
 impl Process {
@@ -46,6 +48,7 @@ impl Process {
             child,
             lines,
             role: role.into(),
+            run: run.into(),
         }
     }
 
@@ -88,10 +91,13 @@ impl Process {
         kill_process(Pid::from_child(&self.child), signal).unwrap();
     }
 
-    /// `kill -9`, and waits until it is gone.
+    /// `kill -9`, waits until it is gone, and cleans up after it, as the launcher does.
     pub(crate) fn kill(&mut self) {
         self.child.kill().unwrap();
         self.child.wait().unwrap();
+        let launcher = Domain::join(&self.run, MAX_ACTORS).unwrap();
+        launcher.clean();
+        launcher.leave().unwrap();
     }
 
     /// Closes the child's standard input and waits until it has ended in good order.

@@ -73,8 +73,8 @@ fn times(config: &Config, domain: &Domain, server: &mut Peer, patience: &Patienc
         Err(Interruption::Stopped) => patience.check(),
         Err(Interruption::Channel(error)) => server.check().and(Err(error.into())),
     };
-    ask(&|| client.describe(domain, &bell).map(|_| ()))?;
-    ask(&|| client.reset(domain, &bell, None).map(|_| ()))?;
+    ask(&|| client.describe(&bell).map(|_| ()))?;
+    ask(&|| client.reset(&bell, None).map(|_| ()))?;
 
     let actions = vec![0.5; environments * config.spec.action.width()];
     let mut times = Vec::new();
@@ -82,7 +82,7 @@ fn times(config: &Config, domain: &Domain, server: &mut Peer, patience: &Patienc
     let (begun, mut looked) = (Instant::now(), Instant::now());
     loop {
         let before = Instant::now();
-        match client.step(domain, &bell, &actions) {
+        match client.step(&bell, &actions) {
             Ok(Stepped::Taken(_)) => {}
             Ok(Stepped::Lost) => {
                 server.check()?;

@@ -131,8 +131,8 @@ impl EnvironmentClient {
     ///
     /// # Errors
     /// When interrupted.
-    pub fn describe(&self, domain: &Domain, bell: &Bell) -> Result<(EnvironmentSpec, usize), Interruption> {
-        let response = self.insist(domain, bell, Ask::Describe, 0, &[])?;
+    pub fn describe(&self, bell: &Bell) -> Result<(EnvironmentSpec, usize), Interruption> {
+        let response = self.insist(bell, Ask::Describe, 0, &[])?;
         let header = response.user_header();
         let (observation, action) = (header.observation_width as usize, header.action_width as usize);
         let payload = response.payload();
@@ -171,10 +171,10 @@ impl EnvironmentClient {
     ///
     /// # Errors
     /// When interrupted.
-    pub fn reset(&self, domain: &Domain, bell: &Bell, evaluation: Option<u64>) -> Result<Observed, Interruption> {
+    pub fn reset(&self, bell: &Bell, evaluation: Option<u64>) -> Result<Observed, Interruption> {
         let response = match evaluation {
-            None => self.insist(domain, bell, Ask::Reset, 0, &[]),
-            Some(episode) => self.insist(domain, bell, Ask::ResetToEvaluation, episode, &[]),
+            None => self.insist(bell, Ask::Reset, 0, &[]),
+            Some(episode) => self.insist(bell, Ask::ResetToEvaluation, episode, &[]),
         }?;
         self.observed(response).map_err(Interruption::from)
     }
@@ -183,8 +183,8 @@ impl EnvironmentClient {
     ///
     /// # Errors
     /// When interrupted, or the server refuses the actions.
-    pub fn step(&self, domain: &Domain, bell: &Bell, actions: &[f32]) -> Result<Stepped, Interruption> {
-        match self.ask_within_episodes(domain, bell, Ask::Step, actions)? {
+    pub fn step(&self, bell: &Bell, actions: &[f32]) -> Result<Stepped, Interruption> {
+        match self.ask_within_episodes(bell, Ask::Step, actions)? {
             Some(response) => Ok(Stepped::Taken(self.observed(response)?)),
             None => Ok(Stepped::Lost),
         }
@@ -194,8 +194,8 @@ impl EnvironmentClient {
     ///
     /// # Errors
     /// When interrupted, or the server refuses: its environments cannot say their state, or run evaluation episodes.
-    pub fn snapshot(&self, domain: &Domain, bell: &Bell) -> Result<Snapshot, Interruption> {
-        let Some(response) = self.ask_within_episodes(domain, bell, Ask::Snapshot, &[])? else {
+    pub fn snapshot(&self, bell: &Bell) -> Result<Snapshot, Interruption> {
+        let Some(response) = self.ask_within_episodes(bell, Ask::Snapshot, &[])? else {
             return Ok(Snapshot::Lost);
         };
         let words = words_of(self.answered(&response)?);
@@ -210,12 +210,12 @@ impl EnvironmentClient {
     ///
     /// # Errors
     /// When interrupted, or the server refuses the words; it stays as it was then.
-    pub fn restore(&self, domain: &Domain, bell: &Bell, words: &[u64]) -> Result<Observed, Interruption> {
+    pub fn restore(&self, bell: &Bell, words: &[u64]) -> Result<Observed, Interruption> {
         if words.len() != self.snapshot_words {
             let cause = format!("{} words for a snapshot of {}", words.len(), self.snapshot_words);
             return Err(ChannelError::new(&self.channel, "restore", cause).into());
         }
-        let response = self.insist(domain, bell, Ask::Restore, 0, numbers_of(words))?;
+        let response = self.insist(bell, Ask::Restore, 0, numbers_of(words))?;
         self.observed(response).map_err(Interruption::from)
     }
 
@@ -243,30 +243,17 @@ impl EnvironmentClient {
     }
 
     /// Asks once: for requests about the episodes under way. `None` when the server that ran them is no more.
-    fn ask_within_episodes(
-        &self,
-        domain: &Domain,
-        bell: &Bell,
-        ask: Ask,
-        payload: &[f32],
-    ) -> Result<Option<Answer>, Interruption> {
+    fn ask_within_episodes(&self, bell: &Bell, ask: Ask, payload: &[f32]) -> Result<Option<Answer>, Interruption> {
         let pending = self.send(ask, 0, payload)?;
-        let answer = self.answer(domain, bell, &pending)?;
+        let answer = self.answer(bell, &pending)?;
         Ok(answer.filter(|response| response.user_header().verdict != Verdict::NotStarted as u32))
     }
 
     /// Asks until some server answers: for requests that may be asked twice.
-    fn insist(
-        &self,
-        domain: &Domain,
-        bell: &Bell,
-        ask: Ask,
-        episode: u64,
-        payload: &[f32],
-    ) -> Result<Answer, Interruption> {
+    fn insist(&self, bell: &Bell, ask: Ask, episode: u64, payload: &[f32]) -> Result<Answer, Interruption> {
         loop {
             let pending = self.send(ask, episode, payload)?;
-            if let Some(response) = self.answer(domain, bell, &pending)? {
+            if let Some(response) = self.answer(bell, &pending)? {
                 return Ok(response);
             }
         }
@@ -292,7 +279,7 @@ impl EnvironmentClient {
     }
 
     /// Waits for the answer; `None` when the server that was asked is no more.
-    fn answer(&self, domain: &Domain, bell: &Bell, pending: &Pending) -> Result<Option<Answer>, Interruption> {
+    fn answer(&self, bell: &Bell, pending: &Pending) -> Result<Option<Answer>, Interruption> {
         let lost = std::cell::Cell::new(false);
         let answer = wait_for(
             bell,
@@ -304,8 +291,7 @@ impl EnvironmentClient {
                 Err(cause) => Err(ChannelError::new(&self.channel, "hear the answer", cause)),
             },
             || {
-                // A dead server counts as connected until it is cleaned up.
-                domain.clean();
+                // A dead server counts as connected until the launcher has cleaned up after it.
                 lost.set(!pending.is_connected());
                 Ok(())
             },
