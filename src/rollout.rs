@@ -3,7 +3,7 @@
 use anyhow::{Context, ensure};
 use shoal_common::channel::environment::StepBlocks;
 use shoal_common::config::Config;
-use shoal_common::network::{ActionRange, PolicyNetwork};
+use shoal_common::network::{ActionRange, NetworkLayout, PolicyNetwork};
 use shoal_common::space::EnvironmentSpec;
 use shoal_env_server::vector::{Start, VectorEnvironment};
 
@@ -103,9 +103,9 @@ impl<'a> Rollout<'a> {
     }
 }
 
-/// The fingerprint that a policy file of this run must have.
-pub(crate) fn policy_fingerprint(config: &Config) -> anyhow::Result<u64> {
-    Ok(policy_of(config)?.layout().fingerprint())
+/// The network that a policy file of this run must be for.
+pub(crate) fn policy_layout(config: &Config) -> anyhow::Result<NetworkLayout> {
+    Ok(*policy_of(config)?.layout())
 }
 
 fn policy_of(config: &Config) -> anyhow::Result<PolicyNetwork> {
@@ -130,7 +130,7 @@ pub(crate) mod tests {
 
     /// A small configuration for tests, and a policy for it that always takes the action in the middle of its range.
     pub(crate) fn small(environment: &str) -> (Config, Vec<f32>) {
-        let text = format!("[run]\n[environment]\n{environment}\n[ddpg]\nhidden = [4, 3]\n");
+        let text = format!("[run]\nid = \"1a\"\n[environment]\n{environment}\n[ddpg]\nhidden = [4, 3]\n");
         let mut table: toml::Table = text.parse().unwrap();
         let mut parameters = table["environment"].as_table().unwrap().clone();
         let name = parameters.remove("name").unwrap();

@@ -94,7 +94,7 @@ impl<'a> Evaluator<'a> {
         let client = connect(domain, &bell, settings.server, &settings.spec, settings.envs, stop)?;
         let policy = PolicyReader::open(domain, network.layout().fingerprint(), network.layout().parameters())?;
         let best = if settings.best.exists() {
-            Some(PolicyFile::read(&settings.best, network.layout().fingerprint())?.return_mean)
+            Some(PolicyFile::read(&settings.best, network.layout())?.return_mean)
         } else {
             None
         };

@@ -284,7 +284,7 @@ mod tests {
         Config::from_table(text.parse().unwrap(), "test")
     }
 
-    const LEAST: &str = "[run]\n[spec]\ntime_limit = 200\nobservation.discrete.n = 16\naction.box = { low = [-2.0], high = [2.0] }\n\
+    const LEAST: &str = "[run]\nid = \"1a\"\n[spec]\ntime_limit = 200\nobservation.discrete.n = 16\naction.box = { low = [-2.0], high = [2.0] }\n\
         [environment]\nname = \"pendulum\"\n";
 
     #[test]

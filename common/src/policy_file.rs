@@ -4,6 +4,7 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 use crate::durable::{self, Kind, SealError};
+use crate::network::NetworkLayout;
 
 const KIND: Kind = Kind {
     magic: *b"SHOALPOL",
@@ -69,8 +70,8 @@ impl PolicyFile {
         })
     }
 
-    /// Reads the policy at `path`, which must be for a network of layout `fingerprint`.
-    pub fn read(path: &Path, fingerprint: u64) -> Result<Self, PolicyFileError> {
+    /// Reads the policy at `path`, which must be for a network of this layout and have all its parameters.
+    pub fn read(path: &Path, network: &NetworkLayout) -> Result<Self, PolicyFileError> {
         let refused = |reason| PolicyFileError::Refused {
             path: path.into(),
             reason,
@@ -82,11 +83,16 @@ impl PolicyFile {
             body => body.map_err(|error| refused(error.to_string()))?,
         };
         let policy = Self::parse(&body).ok_or_else(|| refused("its parts do not fit together".into()))?;
+        let (fingerprint, parameters) = (network.fingerprint(), network.parameters());
         if policy.fingerprint != fingerprint {
             return Err(refused(format!(
                 "it is for another network (fingerprint {:016x}, expected {fingerprint:016x})",
                 policy.fingerprint
             )));
+        }
+        if policy.parameters.len() != parameters {
+            let found = policy.parameters.len();
+            return Err(refused(format!("it has {found} parameters, its network {parameters}")));
         }
         Ok(policy)
     }
@@ -131,15 +137,19 @@ mod tests {
 
     use super::*;
 
+    fn network() -> NetworkLayout {
+        NetworkLayout::policy(1, [1, 1], 1)
+    }
+
     fn policy() -> PolicyFile {
         PolicyFile {
-            fingerprint: 7,
+            fingerprint: network().fingerprint(),
             version: 8,
             env_steps: 9,
             return_mean: -150.25,
             return_std: 94.5,
             episodes: 100,
-            parameters: vec![1.0, -2.5, 1e-40],
+            parameters: vec![1.0, -2.5, 1e-40, 0.0, -0.0, 4.0],
         }
     }
 
@@ -147,16 +157,19 @@ mod tests {
     fn a_policy_reads_back_as_written_and_a_better_one_replaces_it() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("best.policy");
-        assert!(matches!(PolicyFile::read(&path, 7), Err(PolicyFileError::Missing(_))));
+        assert!(matches!(
+            PolicyFile::read(&path, &network()),
+            Err(PolicyFileError::Missing(_))
+        ));
         policy().write(&path).unwrap();
-        assert_eq!(PolicyFile::read(&path, 7).unwrap(), policy());
+        assert_eq!(PolicyFile::read(&path, &network()).unwrap(), policy());
         let better = PolicyFile {
             version: 9,
-            parameters: vec![],
+            parameters: vec![2.0; 6],
             ..policy()
         };
         better.write(&path).unwrap();
-        assert_eq!(PolicyFile::read(&path, 7).unwrap(), better);
+        assert_eq!(PolicyFile::read(&path, &network()).unwrap(), better);
         assert_eq!(fs::metadata(&path).unwrap().permissions().mode() & 0o777, 0o600);
         assert_eq!(fs::read_dir(&directory).unwrap().count(), 1);
     }
@@ -167,7 +180,7 @@ mod tests {
         let path = directory.path().join("best.policy");
         policy().write(&path).unwrap();
         assert!(
-            PolicyFile::read(&path, 1)
+            PolicyFile::read(&path, &NetworkLayout::policy(2, [1, 1], 1))
                 .unwrap_err()
                 .to_string()
                 .contains("another network")
@@ -176,20 +189,26 @@ mod tests {
         for at in 0..whole.len() {
             fs::write(&path, &whole[..at]).unwrap();
             assert!(
-                matches!(PolicyFile::read(&path, 7), Err(PolicyFileError::Refused { .. })),
+                matches!(
+                    PolicyFile::read(&path, &network()),
+                    Err(PolicyFileError::Refused { .. })
+                ),
                 "cut to {at} bytes"
             );
             let mut damaged = whole.clone();
             damaged[at] ^= 4;
             fs::write(&path, damaged).unwrap();
             assert!(
-                matches!(PolicyFile::read(&path, 7), Err(PolicyFileError::Refused { .. })),
+                matches!(
+                    PolicyFile::read(&path, &network()),
+                    Err(PolicyFileError::Refused { .. })
+                ),
                 "byte {at}"
             );
         }
         durable::write_atomically(&path, |file| durable::seal(KIND, file, |body| body.write_all(&[0; 60]))).unwrap();
         assert!(
-            PolicyFile::read(&path, 0)
+            PolicyFile::read(&path, &network())
                 .unwrap_err()
                 .to_string()
                 .contains("do not fit together")
@@ -203,7 +222,7 @@ mod tests {
         policy().write(&path).unwrap();
         let failed = durable::write_atomically(&path, |_| Err(io::Error::other("disk full")));
         assert_eq!(failed.unwrap_err().to_string(), "disk full");
-        assert_eq!(PolicyFile::read(&path, 7).unwrap(), policy());
+        assert_eq!(PolicyFile::read(&path, &network()).unwrap(), policy());
         assert_eq!(fs::read_dir(&directory).unwrap().count(), 1);
     }
 }

@@ -113,6 +113,17 @@ pub struct Loaded {
     pub warnings: Vec<String>,
 }
 
+/// What `save` has just done to the directory; for tests that stop it there.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum SaveStep {
+    /// The new checkpoint is on the disk, under its temporary name.
+    Prepared,
+    /// `latest.ckpt` has become `previous.ckpt`, or was put aside.
+    Kept,
+    /// The new checkpoint is `latest.ckpt`.
+    Published,
+}
+
 /// The checkpoints of a run. One process at a time writes them.
 #[derive(Debug)]
 pub struct Checkpoints {
@@ -120,6 +131,7 @@ pub struct Checkpoints {
     fingerprint: u64,
     /// Whether `latest.ckpt` is there and whole; `None` before anybody has looked.
     latest_is_sound: Option<bool>,
+    hook: fn(SaveStep),
 }
 
 #[derive(Serialize, Deserialize)]
@@ -144,7 +156,13 @@ impl Checkpoints {
             directory: directory.into(),
             fingerprint,
             latest_is_sound: None,
+            hook: |_| (),
         }
+    }
+
+    /// Calls `hook` after each step of every later `save`. A seam for crash tests.
+    pub fn on_step(&mut self, hook: fn(SaveStep)) {
+        self.hook = hook;
     }
 
     /// Reads the newest checkpoint that is whole; `None` if there is none at all.
@@ -194,8 +212,12 @@ impl Checkpoints {
     /// Writes a checkpoint. When this returns it is on the disk, and a power loss leaves it or a later one.
     pub fn save(&mut self, counters: &Counters, sections: &[(&str, &[f32])]) -> Result<(), CheckpointError> {
         let prepared = self.prepare(counters, sections)?;
+        (self.hook)(SaveStep::Prepared);
         self.keep_latest()?;
-        self.publish(prepared)
+        (self.hook)(SaveStep::Kept);
+        self.publish(prepared)?;
+        (self.hook)(SaveStep::Published);
+        Ok(())
     }
 
     fn prepare(&self, counters: &Counters, sections: &[(&str, &[f32])]) -> Result<Prepared, CheckpointError> {
@@ -291,10 +313,22 @@ impl Checkpoints {
     }
 }
 
-/// Splits a body into its header and the numbers of each section; `None` unless it is used up exactly.
+/// More updates, rows and versions than any run will have, and far from overflowing when they are counted on.
+const LIMIT: u64 = 1 << 60;
+
+/// Splits a body into its header and the numbers of each section; `None` unless it is used up exactly and a run can have
+/// come so far.
 fn parse(body: &[u8]) -> Option<(Header, Vec<Vec<f32>>)> {
     let (header, read): (Header, usize) = bincode::serde::decode_from_slice(body, encoding()).ok()?;
     let (mut rest, odd) = body.get(read..)?.as_chunks::<{ size_of::<f32>() }>();
+    let Counters {
+        updates,
+        rows,
+        policy_version,
+    } = header.counters;
+    if updates.max(rows).max(policy_version) >= LIMIT {
+        return None;
+    }
     let mut sections = Vec::with_capacity(header.sections.len());
     for (_, length) in &header.sections {
         let (numbers, after) = rest.split_at_checked(usize::try_from(*length).ok()?)?;

@@ -28,12 +28,13 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Ended> {
         }
         learner.call_the_roll()?;
         let updates = learner.updates();
+        // A power loss may leave a replay of many rows without one that can be read: new ones have to come first.
         let drained = learner.intake.drain(&mut learner.replay, CHUNKS_AT_ONCE, |replay| {
-            ratio.is_behind(replay.head(), updates)
+            !replay.rows().is_empty() && ratio.is_behind(replay.head(), updates)
         })?;
         learner.rows = learner.replay.head();
 
-        if updates < ratio.allowed(learner.rows) {
+        if updates < ratio.allowed(learner.rows) && !learner.replay.rows().is_empty() {
             learner.update()?;
             if learner.updates().is_multiple_of(PUBLISH_EVERY) {
                 learner.publish()?;

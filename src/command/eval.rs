@@ -11,7 +11,7 @@ use shoal_common::policy_file::PolicyFile;
 use shoal_common::run_dir::RunDir;
 
 use crate::cli::EvalArgs;
-use crate::rollout::{Rollout, Trajectory, policy_fingerprint};
+use crate::rollout::{Rollout, Trajectory, policy_layout};
 
 /// Distance below which a vehicle has reached the goal, in m.
 const REACHED: f64 = 0.05;
@@ -33,7 +33,7 @@ impl WhichPolicy {
             Self::Best => run.best_policy(),
             Self::Last => run.last_policy(),
         };
-        Ok(PolicyFile::read(&path, policy_fingerprint(config)?)?)
+        Ok(PolicyFile::read(&path, &policy_layout(config)?)?)
     }
 }
 
@@ -180,7 +180,7 @@ mod tests {
         let missing = WhichPolicy::Best.read(&run, &config).unwrap_err().to_string();
         assert!(missing.contains("best.policy") && !missing.contains('\n'), "{missing}");
 
-        let fingerprint = policy_fingerprint(&config).unwrap();
+        let fingerprint = policy_layout(&config).unwrap().fingerprint();
         let policy = PolicyFile {
             fingerprint,
             version: 3,

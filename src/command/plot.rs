@@ -100,7 +100,7 @@ mod tests {
     use shoal_common::policy_file::PolicyFile;
 
     use super::*;
-    use crate::rollout::policy_fingerprint;
+    use crate::rollout::policy_layout;
     use crate::rollout::tests::small;
 
     fn files_of(environment: &str) -> Vec<String> {
@@ -109,7 +109,7 @@ mod tests {
         let (config, parameters) = small(environment);
         std::fs::write(run_dir.config_file(), config.to_toml().unwrap()).unwrap();
         std::fs::create_dir(run_dir.checkpoints()).unwrap();
-        let fingerprint = policy_fingerprint(&config).unwrap();
+        let fingerprint = policy_layout(&config).unwrap().fingerprint();
         let policy = PolicyFile {
             fingerprint,
             version: 1,

@@ -105,6 +105,8 @@ fn smooth(points: &[(f64, f64)], window: usize) -> Vec<(f64, f64)> {
 
 #[cfg(test)]
 mod tests {
+    use proptest::prelude::*;
+
     use super::*;
 
     fn evaluations(count: u64) -> Vec<Evaluation> {
@@ -152,5 +154,29 @@ mod tests {
         evaluations[3].return_mean = f64::NAN;
         learning_curve(&evaluations, &path).unwrap();
         assert!(!std::fs::read_to_string(path).unwrap().contains("NaN"));
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig { cases: 150, failure_persistence: None, ..ProptestConfig::default() })]
+
+        /// `evaluations.csv` may say anything.
+        #[test]
+        fn any_numbers_are_drawn(
+            numbers in prop::collection::vec((
+                prop_oneof![0..9_u64, any::<u64>()],
+                prop_oneof![
+                    any::<f64>(),
+                    prop::num::f64::ANY,
+                    prop::sample::select(vec![f64::MAX, f64::MIN, f64::INFINITY, f64::NAN, 5e-324, 0.0, 1e15, 1.0 + f64::EPSILON, 1.0]),
+                ],
+            ), 0..12),
+        ) {
+            let directory = tempfile::tempdir().unwrap();
+            let evaluations: Vec<_> = numbers
+                .into_iter()
+                .map(|(env_steps, return_mean)| Evaluation { env_steps, return_mean, ..Evaluation::default() })
+                .collect();
+            learning_curve(&evaluations, &directory.path().join("curve.svg")).unwrap();
+        }
     }
 }

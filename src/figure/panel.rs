@@ -34,7 +34,7 @@ pub(super) enum Look {
     Crosses,
 }
 
-/// Points that belong together. Those that are not finite are left out.
+/// Points that belong together. Those that are not finite, or beyond all measure, are left out.
 pub(super) struct Series<'a> {
     /// Its place in the legend; none where it is empty.
     pub(super) label: &'a str,
@@ -122,7 +122,7 @@ impl Panel<'_> {
                 .points
                 .iter()
                 .copied()
-                .filter(|(x, y)| x.is_finite() && y.is_finite());
+                .filter(|(x, y)| x.abs() <= LARGEST && y.abs() <= LARGEST);
             let line = stroke(series.color, series.opacity, series.width);
             match series.look {
                 Look::Line => chart.draw_series(LineSeries::new(finite, line))?,
@@ -195,17 +195,22 @@ impl Ticks {
     }
 }
 
-/// A range that holds all of `values` with a little room to both sides, whatever they are.
+/// What is larger belongs to no diagram: the numbers between its ticks could not be computed with.
+const LARGEST: f64 = 1e30;
+
+/// A range that holds all of `values` that can be drawn with a little room to both sides, whatever they are. It is never so
+/// narrow that its ticks would be the same number: then looking for the next one never ends.
 pub(super) fn range_of(values: impl Iterator<Item = f64>) -> Range<f64> {
-    let finite = values.filter(|value| value.is_finite());
-    let (low, high) = finite.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| {
+    let drawn = values.filter(|value| value.abs() <= LARGEST);
+    let (low, high) = drawn.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| {
         (low.min(v), high.max(v))
     });
     if low > high {
         return 0.0..1.0;
     }
     let room = if high > low {
-        0.05 * (high - low)
+        let magnitude = low.abs().max(high.abs()).max(1e-3);
+        (0.05 * (high - low)).max(1e-6 * magnitude)
     } else {
         (0.05 * high.abs()).max(0.5)
     };
@@ -236,9 +241,12 @@ mod tests {
             &[0.0, 0.0],
             &[-1600.0, -150.0],
             &[1e9, 1e9],
+            &[1.0, 1.0 + f64::EPSILON],
+            &[0.0, 5e-324],
+            &[-1e30, 1e30],
         ] {
             let range = range_of(values.iter().copied());
-            assert!(range.start < range.end, "{values:?}");
+            assert!(range.start + 1e-7 * range.end.abs() < range.end, "{values:?}");
             assert!(values.iter().all(|v| v.is_nan() || range.contains(v)), "{values:?}");
         }
     }

@@ -1,7 +1,7 @@
 //! All processes of a run: who is there, who is ready, who has to be started again, and who is given up.
 
 use std::os::unix::process::ExitStatusExt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitStatus;
 use std::time::{Duration, Instant};
 
@@ -50,14 +50,7 @@ pub(super) struct Crew {
 impl Crew {
     pub(super) fn new(config: &Config, run: &RunDir, log: Log) -> anyhow::Result<Self> {
         let counter = run.path().join("incarnations");
-        let started = match std::fs::read_to_string(&counter) {
-            Ok(text) => text
-                .trim()
-                .parse()
-                .with_context(|| format!("{} is damaged", counter.display()))?,
-            Err(error) if error.kind() == std::io::ErrorKind::NotFound => 0,
-            Err(error) => return Err(error).with_context(|| format!("cannot read {}", counter.display())),
-        };
+        let started = read_counter(&counter)?;
         let members = [
             (Role::Learner, 0),
             (Role::EnvServer, config.evaluation_server()),
@@ -325,10 +318,68 @@ impl Crew {
     }
 }
 
+/// Processes ever started in this run.
+fn read_counter(path: &Path) -> anyhow::Result<u64> {
+    /// More than any run starts, and far from overflowing when it is counted on.
+    const LIMIT: u64 = 1 << 60;
+    let text = match std::fs::read(path) {
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(0),
+        text => text.with_context(|| format!("cannot read {}", path.display()))?,
+    };
+    let number = std::str::from_utf8(&text)
+        .ok()
+        .and_then(|text| text.trim().parse().ok());
+    number.filter(|started| *started < LIMIT).with_context(|| {
+        format!(
+            "{} is damaged: write a number into it that is greater than every incarnation in the run's log",
+            path.display()
+        )
+    })
+}
+
 fn ending(status: ExitStatus) -> String {
     match (status.signal(), status.code()) {
         (Some(signal), _) => format!("killed by signal {signal}"),
         (_, Some(code)) => format!("ended with exit code {code}"),
         _ => "ended".into(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn counted(bytes: &[u8]) -> anyhow::Result<u64> {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("incarnations");
+        std::fs::write(&path, bytes).unwrap();
+        let counted = read_counter(&path);
+        assert_eq!(std::fs::read(path).unwrap(), bytes);
+        counted
+    }
+
+    proptest! {
+        #[test]
+        fn a_counter_is_a_number_that_can_be_counted_on_or_refused(
+            bytes in prop_oneof![
+                prop::collection::vec(any::<u8>(), 0..30),
+                "[ +-]?[0-9]{0,25}\n?".prop_map(String::into_bytes),
+                any::<u64>().prop_map(|n| n.to_string().into_bytes()),
+            ],
+        ) {
+            match counted(&bytes) {
+                Ok(started) => prop_assert!(started < 1 << 60),
+                Err(error) => prop_assert!(error.to_string().contains("incarnations is damaged"), "{}", error),
+            }
+        }
+    }
+
+    #[test]
+    fn a_counter_that_is_not_there_is_none() {
+        assert_eq!(read_counter(Path::new("/nowhere/incarnations")).unwrap(), 0);
+        assert_eq!(counted(b"17").unwrap(), 17);
+        assert!(counted(b"18446744073709551615").is_err() && counted(b"").is_err());
     }
 }

@@ -1,7 +1,7 @@
 //! A CSV file that grows by rows of one kind.
 
 use std::fs::{File, OpenOptions};
-use std::io::{self, BufRead, BufReader, Seek, SeekFrom};
+use std::io::{self, BufRead, BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
@@ -30,7 +30,8 @@ pub(super) struct Table {
 }
 
 impl Table {
-    /// Opens the table at `path`, a new one where there is none. A last line that a crash cut short is removed.
+    /// Opens the table at `path`, a new one where there is none. A last line that a crash cut short is removed; a file that
+    /// is no such table is left as it is.
     pub(super) fn open<Row: Serialize + Default>(path: &Path) -> Result<Self, RecordError> {
         let write = |cause| RecordError::Write {
             path: path.to_owned(),
@@ -44,20 +45,19 @@ impl Table {
             .open(path)
             .map_err(write)?;
         let (end, lines) = whole_lines(&file).map_err(write)?;
+        let expected = header_of::<Row>(path)?;
+        let found = first_line(&file, expected.len()).map_err(write)?;
+        if (end > 0 && found != expected) || !expected.starts_with(&found) {
+            let [found, expected] = [found, expected].map(|line| String::from_utf8_lossy(&line).trim_end().to_owned());
+            let reason = format!("its first line is {found:?}, not {expected:?}");
+            return Err(RecordError::Malformed {
+                path: path.to_owned(),
+                reason,
+            });
+        }
         file.set_len(end)
             .and_then(|()| file.seek(SeekFrom::End(0)))
             .map_err(write)?;
-        if end > 0 {
-            let found = headers(path)?;
-            let expected = header_of::<Row>(path)?;
-            if found != expected {
-                let reason = format!("its columns are {}, not {}", found.join(", "), expected.join(", "));
-                return Err(RecordError::Malformed {
-                    path: path.to_owned(),
-                    reason,
-                });
-            }
-        }
         Ok(Self::onto(path, file, lines))
     }
 
@@ -129,20 +129,23 @@ fn whole_lines(file: &File) -> io::Result<(u64, u64)> {
     }
 }
 
-fn headers(path: &Path) -> Result<Vec<String>, RecordError> {
-    let mut reader = csv::Reader::from_path(path).map_err(|error| malformed(path, &error))?;
-    let headers = reader.headers().map_err(|error| malformed(path, &error))?;
-    Ok(headers.iter().map(Into::into).collect())
+/// The first line with its end, or as much of it as shows that it is not `length` bytes long.
+fn first_line(mut file: &File, length: usize) -> io::Result<Vec<u8>> {
+    let mut line = Vec::new();
+    file.rewind()?;
+    BufReader::new(file.take(length as u64 + 1)).read_until(b'\n', &mut line)?;
+    Ok(line)
 }
 
-fn header_of<Row: Serialize + Default>(path: &Path) -> Result<Vec<String>, RecordError> {
+/// The line that a table of such rows begins with.
+fn header_of<Row: Serialize + Default>(path: &Path) -> Result<Vec<u8>, RecordError> {
     let mut writer = csv::Writer::from_writer(Vec::new());
     writer
         .serialize(Row::default())
         .map_err(|error| malformed(path, &error))?;
-    let text = writer.into_inner().unwrap_or_default();
-    let first = text.split(|byte| *byte == b'\n').next().unwrap_or_default();
-    Ok(String::from_utf8_lossy(first).split(',').map(Into::into).collect())
+    let mut text = writer.into_inner().unwrap_or_default();
+    text.truncate(text.iter().position(|byte| *byte == b'\n').map_or(0, |end| end + 1));
+    Ok(text)
 }
 
 fn record_error(path: &Path, error: csv::Error) -> RecordError {

@@ -1,5 +1,7 @@
 use std::io::Write;
 
+use proptest::prelude::*;
+
 use super::*;
 
 fn run() -> (tempfile::TempDir, RunDir) {
@@ -154,10 +156,25 @@ fn a_foreign_file_and_a_full_disk_are_errors_in_one_line() {
     std::fs::write(run.evaluations(), "a,b\n1,2\n").unwrap();
     let message = Recorder::open(&run, 0).unwrap_err().to_string();
     assert!(
-        message.contains("its columns are a, b, not wall_seconds") && !message.contains('\n'),
+        message.contains("its first line is \"a,b\", not \"wall_seconds,") && !message.contains('\n'),
         "{message}"
     );
     assert_eq!(text(&run.evaluations()), "a,b\n1,2\n", "left as it was");
+
+    // Without an end of line too: nothing of it is a line that was cut short.
+    for foreign in [
+        "a,b",
+        "a,b\n1,2",
+        "wall_seconds,env_steps,a",
+        "wall_seconds,env_steps\n1",
+    ] {
+        std::fs::write(run.evaluations(), foreign).unwrap();
+        assert!(Recorder::open(&run, 0).is_err(), "{foreign:?}");
+        assert_eq!(text(&run.evaluations()), foreign);
+    }
+    // But a header that was is.
+    std::fs::write(run.evaluations(), "wall_seconds,env_").unwrap();
+    Recorder::open(&run, 0).unwrap();
 
     let full = std::fs::OpenOptions::new().write(true).open("/dev/full").unwrap();
     let mut full = Table::onto(Path::new("/dev/full"), full, 0);
@@ -177,4 +194,43 @@ fn no_evaluations_yet_is_no_error() {
     assert_eq!(read_evaluations(&run.evaluations()).unwrap(), []);
     Recorder::open(&run, 0).unwrap();
     assert_eq!(read_evaluations(&run.evaluations()).unwrap(), []);
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 200, failure_persistence: None, ..ProptestConfig::default() })]
+
+    /// Rows come back or an error does, whatever is in the file; a file that is refused stays, of others at most the end of
+    /// the last line goes.
+    #[test]
+    fn any_file_is_continued_or_refused(
+        header in any::<bool>(),
+        lines in prop::collection::vec("[-0-9.,eENainf\"]{0,40}\n", 0..5),
+        numbers in prop::collection::vec((any::<f64>(), any::<u64>(), any::<f64>()), 0..5),
+        end in prop::collection::vec(any::<u8>(), 0..50),
+    ) {
+        let (_parent, run) = run();
+        let mut bytes = vec![];
+        if header {
+            bytes.extend(b"wall_seconds,env_steps,updates,policy_version,return_mean,return_std,episodes,best\n");
+        }
+        bytes.extend(lines.concat().bytes());
+        for (seconds, steps, mean) in numbers {
+            bytes.extend(format!("{seconds:e},{steps},1,1,{mean},0.0,10,1\n").bytes());
+        }
+        bytes.extend(&end);
+        std::fs::write(run.evaluations(), &bytes).unwrap();
+        if let Err(error) = read_evaluations(&run.evaluations()) {
+            prop_assert!(!error.to_string().contains('\n'), "{}", error);
+        }
+        prop_assert_eq!(&std::fs::read(run.evaluations()).unwrap(), &bytes);
+        let opened = Table::open::<Evaluation>(&run.evaluations());
+        let after = std::fs::read(run.evaluations()).unwrap();
+        match opened {
+            Ok(_) => {
+                let cut = bytes.strip_prefix(&after[..]);
+                prop_assert!(cut.is_some_and(|cut| !cut.contains(&b'\n')));
+            }
+            Err(_) => prop_assert_eq!(after, bytes),
+        }
+    }
 }

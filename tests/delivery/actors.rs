@@ -5,11 +5,13 @@ use std::time::Duration;
 use rustix::process::Signal;
 
 use crate::children::MAX_ACTORS;
-use crate::chunks::{WINDOW, all, committed};
+use crate::chunks::{ROWS, WINDOW, all, committed};
 use crate::process::Process;
 use crate::run::Run;
 
 const FULL: u64 = WINDOW as u64;
+/// More than the chunks that can be borrowed at a time, by far.
+const LIVES: u64 = 50;
 
 fn sends(actor: &mut Process, chunks: u64) {
     actor.told(&format!("send {chunks}"));
@@ -106,4 +108,72 @@ fn actors_killed_at_any_moment_lose_no_chunk_that_was_sent() {
     }
     expected.extend(all(0, 9, 1));
     assert_eq!(committed, expected);
+}
+
+/// Dies with a chunk that it had borrowed and filled in part, or not at all, or wholly.
+#[test]
+fn a_chunk_that_a_dead_actor_held_is_nobodys_and_its_memory_is_free_again() {
+    let run = Run::new();
+    let _domain = run.join();
+    let mut learner = run.start("learner 1");
+    learner.told("run");
+    let (mut expected, mut traces) = (Vec::new(), Vec::new());
+    for incarnation in 1..=LIVES {
+        let mut actor = run.start(&format!("actor 0 {incarnation}"));
+        let sent = incarnation % 3;
+        if sent > 0 {
+            sends(&mut actor, sent);
+        }
+        actor.told(&format!("hold {}", incarnation % (ROWS as u64 + 1)));
+        actor.says("holding");
+        actor.kill();
+        expected.extend(all(0, incarnation, sent));
+        traces.push(run.traces().len());
+    }
+    let mut last = run.start(&format!("actor 0 {}", LIVES + 1));
+    sends(&mut last, 3 * FULL);
+    finishes(&mut last);
+    learner.ends();
+    expected.extend(all(0, LIVES + 1, 3 * FULL));
+    assert_eq!(committed(&run.replay(), MAX_ACTORS), expected);
+    // The first lives fill what is kept for the learner.
+    assert!(
+        traces[LIVES as usize - 1] <= traces[9],
+        "files of the run after each life: {traces:?}"
+    );
+}
+
+#[test]
+fn an_actor_that_dies_with_a_full_window_and_a_chunk_in_hand_loses_only_that_chunk() {
+    let run = Run::new();
+    let _domain = run.join();
+    let mut learner = run.start("learner 1");
+    let (mut expected, mut traces) = (Vec::new(), Vec::new());
+    for incarnation in 1..=LIVES {
+        // It has borrowed and sent its first, empty chunk when it is ready, though nobody takes anything yet.
+        let mut actor = run.start(&format!("actor 0 {incarnation}"));
+        // What its predecessor left, and one of its own.
+        let left = if incarnation == 1 { 0 } else { FULL };
+        learner.told(&format!("take {}", left + 1));
+        sends(&mut actor, 1 + FULL);
+        learner.says("took");
+        let before = (incarnation - 1) * (1 + FULL);
+        assert_eq!(run.commits().committed(0).sequence, before + 1, "the window is full");
+        actor.told(&format!("hold {}", incarnation % (ROWS as u64 + 1)));
+        actor.says("holding");
+        actor.kill();
+        expected.extend(all(0, incarnation, 1 + FULL));
+        traces.push(run.traces().len());
+    }
+    let mut last = run.start(&format!("actor 0 {}", LIVES + 1));
+    learner.told("run");
+    sends(&mut last, 3 * FULL);
+    finishes(&mut last);
+    learner.ends();
+    expected.extend(all(0, LIVES + 1, 3 * FULL));
+    assert_eq!(committed(&run.replay(), MAX_ACTORS), expected);
+    assert!(
+        traces[LIVES as usize - 1] <= traces[9],
+        "files of the run after each life: {traces:?}"
+    );
 }

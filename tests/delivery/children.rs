@@ -85,7 +85,7 @@ fn stall(line: &str) -> ! {
 }
 
 /// Commands: `send N` chunks, saying `sending S` after each and `full S` when it first naps before a full window;
-/// `finish`, until all are committed.
+/// `hold N`, which fills N rows of a chunk and says `holding`, to be killed with it; `finish`, until all are committed.
 fn actor(domain: &Domain, replay: &std::path::Path, index: u32, incarnation: u64) {
     let bell = Bell::hang(domain, Place(Role::Actor, index)).unwrap();
     let learner = Ringer::new(domain, Place(Role::Learner, 0)).unwrap();
@@ -115,6 +115,15 @@ fn actor(domain: &Domain, replay: &std::path::Path, index: u32, incarnation: u64
         let most_in_flight = match word {
             "send" => u64::from(WINDOW) - 1,
             "finish" => 0,
+            "hold" => {
+                let mut chunk = sender.begin().unwrap();
+                fill(
+                    &mut chunk,
+                    (index, incarnation, sender.sent() + 1 - before),
+                    count as usize,
+                );
+                stall("holding");
+            }
             _ => panic!("no such command: {command}"),
         };
         for _ in 0..count.max(1) {
@@ -132,7 +141,7 @@ fn actor(domain: &Domain, replay: &std::path::Path, index: u32, incarnation: u64
             .unwrap();
             if word == "send" {
                 let mut chunk = sender.begin().unwrap();
-                fill(&mut chunk, (index, incarnation, sender.sent() + 1 - before));
+                fill(&mut chunk, (index, incarnation, sender.sent() + 1 - before), ROWS);
                 let begun = Instant::now();
                 sender.send(chunk, 0).unwrap();
                 slowest = slowest.max(begun.elapsed());

@@ -26,9 +26,9 @@ pub(crate) fn replay_layout(actors: u32) -> ReplayLayout {
     }
 }
 
-/// Fills a chunk.
-pub(crate) fn fill(chunk: &mut Chunk, (actor, incarnation, sequence): Id) {
-    for row in 0..ROWS {
+/// Fills the first rows of a chunk.
+pub(crate) fn fill(chunk: &mut Chunk, (actor, incarnation, sequence): Id, rows: usize) {
+    for row in 0..rows {
         let s = [actor as f32, incarnation as f32];
         let s_next = [row as f32, -1.0];
         let [a, r] = [sequence as f32, 0.5];

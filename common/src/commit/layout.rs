@@ -22,6 +22,10 @@ const BLOCK: usize = 4096;
 /// Words of the identity, its seal included.
 const IDENTITY_WORDS: usize = 9;
 
+/// More actors than any run has. A file that claims more, and is as long as it says, asks its reader for memory without
+/// end.
+const MOST_ACTORS: usize = 1 << 16;
+
 /// Slots that hold a commit record: two for what is committed (a record of generation g goes to slot g mod 2), then
 /// two for what is known to have reached the disk.
 pub const SLOTS: usize = 4;
@@ -78,9 +82,10 @@ pub enum IdentityFault {
 }
 
 impl ReplayLayout {
-    /// Where everything lies, or `None` if the ring or the actors are none or the file would be larger than a file can be.
+    /// Where everything lies, or `None` if the ring or the actors are none, the actors too many, or the file would be
+    /// larger than a file can be.
     pub fn places(&self) -> Option<Places> {
-        if self.ring == 0 || self.actors == 0 {
+        if self.ring == 0 || !(1..=MOST_ACTORS).contains(&self.actors) {
             return None;
         }
         let ring = usize::try_from(self.ring).ok()?;

@@ -116,8 +116,10 @@ impl Record {
         for (i, word) in record.words.iter_mut().enumerate() {
             *word = words.load(offset + (1 + i) * WORD);
         }
-        // The limit keeps sums of what a file says from overflowing.
-        let possible = record.tail() <= record.head() && record.head().max(record.generation()) < LIMIT;
+        // The limit keeps sums of what a file says from overflowing: all rows are some actor's.
+        let possible = record.tail() <= record.head()
+            && record.head().max(record.generation()) < LIMIT
+            && (0..actors).all(|actor| record.actor(actor).rows <= record.head());
         (words.load(offset) == record.seal() && possible).then_some(record)
     }
 

@@ -3,6 +3,11 @@
 use std::fmt::Display;
 
 use super::{Config, ConfigError};
+use crate::space::Space;
+
+/// Numbers in an observation or an action: many more than any environment has, and few enough that sizes computed from
+/// them stay far from overflowing.
+const WIDEST: usize = 4_096;
 
 impl Config {
     /// Whether every number is one that makes sense.
@@ -12,6 +17,7 @@ impl Config {
     pub fn check(&self) -> Result<(), ConfigError> {
         let Self {
             run,
+            spec,
             actors,
             exploration,
             ddpg,
@@ -20,8 +26,12 @@ impl Config {
             checkpoint,
             ..
         } = self;
+        named("run.id", &run.id)?;
         within("run.seed", run.seed, 0, i64::MAX as u64)?;
         within("run.steps", run.steps, 1, 1_000_000_000_000)?;
+        sized("spec.observation", &spec.observation)?;
+        sized("spec.action", &spec.action)?;
+        within("spec.time_limit", spec.time_limit, 1, 1_000_000)?;
         within("actors.max", actors.max, 1, 256)?;
         within("actors.count", actors.count, 1, actors.max)?;
         within("actors.envs", actors.envs, 1, 4_096)?;
@@ -57,4 +67,28 @@ fn within<T: PartialOrd + Display>(key: &'static str, value: T, low: T, high: T)
         value: value.to_string(),
         expected: format!("from {low} to {high}"),
     })
+}
+
+/// The id is part of file names, and what has those names is removed when the run ends: `..` would be everybody's.
+fn named(key: &'static str, id: &str) -> Result<(), ConfigError> {
+    if (1..=32).contains(&id.len()) && id.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'-') {
+        return Ok(());
+    }
+    Err(ConfigError::OutOfRange {
+        key,
+        value: format!("{id:?}"),
+        expected: "1 to 32 letters, digits and hyphens, as the program chose it".into(),
+    })
+}
+
+fn sized(key: &'static str, space: &Space) -> Result<(), ConfigError> {
+    let (value, expected) = match space {
+        Space::Discrete { n: 0 } => ("no index at all".into(), "one index or more".into()),
+        Space::Box { low, high } if low.len() != high.len() || !(1..=WIDEST).contains(&low.len()) => (
+            format!("{} lower and {} upper bounds", low.len(), high.len()),
+            format!("as many of each, from 1 to {WIDEST}"),
+        ),
+        _ => return Ok(()),
+    };
+    Err(ConfigError::OutOfRange { key, value, expected })
 }

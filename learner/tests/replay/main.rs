@@ -9,5 +9,6 @@
 mod chunks;
 mod crashes;
 mod file;
+mod hostile;
 mod model;
 mod processes;

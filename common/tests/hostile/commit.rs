@@ -1,0 +1,204 @@
+//! The header of the replay, as its readers see it.
+
+use std::fs::{self, File};
+use std::os::unix::fs::FileExt;
+use std::path::{Path, PathBuf};
+
+use proptest::prelude::*;
+use shoal_common::commit::{CommitReader, OpenError, Places, ReplayLayout};
+use shoal_common::transition::RowLayout;
+use tempfile::TempDir;
+
+use crate::bytes::{Damage, damage, extreme};
+
+const ACTORS: usize = 3;
+const WORDS: usize = 3 + 3 * ACTORS;
+
+fn layout() -> ReplayLayout {
+    ReplayLayout {
+        row: RowLayout::new(1, 1),
+        ring: 10,
+        actors: ACTORS,
+        fingerprint: 5,
+    }
+}
+
+fn places() -> Places {
+    layout().places().unwrap()
+}
+
+fn word(bytes: &mut [u8], at: usize, word: u64) {
+    bytes[at..at + 8].copy_from_slice(&word.to_le_bytes());
+}
+
+/// A slot with these words and the seal that fits them.
+fn sealed(bytes: &mut [u8], slot: usize, words: &[u64]) {
+    let record: Vec<u8> = words.iter().flat_map(|word| word.to_le_bytes()).collect();
+    word(bytes, slot, 1 << 32 | u64::from(crc32fast::hash(&record)));
+    bytes[slot + 8..][..record.len()].copy_from_slice(&record);
+}
+
+/// A replay of six rows, all of actor 0.
+fn file() -> Vec<u8> {
+    let mut bytes = vec![0; places().end];
+    for (i, of_identity) in layout().identity().into_iter().enumerate() {
+        word(&mut bytes, 8 * i, of_identity);
+    }
+    let mut words = [0; WORDS];
+    words[..6].copy_from_slice(&[2, 6, 0, 1, 3, 6]);
+    sealed(&mut bytes, places().slots[0], &words);
+    word(&mut bytes, places().selector, 2);
+    bytes
+}
+
+fn written(bytes: &[u8]) -> (TempDir, PathBuf) {
+    let directory = TempDir::new().unwrap();
+    let path = directory.path().join("replay.bin");
+    fs::write(&path, bytes).unwrap();
+    (directory, path)
+}
+
+/// Opens and asks everything.
+fn ask(path: &Path) -> Option<CommitReader> {
+    let before = fs::read(path).unwrap();
+    let reader = match CommitReader::open(path) {
+        Ok(reader) => Some(reader),
+        Err(OpenError::NotYet { .. } | OpenError::Refused { .. }) => None,
+        Err(error) => panic!("{error}"),
+    };
+    if let Some(reader) = &reader {
+        reader.rows();
+        for actor in 0..reader.layout().actors {
+            assert_eq!(reader.actor(actor).mark, reader.committed(actor));
+        }
+        let record = reader.snapshot().unwrap();
+        assert!(record.tail() <= record.head() && record.actors() == reader.layout().actors);
+    }
+    assert_eq!(fs::read(path).unwrap(), before);
+    reader
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 300, failure_persistence: None, ..ProptestConfig::default() })]
+
+    #[test]
+    fn a_damaged_header_is_read_or_refused(damage in prop::collection::vec(damage(), 1..4), in_use in any::<bool>()) {
+        let mut bytes = file();
+        for damage in damage {
+            match damage {
+                // Where it hurts.
+                Damage::Flip(at, bits) if in_use => {
+                    let slot = places().slots[0];
+                    let used: Vec<usize> = (0..72).chain(4096..4112).chain(slot..slot + 8 * (WORDS + 1)).collect();
+                    bytes[*at.get(&used)] ^= bits;
+                }
+                damage => damage.apply(&mut bytes),
+            }
+            if bytes.len() < places().end {
+                break;
+            }
+        }
+        let (_directory, path) = written(&bytes);
+        if let Some(reader) = ask(&path) {
+            prop_assert_eq!(reader.layout(), &layout());
+            prop_assert_eq!(reader.rows(), 6);
+        }
+    }
+
+    /// With seals that fit.
+    #[test]
+    fn records_that_lie_are_read_or_refused(
+        records in prop::array::uniform4(prop::collection::vec(extreme(), WORDS)),
+        selector in extreme(),
+        reach in extreme(),
+    ) {
+        let mut bytes = file();
+        for (slot, words) in places().slots.into_iter().zip(records) {
+            sealed(&mut bytes, slot, &words);
+        }
+        word(&mut bytes, places().selector, selector);
+        word(&mut bytes, places().reach, reach);
+        let (_directory, path) = written(&bytes);
+        ask(&path);
+    }
+
+    /// With a checksum that fits, in a file as long as the header says where a file can be.
+    #[test]
+    fn an_identity_that_lies_is_refused(
+        words in prop::array::uniform5(extreme()),
+        width in any::<bool>(),
+        sizes in any::<bool>(),
+    ) {
+        let [observation, action, row, ring, actors] = words;
+        let mut identity = layout().identity();
+        identity.truncate(8);
+        identity[2..7].copy_from_slice(&[observation, action, row, ring, actors]);
+        if width {
+            identity[4] = observation.wrapping_mul(2).wrapping_add(action).wrapping_add(3);
+        }
+        let bytes: Vec<u8> = identity.iter().flat_map(|word| word.to_le_bytes()).collect();
+        let (_directory, path) = written(&bytes);
+        let file = File::options().write(true).open(&path).unwrap();
+        file.write_all_at(&u64::from(crc32fast::hash(&bytes)).to_le_bytes(), 64).unwrap();
+        let claimed = ReplayLayout {
+            row: RowLayout::new(observation as u32 as usize, action as u32 as usize),
+            ring,
+            actors: actors as usize,
+            fingerprint: 5,
+        };
+        // Nothing is in it: the space is not used.
+        let length = claimed.places().map_or(1 << 20, |places| places.end as u64);
+        if file.set_len(if sizes { length } else { 1 << 20 }).is_ok() {
+            match CommitReader::open(&path) {
+                Err(OpenError::NotYet { .. } | OpenError::Refused { .. }) => {}
+                // A header larger than the memory there is to map it into.
+                Err(OpenError::Io { .. }) => prop_assert!(length > 1 << 40),
+                Ok(reader) => panic!("nothing was committed: {reader:?}"),
+            }
+        }
+    }
+}
+
+#[test]
+fn a_whole_file_is_read() {
+    let (_directory, path) = written(&file());
+    let reader = ask(&path).unwrap();
+    assert_eq!(
+        (reader.rows(), reader.actor(0).rows, reader.committed(0).sequence),
+        (6, 6, 3)
+    );
+}
+
+#[test]
+fn a_record_with_more_rows_of_an_actor_than_rows_is_damaged() {
+    let mut bytes = file();
+    let mut words = [0; WORDS];
+    words[..6].copy_from_slice(&[2, 6, 0, 1, 3, u64::MAX]);
+    sealed(&mut bytes, places().slots[0], &words);
+    let (_directory, path) = written(&bytes);
+    assert!(ask(&path).is_none());
+}
+
+#[test]
+fn a_file_for_more_actors_than_there_can_be_is_refused_and_not_read() {
+    let many = ReplayLayout {
+        actors: u32::MAX as usize,
+        ..layout()
+    };
+    let bytes: Vec<u8> = many.identity().iter().flat_map(|word| word.to_le_bytes()).collect();
+    let (_directory, path) = written(&bytes);
+    // As long as it would have to be: half a terabyte, none of which is there.
+    let slot = (u64::from(u32::MAX) * 3 + 4) * 8;
+    let length = 8192 + 4 * slot.next_multiple_of(4096) + 8192;
+    File::options()
+        .write(true)
+        .open(&path)
+        .unwrap()
+        .set_len(length)
+        .unwrap();
+    let error = CommitReader::open(&path).unwrap_err();
+    assert!(
+        matches!(error, OpenError::Refused { .. }) && error.to_string().contains("impossible size"),
+        "{error}"
+    );
+}

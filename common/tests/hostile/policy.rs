@@ -1,0 +1,114 @@
+//! Policy files.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use proptest::prelude::*;
+use shoal_common::durable::{self, Kind};
+use shoal_common::network::NetworkLayout;
+use shoal_common::policy_file::{PolicyFile, PolicyFileError};
+use tempfile::TempDir;
+
+use crate::bytes::{damage, extreme};
+
+fn network() -> NetworkLayout {
+    NetworkLayout::policy(2, [3, 2], 1)
+}
+
+fn policy() -> PolicyFile {
+    PolicyFile {
+        fingerprint: network().fingerprint(),
+        version: 8,
+        env_steps: 9,
+        return_mean: -150.25,
+        return_std: 94.5,
+        episodes: 100,
+        parameters: (0..network().parameters()).map(|i| i as f32).collect(),
+    }
+}
+
+fn directory() -> (TempDir, PathBuf) {
+    let directory = TempDir::new().unwrap();
+    let path = directory.path().join("best.policy");
+    (directory, path)
+}
+
+/// A whole policy, or refused; the file stays.
+fn read(path: &Path) -> Option<PolicyFile> {
+    let before = fs::read(path).unwrap();
+    let read = PolicyFile::read(path, &network());
+    assert_eq!(fs::read(path).unwrap(), before);
+    match read {
+        Ok(policy) => {
+            assert_eq!(policy.parameters.len(), network().parameters());
+            Some(policy)
+        }
+        Err(PolicyFileError::Refused { .. }) => None,
+        Err(error) => panic!("{error}"),
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 200, failure_persistence: None, ..ProptestConfig::default() })]
+
+    #[test]
+    fn any_bytes_are_refused(bytes in prop::collection::vec(any::<u8>(), 0..300)) {
+        let (_directory, path) = directory();
+        fs::write(&path, bytes).unwrap();
+        prop_assert_eq!(read(&path), None);
+    }
+
+    #[test]
+    fn a_damaged_policy_is_refused(damage in prop::collection::vec(damage(), 1..5)) {
+        let (_directory, path) = directory();
+        policy().write(&path).unwrap();
+        let whole = fs::read(&path).unwrap();
+        let mut bytes = whole.clone();
+        damage.into_iter().for_each(|damage| damage.apply(&mut bytes));
+        fs::write(&path, &bytes).unwrap();
+        prop_assert_eq!(read(&path), (bytes == whole).then(policy));
+    }
+
+    /// With a checksum that fits.
+    #[test]
+    fn a_body_that_lies_is_refused(
+        words in prop::array::uniform7(extreme()),
+        right_network in any::<bool>(),
+        right_count in any::<bool>(),
+        numbers in prop::collection::vec(any::<u8>(), 0..120),
+    ) {
+        const KIND: Kind = Kind { magic: *b"SHOALPOL", version: 1, name: "a policy file" };
+        let mut words = words;
+        if right_network {
+            words[0] = network().fingerprint();
+        }
+        if right_count {
+            words[6] = numbers.len() as u64 / 4;
+        }
+        let body: Vec<u8> = words.into_iter().flat_map(u64::to_le_bytes).chain(numbers.iter().copied()).collect();
+        let (_directory, path) = directory();
+        durable::write_atomically(&path, |file| {
+            durable::seal(KIND, file, |to| std::io::Write::write_all(to, &body))
+        }).unwrap();
+        let fits = words[0] == network().fingerprint() && words[6] == numbers.len() as u64 / 4;
+        let whole = fits && numbers.len() == 4 * network().parameters();
+        prop_assert_eq!(read(&path).is_some(), whole);
+    }
+}
+
+#[test]
+fn a_policy_of_the_right_network_without_its_parameters_is_refused() {
+    let (_directory, path) = directory();
+    for count in [0, 1, network().parameters() - 1, network().parameters() + 1] {
+        let policy = PolicyFile {
+            parameters: vec![0.5; count],
+            ..policy()
+        };
+        policy.write(&path).unwrap();
+        let line = PolicyFile::read(&path, &network()).unwrap_err().to_string();
+        assert!(
+            line.contains(&format!("it has {count} parameters")) && !line.contains('\n'),
+            "{line}"
+        );
+    }
+}
