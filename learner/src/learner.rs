@@ -119,6 +119,7 @@ impl<'a> Learner<'a> {
             row,
             ring: settings.ring_rows(),
             actors: settings.max_actors as usize,
+            standing_words: 0,
             fingerprint: settings.fingerprint,
         };
         let replay = if settings.replay.exists() {

@@ -22,6 +22,7 @@ pub(crate) fn replay_layout(actors: u32) -> ReplayLayout {
         row: row_layout(),
         ring: RING,
         actors: actors as usize,
+        standing_words: 0,
         fingerprint: 1,
     }
 }

@@ -12,7 +12,7 @@ compile_error!("the replay file and the checkpoints are written as they stand in
 /// "SHOALRPL", read as a number.
 const MAGIC: u64 = u64::from_le_bytes(*b"SHOALRPL");
 /// The format this build reads and writes. Raise it with every change of the layout or of a checksum.
-const VERSION: u64 = 1;
+const VERSION: u64 = 2;
 
 /// Bytes of a header word; every field of the header is one.
 const WORD: usize = size_of::<u64>();
@@ -20,11 +20,14 @@ const WORD: usize = size_of::<u64>();
 /// tears one leaves its neighbours whole.
 const BLOCK: usize = 4096;
 /// Words of the identity, its seal included.
-const IDENTITY_WORDS: usize = 9;
+const IDENTITY_WORDS: usize = 10;
 
 /// More actors than any run has. A file that claims more, and is as long as it says, asks its reader for memory without
 /// end.
 const MOST_ACTORS: usize = 1 << 16;
+
+/// More words than tell where any actor stands, for the same reason.
+const MOST_STANDING_WORDS: usize = 1 << 24;
 
 /// Slots that hold a commit record: two for what is committed (a record of generation g goes to slot g mod 2), then
 /// two for what is known to have reached the disk.
@@ -41,6 +44,8 @@ pub struct ReplayLayout {
     pub ring: u64,
     /// Actors there may ever be; their indices are `0 .. actors`.
     pub actors: usize,
+    /// Words that say where an actor stood after its last chunk; 0 where nobody asks.
+    pub standing_words: usize,
     /// Identifies the configuration the rows were collected under; the caller's to choose.
     pub fingerprint: u64,
 }
@@ -85,11 +90,11 @@ impl ReplayLayout {
     /// Where everything lies, or `None` if the ring or the actors are none, the actors too many, or the file would be
     /// larger than a file can be.
     pub fn places(&self) -> Option<Places> {
-        if self.ring == 0 || !(1..=MOST_ACTORS).contains(&self.actors) {
+        if self.ring == 0 || !(1..=MOST_ACTORS).contains(&self.actors) || self.standing_words > MOST_STANDING_WORDS {
             return None;
         }
         let ring = usize::try_from(self.ring).ok()?;
-        let slot = Record::words_of(self.actors)?
+        let slot = Record::words_of(self)?
             .checked_add(1)?
             .checked_mul(WORD)?
             .checked_next_multiple_of(BLOCK)?;
@@ -126,6 +131,7 @@ impl ReplayLayout {
             self.row.width() as u64,
             self.ring,
             self.actors as u64,
+            self.standing_words as u64,
             self.fingerprint,
         ];
         words.push(crc32fast::hash(bytemuck::cast_slice(&words)).into());
@@ -151,7 +157,8 @@ impl ReplayLayout {
             row: RowLayout::new(size(fields[2])?, size(fields[3])?),
             ring: fields[5],
             actors: size(fields[6])?,
-            fingerprint: fields[7],
+            standing_words: size(fields[7])?,
+            fingerprint: fields[8],
         };
         if fields[4] != layout.row.width() as u64 {
             return Err(IdentityFault::Size);
@@ -181,6 +188,14 @@ impl ReplayLayout {
         })
         .or_else(|| differs("its ring has", self.ring as usize, found.ring as usize, "rows"))
         .or_else(|| differs("it has room for", self.actors, found.actors, "actors"))
+        .or_else(|| {
+            differs(
+                "where an actor stands takes",
+                self.standing_words,
+                found.standing_words,
+                "words",
+            )
+        })
         .or_else(|| {
             (self.fingerprint != found.fingerprint).then(|| {
                 format!(

@@ -117,12 +117,12 @@ impl CommitReader {
             "actor {actor} of a replay for {}",
             self.layout.actors
         );
-        self.consistent(|slot| record::load_actor(&self.words, slot, actor))
+        self.consistent(|slot| record::load_actor(&self.words, slot, &self.layout, actor))
     }
 
     /// The whole record, all of one moment. `None` if it is damaged, which only the learner can repair.
     pub fn snapshot(&self) -> Option<Record> {
-        self.consistent(|slot| Record::load(&self.words, slot, self.layout.actors))
+        self.consistent(|slot| Record::load(&self.words, slot, &self.layout))
     }
 
     /// Reads from the published slot until no other record was published meanwhile. The writer touches a slot only

@@ -2,6 +2,7 @@
 
 use std::sync::atomic::{Ordering, fence};
 
+use super::layout::ReplayLayout;
 use super::words::{Words, WritableWords};
 
 /// Identifies a chunk of one actor. Ordered: a later incarnation comes after every chunk of the earlier ones.
@@ -27,8 +28,10 @@ pub struct ActorCommit {
 /// A commit record. Rows are numbered from 0 in the order they were committed, for the life of the file.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Record {
-    /// Exactly as in a slot: the four fields below, then three words an actor.
+    /// Exactly as in a slot: the three fields below, then for each actor three words and where it stood.
     words: Vec<u64>,
+    /// Words of an actor.
+    stride: usize,
 }
 
 const GENERATION: usize = 0;
@@ -44,15 +47,18 @@ const OPEN: u64 = 0;
 const LIMIT: u64 = 1 << 60;
 
 impl Record {
-    /// The record of an empty replay.
-    pub fn empty(actors: usize) -> Self {
+    /// The record of an empty replay of this layout, which is one that has `places`.
+    pub fn empty(layout: &ReplayLayout) -> Self {
+        let stride = ACTOR_WORDS + layout.standing_words;
         Self {
-            words: vec![0; ACTORS + ACTOR_WORDS * actors],
+            words: vec![0; ACTORS + stride * layout.actors],
+            stride,
         }
     }
 
-    pub(super) fn words_of(actors: usize) -> Option<usize> {
-        actors.checked_mul(ACTOR_WORDS)?.checked_add(ACTORS)
+    pub(super) fn words_of(layout: &ReplayLayout) -> Option<usize> {
+        let stride = layout.standing_words.checked_add(ACTOR_WORDS)?;
+        layout.actors.checked_mul(stride)?.checked_add(ACTORS)
     }
 
     /// Counts the records ever written: the greater one is the newer.
@@ -72,7 +78,7 @@ impl Record {
 
     /// Actors there is room for.
     pub fn actors(&self) -> usize {
-        (self.words.len() - ACTORS) / ACTOR_WORDS
+        (self.words.len() - ACTORS) / self.stride
     }
 
     /// What is committed of an actor.
@@ -80,7 +86,7 @@ impl Record {
     /// # Panics
     /// As indexing a slice does: `actor` must be less than `actors()`.
     pub fn actor(&self, actor: usize) -> ActorCommit {
-        actor_from(|i| self.words[ACTORS + ACTOR_WORDS * actor + i])
+        actor_from(|i| self.words[ACTORS + self.stride * actor + i])
     }
 
     /// Adds a chunk.
@@ -88,11 +94,27 @@ impl Record {
     /// # Panics
     /// As indexing a slice does: `actor` must be less than `actors()`.
     pub fn add(&mut self, actor: usize, mark: ChunkMark, rows: u64) {
-        let at = ACTORS + ACTOR_WORDS * actor;
+        let at = ACTORS + self.stride * actor;
         self.words[at] = mark.incarnation;
         self.words[at + 1] = mark.sequence;
         self.words[at + 2] += rows;
         self.words[HEAD] += rows;
+    }
+
+    /// Where an actor stood after its last chunk, in words of its own; zeros before the first.
+    ///
+    /// # Panics
+    /// As indexing a slice does: `actor` must be less than `actors()`.
+    pub fn standing(&self, actor: usize) -> &[u64] {
+        &self.words[ACTORS + self.stride * actor..][..self.stride][ACTOR_WORDS..]
+    }
+
+    /// Says where an actor stands.
+    ///
+    /// # Panics
+    /// As `copy_from_slice` does: the layout says how many words there are.
+    pub fn set_standing(&mut self, actor: usize, words: &[u64]) {
+        self.words[ACTORS + self.stride * actor..][..self.stride][ACTOR_WORDS..].copy_from_slice(words);
     }
 
     /// Makes it the record of another generation.
@@ -111,15 +133,15 @@ impl Record {
     }
 
     /// Reads the record of the slot at `offset`; `None` if it was not finished or is damaged.
-    pub fn load(words: &Words, offset: usize, actors: usize) -> Option<Self> {
-        let mut record = Self::empty(actors);
+    pub fn load(words: &Words, offset: usize, layout: &ReplayLayout) -> Option<Self> {
+        let mut record = Self::empty(layout);
         for (i, word) in record.words.iter_mut().enumerate() {
             *word = words.load(offset + (1 + i) * WORD);
         }
         // The limit keeps sums of what a file says from overflowing: all rows are some actor's.
         let possible = record.tail() <= record.head()
             && record.head().max(record.generation()) < LIMIT
-            && (0..actors).all(|actor| record.actor(actor).rows <= record.head());
+            && (0..layout.actors).all(|actor| record.actor(actor).rows <= record.head());
         (words.load(offset) == record.seal() && possible).then_some(record)
     }
 
@@ -151,8 +173,9 @@ pub(super) fn load_head(words: &Words, offset: usize) -> u64 {
 }
 
 /// What is committed of an actor, by the record in the slot at `offset`.
-pub(super) fn load_actor(words: &Words, offset: usize, actor: usize) -> ActorCommit {
-    actor_from(|i| words.load(offset + (1 + ACTORS + ACTOR_WORDS * actor + i) * WORD))
+pub(super) fn load_actor(words: &Words, offset: usize, layout: &ReplayLayout, actor: usize) -> ActorCommit {
+    let stride = ACTOR_WORDS + layout.standing_words;
+    actor_from(|i| words.load(offset + (1 + ACTORS + stride * actor + i) * WORD))
 }
 
 fn actor_from(word: impl Fn(usize) -> u64) -> ActorCommit {

@@ -99,6 +99,15 @@ impl<'a> Reserved<'a> {
 }
 
 impl Filled<'_> {
+    /// Says where the actor stands after the chunk, in as many words as the layout has; otherwise it stays as it was.
+    ///
+    /// # Panics
+    /// As `copy_from_slice` does when there are more or fewer.
+    pub fn standing(self, words: &[u64]) -> Self {
+        self.chunk.replay.record.set_standing(self.chunk.actor, words);
+        self
+    }
+
     /// Makes the chunk part of the replay.
     pub fn commit(self) {
         let Reserved { replay, actor, mark } = self.chunk;

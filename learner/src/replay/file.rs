@@ -46,7 +46,7 @@ pub(super) fn create(path: &Path, layout: &ReplayLayout) -> Result<(File, Places
     for (i, word) in layout.identity().into_iter().enumerate() {
         words.store(i * size_of::<u64>(), word);
     }
-    let mut record = Record::empty(layout.actors);
+    let mut record = Record::empty(layout);
     record.set_generation(1);
     // As committed, and as synced: whatever a power loss destroys later, this one is a state to fall back to.
     for slot in [1, SYNCED] {

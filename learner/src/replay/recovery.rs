@@ -52,7 +52,7 @@ impl Candidate<'_> {
 /// Chooses the newest record if all its rows are intact, but for those that were being replaced. Otherwise the one under which most of the synced rows are, and
 /// of those the one with most rows.
 pub(super) fn recover(words: &Words, places: &Places, layout: &ReplayLayout, ring: &Ring) -> Result<Found, String> {
-    let slots: [Option<Record>; SLOTS] = places.slots.map(|slot| Record::load(words, slot, layout.actors));
+    let slots: [Option<Record>; SLOTS] = places.slots.map(|slot| Record::load(words, slot, layout));
     let newest_of = |from: usize| {
         let records = slots
             .iter()

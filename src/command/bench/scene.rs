@@ -48,6 +48,7 @@ impl Scene {
             row: self.config.row_layout(),
             ring: self.config.replay.capacity,
             actors: self.config.actors.max as usize,
+            standing_words: 0,
             fingerprint: self.config.fingerprint(),
         }
     }
