@@ -22,6 +22,7 @@ use self::log::Log;
 use self::progress::Progress;
 pub(crate) use self::progress::thousands;
 use crate::recorder::Recorder;
+use crate::room;
 
 /// How often the launcher looks round.
 const ROUND: Duration = Duration::from_millis(50);
@@ -53,7 +54,9 @@ pub(crate) fn run(config: &Config, run: &RunDir, quiet: bool) -> anyhow::Result<
     let lock = run.lock()?;
     Domain::remove_abandoned()?;
     let domain = Domain::join(&config.run.id, config.actors.max)?;
-    let outcome = Launcher::new(config, run, &domain, signals, quiet, lock).and_then(Launcher::run);
+    let outcome = room::claim(config, run, &domain)
+        .and_then(|()| Launcher::new(config, run, &domain, signals, quiet, lock))
+        .and_then(Launcher::run);
     // Even where something failed: no role is left by now.
     let left = domain.leave();
     let outcome = outcome?;

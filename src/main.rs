@@ -8,6 +8,7 @@ mod plan;
 mod recorder;
 mod role;
 mod rollout;
+mod room;
 mod tensorboard;
 
 use std::io::Write;
@@ -21,6 +22,8 @@ use shoal_common::report::Role;
 use crate::cli::{Cli, Command};
 
 fn main() -> ExitCode {
+    // Whatever this program makes is for its user alone.
+    rustix::process::umask(rustix::fs::Mode::RWXG | rustix::fs::Mode::RWXO);
     // What goes wrong in shared memory is returned as an error and said once, by us.
     set_log_level(LogLevel::Fatal);
     // A file-size limit shall be an error of the write that meets it, not the end of the process.

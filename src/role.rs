@@ -118,7 +118,7 @@ fn evaluator_settings(config: &Config, run: &RunDir, identity: Identity) -> eval
     }
 }
 
-fn learner_settings(config: &Config, run: &RunDir, identity: Identity) -> learner::Settings {
+pub(crate) fn learner_settings(config: &Config, run: &RunDir, identity: Identity) -> learner::Settings {
     let ddpg = &config.ddpg;
     learner::Settings {
         identity,

@@ -68,17 +68,14 @@ impl Workplace {
 
     /// Starts a quick run in `name` and waits until every role is ready.
     pub(crate) fn start(&self, name: &str, arguments: &[&str]) -> Running {
+        self.start_as(name, &[arguments, &QUICK[..]].concat())
+    }
+
+    /// Starts a run in `name` with these arguments and no others, and waits until every role is ready.
+    pub(crate) fn start_as(&self, name: &str, arguments: &[&str]) -> Running {
         let stderr = std::fs::File::create(self.path().join("stderr")).unwrap();
         let child = self
-            .shoal(
-                &[
-                    &["train", "pendulum", "--run", name],
-                    arguments,
-                    &QUICK[..],
-                    &["--json"],
-                ]
-                .concat(),
-            )
+            .shoal(&[&["train", "pendulum", "--run", name], arguments, &["--json"]].concat())
             .stdout(Stdio::piped())
             .stderr(stderr)
             // A signal to the test runner's group is not for the run.
@@ -169,7 +166,7 @@ pub(crate) struct Leftovers {
 }
 
 impl Leftovers {
-    fn of(run: &Path) -> Self {
+    pub(crate) fn of(run: &Path) -> Self {
         let config = std::fs::read_to_string(run.join("config.toml")).unwrap();
         let table: toml::Table = config.parse().unwrap();
         let log = std::fs::read_to_string(run.join("shoal.log")).unwrap();
@@ -193,6 +190,11 @@ impl Leftovers {
             .collect()
     }
 
+    /// The run's name in shared memory.
+    pub(crate) fn run_id(&self) -> &str {
+        &self.run_id
+    }
+
     /// Waits until nothing is left.
     pub(crate) fn vanish(&self) {
         assert!(!self.pids.is_empty());
@@ -201,6 +203,15 @@ impl Leftovers {
             self.files().is_empty()
         });
     }
+}
+
+/// The one line that a failed command said.
+pub(crate) fn complaint(output: &Output) -> String {
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(!output.status.success(), "{said}");
+    assert!(output.stdout.is_empty());
+    assert_eq!(said.lines().count(), 1, "one line: {said}");
+    said
 }
 
 /// The last line of what was printed, as JSON.

@@ -2,9 +2,13 @@
 //! response what came of them; observations are read where the server wrote them.
 
 use iceoryx2::prelude::*;
+use iceoryx2::service::header::request_response::{
+    RequestHeader as IoxRequestHeader, ResponseHeader as IoxResponseHeader,
+};
 use iceoryx2::service::port_factory::request_response::PortFactory;
 
-use super::{ChannelError, Domain, service_name};
+use super::{ChannelError, Domain, memory, service_name};
+use crate::space::EnvironmentSpec;
 
 mod client;
 mod message;
@@ -13,6 +17,39 @@ mod port;
 pub use client::{EnvironmentClient, Observed, Stepped};
 pub use message::{Ask, RequestHeader, ResponseHeader, ResponseLayout, StepBlocks};
 pub use port::{EnvironmentPort, Request};
+
+/// Requests that may wait for their answers: one, and those that a killed server left unanswered.
+const ACTIVE_REQUESTS: usize = 4;
+const LOANED_REQUESTS: usize = 2;
+/// Answers of a request that may wait.
+const RESPONSE_BUFFER: usize = 2;
+/// Answers of a request in hand: the observation acted on is held until its transition is written.
+const BORROWED_RESPONSES: usize = 4;
+const LOANED_RESPONSES: usize = 2;
+/// Processes that may take part in one conversation.
+const NODES: usize = 8;
+
+/// Bytes of shared memory that the conversation with one server of so many such environments reserves.
+pub fn reserved(spec: &EnvironmentSpec, environments: usize) -> u64 {
+    // A client may have let go of as many requests as it may wait for, and the server still hold them.
+    let requests = 2 * ACTIVE_REQUESTS + LOANED_REQUESTS;
+    let of_a_request = RESPONSE_BUFFER + BORROWED_RESPONSES + LOANED_RESPONSES;
+    let responses = 2 * ACTIVE_REQUESTS * of_a_request;
+    let (question, answer) = (environments * spec.action.width(), answer_length(spec, environments));
+    memory::service(NODES)
+        + memory::segment::<IoxRequestHeader, RequestHeader>(requests, size_of::<f32>() * question)
+        + memory::segment::<IoxResponseHeader, ResponseHeader>(responses, size_of::<f32>() * answer)
+        + memory::connection(1, ACTIVE_REQUESTS, requests, requests)
+        + memory::connection(2 * ACTIVE_REQUESTS, RESPONSE_BUFFER, BORROWED_RESPONSES, responses)
+}
+
+/// The most numbers in a response: those of [`ResponseLayout`], or of a description.
+fn answer_length(spec: &EnvironmentSpec, environments: usize) -> usize {
+    let described = 2 * (spec.observation.width() + spec.action.width());
+    ResponseLayout::new(environments, spec.observation.width())
+        .len()
+        .max(described)
+}
 
 fn name(index: u32) -> String {
     format!("env/{index}")
@@ -30,12 +67,11 @@ fn service(domain: &Domain, channel: &str) -> Result<EnvironmentService, Channel
         .response_user_header::<ResponseHeader>()
         .max_clients(1)
         .max_servers(1)
-        .max_nodes(8)
-        .max_active_requests_per_client(4)
-        .max_loaned_requests(2)
-        .max_response_buffer_size(2)
-        // The observation acted on is held until its transition is written.
-        .max_borrowed_responses_per_pending_response(4)
+        .max_nodes(NODES)
+        .max_active_requests_per_client(ACTIVE_REQUESTS)
+        .max_loaned_requests(LOANED_REQUESTS)
+        .max_response_buffer_size(RESPONSE_BUFFER)
+        .max_borrowed_responses_per_pending_response(BORROWED_RESPONSES)
         .open_or_create()
         .map_err(|cause| ChannelError::new(channel, "open", cause))
 }

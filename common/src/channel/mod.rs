@@ -9,6 +9,7 @@ use iceoryx2::prelude::*;
 mod bell;
 mod domain;
 pub mod environment;
+mod memory;
 pub mod policy;
 mod pulse;
 pub mod reports;
@@ -16,6 +17,7 @@ pub mod transitions;
 
 pub use bell::{Bell, Place, Ringer, wait_for};
 pub use domain::{Domain, DomainError};
+pub use memory::free_shared_memory;
 pub use pulse::Pulse;
 
 /// A channel does not work: its service or port cannot be had, or memory is exhausted.

@@ -13,11 +13,21 @@ use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::*;
 use iceoryx2::sample::Sample;
 use iceoryx2::sample_mut::SampleMut;
+use iceoryx2::service::header::publish_subscribe::Header;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 
-use super::{ChannelError, Domain, claim, service_name};
+use super::{ChannelError, Domain, claim, memory, service_name};
 use crate::commit::ChunkMark;
 use crate::transition::{RowLayout, Transition};
+
+/// Chunks the learner has in hand.
+const BORROWED: usize = 2;
+
+/// Chunks an actor has in hand.
+const LOANED: usize = 2;
+
+/// Processes that may take part in one flow.
+const NODES: usize = 8;
 
 /// What a chunk's receiver knows of it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ZeroCopySend)]
@@ -91,7 +101,7 @@ impl ChunkSender {
             service(domain, &channel, window)?
                 .publisher_builder()
                 .initial_max_slice_len(rows * layout.width())
-                .max_loaned_samples(2)
+                .max_loaned_samples(LOANED)
                 .create()
                 .map_err(|cause| ChannelError::new(&channel, "send", cause))
         })?;
@@ -267,6 +277,14 @@ impl ReceivedChunk {
     }
 }
 
+/// Bytes of shared memory that one actor's chunks reserve, with so many rows each and such a window.
+pub fn reserved(layout: RowLayout, rows: usize, window: u32) -> u64 {
+    let chunks = buffer(window) + BORROWED + window as usize + LOANED;
+    memory::service(NODES)
+        + memory::segment::<Header, ChunkHeader>(chunks, size_of::<f32>() * rows * layout.width())
+        + memory::connection(1, buffer(window), BORROWED, chunks)
+}
+
 fn name(actor: u32) -> String {
     format!("transitions/{actor}")
 }
@@ -285,11 +303,11 @@ fn service(domain: &Domain, channel: &str, window: u32) -> Result<ChunkService, 
         .user_header::<ChunkHeader>()
         .max_publishers(1)
         .max_subscribers(1)
-        .max_nodes(8)
+        .max_nodes(NODES)
         .enable_safe_overflow(false)
         .history_size(window as usize)
         .subscriber_max_buffer_size(buffer(window))
-        .subscriber_max_borrowed_samples(2)
+        .subscriber_max_borrowed_samples(BORROWED)
         .open_or_create()
         .map_err(|cause| ChannelError::new(channel, "open", cause))
 }

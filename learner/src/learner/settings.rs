@@ -4,15 +4,17 @@ use std::path::PathBuf;
 
 use shoal_common::channel::ChannelError;
 use shoal_common::config::{self, Mode};
+use shoal_common::network::NetworkLayout;
 use shoal_common::policy_file::PolicyFileError;
 use shoal_common::report::Identity;
 use shoal_common::space::EnvironmentSpec;
+use shoal_common::transition::RowLayout;
 
 use crate::checkpoint::{CheckpointError, SectionError};
-use crate::ddpg::{DdpgError, DdpgSettings};
+use crate::ddpg::{DdpgError, DdpgSettings, DdpgState};
 use crate::intake::IntakeError;
 use crate::ratio::Ratio;
-use crate::replay::ReplayError;
+use crate::replay::{ReplayError, ReplayLayout};
 
 /// What a learner is told.
 #[derive(Clone, Debug)]
@@ -96,9 +98,37 @@ pub enum LearnerError {
 }
 
 impl Settings {
+    /// Bytes that the learner's files need on the disk beyond what is there already; `None` where a replay so large is not
+    /// possible.
+    pub fn disk_bytes(&self) -> Option<u64> {
+        let replay = if self.replay.exists() {
+            0
+        } else {
+            self.replay_layout().places()?.end as u64
+        };
+        let (observation, action) = (self.spec.observation.width(), self.spec.action.width());
+        let actor = NetworkLayout::policy(observation, self.ddpg.hidden, action).parameters();
+        let critic = NetworkLayout::critic(observation, self.ddpg.hidden, action).parameters();
+        // Half of a checkpoint's parts are an actor's, half a critic's.
+        let checkpoint = DdpgState::PARTS.len() / 2 * (actor + critic);
+        // The latest, the one before it, and the next one while it is written; the best policy and the last likewise.
+        let numbers = 3 * checkpoint + 3 * actor;
+        Some(replay + (size_of::<f32>() * numbers) as u64)
+    }
+
+    /// What the replay of this run holds.
+    pub(super) fn replay_layout(&self) -> ReplayLayout {
+        ReplayLayout {
+            row: RowLayout::new(self.spec.observation.width(), self.spec.action.width()),
+            ring: self.ring_rows(),
+            actors: self.max_actors as usize,
+            fingerprint: self.fingerprint,
+        }
+    }
+
     /// Rows the ring holds: the sampling window, and in lockstep the rows of two checkpoint intervals beyond it, because
     /// a learner that goes on from a checkpoint samples them again.
-    pub(super) fn ring_rows(&self) -> u64 {
+    fn ring_rows(&self) -> u64 {
         let slack = match self.mode {
             Mode::Free => 0,
             Mode::Lockstep => {

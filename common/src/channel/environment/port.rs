@@ -5,7 +5,7 @@ use iceoryx2::port::server::Server;
 use iceoryx2::prelude::*;
 
 use super::message::{Ask, RequestHeader, ResponseHeader, ResponseLayout, StepBlocks, Verdict};
-use super::{name, service};
+use super::{LOANED_RESPONSES, answer_length, name, service};
 use crate::channel::{Bell, ChannelError, Domain, Interruption, Place, Ringer, claim, wait_for};
 use crate::report::Role;
 use crate::space::{EnvironmentSpec, Space};
@@ -43,11 +43,12 @@ impl EnvironmentPort {
     ) -> Result<Self, ChannelError> {
         let channel = name(index);
         let layout = ResponseLayout::new(environments, spec.observation.width());
-        let described = 2 * (spec.observation.width() + spec.action.width());
+        let longest = answer_length(&spec, environments);
         let server = claim(domain, &channel, "answer", || {
             service(domain, &channel)?
                 .server_builder()
-                .initial_max_slice_len(layout.len().max(described))
+                .initial_max_slice_len(longest)
+                .max_loaned_responses_per_request(LOANED_RESPONSES)
                 .create()
                 .map_err(|cause| ChannelError::new(&channel, "answer", cause))
         })?;
