@@ -2,6 +2,7 @@
 //! mounted in a namespace of their own; where the machine allows none, those tests say so and show nothing.
 
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
+#![allow(clippy::print_stderr, reason = "a test that could not be done says so")]
 
 mod support;
 
@@ -100,6 +101,8 @@ fn what_a_run_reserves_is_at_most_what_was_computed_and_at_least_half_of_it() {
     ] {
         let place = Workplace::new();
         let running = place.start_as("run", &[&QUICK[..], &ENDLESS, arguments].concat());
+        // A role opens its last channels after it has said that it is ready.
+        until("everybody is at work", || running.learned("updates") > 0);
         let (promise, files): (Vec<_>, Vec<_>) = files_of(&running)
             .into_iter()
             .partition(|path| path.to_string_lossy().ends_with("_promise"));
@@ -171,7 +174,7 @@ fn a_full_disk_is_said_before_anything_is_made() {
     };
     let said = complaint(&output);
     assert!(
-        said.contains("of disk and") && said.contains("/small has 8.0 MiB"),
+        said.contains("of disk and") && said.contains("small has 8.0 MiB"),
         "{said}"
     );
 }
@@ -276,6 +279,7 @@ fn two_users_do_not_touch_each_other() {
     }
     let (place, other) = (Workplace::new(), Workplace::new());
     let running = place.start("run", &ENDLESS);
+    until("everybody is at work", || running.learned("updates") > 0);
     let state = || {
         let mut files: Vec<_> = files_of(&running)
             .into_iter()

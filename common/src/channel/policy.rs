@@ -204,3 +204,42 @@ fn service(domain: &Domain) -> Result<PortFactory<ipc::Service, [f32], PolicyHea
         .open_or_create()
         .map_err(|cause| ChannelError::new(CHANNEL, "open", cause))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn there_is_room_for_the_next_policy_while_every_reader_holds_two_that_nobody_else_holds() {
+        const MAX_ACTORS: u32 = 3;
+        let run_id = format!("{:x}", std::process::id());
+        let domain = Domain::join(&run_id, MAX_ACTORS).unwrap();
+        let publisher = PolicyPublisher::open(&domain, 100).unwrap();
+        let readers: Vec<_> = (0..readers(MAX_ACTORS as usize))
+            .map(|_| PolicyReader::open(&domain, 0, 100).unwrap().subscriber)
+            .collect();
+        let publish = |version| {
+            let header = PolicyHeader {
+                version,
+                ..PolicyHeader::default()
+            };
+            publisher.publish(&[version as f32; 100], header).unwrap();
+        };
+        let mut held = Vec::new();
+        let mut version = 0;
+        for reader in readers.iter().flat_map(|reader| [reader; BORROWED]) {
+            version += 1;
+            publish(version);
+            held.push((version, reader.receive().unwrap().unwrap()));
+        }
+        for further in 1..10 {
+            publish(version + further);
+        }
+        for (version, sample) in &held {
+            assert_eq!(sample.user_header().version, *version);
+            assert_eq!(sample.payload(), [*version as f32; 100]);
+        }
+        drop((held, readers, publisher));
+        domain.leave().unwrap();
+    }
+}
