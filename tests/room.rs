@@ -149,7 +149,7 @@ fn what_another_run_was_promised_is_not_free() {
     let place = Workplace::new();
     let script = "mount -t tmpfs -o size=64m tmpfs /dev/shm
         $SHOAL train pendulum --steps 100000000 --run first --quiet & first=$!
-        until ls /dev/shm | grep -q promise; do sleep 0.05; done
+        timeout 60 sh -c 'until ls /dev/shm | grep -q promise; do sleep 0.05; done'
         $SHOAL train pendulum --steps 100 --run second --json || code=$?
         kill $first; wait $first || true
         exit $code";
@@ -185,8 +185,9 @@ fn a_disk_that_fills_up_ends_the_run_with_one_line() {
     fs::create_dir(place.path().join("small")).unwrap();
     let script = "mount -t tmpfs -o size=32m tmpfs small
         $SHOAL train pendulum --steps 100000000 --run small/run $QUICK --json & run=$!
-        until test -s small/run/checkpoints/latest.ckpt; do sleep 0.05; done
+        timeout 60 sh -c 'until test -s small/run/checkpoints/latest.ckpt; do sleep 0.05; done'
         cat /dev/zero > small/filler 2>/dev/null || true
+        timeout 60 tail --pid=$run -f /dev/null
         wait $run";
     let Some(output) = in_namespace(&place, script) else {
         return;
