@@ -45,16 +45,15 @@ fn check_shared_memory(config: &Config) -> anyhow::Result<()> {
         needs::shared_memory(&smaller) <= free
     });
     let advice = match fits {
-        Some(max) => format!("it would do for {max} (actors.max = {max}); or"),
-        None => "choose smaller networks (ddpg.hidden) or chunks (actors.chunk_steps),".into(),
+        Some(max) => format!("lay it out for at most {max} (--set actors.max={max})"),
+        None => "choose smaller networks (ddpg.hidden) or chunks (actors.chunk_steps)".into(),
     };
     bail!(
-        "the run needs {} of /dev/shm for up to {} actors, and {} are free: {advice} end other runs or make it larger \
-         (mount -o remount,size={}m /dev/shm; docker run --shm-size)",
+        "the run needs {} of /dev/shm for up to {} actors, and {} are free: {advice}, end other runs, or make it larger \
+         (mount -o remount,size=… /dev/shm, or docker run --shm-size=…)",
         mebibytes(need),
         config.actors.max,
-        mebibytes(free),
-        need.next_multiple_of(64 << 20) >> 20
+        mebibytes(free)
     );
 }
 

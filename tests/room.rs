@@ -138,7 +138,7 @@ fn the_default_run_fits_into_a_container_and_one_of_64_actors_is_refused_there()
     );
     let said = complaint(&refused.unwrap());
     assert!(
-        said.contains("MiB of /dev/shm for up to 64 actors, and 64.0 MiB are free: it would do for "),
+        said.contains("MiB of /dev/shm for up to 64 actors, and 64.0 MiB are free: lay it out for at most "),
         "{said}"
     );
     assert!(!place.path().join("large").exists(), "nothing was made");
