@@ -103,10 +103,9 @@ fn what_a_run_reserves_is_at_most_what_was_computed_and_at_least_half_of_it() {
         let running = place.start_as("run", &[&QUICK[..], &ENDLESS, arguments].concat());
         // A role opens its last channels after it has said that it is ready.
         until("everybody is at work", || running.learned("updates") > 0);
-        let (promise, files): (Vec<_>, Vec<_>) = files_of(&running)
-            .into_iter()
-            .partition(|path| path.to_string_lossy().ends_with("_promise"));
-        let computed = fs::metadata(&promise[0]).unwrap().len();
+        let files = files_of(&running);
+        let promised = |path: &PathBuf| path.to_str()?.split_once("_promise_")?.1.parse().ok();
+        let computed: u64 = files.iter().find_map(promised).unwrap();
         let reserved: u64 = files
             .iter()
             .map(|path| fs::metadata(path).unwrap().len().next_multiple_of(PAGE))

@@ -3,7 +3,7 @@
 //! iceoryx2 makes its files at their full size and sparse: a page is taken when it is first written. So a file system
 //! that is full is a SIGBUS at some later write and no error, and what counts is what is reserved, not what is taken.
 
-use std::fs::{File, Metadata, OpenOptions};
+use std::fs::{Metadata, OpenOptions};
 use std::io;
 use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::Path;
@@ -22,8 +22,9 @@ const CHANNEL: usize = 256;
 const SERVICE: usize = 768;
 const PARTY: usize = 96;
 
-/// Name, after the run's prefix, of the file whose length says how much the run was promised. It takes no memory.
-const PROMISE: &str = "promise";
+/// An empty file says how much the run was promised: its name is the run's prefix, this, and the number of bytes. (Not its
+/// length: that may be limited.)
+const PROMISE: &str = "promise_";
 
 /// Bytes of a port's data: so many chunks with headers `H` and `U` and a payload of so many bytes.
 pub(super) fn segment<H, U>(chunks: usize, payload: usize) -> u64 {
@@ -64,15 +65,15 @@ pub fn free_shared_memory(run_id: &str) -> io::Result<Option<u64>> {
 
 /// Notes that the run may take so many bytes. The note goes with the run's other files.
 pub(super) fn promise(run_id: &str, bytes: u64) -> io::Result<()> {
-    let path = Path::new(SHARED_MEMORY).join(prefix(run_id) + PROMISE);
+    let path = Path::new(SHARED_MEMORY).join(format!("{}{PROMISE}{bytes}", prefix(run_id)));
     let mut options = OpenOptions::new();
-    let file: File = options
+    options
         .write(true)
         .create(true)
         .truncate(false)
         .mode(0o600)
         .open(path)?;
-    file.set_len(bytes)
+    Ok(())
 }
 
 /// What this user's other runs were promised and have not taken.
@@ -84,12 +85,13 @@ fn promised_to_others(run_id: &str) -> io::Result<u64> {
         .filter_map(|entry| Some((entry.file_name().into_string().ok()?, entry.metadata().ok()?)))
         .filter(|(_, metadata)| metadata.uid() == user)
         .collect();
-    let outstanding = |(name, promise): &(String, Metadata)| {
-        let run = name.strip_suffix(PROMISE)?;
+    let outstanding = |(name, _): &(String, Metadata)| {
+        let (run, promised) = name.split_once(PROMISE)?;
+        let promised: u64 = promised.parse().ok()?;
         let others = run.starts_with("shoal_") && run != prefix(run_id);
         let taken = files.iter().filter(|(name, _)| name.starts_with(run));
         let taken: u64 = taken.map(|(_, file)| 512 * file.blocks()).sum();
-        others.then(|| promise.len().saturating_sub(taken))
+        others.then(|| promised.saturating_sub(taken))
     };
     Ok(files.iter().filter_map(outstanding).sum())
 }
