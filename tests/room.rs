@@ -43,6 +43,12 @@ fn in_namespace(place: &Workplace, script: &str) -> Option<Output> {
     Some(command.output().unwrap())
 }
 
+/// A shared memory of 64 MB, and a user's directory that belongs to it: with the one outside, the next start would find
+/// killed runs whose files it cannot see.
+const CONTAINER: &str = "mount -t tmpfs -o size=64m tmpfs /dev/shm
+    mkdir -p /tmp/shoal-$(id -u); mount -t tmpfs -o mode=700 tmpfs /tmp/shoal-$(id -u)
+    ";
+
 fn files_of(running: &Running) -> Vec<PathBuf> {
     let files = running.leftovers().files().into_iter();
     files.map(|name| Path::new("/dev/shm").join(name)).collect()
@@ -121,10 +127,9 @@ fn what_a_run_reserves_is_at_most_what_was_computed_and_at_least_half_of_it() {
 #[test]
 fn the_default_run_fits_into_a_container_and_one_of_64_actors_is_refused_there() {
     let place = Workplace::new();
-    let small = "mount -t tmpfs -o size=64m tmpfs /dev/shm; ";
     let Some(output) = in_namespace(
         &place,
-        &format!("{small} exec $SHOAL train pendulum --steps 1300 --run run --json"),
+        &format!("{CONTAINER} exec $SHOAL train pendulum --steps 1300 --run run --json"),
     ) else {
         return;
     };
@@ -133,7 +138,7 @@ fn the_default_run_fits_into_a_container_and_one_of_64_actors_is_refused_there()
 
     let refused = in_namespace(
         &place,
-        &format!("{small} exec $SHOAL train pendulum --steps 1300 --run large --json --actors 64"),
+        &format!("{CONTAINER} exec $SHOAL train pendulum --steps 1300 --run large --json --actors 64"),
     );
     let said = complaint(&refused.unwrap());
     assert!(
@@ -146,13 +151,12 @@ fn the_default_run_fits_into_a_container_and_one_of_64_actors_is_refused_there()
 #[test]
 fn what_another_run_was_promised_is_not_free() {
     let place = Workplace::new();
-    let script = "mount -t tmpfs -o size=64m tmpfs /dev/shm
-        $SHOAL train pendulum --steps 100000000 --run first --quiet & first=$!
+    let script = "$SHOAL train pendulum --steps 100000000 --run first --quiet & first=$!
         timeout 60 sh -c 'until ls /dev/shm | grep -q promise; do sleep 0.05; done'
         $SHOAL train pendulum --steps 100 --run second --json || code=$?
         kill $first; wait $first || true
         exit $code";
-    let Some(output) = in_namespace(&place, script) else {
+    let Some(output) = in_namespace(&place, &[CONTAINER, script].concat()) else {
         return;
     };
     let said = complaint(&output);
