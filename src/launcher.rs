@@ -25,7 +25,7 @@ use self::log::Log;
 use self::progress::Progress;
 pub(crate) use self::progress::thousands;
 use crate::recorder::Recorder;
-use crate::status;
+use crate::{room, status};
 
 /// How often the launcher looks round.
 const ROUND: Duration = Duration::from_millis(50);
@@ -65,7 +65,9 @@ pub(crate) fn run(config: Config, run: &RunDir, lock: RunLock, quiet: bool) -> a
     Domain::wait_for_the_last(&config.run.id, PREDECESSORS_END)?;
     Domain::remove_abandoned()?;
     let domain = Domain::join(&config.run.id, config.actors.max)?;
-    let outcome = Launcher::new(config, run, &domain, signals, quiet, lock).and_then(Launcher::run);
+    let outcome = room::claim(&config, run, &domain)
+        .and_then(|()| Launcher::new(config, run, &domain, signals, quiet, lock))
+        .and_then(Launcher::run);
     // Even where something failed: no role is left by now.
     let left = domain.leave();
     let outcome = outcome?;

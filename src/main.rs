@@ -9,6 +9,7 @@ mod recorder;
 mod remote;
 mod role;
 mod rollout;
+mod room;
 mod status;
 mod tensorboard;
 
@@ -23,6 +24,8 @@ use shoal_common::report::Role;
 use crate::cli::{Cli, Command};
 
 fn main() -> ExitCode {
+    // Whatever this program makes is for its user alone.
+    rustix::process::umask(rustix::fs::Mode::RWXG | rustix::fs::Mode::RWXO);
     // What goes wrong in shared memory is returned as an error and said once, by us.
     set_log_level(LogLevel::Fatal);
     // A file-size limit shall be an error of the write that meets it, not the end of the process.

@@ -11,6 +11,7 @@ use shoal_env_server::environment;
 use toml::{Table, Value};
 
 use crate::cli::TrainArgs;
+use crate::room;
 
 const PRESETS: [(&str, &str); 4] = [
     ("pendulum", include_str!("../presets/pendulum.toml")),
@@ -32,6 +33,8 @@ impl Plan {
     pub(crate) fn new(args: &TrainArgs) -> anyhow::Result<Self> {
         let (name, table) = sections(&args.what)?;
         let config = resolve(table, args, &args.what)?;
+        let place = args.run.clone().unwrap_or_else(|| Path::new("runs").join(&name));
+        room::check(&config, &RunDir::planned(&place))?;
         let run = match &args.run {
             Some(path) => RunDir::create(path)?,
             None => RunDir::create_next(Path::new("runs"), &name)?,

@@ -120,7 +120,7 @@ fn explorer_settings(config: &Config, run: &RunDir, identity: Identity) -> explo
         mode: config.run.mode,
         spec: config.spec.clone(),
         envs: config.actors.envs as usize,
-        chunk_rows: config.chunk_rows(),
+        chunk: config.chunk_layout(),
         window: config.actors.window,
         exploration: config.exploration.clone(),
         hidden: config.ddpg.hidden,
@@ -142,7 +142,12 @@ fn evaluator_settings(config: &Config, run: &RunDir, identity: Identity, judged:
     }
 }
 
-fn learner_settings(config: &Config, run: &RunDir, identity: Identity, judged: Option<u64>) -> learner::Settings {
+pub(crate) fn learner_settings(
+    config: &Config,
+    run: &RunDir,
+    identity: Identity,
+    judged: Option<u64>,
+) -> learner::Settings {
     let ddpg = &config.ddpg;
     learner::Settings {
         identity,
@@ -152,7 +157,7 @@ fn learner_settings(config: &Config, run: &RunDir, identity: Identity, judged: O
         actors: config.actors.count,
         max_actors: config.actors.max,
         window: config.actors.window,
-        chunk_rows: config.chunk_rows(),
+        chunk: config.chunk_layout(),
         spec: config.spec.clone(),
         ddpg: DdpgSettings {
             tau: ddpg.tau,

@@ -4,18 +4,7 @@
 
 mod support;
 
-use std::process::Output;
-
-use support::{QUICK, Workplace, until};
-
-/// The one line that a failed command said.
-fn complaint(output: &Output) -> String {
-    let said = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert!(!output.status.success(), "{said}");
-    assert!(output.stdout.is_empty());
-    assert_eq!(said.lines().count(), 1, "one line: {said}");
-    said
-}
+use support::{QUICK, Workplace, complaint, until};
 
 #[test]
 fn what_cannot_be_trained_is_refused_before_anything_is_made() {

@@ -15,7 +15,7 @@ use shoal_env_server::vector::{Start, VectorEnvironment};
 use shoal_learner::ddpg::{Ddpg, DdpgSettings};
 use shoal_learner::minibatch::Minibatch;
 use shoal_learner::sampling::Sampler;
-use support::{Workplace, parse, until};
+use support::{Running, Workplace, parse, until};
 
 #[test]
 fn the_same_seed_and_actors_give_the_same_bits_and_another_seed_others() {
@@ -43,36 +43,87 @@ fn the_same_seed_and_actors_give_the_same_bits_and_another_seed_others() {
     assert_ne!(run("6").0, first.0);
 }
 
+const SHARED: [&str; 13] = [
+    "--lockstep",
+    "--actors",
+    "2",
+    "--envs",
+    "2",
+    "--steps",
+    "60000",
+    "--set",
+    "checkpoint.every_updates=700",
+    "--set",
+    "evaluation.every=1500",
+    "--set",
+    "replay.capacity=1500",
+];
+
+/// The weights a run ends with, and what its policies were judged to be on the way.
+fn end_of(running: Running) -> (serde_json::Value, Vec<String>) {
+    let run = running.run.clone();
+    let (code, printed, leftovers) = running.wait();
+    assert_eq!(
+        code,
+        Some(0),
+        "{}",
+        std::fs::read_to_string(run.join("shoal.log")).unwrap()
+    );
+    assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
+    let evaluations = std::fs::read_to_string(run.join("evaluations.csv")).unwrap();
+    let without_time = |line: &str| line.split_once(',').unwrap().1.to_owned();
+    (
+        parse(&printed)["weights_sha256"].clone(),
+        evaluations.lines().map(without_time).collect(),
+    )
+}
+
+fn comes_further(running: &Running, by: u64) {
+    let rows = running.learned("env_steps") + by;
+    until("it has come further", || running.learned("env_steps") >= rows);
+}
+
 #[test]
-fn a_learner_killed_in_lockstep_ends_with_the_bits_of_one_that_was_not() {
+fn whoever_is_killed_in_lockstep_the_run_ends_with_the_bits_of_a_whole_one() {
     let place = Workplace::new();
-    let arguments = [
-        "--lockstep",
-        "--actors",
-        "2",
-        "--steps",
-        "40000",
-        "--set",
-        "checkpoint.every_updates=700",
-        "--set",
-        "evaluation.every=1500",
-        "--set",
-        "replay.capacity=1500",
-    ];
-    // The same overrides in the same order for both, so that nothing but the kills differs.
-    let finish = |kills: usize, name: &str| {
-        let running = place.start(name, &arguments);
-        for n in 1..=kills {
-            let rows = 8000 * n as u64;
-            until("it has come further", || running.learned("env_steps") >= rows);
-            running.kill("learner-0");
-            until("it is replaced", || running.pids("learner-0").len() == n + 1);
-        }
-        let (code, printed, _) = running.wait();
-        assert_eq!(code, Some(0));
-        parse(&printed)["weights_sha256"].clone()
-    };
-    assert_eq!(finish(3, "killed"), finish(0, "whole"));
+    let whole = end_of(place.start("whole", &SHARED));
+    let running = place.start("killed", &SHARED);
+    for who in [
+        "actor-1",
+        "learner-0",
+        "env-server-0",
+        "evaluator-0",
+        "env-server-16",
+        "learner-0",
+        "actor-0",
+        "env-server-1",
+        "actor-1",
+        "learner-0",
+    ] {
+        comes_further(&running, 2000);
+        let starts = running.pids(who).len();
+        running.kill(who);
+        until("it is replaced", || running.pids(who).len() > starts);
+    }
+    assert_eq!(end_of(running), whole);
+}
+
+#[test]
+fn a_lockstep_run_stopped_or_killed_altogether_is_resumed_to_the_bits_of_a_whole_one() {
+    let place = Workplace::new();
+    let whole = end_of(place.start("whole", &SHARED));
+    let mut running = place.start("broken", &SHARED);
+    for _ in 0..2 {
+        comes_further(&running, 5000);
+        assert!(place.output(&["stop", "broken"]).status.success());
+        running.wait();
+        running = place.resume("broken", &[]);
+        comes_further(&running, 5000);
+        running.kill_everybody();
+        drop(running);
+        running = place.resume("broken", &[]);
+    }
+    assert_eq!(end_of(running), whole);
 }
 
 #[test]

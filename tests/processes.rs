@@ -83,15 +83,7 @@ fn what_a_run_left_whose_processes_were_all_killed_goes_with_the_next_start() {
     let place = Workplace::new();
     let running = place.start("killed", &ENDLESS);
     let leftovers = running.leftovers();
-    // Stopped first, so that no role notices the end of another.
-    let everybody = leftovers.processes();
-    for signal in [Signal::STOP, Signal::KILL] {
-        running.signal(signal);
-        for pid in &everybody {
-            rustix::process::kill_process(rustix::process::Pid::from_raw(*pid).unwrap(), signal).unwrap();
-        }
-    }
-    until("everybody is dead", || leftovers.processes().is_empty());
+    running.kill_everybody();
     assert!(
         !leftovers.files().is_empty(),
         "a killed run cannot clean up: or this test shows nothing"

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use shoal_common::channel::environment::{EnvironmentClient, Stepped};
+use shoal_common::channel::environment::{Begin, EnvironmentClient, Stepped};
 use shoal_common::channel::policy::{PolicyHeader, PolicyReader};
 use shoal_common::channel::reports::Reporter;
 use shoal_common::channel::{Bell, Domain, Place, Pulse, Ringer, wait_for};
@@ -184,7 +184,7 @@ impl<'a> Evaluator<'a> {
             ..
         } = self;
         let Some(policy) = policy.held() else { return Ok(None) };
-        let mut current = client.reset(bell, Some(first))?;
+        let mut current = client.reset(bell, Begin::Evaluation(first))?;
         let mut returns = vec![0.0; self.settings.envs];
         let mut under_way = vec![true; self.settings.envs];
         while under_way.contains(&true) {

@@ -13,7 +13,7 @@
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use shoal_common::channel::environment::{EnvironmentClient, Observed, Stepped};
+use shoal_common::channel::environment::{Begin, EnvironmentClient, Observed, Snapshot, Stepped};
 use shoal_common::channel::policy::PolicyReader;
 use shoal_common::channel::reports::Reporter;
 use shoal_common::channel::transitions::{Chunk, ChunkSender};
@@ -25,10 +25,11 @@ use shoal_common::report::{Activity, EpisodeReport, Identity, Role};
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::stop::Stop;
 use shoal_common::stream::{Purpose, stream};
-use shoal_common::transition::{RowLayout, Transition};
+use shoal_common::transition::{ChunkLayout, Transition};
 
 use crate::error::{ActorError, Ended};
 use crate::noise::OrnsteinUhlenbeck;
+use crate::standing::Standing;
 
 /// How long an actor waits for its last chunk to be committed when the whole run ends.
 const FAREWELL: Duration = Duration::from_secs(1);
@@ -46,8 +47,8 @@ pub struct Settings {
     pub spec: EnvironmentSpec,
     /// Environments stepped at once.
     pub envs: usize,
-    /// Rows in a chunk.
-    pub chunk_rows: usize,
+    /// What a chunk has room for.
+    pub chunk: ChunkLayout,
     /// Chunks that may be sent and not committed.
     pub window: u32,
     /// The noise.
@@ -94,12 +95,16 @@ struct Explorer<'a> {
     actions: Vec<f32>,
     /// Steps of every environment since the actor's stream began.
     step: u64,
+    /// Where it stood after the last chunk, where it can say that.
+    standing: Option<Standing>,
+    /// Episodes whose ends are in the chunk under way.
+    ended: Vec<EpisodeReport>,
 }
 
 impl<'a> Explorer<'a> {
     fn new(domain: &Domain, settings: &'a Settings, stop: &'a Stop) -> Result<Self, Ended> {
         let Identity { index, incarnation, .. } = settings.identity;
-        let row = RowLayout::new(settings.spec.observation.width(), settings.spec.action.width());
+        let row = settings.chunk.row;
         let range = ActionRange::new(&settings.spec.action)?;
         let network = PolicyNetwork::new(row.observation_width(), settings.hidden, range, settings.envs);
 
@@ -110,14 +115,18 @@ impl<'a> Explorer<'a> {
         pulse.beat(Activity::WaitingForPeer);
 
         let commits = wait_for_replay(settings, &bell, stop, &mut pulse)?;
-        let greeting = ChunkSender::open(domain, index, incarnation, row, settings.chunk_rows, settings.window)?;
+        let greeting = ChunkSender::open(domain, index, incarnation, settings.chunk, settings.window)?;
         let learner = Ringer::new(domain, Place(Role::Learner, 0))?;
         learner.ring();
         let sender = greeting.wait(&commits, &bell, stop, || pulse.beat(Activity::WaitingForPeer))?;
-        // In lockstep chunk k belongs to round k whoever sends it, and the noise goes on where the last chunk left it.
-        let (step, stream_incarnation) = match settings.mode {
-            Mode::Free => (0, incarnation),
-            Mode::Lockstep => (sender.sent() * (settings.chunk_rows / settings.envs) as u64, 0),
+        // In lockstep nothing may depend on how often an actor was started: it goes on where the last chunk left it.
+        let (stream_incarnation, standing) = match settings.mode {
+            Mode::Lockstep if sender.sent() > 0 => {
+                let words = commits.standing(index as usize);
+                (0, Standing::read(&words, &settings.chunk, settings.envs))
+            }
+            Mode::Lockstep => (0, None),
+            Mode::Free => (incarnation, None),
         };
         let stream = stream(settings.seed, Purpose::Exploration, index.into(), stream_incarnation);
         Ok(Self {
@@ -128,7 +137,9 @@ impl<'a> Explorer<'a> {
             policy,
             noise: OrnsteinUhlenbeck::new(&settings.exploration, settings.envs, row.action_width(), stream),
             network,
-            step,
+            step: 0,
+            standing,
+            ended: Vec::new(),
             sender,
             chunk: None,
             commits,
@@ -146,15 +157,34 @@ impl<'a> Explorer<'a> {
             if let Err(ended) = self.run_until_the_server_is_lost() {
                 return ended;
             }
-            tracing::warn!("the environment server was restarted; the episodes under way are given up");
+            tracing::warn!("the environment server was restarted");
         }
     }
 
-    fn run_until_the_server_is_lost(&mut self) -> Result<(), Ended> {
-        let mut current = self.client.reset(&self.bell, None)?;
-        for environment in 0..self.settings.envs {
-            self.begin_episode(environment);
+    /// Begins new episodes, and gives up those under way; in lockstep goes on with those after the last chunk.
+    fn begin(&mut self) -> Result<Observed, Ended> {
+        if self.settings.mode == Mode::Free {
+            (0..self.settings.envs).for_each(|environment| self.begin_episode(environment));
+            return Ok(self.client.reset(&self.bell, Begin::Next)?);
         }
+        self.chunk = None;
+        self.ended.clear();
+        let sent = self.sender.sent();
+        self.step = sent * (self.settings.chunk.rows / self.settings.envs) as u64;
+        if let Some(standing) = &self.standing {
+            self.noise.restore(&standing.noise);
+            self.returns.clone_from(&standing.returns);
+            self.lengths.clone_from(&standing.lengths);
+            return Ok(self.client.restore(&self.bell, &standing.snapshot)?);
+        }
+        (0..self.settings.envs).for_each(|environment| self.begin_episode(environment));
+        // Without a word of where it stood there is only the beginning that is the same for everyone.
+        let begin = if sent == 0 { Begin::Training(0) } else { Begin::Next };
+        Ok(self.client.reset(&self.bell, begin)?)
+    }
+
+    fn run_until_the_server_is_lost(&mut self) -> Result<(), Ended> {
+        let mut current = self.begin()?;
         loop {
             let version = self.await_policy()?;
             if self.chunk.is_none() {
@@ -172,6 +202,9 @@ impl<'a> Explorer<'a> {
             self.pulse.count(self.settings.envs as u64);
             self.pulse.beat(Activity::Working);
             if self.chunk.as_ref().is_some_and(Chunk::is_full) {
+                if !self.take_stand()? {
+                    return Ok(());
+                }
                 self.await_room()?;
                 self.send(version)?;
             }
@@ -247,7 +280,7 @@ impl<'a> Explorer<'a> {
             self.returns[e] += f64::from(transition.r);
             self.lengths[e] += 1;
             if transition.last {
-                self.episodes.send(EpisodeReport {
+                self.ended.push(EpisodeReport {
                     actor: self.settings.identity.index,
                     environment: e as u32,
                     steps: self.lengths[e],
@@ -265,6 +298,28 @@ impl<'a> Explorer<'a> {
         self.noise.reset(environment);
         self.returns[environment] = 0.0;
         self.lengths[environment] = 0;
+    }
+
+    /// Says behind the chunk's rows where the actor stands after them, where that is asked for; whether the environment
+    /// server is still there to say its part.
+    fn take_stand(&mut self) -> Result<bool, Ended> {
+        if self.settings.chunk.standing_words == 0 {
+            return Ok(true);
+        }
+        let Snapshot::Taken(snapshot) = self.client.snapshot(&self.bell)? else {
+            return Ok(false);
+        };
+        let standing = Standing {
+            snapshot,
+            noise: self.noise.state().into(),
+            returns: self.returns.clone(),
+            lengths: self.lengths.clone(),
+        };
+        if let Some(chunk) = &mut self.chunk {
+            chunk.set_standing(&standing.words());
+        }
+        self.standing = Some(standing);
+        Ok(true)
     }
 
     /// Waits until another chunk may be sent.
@@ -303,6 +358,7 @@ impl<'a> Explorer<'a> {
         if let Some(chunk) = self.chunk.take() {
             self.sender.send(chunk, version)?;
             self.learner.ring();
+            self.ended.drain(..).for_each(|episode| self.episodes.send(episode));
         }
         Ok(())
     }

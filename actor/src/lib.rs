@@ -5,3 +5,4 @@ pub mod error;
 pub mod evaluator;
 pub mod explorer;
 pub mod noise;
+mod standing;

@@ -33,6 +33,16 @@ impl OrnsteinUhlenbeck {
         self.x[environment * self.width..][..self.width].fill(0.0);
     }
 
+    /// The processes' states, environment after environment.
+    pub(crate) fn state(&self) -> &[f64] {
+        &self.x
+    }
+
+    /// Goes on from these states; others than so many are none of this noise.
+    pub(crate) fn restore(&mut self, state: &[f64]) {
+        self.x.copy_from_slice(state);
+    }
+
     /// Advances every process by step number `step`: x ← x − θ x + σ N(0, 1).
     pub fn advance(&mut self, step: u64) {
         self.stream.set_stream(step);

@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 use crate::space::EnvironmentSpec;
-use crate::transition::RowLayout;
+use crate::transition::{ChunkLayout, RowLayout};
 
 /// Everything a run was started with.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -249,6 +249,26 @@ impl Config {
     /// How a transition's row is laid out.
     pub fn row_layout(&self) -> RowLayout {
         RowLayout::new(self.spec.observation.width(), self.spec.action.width())
+    }
+
+    /// What a chunk of transitions has room for.
+    pub fn chunk_layout(&self) -> ChunkLayout {
+        ChunkLayout {
+            row: self.row_layout(),
+            rows: self.chunk_rows(),
+            standing_words: self.standing_words(),
+        }
+    }
+
+    /// Words that say where an actor stands between two chunks: in lockstep, where the environments can say their state, a
+    /// process that is killed is replaced by one that goes on with the same bits.
+    pub fn standing_words(&self) -> usize {
+        let envs = self.actors.envs as usize;
+        match (self.run.mode, self.spec.snapshot_words(envs)) {
+            (Mode::Free, _) | (_, 0) => 0,
+            // And of each environment the state of the noise, and the return and length of its episode.
+            (Mode::Lockstep, snapshot) => snapshot + envs * (self.spec.action.width() + 2),
+        }
     }
 
     /// A number for all that the rows of the replay and the weights of a checkpoint depend on. Length of the run, number

@@ -88,6 +88,11 @@ impl RunDir {
         }
     }
 
+    /// The run directory that is to be at `path`: nothing is made, and nothing looked at.
+    pub fn planned(path: &Path) -> Self {
+        Self { path: path.into() }
+    }
+
     /// An existing run directory.
     ///
     /// # Errors

@@ -1,10 +1,23 @@
 //! A transition as it stands in a chunk and in the replay: `s, a, r, discount, s', last`, all `f32`.
 
+use crate::channel::NUMBERS_OF_A_WORD;
+
 /// Where each field of a transition's row lies. The one statement of the layout; everyone else asks it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct RowLayout {
     observation: usize,
     action: usize,
+}
+
+/// What a chunk has room for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ChunkLayout {
+    /// The fields of a row.
+    pub row: RowLayout,
+    /// Rows.
+    pub rows: usize,
+    /// Words (`u64`) behind the rows, which say where the actor stands after the chunk; 0 where nobody asks.
+    pub standing_words: usize,
 }
 
 /// A transition, borrowed from its row.
@@ -71,6 +84,23 @@ impl RowLayout {
         rest[1] = transition.discount;
         rest[2..2 + self.observation].copy_from_slice(transition.s_next);
         rest[2 + self.observation] = f32::from(u8::from(transition.last));
+    }
+}
+
+impl ChunkLayout {
+    /// Numbers that the rows take.
+    pub fn numbers_of_rows(&self) -> usize {
+        self.rows * self.row.width()
+    }
+
+    /// Numbers in a chunk.
+    pub fn len(&self) -> usize {
+        self.numbers_of_rows() + NUMBERS_OF_A_WORD * self.standing_words
+    }
+
+    /// Whether a chunk holds nothing.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
     }
 }
 

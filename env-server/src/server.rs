@@ -27,13 +27,13 @@ pub fn serve(
             Err(Interruption::Channel(error)) => return Err(error),
         };
         let refused = match request.ask() {
-            Some(ask @ (Ask::Reset | Ask::ResetToEvaluation)) => {
+            Some(ask @ (Ask::Reset | Ask::ResetToTraining | Ask::ResetToEvaluation)) => {
+                let first = request.episode();
+                let episodes = vec![first; environments.count()];
                 let start = match ask {
-                    Ask::Reset => Start::Next,
-                    _ => Start::Evaluation {
-                        seed,
-                        first: request.episode(),
-                    },
+                    Ask::ResetToTraining => Start::Episodes(&episodes),
+                    Ask::ResetToEvaluation => Start::Evaluation { seed, first },
+                    _ => Start::Next,
                 };
                 started = true;
                 request

@@ -3,7 +3,7 @@
 use shoal_common::channel::transitions::{ChunkReceiver, ReceivedChunk};
 use shoal_common::channel::{ChannelError, Domain, Place, Ringer};
 use shoal_common::report::Role;
-use shoal_common::transition::RowLayout;
+use shoal_common::transition::ChunkLayout;
 
 use crate::replay::{Appended, ChunkError, Replay};
 
@@ -27,7 +27,7 @@ pub enum IntakeError {
 #[derive(Debug)]
 pub struct Intake {
     sources: Vec<Source>,
-    row: RowLayout,
+    chunk: ChunkLayout,
     window: u32,
     /// Rows after which nothing more is taken.
     limit: u64,
@@ -47,10 +47,16 @@ impl Intake {
     ///
     /// # Errors
     /// When shared memory cannot be had, or another learner lives.
-    pub fn open(domain: &Domain, actors: u32, window: u32, row: RowLayout, limit: u64) -> Result<Self, ChannelError> {
+    pub fn open(
+        domain: &Domain,
+        actors: u32,
+        window: u32,
+        chunk: ChunkLayout,
+        limit: u64,
+    ) -> Result<Self, ChannelError> {
         let mut intake = Self {
             sources: Vec::new(),
-            row,
+            chunk,
             window,
             limit,
             turn: 0,
@@ -67,7 +73,7 @@ impl Intake {
     pub fn widen(&mut self, domain: &Domain, actors: u32) -> Result<(), ChannelError> {
         for actor in self.sources.len() as u32..actors {
             self.sources.push(Source {
-                receiver: ChunkReceiver::open(domain, actor, self.window)?,
+                receiver: ChunkReceiver::open(domain, actor, self.chunk, self.window)?,
                 bell: Ringer::new(domain, Place(Role::Actor, actor))?,
             });
         }
@@ -112,10 +118,10 @@ impl Intake {
     /// When the channel does not work or the chunk is none of this run.
     pub fn take_from(&self, actor: usize, replay: &mut Replay) -> Result<Option<Appended>, IntakeError> {
         let source = &self.sources[actor];
-        let Some(chunk) = source.receiver.receive(self.row)? else {
+        let Some(chunk) = source.receiver.receive()? else {
             return Ok(None);
         };
-        let room = (self.limit - replay.head()).min(chunk.header().rows.into()) as usize * self.row.width();
+        let room = (self.limit - replay.head()).min(chunk.header().rows.into()) as usize * self.chunk.row.width();
         let appended = append(replay, actor, &chunk, room)?;
         drop(chunk);
         source.bell.ring();
@@ -130,7 +136,14 @@ impl Intake {
 
 fn append(replay: &mut Replay, actor: usize, chunk: &ReceivedChunk, room: usize) -> Result<Appended, IntakeError> {
     let mark = chunk.mark(replay.committed(actor).mark);
-    replay
-        .append_and_commit(actor, mark, &chunk.rows()[..room])
-        .map_err(|cause| IntakeError::Chunk { actor, cause })
+    let refused = |cause| IntakeError::Chunk { actor, cause };
+    let Some(reserved) = replay.begin(actor, mark).map_err(refused)? else {
+        return Ok(Appended::Duplicate);
+    };
+    let filled = reserved.fill(&chunk.rows()[..room]).map_err(refused)?;
+    match chunk.standing() {
+        Some(words) => filled.standing(&words).commit(),
+        None => filled.commit(),
+    }
+    Ok(Appended::Accepted)
 }

@@ -18,13 +18,12 @@ use shoal_common::config::Mode;
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::report::{Activity, Heartbeat, LearnerReport, Role};
 use shoal_common::stop::Stop;
-use shoal_common::transition::RowLayout;
 
 use crate::checkpoint::{Checkpoints, Counters};
 use crate::ddpg::{Ddpg, DdpgState};
 use crate::intake::Intake;
 use crate::minibatch::Minibatch;
-use crate::replay::{Replay, ReplayLayout, SyncedRows};
+use crate::replay::{Replay, SyncedRows};
 use crate::sampling::Sampler;
 pub use settings::{LearnerError, Settings};
 
@@ -113,15 +112,8 @@ impl<'a> Learner<'a> {
     fn new(domain: &'a Domain, settings: &'a Settings, stop: &'a Stop) -> Result<Self, LearnerError> {
         let mut ddpg = Ddpg::new(&settings.spec, &settings.ddpg, settings.seed)?;
         let bell = Bell::hang(domain, Place(Role::Learner, 0))?;
-        let row = RowLayout::new(settings.spec.observation.width(), settings.spec.action.width());
-
-        let layout = ReplayLayout {
-            row,
-            ring: settings.ring_rows(),
-            actors: settings.max_actors as usize,
-            standing_words: 0,
-            fingerprint: settings.fingerprint,
-        };
+        let layout = settings.replay_layout();
+        let row = layout.row;
         let replay = if settings.replay.exists() {
             Replay::open(&settings.replay, &layout)?
         } else {
@@ -159,7 +151,7 @@ impl<'a> Learner<'a> {
         let learner = Self {
             publisher: PolicyPublisher::open(domain, ddpg.policy().len())?,
             evaluator: Ringer::new(domain, Place(Role::Evaluator, 0))?,
-            intake: Intake::open(domain, settings.actors, settings.window, row, settings.steps)?,
+            intake: Intake::open(domain, settings.actors, settings.window, settings.chunk, settings.steps)?,
             sampler: Sampler::new(settings.seed),
             batch: Minibatch::new(row, settings.ddpg.batch),
             indices: vec![0; settings.ddpg.batch],

@@ -29,7 +29,7 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Ended> {
         let (before, updates) = (learner.rows, learner.updates());
         let mut rows = before;
         for actor in 0..learner.intake.actors() {
-            rows += (learner.settings.chunk_rows as u64).min(learner.settings.steps - rows);
+            rows += (learner.settings.chunk.rows as u64).min(learner.settings.steps - rows);
             await_rows(learner, actor, rows)?;
         }
         // Only now: whoever is interrupted within a round goes on from its beginning.

@@ -18,7 +18,7 @@ use shoal_env_server::vector::VectorEnvironment;
 use shoal_learner::intake::Intake;
 use shoal_learner::replay::{Replay, ReplayError, Step};
 
-use crate::chunks::{ROWS, WINDOW, fill, replay_layout, row_layout};
+use crate::chunks::{ROWS, WINDOW, chunk_layout, fill, replay_layout};
 use crate::process::MARK;
 
 pub(crate) const ROLE: &str = "SHOAL_TEST_ROLE";
@@ -95,7 +95,7 @@ fn actor(domain: &Domain, replay: &std::path::Path, index: u32, incarnation: u64
             opened => break opened.unwrap(),
         }
     };
-    let greeting = ChunkSender::open(domain, index, incarnation, row_layout(), ROWS, WINDOW).unwrap();
+    let greeting = ChunkSender::open(domain, index, incarnation, chunk_layout(), WINDOW).unwrap();
     say("ready");
     let mut slowest = Duration::ZERO;
     let stop = Stop::default();
@@ -173,7 +173,7 @@ fn learner(domain: &Domain, path: &std::path::Path, actors: u32, stalls_at: Opti
             }
         });
     }
-    let mut intake = Intake::open(domain, actors, WINDOW, row_layout(), u64::MAX).unwrap();
+    let mut intake = Intake::open(domain, actors, WINDOW, chunk_layout(), u64::MAX).unwrap();
     say("ready");
     let commands = commands();
     let mut quota = if stalls_at.is_some() { u64::MAX } else { replay.head() };

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use shoal_common::channel::transitions::Chunk;
-use shoal_common::transition::{RowLayout, Transition};
+use shoal_common::transition::{ChunkLayout, RowLayout, Transition};
 use shoal_learner::replay::{Replay, ReplayLayout};
 
 pub(crate) const WINDOW: u32 = 8;
@@ -13,8 +13,16 @@ const RING: u64 = 1 << 16;
 /// A chunk: actor, incarnation, sequence.
 pub(crate) type Id = (u32, u64, u64);
 
-pub(crate) fn row_layout() -> RowLayout {
+fn row_layout() -> RowLayout {
     RowLayout::new(2, 1)
+}
+
+pub(crate) fn chunk_layout() -> ChunkLayout {
+    ChunkLayout {
+        row: row_layout(),
+        rows: ROWS,
+        standing_words: 0,
+    }
 }
 
 pub(crate) fn replay_layout(actors: u32) -> ReplayLayout {

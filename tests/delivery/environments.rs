@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use rustix::process::Signal;
-use shoal_common::channel::environment::{EnvironmentClient, Observed, Snapshot, Stepped};
+use shoal_common::channel::environment::{Begin, EnvironmentClient, Observed, Snapshot, Stepped};
 use shoal_common::channel::{Bell, Domain, Interruption, Place};
 use shoal_common::report::Role;
 
@@ -33,7 +33,7 @@ impl Asker {
     }
 
     fn reset(&self) -> Observed {
-        self.client.reset(&self.bell, None).expect("no hang")
+        self.client.reset(&self.bell, Begin::Next).expect("no hang")
     }
 
     fn step(&self) -> Stepped {

@@ -74,6 +74,11 @@ impl Workplace {
         )
     }
 
+    /// Starts a run in `name` with these arguments and no others, and waits until every role is ready.
+    pub(crate) fn start_as(&self, name: &str, arguments: &[&str]) -> Running {
+        self.launch(name, &[&["train", "pendulum", "--run", name], arguments].concat())
+    }
+
     /// Goes on with the run in `name` and waits until every role is ready.
     pub(crate) fn resume(&self, name: &str, arguments: &[&str]) -> Running {
         self.launch(name, &[&["resume", name], arguments].concat())
@@ -156,6 +161,20 @@ impl Running {
         kill_process(Pid::from_raw(pid).unwrap(), signal).unwrap();
     }
 
+    /// Kills all processes of the run at once, and waits until they are gone. They are stopped first, so that none
+    /// notices the end of another.
+    pub(crate) fn kill_everybody(&self) {
+        let everybody = self.leftovers().processes();
+        for signal in [Signal::STOP, Signal::KILL] {
+            self.signal(signal);
+            for pid in &everybody {
+                // One may have ended in between.
+                let _ = kill_process(Pid::from_raw(*pid).unwrap(), signal);
+            }
+        }
+        until("everybody is dead", || self.leftovers().processes().is_empty());
+    }
+
     /// Sends a signal to the launcher.
     pub(crate) fn signal(&self, signal: Signal) {
         kill_process(Pid::from_child(&self.child), signal).unwrap();
@@ -195,7 +214,7 @@ pub(crate) struct Leftovers {
 }
 
 impl Leftovers {
-    fn of(run: &Path) -> Self {
+    pub(crate) fn of(run: &Path) -> Self {
         let config = std::fs::read_to_string(run.join("config.toml")).unwrap();
         let table: toml::Table = config.parse().unwrap();
         let log = std::fs::read_to_string(run.join("shoal.log")).unwrap();
@@ -217,6 +236,11 @@ impl Leftovers {
             .map(|entry| entry.unwrap().file_name().to_string_lossy().into_owned())
             .filter(|name| name.contains(&self.run_id))
             .collect()
+    }
+
+    /// The run's name in shared memory.
+    pub(crate) fn run_id(&self) -> &str {
+        &self.run_id
     }
 
     /// Waits until nothing is left.
@@ -247,6 +271,15 @@ pub(crate) fn sent(run: &Path, actor: u32) -> u64 {
 pub(crate) fn committed(run: &Path, actor: usize) -> u64 {
     let commits = shoal_common::commit::CommitReader::open(&run.join("replay.bin")).unwrap();
     commits.actor(actor).rows
+}
+
+/// The one line that a failed command said.
+pub(crate) fn complaint(output: &Output) -> String {
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(!output.status.success(), "{said}");
+    assert!(output.stdout.is_empty());
+    assert_eq!(said.lines().count(), 1, "one line: {said}");
+    said
 }
 
 /// The last line of what was printed, as JSON.

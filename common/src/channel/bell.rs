@@ -8,7 +8,7 @@ use iceoryx2::port::notifier::Notifier;
 use iceoryx2::prelude::*;
 use iceoryx2::service::port_factory::event::PortFactory;
 
-use super::{ChannelError, Domain, Interruption, claim, service_name};
+use super::{ChannelError, Domain, Interruption, claim, memory, service_name};
 use crate::report::Role;
 use crate::stop::Stop;
 
@@ -43,6 +43,12 @@ pub struct Ringer {
 }
 
 impl Bell {
+    /// Bytes of shared memory that a bell reserves in a run of up to so many actors.
+    pub fn reserved(max_actors: usize) -> u64 {
+        // The second file holds what has rung: iceoryx2 has one of 2103 bytes for each listener.
+        memory::service(2 * parties(max_actors)) + memory::pages(2103)
+    }
+
     /// Hangs the bell of this process.
     ///
     /// # Errors
@@ -124,8 +130,12 @@ pub fn wait_for<T>(
     }
 }
 
+fn parties(max_actors: usize) -> usize {
+    2 * max_actors + 8
+}
+
 fn service(domain: &Domain, channel: &str) -> Result<PortFactory<ipc::Service>, ChannelError> {
-    let parties = 2 * domain.max_actors() + 8;
+    let parties = parties(domain.max_actors());
     domain
         .node()
         .service_builder(&service_name(domain, channel)?)

@@ -4,11 +4,14 @@ use std::time::{Duration, Instant};
 
 use iceoryx2::port::server::Server;
 use iceoryx2::prelude::*;
+use iceoryx2::service::header::request_response::{
+    RequestHeader as IoxRequestHeader, ResponseHeader as IoxResponseHeader,
+};
 use iceoryx2::service::port_factory::request_response::PortFactory;
 
 pub use self::message::{Answer, Question, RoleState, RoleStatus, RunStatus};
 use self::message::{VERSION, decode, encode};
-use super::{ChannelError, Domain, claim, service_name};
+use super::{ChannelError, Domain, claim, memory, service_name};
 
 mod message;
 
@@ -17,8 +20,15 @@ const CHANNEL: &str = "control";
 /// Terminals that may ask at the same time.
 const CLIENTS: usize = 8;
 
-/// Bytes of an answer at first; it grows with the number of roles.
-const ANSWER: usize = 4096;
+/// Processes that may take part: askers that were killed count until the launcher has cleaned up after them.
+const NODES: usize = 2 * CLIENTS;
+
+const ACTIVE_REQUESTS: usize = 2;
+
+/// Bytes of the longest question, and of the longest answer to each role of the run and beside them.
+const QUESTION: usize = 64;
+const ANSWER: usize = 1024;
+const ANSWER_OF_A_ROLE: usize = 96;
 
 /// How long the asker sleeps between looks. The launcher looks twenty times a second.
 const NAP: Duration = Duration::from_millis(5);
@@ -59,8 +69,7 @@ impl ControlPort {
         let server = claim(CHANNEL, "answer", || {
             service(domain)?
                 .server_builder()
-                .initial_max_slice_len(ANSWER)
-                .allocation_strategy(AllocationStrategy::PowerOfTwo)
+                .initial_max_slice_len(answer_length(domain.max_actors()))
                 .create()
                 .map_err(|cause| ChannelError::new(CHANNEL, "answer", cause))
         })?;
@@ -113,7 +122,7 @@ pub fn ask(domain: &Domain, question: Question, patience: Duration) -> Result<An
     let client = claim(CHANNEL, "ask", || {
         service(domain)?
             .client_builder()
-            .initial_max_slice_len(64)
+            .initial_max_slice_len(QUESTION)
             .create()
             .map_err(|cause| ChannelError::new(CHANNEL, "ask", cause))
     })?;
@@ -142,6 +151,23 @@ pub fn ask(domain: &Domain, question: Question, patience: Duration) -> Result<An
     }
 }
 
+/// Bytes of shared memory that the conversation reserves in a run of up to so many actors.
+pub fn reserved(max_actors: usize) -> u64 {
+    // As in the conversation with an environment server, and with iceoryx2's own numbers of loans.
+    let questions = 2 * ACTIVE_REQUESTS + 2;
+    let answers = 2 * ACTIVE_REQUESTS * 4;
+    memory::service(NODES)
+        + CLIENTS as u64 * memory::segment::<IoxRequestHeader, ControlHeader>(questions, QUESTION)
+        + memory::segment::<IoxResponseHeader, ControlHeader>(CLIENTS * answers, answer_length(max_actors))
+        + CLIENTS as u64 * memory::connection(1, ACTIVE_REQUESTS, questions, questions)
+        + CLIENTS as u64 * memory::connection(2 * ACTIVE_REQUESTS, 1, 1, CLIENTS * answers)
+}
+
+/// Learner, evaluator with its server, and for each actor a server.
+fn answer_length(max_actors: usize) -> usize {
+    ANSWER + ANSWER_OF_A_ROLE * (2 * max_actors + 3)
+}
+
 type ControlService = PortFactory<ipc::Service, [u8], ControlHeader, [u8], ControlHeader>;
 
 fn service(domain: &Domain) -> Result<ControlService, ChannelError> {
@@ -153,8 +179,8 @@ fn service(domain: &Domain) -> Result<ControlService, ChannelError> {
         .response_user_header::<ControlHeader>()
         .max_servers(1)
         .max_clients(CLIENTS)
-        .max_nodes(2 * CLIENTS)
-        .max_active_requests_per_client(2)
+        .max_nodes(NODES)
+        .max_active_requests_per_client(ACTIVE_REQUESTS)
         .max_response_buffer_size(1)
         .max_borrowed_responses_per_pending_response(1)
         .open_or_create()

@@ -1,9 +1,9 @@
 //! A run's own corner of shared memory. Every run has a root directory and a file prefix of its own, below a directory
 //! that belongs to one user: two runs never meet, two users neither, and what a killed run left behind is known by name.
 
-use std::fs::{DirBuilder, File};
+use std::fs::{DirBuilder, File, Permissions};
 use std::io;
-use std::os::unix::fs::{DirBuilderExt, MetadataExt};
+use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
@@ -13,7 +13,9 @@ use iceoryx2::prelude::{
 };
 use rustix::fs::FlockOperation;
 
-const SHARED_MEMORY: &str = "/dev/shm";
+use super::memory;
+
+pub(super) const SHARED_MEMORY: &str = "/dev/shm";
 
 /// Membership of a process in a run: what all its channels are opened through.
 #[derive(Debug)]
@@ -76,6 +78,7 @@ impl Domain {
             .signal_handling_mode(SignalHandlingMode::Disabled)
             .create::<ipc::Service>()
             .map_err(|cause| failed(format!("{cause:?}")))?;
+        close_to_others(run_id)?;
         Ok(Self {
             node,
             run_id: run_id.into(),
@@ -91,6 +94,15 @@ impl Domain {
     /// The most actors the run's channels have room for.
     pub fn max_actors(&self) -> usize {
         self.max_actors
+    }
+
+    /// Notes that this run may take so many bytes of shared memory, so that
+    /// [`free_shared_memory`](super::free_shared_memory) does not offer them to the user's other runs.
+    ///
+    /// # Errors
+    /// When shared memory cannot be had.
+    pub fn promise(&self, bytes: u64) -> Result<(), DomainError> {
+        memory::promise(&self.run_id, bytes).map_err(io_error("note the run's needs in", Path::new(SHARED_MEMORY)))
     }
 
     /// The text of the configuration file with which other iceoryx2 programs find this run.
@@ -172,6 +184,21 @@ impl Domain {
 /// File names of the run in shared memory begin with this.
 pub(super) fn prefix(run_id: &str) -> String {
     format!("shoal_{run_id}_")
+}
+
+/// Closes the one file that iceoryx2 opens to everybody, whatever the umask: the one that counts the run's nodes.
+fn close_to_others(run_id: &str) -> Result<(), DomainError> {
+    let shared_memory = Path::new(SHARED_MEMORY);
+    let listing = std::fs::read_dir(shared_memory).map_err(io_error("list", shared_memory))?;
+    for entry in listing.flatten() {
+        let name = entry.file_name();
+        let name = name.to_string_lossy();
+        if name.starts_with(&prefix(run_id)) && name.ends_with(".global_mgmt") {
+            let path = entry.path();
+            std::fs::set_permissions(&path, Permissions::from_mode(0o600)).map_err(io_error("close", &path))?;
+        }
+    }
+    Ok(())
 }
 
 fn iox_config(root: &Path, run_id: &str) -> Result<Config, String> {

@@ -10,14 +10,18 @@ mod bell;
 pub mod control;
 mod domain;
 pub mod environment;
+mod memory;
 pub mod policy;
 mod pulse;
 pub mod reports;
 pub mod transitions;
+mod words;
 
 pub use bell::{Bell, Place, Ringer, wait_for};
 pub use domain::{Domain, DomainError};
+pub use memory::free_shared_memory;
 pub use pulse::Pulse;
+pub(crate) use words::NUMBERS_OF_A_WORD;
 
 /// A channel does not work: its service or port cannot be had, or memory is exhausted.
 #[derive(Debug, thiserror::Error)]

@@ -6,11 +6,18 @@ use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::*;
 use iceoryx2::sample::Sample;
+use iceoryx2::service::header::publish_subscribe::Header;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 
-use super::{ChannelError, Domain, claim, service_name};
+use super::{ChannelError, Domain, claim, memory, service_name};
 
 const CHANNEL: &str = "policy";
+
+/// Policies that wait for a reader: the newest.
+const BUFFER: usize = 1;
+
+/// Policies a reader has in hand: one in use, and the next one before the first is let go.
+const BORROWED: usize = 2;
 
 /// What a reader knows of a policy.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ZeroCopySend)]
@@ -55,11 +62,13 @@ impl PolicyPublisher {
     /// # Errors
     /// When shared memory cannot be had, or another learner lives.
     pub fn open(domain: &Domain, parameters: usize) -> Result<Self, ChannelError> {
+        let samples = samples(domain.max_actors());
         let publisher = claim(CHANNEL, "publish", || {
             service(domain)?
                 .publisher_builder()
                 .initial_max_slice_len(parameters)
                 .max_loaned_samples(1)
+                .override_sample_preallocation(move |_| samples)
                 .create()
                 .map_err(|cause| ChannelError::new(CHANNEL, "publish", cause))
         })?;
@@ -153,6 +162,32 @@ impl Policy {
     }
 }
 
+/// Bytes of shared memory that policies of so many parameters reserve in a run of up to so many actors. Twice what one
+/// learner needs: readers go on with the policy of a learner that was killed, and its memory stays until they have
+/// another.
+pub fn reserved(max_actors: usize, parameters: usize) -> u64 {
+    let (samples, readers) = (samples(max_actors), readers(max_actors));
+    let learner = memory::segment::<Header, PolicyHeader>(samples, size_of::<f32>() * parameters)
+        + readers as u64 * memory::connection(1, BUFFER, BORROWED, samples);
+    memory::service(readers + nodes(max_actors)) + 2 * learner
+}
+
+/// The evaluator, the actors, and one more.
+fn readers(max_actors: usize) -> usize {
+    max_actors + 2
+}
+
+fn nodes(max_actors: usize) -> usize {
+    max_actors + 4
+}
+
+/// Policies that can be in use at once. What waits for the readers is one policy, the newest, for all of them, and while
+/// it is being replaced two; iceoryx2 would reserve one for each reader.
+fn samples(max_actors: usize) -> usize {
+    let (waiting, being_written) = (2, 1);
+    readers(max_actors) * BORROWED + waiting + being_written
+}
+
 fn service(domain: &Domain) -> Result<PortFactory<ipc::Service, [f32], PolicyHeader>, ChannelError> {
     domain
         .node()
@@ -160,13 +195,51 @@ fn service(domain: &Domain) -> Result<PortFactory<ipc::Service, [f32], PolicyHea
         .publish_subscribe::<[f32]>()
         .user_header::<PolicyHeader>()
         .max_publishers(1)
-        .max_subscribers(domain.max_actors() + 2)
-        .max_nodes(domain.max_actors() + 4)
+        .max_subscribers(readers(domain.max_actors()))
+        .max_nodes(nodes(domain.max_actors()))
         .enable_safe_overflow(true)
         .history_size(1)
-        .subscriber_max_buffer_size(1)
-        // One in use, and the next one in hand before the first is let go.
-        .subscriber_max_borrowed_samples(2)
+        .subscriber_max_buffer_size(BUFFER)
+        .subscriber_max_borrowed_samples(BORROWED)
         .open_or_create()
         .map_err(|cause| ChannelError::new(CHANNEL, "open", cause))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn there_is_room_for_the_next_policy_while_every_reader_holds_two_that_nobody_else_holds() {
+        const MAX_ACTORS: u32 = 3;
+        let run_id = format!("{:x}", std::process::id());
+        let domain = Domain::join(&run_id, MAX_ACTORS).unwrap();
+        let publisher = PolicyPublisher::open(&domain, 100).unwrap();
+        let readers: Vec<_> = (0..readers(MAX_ACTORS as usize))
+            .map(|_| PolicyReader::open(&domain, 0, 100).unwrap().subscriber)
+            .collect();
+        let publish = |version| {
+            let header = PolicyHeader {
+                version,
+                ..PolicyHeader::default()
+            };
+            publisher.publish(&[version as f32; 100], header).unwrap();
+        };
+        let mut held = Vec::new();
+        let mut version = 0;
+        for reader in readers.iter().flat_map(|reader| [reader; BORROWED]) {
+            version += 1;
+            publish(version);
+            held.push((version, reader.receive().unwrap().unwrap()));
+        }
+        for further in 1..10 {
+            publish(version + further);
+        }
+        for (version, sample) in &held {
+            assert_eq!(sample.user_header().version, *version);
+            assert_eq!(sample.payload(), [*version as f32; 100]);
+        }
+        drop((held, readers, publisher));
+        domain.leave().unwrap();
+    }
 }

@@ -6,10 +6,17 @@ use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::*;
+use iceoryx2::service::header::publish_subscribe::Header;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 
-use super::{ChannelError, Domain, claim, service_name};
+use super::{ChannelError, Domain, claim, memory, service_name};
 use crate::report::{EpisodeReport, EvaluationReport, Heartbeat, LearnerReport};
+
+/// Reports a reader has in hand: each is copied and let go.
+const BORROWED: usize = 1;
+
+/// Reports a sender has in hand.
+const LOANED: usize = 1;
 
 /// A kind of report: its channel, and how many may wait to be read.
 pub trait Report: Copy + Debug + ZeroCopySend + 'static {
@@ -19,6 +26,8 @@ pub trait Report: Copy + Debug + ZeroCopySend + 'static {
     const BUFFER: usize;
     /// Reports that a reader who comes late is still given.
     const HISTORY: usize;
+    /// Readers there may be: the launcher, the learner, and room for one more to look on.
+    const READERS: usize = 3;
 }
 
 impl Report for Heartbeat {
@@ -29,8 +38,11 @@ impl Report for Heartbeat {
 
 impl Report for EpisodeReport {
     const CHANNEL: &'static str = "reports/episodes";
+    // As many environments as an actor can have: a time limit ends all their episodes at the same step.
     const BUFFER: usize = 4096;
     const HISTORY: usize = 0;
+    // The launcher alone: each further one would cost every actor 370 KB.
+    const READERS: usize = 1;
 }
 
 impl Report for EvaluationReport {
@@ -67,6 +79,7 @@ impl<R: Report> Reporter<R> {
         let publisher = claim(R::CHANNEL, "report", || {
             service::<R>(domain)?
                 .publisher_builder()
+                .max_loaned_samples(LOANED)
                 .create()
                 .map_err(|cause| ChannelError::new(R::CHANNEL, "report", cause))
         })?;
@@ -116,19 +129,31 @@ impl<R: Report> Reports<R> {
     }
 }
 
+/// Bytes of shared memory that reports of kind `R` reserve in a run of up to so many actors, with so many senders.
+pub fn reserved<R: Report>(max_actors: usize, senders: usize) -> u64 {
+    let samples = R::READERS * (R::BUFFER + BORROWED) + R::HISTORY + LOANED;
+    let sender = memory::segment::<Header, ()>(samples, size_of::<R>())
+        + R::READERS as u64 * memory::connection(1, R::BUFFER, BORROWED, samples);
+    memory::service(2 * parties(max_actors)) + senders as u64 * sender
+}
+
+fn parties(max_actors: usize) -> usize {
+    2 * max_actors + 8
+}
+
 fn service<R: Report>(domain: &Domain) -> Result<PortFactory<ipc::Service, R, ()>, ChannelError> {
-    let parties = 2 * domain.max_actors() + 8;
+    let parties = parties(domain.max_actors());
     domain
         .node()
         .service_builder(&service_name(domain, R::CHANNEL)?)
         .publish_subscribe::<R>()
         .max_publishers(parties)
-        .max_subscribers(3)
+        .max_subscribers(R::READERS)
         .max_nodes(parties)
         .enable_safe_overflow(true)
         .history_size(R::HISTORY)
         .subscriber_max_buffer_size(R::BUFFER)
-        .subscriber_max_borrowed_samples(1)
+        .subscriber_max_borrowed_samples(BORROWED)
         .open_or_create()
         .map_err(|cause| ChannelError::new(R::CHANNEL, "open", cause))
 }

@@ -14,12 +14,23 @@ use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::*;
 use iceoryx2::sample::Sample;
 use iceoryx2::sample_mut::SampleMut;
+use iceoryx2::service::header::publish_subscribe::Header;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 
-use super::{Bell, ChannelError, Domain, Interruption, claim, service_name, wait_for};
+use super::words::{numbers_of, words_of};
+use super::{Bell, ChannelError, Domain, Interruption, claim, memory, service_name, wait_for};
 use crate::commit::{ChunkMark, CommitReader};
 use crate::stop::Stop;
-use crate::transition::{RowLayout, Transition};
+use crate::transition::{ChunkLayout, Transition};
+
+/// Chunks the learner has in hand.
+const BORROWED: usize = 2;
+
+/// Chunks an actor has in hand.
+const LOANED: usize = 2;
+
+/// Processes that may take part in one flow.
+const NODES: usize = 8;
 
 /// What a chunk's receiver knows of it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ZeroCopySend)]
@@ -42,8 +53,7 @@ pub struct ChunkHeader {
 pub struct ChunkSender {
     publisher: Publisher<ipc::Service, [f32], ChunkHeader>,
     channel: String,
-    layout: RowLayout,
-    rows: usize,
+    layout: ChunkLayout,
     actor: u32,
     incarnation: u64,
     sent: u64,
@@ -57,8 +67,7 @@ pub struct Greeting(ChunkSender);
 #[derive(Debug)]
 pub struct Chunk {
     sample: SampleMut<ipc::Service, [f32], ChunkHeader>,
-    layout: RowLayout,
-    rows: usize,
+    layout: ChunkLayout,
     filled: usize,
 }
 
@@ -67,13 +76,14 @@ pub struct Chunk {
 pub struct ChunkReceiver {
     subscriber: Subscriber<ipc::Service, [f32], ChunkHeader>,
     channel: String,
+    layout: ChunkLayout,
 }
 
 /// A chunk in the sender's memory; its place is free again when this is dropped.
 #[derive(Debug)]
 pub struct ReceivedChunk {
     sample: Sample<ipc::Service, [f32], ChunkHeader>,
-    width: usize,
+    layout: ChunkLayout,
 }
 
 impl Greeting {
@@ -107,7 +117,7 @@ impl Greeting {
 }
 
 impl ChunkSender {
-    /// The sending end of `actor`, whose chunks have `rows` rows and of which `window` may be uncommitted. Incarnations
+    /// The sending end of `actor`, whose chunks have this layout and of which `window` may be uncommitted. Incarnations
     /// count from 1.
     ///
     /// # Errors
@@ -116,16 +126,15 @@ impl ChunkSender {
         domain: &Domain,
         actor: u32,
         incarnation: u64,
-        layout: RowLayout,
-        rows: usize,
+        layout: ChunkLayout,
         window: u32,
     ) -> Result<Greeting, ChannelError> {
         let channel = name(actor);
         let publisher = claim(&channel, "send", || {
             service(domain, &channel, window)?
                 .publisher_builder()
-                .initial_max_slice_len(rows * layout.width())
-                .max_loaned_samples(2)
+                .initial_max_slice_len(layout.len())
+                .max_loaned_samples(LOANED)
                 .create()
                 .map_err(|cause| ChannelError::new(&channel, "send", cause))
         })?;
@@ -133,7 +142,6 @@ impl ChunkSender {
             publisher,
             channel,
             layout,
-            rows,
             actor,
             incarnation,
             sent: 0,
@@ -159,12 +167,11 @@ impl ChunkSender {
     pub fn begin(&self) -> Result<Chunk, ChannelError> {
         let sample = self
             .publisher
-            .loan_slice(self.rows * self.layout.width())
+            .loan_slice(self.layout.len())
             .map_err(|cause| ChannelError::new(&self.channel, "begin a chunk", cause))?;
         Ok(Chunk {
             sample,
             layout: self.layout,
-            rows: self.rows,
             filled: 0,
         })
     }
@@ -210,11 +217,21 @@ impl ChunkSender {
 impl Chunk {
     /// Writes the next row. A full chunk takes no more.
     pub fn push(&mut self, transition: &Transition<'_>) {
-        let width = self.layout.width();
-        if let Some(row) = self.sample.payload_mut().chunks_exact_mut(width).nth(self.filled) {
-            self.layout.write(transition, row);
+        let rows = self.layout.numbers_of_rows();
+        let mut rows = self.sample.payload_mut()[..rows].chunks_exact_mut(self.layout.row.width());
+        if let Some(row) = rows.nth(self.filled) {
+            self.layout.row.write(transition, row);
             self.filled += 1;
         }
+    }
+
+    /// Says where the actor stands after the last row.
+    ///
+    /// # Panics
+    /// As `copy_from_slice` does: the layout says how many words there are.
+    pub fn set_standing(&mut self, words: &[u64]) {
+        let rows = self.layout.numbers_of_rows();
+        self.sample.payload_mut()[rows..].copy_from_slice(numbers_of(words));
     }
 
     /// Rows written.
@@ -229,16 +246,16 @@ impl Chunk {
 
     /// Whether every row is written.
     pub fn is_full(&self) -> bool {
-        self.filled == self.rows
+        self.filled == self.layout.rows
     }
 }
 
 impl ChunkReceiver {
-    /// The receiving end of `actor`'s chunks.
+    /// The receiving end of `actor`'s chunks, which have this layout.
     ///
     /// # Errors
     /// When shared memory cannot be had, or another learner lives.
-    pub fn open(domain: &Domain, actor: u32, window: u32) -> Result<Self, ChannelError> {
+    pub fn open(domain: &Domain, actor: u32, layout: ChunkLayout, window: u32) -> Result<Self, ChannelError> {
         let channel = name(actor);
         let subscriber = claim(&channel, "receive", || {
             service(domain, &channel, window)?
@@ -247,33 +264,36 @@ impl ChunkReceiver {
                 .create()
                 .map_err(|cause| ChannelError::new(&channel, "receive", cause))
         })?;
-        Ok(Self { subscriber, channel })
+        Ok(Self {
+            subscriber,
+            channel,
+            layout,
+        })
     }
 
     /// The next chunk, if there is one.
     ///
     /// # Errors
     /// When the sender's memory cannot be mapped, or the chunk contradicts itself.
-    pub fn receive(&self, layout: RowLayout) -> Result<Option<ReceivedChunk>, ChannelError> {
+    pub fn receive(&self) -> Result<Option<ReceivedChunk>, ChannelError> {
         let received = self
             .subscriber
             .receive()
             .map_err(|cause| ChannelError::new(&self.channel, "receive", cause))?;
         let Some(sample) = received else { return Ok(None) };
-        let width = layout.width();
-        if sample.user_header().rows as usize * width > sample.payload().len() {
-            let cause = format!(
-                "a chunk of {} numbers claims {} rows",
-                sample.payload().len(),
-                sample.user_header().rows
-            );
+        let (rows, numbers) = (sample.user_header().rows as usize, sample.payload().len());
+        if rows > self.layout.rows || numbers != self.layout.len() {
+            let cause = format!("a chunk of {numbers} numbers claims {rows} rows");
             return Err(ChannelError {
                 channel: self.channel.clone(),
                 action: "receive",
                 cause,
             });
         }
-        Ok(Some(ReceivedChunk { sample, width }))
+        Ok(Some(ReceivedChunk {
+            sample,
+            layout: self.layout,
+        }))
     }
 }
 
@@ -289,17 +309,39 @@ impl ReceivedChunk {
         let ChunkHeader {
             incarnation, sequence, ..
         } = *self.header();
-        let is_greeting = sequence == 0;
         ChunkMark {
             incarnation,
-            sequence: if is_greeting { committed.sequence } else { sequence },
+            sequence: if self.is_greeting() {
+                committed.sequence
+            } else {
+                sequence
+            },
         }
+    }
+
+    fn is_greeting(&self) -> bool {
+        self.header().sequence == 0
     }
 
     /// Its filled rows, one after the other.
     pub fn rows(&self) -> &[f32] {
-        &self.sample.payload()[..self.header().rows as usize * self.width]
+        &self.sample.payload()[..self.header().rows as usize * self.layout.row.width()]
     }
+
+    /// Where the actor stands after it; `None` for a greeting, and where nobody asks.
+    pub fn standing(&self) -> Option<Vec<u64>> {
+        let rows = self.layout.numbers_of_rows();
+        let asked = self.layout.standing_words > 0 && !self.is_greeting();
+        asked.then(|| words_of(&self.sample.payload()[rows..]))
+    }
+}
+
+/// Bytes of shared memory that one actor's chunks of this layout reserve, with such a window.
+pub fn reserved(layout: &ChunkLayout, window: u32) -> u64 {
+    let chunks = buffer(window) + BORROWED + window as usize + LOANED;
+    memory::service(NODES)
+        + memory::segment::<Header, ChunkHeader>(chunks, size_of::<f32>() * layout.len())
+        + memory::connection(1, buffer(window), BORROWED, chunks)
 }
 
 fn name(actor: u32) -> String {
@@ -320,11 +362,11 @@ fn service(domain: &Domain, channel: &str, window: u32) -> Result<ChunkService, 
         .user_header::<ChunkHeader>()
         .max_publishers(1)
         .max_subscribers(1)
-        .max_nodes(8)
+        .max_nodes(NODES)
         .enable_safe_overflow(false)
         .history_size(window as usize)
         .subscriber_max_buffer_size(buffer(window))
-        .subscriber_max_borrowed_samples(2)
+        .subscriber_max_borrowed_samples(BORROWED)
         .open_or_create()
         .map_err(|cause| ChannelError::new(channel, "open", cause))
 }

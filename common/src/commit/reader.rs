@@ -120,6 +120,17 @@ impl CommitReader {
         self.consistent(|slot| record::load_actor(&self.words, slot, &self.layout, actor))
     }
 
+    /// Where an actor stood after its last chunk, as it said it; zeros before the first.
+    ///
+    /// # Panics
+    /// As indexing a slice does: `actor` must be less than `layout().actors`.
+    pub fn standing(&self, actor: usize) -> Vec<u64> {
+        self.snapshot().map_or_else(
+            || vec![0; self.layout.standing_words],
+            |record| record.standing(actor).to_vec(),
+        )
+    }
+
     /// The whole record, all of one moment. `None` if it is damaged, which only the learner can repair.
     pub fn snapshot(&self) -> Option<Record> {
         self.consistent(|slot| Record::load(&self.words, slot, &self.layout))

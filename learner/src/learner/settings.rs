@@ -4,15 +4,17 @@ use std::path::PathBuf;
 
 use shoal_common::channel::ChannelError;
 use shoal_common::config::{self, Mode};
+use shoal_common::network::NetworkLayout;
 use shoal_common::policy_file::PolicyFileError;
 use shoal_common::report::Identity;
 use shoal_common::space::EnvironmentSpec;
+use shoal_common::transition::ChunkLayout;
 
 use crate::checkpoint::{CheckpointError, SectionError};
-use crate::ddpg::{DdpgError, DdpgSettings};
+use crate::ddpg::{DdpgError, DdpgSettings, DdpgState};
 use crate::intake::IntakeError;
 use crate::ratio::Ratio;
-use crate::replay::ReplayError;
+use crate::replay::{ReplayError, ReplayLayout};
 
 /// What a learner is told.
 #[derive(Clone, Debug)]
@@ -31,8 +33,8 @@ pub struct Settings {
     pub max_actors: u32,
     /// Chunks an actor may have sent and not committed.
     pub window: u32,
-    /// Rows in a full chunk.
-    pub chunk_rows: usize,
+    /// What a chunk has room for.
+    pub chunk: ChunkLayout,
     /// What is controlled.
     pub spec: EnvironmentSpec,
     /// The algorithm's numbers.
@@ -98,20 +100,49 @@ pub enum LearnerError {
 }
 
 impl Settings {
+    /// Bytes that the learner's files need on the disk beyond what is there already; `None` where a replay so large is not
+    /// possible.
+    pub fn disk_bytes(&self) -> Option<u64> {
+        let replay = if self.replay.exists() {
+            0
+        } else {
+            self.replay_layout().places()?.end as u64
+        };
+        let (observation, action) = (self.spec.observation.width(), self.spec.action.width());
+        let actor = NetworkLayout::policy(observation, self.ddpg.hidden, action).parameters();
+        let critic = NetworkLayout::critic(observation, self.ddpg.hidden, action).parameters();
+        // Half of a checkpoint's parts are an actor's, half a critic's.
+        let checkpoint = DdpgState::PARTS.len() / 2 * (actor + critic);
+        // The latest, the one before it, and the next one while it is written; the best policy and the last likewise.
+        let numbers = 3 * checkpoint + 3 * actor;
+        Some(replay + (size_of::<f32>() * numbers) as u64)
+    }
+
+    /// What the replay of this run holds.
+    pub(super) fn replay_layout(&self) -> ReplayLayout {
+        ReplayLayout {
+            row: self.chunk.row,
+            ring: self.ring_rows(),
+            actors: self.max_actors as usize,
+            standing_words: self.chunk.standing_words,
+            fingerprint: self.fingerprint,
+        }
+    }
+
     /// Rows the ring holds: the sampling window, and in lockstep the rows of two checkpoint intervals beyond it, because
     /// a learner that goes on from a checkpoint samples them again.
-    pub(super) fn ring_rows(&self) -> u64 {
+    fn ring_rows(&self) -> u64 {
         let slack = match self.mode {
             Mode::Free => 0,
             Mode::Lockstep => {
                 // Without updates there are no checkpoints to go back to.
                 let interval = self.checkpoint.every_updates as f64 / self.ratio.updates_per_step;
                 let rows = if interval.is_finite() { 2.0 * interval } else { 0.0 };
-                let round = self.chunk_rows as u64 * u64::from(self.actors);
-                rows as u64 + 2 * round
+                let round = self.chunk.rows as u64 * u64::from(self.actors);
+                (rows as u64).saturating_add(2 * round)
             }
         };
         // A ring must have room for a chunk, however small the window.
-        (self.capacity + slack).max(self.chunk_rows as u64)
+        self.capacity.saturating_add(slack).max(self.chunk.rows as u64)
     }
 }

@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::bail;
 use serde::Serialize;
-use shoal_common::channel::environment::{EnvironmentClient, Stepped};
+use shoal_common::channel::environment::{Begin, EnvironmentClient, Stepped};
 use shoal_common::channel::{Bell, Domain, Interruption, Place};
 use shoal_common::config::Config;
 use shoal_common::report::Role;
@@ -74,7 +74,7 @@ fn times(config: &Config, domain: &Domain, server: &mut Peer, patience: &Patienc
         Err(Interruption::Channel(error)) => server.check().and(Err(error.into())),
     };
     ask(&|| client.describe(&bell).map(|_| ()))?;
-    ask(&|| client.reset(&bell, None).map(|_| ()))?;
+    ask(&|| client.reset(&bell, Begin::Next).map(|_| ()))?;
 
     let actions = vec![0.5; environments * config.spec.action.width()];
     let mut times = Vec::new();

@@ -89,7 +89,7 @@ fn move_rows(
     let bell = Bell::hang(domain, Place(Role::Actor, 0))?;
     let ringer = Ringer::new(domain, Place(Role::Learner, 0))?;
     let commits = wait_for_replay(run, &bell, learner, patience)?;
-    let mut sender = ChunkSender::open(domain, 0, 1, row, config.chunk_rows(), config.actors.window)?.wait(
+    let mut sender = ChunkSender::open(domain, 0, 1, config.chunk_layout(), config.actors.window)?.wait(
         &commits,
         &bell,
         &patience.stop,

@@ -5,14 +5,24 @@ use iceoryx2::port::client::Client;
 use iceoryx2::prelude::*;
 use iceoryx2::response::Response;
 
-use super::message::{
-    Ask, Block, NUMBERS_OF_A_WORD, RequestHeader, ResponseHeader, ResponseLayout, Verdict, numbers_of, words_of,
-};
-use super::{name, service};
+use super::message::{Ask, Block, RequestHeader, ResponseHeader, ResponseLayout, Verdict};
+use super::{name, question_length, service};
+use crate::channel::words::{numbers_of, words_of};
 use crate::channel::{Bell, ChannelError, Domain, Interruption, Place, Ringer, claim, wait_for};
 use crate::report::Role;
 use crate::space::{EnvironmentSpec, Space};
 use crate::stop::Stop;
+
+/// Which episodes a reset begins.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Begin {
+    /// The next one of each environment.
+    Next,
+    /// This one of each environment's own stream.
+    Training(u64),
+    /// Of environment `e`, the evaluation episode that far after this one.
+    Evaluation(u64),
+}
 
 /// What an environment server can say to a step.
 #[derive(Debug)]
@@ -108,7 +118,7 @@ impl EnvironmentClient {
     ) -> Result<Self, ChannelError> {
         let channel = name(index);
         let snapshot_words = spec.snapshot_words(environments);
-        let longest = (environments * spec.action.width()).max(NUMBERS_OF_A_WORD * snapshot_words);
+        let longest = question_length(spec, environments);
         let client = claim(&channel, "ask", || {
             service(domain, &channel)?
                 .client_builder()
@@ -166,15 +176,15 @@ impl EnvironmentClient {
         }
     }
 
-    /// Every environment begins a new episode; with `evaluation`, environment `e` begins the evaluation episode that far
-    /// after the given one.
+    /// Every environment begins an episode.
     ///
     /// # Errors
     /// When interrupted.
-    pub fn reset(&self, bell: &Bell, evaluation: Option<u64>) -> Result<Observed, Interruption> {
-        let response = match evaluation {
-            None => self.insist(bell, Ask::Reset, 0, &[]),
-            Some(episode) => self.insist(bell, Ask::ResetToEvaluation, episode, &[]),
+    pub fn reset(&self, bell: &Bell, begin: Begin) -> Result<Observed, Interruption> {
+        let response = match begin {
+            Begin::Next => self.insist(bell, Ask::Reset, 0, &[]),
+            Begin::Training(episode) => self.insist(bell, Ask::ResetToTraining, episode, &[]),
+            Begin::Evaluation(first) => self.insist(bell, Ask::ResetToEvaluation, first, &[]),
         }?;
         self.observed(response).map_err(Interruption::from)
     }

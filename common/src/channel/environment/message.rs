@@ -18,16 +18,19 @@ pub enum Ask {
     Snapshot = 4,
     /// The environments go on with the training episodes of a snapshot.
     Restore = 5,
+    /// Every environment begins the training episode `episode` of its own stream, and counts on from there.
+    ResetToTraining = 6,
 }
 
 impl Ask {
-    pub(super) const ALL: [Self; 6] = [
+    pub(super) const ALL: [Self; 7] = [
         Self::Describe,
         Self::Reset,
         Self::ResetToEvaluation,
         Self::Step,
         Self::Snapshot,
         Self::Restore,
+        Self::ResetToTraining,
     ];
 }
 
@@ -38,7 +41,7 @@ impl Ask {
 pub struct RequestHeader {
     pub(super) ask: u32,
     pub(super) reserved: u32,
-    /// The first evaluation episode of [`Ask::ResetToEvaluation`].
+    /// The episode of [`Ask::ResetToTraining`], the first one of [`Ask::ResetToEvaluation`].
     pub episode: u64,
 }
 
@@ -166,32 +169,9 @@ impl ResponseLayout {
     }
 }
 
-/// Numbers that carry the bits of a word.
-pub(super) const NUMBERS_OF_A_WORD: usize = 2;
-
-/// Words as they travel.
-pub(super) fn numbers_of(words: &[u64]) -> &[f32] {
-    bytemuck::cast_slice(words)
-}
-
-/// The words whose bits came, wherever in memory they lie.
-pub(super) fn words_of(numbers: &[f32]) -> Vec<u64> {
-    let (words, _) = numbers.as_chunks::<NUMBERS_OF_A_WORD>();
-    words.iter().map(|numbers| bytemuck::cast(*numbers)).collect()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn words_come_as_they_went() {
-        let words = [0, u64::MAX, 0x7FA0_0001_FFA0_0001, f64::NAN.to_bits(), 1];
-        assert_eq!(words_of(numbers_of(&words)), words);
-        let mut shifted = vec![0.0];
-        shifted.extend(numbers_of(&words));
-        assert_eq!(words_of(&shifted[1..]), words, "f32 is aligned more loosely");
-    }
 
     #[test]
     fn what_is_written_into_a_block_is_read_from_it() {

@@ -4,10 +4,9 @@ use iceoryx2::active_request::ActiveRequest;
 use iceoryx2::port::server::Server;
 use iceoryx2::prelude::*;
 
-use super::message::{
-    Ask, NUMBERS_OF_A_WORD, RequestHeader, ResponseHeader, ResponseLayout, StepBlocks, Verdict, numbers_of, words_of,
-};
-use super::{name, service};
+use super::message::{Ask, RequestHeader, ResponseHeader, ResponseLayout, StepBlocks, Verdict};
+use super::{LOANED_RESPONSES, answer_length, name, service};
+use crate::channel::words::{numbers_of, words_of};
 use crate::channel::{Bell, ChannelError, Domain, Interruption, Place, Ringer, claim, wait_for};
 use crate::report::Role;
 use crate::space::{EnvironmentSpec, Space};
@@ -45,12 +44,12 @@ impl EnvironmentPort {
     ) -> Result<Self, ChannelError> {
         let channel = name(index);
         let layout = ResponseLayout::new(environments, spec.observation.width());
-        let described = 2 * (spec.observation.width() + spec.action.width());
-        let snapshot = NUMBERS_OF_A_WORD * spec.snapshot_words(environments);
+        let longest = answer_length(&spec, environments);
         let server = claim(&channel, "answer", || {
             service(domain, &channel)?
                 .server_builder()
-                .initial_max_slice_len(layout.len().max(described).max(snapshot))
+                .initial_max_slice_len(longest)
+                .max_loaned_responses_per_request(LOANED_RESPONSES)
                 .create()
                 .map_err(|cause| ChannelError::new(&channel, "answer", cause))
         })?;
@@ -102,7 +101,7 @@ impl Request<'_> {
         Ask::ALL.into_iter().find(|ask| *ask as u32 == code)
     }
 
-    /// The evaluation episode that environment 0 shall begin.
+    /// The evaluation episode that environment 0 shall begin, or the training episode that each shall.
     pub fn episode(&self) -> u64 {
         self.request.user_header().episode
     }

@@ -1,0 +1,320 @@
+//! Whether there is room is asked before anything starts, and what is made is for its owner alone. Small file systems are
+//! mounted in a namespace of their own; where the machine allows none, those tests say so and show nothing.
+
+#![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
+#![allow(clippy::print_stderr, reason = "a test that could not be done says so")]
+
+mod support;
+
+use std::fs;
+use std::os::unix::fs::{MetadataExt, chown};
+use std::os::unix::process::CommandExt;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+
+use support::{Leftovers, QUICK, Running, Workplace, complaint, json, until};
+
+const SHOAL: &str = env!("CARGO_BIN_EXE_shoal");
+const ENDLESS: [&str; 2] = ["--steps", "100000000"];
+const PAGE: u64 = 4096;
+
+/// Runs a shell script that may mount what it likes, with `$SHOAL` the program and `$QUICK` the quick settings; `None`
+/// where the machine does not allow that.
+fn in_namespace(place: &Workplace, script: &str) -> Option<Output> {
+    let ways: [&[&str]; 2] = [&["--mount"], &["--user", "--map-root-user", "--mount"]];
+    let allowed = |way: &&[&str]| {
+        let mount = ["sh", "-c", "mount -t tmpfs tmpfs /mnt"];
+        let tried = Command::new("unshare").args(*way).args(mount).output();
+        tried.is_ok_and(|output| output.status.success())
+    };
+    let Some(way) = ways.into_iter().find(allowed) else {
+        eprintln!("skipped: this machine allows no mount namespace");
+        return None;
+    };
+    let quick: Vec<String> = QUICK.iter().map(|argument| argument.replace(' ', "")).collect();
+    let mut command = Command::new("unshare");
+    command
+        .args(way)
+        .args(["sh", "-ec", script])
+        .env("SHOAL", SHOAL)
+        .env("QUICK", quick.join(" "))
+        .current_dir(place.path())
+        .stdin(Stdio::null());
+    Some(command.output().unwrap())
+}
+
+/// A shared memory of 64 MB, and a user's directory that belongs to it: with the one outside, the next start would find
+/// killed runs whose files it cannot see.
+const CONTAINER: &str = "mount -t tmpfs -o size=64m tmpfs /dev/shm
+    mkdir -p /tmp/shoal-$(id -u); mount -t tmpfs -o mode=700 tmpfs /tmp/shoal-$(id -u)
+    ";
+
+fn files_of(running: &Running) -> Vec<PathBuf> {
+    let files = running.leftovers().files().into_iter();
+    files.map(|name| Path::new("/dev/shm").join(name)).collect()
+}
+
+/// What is in a directory, and in those below it.
+fn everything_in(directory: &Path) -> Vec<PathBuf> {
+    let mut found = vec![directory.to_owned()];
+    let mut next = 0;
+    while let Some(path) = found.get(next) {
+        if path.is_dir() {
+            let inside: Vec<PathBuf> = fs::read_dir(path).unwrap().map(|entry| entry.unwrap().path()).collect();
+            found.extend(inside);
+        }
+        next += 1;
+    }
+    found
+}
+
+fn is_private(path: &Path) -> bool {
+    // What has gone in between is nobody's.
+    fs::symlink_metadata(path).is_ok_and(|metadata| metadata.mode() & 0o077 == 0) || !path.exists()
+}
+
+#[test]
+fn what_a_run_reserves_is_at_most_what_was_computed_and_at_least_half_of_it() {
+    for arguments in [
+        &["--actors", "1", "--set", "actors.max=1"][..],
+        &["--actors", "12", "--set", "actors.max=12"],
+        &[
+            "--actors",
+            "3",
+            "--set",
+            "actors.max=3",
+            "--envs",
+            "40",
+            "--set",
+            "actors.window=40",
+        ],
+        &[
+            "--actors",
+            "6",
+            "--set",
+            "actors.max=6",
+            "--set",
+            "ddpg.hidden=[400, 300]",
+        ],
+        &[
+            "--actors",
+            "2",
+            "--set",
+            "actors.max=2",
+            "--set",
+            "actors.chunk_steps=2000",
+        ],
+    ] {
+        let place = Workplace::new();
+        let running = place.start_as("run", &[&QUICK[..], &ENDLESS, arguments].concat());
+        // A role opens its last channels after it has said that it is ready.
+        until("everybody is at work", || running.learned("updates") > 0);
+        let files = files_of(&running);
+        let promised = |path: &PathBuf| path.to_str()?.split_once("_promise_")?.1.parse().ok();
+        let computed: u64 = files.iter().find_map(promised).unwrap();
+        let reserved: u64 = files
+            .iter()
+            .map(|path| fs::metadata(path).unwrap().len().next_multiple_of(PAGE))
+            .sum();
+        eprintln!("{arguments:?}: {reserved} bytes reserved, {computed} computed");
+        assert!(
+            reserved <= computed && computed <= 2 * reserved,
+            "{arguments:?}: {reserved} bytes reserved, {computed} computed"
+        );
+    }
+}
+
+#[test]
+fn the_default_run_fits_into_a_container_and_one_of_64_actors_is_refused_there() {
+    let place = Workplace::new();
+    let Some(output) = in_namespace(
+        &place,
+        &format!("{CONTAINER} exec $SHOAL train pendulum --steps 1300 --run run --json"),
+    ) else {
+        return;
+    };
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    assert_eq!(json(&output)["env_steps"], 1300);
+
+    let refused = in_namespace(
+        &place,
+        &format!("{CONTAINER} exec $SHOAL train pendulum --steps 1300 --run large --json --actors 64"),
+    );
+    let said = complaint(&refused.unwrap());
+    assert!(
+        said.contains("MiB of /dev/shm for up to 64 actors, and 64.0 MiB are free: lay it out for at most "),
+        "{said}"
+    );
+    assert!(!place.path().join("large").exists(), "nothing was made");
+}
+
+#[test]
+fn what_another_run_was_promised_is_not_free() {
+    let place = Workplace::new();
+    let script = "$SHOAL train pendulum --steps 100000000 --run first --quiet & first=$!
+        timeout 60 sh -c 'until ls /dev/shm | grep -q promise; do sleep 0.05; done'
+        $SHOAL train pendulum --steps 100 --run second --json || code=$?
+        kill $first; wait $first || true
+        exit $code";
+    let Some(output) = in_namespace(&place, &[CONTAINER, script].concat()) else {
+        return;
+    };
+    let said = complaint(&output);
+    assert!(said.contains("of /dev/shm"), "{said}");
+    assert!(!place.path().join("second").exists(), "nothing was made");
+}
+
+#[test]
+fn a_full_disk_is_said_before_anything_is_made() {
+    let place = Workplace::new();
+    fs::create_dir(place.path().join("small")).unwrap();
+    let script = "mount -t tmpfs -o size=8m tmpfs small
+        $SHOAL train pendulum --run small/run --json || code=$?
+        ls small
+        exit $code";
+    let Some(output) = in_namespace(&place, script) else {
+        return;
+    };
+    let said = complaint(&output);
+    assert!(
+        said.contains("of disk and") && said.contains("small has 8.0 MiB"),
+        "{said}"
+    );
+}
+
+#[test]
+fn a_disk_that_fills_up_ends_the_run_with_one_line() {
+    let place = Workplace::new();
+    fs::create_dir(place.path().join("small")).unwrap();
+    let script = "mount -t tmpfs -o size=32m tmpfs small
+        $SHOAL train pendulum --steps 100000000 --run small/run $QUICK --json & run=$!
+        timeout 60 sh -c 'until test -s small/run/checkpoints/latest.ckpt; do sleep 0.05; done'
+        cat /dev/zero > small/filler 2>/dev/null || true
+        timeout 60 tail --pid=$run -f /dev/null
+        wait $run";
+    let Some(output) = in_namespace(&place, script) else {
+        return;
+    };
+    let said = complaint(&output);
+    assert!(said.contains("No space left on device"), "{said}");
+}
+
+#[test]
+fn a_directory_that_cannot_be_written_is_said() {
+    let place = Workplace::new();
+    fs::create_dir(place.path().join("closed")).unwrap();
+    let script = "mount -t tmpfs -o ro tmpfs closed; exec $SHOAL train pendulum --run closed/run --json";
+    let Some(output) = in_namespace(&place, script) else {
+        return;
+    };
+    let said = complaint(&output);
+    assert!(
+        said.contains("closed/run") && said.contains("Read-only file system"),
+        "{said}"
+    );
+
+    place.train(&["pendulum", "--steps", "300", "--run", "run"]);
+    let closed = "mount --bind run run; mount -o remount,bind,ro run;";
+    let judged = in_namespace(
+        &place,
+        &format!("{closed} exec $SHOAL eval run --policy last --episodes 2 --json"),
+    );
+    assert_eq!(json(&judged.unwrap())["episodes"], 2, "to read is enough");
+    let said = complaint(&in_namespace(&place, &format!("{closed} exec $SHOAL plot run")).unwrap());
+    assert!(
+        said.contains(".svg") && said.contains("Read-only file system"),
+        "{said}"
+    );
+}
+
+#[test]
+fn a_limit_of_open_files_is_raised_where_it_can_be_and_said_where_not() {
+    let place = Workplace::new();
+    let limited = |limit: &str, run: &str| {
+        let script = format!("ulimit {limit}; exec {SHOAL} train pendulum --steps 300 --run {run} --json \"$@\"");
+        let mut command = Command::new("sh");
+        command
+            .args(["-c", &script, "sh"])
+            .args(QUICK)
+            .current_dir(place.path());
+        command.output().unwrap()
+    };
+    let said = complaint(&limited("-n 64", "run"));
+    assert!(
+        said.contains("open files") && said.contains("the limit is 64"),
+        "{said}"
+    );
+    assert!(!place.path().join("run").exists(), "nothing was made");
+    let output = limited("-Sn 32", "run");
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+}
+
+#[test]
+fn everything_a_run_makes_is_for_its_owner_alone() {
+    let place = Workplace::new();
+    let running = place.start("run", &ENDLESS);
+    until("there is a checkpoint", || {
+        running.run.join("checkpoints/latest.ckpt").exists()
+    });
+    let user = rustix::process::getuid().as_raw();
+    // What is below it is closed with it.
+    let root = PathBuf::from(format!("/tmp/shoal-{user}"));
+    let files = files_of(&running);
+    assert!(files.len() > 50, "{files:?}");
+    let open = |paths: Vec<PathBuf>| paths.into_iter().filter(|path| !is_private(path)).collect::<Vec<_>>();
+    let none: [PathBuf; 0] = [];
+    assert_eq!(open([files, vec![root]].concat()), none);
+    assert_eq!(open(everything_in(&running.run)), none);
+    running.signal(rustix::process::Signal::INT);
+    running.wait();
+    assert!(place.output(&["plot", "run", "--out", "figures"]).status.success());
+    assert_eq!(open(everything_in(&place.path().join("run"))), none);
+    let figures = everything_in(&place.path().join("figures"));
+    assert!(figures.len() > 1);
+    assert_eq!(open(figures), none);
+}
+
+#[test]
+fn two_users_do_not_touch_each_other() {
+    const NOBODY: u32 = 65534;
+    if !rustix::process::getuid().is_root() {
+        eprintln!("skipped: only root can be two users");
+        return;
+    }
+    let (place, other) = (Workplace::new(), Workplace::new());
+    let running = place.start("run", &ENDLESS);
+    until("everybody is at work", || running.learned("updates") > 0);
+    let state = || {
+        let mut files: Vec<_> = files_of(&running)
+            .into_iter()
+            .map(|path| fs::metadata(path).map(|metadata| metadata.ino()).unwrap())
+            .collect();
+        files.sort_unstable();
+        (files, running.log().lines().count())
+    };
+    let before = state();
+
+    // The program's own directory may be closed to others.
+    let program = other.path().join("shoal");
+    fs::copy(SHOAL, &program).unwrap();
+    chown(other.path(), Some(NOBODY), Some(NOBODY)).unwrap();
+    let output = Command::new(&program)
+        .args(["train", "pendulum", "--steps", "300", "--run", "run", "--json"])
+        .args(QUICK)
+        .current_dir(other.path())
+        .env("HOME", other.path())
+        .uid(NOBODY)
+        .gid(NOBODY)
+        .output()
+        .unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    assert_eq!(json(&output)["env_steps"], 300);
+    for path in everything_in(&other.path().join("run")) {
+        assert_eq!(fs::metadata(&path).unwrap().uid(), NOBODY, "{}", path.display());
+    }
+    let root = fs::metadata(format!("/tmp/shoal-{NOBODY}")).unwrap();
+    assert_eq!((root.uid(), root.mode() & 0o777), (NOBODY, 0o700));
+    let left = Leftovers::of(&other.path().join("run"));
+    assert!(left.files().is_empty(), "{:?} of {}", left.files(), left.run_id());
+    assert_eq!(state(), before, "the first run was not touched");
+}
