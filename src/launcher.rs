@@ -223,19 +223,12 @@ impl<'a> Launcher<'a> {
 
     /// The evaluator may still be at the policy of the last period.
     fn await_last_evaluation(&mut self) -> anyhow::Result<()> {
-        let evaluation = self.config.evaluation.clone();
         let patience = Instant::now();
         while patience.elapsed() < LAST_EVALUATION && self.signals.received().is_none() {
             self.read_reports()?;
-            let last = self
-                .progress
-                .learner()
-                .map_or(0, |learner| evaluation.period(learner.env_steps));
-            if self
-                .progress
-                .evaluated()
-                .is_some_and(|report| evaluation.period(report.env_steps) >= last)
-            {
+            let last = self.progress.learner().map_or(0, |learner| learner.env_steps);
+            // What is judged is in the records, this launcher's or an earlier one's.
+            if status::judged(&self.config, self.run)? >= Some(self.config.evaluation.period(last)) {
                 break;
             }
             std::thread::sleep(ROUND);

@@ -15,7 +15,7 @@ use shoal_learner::ratio::Ratio;
 use tracing_subscriber::filter::LevelFilter;
 
 use crate::cli::RoleArgs;
-use crate::recorder::read_evaluations;
+use crate::status::judged;
 
 /// Runs a role until it is through, or its standard input closes.
 pub(crate) fn run(role: Role, args: &RoleArgs) -> anyhow::Result<()> {
@@ -101,16 +101,6 @@ fn serve(domain: &Domain, config: &Config, identity: Identity, stop: &Stop) -> a
         pulse,
         stop,
     )?)
-}
-
-/// The period of the policy that was judged last, by the run's records: the launcher has them written before it starts
-/// anybody again.
-fn judged(config: &Config, run: &RunDir) -> anyhow::Result<Option<u64>> {
-    let evaluations = read_evaluations(&run.evaluations())?;
-    let periods = evaluations
-        .iter()
-        .map(|evaluation| config.evaluation.period(evaluation.env_steps));
-    Ok(periods.max())
 }
 
 fn explorer_settings(config: &Config, run: &RunDir, identity: Identity) -> explorer::Settings {

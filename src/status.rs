@@ -6,6 +6,8 @@ use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
 use shoal_learner::checkpoint::Checkpoints;
 
+use crate::recorder::{RecordError, read_evaluations};
+
 /// How a run stands that nobody works on: what a learner would go on from.
 pub(crate) fn at_rest(config: &Config, run: &RunDir) -> anyhow::Result<RunStatus> {
     let counters = Checkpoints::new(&run.checkpoints(), config.fingerprint())
@@ -33,6 +35,16 @@ pub(crate) fn replay_rows(run: &RunDir) -> Result<u64, OpenError> {
         Err(OpenError::NotYet { .. }) => Ok(0),
         Err(error) => Err(error),
     }
+}
+
+/// The period of the policy that was judged last, by the run's records: the launcher has them written before it starts
+/// anybody again.
+pub(crate) fn judged(config: &Config, run: &RunDir) -> Result<Option<u64>, RecordError> {
+    let evaluations = read_evaluations(&run.evaluations())?;
+    let periods = evaluations
+        .iter()
+        .map(|evaluation| config.evaluation.period(evaluation.env_steps));
+    Ok(periods.max())
 }
 
 /// Updates for each environment step beyond the warm-up.

@@ -97,6 +97,8 @@ struct Explorer<'a> {
     step: u64,
     /// Where it stood after the last chunk, where it can say that.
     standing: Option<Standing>,
+    /// Since when it knows that the run ends.
+    hurried: Option<Instant>,
     /// Episodes whose ends are in the chunk under way.
     ended: Vec<EpisodeReport>,
 }
@@ -139,6 +141,7 @@ impl<'a> Explorer<'a> {
             network,
             step: 0,
             standing,
+            hurried: None,
             ended: Vec::new(),
             sender,
             chunk: None,
@@ -381,9 +384,8 @@ impl<'a> Explorer<'a> {
     /// Waits until no more than `most` chunks are uncommitted; whether that came about.
     fn await_commits(&mut self, most: u64) -> Result<bool, ChannelError> {
         let index = self.settings.identity.index as usize;
-        let mut hurried: Option<Instant> = None;
         while self.sender.in_flight(self.commits.committed(index)) > most {
-            if self.stop.at_once() && hurried.get_or_insert_with(Instant::now).elapsed() >= FAREWELL {
+            if self.stop.at_once() && self.hurried.get_or_insert_with(Instant::now).elapsed() >= FAREWELL {
                 return Ok(false);
             }
             self.pulse.beat(Activity::WaitingForRatio);

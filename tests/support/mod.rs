@@ -156,6 +156,11 @@ impl Running {
         self.signal_role(who, Signal::STOP);
     }
 
+    /// Lets a stopped process go on.
+    pub(crate) fn go_on(&self, who: &str) {
+        self.signal_role(who, Signal::CONT);
+    }
+
     fn signal_role(&self, who: &str, signal: Signal) {
         let pid = *self.pids(who).last().unwrap();
         kill_process(Pid::from_raw(pid).unwrap(), signal).unwrap();

@@ -1,0 +1,264 @@
+//! Runs that were broken off go on: after the launcher was killed, after everything was, and after what a disk may do.
+
+#![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
+
+mod support;
+
+use std::os::unix::fs::FileExt;
+use std::path::Path;
+use std::time::Duration;
+
+use rustix::process::Signal;
+use shoal_common::commit::CommitReader;
+use shoal_common::config::Config;
+use support::{Running, Workplace, complaint, parse, until};
+
+/// Rows of the quick runs' ring.
+const RING: u64 = 2000;
+
+const ENDLESS: [&str; 2] = ["--steps", "100000000"];
+
+fn learns(running: &Running) {
+    let before = running.learned("updates");
+    until("something more is learned", || running.learned("updates") > before);
+}
+
+fn has_saved(running: &Running) {
+    let checkpoint = running.run.join("checkpoints/latest.ckpt");
+    until("there is a checkpoint", || checkpoint.exists());
+}
+
+fn rows(run: &Path) -> u64 {
+    CommitReader::open(&run.join("replay.bin")).unwrap().rows()
+}
+
+/// A run that has learned something, whose processes are all killed.
+fn killed(place: &Workplace, arguments: &[&str]) -> std::path::PathBuf {
+    let quickly = ["--set", "checkpoint.every_seconds=0.5"];
+    let running = place.start("run", &[&ENDLESS[..], &quickly, arguments].concat());
+    learns(&running);
+    has_saved(&running);
+    learns(&running);
+    running.kill_everybody();
+    running.run.clone()
+}
+
+/// Goes on for so many steps more, to the end.
+fn goes_on(place: &Workplace, more: u64) -> serde_json::Value {
+    let steps = rows(&place.path().join("run")) + more;
+    let (code, printed, leftovers) = place.resume("run", &["--steps", &steps.to_string()]).wait();
+    assert_eq!(code, Some(0), "{}", place.said());
+    assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
+    let result = parse(&printed);
+    assert_eq!(result["env_steps"], steps);
+    assert_eq!(result["updates"], steps - 64);
+    result
+}
+
+#[test]
+fn when_the_launcher_is_killed_the_run_can_be_resumed_at_once() {
+    let place = Workplace::new();
+    let running = place.start("run", &ENDLESS);
+    learns(&running);
+    let (run, before) = (running.run.clone(), rows(&running.run));
+    running.signal(Signal::KILL);
+    // The old roles may still be saving what they have.
+    let resumed = place.resume("run", &[]);
+    learns(&resumed);
+    assert!(rows(&run) > before);
+    assert!(place.output(&["stop", "run"]).status.success());
+    let (code, _, leftovers) = resumed.wait();
+    assert_eq!(code, Some(0));
+    assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
+    for actor in 0..2 {
+        let (sent, committed) = (support::sent(&run, actor), support::committed(&run, actor as usize));
+        // Between two launchers nobody writes down what an actor says of its last chunks.
+        assert!(
+            (sent..sent + 100).contains(&committed),
+            "actor {actor} sent {sent}, {committed} are there"
+        );
+    }
+}
+
+#[test]
+fn when_everything_is_killed_at_once_no_committed_row_is_lost() {
+    let place = Workplace::new();
+    let run = killed(&place, &[]);
+    let before = rows(&run);
+    assert!(before > 64);
+    let status = place.output(&["status", "run", "--json"]);
+    assert_eq!(status.status.code(), Some(3));
+    assert_eq!(support::json(&status)["replay_rows"], before);
+    goes_on(&place, 2000);
+    let log = std::fs::read_to_string(run.join("shoal.log")).unwrap();
+    assert!(
+        log.contains(&format!("of {before} rows")),
+        "the learner began with all of them: {log}"
+    );
+}
+
+#[test]
+fn a_role_that_is_stopped_for_a_while_goes_on_and_nothing_is_there_twice() {
+    stopped_for(Duration::from_secs(4));
+}
+
+#[test]
+#[ignore = "takes minutes"]
+fn a_role_that_is_stopped_for_half_a_minute_goes_on_and_nothing_is_there_twice() {
+    stopped_for(Duration::from_secs(30));
+}
+
+/// Stops each role in turn, then the launcher, then everybody.
+fn stopped_for(length: Duration) {
+    let place = Workplace::new();
+    let running = place.start("run", &[&ENDLESS[..], &["--set", "replay.capacity=200000"]].concat());
+    let run = running.run.clone();
+    learns(&running);
+    for who in ["actor-0", "env-server-0", "evaluator-0", "env-server-16", "learner-0"] {
+        running.stop(who);
+        std::thread::sleep(length);
+        let status = place.status("run");
+        let mut roles = status["roles"].as_array().unwrap().iter();
+        let stopped = roles.find(|role| format!("{}-{}", role["role"].as_str().unwrap(), role["index"]) == who);
+        assert_eq!(stopped.unwrap()["state"], "silent", "{who}: {status}");
+        running.go_on(who);
+        learns(&running);
+    }
+    running.signal(Signal::STOP);
+    std::thread::sleep(length);
+    running.signal(Signal::CONT);
+    learns(&running);
+    assert_eq!(place.status("run")["running"], true);
+
+    assert!(place.output(&["stop", "run"]).status.success());
+    let log = running.log();
+    let (code, _, leftovers) = running.wait();
+    assert_eq!(code, Some(0));
+    assert!(leftovers.files().is_empty());
+    assert!(!log.contains("starting it again"), "{log}");
+    for actor in 0..2 {
+        assert_eq!(
+            support::sent(&run, actor),
+            support::committed(&run, actor as usize),
+            "actor {actor}"
+        );
+    }
+}
+
+#[test]
+fn a_damaged_checkpoint_is_reported_and_the_one_before_it_used() {
+    let place = Workplace::new();
+    let run = killed(&place, &[]);
+    let latest = run.join("checkpoints/latest.ckpt");
+    assert!(run.join("checkpoints/previous.ckpt").exists());
+    let mut bytes = std::fs::read(&latest).unwrap();
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 1;
+    std::fs::write(&latest, &bytes).unwrap();
+    goes_on(&place, 500);
+    let log = std::fs::read_to_string(run.join("shoal.log")).unwrap();
+    assert!(
+        log.contains("latest.ckpt: is damaged") && log.contains("going on from"),
+        "{log}"
+    );
+    assert_eq!(
+        std::fs::read(run.join("checkpoints/damaged-0.ckpt")).unwrap(),
+        bytes,
+        "kept for inspection"
+    );
+}
+
+#[test]
+fn what_is_not_this_runs_is_refused_in_one_line_and_left_as_it_is() {
+    let place = Workplace::new();
+    let run = killed(&place, &[]);
+    let config = std::fs::read_to_string(run.join("config.toml")).unwrap();
+    let replay = std::fs::read(run.join("replay.bin")).unwrap();
+
+    // Another configuration.
+    std::fs::write(run.join("config.toml"), config.replace("gamma = 0.99", "gamma = 0.9")).unwrap();
+    let said = complaint(&place.output(&["resume", "run"]));
+    assert!(said.contains("another configuration"), "{said}");
+    std::fs::write(run.join("config.toml"), &config).unwrap();
+
+    // A replay of another version: the second word of the file.
+    let file = std::fs::File::options()
+        .write(true)
+        .open(run.join("replay.bin"))
+        .unwrap();
+    file.write_all_at(&99_u64.to_le_bytes(), 8).unwrap();
+    let said = complaint(&place.output(&["resume", "run"]));
+    assert!(said.contains("replay.bin") && said.contains("version is 99"), "{said}");
+    file.write_all_at(&replay[8..16], 8).unwrap();
+
+    // Another layout.
+    std::fs::write(
+        run.join("config.toml"),
+        config.replace("capacity = 2000", "capacity = 3000"),
+    )
+    .unwrap();
+    let (code, said) = resume_fails(&place);
+    assert!(
+        code == Some(1) && said.contains("its ring has 2000 rows, this run's 3000"),
+        "{said}"
+    );
+    std::fs::write(run.join("config.toml"), &config).unwrap();
+
+    assert_eq!(std::fs::read(run.join("replay.bin")).unwrap(), replay);
+    goes_on(&place, 500);
+}
+
+/// A resumption whose learner is given up; what was said.
+fn resume_fails(place: &Workplace) -> (Option<i32>, String) {
+    let output = place.output(&["resume", "run"]);
+    (
+        output.status.code(),
+        String::from_utf8_lossy(&output.stderr).into_owned(),
+    )
+}
+
+#[test]
+fn after_a_power_loss_the_replay_falls_back_to_what_it_can_prove() {
+    let place = Workplace::new();
+    let run = killed(&place, &[]);
+    let before = rows(&run);
+    // The newest rows never reached the disk: they are zeros.
+    let file = std::fs::File::options()
+        .write(true)
+        .open(run.join("replay.bin"))
+        .unwrap();
+    let row = 4 * Config::load(&run.join("config.toml")).unwrap().row_layout().width() as u64;
+    let ring = file.metadata().unwrap().len() - (RING * row).next_multiple_of(4096);
+    for newest in before - 20..before {
+        file.write_all_at(&vec![0; row as usize], ring + newest % RING * row)
+            .unwrap();
+    }
+    drop(file);
+    goes_on(&place, 3000);
+    let log = std::fs::read_to_string(run.join("shoal.log")).unwrap();
+    let log: Vec<&str> = log.lines().filter(|line| !line.contains("DEBUG")).collect();
+    let warned = log
+        .iter()
+        .any(|line| line.contains("WARN") && line.contains("replay.bin"));
+    assert!(warned, "{}", log.join("\n"));
+}
+
+#[test]
+fn a_role_that_cannot_start_is_given_up_with_its_last_words_and_the_run_can_be_resumed() {
+    let place = Workplace::new();
+    let run = killed(&place, &[]);
+    // What the evaluator cannot read.
+    let best = run.join("checkpoints/best.policy");
+    until("there is a best policy", || best.exists());
+    let bytes = std::fs::read(&best).unwrap();
+    std::fs::write(&best, b"not a policy at all").unwrap();
+    let (code, said) = resume_fails(&place);
+    assert_eq!(code, Some(1));
+    assert!(
+        said.contains("evaluator-0 failed 5 times") && said.contains("best.policy"),
+        "{said}"
+    );
+    assert!(said.contains("shoal resume"), "{said}");
+    std::fs::write(&best, bytes).unwrap();
+    goes_on(&place, 500);
+}
