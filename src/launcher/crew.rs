@@ -361,6 +361,8 @@ mod tests {
     }
 
     proptest! {
+        #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::default() })]
+
         #[test]
         fn a_counter_is_a_number_that_can_be_counted_on_or_refused(
             bytes in prop_oneof![
