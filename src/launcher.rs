@@ -52,10 +52,9 @@ pub(crate) enum Ending {
 pub(crate) struct Outcome {
     pub(crate) ending: Ending,
     pub(crate) wall: Duration,
-    /// How the run stood when it began.
-    pub(crate) rest: RunStatus,
-    /// What the learner said last.
-    pub(crate) learner: Option<LearnerReport>,
+    /// How the run stood when it began, and how it stands now.
+    pub(crate) before: RunStatus,
+    pub(crate) after: RunStatus,
     pub(crate) episodes: u64,
 }
 
@@ -171,8 +170,9 @@ impl<'a> Launcher<'a> {
         Ok(Outcome {
             ending,
             wall: self.begun.elapsed(),
-            learner: self.progress.learner().copied(),
-            rest: self.rest,
+            // What the learner saved: its last report may have come too late to be heard.
+            after: status::at_rest(&self.config, self.run)?,
+            before: self.rest,
             episodes: self.recorder.episodes(),
         })
     }
@@ -223,10 +223,10 @@ impl<'a> Launcher<'a> {
 
     /// The evaluator may still be at the policy of the last period.
     fn await_last_evaluation(&mut self) -> anyhow::Result<()> {
+        let last = status::at_rest(&self.config, self.run)?.env_steps;
         let patience = Instant::now();
         while patience.elapsed() < LAST_EVALUATION && self.signals.received().is_none() {
             self.read_reports()?;
-            let last = self.progress.learner().map_or(0, |learner| learner.env_steps);
             // What is judged is in the records, this launcher's or an earlier one's.
             if status::judged(&self.config, self.run)? >= Some(self.config.evaluation.period(last)) {
                 break;

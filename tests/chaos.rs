@@ -181,7 +181,7 @@ fn ratio_is_kept(run: &Path, config: &Config) {
 
 /// Chaos for so long over a run started with `arguments`; the run's end, when it has gone on to `steps`.
 fn chaos(seed: u64, length: Duration, arguments: &[&str], steps: u64) -> (Figures, Value) {
-    let place = Workplace::new();
+    let place = Workplace::where_chunks_are_counted();
     let begin = ["train", "pendulum", "--run", "run", "--steps", "100000000"];
     let running = place.launch("run", &[&begin[..], arguments].concat());
     let run = running.run.clone();

@@ -97,7 +97,7 @@ fn a_watching_terminal_sees_the_run_to_its_end() {
 
 #[test]
 fn actors_come_and_go_while_training_goes_on_and_none_of_their_rows_is_lost() {
-    let place = Workplace::new();
+    let place = Workplace::where_chunks_are_counted();
     let running = place.start("run", &[&ENDLESS[..], &["--actors", "1"]].concat());
     for actors in [4, 2, 3, 1] {
         let output = place.output(&["scale", "run", "--actors", &actors.to_string()]);

@@ -385,8 +385,11 @@ impl<'a> Explorer<'a> {
     fn await_commits(&mut self, most: u64) -> Result<bool, ChannelError> {
         let index = self.settings.identity.index as usize;
         while self.sender.in_flight(self.commits.committed(index)) > most {
-            if self.stop.at_once() && self.hurried.get_or_insert_with(Instant::now).elapsed() >= FAREWELL {
-                return Ok(false);
+            if self.stop.at_once() {
+                let hurried = self.hurried.get_or_insert_with(Instant::now);
+                if !self.sender.is_heard() || hurried.elapsed() >= FAREWELL {
+                    return Ok(false);
+                }
             }
             self.pulse.beat(Activity::WaitingForRatio);
             self.sender.look_after()?;

@@ -93,10 +93,6 @@ fn await_evaluation(
     if judged.is_some_and(|judged| evaluation.period(learner.rows) <= judged) {
         return Ok(());
     }
-    // The actors went on after this round, so its policy was judged: this learner does the round again.
-    if learner.replay.head() > learner.rows {
-        return Ok(());
-    }
     let version = learner.policy_version();
     let Learner {
         bell,

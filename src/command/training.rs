@@ -84,16 +84,10 @@ impl Summary {
         judged: Option<&EvaluationSummary>,
     ) -> anyhow::Result<Self> {
         let wall_seconds = outcome.wall.as_secs_f64();
-        let RunStatus { env_steps, updates, .. } = outcome.rest;
-        let (env_steps, updates, done, taken) = outcome.learner.map_or((env_steps, updates, 0, 0), |last| {
-            let since = |now: u64, before: u64| now.saturating_sub(before);
-            (
-                last.env_steps,
-                last.updates,
-                since(last.updates, updates),
-                since(last.env_steps, env_steps),
-            )
-        });
+        let RunStatus { env_steps, updates, .. } = outcome.after;
+        // A learner whose checkpoint was damaged has begun before where the run stood.
+        let done = updates.saturating_sub(outcome.before.updates);
+        let taken = env_steps.saturating_sub(outcome.before.env_steps);
         Ok(Self {
             run: run.path().display().to_string(),
             env_steps,

@@ -29,6 +29,8 @@ pub(crate) const QUICK: [&str; 10] = [
 /// A directory to run the program in.
 pub(crate) struct Workplace {
     directory: tempfile::TempDir,
+    /// What the log of its runs is to tell of (`SHOAL_LOG`).
+    log: &'static str,
 }
 
 /// A run under way; killed with all its roles when dropped.
@@ -41,6 +43,15 @@ impl Workplace {
     pub(crate) fn new() -> Self {
         Self {
             directory: tempfile::tempdir().unwrap(),
+            log: "info",
+        }
+    }
+
+    /// A place whose runs' logs tell of every chunk that is sent.
+    pub(crate) fn where_chunks_are_counted() -> Self {
+        Self {
+            log: "debug",
+            ..Self::new()
         }
     }
 
@@ -94,8 +105,7 @@ impl Workplace {
             .shoal(&[arguments, &["--json"]].concat())
             .stdout(Stdio::piped())
             .stderr(std::fs::File::create(self.path().join("stderr")).unwrap())
-            // So that the log says which chunks were sent.
-            .env("SHOAL_LOG", "debug")
+            .env("SHOAL_LOG", self.log)
             // A signal to the test runner's group is not for the run.
             .process_group(0)
             .spawn()
@@ -258,7 +268,7 @@ impl Leftovers {
     }
 }
 
-/// Rows that an actor has sent in all its starts, by the log of a run started with `SHOAL_LOG=debug`.
+/// Rows that an actor has sent in all its starts, by the log of a run in a [`Workplace`] where they are counted.
 pub(crate) fn sent(run: &Path, actor: u32) -> u64 {
     let log = std::fs::read_to_string(run.join("shoal.log")).unwrap();
     let number = |line: &str, name: &str| -> u64 {

@@ -15,6 +15,7 @@ use iceoryx2::prelude::*;
 use iceoryx2::sample::Sample;
 use iceoryx2::sample_mut::SampleMut;
 use iceoryx2::service::header::publish_subscribe::Header;
+use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 
 use super::words::{numbers_of, words_of};
@@ -51,6 +52,7 @@ pub struct ChunkHeader {
 /// An actor's end.
 #[derive(Debug)]
 pub struct ChunkSender {
+    service: ChunkService,
     publisher: Publisher<ipc::Service, [f32], ChunkHeader>,
     channel: String,
     layout: ChunkLayout,
@@ -130,15 +132,18 @@ impl ChunkSender {
         window: u32,
     ) -> Result<Greeting, ChannelError> {
         let channel = name(actor);
-        let publisher = claim(&channel, "send", || {
-            service(domain, &channel, window)?
+        let (service, publisher) = claim(&channel, "send", || {
+            let service = service(domain, &channel, window)?;
+            let publisher = service
                 .publisher_builder()
                 .initial_max_slice_len(layout.len())
                 .max_loaned_samples(LOANED)
                 .create()
-                .map_err(|cause| ChannelError::new(&channel, "send", cause))
+                .map_err(|cause| ChannelError::new(&channel, "send", cause))?;
+            Ok::<_, ChannelError>((service, publisher))
         })?;
         let sender = Self {
+            service,
             publisher,
             channel,
             layout,
@@ -201,6 +206,11 @@ impl ChunkSender {
             .map_err(|cause| ChannelError::new(&self.channel, "send", cause))?;
         tracing::debug!(self.incarnation, self.sent, rows, "sent a chunk");
         Ok(())
+    }
+
+    /// Whether there is a learner to take chunks; one that was killed counts until the launcher has cleaned up after it.
+    pub fn is_heard(&self) -> bool {
+        self.service.dynamic_config().number_of_subscribers() > 0
     }
 
     /// Hands what is not committed to a learner that has come anew. To be called while waiting.

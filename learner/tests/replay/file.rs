@@ -19,7 +19,7 @@ proptest! {
         let mut bytes = bytes;
         if magic && bytes.len() >= 16 {
             bytes[..8].copy_from_slice(b"SHOALRPL");
-            bytes[8..16].copy_from_slice(&1_u64.to_le_bytes());
+            bytes[8..16].copy_from_slice(&2_u64.to_le_bytes());
         }
         let opened = reopen(&directory.replay(), &bytes, 10);
         prop_assert!(matches!(opened, Err(ReplayError::Refused { .. })), "{:?}", opened);
@@ -55,7 +55,7 @@ fn a_file_that_is_not_the_one_meant_is_refused_by_name_and_left_alone() {
     refused(
         &patched(8, &[9]),
         &right,
-        "format version is 9, this program reads version 1",
+        "format version is 9, this program reads version 2",
     );
     refused(&patched(40, &[9]), &right, "header is damaged");
     refused(&[], &right, "cut short: 0 bytes");
