@@ -34,6 +34,8 @@ struct Figures {
     rows: u64,
     rows_lost: u64,
     scalings: usize,
+    /// The longest time without a report of the learner, which comes twice a second, in seconds.
+    silence: f64,
 }
 
 fn now() -> f64 {
@@ -151,10 +153,12 @@ fn inspect(run: &Path, config: &Config, rows: u64) {
     assert!(seen.len() > 1000);
 }
 
-/// A learner is never ahead of the ratio, and takes nothing while the actors are ahead by more than is agreed.
-fn ratio_is_kept(run: &Path, config: &Config) {
+/// A learner is never ahead of the ratio, and takes nothing while the actors are ahead by more than is agreed. Returns the
+/// longest time without a report.
+fn ratio_is_kept(run: &Path, config: &Config) -> f64 {
     #[derive(serde::Deserialize)]
     struct Row {
+        wall_seconds: f64,
         env_steps: u64,
         updates: u64,
     }
@@ -177,6 +181,8 @@ fn ratio_is_kept(run: &Path, config: &Config) {
             two[1].updates
         );
     }
+    let silences = rows.windows(2).map(|two| two[1].wall_seconds - two[0].wall_seconds);
+    silences.fold(0.0, f64::max)
 }
 
 /// Chaos for so long over a run started with `arguments`; the run's end, when it has gone on to `steps`.
@@ -198,7 +204,7 @@ fn chaos(seed: u64, length: Duration, arguments: &[&str], steps: u64) -> (Figure
     let config = Config::load(&run.join("config.toml")).unwrap();
     let (rows, rows_lost) = account(&run, &config, &kills);
     inspect(&run, &config, rows);
-    ratio_is_kept(&run, &config);
+    let silence = ratio_is_kept(&run, &config);
 
     let steps = steps.max(rows + 1000).to_string();
     let (code, printed, leftovers) = place.resume("run", &["--steps", &steps]).wait();
@@ -215,6 +221,7 @@ fn chaos(seed: u64, length: Duration, arguments: &[&str], steps: u64) -> (Figure
         rows,
         rows_lost,
         scalings,
+        silence,
     };
     (figures, parse(&printed))
 }
@@ -225,14 +232,15 @@ impl std::fmt::Display for Figures {
         let at = |share: f64| self.recoveries.get(((n.max(1) - 1) as f64 * share).round() as usize);
         write!(
             f,
-            "{} kills, {} scalings, {n} recoveries (seconds: median {:.3?}, p99 {:.3?}, longest {:.3?}), {} rows, {} of them lost",
+            "{} kills, {} scalings, {n} recoveries (seconds: median {:.3?}, p99 {:.3?}, longest {:.3?}), {} rows, {} of them lost; longest silence of the learner {:.3} s",
             self.kills,
             self.scalings,
             at(0.5),
             at(0.99),
             at(1.0),
             self.rows,
-            self.rows_lost
+            self.rows_lost,
+            self.silence
         )
     }
 }
