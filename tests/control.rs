@@ -136,6 +136,28 @@ fn actors_come_and_go_while_training_goes_on_and_none_of_their_rows_is_lost() {
 }
 
 #[test]
+fn what_was_sent_is_taken_in_at_the_end_however_far_the_learner_is_behind() {
+    let place = Workplace::where_chunks_are_counted();
+    let slowly = ["--set", "replay.warmup=64", "--set", "actors.chunk_steps=64"];
+    let running = place.start_as("run", &[&ENDLESS[..], &slowly].concat());
+    // Two windows of 512 rows: more than a second's work.
+    until("the actors wait", || {
+        let sent = support::sent(&running.run, 0);
+        sent >= support::committed(&running.run, 0) + 512
+    });
+    let run = running.run.clone();
+    assert!(place.output(&["stop", "run"]).status.success());
+    running.wait();
+    for actor in 0..2 {
+        assert_eq!(
+            support::sent(&run, actor),
+            support::committed(&run, actor as usize),
+            "actor {actor}"
+        );
+    }
+}
+
+#[test]
 fn a_stopped_run_goes_on_where_it_was() {
     let place = Workplace::new();
     let running = place.start("run", &ENDLESS);

@@ -90,9 +90,6 @@ fn whoever_is_killed_in_lockstep_the_run_ends_with_the_bits_of_a_whole_one() {
     let place = Workplace::new();
     let whole = end_of(place.start("whole", &SHARED));
     let running = place.start("killed", &SHARED);
-    // At the very beginning: before its first chunk.
-    running.kill("actor-0");
-    until("it is replaced", || running.pids("actor-0").len() == 2);
     for who in [
         "actor-1",
         "learner-0",
@@ -109,6 +106,23 @@ fn whoever_is_killed_in_lockstep_the_run_ends_with_the_bits_of_a_whole_one() {
         let starts = running.pids(who).len();
         running.kill(who);
         until("it is replaced", || running.pids(who).len() > starts);
+    }
+    assert_eq!(end_of(running), whole);
+}
+
+#[test]
+fn an_actor_killed_before_its_first_chunk_begins_again_as_if_it_had_never_been() {
+    let place = Workplace::new();
+    // Long chunks, so that the kills come before the first one is sent.
+    let arguments = [&SHARED[..], &["--set", "actors.chunk_steps=4000"]].concat();
+    let whole = end_of(place.start("whole", &arguments));
+    let running = place.start("killed", &arguments);
+    for _ in 0..3 {
+        for who in ["actor-0", "actor-1"] {
+            let starts = running.pids(who).len();
+            running.kill(who);
+            until("it is replaced", || running.pids(who).len() > starts);
+        }
     }
     assert_eq!(end_of(running), whole);
 }

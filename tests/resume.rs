@@ -51,6 +51,15 @@ fn goes_on(place: &Workplace, more: u64) -> serde_json::Value {
     let result = parse(&printed);
     assert_eq!(result["env_steps"], steps);
     assert_eq!(result["updates"], steps - 64);
+    let evaluations = csv::Reader::from_path(place.path().join("run/evaluations.csv")).unwrap();
+    let periods: Vec<u64> = evaluations
+        .into_records()
+        .map(|row| row.unwrap()[1].parse::<u64>().unwrap() / 2000)
+        .collect();
+    assert!(
+        periods.is_sorted_by(|a, b| a < b),
+        "each period is judged once: {periods:?}"
+    );
     result
 }
 

@@ -241,3 +241,21 @@ fn words_that_are_no_snapshot_are_refused_and_the_server_goes_on() {
     assert_eq!(asker.taken(), words);
     asker.steps(3);
 }
+
+#[test]
+fn a_training_episode_is_begun_by_its_number_whatever_came_before() {
+    let run = Run::new();
+    let domain = run.join();
+    let _server = run.start("env-server");
+    let asker = Asker::new(&domain);
+    let begin = |begin| {
+        let observed = asker.client.reset(&asker.bell, begin).expect("no hang");
+        observed.observations().to_vec()
+    };
+    let [first, second] = [begin(Begin::Next), begin(Begin::Next)];
+    assert_ne!(first, second);
+    asker.steps(10);
+    assert_eq!(begin(Begin::Training(0)), first);
+    assert_eq!(begin(Begin::Next), second, "it counts on from there");
+    assert_eq!(begin(Begin::Training(1)), second);
+}
