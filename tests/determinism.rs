@@ -5,6 +5,8 @@
 
 mod support;
 
+use std::time::Duration;
+
 use shoal_actor::noise::OrnsteinUhlenbeck;
 use shoal_common::channel::environment::ResponseLayout;
 use shoal_common::commit::CommitReader;
@@ -117,12 +119,14 @@ fn an_actor_killed_before_its_first_chunk_begins_again_as_if_it_had_never_been()
     let arguments = [&SHARED[..], &["--set", "actors.chunk_steps=4000"]].concat();
     let whole = end_of(place.start("whole", &arguments));
     let running = place.start("killed", &arguments);
-    for _ in 0..3 {
-        for who in ["actor-0", "actor-1"] {
-            let starts = running.pids(who).len();
-            running.kill(who);
-            until("it is replaced", || running.pids(who).len() > starts);
-        }
+    let commits = CommitReader::open(&running.run.join("replay.bin")).unwrap();
+    for (actor, who) in ["actor-0", "actor-1"].into_iter().enumerate() {
+        let starts = running.pids(who).len();
+        until("the learner knows of it", || commits.committed(actor).incarnation > 0);
+        std::thread::sleep(Duration::from_millis(10));
+        assert_eq!(commits.actor(actor).rows, 0, "or this test shows nothing");
+        running.kill(who);
+        until("it is replaced", || running.pids(who).len() > starts);
     }
     assert_eq!(end_of(running), whole);
 }
