@@ -12,12 +12,12 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
-use shoal_common::channel::Domain;
 use shoal_common::channel::control::{Answer, ControlPort, Question, RunStatus};
 use shoal_common::channel::reports::Reports;
+use shoal_common::channel::{Domain, DomainError};
 use shoal_common::config::Config;
-use shoal_common::report::{EpisodeReport, EvaluationReport, Heartbeat, LearnerReport};
-use shoal_common::run_dir::{RunDir, RunLock};
+use shoal_common::report::{EpisodeReport, EvaluationReport, Heartbeat, LearnerReport, Role};
+use shoal_common::run_dir::RunDir;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 use self::crew::Crew;
@@ -32,6 +32,10 @@ const ROUND: Duration = Duration::from_millis(50);
 
 /// How long the evaluator may take over the last policy once the learner is through.
 const LAST_EVALUATION: Duration = Duration::from_secs(5);
+
+/// How long actors may take to hand over their last chunks, and the others to end; the learner saves its state.
+const ACTORS_END: Duration = Duration::from_secs(3);
+const OTHERS_END: Duration = Duration::from_secs(15);
 
 /// How long the roles of a launcher that was killed may take to end.
 const PREDECESSORS_END: Duration = Duration::from_secs(10);
@@ -59,19 +63,41 @@ pub(crate) struct Outcome {
 }
 
 /// Runs all roles until the learner is through, a signal comes, or somebody asks for the end.
-pub(crate) fn run(config: Config, run: &RunDir, lock: RunLock, quiet: bool) -> anyhow::Result<Outcome> {
+pub(crate) fn run(config: Config, run: &RunDir, quiet: bool) -> anyhow::Result<Outcome> {
     let signals = Signals::register()?;
-    Domain::wait_for_the_last(&config.run.id, PREDECESSORS_END)?;
+    Domain::wait_for_the_last(&config.run.id, PREDECESSORS_END).map_err(|error| explain(error, run))?;
     Domain::remove_abandoned()?;
     let domain = Domain::join(&config.run.id, config.actors.max)?;
     let outcome = room::claim(&config, run, &domain)
-        .and_then(|()| Launcher::new(config, run, &domain, signals, quiet, lock))
+        .and_then(|()| Launcher::new(config, run, &domain, signals, quiet))
         .and_then(Launcher::run);
     // Even where something failed: no role is left by now.
     let left = domain.leave();
     let outcome = outcome?;
     left?;
     Ok(outcome)
+}
+
+/// Says whose processes they are that keep a run from beginning.
+fn explain(error: DomainError, run: &RunDir) -> anyhow::Error {
+    let DomainError::StillAlive { pids, .. } = &error else {
+        return error.into();
+    };
+    // A role's arguments are its name, the run's directory, and two numbers.
+    let directory = |pid: &i32| {
+        let arguments = std::fs::read(format!("/proc/{pid}/cmdline")).ok()?;
+        let directory = arguments.split(|byte| *byte == 0).nth(2)?;
+        Some(String::from_utf8_lossy(directory).into_owned())
+    };
+    let here = run.path().display();
+    match pids
+        .iter()
+        .find_map(directory)
+        .filter(|there| *there != here.to_string())
+    {
+        Some(there) => anyhow::anyhow!("{here} is a copy of {there}, which is going on: end that one first"),
+        None => error.into(),
+    }
 }
 
 /// The signals that end a run. Once this is dropped they end the process again, as they do everywhere else.
@@ -114,6 +140,9 @@ struct Launcher<'a> {
     control: ControlPort,
     /// How the run stood when this launcher began.
     rest: RunStatus,
+    /// Somebody has asked for the end; the end has begun.
+    to_end: bool,
+    ends: bool,
     crew: Crew,
     recorder: Recorder,
     progress: Progress,
@@ -123,18 +152,10 @@ struct Launcher<'a> {
     episode_reports: Reports<EpisodeReport>,
     evaluation_reports: Reports<EvaluationReport>,
     learner_reports: Reports<LearnerReport>,
-    _lock: RunLock,
 }
 
 impl<'a> Launcher<'a> {
-    fn new(
-        config: Config,
-        run: &'a RunDir,
-        domain: &'a Domain,
-        signals: Signals,
-        quiet: bool,
-        lock: RunLock,
-    ) -> anyhow::Result<Self> {
+    fn new(config: Config, run: &'a RunDir, domain: &'a Domain, signals: Signals, quiet: bool) -> anyhow::Result<Self> {
         let log = Log::open(&run.log())?;
         write_iox_config(domain, run)?;
         std::fs::create_dir_all(run.checkpoints()).context("cannot make the directory for checkpoints")?;
@@ -142,6 +163,8 @@ impl<'a> Launcher<'a> {
         Ok(Self {
             control: ControlPort::open(domain)?,
             rest: status::at_rest(&config, run)?,
+            to_end: false,
+            ends: false,
             run,
             domain,
             heartbeats: Reports::open(domain)?,
@@ -154,7 +177,6 @@ impl<'a> Launcher<'a> {
             config,
             signals,
             begun: Instant::now(),
-            _lock: lock,
         })
     }
 
@@ -164,6 +186,10 @@ impl<'a> Launcher<'a> {
         self.progress.say("ending");
         let ended = self.end_crew();
         self.progress.clear();
+        self.control.dismiss(&match &ended {
+            Ok(()) => Answer::Accepted,
+            Err(error) => Answer::Refused(format!("{error:#}")),
+        });
         let ending = ending?;
         ended?;
         self.recorder.flush()?;
@@ -184,7 +210,8 @@ impl<'a> Launcher<'a> {
                 return Ok(Ending::Interrupted(signal));
             }
             self.read_reports()?;
-            if self.attend()? {
+            self.attend()?;
+            if self.to_end {
                 return Ok(Ending::Stopped);
             }
             if self.crew.look_after(self.domain)? == crew::State::LearnerDone {
@@ -196,9 +223,8 @@ impl<'a> Launcher<'a> {
         }
     }
 
-    /// Answers who asks from another terminal; whether somebody asked for the end.
-    fn attend(&mut self) -> anyhow::Result<bool> {
-        let mut to_end = false;
+    /// Answers who asks from another terminal. Who asks for the end is answered when it is there.
+    fn attend(&mut self) -> anyhow::Result<()> {
         let Self {
             config,
             run,
@@ -206,19 +232,24 @@ impl<'a> Launcher<'a> {
             crew,
             progress,
             rest,
+            ends,
+            to_end,
             ..
         } = self;
-        control.attend(|question| -> anyhow::Result<Answer> {
+        control.attend(|question| -> anyhow::Result<Option<Answer>> {
             match question {
-                Question::Status => Ok(Answer::Status(desk::status(config, run, crew, progress, rest)?)),
-                Question::Scale { actors } => desk::scale(config, run, crew, actors),
+                Question::Status => Ok(Some(match desk::status(config, run, crew, progress, rest) {
+                    Ok(status) => Answer::Status(status),
+                    Err(error) => Answer::Refused(error.to_string()),
+                })),
+                Question::Scale { .. } if *ends => Ok(Some(Answer::Refused("the run is ending".into()))),
+                Question::Scale { actors } => desk::scale(config, run, crew, actors).map(Some),
                 Question::Stop => {
-                    to_end = true;
-                    Ok(Answer::Accepted)
+                    *to_end = true;
+                    Ok(None)
                 }
             }
-        })?;
-        Ok(to_end)
+        })
     }
 
     /// The evaluator may still be at the policy of the last period.
@@ -227,6 +258,7 @@ impl<'a> Launcher<'a> {
         let patience = Instant::now();
         while patience.elapsed() < LAST_EVALUATION && self.signals.received().is_none() {
             self.read_reports()?;
+            self.attend()?;
             // What is judged is in the records, this launcher's or an earlier one's.
             if status::judged(&self.config, self.run)? >= Some(self.config.evaluation.period(last)) {
                 break;
@@ -236,9 +268,27 @@ impl<'a> Launcher<'a> {
         Ok(())
     }
 
+    /// Ends everyone: the actors first, so that the learner still takes what they send.
     fn end_crew(&mut self) -> anyhow::Result<()> {
-        self.crew.end_all();
-        self.read_reports()
+        self.ends = true;
+        let actors = |role| role == Role::Actor;
+        self.end(actors, ACTORS_END);
+        self.end(|_| true, OTHERS_END);
+        self.read_reports()?;
+        self.crew.say_farewell()
+    }
+
+    fn end(&mut self, which: impl Fn(Role) -> bool + Copy, patience: Duration) {
+        let deadline = Instant::now() + patience;
+        self.crew.ask_to_end(which);
+        while !self.crew.have_ended(which) {
+            if Instant::now() >= deadline {
+                self.crew.kill(which);
+            }
+            // No question keeps a run from ending.
+            let _ = self.attend();
+            std::thread::sleep(Duration::from_millis(5));
+        }
     }
 
     fn read_reports(&mut self) -> anyhow::Result<()> {

@@ -34,8 +34,10 @@ fn main() -> ExitCode {
         .map_err(anyhow::Error::from)
         .and_then(|_| run(&Cli::parse().command));
     result.unwrap_or_else(|error| {
-        // Where nobody reads standard error any more, there is nobody to tell.
-        let _ = writeln!(std::io::stderr(), "error: {error:#}");
+        // Where nobody reads any more, there is nobody to tell.
+        if !is_broken_pipe(&error) {
+            let _ = writeln!(std::io::stderr(), "error: {}", in_one_line(&error));
+        }
         ExitCode::FAILURE
     })
 }
@@ -55,6 +57,22 @@ fn run(command: &Command) -> anyhow::Result<ExitCode> {
         Command::Evaluator(args) => role::run(Role::Evaluator, args).map(done),
         Command::Learner(args) => role::run(Role::Learner, args).map(done),
     }
+}
+
+/// The error and its causes, but for those that it names itself.
+fn in_one_line(error: &anyhow::Error) -> String {
+    let mut line = error.to_string();
+    for cause in error.chain().skip(1).map(ToString::to_string) {
+        if !line.contains(&cause) {
+            line += &format!(": {cause}");
+        }
+    }
+    line
+}
+
+fn is_broken_pipe(error: &anyhow::Error) -> bool {
+    let cause = error.downcast_ref::<std::io::Error>();
+    cause.is_some_and(|cause| cause.kind() == std::io::ErrorKind::BrokenPipe)
 }
 
 fn done((): ()) -> ExitCode {

@@ -1,7 +1,7 @@
 //! A run that goes on, seen from another terminal.
 
 use std::path::Path;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::bail;
 use shoal_common::channel::Domain;
@@ -9,8 +9,11 @@ use shoal_common::channel::control::{self, Answer, ControlError, Question, RunSt
 use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
 
-/// A launcher that starts, or ends, does not answer for a while.
+/// How long a launcher may take to answer: one that starts does not at once.
 const PATIENCE: Duration = Duration::from_secs(5);
+
+/// How long a run may take to end: more than its roles are given.
+const TO_THE_END: Duration = Duration::from_secs(60);
 
 /// A run and the way to its launcher, if it has one.
 #[derive(Debug)]
@@ -28,37 +31,66 @@ impl Remote {
     }
 
     /// Asks the run's launcher; `None` where there is none, or none any more.
-    fn ask(&self, question: Question) -> anyhow::Result<Option<Answer>> {
+    fn ask(&self, question: Question, patience: Duration) -> anyhow::Result<Option<Answer>> {
         if !self.run.goes_on()? {
             return Ok(None);
         }
         let domain = Domain::join(&self.config.run.id, self.config.actors.max)?;
-        let answer = control::ask(&domain, question, PATIENCE);
+        let lives = || self.run.goes_on().unwrap_or(true);
+        let answer = control::ask(&domain, question, patience, lives);
         domain.leave()?;
         match answer {
             Ok(answer) => Ok(Some(answer)),
-            Err(ControlError::Silence) if !self.run.goes_on()? => Ok(None),
+            Err(ControlError::Gone) => Ok(None),
             Err(error) => Err(error.into()),
         }
     }
 
     /// How the run gets on; `None` where it does not go on.
     pub(crate) fn status(&self) -> anyhow::Result<Option<RunStatus>> {
-        match self.ask(Question::Status)? {
+        match self.ask(Question::Status, PATIENCE)? {
             None => Ok(None),
             Some(Answer::Status(status)) => Ok(Some(status)),
             Some(other) => bail!("the launcher gave an answer that does not fit: {other:?}"),
         }
     }
 
-    /// Has the launcher do something.
-    pub(crate) fn command(&self, question: Question) -> anyhow::Result<()> {
-        let here = self.run.path().display();
-        match self.ask(question)? {
-            None => bail!("nothing runs in {here}; `shoal resume {here}` goes on with it"),
-            Some(Answer::Accepted) => Ok(()),
-            Some(Answer::Refused(reason)) => bail!("{reason}"),
-            Some(other) => bail!("the launcher gave an answer that does not fit: {other:?}"),
+    /// Goes on with so many actors.
+    pub(crate) fn scale(&self, actors: u32) -> anyhow::Result<()> {
+        match self.ask(Question::Scale { actors }, PATIENCE)? {
+            None => bail!("{}", self.nothing_runs()),
+            Some(answer) => self.accepted(answer),
         }
+    }
+
+    /// Ends the run, and waits until it has ended.
+    pub(crate) fn stop(&self) -> anyhow::Result<()> {
+        // A launcher that does not answer at all is not waited for so long.
+        if self.status()?.is_none() {
+            bail!("{}", self.nothing_runs());
+        }
+        let answer = self.ask(Question::Stop, TO_THE_END)?;
+        let asked = Instant::now();
+        while self.run.goes_on()? {
+            if asked.elapsed() >= PATIENCE {
+                bail!("{} has said that it ends, and does not", self.run.path().display());
+            }
+            std::thread::sleep(Duration::from_millis(10));
+        }
+        // Without an answer it has ended for another reason, which its own terminal says.
+        answer.map_or(Ok(()), |answer| self.accepted(answer))
+    }
+
+    fn accepted(&self, answer: Answer) -> anyhow::Result<()> {
+        match answer {
+            Answer::Accepted => Ok(()),
+            Answer::Refused(reason) => bail!("{reason}"),
+            other @ Answer::Status(_) => bail!("the launcher gave an answer that does not fit: {other:?}"),
+        }
+    }
+
+    fn nothing_runs(&self) -> String {
+        let here = self.run.path().display();
+        format!("nothing runs in {here}; `shoal resume {here}` goes on with it")
     }
 }

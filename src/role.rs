@@ -1,5 +1,7 @@
 //! One role of a run, in a process of its own: the run directory says everything, this hands each role its part of it.
 
+use std::ffi::CString;
+
 use anyhow::Context;
 use shoal_actor::{evaluator, explorer};
 use shoal_common::channel::environment::EnvironmentPort;
@@ -28,6 +30,10 @@ pub(crate) fn run(role: Role, args: &RoleArgs) -> anyhow::Result<()> {
         .log_internal_errors(false)
         .init();
 
+    // For `ps` and `top`, which would show how it was started; 15 bytes are kept.
+    if let Ok(name) = CString::new(format!("shoal-{}-{}", role.name(), args.index)) {
+        let _ = rustix::thread::set_name(&name);
+    }
     let stop = Stop::when_stdin_closes().context("cannot watch standard input")?;
     let run = RunDir::open(&args.run)?;
     let config = run.config()?;

@@ -22,6 +22,9 @@ pub(crate) fn at_rest(config: &Config, run: &RunDir) -> anyhow::Result<RunStatus
         actors: config.actors.count,
         updates_per_step: config.replay.updates_per_step,
         policy_version: counters.policy_version,
+        eval_return_mean: read_evaluations(&run.evaluations())?
+            .last()
+            .map(|last| last.return_mean),
         ..Default::default()
     };
     status.ratio = ratio(&status, config.replay.warmup);

@@ -158,6 +158,25 @@ fn what_was_sent_is_taken_in_at_the_end_however_far_the_learner_is_behind() {
 }
 
 #[test]
+fn an_end_without_the_learners_state_saved_is_no_success() {
+    let place = Workplace::new();
+    let running = place.start("run", &ENDLESS);
+    learns(&running);
+    running.stop("learner-0");
+    let stopped = place.output(&["stop", "run"]);
+    assert_eq!(stopped.status.code(), Some(1));
+    assert!(
+        said(&stopped).contains("did not save its last state"),
+        "{}",
+        said(&stopped)
+    );
+    let (code, _, leftovers) = running.wait();
+    assert_eq!(code, Some(1));
+    assert!(place.said().contains("did not save its last state"), "{}", place.said());
+    assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
+}
+
+#[test]
 fn a_stopped_run_goes_on_where_it_was() {
     let place = Workplace::new();
     let running = place.start("run", &ENDLESS);

@@ -113,6 +113,33 @@ fn whoever_is_killed_in_lockstep_the_run_ends_with_the_bits_of_a_whole_one() {
 }
 
 #[test]
+fn an_evaluator_killed_while_a_new_learner_does_its_rounds_again_holds_nobody_up() {
+    let place = Workplace::new();
+    let arguments = [
+        "--lockstep",
+        "--steps",
+        "9000",
+        "--set",
+        "evaluation.every=1500",
+        "--set",
+        // From the beginning again, each time.
+        "checkpoint.every_updates=100000",
+    ];
+    let whole = end_of(place.start("whole", &arguments));
+    let running = place.start("killed", &arguments);
+    let evaluations = running.run.join("evaluations.csv");
+    for period in [2, 4] {
+        comes_further(&running, 3000);
+        running.kill("learner-0");
+        until("the policy of the period is judged", || {
+            std::fs::read_to_string(&evaluations).unwrap().lines().count() >= 2 + period
+        });
+        running.kill("evaluator-0");
+    }
+    assert_eq!(end_of(running), whole);
+}
+
+#[test]
 fn an_actor_killed_before_its_first_chunk_begins_again_as_if_it_had_never_been() {
     let place = Workplace::new();
     // Long chunks, so that the kills come before the first one is sent.

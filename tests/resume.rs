@@ -184,6 +184,38 @@ fn a_damaged_checkpoint_is_reported_and_the_one_before_it_used() {
 }
 
 #[test]
+fn a_lost_counter_of_incarnations_keeps_nobody_from_going_on() {
+    for counter in [None, Some("3")] {
+        let place = Workplace::new();
+        let run = killed(&place, &[]);
+        let file = run.join("incarnations");
+        match counter {
+            None => std::fs::remove_file(&file).unwrap(),
+            Some(number) => std::fs::write(&file, number).unwrap(),
+        }
+        goes_on(&place, 500);
+    }
+}
+
+#[test]
+fn a_copy_of_a_run_that_goes_on_is_told_from_it() {
+    let place = Workplace::new();
+    let running = place.start("run", &ENDLESS);
+    learns(&running);
+    let copied = std::process::Command::new("cp")
+        .args(["-r", "run", "copy"])
+        .current_dir(place.path())
+        .status();
+    assert!(copied.unwrap().success());
+    let said = complaint(&place.output(&["resume", "copy"]));
+    assert!(
+        said.contains("is a copy of") && said.contains(running.run.to_str().unwrap()),
+        "{said}"
+    );
+    learns(&running);
+}
+
+#[test]
 fn what_is_not_this_runs_is_refused_in_one_line_and_left_as_it_is() {
     let place = Workplace::new();
     let run = killed(&place, &[]);

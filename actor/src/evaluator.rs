@@ -9,7 +9,7 @@ use shoal_common::channel::{Bell, Domain, Place, Pulse, Ringer, wait_for};
 use shoal_common::config::Evaluation;
 use shoal_common::network::{ActionRange, PolicyNetwork};
 use shoal_common::policy_file::PolicyFile;
-use shoal_common::report::{Activity, EvaluationReport, Identity, Role};
+use shoal_common::report::{Activity, EvaluationReport, Identity, JudgedReport, Role};
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::stop::Stop;
 
@@ -77,6 +77,7 @@ struct Evaluator<'a> {
     policy: PolicyReader,
     network: PolicyNetwork,
     reports: Reporter<EvaluationReport>,
+    judgements: Reporter<JudgedReport>,
     pulse: Pulse,
     actions: Vec<f32>,
     /// The period of the policy judged last.
@@ -99,6 +100,10 @@ impl<'a> Evaluator<'a> {
             None
         };
         pulse.beat(Activity::WaitingForPeer);
+        let judgements = Reporter::open(domain)?;
+        if let Some(period) = settings.judged {
+            judgements.send(JudgedReport { period });
+        }
         Ok(Self {
             settings,
             stop,
@@ -106,6 +111,7 @@ impl<'a> Evaluator<'a> {
             client,
             policy,
             reports: Reporter::open(domain)?,
+            judgements,
             pulse,
             actions: vec![0.0; settings.envs * network.range().width()],
             network,
@@ -131,7 +137,8 @@ impl<'a> Evaluator<'a> {
             self.keep(&header, return_mean, return_std)?;
             self.best = Some(return_mean);
         }
-        self.judged = Some(self.settings.evaluation.period(header.env_steps));
+        let period = self.settings.evaluation.period(header.env_steps);
+        self.judged = Some(period);
         self.reports.send(EvaluationReport {
             policy_version: header.version,
             env_steps: header.env_steps,
@@ -141,6 +148,7 @@ impl<'a> Evaluator<'a> {
             episodes: self.settings.evaluation.episodes,
             best: best.into(),
         });
+        self.judgements.send(JudgedReport { period });
         self.learner.ring();
         Ok(())
     }
@@ -155,6 +163,7 @@ impl<'a> Evaluator<'a> {
             stop,
             pulse,
             reports,
+            judgements,
             ..
         } = self;
         let due = |header: &PolicyHeader| judged.is_none_or(|j| settings.evaluation.period(header.env_steps) > j);
@@ -165,6 +174,7 @@ impl<'a> Evaluator<'a> {
             || {
                 pulse.beat(Activity::WaitingForPeer);
                 reports.look_after();
+                judgements.look_after();
                 Ok(())
             },
         )?;

@@ -164,6 +164,14 @@ pub struct EvaluationReport {
     pub best: u32,
 }
 
+/// How far the judging is: sent when an evaluator begins and after each policy it has judged.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ZeroCopySend)]
+#[repr(C)]
+pub struct JudgedReport {
+    /// The period of the policy judged last.
+    pub period: u64,
+}
+
 /// How the learner gets on: sent about twice a second.
 #[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
 #[repr(C)]

@@ -143,6 +143,14 @@ impl<'a> Learner<'a> {
                     counters.rows,
                     replay.head()
                 );
+                if replay.head() < counters.rows {
+                    tracing::warn!(
+                        "{} has {} rows, and its checkpoint was made with {}: those are collected again",
+                        settings.replay.display(),
+                        replay.head(),
+                        counters.rows
+                    );
+                }
                 counters
             }
         };
@@ -182,11 +190,6 @@ impl<'a> Learner<'a> {
     /// Updates done.
     pub(crate) fn updates(&self) -> u64 {
         self.ddpg.updates()
-    }
-
-    /// Version of the policy published last.
-    pub(crate) fn policy_version(&self) -> u64 {
-        self.policy_version
     }
 
     /// Lines 11 to 16 of Algorithm 4, on the replay as it was at `self.rows` rows.

@@ -6,13 +6,16 @@
 
 use shoal_common::channel::reports::Reports;
 use shoal_common::channel::{ChannelError, wait_for};
-use shoal_common::report::{Activity, EvaluationReport};
+use shoal_common::report::{Activity, JudgedReport};
 
 use crate::intake::IntakeError;
 use crate::learner::{Ended, Learner, LearnerError};
 
 pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Ended> {
-    let evaluations = Reports::<EvaluationReport>::open(learner.domain)?;
+    let mut judging = Judging {
+        reports: Reports::open(learner.domain)?,
+        judged: learner.settings.judged,
+    };
     let interval = learner.settings.checkpoint.every_updates;
     let needed = learner.rows.saturating_sub(learner.settings.capacity);
     if learner.replay.rows().start > needed || learner.replay.head() < learner.rows {
@@ -23,8 +26,7 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Ended> {
         learner.save()?;
     }
     learner.announce();
-    let judged = learner.settings.judged;
-    await_evaluation(learner, &evaluations, judged)?;
+    judging.wait(learner)?;
     while learner.rows < learner.settings.steps {
         let (before, updates) = (learner.rows, learner.updates());
         let mut rows = before;
@@ -40,8 +42,7 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Ended> {
         }
         learner.publish()?;
         learner.announce();
-        let judged = Some(learner.settings.evaluation.period(before)).max(learner.settings.judged);
-        await_evaluation(learner, &evaluations, judged)?;
+        judging.wait(learner)?;
         if learner.updates() / interval > updates / interval {
             learner.save()?;
         }
@@ -83,39 +84,41 @@ fn await_rows(learner: &mut Learner<'_>, actor: usize, rows: u64) -> Result<(), 
     Ok(())
 }
 
-/// Waits until the policy just published is judged, if it is one that must be: the first after the period `judged`.
-fn await_evaluation(
-    learner: &mut Learner<'_>,
-    evaluations: &Reports<EvaluationReport>,
+/// What is known of the evaluator's work.
+struct Judging {
+    reports: Reports<JudgedReport>,
+    /// The period of the policy judged last.
     judged: Option<u64>,
-) -> Result<(), Ended> {
-    let evaluation = &learner.settings.evaluation;
-    if judged.is_some_and(|judged| evaluation.period(learner.rows) <= judged) {
-        return Ok(());
-    }
-    let version = learner.policy_version();
-    let Learner {
-        bell,
-        stop,
-        publisher,
-        pulse,
-        ..
-    } = learner;
-    wait_for(
-        bell,
-        stop,
-        || -> Result<Option<()>, ChannelError> {
-            while let Some(report) = evaluations.receive()? {
-                if report.policy_version == version {
-                    return Ok(Some(()));
+}
+
+impl Judging {
+    /// Waits until a policy of this period is judged: the one just published, if none was before.
+    fn wait(&mut self, learner: &mut Learner<'_>) -> Result<(), Ended> {
+        let due = Some(learner.settings.evaluation.period(learner.rows));
+        let Learner {
+            bell,
+            stop,
+            publisher,
+            pulse,
+            ..
+        } = learner;
+        if self.judged >= due {
+            return Ok(());
+        }
+        wait_for(
+            bell,
+            stop,
+            || -> Result<Option<()>, ChannelError> {
+                while let Some(report) = self.reports.receive()? {
+                    self.judged = self.judged.max(Some(report.period));
                 }
-            }
-            Ok(None)
-        },
-        || {
-            pulse.beat(Activity::WaitingForPeer);
-            publisher.look_after()
-        },
-    )?;
-    Ok(())
+                Ok((self.judged >= due).then_some(()))
+            },
+            || {
+                pulse.beat(Activity::WaitingForPeer);
+                publisher.look_after()
+            },
+        )?;
+        Ok(())
+    }
 }

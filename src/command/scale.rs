@@ -4,7 +4,7 @@ use std::io::Write;
 use std::time::{Duration, Instant};
 
 use anyhow::bail;
-use shoal_common::channel::control::{Question, RoleState, RunStatus};
+use shoal_common::channel::control::{RoleState, RunStatus};
 use shoal_common::report::Role;
 
 use crate::cli::ScaleArgs;
@@ -16,7 +16,7 @@ const PATIENCE: Duration = Duration::from_secs(60);
 /// Asks for so many actors, and waits until there are.
 pub(crate) fn run(args: &ScaleArgs) -> anyhow::Result<()> {
     let remote = Remote::open(&args.run)?;
-    remote.command(Question::Scale { actors: args.actors })?;
+    remote.scale(args.actors)?;
     let (asked, here) = (Instant::now(), args.run.display());
     loop {
         match remote.status()? {

@@ -4,7 +4,7 @@ use std::io::{IsTerminal, Write};
 use std::process::ExitCode;
 use std::time::Duration;
 
-use comfy_table::presets::UTF8_HORIZONTAL_ONLY;
+use comfy_table::presets::NOTHING;
 use comfy_table::{CellAlignment, Table};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
@@ -59,7 +59,8 @@ pub(crate) fn run(args: &StatusArgs) -> anyhow::Result<ExitCode> {
 
 /// Shows how a run stands that does not go on.
 fn rest(args: &StatusArgs, remote: &Remote) -> anyhow::Result<ExitCode> {
-    let status = at_rest(&remote.config, &remote.run)?;
+    // It may have been scaled, or been given more steps, since it was looked at first.
+    let status = at_rest(&remote.run.config()?, &remote.run)?;
     let mut stdout = std::io::stdout().lock();
     let here = args.run.display();
     if args.json {
@@ -110,7 +111,7 @@ fn progress(status: &RunStatus) -> String {
 
 fn table(status: &RunStatus) -> String {
     let mut table = Table::new();
-    table.load_style(UTF8_HORIZONTAL_ONLY);
+    table.load_style(NOTHING);
     table.set_header(["role", "pid", "state", "restarts", "rate", "policy", "lag"]);
     for role in &status.roles {
         let or_none = |number: Option<u64>| number.map_or_else(String::new, thousands);
@@ -132,12 +133,14 @@ fn table(status: &RunStatus) -> String {
     let evaluated = status
         .eval_return_mean
         .map_or_else(String::new, |mean| format!(", eval {mean:.1}"));
-    let waiting = status.waiting.as_deref().unwrap_or("nobody waits");
+    let waiting = status
+        .waiting
+        .as_deref()
+        .map_or("nobody waits", |waiting| waiting.split(':').next().unwrap_or(waiting));
     format!(
-        "{table}\n{}, {} rows, {} actors{evaluated}\n{:.0} updates/s, {:.0} steps/s, ratio {:.2} of {:.2}; {waiting}",
+        "{}, {} rows{evaluated}\n{:.0} updates/s, {:.0} steps/s, ratio {:.2} of {:.2}; {waiting}\n\n{table}",
         progress(status),
         thousands(status.replay_rows),
-        status.actors,
         status.updates_per_second,
         status.env_steps_per_second,
         status.ratio,
@@ -153,6 +156,7 @@ fn in_words(state: RoleState) -> &'static str {
         RoleState::WaitingForRatio => "waits (ratio)",
         RoleState::Silent => "silent (stopped?)",
         RoleState::Retiring => "retiring",
+        RoleState::Ending => "ending",
         RoleState::Restarting => "restarting",
         RoleState::Done => "done",
     }

@@ -37,8 +37,9 @@ struct Summary {
 }
 
 /// Trains until the run's end or an earlier one, judges what was learned, draws it, and tells the person.
-pub(crate) fn conduct(config: Config, run: &RunDir, lock: RunLock, telling: &Telling) -> anyhow::Result<ExitCode> {
-    let outcome = launcher::run(config.clone(), run, lock, telling.quiet)?;
+/// The run is this process's until all of that is done.
+pub(crate) fn conduct(config: Config, run: &RunDir, _lock: RunLock, telling: &Telling) -> anyhow::Result<ExitCode> {
+    let outcome = launcher::run(config.clone(), run, telling.quiet)?;
     let judged = match outcome.ending {
         Ending::Finished => judge(&config, run)?,
         Ending::Stopped | Ending::Interrupted(_) => Vec::new(),

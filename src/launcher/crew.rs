@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, bail};
 use shoal_common::channel::Domain;
 use shoal_common::channel::control::RoleStatus;
+use shoal_common::commit::{CommitReader, OpenError};
 use shoal_common::config::Config;
 use shoal_common::durable::write_atomically;
 use shoal_common::report::{Activity, Heartbeat, Identity, Role};
@@ -17,12 +18,11 @@ use super::log::Log;
 use super::member::{Consequence, LIMIT, Member};
 use super::process::{Process, name};
 
-/// How long actors may take to hand over their last chunks, and the learner to save its state.
-const ACTORS_END: Duration = Duration::from_secs(3);
-const OTHERS_END: Duration = Duration::from_secs(15);
-
 /// How often the dead are cleaned up after whose end the launcher does not see: terminals that asked something.
 const CLEANING: Duration = Duration::from_secs(2);
+
+/// More processes than are started without any of them sending a chunk.
+const NEVER_SENT: u64 = 100_000;
 
 /// How the crew is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -45,12 +45,23 @@ pub(super) struct Crew {
     started: u64,
     all_ready: bool,
     cleaned: Instant,
+    /// How the learner ended, if it was not with its state saved.
+    unsaved: Option<String>,
 }
 
 impl Crew {
     pub(super) fn new(config: &Config, run: &RunDir, log: Log) -> anyhow::Result<Self> {
         let counter = run.path().join("incarnations");
-        let started = read_counter(&counter)?;
+        let mut started = read_counter(&counter)?;
+        let committed = last_committed(run)?;
+        if started < committed {
+            // The counter was lost. A lower incarnation's chunks would be taken for old ones, and its noise was used.
+            started = committed + NEVER_SENT;
+            log.note(
+                "launcher",
+                &format!("{} is lost or wrong; counting on from {started}", counter.display()),
+            );
+        }
         let members = [
             (Role::Learner, 0),
             (Role::EnvServer, config.evaluation_server()),
@@ -66,6 +77,7 @@ impl Crew {
             started,
             all_ready: false,
             cleaned: Instant::now(),
+            unsaved: None,
         })
     }
 
@@ -174,7 +186,6 @@ impl Crew {
     fn look_after_one(&mut self, i: usize, domain: &Domain) -> anyhow::Result<State> {
         let is_wanted = self.is_wanted(&self.members[i]);
         let member = &mut self.members[i];
-        let stuck = member.is_stuck();
         let name = name(member.identity);
         let Some(process) = &mut member.process else {
             if is_wanted && Instant::now() >= member.restart_at {
@@ -183,10 +194,6 @@ impl Crew {
             }
             return Ok(State::AtWork);
         };
-        if stuck {
-            self.log.note(&name, "is not ready after a minute, and was killed");
-            process.kill();
-        }
         let Some(status) = process.exit_status() else {
             return Ok(State::AtWork);
         };
@@ -274,51 +281,77 @@ impl Crew {
         );
     }
 
-    /// Ends everyone: the actors first, so that the learner still takes what they send.
-    pub(super) fn end_all(&mut self) {
-        self.end(|role| role == Role::Actor, ACTORS_END);
-        self.end(|_| true, OTHERS_END);
-        self.log.note("launcher", "every role has ended");
+    /// Asks the processes of some roles to end.
+    pub(super) fn ask_to_end(&mut self, which: impl Fn(Role) -> bool) {
+        for member in self.members.iter_mut().filter(|member| which(member.identity.role)) {
+            if let Some(process) = &mut member.process {
+                member.ends = true;
+                process.ask_to_end();
+            }
+        }
     }
 
-    fn end(&mut self, which: impl Fn(Role) -> bool, patience: Duration) {
-        let deadline = Instant::now() + patience;
-        let mut leaving: Vec<_> = self
-            .members
-            .iter_mut()
-            .filter(|member| which(member.identity.role))
-            .collect();
-        for process in leaving.iter_mut().filter_map(|member| member.process.as_mut()) {
-            process.ask_to_end();
-        }
-        loop {
-            for member in &mut leaving {
-                if member
-                    .process
-                    .as_mut()
-                    .is_some_and(|process| process.exit_status().is_some())
-                {
+    /// Whether the processes of some roles have ended.
+    pub(super) fn have_ended(&mut self, which: impl Fn(Role) -> bool) -> bool {
+        let mut all = true;
+        for member in self.members.iter_mut().filter(|member| which(member.identity.role)) {
+            let Some(process) = &mut member.process else { continue };
+            match process.exit_status() {
+                Some(status) => {
                     member.process = None;
+                    if member.identity.role == Role::Learner && !status.success() {
+                        self.unsaved = Some(ending(status));
+                    }
+                }
+                None => all = false,
+            }
+        }
+        all
+    }
+
+    /// Kills the processes of some roles that did not end when they were asked to.
+    pub(super) fn kill(&mut self, which: impl Fn(Role) -> bool) {
+        for member in self.members.iter_mut().filter(|member| which(member.identity.role)) {
+            if member.process.take().is_some() {
+                let name = name(member.identity);
+                self.log.note(&name, "did not end when asked to, and was killed");
+                if member.identity.role == Role::Learner {
+                    self.unsaved = Some("it did not end when asked to, and was killed".into());
                 }
             }
-            if leaving.iter().all(|member| member.process.is_none()) {
-                return;
-            }
-            if Instant::now() >= deadline {
-                break;
-            }
-            std::thread::sleep(Duration::from_millis(5));
         }
-        for member in leaving {
-            if member.process.take().is_some() {
-                self.log
-                    .note(&name(member.identity), "did not end when asked to, and was killed");
-            }
-        }
+    }
+
+    /// Says that every role has ended.
+    ///
+    /// # Errors
+    /// When the learner did not save its state at its end.
+    pub(super) fn say_farewell(&self) -> anyhow::Result<()> {
+        self.log.note("launcher", "every role has ended");
+        let Some(how) = &self.unsaved else { return Ok(()) };
+        let lines = self.log.last_lines(&name(Identity {
+            role: Role::Learner,
+            index: 0,
+            incarnation: 0,
+        }));
+        let said = lines.last().map_or_else(String::new, |line| format!(": {line}"));
+        bail!(
+            "the learner did not save its last state ({how}){said}; `shoal resume {}` goes on from the newest checkpoint",
+            self.run.display()
+        );
     }
 }
 
-/// Processes ever started in this run.
+/// The greatest incarnation of an actor that is in the run's replay.
+fn last_committed(run: &RunDir) -> anyhow::Result<u64> {
+    let commits = match CommitReader::open(&run.replay_file()) {
+        Err(OpenError::NotYet { .. }) => return Ok(0),
+        opened => opened?,
+    };
+    let marks = (0..commits.layout().actors).map(|actor| commits.committed(actor).incarnation);
+    Ok(marks.max().unwrap_or(0))
+}
+
 fn read_counter(path: &Path) -> anyhow::Result<u64> {
     /// More than any run starts, and far from overflowing when it is counted on.
     const LIMIT: u64 = 1 << 60;

@@ -1,6 +1,7 @@
 //! What the launcher says and does when somebody asks from another terminal.
 
 use shoal_common::channel::control::{Answer, RunStatus};
+use shoal_common::commit::OpenError;
 use shoal_common::config::{Config, Mode};
 use shoal_common::report::{Activity, Role};
 use shoal_common::run_dir::RunDir;
@@ -16,7 +17,7 @@ pub(super) fn status(
     crew: &Crew,
     progress: &Progress,
     rest: &RunStatus,
-) -> anyhow::Result<RunStatus> {
+) -> Result<RunStatus, OpenError> {
     let mut status = RunStatus {
         replay_rows: status::replay_rows(run)?,
         actors: crew.actors(),
@@ -29,7 +30,9 @@ pub(super) fn status(
         status.ratio = status::ratio(&status, config.replay.warmup);
     }
     (status.updates_per_second, status.env_steps_per_second) = progress.rates().unwrap_or_default();
-    status.eval_return_mean = progress.evaluated().map(|report| report.return_mean);
+    if let Some(report) = progress.evaluated() {
+        status.eval_return_mean = Some(report.return_mean);
+    }
     status.roles = crew.status(status.policy_version);
     status.waiting = waiting(crew).map(|who| {
         let (ratio, agreed) = (status.ratio, status.updates_per_step);

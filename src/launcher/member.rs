@@ -16,9 +16,6 @@ pub(super) const LIMIT: u32 = 5;
 /// The pause before the first restart after a failure; each further one is twice as long.
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
 
-/// How long a process may take to be ready before it counts as stuck.
-const READY: Duration = Duration::from_secs(60);
-
 /// A process that has worked for so long has recovered from whatever made its predecessors fail.
 const RECOVERED: Duration = Duration::from_secs(30);
 
@@ -35,6 +32,8 @@ pub(super) struct Member {
     pub(super) process: Option<Process>,
     /// It was asked to hand over what it has, and is not to be replaced.
     pub(super) retires: bool,
+    /// It was asked to end with the whole run.
+    pub(super) ends: bool,
     pub(super) restarts: u32,
     pub(super) restart_at: Instant,
     begun: Instant,
@@ -66,6 +65,7 @@ impl Member {
             },
             process: None,
             retires: false,
+            ends: false,
             restarts: 0,
             restart_at: Instant::now(),
             begun: Instant::now(),
@@ -91,11 +91,6 @@ impl Member {
 
     pub(super) fn is_ready(&self) -> bool {
         self.heard.is_some()
-    }
-
-    /// Whether it should long have been ready.
-    pub(super) fn is_stuck(&self) -> bool {
-        !self.is_ready() && self.begun.elapsed() >= READY
     }
 
     pub(super) fn activity(&self) -> Option<Activity> {
@@ -162,6 +157,7 @@ impl Member {
             (None, _) => RoleState::Restarting,
             (_, Some((then, _))) if then.elapsed() >= SILENT => RoleState::Silent,
             _ if self.retires => RoleState::Retiring,
+            _ if self.ends => RoleState::Ending,
             (_, None) => RoleState::Starting,
             (_, Some((_, heartbeat))) => match heartbeat.activity() {
                 Some(Activity::WaitingForPeer) => RoleState::WaitingForPeer,

@@ -3,7 +3,7 @@
 use shoal_common::channel::{Bell, control, environment, policy, reports, transitions};
 use shoal_common::config::Config;
 use shoal_common::network::NetworkLayout;
-use shoal_common::report::{EpisodeReport, EvaluationReport, Heartbeat, Identity, LearnerReport, Role};
+use shoal_common::report::{EpisodeReport, EvaluationReport, Heartbeat, Identity, JudgedReport, LearnerReport, Role};
 use shoal_common::run_dir::RunDir;
 
 use crate::role::learner_settings;
@@ -34,6 +34,7 @@ pub(super) fn shared_memory(config: &Config) -> u64 {
         + reports::reserved::<Heartbeat>(max, roles)
         + reports::reserved::<EpisodeReport>(max, max)
         + reports::reserved::<EvaluationReport>(max, 1)
+        + reports::reserved::<JudgedReport>(max, 1)
         + reports::reserved::<LearnerReport>(max, 1)
         + roles as u64 * Bell::reserved(max)
 }

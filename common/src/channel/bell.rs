@@ -1,7 +1,7 @@
 //! Waking each other: data channels never wake anybody, so whoever waits has a bell, and whoever has news for it rings.
 
 use std::fmt;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use iceoryx2::port::listener::{Listener, ListenerWaitError};
 use iceoryx2::port::notifier::Notifier;
@@ -55,7 +55,7 @@ impl Bell {
     /// When shared memory cannot be had.
     pub fn hang(domain: &Domain, place: Place) -> Result<Self, ChannelError> {
         let channel = place.to_string();
-        let listener = claim(&channel, "listen", || {
+        let listener = claim(|| {
             service(domain, &channel)?
                 .listener_builder()
                 .create()
@@ -86,7 +86,7 @@ impl Ringer {
     /// When shared memory cannot be had.
     pub fn new(domain: &Domain, place: Place) -> Result<Self, ChannelError> {
         let channel = place.to_string();
-        let notifier = claim(&channel, "ring", || {
+        let notifier = claim(|| {
             service(domain, &channel)?
                 .notifier_builder()
                 .create()
@@ -103,8 +103,8 @@ impl Ringer {
     }
 }
 
-/// Waits until `poll` yields something: polls a short while, then sleeps at the bell; after each nap without a ring,
-/// `look_after` may renew connections.
+/// Waits until `poll` yields something: polls a short while, then sleeps at the bell; while it waits, `look_after` renews
+/// connections, some twenty times a second.
 ///
 /// # Errors
 /// [`Interruption::Stopped`] once `stop` is requested, and whatever `poll` or `look_after` fail with.
@@ -114,6 +114,7 @@ pub fn wait_for<T>(
     mut poll: impl FnMut() -> Result<Option<T>, ChannelError>,
     mut look_after: impl FnMut() -> Result<(), ChannelError>,
 ) -> Result<T, Interruption> {
+    let mut looked_after = Instant::now();
     loop {
         for _ in 0..POLLS {
             if let Some(found) = poll()? {
@@ -124,7 +125,10 @@ pub fn wait_for<T>(
         if stop.requested() {
             return Err(Interruption::Stopped);
         }
-        if !bell.wait(NAP)? {
+        bell.wait(NAP)?;
+        // By the clock: rings that bring nothing must not keep it from its connections.
+        if looked_after.elapsed() >= NAP {
+            looked_after = Instant::now();
             look_after()?;
         }
     }

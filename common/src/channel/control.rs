@@ -2,6 +2,7 @@
 
 use std::time::{Duration, Instant};
 
+use iceoryx2::active_request::ActiveRequest;
 use iceoryx2::port::server::Server;
 use iceoryx2::prelude::*;
 use iceoryx2::service::header::request_response::{
@@ -33,11 +34,18 @@ const ANSWER_OF_A_ROLE: usize = 96;
 /// How long the asker sleeps between looks. The launcher looks twenty times a second.
 const NAP: Duration = Duration::from_millis(5);
 
+/// How often it asks itself whether there is still a launcher.
+const LOOK: Duration = Duration::from_millis(100);
+
 /// The launcher's end.
 #[derive(Debug)]
 pub struct ControlPort {
     server: Server<ipc::Service, [u8], ControlHeader, [u8], ControlHeader>,
+    /// Who will be answered later.
+    waiting: Vec<ControlRequest>,
 }
+
+type ControlRequest = ActiveRequest<ipc::Service, [u8], ControlHeader, [u8], ControlHeader>;
 
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ZeroCopySend)]
 #[repr(C)]
@@ -52,6 +60,9 @@ pub enum ControlError {
     /// The channel does not work.
     #[error(transparent)]
     Channel(#[from] ChannelError),
+    /// There is no launcher any more.
+    #[error("the launcher has ended")]
+    Gone,
     /// Nobody answers.
     #[error("the launcher does not answer; is it stopped?")]
     Silence,
@@ -66,60 +77,83 @@ impl ControlPort {
     /// # Errors
     /// When shared memory cannot be had.
     pub fn open(domain: &Domain) -> Result<Self, ChannelError> {
-        let server = claim(CHANNEL, "answer", || {
+        let server = claim(|| {
             service(domain)?
                 .server_builder()
                 .initial_max_slice_len(answer_length(domain.max_actors()))
                 .create()
                 .map_err(|cause| ChannelError::new(CHANNEL, "answer", cause))
         })?;
-        Ok(Self { server })
+        Ok(Self {
+            server,
+            waiting: Vec::new(),
+        })
     }
 
-    /// Answers everything that was asked since the last call.
+    /// Answers everything that was asked since the last call; whom `answer` has no answer for waits.
     ///
     /// # Errors
     /// When the channel does not work, or `answer` fails.
     pub fn attend<E: From<ChannelError>>(
-        &self,
-        mut answer: impl FnMut(Question) -> Result<Answer, E>,
+        &mut self,
+        mut answer: impl FnMut(Question) -> Result<Option<Answer>, E>,
     ) -> Result<(), E> {
-        let received = || {
-            self.server
+        loop {
+            let received = self
+                .server
                 .receive()
-                .map_err(|cause| ChannelError::new(CHANNEL, "hear a question", cause))
-        };
-        while let Some(request) = received()? {
+                .map_err(|cause| ChannelError::new(CHANNEL, "hear a question", cause))?;
+            let Some(request) = received else { return Ok(()) };
             let answer = match decode(request.user_header().version, request.payload()) {
                 Ok(question) => answer(question)?,
-                Err(reason) => Answer::Refused(format!("the question cannot be read: {reason}")),
+                Err(reason) => Some(Answer::Refused(format!("the question cannot be read: {reason}"))),
             };
-            // An asker that has gone, or has no memory left, is no reason for the launcher to fail.
-            let bytes = encode(&answer);
-            let sent = request.loan_slice(bytes.len()).map(|mut response| {
-                response.payload_mut().copy_from_slice(&bytes);
-                response.user_header_mut().version = VERSION;
-                response.send()
-            });
-            if !matches!(sent, Ok(Ok(()))) {
-                tracing::debug!(?sent, "a question went without an answer");
+            match answer {
+                Some(answer) => send(&request, &answer),
+                None => self.waiting.push(request),
             }
         }
-        Ok(())
+    }
+
+    /// Answers those who wait, and gives them a moment to hear it; for the end.
+    pub fn dismiss(mut self, answer: &Answer) {
+        if self.waiting.is_empty() {
+            return;
+        }
+        self.waiting.drain(..).for_each(|request| send(&request, answer));
+        std::thread::sleep(10 * NAP);
     }
 }
 
-/// Asks the launcher of the run.
+/// An asker that has gone, or has no memory left, is no reason for the launcher to fail.
+fn send(request: &ControlRequest, answer: &Answer) {
+    let bytes = encode(answer);
+    let sent = request.loan_slice(bytes.len()).map(|mut response| {
+        response.payload_mut().copy_from_slice(&bytes);
+        response.user_header_mut().version = VERSION;
+        response.send()
+    });
+    if !matches!(sent, Ok(Ok(()))) {
+        tracing::debug!(?sent, "a question went without an answer");
+    }
+}
+
+/// Asks the launcher of the run, for as long as `lives` says that there is one.
 ///
 /// # Errors
 /// When there is no answer within `patience`, or none that can be read.
-pub fn ask(domain: &Domain, question: Question, patience: Duration) -> Result<Answer, ControlError> {
+pub fn ask(
+    domain: &Domain,
+    question: Question,
+    patience: Duration,
+    lives: impl Fn() -> bool,
+) -> Result<Answer, ControlError> {
     let failed = |cause: String| ChannelError {
         channel: CHANNEL.into(),
         action: "ask",
         cause,
     };
-    let client = claim(CHANNEL, "ask", || {
+    let client = claim(|| {
         service(domain)?
             .client_builder()
             .initial_max_slice_len(QUESTION)
@@ -135,15 +169,24 @@ pub fn ask(domain: &Domain, question: Question, patience: Duration) -> Result<An
     };
     let question = encode(&question);
     let mut pending = ask(&question).map_err(failed)?;
+    let mut looked = Instant::now();
+    let mut gone = false;
     loop {
         let received = pending.receive().map_err(|cause| failed(format!("{cause:?}")))?;
         if let Some(response) = received {
             return decode(response.user_header().version, response.payload()).map_err(ControlError::Unreadable);
         }
+        if gone {
+            return Err(ControlError::Gone);
+        }
         if Instant::now() >= deadline {
             return Err(ControlError::Silence);
         }
         std::thread::sleep(NAP);
+        if looked.elapsed() >= LOOK {
+            looked = Instant::now();
+            gone = !lives();
+        }
         // The launcher may have opened its end only now.
         if pending.number_of_server_connections() == 0 {
             pending = ask(&question).map_err(failed)?;

@@ -42,12 +42,15 @@ pub enum DomainError {
     #[error("{0} belongs to another user; remove it, or ask its owner to")]
     Foreign(PathBuf),
     /// Processes of the run's last launcher are still there.
-    #[error("run {run_id} cannot go on: processes of it are still alive and do not end (stopped?): kill -9 {pids}")]
+    #[error(
+        "run {run_id} cannot go on: processes of it are still alive and do not end (stopped?): kill -9 {}",
+        pids.iter().map(i32::to_string).collect::<Vec<_>>().join(" ")
+    )]
     StillAlive {
         /// The run.
         run_id: String,
         /// Their numbers.
-        pids: String,
+        pids: Vec<i32>,
     },
     /// iceoryx2 refused.
     #[error("cannot join run {run_id} in shared memory: {cause}; is /dev/shm mounted and not full?")]
@@ -155,7 +158,7 @@ impl Domain {
             if Instant::now() >= deadline {
                 return Err(DomainError::StillAlive {
                     run_id: run_id.into(),
-                    pids: left.iter().map(i32::to_string).collect::<Vec<_>>().join(" "),
+                    pids: left,
                 });
             }
             std::thread::sleep(Duration::from_millis(20));

@@ -61,17 +61,12 @@ const CLAIM_PATIENCE: Duration = Duration::from_secs(5);
 
 /// Opens a service or makes a port. A process that died may still hold the place until the launcher has cleaned up after
 /// it; two processes may also make and remove the same service at the same time. So: try again for a while.
-fn claim<T, E: Debug>(
-    channel: &str,
-    action: &'static str,
-    mut attempt: impl FnMut() -> Result<T, E>,
-) -> Result<T, ChannelError> {
+fn claim<T>(mut attempt: impl FnMut() -> Result<T, ChannelError>) -> Result<T, ChannelError> {
     let deadline = Instant::now() + CLAIM_PATIENCE;
     loop {
         match attempt() {
-            Ok(made) => return Ok(made),
-            Err(cause) if Instant::now() >= deadline => return Err(ChannelError::new(channel, action, cause)),
-            Err(_) => std::thread::sleep(Duration::from_millis(5)),
+            Err(_) if Instant::now() < deadline => std::thread::sleep(Duration::from_millis(5)),
+            result => return result,
         }
     }
 }

@@ -63,7 +63,7 @@ impl PolicyPublisher {
     /// When shared memory cannot be had, or another learner lives.
     pub fn open(domain: &Domain, parameters: usize) -> Result<Self, ChannelError> {
         let samples = samples(domain.max_actors());
-        let publisher = claim(CHANNEL, "publish", || {
+        let publisher = claim(|| {
             service(domain)?
                 .publisher_builder()
                 .initial_max_slice_len(parameters)
@@ -108,7 +108,7 @@ impl PolicyReader {
     /// # Errors
     /// When shared memory cannot be had.
     pub fn open(domain: &Domain, fingerprint: u64, parameters: usize) -> Result<Self, ChannelError> {
-        let subscriber = claim(CHANNEL, "read", || {
+        let subscriber = claim(|| {
             service(domain)?
                 .subscriber_builder()
                 .create()

@@ -10,7 +10,7 @@ use iceoryx2::service::header::publish_subscribe::Header;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 
 use super::{ChannelError, Domain, claim, memory, service_name};
-use crate::report::{EpisodeReport, EvaluationReport, Heartbeat, LearnerReport};
+use crate::report::{EpisodeReport, EvaluationReport, Heartbeat, JudgedReport, LearnerReport};
 
 /// Reports a reader has in hand: each is copied and let go.
 const BORROWED: usize = 1;
@@ -48,8 +48,14 @@ impl Report for EpisodeReport {
 impl Report for EvaluationReport {
     const CHANNEL: &'static str = "reports/evaluations";
     const BUFFER: usize = 64;
-    // A learner in lockstep that was restarted needs the evaluation it was waiting for.
     const HISTORY: usize = 2;
+}
+
+impl Report for JudgedReport {
+    const CHANNEL: &'static str = "reports/judged";
+    const BUFFER: usize = 8;
+    // A learner in lockstep that was restarted waits for it.
+    const HISTORY: usize = 1;
 }
 
 impl Report for LearnerReport {
@@ -76,7 +82,7 @@ impl<R: Report> Reporter<R> {
     /// # Errors
     /// When shared memory cannot be had.
     pub fn open(domain: &Domain) -> Result<Self, ChannelError> {
-        let publisher = claim(R::CHANNEL, "report", || {
+        let publisher = claim(|| {
             service::<R>(domain)?
                 .publisher_builder()
                 .max_loaned_samples(LOANED)
@@ -107,7 +113,7 @@ impl<R: Report> Reports<R> {
     /// # Errors
     /// When shared memory cannot be had.
     pub fn open(domain: &Domain) -> Result<Self, ChannelError> {
-        let subscriber = claim(R::CHANNEL, "read", || {
+        let subscriber = claim(|| {
             service::<R>(domain)?
                 .subscriber_builder()
                 .create()

@@ -132,7 +132,7 @@ impl ChunkSender {
         window: u32,
     ) -> Result<Greeting, ChannelError> {
         let channel = name(actor);
-        let (service, publisher) = claim(&channel, "send", || {
+        let (service, publisher) = claim(|| {
             let service = service(domain, &channel, window)?;
             let publisher = service
                 .publisher_builder()
@@ -140,7 +140,7 @@ impl ChunkSender {
                 .max_loaned_samples(LOANED)
                 .create()
                 .map_err(|cause| ChannelError::new(&channel, "send", cause))?;
-            Ok::<_, ChannelError>((service, publisher))
+            Ok((service, publisher))
         })?;
         let sender = Self {
             service,
@@ -267,7 +267,7 @@ impl ChunkReceiver {
     /// When shared memory cannot be had, or another learner lives.
     pub fn open(domain: &Domain, actor: u32, layout: ChunkLayout, window: u32) -> Result<Self, ChannelError> {
         let channel = name(actor);
-        let subscriber = claim(&channel, "receive", || {
+        let subscriber = claim(|| {
             service(domain, &channel, window)?
                 .subscriber_builder()
                 .buffer_size(buffer(window))

@@ -7,12 +7,12 @@ use super::words::{Words, WritableWords};
 
 /// Identifies a chunk of one actor. Ordered: a later incarnation comes after every chunk of the earlier ones.
 ///
-/// The default means "none": an incarnation numbers its chunks from 1.
+/// The default means "none": incarnations and sequence numbers count from 1.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub struct ChunkMark {
-    /// How often the actor has been started before.
+    /// Grows with every process that the run starts.
     pub incarnation: u64,
-    /// The chunk's number within the incarnation.
+    /// The chunk's number, over all of the actor's incarnations.
     pub sequence: u64,
 }
 

@@ -100,6 +100,8 @@ pub enum RoleState {
     Silent,
     /// Handing over what it has, to end for good.
     Retiring,
+    /// Asked to end with the whole run.
+    Ending,
     /// Ended, and about to be started again.
     Restarting,
     /// Through with everything.

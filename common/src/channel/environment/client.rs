@@ -119,7 +119,7 @@ impl EnvironmentClient {
         let channel = name(index);
         let snapshot_words = spec.snapshot_words(environments);
         let longest = question_length(spec, environments);
-        let client = claim(&channel, "ask", || {
+        let client = claim(|| {
             service(domain, &channel)?
                 .client_builder()
                 .initial_max_slice_len(longest)

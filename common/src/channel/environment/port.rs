@@ -45,7 +45,7 @@ impl EnvironmentPort {
         let channel = name(index);
         let layout = ResponseLayout::new(environments, spec.observation.width());
         let longest = answer_length(&spec, environments);
-        let server = claim(&channel, "answer", || {
+        let server = claim(|| {
             service(domain, &channel)?
                 .server_builder()
                 .initial_max_slice_len(longest)
