@@ -82,9 +82,12 @@ fn end_of(running: Running) -> (serde_json::Value, Vec<String>) {
 }
 
 fn comes_further(running: &Running, by: u64) {
-    let rows = || CommitReader::open(&running.run.join("replay.bin")).map_or(0, |commits| commits.rows());
-    let wanted = rows() + by;
-    until("it has come further", || rows() >= wanted);
+    let wanted = rows_of(running) + by;
+    until("it has come further", || rows_of(running) >= wanted);
+}
+
+fn rows_of(running: &Running) -> u64 {
+    CommitReader::open(&running.run.join("replay.bin")).map_or(0, |commits| commits.rows())
 }
 
 #[test]
@@ -122,14 +125,27 @@ fn an_evaluator_killed_while_a_new_learner_does_its_rounds_again_holds_nobody_up
         "--set",
         "evaluation.every=1500",
         "--set",
-        // From the beginning again, each time.
+        // From the beginning again, each time, and slowly.
         "checkpoint.every_updates=100000",
+        "--set",
+        "ddpg.batch=512",
+        "--set",
+        "ddpg.hidden=[24,16]",
+        "--set",
+        "replay.warmup=64",
+        "--set",
+        // Judged before those rounds are done, and after the new learner has begun with them.
+        "evaluation.episodes=2000",
+        "--set",
+        "evaluation.final_episodes=3",
     ];
-    let whole = end_of(place.start("whole", &arguments));
-    let running = place.start("killed", &arguments);
+    let whole = end_of(place.start_as("whole", &arguments));
+    let running = place.start_as("killed", &arguments);
     let evaluations = running.run.join("evaluations.csv");
     for period in [2, 4] {
-        comes_further(&running, 3000);
+        until("a policy of the period is there", || {
+            rows_of(&running) >= 1500 * period as u64
+        });
         running.kill("learner-0");
         until("the policy of the period is judged", || {
             std::fs::read_to_string(&evaluations).unwrap().lines().count() >= 2 + period

@@ -188,6 +188,8 @@ fn a_lost_counter_of_incarnations_keeps_nobody_from_going_on() {
     for counter in [None, Some("3")] {
         let place = Workplace::new();
         let run = killed(&place, &[]);
+        // Now the replay knows of greater ones than those of a first start.
+        goes_on(&place, 500);
         let file = run.join("incarnations");
         match counter {
             None => std::fs::remove_file(&file).unwrap(),
