@@ -143,9 +143,9 @@ fn an_evaluator_killed_while_a_new_learner_does_its_rounds_again_holds_nobody_up
     let running = place.start_as("killed", &arguments);
     let evaluations = running.run.join("evaluations.csv");
     for period in [2, 4] {
-        until("a policy of the period is there", || {
-            rows_of(&running) >= 1500 * period as u64
-        });
+        until("its rows are there", || rows_of(&running) >= 1500 * period as u64);
+        // It is published, and the evaluator is at it.
+        std::thread::sleep(Duration::from_millis(60));
         running.kill("learner-0");
         until("the policy of the period is judged", || {
             std::fs::read_to_string(&evaluations).unwrap().lines().count() >= 2 + period
