@@ -128,14 +128,14 @@ fn an_evaluator_killed_while_a_new_learner_does_its_rounds_again_holds_nobody_up
         // From the beginning again, each time, and slowly.
         "checkpoint.every_updates=100000",
         "--set",
-        "ddpg.batch=512",
+        "ddpg.batch=1024",
         "--set",
         "ddpg.hidden=[24,16]",
         "--set",
         "replay.warmup=64",
         "--set",
         // Judged before those rounds are done, and after the new learner has begun with them.
-        "evaluation.episodes=2000",
+        "evaluation.episodes=1000",
         "--set",
         "evaluation.final_episodes=3",
     ];
