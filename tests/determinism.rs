@@ -121,7 +121,7 @@ fn an_evaluator_killed_while_a_new_learner_does_its_rounds_again_holds_nobody_up
     let arguments = [
         "--lockstep",
         "--steps",
-        "9000",
+        "6000",
         "--set",
         "evaluation.every=1500",
         "--set",
@@ -134,24 +134,27 @@ fn an_evaluator_killed_while_a_new_learner_does_its_rounds_again_holds_nobody_up
         "--set",
         "replay.warmup=64",
         "--set",
-        // Judged before those rounds are done, and after the new learner has begun with them.
-        "evaluation.episodes=1000",
+        // Judged only when the new learner has begun with those rounds.
+        "evaluation.episodes=3000",
         "--set",
         "evaluation.final_episodes=3",
     ];
     let whole = end_of(place.start_as("whole", &arguments));
     let running = place.start_as("killed", &arguments);
     let evaluations = running.run.join("evaluations.csv");
-    for period in [2, 4] {
-        until("its rows are there", || rows_of(&running) >= 1500 * period as u64);
-        // It is published, and the evaluator is at it.
-        std::thread::sleep(Duration::from_millis(60));
-        running.kill("learner-0");
-        until("the policy of the period is judged", || {
-            std::fs::read_to_string(&evaluations).unwrap().lines().count() >= 2 + period
-        });
-        running.kill("evaluator-0");
-    }
+    until("the rows of a period are there", || rows_of(&running) >= 3000);
+    // Its policy is published, and the evaluator is at it.
+    std::thread::sleep(Duration::from_millis(60));
+    running.kill("learner-0");
+    until("there is a new learner", || running.pids("learner-0").len() == 2);
+    std::thread::sleep(Duration::from_millis(150));
+    running.stop("learner-0");
+    until("the policy is judged", || {
+        std::fs::read_to_string(&evaluations).unwrap().lines().count() == 4
+    });
+    running.kill("evaluator-0");
+    until("there is a new evaluator", || running.pids("evaluator-0").len() == 2);
+    running.go_on("learner-0");
     assert_eq!(end_of(running), whole);
 }
 
