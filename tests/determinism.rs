@@ -135,7 +135,7 @@ fn an_evaluator_killed_while_a_new_learner_does_its_rounds_again_holds_nobody_up
         "replay.warmup=64",
         "--set",
         // Judged only when the new learner has begun with those rounds.
-        "evaluation.episodes=3000",
+        "evaluation.episodes=10000",
         "--set",
         "evaluation.final_episodes=3",
     ];
@@ -144,7 +144,7 @@ fn an_evaluator_killed_while_a_new_learner_does_its_rounds_again_holds_nobody_up
     let evaluations = running.run.join("evaluations.csv");
     until("the rows of a period are there", || rows_of(&running) >= 3000);
     // Its policy is published, and the evaluator is at it.
-    std::thread::sleep(Duration::from_millis(60));
+    std::thread::sleep(Duration::from_millis(20));
     running.kill("learner-0");
     until("there is a new learner", || running.pids("learner-0").len() == 2);
     std::thread::sleep(Duration::from_millis(150));
