@@ -33,6 +33,9 @@ const ROUND: Duration = Duration::from_millis(50);
 /// How long the evaluator may take over the last policy once the learner is through.
 const LAST_EVALUATION: Duration = Duration::from_secs(5);
 
+/// How long a learner may take to come back when the run is to end.
+const LEARNER_BACK: Duration = Duration::from_secs(5);
+
 /// How long actors may take to hand over their last chunks, and the others to end; the learner saves its state.
 const ACTORS_END: Duration = Duration::from_secs(3);
 const OTHERS_END: Duration = Duration::from_secs(15);
@@ -140,8 +143,9 @@ struct Launcher<'a> {
     control: ControlPort,
     /// How the run stood when this launcher began.
     rest: RunStatus,
-    /// Somebody has asked for the end; the end has begun.
-    to_end: bool,
+    /// When somebody asked for the end first.
+    to_end: Option<Instant>,
+    /// The end has begun.
     ends: bool,
     crew: Crew,
     recorder: Recorder,
@@ -163,7 +167,7 @@ impl<'a> Launcher<'a> {
         Ok(Self {
             control: ControlPort::open(domain)?,
             rest: status::at_rest(&config, run)?,
-            to_end: false,
+            to_end: None,
             ends: false,
             run,
             domain,
@@ -211,12 +215,14 @@ impl<'a> Launcher<'a> {
             }
             self.read_reports()?;
             self.attend()?;
-            if self.to_end {
-                return Ok(Ending::Stopped);
-            }
             if self.crew.look_after(self.domain)? == crew::State::LearnerDone {
                 self.await_last_evaluation()?;
                 return Ok(Ending::Finished);
+            }
+            // A learner that has just died shall come back and take in what was sent, before everybody ends.
+            let may_end = |asked: Instant| self.crew.has_learner() || asked.elapsed() >= LEARNER_BACK;
+            if self.to_end.is_some_and(may_end) {
+                return Ok(Ending::Stopped);
             }
             self.progress.draw(&self.crew);
             std::thread::sleep(ROUND);
@@ -245,7 +251,7 @@ impl<'a> Launcher<'a> {
                 Question::Scale { .. } if *ends => Ok(Some(Answer::Refused("the run is ending".into()))),
                 Question::Scale { actors } => desk::scale(config, run, crew, actors).map(Some),
                 Question::Stop => {
-                    *to_end = true;
+                    to_end.get_or_insert_with(Instant::now);
                     Ok(None)
                 }
             }

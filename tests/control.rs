@@ -177,6 +177,25 @@ fn an_end_without_the_learners_state_saved_is_no_success() {
 }
 
 #[test]
+fn a_learner_that_has_just_died_comes_back_before_the_run_ends() {
+    let place = Workplace::where_chunks_are_counted();
+    let running = place.start("run", &ENDLESS);
+    learns(&running);
+    running.kill("learner-0");
+    let stopped = place.output(&["stop", "run"]);
+    assert!(stopped.status.success(), "{}", said(&stopped));
+    let run = running.run.clone();
+    running.wait();
+    for actor in 0..2 {
+        assert_eq!(
+            support::sent(&run, actor),
+            support::committed(&run, actor as usize),
+            "actor {actor}"
+        );
+    }
+}
+
+#[test]
 fn a_stopped_run_goes_on_where_it_was() {
     let place = Workplace::new();
     let running = place.start("run", &ENDLESS);

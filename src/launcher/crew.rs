@@ -45,6 +45,7 @@ pub(super) struct Crew {
     started: u64,
     all_ready: bool,
     cleaned: Instant,
+    learner_done: bool,
     /// How the learner ended, if it was not with its state saved.
     unsaved: Option<String>,
 }
@@ -77,6 +78,7 @@ impl Crew {
             started,
             all_ready: false,
             cleaned: Instant::now(),
+            learner_done: false,
             unsaved: None,
         })
     }
@@ -156,6 +158,15 @@ impl Crew {
         of_role.find_map(Member::activity)
     }
 
+    /// Whether there is a learner, past its start.
+    pub(super) fn has_learner(&self) -> bool {
+        let mut learners = self
+            .members
+            .iter()
+            .filter(|member| member.identity.role == Role::Learner);
+        learners.any(|learner| learner.process.is_some() && learner.is_ready())
+    }
+
     /// How often processes were started again.
     pub(super) fn restarts(&self) -> u32 {
         self.members.iter().map(|member| member.restarts).sum()
@@ -199,6 +210,7 @@ impl Crew {
         };
         if member.identity.role == Role::Learner && status.success() {
             member.process = None;
+            self.learner_done = true;
             self.log.note(&name, "done");
             return Ok(State::LearnerDone);
         }
@@ -284,9 +296,15 @@ impl Crew {
     /// Asks the processes of some roles to end.
     pub(super) fn ask_to_end(&mut self, which: impl Fn(Role) -> bool) {
         for member in self.members.iter_mut().filter(|member| which(member.identity.role)) {
-            if let Some(process) = &mut member.process {
-                member.ends = true;
-                process.ask_to_end();
+            match &mut member.process {
+                Some(process) => {
+                    member.ends = true;
+                    process.ask_to_end();
+                }
+                None if member.identity.role == Role::Learner && !self.learner_done => {
+                    self.unsaved = Some("it had died and was not back yet".into());
+                }
+                None => {}
             }
         }
     }
