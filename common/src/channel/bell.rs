@@ -114,7 +114,8 @@ pub fn wait_for<T>(
     mut poll: impl FnMut() -> Result<Option<T>, ChannelError>,
     mut look_after: impl FnMut() -> Result<(), ChannelError>,
 ) -> Result<T, Interruption> {
-    let mut looked_after = Instant::now();
+    // The clock is not read for an answer that comes while it polls.
+    let mut looked_after = None;
     loop {
         for _ in 0..POLLS {
             if let Some(found) = poll()? {
@@ -125,10 +126,11 @@ pub fn wait_for<T>(
         if stop.requested() {
             return Err(Interruption::Stopped);
         }
+        let since = looked_after.get_or_insert_with(Instant::now);
         bell.wait(NAP)?;
         // By the clock: rings that bring nothing must not keep it from its connections.
-        if looked_after.elapsed() >= NAP {
-            looked_after = Instant::now();
+        if since.elapsed() >= NAP {
+            *since = Instant::now();
             look_after()?;
         }
     }
