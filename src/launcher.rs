@@ -86,11 +86,14 @@ fn explain(error: DomainError, run: &RunDir) -> anyhow::Error {
     let DomainError::StillAlive { pids, .. } = &error else {
         return error.into();
     };
-    // A role's arguments are its name, the run's directory, and two numbers.
+    // A role's arguments are its name, the run's directory, and two numbers; a launcher's are what somebody typed.
+    let roles = [Role::EnvServer, Role::Actor, Role::Evaluator, Role::Learner].map(Role::name);
     let directory = |pid: &i32| {
         let arguments = std::fs::read(format!("/proc/{pid}/cmdline")).ok()?;
-        let directory = arguments.split(|byte| *byte == 0).nth(2)?;
-        Some(String::from_utf8_lossy(directory).into_owned())
+        let arguments = String::from_utf8_lossy(&arguments);
+        let mut arguments = arguments.split('\0').skip(1);
+        let is_role = roles.contains(&arguments.next()?);
+        arguments.next().filter(|_| is_role).map(str::to_owned)
     };
     let here = run.path().display();
     match pids

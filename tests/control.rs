@@ -7,7 +7,7 @@ mod support;
 use std::process::Output;
 
 use serde_json::Value;
-use support::{Running, Workplace, json, parse, until};
+use support::{Workplace, json, parse, until};
 
 const ENDLESS: [&str; 2] = ["--steps", "100000000"];
 
@@ -20,16 +20,11 @@ fn roles<'a>(status: &'a Value, name: &str) -> Vec<&'a Value> {
     all.filter(|role| role["role"] == name).collect()
 }
 
-fn learns(running: &Running) {
-    let before = running.learned("updates");
-    until("something more is learned", || running.learned("updates") > before);
-}
-
 #[test]
 fn status_shows_every_role_while_a_run_goes_on_and_says_so_when_nothing_runs() {
     let place = Workplace::new();
     let running = place.start("run", &[&ENDLESS[..], &["--actors", "2"]].concat());
-    learns(&running);
+    running.learns_on();
     let status = place.status("run");
     assert_eq!(status["running"], true);
     for (role, count) in [("learner", 1), ("evaluator", 1), ("actor", 2), ("env-server", 3)] {
@@ -108,7 +103,7 @@ fn actors_come_and_go_while_training_goes_on_and_none_of_their_rows_is_lost() {
         until("the retired actors' environment servers have ended", || {
             roles(&place.status("run"), "env-server").len() == actors + 1
         });
-        learns(&running);
+        running.learns_on();
     }
     for (actors, part) in [("0", "room for 1 to 16"), ("17", "room for 1 to 16")] {
         let output = place.output(&["scale", "run", "--actors", actors]);
@@ -125,14 +120,7 @@ fn actors_come_and_go_while_training_goes_on_and_none_of_their_rows_is_lost() {
     let (code, _, leftovers) = running.wait();
     assert_eq!(code, Some(0));
     assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
-    for actor in 0..4 {
-        assert_eq!(
-            support::sent(&run, actor as u32),
-            support::committed(&run, actor),
-            "actor {actor}"
-        );
-        assert!(support::committed(&run, actor) > 0, "actor {actor}");
-    }
+    support::all_that_was_sent_is_there(&run, 4);
 }
 
 #[test]
@@ -148,20 +136,14 @@ fn what_was_sent_is_taken_in_at_the_end_however_far_the_learner_is_behind() {
     let run = running.run.clone();
     assert!(place.output(&["stop", "run"]).status.success());
     running.wait();
-    for actor in 0..2 {
-        assert_eq!(
-            support::sent(&run, actor),
-            support::committed(&run, actor as usize),
-            "actor {actor}"
-        );
-    }
+    support::all_that_was_sent_is_there(&run, 2);
 }
 
 #[test]
 fn an_end_without_the_learners_state_saved_is_no_success() {
     let place = Workplace::new();
     let running = place.start("run", &ENDLESS);
-    learns(&running);
+    running.learns_on();
     running.stop("learner-0");
     let stopped = place.output(&["stop", "run"]);
     assert_eq!(stopped.status.code(), Some(1));
@@ -180,26 +162,20 @@ fn an_end_without_the_learners_state_saved_is_no_success() {
 fn a_learner_that_has_just_died_comes_back_before_the_run_ends() {
     let place = Workplace::where_chunks_are_counted();
     let running = place.start("run", &ENDLESS);
-    learns(&running);
+    running.learns_on();
     running.kill("learner-0");
     let stopped = place.output(&["stop", "run"]);
     assert!(stopped.status.success(), "{}", said(&stopped));
     let run = running.run.clone();
     running.wait();
-    for actor in 0..2 {
-        assert_eq!(
-            support::sent(&run, actor),
-            support::committed(&run, actor as usize),
-            "actor {actor}"
-        );
-    }
+    support::all_that_was_sent_is_there(&run, 2);
 }
 
 #[test]
 fn a_stopped_run_goes_on_where_it_was() {
     let place = Workplace::new();
     let running = place.start("run", &ENDLESS);
-    learns(&running);
+    running.learns_on();
     assert!(place.output(&["scale", "run", "--actors", "3"]).status.success());
     let run = running.run.clone();
     let stopped = place.output(&["stop", "run"]);
@@ -283,5 +259,5 @@ fn a_launcher_that_does_not_answer_is_said_to_be_silent() {
     running.signal(rustix::process::Signal::CONT);
     assert_eq!(output.status.code(), Some(1));
     assert!(said(&output).contains("does not answer"), "{}", said(&output));
-    learns(&running);
+    running.learns_on();
 }

@@ -18,11 +18,6 @@ const RING: u64 = 2000;
 
 const ENDLESS: [&str; 2] = ["--steps", "100000000"];
 
-fn learns(running: &Running) {
-    let before = running.learned("updates");
-    until("something more is learned", || running.learned("updates") > before);
-}
-
 fn has_saved(running: &Running) {
     let checkpoint = running.run.join("checkpoints/previous.ckpt");
     until("there are two checkpoints", || checkpoint.exists());
@@ -36,7 +31,7 @@ fn rows(run: &Path) -> u64 {
 fn killed(place: &Workplace, arguments: &[&str]) -> std::path::PathBuf {
     let quickly = ["--set", "checkpoint.every_seconds=0.5"];
     let running = place.start("run", &[&ENDLESS[..], &quickly, arguments].concat());
-    learns(&running);
+    running.learns_on();
     has_saved(&running);
     running.kill_everybody();
     running.run.clone()
@@ -58,12 +53,12 @@ fn goes_on(place: &Workplace, more: u64) -> serde_json::Value {
 fn when_the_launcher_is_killed_the_run_can_be_resumed_at_once() {
     let place = Workplace::where_chunks_are_counted();
     let running = place.start("run", &ENDLESS);
-    learns(&running);
+    running.learns_on();
     let (run, before) = (running.run.clone(), rows(&running.run));
     running.signal(Signal::KILL);
     // The old roles may still be saving what they have.
     let resumed = place.resume("run", &[]);
-    learns(&resumed);
+    resumed.learns_on();
     assert!(rows(&run) > before);
     assert!(place.output(&["stop", "run"]).status.success());
     let (code, _, leftovers) = resumed.wait();
@@ -105,7 +100,7 @@ fn a_policy_of_a_period_that_was_judged_is_not_judged_again() {
     until("the first policy is judged", || judged() == 1);
     running.kill("evaluator-0");
     until("it is replaced", || running.pids("evaluator-0").len() == 2);
-    learns(&running);
+    running.learns_on();
     assert!(place.output(&["stop", "run"]).status.success());
     running.wait();
     goes_on(&place, 2000);
@@ -128,7 +123,7 @@ fn stopped_for(length: Duration) {
     let place = Workplace::where_chunks_are_counted();
     let running = place.start("run", &[&ENDLESS[..], &["--set", "replay.capacity=200000"]].concat());
     let run = running.run.clone();
-    learns(&running);
+    running.learns_on();
     for who in ["actor-0", "env-server-0", "evaluator-0", "env-server-16", "learner-0"] {
         running.stop(who);
         std::thread::sleep(length);
@@ -137,12 +132,12 @@ fn stopped_for(length: Duration) {
         let stopped = roles.find(|role| format!("{}-{}", role["role"].as_str().unwrap(), role["index"]) == who);
         assert_eq!(stopped.unwrap()["state"], "silent", "{who}: {status}");
         running.go_on(who);
-        learns(&running);
+        running.learns_on();
     }
     running.signal(Signal::STOP);
     std::thread::sleep(length);
     running.signal(Signal::CONT);
-    learns(&running);
+    running.learns_on();
     assert_eq!(place.status("run")["running"], true);
 
     assert!(place.output(&["stop", "run"]).status.success());
@@ -151,13 +146,7 @@ fn stopped_for(length: Duration) {
     assert_eq!(code, Some(0));
     assert!(leftovers.files().is_empty());
     assert!(!log.contains("starting it again"), "{log}");
-    for actor in 0..2 {
-        assert_eq!(
-            support::sent(&run, actor),
-            support::committed(&run, actor as usize),
-            "actor {actor}"
-        );
-    }
+    support::all_that_was_sent_is_there(&run, 2);
 }
 
 #[test]
@@ -203,7 +192,7 @@ fn a_lost_counter_of_incarnations_keeps_nobody_from_going_on() {
 fn a_copy_of_a_run_that_goes_on_is_told_from_it() {
     let place = Workplace::new();
     let running = place.start("run", &ENDLESS);
-    learns(&running);
+    running.learns_on();
     let copied = std::process::Command::new("cp")
         .args(["-r", "run", "copy"])
         .current_dir(place.path())
@@ -214,7 +203,7 @@ fn a_copy_of_a_run_that_goes_on_is_told_from_it() {
         said.contains("is a copy of") && said.contains(running.run.to_str().unwrap()),
         "{said}"
     );
-    learns(&running);
+    running.learns_on();
 }
 
 #[test]

@@ -138,6 +138,12 @@ impl Running {
         std::fs::read_to_string(self.run.join("shoal.log")).unwrap_or_default()
     }
 
+    /// Waits until the learner has reported more updates than by now.
+    pub(crate) fn learns_on(&self) {
+        let before = self.learned("updates");
+        until("something more is learned", || self.learned("updates") > before);
+    }
+
     /// The highest number that the learner has reported in a column of `learner.csv`; 0 before the first report.
     pub(crate) fn learned(&self, column: &str) -> u64 {
         let learned = std::fs::read_to_string(self.run.join("learner.csv")).unwrap_or_default();
@@ -295,6 +301,17 @@ pub(crate) fn complaint(output: &Output) -> String {
     assert!(output.stdout.is_empty());
     assert_eq!(said.lines().count(), 1, "one line: {said}");
     said
+}
+
+/// Each of so many actors has sent rows, and all of them are in the replay.
+pub(crate) fn all_that_was_sent_is_there(run: &Path, actors: u32) {
+    for actor in 0..actors {
+        let (sent, committed) = (sent(run, actor), committed(run, actor as usize));
+        assert!(
+            sent > 0 && sent == committed,
+            "actor {actor} sent {sent} rows, {committed} are there"
+        );
+    }
 }
 
 /// The last line of what was printed, as JSON.
