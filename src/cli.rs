@@ -45,7 +45,8 @@ pub(crate) enum Command {
 
 #[derive(Args, Clone, Debug)]
 pub(crate) struct TrainArgs {
-    /// What to train: pendulum, point-mass-r1, point-mass-r2, point-mass-r3, or a configuration file (FILE.toml).
+    /// What to train: frozen-lake, frozen-lake-sarsa, cart-pole, pendulum, point-mass-r1, point-mass-r2, point-mass-r3, or
+    /// a configuration file (FILE.toml).
     #[arg(value_name = "PRESET|FILE.toml")]
     pub(crate) what: String,
     /// Run directory to make [default: runs/<preset>-<n>].
@@ -63,6 +64,9 @@ pub(crate) struct TrainArgs {
     /// Environment steps over all actors.
     #[arg(long, value_name = "N")]
     pub(crate) steps: Option<u64>,
+    /// Episodes over all actors, where they come before the steps.
+    #[arg(long, value_name = "M")]
+    pub(crate) episodes: Option<u64>,
     /// Take turns: the same seed and actor count give the same bits.
     #[arg(long)]
     pub(crate) lockstep: bool,
@@ -91,6 +95,9 @@ pub(crate) struct ResumeArgs {
     /// Environment steps over all actors, those already taken included [default: as before].
     #[arg(long, value_name = "N")]
     pub(crate) steps: Option<u64>,
+    /// Episodes over all actors, those already over included [default: as before].
+    #[arg(long, value_name = "M")]
+    pub(crate) episodes: Option<u64>,
     #[command(flatten)]
     pub(crate) telling: Telling,
 }

@@ -62,7 +62,6 @@ pub(crate) struct Outcome {
     /// How the run stood when it began, and how it stands now.
     pub(crate) before: RunStatus,
     pub(crate) after: RunStatus,
-    pub(crate) episodes: u64,
 }
 
 /// Runs all roles until the learner is through, a signal comes, or somebody asks for the end.
@@ -206,7 +205,6 @@ impl<'a> Launcher<'a> {
             // What the learner saved: its last report may have come too late to be heard.
             after: status::at_rest(&self.config, self.run)?,
             before: self.rest,
-            episodes: self.recorder.episodes(),
         })
     }
 

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 use shoal_common::config::{Actors, Config};
-use shoal_common::network::ActionRange;
+use shoal_common::policy::PolicyLayout;
 use shoal_common::run_dir::{RunDir, RunLock};
 use shoal_env_server::environment;
 use toml::{Table, Value};
@@ -13,11 +13,14 @@ use toml::{Table, Value};
 use crate::cli::TrainArgs;
 use crate::room;
 
-const PRESETS: [(&str, &str); 4] = [
+const PRESETS: [(&str, &str); 7] = [
     ("pendulum", include_str!("../presets/pendulum.toml")),
     ("point-mass-r1", include_str!("../presets/point-mass-r1.toml")),
     ("point-mass-r2", include_str!("../presets/point-mass-r2.toml")),
     ("point-mass-r3", include_str!("../presets/point-mass-r3.toml")),
+    ("frozen-lake", include_str!("../presets/frozen-lake.toml")),
+    ("frozen-lake-sarsa", include_str!("../presets/frozen-lake-sarsa.toml")),
+    ("cart-pole", include_str!("../presets/cart-pole.toml")),
 ];
 
 /// A run that can begin.
@@ -91,6 +94,10 @@ fn resolve(mut table: Table, args: &TrainArgs, origin: &str) -> anyhow::Result<C
     if let Some(envs) = args.envs {
         set("actors", "envs", i64::from(envs).into())?;
     }
+    if let Some(episodes) = args.episodes {
+        let episodes = i64::try_from(episodes).context("--episodes: must be below 2^63")?;
+        set("run", "episodes", episodes.into())?;
+    }
     if args.lockstep {
         set("run", "mode", "lockstep".into())?;
     }
@@ -123,6 +130,8 @@ fn resolve(mut table: Table, args: &TrainArgs, origin: &str) -> anyhow::Result<C
     )?;
     describe_environment(&mut table)?;
     let mut config = Config::from_table(table, origin)?;
+    PolicyLayout::new(&config.algorithm, &config.spec)
+        .with_context(|| format!("{} cannot control {}", config.algorithm.name(), config.environment.name))?;
     // Also a short run ends with its policy judged.
     config.evaluation.every = config.evaluation.every.min(config.run.steps);
     Ok(config)
@@ -141,7 +150,6 @@ fn describe_environment(table: &mut Table) -> anyhow::Result<()> {
     };
     let mut parameters = environment::resolve(&name, section)?;
     let spec = environment::make(&name, &parameters)?.spec();
-    ActionRange::new(&spec.action).with_context(|| format!("DDPG cannot control {name}"))?;
     parameters.insert("name".into(), name.into());
     table.insert("environment".into(), parameters.into());
     table.insert("spec".into(), Value::try_from(spec)?);
@@ -193,9 +201,10 @@ mod tests {
     fn every_preset_is_a_configuration() {
         for (name, _) in PRESETS {
             let config = plan(&[name]).unwrap();
-            assert_eq!(config.spec.time_limit, 200, "{name}");
+            let limit = if name.starts_with("frozen-lake") { 100 } else { 200 };
+            assert_eq!(config.spec.time_limit, limit, "{name}");
             assert!(
-                config.environment.parameters.len() > 1,
+                !config.environment.parameters.is_empty(),
                 "every parameter is filled in: {:?}",
                 config.environment
             );
@@ -234,7 +243,7 @@ mod tests {
         );
         assert_eq!(config.environment.parameters["reward"].as_str(), Some("r2"));
         assert_eq!(config.environment.parameters["friction"].as_float(), Some(0.03));
-        assert_eq!(config.ddpg.hidden, [20, 10]);
+        assert_eq!(config.algorithm.ddpg().unwrap().hidden, [20, 10]);
     }
 
     #[test]

@@ -131,11 +131,6 @@ impl Recorder {
         }
     }
 
-    /// Exploration episodes of the whole run.
-    pub(crate) fn episodes(&self) -> u64 {
-        self.episodes.len()
-    }
-
     /// A policy has been judged.
     pub(crate) fn evaluation(&mut self, report: &EvaluationReport, wall: Duration) -> Result<(), RecordError> {
         self.evaluations.write(&Evaluation {

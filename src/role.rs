@@ -11,7 +11,6 @@ use shoal_common::report::{Identity, Role};
 use shoal_common::run_dir::RunDir;
 use shoal_common::stop::Stop;
 use shoal_env_server::vector::VectorEnvironment;
-use shoal_learner::ddpg::DdpgSettings;
 use shoal_learner::learner;
 use shoal_learner::ratio::Ratio;
 use tracing_subscriber::filter::LevelFilter;
@@ -118,9 +117,7 @@ fn explorer_settings(config: &Config, run: &RunDir, identity: Identity) -> explo
         envs: config.actors.envs as usize,
         chunk: config.chunk_layout(),
         window: config.actors.window,
-        exploration: config.exploration.clone(),
-        hidden: config.ddpg.hidden,
-        gamma: config.ddpg.gamma,
+        algorithm: config.algorithm.clone(),
         replay: run.replay_file(),
     }
 }
@@ -132,7 +129,7 @@ fn evaluator_settings(config: &Config, run: &RunDir, identity: Identity, judged:
         server: config.evaluation_server(),
         envs: config.evaluation_envs() as usize,
         evaluation: config.evaluation.clone(),
-        hidden: config.ddpg.hidden,
+        algorithm: config.algorithm.clone(),
         best: run.best_policy(),
         judged,
     }
@@ -144,7 +141,6 @@ pub(crate) fn learner_settings(
     identity: Identity,
     judged: Option<u64>,
 ) -> learner::Settings {
-    let ddpg = &config.ddpg;
     learner::Settings {
         identity,
         seed: config.run.seed,
@@ -155,13 +151,9 @@ pub(crate) fn learner_settings(
         window: config.actors.window,
         chunk: config.chunk_layout(),
         spec: config.spec.clone(),
-        ddpg: DdpgSettings {
-            tau: ddpg.tau,
-            actor_learning_rate: ddpg.actor_learning_rate,
-            critic_learning_rate: ddpg.critic_learning_rate,
-            hidden: ddpg.hidden,
-            batch: ddpg.batch,
-        },
+        algorithm: config.algorithm.clone(),
+        envs: config.actors.envs,
+        episodes: config.run.episodes,
         ratio: Ratio {
             warmup: config.replay.warmup,
             updates_per_step: config.replay.updates_per_step,

@@ -3,7 +3,7 @@
 use anyhow::{Context, ensure};
 use shoal_common::channel::environment::StepBlocks;
 use shoal_common::config::Config;
-use shoal_common::network::{ActionRange, NetworkLayout, PolicyNetwork};
+use shoal_common::policy::{Policy, PolicyLayout};
 use shoal_common::space::EnvironmentSpec;
 use shoal_env_server::vector::{Start, VectorEnvironment};
 
@@ -30,7 +30,7 @@ impl Trajectory {
 /// A policy, and an environment of the run to try it in.
 pub(crate) struct Rollout<'a> {
     environment: VectorEnvironment,
-    policy: PolicyNetwork,
+    policy: Policy,
     parameters: &'a [f32],
 }
 
@@ -82,7 +82,7 @@ impl<'a> Rollout<'a> {
             ..Trajectory::default()
         };
         loop {
-            self.policy.forward(self.parameters, &observation, &mut action);
+            self.policy.act(self.parameters, &observation, &mut action);
             let (mut reward, mut terminated, mut truncated) = ([0.0], [0.0], [0.0]);
             let blocks = StepBlocks {
                 observations: &mut observation,
@@ -103,19 +103,13 @@ impl<'a> Rollout<'a> {
     }
 }
 
-/// The network that a policy file of this run must be for.
-pub(crate) fn policy_layout(config: &Config) -> anyhow::Result<NetworkLayout> {
-    Ok(*policy_of(config)?.layout())
+/// What a policy file of this run must hold.
+pub(crate) fn policy_layout(config: &Config) -> anyhow::Result<PolicyLayout> {
+    PolicyLayout::new(&config.algorithm, &config.spec).with_context(|| config.environment.name.clone())
 }
 
-fn policy_of(config: &Config) -> anyhow::Result<PolicyNetwork> {
-    let range = ActionRange::new(&config.spec.action).context(config.environment.name.clone())?;
-    Ok(PolicyNetwork::new(
-        config.spec.observation.width(),
-        config.ddpg.hidden,
-        range,
-        1,
-    ))
+fn policy_of(config: &Config) -> anyhow::Result<Policy> {
+    Policy::new(&config.algorithm, &config.spec, 1).with_context(|| config.environment.name.clone())
 }
 
 fn environment_of(config: &Config) -> anyhow::Result<VectorEnvironment> {

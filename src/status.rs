@@ -17,6 +17,8 @@ pub(crate) fn at_rest(config: &Config, run: &RunDir) -> anyhow::Result<RunStatus
     let mut status = RunStatus {
         env_steps: counters.rows,
         steps: config.run.steps,
+        episodes: counters.episodes,
+        episodes_limit: config.run.episodes,
         updates: counters.updates,
         replay_rows: replay_rows(run)?,
         actors: config.actors.count,

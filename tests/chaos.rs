@@ -143,7 +143,7 @@ fn inspect(run: &Path, config: &Config, rows: u64) {
     for index in replay.rows() {
         let row = replay.row(index);
         let transition = layout.row.read(row);
-        assert_eq!(transition.discount, config.ddpg.gamma as f32);
+        assert_eq!(transition.discount, config.algorithm.gamma() as f32);
         // Spinning at full speed under full torque, a pendulum may come by exactly where it was.
         if transition.a[0].abs() < 2.0 {
             let bits: Vec<u32> = row.iter().map(|x| x.to_bits()).collect();

@@ -10,7 +10,7 @@ use std::time::Duration;
 use shoal_actor::noise::OrnsteinUhlenbeck;
 use shoal_common::channel::environment::ResponseLayout;
 use shoal_common::commit::CommitReader;
-use shoal_common::config::Config;
+use shoal_common::config::{Algorithm, Config};
 use shoal_common::network::{ActionRange, PolicyNetwork};
 use shoal_common::stream::{Purpose, stream};
 use shoal_common::transition::Transition;
@@ -234,15 +234,10 @@ fn one_actor_in_lockstep_is_algorithm_4_in_a_single_process() {
 fn twin(config: &Config) -> String {
     let seed = config.run.seed;
     let row = config.row_layout();
-    let ddpg = &config.ddpg;
-    let settings = DdpgSettings {
-        tau: ddpg.tau,
-        actor_learning_rate: ddpg.actor_learning_rate,
-        critic_learning_rate: ddpg.critic_learning_rate,
-        hidden: ddpg.hidden,
-        batch: ddpg.batch,
+    let Algorithm::Ddpg(ddpg, noise) = &config.algorithm else {
+        panic!("the twin is DDPG's")
     };
-    let mut learner = Ddpg::new(&config.spec, &settings, seed).unwrap();
+    let mut learner = Ddpg::new(&config.spec, &DdpgSettings::from(ddpg), seed).unwrap();
     let sampler = Sampler::new(seed);
     let mut batch = Minibatch::new(row, ddpg.batch);
     let mut indices = vec![0; ddpg.batch];
@@ -250,7 +245,7 @@ fn twin(config: &Config) -> String {
     let range = ActionRange::new(&config.spec.action).unwrap();
     let mut mu = PolicyNetwork::new(row.observation_width(), ddpg.hidden, range, 1);
     let exploration = stream(seed, Purpose::Exploration, 0, 0);
-    let mut noise = OrnsteinUhlenbeck::new(&config.exploration, 1, row.action_width(), exploration);
+    let mut noise = OrnsteinUhlenbeck::new(noise, 1, row.action_width(), exploration);
 
     let environment = &config.environment;
     let mut environment = VectorEnvironment::new(&environment.name, &environment.parameters, 1, seed, 0, 0).unwrap();

@@ -2,7 +2,7 @@
 
 use shoal_common::channel::{ChannelError, Interruption};
 use shoal_common::commit::OpenError;
-use shoal_common::network::ActionRangeError;
+use shoal_common::policy::PolicyError;
 use shoal_common::policy_file::PolicyFileError;
 
 /// Why an actor or an evaluator cannot go on.
@@ -19,7 +19,7 @@ pub enum ActorError {
     PolicyFile(#[from] PolicyFileError),
     /// The policy cannot act in this environment.
     #[error(transparent)]
-    Actions(#[from] ActionRangeError),
+    Actions(#[from] PolicyError),
     /// The environment server serves something else than the run was configured for.
     #[error("environment server {index} serves {served}, the run's config.toml says {configured}")]
     Server {

@@ -6,8 +6,8 @@ use shoal_common::channel::environment::{Begin, EnvironmentClient, Stepped};
 use shoal_common::channel::policy::{PolicyHeader, PolicyReader};
 use shoal_common::channel::reports::Reporter;
 use shoal_common::channel::{Bell, Domain, Place, Pulse, Ringer, wait_for};
-use shoal_common::config::Evaluation;
-use shoal_common::network::{ActionRange, PolicyNetwork};
+use shoal_common::config::{Algorithm, Evaluation};
+use shoal_common::policy::Policy;
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::report::{Activity, EvaluationReport, Identity, JudgedReport, Role};
 use shoal_common::space::EnvironmentSpec;
@@ -29,8 +29,8 @@ pub struct Settings {
     pub envs: usize,
     /// How often, and how long.
     pub evaluation: Evaluation,
-    /// Units of the policy's hidden layers.
-    pub hidden: [usize; 2],
+    /// What is learned, and with it what kind of policy.
+    pub algorithm: Algorithm,
     /// Where the best policy is kept.
     pub best: PathBuf,
     /// The period of the policy that an evaluator before this one judged last.
@@ -74,8 +74,8 @@ struct Evaluator<'a> {
     bell: Bell,
     learner: Ringer,
     client: EnvironmentClient,
-    policy: PolicyReader,
-    network: PolicyNetwork,
+    reader: PolicyReader,
+    policy: Policy,
     reports: Reporter<EvaluationReport>,
     judgements: Reporter<JudgedReport>,
     pulse: Pulse,
@@ -87,15 +87,14 @@ struct Evaluator<'a> {
 
 impl<'a> Evaluator<'a> {
     fn new(domain: &Domain, settings: &'a Settings, stop: &'a Stop) -> Result<Self, Ended> {
-        let range = ActionRange::new(&settings.spec.action)?;
-        let observation = settings.spec.observation.width();
-        let network = PolicyNetwork::new(observation, settings.hidden, range, settings.envs);
+        let policy = Policy::new(&settings.algorithm, &settings.spec, settings.envs)?;
+        let layout = policy.layout();
         let bell = Bell::hang(domain, Place(Role::Evaluator, settings.identity.index))?;
         let mut pulse = Pulse::new(domain, settings.identity)?;
         let client = connect(domain, &bell, settings.server, &settings.spec, settings.envs, stop)?;
-        let policy = PolicyReader::open(domain, network.layout().fingerprint(), network.layout().parameters())?;
+        let reader = PolicyReader::open(domain, layout.fingerprint(), layout.parameters())?;
         let best = if settings.best.exists() {
-            Some(PolicyFile::read(&settings.best, network.layout())?.return_mean)
+            Some(PolicyFile::read(&settings.best, &layout)?.return_mean)
         } else {
             None
         };
@@ -109,12 +108,12 @@ impl<'a> Evaluator<'a> {
             stop,
             learner: Ringer::new(domain, Place(Role::Learner, 0))?,
             client,
-            policy,
+            reader,
             reports: Reporter::open(domain)?,
             judgements,
             pulse,
-            actions: vec![0.0; settings.envs * network.range().width()],
-            network,
+            actions: vec![0.0; settings.envs * settings.spec.action.width()],
+            policy,
             bell,
             judged: settings.judged,
             best,
@@ -156,7 +155,7 @@ impl<'a> Evaluator<'a> {
     /// Waits for a policy of a period that was not judged yet.
     fn await_due_policy(&mut self) -> Result<PolicyHeader, Ended> {
         let Self {
-            policy,
+            reader,
             judged,
             settings,
             bell,
@@ -170,7 +169,7 @@ impl<'a> Evaluator<'a> {
         let header = wait_for(
             bell,
             stop,
-            || Ok(policy.latest()?.map(|policy| *policy.header()).filter(due)),
+            || Ok(reader.latest()?.map(|policy| *policy.header()).filter(due)),
             || {
                 pulse.beat(Activity::WaitingForPeer);
                 reports.look_after();
@@ -187,18 +186,18 @@ impl<'a> Evaluator<'a> {
         let Self {
             client,
             bell,
+            reader,
             policy,
-            network,
             pulse,
             actions,
             ..
         } = self;
-        let Some(policy) = policy.held() else { return Ok(None) };
+        let Some(held) = reader.held() else { return Ok(None) };
         let mut current = client.reset(bell, Begin::Evaluation(first))?;
         let mut returns = vec![0.0; self.settings.envs];
         let mut under_way = vec![true; self.settings.envs];
         while under_way.contains(&true) {
-            network.forward(policy.parameters(), current.observations(), actions);
+            policy.act(held.parameters(), current.observations(), actions);
             match client.step(bell, actions)? {
                 Stepped::Taken(next) => current = next,
                 Stepped::Lost => return Ok(None),
@@ -219,7 +218,7 @@ impl<'a> Evaluator<'a> {
     }
 
     fn keep(&self, header: &PolicyHeader, return_mean: f64, return_std: f64) -> Result<(), ActorError> {
-        let Some(policy) = self.policy.held() else {
+        let Some(held) = self.reader.held() else {
             return Ok(());
         };
         let file = PolicyFile {
@@ -229,7 +228,7 @@ impl<'a> Evaluator<'a> {
             return_mean,
             return_std,
             episodes: self.settings.evaluation.episodes.into(),
-            parameters: policy.parameters().to_vec(),
+            parameters: held.parameters().to_vec(),
         };
         Ok(file.write(&self.settings.best)?)
     }

@@ -3,10 +3,10 @@
 //! ```text
 //! loop {
 //!     policy  = newest(policy)                     // in lockstep: exactly the one after the last round
-//!     actions = clip(μ(observations) + noise)      // equation 3.32
+//!     actions = explore(policy, observations)      // as the algorithm does: noise, sampling, or ε-greedy
 //!     next    = environments.step(actions)
 //!     chunk.push(s, a, r, discount, s', last)
-//!     when the chunk is full: wait for room in the window, send it
+//!     when the chunk is full, or its episode over: wait for room in the window, send it
 //! }
 //! ```
 
@@ -19,8 +19,8 @@ use shoal_common::channel::reports::Reporter;
 use shoal_common::channel::transitions::{Chunk, ChunkSender};
 use shoal_common::channel::{Bell, ChannelError, Domain, Interruption, Place, Pulse, Ringer, wait_for};
 use shoal_common::commit::{CommitReader, OpenError};
-use shoal_common::config::{Exploration, Mode};
-use shoal_common::network::{ActionRange, PolicyNetwork};
+use shoal_common::config::{Algorithm, Mode};
+use shoal_common::policy::PolicyLayout;
 use shoal_common::report::{Activity, EpisodeReport, Identity, Role};
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::stop::Stop;
@@ -28,7 +28,7 @@ use shoal_common::stream::{Purpose, stream};
 use shoal_common::transition::{ChunkLayout, Transition};
 
 use crate::error::{ActorError, Ended};
-use crate::noise::OrnsteinUhlenbeck;
+use crate::exploration::Exploration;
 use crate::standing::Standing;
 
 /// How long an actor waits for its last chunk to be committed when the whole run ends.
@@ -51,12 +51,8 @@ pub struct Settings {
     pub chunk: ChunkLayout,
     /// Chunks that may be sent and not committed.
     pub window: u32,
-    /// The noise.
-    pub exploration: Exploration,
-    /// Units of the policy's hidden layers.
-    pub hidden: [usize; 2],
-    /// γ
-    pub gamma: f64,
+    /// What is learned, and with it how to explore.
+    pub algorithm: Algorithm,
     /// The replay, whose commit record tells what has arrived.
     pub replay: PathBuf,
 }
@@ -83,8 +79,7 @@ struct Explorer<'a> {
     learner: Ringer,
     client: EnvironmentClient,
     policy: PolicyReader,
-    network: PolicyNetwork,
-    noise: OrnsteinUhlenbeck,
+    exploration: Exploration,
     sender: ChunkSender,
     chunk: Option<Chunk>,
     commits: CommitReader,
@@ -107,13 +102,11 @@ impl<'a> Explorer<'a> {
     fn new(domain: &Domain, settings: &'a Settings, stop: &'a Stop) -> Result<Self, Ended> {
         let Identity { index, incarnation, .. } = settings.identity;
         let row = settings.chunk.row;
-        let range = ActionRange::new(&settings.spec.action)?;
-        let network = PolicyNetwork::new(row.observation_width(), settings.hidden, range, settings.envs);
-
+        let layout = PolicyLayout::new(&settings.algorithm, &settings.spec)?;
         let bell = Bell::hang(domain, Place(Role::Actor, index))?;
         let mut pulse = Pulse::new(domain, settings.identity)?;
         let client = connect(domain, &bell, index, &settings.spec, settings.envs, stop)?;
-        let policy = PolicyReader::open(domain, network.layout().fingerprint(), network.layout().parameters())?;
+        let policy = PolicyReader::open(domain, layout.fingerprint(), layout.parameters())?;
         pulse.beat(Activity::WaitingForPeer);
 
         let commits = wait_for_replay(settings, &bell, stop, &mut pulse)?;
@@ -122,23 +115,25 @@ impl<'a> Explorer<'a> {
         learner.ring();
         let sender = greeting.wait(&commits, &bell, stop, || pulse.beat(Activity::WaitingForPeer))?;
         // In lockstep nothing may depend on how often an actor was started: it goes on where the last chunk left it.
-        let (stream_incarnation, standing) = match settings.mode {
-            Mode::Lockstep if sender.sent() > 0 => {
-                let words = commits.standing(index as usize);
-                (0, Standing::read(&words, &settings.chunk, settings.envs))
-            }
-            Mode::Lockstep => (0, None),
-            Mode::Free => (incarnation, None),
+        let incarnation = match settings.mode {
+            Mode::Lockstep => 0,
+            Mode::Free => incarnation,
         };
-        let stream = stream(settings.seed, Purpose::Exploration, index.into(), stream_incarnation);
+        let stream = stream(settings.seed, Purpose::Exploration, index.into(), incarnation);
+        let exploration = Exploration::new(&settings.algorithm, &settings.spec, settings.envs, stream)?;
+        let standing = if settings.mode == Mode::Lockstep && sender.sent() > 0 {
+            let words = commits.standing(index as usize);
+            Standing::read(&words, &settings.chunk, settings.envs, exploration.state().len())
+        } else {
+            None
+        };
         Ok(Self {
             settings,
             stop,
             learner,
             client,
             policy,
-            noise: OrnsteinUhlenbeck::new(&settings.exploration, settings.envs, row.action_width(), stream),
-            network,
+            exploration,
             step: 0,
             standing,
             hurried: None,
@@ -172,16 +167,17 @@ impl<'a> Explorer<'a> {
         }
         self.chunk = None;
         self.ended.clear();
-        let sent = self.sender.sent();
-        self.step = sent * (self.settings.chunk.rows / self.settings.envs) as u64;
         if let Some(standing) = &self.standing {
-            self.noise.restore(&standing.noise);
+            self.step = standing.step;
+            self.exploration.restore(&standing.noise);
             self.returns.clone_from(&standing.returns);
             self.lengths.clone_from(&standing.lengths);
             return Ok(self.client.restore(&self.bell, &standing.snapshot)?);
         }
         (0..self.settings.envs).for_each(|environment| self.begin_episode(environment));
         // Without a word of where it stood there is only the beginning that is the same for everyone.
+        let sent = self.sender.sent();
+        self.step = sent * (self.settings.chunk.rows / self.settings.envs) as u64;
         let begin = if sent == 0 { Begin::Training(0) } else { Begin::Next };
         Ok(self.client.reset(&self.bell, begin)?)
     }
@@ -204,7 +200,7 @@ impl<'a> Explorer<'a> {
             self.step += 1;
             self.pulse.count(self.settings.envs as u64);
             self.pulse.beat(Activity::Working);
-            if self.chunk.as_ref().is_some_and(Chunk::is_full) {
+            if self.chunk_is_complete() {
                 if !self.take_stand()? {
                     return Ok(());
                 }
@@ -215,6 +211,12 @@ impl<'a> Explorer<'a> {
                 return Err(Ended::Stopped);
             }
         }
+    }
+
+    /// Whether the chunk is full, or holds the one episode that it is for.
+    fn chunk_is_complete(&self) -> bool {
+        let episode_is_over = self.settings.algorithm.learns_from_episodes() && !self.ended.is_empty();
+        self.chunk.as_ref().is_some_and(Chunk::is_full) || episode_is_over
     }
 
     /// The version of the policy to act with: the newest, or in lockstep the one after the last round.
@@ -254,26 +256,29 @@ impl<'a> Explorer<'a> {
         Ok(version)
     }
 
-    /// Line 8 of Algorithm 4, for every environment.
+    /// Chooses an action for every environment.
     fn act(&mut self, current: &Observed) {
         if let Some(policy) = self.policy.held() {
-            self.network
-                .forward(policy.parameters(), current.observations(), &mut self.actions);
+            self.exploration.act(
+                policy.parameters(),
+                current.observations(),
+                self.step,
+                &mut self.actions,
+            );
         }
-        self.noise.advance(self.step);
-        self.noise.disturb(&mut self.actions, self.network.range());
     }
 
     /// Line 10 of Algorithm 4, for every environment.
     fn remember(&mut self, current: &Observed, next: &Observed, version: u64) {
-        let width = self.network.range().width();
+        let width = self.settings.chunk.row.action_width();
+        let gamma = self.settings.algorithm.gamma() as f32;
         for e in 0..self.settings.envs {
             let (terminated, truncated) = (next.terminated(e), next.truncated(e));
             let transition = Transition {
                 s: current.observation(e),
                 a: &self.actions[e * width..][..width],
                 r: next.reward(e),
-                discount: if terminated { 0.0 } else { self.settings.gamma as f32 },
+                discount: if terminated { 0.0 } else { gamma },
                 s_next: next.next_observation(e),
                 last: terminated || truncated,
             };
@@ -298,7 +303,7 @@ impl<'a> Explorer<'a> {
     }
 
     fn begin_episode(&mut self, environment: usize) {
-        self.noise.reset(environment);
+        self.exploration.begin_episode(environment);
         self.returns[environment] = 0.0;
         self.lengths[environment] = 0;
     }
@@ -314,7 +319,8 @@ impl<'a> Explorer<'a> {
         };
         let standing = Standing {
             snapshot,
-            noise: self.noise.state().into(),
+            step: self.step,
+            noise: self.exploration.state().into(),
             returns: self.returns.clone(),
             lengths: self.lengths.clone(),
         };

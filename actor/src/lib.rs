@@ -3,6 +3,7 @@
 
 pub mod error;
 pub mod evaluator;
+pub mod exploration;
 pub mod explorer;
 pub mod noise;
 mod standing;

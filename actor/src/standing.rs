@@ -7,6 +7,8 @@ use shoal_common::transition::ChunkLayout;
 pub(crate) struct Standing {
     /// The environments, as their server says it.
     pub(crate) snapshot: Vec<u64>,
+    /// Steps of every environment since the actor's stream began.
+    pub(crate) step: u64,
     /// The state of the noise, environment after environment.
     pub(crate) noise: Vec<f64>,
     /// Returns of the episodes under way.
@@ -20,19 +22,28 @@ impl Standing {
     pub(crate) fn words(&self) -> Vec<u64> {
         let own = self.noise.iter().chain(&self.returns).map(|number| number.to_bits());
         let lengths = self.lengths.iter().map(|length| u64::from(*length));
-        self.snapshot.iter().copied().chain(own).chain(lengths).collect()
+        let step = std::iter::once(self.step);
+        self.snapshot
+            .iter()
+            .copied()
+            .chain(step)
+            .chain(own)
+            .chain(lengths)
+            .collect()
     }
 
-    /// Reads the words of an actor with `envs` environments; `None` where they are not so many as `layout` says.
-    pub(crate) fn read(words: &[u64], layout: &ChunkLayout, envs: usize) -> Option<Self> {
-        let noise = envs * layout.row.action_width();
-        let snapshot = layout.standing_words.checked_sub(noise + 2 * envs)?;
+    /// Reads the words of an actor with `envs` environments, whose noise has so many numbers; `None` where they are not so
+    /// many as `layout` says.
+    pub(crate) fn read(words: &[u64], layout: &ChunkLayout, envs: usize, noise: usize) -> Option<Self> {
+        let snapshot = layout.standing_words.checked_sub(1 + noise + 2 * envs)?;
         let (snapshot, rest) = words.split_at_checked(snapshot)?;
+        let (step, rest) = rest.split_first()?;
         let (noise, rest) = rest.split_at_checked(noise)?;
         let (returns, lengths) = rest.split_at_checked(envs)?;
         let numbers = |words: &[u64]| words.iter().map(|bits| f64::from_bits(*bits)).collect();
         (lengths.len() == envs).then(|| Self {
             snapshot: snapshot.into(),
+            step: *step,
             noise: numbers(noise),
             returns: numbers(returns),
             // An episode's length was a `u32` before it was a word.
@@ -52,22 +63,23 @@ mod tests {
         let layout = ChunkLayout {
             row: RowLayout::new(3, 2),
             rows: 4,
-            standing_words: 10 + 2 * (2 + 2),
+            standing_words: 10 + 1 + 2 * (2 + 2),
         };
         let standing = Standing {
             snapshot: (0..10).collect(),
+            step: 77,
             noise: vec![0.5, -0.0, f64::MIN_POSITIVE, 3.0],
             returns: vec![-1200.5, 0.0],
             lengths: vec![199, 0],
         };
         let words = standing.words();
-        assert_eq!(Standing::read(&words, &layout, 2), Some(standing));
-        assert_eq!(Standing::read(&words[1..], &layout, 2), None);
-        assert_eq!(Standing::read(&[], &layout, 2), None);
+        assert_eq!(Standing::read(&words, &layout, 2, 4), Some(standing));
+        assert_eq!(Standing::read(&words[1..], &layout, 2, 4), None);
+        assert_eq!(Standing::read(&[], &layout, 2, 4), None);
         let free = ChunkLayout {
             standing_words: 0,
             ..layout
         };
-        assert_eq!(Standing::read(&words, &free, 2), None);
+        assert_eq!(Standing::read(&words, &free, 2, 4), None);
     }
 }

@@ -1,8 +1,12 @@
 //! The run's configuration, as it stands in `config.toml` once everything is decided. Each section belongs to one part of
 //! the system, and a role is handed the sections it needs, never the whole.
 
+mod algorithm;
 mod defaults;
 mod limits;
+mod sections;
+
+pub use algorithm::{Algorithm, Ddpg, Exploration, Reinforce, Tabular, Weight};
 
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
@@ -10,12 +14,13 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
+use self::sections::Sections;
 use crate::space::EnvironmentSpec;
 use crate::transition::{ChunkLayout, RowLayout};
 
 /// Everything a run was started with.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(try_from = "Sections", into = "Sections")]
 pub struct Config {
     /// Identity and length of the run.
     pub run: Run,
@@ -24,22 +29,14 @@ pub struct Config {
     /// What the environment says of itself.
     pub spec: EnvironmentSpec,
     /// Who explores, and in how large portions.
-    #[serde(default)]
     pub actors: Actors,
-    /// The exploration noise.
-    #[serde(default)]
-    pub exploration: Exploration,
     /// What is learned, and how.
-    #[serde(default)]
-    pub ddpg: Ddpg,
+    pub algorithm: Algorithm,
     /// What is remembered, and how often it is used.
-    #[serde(default)]
     pub replay: Replay,
     /// How often the policy is judged.
-    #[serde(default)]
     pub evaluation: Evaluation,
     /// How often the learner's state is saved.
-    #[serde(default)]
     pub checkpoint: Checkpoint,
 }
 
@@ -55,6 +52,9 @@ pub struct Run {
     pub mode: Mode,
     /// Environment steps over all actors after which training ends.
     pub steps: u64,
+    /// Episodes over all actors after which it ends, if that is earlier.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub episodes: Option<u64>,
 }
 
 /// Whether timing may decide anything.
@@ -91,34 +91,6 @@ pub struct Actors {
     pub window: u32,
     /// The most actors the run can be scaled to.
     pub max: u32,
-}
-
-/// Ornstein-Uhlenbeck noise: x ← x − θ x + σ N(0, 1) at each step, added to the action in units of half its range.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct Exploration {
-    /// θ, the pull towards zero.
-    pub theta: f64,
-    /// σ, the size of each step's impulse.
-    pub sigma: f64,
-}
-
-/// Algorithm 4 with the numbers of section 4.3.1.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct Ddpg {
-    /// Units of the two hidden layers, of actor and critic alike.
-    pub hidden: [usize; 2],
-    /// γ, the discount of one step.
-    pub gamma: f64,
-    /// τ, how far the target networks follow in one update (equation 3.31).
-    pub tau: f64,
-    /// Adam's step size for the actor, α_μ.
-    pub actor_learning_rate: f64,
-    /// Adam's step size for the critic, α_Q.
-    pub critic_learning_rate: f64,
-    /// N, transitions in a minibatch.
-    pub batch: usize,
 }
 
 /// What is remembered, and how often it is used.
@@ -266,23 +238,30 @@ impl Config {
         let envs = self.actors.envs as usize;
         match (self.run.mode, self.spec.snapshot_words(envs)) {
             (Mode::Free, _) | (_, 0) => 0,
-            // And of each environment the state of the noise, and the return and length of its episode.
-            (Mode::Lockstep, snapshot) => snapshot + envs * (self.spec.action.width() + 2),
+            // The actor's own step, and of each environment the state of the noise and the return and length of its episode.
+            (Mode::Lockstep, snapshot) => snapshot + 1 + envs * (self.noise_width() + 2),
+        }
+    }
+
+    /// Numbers in the exploration noise's state for each environment.
+    pub fn noise_width(&self) -> usize {
+        match self.algorithm {
+            Algorithm::Ddpg(..) => self.spec.action.width(),
+            _ => 0,
         }
     }
 
     /// A number for all that the rows of the replay and the weights of a checkpoint depend on. Length of the run, number
     /// of actors and intervals are not among it: those may change when a run is resumed.
     pub fn fingerprint(&self) -> u64 {
+        let algorithm = match &self.algorithm {
+            // As it was written when there was no other.
+            Algorithm::Ddpg(ddpg, exploration) => format!("{ddpg:?} {exploration:?}"),
+            other => format!("{other:?}"),
+        };
         let identity = format!(
-            "{} {} {:?} {} {:?} {:?} {:?}",
-            self.run.id,
-            self.run.seed,
-            self.run.mode,
-            self.environment.name,
-            self.environment.parameters,
-            self.ddpg,
-            self.exploration
+            "{} {} {:?} {} {:?} {algorithm}",
+            self.run.id, self.run.seed, self.run.mode, self.environment.name, self.environment.parameters,
         );
         let digest = Sha256::digest(identity.as_bytes());
         digest.iter().take(8).fold(0, |word, &byte| word << 8 | u64::from(byte))

@@ -5,6 +5,7 @@ pub mod commit;
 pub mod config;
 pub mod durable;
 pub mod network;
+pub mod policy;
 pub mod policy_file;
 pub mod report;
 pub mod run_dir;

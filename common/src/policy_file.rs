@@ -4,7 +4,7 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 use crate::durable::{self, Kind, SealError};
-use crate::network::NetworkLayout;
+use crate::policy::PolicyLayout;
 
 const KIND: Kind = Kind {
     magic: *b"SHOALPOL",
@@ -70,8 +70,8 @@ impl PolicyFile {
         })
     }
 
-    /// Reads the policy at `path`, which must be for a network of this layout and have all its parameters.
-    pub fn read(path: &Path, network: &NetworkLayout) -> Result<Self, PolicyFileError> {
+    /// Reads the policy at `path`, which must be of this layout and have all its parameters.
+    pub fn read(path: &Path, layout: &PolicyLayout) -> Result<Self, PolicyFileError> {
         let refused = |reason| PolicyFileError::Refused {
             path: path.into(),
             reason,
@@ -83,7 +83,7 @@ impl PolicyFile {
             body => body.map_err(|error| refused(error.to_string()))?,
         };
         let policy = Self::parse(&body).ok_or_else(|| refused("its parts do not fit together".into()))?;
-        let (fingerprint, parameters) = (network.fingerprint(), network.parameters());
+        let (fingerprint, parameters) = (layout.fingerprint(), layout.parameters());
         if policy.fingerprint != fingerprint {
             return Err(refused(format!(
                 "it is for another network (fingerprint {:016x}, expected {fingerprint:016x})",
@@ -133,17 +133,19 @@ const HEAD_WORDS: usize = 7;
 #[cfg(test)]
 mod tests {
     use std::fs;
+
+    use crate::network::NetworkLayout;
     use std::os::unix::fs::PermissionsExt;
 
     use super::*;
 
-    fn network() -> NetworkLayout {
-        NetworkLayout::policy(1, [1, 1], 1)
+    fn layout() -> PolicyLayout {
+        PolicyLayout::Deterministic(NetworkLayout::policy(1, [1, 1], 1))
     }
 
     fn policy() -> PolicyFile {
         PolicyFile {
-            fingerprint: network().fingerprint(),
+            fingerprint: layout().fingerprint(),
             version: 8,
             env_steps: 9,
             return_mean: -150.25,
@@ -158,18 +160,18 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("best.policy");
         assert!(matches!(
-            PolicyFile::read(&path, &network()),
+            PolicyFile::read(&path, &layout()),
             Err(PolicyFileError::Missing(_))
         ));
         policy().write(&path).unwrap();
-        assert_eq!(PolicyFile::read(&path, &network()).unwrap(), policy());
+        assert_eq!(PolicyFile::read(&path, &layout()).unwrap(), policy());
         let better = PolicyFile {
             version: 9,
             parameters: vec![2.0; 6],
             ..policy()
         };
         better.write(&path).unwrap();
-        assert_eq!(PolicyFile::read(&path, &network()).unwrap(), better);
+        assert_eq!(PolicyFile::read(&path, &layout()).unwrap(), better);
         assert_eq!(fs::metadata(&path).unwrap().permissions().mode() & 0o777, 0o600);
         assert_eq!(fs::read_dir(&directory).unwrap().count(), 1);
     }
@@ -180,7 +182,7 @@ mod tests {
         let path = directory.path().join("best.policy");
         policy().write(&path).unwrap();
         assert!(
-            PolicyFile::read(&path, &NetworkLayout::policy(2, [1, 1], 1))
+            PolicyFile::read(&path, &PolicyLayout::Deterministic(NetworkLayout::policy(2, [1, 1], 1)))
                 .unwrap_err()
                 .to_string()
                 .contains("another network")
@@ -189,26 +191,20 @@ mod tests {
         for at in 0..whole.len() {
             fs::write(&path, &whole[..at]).unwrap();
             assert!(
-                matches!(
-                    PolicyFile::read(&path, &network()),
-                    Err(PolicyFileError::Refused { .. })
-                ),
+                matches!(PolicyFile::read(&path, &layout()), Err(PolicyFileError::Refused { .. })),
                 "cut to {at} bytes"
             );
             let mut damaged = whole.clone();
             damaged[at] ^= 4;
             fs::write(&path, damaged).unwrap();
             assert!(
-                matches!(
-                    PolicyFile::read(&path, &network()),
-                    Err(PolicyFileError::Refused { .. })
-                ),
+                matches!(PolicyFile::read(&path, &layout()), Err(PolicyFileError::Refused { .. })),
                 "byte {at}"
             );
         }
         durable::write_atomically(&path, |file| durable::seal(KIND, file, |body| body.write_all(&[0; 60]))).unwrap();
         assert!(
-            PolicyFile::read(&path, &network())
+            PolicyFile::read(&path, &layout())
                 .unwrap_err()
                 .to_string()
                 .contains("do not fit together")
@@ -222,7 +218,7 @@ mod tests {
         policy().write(&path).unwrap();
         let failed = durable::write_atomically(&path, |_| Err(io::Error::other("disk full")));
         assert_eq!(failed.unwrap_err().to_string(), "disk full");
-        assert_eq!(PolicyFile::read(&path, &network()).unwrap(), policy());
+        assert_eq!(PolicyFile::read(&path, &layout()).unwrap(), policy());
         assert_eq!(fs::read_dir(&directory).unwrap().count(), 1);
     }
 }

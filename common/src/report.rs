@@ -178,15 +178,18 @@ pub struct JudgedReport {
 pub struct LearnerReport {
     /// Environment steps committed to the replay.
     pub env_steps: u64,
+    /// Episodes that end within them.
+    pub episodes: u64,
     /// Updates done.
     pub updates: u64,
     /// Version of the policy published last.
     pub policy_version: u64,
-    /// Mean squared TD error, averaged over the updates since the last report (line 13 of Algorithm 4).
+    /// Mean squared error of what estimates values, averaged over the updates since the last report (line 13 of Algorithm
+    /// 4; of the baseline; of the table).
     pub critic_loss: f64,
-    /// −mean Q(s, μ(s)), averaged likewise.
+    /// What the policy's steps make smaller, averaged likewise: −mean Q(s, μ(s)); of REINFORCE, its objective's negative.
     pub actor_loss: f64,
-    /// Mean Q(s, a), averaged likewise.
+    /// Mean Q(s, a), or of REINFORCE the mean return, averaged likewise.
     pub q_mean: f64,
     /// Updates averaged over; the three means are 0 where it is 0.
     pub averaged: u64,

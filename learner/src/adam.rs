@@ -37,21 +37,51 @@ impl Adam {
     ///
     /// Bias correction as in PyTorch: θ ← θ − α / (1 − β₁ᵗ) · m / (√v / √(1 − β₂ᵗ) + ε).
     pub fn step(&mut self, t: u64, gradient: &[f32], parameters: &mut [f32], tau: f32, target: &mut [f32]) {
-        let step_size = (self.learning_rate / (1.0 - BETA_1.powf(t as f64))) as f32;
-        let correction = (1.0 / (1.0 - BETA_2.powf(t as f64)).sqrt()) as f32;
-        let (fresh_1, fresh_2) = ((1.0 - BETA_1) as f32, (1.0 - BETA_2) as f32);
+        let bias = self.bias(t);
         let moments = self.first_moment.iter_mut().zip(self.second_moment.iter_mut());
         let weights = parameters.iter_mut().zip(target);
         Arch::new().dispatch(|| {
-            for ((&g, (m, v)), (weight, target)) in gradient.iter().zip(moments).zip(weights) {
-                // A gradient below the floor cannot lift either moment over its own; its square would be denormal.
-                let g = floored(g, FIRST_MOMENT_FLOOR);
-                *m = floored(*m + fresh_1 * (g - *m), FIRST_MOMENT_FLOOR);
-                *v = floored(*v + fresh_2 * (g * g - *v), SECOND_MOMENT_FLOOR);
-                *weight -= step_size * *m / (v.sqrt() * correction + EPSILON);
+            for ((g, (m, v)), (weight, target)) in gradient.iter().zip(moments).zip(weights) {
+                *weight -= bias.step(*g, m, v);
                 *target += tau * (*weight - *target);
             }
         });
+    }
+
+    /// As [`step`](Self::step), of a network that no target follows.
+    pub fn step_alone(&mut self, t: u64, gradient: &[f32], parameters: &mut [f32]) {
+        let bias = self.bias(t);
+        let moments = self.first_moment.iter_mut().zip(self.second_moment.iter_mut());
+        for ((g, (m, v)), weight) in gradient.iter().zip(moments).zip(parameters) {
+            *weight -= bias.step(*g, m, v);
+        }
+    }
+
+    fn bias(&self, t: u64) -> Bias {
+        Bias {
+            step_size: (self.learning_rate / (1.0 - BETA_1.powf(t as f64))) as f32,
+            correction: (1.0 / (1.0 - BETA_2.powf(t as f64)).sqrt()) as f32,
+        }
+    }
+}
+
+/// What a step's number makes of learning rate and moments.
+#[derive(Clone, Copy)]
+struct Bias {
+    step_size: f32,
+    correction: f32,
+}
+
+impl Bias {
+    /// How far a parameter goes against `g`, whose moments become newer by it.
+    #[inline(always)]
+    fn step(self, g: f32, m: &mut f32, v: &mut f32) -> f32 {
+        let (fresh_1, fresh_2) = ((1.0 - BETA_1) as f32, (1.0 - BETA_2) as f32);
+        // A gradient below the floor cannot lift either moment over its own; its square would be denormal.
+        let g = floored(g, FIRST_MOMENT_FLOOR);
+        *m = floored(*m + fresh_1 * (g - *m), FIRST_MOMENT_FLOOR);
+        *v = floored(*v + fresh_2 * (g * g - *v), SECOND_MOMENT_FLOOR);
+        self.step_size * *m / (v.sqrt() * self.correction + EPSILON)
     }
 }
 
@@ -109,6 +139,19 @@ mod tests {
                 );
             }
         }
+    }
+
+    #[test]
+    fn a_step_alone_is_the_step_beside_a_target() {
+        let (mut alone, mut beside) = (Adam::new(1e-2, 3), Adam::new(1e-2, 3));
+        let (mut weights, mut same, mut target) = ([0.5_f32; 3], [0.5_f32; 3], [0.0_f32; 3]);
+        for t in 1..=20 {
+            let gradient = [0.3, -0.1 * t as f32, 0.0];
+            alone.step_alone(t, &gradient, &mut weights);
+            beside.step(t, &gradient, &mut same, 0.1, &mut target);
+        }
+        assert_eq!(weights, same);
+        assert_ne!(weights[..2], [0.5; 2]);
     }
 
     #[test]

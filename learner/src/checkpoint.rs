@@ -13,7 +13,7 @@ use shoal_common::durable::{self, Kind, Prepared, SealError, sync_directory_of};
 
 const KIND: Kind = Kind {
     magic: *b"SHOALCKP",
-    version: 1,
+    version: 2,
     name: "a checkpoint",
 };
 const LATEST: &str = "latest.ckpt";
@@ -26,6 +26,8 @@ pub struct Counters {
     pub updates: u64,
     /// Environment steps learned from, over all actors: the rows of the replay that the updates were allowed by.
     pub rows: u64,
+    /// Episodes that end within those rows.
+    pub episodes: u64,
     /// Version of the policy last published.
     pub policy_version: u64,
 }
@@ -324,9 +326,10 @@ fn parse(body: &[u8]) -> Option<(Header, Vec<Vec<f32>>)> {
     let Counters {
         updates,
         rows,
+        episodes,
         policy_version,
     } = header.counters;
-    if updates.max(rows).max(policy_version) >= LIMIT {
+    if updates.max(rows).max(episodes).max(policy_version) >= LIMIT {
         return None;
     }
     let mut sections = Vec::with_capacity(header.sections.len());

@@ -5,6 +5,7 @@
 //! and the environment servers.
 
 use crate::adam::Adam;
+pub use crate::algorithm::Losses;
 use crate::aligned::Aligned;
 use crate::digest::sha256;
 use crate::initialise::initialise;
@@ -12,6 +13,7 @@ use crate::minibatch::Minibatch;
 use crate::pass::Pass;
 use crate::product;
 use nalgebra::{DMatrix, DVector};
+use shoal_common::config;
 use shoal_common::network::{ActionRange, ActionRangeError, NetworkLayout};
 use shoal_common::space::EnvironmentSpec;
 
@@ -28,6 +30,18 @@ pub struct DdpgSettings {
     pub hidden: [usize; 2],
     /// Transitions in a minibatch, N.
     pub batch: usize,
+}
+
+impl From<&config::Ddpg> for DdpgSettings {
+    fn from(ddpg: &config::Ddpg) -> Self {
+        Self {
+            tau: ddpg.tau,
+            actor_learning_rate: ddpg.actor_learning_rate,
+            critic_learning_rate: ddpg.critic_learning_rate,
+            hidden: ddpg.hidden,
+            batch: ddpg.batch,
+        }
+    }
 }
 
 /// Why a [`Ddpg`] cannot be made or restored.
@@ -56,17 +70,6 @@ pub enum DdpgError {
         /// Numbers it must hold.
         expected: usize,
     },
-}
-
-/// How the networks did on a minibatch, before the step that it led to.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Losses {
-    /// L of line 13: mean of (y − Q(s, a))².
-    pub critic_loss: f32,
-    /// −mean of Q(s, μ(s)), Q after its step.
-    pub actor_loss: f32,
-    /// Mean of Q(s, a), Q before its step.
-    pub q_mean: f32,
 }
 
 /// Everything an update changes, as a checkpoint keeps it.
@@ -162,7 +165,8 @@ impl Ddpg {
         })
     }
 
-    /// One update from a minibatch of N transitions: lines 12 to 16. Panics when the batch has other dimensions than the
+    /// One update from a minibatch of N transitions: lines 12 to 16. Returns L of line 13, −mean of Q(s, μ(s)), Q after its step,
+    /// and the mean of Q(s, a), Q before it. Panics when the batch has other dimensions than the
     /// networks and settings. Nothing is allocated.
     pub fn update(&mut self, batch: &Minibatch) -> Losses {
         assert_eq!(batch.size(), self.y.len(), "transitions in the minibatch");

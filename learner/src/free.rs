@@ -16,12 +16,11 @@ const CHUNKS_AT_ONCE: u32 = 8;
 const NAP: Duration = Duration::from_millis(50);
 
 pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Ended> {
-    let steps = learner.settings.steps;
     let ratio = learner.settings.ratio;
     let every = Duration::from_secs_f64(learner.settings.checkpoint.every_seconds);
     let mut saved = Instant::now();
     // After a crash the replay is ahead of the checkpoint: those rows count.
-    learner.rows = learner.replay.head();
+    learner.count_rows(learner.replay.head());
     loop {
         if learner.stop.requested() {
             return Err(Ended::Stopped);
@@ -32,7 +31,7 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Ended> {
         let drained = learner.intake.drain(&mut learner.replay, CHUNKS_AT_ONCE, |replay| {
             !replay.rows().is_empty() && ratio.is_behind(replay.head(), updates)
         })?;
-        learner.rows = learner.replay.head();
+        learner.count_rows(learner.replay.head());
 
         if updates < ratio.allowed(learner.rows) && !learner.replay.rows().is_empty() {
             learner.update()?;
@@ -40,7 +39,7 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Ended> {
                 learner.publish()?;
             }
             learner.tell(Activity::Working);
-        } else if learner.rows >= steps {
+        } else if learner.has_all_rows() {
             learner.publish()?;
             return Ok(());
         } else {

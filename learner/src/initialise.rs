@@ -22,6 +22,22 @@ pub fn initialise(layout: &NetworkLayout, seed: u64, index: u64) -> Vec<f32> {
     parameters
 }
 
+/// Seeded first weights as the thesis's tool has them where nothing is said (Glorot and Bengio 2010): each layer's weights
+/// uniform within ±√(6 / (inputs + outputs)), biases zero.
+///
+/// `index` tells the networks of one run apart.
+pub fn glorot(layout: &NetworkLayout, seed: u64, index: u64) -> Vec<f32> {
+    let mut stream = stream(seed, Purpose::Initialisation, index, 0);
+    let mut parameters = vec![0.0; layout.parameters()];
+    for (range, (inputs, outputs)) in layout.layer_ranges().into_iter().zip(layout.layer_sizes()) {
+        let bound = (6.0 / (inputs + outputs) as f32).sqrt();
+        for weight in &mut parameters[range.weights] {
+            *weight = (2.0 * stream.random::<f32>() - 1.0) * bound;
+        }
+    }
+    parameters
+}
+
 fn fan_in_bound(inputs: usize) -> f32 {
     1.0 / (inputs as f32).sqrt()
 }
@@ -29,6 +45,20 @@ fn fan_in_bound(inputs: usize) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn glorot_weights_fill_their_bounds_and_biases_are_zero() {
+        let layout = NetworkLayout::policy(4, [60, 40], 2);
+        let parameters = glorot(&layout, 7, 0);
+        let bounds = [6.0 / 64.0, 6.0 / 100.0, 6.0 / 42.0].map(f32::sqrt);
+        for (range, bound) in layout.layer_ranges().into_iter().zip(bounds) {
+            let largest = parameters[range.weights]
+                .iter()
+                .fold(0.0_f32, |most, x| most.max(x.abs()));
+            assert!(largest <= bound && largest > 0.9 * bound, "{largest} of {bound}");
+            assert!(parameters[range.biases].iter().all(|bias| *bias == 0.0));
+        }
+    }
 
     #[test]
     fn each_layer_fills_its_bounds_and_keeps_them() {

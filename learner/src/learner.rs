@@ -1,8 +1,8 @@
 //! The learner's process: what free and lockstep runs share. Their loops are in [`crate::free`] and [`crate::lockstep`].
 //!
 //! ```text
-//! chunks ─▶ replay ─▶ minibatch ─▶ ddpg.update ─▶ policy
-//!           (mapped)                   └─▶ checkpoint
+//! chunks ─▶ replay ─▶ algorithm.update ─▶ policy
+//!           (mapped)              └─▶ checkpoint
 //! ```
 
 mod settings;
@@ -19,12 +19,10 @@ use shoal_common::policy_file::PolicyFile;
 use shoal_common::report::{Activity, Heartbeat, LearnerReport, Role};
 use shoal_common::stop::Stop;
 
+use crate::algorithm::Algorithm;
 use crate::checkpoint::{Checkpoints, Counters};
-use crate::ddpg::{Ddpg, DdpgState};
 use crate::intake::Intake;
-use crate::minibatch::Minibatch;
 use crate::replay::{Replay, SyncedRows};
-use crate::sampling::Sampler;
 pub use settings::{LearnerError, Settings};
 
 const REPORT_INTERVAL: Duration = Duration::from_millis(500);
@@ -92,10 +90,9 @@ pub(crate) struct Learner<'a> {
     pub(crate) pulse: Pulse,
     /// Rows that updates have been allowed by. In a free run, the replay's head; in lockstep, the rows of whole rounds.
     pub(crate) rows: u64,
-    ddpg: Ddpg,
-    sampler: Sampler,
-    batch: Minibatch,
-    indices: Vec<u64>,
+    /// Episodes that end within them.
+    episodes: u64,
+    algorithm: Box<dyn Algorithm>,
     pub(crate) publisher: PolicyPublisher,
     evaluator: Ringer,
     policy_version: u64,
@@ -110,10 +107,9 @@ pub(crate) struct Learner<'a> {
 
 impl<'a> Learner<'a> {
     fn new(domain: &'a Domain, settings: &'a Settings, stop: &'a Stop) -> Result<Self, LearnerError> {
-        let mut ddpg = Ddpg::new(&settings.spec, &settings.ddpg, settings.seed)?;
+        let mut algorithm = settings.method()?;
         let bell = Bell::hang(domain, Place(Role::Learner, 0))?;
         let layout = settings.replay_layout();
-        let row = layout.row;
         let replay = if settings.replay.exists() {
             Replay::open(&settings.replay, &layout)?
         } else {
@@ -126,17 +122,8 @@ impl<'a> Learner<'a> {
             None => Counters::default(),
             Some(mut loaded) => {
                 loaded.warnings.iter().for_each(|warning| tracing::warn!("{warning}"));
-                let lengths = ddpg.state().parts.map(<[f32]>::len);
-                let mut sections = Vec::new();
-                for (name, length) in DdpgState::PARTS.into_iter().zip(lengths) {
-                    sections.push(loaded.checkpoint.take(name, length)?);
-                }
                 let counters = loaded.checkpoint.counters;
-                let parts = std::array::from_fn(|i| sections[i].as_slice());
-                ddpg.restore(&DdpgState {
-                    updates: counters.updates,
-                    parts,
-                })?;
+                algorithm.restore(counters.updates, &mut loaded.checkpoint)?;
                 tracing::info!(
                     "going on after {} updates and {} of {} rows",
                     counters.updates,
@@ -157,14 +144,12 @@ impl<'a> Learner<'a> {
 
         let mut pulse = Pulse::new(domain, settings.identity)?;
         let learner = Self {
-            publisher: PolicyPublisher::open(domain, ddpg.policy().len())?,
+            publisher: PolicyPublisher::open(domain, algorithm.policy().len())?,
             evaluator: Ringer::new(domain, Place(Role::Evaluator, 0))?,
             intake: Intake::open(domain, settings.actors, settings.window, settings.chunk, settings.steps)?,
-            sampler: Sampler::new(settings.seed),
-            batch: Minibatch::new(row, settings.ddpg.batch),
-            indices: vec![0; settings.ddpg.batch],
             policy_version: counters.policy_version,
             rows: counters.rows,
+            episodes: counters.episodes,
             reporter: Reporter::open(domain)?,
             report: empty_report(),
             reported: Instant::now(),
@@ -180,7 +165,7 @@ impl<'a> Learner<'a> {
                 pulse.beat(Activity::WaitingForPeer);
                 pulse
             },
-            ddpg,
+            algorithm,
             checkpoints,
         };
         learner.publish_current()?;
@@ -189,26 +174,39 @@ impl<'a> Learner<'a> {
 
     /// Updates done.
     pub(crate) fn updates(&self) -> u64 {
-        self.ddpg.updates()
+        self.algorithm.updates()
     }
 
-    /// Lines 11 to 16 of Algorithm 4, on the replay as it was at `self.rows` rows.
+    /// Learns what is due next, on the replay as it was at `self.rows` rows.
     pub(crate) fn update(&mut self) -> Result<(), LearnerError> {
-        let window = self.replay.window(self.rows, self.settings.capacity);
-        self.sampler.indices(self.ddpg.updates(), window, &mut self.indices);
-        self.batch.gather(&self.replay, &self.indices);
-        let losses = self.ddpg.update(&self.batch);
+        let before = self.updates();
+        let losses = self.algorithm.update(&self.replay, self.rows);
         if !(losses.critic_loss.is_finite() && losses.actor_loss.is_finite()) {
             return Err(LearnerError::Diverged {
-                updates: self.ddpg.updates(),
+                updates: self.algorithm.updates(),
             });
         }
         self.report.critic_loss += f64::from(losses.critic_loss);
         self.report.actor_loss += f64::from(losses.actor_loss);
         self.report.q_mean += f64::from(losses.q_mean);
         self.report.averaged += 1;
-        self.pulse.count(1);
+        self.pulse.count(self.updates() - before);
         Ok(())
+    }
+
+    /// Rows that updates are allowed by from now on, and the episodes that end within them.
+    pub(crate) fn count_rows(&mut self, rows: u64) {
+        let newest = self.rows.max(self.replay.rows().start)..rows;
+        let layout = self.replay.layout().row;
+        let ends = newest.filter(|row| layout.read(self.replay.row(*row)).last);
+        self.episodes += ends.count() as u64;
+        self.rows = rows;
+    }
+
+    /// Whether the steps are taken that were to be taken, or the episodes.
+    pub(crate) fn has_all_rows(&self) -> bool {
+        let Settings { steps, episodes, .. } = *self.settings;
+        self.rows >= steps || episodes.is_some_and(|episodes| self.episodes >= episodes)
     }
 
     /// Publishes the policy as it is now, as a new version.
@@ -222,10 +220,10 @@ impl<'a> Learner<'a> {
             incarnation: self.settings.identity.incarnation,
             version: self.policy_version,
             env_steps: self.rows,
-            updates: self.ddpg.updates(),
-            fingerprint: self.ddpg.policy_layout().fingerprint(),
+            updates: self.algorithm.updates(),
+            fingerprint: self.algorithm.layout().fingerprint(),
         };
-        Ok(self.publisher.publish(self.ddpg.policy(), header)?)
+        Ok(self.publisher.publish(self.algorithm.policy(), header)?)
     }
 
     /// Listens to actors that have come since: a run is scaled while it goes on.
@@ -253,7 +251,7 @@ impl<'a> Learner<'a> {
                 self.bell.wait(Duration::from_millis(10))?;
             }
         }
-        self.rows = self.replay.head();
+        self.count_rows(self.replay.head());
         Ok(())
     }
 
@@ -287,7 +285,8 @@ impl<'a> Learner<'a> {
         report.actor_loss /= n;
         report.q_mean /= n;
         report.env_steps = self.rows;
-        report.updates = self.ddpg.updates();
+        report.episodes = self.episodes;
+        report.updates = self.algorithm.updates();
         report.policy_version = self.policy_version;
         self.reporter.look_after();
         self.reporter.send(report);
@@ -306,14 +305,13 @@ impl<'a> Learner<'a> {
                 .spawn(|| pending.run())
                 .ok();
         }
-        let state = self.ddpg.state();
-        let sections: Vec<(&str, &[f32])> = DdpgState::PARTS.into_iter().zip(state.parts).collect();
         let counters = Counters {
-            updates: state.updates,
+            updates: self.updates(),
             rows: self.rows,
+            episodes: self.episodes,
             policy_version: self.policy_version,
         };
-        Ok(self.checkpoints.save(&counters, &sections)?)
+        Ok(self.checkpoints.save(&counters, &self.algorithm.state())?)
     }
 
     fn end_sync(&mut self) {
@@ -329,13 +327,13 @@ impl<'a> Learner<'a> {
         self.end_sync();
         self.replay.flush()?;
         PolicyFile {
-            fingerprint: self.ddpg.policy_layout().fingerprint(),
+            fingerprint: self.algorithm.layout().fingerprint(),
             version: self.policy_version,
             env_steps: self.rows,
             return_mean: f64::NAN,
             return_std: f64::NAN,
             episodes: 0,
-            parameters: self.ddpg.policy().to_vec(),
+            parameters: self.algorithm.policy().to_vec(),
         }
         .write(&self.settings.last_policy)?;
         self.send_report();
@@ -347,6 +345,7 @@ impl<'a> Learner<'a> {
 fn empty_report() -> LearnerReport {
     LearnerReport {
         env_steps: 0,
+        episodes: 0,
         updates: 0,
         policy_version: 0,
         critic_loss: 0.0,

@@ -1,6 +1,7 @@
-//! Replay, gradients, Adam, DDPG, checkpoints.
+//! Replay, gradients, Adam, the algorithms (DDPG, REINFORCE, Q-learning, SARSA), checkpoints.
 
 pub mod adam;
+pub mod algorithm;
 pub mod aligned;
 pub mod checkpoint;
 pub mod ddpg;
@@ -11,8 +12,11 @@ pub mod intake;
 pub mod learner;
 mod lockstep;
 pub mod minibatch;
+pub mod off_policy;
 pub mod pass;
 pub mod product;
 pub mod ratio;
+pub mod reinforce;
 pub mod replay;
 pub mod sampling;
+pub mod tabular;

@@ -27,15 +27,14 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Ended> {
     }
     learner.announce();
     judging.wait(learner)?;
-    while learner.rows < learner.settings.steps {
+    while !learner.has_all_rows() {
         let (before, updates) = (learner.rows, learner.updates());
         let mut rows = before;
         for actor in 0..learner.intake.actors() {
-            rows += (learner.settings.chunk.rows as u64).min(learner.settings.steps - rows);
-            await_rows(learner, actor, rows)?;
+            rows = await_chunk(learner, actor, rows)?;
         }
         // Only now: whoever is interrupted within a round goes on from its beginning.
-        learner.rows = rows;
+        learner.count_rows(rows);
         while learner.updates() < learner.settings.ratio.allowed(learner.rows) {
             learner.update()?;
             learner.tell(Activity::Working);
@@ -53,9 +52,12 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Ended> {
     Ok(())
 }
 
-/// Waits until the actor's chunk of this round is in the replay, which then has `rows` rows or more.
-fn await_rows(learner: &mut Learner<'_>, actor: usize, rows: u64) -> Result<(), Ended> {
-    while learner.replay.head() < rows {
+/// Waits until the actor's chunk of this round is in the replay, which begins at row `first`; returns the row after it.
+fn await_chunk(learner: &mut Learner<'_>, actor: usize, first: u64) -> Result<u64, Ended> {
+    loop {
+        if let Some(end) = end_of_chunk(learner, first) {
+            return Ok(end);
+        }
         let Learner {
             bell,
             stop,
@@ -81,7 +83,23 @@ fn await_rows(learner: &mut Learner<'_>, actor: usize, rows: u64) -> Result<(), 
         taken?;
         learner.tell(Activity::Working);
     }
-    Ok(())
+}
+
+/// The row after the chunk that begins at row `first`, if it is in the replay: a chunk is full, or one whole episode, or
+/// was cut off where the run's steps end.
+fn end_of_chunk(learner: &Learner<'_>, first: u64) -> Option<u64> {
+    let Learner { settings, replay, .. } = learner;
+    let head = replay.head();
+    if head <= first {
+        return (first >= settings.steps).then_some(first);
+    }
+    let full = (first + settings.chunk.rows as u64).min(settings.steps);
+    if settings.algorithm.learns_from_episodes() {
+        let row = replay.layout().row;
+        let last = (first..head.min(full)).find(|index| row.read(replay.row(*index)).last);
+        return last.map(|last| last + 1).or((head >= full).then_some(full));
+    }
+    (head >= full).then_some(full)
 }
 
 /// What is known of the evaluator's work.

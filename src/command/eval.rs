@@ -143,6 +143,7 @@ fn final_distance(config: &Config, trajectory: &Trajectory) -> Option<f64> {
 mod tests {
     use super::*;
     use crate::rollout::tests::small;
+    use shoal_common::config::Algorithm;
 
     #[test]
     fn the_same_seed_gives_the_same_evaluation() {
@@ -201,7 +202,10 @@ mod tests {
         };
         super::run(&args).unwrap();
 
-        config.ddpg.hidden = [5, 3];
+        let Algorithm::Ddpg(ddpg, _) = &mut config.algorithm else {
+            unreachable!()
+        };
+        ddpg.hidden = [5, 3];
         let foreign = WhichPolicy::Last.read(&run, &config).unwrap_err().to_string();
         assert!(
             foreign.contains("another network") && !foreign.contains('\n'),

@@ -16,15 +16,18 @@ pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
     // Only who holds the lock may change the configuration.
     let lock = run.lock()?;
     let here = args.run.display();
-    let taken = status::at_rest(&config, &run)
-        .with_context(|| format!("cannot resume {here}"))?
-        .env_steps;
+    let rest = status::at_rest(&config, &run).with_context(|| format!("cannot resume {here}"))?;
+    let (taken, over) = (rest.env_steps, rest.episodes);
     let steps = args.steps.unwrap_or(config.run.steps);
     if taken >= steps {
         bail!("{here} has taken {taken} of {steps} steps already: give it more with --steps");
     }
-    if steps != config.run.steps {
-        config.run.steps = steps;
+    let episodes = args.episodes.or(config.run.episodes);
+    if let Some(episodes) = episodes.filter(|episodes| over >= *episodes) {
+        bail!("{here} has finished {over} of {episodes} episodes already: give it more with --episodes");
+    }
+    if (steps, episodes) != (config.run.steps, config.run.episodes) {
+        (config.run.steps, config.run.episodes) = (steps, episodes);
         config.check()?;
         run.write_config(&config)?;
     }

@@ -69,7 +69,7 @@ fn rest(args: &StatusArgs, remote: &Remote) -> anyhow::Result<ExitCode> {
             status: &status,
         };
         writeln!(stdout, "{}", serde_json::to_string(&printed)?)?;
-    } else if status.env_steps < status.steps {
+    } else if !status.is_done() {
         writeln!(
             stdout,
             "nothing runs in {here}; {}; to go on: shoal resume {here}",
@@ -101,12 +101,20 @@ fn screen() -> ProgressBar {
 }
 
 fn progress(status: &RunStatus) -> String {
-    format!(
-        "{} of {} steps, {} updates",
-        thousands(status.env_steps),
-        thousands(status.steps),
-        thousands(status.updates)
-    )
+    let updates = thousands(status.updates);
+    match status.episodes_limit {
+        Some(limit) => format!(
+            "{} of {} episodes, {} steps, {updates} updates",
+            thousands(status.episodes),
+            thousands(limit),
+            thousands(status.env_steps)
+        ),
+        None => format!(
+            "{} of {} steps, {updates} updates",
+            thousands(status.env_steps),
+            thousands(status.steps)
+        ),
+    }
 }
 
 fn table(status: &RunStatus) -> String {

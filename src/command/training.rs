@@ -10,8 +10,7 @@ use shoal_common::channel::control::RunStatus;
 use shoal_common::config::Config;
 use shoal_common::run_dir::{RunDir, RunLock};
 use shoal_learner::checkpoint::Checkpoints;
-use shoal_learner::ddpg::DdpgState;
-use shoal_learner::digest;
+use shoal_learner::{algorithm, digest};
 
 use super::eval::{EvaluationSummary, WhichPolicy, evaluate};
 use super::plot;
@@ -85,7 +84,12 @@ impl Summary {
         judged: Option<&EvaluationSummary>,
     ) -> anyhow::Result<Self> {
         let wall_seconds = outcome.wall.as_secs_f64();
-        let RunStatus { env_steps, updates, .. } = outcome.after;
+        let RunStatus {
+            env_steps,
+            updates,
+            episodes,
+            ..
+        } = outcome.after;
         // A learner whose checkpoint was damaged has begun before where the run stood.
         let done = updates.saturating_sub(outcome.before.updates);
         let taken = env_steps.saturating_sub(outcome.before.env_steps);
@@ -93,7 +97,7 @@ impl Summary {
             run: run.path().display().to_string(),
             env_steps,
             updates,
-            episodes: outcome.episodes,
+            episodes,
             wall_seconds,
             updates_per_second: done as f64 / wall_seconds,
             env_steps_per_second: taken as f64 / wall_seconds,
@@ -105,13 +109,13 @@ impl Summary {
     }
 }
 
-/// SHA-256 of actor, critic and both targets in the newest checkpoint.
+/// SHA-256 of what was learned, in the newest checkpoint: of DDPG, actor, critic and both targets.
 fn weights_sha256(config: &Config, run: &RunDir) -> anyhow::Result<Option<String>> {
     let loaded = Checkpoints::new(&run.checkpoints(), config.fingerprint()).load_newest()?;
     Ok(loaded.map(|loaded| {
         let section = |name| loaded.checkpoint.sections.iter().find(|(found, _)| found == name);
-        let networks = DdpgState::PARTS.iter().take(4).filter_map(section);
-        digest::sha256(&networks.map(|(_, numbers)| numbers.as_slice()).collect::<Vec<_>>())
+        let weights = algorithm::weights(&config.algorithm).iter().filter_map(section);
+        digest::sha256(&weights.map(|(_, numbers)| numbers.as_slice()).collect::<Vec<_>>())
     }))
 }
 

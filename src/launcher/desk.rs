@@ -25,6 +25,7 @@ pub(super) fn status(
     };
     if let Some(learner) = progress.learner() {
         status.env_steps = learner.env_steps;
+        status.episodes = learner.episodes;
         status.updates = learner.updates;
         status.policy_version = learner.policy_version;
         status.ratio = status::ratio(&status, config.replay.warmup);

@@ -17,6 +17,8 @@ const SPAN: Duration = Duration::from_secs(5);
 #[derive(Debug)]
 pub(super) struct Progress {
     bar: ProgressBar,
+    /// Whether the bar counts episodes; else steps.
+    counts_episodes: bool,
     warmup: u64,
     updates_per_step: f64,
     learner: Option<LearnerReport>,
@@ -35,7 +37,8 @@ impl Progress {
         } else {
             ProgressDrawTarget::stderr()
         };
-        let bar = ProgressBar::with_draw_target(Some(config.run.steps), target);
+        let length = config.run.episodes.unwrap_or(config.run.steps);
+        let bar = ProgressBar::with_draw_target(Some(length), target);
         if let Ok(style) = ProgressStyle::with_template("{prefix:.bold} {bar:16.cyan/dim} {msg}") {
             bar.set_style(style.progress_chars("━━─"));
         }
@@ -43,6 +46,7 @@ impl Progress {
         bar.set_message("starting");
         Self {
             bar,
+            counts_episodes: config.run.episodes.is_some(),
             warmup: config.replay.warmup,
             updates_per_step: config.replay.updates_per_step,
             learner: None,
@@ -90,17 +94,18 @@ impl Progress {
         }
         self.drawn = Instant::now();
         let Some(learner) = self.learner else { return };
-        self.bar.set_position(learner.env_steps);
+        self.bar.set_position(self.done(&learner));
         self.bar.set_message(self.line(&learner, crew));
     }
 
     /// How far it is and how good, below it how fast and who waits, and restarts if there were any: each fits 80 columns.
     fn line(&self, learner: &LearnerReport, crew: &Crew) -> String {
-        let steps = self.bar.length().unwrap_or(0);
+        let (done, all) = (self.done(learner), self.bar.length().unwrap_or(0));
         let rates = self.rates();
-        let mut outcome = vec![format!("{}/{} steps", thousands(learner.env_steps), thousands(steps))];
-        if let Some((_, env_steps)) = rates.filter(|(_, env_steps)| *env_steps > 0.0) {
-            let left = steps.saturating_sub(learner.env_steps) as f64 / env_steps;
+        let unit = if self.counts_episodes { "episodes" } else { "steps" };
+        let mut outcome = vec![format!("{}/{} {unit}", thousands(done), thousands(all))];
+        if let Some(pace) = self.pace(|report| self.done(report)).filter(|pace| *pace > 0.0) {
+            let left = all.saturating_sub(done) as f64 / pace;
             outcome.push(format!("{} left", HumanDuration(Duration::from_secs_f64(left))));
         }
         if let Some(evaluated) = &self.evaluated {
@@ -126,15 +131,30 @@ impl Progress {
         lines.join("\n  ")
     }
 
+    /// Steps or episodes, whichever the run is to end with.
+    fn done(&self, learner: &LearnerReport) -> u64 {
+        if self.counts_episodes {
+            learner.episodes
+        } else {
+            learner.env_steps
+        }
+    }
+
     /// Updates and environment steps a second; `None` while the learner is not heard of.
     pub(super) fn rates(&self) -> Option<(f64, f64)> {
+        Some((
+            self.pace(|report| report.updates)?,
+            self.pace(|report| report.env_steps)?,
+        ))
+    }
+
+    fn pace(&self, count: impl Fn(&LearnerReport) -> u64) -> Option<f64> {
         if self.heard.elapsed() > SPAN {
             return None;
         }
         let ((then, old), (now, new)) = (self.recent.front()?, self.recent.back()?);
         let seconds = (*now - *then).as_secs_f64();
-        let rate = |new: u64, old: u64| new.saturating_sub(old) as f64 / seconds;
-        (seconds > 0.0).then(|| (rate(new.updates, old.updates), rate(new.env_steps, old.env_steps)))
+        (seconds > 0.0).then(|| count(new).saturating_sub(count(old)) as f64 / seconds)
     }
 }
 

@@ -26,7 +26,6 @@ pub(crate) enum RecordError {
 pub(super) struct Table {
     path: PathBuf,
     rows: csv::Writer<File>,
-    len: u64,
 }
 
 impl Table {
@@ -67,20 +66,13 @@ impl Table {
         Self {
             path: path.to_owned(),
             rows,
-            len: lines.saturating_sub(1),
         }
-    }
-
-    /// Rows in the table.
-    pub(super) fn len(&self) -> u64 {
-        self.len
     }
 
     pub(super) fn write(&mut self, row: &impl Serialize) -> Result<(), RecordError> {
         self.rows
             .serialize(row)
             .map_err(|error| record_error(&self.path, error))?;
-        self.len += 1;
         Ok(())
     }
 

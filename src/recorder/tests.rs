@@ -38,6 +38,7 @@ fn learner(env_steps: u64, updates: u64, averaged: u64) -> LearnerReport {
     let policy_version = updates / 10;
     LearnerReport {
         env_steps,
+        episodes: 0,
         updates,
         policy_version,
         critic_loss: 0.5,

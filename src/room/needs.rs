@@ -2,7 +2,7 @@
 
 use shoal_common::channel::{Bell, control, environment, policy, reports, transitions};
 use shoal_common::config::Config;
-use shoal_common::network::NetworkLayout;
+use shoal_common::policy::PolicyLayout;
 use shoal_common::report::{EpisodeReport, EvaluationReport, Heartbeat, Identity, JudgedReport, LearnerReport, Role};
 use shoal_common::run_dir::RunDir;
 
@@ -21,8 +21,8 @@ const FILES_OF_AN_ACTOR: u64 = 12;
 pub(super) fn shared_memory(config: &Config) -> u64 {
     let max = config.actors.max as usize;
     let (spec, actors) = (&config.spec, max as u64);
-    let parameters =
-        NetworkLayout::policy(spec.observation.width(), config.ddpg.hidden, spec.action.width()).parameters();
+    // Who cannot control the environment is refused elsewhere.
+    let parameters = PolicyLayout::new(&config.algorithm, spec).map_or(0, |layout| layout.parameters());
     let explorer = environment::reserved(spec, config.actors.envs as usize)
         + transitions::reserved(&config.chunk_layout(), config.actors.window);
     // An environment server and whom it serves, for each actor and the evaluator; and the learner.

@@ -1,6 +1,6 @@
-//! What a configuration is where nothing else is said: the thesis's numbers where it prints them (section 4.3.1).
+//! What a configuration is where nothing else is said: the thesis's numbers where it prints them (sections 4.1 to 4.3).
 
-use super::{Actors, Checkpoint, Ddpg, Evaluation, Exploration, Mode, Replay, Run};
+use super::{Actors, Checkpoint, Ddpg, Evaluation, Exploration, Mode, Reinforce, Replay, Run, Tabular, Weight};
 
 impl Default for Run {
     fn default() -> Self {
@@ -9,6 +9,7 @@ impl Default for Run {
             seed: 1,
             mode: Mode::Free,
             steps: 120_000,
+            episodes: None,
         }
     }
 }
@@ -43,6 +44,31 @@ impl Default for Ddpg {
             actor_learning_rate: 1e-4,
             critic_learning_rate: 1e-3,
             batch: 64,
+        }
+    }
+}
+
+impl Default for Reinforce {
+    fn default() -> Self {
+        Self {
+            hidden: [10, 2],
+            gamma: 0.95,
+            learning_rate: 0.01,
+            weight: Weight::Normalised,
+            discount_steps: false,
+            learn_at_limit: true,
+            baseline_hidden: [32, 32],
+            baseline_learning_rate: 0.01,
+        }
+    }
+}
+
+impl Default for Tabular {
+    fn default() -> Self {
+        Self {
+            gamma: 0.999,
+            alpha: 0.03,
+            epsilon: 0.4,
         }
     }
 }

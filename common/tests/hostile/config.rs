@@ -96,9 +96,11 @@ fn usable(config: &Config) {
     };
     assert!(layout.places().is_some());
     let (observation, action) = (row.observation_width(), row.action_width());
-    let batch = config.ddpg.batch.max(config.actors.envs as usize);
-    let network = NetworkLayout::critic(observation, config.ddpg.hidden, action);
-    assert!(network.parameters().checked_mul(size_of::<f32>() * batch).is_some());
+    if let Some(ddpg) = config.algorithm.ddpg() {
+        let batch = ddpg.batch.max(config.actors.envs as usize);
+        let network = NetworkLayout::critic(observation, ddpg.hidden, action);
+        assert!(network.parameters().checked_mul(size_of::<f32>() * batch).is_some());
+    }
     assert!(config.evaluation_server() < 257 && (1..=64).contains(&config.evaluation_envs()));
     assert_eq!(config.evaluation.period(0), 0);
     assert!(std::time::Duration::try_from_secs_f64(config.checkpoint.every_seconds).is_ok());

@@ -6,24 +6,25 @@ use std::path::{Path, PathBuf};
 use proptest::prelude::*;
 use shoal_common::durable::{self, Kind};
 use shoal_common::network::NetworkLayout;
+use shoal_common::policy::PolicyLayout;
 use shoal_common::policy_file::{PolicyFile, PolicyFileError};
 use tempfile::TempDir;
 
 use crate::bytes::{damage, extreme};
 
-fn network() -> NetworkLayout {
-    NetworkLayout::policy(2, [3, 2], 1)
+fn layout() -> PolicyLayout {
+    PolicyLayout::Deterministic(NetworkLayout::policy(2, [3, 2], 1))
 }
 
 fn policy() -> PolicyFile {
     PolicyFile {
-        fingerprint: network().fingerprint(),
+        fingerprint: layout().fingerprint(),
         version: 8,
         env_steps: 9,
         return_mean: -150.25,
         return_std: 94.5,
         episodes: 100,
-        parameters: (0..network().parameters()).map(|i| i as f32).collect(),
+        parameters: (0..layout().parameters()).map(|i| i as f32).collect(),
     }
 }
 
@@ -36,11 +37,11 @@ fn directory() -> (TempDir, PathBuf) {
 /// A whole policy, or refused; the file stays.
 fn read(path: &Path) -> Option<PolicyFile> {
     let before = fs::read(path).unwrap();
-    let read = PolicyFile::read(path, &network());
+    let read = PolicyFile::read(path, &layout());
     assert_eq!(fs::read(path).unwrap(), before);
     match read {
         Ok(policy) => {
-            assert_eq!(policy.parameters.len(), network().parameters());
+            assert_eq!(policy.parameters.len(), layout().parameters());
             Some(policy)
         }
         Err(PolicyFileError::Refused { .. }) => None,
@@ -80,7 +81,7 @@ proptest! {
         const KIND: Kind = Kind { magic: *b"SHOALPOL", version: 1, name: "a policy file" };
         let mut words = words;
         if right_network {
-            words[0] = network().fingerprint();
+            words[0] = layout().fingerprint();
         }
         if right_count {
             words[6] = numbers.len() as u64 / 4;
@@ -90,8 +91,8 @@ proptest! {
         durable::write_atomically(&path, |file| {
             durable::seal(KIND, file, |to| std::io::Write::write_all(to, &body))
         }).unwrap();
-        let fits = words[0] == network().fingerprint() && words[6] == numbers.len() as u64 / 4;
-        let whole = fits && numbers.len() == 4 * network().parameters();
+        let fits = words[0] == layout().fingerprint() && words[6] == numbers.len() as u64 / 4;
+        let whole = fits && numbers.len() == 4 * layout().parameters();
         prop_assert_eq!(read(&path).is_some(), whole);
     }
 }
@@ -99,13 +100,13 @@ proptest! {
 #[test]
 fn a_policy_of_the_right_network_without_its_parameters_is_refused() {
     let (_directory, path) = directory();
-    for count in [0, 1, network().parameters() - 1, network().parameters() + 1] {
+    for count in [0, 1, layout().parameters() - 1, layout().parameters() + 1] {
         let policy = PolicyFile {
             parameters: vec![0.5; count],
             ..policy()
         };
         policy.write(&path).unwrap();
-        let line = PolicyFile::read(&path, &network()).unwrap_err().to_string();
+        let line = PolicyFile::read(&path, &layout()).unwrap_err().to_string();
         assert!(
             line.contains(&format!("it has {count} parameters")) && !line.contains('\n'),
             "{line}"

@@ -11,6 +11,7 @@ fn counters(updates: u64) -> Counters {
     Counters {
         updates,
         rows: 3 * updates,
+        episodes: 2,
         policy_version: 4,
     }
 }
@@ -182,12 +183,12 @@ fn one_of_another_configuration_is_refused_and_not_replaced() {
 fn one_of_another_version_is_refused() {
     let (directory, latest, _) = two();
     durable::write_atomically(&latest, |file| {
-        durable::seal(Kind { version: 2, ..KIND }, file, |_| Ok(()))
+        durable::seal(Kind { version: 1, ..KIND }, file, |_| Ok(()))
     })
     .unwrap();
     let error = load(&directory).unwrap_err().to_string();
     assert!(
-        error.contains("format version 2, this program reads version 1"),
+        error.contains("format version 1, this program reads version 2"),
         "{error}"
     );
 }

@@ -4,14 +4,13 @@ use std::path::PathBuf;
 
 use shoal_common::channel::ChannelError;
 use shoal_common::config::{self, Mode};
-use shoal_common::network::NetworkLayout;
 use shoal_common::policy_file::PolicyFileError;
 use shoal_common::report::Identity;
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::transition::ChunkLayout;
 
+use crate::algorithm::{self, Algorithm, AlgorithmError, Room};
 use crate::checkpoint::{CheckpointError, SectionError};
-use crate::ddpg::{DdpgError, DdpgSettings, DdpgState};
 use crate::intake::IntakeError;
 use crate::ratio::Ratio;
 use crate::replay::{ReplayError, ReplayLayout};
@@ -37,8 +36,12 @@ pub struct Settings {
     pub chunk: ChunkLayout,
     /// What is controlled.
     pub spec: EnvironmentSpec,
-    /// The algorithm's numbers.
-    pub ddpg: DdpgSettings,
+    /// What is learned, and how.
+    pub algorithm: config::Algorithm,
+    /// Environments of each actor.
+    pub envs: u32,
+    /// Episodes after which training ends, if that is before `steps`.
+    pub episodes: Option<u64>,
     /// Updates per step.
     pub ratio: Ratio,
     /// Transitions that minibatches are sampled from.
@@ -79,7 +82,7 @@ pub enum LearnerError {
     Section(#[from] SectionError),
     /// The algorithm cannot learn this.
     #[error(transparent)]
-    Ddpg(#[from] DdpgError),
+    Algorithm(#[from] AlgorithmError),
     /// The policy cannot be left behind.
     #[error(transparent)]
     PolicyFile(#[from] PolicyFileError),
@@ -101,21 +104,29 @@ pub enum LearnerError {
 
 impl Settings {
     /// Bytes that the learner's files need on the disk beyond what is there already; `None` where a replay so large is not
-    /// possible.
+    /// possible, or nothing can be learned.
     pub fn disk_bytes(&self) -> Option<u64> {
         let replay = if self.replay.exists() {
             0
         } else {
             self.replay_layout().places()?.end as u64
         };
-        let (observation, action) = (self.spec.observation.width(), self.spec.action.width());
-        let actor = NetworkLayout::policy(observation, self.ddpg.hidden, action).parameters();
-        let critic = NetworkLayout::critic(observation, self.ddpg.hidden, action).parameters();
-        // Half of a checkpoint's parts are an actor's, half a critic's.
-        let checkpoint = DdpgState::PARTS.len() / 2 * (actor + critic);
+        let algorithm = self.method().ok()?;
+        let checkpoint: usize = algorithm.state().iter().map(|(_, numbers)| numbers.len()).sum();
         // The latest, the one before it, and the next one while it is written; the best policy and the last likewise.
-        let numbers = 3 * checkpoint + 3 * actor;
+        let numbers = 3 * checkpoint + 3 * algorithm.policy().len();
         Some(replay + (size_of::<f32>() * numbers) as u64)
+    }
+
+    /// The learning method, before its first update.
+    pub(super) fn method(&self) -> Result<Box<dyn Algorithm>, AlgorithmError> {
+        let room = Room {
+            capacity: self.capacity,
+            chunk_rows: self.chunk.rows,
+            actors: self.actors,
+            envs: self.envs,
+        };
+        algorithm::new(&self.algorithm, &self.spec, self.seed, room)
     }
 
     /// What the replay of this run holds.

@@ -34,6 +34,7 @@ fn save(directory: &Path, updates: u64) {
     let counters = Counters {
         updates,
         rows: 2 * updates,
+        episodes: 0,
         policy_version: 1,
     };
     let sections: [(&str, &[f32]); 3] = [("actor", &[1.0, 2.0]), ("empty", &[]), ("critic", &[updates as f32])];
@@ -98,7 +99,7 @@ fn damaged(mut bytes: Vec<u8>, damage: Vec<Damage>) -> Vec<u8> {
 fn sealed(path: &Path, body: &[u8]) {
     const KIND: Kind = Kind {
         magic: *b"SHOALCKP",
-        version: 1,
+        version: 2,
         name: "a checkpoint",
     };
     durable::write_atomically(path, |file| durable::seal(KIND, file, |to| to.write_all(body))).unwrap();

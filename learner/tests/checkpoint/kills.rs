@@ -24,6 +24,7 @@ fn counters(updates: u64) -> Counters {
     Counters {
         updates,
         rows: 3 * updates,
+        episodes: 0,
         policy_version: updates + 1,
     }
 }

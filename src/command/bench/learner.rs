@@ -7,15 +7,15 @@ use serde::Serialize;
 use shoal_common::commit::ChunkMark;
 use shoal_common::config::Config;
 use shoal_common::stream::{Purpose, stream};
-use shoal_learner::ddpg::{Ddpg, DdpgSettings};
-use shoal_learner::minibatch::Minibatch;
+use shoal_learner::algorithm::Algorithm;
+use shoal_learner::ddpg::Ddpg;
+use shoal_learner::off_policy::OffPolicy;
 use shoal_learner::product::products_of_update;
 use shoal_learner::replay::Replay;
-use shoal_learner::sampling::Sampler;
 
 use super::product::Multiplication;
 use super::rows::{ENVIRONMENTS, Rows};
-use super::scene::Scene;
+use super::scene::{Scene, ddpg};
 use super::window::{self, Windows};
 use super::{Figures, Patience};
 
@@ -61,11 +61,11 @@ pub(super) fn measure(patience: &Patience) -> anyhow::Result<LearnerFigures> {
     // Mapped as ever, and gone from the directory whatever becomes of this process.
     let config = scene.remove_directory()?;
     let mut learner = Learner::new(&config, replay, patience)?;
-    let (mut list, mut fastest) = multiplications(&config, &learner.ddpg);
+    let (mut list, mut fastest) = multiplications(&config, &learner.method.ddpg, learner.batch);
 
     window::rate(patience.length.mul_f64(WARM_UP), || learner.update());
     let (mut updates, mut limit, mut products) = (Windows::default(), Windows::default(), Windows::default());
-    let flop = learner.ddpg.flop_per_update();
+    let flop = learner.method.ddpg.flop_per_update();
     for _ in 0..window::count(patience.length, SHARE, WINDOW) {
         patience.check()?;
         updates.add(window::rate(WINDOW, || learner.update()));
@@ -83,7 +83,7 @@ pub(super) fn measure(patience: &Patience) -> anyhow::Result<LearnerFigures> {
         limit_kernel: fastest.kernel.name(),
         products_gflops: products.median(),
         share_of_products: achieved / products.median(),
-        batch: config.ddpg.batch,
+        batch: learner.batch,
         replay_rows: learner.replay.head(),
         threads: 1,
         updates,
@@ -94,25 +94,15 @@ pub(super) fn measure(patience: &Patience) -> anyhow::Result<LearnerFigures> {
 
 /// What a learner updates with, as in its loop.
 struct Learner {
-    ddpg: Ddpg,
-    sampler: Sampler,
+    method: OffPolicy,
+    batch: usize,
     replay: Replay,
-    batch: Minibatch,
-    indices: Vec<u64>,
-    capacity: u64,
 }
 
 impl Learner {
     /// New networks, and a replay that is filled to its capacity.
     fn new(config: &Config, mut replay: Replay, patience: &Patience) -> anyhow::Result<Self> {
         let row = config.row_layout();
-        let settings = DdpgSettings {
-            tau: config.ddpg.tau,
-            actor_learning_rate: config.ddpg.actor_learning_rate,
-            critic_learning_rate: config.ddpg.critic_learning_rate,
-            hidden: config.ddpg.hidden,
-            batch: config.ddpg.batch,
-        };
         let mut rows = Rows::new(config)?;
         let mut chunk = vec![0.0; ENVIRONMENTS * row.width()];
         for sequence in 1..=config.replay.capacity / ENVIRONMENTS as u64 {
@@ -124,22 +114,16 @@ impl Learner {
             };
             replay.append_and_commit(0, mark, &chunk).context("the replay")?;
         }
+        let ddpg = ddpg(config)?;
         Ok(Self {
-            ddpg: Ddpg::new(&config.spec, &settings, config.run.seed)?,
-            sampler: Sampler::new(config.run.seed),
-            batch: Minibatch::new(row, settings.batch),
-            indices: vec![0; settings.batch],
-            capacity: config.replay.capacity,
+            method: OffPolicy::new(&config.spec, ddpg, config.run.seed, config.replay.capacity)?,
+            batch: ddpg.batch,
             replay,
         })
     }
 
     fn update(&mut self) {
-        let Self { sampler, replay, .. } = self;
-        let window = replay.window(replay.head(), self.capacity);
-        sampler.indices(self.ddpg.updates(), window, &mut self.indices);
-        self.batch.gather(replay, &self.indices);
-        std::hint::black_box(self.ddpg.update(&self.batch));
+        std::hint::black_box(self.method.update(&self.replay, self.replay.head()));
     }
 }
 
@@ -158,10 +142,10 @@ impl List {
 }
 
 /// All products of an update, each with its best kernel, and the fastest of them once more.
-fn multiplications(config: &Config, ddpg: &Ddpg) -> (List, Multiplication) {
+fn multiplications(config: &Config, ddpg: &Ddpg, batch: usize) -> (List, Multiplication) {
     let mut random = stream(config.run.seed, Purpose::Exploration, 1, 0);
     let (mut distinct, mut order): (Vec<Multiplication>, Vec<usize>) = Default::default();
-    for product in products_of_update(ddpg.policy_layout(), ddpg.critic_layout(), config.ddpg.batch) {
+    for product in products_of_update(ddpg.policy_layout(), ddpg.critic_layout(), batch) {
         let known = distinct.iter().position(|known| known.product == product);
         order.push(known.unwrap_or(distinct.len()));
         if known.is_none() {

@@ -7,7 +7,7 @@ use shoal_common::network::{ActionRange, PolicyNetwork};
 use shoal_learner::initialise::initialise;
 
 use super::rows::{ENVIRONMENTS, Rows};
-use super::scene::Scene;
+use super::scene::{Scene, ddpg};
 use super::window::{self, Windows};
 use super::{Figures, Patience};
 
@@ -35,7 +35,7 @@ pub(super) fn measure(patience: &Patience) -> anyhow::Result<PolicyFigures> {
     let range = ActionRange::new(&config.spec.action)?;
     let width = config.spec.observation.width();
     let mut actions = vec![0.0; ENVIRONMENTS * range.width()];
-    let mut policy = PolicyNetwork::new(width, config.ddpg.hidden, range, ENVIRONMENTS);
+    let mut policy = PolicyNetwork::new(width, ddpg(&config)?.hidden, range, ENVIRONMENTS);
     let parameters = initialise(policy.layout(), config.run.seed, 0);
     let rows = Rows::new(&config)?;
 

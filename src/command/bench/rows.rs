@@ -40,7 +40,7 @@ impl Rows {
             environments,
             layout,
             row,
-            gamma: config.ddpg.gamma as f32,
+            gamma: config.algorithm.gamma() as f32,
             random: stream(config.run.seed, Purpose::Exploration, 0, 0),
             bounds,
             observations,

@@ -3,7 +3,7 @@
 use anyhow::Context;
 use shoal_common::channel::Domain;
 use shoal_common::commit::ReplayLayout;
-use shoal_common::config::Config;
+use shoal_common::config::{Config, Ddpg};
 use shoal_common::report::Role;
 use shoal_common::run_dir::RunDir;
 use tempfile::TempDir;
@@ -20,6 +20,11 @@ pub(super) struct Scene {
     directory: TempDir,
 }
 
+/// DDPG's numbers: the only learner that is measured.
+pub(super) fn ddpg(config: &Config) -> anyhow::Result<&Ddpg> {
+    config.algorithm.ddpg().context("only DDPG is measured")
+}
+
 impl Scene {
     /// The preset with these settings, as `--set` takes them.
     pub(super) fn new(set: &[&str]) -> anyhow::Result<Self> {
@@ -34,6 +39,7 @@ impl Scene {
             actors: Some(1),
             envs: Some(1),
             steps: None,
+            episodes: None,
             lockstep: false,
             set: set.iter().map(|assignment| (*assignment).into()).collect(),
             telling: Telling::default(),

@@ -16,7 +16,7 @@ use shoal_learner::sampling::Sampler;
 
 use super::peer::Peer;
 use super::rows::{ENVIRONMENTS, Rows};
-use super::scene::Scene;
+use super::scene::{Scene, ddpg};
 use super::window::{self, Windows};
 use super::{Figures, Patience};
 
@@ -67,7 +67,7 @@ pub(super) fn measure(patience: &Patience) -> anyhow::Result<TransitionFigures> 
         row_bytes: size_of::<f32>() * scene.config.row_layout().width(),
         window_chunks: scene.config.actors.window,
         replay_rows: replay.rows().end - replay.rows().start,
-        batch: scene.config.ddpg.batch,
+        batch: ddpg(&scene.config)?.batch,
         moved,
         sampled,
     })
@@ -166,8 +166,9 @@ fn wait_for_replay(run: &RunDir, bell: &Bell, learner: &mut Peer, patience: &Pat
 /// Rows a second into minibatches, drawn as the learner draws them.
 fn sample(replay: &Replay, config: &Config, patience: &Patience) -> anyhow::Result<Windows> {
     let sampler = Sampler::new(config.run.seed);
-    let mut batch = Minibatch::new(config.row_layout(), config.ddpg.batch);
-    let mut indices = vec![0; config.ddpg.batch];
+    let size = ddpg(config)?.batch;
+    let mut batch = Minibatch::new(config.row_layout(), size);
+    let mut indices = vec![0; size];
     let mut update = 0;
     let mut gather = || {
         let newest = replay.window(replay.head(), config.replay.capacity);
@@ -181,7 +182,7 @@ fn sample(replay: &Replay, config: &Config, patience: &Patience) -> anyhow::Resu
     let mut windows = Windows::default();
     for _ in 0..window::count(patience.length, SHARES[2], SAMPLING_WINDOW) {
         patience.check()?;
-        windows.add(window::rate(SAMPLING_WINDOW, &mut gather) * config.ddpg.batch as f64);
+        windows.add(window::rate(SAMPLING_WINDOW, &mut gather) * size as f64);
     }
     Ok(windows)
 }

@@ -5,7 +5,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 /// The form of the messages. Raise it with every change: launcher and asker may be of different builds.
-pub(super) const VERSION: u32 = 1;
+pub(super) const VERSION: u32 = 2;
 
 /// What can be asked of a launcher.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -41,6 +41,10 @@ pub struct RunStatus {
     pub env_steps: u64,
     /// Environment steps after which training ends.
     pub steps: u64,
+    /// Episodes that end within the steps learned from.
+    pub episodes: u64,
+    /// Episodes after which training ends, if that is earlier.
+    pub episodes_limit: Option<u64>,
     /// Updates done.
     pub updates: u64,
     /// Rows committed to the replay over the whole run.
@@ -61,6 +65,13 @@ pub struct RunStatus {
     pub eval_return_mean: Option<f64>,
     /// Who waits for whom; `None` where nobody waits.
     pub waiting: Option<String>,
+}
+
+impl RunStatus {
+    /// Whether the run has come to its end.
+    pub fn is_done(&self) -> bool {
+        self.env_steps >= self.steps || self.episodes_limit.is_some_and(|limit| self.episodes >= limit)
+    }
 }
 
 /// How a process of a run gets on.

@@ -1,0 +1,200 @@
+//! How each algorithm's actors try what their policy would not do.
+
+use rand::RngExt;
+use shoal_common::config::Algorithm;
+use shoal_common::network::PolicyNetwork;
+use shoal_common::policy::{self, PolicyError, PolicyLayout, Scores, highest};
+use shoal_common::space::EnvironmentSpec;
+use shoal_common::stream::Stream;
+
+use crate::noise::OrnsteinUhlenbeck;
+
+/// A policy and its exploration, for all environments of an actor. A step's random numbers are reached by the step's own
+/// number, so that a step done again gets the same ones.
+#[derive(Clone, Debug)]
+pub enum Exploration {
+    /// DDPG: the policy's action and noise (line 8 of Algorithm 4).
+    Noise(PolicyNetwork, OrnsteinUhlenbeck),
+    /// REINFORCE: an action drawn from π(·|s), the softmax of the scores (line 3 of Algorithm 3).
+    Sample(Scores, Stream),
+    /// Q-learning and SARSA: the action with the highest value, the first of equals, but with probability ε any of all
+    /// (section 3.3.2).
+    EpsilonGreedy(Scores, Stream, f64),
+}
+
+impl Exploration {
+    /// The exploration of `algorithm` in `environments` environments like `spec`.
+    ///
+    /// # Errors
+    /// When the algorithm cannot control them.
+    pub fn new(
+        algorithm: &Algorithm,
+        spec: &EnvironmentSpec,
+        environments: usize,
+        stream: Stream,
+    ) -> Result<Self, PolicyError> {
+        Ok(match algorithm {
+            Algorithm::Ddpg(ddpg, noise) => {
+                let network = policy::deterministic(ddpg, spec, environments)?;
+                let noise = OrnsteinUhlenbeck::new(noise, environments, spec.action.width(), stream);
+                Self::Noise(network, noise)
+            }
+            Algorithm::Reinforce(reinforce) => Self::Sample(policy::softmax(reinforce, spec, environments)?, stream),
+            Algorithm::QLearning(tabular) | Algorithm::Sarsa(tabular) => {
+                let values = policy::table(algorithm.name(), spec, environments)?;
+                Self::EpsilonGreedy(values, stream, tabular.epsilon)
+            }
+        })
+    }
+
+    /// What the policy's parameters are.
+    pub fn layout(&self) -> PolicyLayout {
+        match self {
+            Self::Noise(network, _) => PolicyLayout::Deterministic(*network.layout()),
+            Self::Sample(scores, _) | Self::EpsilonGreedy(scores, ..) => scores.layout(),
+        }
+    }
+
+    /// Chooses the actions of step number `step`, one for each observation.
+    pub fn act(&mut self, parameters: &[f32], observations: &[f32], step: u64, actions: &mut [f32]) {
+        match self {
+            Self::Noise(network, noise) => {
+                network.forward(parameters, observations, actions);
+                noise.advance(step);
+                noise.disturb(actions, network.range());
+            }
+            Self::Sample(logits, stream) => {
+                go_to(stream, step);
+                for (action, logits) in actions.iter_mut().zip(logits.of(parameters, observations)) {
+                    *action = drawn(logits, stream.random()) as f32;
+                }
+            }
+            Self::EpsilonGreedy(values, stream, epsilon) => {
+                go_to(stream, step);
+                let count = values.actions();
+                for (action, values) in actions.iter_mut().zip(values.of(parameters, observations)) {
+                    // Both are drawn, whatever comes of the first: the numbers of the next environment stay in their place.
+                    let (explore, which): (f64, f64) = (stream.random(), stream.random());
+                    let any = (which * count as f64) as usize;
+                    *action = if explore < *epsilon { any } else { highest(values) } as f32;
+                }
+            }
+        }
+    }
+
+    /// Begins an episode of one environment (line 5 of Algorithm 4).
+    pub fn begin_episode(&mut self, environment: usize) {
+        if let Self::Noise(_, noise) = self {
+            noise.reset(environment);
+        }
+    }
+
+    /// What the next step depends on besides its number, environment after environment.
+    pub(crate) fn state(&self) -> &[f64] {
+        match self {
+            Self::Noise(_, noise) => noise.state(),
+            Self::Sample(..) | Self::EpsilonGreedy(..) => &[],
+        }
+    }
+
+    /// Goes on from this state; another length than `state` has is none of this exploration.
+    pub(crate) fn restore(&mut self, state: &[f64]) {
+        if let Self::Noise(_, noise) = self {
+            noise.restore(state);
+        }
+    }
+}
+
+fn go_to(stream: &mut Stream, step: u64) {
+    stream.set_stream(step);
+    stream.set_word_pos(0);
+}
+
+/// The action that `u`, uniform in [0, 1), draws from the softmax of these logits.
+fn drawn(logits: &[f32], u: f64) -> usize {
+    let greatest = f64::from(logits[highest(logits)]);
+    let weight = |logit: &f32| (f64::from(*logit) - greatest).exp();
+    let mut left = u * logits.iter().map(weight).sum::<f64>();
+    for (action, logit) in logits.iter().enumerate() {
+        left -= weight(logit);
+        if left < 0.0 {
+            return action;
+        }
+    }
+    logits.len() - 1
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use shoal_common::config::{Reinforce, Tabular};
+    use shoal_common::space::Space;
+    use shoal_common::stream::{Purpose, stream};
+
+    fn lake(epsilon: f64) -> Exploration {
+        let spec = EnvironmentSpec {
+            observation: Space::Discrete { n: 2 },
+            action: Space::Discrete { n: 4 },
+            time_limit: 100,
+            state_width: 1,
+        };
+        let tabular = Tabular {
+            epsilon,
+            ..Tabular::default()
+        };
+        let stream = stream(7, Purpose::Exploration, 0, 0);
+        Exploration::new(&Algorithm::QLearning(tabular), &spec, 1, stream).unwrap()
+    }
+
+    /// How often each action was chosen in 4,000 steps.
+    fn counts(exploration: &mut Exploration, parameters: &[f32], observation: &[f32]) -> Vec<u32> {
+        let mut counts = vec![0; 4];
+        let mut action = [f32::NAN];
+        for step in 0..4_000 {
+            exploration.act(parameters, observation, step, &mut action);
+            counts[action[0] as usize] += 1;
+        }
+        counts
+    }
+
+    #[test]
+    fn epsilon_is_shared_by_all_actions_and_the_rest_by_the_best() {
+        let values = [0.0, 3.0, 3.0, 1.0, 0.0, 0.0, 0.0, 2.0];
+        assert_eq!(
+            counts(&mut lake(0.0), &values, &[0.0]),
+            [0, 4_000, 0, 0],
+            "the first of equals"
+        );
+        let exploring = counts(&mut lake(0.4), &values, &[1.0]);
+        // 400 each, standard deviation 19, and for the best 2,800.
+        assert!(exploring[..3].iter().all(|n| n.abs_diff(400) < 100), "{exploring:?}");
+        assert!(exploring[3].abs_diff(2_800) < 150, "{exploring:?}");
+    }
+
+    #[test]
+    fn actions_are_drawn_from_the_softmax_and_again_the_same_by_step() {
+        let spec = EnvironmentSpec {
+            observation: Space::boxed(&[(-1.0, 1.0)]),
+            action: Space::Discrete { n: 2 },
+            time_limit: 100,
+            state_width: 1,
+        };
+        let stream = stream(7, Purpose::Exploration, 0, 0);
+        let algorithm = Algorithm::Reinforce(Reinforce {
+            hidden: [1, 1],
+            ..Reinforce::default()
+        });
+        let mut policy = Exploration::new(&algorithm, &spec, 1, stream).unwrap();
+        // The logits are 0 and ln 3, whatever is observed: probabilities 1/4 and 3/4.
+        let parameters = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 3_f32.ln()];
+        let drawn = counts(&mut policy, &parameters, &[0.5]);
+        assert!(drawn[0].abs_diff(1_000) < 120 && drawn[2] == 0, "{drawn:?}");
+        assert_eq!(counts(&mut policy, &parameters, &[0.5]), drawn);
+    }
+
+    #[test]
+    fn the_last_action_takes_what_rounding_leaves() {
+        assert_eq!(drawn(&[0.0, 0.0], 1.0), 1);
+        assert_eq!(drawn(&[f32::NEG_INFINITY, 1e30], 0.0), 1);
+    }
+}

@@ -1,0 +1,78 @@
+//! DDPG over the replay: minibatches drawn at random from the newest rows (line 11 of Algorithm 4).
+
+use shoal_common::config;
+use shoal_common::policy::PolicyLayout;
+use shoal_common::space::EnvironmentSpec;
+use shoal_common::transition::RowLayout;
+
+use crate::algorithm::{Algorithm, Losses, Section};
+use crate::checkpoint::{Checkpoint, SectionError};
+use crate::ddpg::{Ddpg, DdpgError, DdpgSettings, DdpgState};
+use crate::minibatch::Minibatch;
+use crate::replay::Replay;
+use crate::sampling::Sampler;
+
+/// DDPG and its way of drawing from the replay.
+#[derive(Debug)]
+pub struct OffPolicy {
+    /// The networks.
+    pub ddpg: Ddpg,
+    sampler: Sampler,
+    batch: Minibatch,
+    indices: Vec<u64>,
+    capacity: u64,
+}
+
+impl OffPolicy {
+    /// New networks, drawn from `seed`, that learn from the newest `capacity` rows.
+    ///
+    /// # Errors
+    /// When DDPG cannot control an environment like `spec`, or a setting is out of range.
+    pub fn new(spec: &EnvironmentSpec, settings: &config::Ddpg, seed: u64, capacity: u64) -> Result<Self, DdpgError> {
+        let row = RowLayout::new(spec.observation.width(), spec.action.width());
+        Ok(Self {
+            ddpg: Ddpg::new(spec, &DdpgSettings::from(settings), seed)?,
+            sampler: Sampler::new(seed),
+            batch: Minibatch::new(row, settings.batch),
+            indices: vec![0; settings.batch],
+            capacity,
+        })
+    }
+}
+
+impl Algorithm for OffPolicy {
+    fn policy(&self) -> &[f32] {
+        self.ddpg.policy()
+    }
+
+    fn layout(&self) -> PolicyLayout {
+        PolicyLayout::Deterministic(*self.ddpg.policy_layout())
+    }
+
+    fn updates(&self) -> u64 {
+        self.ddpg.updates()
+    }
+
+    fn update(&mut self, replay: &Replay, rows: u64) -> Losses {
+        let window = replay.window(rows, self.capacity);
+        self.sampler.indices(self.ddpg.updates(), window, &mut self.indices);
+        self.batch.gather(replay, &self.indices);
+        self.ddpg.update(&self.batch)
+    }
+
+    fn state(&self) -> Vec<Section<'_>> {
+        DdpgState::PARTS.into_iter().zip(self.ddpg.state().parts).collect()
+    }
+
+    fn restore(&mut self, updates: u64, checkpoint: &mut Checkpoint) -> Result<(), SectionError> {
+        let lengths = self.ddpg.state().parts.map(<[f32]>::len);
+        let mut sections = Vec::new();
+        for (name, length) in DdpgState::PARTS.into_iter().zip(lengths) {
+            sections.push(checkpoint.take(name, length)?);
+        }
+        let parts = std::array::from_fn(|i| sections[i].as_slice());
+        // Each has the length it has here.
+        let _ = self.ddpg.restore(&DdpgState { updates, parts });
+        Ok(())
+    }
+}

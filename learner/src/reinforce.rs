@@ -1,0 +1,273 @@
+//! REINFORCE: Algorithm 3 (section 3.4.1), its variants of section 4.2.2, and the baseline of equation 3.25.
+//!
+//! Symbols as there: policy π with parameters θ, return G, baseline V with parameters θ_v, δ = G − V(s).
+//!
+//! The reading of Algorithm 3: its line 6 is averaged over an episode's time steps, and Adam takes one step an episode, so
+//! that the whole of it was collected with the policy that the step begins at. Where several actors take part a round has
+//! an episode of each, and the step follows the mean of theirs. What the other readings do is told in
+//! `docs/REPRODUCTION.md`.
+
+use nalgebra::DMatrix;
+use shoal_common::config::{self, Weight};
+use shoal_common::network::NetworkLayout;
+use shoal_common::policy::{self, PolicyError, PolicyLayout};
+use shoal_common::space::EnvironmentSpec;
+use shoal_common::transition::Transition;
+
+use crate::adam::Adam;
+use crate::algorithm::{Algorithm, Losses, Room, Section};
+use crate::aligned::Aligned;
+use crate::checkpoint::{Checkpoint, SectionError};
+use crate::initialise::glorot;
+use crate::pass::Pass;
+use crate::replay::Replay;
+
+/// Added to a standard deviation before it divides. An episode whose returns are all equal then weighs nothing.
+const SPREAD_FLOOR: f32 = 1e-8;
+
+/// A network that learns by itself, and what its optimiser remembers.
+#[derive(Clone, Debug)]
+struct Learned {
+    layout: NetworkLayout,
+    parameters: Aligned,
+    gradient: Aligned,
+    adam: Adam,
+    pass: Pass,
+    /// ∂L/∂output
+    d: DMatrix<f32>,
+}
+
+impl Learned {
+    fn new(layout: NetworkLayout, learning_rate: f64, seed: u64, index: u64, steps: usize) -> Self {
+        let parameters = glorot(&layout, seed, index);
+        Self {
+            layout,
+            gradient: Aligned::zeros(parameters.len(), 2),
+            adam: Adam::new(learning_rate, parameters.len()),
+            parameters: Aligned::from_slice(&parameters, 0),
+            pass: Pass::new(layout, steps),
+            d: DMatrix::zeros(layout.outputs(), steps),
+        }
+    }
+
+    fn forward(&mut self, s: &DMatrix<f32>) {
+        self.pass.forward(&self.parameters, s.as_slice(), &[]);
+    }
+
+    /// One step of Adam against the gradient that the first `steps` columns of `d` make of the pass before.
+    fn descend(&mut self, t: u64, steps: usize, s: &DMatrix<f32>) {
+        self.d.columns_mut(steps, s.ncols() - steps).fill(0.0);
+        self.pass
+            .backward(&self.parameters, s.as_slice(), &self.d, &mut self.gradient);
+        self.adam.step_alone(t, &self.gradient, &mut self.parameters);
+    }
+}
+
+/// The learner of REINFORCE.
+#[derive(Clone, Debug)]
+pub struct Reinforce {
+    settings: config::Reinforce,
+    policy: Learned,
+    baseline: Option<Learned>,
+    /// Rows learned from.
+    rows: u64,
+    /// Steps that Adam took, as a checkpoint keeps it: exact up to 2²⁴, more episodes than any run has.
+    steps: [f32; 1],
+    /// Room for the observations of a round, a column a time step.
+    s: DMatrix<f32>,
+}
+
+impl Reinforce {
+    /// Names of the sections that hold what was learned.
+    pub(crate) const WEIGHTS: [&'static str; 2] = ["policy", "baseline"];
+    const MOMENTS: [[&'static str; 2]; 2] = [
+        ["policy's first moment", "policy's second moment"],
+        ["baseline's first moment", "baseline's second moment"],
+    ];
+    const STEPS: &'static str = "steps of Adam";
+
+    /// New networks, drawn from `seed`, for an environment like `spec`.
+    ///
+    /// # Errors
+    /// When it has real-valued actions or counted observations.
+    pub fn new(
+        settings: &config::Reinforce,
+        spec: &EnvironmentSpec,
+        seed: u64,
+        room: Room,
+    ) -> Result<Self, PolicyError> {
+        let observation = spec.observation.width();
+        let actions = policy::softmax(settings, spec, 0)?.actions();
+        let steps = room.chunk_rows * room.actors as usize;
+        let network = NetworkLayout::policy(observation, settings.hidden, actions);
+        let baseline = (settings.weight == Weight::Baseline).then(|| {
+            let network = NetworkLayout::policy(observation, settings.baseline_hidden, 1);
+            Learned::new(network, settings.baseline_learning_rate, seed, 1, steps)
+        });
+        Ok(Self {
+            policy: Learned::new(network, settings.learning_rate, seed, 0, steps),
+            baseline,
+            settings: settings.clone(),
+            rows: 0,
+            steps: [0.0],
+            s: DMatrix::zeros(observation, steps),
+        })
+    }
+
+    /// Lines 4 to 7 for the episodes of a round, one after the other. Returns the means, over episodes and their steps, of
+    /// δ² (0 without a baseline), of −weight · ln π, and of G.
+    fn learn(&mut self, steps: &[Transition<'_>]) -> Losses {
+        let episodes: Vec<&[Transition<'_>]> = steps
+            .split_inclusive(|step| step.last)
+            .filter(|episode| self.learns_from(episode))
+            .collect();
+        if episodes.is_empty() {
+            return Losses::default();
+        }
+        self.s.fill(0.0);
+        for (mut column, step) in self.s.column_iter_mut().zip(episodes.iter().copied().flatten()) {
+            column.copy_from_slice(step.s);
+        }
+        self.policy.forward(&self.s);
+        if let Some(baseline) = &mut self.baseline {
+            baseline.forward(&self.s);
+        }
+        let (mut column, mut losses) = (0, Losses::default());
+        for episode in &episodes {
+            let share = 1.0 / (episode.len() * episodes.len()) as f32;
+            let returns = returns(episode);
+            let (mean, spread) = mean_and_spread(&returns);
+            let mut gamma_t = 1.0;
+            for (step, g) in episode.iter().zip(&returns) {
+                let weight = match (self.settings.weight, &mut self.baseline) {
+                    (Weight::Normalised, _) => (g - mean) / (spread + SPREAD_FLOOR),
+                    (_, Some(baseline)) => {
+                        // Of ½ δ², equation 3.22.
+                        let delta = g - baseline.pass.output[column];
+                        baseline.d[column] = -share * delta;
+                        losses.critic_loss += share * delta * delta;
+                        delta
+                    }
+                    (_, None) => *g,
+                };
+                let logits = self.policy.pass.output.column(column);
+                let mut d = self.policy.d.column_mut(column);
+                let action = (step.a[0] as usize).min(logits.len() - 1);
+                let ln_normaliser = ln_sum_exp(logits.as_slice());
+                // Of −weight · ln π(a|s): weight · (π(·|s) − 1[·= a]).
+                let scale = share * gamma_t * weight;
+                for (k, (d, logit)) in d.iter_mut().zip(logits.iter()).enumerate() {
+                    *d = scale * ((logit - ln_normaliser).exp() - f32::from(u8::from(k == action)));
+                }
+                losses.actor_loss -= scale * (logits[action] - ln_normaliser);
+                losses.q_mean += share * g;
+                if self.settings.discount_steps {
+                    gamma_t *= step.discount;
+                }
+                column += 1;
+            }
+        }
+        self.steps[0] += 1.0;
+        let t = self.steps[0] as u64;
+        self.policy.descend(t, column, &self.s);
+        if let Some(baseline) = &mut self.baseline {
+            baseline.descend(t, column, &self.s);
+        }
+        losses
+    }
+
+    /// Whether an episode is over, and not by the time limit where that is no lesson.
+    fn learns_from(&self, episode: &[Transition<'_>]) -> bool {
+        episode
+            .last()
+            .is_some_and(|end| end.last && (self.settings.learn_at_limit || end.discount == 0.0))
+    }
+
+    fn networks(&self) -> impl Iterator<Item = &Learned> {
+        std::iter::once(&self.policy).chain(&self.baseline)
+    }
+}
+
+/// Line 5: G of each step, from the last one back. After the last one nothing comes, whatever ended the episode.
+fn returns(episode: &[Transition<'_>]) -> Vec<f32> {
+    let mut returns: Vec<f32> = episode
+        .iter()
+        .rev()
+        .scan(0.0, |g, step| {
+            *g = step.r + if step.last { 0.0 } else { step.discount * *g };
+            Some(*g)
+        })
+        .collect();
+    returns.reverse();
+    returns
+}
+
+/// Mean and standard deviation of all the numbers.
+fn mean_and_spread(numbers: &[f32]) -> (f32, f32) {
+    let n = numbers.len() as f32;
+    let mean = numbers.iter().sum::<f32>() / n;
+    let squares: f32 = numbers.iter().map(|number| (number - mean).powi(2)).sum();
+    (mean, (squares / n).sqrt())
+}
+
+fn ln_sum_exp(logits: &[f32]) -> f32 {
+    let greatest = logits.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+    greatest + logits.iter().map(|logit| (logit - greatest).exp()).sum::<f32>().ln()
+}
+
+impl Algorithm for Reinforce {
+    fn policy(&self) -> &[f32] {
+        &self.policy.parameters
+    }
+
+    fn layout(&self) -> PolicyLayout {
+        PolicyLayout::Softmax(self.policy.layout)
+    }
+
+    fn updates(&self) -> u64 {
+        self.rows
+    }
+
+    fn update(&mut self, replay: &Replay, rows: u64) -> Losses {
+        let layout = replay.layout().row;
+        let round: Vec<Transition<'_>> = (self.rows..rows).map(|row| layout.read(replay.row(row))).collect();
+        self.rows = rows;
+        self.learn(&round)
+    }
+
+    fn state(&self) -> Vec<Section<'_>> {
+        let names = Self::WEIGHTS.into_iter().zip(Self::MOMENTS);
+        let networks = self
+            .networks()
+            .zip(names)
+            .flat_map(|(network, (name, [first, second]))| {
+                [
+                    (name, &*network.parameters),
+                    (first, &*network.adam.first_moment),
+                    (second, &*network.adam.second_moment),
+                ]
+            });
+        networks.chain([(Self::STEPS, self.steps.as_slice())]).collect()
+    }
+
+    fn restore(&mut self, updates: u64, checkpoint: &mut Checkpoint) -> Result<(), SectionError> {
+        let names = Self::WEIGHTS.into_iter().zip(Self::MOMENTS);
+        for (network, (name, [first, second])) in std::iter::once(&mut self.policy).chain(&mut self.baseline).zip(names)
+        {
+            for (numbers, name) in [
+                (&mut network.parameters, name),
+                (&mut network.adam.first_moment, first),
+                (&mut network.adam.second_moment, second),
+            ] {
+                let kept = checkpoint.take(name, numbers.len())?;
+                numbers.copy_from_slice(&kept);
+            }
+        }
+        self.steps = [checkpoint.take(Self::STEPS, 1)?[0]];
+        self.rows = updates;
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests;

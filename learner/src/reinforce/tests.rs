@@ -1,0 +1,270 @@
+use rand::RngExt;
+use shoal_common::network::Activations;
+use shoal_common::space::Space;
+use shoal_common::stream::{Purpose, stream};
+
+use super::*;
+
+const ROOM: Room = Room {
+    capacity: 100,
+    chunk_rows: 12,
+    actors: 2,
+    envs: 1,
+};
+
+fn spec() -> EnvironmentSpec {
+    EnvironmentSpec {
+        observation: Space::boxed(&[(-1.0, 1.0); 3]),
+        action: Space::Discrete { n: 3 },
+        time_limit: 12,
+        state_width: 1,
+    }
+}
+
+fn settings(weight: Weight) -> config::Reinforce {
+    config::Reinforce {
+        hidden: [7, 5],
+        baseline_hidden: [6, 4],
+        weight,
+        ..config::Reinforce::default()
+    }
+}
+
+/// Output layers as large as the others, so that every gradient is well above rounding.
+fn learner(settings: &config::Reinforce) -> Reinforce {
+    let mut learner = Reinforce::new(settings, &spec(), 1, ROOM).unwrap();
+    let mut numbers = stream(1, Purpose::Sampling, 0, 0);
+    for network in std::iter::once(&mut learner.policy).chain(&mut learner.baseline) {
+        network
+            .parameters
+            .iter_mut()
+            .for_each(|x| *x = numbers.random_range(-0.7..0.7));
+    }
+    learner
+}
+
+/// An episode's steps, each number its own; `terminated` or ended by the time limit.
+struct Episode {
+    s: Vec<[f32; 3]>,
+    a: Vec<[f32; 1]>,
+    r: Vec<f32>,
+    terminated: bool,
+}
+
+impl Episode {
+    fn random(seed: u64, steps: usize, terminated: bool) -> Self {
+        let mut numbers = stream(seed, Purpose::Environment, 0, 0);
+        Self {
+            s: (0..steps)
+                .map(|_| std::array::from_fn(|_| numbers.random_range(-1.0..1.0)))
+                .collect(),
+            a: (0..steps).map(|_| [numbers.random_range(0..3_u8).into()]).collect(),
+            r: (0..steps).map(|_| numbers.random_range(-1.0..2.0)).collect(),
+            terminated,
+        }
+    }
+
+    fn steps(&self) -> Vec<Transition<'_>> {
+        let end = self.r.len() - 1;
+        let step = |t: usize| Transition {
+            s: &self.s[t],
+            a: &self.a[t],
+            r: self.r[t],
+            discount: if t == end && self.terminated { 0.0 } else { 0.9 },
+            s_next: &[9.0; 3],
+            last: t == end,
+        };
+        (0..=end).map(step).collect()
+    }
+
+    /// Σ γᵏ r from each step on, each sum by itself.
+    fn returns(&self) -> Vec<f64> {
+        let tail = |t: usize| {
+            (t..self.r.len())
+                .map(|k| 0.9_f64.powi((k - t) as i32) * f64::from(self.r[k]))
+                .sum()
+        };
+        (0..self.r.len()).map(tail).collect()
+    }
+}
+
+/// ln π(a|s), or V(s), computed by the network alone.
+fn output(layout: &NetworkLayout, parameters: &[f32], s: &[f32]) -> Vec<f64> {
+    let [mut h1, mut h2] = layout.hidden().map(|units| vec![0.0; units]);
+    let mut out = vec![0.0; layout.outputs()];
+    let to = Activations {
+        h1: &mut h1,
+        h2: &mut h2,
+        output: &mut out,
+    };
+    layout.forward(parameters, s, &[], to);
+    out.into_iter().map(f64::from).collect()
+}
+
+fn ln_pi(layout: &NetworkLayout, parameters: &[f32], step: &Transition<'_>) -> f64 {
+    let logits = output(layout, parameters, step.s);
+    logits[step.a[0] as usize] - logits.iter().map(|logit| logit.exp()).sum::<f64>().ln()
+}
+
+/// Mean over the episodes of the mean over the steps of weight · ln π: what a step ascends.
+fn objective(layout: &NetworkLayout, parameters: &[f32], episodes: &[(&Episode, Vec<f64>)]) -> f64 {
+    let of = |(episode, weights): &(&Episode, Vec<f64>)| {
+        let steps = episode.steps();
+        let terms = steps
+            .iter()
+            .zip(weights)
+            .map(|(step, weight)| weight * ln_pi(layout, parameters, step));
+        terms.sum::<f64>() / steps.len() as f64
+    };
+    episodes.iter().map(of).sum::<f64>() / episodes.len() as f64
+}
+
+fn agrees_with_finite_differences(
+    layout: &NetworkLayout,
+    parameters: &[f32],
+    gradient: &[f32],
+    f: impl Fn(&NetworkLayout, &[f32]) -> f64,
+) {
+    let h = 2e-3;
+    let mut compared = 0;
+    for i in (0..parameters.len()).step_by(3) {
+        let mut moved = parameters.to_vec();
+        let mut at = |by: f32| {
+            moved[i] = parameters[i] + by;
+            f(layout, &moved)
+        };
+        let (plus, minus, near) = (at(h), at(-h), at(h / 4.0));
+        let slope = (plus - minus) / f64::from(2.0 * h);
+        // A ReLU that changes sides within h has no slope there.
+        if ((near - at(-h / 4.0)) / f64::from(h / 2.0) - slope).abs() > 3e-4 {
+            continue;
+        }
+        let found = f64::from(gradient[i]);
+        assert!(
+            (found - slope).abs() < 1e-3 + 1e-2 * slope.abs(),
+            "parameter {i}: {found}, and {slope}"
+        );
+        compared += 1;
+    }
+    assert!(compared > parameters.len() / 5, "only {compared} were compared");
+    assert!(gradient.iter().any(|g| g.abs() > 1e-2), "there is something to compare");
+}
+
+#[test]
+fn the_gradient_is_that_of_the_objective() {
+    let (long, short) = (Episode::random(1, 12, false), Episode::random(2, 5, true));
+    let steps = [long.steps(), short.steps()].concat();
+    for (weight, discount_steps) in [
+        (Weight::Return, false),
+        (Weight::Return, true),
+        (Weight::Normalised, false),
+    ] {
+        let settings = config::Reinforce {
+            discount_steps,
+            ..settings(weight)
+        };
+        let mut learner = learner(&settings);
+        let before = learner.policy.parameters.to_vec();
+        learner.learn(&steps);
+        let weights = |episode: &Episode| -> Vec<f64> {
+            let returns = episode.returns();
+            let n = returns.len() as f64;
+            let mean = returns.iter().sum::<f64>() / n;
+            let spread = (returns.iter().map(|g| (g - mean).powi(2)).sum::<f64>() / n).sqrt();
+            let weight_of = |(t, g): (usize, &f64)| match weight {
+                Weight::Normalised => (g - mean) / spread,
+                _ if discount_steps => 0.9_f64.powi(t as i32) * g,
+                _ => *g,
+            };
+            returns.iter().enumerate().map(weight_of).collect()
+        };
+        let episodes = [(&long, weights(&long)), (&short, weights(&short))];
+        let descended = learner.policy.gradient.to_vec();
+        agrees_with_finite_differences(&learner.policy.layout, &before, &descended, |layout, parameters| {
+            -objective(layout, parameters, &episodes)
+        });
+    }
+}
+
+#[test]
+fn the_baseline_is_taken_off_the_return_and_follows_it() {
+    let episode = Episode::random(3, 12, true);
+    let mut learner = learner(&settings(Weight::Baseline));
+    let before = learner.policy.parameters.to_vec();
+    let baseline = learner.baseline.as_ref().unwrap();
+    let (layout, values) = (baseline.layout, baseline.parameters.to_vec());
+    learner.learn(&episode.steps());
+    let deltas = |values: &[f32]| -> Vec<f64> {
+        let steps = episode.steps();
+        let each = steps.iter().zip(episode.returns());
+        each.map(|(step, g)| g - output(&layout, values, step.s)[0]).collect()
+    };
+    let weights = [(&episode, deltas(&values))];
+    let descended = learner.policy.gradient.to_vec();
+    agrees_with_finite_differences(&learner.policy.layout, &before, &descended, |layout, parameters| {
+        -objective(layout, parameters, &weights)
+    });
+    let descended = learner.baseline.as_ref().unwrap().gradient.to_vec();
+    agrees_with_finite_differences(&layout, &values, &descended, |_, values| {
+        deltas(values).iter().map(|delta| delta * delta / 2.0).sum::<f64>() / 12.0
+    });
+}
+
+#[test]
+fn only_whole_episodes_are_learned_from_and_at_the_limit_only_where_that_is_wanted() {
+    let (cut, over) = (Episode::random(1, 12, false), Episode::random(2, 5, true));
+    let mut skips = learner(&config::Reinforce {
+        learn_at_limit: false,
+        ..settings(Weight::Return)
+    });
+    let before = skips.policy.parameters.to_vec();
+    skips.learn(&cut.steps());
+    assert_eq!(*skips.policy.parameters, before);
+    assert_eq!(skips.steps, [0.0]);
+
+    let mut learns = learner(&settings(Weight::Return));
+    learns.learn(&cut.steps());
+    assert_ne!(*learns.policy.parameters, before);
+
+    // Of a round with both, the skipping one learns from the one that is over alone.
+    let mut alone = skips.clone();
+    alone.learn(&over.steps());
+    skips.learn(&[cut.steps(), over.steps()].concat());
+    assert_eq!(*skips.policy.parameters, *alone.policy.parameters);
+    let mut unfinished = learns.clone();
+    unfinished.learn(&over.steps()[..4]);
+    assert_eq!(*unfinished.policy.parameters, *learns.policy.parameters);
+}
+
+#[test]
+fn an_episode_of_equal_returns_changes_nothing_when_normalised() {
+    let mut learner = learner(&settings(Weight::Normalised));
+    let before = learner.policy.parameters.to_vec();
+    learner.learn(&Episode::random(4, 1, true).steps());
+    assert_eq!(*learner.policy.parameters, before);
+}
+
+#[test]
+fn a_state_reads_back_and_goes_on_with_the_same_bits() {
+    let rounds: Vec<Episode> = (0..4).map(|seed| Episode::random(seed, 9, true)).collect();
+    let mut straight = learner(&settings(Weight::Baseline));
+    for round in &rounds[..2] {
+        straight.learn(&round.steps());
+    }
+    let sections = straight
+        .state()
+        .into_iter()
+        .map(|(name, numbers)| (name.into(), numbers.into()));
+    let mut checkpoint = Checkpoint {
+        sections: sections.collect(),
+        ..Checkpoint::default()
+    };
+    let mut resumed = Reinforce::new(&settings(Weight::Baseline), &spec(), 2, ROOM).unwrap();
+    resumed.restore(18, &mut checkpoint).unwrap();
+    for learner in [&mut straight, &mut resumed] {
+        for round in &rounds[2..] {
+            learner.learn(&round.steps());
+        }
+    }
+    assert_eq!(straight.state(), resumed.state());
+}

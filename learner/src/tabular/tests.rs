@@ -1,0 +1,123 @@
+use shoal_common::space::Space;
+
+use super::*;
+
+const ROOM: Room = Room {
+    capacity: 100,
+    chunk_rows: 4,
+    actors: 2,
+    envs: 2,
+};
+
+fn lake(states: u32, actions: u32) -> EnvironmentSpec {
+    EnvironmentSpec {
+        observation: Space::Discrete { n: states },
+        action: Space::Discrete { n: actions },
+        time_limit: 100,
+        state_width: 1,
+    }
+}
+
+fn table(method: Method, alpha: f64) -> Tabular {
+    let settings = config::Tabular {
+        alpha,
+        ..config::Tabular::default()
+    };
+    Tabular::new(method, &settings, &lake(3, 2), ROOM).unwrap()
+}
+
+/// s, a, r, discount, s', last
+type Row = (usize, usize, f32, f32, usize, bool);
+
+fn teach(table: &mut Tabular, slot: usize, (s, a, r, discount, s_next, last): Row) {
+    let transition = Transition {
+        s: &[s as f32],
+        a: &[a as f32],
+        r,
+        discount,
+        s_next: &[s_next as f32],
+        last,
+    };
+    table.learn(&transition, slot);
+}
+
+#[test]
+fn q_learning_takes_the_best_of_the_next_state() {
+    let mut table = table(Method::QLearning, 0.5);
+    table.q = vec![1.0, 2.0, 10.0, 30.0, 0.0, 0.0];
+    teach(&mut table, 0, (0, 1, 4.0, 0.5, 1, false));
+    // 2 + ½ (4 + ½ · 30 − 2)
+    assert_eq!(table.q, [1.0, 10.5, 10.0, 30.0, 0.0, 0.0]);
+    teach(&mut table, 0, (1, 0, 1.0, 0.0, 0, true));
+    assert_eq!(table.q[2], 5.5, "nothing comes after a terminal state");
+    teach(&mut table, 0, (0, 0, 0.0, 0.5, 1, true));
+    assert_eq!(
+        table.q[0], 8.0,
+        "but something after one that the time limit cut off: 1 + ½ (½ · 30 − 1)"
+    );
+}
+
+#[test]
+fn sarsa_takes_the_action_that_was_taken_next_in_the_same_environment() {
+    let mut table = table(Method::Sarsa, 0.5);
+    table.q = vec![1.0, 2.0, 10.0, 30.0, 0.0, 0.0];
+    teach(&mut table, 0, (0, 1, 4.0, 0.5, 1, false));
+    // Another environment's step is not its successor.
+    teach(&mut table, 1, (2, 0, 0.0, 0.5, 1, false));
+    assert_eq!(table.q, [1.0, 2.0, 10.0, 30.0, 0.0, 0.0], "before a' is known");
+    teach(&mut table, 0, (1, 0, 8.0, 0.0, 2, true));
+    // 2 + ½ (4 + ½ · 10 − 2), and then 10 + ½ (8 − 10)
+    assert_eq!(table.q, [1.0, 5.5, 9.0, 30.0, 0.0, 0.0]);
+    teach(&mut table, 0, (0, 0, 100.0, 0.5, 1, true));
+    teach(&mut table, 0, (1, 0, 0.0, 0.5, 1, false));
+    assert_eq!(
+        table.q[0], 1.0,
+        "of a step that the time limit cut off nothing is known to come after"
+    );
+    // The other environment's turn: 0 + ½ (0 + ½ · 30 − 0)
+    teach(&mut table, 1, (1, 1, 0.0, 0.5, 1, false));
+    assert_eq!(table.q[4], 7.5);
+}
+
+#[test]
+fn a_row_is_of_the_environment_that_its_place_says() {
+    // Two actors with two environments each, two steps a chunk.
+    let table = table(Method::Sarsa, 0.5);
+    let slots: Vec<usize> = (0..12).map(|row| table.slot(row)).collect();
+    assert_eq!(slots, [0, 1, 0, 1, 2, 3, 2, 3, 0, 1, 0, 1]);
+}
+
+#[test]
+fn a_state_reads_back_and_anothers_is_refused() {
+    let mut old = table(Method::Sarsa, 0.5);
+    teach(&mut old, 3, (0, 1, 4.0, 0.5, 1, false));
+    teach(&mut old, 1, (1, 1, 4.0, 0.0, 1, true));
+    let sections = old
+        .state()
+        .into_iter()
+        .map(|(name, numbers)| (name.into(), numbers.into()));
+    let mut checkpoint = Checkpoint {
+        sections: sections.collect(),
+        ..Checkpoint::default()
+    };
+    let mut new = table(Method::Sarsa, 0.5);
+    new.restore(7, &mut checkpoint.clone()).unwrap();
+    assert_eq!((&new.q, &new.pending, new.updates()), (&old.q, &old.pending, 7));
+    checkpoint.sections.remove(0);
+    assert!(new.restore(7, &mut checkpoint).is_err());
+}
+
+#[test]
+fn real_numbers_are_no_states() {
+    let pendulum = EnvironmentSpec {
+        observation: Space::boxed(&[(-1.0, 1.0)]),
+        ..lake(1, 2)
+    };
+    let refused = Tabular::new(Method::Sarsa, &config::Tabular::default(), &pendulum, ROOM);
+    assert!(
+        refused
+            .unwrap_err()
+            .to_string()
+            .contains("sarsa needs a discrete observation space")
+    );
+}
