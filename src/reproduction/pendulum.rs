@@ -88,12 +88,12 @@ impl Family for Pendulum {
 
 fn claims(seeds: &[SeedResult<Tests>]) -> Vec<Claim> {
     let around_150 = |value: f64| (-190.0..=-110.0).contains(&value);
-    let measured = |of: fn(&Measures) -> f64, decimals| {
+    let measured = |of: fn(&Measures) -> f64, decimals, unit| {
         let [best, last] = [0, 1].map(|i| {
             let measures = |seed: &SeedResult<Tests>| of([&seed.tests.best, &seed.tests.last][i]);
             spread(seeds.iter().map(measures), decimals)
         });
-        format!("{best}; last policy: {last}")
+        format!("{best}{unit} (last policy {last}{unit})")
     };
     let judge = |thesis, criterion, ours, holds: fn(&Measures) -> bool| Claim {
         thesis,
@@ -107,10 +107,10 @@ fn claims(seeds: &[SeedResult<Tests>]) -> Vec<Claim> {
             criterion: "both the final evaluation (100 fixed episodes) and the mean of the last fifth of the evaluations \
                         during training lie between −190 and −110",
             ours: format!(
-                "final evaluation {}; last fifth of the evaluations {}; last policy: {}",
+                "final evaluation {} (last policy {}); last fifth of the evaluations {}",
                 spread(seeds.iter().map(|seed| seed.best.evaluation.return_mean), 1),
-                spread(seeds.iter().map(SeedResult::late_mean), 1),
-                spread(seeds.iter().map(|seed| seed.last.evaluation.return_mean), 1)
+                spread(seeds.iter().map(|seed| seed.last.evaluation.return_mean), 1),
+                spread(seeds.iter().map(SeedResult::late_mean), 1)
             ),
             held: seeds
                 .iter()
@@ -120,16 +120,16 @@ fn claims(seeds: &[SeedResult<Tests>]) -> Vec<Claim> {
         judge(
             "The pendulum swings back and forth a few times to gain momentum",
             "it turns back at least once before it is up",
-            format!("turns: {}", measured(|it| it.reversals.into(), 0)),
+            format!("turns: {}", measured(|it| it.reversals.into(), 0, "")),
             |it| it.reversals >= 1,
         ),
         judge(
             "The angle and angular velocity converge to zero",
             "at rest the angle stays below 0.1 rad, the angular velocity below 0.1 rad/s",
             format!(
-                "greatest angle at rest {} rad; greatest velocity {} rad/s",
-                measured(|it| it.angle_at_rest, 3),
-                measured(|it| it.velocity_at_rest, 3)
+                "greatest angle at rest {}; greatest velocity {}",
+                measured(|it| it.angle_at_rest, 3, " rad"),
+                measured(|it| it.velocity_at_rest, 3, " rad/s")
             ),
             |it| it.angle_at_rest < 0.1 && it.velocity_at_rest < 0.1,
         ),
@@ -137,9 +137,9 @@ fn claims(seeds: &[SeedResult<Tests>]) -> Vec<Claim> {
             "The applied torque converges to a small value",
             "at rest the torque is below 0.2 N m in the mean of its size (its range is ±2)",
             format!(
-                "torque at rest {} N m; its change from step to step {} N m",
-                measured(|it| it.torque_at_rest, 3),
-                measured(|it| it.chatter_at_rest, 3)
+                "torque at rest {}; its change from step to step {}",
+                measured(|it| it.torque_at_rest, 3, " N m"),
+                measured(|it| it.chatter_at_rest, 3, " N m")
             ),
             |it| it.torque_at_rest < 0.2,
         ),
