@@ -67,7 +67,7 @@ impl Batch<'_> {
         let mut progress = Progress::new(self.folder, self.effort, self.jobs.len(), &due)?;
         let queue = Mutex::new(due);
         let mut failures = BTreeMap::new();
-        std::thread::scope(|scope| -> anyhow::Result<()> {
+        std::thread::scope(|scope| {
             let (events, heard) = mpsc::channel();
             for _ in 0..at_once {
                 let (events, queue, signal) = (events.clone(), &queue, &*signal);
@@ -80,8 +80,9 @@ impl Batch<'_> {
                     Ok(Event::Through(job)) => progress.through(&job),
                     Ok(Event::Kept(job, steps)) => {
                         progress.kept(&job, steps);
+                        // What cannot be written now is tried again at the end, and said then.
                         if self.effort == Effort::Full {
-                            write(&failures)?;
+                            let _ = write(&failures);
                         }
                     }
                     Ok(Event::Failed(job, error)) => {
@@ -90,11 +91,11 @@ impl Batch<'_> {
                         failures.insert(job.name(), said);
                     }
                     Err(mpsc::RecvTimeoutError::Timeout) => {}
-                    Err(mpsc::RecvTimeoutError::Disconnected) => return Ok(()),
+                    Err(mpsc::RecvTimeoutError::Disconnected) => break,
                 }
                 progress.draw();
             }
-        })?;
+        });
         progress.clear();
         write(&failures)?;
         Ok(match (signal.load(Ordering::Relaxed), failures.len()) {

@@ -49,6 +49,8 @@ impl Display for Verdict {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::NotJudged => write!(f, "not judged"),
+            Self::Holds { of: 1, .. } => write!(f, "**holds** for the only seed"),
+            Self::Fails { of: 1, .. } => write!(f, "**does not hold** for the only seed"),
             Self::Holds { of, held } if of == held => write!(f, "**holds** for all {of} seeds"),
             Self::Holds { of, held } => write!(f, "**holds** for {held} of {of} seeds"),
             Self::Fails { of, held } => write!(f, "**does not hold**: for {held} of {of} seeds"),
@@ -56,7 +58,7 @@ impl Display for Verdict {
     }
 }
 
-/// Numbers of several seeds as "median [least, greatest]".
+/// Numbers of several seeds as "median [least, greatest]"; of one seed just that one.
 pub(super) fn spread(values: impl IntoIterator<Item = f64>, decimals: usize) -> String {
     let mut values: Vec<f64> = values.into_iter().collect();
     values.sort_by(f64::total_cmp);
@@ -71,6 +73,9 @@ pub(super) fn spread(values: impl IntoIterator<Item = f64>, decimals: usize) -> 
             None => text,
         }
     };
+    if values.len() == 1 {
+        return say(*least);
+    }
     format!("{} [{}, {}]", say(median(&values)), say(*least), say(*greatest))
 }
 
@@ -110,7 +115,11 @@ mod tests {
         assert_eq!(verdict(&[]), Verdict::NotJudged);
         assert_eq!(claim(&[true]).verdict(Effort::Quick), Verdict::NotJudged);
         assert_eq!(verdict(&[true; 5]).to_string(), "**holds** for all 5 seeds");
-        assert_eq!(verdict(&[false]).to_string(), "**does not hold**: for 0 of 1 seeds");
+        assert_eq!(verdict(&[false]).to_string(), "**does not hold** for the only seed");
+        assert_eq!(
+            verdict(&[false, false, true]).to_string(),
+            "**does not hold**: for 1 of 3 seeds"
+        );
     }
 
     #[test]
@@ -120,7 +129,7 @@ mod tests {
             "\u{2212}150.0 [\u{2212}160.0, \u{2212}140.0]"
         );
         assert_eq!(spread([1.0, 2.0], 2), "1.50 [1.00, 2.00]");
-        assert_eq!(spread([-0.001], 1), "0.0 [0.0, 0.0]");
+        assert_eq!(spread([-0.001], 1), "0.0");
         assert_eq!(spread([], 1), "—");
     }
 }

@@ -272,7 +272,7 @@ mod tests {
         let full = of(&[true], Effort::Full);
         for part in [
             "Of 1 claims 1 hold, 0 do not, 0 are not judged.",
-            "| it swings up | 0.01 | it is up | **holds** for all 1 seeds |",
+            "| it swings up | 0.01 | it is up | **holds** for the only seed |",
             "missing: 2",
             "![Figure 4.9](figures/swing.png)",
         ] {

@@ -13,6 +13,7 @@ use rustix::process::{Pid, Signal, kill_process};
 use shoal_common::run_dir::{RunDir, RunDirError};
 
 use super::experiment::{Effort, Experiment};
+use crate::command::eval::WhichPolicy;
 use crate::status;
 
 /// How often a training is looked at.
@@ -71,7 +72,7 @@ pub(super) fn train(
     let mut command = Command::new("/proc/self/exe");
     command.arg0("shoal");
     match Standing::of(run)? {
-        Standing::Begun(taken) if taken >= steps && last_policy_is_there(run)? => return Ok(Trained::Through),
+        Standing::Begun(_) if ended_at(run)? >= Some(steps) => return Ok(Trained::Through),
         Standing::Absent => {
             command
                 .args(["train", experiment.preset, "--lockstep", "--run"])
@@ -89,9 +90,13 @@ pub(super) fn train(
     conduct(&mut command, signal)
 }
 
-/// A run whose steps are taken has ended in order when its last policy is there.
-fn last_policy_is_there(run: &Path) -> anyhow::Result<bool> {
-    Ok(RunDir::open(run)?.last_policy().exists())
+/// The environment steps that the last policy of a run was learned from: it is written when a run ends in order.
+fn ended_at(run: &Path) -> anyhow::Result<Option<u64>> {
+    let run = RunDir::open(run)?;
+    if !run.last_policy().exists() {
+        return Ok(None);
+    }
+    Ok(Some(WhichPolicy::Last.read(&run, &run.config()?)?.env_steps))
 }
 
 fn conduct(command: &mut Command, signal: &AtomicUsize) -> anyhow::Result<Trained> {
