@@ -1,5 +1,7 @@
 //! `shoal reproduce`: what is interrupted goes on, what is there is not run again, and what is not ours is refused.
 
+#![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
+
 mod support;
 
 use std::path::{Path, PathBuf};

@@ -33,9 +33,10 @@ pub(crate) fn learning_curves(
     }
     for (i, curve) in curves.iter().enumerate() {
         let label = if i == 0 { "each seed" } else { "" };
+        let (opacity, width) = if curves.len() > 1 { (0.4, 0.9) } else { (1.0, 1.8) };
         series.push(Series {
-            opacity: 0.4,
-            width: 0.9,
+            opacity,
+            width,
             ..Series::line(label, BLUE, scaled(&mut curve.iter().copied()))
         });
     }

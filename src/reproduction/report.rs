@@ -163,12 +163,12 @@ fn compose(sections: &[(Section, Vec<String>)], effort: Effort, figures: &Path) 
         text += "> **A quick look.** A few seeds, tiny networks, hardly any steps: this shows that everything works, and \
             judges nothing.\n\n";
     }
-    let _ = write!(
+    let _ = writeln!(
         text,
         "Made by `shoal reproduce{quick}`, version {}. Each seed is a run of the whole system in lockstep, so that the same \
         seed gives the same bits on the same kind of machine. The numbers are of each run's best policy by evaluation \
         unless something else is said: the median over the seeds, with the least and the greatest in brackets. A claim \
-        holds when its criterion does for more than half of the seeds.\n",
+        holds when its criterion does for more than half of the seeds.",
         env!("CARGO_PKG_VERSION")
     );
     if effort == Effort::Full {
@@ -178,9 +178,9 @@ fn compose(sections: &[(Section, Vec<String>)], effort: Effort, figures: &Path) 
             .map(|claim| claim.verdict(effort))
             .collect();
         let count = |which: fn(&Verdict) -> bool| verdicts.iter().filter(|verdict| which(verdict)).count();
-        let _ = write!(
+        let _ = writeln!(
             text,
-            "\nOf {} claims {} hold, {} do not, {} are not judged.\n",
+            "\nOf {} claims {} hold, {} do not, {} are not judged.",
             verdicts.len(),
             count(|verdict| matches!(verdict, Verdict::Holds { .. })),
             count(|verdict| matches!(verdict, Verdict::Fails { .. })),

@@ -257,7 +257,7 @@ pub(super) mod tests {
     fn a_result_reads_back() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("seed-3.json");
-        let made = result(experiment(), 3, -150.25, vec![0.1, 3.142, -2e-5]);
+        let made = result(experiment(), 3, -150.25, vec![0.1, 3.25, -2e-5]);
         write(&made, &path).unwrap();
         assert_eq!(read::<Vec<f64>>(&path).unwrap(), made);
         let header = Header::read(&path).unwrap();
