@@ -128,7 +128,10 @@ fn a_seed_that_fails_is_missing_and_the_others_go_on() {
     assert_eq!(Reproducing::start(&place, &PENDULUM).wait().code(), Some(1));
     assert!(place.said().contains("pendulum seed 1: failed: "), "{}", place.said());
     let report = std::fs::read_to_string(place.path().join("kept/REPORT.md")).unwrap();
-    assert!(report.contains("seeds 2; missing: 1; seed 1 failed: "), "{report}");
+    assert!(
+        report.contains("seeds 2; missing: 1; seed 1 failed: pendulum/seed-1 is not"),
+        "{report}"
+    );
     assert_eq!(std::fs::read_to_string(first.join("notes.txt")).unwrap(), "mine");
     assert_eq!(starts(&second), 1);
 

@@ -86,7 +86,9 @@ impl Batch<'_> {
                         }
                     }
                     Ok(Event::Failed(job, error)) => {
-                        let said = format!("{error:#}");
+                        // The report may be read anywhere: it names places within the folder.
+                        let here = format!("{}/", self.folder.path().display());
+                        let said = format!("{error:#}").replace(&here, "");
                         progress.failed(&job, &said);
                         failures.insert(job.name(), said);
                     }

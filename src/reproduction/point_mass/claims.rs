@@ -41,6 +41,9 @@ fn near_mean(seed: &Seed, number: Number) -> f64 {
 
 /// The median over the seeds: of the best policy, and of the last.
 fn both(seeds: &[Seed], number: Number, decimals: usize, unit: &str) -> String {
+    if seeds.is_empty() {
+        return "no results".into();
+    }
     format!(
         "{} {unit} (last policy {} {unit})",
         spread(seeds.iter().map(|seed| near_mean(seed, number)), decimals),
