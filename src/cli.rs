@@ -2,10 +2,12 @@
 
 use std::path::PathBuf;
 
+use clap::builder::PossibleValuesParser;
 use clap::{Args, Parser, Subcommand};
 
 use crate::command::bench::Stage;
 use crate::command::eval::WhichPolicy;
+use crate::command::reproduce;
 
 /// Shared-memory off-policy actor-learner: distributed reinforcement learning on one machine.
 #[derive(Debug, Parser)]
@@ -31,6 +33,8 @@ pub(crate) enum Command {
     Eval(EvalArgs),
     /// Draw a run's figures.
     Plot(PlotArgs),
+    /// Run the thesis's experiments over several seeds, draw its figures, and report which of its claims hold.
+    Reproduce(ReproduceArgs),
     /// Measure a stage of the system on this machine.
     Bench(BenchArgs),
     #[command(hide = true)]
@@ -154,6 +158,29 @@ pub(crate) struct PlotArgs {
     /// Where to put the figures [default: the run directory].
     #[arg(long, value_name = "DIR")]
     pub(crate) out: Option<PathBuf>,
+}
+
+/// What is interrupted goes on when the same is typed again; what is there is not run again.
+#[derive(Args, Clone, Debug)]
+pub(crate) struct ReproduceArgs {
+    /// What to run; everything where nothing is named.
+    #[arg(value_name = "EXPERIMENT", value_parser = PossibleValuesParser::new(reproduce::choices()))]
+    pub(crate) experiments: Vec<String>,
+    /// Seeds 1 to N of each experiment [default: 5; with --quick 2].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    pub(crate) seeds: Option<u32>,
+    /// Trainings at a time [default: half the cores, for each keeps about two busy].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
+    pub(crate) jobs: Option<u16>,
+    /// A first look in a few minutes: tiny networks, hardly any steps; nothing is judged.
+    #[arg(long)]
+    pub(crate) quick: bool,
+    /// Where runs, results and figures lie [default: runs/reproduction; with --quick runs/reproduction-quick].
+    #[arg(long, value_name = "DIR")]
+    pub(crate) out: Option<PathBuf>,
+    /// Where to write the report [default: REPORT.md in that directory].
+    #[arg(long, value_name = "FILE")]
+    pub(crate) report: Option<PathBuf>,
 }
 
 #[derive(Args, Clone, Debug)]

@@ -7,11 +7,13 @@ mod launcher;
 mod plan;
 mod recorder;
 mod remote;
+mod reproduction;
 mod role;
 mod rollout;
 mod room;
 mod status;
 mod tensorboard;
+mod test_run;
 
 use std::io::Write;
 use std::process::ExitCode;
@@ -51,6 +53,7 @@ fn run(command: &Command) -> anyhow::Result<ExitCode> {
         Command::Stop(args) => command::stop::run(args).map(done),
         Command::Eval(args) => command::eval::run(args).map(done),
         Command::Plot(args) => command::plot::run(args).map(done),
+        Command::Reproduce(args) => command::reproduce::run(args),
         Command::Bench(args) => command::bench::run(args).map(done),
         Command::EnvServer(args) => role::run(Role::EnvServer, args).map(done),
         Command::Actor(args) => role::run(Role::Actor, args).map(done),

@@ -224,5 +224,10 @@ pub(crate) fn read_evaluations(path: &Path) -> Result<Vec<Evaluation>, RecordErr
     table::rows(path)
 }
 
+/// Environment steps of a run by its records; none before the first row.
+pub(crate) fn recorded_steps(run: &RunDir) -> Result<Option<u64>, RecordError> {
+    Ok(table::last::<Learner>(&run.learner_log())?.map(|row| row.env_steps))
+}
+
 #[cfg(test)]
 mod tests;

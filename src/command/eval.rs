@@ -4,7 +4,7 @@ use std::io::Write;
 
 use comfy_table::Table;
 use comfy_table::presets::UTF8_BORDERS_ONLY;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use shoal_actor::evaluator::mean_and_std;
 use shoal_common::config::Config;
 use shoal_common::policy_file::PolicyFile;
@@ -12,9 +12,7 @@ use shoal_common::run_dir::RunDir;
 
 use crate::cli::EvalArgs;
 use crate::rollout::{Rollout, Trajectory, policy_layout};
-
-/// Distance below which a vehicle has reached the goal, in m.
-const REACHED: f64 = 0.05;
+use crate::test_run::point_mass::REACHED;
 
 /// One of a run's policies.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
@@ -38,17 +36,17 @@ impl WhichPolicy {
 }
 
 /// How a policy did; the fields of `eval --json`.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct EvaluationSummary {
     pub(crate) return_mean: f64,
     /// Of the sample: n − 1. 0 for a single episode.
     pub(crate) return_std: f64,
     pub(crate) episodes: u32,
     /// Of a point mass: the mean distance to the goal at the end, in m.
-    #[serde(skip_serializing_if = "Option::is_none")]
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(crate) final_distance_mean: Option<f64>,
     /// Of a point mass: the share of episodes that end within 0.05 m of the goal.
-    #[serde(skip_serializing_if = "Option::is_none")]
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(crate) reached_fraction: Option<f64>,
 }
 

@@ -1,6 +1,5 @@
 //! `shoal plot`: the pictures of a run.
 
-use std::f64::consts::PI;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
@@ -10,22 +9,11 @@ use shoal_common::run_dir::RunDir;
 
 use super::eval::WhichPolicy;
 use crate::cli::PlotArgs;
-use crate::figure::{self, TestRun};
+use crate::figure;
 use crate::recorder::read_evaluations;
 use crate::rollout::Rollout;
-
-/// Start positions of the thesis, (x, y) in m: those of appendix A.2 in its order, and those of section 5.3.
-const FAR_STARTS: [[f64; 2]; 8] = [
-    [3.0, 3.0],
-    [3.0, 0.0],
-    [3.0, -3.0],
-    [0.0, -3.0],
-    [-3.0, -3.0],
-    [-3.0, 0.0],
-    [-3.0, 3.0],
-    [0.0, 3.0],
-];
-const NEAR_STARTS: [[f64; 2]; 4] = [[2.0, -2.0], [-2.0, 2.0], [2.0, 2.0], [-2.0, -2.0]];
+use crate::test_run::pendulum::SwingUp;
+use crate::test_run::point_mass::{Drive, FAR_STARTS, NEAR_STARTS};
 
 /// Draws what there is to draw of a run, and says where it is.
 pub(crate) fn run(args: &PlotArgs) -> anyhow::Result<()> {
@@ -60,23 +48,14 @@ fn behaviour(run: &RunDir, config: &Config, out: &Path) -> anyhow::Result<Vec<Pa
     let mut rollout = Rollout::new(config, &policy.parameters)?;
     if name == "pendulum" {
         let path = out.join("swing-up.svg");
-        figure::swing_up(&rollout.episode_from(&[PI, 0.0])?, PI, &path)?;
+        figure::swing_up(&SwingUp::run(&mut rollout)?, &path)?;
         return Ok(vec![path]);
     }
-    let mut from = |starts: &[[f64; 2]]| -> anyhow::Result<Vec<TestRun>> {
-        let run = |&[x, y]: &[f64; 2]| {
-            Ok(TestRun {
-                start: [x, y],
-                trajectory: rollout.episode_from(&[x, y, 0.0, 0.0])?,
-            })
-        };
-        starts.iter().map(run).collect()
-    };
     let files = ["test-runs.svg", "test-runs-far.svg", "trajectories.svg"].map(|file| out.join(file));
-    figure::test_runs(&from(starts_shown(config))?, &files[0])?;
-    let mut runs = from(&FAR_STARTS)?;
+    figure::test_runs(&Drive::run_from(&mut rollout, starts_shown(config))?, &files[0])?;
+    let mut runs = Drive::run_from(&mut rollout, &FAR_STARTS)?;
     figure::test_runs(&runs, &files[1])?;
-    runs.extend(from(&NEAR_STARTS)?);
+    runs.extend(Drive::run_from(&mut rollout, &NEAR_STARTS)?);
     figure::trajectories(&runs, &files[2])?;
     Ok(files.into())
 }

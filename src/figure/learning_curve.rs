@@ -18,11 +18,7 @@ pub(crate) fn learning_curve(evaluations: &[Evaluation], path: &Path) -> anyhow:
         .last()
         .map_or(0, |evaluation| evaluation.env_steps)
         .max(1_000);
-    let (unit, label) = match last {
-        0..20_000 => (1.0, "environment steps"),
-        20_000..20_000_000 => (1e3, "environment steps (thousands)"),
-        _ => (1e6, "environment steps (millions)"),
-    };
+    let (unit, label) = unit_of(last);
     let raw: Vec<_> = evaluations
         .iter()
         .map(|e| (e.env_steps as f64 / unit, e.return_mean))
@@ -81,6 +77,15 @@ pub(crate) fn learning_curve(evaluations: &[Evaluation], path: &Path) -> anyhow:
         }
         Ok(())
     })
+}
+
+/// In what steps are counted on an axis that reaches to `last`.
+pub(super) fn unit_of(last: u64) -> (f64, &'static str) {
+    match last {
+        0..20_000 => (1.0, "environment steps"),
+        20_000..20_000_000 => (1e3, "environment steps (thousands)"),
+        _ => (1e6, "environment steps (millions)"),
+    }
 }
 
 /// How many evaluations are averaged: about a twelfth of them, an odd number, and 1 where there is nothing to smooth.

@@ -29,6 +29,8 @@ pub(super) struct Axis<'a> {
 #[derive(Clone, Copy)]
 pub(super) enum Look {
     Line,
+    /// The inside of the polygon that the points go round.
+    Area,
     Dots,
     Rings,
     Crosses,
@@ -126,6 +128,11 @@ impl Panel<'_> {
             let line = stroke(series.color, series.opacity, series.width);
             match series.look {
                 Look::Line => chart.draw_series(LineSeries::new(finite, line))?,
+                Look::Area => {
+                    let outline: Vec<_> = finite.collect();
+                    let fill = series.color.mix(series.opacity).filled();
+                    chart.draw_series((!outline.is_empty()).then(|| Polygon::new(outline, fill)))?
+                }
                 Look::Dots => {
                     let fill = series.color.mix(series.opacity).filled();
                     chart.draw_series(finite.map(|point| Circle::new(point, px(series.width), fill)))?
@@ -145,6 +152,10 @@ impl Panel<'_> {
             let (left, centre, right) = ((px(x), middle), (px(x + 10.0), middle), (px(x + 20.0), middle));
             match series.look {
                 Look::Line => header.draw(&PathElement::new([left, right], style))?,
+                Look::Area => {
+                    let corners = [(px(x), middle - px(5.0)), (px(x + 20.0), middle + px(5.0))];
+                    header.draw(&Rectangle::new(corners, series.color.mix(series.opacity).filled()))?;
+                }
                 Look::Dots => header.draw(&Circle::new(centre, px(series.width), series.color.filled()))?,
                 Look::Rings => header.draw(&Circle::new(centre, px(4.5), style))?,
                 Look::Crosses => header.draw(&Cross::new(centre, px(4.5), style))?,

@@ -6,55 +6,30 @@ use std::path::Path;
 
 use super::canvas::{Area, BLUE, GREEN, INK, VERMILION, save};
 use super::panel::{Axis, Look, Panel, Series, range_of};
-use crate::rollout::Trajectory;
+use crate::test_run::point_mass::Drive;
 
 /// Width and height of a diagram, in pixels.
-const CELL: (u32, u32) = (400, 330);
+pub(super) const CELL: (u32, u32) = (400, 330);
 
-/// An episode from a chosen start position, at rest.
-pub(crate) struct TestRun {
-    /// (x, y) in m; the goal is the origin.
-    pub(crate) start: [f64; 2],
-    pub(crate) trajectory: Trajectory,
-}
-
-impl TestRun {
-    fn path(&self) -> Vec<(f64, f64)> {
-        self.trajectory
-            .observations
-            .iter()
-            .map(|o| (o[0].into(), o[1].into()))
-            .collect()
-    }
-
-    fn distances(&self) -> Vec<(f64, f64)> {
-        over_steps(self.trajectory.observations.iter().map(|o| o[4].into()))
-    }
-
-    fn final_distance(&self) -> f64 {
-        self.trajectory.observations.last().map_or(f64::NAN, |o| o[4].into())
-    }
+pub(super) fn distances(run: &Drive) -> Vec<(f64, f64)> {
+    over_steps(run.distances())
 }
 
 /// Draws each run in a row of its own: path, distance, actions, rewards.
-pub(crate) fn test_runs(runs: &[TestRun], path: &Path) -> anyhow::Result<()> {
+pub(crate) fn test_runs(runs: &[Drive], path: &Path) -> anyhow::Result<()> {
     let rewards = range_of(
         runs.iter()
-            .flat_map(|run| run.trajectory.rewards.iter().copied())
+            .flat_map(|run| run.rewards.iter().copied())
             .chain([0.0, 1.0]),
     );
-    let farthest = runs
-        .iter()
-        .flat_map(TestRun::distances)
-        .map(|(_, d)| d)
-        .fold(1.0, f64::max);
+    let farthest = runs.iter().flat_map(distances).map(|(_, d)| d).fold(1.0, f64::max);
     let size = (4 * CELL.0, (runs.len().max(1) as u32) * CELL.1);
     save(path, size, |sheet| {
         let cells = sheet.split_evenly((runs.len().max(1), 4));
         for (run, row) in runs.iter().zip(cells.chunks_exact(4)) {
             draw_path(run, &row[0])?;
-            draw_distance(run, farthest, &row[1])?;
-            draw_actions(run, &row[2])?;
+            draw_distance("Distance to goal", run, farthest, &row[1])?;
+            draw_actions("Control actions", run, &row[2])?;
             draw_rewards(run, rewards.clone(), &row[3])?;
         }
         Ok(())
@@ -62,22 +37,18 @@ pub(crate) fn test_runs(runs: &[TestRun], path: &Path) -> anyhow::Result<()> {
 }
 
 /// Draws the paths of all runs in one diagram, and their distances in another.
-pub(crate) fn trajectories(runs: &[TestRun], path: &Path) -> anyhow::Result<()> {
-    let extent = extent(runs.iter().flat_map(TestRun::path));
+pub(crate) fn trajectories(runs: &[Drive], path: &Path) -> anyhow::Result<()> {
+    let extent = extent(runs.iter().flat_map(Drive::path));
     let thin = |points| Series {
         opacity: 0.75,
         width: 1.4,
         ..Series::line("", BLUE, points)
     };
-    let mut ways: Vec<_> = runs.iter().map(|run| thin(run.path())).collect();
+    let mut ways: Vec<_> = runs.iter().map(|run| thin(run.path().collect())).collect();
     ways.push(starts(runs.iter().map(|run| (run.start[0], run.start[1])).collect()));
     ways.push(goal());
-    let farthest = runs
-        .iter()
-        .flat_map(TestRun::distances)
-        .map(|(_, d)| d)
-        .fold(1.0, f64::max);
-    let mean = runs.iter().map(TestRun::final_distance).sum::<f64>() / runs.len().max(1) as f64;
+    let farthest = runs.iter().flat_map(distances).map(|(_, d)| d).fold(1.0, f64::max);
+    let mean = runs.iter().map(Drive::final_distance).sum::<f64>() / runs.len().max(1) as f64;
     let note = format!("mean at the end: {mean:.3} m");
     let paths = Panel {
         title: "Trajectories",
@@ -96,12 +67,12 @@ pub(crate) fn trajectories(runs: &[TestRun], path: &Path) -> anyhow::Result<()> 
     let distances = Panel {
         title: "Distance to goal",
         note: &note,
-        x: time_steps(runs.iter().map(|run| run.trajectory.actions.len()).max()),
+        x: time_steps(runs.iter().map(|run| run.steps()).max()),
         y: Axis {
             label: "distance (m)",
             range: 0.0..1.05 * farthest,
         },
-        series: runs.iter().map(|run| thin(run.distances())).collect(),
+        series: runs.iter().map(|run| thin(distances(run))).collect(),
         equal_scale: false,
     };
     save(path, (1160, 560), |sheet| {
@@ -111,9 +82,9 @@ pub(crate) fn trajectories(runs: &[TestRun], path: &Path) -> anyhow::Result<()> 
     })
 }
 
-fn draw_path(run: &TestRun, area: &Area<'_>) -> anyhow::Result<()> {
+pub(super) fn draw_path(run: &Drive, area: &Area<'_>) -> anyhow::Result<()> {
     let [x, y] = run.start;
-    let extent = extent(run.path().into_iter());
+    let extent = extent(run.path());
     let panel = Panel {
         title: &format!("From ({x}, {y})").replace('-', "\u{2212}"),
         note: "",
@@ -125,34 +96,38 @@ fn draw_path(run: &TestRun, area: &Area<'_>) -> anyhow::Result<()> {
             label: "y (m)",
             range: extent,
         },
-        series: vec![Series::line("", BLUE, run.path()), starts(vec![(x, y)]), goal()],
+        series: vec![
+            Series::line("", BLUE, run.path().collect()),
+            starts(vec![(x, y)]),
+            goal(),
+        ],
         equal_scale: true,
     };
     panel.draw(area)
 }
 
-fn draw_distance(run: &TestRun, farthest: f64, area: &Area<'_>) -> anyhow::Result<()> {
+pub(super) fn draw_distance(title: &str, run: &Drive, farthest: f64, area: &Area<'_>) -> anyhow::Result<()> {
     let panel = Panel {
-        title: "Distance to goal",
+        title,
         note: &format!("{:.3} m at the end", run.final_distance()),
-        x: time_steps(Some(run.trajectory.actions.len())),
+        x: time_steps(Some(run.steps())),
         y: Axis {
             label: "distance (m)",
             range: 0.0..1.05 * farthest,
         },
-        series: vec![Series::line("", BLUE, run.distances())],
+        series: vec![Series::line("", BLUE, distances(run))],
         equal_scale: false,
     };
     panel.draw(area)
 }
 
-fn draw_actions(run: &TestRun, area: &Area<'_>) -> anyhow::Result<()> {
-    let direction = over_steps(run.trajectory.actions.iter().map(|a| f64::from(a[0]) / PI));
-    let force = over_steps(run.trajectory.actions.iter().map(|a| a[1].into()));
+pub(super) fn draw_actions(title: &str, run: &Drive, area: &Area<'_>) -> anyhow::Result<()> {
+    let direction = over_steps(run.direction.iter().map(|theta| theta / PI));
+    let force = over_steps(run.force.iter().copied());
     let panel = Panel {
-        title: "Control actions",
+        title,
         note: "",
-        x: time_steps(Some(run.trajectory.actions.len())),
+        x: time_steps(Some(run.steps())),
         y: Axis {
             label: "force (N), direction / π",
             range: -1.1..2.1,
@@ -172,30 +147,26 @@ fn draw_actions(run: &TestRun, area: &Area<'_>) -> anyhow::Result<()> {
     panel.draw(area)
 }
 
-fn draw_rewards(run: &TestRun, range: Range<f64>, area: &Area<'_>) -> anyhow::Result<()> {
+fn draw_rewards(run: &Drive, range: Range<f64>, area: &Area<'_>) -> anyhow::Result<()> {
     let panel = Panel {
         title: "Rewards",
-        note: &format!("return {:.1}", run.trajectory.episode_return()).replace('-', "\u{2212}"),
-        x: time_steps(Some(run.trajectory.actions.len())),
+        note: &format!("return {:.1}", run.episode_return()).replace('-', "\u{2212}"),
+        x: time_steps(Some(run.steps())),
         y: Axis { label: "reward", range },
-        series: vec![Series::line(
-            "",
-            GREEN,
-            over_steps(run.trajectory.rewards.iter().copied()),
-        )],
+        series: vec![Series::line("", GREEN, over_steps(run.rewards.iter().copied()))],
         equal_scale: false,
     };
     panel.draw(area)
 }
 
-fn starts<'a>(points: Vec<(f64, f64)>) -> Series<'a> {
+pub(super) fn starts<'a>(points: Vec<(f64, f64)>) -> Series<'a> {
     Series {
         look: Look::Rings,
         ..Series::line("start", INK, points)
     }
 }
 
-fn goal<'a>() -> Series<'a> {
+pub(super) fn goal<'a>() -> Series<'a> {
     Series {
         look: Look::Crosses,
         width: 2.2,
@@ -203,11 +174,11 @@ fn goal<'a>() -> Series<'a> {
     }
 }
 
-fn over_steps(values: impl Iterator<Item = f64>) -> Vec<(f64, f64)> {
+pub(super) fn over_steps(values: impl Iterator<Item = f64>) -> Vec<(f64, f64)> {
     values.enumerate().map(|(t, value)| (t as f64, value)).collect()
 }
 
-fn time_steps<'a>(steps: Option<usize>) -> Axis<'a> {
+pub(super) fn time_steps<'a>(steps: Option<usize>) -> Axis<'a> {
     Axis {
         label: "time step",
         range: 0.0..steps.unwrap_or(1).max(1) as f64,
@@ -215,7 +186,7 @@ fn time_steps<'a>(steps: Option<usize>) -> Axis<'a> {
 }
 
 /// A square around the goal that holds all the points.
-fn extent(points: impl Iterator<Item = (f64, f64)>) -> Range<f64> {
+pub(super) fn extent(points: impl Iterator<Item = (f64, f64)>) -> Range<f64> {
     let reach = points
         .flat_map(|(x, y)| [x.abs(), y.abs()])
         .filter(|r| r.is_finite())
@@ -226,29 +197,10 @@ fn extent(points: impl Iterator<Item = (f64, f64)>) -> Range<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::test_run::point_mass::tests::drive;
 
-    fn run(start: [f64; 2]) -> TestRun {
-        let position = |t: i32| {
-            let left = (-f64::from(t) / 30.0).exp();
-            let bend = 0.6 * left * (1.0 - left);
-            [start[0] * left - start[1] * bend, start[1] * left + start[0] * bend]
-        };
-        let observation = |t| {
-            let [x, y] = position(t);
-            [x, y, 0.0, 0.0, x.hypot(y), 0.0].map(|v| v as f32).to_vec()
-        };
-        let left = |t: i32| (-t as f32 / 30.0).exp();
-        let trajectory = Trajectory {
-            observations: (0..=200).map(observation).collect(),
-            actions: (0..200)
-                .map(|t| vec![2.5 - left(t) * (t as f32 / 3.0).sin(), 2.0 * left(t)])
-                .collect(),
-            rewards: (0..200)
-                .map(|t| if t < 110 { 0.4 * f64::from(left(t)) } else { 1.95 })
-                .collect(),
-            terminated: false,
-        };
-        TestRun { start, trajectory }
+    fn run(start: [f64; 2]) -> Drive {
+        drive(start, 0.01, 0.3, 1.5, 0.1)
     }
 
     #[test]

@@ -1,0 +1,108 @@
+//! The thesis's experiments, run through the system itself over several seeds; what is kept of each, and the report.
+//!
+//! A new experiment is a file with a [`family::Family`] and a line in [`FAMILIES`].
+
+mod batch;
+mod claim;
+mod experiment;
+mod family;
+mod folder;
+mod pendulum;
+mod point_mass;
+mod progress;
+mod report;
+mod result;
+mod settings;
+mod training;
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+use anyhow::Context;
+
+use self::batch::{Batch, Job};
+pub(crate) use self::experiment::Effort;
+use self::experiment::Experiment;
+use self::family::{Entry, entry};
+use self::folder::Folder;
+use self::settings::Settings;
+
+/// Every family, in the report's order.
+const FAMILIES: [Entry; 2] = [entry::<pendulum::Pendulum>(), entry::<point_mass::PointMass>()];
+
+/// What is to be reproduced, and how.
+#[derive(Clone, Debug)]
+pub(crate) struct Order {
+    /// Names of experiments; all of them where it is empty.
+    pub(crate) experiments: Vec<String>,
+    /// Seeds 1 to this one; as many as each experiment has by itself where it is none.
+    pub(crate) seeds: Option<u32>,
+    /// Trainings at a time.
+    pub(crate) jobs: usize,
+    pub(crate) effort: Effort,
+    pub(crate) folder: PathBuf,
+    pub(crate) report: PathBuf,
+}
+
+/// How it went.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Ending {
+    /// Every result that was asked for is there.
+    Complete,
+    /// So many seeds have failed.
+    Failed(usize),
+    /// By this signal; every training has saved its state.
+    Interrupted(i32),
+}
+
+/// The experiments that can be asked for.
+pub(crate) fn names() -> impl Iterator<Item = &'static str> {
+    experiments().map(|(_, experiment)| experiment.name)
+}
+
+/// Runs what is due, keeps each result, and writes the report from all results of the folder.
+pub(crate) fn run(order: &Order) -> anyhow::Result<Ending> {
+    let folder = Folder::open(&order.folder)?;
+    let settings = expected(&folder, order.effort)?;
+    let wanted = experiments()
+        .filter(|(_, it)| order.experiments.is_empty() || order.experiments.iter().any(|name| name == it.name));
+    let jobs: Vec<Job> = wanted
+        .flat_map(|(family, experiment)| {
+            let seeds = order.seeds.unwrap_or(experiment.seeds(order.effort));
+            (1..=u64::from(seeds)).map(move |seed| Job {
+                family,
+                experiment,
+                seed,
+            })
+        })
+        .collect();
+    // What does not belong here is refused before anything starts.
+    for (_, experiment) in experiments() {
+        folder.check(experiment, order.effort, &settings[experiment.name])?;
+    }
+    let write = |failures: &BTreeMap<_, _>| {
+        report::write(&FAMILIES, &folder, order, &jobs, failures)
+            .with_context(|| format!("cannot write the report {}", order.report.display()))
+    };
+    let batch = Batch {
+        folder: &folder,
+        effort: order.effort,
+        jobs: &jobs,
+        settings: &settings,
+    };
+    batch.run(order.jobs, write)
+}
+
+fn experiments() -> impl Iterator<Item = (&'static Entry, &'static Experiment)> {
+    const ENTRIES: &[Entry] = &FAMILIES;
+    ENTRIES
+        .iter()
+        .flat_map(|entry| entry.experiments.iter().map(move |experiment| (entry, experiment)))
+}
+
+/// With which settings each experiment is run by this program.
+fn expected(folder: &Folder, effort: Effort) -> anyhow::Result<BTreeMap<&'static str, Settings>> {
+    experiments()
+        .map(|(_, experiment)| Ok((experiment.name, Settings::expected(experiment, effort, folder)?)))
+        .collect()
+}

@@ -1,0 +1,170 @@
+//! Which seeds are due, so many of them at a time, until all are through or a signal comes.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, PoisonError, mpsc};
+use std::time::Duration;
+
+use anyhow::{Context, bail};
+use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
+
+use super::Ending;
+use super::experiment::{Effort, Experiment};
+use super::family::Entry;
+use super::folder::Folder;
+use super::progress::Progress;
+use super::settings::Settings;
+use super::training::{Standing, Trained, train};
+
+/// How often the live line is drawn.
+const ROUND: Duration = Duration::from_secs(1);
+
+/// One seed of one experiment, through all its stages.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Job {
+    pub(super) family: &'static Entry,
+    pub(super) experiment: &'static Experiment,
+    pub(super) seed: u64,
+}
+
+/// What names a job.
+pub(super) type Name = (&'static str, u64);
+
+impl Job {
+    pub(super) fn name(&self) -> Name {
+        (self.experiment.name, self.seed)
+    }
+}
+
+/// Seeds to bring through, in a folder.
+pub(super) struct Batch<'a> {
+    pub(super) folder: &'a Folder,
+    pub(super) effort: Effort,
+    pub(super) jobs: &'a [Job],
+    pub(super) settings: &'a BTreeMap<&'static str, Settings>,
+}
+
+/// What a worker tells.
+enum Event {
+    Begun(Job),
+    /// A result is there.
+    Kept(Job, u64),
+    /// All of a job's results are there.
+    Through(Job),
+    Failed(Job, anyhow::Error),
+}
+
+impl Batch<'_> {
+    /// Brings all seeds through, `at_once` of them side by side. `write` is called whenever there is something new to
+    /// report, and at the end.
+    pub(super) fn run(
+        &self,
+        at_once: usize,
+        write: impl Fn(&BTreeMap<Name, String>) -> anyhow::Result<()>,
+    ) -> anyhow::Result<Ending> {
+        let signal = watch()?;
+        let due: VecDeque<Job> = self.jobs.iter().copied().filter(|job| self.is_due(job)).collect();
+        let mut progress = Progress::new(self.folder, self.effort, self.jobs.len(), &due)?;
+        let queue = Mutex::new(due);
+        let mut failures = BTreeMap::new();
+        std::thread::scope(|scope| {
+            let (events, heard) = mpsc::channel();
+            for _ in 0..at_once {
+                let (events, queue, signal) = (events.clone(), &queue, &*signal);
+                scope.spawn(move || self.work(queue, signal, &events));
+            }
+            drop(events);
+            loop {
+                match heard.recv_timeout(ROUND) {
+                    Ok(Event::Begun(job)) => progress.begun(job),
+                    Ok(Event::Through(job)) => progress.through(&job),
+                    Ok(Event::Kept(job, steps)) => {
+                        progress.kept(&job, steps);
+                        // What cannot be written now is tried again at the end, and said then.
+                        if self.effort == Effort::Full {
+                            let _ = write(&failures);
+                        }
+                    }
+                    Ok(Event::Failed(job, error)) => {
+                        // The report may be read anywhere: it names places within the folder.
+                        let here = format!("{}/", self.folder.path().display());
+                        let said = format!("{error:#}").replace(&here, "");
+                        progress.failed(&job, &said);
+                        failures.insert(job.name(), said);
+                    }
+                    Err(mpsc::RecvTimeoutError::Timeout) => {}
+                    Err(mpsc::RecvTimeoutError::Disconnected) => break,
+                }
+                progress.draw();
+            }
+        });
+        progress.clear();
+        write(&failures)?;
+        Ok(match (signal.load(Ordering::Relaxed), failures.len()) {
+            (0, 0) => Ending::Complete,
+            (0, failed) => Ending::Failed(failed),
+            (signal, _) => Ending::Interrupted(signal as i32),
+        })
+    }
+
+    fn is_due(&self, job: &Job) -> bool {
+        let stages = job.experiment.stages.iter();
+        stages
+            .map(|stage| self.folder.result(job.experiment, stage, job.seed))
+            .any(|result| !result.exists())
+    }
+
+    /// Takes one job after the other until there is none, or a signal has come.
+    fn work(&self, queue: &Mutex<VecDeque<Job>>, signal: &AtomicUsize, events: &mpsc::Sender<Event>) {
+        let next = || {
+            let mut queue = queue.lock().unwrap_or_else(PoisonError::into_inner);
+            queue.pop_front().filter(|_| signal.load(Ordering::Relaxed) == 0)
+        };
+        while let Some(job) = next() {
+            // Nobody listens only where the report could not be written; then the seed is brought through all the same.
+            let _ = events.send(Event::Begun(job));
+            match self.bring_through(job, signal, events) {
+                Ok(Trained::Through) => _ = events.send(Event::Through(job)),
+                Ok(Trained::Interrupted) => return,
+                Err(error) => _ = events.send(Event::Failed(job, error)),
+            }
+        }
+    }
+
+    fn bring_through(&self, job: Job, signal: &AtomicUsize, events: &mpsc::Sender<Event>) -> anyhow::Result<Trained> {
+        let Job {
+            family,
+            experiment,
+            seed,
+        } = job;
+        let run = self.folder.run(experiment, seed);
+        for stage in experiment.stages {
+            if self.folder.result(experiment, stage, seed).exists() {
+                continue;
+            }
+            let steps = stage.steps(self.effort);
+            if Standing::of(&run)?.steps() > steps {
+                bail!(
+                    "{} is beyond {steps} steps, and its result there was not kept: remove the run to begin it again",
+                    run.display()
+                );
+            }
+            if train(experiment, self.effort, seed, steps, &run, signal)? == Trained::Interrupted {
+                return Ok(Trained::Interrupted);
+            }
+            (family.keep)(self.folder, experiment, stage, seed, &self.settings[experiment.name])?;
+            let _ = events.send(Event::Kept(job, steps));
+        }
+        Ok(Trained::Through)
+    }
+}
+
+/// The signal that has come, 0 before.
+fn watch() -> anyhow::Result<Arc<AtomicUsize>> {
+    let signal = Arc::new(AtomicUsize::new(0));
+    for number in [SIGINT, SIGTERM, SIGHUP] {
+        signal_hook::flag::register_usize(number, Arc::clone(&signal), number as usize)
+            .context("cannot watch for signals")?;
+    }
+    Ok(signal)
+}

@@ -1,0 +1,130 @@
+//! With which settings a run was made: its configuration but for its name, its seed and its length.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use anyhow::{Context, bail};
+use serde::{Deserialize, Serialize};
+use shoal_common::config::Config;
+use shoal_common::run_dir::RunDir;
+use toml::Value;
+
+use super::experiment::{Effort, Experiment};
+use super::folder::Folder;
+use crate::cli::{Telling, TrainArgs};
+use crate::plan::Plan;
+
+/// Keys with their sections, and values as TOML.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) struct Settings(BTreeMap<String, String>);
+
+impl Settings {
+    /// Those of a run.
+    pub(super) fn of(config: &Config) -> anyhow::Result<Self> {
+        let mut settings = BTreeMap::new();
+        flatten("", toml::Value::try_from(config)?, &mut settings);
+        settings
+            .retain(|key, _| !["run.id", "run.seed", "run.steps"].contains(&key.as_str()) && !key.starts_with("spec."));
+        Ok(Self(settings))
+    }
+
+    /// Those of the run in a directory, which must be of this seed.
+    pub(super) fn of_run(run: &Path, seed: u64) -> anyhow::Result<Self> {
+        let config = RunDir::open(run)?.config()?;
+        if config.run.seed != seed {
+            bail!(
+                "{} has seed {}, not {seed}: remove it, or choose another directory with --out",
+                run.display(),
+                config.run.seed
+            );
+        }
+        Self::of(&config)
+    }
+
+    /// Those that a run of `experiment` would have. They are the plan's to decide: it is made, read, and thrown away.
+    pub(super) fn expected(experiment: &Experiment, effort: Effort, folder: &Folder) -> anyhow::Result<Self> {
+        let place = tempfile::tempdir_in(folder.path())
+            .with_context(|| format!("cannot make a directory in {}", folder.path().display()))?;
+        let plan = Plan::new(&TrainArgs {
+            what: experiment.preset.into(),
+            run: Some(place.path().join("plan")),
+            seed: Some(1),
+            actors: None,
+            envs: None,
+            steps: experiment.stages.first().map(|stage| stage.steps(effort)),
+            lockstep: true,
+            set: experiment.settings(effort).map(Into::into).collect(),
+            telling: Telling::default(),
+        })?;
+        Self::of(&plan.config)
+    }
+
+    /// Refuses what was made with other settings. A key that only one of them knows is of another version of this program
+    /// and says nothing.
+    pub(super) fn check(&self, made: &Path, expected: &Self) -> anyhow::Result<()> {
+        for (key, found) in &self.0 {
+            if let Some(wanted) = expected.0.get(key).filter(|wanted| *wanted != found) {
+                bail!(
+                    "{} was made with {key} = {found}, which is now {wanted}: remove it, or choose another directory with --out",
+                    made.display()
+                );
+            }
+        }
+        Ok(())
+    }
+
+    #[cfg(test)]
+    pub(super) fn from_pairs(pairs: &[(&str, &str)]) -> Self {
+        Self(
+            pairs
+                .iter()
+                .map(|(key, value)| ((*key).into(), (*value).into()))
+                .collect(),
+        )
+    }
+}
+
+fn flatten(prefix: &str, value: Value, into: &mut BTreeMap<String, String>) {
+    match value {
+        Value::Table(table) => {
+            for (key, value) in table {
+                let key = if prefix.is_empty() {
+                    key
+                } else {
+                    format!("{prefix}.{key}")
+                };
+                flatten(&key, value, into);
+            }
+        }
+        value => {
+            into.insert(prefix.into(), value.to_string());
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn settings_leave_out_name_seed_and_length() {
+        let parent = tempfile::tempdir().unwrap();
+        let folder = Folder::open(parent.path()).unwrap();
+        let experiment = &super::super::pendulum::EXPERIMENTS[0];
+        let [full, quick] = [Effort::Full, Effort::Quick].map(|e| Settings::expected(experiment, e, &folder).unwrap());
+        assert_eq!(full.0["ddpg.hidden"], "[400, 300]");
+        assert_eq!(full.0["run.mode"], "\"lockstep\"");
+        assert!(
+            !full.0.keys().any(|key| key == "run.seed" || key.starts_with("spec")),
+            "{full:?}"
+        );
+        assert_eq!(Settings::expected(experiment, Effort::Full, &folder).unwrap(), full);
+        let refused = quick.check(Path::new("seed-1.json"), &full).unwrap_err().to_string();
+        assert!(
+            refused.contains("seed-1.json") && refused.contains("which is now") && !refused.contains('\n'),
+            "{refused}"
+        );
+        full.check(Path::new("x"), &full).unwrap();
+        assert_eq!(std::fs::read_dir(parent.path()).unwrap().count(), 0, "nothing stays");
+    }
+}
