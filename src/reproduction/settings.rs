@@ -52,6 +52,7 @@ impl Settings {
             actors: None,
             envs: None,
             steps: experiment.stages.first().map(|stage| stage.steps(effort)),
+            episodes: None,
             lockstep: true,
             set: experiment.settings(effort).map(Into::into).collect(),
             telling: Telling::default(),
