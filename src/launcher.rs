@@ -165,6 +165,9 @@ impl<'a> Launcher<'a> {
         let log = Log::open(&run.log())?;
         write_iox_config(domain, run)?;
         std::fs::create_dir_all(run.checkpoints()).context("cannot make the directory for checkpoints")?;
+        if config.evaluation.keep_policies {
+            std::fs::create_dir_all(run.policies()).context("cannot make the directory for policies")?;
+        }
         let recorder = Recorder::open(run, config.replay.warmup)?;
         Ok(Self {
             control: ControlPort::open(domain)?,

@@ -18,15 +18,18 @@ const UNWRITTEN: Duration = Duration::from_millis(500);
 
 /// A row of `episodes.csv`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-struct Episode {
+pub(crate) struct Episode {
     wall_seconds: f64,
     env_steps: u64,
     actor: u32,
     environment: u32,
-    steps: u32,
-    terminated: u32,
+    /// Steps it took.
+    pub(crate) steps: u32,
+    /// 1 where the environment terminated, 0 where the time limit truncated.
+    pub(crate) terminated: u32,
+    /// Sum of its rewards.
     #[serde(rename = "return")]
-    episode_return: f64,
+    pub(crate) episode_return: f64,
     policy_version: u64,
 }
 
@@ -56,6 +59,7 @@ pub(crate) struct Evaluation {
 struct Learner {
     wall_seconds: f64,
     env_steps: u64,
+    episodes: u64,
     updates: u64,
     policy_version: u64,
     critic_loss: Option<f64>,
@@ -165,6 +169,7 @@ impl Recorder {
         let row = Learner {
             wall_seconds: self.seconds(wall),
             env_steps: report.env_steps,
+            episodes: report.episodes,
             updates: report.updates,
             policy_version: report.policy_version,
             critic_loss: averaged(report.critic_loss),
@@ -224,9 +229,14 @@ pub(crate) fn read_evaluations(path: &Path) -> Result<Vec<Evaluation>, RecordErr
     table::rows(path)
 }
 
-/// Environment steps of a run by its records; none before the first row.
-pub(crate) fn recorded_steps(run: &RunDir) -> Result<Option<u64>, RecordError> {
-    Ok(table::last::<Learner>(&run.learner_log())?.map(|row| row.env_steps))
+/// The rows of an `episodes.csv`, none where there is no such file.
+pub(crate) fn read_episodes(path: &Path) -> Result<Vec<Episode>, RecordError> {
+    table::rows(path)
+}
+
+/// Environment steps and episodes of a run by its records; none before the first row.
+pub(crate) fn recorded(run: &RunDir) -> Result<Option<(u64, u64)>, RecordError> {
+    Ok(table::last::<Learner>(&run.learner_log())?.map(|row| (row.env_steps, row.episodes)))
 }
 
 #[cfg(test)]

@@ -3,10 +3,12 @@
 //! A new experiment is a file with a [`family::Family`] and a line in [`FAMILIES`].
 
 mod batch;
+mod cart_pole;
 mod claim;
 mod experiment;
 mod family;
 mod folder;
+mod frozen_lake;
 mod pendulum;
 mod point_mass;
 mod progress;
@@ -28,7 +30,12 @@ use self::folder::Folder;
 use self::settings::Settings;
 
 /// Every family, in the report's order.
-const FAMILIES: [Entry; 2] = [entry::<pendulum::Pendulum>(), entry::<point_mass::PointMass>()];
+const FAMILIES: [Entry; 4] = [
+    entry::<frozen_lake::FrozenLake>(),
+    entry::<cart_pole::CartPole>(),
+    entry::<pendulum::Pendulum>(),
+    entry::<point_mass::PointMass>(),
+];
 
 /// What is to be reproduced, and how.
 #[derive(Clone, Debug)]
@@ -57,7 +64,9 @@ pub(crate) enum Ending {
 
 /// The experiments that can be asked for.
 pub(crate) fn names() -> impl Iterator<Item = &'static str> {
-    experiments().map(|(_, experiment)| experiment.name)
+    let mut names: Vec<_> = experiments().map(|(_, experiment)| experiment.asked_as).collect();
+    names.dedup();
+    names.into_iter()
 }
 
 /// Runs what is due, keeps each result, and writes the report from all results of the folder.
@@ -65,7 +74,7 @@ pub(crate) fn run(order: &Order) -> anyhow::Result<Ending> {
     let folder = Folder::open(&order.folder)?;
     let settings = expected(&folder, order.effort)?;
     let wanted = experiments()
-        .filter(|(_, it)| order.experiments.is_empty() || order.experiments.iter().any(|name| name == it.name));
+        .filter(|(_, it)| order.experiments.is_empty() || order.experiments.iter().any(|name| name == it.asked_as));
     let jobs: Vec<Job> = wanted
         .flat_map(|(family, experiment)| {
             let seeds = order.seeds.unwrap_or(experiment.seeds(order.effort));

@@ -130,7 +130,7 @@ fn evaluator_settings(config: &Config, run: &RunDir, identity: Identity, judged:
         envs: config.evaluation_envs() as usize,
         evaluation: config.evaluation.clone(),
         algorithm: config.algorithm.clone(),
-        best: run.best_policy(),
+        run: run.clone(),
         judged,
     }
 }

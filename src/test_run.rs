@@ -1,5 +1,6 @@
 //! Test runs as the thesis shows them: what the numbers of a trajectory mean, and what there is to measure.
 
+pub(crate) mod lake;
 pub(crate) mod pendulum;
 pub(crate) mod point_mass;
 

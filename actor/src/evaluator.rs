@@ -1,6 +1,6 @@
 //! The evaluator: runs the newest policy without noise, always from the same start states, and keeps the best one.
 
-use std::path::PathBuf;
+use std::path::Path;
 
 use shoal_common::channel::environment::{Begin, EnvironmentClient, Stepped};
 use shoal_common::channel::policy::{PolicyHeader, PolicyReader};
@@ -10,6 +10,7 @@ use shoal_common::config::{Algorithm, Evaluation};
 use shoal_common::policy::Policy;
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::report::{Activity, EvaluationReport, Identity, JudgedReport, Role};
+use shoal_common::run_dir::RunDir;
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::stop::Stop;
 
@@ -31,8 +32,8 @@ pub struct Settings {
     pub evaluation: Evaluation,
     /// What is learned, and with it what kind of policy.
     pub algorithm: Algorithm,
-    /// Where the best policy is kept.
-    pub best: PathBuf,
+    /// The run's directory, where the best policy is kept, and all of them if that is wanted.
+    pub run: RunDir,
     /// The period of the policy that an evaluator before this one judged last.
     pub judged: Option<u64>,
 }
@@ -93,8 +94,8 @@ impl<'a> Evaluator<'a> {
         let mut pulse = Pulse::new(domain, settings.identity)?;
         let client = connect(domain, &bell, settings.server, &settings.spec, settings.envs, stop)?;
         let reader = PolicyReader::open(domain, layout.fingerprint(), layout.parameters())?;
-        let best = if settings.best.exists() {
-            Some(PolicyFile::read(&settings.best, &layout)?.return_mean)
+        let best = if settings.run.best_policy().exists() {
+            Some(PolicyFile::read(&settings.run.best_policy(), &layout)?.return_mean)
         } else {
             None
         };
@@ -133,8 +134,12 @@ impl<'a> Evaluator<'a> {
         let (return_mean, return_std) = mean_and_std(&returns);
         let best = self.best.is_none_or(|best| return_mean > best);
         if best {
-            self.keep(&header, return_mean, return_std)?;
+            self.keep(&header, return_mean, return_std, &self.settings.run.best_policy())?;
             self.best = Some(return_mean);
+        }
+        if self.settings.evaluation.keep_policies {
+            let path = self.settings.run.judged_policy(header.env_steps);
+            self.keep(&header, return_mean, return_std, &path)?;
         }
         let period = self.settings.evaluation.period(header.env_steps);
         self.judged = Some(period);
@@ -217,7 +222,7 @@ impl<'a> Evaluator<'a> {
         Ok(Some(returns))
     }
 
-    fn keep(&self, header: &PolicyHeader, return_mean: f64, return_std: f64) -> Result<(), ActorError> {
+    fn keep(&self, header: &PolicyHeader, return_mean: f64, return_std: f64, path: &Path) -> Result<(), ActorError> {
         let Some(held) = self.reader.held() else {
             return Ok(());
         };
@@ -230,6 +235,6 @@ impl<'a> Evaluator<'a> {
             episodes: self.settings.evaluation.episodes.into(),
             parameters: held.parameters().to_vec(),
         };
-        Ok(file.write(&self.settings.best)?)
+        Ok(file.write(path)?)
     }
 }

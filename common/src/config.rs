@@ -117,6 +117,8 @@ pub struct Evaluation {
     pub episodes: u32,
     /// Episodes of the last evaluation, whose mean is the run's result.
     pub final_episodes: u32,
+    /// Whether every policy that was judged is kept, not only the best.
+    pub keep_policies: bool,
 }
 
 /// How often the learner's state is saved.

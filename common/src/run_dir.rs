@@ -204,6 +204,16 @@ impl RunDir {
         self.checkpoints().join("best.policy")
     }
 
+    /// `policies`: every policy that was judged, where those are kept.
+    pub fn policies(&self) -> PathBuf {
+        self.path.join("policies")
+    }
+
+    /// `policies/<steps>.policy`: the one that was learned from so many environment steps.
+    pub fn judged_policy(&self, env_steps: u64) -> PathBuf {
+        self.policies().join(format!("{env_steps:012}.policy"))
+    }
+
     /// `checkpoints/last.policy`: the policy the learner ended with.
     pub fn last_policy(&self) -> PathBuf {
         self.checkpoints().join("last.policy")

@@ -79,10 +79,10 @@ fn every_report_is_a_row() {
     );
     assert_eq!(
         text(&run.learner_log()),
-        "wall_seconds,env_steps,updates,policy_version,critic_loss,actor_loss,q_mean,updates_per_second,\
+        "wall_seconds,env_steps,episodes,updates,policy_version,critic_loss,actor_loss,q_mean,updates_per_second,\
          env_steps_per_second,ratio\n\
-         1.5,1000,0,0,,,,,,\n\
-         2.0,2000,500,50,0.5,20.0,-20.0,1000.0,2000.0,0.5\n"
+         1.5,1000,0,0,0,,,,,,\n\
+         2.0,2000,0,500,50,0.5,20.0,-20.0,1000.0,2000.0,0.5\n"
     );
     let events = std::fs::read_dir(run.tensorboard()).unwrap().next().unwrap().unwrap();
     assert!(events.metadata().unwrap().len() > 200);

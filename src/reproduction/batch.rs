@@ -9,7 +9,7 @@ use anyhow::{Context, bail};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 use super::Ending;
-use super::experiment::{Effort, Experiment};
+use super::experiment::{Effort, Experiment, Length};
 use super::family::Entry;
 use super::folder::Folder;
 use super::progress::Progress;
@@ -48,7 +48,7 @@ pub(super) struct Batch<'a> {
 enum Event {
     Begun(Job),
     /// A result is there.
-    Kept(Job, u64),
+    Kept(Job, Length),
     /// All of a job's results are there.
     Through(Job),
     Failed(Job, anyhow::Error),
@@ -78,8 +78,8 @@ impl Batch<'_> {
                 match heard.recv_timeout(ROUND) {
                     Ok(Event::Begun(job)) => progress.begun(job),
                     Ok(Event::Through(job)) => progress.through(&job),
-                    Ok(Event::Kept(job, steps)) => {
-                        progress.kept(&job, steps);
+                    Ok(Event::Kept(job, length)) => {
+                        progress.kept(&job, length);
                         // What cannot be written now is tried again at the end, and said then.
                         if self.effort == Effort::Full {
                             let _ = write(&failures);
@@ -142,18 +142,26 @@ impl Batch<'_> {
             if self.folder.result(experiment, stage, seed).exists() {
                 continue;
             }
-            let steps = stage.steps(self.effort);
-            if Standing::of(&run)?.steps() > steps {
+            let length = stage.length(self.effort);
+            let (done, all) = length.done(Standing::of(&run)?.progress());
+            if matches!(length, Length::Steps(_)) && done > all {
                 bail!(
-                    "{} is beyond {steps} steps, and its result there was not kept: remove the run to begin it again",
+                    "{} is beyond {length}, and its result there was not kept: remove the run to begin it again",
                     run.display()
                 );
             }
-            if train(experiment, self.effort, seed, steps, &run, signal)? == Trained::Interrupted {
+            if train(experiment, self.effort, seed, length, &run, signal)? == Trained::Interrupted {
                 return Ok(Trained::Interrupted);
             }
-            (family.keep)(self.folder, experiment, stage, seed, &self.settings[experiment.name])?;
-            let _ = events.send(Event::Kept(job, steps));
+            (family.keep)(
+                self.folder,
+                experiment,
+                stage,
+                seed,
+                length,
+                &self.settings[experiment.name],
+            )?;
+            let _ = events.send(Event::Kept(job, length));
         }
         Ok(Trained::Through)
     }

@@ -13,8 +13,18 @@ pub(super) struct Claim {
     pub(super) criterion: &'static str,
     /// What was measured.
     pub(super) ours: String,
-    /// For each seed that could be judged, whether it holds.
+    pub(super) scope: Scope,
+    /// For each seed that could be judged, or once for all of them, whether it holds.
     pub(super) held: Vec<bool>,
+}
+
+/// What a claim is about.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Scope {
+    /// Every seed by itself; it holds when it does for more than half of them.
+    EachSeed,
+    /// The seeds together, by a mean, a median or a count.
+    Together,
 }
 
 /// Whether a claim holds.
@@ -31,6 +41,9 @@ pub(super) enum Verdict {
         of: usize,
         held: usize,
     },
+    /// For the seeds together.
+    HoldsTogether,
+    FailsTogether,
 }
 
 impl Claim {
@@ -39,6 +52,8 @@ impl Claim {
         match effort {
             Effort::Quick => Verdict::NotJudged,
             Effort::Full if of == 0 => Verdict::NotJudged,
+            Effort::Full if self.scope == Scope::Together && held == of => Verdict::HoldsTogether,
+            Effort::Full if self.scope == Scope::Together => Verdict::FailsTogether,
             Effort::Full if 2 * held > of => Verdict::Holds { of, held },
             Effort::Full => Verdict::Fails { of, held },
         }
@@ -49,6 +64,8 @@ impl Display for Verdict {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::NotJudged => write!(f, "not judged"),
+            Self::HoldsTogether => write!(f, "**holds**"),
+            Self::FailsTogether => write!(f, "**does not hold**"),
             Self::Holds { of: 1, .. } => write!(f, "**holds** for the only seed"),
             Self::Fails { of: 1, .. } => write!(f, "**does not hold** for the only seed"),
             Self::Holds { of, held } if of == held => write!(f, "**holds** for all {of} seeds"),
@@ -80,7 +97,7 @@ pub(super) fn spread(values: impl IntoIterator<Item = f64>, decimals: usize) -> 
 }
 
 /// Of sorted values, at least one.
-fn median(sorted: &[f64]) -> f64 {
+pub(super) fn median(sorted: &[f64]) -> f64 {
     let middle = sorted.len() / 2;
     if sorted.len() % 2 == 1 {
         sorted[middle]
@@ -103,6 +120,7 @@ mod tests {
             thesis: "it works",
             criterion: "it does",
             ours: String::new(),
+            scope: Scope::EachSeed,
             held: held.into(),
         }
     }
@@ -113,6 +131,13 @@ mod tests {
         assert_eq!(verdict(&[true, true, false]), Verdict::Holds { of: 3, held: 2 });
         assert_eq!(verdict(&[true, false]), Verdict::Fails { of: 2, held: 1 });
         assert_eq!(verdict(&[]), Verdict::NotJudged);
+        let together = |held| Claim {
+            scope: Scope::Together,
+            ..claim(&[held])
+        };
+        assert_eq!(together(true).verdict(Effort::Full).to_string(), "**holds**");
+        assert_eq!(together(false).verdict(Effort::Full), Verdict::FailsTogether);
+        assert_eq!(together(true).verdict(Effort::Quick), Verdict::NotJudged);
         assert_eq!(claim(&[true]).verdict(Effort::Quick), Verdict::NotJudged);
         assert_eq!(verdict(&[true; 5]).to_string(), "**holds** for all 5 seeds");
         assert_eq!(verdict(&[false]).to_string(), "**does not hold** for the only seed");

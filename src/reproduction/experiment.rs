@@ -1,5 +1,11 @@
 //! What is run: an experiment is a preset with settings, in one or more stages.
 
+use std::fmt::{self, Display};
+
+use serde::{Deserialize, Serialize};
+
+use crate::launcher::thousands;
+
 /// How much is done.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Effort {
@@ -12,8 +18,10 @@ pub(crate) enum Effort {
 /// An experiment; each of its seeds is one run directory.
 #[derive(Debug)]
 pub(super) struct Experiment {
-    /// Its name on the command line and in the folder.
+    /// Its name in the folder.
     pub(super) name: &'static str,
+    /// What it is asked for by on the command line: several that differ in a setting have one name there.
+    pub(super) asked_as: &'static str,
     /// The preset to train.
     pub(super) preset: &'static str,
     /// SECTION.KEY=VALUE, beyond the preset.
@@ -26,15 +34,59 @@ pub(super) struct Experiment {
     pub(super) stages: &'static [Stage],
 }
 
-/// A number of steps at which a run is looked at.
+/// A point at which a run is looked at.
 #[derive(Debug)]
 pub(super) struct Stage {
     /// What the result's name ends in; empty for an experiment's first stage.
     pub(super) suffix: &'static str,
-    /// Environment steps since the run's beginning.
-    pub(super) steps: u64,
+    /// Since the run's beginning.
+    pub(super) length: Length,
     /// The same for a quick look.
-    pub(super) quick_steps: u64,
+    pub(super) quick_length: Length,
+}
+
+/// How long a run is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub(super) enum Length {
+    /// Environment steps.
+    Steps(u64),
+    /// Episodes.
+    Episodes(u64),
+}
+
+/// How far a run is.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(super) struct Progress {
+    pub(super) steps: u64,
+    pub(super) episodes: u64,
+}
+
+impl Length {
+    /// How much of it is done, and how much there is, in its own unit.
+    pub(super) fn done(self, progress: Progress) -> (u64, u64) {
+        match self {
+            Self::Steps(steps) => (progress.steps, steps),
+            Self::Episodes(episodes) => (progress.episodes, episodes),
+        }
+    }
+
+    /// As `train` and `resume` take it.
+    pub(super) fn argument(self) -> [String; 2] {
+        match self {
+            Self::Steps(steps) => ["--steps".into(), steps.to_string()],
+            Self::Episodes(episodes) => ["--episodes".into(), episodes.to_string()],
+        }
+    }
+}
+
+impl Display for Length {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Steps(steps) => write!(f, "{} steps", thousands(*steps)),
+            Self::Episodes(episodes) => write!(f, "{} episodes", thousands(*episodes)),
+        }
+    }
 }
 
 impl Experiment {
@@ -55,17 +107,17 @@ impl Experiment {
         }
     }
 
-    /// Steps of a run that is through.
-    pub(super) fn last_steps(&self, effort: Effort) -> u64 {
-        self.stages.iter().map(|stage| stage.steps(effort)).max().unwrap_or(0)
+    /// How long a run is that is through.
+    pub(super) fn length(&self, effort: Effort) -> Option<Length> {
+        self.stages.last().map(|stage| stage.length(effort))
     }
 }
 
 impl Stage {
-    pub(super) fn steps(&self, effort: Effort) -> u64 {
+    pub(super) fn length(&self, effort: Effort) -> Length {
         match effort {
-            Effort::Full => self.steps,
-            Effort::Quick => self.quick_steps,
+            Effort::Full => self.length,
+            Effort::Quick => self.quick_length,
         }
     }
 }

@@ -6,8 +6,9 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use shoal_common::config::Config;
 use shoal_common::policy_file::PolicyFile;
+use shoal_common::run_dir::RunDir;
 
-use super::experiment::{Experiment, Stage};
+use super::experiment::{Experiment, Length, Stage};
 use super::folder::Folder;
 use super::report::{Album, Section};
 use super::result::{self, SeedResult};
@@ -35,6 +36,8 @@ pub(super) struct Policies {
     pub(super) best: PolicyFile,
     /// As the learner left it.
     pub(super) last: PolicyFile,
+    /// Where its records are.
+    pub(super) run: RunDir,
 }
 
 /// The results of a family that lie in a folder.
@@ -65,7 +68,7 @@ impl<T> Results<T> {
 pub(super) struct Entry {
     pub(super) experiments: &'static [Experiment],
     /// Makes and writes the result of a run that has reached the end of a stage.
-    pub(super) keep: fn(&Folder, &'static Experiment, &Stage, u64, &Settings) -> anyhow::Result<()>,
+    pub(super) keep: fn(&Folder, &'static Experiment, &Stage, u64, Length, &Settings) -> anyhow::Result<()>,
     /// What the report says, from the results in the folder.
     pub(super) sections: fn(&Folder, &Album) -> anyhow::Result<Vec<Section>>,
 }

@@ -63,7 +63,7 @@ impl Folder {
         for stage in experiment.stages {
             for seed in self.seeds(experiment, stage)? {
                 let path = self.result(experiment, stage, seed);
-                Header::read(&path)?.check(&path, experiment, seed, stage.steps(effort), settings)?;
+                Header::read(&path)?.check(&path, experiment, seed, stage.length(effort), settings)?;
             }
         }
         for seed in self.numbered(experiment, "")? {

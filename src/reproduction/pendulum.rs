@@ -2,8 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::claim::{Claim, spread};
-use super::experiment::{Experiment, Stage};
+use super::claim::{Claim, Scope, spread};
+use super::experiment::{Experiment, Length, Stage};
 use super::family::{Family, Policies, Results};
 use super::report::{Album, Section};
 use super::result::{SeedResult, representative};
@@ -14,6 +14,7 @@ use crate::test_run::pendulum::{Measures, SwingUp};
 /// 600 episodes of 200 steps.
 pub(super) const EXPERIMENTS: [Experiment; 1] = [Experiment {
     name: "pendulum",
+    asked_as: "pendulum",
     preset: "pendulum",
     settings: &[],
     quick: &[
@@ -26,8 +27,8 @@ pub(super) const EXPERIMENTS: [Experiment; 1] = [Experiment {
     seeds: 5,
     stages: &[Stage {
         suffix: "",
-        steps: 120_000,
-        quick_steps: 4_000,
+        length: Length::Steps(120_000),
+        quick_length: Length::Steps(4_000),
     }],
 }];
 
@@ -99,6 +100,7 @@ fn claims(seeds: &[SeedResult<Tests>]) -> Vec<Claim> {
         thesis,
         criterion,
         ours,
+        scope: Scope::EachSeed,
         held: seeds.iter().map(|seed| holds(&seed.tests.best)).collect(),
     };
     vec![
@@ -112,6 +114,7 @@ fn claims(seeds: &[SeedResult<Tests>]) -> Vec<Claim> {
                 spread(seeds.iter().map(|seed| seed.last.evaluation.return_mean), 1),
                 spread(seeds.iter().map(SeedResult::late_mean), 1)
             ),
+            scope: Scope::EachSeed,
             held: seeds
                 .iter()
                 .map(|seed| around_150(seed.best.evaluation.return_mean) && around_150(seed.late_mean()))

@@ -5,7 +5,7 @@ mod figures;
 
 use serde::{Deserialize, Serialize};
 
-use super::experiment::{Experiment, Stage};
+use super::experiment::{Experiment, Length, Stage};
 use super::family::{Family, Policies, Results};
 use super::report::{Album, Section};
 use crate::rollout::Rollout;
@@ -35,6 +35,7 @@ pub(super) const EXPERIMENTS: [Experiment; 3] = [
 const fn experiment(name: &'static str, stages: &'static [Stage]) -> Experiment {
     Experiment {
         name,
+        asked_as: name,
         preset: name,
         settings: &[],
         quick: QUICK,
@@ -46,8 +47,8 @@ const fn experiment(name: &'static str, stages: &'static [Stage]) -> Experiment 
 const fn stage(suffix: &'static str, steps: u64, quick_steps: u64) -> Stage {
     Stage {
         suffix,
-        steps,
-        quick_steps,
+        length: Length::Steps(steps),
+        quick_length: Length::Steps(quick_steps),
     }
 }
 

@@ -2,18 +2,18 @@
 
 use std::collections::BTreeMap;
 use std::io::{IsTerminal, Write};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use indicatif::{HumanDuration, ProgressBar, ProgressDrawTarget, ProgressStyle};
 use shoal_common::run_dir::RunDir;
 
 use super::batch::{Job, Name};
-use super::experiment::Effort;
+use super::experiment::{self, Effort, Length};
 use super::folder::Folder;
 use super::training::Standing;
 use crate::launcher::thousands;
-use crate::recorder::recorded_steps;
+use crate::recorder::recorded;
 
 /// The live line, and what is to be known for it.
 pub(super) struct Progress<'a> {
@@ -21,11 +21,30 @@ pub(super) struct Progress<'a> {
     bar: ProgressBar,
     live: bool,
     all: usize,
-    /// Every job that was due: its steps when the batch began, and at its end.
-    due: BTreeMap<Name, (u64, u64)>,
+    /// Every job that was due.
+    due: BTreeMap<Name, Due>,
     running: BTreeMap<Name, PathBuf>,
     over: Vec<Name>,
     begun: Instant,
+}
+
+/// A job that was due. An episode is taken for as much work as a step: where there are both, one is as quick as the other
+/// is slow.
+struct Due {
+    length: Length,
+    /// Steps or episodes when the batch began.
+    begin: u64,
+}
+
+impl Due {
+    fn done(&self, run: &Path) -> Option<u64> {
+        let (steps, episodes) = recorded(&RunDir::planned(run)).ok()??;
+        Some(self.length.done(experiment::Progress { steps, episodes }).0)
+    }
+
+    fn all(&self) -> u64 {
+        self.length.done(experiment::Progress::default()).1
+    }
 }
 
 impl<'a> Progress<'a> {
@@ -36,12 +55,14 @@ impl<'a> Progress<'a> {
         due: impl IntoIterator<Item = &'j Job>,
     ) -> anyhow::Result<Self> {
         let live = std::io::stderr().is_terminal();
-        let due: BTreeMap<Name, (u64, u64)> = due
+        let due: BTreeMap<Name, Due> = due
             .into_iter()
-            .map(|job| {
+            .filter_map(|job| {
                 // What cannot be read is said when its turn comes.
                 let standing = Standing::of(&folder.run(job.experiment, job.seed)).unwrap_or(Standing::Absent);
-                (job.name(), (standing.steps(), job.experiment.last_steps(effort)))
+                let length = job.experiment.length(effort)?;
+                let begin = length.done(standing.progress()).0;
+                Some((job.name(), Due { length, begin }))
             })
             .collect();
         let target = if live {
@@ -75,8 +96,8 @@ impl<'a> Progress<'a> {
         }
     }
 
-    pub(super) fn kept(&self, job: &Job, steps: u64) {
-        self.say(&format!("{}: result at {} steps", title(job), thousands(steps)));
+    pub(super) fn kept(&self, job: &Job, length: Length) {
+        self.say(&format!("{}: result at {length}", title(job)));
     }
 
     pub(super) fn through(&mut self, job: &Job) {
@@ -106,9 +127,10 @@ impl<'a> Progress<'a> {
         }
         let mut parts = vec![self.count()];
         for ((name, seed), run) in &self.running {
-            let steps = thousands(steps_of(run).unwrap_or(0));
-            let end = self.due.get(&(*name, *seed)).map_or(0, |(_, end)| *end);
-            parts.push(format!("{name} {seed}: {steps} of {}", thousands(end)));
+            if let Some(due) = self.due.get(&(*name, *seed)) {
+                let done = thousands(due.done(run).unwrap_or(due.begin));
+                parts.push(format!("{name} {seed}: {done} of {}", due.length));
+            }
         }
         if let Some(left) = self.left() {
             parts.push(format!("{:#} left", HumanDuration(left)));
@@ -126,16 +148,17 @@ impl<'a> Progress<'a> {
         format!("{} of {} seeds", self.all - self.due.len() + self.over.len(), self.all)
     }
 
-    /// From the steps that remain, at the rate of this batch so far.
+    /// From what remains, at the rate of this batch so far.
     fn left(&self) -> Option<Duration> {
         let (mut taken, mut remaining) = (0, 0);
-        for (name, (begin, end)) in &self.due {
+        for (name, due) in &self.due {
+            let (begin, end) = (due.begin, due.all());
             let now = match self.running.get(name) {
-                _ if self.over.contains(name) => *end,
-                Some(run) => steps_of(run).unwrap_or(*begin).max(*begin).min(*end),
-                None => *begin,
+                _ if self.over.contains(name) => end,
+                Some(run) => due.done(run).unwrap_or(begin).max(begin).min(end),
+                None => begin,
             };
-            taken += now.saturating_sub(*begin);
+            taken += now.saturating_sub(begin);
             remaining += end.saturating_sub(now);
         }
         let seconds = self.begun.elapsed().as_secs_f64() * remaining as f64 / taken as f64;
@@ -148,11 +171,6 @@ impl<'a> Progress<'a> {
             let _ = writeln!(std::io::stderr(), "{line}");
         });
     }
-}
-
-/// By the run's records.
-fn steps_of(run: &std::path::Path) -> Option<u64> {
-    recorded_steps(&RunDir::planned(run)).ok()?
 }
 
 fn title(job: &Job) -> String {

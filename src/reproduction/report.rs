@@ -15,7 +15,6 @@ use super::experiment::{Effort, Experiment, Stage};
 use super::family::Entry;
 use super::folder::Folder;
 use crate::figure;
-use crate::launcher::thousands;
 
 /// A part of the report.
 pub(super) struct Section {
@@ -135,9 +134,9 @@ impl Stages<'_> {
         let missing: Vec<u64> = asked.map(|job| job.seed).filter(|seed| !there.contains(seed)).collect();
         let say = |seeds: &[u64]| seeds.iter().map(u64::to_string).collect::<Vec<_>>().join(", ");
         let mut line = format!(
-            "`{}`, {} steps: {}",
+            "`{}`, {}: {}",
             experiment.name,
-            thousands(stage.steps(self.effort)),
+            stage.length(self.effort),
             if there.is_empty() {
                 "no seed yet".into()
             } else {
@@ -168,7 +167,8 @@ fn compose(sections: &[(Section, Vec<String>)], effort: Effort, figures: &Path) 
         "Made by `shoal reproduce{quick}`, version {}. Each seed is a run of the whole system in lockstep, so that the same \
         seed gives the same bits on the same kind of machine. The numbers are of each run's best policy by evaluation \
         unless something else is said: the median over the seeds, with the least and the greatest in brackets. A claim \
-        holds when its criterion does for more than half of the seeds.",
+        about single runs holds when its criterion does for more than half of the seeds; one about the seeds together is \
+        judged once.",
         env!("CARGO_PKG_VERSION")
     );
     if effort == Effort::Full {
@@ -182,8 +182,8 @@ fn compose(sections: &[(Section, Vec<String>)], effort: Effort, figures: &Path) 
             text,
             "\nOf {} claims {} hold, {} do not, {} are not judged.",
             verdicts.len(),
-            count(|verdict| matches!(verdict, Verdict::Holds { .. })),
-            count(|verdict| matches!(verdict, Verdict::Fails { .. })),
+            count(|verdict| matches!(verdict, Verdict::Holds { .. } | Verdict::HoldsTogether)),
+            count(|verdict| matches!(verdict, Verdict::Fails { .. } | Verdict::FailsTogether)),
             count(|verdict| *verdict == Verdict::NotJudged)
         );
     }
@@ -238,6 +238,7 @@ fn relative(path: &Path, from: &Path) -> PathBuf {
 
 #[cfg(test)]
 mod tests {
+    use super::super::claim::Scope;
     use super::*;
 
     #[test]
@@ -258,6 +259,7 @@ mod tests {
                 thesis: "it swings up",
                 criterion: "it is up",
                 ours: "0.01".into(),
+                scope: Scope::EachSeed,
                 held: held.into(),
             }],
             figures: vec![Figure {

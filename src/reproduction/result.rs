@@ -10,7 +10,7 @@ use shoal_common::durable::write_atomically;
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::run_dir::RunDir;
 
-use super::experiment::{Experiment, Stage};
+use super::experiment::{Experiment, Length, Stage};
 use super::family::{Family, Policies};
 use super::folder::Folder;
 use super::settings::Settings;
@@ -26,8 +26,8 @@ pub(super) struct Header {
     schema: u32,
     experiment: String,
     pub(super) seed: u64,
-    /// Environment steps since the run's beginning.
-    pub(super) steps: u64,
+    /// Since the run's beginning.
+    length: Length,
     /// The version of this program that made it.
     pub(super) shoal: String,
     settings: Settings,
@@ -85,12 +85,12 @@ impl<T> SeedResult<T> {
 }
 
 impl Header {
-    pub(super) fn new(experiment: &Experiment, seed: u64, steps: u64, settings: &Settings) -> Self {
+    pub(super) fn new(experiment: &Experiment, seed: u64, length: Length, settings: &Settings) -> Self {
         Self {
             schema: SCHEMA,
             experiment: experiment.name.into(),
             seed,
-            steps,
+            length,
             shoal: env!("CARGO_PKG_VERSION").into(),
             settings: settings.clone(),
         }
@@ -119,15 +119,15 @@ impl Header {
         path: &Path,
         experiment: &Experiment,
         seed: u64,
-        steps: u64,
+        length: Length,
         settings: &Settings,
     ) -> anyhow::Result<()> {
         let (found, wanted) = (
-            (self.experiment.as_str(), self.seed, self.steps),
-            (experiment.name, seed, steps),
+            (self.experiment.as_str(), self.seed, self.length),
+            (experiment.name, seed, length),
         );
         if found != wanted {
-            let say = |(name, seed, steps): (&str, u64, u64)| format!("{name}, seed {seed}, {steps} steps");
+            let say = |(name, seed, length): (&str, u64, Length)| format!("{name}, seed {seed}, {length}");
             bail!(
                 "{} is the result of {}, not of {}: remove it, or choose another directory with --out",
                 path.display(),
@@ -145,6 +145,7 @@ pub(super) fn keep<F: Family>(
     experiment: &'static Experiment,
     stage: &Stage,
     seed: u64,
+    length: Length,
     settings: &Settings,
 ) -> anyhow::Result<()> {
     let run = RunDir::open(&folder.run(experiment, seed))?;
@@ -155,7 +156,9 @@ pub(super) fn keep<F: Family>(
         best: WhichPolicy::Best.read(&run, &config)?,
         last: WhichPolicy::Last.read(&run, &config)?,
         config,
+        run,
     };
+    let run = &policies.run;
     let judge = |policy: &PolicyFile| -> anyhow::Result<Policy> {
         let config = &policies.config;
         let episodes = config.evaluation.final_episodes;
@@ -174,12 +177,7 @@ pub(super) fn keep<F: Family>(
         .collect();
     evaluations.sort_by_key(|evaluation| evaluation.steps);
     let result = SeedResult {
-        header: Header::new(
-            experiment,
-            seed,
-            policies.config.run.steps,
-            &Settings::of(&policies.config)?,
-        ),
+        header: Header::new(experiment, seed, length, &Settings::of(&policies.config)?),
         evaluations,
         best: judge(&policies.best)?,
         last: judge(&policies.last)?,
@@ -220,6 +218,7 @@ pub(super) fn representative<T>(results: &[SeedResult<T>]) -> Option<&SeedResult
 
 #[cfg(test)]
 pub(super) mod tests {
+    use super::super::experiment::Progress;
     use super::*;
 
     /// A result of this seed whose best policy has this return, and its last a slightly worse one.
@@ -234,14 +233,20 @@ pub(super) mod tests {
                 reached_fraction: Some(0.99),
             },
         };
-        let steps = experiment.stages[0].steps;
+        let length = experiment.stages[0].length;
+        let steps = length.done(Progress::default()).1;
         let evaluation = |i: u64| Evaluation {
             steps: i * steps / 20,
             mean: return_mean * i.min(10) as f64 / 10.0,
             std: 1.0,
         };
         SeedResult {
-            header: Header::new(experiment, seed, steps, &Settings::from_pairs(&[("ddpg.tau", "0.001")])),
+            header: Header::new(
+                experiment,
+                seed,
+                length,
+                &Settings::from_pairs(&[("ddpg.tau", "0.001")]),
+            ),
             evaluations: (0..=20).map(evaluation).collect(),
             best: policy(return_mean),
             last: policy(return_mean - 1.0),
@@ -264,12 +269,12 @@ pub(super) mod tests {
         assert_eq!(header, made.header);
         let settings = |tau| Settings::from_pairs(&[("ddpg.tau", tau), ("ddpg.new", "1")]);
         header
-            .check(&path, experiment(), 3, 120_000, &settings("0.001"))
+            .check(&path, experiment(), 3, Length::Steps(120_000), &settings("0.001"))
             .unwrap();
 
         let refused = |seed, steps, tau| {
             let error = header
-                .check(&path, experiment(), seed, steps, &settings(tau))
+                .check(&path, experiment(), seed, Length::Steps(steps), &settings(tau))
                 .unwrap_err()
                 .to_string();
             assert!(

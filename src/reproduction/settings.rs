@@ -9,7 +9,7 @@ use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
 use toml::Value;
 
-use super::experiment::{Effort, Experiment};
+use super::experiment::{Effort, Experiment, Length};
 use super::folder::Folder;
 use crate::cli::{Telling, TrainArgs};
 use crate::plan::Plan;
@@ -23,8 +23,9 @@ impl Settings {
     pub(super) fn of(config: &Config) -> anyhow::Result<Self> {
         let mut settings = BTreeMap::new();
         flatten("", toml::Value::try_from(config)?, &mut settings);
-        settings
-            .retain(|key, _| !["run.id", "run.seed", "run.steps"].contains(&key.as_str()) && !key.starts_with("spec."));
+        settings.retain(|key, _| {
+            !["run.id", "run.seed", "run.steps", "run.episodes"].contains(&key.as_str()) && !key.starts_with("spec.")
+        });
         Ok(Self(settings))
     }
 
@@ -45,13 +46,17 @@ impl Settings {
     pub(super) fn expected(experiment: &Experiment, effort: Effort, folder: &Folder) -> anyhow::Result<Self> {
         let place = tempfile::tempdir_in(folder.path())
             .with_context(|| format!("cannot make a directory in {}", folder.path().display()))?;
+        let length = experiment.stages.first().map(|stage| stage.length(effort));
         let plan = Plan::new(&TrainArgs {
             what: experiment.preset.into(),
             run: Some(place.path().join("plan")),
             seed: Some(1),
             actors: None,
             envs: None,
-            steps: experiment.stages.first().map(|stage| stage.steps(effort)),
+            steps: length.and_then(|length| match length {
+                Length::Steps(steps) => Some(steps),
+                Length::Episodes(_) => None,
+            }),
             episodes: None,
             lockstep: true,
             set: experiment.settings(effort).map(Into::into).collect(),

@@ -12,7 +12,7 @@ use anyhow::{Context, bail};
 use rustix::process::{Pid, Signal, kill_process};
 use shoal_common::run_dir::{RunDir, RunDirError};
 
-use super::experiment::{Effort, Experiment};
+use super::experiment::{Effort, Experiment, Length, Progress};
 use crate::command::eval::WhichPolicy;
 use crate::status;
 
@@ -23,8 +23,7 @@ const ROUND: Duration = Duration::from_millis(50);
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Standing {
     Absent,
-    /// So many environment steps are taken.
-    Begun(u64),
+    Begun(Progress),
 }
 
 /// How a training ended.
@@ -46,33 +45,35 @@ impl Standing {
         if directory.goes_on()? {
             return Err(RunDirError::Busy(run.into()).into());
         }
-        Ok(Self::Begun(
-            status::at_rest(&directory.config()?, &directory)?.env_steps,
-        ))
+        let rest = status::at_rest(&directory.config()?, &directory)?;
+        Ok(Self::Begun(Progress {
+            steps: rest.env_steps,
+            episodes: rest.episodes,
+        }))
     }
 
-    /// Environment steps taken.
-    pub(super) fn steps(self) -> u64 {
+    /// How far it is.
+    pub(super) fn progress(self) -> Progress {
         match self {
-            Self::Absent => 0,
-            Self::Begun(steps) => steps,
+            Self::Absent => Progress::default(),
+            Self::Begun(progress) => progress,
         }
     }
 }
 
-/// Brings the run to `steps` environment steps, from wherever it stands. A `signal` other than 0 ends it in order.
+/// Brings the run to this length, from wherever it stands. A `signal` other than 0 ends it in order.
 pub(super) fn train(
     experiment: &Experiment,
     effort: Effort,
     seed: u64,
-    steps: u64,
+    length: Length,
     run: &Path,
     signal: &AtomicUsize,
 ) -> anyhow::Result<Trained> {
     let mut command = Command::new("/proc/self/exe");
     command.arg0("shoal");
     match Standing::of(run)? {
-        Standing::Begun(_) if ended_at(run)? >= Some(steps) => return Ok(Trained::Through),
+        Standing::Begun(progress) if has_ended(run, length, progress)? => return Ok(Trained::Through),
         Standing::Absent => {
             command
                 .args(["train", experiment.preset, "--lockstep", "--run"])
@@ -86,17 +87,21 @@ pub(super) fn train(
             command.arg("resume").arg(run);
         }
     }
-    command.args(["--steps", &steps.to_string(), "--quiet"]);
+    command.args(length.argument()).arg("--quiet");
     conduct(&mut command, signal)
 }
 
-/// The environment steps that the last policy of a run was learned from: it is written when a run ends in order.
-fn ended_at(run: &Path) -> anyhow::Result<Option<u64>> {
+/// Whether a run has come to this length, and ended in order there: then it leaves its last policy.
+fn has_ended(run: &Path, length: Length, progress: Progress) -> anyhow::Result<bool> {
     let run = RunDir::open(run)?;
     if !run.last_policy().exists() {
-        return Ok(None);
+        return Ok(false);
     }
-    Ok(Some(WhichPolicy::Last.read(&run, &run.config()?)?.env_steps))
+    let steps = WhichPolicy::Last.read(&run, &run.config()?)?.env_steps;
+    Ok(match length {
+        Length::Steps(wanted) => steps >= wanted,
+        Length::Episodes(wanted) => progress.episodes >= wanted && steps == progress.steps,
+    })
 }
 
 fn conduct(command: &mut Command, signal: &AtomicUsize) -> anyhow::Result<Trained> {

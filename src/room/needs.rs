@@ -12,6 +12,9 @@ use crate::role::learner_settings;
 /// them is an error and no SIGBUS.
 const RECORDS: u64 = 4 << 20;
 
+/// What a policy's file has besides its parameters, and the block it may begin.
+const POLICY_HEADER: u64 = 4 << 10;
+
 /// Files that any role has open, and what the launcher or the learner adds for each actor. The learner was seen to have
 /// 45 and 11, the launcher 41 and 10.
 const FILES: u64 = 80;
@@ -21,8 +24,7 @@ const FILES_OF_AN_ACTOR: u64 = 12;
 pub(super) fn shared_memory(config: &Config) -> u64 {
     let max = config.actors.max as usize;
     let (spec, actors) = (&config.spec, max as u64);
-    // Who cannot control the environment is refused elsewhere.
-    let parameters = PolicyLayout::new(&config.algorithm, spec).map_or(0, |layout| layout.parameters());
+    let parameters = parameters(config);
     let explorer = environment::reserved(spec, config.actors.envs as usize)
         + transitions::reserved(&config.chunk_layout(), config.actors.window);
     // An environment server and whom it serves, for each actor and the evaluator; and the learner.
@@ -47,7 +49,20 @@ pub(super) fn disk(config: &Config, run: &RunDir) -> Option<u64> {
         index: 0,
         incarnation: 0,
     };
-    Some(learner_settings(config, run, learner, None).disk_bytes()? + RECORDS)
+    let kept = if config.evaluation.keep_policies {
+        let policies = config.run.steps / config.evaluation.every + 1;
+        policies.checked_mul((size_of::<f32>() * parameters(config)) as u64 + POLICY_HEADER)?
+    } else {
+        0
+    };
+    learner_settings(config, run, learner, None)
+        .disk_bytes()?
+        .checked_add(RECORDS + kept)
+}
+
+/// Parameters of the policy. Who cannot control the environment is refused elsewhere.
+fn parameters(config: &Config) -> usize {
+    PolicyLayout::new(&config.algorithm, &config.spec).map_or(0, |layout| layout.parameters())
 }
 
 /// Files that the hungriest process of the run may have open.

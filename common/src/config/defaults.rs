@@ -90,6 +90,7 @@ impl Default for Evaluation {
             every: 2_000,
             episodes: 10,
             final_episodes: 100,
+            keep_policies: false,
         }
     }
 }

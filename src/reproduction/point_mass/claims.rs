@@ -1,6 +1,6 @@
 //! The claims of section 5.3 and appendix A.
 
-use super::super::claim::{Claim, percent, spread};
+use super::super::claim::{Claim, Scope, percent, spread};
 use super::super::result::SeedResult;
 use super::Tests;
 use crate::test_run::point_mass::{Measures, NEAR_STARTS, REACHED};
@@ -62,6 +62,7 @@ fn claim(
         thesis,
         criterion,
         ours,
+        scope: Scope::EachSeed,
         held: seeds.iter().map(holds).collect(),
     }
 }
@@ -134,6 +135,7 @@ pub(super) fn of_r2(r1: &[Seed], r2: &[Seed]) -> Vec<Claim> {
             criterion: "the first evaluation that has made nine tenths of the way from the run's first to its best one comes \
                         in fewer episodes than with r1 and the same seed",
             ours: format!("episodes with r2: {}; with r1: {}", rose(r2), rose(r1)),
+            scope: Scope::EachSeed,
             held: pairs(r1, r2).map(sooner).collect(),
         },
         claim(
@@ -187,6 +189,7 @@ pub(super) fn of_r3(r1: &[Seed], r2: &[Seed], r3: &[Seed]) -> Vec<Claim> {
                 both(r1, FORCE_ON_THE_WAY, 2, "N"),
                 both(r2, FORCE_ON_THE_WAY, 2, "N")
             ),
+            scope: Scope::EachSeed,
             held: less_than(r1)
                 .into_iter()
                 .filter_map(|(seed, less)| {
@@ -222,6 +225,7 @@ pub(super) fn of_comparison(r1: &[Seed], r2: &[Seed], r3: &[Seed]) -> Vec<Claim>
             say(than),
             names[1]
         ),
+        scope: Scope::EachSeed,
         held: pairs(than, seeds)
             .map(|(than, it)| turning(it) < turning(than))
             .collect(),
@@ -264,6 +268,7 @@ pub(super) fn of_longer(before: &[Seed], after: &[Seed]) -> Vec<Claim> {
             spread(pairs(before, after).map(|(b, a)| value(b, a, number).0), decimals),
             spread(pairs(before, after).map(|(b, a)| value(b, a, number).1), decimals)
         ),
+        scope: Scope::EachSeed,
         held: pairs(before, after)
             .map(|(b, a)| value(b, a, number))
             .map(|(b, a)| holds(b, a))
@@ -298,6 +303,7 @@ pub(super) fn of_longer(before: &[Seed], after: &[Seed]) -> Vec<Claim> {
                 spread(after.iter().map(|seed| seed.last.evaluation.return_mean), 1),
                 spread(after.iter().map(|seed| seed.best.evaluation.return_mean), 1)
             ),
+            scope: Scope::EachSeed,
             held: pairs(before, after)
                 .map(|(before, after)| after.last.evaluation.return_mean < before.best.evaluation.return_mean)
                 .collect(),

@@ -121,7 +121,8 @@ pub(super) fn of_longer(album: &Album, seeds: &[SeedResult<Tests>]) -> anyhow::R
     };
     let curves: Vec<_> = seeds.iter().map(SeedResult::curve).collect();
     // Where the curves end, in half.
-    let half = (middle.header.steps / 2, "end of the first training");
+    let end = middle.evaluations.last().map_or(0, |it| it.steps);
+    let half = (end / 2, "end of the first training");
     Ok(vec![
         album.add(
             "point-mass-r2-longer-test-runs",
