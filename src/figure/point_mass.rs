@@ -129,7 +129,7 @@ pub(super) fn draw_actions(title: &str, run: &Drive, area: &Area<'_>) -> anyhow:
         note: "",
         x: time_steps(Some(run.steps())),
         y: Axis {
-            label: "force (N), direction / π",
+            label: "force (N), direction (half turns)",
             range: -1.1..2.1,
         },
         series: vec![
@@ -209,7 +209,7 @@ mod tests {
         let path = dir.path().join("test-runs.svg");
         test_runs(&[run([2.0, -2.0]), run([-2.0, 2.0])], &path).unwrap();
         let svg = std::fs::read_to_string(path).unwrap();
-        for label in ["x (m)", "distance (m)", "force (N), direction / π", "reward"] {
+        for label in ["x (m)", "distance (m)", "force (N), direction (half turns)", "reward"] {
             assert_eq!(svg.lines().filter(|line| line.trim() == label).count(), 2, "{label}");
         }
         assert!(svg.contains("From (2, \u{2212}2)") && svg.contains("From (\u{2212}2, 2)"));

@@ -86,9 +86,14 @@ pub(super) fn write(
             failures,
             effort: order.effort,
         };
+        if !stages.are_of_interest()? {
+            continue;
+        }
         for section in (family.sections)(folder, &album)? {
-            let seeds = stages.seeds_of(&section)?;
-            sections.extend(seeds.map(|seeds| (section, seeds)));
+            if let Some(seeds) = stages.seeds_of(&section)? {
+                let notes = notes(folder, &section)?;
+                sections.push((section, seeds, notes));
+            }
         }
     }
     let parent = parent_of(&order.report);
@@ -108,7 +113,32 @@ struct Stages<'a> {
     effort: Effort,
 }
 
+/// What somebody has written on a section, in `notes/<experiment>.md` of the folder, after the first experiment it is about.
+fn notes(folder: &Folder, section: &Section) -> anyhow::Result<String> {
+    let Some((experiment, suffix)) = section.from.first() else {
+        return Ok(String::new());
+    };
+    let path = folder.path().join("notes").join(format!("{experiment}{suffix}.md"));
+    match std::fs::read_to_string(&path) {
+        Ok(text) => Ok(text),
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(String::new()),
+        Err(error) => Err(error).with_context(|| format!("cannot read {}", path.display())),
+    }
+}
+
 impl Stages<'_> {
+    /// Whether anything of the family was asked for or is there.
+    fn are_of_interest(&self) -> anyhow::Result<bool> {
+        for experiment in self.family.experiments {
+            for stage in experiment.stages {
+                if self.line(experiment, stage)?.1 {
+                    return Ok(true);
+                }
+            }
+        }
+        Ok(false)
+    }
+
     /// Which seeds a section is made from, and which are missing; none where nobody asked for it and nothing is there.
     fn seeds_of(&self, section: &Section) -> anyhow::Result<Option<Vec<String>>> {
         let (mut lines, mut of_interest) = (Vec::new(), false);
@@ -155,7 +185,7 @@ impl Stages<'_> {
     }
 }
 
-fn compose(sections: &[(Section, Vec<String>)], effort: Effort, figures: &Path) -> String {
+fn compose(sections: &[(Section, Vec<String>, String)], effort: Effort, figures: &Path) -> String {
     let mut text = String::from("# The thesis's experiments, done again\n\n");
     let quick = if effort == Effort::Quick { " --quick" } else { "" };
     if effort == Effort::Quick {
@@ -174,7 +204,7 @@ fn compose(sections: &[(Section, Vec<String>)], effort: Effort, figures: &Path) 
     if effort == Effort::Full {
         let verdicts: Vec<Verdict> = sections
             .iter()
-            .flat_map(|(section, _)| &section.claims)
+            .flat_map(|(section, _, _)| &section.claims)
             .map(|claim| claim.verdict(effort))
             .collect();
         let count = |which: fn(&Verdict) -> bool| verdicts.iter().filter(|verdict| which(verdict)).count();
@@ -187,7 +217,7 @@ fn compose(sections: &[(Section, Vec<String>)], effort: Effort, figures: &Path) 
             count(|verdict| *verdict == Verdict::NotJudged)
         );
     }
-    for (section, seeds) in sections {
+    for (section, seeds, notes) in sections {
         let _ = write!(text, "\n## {}\n\n", section.title);
         for line in seeds {
             let _ = writeln!(text, "- {line}");
@@ -206,6 +236,9 @@ fn compose(sections: &[(Section, Vec<String>)], effort: Effort, figures: &Path) 
                 ..
             } = claim;
             let _ = writeln!(text, "| {thesis} | {ours} | {criterion} | {} |", claim.verdict(effort));
+        }
+        if !notes.is_empty() {
+            let _ = write!(text, "\n{}\n", notes.trim_end());
         }
         for Figure { file, caption } in &section.figures {
             let place = figures.join(file);
@@ -269,13 +302,15 @@ mod tests {
         };
         let of = |held: &[bool], effort| {
             let seeds = vec!["`pendulum`: seeds 1; missing: 2".into()];
-            compose(&[(section(held), seeds)], effort, Path::new("figures"))
+            let notes = "It leans a little.\n".into();
+            compose(&[(section(held), seeds, notes)], effort, Path::new("figures"))
         };
         let full = of(&[true], Effort::Full);
         for part in [
             "Of 1 claims 1 hold, 0 do not, 0 are not judged.",
             "| it swings up | 0.01 | it is up | **holds** for the only seed |",
             "missing: 2",
+            "It leans a little.",
             "![Figure 4.9](figures/swing.png)",
         ] {
             assert!(full.contains(part), "{part}: {full}");
