@@ -161,7 +161,7 @@ impl Family for FrozenLake {
             Ok(Judged {
                 episodes: ends.partition_point(|end| *end <= evaluation.env_steps) as u64,
                 sampled: evaluation.return_mean,
-                exact: Walk::of(&greedy(&policy.parameters)),
+                exact: Walk::of(&greedy(&policy.parameters)).rounded(),
             })
         });
         Ok(Tests {

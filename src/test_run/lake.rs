@@ -50,6 +50,17 @@ impl Walk {
     }
 }
 
+impl Walk {
+    /// To four decimals: enough for a figure.
+    pub(crate) fn rounded(self) -> Self {
+        let round = |value: f64| (1e4 * value).round() / 1e4;
+        Self {
+            reached: round(self.reached),
+            steps: round(self.steps),
+        }
+    }
+}
+
 /// The action with the highest value in each state, the first of equals.
 pub(crate) fn greedy(table: &[f32]) -> [usize; STATES] {
     std::array::from_fn(|state| highest(&table[state * ACTIONS..][..ACTIONS]))
