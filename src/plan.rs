@@ -5,7 +5,6 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 use shoal_common::config::{Actors, Config};
-use shoal_common::policy::PolicyLayout;
 use shoal_common::run_dir::{RunDir, RunLock};
 use shoal_env_server::environment;
 use toml::{Table, Value};
@@ -130,8 +129,6 @@ fn resolve(mut table: Table, args: &TrainArgs, origin: &str) -> anyhow::Result<C
     )?;
     describe_environment(&mut table)?;
     let mut config = Config::from_table(table, origin)?;
-    PolicyLayout::new(&config.algorithm, &config.spec)
-        .with_context(|| format!("{} cannot control {}", config.algorithm.name(), config.environment.name))?;
     // Also a short run ends with its policy judged.
     config.evaluation.every = config.evaluation.every.min(config.run.steps);
     Ok(config)

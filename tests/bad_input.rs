@@ -33,7 +33,44 @@ fn what_cannot_be_trained_is_refused_before_anything_is_made() {
         ),
         (&["pendulum", "--set", "environment.start_sped=1"], "start_sped"),
         (&["point-mass-r1", "--set", "environment.friction=-1"], "friction"),
-        (&["pendulum", "--set", "environment.name=cart-pole"], "discrete"),
+        (
+            &["pendulum", "--set", "environment.name=cart-pole"],
+            "ddpg cannot control cart-pole",
+        ),
+        (
+            &["pendulum", "--set", "sarsa.alpha=0.1"],
+            "sarsa cannot control pendulum: sarsa needs a discrete action space",
+        ),
+        (
+            &["frozen-lake", "--set", "ddpg.tau=1"],
+            "sections for two algorithms, [q-learning] and [ddpg]: keep one",
+        ),
+        (
+            &["frozen-lake", "--set", "reinforce.gamma=0.9"],
+            "sections for two algorithms, [reinforce] and [q-learning]: keep one",
+        ),
+        (
+            &["frozen-lake", "--set", "exploration.sigma=0.1"],
+            "[exploration] is the noise of ddpg",
+        ),
+        (
+            &["frozen-lake", "--set", "replay.warmup=64"],
+            "replay.warmup = 64: must be 0: q-learning learns from each step once",
+        ),
+        (
+            &["frozen-lake-sarsa", "--set", "run.mode=free"],
+            "run.mode = free: must be lockstep: sarsa learns",
+        ),
+        (
+            &["cart-pole", "--set", "run.mode=free"],
+            "run.mode = free: must be lockstep: reinforce learns",
+        ),
+        (&["cart-pole", "--envs", "2"], "actors.envs = 2: must be 1: reinforce"),
+        (
+            &["cart-pole", "--set", "actors.chunk_steps=8"],
+            "actors.chunk_steps = 8: must be 200, the time limit",
+        ),
+        (&["cart-pole", "--episodes", "0"], "run.episodes = 0: must be from 1"),
         (&["pendulum", "--steps", "0"], "run.steps = 0"),
     ] {
         let said = complaint(&place.output(&[&["train"], arguments].concat()));

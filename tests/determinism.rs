@@ -18,7 +18,7 @@ use shoal_env_server::vector::{Start, VectorEnvironment};
 use shoal_learner::ddpg::{Ddpg, DdpgSettings};
 use shoal_learner::minibatch::Minibatch;
 use shoal_learner::sampling::Sampler;
-use support::{Running, Workplace, parse, until};
+use support::{Workplace, comes_further, end_of, rows_of, until};
 
 #[test]
 fn the_same_seed_and_actors_give_the_same_bits_and_another_seed_others() {
@@ -61,34 +61,6 @@ const SHARED: [&str; 13] = [
     "--set",
     "replay.capacity=1500",
 ];
-
-/// The weights a run ends with, and what its policies were judged to be on the way.
-fn end_of(running: Running) -> (serde_json::Value, Vec<String>) {
-    let run = running.run.clone();
-    let (code, printed, leftovers) = running.wait();
-    assert_eq!(
-        code,
-        Some(0),
-        "{}",
-        std::fs::read_to_string(run.join("shoal.log")).unwrap()
-    );
-    assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
-    let evaluations = std::fs::read_to_string(run.join("evaluations.csv")).unwrap();
-    let without_time = |line: &str| line.split_once(',').unwrap().1.to_owned();
-    (
-        parse(&printed)["weights_sha256"].clone(),
-        evaluations.lines().map(without_time).collect(),
-    )
-}
-
-fn comes_further(running: &Running, by: u64) {
-    let wanted = rows_of(running) + by;
-    until("it has come further", || rows_of(running) >= wanted);
-}
-
-fn rows_of(running: &Running) -> u64 {
-    CommitReader::open(&running.run.join("replay.bin")).map_or(0, |commits| commits.rows())
-}
 
 #[test]
 fn whoever_is_killed_in_lockstep_the_run_ends_with_the_bits_of_a_whole_one() {

@@ -15,6 +15,7 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 use self::sections::Sections;
+use crate::policy::PolicyError;
 use crate::space::EnvironmentSpec;
 use crate::transition::{ChunkLayout, RowLayout};
 
@@ -167,6 +168,16 @@ pub enum ConfigError {
         value: String,
         /// What would be accepted.
         expected: String,
+    },
+    /// The algorithm does not fit the environment.
+    #[error("{algorithm} cannot control {environment}: {cause}; choose another algorithm or another environment")]
+    Control {
+        /// The algorithm.
+        algorithm: &'static str,
+        /// The environment.
+        environment: String,
+        /// What does not fit.
+        cause: PolicyError,
     },
 }
 

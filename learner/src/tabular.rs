@@ -94,7 +94,9 @@ impl Tabular {
             return self.improve(&step, greatest);
         }
         let mut losses = Losses::default();
-        if let Some(before) = self.take(slot) {
+        // Where the last chunk of a run was cut off, and the run was given more steps, the next row is of another walk.
+        let before = self.take(slot).filter(|before| before.s_next == step.s);
+        if let Some(before) = before {
             let value = self.values(before.s_next)[step.a];
             losses = self.improve(&before, value);
         }

@@ -140,7 +140,7 @@ fn table(status: &RunStatus) -> String {
     }
     let evaluated = status
         .eval_return_mean
-        .map_or_else(String::new, |mean| format!(", eval {mean:.1}"));
+        .map_or_else(String::new, |mean| format!(", eval {mean:.2}"));
     let waiting = status
         .waiting
         .as_deref()

@@ -141,7 +141,7 @@ fn tell(
     ]);
     for (name, judged) in judged {
         let mut text = format!(
-            "return {:.1} ± {:.1} over {} episodes",
+            "return {:.2} ± {:.2} over {} episodes",
             judged.return_mean, judged.return_std, judged.episodes
         );
         if let (Some(distance), Some(reached)) = (judged.final_distance_mean, judged.reached_fraction) {

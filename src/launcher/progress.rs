@@ -98,23 +98,23 @@ impl Progress {
         self.bar.set_message(self.line(&learner, crew));
     }
 
-    /// How far it is and how good, below it how fast and who waits, and restarts if there were any: each fits 80 columns.
+    /// How far it is; how good and how fast; who waits; and restarts if there were any: each on a line of 80 columns.
     fn line(&self, learner: &LearnerReport, crew: &Crew) -> String {
         let (done, all) = (self.done(learner), self.bar.length().unwrap_or(0));
-        let rates = self.rates();
         let unit = if self.counts_episodes { "episodes" } else { "steps" };
-        let mut outcome = vec![format!("{}/{} {unit}", thousands(done), thousands(all))];
+        let mut way = vec![format!("{}/{} {unit}", thousands(done), thousands(all))];
         if let Some(pace) = self.pace(|report| self.done(report)).filter(|pace| *pace > 0.0) {
             let left = all.saturating_sub(done) as f64 / pace;
-            outcome.push(format!("{} left", HumanDuration(Duration::from_secs_f64(left))));
+            way.push(format!("{} left", HumanDuration(Duration::from_secs_f64(left))));
         }
+        let mut pace = Vec::new();
         if let Some(evaluated) = &self.evaluated {
-            outcome.push(format!("eval {:.1}", evaluated.return_mean));
+            pace.push(format!("eval {:.2}", evaluated.return_mean));
         }
-        let mut pace = vec![format!("{} updates", thousands(learner.updates))];
-        if let Some((updates, env_steps)) = rates {
-            pace[0] += &format!(", {updates:.0}/s");
-            pace.push(format!("{env_steps:.0} steps/s"));
+        let updates = thousands(learner.updates);
+        match self.rates() {
+            Some((rate, env_steps)) => pace.push(format!("{updates} updates, {rate:.0}/s · {env_steps:.0} steps/s")),
+            None => pace.push(format!("{updates} updates")),
         }
         let beyond = learner.env_steps.saturating_sub(self.warmup);
         let ratio = if beyond > 0 {
@@ -123,8 +123,8 @@ impl Progress {
             0.0
         };
         let waits = waiting(crew).map(|who| format!(", {who}")).unwrap_or_default();
-        pace.push(format!("ratio {ratio:.2} of {:.2}{waits}", self.updates_per_step));
-        let mut lines = vec![outcome.join(" · "), pace.join(" · ")];
+        let ratio = format!("ratio {ratio:.2} of {:.2}{waits}", self.updates_per_step);
+        let mut lines = vec![way.join(" · "), pace.join(" · "), ratio];
         if crew.restarts() > 0 {
             lines.push(format!("{} restarts; shoal.log says why", crew.restarts()));
         }

@@ -294,6 +294,36 @@ pub(crate) fn committed(run: &Path, actor: usize) -> u64 {
     commits.actor(actor).rows
 }
 
+/// The weights a run ends with, and what its policies were judged to be on the way.
+pub(crate) fn end_of(running: Running) -> (serde_json::Value, Vec<String>) {
+    let run = running.run.clone();
+    let (code, printed, leftovers) = running.wait();
+    assert_eq!(
+        code,
+        Some(0),
+        "{}",
+        std::fs::read_to_string(run.join("shoal.log")).unwrap()
+    );
+    assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
+    let evaluations = std::fs::read_to_string(run.join("evaluations.csv")).unwrap();
+    let without_time = |line: &str| line.split_once(',').unwrap().1.to_owned();
+    (
+        parse(&printed)["weights_sha256"].clone(),
+        evaluations.lines().map(without_time).collect(),
+    )
+}
+
+/// Waits until so many rows more are in the replay.
+pub(crate) fn comes_further(running: &Running, by: u64) {
+    let wanted = rows_of(running) + by;
+    until("it has come further", || rows_of(running) >= wanted);
+}
+
+/// Rows in the replay; 0 before there is one.
+pub(crate) fn rows_of(running: &Running) -> u64 {
+    shoal_common::commit::CommitReader::open(&running.run.join("replay.bin")).map_or(0, |commits| commits.rows())
+}
+
 /// The one line that a failed command said.
 pub(crate) fn complaint(output: &Output) -> String {
     let said = String::from_utf8_lossy(&output.stderr).into_owned();

@@ -3,6 +3,7 @@
 use std::fmt::Display;
 
 use super::{Algorithm, Config, ConfigError, Ddpg, Exploration, Mode, Reinforce, Tabular};
+use crate::policy::PolicyLayout;
 use crate::space::Space;
 
 /// Numbers in an observation or an action: many more than any environment has, and few enough that sizes computed from
@@ -53,6 +54,11 @@ impl Config {
             }
             Algorithm::Sarsa(tabular) => check_tabular(["sarsa.gamma", "sarsa.alpha", "sarsa.epsilon"], tabular)?,
         }
+        PolicyLayout::new(algorithm, spec).map_err(|cause| ConfigError::Control {
+            algorithm: algorithm.name(),
+            environment: self.environment.name.clone(),
+            cause,
+        })?;
         self.check_use_of_rows()?;
         within("replay.tolerance", replay.tolerance, 1, 1_000_000_000)?;
         within("evaluation.every", evaluation.every, 1, u64::MAX)?;
@@ -84,7 +90,7 @@ impl Config {
             }
         }
         if !algorithm.is_off_policy() && self.run.mode == Mode::Free {
-            let why = "learns from what the policy does that it improves (--lockstep)";
+            let why = "learns from what the newest policy does and from nothing older";
             return Err(only("run.mode", "free".into(), "lockstep", why));
         }
         if algorithm.learns_from_episodes() {

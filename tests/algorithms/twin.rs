@@ -1,0 +1,173 @@
+//! Algorithms 1, 2 and 3, plainly: one process, one environment, and the same random streams.
+
+use shoal_actor::exploration::Exploration;
+use shoal_common::channel::environment::ResponseLayout;
+use shoal_common::config::{Algorithm, Config};
+use shoal_common::stream::{Purpose, stream};
+use shoal_common::transition::Transition;
+use shoal_env_server::environment::frozen_lake::{ACTIONS, STATES};
+use shoal_env_server::vector::{Start, VectorEnvironment};
+use shoal_learner::algorithm::{self, Room};
+use shoal_learner::digest::sha256;
+use shoal_learner::replay::{ChunkMark, Replay, ReplayLayout};
+
+/// An environment, and how one acts in it.
+struct World {
+    environment: VectorEnvironment,
+    exploration: Exploration,
+    response: Vec<f32>,
+    /// Actions chosen so far.
+    t: u64,
+    /// Where it stands; behind the end of an episode, where the next one begins.
+    s: Vec<f32>,
+}
+
+/// What came of an action.
+struct Step {
+    s: Vec<f32>,
+    a: f32,
+    r: f32,
+    s_next: Vec<f32>,
+    terminated: bool,
+    truncated: bool,
+}
+
+impl World {
+    fn new(config: &Config) -> Self {
+        let (seed, Config { environment, spec, .. }) = (config.run.seed, config);
+        let streams = stream(seed, Purpose::Exploration, 0, 0);
+        let mut world = Self {
+            environment: VectorEnvironment::new(&environment.name, &environment.parameters, 1, seed, 0, 0).unwrap(),
+            exploration: Exploration::new(&config.algorithm, spec, 1, streams).unwrap(),
+            response: vec![0.0; ResponseLayout::new(1, spec.observation.width()).len()],
+            t: 0,
+            s: vec![0.0; spec.observation.width()],
+        };
+        world.environment.reset(Start::Next, &mut world.s).unwrap();
+        world
+    }
+
+    fn choose(&mut self, parameters: &[f32]) -> f32 {
+        let mut a = [f32::NAN];
+        self.exploration.act(parameters, &self.s, self.t, &mut a);
+        self.t += 1;
+        a[0]
+    }
+
+    fn step(&mut self, a: f32) -> Step {
+        let layout = ResponseLayout::new(1, self.s.len());
+        self.environment
+            .step(&[a], layout.split_mut(&mut self.response))
+            .unwrap();
+        let after = layout.split_mut(&mut self.response);
+        let step = Step {
+            s: self.s.clone(),
+            a,
+            r: after.rewards[0],
+            s_next: after.next_observations.to_vec(),
+            terminated: after.terminated[0] != 0.0,
+            truncated: after.truncated[0] != 0.0,
+        };
+        self.s.copy_from_slice(after.observations);
+        step
+    }
+}
+
+/// SARSA or Q-learning. The SHA-256 of the table it ends with, and how many episodes the time limit cut off.
+pub(crate) fn tabular(config: &Config) -> (String, u64) {
+    let (Algorithm::QLearning(settings) | Algorithm::Sarsa(settings)) = &config.algorithm else {
+        panic!("no table is learned")
+    };
+    let (alpha, gamma) = (settings.alpha as f32, settings.gamma as f32);
+    let mut q = [0.0_f32; STATES * ACTIONS];
+    let mut truncated = 0;
+    let mut world = World::new(config);
+    for _ in 0..config.run.episodes.unwrap() {
+        let mut a = world.choose(&q);
+        loop {
+            let step = world.step(a);
+            let at = step.s[0] as usize * ACTIONS + a as usize;
+            let next = step.s_next[0] as usize * ACTIONS;
+            let over = step.terminated || step.truncated;
+            let target = if let Algorithm::QLearning(_) = config.algorithm {
+                let greatest = q[next..][..ACTIONS].iter().copied().fold(f32::MIN, f32::max);
+                Some(step.r + if step.terminated { 0.0 } else { gamma * greatest })
+            } else if step.terminated {
+                Some(step.r)
+            } else if step.truncated {
+                // No a' is chosen.
+                None
+            } else {
+                a = world.choose(&q);
+                Some(step.r + gamma * q[next + a as usize])
+            };
+            if let Some(target) = target {
+                q[at] += alpha * (target - q[at]);
+            }
+            if over {
+                truncated += u64::from(step.truncated);
+                break;
+            }
+            if let Algorithm::QLearning(_) = config.algorithm {
+                a = world.choose(&q);
+            }
+        }
+    }
+    (sha256(&[&q]), truncated)
+}
+
+/// REINFORCE: an episode with the policy as it is, then an update. The SHA-256 of all the weights it ends with.
+pub(crate) fn reinforce(config: &Config) -> String {
+    let place = tempfile::tempdir().unwrap();
+    let chunk = config.chunk_layout();
+    let room = Room {
+        capacity: config.replay.capacity,
+        chunk_rows: chunk.rows,
+        actors: 1,
+        envs: 1,
+    };
+    let mut learner = algorithm::new(&config.algorithm, &config.spec, config.run.seed, room).unwrap();
+    let layout = ReplayLayout {
+        row: chunk.row,
+        ring: config.replay.capacity,
+        actors: 1,
+        standing_words: 0,
+        fingerprint: 0,
+    };
+    let mut replay = Replay::create(&place.path().join("replay"), &layout).unwrap();
+    let mut world = World::new(config);
+    for number in 0..config.run.episodes.unwrap() {
+        let (mut episode, mut over) = (Vec::new(), false);
+        while !over {
+            let a = world.choose(learner.policy());
+            let step = world.step(a);
+            over = step.terminated || step.truncated;
+            let mut row = vec![0.0; chunk.row.width()];
+            let discount = if step.terminated {
+                0.0
+            } else {
+                config.algorithm.gamma() as f32
+            };
+            let transition = Transition {
+                s: &step.s,
+                a: &[step.a],
+                r: step.r,
+                discount,
+                s_next: &step.s_next,
+                last: over,
+            };
+            chunk.row.write(&transition, &mut row);
+            episode.extend(row);
+        }
+        let mark = ChunkMark {
+            incarnation: 1,
+            sequence: number + 1,
+        };
+        replay.append_and_commit(0, mark, &episode).unwrap();
+        learner.update(&replay, replay.head());
+    }
+    let weights = algorithm::weights(&config.algorithm);
+    let state = learner.state();
+    let learned = state.iter().filter(|(name, _)| weights.contains(name));
+    sha256(&learned.map(|(_, numbers)| *numbers).collect::<Vec<_>>())
+}
