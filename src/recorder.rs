@@ -30,7 +30,8 @@ pub(crate) struct Episode {
     /// Sum of its rewards.
     #[serde(rename = "return")]
     pub(crate) episode_return: f64,
-    policy_version: u64,
+    /// Version of the policy at its end.
+    pub(crate) policy_version: u64,
 }
 
 /// A row of `evaluations.csv`.

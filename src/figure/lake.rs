@@ -29,12 +29,12 @@ pub(crate) fn lake(policy: &[Vec<usize>], values: &[[f64; 4]], path: &Path) -> a
         sheet.draw_text("Policy", &bold(15.0, HPos::Left), (px(MARGIN), px(TITLE / 2.0)))?;
         let right = 2.0 * MARGIN + side;
         sheet.draw_text("Action-values", &bold(15.0, HPos::Left), (px(right), px(TITLE / 2.0)))?;
-        for state in 0..SIDE * SIDE {
+        for (state, kind) in MAP.iter().enumerate() {
             let (row, column) = (state / SIDE, state % SIDE);
             let (x, y) = (column as f64 * CELL, TITLE + row as f64 * CELL);
             field(sheet, MARGIN + x, y, state)?;
             field(sheet, right + x, y, state)?;
-            if matches!(MAP[state], b'H' | b'G') {
+            if matches!(kind, b'H' | b'G') {
                 continue;
             }
             for action in policy.get(state).into_iter().flatten() {

@@ -11,7 +11,6 @@ use super::family::{Family, Policies, Results};
 use super::report::{Album, Section};
 use super::result::SeedResult;
 use crate::figure::{self, Frame, Setting};
-use crate::recorder::read_episodes;
 
 /// Episodes that the moving average of figure 4.6 is over.
 const SPAN: usize = 100;
@@ -137,14 +136,8 @@ impl Family for CartPole {
     const EXPERIMENTS: &'static [Experiment] = &EXPERIMENTS;
 
     fn test(policies: &Policies, _: &Stage) -> anyhow::Result<Tests> {
-        let episodes = read_episodes(&policies.run.episodes())?;
-        // An episode may be recorded that began when the run was over.
-        let wanted = policies.config.run.episodes.unwrap_or(u64::MAX) as usize;
-        let returns: Vec<f64> = episodes
-            .iter()
-            .take(wanted)
-            .map(|episode| episode.episode_return)
-            .collect();
+        let episodes = policies.episodes()?;
+        let returns: Vec<f64> = episodes.iter().map(|episode| episode.episode_return).collect();
         Ok(Tests::of(&returns, is_dead(policies)?))
     }
 

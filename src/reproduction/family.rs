@@ -13,6 +13,7 @@ use super::folder::Folder;
 use super::report::{Album, Section};
 use super::result::{self, SeedResult};
 use super::settings::Settings;
+use crate::recorder::{Episode, read_episodes};
 
 /// Experiments of one kind. Adding one takes this trait and a line in [`super::FAMILIES`].
 pub(super) trait Family {
@@ -38,6 +39,18 @@ pub(super) struct Policies {
     pub(super) last: PolicyFile,
     /// Where its records are.
     pub(super) run: RunDir,
+}
+
+impl Policies {
+    /// The training's episodes in their order, of a run with one actor, one environment, and at most one episode in a chunk:
+    /// then a policy is behind one of them at most. A chunk that was sent and not learned from when a run was interrupted is
+    /// collected again, and its episode recorded again; and one that began when the run was over is none of it.
+    pub(super) fn episodes(&self) -> anyhow::Result<Vec<Episode>> {
+        let mut episodes = read_episodes(&self.run.episodes())?;
+        episodes.dedup_by_key(|episode| episode.policy_version);
+        episodes.truncate(self.config.run.episodes.unwrap_or(u64::MAX) as usize);
+        Ok(episodes)
+    }
 }
 
 /// The results of a family that lie in a folder.

@@ -12,7 +12,7 @@ use super::family::{Family, Policies, Results};
 use super::report::{Album, Figure, Section};
 use super::result::{SeedResult, representative};
 use crate::figure::{self, Frame, Setting};
-use crate::recorder::{read_episodes, read_evaluations};
+use crate::recorder::read_evaluations;
 use crate::rollout::policy_layout;
 use crate::test_run::lake::{LIMIT, Walk, greedy, optimal};
 
@@ -146,7 +146,8 @@ impl Family for FrozenLake {
         let layout = policy_layout(config)?;
         let mut steps = 0;
         // There is one actor with one environment: an episode ends where its steps and those before add up to.
-        let ends: Vec<u64> = read_episodes(&run.episodes())?
+        let ends: Vec<u64> = policies
+            .episodes()?
             .iter()
             .map(|episode| {
                 steps += u64::from(episode.steps);
