@@ -181,12 +181,12 @@ fn the_least_and_the_largest_numbers_that_are_allowed_can_be_computed_with() {
         while accepted(&table).is_some() && width < 1 << 20 {
             usable(&accepted(&table).unwrap());
             width *= 2;
-            for bound in &bounds {
-                replace(&mut table, bound, Value::Array(vec![Value::Float(1.0); width]));
+            for (bound, end) in bounds.iter().zip([-1.0, 1.0]) {
+                replace(&mut table, bound, Value::Array(vec![Value::Float(end); width]));
             }
         }
-        for bound in &bounds {
-            replace(&mut table, bound, Value::Array(vec![Value::Float(1.0); width / 2]));
+        for (bound, end) in bounds.iter().zip([-1.0, 1.0]) {
+            replace(&mut table, bound, Value::Array(vec![Value::Float(end); width / 2]));
         }
     }
     let largest = accepted(&table).unwrap();

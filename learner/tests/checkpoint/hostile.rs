@@ -15,7 +15,7 @@ use tempfile::TempDir;
 const NAMES: [&str; 2] = ["latest.ckpt", "previous.ckpt"];
 
 /// As the header is written: fingerprint, counters, sections.
-type Header = (u64, (u64, u64, u64), Vec<(String, u64)>);
+type Header = (u64, (u64, u64, u64, u64), Vec<(String, u64)>);
 
 /// Whoever asks for more memory than any of these files has gets none.
 fn limit_memory() {
@@ -159,7 +159,7 @@ proptest! {
         let path = directory.path().join("latest.ckpt");
         // Bytes, and bytes where the sections' count and the first name's length are hostile.
         let [sections, name, numbers] = lengths;
-        let mut claims = [7, 1, 2, 3, sections, name].map(u64::to_le_bytes).concat();
+        let mut claims = [7, 1, 2, 3, 4, sections, name].map(u64::to_le_bytes).concat();
         claims.extend(&body);
         claims.extend(numbers.to_le_bytes());
         for body in [&body, &claims] {
@@ -176,7 +176,7 @@ proptest! {
     #[test]
     fn a_header_that_lies_is_refused(
         fingerprint in prop_oneof![Just(7), extreme()],
-        counters in (extreme(), extreme(), extreme()),
+        counters in (extreme(), extreme(), extreme(), extreme()),
         sections in prop::collection::vec(("[a-z]{0,5}", prop_oneof![0..9_u64, extreme()]), 0..4),
         right in any::<bool>(),
         odd in 0..4_usize,
@@ -196,13 +196,13 @@ proptest! {
         sealed(&directory.path().join("latest.ckpt"), &body);
 
         let fits = claimed == Some(numbers as u64) && odd == 0;
-        let possible = counters.0.max(counters.1).max(counters.2) < 1 << 60;
+        let possible = counters.0.max(counters.1).max(counters.2).max(counters.3) < 1 << 60;
         match load(directory.path()) {
             Ok(Some(loaded)) => {
                 prop_assert!(fits && possible && fingerprint == 7);
                 let counters = loaded.checkpoint.counters;
                 // A learner counts on from there.
-                prop_assert!([counters.updates, counters.rows, counters.policy_version].iter().all(|n| *n < 1 << 60));
+                prop_assert!([counters.updates, counters.rows, counters.episodes, counters.policy_version].iter().all(|n| *n < 1 << 60));
             }
             Err(CheckpointError::Refused { .. }) => prop_assert!(fingerprint != 7),
             Err(CheckpointError::AllDamaged { .. }) => prop_assert!(!(fits && possible)),
