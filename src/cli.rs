@@ -166,7 +166,7 @@ pub(crate) struct ReproduceArgs {
     /// What to run; everything where nothing is named.
     #[arg(value_name = "EXPERIMENT", value_parser = PossibleValuesParser::new(reproduce::choices()))]
     pub(crate) experiments: Vec<String>,
-    /// Seeds 1 to N of each experiment [default: 5; with --quick 2].
+    /// Seeds 1 to N of each experiment [default: 5, of frozen-lake and cart-pole 10 to 30; with --quick 2].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     pub(crate) seeds: Option<u32>,
     /// Trainings at a time [default: half the cores, for each keeps about two busy].

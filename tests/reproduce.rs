@@ -146,3 +146,54 @@ fn a_seed_that_fails_is_missing_and_the_others_go_on() {
     );
     assert_eq!(std::fs::read(&result).unwrap(), kept);
 }
+
+#[test]
+fn every_experiment_of_the_thesis_can_be_glanced_at() {
+    let place = Workplace::new();
+    let all = [
+        "reproduce",
+        "all",
+        "--quick",
+        "--seeds",
+        "1",
+        "--jobs",
+        "2",
+        "--out",
+        "kept",
+    ];
+    assert!(Reproducing::start(&place, &all).wait().success(), "{}", place.said());
+    let report = std::fs::read_to_string(place.path().join("kept/REPORT.md")).unwrap();
+    assert!(!report.contains("missing"), "{report}");
+    for (figure, of_the_thesis) in [
+        ("frozen-lake-epsilon-reward", "4.2a"),
+        ("frozen-lake-alpha-steps", "4.3b"),
+        ("frozen-lake-policy", "4.4"),
+        ("cart-pole-seeds", "4.6"),
+        ("pendulum-learning-curve", "4.8"),
+        ("pendulum-swing-up", "4.9"),
+        ("point-mass-r1-test-runs", "5.5"),
+        ("point-mass-r2-learning-curve", "5.6"),
+        ("point-mass-r3-test-runs", "5.9"),
+        ("point-mass-paths", "5.10"),
+        ("point-mass-actions", "5.11"),
+        ("point-mass-r2-longer-learning-curve", "A.3"),
+        ("point-mass-r3-far-2", "A.8"),
+    ] {
+        let line = report.lines().find(|line| line.contains(&format!("{figure}.png")));
+        assert!(
+            line.is_some_and(|line| line.contains(of_the_thesis)),
+            "{figure}: {report}"
+        );
+        assert!(
+            place.path().join(format!("kept/figures/{figure}.png")).exists(),
+            "{figure}"
+        );
+    }
+    // Every policy that was judged on the lake is there, and the table at the end.
+    let lake = place.path().join("kept/frozen-lake");
+    let judged = std::fs::read_dir(lake.join("seed-1/policies")).unwrap().count();
+    let kept: serde_json::Value = serde_json::from_slice(&std::fs::read(lake.join("seed-1.json")).unwrap()).unwrap();
+    assert!(judged > 1, "{judged}");
+    assert_eq!(kept["tests"]["judged"].as_array().unwrap().len(), judged);
+    assert_eq!(kept["tests"]["q"].as_array().unwrap().len(), 64);
+}

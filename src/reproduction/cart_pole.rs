@@ -32,9 +32,9 @@ const SKIPPING: &str = "cart-pole-skip";
 const BASELINE: &str = "cart-pole-baseline";
 
 const VARIANTS: [(&str, &str); 4] = [
-    (PLAIN, "plain returns"),
-    (NORMALISED, "normalised returns"),
-    (SKIPPING, "normalised, no update at the limit"),
+    (PLAIN, "plain"),
+    (NORMALISED, "normalised"),
+    (SKIPPING, "normalised, skipping the limit"),
     (BASELINE, "baseline"),
 ];
 
