@@ -38,10 +38,22 @@ fn together(thesis: &'static str, criterion: &'static str, ours: String, held: O
     }
 }
 
-/// In the mean over the seeds, from one episode to another.
+/// In the mean over the seeds, from one episode to another; not a number where there are none.
 fn reached(seeds: &[SeedResult<Tests>], from: u64, to: u64) -> f64 {
-    let each = seeds.iter().map(|seed| seed.tests.reached(from, to));
-    each.sum::<f64>() / seeds.len().max(1) as f64
+    mean(seeds, |tests| tests.reached(from, to))
+}
+
+/// Over the seeds; not a number where there are none.
+fn mean(seeds: &[SeedResult<Tests>], of: impl Fn(&Tests) -> f64) -> f64 {
+    seeds.iter().map(|seed| of(&seed.tests)).sum::<f64>() / seeds.len() as f64
+}
+
+/// A mean, or that there is none.
+fn say(mean: f64, decimals: usize) -> String {
+    if mean.is_nan() {
+        return "no results".into();
+    }
+    format!("{mean:.decimals$}")
 }
 
 fn at_end(seeds: &[SeedResult<Tests>]) -> f64 {
@@ -75,7 +87,7 @@ fn slow(epsilon: &[Sweep<'_>; 3], best: Walk) -> Claim {
         "The lowest ε of 0.1 does not converge within the 10,000 episodes",
         "over the last 1,000 episodes its mean probability of the goal is more than 0.05 below the best policy's, and those of \
          the other two are not",
-        ends.map(|(label, end)| format!("{label}: {end:.2}")).join("; "),
+        ends.map(|(label, end)| format!("{label}: {}", say(end, 2))).join("; "),
         there.then(|| {
             let converged = ends.map(|(_, end)| end > best.reached - SAME);
             converged == [false, true, true]
@@ -88,7 +100,12 @@ fn early(low: &[SeedResult<Tests>], good: &[SeedResult<Tests>], high: &[SeedResu
     together(
         "ε = 0.7 looks as though it will be the best exploration rate early on",
         "its mean probability of the goal between episodes 500 and 2,000 is the highest",
-        format!("0.1: {low:.3}; 0.4: {middle:.3}; 0.7: {high_mean:.3}"),
+        format!(
+            "0.1: {}; 0.4: {}; 0.7: {}",
+            say(low, 3),
+            say(middle, 3),
+            say(high_mean, 3)
+        ),
         (!good.is_empty() && !high.is_empty()).then_some(high_mean > middle && high_mean > low),
     )
 }
@@ -103,7 +120,9 @@ fn late(good: &[SeedResult<Tests>], high: &[SeedResult<Tests>]) -> Claim {
         "ε = 0.7 is surpassed by ε = 0.4",
         "between episodes 5,000 and 8,000 the mean probability of the goal is higher with 0.4",
         format!(
-            "0.4: {middle:.3}; 0.7: {high_mean:.3}; the learned value of the start (q* 0.786) ends at {} and {}",
+            "0.4: {}; 0.7: {}; the learned value of the start (q* 0.786) ends at {} and {}",
+            say(middle, 3),
+            say(high_mean, 3),
             start(good),
             start(high)
         ),
@@ -145,17 +164,15 @@ fn state_six(good: &[SeedResult<Tests>]) -> Claim {
 }
 
 fn alike(good: &[SeedResult<Tests>], q_star: &Values) -> Claim {
-    let mean = |action: usize| {
-        let values = good.iter().map(|seed| f64::from(seed.tests.q[4 * 6 + action]));
-        values.sum::<f64>() / good.len().max(1) as f64
-    };
     let difference = |seed: &SeedResult<Tests>| f64::from((seed.tests.q[4 * 6] - seed.tests.q[4 * 6 + 2]).abs());
-    let (left, right) = (mean(0), mean(2));
+    let [left, right] = [0, 2].map(|action| mean(good, |tests| f64::from(tests.q[4 * 6 + action])));
     together(
         "q*(6, left) = q*(6, right); the learned Q is only close to optimal",
         "the two differ by less than 0.1 in the mean over the seeds",
         format!(
-            "left {left:.3}, right {right:.3} in the mean (both {:.3} in q*); within a seed they differ by {}",
+            "left {}, right {} in the mean (both {:.3} in q*); within a seed they differ by {}",
+            say(left, 3),
+            say(right, 3),
             q_star[6][0],
             spread(good.iter().map(difference), 2)
         ),
@@ -169,7 +186,7 @@ fn learning_rates(alpha: &[Sweep<'_>; 4]) -> Claim {
     together(
         "A low learning rate leads to slow convergence, a high one may not converge; α = 0.03 is appropriate",
         "over the last 1,000 episodes the mean probability of the goal is highest with 0.03, by more than 0.05 before 0.01 and 0.3",
-        ends.map(|(label, end)| format!("{label}: {end:.2}")).join("; "),
+        ends.map(|(label, end)| format!("{label}: {}", say(end, 2))).join("; "),
         there.then(|| {
             let [low, good, middle, high] = ends.map(|(_, end)| end);
             good > middle && good - low > SAME && good - high > SAME
@@ -178,17 +195,13 @@ fn learning_rates(alpha: &[Sweep<'_>; 4]) -> Claim {
 }
 
 fn on_policy(good: &[SeedResult<Tests>], sarsa: &[SeedResult<Tests>], q_star: &Values) -> Claim {
-    let start = |seeds: &[SeedResult<Tests>]| {
-        let sum: f64 = seeds.iter().map(|seed| highest(&seed.tests, 0)).sum();
-        sum / seeds.len().max(1) as f64
-    };
     let best = q_star[0].iter().copied().fold(f64::NEG_INFINITY, f64::max);
-    let (off, on) = (start(good), start(sarsa));
+    let [off, on] = [good, sarsa].map(|seeds| mean(seeds, |tests| highest(tests, 0)));
     together(
         "Q-learning approximates q* directly, without depending on the policy being followed; SARSA estimates the value of the \
          policy that explores (section 3.3.2)",
         "with the same ε and α the learned value of the start is nearer to q* with Q-learning, and SARSA's is below half of it",
-        format!("Q-learning {off:.2}, SARSA {on:.2}, q* {best:.2}"),
+        format!("Q-learning {}, SARSA {}, q* {best:.2}", say(off, 2), say(on, 2)),
         (!good.is_empty() && !sarsa.is_empty()).then_some((best - off).abs() < (best - on).abs() && on < best / 2.0),
     )
 }
