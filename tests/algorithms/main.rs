@@ -89,22 +89,41 @@ fn q_learning_finds_the_values_of_the_lake_and_a_policy_that_reaches_the_goal() 
 
 #[test]
 fn a_step_at_a_time_q_learning_is_algorithm_2_in_a_single_process() {
-    is_its_algorithm("frozen-lake");
+    is_its_algorithm("frozen-lake", "q-learning");
 }
 
 #[test]
 fn a_step_at_a_time_sarsa_is_algorithm_1_in_a_single_process() {
-    is_its_algorithm("frozen-lake-sarsa");
+    is_its_algorithm("frozen-lake-sarsa", "sarsa");
 }
 
-fn is_its_algorithm(preset: &str) {
+fn is_its_algorithm(preset: &str, section: &str) {
     let place = Workplace::new();
-    // Within 20 steps some episodes are cut off.
-    let limit = "environment.time_limit=20";
-    let result = train(&place, &[preset, "--seed", "11", "--episodes", "700", "--set", limit]);
+    // Within 30 steps some episodes are cut off, and some of so much exploration reach the goal.
+    let [epsilon, alpha] = ["epsilon=0.9", "alpha=0.3"].map(|setting| format!("{section}.{setting}"));
+    let limit = "environment.time_limit=30";
+    let result = train(
+        &place,
+        &[
+            preset,
+            "--seed",
+            "11",
+            "--episodes",
+            "900",
+            "--set",
+            limit,
+            "--set",
+            &epsilon,
+            "--set",
+            &alpha,
+        ],
+    );
     let config = Config::load(&place.path().join("run/config.toml")).unwrap();
-    let (weights, truncated) = twin::tabular(&config);
-    assert!(truncated > 0, "or this shows less");
+    let (weights, truncated, learned) = twin::tabular(&config);
+    assert!(
+        truncated > 0 && learned > 8,
+        "or this shows less: {truncated}, {learned}"
+    );
     assert_eq!(result["weights_sha256"], weights);
 }
 
@@ -134,7 +153,7 @@ const CART_POLE: [&str; 9] = [
     "checkpoint.every_updates=1500",
 ];
 
-const SARSA: [&str; 13] = [
+const SARSA: [&str; 17] = [
     "frozen-lake-sarsa",
     "--actors",
     "2",
@@ -146,6 +165,10 @@ const SARSA: [&str; 13] = [
     "40000",
     "--set",
     "actors.chunk_steps=4",
+    "--set",
+    "sarsa.epsilon=0.9",
+    "--set",
+    "sarsa.alpha=0.3",
     "--set",
     "checkpoint.every_updates=1500",
 ];

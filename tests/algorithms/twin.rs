@@ -73,8 +73,9 @@ impl World {
     }
 }
 
-/// SARSA or Q-learning. The SHA-256 of the table it ends with, and how many episodes the time limit cut off.
-pub(crate) fn tabular(config: &Config) -> (String, u64) {
+/// SARSA or Q-learning. The SHA-256 of the table it ends with, how many episodes the time limit cut off, and how many values
+/// are not 0 any more.
+pub(crate) fn tabular(config: &Config) -> (String, u64, usize) {
     let (Algorithm::QLearning(settings) | Algorithm::Sarsa(settings)) = &config.algorithm else {
         panic!("no table is learned")
     };
@@ -113,7 +114,7 @@ pub(crate) fn tabular(config: &Config) -> (String, u64) {
             }
         }
     }
-    (sha256(&[&q]), truncated)
+    (sha256(&[&q]), truncated, q.iter().filter(|q| **q != 0.0).count())
 }
 
 /// REINFORCE: an episode with the policy as it is, then an update. The SHA-256 of all the weights it ends with.
