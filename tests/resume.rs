@@ -19,8 +19,12 @@ const RING: u64 = 2000;
 const ENDLESS: [&str; 2] = ["--steps", "100000000"];
 
 fn has_saved(running: &Running) {
-    let checkpoint = running.run.join("checkpoints/previous.ckpt");
-    until("there are two checkpoints", || checkpoint.exists());
+    let there = |name: &str| running.run.join("checkpoints").join(name).exists();
+    // A learner killed while it saves leaves the previous one alone.
+    until("there are two checkpoints", || {
+        there("previous.ckpt") && there("latest.ckpt")
+    });
+    until("there is a best policy", || there("best.policy"));
 }
 
 fn rows(run: &Path) -> u64 {
@@ -152,9 +156,16 @@ fn stopped_for(length: Duration) {
 #[test]
 fn a_damaged_checkpoint_is_reported_and_the_one_before_it_used() {
     let place = Workplace::new();
-    let run = killed(&place, &[]);
+    let running = place.start(
+        "run",
+        &[&ENDLESS[..], &["--set", "checkpoint.every_seconds=0.5"]].concat(),
+    );
+    has_saved(&running);
+    // Stopped and not killed: both are there for certain.
+    assert!(place.output(&["stop", "run"]).status.success());
+    let run = running.run.clone();
+    assert_eq!(running.wait().0, Some(0));
     let latest = run.join("checkpoints/latest.ckpt");
-    assert!(run.join("checkpoints/previous.ckpt").exists());
     let mut bytes = std::fs::read(&latest).unwrap();
     let middle = bytes.len() / 2;
     bytes[middle] ^= 1;
@@ -287,7 +298,6 @@ fn a_role_that_cannot_start_is_given_up_with_its_last_words_and_the_run_can_be_r
     let run = killed(&place, &[]);
     // What the evaluator cannot read.
     let best = run.join("checkpoints/best.policy");
-    until("there is a best policy", || best.exists());
     let bytes = std::fs::read(&best).unwrap();
     std::fs::write(&best, b"not a policy at all").unwrap();
     let (code, said) = resume_fails(&place);
