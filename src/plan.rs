@@ -33,8 +33,7 @@ pub(crate) struct Plan {
 impl Plan {
     /// Decides everything, and makes the run directory with its `config.toml` only when nothing is wrong.
     pub(crate) fn new(args: &TrainArgs) -> anyhow::Result<Self> {
-        let (name, table) = sections(&args.what)?;
-        let config = resolve(table, args, &args.what)?;
+        let (name, config) = decide(args)?;
         let place = args.run.clone().unwrap_or_else(|| Path::new("runs").join(&name));
         room::check(&config, &RunDir::planned(&place))?;
         let run = match &args.run {
@@ -49,6 +48,12 @@ impl Plan {
         }
         Ok(Self { config, run, lock })
     }
+}
+
+/// The configuration that a run with these options has, and the name it gets. Nothing is made.
+pub(crate) fn decide(args: &TrainArgs) -> anyhow::Result<(String, Config)> {
+    let (name, table) = sections(&args.what)?;
+    Ok((name, resolve(table, args, &args.what)?))
 }
 
 /// The sections of a preset or a file, and the name that a run of it gets.

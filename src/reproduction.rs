@@ -72,7 +72,7 @@ pub(crate) fn names() -> impl Iterator<Item = &'static str> {
 /// Runs what is due, keeps each result, and writes the report from all results of the folder.
 pub(crate) fn run(order: &Order) -> anyhow::Result<Ending> {
     let folder = Folder::open(&order.folder)?;
-    let settings = expected(&folder, order.effort)?;
+    let settings = expected(order.effort)?;
     let wanted = experiments()
         .filter(|(_, it)| order.experiments.is_empty() || order.experiments.iter().any(|name| name == it.asked_as));
     let jobs: Vec<Job> = wanted
@@ -110,8 +110,8 @@ fn experiments() -> impl Iterator<Item = (&'static Entry, &'static Experiment)> 
 }
 
 /// With which settings each experiment is run by this program.
-fn expected(folder: &Folder, effort: Effort) -> anyhow::Result<BTreeMap<&'static str, Settings>> {
+fn expected(effort: Effort) -> anyhow::Result<BTreeMap<&'static str, Settings>> {
     experiments()
-        .map(|(_, experiment)| Ok((experiment.name, Settings::expected(experiment, effort, folder)?)))
+        .map(|(_, experiment)| Ok((experiment.name, Settings::expected(experiment, effort)?)))
         .collect()
 }

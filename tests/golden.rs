@@ -1,6 +1,9 @@
 //! Replays data recorded from Gymnasium and PyTorch: every file of `tests/golden`, or of the directory that
 //! `SHOAL_GOLDEN_DIR` names.
 
+#[path = "support/value_iteration.rs"]
+mod value_iteration;
+
 use std::path::{Path, PathBuf};
 
 use serde_json::Value;
@@ -217,7 +220,7 @@ fn frozen_lake(file: &Value) -> Result<(), Failure> {
         }
     }
     let recorded = read(file, "q_star_gamma_0_999", ROWS)?;
-    let q_star = value_iteration(0.999);
+    let q_star = value_iteration::optimal_values(0.999);
     if recorded.len() != q_star.len() {
         return Err(format!("action values of {} states", recorded.len()));
     }
@@ -232,26 +235,6 @@ fn same_outcome(ours: &frozen_lake::Outcome, recorded: &Value) -> bool {
         && recorded["next"].as_u64() == Some(ours.next as u64)
         && recorded["reward"].as_f64() == Some(ours.reward)
         && recorded["terminated"].as_bool() == Some(ours.terminated)
-}
-
-/// The lake's optimal action values: Bellman's optimality equation, iterated until nothing changes by 1e-12.
-fn value_iteration(gamma: f64) -> [[f64; frozen_lake::ACTIONS]; frozen_lake::STATES] {
-    let mut q = [[0.0; frozen_lake::ACTIONS]; frozen_lake::STATES];
-    loop {
-        let v = q.map(|values| values.into_iter().fold(f64::NEG_INFINITY, f64::max));
-        let backup = |o: frozen_lake::Outcome| o.p * (o.reward + if o.terminated { 0.0 } else { gamma * v[o.next] });
-        let mut change: f64 = 0.0;
-        for (state, values) in q.iter_mut().enumerate() {
-            for (action, value) in values.iter_mut().enumerate() {
-                let next: f64 = frozen_lake::transitions(state, action).map(backup).sum();
-                change = change.max((next - *value).abs());
-                *value = next;
-            }
-        }
-        if change < 1e-12 {
-            return q;
-        }
-    }
 }
 
 /// Four DDPG updates by PyTorch's autograd and Adam: `initial` networks, `batches`, and the `expected` networks after each.

@@ -6,9 +6,9 @@ use shoal_common::space::EnvironmentSpec;
 
 use crate::checkpoint::{Checkpoint, SectionError};
 use crate::ddpg::{DdpgError, DdpgState};
-use crate::off_policy::OffPolicy;
 use crate::reinforce::Reinforce;
 use crate::replay::Replay;
+use crate::replayed_ddpg::ReplayedDdpg;
 use crate::tabular::{Method, Tabular};
 
 /// A learning method: what it does with the rows of the replay, what actors act with, and what a checkpoint keeps of it.
@@ -85,7 +85,7 @@ pub fn new(
     room: Room,
 ) -> Result<Box<dyn Algorithm>, AlgorithmError> {
     Ok(match algorithm {
-        config::Algorithm::Ddpg(ddpg, _) => Box::new(OffPolicy::new(spec, ddpg, seed, room.capacity)?),
+        config::Algorithm::Ddpg(ddpg, _) => Box::new(ReplayedDdpg::new(spec, ddpg, seed, room.capacity)?),
         config::Algorithm::Reinforce(reinforce) => Box::new(Reinforce::new(reinforce, spec, seed, room)?),
         config::Algorithm::QLearning(tabular) => Box::new(Tabular::new(Method::QLearning, tabular, spec, room)?),
         config::Algorithm::Sarsa(tabular) => Box::new(Tabular::new(Method::Sarsa, tabular, spec, room)?),

@@ -7,15 +7,14 @@ use plotters::prelude::{Polygon, RGBColor, Rectangle, WHITE};
 use plotters::style::Color;
 use plotters::style::text_anchor::HPos;
 
+use shoal_env_server::environment::frozen_lake::MAP;
+
 use super::canvas::{Area, BLUE, FAINT, INK, bold, px, save, stroke, text};
 
 const SIDE: usize = 4;
 const CELL: f64 = 120.0;
 const MARGIN: f64 = 30.0;
 const TITLE: f64 = 34.0;
-
-/// Row by row: S the start, F frozen, H a hole, G the goal.
-const MAP: &[u8; SIDE * SIDE] = b"SFFFFHFHFFFHHFFG";
 
 /// From a field's middle to where an action means to go: left, down, right, up.
 const DIRECTIONS: [(f64, f64); 4] = [(-1.0, 0.0), (0.0, 1.0), (1.0, 0.0), (0.0, -1.0)];

@@ -80,9 +80,28 @@ pub(crate) fn lines_apart(frame: &Frame<'_>, settings: &[Setting], path: &Path) 
     })
 }
 
+/// One curve of several with the same points on the x axis, as far as all of them go: at each point what `of` makes of
+/// their values, sorted.
+pub(crate) fn pointwise(curves: &[Vec<(f64, f64)>], of: impl Fn(&[f64]) -> f64) -> Vec<(f64, f64)> {
+    let common = curves.iter().map(Vec::len).min().unwrap_or(0);
+    let at = |i: usize| {
+        let mut values: Vec<f64> = curves.iter().map(|curve| curve[i].1).collect();
+        values.sort_by(f64::total_cmp);
+        (curves[0][i].0, of(&values))
+    };
+    (0..common).map(at).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn curves_are_joined_as_far_as_all_of_them_go() {
+        let curves = [vec![(1.0, 4.0), (2.0, 5.0)], vec![(1.0, 2.0)]];
+        assert_eq!(pointwise(&curves, |sorted| sorted[0]), [(1.0, 2.0)]);
+        assert_eq!(pointwise(&[], |_| 0.0), []);
+    }
 
     #[test]
     fn settings_have_their_names_and_the_level_is_drawn() {

@@ -149,7 +149,7 @@ impl Family for CartPole {
                 let runs: Vec<_> = seeds.iter().map(|seed| seed.tests.curve()).collect();
                 Setting {
                     label: (*label).into(),
-                    curve: median_curve(&runs),
+                    curve: figure::pointwise(&runs, median),
                     runs,
                 }
             })
@@ -187,7 +187,7 @@ const REMARK: &str = "The environment is Gymnasium's: the pole falls at ±12° o
     Algorithm 3: without γᵗ, the mean over the episode's steps, one step of Adam an episode, weights as TensorFlow draws \
     them (Glorot, biases zero); normalising is (G − mean) / (standard deviation + 1e-8) over one episode, so that equal \
     returns weigh nothing; the baseline has two hidden layers of 32 units and Adam's rate 0.01. A prototype decided between \
-    the readings, 40 runs each: with the sum instead of the mean, plain returns solve the task in three of four runs, \
+    the readings, 40 runs each, which no command here repeats: with the sum instead of the mean, plain returns solve the task in three of four runs, \
     against the thesis; with γᵗ normalised returns cross 195 at episode 1,900 to 2,800, if at all; with a step of Adam at \
     every time step nothing is learned. Only this reading gives plain returns that fail and normalised ones that cross near \
     800. Two units in the second hidden layer are few: where both are dead from some episode on, the policy says the same \
@@ -207,17 +207,6 @@ fn is_dead(policies: &Policies) -> anyhow::Result<bool> {
     let mut each = scores.of(&policies.last.parameters, &states);
     let first: Option<Vec<f32>> = each.next().map(Into::into);
     Ok(first.is_none_or(|first| each.all(|scores| scores == first)))
-}
-
-/// The median of curves, point by point, as far as all of them go.
-fn median_curve(curves: &[Vec<(f64, f64)>]) -> Vec<(f64, f64)> {
-    let common = curves.iter().map(Vec::len).min().unwrap_or(0);
-    let at = |i: usize| {
-        let mut values: Vec<f64> = curves.iter().map(|curve| curve[i].1).collect();
-        values.sort_by(f64::total_cmp);
-        (curves[0][i].0, median(&values))
-    };
-    (0..common).map(at).collect()
 }
 
 type Seeds<'a> = &'a [SeedResult<Tests>];

@@ -107,8 +107,6 @@ pub(super) struct Tests {
 struct Judged {
     /// Training episodes before it.
     episodes: u64,
-    /// Mean return of its evaluation: the share of a few episodes that reached the goal.
-    sampled: f64,
     /// What the lake's table says of it.
     exact: Walk,
 }
@@ -161,7 +159,6 @@ impl Family for FrozenLake {
             let policy = PolicyFile::read(&path, &layout).context("a policy that was judged")?;
             Ok(Judged {
                 episodes: ends.partition_point(|end| *end <= evaluation.env_steps) as u64,
-                sampled: evaluation.return_mean,
                 exact: Walk::of(&greedy(&policy.parameters)).rounded(),
             })
         });
@@ -207,11 +204,11 @@ impl Family for FrozenLake {
                 "Every step is a round of the whole system: one actor, chunks of one row, one update, then the next action; \
                  that is Algorithm 2 to the letter (and Algorithm 1 for `{SARSA}`: a' is chosen before the update). Ties are \
                  broken by the first index, and with probability ε any of the four actions is taken, the greedy one \
-                 included. (Other readings were tried in a prototype: with random ties ε = 0.1 comes further, to 0.64 of \
+                 included. (Other readings were tried in a prototype, which no command here repeats: with random ties ε = 0.1 comes further, to 0.64 of \
                  the goal instead of 0.28; where exploration excludes the greedy action, ε = 0.7 loses its early lead.) The \
                  policies on the way are judged exactly, by the lake's table: how likely the goal is reached within {LIMIT} \
                  steps, and how many steps it takes, {LIMIT} where it is not reached. The five evaluation episodes of the \
-                 thesis are run as well, but five throws say little. The best policy reaches the goal with probability \
+                 thesis are run and kept as well, but five throws say little. The best policy reaches the goal with probability \
                  {:.3}.",
                 walk.reached
             ),
@@ -237,7 +234,7 @@ fn of_sweep(
             let runs: Vec<_> = seeds.iter().map(|seed| seed.tests.on_grid(of)).collect();
             Setting {
                 label: (*label).into(),
-                curve: mean_curve(&runs),
+                curve: figure::pointwise(&runs, mean),
                 runs,
             }
         });
@@ -273,14 +270,8 @@ fn of_sweep(
     ])
 }
 
-/// The mean of curves, point by point, as far as all of them go.
-fn mean_curve(curves: &[Vec<(f64, f64)>]) -> Vec<(f64, f64)> {
-    let common = curves.iter().map(Vec::len).min().unwrap_or(0);
-    let mean = |i: usize| {
-        let sum: f64 = curves.iter().map(|curve| curve[i].1).sum();
-        (curves[0][i].0, sum / curves.len() as f64)
-    };
-    (0..common).map(mean).collect()
+fn mean(values: &[f64]) -> f64 {
+    values.iter().sum::<f64>() / values.len() as f64
 }
 
 fn draw_table(table: &[f32], path: &std::path::Path) -> anyhow::Result<()> {

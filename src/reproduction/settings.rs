@@ -3,16 +3,15 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use anyhow::{Context, bail};
+use anyhow::bail;
 use serde::{Deserialize, Serialize};
 use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
 use toml::Value;
 
 use super::experiment::{Effort, Experiment, Length};
-use super::folder::Folder;
 use crate::cli::{Telling, TrainArgs};
-use crate::plan::Plan;
+use crate::plan;
 
 /// Keys with their sections, and values as TOML.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -42,14 +41,12 @@ impl Settings {
         Self::of(&config)
     }
 
-    /// Those that a run of `experiment` would have. They are the plan's to decide: it is made, read, and thrown away.
-    pub(super) fn expected(experiment: &Experiment, effort: Effort, folder: &Folder) -> anyhow::Result<Self> {
-        let place = tempfile::tempdir_in(folder.path())
-            .with_context(|| format!("cannot make a directory in {}", folder.path().display()))?;
+    /// Those that a run of `experiment` would have.
+    pub(super) fn expected(experiment: &Experiment, effort: Effort) -> anyhow::Result<Self> {
         let length = experiment.stages.first().map(|stage| stage.length(effort));
-        let plan = Plan::new(&TrainArgs {
+        let (_, config) = plan::decide(&TrainArgs {
             what: experiment.preset.into(),
-            run: Some(place.path().join("plan")),
+            run: None,
             seed: Some(1),
             actors: None,
             envs: None,
@@ -62,7 +59,7 @@ impl Settings {
             set: experiment.settings(effort).map(Into::into).collect(),
             telling: Telling::default(),
         })?;
-        Self::of(&plan.config)
+        Self::of(&config)
     }
 
     /// Refuses what was made with other settings. A key that only one of them knows is of another version of this program
@@ -114,23 +111,20 @@ mod tests {
 
     #[test]
     fn settings_leave_out_name_seed_and_length() {
-        let parent = tempfile::tempdir().unwrap();
-        let folder = Folder::open(parent.path()).unwrap();
         let experiment = &super::super::pendulum::EXPERIMENTS[0];
-        let [full, quick] = [Effort::Full, Effort::Quick].map(|e| Settings::expected(experiment, e, &folder).unwrap());
+        let [full, quick] = [Effort::Full, Effort::Quick].map(|e| Settings::expected(experiment, e).unwrap());
         assert_eq!(full.0["ddpg.hidden"], "[400, 300]");
         assert_eq!(full.0["run.mode"], "\"lockstep\"");
         assert!(
             !full.0.keys().any(|key| key == "run.seed" || key.starts_with("spec")),
             "{full:?}"
         );
-        assert_eq!(Settings::expected(experiment, Effort::Full, &folder).unwrap(), full);
+        assert_eq!(Settings::expected(experiment, Effort::Full).unwrap(), full);
         let refused = quick.check(Path::new("seed-1.json"), &full).unwrap_err().to_string();
         assert!(
             refused.contains("seed-1.json") && refused.contains("which is now") && !refused.contains('\n'),
             "{refused}"
         );
         full.check(Path::new("x"), &full).unwrap();
-        assert_eq!(std::fs::read_dir(parent.path()).unwrap().count(), 0, "nothing stays");
     }
 }

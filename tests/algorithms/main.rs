@@ -7,6 +7,8 @@ mod lake;
 #[path = "../support/mod.rs"]
 mod support;
 mod twin;
+#[path = "../support/value_iteration.rs"]
+mod value_iteration;
 
 use rustix::process::Signal;
 use shoal_common::config::Config;
@@ -73,7 +75,7 @@ fn q_learning_finds_the_values_of_the_lake_and_a_policy_that_reaches_the_goal() 
             "q-learning.epsilon=0.7",
         ],
     );
-    let (learned, optimal) = (table(&place), lake::value_iteration(0.999));
+    let (learned, optimal) = (table(&place), value_iteration::optimal_values(0.999));
     let furthest = optimal
         .as_flattened()
         .iter()

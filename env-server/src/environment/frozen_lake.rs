@@ -13,7 +13,7 @@ use super::{
 };
 
 /// Row by row: S the start, F frozen, H a hole, G the goal.
-const MAP: &[u8; STATES] = b"SFFFFHFHFFFHHFFG";
+pub const MAP: &[u8; STATES] = b"SFFFFHFHFFFHHFFG";
 const SIDE: usize = 4;
 
 /// How many states there are: fields of the lake, numbered row by row.

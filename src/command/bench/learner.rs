@@ -9,9 +9,9 @@ use shoal_common::config::Config;
 use shoal_common::stream::{Purpose, stream};
 use shoal_learner::algorithm::Algorithm;
 use shoal_learner::ddpg::Ddpg;
-use shoal_learner::off_policy::OffPolicy;
 use shoal_learner::product::products_of_update;
 use shoal_learner::replay::Replay;
+use shoal_learner::replayed_ddpg::ReplayedDdpg;
 
 use super::product::Multiplication;
 use super::rows::{ENVIRONMENTS, Rows};
@@ -94,7 +94,7 @@ pub(super) fn measure(patience: &Patience) -> anyhow::Result<LearnerFigures> {
 
 /// What a learner updates with, as in its loop.
 struct Learner {
-    method: OffPolicy,
+    method: ReplayedDdpg,
     batch: usize,
     replay: Replay,
 }
@@ -116,7 +116,7 @@ impl Learner {
         }
         let ddpg = ddpg(config)?;
         Ok(Self {
-            method: OffPolicy::new(&config.spec, ddpg, config.run.seed, config.replay.capacity)?,
+            method: ReplayedDdpg::new(&config.spec, ddpg, config.run.seed, config.replay.capacity)?,
             batch: ddpg.batch,
             replay,
         })

@@ -217,7 +217,6 @@ mod tests {
     fn seed(number: u64, rises: &[(u64, f64)], q: &Values) -> SeedResult<Tests> {
         let judged = rises.iter().map(|(episodes, reached)| Judged {
             episodes: *episodes,
-            sampled: 0.0,
             exact: Walk {
                 reached: *reached,
                 steps: 50.0,

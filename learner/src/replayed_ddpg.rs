@@ -14,7 +14,7 @@ use crate::sampling::Sampler;
 
 /// DDPG and its way of drawing from the replay.
 #[derive(Debug)]
-pub struct OffPolicy {
+pub struct ReplayedDdpg {
     /// The networks.
     pub ddpg: Ddpg,
     sampler: Sampler,
@@ -23,7 +23,7 @@ pub struct OffPolicy {
     capacity: u64,
 }
 
-impl OffPolicy {
+impl ReplayedDdpg {
     /// New networks, drawn from `seed`, that learn from the newest `capacity` rows.
     ///
     /// # Errors
@@ -40,7 +40,7 @@ impl OffPolicy {
     }
 }
 
-impl Algorithm for OffPolicy {
+impl Algorithm for ReplayedDdpg {
     fn policy(&self) -> &[f32] {
         self.ddpg.policy()
     }
