@@ -49,9 +49,9 @@ pub(crate) enum Command {
 
 #[derive(Args, Clone, Debug)]
 pub(crate) struct TrainArgs {
-    /// What to train: frozen-lake, frozen-lake-sarsa, cart-pole, pendulum, point-mass-r1, point-mass-r2, point-mass-r3, or
-    /// a configuration file (FILE.toml).
-    #[arg(value_name = "PRESET|FILE.toml")]
+    /// What to train: frozen-lake, frozen-lake-sarsa, cart-pole, pendulum, point-mass-r1, point-mass-r2, point-mass-r3,
+    /// gym: and a Gymnasium environment (gym:HalfCheetah-v5), or a configuration file (FILE.toml).
+    #[arg(value_name = "PRESET|gym:ID|FILE.toml")]
     pub(crate) what: String,
     /// Run directory to make [default: runs/<preset>-<n>].
     #[arg(long, value_name = "DIR")]

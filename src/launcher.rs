@@ -330,10 +330,11 @@ fn each<R: shoal_common::channel::reports::Report>(
     Ok(())
 }
 
-/// With this file, iceoryx2's own tools find the run's services when they are started in the run directory.
+/// With this file, iceoryx2's own tools find the run's services when they are started in the run directory, and so do
+/// environment servers that are programs of their own.
 fn write_iox_config(domain: &Domain, run: &RunDir) -> anyhow::Result<()> {
-    let directory = run.path().join("config");
-    std::fs::create_dir_all(&directory)?;
-    std::fs::write(directory.join("iceoryx2.toml"), domain.iox_config()?)?;
+    let file = run.iceoryx2_config();
+    file.parent().map_or(Ok(()), std::fs::create_dir_all)?;
+    std::fs::write(file, domain.iox_config()?)?;
     Ok(())
 }

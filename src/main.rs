@@ -2,8 +2,10 @@
 
 mod cli;
 mod command;
+mod environment_server;
 mod figure;
 mod launcher;
+mod peer;
 mod plan;
 mod recorder;
 mod remote;

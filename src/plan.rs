@@ -4,12 +4,14 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
-use shoal_common::config::{Actors, Config};
+use shoal_common::config::{Actors, Config, Environment};
 use shoal_common::run_dir::{RunDir, RunLock};
+use shoal_common::space::{EnvironmentSpec, Space};
 use shoal_env_server::environment;
 use toml::{Table, Value};
 
 use crate::cli::TrainArgs;
+use crate::environment_server::{self, Conversation, GYMNASIUM};
 use crate::room;
 
 const PRESETS: [(&str, &str); 7] = [
@@ -21,6 +23,14 @@ const PRESETS: [(&str, &str); 7] = [
     ("frozen-lake-sarsa", include_str!("../presets/frozen-lake-sarsa.toml")),
     ("cart-pole", include_str!("../presets/cart-pole.toml")),
 ];
+
+/// What a Gymnasium environment is trained with, by the kinds of its observations and actions.
+const FOR_CONTINUOUS_ACTIONS: &str = include_str!("../presets/gym-continuous.toml");
+const FOR_DISCRETE_ACTIONS: &str = include_str!("../presets/gym-discrete.toml");
+const FOR_A_TABLE: &str = include_str!("../presets/gym-table.toml");
+
+/// Sections that name the method.
+const METHODS: [&str; 4] = ["ddpg", "reinforce", "q-learning", "sarsa"];
 
 /// A run that can begin.
 #[derive(Debug)]
@@ -61,11 +71,17 @@ fn sections(what: &str) -> anyhow::Result<(String, Table)> {
     if let Some((name, text)) = PRESETS.into_iter().find(|(name, _)| *name == what) {
         return Ok((name.into(), text.parse().with_context(|| format!("preset {name}"))?));
     }
+    if let Some(id) = what.strip_prefix(GYMNASIUM) {
+        let mut table = Table::new();
+        put(&mut table, &["environment", "name"], what.into())?;
+        let is_plain = |c: char| c.is_ascii_alphanumeric() || "-._".contains(c);
+        return Ok((format!("gym-{}", id.replace(|c| !is_plain(c), "-")), table));
+    }
     let path = PathBuf::from(what);
     if path.extension().is_none_or(|extension| extension != "toml") {
         let known: Vec<&str> = PRESETS.iter().map(|(name, _)| *name).collect();
         bail!(
-            "there is no preset `{what}`: choose {}, or a file that ends in .toml",
+            "there is no preset `{what}`: choose {}, a file that ends in .toml, or gym: and a Gymnasium environment",
             known.join(", ")
         );
     }
@@ -139,22 +155,76 @@ fn resolve(mut table: Table, args: &TrainArgs, origin: &str) -> anyhow::Result<C
     Ok(config)
 }
 
-/// Fills in every parameter of the environment, and what the environment says of itself.
+/// Fills in what the environment says of itself: of ours every parameter too, and for Gymnasium's a method that suits
+/// it, where no other is named.
 fn describe_environment(table: &mut Table) -> anyhow::Result<()> {
     let Some(Value::Table(section)) = table.get_mut("environment") else {
         bail!("the section [environment] is missing: it must have a name");
     };
     let Some(Value::String(name)) = section.remove("name") else {
         bail!(
-            "environment.name is missing: it must be one of {}",
+            "environment.name is missing: it must be one of {}, or begin with {GYMNASIUM}",
             environment::names().collect::<Vec<_>>().join(", ")
         );
     };
-    let mut parameters = environment::resolve(&name, section)?;
-    let spec = environment::make(&name, &parameters)?.spec();
-    parameters.insert("name".into(), name.into());
-    table.insert("environment".into(), parameters.into());
+    let server = match section.remove("server") {
+        Some(command) => Some(
+            command
+                .try_into()
+                .map_err(|error| anyhow::anyhow!("environment.server: {}", one_line(&error)))?,
+        ),
+        None => environment_server::default_command(&name),
+    };
+    let (environment, spec) = if let Some(server) = server {
+        let environment = Environment {
+            name,
+            server,
+            parameters: section.clone(),
+        };
+        let spec = Conversation::begin(&environment, 1, 0)?.spec().clone();
+        (environment, spec)
+    } else {
+        let parameters = environment::resolve(&name, section)?;
+        let spec = environment::make(&name, &parameters)?.spec();
+        let environment = Environment {
+            name,
+            server: vec![],
+            parameters,
+        };
+        (environment, spec)
+    };
+    if environment.name.starts_with(GYMNASIUM) {
+        suit(table, &spec)?;
+    }
+    table.insert("environment".into(), Value::try_from(environment)?);
     table.insert("spec".into(), Value::try_from(spec)?);
+    Ok(())
+}
+
+/// Puts a method's settings beside those that are there, by what the environment's spaces allow.
+fn suit(table: &mut Table, spec: &EnvironmentSpec) -> anyhow::Result<()> {
+    let text = match (&spec.observation, &spec.action) {
+        (_, Space::Box { .. }) => FOR_CONTINUOUS_ACTIONS,
+        (Space::Box { .. }, Space::Discrete { .. }) => FOR_DISCRETE_ACTIONS,
+        (Space::Discrete { .. }, Space::Discrete { .. }) => FOR_A_TABLE,
+    };
+    let mut method: Table = text.parse()?;
+    let another = |name: &&str| table.contains_key(*name) && !method.contains_key(*name);
+    if METHODS.iter().any(another) {
+        return Ok(());
+    }
+    if method.contains_key("reinforce") {
+        // A chunk is an episode.
+        put(&mut method, &["actors", "chunk_steps"], spec.time_limit.into())?;
+    }
+    for (section, values) in method {
+        let there = table.entry(section).or_insert_with(|| Table::new().into());
+        if let (Value::Table(there), Value::Table(values)) = (there, values) {
+            values.into_iter().for_each(|(key, value)| {
+                there.entry(key).or_insert(value);
+            });
+        }
+    }
     Ok(())
 }
 

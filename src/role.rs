@@ -16,6 +16,7 @@ use shoal_learner::ratio::Ratio;
 use tracing_subscriber::filter::LevelFilter;
 
 use crate::cli::RoleArgs;
+use crate::environment_server::{self, Post};
 use crate::status::judged;
 
 /// Runs a role until it is through, or its standard input closes.
@@ -36,12 +37,17 @@ pub(crate) fn run(role: Role, args: &RoleArgs) -> anyhow::Result<()> {
     let stop = Stop::when_stdin_closes().context("cannot watch standard input")?;
     let run = RunDir::open(&args.run)?;
     let config = run.config()?;
-    let domain = Domain::join(&config.run.id, config.actors.max)?;
     let identity = Identity {
         role,
         index: args.index,
         incarnation: args.incarnation,
     };
+    if role == Role::EnvServer
+        && let Some(program) = server_post(&config, &run, identity).command(&config.environment)?
+    {
+        return Err(environment_server::become_it(program));
+    }
+    let domain = Domain::join(&config.run.id, config.actors.max)?;
     let ended = work(&domain, &config, &run, identity, &stop);
     let left = domain.leave();
     ended?;
@@ -56,7 +62,7 @@ fn log_level() -> LevelFilter {
 
 fn work(domain: &Domain, config: &Config, run: &RunDir, identity: Identity, stop: &Stop) -> anyhow::Result<()> {
     match identity.role {
-        Role::EnvServer => serve(domain, config, identity, stop),
+        Role::EnvServer => serve(domain, config, &server_post(config, run, identity), identity, stop),
         Role::Actor => Ok(explorer::explore(
             domain,
             &explorer_settings(config, run, identity),
@@ -75,34 +81,48 @@ fn work(domain: &Domain, config: &Config, run: &RunDir, identity: Identity, stop
     }
 }
 
-fn serve(domain: &Domain, config: &Config, identity: Identity, stop: &Stop) -> anyhow::Result<()> {
+/// What an environment server has to know.
+fn server_post<'a>(config: &'a Config, run: &RunDir, identity: Identity) -> Post<'a> {
     let Identity { index, incarnation, .. } = identity;
-    let (client, envs) = if index == config.evaluation_server() {
+    let (client, environments) = if index == config.evaluation_server() {
         (Place(Role::Evaluator, 0), config.evaluation_envs())
     } else {
         (Place(Role::Actor, index), config.actors.envs)
     };
-    // In lockstep nothing may depend on how often a process was started.
-    let stream = if config.run.mode == Mode::Lockstep {
-        0
-    } else {
-        incarnation
-    };
+    Post {
+        iceoryx2: run.iceoryx2_config(),
+        run_id: &config.run.id,
+        index,
+        incarnation,
+        client,
+        environments,
+        seed: config.run.seed,
+        // In lockstep nothing may depend on how often a process was started.
+        stream: if config.run.mode == Mode::Lockstep {
+            0
+        } else {
+            incarnation
+        },
+    }
+}
+
+fn serve(domain: &Domain, config: &Config, post: &Post<'_>, identity: Identity, stop: &Stop) -> anyhow::Result<()> {
     let environment = &config.environment;
     let mut environments = VectorEnvironment::new(
         &environment.name,
         &environment.parameters,
-        envs,
-        config.run.seed,
-        index.into(),
-        stream,
+        post.environments,
+        post.seed,
+        post.index.into(),
+        post.stream,
     )?;
-    let port = EnvironmentPort::open(domain, index, environments.spec().clone(), environments.count(), client)?;
+    let spec = environments.spec().clone();
+    let port = EnvironmentPort::open(domain, post.index, spec, environments.count(), post.client)?;
     let pulse = Pulse::new(domain, identity)?;
     Ok(shoal_env_server::server::serve(
         &mut environments,
         &port,
-        config.run.seed,
+        post.seed,
         pulse,
         stop,
     )?)

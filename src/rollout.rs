@@ -1,11 +1,14 @@
-//! Whole episodes of a policy without exploration, in this process: what `eval` judges and `plot` draws.
+//! Whole episodes of a policy without exploration: what `eval` judges and `plot` draws. Our own environments are stepped
+//! in this process, others by their servers.
 
-use anyhow::{Context, ensure};
+use anyhow::{Context, bail, ensure};
 use shoal_common::channel::environment::StepBlocks;
 use shoal_common::config::Config;
 use shoal_common::policy::{Policy, PolicyLayout};
 use shoal_common::space::EnvironmentSpec;
 use shoal_env_server::vector::{Start, VectorEnvironment};
+
+use crate::environment_server::Conversation;
 
 /// An episode of T steps.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -29,14 +32,30 @@ impl Trajectory {
 
 /// A policy, and an environment of the run to try it in.
 pub(crate) struct Rollout<'a> {
-    environment: VectorEnvironment,
+    config: &'a Config,
+    stage: Stage,
     policy: Policy,
     parameters: &'a [f32],
 }
 
+/// Where one environment is stepped.
+enum Stage {
+    Here(Box<VectorEnvironment>),
+    /// By another program, whose evaluation episodes start as this seed says. Begun with the first episode.
+    Elsewhere(Option<(u64, Conversation)>),
+}
+
+/// What a step gave.
+struct Step {
+    s_next: Vec<f32>,
+    reward: f64,
+    terminated: bool,
+    truncated: bool,
+}
+
 impl<'a> Rollout<'a> {
     /// The environment and network of `config`, with these parameters.
-    pub(crate) fn new(config: &Config, parameters: &'a [f32]) -> anyhow::Result<Self> {
+    pub(crate) fn new(config: &'a Config, parameters: &'a [f32]) -> anyhow::Result<Self> {
         let policy = policy_of(config)?;
         let expected = policy.layout().parameters();
         let found = parameters.len();
@@ -44,19 +63,9 @@ impl<'a> Rollout<'a> {
             found == expected,
             "the policy has {found} parameters, the run's network {expected}"
         );
-        let environment = environment_of(config)?;
-        let name = &config.environment.name;
-        // Here no state is saved, and runs of older builds do not know its width.
-        let said = EnvironmentSpec {
-            state_width: config.spec.state_width,
-            ..environment.spec().clone()
-        };
-        ensure!(
-            said == config.spec,
-            "config.toml: [spec] is not what environment {name} says of itself"
-        );
         Ok(Self {
-            environment,
+            config,
+            stage: Stage::of(config)?,
             policy,
             parameters,
         })
@@ -67,40 +76,120 @@ impl<'a> Rollout<'a> {
         self.episode(Start::Evaluation { seed, first: number })
     }
 
-    /// Runs an episode that starts in a physical state of the environment.
+    /// Runs an episode that starts in a physical state of the environment, which must be one of ours.
     pub(crate) fn episode_from(&mut self, state: &[f64]) -> anyhow::Result<Trajectory> {
         self.episode(Start::States(state))
     }
 
     fn episode(&mut self, start: Start<'_>) -> anyhow::Result<Trajectory> {
-        let width = self.environment.spec().observation.width();
-        let (mut observation, mut next) = (vec![0.0; width], vec![0.0; width]);
-        let mut action = vec![0.0; self.environment.spec().action.width()];
-        self.environment.reset(start, &mut observation)?;
+        let mut observation = self.stage.begin(self.config, start)?;
+        let mut action = vec![0.0; self.config.spec.action.width()];
         let mut trajectory = Trajectory {
             observations: vec![observation.clone()],
             ..Trajectory::default()
         };
         loop {
             self.policy.act(self.parameters, &observation, &mut action);
-            let (mut reward, mut terminated, mut truncated) = ([0.0], [0.0], [0.0]);
-            let blocks = StepBlocks {
-                observations: &mut observation,
-                next_observations: &mut next,
-                rewards: &mut reward,
-                terminated: &mut terminated,
-                truncated: &mut truncated,
-            };
-            self.environment.step(&action, blocks)?;
-            trajectory.observations.push(next.clone());
+            let step = self.stage.step(&action)?;
+            observation.clone_from(&step.s_next);
+            trajectory.observations.push(step.s_next);
             trajectory.actions.push(action.clone());
-            trajectory.rewards.push(reward[0].into());
-            if terminated[0] != 0.0 || truncated[0] != 0.0 {
-                trajectory.terminated = terminated[0] != 0.0;
+            trajectory.rewards.push(step.reward);
+            if step.terminated || step.truncated {
+                trajectory.terminated = step.terminated;
                 return Ok(trajectory);
             }
         }
     }
+}
+
+impl Stage {
+    fn of(config: &Config) -> anyhow::Result<Self> {
+        if !config.environment.server.is_empty() {
+            return Ok(Self::Elsewhere(None));
+        }
+        let (name, parameters) = (&config.environment.name, &config.environment.parameters);
+        let environment = VectorEnvironment::new(name, parameters, 1, config.run.seed, 0, 0)?;
+        // Here no state is saved, and runs of older builds do not know its width.
+        let said = EnvironmentSpec {
+            state_width: config.spec.state_width,
+            ..environment.spec().clone()
+        };
+        same_spec(config, &said)?;
+        Ok(Self::Here(Box::new(environment)))
+    }
+
+    /// Begins an episode; its first observation.
+    fn begin(&mut self, config: &Config, start: Start<'_>) -> anyhow::Result<Vec<f32>> {
+        match (self, start) {
+            (Self::Here(environment), start) => {
+                let mut observation = vec![0.0; config.spec.observation.width()];
+                environment.reset(start, &mut observation)?;
+                Ok(observation)
+            }
+            (Self::Elsewhere(conversation), Start::Evaluation { seed, first }) => {
+                if conversation.as_ref().is_none_or(|(of, _)| *of != seed) {
+                    // One at a time.
+                    *conversation = None;
+                }
+                let begin = || anyhow::Ok((seed, Conversation::begin(&config.environment, 1, seed)?));
+                let (_, conversation) = match conversation {
+                    Some(begun) => begun,
+                    None => conversation.insert(begin()?),
+                };
+                same_spec(config, conversation.spec())?;
+                Ok(conversation.begin_evaluation(first)?.observation(0).to_vec())
+            }
+            (Self::Elsewhere(_), _) => bail!(
+                "episodes of {} cannot be begun in a state of one's choice",
+                config.environment.name
+            ),
+        }
+    }
+
+    fn step(&mut self, action: &[f32]) -> anyhow::Result<Step> {
+        match self {
+            Self::Here(environment) => {
+                let width = environment.spec().observation.width();
+                // What comes after an end is not looked at.
+                let (mut observation, mut s_next) = (vec![0.0; width], vec![0.0; width]);
+                let (mut reward, mut terminated, mut truncated) = ([0.0], [0.0], [0.0]);
+                let blocks = StepBlocks {
+                    observations: &mut observation,
+                    next_observations: &mut s_next,
+                    rewards: &mut reward,
+                    terminated: &mut terminated,
+                    truncated: &mut truncated,
+                };
+                environment.step(action, blocks)?;
+                Ok(Step {
+                    s_next,
+                    reward: reward[0].into(),
+                    terminated: terminated[0] != 0.0,
+                    truncated: truncated[0] != 0.0,
+                })
+            }
+            Self::Elsewhere(conversation) => {
+                let (_, conversation) = conversation.as_mut().context("a step before an episode")?;
+                let observed = conversation.step(action)?;
+                Ok(Step {
+                    s_next: observed.next_observation(0).to_vec(),
+                    reward: observed.reward(0).into(),
+                    terminated: observed.terminated(0),
+                    truncated: observed.truncated(0),
+                })
+            }
+        }
+    }
+}
+
+fn same_spec(config: &Config, said: &EnvironmentSpec) -> anyhow::Result<()> {
+    let name = &config.environment.name;
+    ensure!(
+        *said == config.spec,
+        "config.toml: [spec] is not what environment {name} says of itself"
+    );
+    Ok(())
 }
 
 /// What a policy file of this run must hold.
@@ -110,11 +199,6 @@ pub(crate) fn policy_layout(config: &Config) -> anyhow::Result<PolicyLayout> {
 
 fn policy_of(config: &Config) -> anyhow::Result<Policy> {
     Policy::new(&config.algorithm, &config.spec, 1).with_context(|| config.environment.name.clone())
-}
-
-fn environment_of(config: &Config) -> anyhow::Result<VectorEnvironment> {
-    let (name, parameters) = (&config.environment.name, &config.environment.parameters);
-    Ok(VectorEnvironment::new(name, parameters, 1, config.run.seed, 0, 0)?)
 }
 
 #[cfg(test)]

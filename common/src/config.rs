@@ -71,8 +71,11 @@ pub enum Mode {
 /// What is controlled: an environment's name, and the parameters that this environment understands.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Environment {
-    /// One of the environments' names.
+    /// One of the environments' names, or what another program makes an environment from, as `gym:Pendulum-v1`.
     pub name: String,
+    /// The command that starts that program, an environment server as `docs/PROTOCOL.md` has it; empty for our own.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub server: Vec<String>,
     /// The environment's own parameters.
     #[serde(flatten)]
     pub parameters: toml::Table,

@@ -73,6 +73,7 @@ pub enum Activity {
 ///
 /// Role and activity travel as numbers, because a sender in another language may know more of them than we do.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ZeroCopySend)]
+#[type_name("ShoalHeartbeat")]
 #[repr(C)]
 pub struct Heartbeat {
     role: u32,

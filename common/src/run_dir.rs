@@ -244,6 +244,11 @@ impl RunDir {
         self.path.join("shoal.log")
     }
 
+    /// `config/iceoryx2.toml`: where the run lies in shared memory, for programs that are not this one.
+    pub fn iceoryx2_config(&self) -> PathBuf {
+        self.path.join("config/iceoryx2.toml")
+    }
+
     /// `learning-curve.svg`: evaluation returns over time.
     pub fn learning_curve(&self) -> PathBuf {
         self.path.join("learning-curve.svg")

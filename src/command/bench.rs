@@ -1,7 +1,7 @@
 //! `shoal bench`: how fast each stage is on this machine.
 
+mod gym;
 mod learner;
-mod peer;
 mod policy;
 mod product;
 mod rows;
@@ -39,6 +39,8 @@ pub(crate) enum Stage {
     Step,
     /// Actions a second.
     Policy,
+    /// Steps of a Gymnasium environment through its server in Python, beside Gymnasium's own vectors.
+    Gym,
 }
 
 /// What a stage's measurement gave: its fields are those of `--json`.
@@ -62,6 +64,7 @@ pub(crate) fn run(args: &BenchArgs) -> anyhow::Result<()> {
         Stage::Transitions => tell(&transitions::measure(&patience)?, args.json),
         Stage::Step => tell(&step::measure(&patience)?, args.json),
         Stage::Policy => tell(&policy::measure(&patience)?, args.json),
+        Stage::Gym => tell(&gym::measure(&patience)?, args.json),
     }
 }
 

@@ -79,10 +79,12 @@ impl Workplace {
 
     /// Starts a quick run in `name` and waits until every role is ready.
     pub(crate) fn start(&self, name: &str, arguments: &[&str]) -> Running {
-        self.launch(
-            name,
-            &[&["train", "pendulum", "--run", name], arguments, &QUICK[..]].concat(),
-        )
+        self.start_in(name, "pendulum", arguments)
+    }
+
+    /// Starts a quick run of `what` in `name` and waits until every role is ready.
+    pub(crate) fn start_in(&self, name: &str, what: &str, arguments: &[&str]) -> Running {
+        self.launch(name, &[&["train", what, "--run", name], arguments, &QUICK[..]].concat())
     }
 
     /// Starts a run in `name` with these arguments and no others, and waits until every role is ready.
@@ -380,5 +382,6 @@ fn pids(log: &str) -> Vec<(String, i32)> {
 fn is_ours(pid: i32) -> bool {
     let alive = test_kill_process(Pid::from_raw(pid).unwrap()).is_ok();
     let command = std::fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
-    alive && command.starts_with(b"shoal\0")
+    let serves = || command.windows(11).any(|part| part == b"--iceoryx2\0");
+    alive && (command.starts_with(b"shoal\0") || serves())
 }

@@ -16,7 +16,7 @@ mod client;
 mod message;
 mod port;
 
-pub use client::{Begin, EnvironmentClient, Observed, Snapshot, Stepped};
+pub use client::{Begin, EnvironmentClient, Observed, Snapshot, Stepped, describe};
 pub use message::{Ask, RequestHeader, ResponseHeader, ResponseLayout, StepBlocks};
 pub use port::{EnvironmentPort, Request};
 

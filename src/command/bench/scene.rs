@@ -8,8 +8,8 @@ use shoal_common::report::Role;
 use shoal_common::run_dir::RunDir;
 use tempfile::TempDir;
 
-use super::peer::Peer;
 use crate::cli::{Telling, TrainArgs};
+use crate::peer::Peer;
 use crate::plan::Plan;
 
 /// A run that exists until this is dropped.
@@ -73,7 +73,7 @@ impl Scene {
     ) -> anyhow::Result<T> {
         Domain::remove_abandoned()?;
         let domain = Domain::join(&self.config.run.id, self.config.actors.max)?;
-        let acted = Peer::start(role, &self.run).and_then(|mut peer| {
+        let acted = Peer::role(role, &self.run).and_then(|mut peer| {
             let acted = act(&domain, &mut peer);
             let ended = peer.end();
             let acted = acted?;

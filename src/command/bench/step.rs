@@ -9,10 +9,10 @@ use shoal_common::channel::{Bell, Domain, Interruption, Place};
 use shoal_common::config::Config;
 use shoal_common::report::Role;
 
-use super::peer::Peer;
 use super::scene::Scene;
 use super::spin;
 use super::{Figures, Patience};
+use crate::peer::Peer;
 
 /// How often the other process is looked after.
 const LOOK: Duration = Duration::from_millis(50);
@@ -59,7 +59,7 @@ pub(super) fn measure(patience: &Patience) -> anyhow::Result<StepFigures> {
 }
 
 /// In µs; `sorted` are ns, and at least one.
-fn quantile_of(sorted: &[u32], quantile: f64) -> f64 {
+pub(super) fn quantile_of(sorted: &[u32], quantile: f64) -> f64 {
     f64::from(sorted[((sorted.len() - 1) as f64 * quantile) as usize]) / 1e3
 }
 

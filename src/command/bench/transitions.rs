@@ -14,11 +14,11 @@ use shoal_learner::minibatch::Minibatch;
 use shoal_learner::replay::Replay;
 use shoal_learner::sampling::Sampler;
 
-use super::peer::Peer;
 use super::rows::{ENVIRONMENTS, Rows};
 use super::scene::{Scene, ddpg};
 use super::window::{self, Windows};
 use super::{Figures, Patience};
+use crate::peer::Peer;
 
 const WINDOW: Duration = Duration::from_millis(100);
 const SAMPLING_WINDOW: Duration = Duration::from_millis(20);

@@ -103,6 +103,26 @@ impl Observed {
     }
 }
 
+/// Asks environment server `index`, of which nothing is known, for its spaces and the number of its environments.
+///
+/// # Errors
+/// When interrupted.
+pub fn describe(
+    domain: &Domain,
+    index: u32,
+    bell: &Bell,
+    stop: Stop,
+) -> Result<(EnvironmentSpec, usize), Interruption> {
+    let unknown = Space::boxed(&[]);
+    let spec = EnvironmentSpec {
+        observation: unknown.clone(),
+        action: unknown,
+        time_limit: 0,
+        state_width: 0,
+    };
+    EnvironmentClient::open(domain, index, &spec, 0, stop)?.describe(bell)
+}
+
 impl EnvironmentClient {
     /// Opens the conversation with environment server `index`, which is expected to step so many environments of this
     /// kind. Whether it does, [`describe`](Self::describe) tells. Waiting for an answer ends when `stop` is requested.
@@ -143,37 +163,9 @@ impl EnvironmentClient {
     /// When interrupted.
     pub fn describe(&self, bell: &Bell) -> Result<(EnvironmentSpec, usize), Interruption> {
         let response = self.insist(bell, Ask::Describe, 0, &[])?;
-        let header = response.user_header();
-        let (observation, action) = (header.observation_width as usize, header.action_width as usize);
-        let payload = response.payload();
-        let space = |discrete: u32, start: usize, width: usize| {
-            if discrete > 0 {
-                return Some(Space::Discrete { n: discrete });
-            }
-            let low = payload.get(start..start + width)?.to_vec();
-            let high = payload.get(start + width..start + 2 * width)?.to_vec();
-            Some(Space::Box { low, high })
-        };
-        let actions_start = if header.discrete_observations > 0 {
-            0
-        } else {
-            2 * observation
-        };
-        match (
-            space(header.discrete_observations, 0, observation),
-            space(header.discrete_actions, actions_start, action),
-        ) {
-            (Some(observation), Some(action)) => {
-                let spec = EnvironmentSpec {
-                    observation,
-                    action,
-                    time_limit: header.time_limit,
-                    state_width: header.state_width as usize,
-                };
-                Ok((spec, header.environments as usize))
-            }
-            _ => Err(ChannelError::new(&self.channel, "describe", "the answer is too short").into()),
-        }
+        let (header, payload) = (response.user_header(), response.payload());
+        let described = header.described(payload);
+        described.ok_or_else(|| ChannelError::new(&self.channel, "describe", "the answer is too short").into())
     }
 
     /// Every environment begins an episode.

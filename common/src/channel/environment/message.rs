@@ -1,6 +1,9 @@
-//! What travels between an actor and its environment server.
+//! What travels between an actor and its environment server. `docs/PROTOCOL.md` has it for whoever writes a server in
+//! another language.
 
 use iceoryx2::prelude::ZeroCopySend;
+
+use crate::space::{EnvironmentSpec, Space};
 
 /// What a request asks for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -37,6 +40,7 @@ impl Ask {
 /// Header of a request. Its payload is the actions, environment after environment, for [`Ask::Step`], the words of the
 /// snapshot for [`Ask::Restore`], and empty otherwise.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ZeroCopySend)]
+#[type_name("ShoalEnvironmentRequest")]
 #[repr(C)]
 pub struct RequestHeader {
     pub(super) ask: u32,
@@ -69,6 +73,7 @@ pub(super) enum Verdict {
 /// Header of a response. The payload answers [`Ask::Describe`] with the least and greatest values of an observation and of
 /// an action (for boxes), [`Ask::Snapshot`] with its words, and everything else with the blocks of [`ResponseLayout`].
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ZeroCopySend)]
+#[type_name("ShoalEnvironmentResponse")]
 #[repr(C)]
 pub struct ResponseHeader {
     pub(super) verdict: u32,
@@ -86,6 +91,33 @@ pub struct ResponseHeader {
     pub time_limit: u32,
     /// Numbers in an environment's state; 0 where it cannot be said.
     pub state_width: u32,
+}
+
+impl ResponseHeader {
+    /// What the server says of itself, where `bounds` is its answer to [`Ask::Describe`]: the spaces, and how many
+    /// environments there are. `None` for an answer that is too short.
+    pub(super) fn described(&self, bounds: &[f32]) -> Option<(EnvironmentSpec, usize)> {
+        let mut rest = bounds;
+        let mut space = |discrete: u32, width: u32| {
+            if discrete > 0 {
+                return Some(Space::Discrete { n: discrete });
+            }
+            let width = width as usize;
+            let (low, high) = (rest.get(..width)?, rest.get(width..)?.get(..width)?);
+            rest = &rest[2 * width..];
+            Some(Space::Box {
+                low: low.into(),
+                high: high.into(),
+            })
+        };
+        let spec = EnvironmentSpec {
+            observation: space(self.discrete_observations, self.observation_width)?,
+            action: space(self.discrete_actions, self.action_width)?,
+            time_limit: self.time_limit,
+            state_width: self.state_width as usize,
+        };
+        Some((spec, self.environments as usize))
+    }
 }
 
 /// Where the blocks of a response lie, each of them environment after environment.
@@ -172,6 +204,25 @@ impl ResponseLayout {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn what_a_server_says_of_itself_is_read_as_far_as_it_goes() {
+        let header = ResponseHeader {
+            environments: 3,
+            observation_width: 2,
+            discrete_actions: 4,
+            action_width: 1,
+            time_limit: 200,
+            ..ResponseHeader::default()
+        };
+        let (spec, environments) = header.described(&[-1.0, -2.0, 1.0, 2.0]).unwrap();
+        assert_eq!(spec.observation, Space::boxed(&[(-1.0, 1.0), (-2.0, 2.0)]));
+        assert_eq!(
+            (spec.action, spec.time_limit, environments),
+            (Space::Discrete { n: 4 }, 200, 3)
+        );
+        assert_eq!(header.described(&[-1.0, -2.0, 1.0]), None);
+    }
 
     #[test]
     fn what_is_written_into_a_block_is_read_from_it() {

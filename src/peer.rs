@@ -1,4 +1,4 @@
-//! The other process of a measurement: a role as a run has it.
+//! Another process that works for this one outside of any run: a role that is measured, an environment server that is asked.
 
 use std::io::{BufRead, BufReader};
 use std::os::unix::process::CommandExt;
@@ -7,38 +7,44 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
+use rustix::process::Pid;
 use shoal_common::report::Role;
 use shoal_common::run_dir::RunDir;
 
 /// How long a learner may take to bring its replay to the disk.
 const FAREWELL: Duration = Duration::from_secs(15);
 
-/// A role's process. It ends when its standard input closes, be it because this process is no more.
+/// How long one may take that is not needed any more.
+const DISMISSAL: Duration = Duration::from_secs(2);
+
+/// A process. It ends when its standard input closes, be it because this process is no more.
 #[derive(Debug)]
-pub(super) struct Peer {
+pub(crate) struct Peer {
     child: Child,
     /// Held apart from the child: waiting for a child closes its own.
     stdin: Option<ChildStdin>,
     /// Gives the last line that the process wrote.
     listener: Option<JoinHandle<Option<String>>>,
-    role: Role,
+    what: String,
 }
 
 impl Peer {
     /// Starts this program again as `role` 0 of the run.
-    pub(super) fn start(role: Role, run: &RunDir) -> anyhow::Result<Self> {
-        let mut child = Command::new("/proc/self/exe")
-            .arg0("shoal")
-            .arg(role.name())
-            .arg(run.path())
-            .args(["0", "1"])
+    pub(crate) fn role(role: Role, run: &RunDir) -> anyhow::Result<Self> {
+        let mut command = Command::new("/proc/self/exe");
+        command.arg0("shoal").arg(role.name()).arg(run.path()).args(["0", "1"]);
+        Self::start(&mut command, role.name().into()).with_context(|| format!("cannot start the {}", role.name()))
+    }
+
+    /// Starts a process that messages call `what`.
+    pub(crate) fn start(command: &mut Command, what: String) -> std::io::Result<Self> {
+        let mut child = command
             .stdin(Stdio::piped())
             .stdout(Stdio::null())
             .stderr(Stdio::piped())
             // Ctrl-C is for this process, which then ends the other one.
             .process_group(0)
-            .spawn()
-            .with_context(|| format!("cannot start the {}", role.name()))?;
+            .spawn()?;
         let stdin = child.stdin.take();
         let listener = child
             .stderr
@@ -48,12 +54,17 @@ impl Peer {
             child,
             stdin,
             listener,
-            role,
+            what,
         })
     }
 
+    /// Its number.
+    pub(crate) fn pid(&self) -> Pid {
+        Pid::from_child(&self.child)
+    }
+
     /// An error if the process has ended, with what it said last.
-    pub(super) fn check(&mut self) -> anyhow::Result<()> {
+    pub(crate) fn check(&mut self) -> anyhow::Result<()> {
         match self.child.try_wait()? {
             Some(status) => self.ended_early(status),
             None => Ok(()),
@@ -61,16 +72,25 @@ impl Peer {
     }
 
     /// Asks the process to end, and waits for it.
-    pub(super) fn end(mut self) -> anyhow::Result<()> {
+    pub(crate) fn end(mut self) -> anyhow::Result<()> {
         self.stdin = None;
         let deadline = Instant::now() + FAREWELL;
         loop {
             match self.child.try_wait()? {
                 Some(status) if status.success() => return Ok(()),
                 Some(status) => return self.ended_early(status),
-                None if Instant::now() >= deadline => bail!("the {} did not end when asked to", self.role.name()),
+                None if Instant::now() >= deadline => bail!("the {} did not end when asked to", self.what),
                 None => std::thread::sleep(Duration::from_millis(2)),
             }
+        }
+    }
+
+    /// Asks the process to end; one that does not is killed when this is dropped.
+    pub(crate) fn dismiss(&mut self) {
+        self.stdin = None;
+        let deadline = Instant::now() + DISMISSAL;
+        while matches!(self.child.try_wait(), Ok(None)) && Instant::now() < deadline {
+            std::thread::sleep(Duration::from_millis(2));
         }
     }
 
@@ -78,7 +98,7 @@ impl Peer {
         let said = self.listener.take().and_then(|listener| listener.join().ok().flatten());
         let said = said.unwrap_or_else(|| "it said nothing".into());
         let said = said.strip_prefix("error: ").unwrap_or(&said);
-        bail!("the {} ended ({status}): {said}", self.role.name());
+        bail!("the {} ended ({status}): {said}", self.what);
     }
 }
 

@@ -1,0 +1,232 @@
+//! Environment servers that are other programs (`docs/PROTOCOL.md`): how one is started, and a conversation with one
+//! outside of any run, to learn what it serves or to try a policy in it.
+
+use std::os::unix::process::CommandExt;
+use std::path::PathBuf;
+use std::process::Command;
+use std::time::Duration;
+
+use anyhow::{Context, bail};
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::process::{PidfdFlags, pidfd_open};
+use shoal_common::channel::environment::{Begin, EnvironmentClient, Observed, Stepped, describe};
+use shoal_common::channel::{Bell, Domain, Interruption, Place};
+use shoal_common::config::Environment;
+use shoal_common::report::Role;
+use shoal_common::space::EnvironmentSpec;
+use shoal_common::stop::Stop;
+use tempfile::TempDir;
+
+use crate::peer::Peer;
+
+/// Environments whose name begins with this are Gymnasium's.
+pub(crate) const GYMNASIUM: &str = "gym:";
+
+/// How long a program may take until it says what it serves: a simulator's libraries have to be loaded.
+const PATIENCE: Duration = Duration::from_secs(120);
+
+/// The command that serves environments of this name where the configuration names none.
+pub(crate) fn default_command(name: &str) -> Option<Vec<String>> {
+    let gymnasium = || ["python3", "-m", "shoal_gym"].map(Into::into).into();
+    name.starts_with(GYMNASIUM).then(gymnasium)
+}
+
+/// Which server of which run a program is to be.
+pub(crate) struct Post<'a> {
+    /// The file that says where the run lies in shared memory.
+    pub(crate) iceoryx2: PathBuf,
+    pub(crate) run_id: &'a str,
+    pub(crate) index: u32,
+    pub(crate) incarnation: u64,
+    /// Who asks it.
+    pub(crate) client: Place,
+    pub(crate) environments: u32,
+    pub(crate) seed: u64,
+    /// Which random streams its training episodes come from, besides seed and index.
+    pub(crate) stream: u64,
+}
+
+impl Post<'_> {
+    /// What starts the program; `None` where the environment is one of our own.
+    pub(crate) fn command(&self, environment: &Environment) -> anyhow::Result<Option<Command>> {
+        let Some((program, arguments)) = environment.server.split_first() else {
+            return Ok(None);
+        };
+        let mut command = Command::new(program);
+        command
+            .args(arguments)
+            .arg("--iceoryx2")
+            .arg(&self.iceoryx2)
+            .args(["--run", self.run_id])
+            .args(["--index", &self.index.to_string()])
+            .args(["--incarnation", &self.incarnation.to_string()])
+            .args(["--client", &format!("{}/{}", self.client.0.name(), self.client.1)])
+            .args(["--environments", &self.environments.to_string()])
+            .args(["--seed", &self.seed.to_string()])
+            .args(["--stream", &self.stream.to_string()])
+            .args(["--name", &environment.name])
+            .args(["--parameters", &serde_json::to_string(&environment.parameters)?]);
+        Ok(Some(command))
+    }
+}
+
+/// Becomes the program: the process stays the launcher's child, with its standard input and error.
+pub(crate) fn become_it(mut command: Command) -> anyhow::Error {
+    let cause = command.exec();
+    anyhow::Error::from(cause).context(cannot_start(&command))
+}
+
+fn cannot_start(command: &Command) -> String {
+    format!(
+        "cannot start the environment server {}",
+        command.get_program().display()
+    )
+}
+
+/// A program that serves environments to this process, until this is dropped.
+pub(crate) struct Conversation {
+    client: EnvironmentClient,
+    bell: Bell,
+    spec: EnvironmentSpec,
+    program: Peer,
+    // The last to go.
+    _corner: Corner,
+    _directory: TempDir,
+}
+
+/// A corner of shared memory that is left tidy.
+struct Corner(Option<Domain>);
+
+impl Drop for Corner {
+    fn drop(&mut self) {
+        // What cannot be removed now is removed by the next who comes.
+        let _ = self.0.take().map(Domain::leave);
+    }
+}
+
+impl Conversation {
+    /// Starts the environment's server, with so many environments, and asks what it serves. Its evaluation episodes start
+    /// as `seed` says.
+    ///
+    /// # Errors
+    /// When it cannot be started, ends, or does not answer; with what it said last.
+    pub(crate) fn begin(environment: &Environment, environments: u32, seed: u64) -> anyhow::Result<Self> {
+        Domain::remove_abandoned()?;
+        let run_id = format!("{:08x}", rand::random::<u32>());
+        let domain = Domain::join(&run_id, 1)?;
+        let directory = tempfile::tempdir().context("cannot make a temporary directory")?;
+        let post = Post {
+            iceoryx2: directory.path().join("iceoryx2.toml"),
+            run_id: &run_id,
+            index: 0,
+            incarnation: 1,
+            client: Place(Role::Evaluator, 0),
+            environments,
+            seed,
+            stream: 0,
+        };
+        match opened(&domain, &post, environment) {
+            Ok((client, bell, spec, program)) => Ok(Self {
+                client,
+                bell,
+                spec,
+                program,
+                _corner: Corner(Some(domain)),
+                _directory: directory,
+            }),
+            Err(error) => {
+                domain.leave()?;
+                Err(error)
+            }
+        }
+    }
+
+    /// What the program says of its environments.
+    pub(crate) fn spec(&self) -> &EnvironmentSpec {
+        &self.spec
+    }
+
+    /// Begins evaluation episode `number`.
+    ///
+    /// # Errors
+    /// When the program has ended or refuses.
+    pub(crate) fn begin_evaluation(&mut self, number: u64) -> anyhow::Result<Observed> {
+        let begun = self.client.reset(&self.bell, Begin::Evaluation(number));
+        answered(begun, &mut self.program)
+    }
+
+    /// Every environment takes a step with its action.
+    ///
+    /// # Errors
+    /// When the program has ended or refuses.
+    pub(crate) fn step(&mut self, actions: &[f32]) -> anyhow::Result<Observed> {
+        let stepped = self.client.step(&self.bell, actions);
+        match answered(stepped, &mut self.program)? {
+            Stepped::Taken(observed) => Ok(observed),
+            Stepped::Lost => bail!("the environment server gave up its episodes"),
+        }
+    }
+}
+
+impl Drop for Conversation {
+    fn drop(&mut self) {
+        self.program.dismiss();
+    }
+}
+
+type Opened = (EnvironmentClient, Bell, EnvironmentSpec, Peer);
+
+fn opened(domain: &Domain, post: &Post<'_>, environment: &Environment) -> anyhow::Result<Opened> {
+    let Some(mut command) = post.command(environment)? else {
+        bail!("environment {} is not served by another program", environment.name);
+    };
+    std::fs::write(&post.iceoryx2, domain.iox_config()?).context("cannot write a temporary file")?;
+    let bell = Bell::hang(domain, post.client)?;
+    let mut program = Peer::start(&mut command, "environment server".into()).with_context(|| cannot_start(&command))?;
+    let heard = Stop::default();
+    let stop = stopped_when_it_ends(&program, heard.clone())?;
+    let described = describe(domain, post.index, &bell, stop.clone());
+    heard.request();
+    let (spec, environments) = answered(described, &mut program).map_err(with_advice)?;
+    let opened = EnvironmentClient::open(domain, post.index, &spec, environments, stop);
+    let client = answered(opened.map_err(Interruption::from), &mut program)?;
+    Ok((client, bell, spec, program))
+}
+
+/// Says what to do where Gymnasium's server is not installed.
+fn with_advice(error: anyhow::Error) -> anyhow::Error {
+    if error.to_string().contains("No module named shoal_gym") {
+        return anyhow::anyhow!("{error}; install it, as python/README.md says: pip install ./python");
+    }
+    error
+}
+
+/// A stop that is requested once the program has ended, or was not `heard` of for too long.
+fn stopped_when_it_ends(program: &Peer, heard: Stop) -> anyhow::Result<Stop> {
+    let stop = Stop::default();
+    let flag = stop.clone();
+    let process = pidfd_open(program.pid(), PidfdFlags::empty()).context("cannot watch the environment server")?;
+    std::thread::Builder::new()
+        .name("watch".into())
+        .spawn(move || {
+            let patience = Timespec {
+                tv_sec: PATIENCE.as_secs() as i64,
+                tv_nsec: 0,
+            };
+            let ended = || poll(&mut [PollFd::new(&process, PollFlags::IN)], Some(&patience));
+            while ended() == Ok(0) && heard.requested() {}
+            flag.request();
+        })
+        .context("cannot watch the environment server")?;
+    Ok(stop)
+}
+
+fn answered<T>(answer: Result<T, Interruption>, program: &mut Peer) -> anyhow::Result<T> {
+    answer.or_else(|interruption| {
+        program.check()?;
+        match interruption {
+            Interruption::Stopped => bail!("the environment server did not answer within {PATIENCE:?}"),
+            Interruption::Channel(error) => Err(error.into()),
+        }
+    })
+}

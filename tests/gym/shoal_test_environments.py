@@ -1,0 +1,72 @@
+"""Environments that end, fail and cannot be served, for the tests."""
+
+import os
+
+import gymnasium as gym
+import numpy as np
+
+
+class Ends(gym.Env):
+    """Ends by itself after ``after`` steps, if the time limit of 5 does not end it before; says what it was seeded with."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (2, 2))
+    action_space = gym.spaces.Box(np.array([-2, 0], np.float32), np.array([2, 1], np.float32))
+
+    def __init__(self, after=3):
+        self.after = after
+
+    def _observation(self):
+        return np.array([[self.start, self.steps], [0, 1]], np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.start, self.steps = self.np_random.uniform(), 0
+        return self._observation(), {}
+
+    def step(self, action):
+        assert action.shape == (2,) and self.action_space.contains(action), action
+        self.steps += 1
+        return self._observation(), 10.0 * self.start, self.steps == self.after, False, {}
+
+
+class Fails(Ends):
+    """Goes wrong in its fourth step."""
+
+    def __init__(self, how):
+        super().__init__(after=0)
+        self.how = how
+
+    def step(self, action):
+        if self.steps == 3 and self.how == "raise":
+            raise RuntimeError("the motor is on fire")
+        if self.steps == 3 and self.how == "abort":
+            os.abort()
+        return super().step(action)
+
+
+class Odd(Ends):
+    observation_space = gym.spaces.Dict({"position": gym.spaces.Box(-1, 1, (1,))})
+
+
+class Offset(gym.Env):
+    """Counts from 5 observations and from -1 actions; action 0 of three leads on, the others end."""
+
+    observation_space = gym.spaces.Discrete(4, start=5)
+    action_space = gym.spaces.Discrete(3, start=-1)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.state = 5
+        return self.state, {}
+
+    def step(self, action):
+        assert self.action_space.contains(action), action
+        self.state += action == 0
+        return self.state, float(self.state == 8), bool(action != 0 or self.state == 8), False, {}
+
+
+gym.register("Ends-v0", entry_point=Ends, max_episode_steps=5)
+gym.register("Endless-v0", entry_point=Ends)
+gym.register("Fails-v0", entry_point=Fails, max_episode_steps=5)
+gym.register("Odd-v0", entry_point=Odd, max_episode_steps=5)
+gym.register("Offset-v0", entry_point=Offset, max_episode_steps=5)
