@@ -185,7 +185,7 @@ mod tests {
             ),
             (10.0, 55.0, 100.0)
         );
-        assert_eq!(super::spread(&[long.clone()]), None);
+        assert_eq!(super::spread(std::slice::from_ref(&long)), None);
         assert_eq!(super::spread(&[long, vec![]]), None, "a run that was never judged");
         assert_eq!(super::spread(&[late, vec![(300.0, 1.0), (400.0, 1.0)]]), None);
     }

@@ -133,9 +133,9 @@ function time() {
     if (series.length) parts.push(new Chart({ title, axis: TIME, link, series, marks, height: 220, unit: "", ...more }).element);
   };
   const agreed = [...new Set(runs.map((run) => run.updates_per_step))];
-  chart("Ratio: updates for each environment step after the warm-up", "ratio", agreed.length === 1 ? { line: agreed[0] } : {});
-  chart("Throughput: environment steps per second", "env_steps_per_second", { unit: "steps/s" });
-  chart("Throughput: updates per second", "updates_per_second", { unit: "updates/s" });
+  chart("Ratio: updates per step after the warm-up", "ratio", agreed.length === 1 ? { line: agreed[0] } : {});
+  chart("Environment steps per second", "env_steps_per_second", { unit: "steps/s" });
+  chart("Updates per second", "updates_per_second", { unit: "updates/s" });
   chart("Loss of the critic", "critic_loss");
   chart("Loss of the actor", "actor_loss");
   chart("Mean value of the sampled actions (Q)", "q_mean");
