@@ -33,6 +33,8 @@ pub(crate) enum Command {
     Eval(EvalArgs),
     /// Draw a run's figures.
     Plot(PlotArgs),
+    /// Put what there is to see of one run, or of several side by side, into one file that can be sent to anybody.
+    Report(ReportArgs),
     /// Run the thesis's experiments over several seeds, draw its figures, and report which of its claims hold.
     Reproduce(ReproduceArgs),
     /// Measure a stage of the system on this machine.
@@ -157,6 +159,16 @@ pub(crate) struct PlotArgs {
     pub(crate) run: PathBuf,
     /// Where to put the figures [default: the run directory].
     #[arg(long, value_name = "DIR")]
+    pub(crate) out: Option<PathBuf>,
+}
+
+#[derive(Args, Clone, Debug)]
+pub(crate) struct ReportArgs {
+    /// Run directories; of one environment they are compared.
+    #[arg(value_name = "RUN", required = true)]
+    pub(crate) runs: Vec<PathBuf>,
+    /// The file to write [default: report.html in the run directory; of several runs, in the working directory].
+    #[arg(long, value_name = "FILE")]
     pub(crate) out: Option<PathBuf>,
 }
 

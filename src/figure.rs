@@ -14,7 +14,7 @@ mod raster;
 pub(crate) use comparison::{Agent, actions_beside, paths_beside};
 pub(crate) use lake::lake;
 pub(crate) use learning_curve::learning_curve;
-pub(crate) use learning_curves::learning_curves;
+pub(crate) use learning_curves::{learning_curves, quantile};
 pub(crate) use lines::{Frame, Setting, lines, lines_apart, pointwise};
 pub(crate) use pendulum::swing_up;
 pub(crate) use point_mass::{test_runs, trajectories};

@@ -2,6 +2,7 @@
 
 mod crew;
 mod desk;
+mod incarnations;
 mod log;
 mod member;
 mod process;
@@ -303,6 +304,9 @@ impl<'a> Launcher<'a> {
 
     fn read_reports(&mut self) -> anyhow::Result<()> {
         let wall = self.begun.elapsed();
+        for incident in self.crew.take_incidents() {
+            self.recorder.incident(&incident, wall)?;
+        }
         while let Some(heartbeat) = self.heartbeats.receive()? {
             self.crew.hear(&heartbeat);
         }

@@ -9,6 +9,7 @@ mod peer;
 mod plan;
 mod recorder;
 mod remote;
+mod report;
 mod reproduction;
 mod role;
 mod rollout;
@@ -55,6 +56,7 @@ fn run(command: &Command) -> anyhow::Result<ExitCode> {
         Command::Stop(args) => command::stop::run(args).map(done),
         Command::Eval(args) => command::eval::run(args).map(done),
         Command::Plot(args) => command::plot::run(args).map(done),
+        Command::Report(args) => command::report::run(args).map(done),
         Command::Reproduce(args) => command::reproduce::run(args),
         Command::Bench(args) => command::bench::run(args).map(done),
         Command::EnvServer(args) => role::run(Role::EnvServer, args).map(done),

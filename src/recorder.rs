@@ -1,5 +1,6 @@
-//! The run's records: three tables, and the same numbers for TensorBoard.
+//! The run's records: four tables, and the numbers of three of them for TensorBoard.
 
+mod incident;
 mod table;
 
 use std::path::Path;
@@ -10,6 +11,7 @@ use shoal_common::report::{EpisodeReport, EvaluationReport, LearnerReport};
 use shoal_common::run_dir::RunDir;
 
 use crate::tensorboard::EventFile;
+pub(crate) use incident::{Incident, IncidentRow, What};
 pub(crate) use table::RecordError;
 use table::Table;
 
@@ -19,8 +21,10 @@ const UNWRITTEN: Duration = Duration::from_millis(500);
 /// A row of `episodes.csv`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Episode {
-    wall_seconds: f64,
-    env_steps: u64,
+    /// Seconds the run had taken, over all its launchers.
+    pub(crate) wall_seconds: f64,
+    /// Environment steps over all actors by then.
+    pub(crate) env_steps: u64,
     actor: u32,
     environment: u32,
     /// Steps it took.
@@ -57,19 +61,24 @@ pub(crate) struct Evaluation {
 
 /// A row of `learner.csv`. Empty where there is nothing to tell: no update since the row before, or none before it.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-struct Learner {
-    wall_seconds: f64,
-    env_steps: u64,
-    episodes: u64,
-    updates: u64,
+pub(crate) struct Learner {
+    /// Seconds the run had taken, over all its launchers.
+    pub(crate) wall_seconds: f64,
+    /// Rows committed to the replay.
+    pub(crate) env_steps: u64,
+    /// Episodes over; older builds did not say.
+    #[serde(default)]
+    pub(crate) episodes: u64,
+    /// Updates done.
+    pub(crate) updates: u64,
     policy_version: u64,
-    critic_loss: Option<f64>,
-    actor_loss: Option<f64>,
-    q_mean: Option<f64>,
-    updates_per_second: Option<f64>,
-    env_steps_per_second: Option<f64>,
+    pub(crate) critic_loss: Option<f64>,
+    pub(crate) actor_loss: Option<f64>,
+    pub(crate) q_mean: Option<f64>,
+    pub(crate) updates_per_second: Option<f64>,
+    pub(crate) env_steps_per_second: Option<f64>,
     /// Updates for each environment step beyond the warm-up.
-    ratio: Option<f64>,
+    pub(crate) ratio: Option<f64>,
 }
 
 /// Writes the records of a run. A resumed run's are continued: one header, and seconds that count on.
@@ -78,11 +87,14 @@ pub(crate) struct Recorder {
     episodes: Table,
     evaluations: Table,
     learner: Table,
+    incidents: Table,
     events: EventFile,
     events_path: std::path::PathBuf,
     warmup: u64,
     /// Seconds of the run's launchers before this one.
     earlier: f64,
+    /// Environment steps by the newest report.
+    env_steps: u64,
     previous: Option<(Duration, LearnerReport)>,
     flushed: Instant,
 }
@@ -93,23 +105,32 @@ impl Recorder {
         let episodes = Table::open::<Episode>(&run.episodes())?;
         let evaluations = Table::open::<Evaluation>(&run.evaluations())?;
         let learner = Table::open::<Learner>(&run.learner_log())?;
-        let earlier = table::last::<Learner>(&run.learner_log())?.map_or(0.0, |row| row.wall_seconds);
+        let incidents = Table::open::<IncidentRow>(&run.incidents())?;
+        let last = table::last::<Learner>(&run.learner_log())?;
+        let (earlier, env_steps) = last.as_ref().map_or((0.0, 0), |row| (row.wall_seconds, row.env_steps));
         let events = EventFile::create(&run.tensorboard()).map_err(|cause| RecordError::Write {
             path: run.tensorboard(),
             cause,
         })?;
         let (events_path, flushed) = (run.tensorboard(), Instant::now());
-        Ok(Self {
+        let mut recorder = Self {
             episodes,
             evaluations,
             learner,
+            incidents,
             events,
             events_path,
             warmup,
             earlier,
+            env_steps,
             previous: None,
             flushed,
-        })
+        };
+        if last.is_some() {
+            let resumed = Incident::of_launcher(What::Resumed, String::new());
+            recorder.incident(&resumed, Duration::ZERO)?;
+        }
+        Ok(recorder)
     }
 
     /// An exploration episode has ended, `wall` after this launcher's start.
@@ -180,6 +201,7 @@ impl Recorder {
             env_steps_per_second: rate(|report| report.env_steps),
             ratio: (explored > 0).then(|| report.updates as f64 / explored as f64),
         };
+        self.env_steps = report.env_steps;
         self.previous = Some((wall, *report));
         self.learner.write(&row)?;
         let scalars = [
@@ -195,6 +217,19 @@ impl Recorder {
             &scalars.map(|(tag, value)| (tag, value.unwrap_or(f64::NAN))),
         )?;
         self.flush()
+    }
+
+    /// Something became of a process. It is in the file when this returns.
+    pub(crate) fn incident(&mut self, incident: &Incident, wall: Duration) -> Result<(), RecordError> {
+        self.incidents.write(&IncidentRow {
+            wall_seconds: self.seconds(wall),
+            env_steps: self.env_steps,
+            role: incident.role.into(),
+            index: incident.index,
+            what: incident.what,
+            detail: incident.detail.clone(),
+        })?;
+        self.incidents.flush()
     }
 
     /// Hands everything to the system, which keeps it whatever becomes of this process.
@@ -233,6 +268,16 @@ pub(crate) fn read_evaluations(path: &Path) -> Result<Vec<Evaluation>, RecordErr
 /// The rows of an `episodes.csv`, none where there is no such file.
 pub(crate) fn read_episodes(path: &Path) -> Result<Vec<Episode>, RecordError> {
     table::rows(path)
+}
+
+/// The rows of a `learner.csv`, none where there is no such file.
+pub(crate) fn read_learner(path: &Path) -> Result<Vec<Learner>, RecordError> {
+    table::rows(path)
+}
+
+/// The rows of an `incidents.csv`; nothing where there is no such file: older builds kept none.
+pub(crate) fn read_incidents(path: &Path) -> Result<Option<Vec<IncidentRow>>, RecordError> {
+    path.exists().then(|| table::rows(path)).transpose()
 }
 
 /// Environment steps and episodes of a run by its records; none before the first row.

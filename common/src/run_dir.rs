@@ -234,6 +234,11 @@ impl RunDir {
         self.path.join("learner.csv")
     }
 
+    /// `incidents.csv`: what became of processes on the way.
+    pub fn incidents(&self) -> PathBuf {
+        self.path.join("incidents.csv")
+    }
+
     /// `tensorboard/`: the same as event files.
     pub fn tensorboard(&self) -> PathBuf {
         self.path.join("tensorboard")

@@ -83,7 +83,7 @@ fn quantiles(curves: &[Vec<(u64, f64)>], share: f64) -> Vec<(u64, f64)> {
 }
 
 /// Between the two nearest of the sorted values, in proportion.
-fn quantile(sorted: &[f64], share: f64) -> f64 {
+pub(crate) fn quantile(sorted: &[f64], share: f64) -> f64 {
     let place = share * (sorted.len() - 1) as f64;
     let (below, above) = (sorted[place.floor() as usize], sorted[place.ceil() as usize]);
     below + (above - below) * place.fract()

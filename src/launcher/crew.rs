@@ -1,22 +1,23 @@
 //! All processes of a run: who is there, who is ready, who has to be started again, and who is given up.
 
 use std::os::unix::process::ExitStatusExt;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::ExitStatus;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use shoal_common::channel::Domain;
 use shoal_common::channel::control::RoleStatus;
-use shoal_common::commit::{CommitReader, OpenError};
 use shoal_common::config::Config;
 use shoal_common::durable::write_atomically;
 use shoal_common::report::{Activity, Heartbeat, Identity, Role};
 use shoal_common::run_dir::RunDir;
 
+use super::incarnations::{last_committed, read_counter};
 use super::log::Log;
 use super::member::{Consequence, LIMIT, Member};
 use super::process::{Process, name};
+use crate::recorder::{Incident, What};
 
 /// How often the dead are cleaned up after whose end the launcher does not see: terminals that asked something.
 const CLEANING: Duration = Duration::from_secs(2);
@@ -39,6 +40,8 @@ pub(super) struct Crew {
     actors: u32,
     max_actors: u32,
     log: Log,
+    /// What has happened since the last [`Crew::take_incidents`].
+    incidents: Vec<Incident>,
     run: PathBuf,
     /// Where the number of processes ever started is kept: incarnations are never used twice, not by a resumed run either.
     counter: PathBuf,
@@ -73,6 +76,7 @@ impl Crew {
             actors: config.actors.count,
             max_actors: config.actors.max,
             log,
+            incidents: Vec::new(),
             run: run.path().into(),
             counter,
             started,
@@ -89,12 +93,19 @@ impl Crew {
         self.recruit()
     }
 
+    /// What has happened since this was asked last, in order.
+    pub(super) fn take_incidents(&mut self) -> Vec<Incident> {
+        std::mem::take(&mut self.incidents)
+    }
+
     /// Goes on with so many actors.
     pub(super) fn scale(&mut self, actors: u32) -> anyhow::Result<()> {
         self.log.note(
             "launcher",
             &format!("actors: {actors} from now on, {} before", self.actors),
         );
+        let detail = format!("{} to {actors} actors", self.actors);
+        self.incidents.push(Incident::of_launcher(What::Scaled, detail));
         self.actors = actors;
         self.recruit()
     }
@@ -202,6 +213,7 @@ impl Crew {
             if is_wanted && Instant::now() >= member.restart_at {
                 member.restarts += 1;
                 self.start(i)?;
+                self.note_incident(i, What::StartedAgain, String::new());
             }
             return Ok(State::AtWork);
         };
@@ -218,12 +230,20 @@ impl Crew {
             member.process = None;
             member.restart_at = Instant::now();
             self.log.note(&name, &format!("retired: {}", ending(status)));
+            self.note_incident(i, What::Retired, String::new());
             self.clean(domain);
             return Ok(State::AtWork);
         }
-        match member.ended(status) {
+        let consequence = member.ended(status);
+        let what = if status.signal().is_some() {
+            What::Killed
+        } else {
+            What::Failed
+        };
+        self.note_incident(i, what, ending(status));
+        match consequence {
             Consequence::Restart(pause) => {
-                member.restart_at = Instant::now() + pause;
+                self.members[i].restart_at = Instant::now() + pause;
                 self.log
                     .note(&name, &format!("{}; starting it again in {pause:?}", ending(status)));
                 // Its places in shared memory are free for its successor.
@@ -233,8 +253,16 @@ impl Crew {
                 }
                 Ok(State::AtWork)
             }
-            Consequence::GiveUp => self.give_up(&name, status),
+            Consequence::GiveUp => {
+                self.note_incident(i, What::GivenUp, String::new());
+                self.give_up(&name, status)
+            }
         }
+    }
+
+    fn note_incident(&mut self, i: usize, what: What, detail: String) {
+        self.incidents
+            .push(Incident::of(self.members[i].identity, what, detail));
     }
 
     fn clean(&mut self, domain: &Domain) {
@@ -333,6 +361,8 @@ impl Crew {
             if member.process.take().is_some() {
                 let name = name(member.identity);
                 self.log.note(&name, "did not end when asked to, and was killed");
+                let detail = "did not end when asked to".into();
+                self.incidents.push(Incident::of(member.identity, What::Killed, detail));
                 if member.identity.role == Role::Learner {
                     self.unsaved = Some("it did not end when asked to, and was killed".into());
                 }
@@ -360,79 +390,10 @@ impl Crew {
     }
 }
 
-/// The greatest incarnation of an actor that is in the run's replay.
-fn last_committed(run: &RunDir) -> anyhow::Result<u64> {
-    let commits = match CommitReader::open(&run.replay_file()) {
-        Err(OpenError::NotYet { .. }) => return Ok(0),
-        opened => opened?,
-    };
-    let marks = (0..commits.layout().actors).map(|actor| commits.committed(actor).incarnation);
-    Ok(marks.max().unwrap_or(0))
-}
-
-fn read_counter(path: &Path) -> anyhow::Result<u64> {
-    /// More than any run starts, and far from overflowing when it is counted on.
-    const LIMIT: u64 = 1 << 60;
-    let text = match std::fs::read(path) {
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(0),
-        text => text.with_context(|| format!("cannot read {}", path.display()))?,
-    };
-    let number = std::str::from_utf8(&text)
-        .ok()
-        .and_then(|text| text.trim().parse().ok());
-    number.filter(|started| *started < LIMIT).with_context(|| {
-        format!(
-            "{} is damaged: write a number into it that is greater than every incarnation in the run's log",
-            path.display()
-        )
-    })
-}
-
 fn ending(status: ExitStatus) -> String {
     match (status.signal(), status.code()) {
         (Some(signal), _) => format!("killed by signal {signal}"),
         (_, Some(code)) => format!("ended with exit code {code}"),
         _ => "ended".into(),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use proptest::prelude::*;
-
-    use super::*;
-
-    fn counted(bytes: &[u8]) -> anyhow::Result<u64> {
-        let directory = tempfile::tempdir().unwrap();
-        let path = directory.path().join("incarnations");
-        std::fs::write(&path, bytes).unwrap();
-        let counted = read_counter(&path);
-        assert_eq!(std::fs::read(path).unwrap(), bytes);
-        counted
-    }
-
-    proptest! {
-        #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::default() })]
-
-        #[test]
-        fn a_counter_is_a_number_that_can_be_counted_on_or_refused(
-            bytes in prop_oneof![
-                prop::collection::vec(any::<u8>(), 0..30),
-                "[ +-]?[0-9]{0,25}\n?".prop_map(String::into_bytes),
-                any::<u64>().prop_map(|n| n.to_string().into_bytes()),
-            ],
-        ) {
-            match counted(&bytes) {
-                Ok(started) => prop_assert!(started < 1 << 60),
-                Err(error) => prop_assert!(error.to_string().contains("incarnations is damaged"), "{}", error),
-            }
-        }
-    }
-
-    #[test]
-    fn a_counter_that_is_not_there_is_none() {
-        assert_eq!(read_counter(Path::new("/nowhere/incarnations")).unwrap(), 0);
-        assert_eq!(counted(b"17").unwrap(), 17);
-        assert!(counted(b"18446744073709551615").is_err() && counted(b"").is_err());
     }
 }

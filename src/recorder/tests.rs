@@ -139,6 +139,34 @@ fn a_line_cut_short_by_a_crash_is_not_continued() {
 }
 
 #[test]
+fn incidents_are_written_at_once_and_say_when_by_seconds_and_by_steps() {
+    let (_parent, run) = run();
+    assert_eq!(
+        read_incidents(&run.incidents()).unwrap(),
+        None,
+        "as in a run of an older build"
+    );
+    let killed = Incident {
+        role: "actor",
+        index: 3,
+        what: What::Killed,
+        detail: "killed by signal 9".into(),
+    };
+    let mut recorder = Recorder::open(&run, 0).unwrap();
+    recorder.learner(&learner(2_000, 500, 1), seconds(1.0)).unwrap();
+    recorder.incident(&killed, seconds(1.5)).unwrap();
+    let first = "wall_seconds,env_steps,role,index,what,detail\n1.5,2000,actor,3,killed,killed by signal 9\n";
+    assert_eq!(text(&run.incidents()), first);
+    drop(recorder);
+
+    let mut recorder = Recorder::open(&run, 0).unwrap();
+    recorder.incident(&killed, seconds(0.5)).unwrap();
+    let second = "1.0,2000,launcher,0,resumed,\n1.5,2000,actor,3,killed,killed by signal 9\n";
+    assert_eq!(text(&run.incidents()), format!("{first}{second}"));
+    assert_eq!(read_incidents(&run.incidents()).unwrap().unwrap().len(), 3);
+}
+
+#[test]
 fn a_restarted_learner_has_no_rate_rather_than_a_wrong_one() {
     let (_parent, run) = run();
     let mut recorder = Recorder::open(&run, 0).unwrap();

@@ -66,6 +66,10 @@ fn gymnasiums_pendulum_is_trained_while_its_servers_are_killed() {
     let (first, second) = (judged(), judged());
     assert!(first.status.success(), "{}", String::from_utf8_lossy(&first.stderr));
     assert_eq!(first.stdout, second.stdout, "evaluation episodes start alike");
+    let output = place.output(&["report", "run", "--out", "page.html"]);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let page = std::fs::read_to_string(place.path().join("page.html")).unwrap();
+    assert!(page.contains("\"terminated\":false"), "episodes are played");
 }
 
 #[test]

@@ -19,13 +19,13 @@ const M_CART: f64 = 1.0;
 /// Mass of the pole in kg.
 const M_POLE: f64 = 0.1;
 /// Half the pole's length in m.
-const L: f64 = 0.5;
+pub const L: f64 = 0.5;
 /// Size of the push in N.
 const FORCE: f64 = 10.0;
 /// Δt in s.
-const DT: f64 = 0.02;
+pub const DT: f64 = 0.02;
 /// The cart leaves the track beyond this |x|, in m.
-const X_LIMIT: f64 = 2.4;
+pub const X_LIMIT: f64 = 2.4;
 /// The pole has fallen beyond this |θ|: 12° in rad. (The thesis's table shows twice this: the observation's range.)
 const THETA_LIMIT: f64 = 12.0 / 180.0 * std::f64::consts::PI;
 

@@ -16,7 +16,7 @@ use super::{
 };
 
 /// Δt in s.
-const DT: f64 = 0.05;
+pub const DT: f64 = 0.05;
 /// Gravity in m/s², as Gymnasium rounds it.
 const G: f64 = 10.0;
 /// Mass in kg.

@@ -17,7 +17,7 @@ pub use parameters::Parameters;
 pub use reward::{Motion, Reward};
 
 /// Δt in s.
-const DT: f64 = 0.05;
+pub const DT: f64 = 0.05;
 /// Walls at this |x| and |y|, in m.
 const WALL: f64 = 4.0;
 /// Greatest |ẋ| and |ẏ|, in m/s.

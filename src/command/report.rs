@@ -1,0 +1,118 @@
+//! `shoal report`: one file with everything there is to see of one run or several, to be looked at anywhere.
+
+use std::io::{ErrorKind, Read, Write};
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, bail, ensure};
+use shoal_common::durable::write_atomically;
+use shoal_common::run_dir::RunDir;
+
+use crate::cli::ReportArgs;
+use crate::report::{self, MARK};
+
+/// The report's name where none is given.
+const NAME: &str = "report.html";
+
+/// Gathers what the runs left behind so far, writes the page, and says where it is.
+pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<()> {
+    let runs = open(&args.runs)?;
+    let out = match (&args.out, &runs[..]) {
+        (Some(out), _) => out.clone(),
+        (None, [run]) => run.path().join(NAME),
+        (None, _) => NAME.into(),
+    };
+    refuse_what_is_no_report(&out)?;
+    let report = report::gather(&runs)?;
+    for (reason, names) in report.not_played() {
+        writeln!(
+            std::io::stderr().lock(),
+            "{}: no episode is played: {reason}",
+            names.join(", ")
+        )?;
+    }
+    let page = report.page()?;
+    write_atomically(&out, |file| file.write_all(page.as_bytes()))
+        .with_context(|| format!("cannot write {}; choose another place with --out", out.display()))?;
+    writeln!(std::io::stdout().lock(), "{}", out.display())?;
+    Ok(())
+}
+
+/// The runs, each of them once.
+fn open(paths: &[PathBuf]) -> anyhow::Result<Vec<RunDir>> {
+    let mut runs: Vec<RunDir> = Vec::new();
+    for path in paths {
+        let run = RunDir::open(path)?;
+        let twice = runs.contains(&run);
+        ensure!(!twice, "{} is named twice: name each run once", path.display());
+        runs.push(run);
+    }
+    Ok(runs)
+}
+
+/// Only a report is replaced by a report.
+fn refuse_what_is_no_report(out: &Path) -> anyhow::Result<()> {
+    if out.is_dir() {
+        bail!("{} is a directory: give --out the name of a file", out.display());
+    }
+    let mut start = Vec::new();
+    match std::fs::File::open(out).and_then(|file| file.take(MARK.len() as u64).read_to_end(&mut start)) {
+        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(()),
+        read => read.with_context(|| format!("cannot read {}; choose another file with --out", out.display()))?,
+    };
+    ensure!(
+        start == MARK.as_bytes(),
+        "{} is there and is no report: choose another file with --out, or remove it",
+        out.display()
+    );
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::rollout::tests::small;
+
+    #[test]
+    fn a_report_replaces_a_report_and_nothing_else() {
+        let parent = tempfile::tempdir().unwrap();
+        let run_dir = RunDir::create(&parent.path().join("run")).unwrap();
+        let (config, _) = small("name = \"pendulum\"");
+        std::fs::write(run_dir.config_file(), config.to_toml().unwrap()).unwrap();
+        let report = |out: &Path| {
+            run(&ReportArgs {
+                runs: vec![run_dir.path().into()],
+                out: Some(out.into()),
+            })
+        };
+        let out = parent.path().join("page.html");
+        report(&out).unwrap();
+        report(&out).unwrap();
+        let config = run_dir.config_file();
+        let before = std::fs::read(&config).unwrap();
+        assert!(
+            report(&config)
+                .unwrap_err()
+                .to_string()
+                .contains("is there and is no report")
+        );
+        assert_eq!(std::fs::read(&config).unwrap(), before);
+        assert!(
+            report(parent.path())
+                .unwrap_err()
+                .to_string()
+                .contains("is a directory")
+        );
+        let nowhere = report(Path::new("/nowhere/at/all.html")).unwrap_err().to_string();
+        assert!(nowhere.contains("cannot write /nowhere/at/all.html"), "{nowhere}");
+    }
+
+    #[test]
+    fn a_run_is_named_once() {
+        let parent = tempfile::tempdir().unwrap();
+        let run_dir = RunDir::create(&parent.path().join("run")).unwrap();
+        std::fs::write(run_dir.config_file(), "").unwrap();
+        let around = run_dir.path().join("../run");
+        let twice = open(&[run_dir.path().into(), around]).unwrap_err().to_string();
+        assert!(twice.contains("is named twice"), "{twice}");
+    }
+}

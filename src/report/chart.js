@@ -1,0 +1,275 @@
+/* A diagram of curves and bands over steps or time, with zoom and a pointer that reads values. */
+
+const MARGIN = { left: 62, right: 14, top: 12, bottom: 44 };
+const TOLD = 8;
+/** More names than are listed unasked. */
+const MANY = 12;
+
+/**
+ * options: `title`, `unit` (of y), `axis` (STEPS or TIME), `link`, `series`, and perhaps `marks`, `height`, `line` (a value to
+ * be met). A series has `name`, `colour`, `x`, `y` and perhaps `low`, `high`, `band` (what lies between), `look` (thin, thick).
+ * A mark has `x` and `text`.
+ */
+class Chart {
+  constructor(options) {
+    Object.assign(this, { marks: [], height: 300 }, options);
+    this.hidden = new Set();
+    this.cursor = null;
+    this.picture = svg("svg", { role: "img", "aria-label": this.described() });
+    this.readout = html("div", { class: "readout", hidden: true });
+    this.spoken = html("p", { class: "unseen", "aria-live": "polite" });
+    this.plot = html(
+      "div",
+      {
+        class: "plot",
+        tabindex: 0,
+        role: "group",
+        "aria-label": `${this.title}: left and right arrows read values, plus and minus zoom, 0 shows all`,
+        onkeydown: (event) => this.key(event),
+        onpointerdown: (event) => this.press(event),
+        onpointermove: (event) => this.point(event),
+        onpointerup: (event) => this.release(event),
+        onpointercancel: () => this.leave(),
+        onpointerleave: () => this.leave(),
+        ondblclick: () => this.link.show(null),
+        onwheel: (event) => this.wheel(event),
+        onblur: () => this.leave(),
+      },
+      this.picture,
+      this.readout,
+    );
+    const button = (sign, name, act) => html("button", { type: "button", "aria-label": `${this.title}: ${name}`, title: name, onclick: act }, sign);
+    this.element = html(
+      "figure",
+      { class: "chart" },
+      html(
+        "figcaption",
+        {},
+        html("span", { class: "title" }, this.title),
+        html(
+          "span",
+          { class: "tools" },
+          button("−", "zoom out", () => this.link.zoom(2)),
+          button("+", "zoom in", () => this.link.zoom(0.5)),
+          button("All", "show all", () => this.link.show(null)),
+        ),
+      ),
+      this.plot,
+      this.legend(),
+      this.spoken,
+    );
+    this.link.members.push(this);
+    new ResizeObserver(() => this.draw()).observe(this.plot);
+  }
+
+  described() {
+    const named = this.series.filter((series) => series.name && series.y.some(isNumber));
+    const told = named.slice(0, TOLD).map((series) => {
+      const values = series.y.filter(isNumber);
+      return `${series.name} from ${text(values[0])} to ${text(values[values.length - 1])}`;
+    });
+    return `${this.title} over ${this.axis.label}: ${told.join("; ") || "nothing yet"}`;
+  }
+
+  legend() {
+    const entry = (series) =>
+      html(
+        "button",
+        {
+          type: "button",
+          class: `c${series.colour} ${series.look ?? ""}`,
+          "aria-pressed": "true",
+          onclick: (event) => {
+            const shown = this.hidden.delete(series) || !this.hidden.add(series);
+            event.currentTarget.setAttribute("aria-pressed", String(shown));
+            this.draw();
+          },
+        },
+        html("i", {}),
+        series.band ? `${series.name} (band: ${series.band})` : series.name,
+      );
+    // A single curve that the title names needs no other name.
+    const named = this.series.filter((series) => series.name);
+    const legend = html("div", { class: "legend", hidden: named.length === 1 && !named[0].band }, named.map(entry));
+    return named.length > MANY ? html("details", {}, html("summary", {}, `Names of the ${named.length} curves`), legend) : legend;
+  }
+
+  extent() {
+    return this.series.flatMap(({ x }) => (x.length ? [x[0], x[x.length - 1]] : []));
+  }
+
+  shown() {
+    return this.series.filter((series) => !this.hidden.has(series));
+  }
+
+  draw() {
+    const width = this.plot.clientWidth;
+    if (!width) return;
+    const { height } = this;
+    const domain = this.link.domain;
+    this.x = scale(domain, [MARGIN.left, width - MARGIN.right]);
+    const visible = this.shown().flatMap(({ x, y, low, high }) =>
+      [y, low, high].filter(Boolean).flatMap((values) => values.filter((_, i) => x[i] >= domain[0] && x[i] <= domain[1])),
+    );
+    const range = rangeOf(this.line === undefined ? visible : [...visible, this.line]);
+    this.y = scale(range, [height - MARGIN.bottom, MARGIN.top]);
+    set(this.picture, { viewBox: `0 0 ${width} ${height}`, width, height });
+    const clip = (this.clip ??= freshId());
+    this.pointer = svg("g", { class: "pointer" });
+    this.picture.replaceChildren(
+      svg("clipPath", { id: clip }, svg("rect", { x: MARGIN.left, y: 0, width: Math.max(0, width - MARGIN.left - MARGIN.right), height: height - MARGIN.bottom })),
+      this.axes(domain, range, width),
+      svg("g", { "clip-path": `url(#${clip})` }, this.markLines(), this.shown().map((series) => this.curve(series))),
+      this.pointer,
+    );
+    if (!visible.some(isNumber)) {
+      const middle = { class: "nothing", x: width / 2, y: (height - MARGIN.bottom) / 2, "text-anchor": "middle" };
+      this.picture.append(svg("text", middle, "nothing to show here yet"));
+    }
+  }
+
+  axes(domain, range, width) {
+    const { height, x, y } = this;
+    const bottom = height - MARGIN.bottom;
+    const across = this.axis.scale(this.link.whole[1]);
+    const part = svg("g", { class: "axes" });
+    for (const value of ticks(range[0], range[1], 5)) {
+      part.append(svg("line", { x1: MARGIN.left, x2: width - MARGIN.right, y1: y(value), y2: y(value) }));
+      part.append(svg("text", { x: MARGIN.left - 8, y: y(value) + 4, "text-anchor": "end" }, text(value)));
+    }
+    const units = domain.map((end) => end / across.unit);
+    for (const value of ticks(units[0], units[1], Math.max(3, Math.min(8, width / 90)))) {
+      const place = x(value * across.unit);
+      part.append(svg("line", { class: "tick", x1: place, x2: place, y1: bottom, y2: bottom + 5 }));
+      part.append(svg("text", { x: place, y: bottom + 19, "text-anchor": "middle" }, across.write(value * across.unit)));
+    }
+    part.append(svg("line", { class: "base", x1: MARGIN.left, x2: width - MARGIN.right, y1: bottom, y2: bottom }));
+    part.append(svg("text", { class: "label", x: width - MARGIN.right, y: height - 6, "text-anchor": "end" }, this.axis.label + across.suffix));
+    if (this.line !== undefined) {
+      part.append(svg("line", { class: "wanted", x1: MARGIN.left, x2: width - MARGIN.right, y1: y(this.line), y2: y(this.line) }));
+    }
+    return part;
+  }
+
+  markLines() {
+    const line = (mark) => svg("line", { class: `mark ${mark.kind}`, x1: this.x(mark.x), x2: this.x(mark.x), y1: 0, y2: this.height - MARGIN.bottom });
+    return svg("g", {}, this.marks.map(line));
+  }
+
+  curve(series) {
+    const group = svg("g", { class: `c${series.colour} ${series.look ?? ""}` });
+    const place = (value, i) => `${this.x(series.x[i]).toFixed(1)} ${this.y(value).toFixed(1)}`;
+    if (series.low) {
+      const known = series.low.map((_, i) => i).filter((i) => isNumber(series.low[i]) && isNumber(series.high[i]));
+      const around = [...known.map((i) => place(series.high[i], i)), ...known.reverse().map((i) => place(series.low[i], i))];
+      if (around.length) group.append(svg("path", { class: "band", d: `M${around.join("L")}Z` }));
+    }
+    let path = "";
+    let pen = "M";
+    series.y.forEach((value, i) => {
+      if (!isNumber(value) || !isNumber(series.x[i])) return (pen = "M");
+      path += pen + place(value, i);
+      return (pen = "L");
+    });
+    group.append(svg("path", { class: "line", d: path }));
+    const few = series.y.filter(isNumber).length <= 40;
+    if (few && series.look !== "thick") {
+      series.y.forEach((value, i) => {
+        if (isNumber(value)) group.append(svg("circle", { r: 2.5, cx: this.x(series.x[i]), cy: this.y(value) }));
+      });
+    }
+    return group;
+  }
+
+  /** Shows what the curves are at the place `at` of the x axis. */
+  read(at, aloud = false, height = null) {
+    this.cursor = at;
+    const found = this.shown().filter((series) => series.name && series.x.length).map((series) => ({ series, i: nearest(series.x, at) }));
+    const values = found.filter(({ series, i }) => isNumber(series.y[i]));
+    const distance = ({ series, i }) => (height === null ? 0 : Math.abs(this.y(series.y[i]) - height));
+    const told = values.sort((a, b) => distance(a) - distance(b)).slice(0, TOLD);
+    this.pointer.replaceChildren(
+      svg("line", { x1: this.x(at), x2: this.x(at), y1: MARGIN.top, y2: this.height - MARGIN.bottom }),
+      ...told.map(({ series, i }) => svg("circle", { class: `c${series.colour}`, r: 4, cx: this.x(series.x[i]), cy: this.y(series.y[i]) })),
+    );
+    const marks = this.marks.filter((mark) => Math.abs(this.x(mark.x) - this.x(at)) < 6).slice(0, 4);
+    const lines = told.map(({ series, i }) => [series, `${series.name}: ${text(series.y[i])}${this.unit ? ` ${this.unit}` : ""}${series.low ? `, ${text(series.low[i])} to ${text(series.high[i])}` : ""}`]);
+    this.readout.replaceChildren(
+      html("b", {}, this.axis.say(at)),
+      ...lines.map(([series, line]) => html("span", { class: `c${series.colour}` }, html("i", {}), line)),
+      ...marks.map((mark) => html("span", { class: "c1" }, mark.text)),
+    );
+    this.readout.hidden = false;
+    const right = this.x(at) > this.plot.clientWidth / 2;
+    this.readout.style.left = right ? "auto" : `${this.x(at) + 12}px`;
+    this.readout.style.right = right ? `${this.plot.clientWidth - this.x(at) + 12}px` : "auto";
+    if (aloud) this.spoken.textContent = `${this.axis.say(at)}. ${lines.map(([, line]) => line).join(". ")}`;
+  }
+
+  place(event) {
+    const box = this.plot.getBoundingClientRect();
+    return [Math.max(MARGIN.left, Math.min(box.width - MARGIN.right, event.clientX - box.left)), event.clientY - box.top];
+  }
+
+  press(event) {
+    if (event.button !== 0) return;
+    this.from = this.place(event)[0];
+  }
+
+  point(event) {
+    if (!this.x) return;
+    const [left, top] = this.place(event);
+    this.read(this.x.inverse(left), false, top);
+    if (this.from !== undefined && Math.abs(left - this.from) > 4) {
+      const chosen = { class: "chosen", x: Math.min(left, this.from), y: MARGIN.top, width: Math.abs(left - this.from), height: this.height - MARGIN.top - MARGIN.bottom };
+      this.pointer.append(svg("rect", chosen));
+    }
+  }
+
+  release(event) {
+    const left = this.place(event)[0];
+    const from = this.from;
+    this.from = undefined;
+    if (from !== undefined && Math.abs(left - from) > 8) this.link.show([this.x.inverse(from), this.x.inverse(left)]);
+    else this.point(event);
+  }
+
+  leave() {
+    this.from = undefined;
+    this.readout.hidden = true;
+    this.pointer?.replaceChildren();
+  }
+
+  wheel(event) {
+    if (!event.ctrlKey) return;
+    event.preventDefault();
+    this.link.zoom(event.deltaY > 0 ? 1.25 : 0.8, this.x.inverse(this.place(event)[0]));
+  }
+
+  key(event) {
+    const [low, high] = this.link.domain;
+    const acts = {
+      ArrowLeft: () => this.step(-1),
+      ArrowRight: () => this.step(1),
+      "+": () => this.link.zoom(0.5, this.cursor),
+      "-": () => this.link.zoom(2, this.cursor),
+      0: () => this.link.show(null),
+      Escape: () => this.leave(),
+      PageUp: () => this.link.move(-0.5),
+      PageDown: () => this.link.move(0.5),
+    };
+    const act = acts[event.key];
+    if (!act || !(high > low) || event.ctrlKey || event.altKey || event.metaKey) return;
+    event.preventDefault();
+    act();
+  }
+
+  /** Reads the next place at which something shown has a value. */
+  step(direction) {
+    const [low, high] = this.link.domain;
+    const from = this.cursor ?? (direction > 0 ? low - 1 : high + 1);
+    const least = (high - low) / 200;
+    const places = this.shown().flatMap(({ x }) => x).filter((x) => x >= low && x <= high && (x - from) * direction > (this.cursor === null ? 0 : least));
+    if (places.length) this.read(direction > 0 ? Math.min(...places) : Math.max(...places), true);
+  }
+}

@@ -1,0 +1,54 @@
+/* Elements, and numbers as text. */
+
+const SVG = "http://www.w3.org/2000/svg";
+
+function build(element, attributes, children) {
+  for (const [name, value] of Object.entries(attributes)) {
+    if (name.startsWith("on")) element.addEventListener(name.slice(2), value);
+    else if (value !== null && value !== false) element.setAttribute(name, value === true ? "" : value);
+  }
+  element.append(...children.flat().filter((child) => child !== null));
+  return element;
+}
+
+/** An HTML element: attributes by name, listeners as `onclick` and the like, then children. */
+function html(name, attributes = {}, ...children) {
+  return build(document.createElement(name), attributes, children);
+}
+
+/** The same for SVG. */
+function svg(name, attributes = {}, ...children) {
+  return build(document.createElementNS(SVG, name), attributes, children);
+}
+
+function set(element, attributes) {
+  for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
+}
+
+/** A name that no other element of the page has. */
+const freshId = ((count) => () => `part-${(count += 1)}`)(0);
+
+const isNumber = (value) => typeof value === "number" && Number.isFinite(value);
+
+/** A value with about four digits, and a true minus sign. */
+function text(value) {
+  if (!isNumber(value)) return "–";
+  const size = Math.abs(value);
+  const plain = size === 0 || (size >= 1e-3 && size < 1e6);
+  const digits = size >= 1000 ? 0 : size >= 100 ? 1 : size >= 1 ? 2 : 4;
+  const number = plain ? Number(value.toFixed(digits)).toLocaleString("en-GB", { maximumFractionDigits: 4 }) : value.toExponential(2);
+  return number.replace("-", "−");
+}
+
+const whole = (value) => (isNumber(value) ? value.toLocaleString("en-GB") : "–");
+
+/** Seconds as people say them. */
+function duration(seconds) {
+  if (!isNumber(seconds)) return "–";
+  if (seconds < 60) return `${Number(seconds.toFixed(seconds < 10 ? 2 : 1))} s`;
+  const minutes = Math.floor(seconds / 60);
+  if (minutes < 60) return `${minutes} min ${Math.round(seconds % 60)} s`;
+  return `${Math.floor(minutes / 60)} h ${minutes % 60} min`;
+}
+
+const plural = (count, noun) => `${whole(count)} ${noun}${count === 1 ? "" : "s"}`;

@@ -1,0 +1,85 @@
+//! Fewer and shorter numbers, as a picture needs them.
+
+use std::ops::Range;
+
+/// Five significant digits: finer than any screen.
+pub(super) fn short(value: f64) -> f64 {
+    format!("{value:.4e}").parse().unwrap_or(value)
+}
+
+/// At most `most` parts of `0 .. len`, one after the other and about equally long.
+pub(super) fn parts(len: usize, most: usize) -> impl Iterator<Item = Range<usize>> {
+    let count = len.min(most.max(1));
+    (0..count).map(move |i| i * len / count..(i + 1) * len / count)
+}
+
+/// The mean of those that are numbers; NaN where there are none.
+pub(super) fn mean(values: impl Iterator<Item = f64>) -> f64 {
+    let (mut sum, mut count) = (0.0, 0);
+    for value in values.filter(|value| value.is_finite()) {
+        sum += value;
+        count += 1;
+    }
+    short(sum / f64::from(count))
+}
+
+/// At most `most` (or four) places in `values`, in order: the first, the last, and the least and greatest of each part
+/// between, so that no peak is lost.
+pub(super) fn telling(values: &[f64], most: usize) -> Vec<usize> {
+    if values.len() <= most {
+        return (0..values.len()).collect();
+    }
+    let last = values.len() - 1;
+    let mut places = vec![0, last];
+    for part in parts(values.len(), (most / 2).max(2) - 1) {
+        let by_value = |a: &usize, b: &usize| values[*a].total_cmp(&values[*b]);
+        places.extend(part.clone().min_by(by_value));
+        places.extend(part.max_by(by_value));
+    }
+    places.sort_unstable();
+    places.dedup();
+    places
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    #[test]
+    fn five_digits_are_kept() {
+        assert_eq!(
+            [2.345_678_9, -0.000_123_456_78, 0.0, 1_234_567.0].map(short),
+            [2.345_7, -0.000_123_46, 0.0, 1_234_600.0]
+        );
+        assert!(short(f64::NAN).is_nan());
+        assert_eq!(mean([1.0, f64::NAN, 3.0].into_iter()), 2.0);
+        assert!(mean(std::iter::empty()).is_nan());
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::default() })]
+
+        #[test]
+        fn ends_and_peaks_are_kept_and_nothing_is_there_twice(
+            values in prop::collection::vec(-1e9..1e9_f64, 1..300),
+            most in 4..100_usize,
+        ) {
+            let places = telling(&values, most);
+            prop_assert!(places.len() <= most.max(values.len().min(most)), "{} of {most}", places.len());
+            prop_assert!(places.windows(2).all(|pair| pair[0] < pair[1]));
+            prop_assert_eq!((places[0], places[places.len() - 1]), (0, values.len() - 1));
+            let greatest = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+            prop_assert!(places.iter().any(|place| values[*place] == greatest));
+        }
+
+        #[test]
+        fn parts_cover_everything_once(len in 0..1000_usize, most in 1..50_usize) {
+            let parts: Vec<_> = parts(len, most).collect();
+            prop_assert!(parts.len() <= most);
+            prop_assert!(parts.iter().all(|part| !part.is_empty()));
+            prop_assert_eq!(parts.into_iter().flatten().collect::<Vec<_>>(), (0..len).collect::<Vec<_>>());
+        }
+    }
+}

@@ -1,0 +1,162 @@
+/* The page: what there is to see of the runs, section by section. */
+
+const report = JSON.parse(document.getElementById("data").textContent);
+const { runs } = report;
+const COLOURS = 6;
+const several = runs.length > 1;
+
+/** A section with its heading and its place in the list at the top. */
+function section(title, ...parts) {
+  const id = title.toLowerCase().replaceAll(" ", "-");
+  document.querySelector("nav").append(html("a", { href: `#${id}` }, title));
+  const heading = html("h2", { id: `${id}-title` }, title);
+  document.querySelector("main").append(html("section", { id, "aria-labelledby": heading.id }, heading, ...parts));
+}
+
+/** What is said of runs, once for all of whom it is said: `of` gives a sentence or nothing. */
+function said(of) {
+  const names = new Map();
+  for (const run of runs) {
+    const words = of(run);
+    if (words) names.set(words, [...(names.get(words) ?? []), run.name]);
+  }
+  return [...names].map(([words, who]) => aside(several ? `${who.join(", ")}: ${words}` : words));
+}
+
+const aside = (words) => html("p", { class: "aside" }, words);
+
+/** A table with a row for each fact and a column for each run. */
+function table(label, rows) {
+  const head = html("tr", {}, html("td", {}), ...runs.map((run, i) => html("th", { scope: "col" }, html("i", { class: `swatch c${i % COLOURS}` }), run.name)));
+  const row = ([name, values, differs]) => html("tr", { class: differs ? "differs" : "" }, html("th", { scope: "row" }, name), ...values.map((value) => html("td", {}, value)));
+  return html("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": label }, html("table", {}, html("thead", {}, head), html("tbody", {}, rows.map(row))));
+}
+
+function glance() {
+  const judged = (of) => (of ? `${text(of.mean)} ± ${text(of.std)} (${plural(of.episodes, "episode")}, step ${whole(of.env_steps)})` : "not judged yet");
+  const states = { training: "being trained", finished: "finished", unfinished: "not finished" };
+  const planned = (run) => `${whole(run.env_steps)} of ${whole(run.planned_steps)}`;
+  const episodes = (run) => (run.planned_episodes === null ? whole(run.episodes) : `${whole(run.episodes)} of ${whole(run.planned_episodes)}`);
+  const incidents = ({ incidents }) => (incidents ? `${plural(incidents.kills, "kill")}, ${plural(incidents.restarts, "restart")}` : "not recorded");
+  const facts = [
+    ["state", (run) => states[run.state]],
+    ["environment", (run) => run.environment],
+    ["method", (run) => `${run.algorithm}, ${run.mode}`],
+    ["seed", (run) => String(run.seed)],
+    ["environment steps", planned],
+    ["episodes", episodes],
+    ["updates", (run) => whole(run.updates)],
+    ["time", (run) => duration(run.wall_seconds)],
+    ["best return", (run) => judged(run.best)],
+    ["last return", (run) => judged(run.last)],
+    ["processes", incidents],
+  ];
+  section(
+    "At a glance",
+    table("The runs at a glance", facts.map(([name, of]) => [name, runs.map(of)])),
+    aside("Returns are means over the episodes of an evaluation ± their standard deviation, without exploration."),
+  );
+}
+
+/** The curves of one environment's runs: repetitions with their median and spread. */
+function returns(comparison, axis) {
+  const x = (curve) => (axis === STEPS ? curve.steps : curve.time);
+  const spreads = comparison.sets.filter((set) => set.by_steps);
+  const all = comparison.sets.flatMap((set) => set.runs);
+  // Where nothing but one median stands out from few runs, each run keeps the colour it has everywhere.
+  const own = spreads.length <= 1 && all.length <= COLOURS;
+  const series = [];
+  comparison.sets.forEach((set, at) => {
+    const spread = axis === STEPS ? set.by_steps : set.by_time;
+    for (const i of set.runs) {
+      const { evaluations } = runs[i];
+      const curve = { name: own || set.runs.length === 1 ? runs[i].name : "", colour: (own ? i : at) % COLOURS, x: x(evaluations), y: evaluations.mean };
+      if (all.length === 1 && evaluations.std.length) {
+        curve.low = curve.y.map((mean, n) => (isNumber(mean) ? mean - (evaluations.std[n] ?? 0) : null));
+        curve.high = curve.y.map((mean, n) => (isNumber(mean) ? mean + (evaluations.std[n] ?? 0) : null));
+        curve.band = "± standard deviation of the episodes";
+      }
+      if (set.runs.length > 1) curve.look = "thin";
+      series.push(curve);
+    }
+    if (spread) {
+      const { band, low, high, median } = spread;
+      series.push({ name: `median of ${set.label}`, colour: own ? "ink" : at % COLOURS, x: spread.x, y: median, low, high, band, look: "thick" });
+    }
+  });
+  return new Chart({ title: `Evaluation return, ${comparison.environment}`, unit: "", axis, link: new Link(), series, height: 340 });
+}
+
+function learning() {
+  const place = html("div", {});
+  const draw = (axis) => {
+    place.replaceChildren(...report.comparisons.map((comparison) => returns(comparison, axis).element));
+    place.append(...report.comparisons.flatMap((comparison) => explored(comparison, axis)));
+  };
+  const name = freshId();
+  const choice = (words, axis, checked) => html("label", {}, html("input", { type: "radio", name, checked, onchange: () => draw(axis) }), words);
+  section(
+    "Learning curves",
+    html("fieldset", {}, html("legend", {}, "over"), choice("environment steps", STEPS, true), choice("time", TIME, false)),
+    place,
+    aside("Drag over a diagram to look closer, double-click to see all; a name below it hides or shows its curve."),
+  );
+  draw(STEPS);
+}
+
+/** A curve of each run that has one. */
+function perRun(of, which = runs.map((_, i) => i)) {
+  const series = which.map((i) => ({ name: runs[i].name, colour: i % COLOURS, look: "fine", ...of(runs[i]) }));
+  return series.filter((series) => series.y.some(isNumber));
+}
+
+function explored(comparison, axis) {
+  const returns = ({ exploration }) => ({ x: axis === STEPS ? exploration.steps : exploration.time, y: exploration.mean });
+  const series = perRun(returns, comparison.sets.flatMap((set) => set.runs));
+  const title = `Return while exploring, ${comparison.environment}`;
+  return series.length ? [new Chart({ title, unit: "", axis, link: new Link(), series, height: 240 }).element] : [];
+}
+
+function episodes() {
+  const playable = runs.filter((run) => run.played.episodes.length);
+  section("Episodes", playable.length ? new Player(playable).element : null, ...said((run) => run.played.why_not));
+}
+
+function time() {
+  const link = new Link();
+  const parts = runs.filter((run) => run.incidents?.rows.length).map((run) => new Timeline(run, link, several).element);
+  parts.push(...said((run) => (run.incidents ? null : "What became of processes is not on record: an older build made this.")));
+  parts.push(...said((run) => (run.incidents?.rows.length === 0 ? "No process ended before its time." : null)));
+  const marks = runs.length <= COLOURS ? runs.flatMap((run) => marksOf(run).map((mark) => ({ ...mark, text: several ? `${run.name}: ${mark.text}` : mark.text }))) : [];
+  const chart = (title, key, more = {}) => {
+    const series = perRun(({ learner }) => ({ x: learner.time, y: learner[key] }));
+    if (series.length) parts.push(new Chart({ title, axis: TIME, link, series, marks, height: 220, unit: "", ...more }).element);
+  };
+  const agreed = [...new Set(runs.map((run) => run.updates_per_step))];
+  chart("Ratio: updates per step after the warm-up", "ratio", agreed.length === 1 ? { line: agreed[0] } : {});
+  chart("Environment steps per second", "env_steps_per_second", { unit: "steps/s" });
+  chart("Updates per second", "updates_per_second", { unit: "updates/s" });
+  chart("Loss of the critic", "critic_loss");
+  chart("Loss of the actor", "actor_loss");
+  chart("Mean value of the sampled actions (Q)", "q_mean");
+  section("Over time", ...parts, aside("The diagrams of this section are zoomed together. Lines across them mark what became of processes; a dashed level is what was agreed."));
+}
+
+function settings() {
+  const keys = [...new Set(runs.flatMap((run) => run.settings.map(([key]) => key)))].sort();
+  const values = runs.map((run) => new Map(run.settings));
+  const rows = keys.map((key) => {
+    const found = values.map((of) => of.get(key) ?? "–");
+    return [key, found, several && new Set(found).size > 1];
+  });
+  const place = html("div", {});
+  const show = (all) => place.replaceChildren(table("Settings", all ? rows : rows.filter(([, , differs]) => differs)));
+  const only = html("label", {}, html("input", { type: "checkbox", onchange: (event) => show(!event.target.checked) }), "only those that differ");
+  section("Settings", several ? html("p", {}, only) : null, place);
+  show(true);
+}
+
+document.getElementById("made").textContent =
+  `Made ${new Date(report.made * 1000).toISOString().slice(0, 16).replace("T", " ")} UTC by shoal ${report.version}` +
+  (runs.some((run) => run.state === "training") ? "; training was going on." : ".");
+for (const part of [glance, learning, episodes, time, settings]) part();

@@ -1,0 +1,173 @@
+/* Plays episodes: a picture, a slider, and the signals beside it. */
+
+const SPEEDS = [0.25, 0.5, 1, 2, 4];
+/** Seconds a frame stays where an environment has no time of its own. */
+const UNTIMED = 0.5;
+
+class Player {
+  constructor(runs) {
+    this.runs = runs;
+    this.stage = html("div", { class: "stage" });
+    this.signals = html("div", { class: "signals" });
+    this.policy = html("p", { class: "aside" });
+    this.time = html("output", { class: "time" });
+    this.play = html("button", { type: "button", class: "play", onclick: () => this.toggle() }, "");
+    const step = (sign, by, name) => html("button", { type: "button", "aria-label": name, title: name, onclick: () => this.step(by) }, sign);
+    this.slider = html("input", { type: "range", min: 0, step: 1, "aria-label": "Step of the episode", oninput: () => this.go(Number(this.slider.value)) });
+    const choice = (label, values, selected, onchange) => {
+      const id = freshId();
+      const options = values.map(([value, words]) => html("option", { value, selected: value === selected }, words));
+      const select = html("select", { id, onchange: (event) => onchange(Number(event.target.value)) }, options);
+      return html("span", { class: "choice" }, html("label", { for: id }, label), select);
+    };
+    this.speed = 1;
+    this.episodes = html("span", {});
+    this.choice = choice;
+    this.element = html(
+      "div",
+      { class: "player", tabindex: 0, role: "group", "aria-label": "Player: space plays and pauses, arrows step, Home and End jump", onkeydown: (event) => this.key(event) },
+      html(
+        "div",
+        { class: "choices" },
+        runs.length > 1 ? choice("Run", runs.map((run, i) => [i, run.name]), 0, (i) => this.load(this.runs[i], 0)) : null,
+        this.episodes,
+        choice("Speed", SPEEDS.map((speed) => [speed, `${speed}×`]), 1, (speed) => (this.speed = speed)),
+      ),
+      html(
+        "div",
+        { class: "show" },
+        html("div", { class: "watch" }, this.stage, html("div", { class: "controls" }, step("|◀", -1, "one step back"), this.play, step("▶|", 1, "one step on"), this.slider), this.time),
+        this.signals,
+      ),
+      this.policy,
+      html("p", { class: "aside" }, "Space plays and pauses, the arrow keys step, Home and End jump; a click into a line goes there."),
+    );
+    // Space plays from anywhere on the page that has no use for it, as long as the picture can be seen.
+    document.addEventListener("keydown", (event) => {
+      const box = this.element.getBoundingClientRect();
+      if (event.target === document.body && box.top < innerHeight * 0.8 && box.bottom > innerHeight * 0.2) this.key(event);
+    });
+    this.load(runs[0], 0);
+  }
+
+  load(run, number) {
+    this.pause();
+    this.run = run;
+    const { played } = run;
+    const { scene } = played;
+    this.episode = played.episodes[number];
+    this.frames = this.episode.signals[0].values.length;
+    this.dt = scene.dt ?? null;
+    const told = (episode, i) => [i, `${episode.number + 1}: return ${text(episode.return)}, ${plural(episode.steps, "step")}${episode.terminated ? ", terminated" : ""}`];
+    this.episodes.replaceChildren(this.choice("Episode", played.episodes.map(told), number, (i) => this.load(run, i)));
+    const { element, draw } = SCENES[scene.kind](scene, this.episode);
+    this.drawScene = draw;
+    this.stage.replaceChildren(element);
+    this.element.classList.toggle("without-picture", scene.kind === "lines");
+    this.cursors = this.episode.signals.map((signal) => this.strip(signal));
+    this.policy.textContent = `${run.name}: ${played.policy}, without exploration, from the starts that every evaluation has.`;
+    set(this.slider, { max: this.frames - 1 });
+    this.go(0);
+  }
+
+  /** A signal's line, its present value, and where it is now. */
+  strip(signal) {
+    const range = rangeOf(signal.values, 0.08);
+    const across = scale([0, Math.max(1, this.frames - 1)], [0, 1000]);
+    const up = scale(range, [60, 0]);
+    let path = "";
+    let pen = "M";
+    signal.values.forEach((value, i) => {
+      if (!isNumber(value)) return (pen = "M");
+      path += `${pen}${across(i).toFixed(1)} ${up(value).toFixed(2)}`;
+      return (pen = "L");
+    });
+    const now = svg("line", { class: "now", y1: 0, y2: 60 });
+    const zero = range[0] < 0 && range[1] > 0 ? svg("line", { class: "zero", x1: 0, x2: 1000, y1: up(0), y2: up(0) }) : null;
+    const value = html("b", {});
+    const choose = (event) => {
+      if (event.type !== "pointerdown" && !event.buttons) return;
+      const box = event.currentTarget.getBoundingClientRect();
+      this.go(Math.round(across.inverse(((event.clientX - box.left) / box.width) * 1000)));
+    };
+    const drawing = svg("svg", { viewBox: "0 0 1000 60", preserveAspectRatio: "none", "aria-hidden": "true", onpointerdown: choose, onpointermove: choose }, zero, svg("path", { class: "line c0", d: path }), now);
+    const known = signal.values.filter(isNumber);
+    const [least, most] = known.length ? [known.reduce((a, b) => Math.min(a, b)), known.reduce((a, b) => Math.max(a, b))] : [];
+    const unit = signal.unit ? ` ${signal.unit}` : "";
+    const element = html(
+      "div",
+      { class: "strip" },
+      html("p", {}, html("span", {}, signal.name + (signal.unit ? ` (${signal.unit})` : "")), value),
+      drawing,
+      html("p", { class: "ends" }, `${text(least)} to ${text(most)}${unit}`),
+    );
+    const move = (i) => {
+      set(now, { x1: across(i), x2: across(i) });
+      value.textContent = text(signal.values[i]);
+    };
+    return { element, move };
+  }
+
+  /** Shows a frame; where the episode has no such, the nearest. */
+  go(frame) {
+    this.frame = Math.max(0, Math.min(this.frames - 1, frame));
+    if (this.signals.firstChild !== this.cursors[0].element) this.signals.replaceChildren(...this.cursors.map(({ element }) => element));
+    this.slider.value = this.frame;
+    const step = Math.min(this.frame * this.episode.stride, this.episode.steps);
+    const seconds = this.dt === null ? "" : `, ${(step * this.dt).toFixed(2)} s`;
+    this.time.textContent = `step ${whole(step)} of ${whole(this.episode.steps)}${seconds}`;
+    set(this.slider, { "aria-valuetext": this.time.textContent });
+    this.drawScene(this.frame);
+    for (const { move } of this.cursors) move(this.frame);
+  }
+
+  step(by) {
+    this.pause();
+    this.go(this.frame + by);
+  }
+
+  toggle() {
+    if (this.playing) return this.pause();
+    if (this.frame === this.frames - 1) this.go(0);
+    this.playing = true;
+    this.name();
+    let [before, due] = [null, 0];
+    const tick = (now) => {
+      if (!this.playing) return;
+      const seconds = this.dt === null ? UNTIMED : this.dt * this.episode.stride;
+      due += before === null ? 0 : (Math.min(250, now - before) / 1000 / seconds) * this.speed;
+      before = now;
+      const frames = Math.floor(due);
+      due -= frames;
+      if (frames) this.go(this.frame + frames);
+      if (this.frame === this.frames - 1) this.pause();
+      else requestAnimationFrame(tick);
+    };
+    requestAnimationFrame(tick);
+    return undefined;
+  }
+
+  pause() {
+    this.playing = false;
+    this.name();
+  }
+
+  name() {
+    this.play.textContent = this.playing ? "❚❚ Pause" : "▶ Play";
+    set(this.play, { "data-playing": String(Boolean(this.playing)) });
+  }
+
+  key(event) {
+    const { target } = event;
+    const slides = target === this.slider;
+    if (event.ctrlKey || event.altKey || event.metaKey || target.matches("select")) return;
+    // A button's own key is space, and it does what it says.
+    if (event.key === " " && target.matches("button")) return;
+    const acts = { " ": () => this.toggle(), ArrowLeft: () => this.step(-1), ArrowRight: () => this.step(1), Home: () => this.step(-this.frames), End: () => this.step(this.frames) };
+    if (!acts[event.key] || (target === document.body && event.key !== " " && !event.key.startsWith("Arrow"))) return;
+    event.preventDefault();
+    event.stopPropagation();
+    if (slides) this.pause();
+    acts[event.key]();
+  }
+}

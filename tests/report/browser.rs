@@ -1,0 +1,210 @@
+//! A page in headless Chromium, driven over the pipe that Chromium itself offers: messages of its DevTools protocol as
+//! JSON, each ended by a zero byte. No crate is needed for that, and no port is opened.
+
+use std::io::{BufRead, BufReader, Write};
+use std::os::unix::process::CommandExt;
+use std::path::Path;
+use std::process::{Child, ChildStdin, Command, Stdio};
+use std::sync::mpsc::{Receiver, channel};
+use std::time::Duration;
+
+use rustix::process::{Pid, Signal, kill_process_group};
+use serde_json::{Value, json};
+
+/// After so long without a word Chromium is stuck.
+const PATIENCE: Duration = Duration::from_secs(120);
+
+/// Where this is set, a test that finds no Chromium has failed.
+const REQUIRED: &str = "SHOAL_REQUIRE_BROWSER";
+
+const NAMES: [&str; 4] = ["chromium", "chromium-browser", "google-chrome", "chrome"];
+
+/// A browser with one page.
+pub(crate) struct Browser {
+    child: Child,
+    to: ChildStdin,
+    from: Receiver<Value>,
+    sent: u64,
+    session: Option<Value>,
+    events: Vec<Value>,
+    _profile: tempfile::TempDir,
+}
+
+impl Browser {
+    /// None where there is no Chromium; that is said, or is a failure where one is required.
+    pub(crate) fn start() -> Option<Self> {
+        let path = std::env::var_os("PATH").unwrap_or_default();
+        let found = NAMES
+            .iter()
+            .find(|name| std::env::split_paths(&path).any(|directory| directory.join(name).is_file()));
+        let Some(name) = found else {
+            assert!(
+                std::env::var_os(REQUIRED).is_none(),
+                "{REQUIRED} is set and there is no Chromium"
+            );
+            eprintln!("skipped: there is no Chromium here, so nobody has looked at the report's page");
+            return None;
+        };
+        let profile = tempfile::tempdir().unwrap();
+        // Chromium reads from descriptor 3 and writes to 4.
+        let mut child = Command::new("sh")
+            .args(["-c", "exec \"$@\" 3<&0 4>&1 </dev/null >/dev/null 2>&1", "sh", name])
+            .args([
+                "--remote-debugging-pipe",
+                "--headless",
+                "--no-sandbox",
+                "--disable-gpu",
+                "--disable-dev-shm-usage",
+            ])
+            .args([
+                "--no-first-run",
+                "--disable-background-networking",
+                "--disable-component-update",
+                "--disable-sync",
+                "--hide-scrollbars",
+            ])
+            .arg(format!("--user-data-dir={}", profile.path().display()))
+            .arg("about:blank")
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .process_group(0)
+            .spawn()
+            .unwrap();
+        let to = child.stdin.take().unwrap();
+        let messages = BufReader::new(child.stdout.take().unwrap()).split(0);
+        let (sender, from) = channel();
+        std::thread::spawn(move || {
+            for message in messages.map_while(Result::ok) {
+                if sender.send(serde_json::from_slice(&message).unwrap()).is_err() {
+                    break;
+                }
+            }
+        });
+        let mut browser = Self {
+            child,
+            to,
+            from,
+            sent: 0,
+            session: None,
+            events: Vec::new(),
+            _profile: profile,
+        };
+        let target = browser.call("Target.createTarget", json!({ "url": "about:blank" }))["targetId"].clone();
+        let attached = browser.call("Target.attachToTarget", json!({ "targetId": target, "flatten": true }));
+        browser.session = Some(attached["sessionId"].clone());
+        for domain in ["Page", "Network", "Runtime", "Log"] {
+            browser.call(&format!("{domain}.enable"), json!({}));
+        }
+        Some(browser)
+    }
+
+    /// Loads a file, in a window so wide.
+    pub(crate) fn open(&mut self, page: &Path, width: u32, dark: bool) {
+        let size = json!({ "width": width, "height": 800, "deviceScaleFactor": 1, "mobile": false });
+        self.call("Emulation.setDeviceMetricsOverride", size);
+        let scheme = json!({ "name": "prefers-color-scheme", "value": if dark { "dark" } else { "light" } });
+        self.call("Emulation.setEmulatedMedia", json!({ "features": [scheme] }));
+        self.events.clear();
+        self.call("Page.navigate", json!({ "url": format!("file://{}", page.display()) }));
+        while self.events_called("Page.loadEventFired").next().is_none() {
+            let event = self.receive();
+            self.events.push(event);
+        }
+    }
+
+    /// The value of an expression in the page, awaited.
+    pub(crate) fn value(&mut self, expression: &str) -> Value {
+        let question = json!({ "expression": expression, "returnByValue": true, "awaitPromise": true });
+        let answer = self.call("Runtime.evaluate", question);
+        assert_eq!(answer["exceptionDetails"], Value::Null, "{expression}");
+        answer["result"]["value"].clone()
+    }
+
+    /// Presses a key where the focus is.
+    pub(crate) fn key(&mut self, key: &str) {
+        let code = match key {
+            " " => 32,
+            "End" => 35,
+            "Home" => 36,
+            "ArrowLeft" => 37,
+            "ArrowRight" => 39,
+            "Tab" => 9,
+            other => panic!("no code for {other:?}"),
+        };
+        let text = if key == " " { key } else { "" };
+        let event =
+            |kind| json!({ "type": kind, "key": key, "code": key, "windowsVirtualKeyCode": code, "text": text });
+        self.call("Input.dispatchKeyEvent", event("keyDown"));
+        self.call(
+            "Input.dispatchKeyEvent",
+            json!({ "type": "keyUp", "key": key, "windowsVirtualKeyCode": code }),
+        );
+    }
+
+    /// Clicks into an element, at this share of its width.
+    pub(crate) fn click(&mut self, selector: &str, share: f64) {
+        let place = self.value(&format!(
+            "(() => {{ const e = document.querySelector({selector:?}); e.scrollIntoView({{ block: 'center', behavior: 'instant' }}); \
+             const b = e.getBoundingClientRect(); return [b.left + {share} * b.width, b.top + b.height / 2]; }})()"
+        ));
+        for kind in ["mousePressed", "mouseReleased"] {
+            let event =
+                json!({ "type": kind, "x": place[0], "y": place[1], "button": "left", "buttons": 1, "clickCount": 1 });
+            self.call("Input.dispatchMouseEvent", event);
+        }
+    }
+
+    /// What the page has complained of since it was opened: exceptions, errors and warnings.
+    pub(crate) fn complaints(&mut self) -> Vec<String> {
+        // What was said before this answer has come before it.
+        self.value("0");
+        let said = ["Runtime.exceptionThrown", "Runtime.consoleAPICalled", "Log.entryAdded"];
+        let events = self.events.iter();
+        events
+            .filter(|event| said.iter().any(|kind| event["method"] == *kind))
+            .map(|event| event["params"].to_string())
+            .collect()
+    }
+
+    /// What it has asked for since, itself included.
+    pub(crate) fn requests(&self) -> Vec<String> {
+        let sent = self.events_called("Network.requestWillBeSent");
+        let url = |event: &Value| event["params"]["request"]["url"].as_str().unwrap().to_owned();
+        sent.map(url).filter(|url| !url.starts_with("data:")).collect()
+    }
+
+    fn events_called(&self, method: &str) -> impl Iterator<Item = &Value> {
+        self.events.iter().filter(move |event| event["method"] == method)
+    }
+
+    fn call(&mut self, method: &str, parameters: Value) -> Value {
+        self.sent += 1;
+        let mut message = json!({ "id": self.sent, "method": method, "params": parameters });
+        if let Some(session) = &self.session {
+            message["sessionId"] = session.clone();
+        }
+        self.to.write_all(format!("{message}\0").as_bytes()).unwrap();
+        loop {
+            let mut message = self.receive();
+            if message["id"] == self.sent {
+                assert_eq!(message["error"], Value::Null, "{method}");
+                return message["result"].take();
+            }
+            self.events.push(message);
+        }
+    }
+
+    fn receive(&self) -> Value {
+        self.from
+            .recv_timeout(PATIENCE)
+            .expect("Chromium has ended, or says nothing any more")
+    }
+}
+
+impl Drop for Browser {
+    fn drop(&mut self) {
+        // All of its processes: they are of one group.
+        let _ = kill_process_group(Pid::from_child(&self.child), Signal::KILL);
+        let _ = self.child.wait();
+    }
+}

@@ -1,0 +1,297 @@
+//! The report of real runs: one file that is complete in itself, looked at in a real browser.
+
+#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that panics has failed")]
+#![allow(clippy::print_stderr, reason = "a test that could not be done says so")]
+
+mod browser;
+#[path = "../support/mod.rs"]
+mod support;
+
+use std::path::PathBuf;
+
+use browser::Browser;
+use serde_json::Value;
+use support::{Running, Workplace, complaint, until};
+
+/// A short run of each environment; the pendulum's is repeated with another seed, and made again with a kill on its way.
+fn runs() -> (Workplace, Vec<&'static str>) {
+    let place = Workplace::new();
+    let judge = ["--set", "evaluation.every=200", "--steps", "800"];
+    place.train(&[&["pendulum", "--run", "swing", "--lockstep"], &judge[..]].concat());
+    place.train(&[&["point-mass-r3", "--run", "drive", "--lockstep"], &judge[..]].concat());
+    place.train(
+        &[
+            &["pendulum", "--run", "swing-2", "--lockstep", "--seed", "2"],
+            &judge[..],
+        ]
+        .concat(),
+    );
+    for (preset, name, episodes) in [("cart-pole", "balance", "10"), ("frozen-lake", "lake", "40")] {
+        let arguments = ["train", preset, "--run", name, "--episodes", episodes, "--quiet"];
+        let trained = place.output(
+            &[
+                &arguments[..],
+                &["--set", "evaluation.episodes=3", "--set", "evaluation.final_episodes=3"],
+            ]
+            .concat(),
+        );
+        assert!(trained.status.success(), "{}", String::from_utf8_lossy(&trained.stderr));
+    }
+    killed_on_the_way(&place, "again");
+    (place, vec!["swing", "swing-2", "drive", "balance", "lake", "again"])
+}
+
+/// A pendulum's run whose actor was killed, and which was stopped.
+fn killed_on_the_way(place: &Workplace, name: &str) {
+    let running = place.start(
+        name,
+        &[
+            "--steps",
+            "1000000000",
+            "--actors",
+            "1",
+            "--set",
+            "evaluation.every=200",
+        ],
+    );
+    running.learns_on();
+    running.kill("actor-0");
+    until("the kill is on record", || {
+        incidents(&running).contains("actor,0,started-again")
+    });
+    until("it was judged", || running.run.join("checkpoints/best.policy").exists());
+    assert!(place.output(&["stop", name]).status.success());
+    running.wait();
+}
+
+fn incidents(running: &Running) -> String {
+    std::fs::read_to_string(running.run.join("incidents.csv")).unwrap_or_default()
+}
+
+/// Writes the report of these runs and gives its place.
+fn report(place: &Workplace, runs: &[&str]) -> PathBuf {
+    let output = place.output(&[&["report"], runs, &["--out", "page.html"]].concat());
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    assert_eq!(String::from_utf8_lossy(&output.stdout), "page.html\n");
+    std::fs::canonicalize(place.path().join("page.html")).unwrap()
+}
+
+/// Where the moving part of the player's picture is.
+fn moving_part(browser: &mut Browser) -> Vec<Value> {
+    let place = "(() => { const b = document.querySelector('[data-part=moves]').getBoundingClientRect(); \
+                 return [Math.round(b.left * 10), Math.round((b.top + scrollY) * 10)]; })()";
+    browser.value(place).as_array().unwrap().clone()
+}
+
+fn frame(browser: &mut Browser) -> u64 {
+    let frame = browser.value("document.querySelector('.player input[type=range]').value");
+    frame.as_str().unwrap().parse().unwrap()
+}
+
+fn plays(browser: &mut Browser) -> bool {
+    browser.value("document.querySelector('.play').dataset.playing") == "true"
+}
+
+#[test]
+fn a_report_is_looked_at_in_a_browser() {
+    let Some(mut browser) = Browser::start() else { return };
+    let (place, runs) = runs();
+    let page = report(&place, &runs);
+    browser.open(&page, 1200, false);
+    assert_eq!(browser.complaints(), [""; 0]);
+    assert_eq!(
+        browser.requests(),
+        [format!("file://{}", page.display())],
+        "nothing but itself"
+    );
+
+    let names = browser.value("document.querySelector('.legend').innerText");
+    assert!(names.as_str().unwrap().contains("median of 2 runs of ddpg"), "{names}");
+
+    // Every diagram has a curve, and the kill is on the time line.
+    let charts = browser.value("[...document.querySelectorAll('figure.chart .plot:not(.timeline)')].map((plot) => [...plot.querySelectorAll('.line')].some((line) => line.getAttribute('d').includes('L')) || plot.querySelector('circle') !== null)");
+    let charts = charts.as_array().unwrap();
+    assert!(
+        charts.len() >= 8 && charts.iter().all(|drawn| drawn == true),
+        "{charts:?}"
+    );
+    let signs = browser
+        .value("[...document.querySelectorAll('.timeline .sign title')].map((title) => title.textContent).join('\\n')");
+    let signs = signs.as_str().unwrap();
+    assert!(
+        signs.contains("actor 0 killed by signal 9") && signs.contains("actor 0 started again"),
+        "{signs}"
+    );
+
+    for (i, run) in runs.iter().enumerate() {
+        browser.value(&format!(
+            "(() => {{ const choice = document.querySelector('.player select'); choice.value = {i}; choice.dispatchEvent(new Event('change')); }})()"
+        ));
+        it_is_played(&mut browser, run);
+    }
+    a_curve_is_read_and_zoomed(&mut browser);
+    assert_eq!(browser.complaints(), [""; 0]);
+    it_fits_a_phone_and_the_dark(&mut browser, &page);
+}
+
+/// By the slider, by the keyboard, and by itself.
+fn it_is_played(browser: &mut Browser, run: &str) {
+    let start = moving_part(browser);
+    browser.click(".player input[type=range]", 0.5);
+    let middle = frame(browser);
+    assert!(middle > 0, "{run}: the slider was moved");
+    // What comes back to the same place half-way has at least been elsewhere: the lake's walker does.
+    let mut places = vec![start, moving_part(browser)];
+    browser.value("document.querySelector('.player').focus()");
+    browser.key("Home");
+    assert_eq!(frame(browser), 0, "{run}");
+    for step in 1..=3 {
+        browser.key("ArrowRight");
+        assert_eq!(frame(browser), step.min(last_frame(browser)), "{run}");
+        places.push(moving_part(browser));
+    }
+    browser.key("ArrowLeft");
+    browser.key("End");
+    assert_eq!(frame(browser), last_frame(browser), "{run}");
+    places.push(moving_part(browser));
+    assert!(
+        places.iter().any(|place| place != &places[0]),
+        "{run}: something moves: {places:?}"
+    );
+
+    browser.key("Home");
+    browser.key(" ");
+    until("space plays", || frame(browser) > 0);
+    // The others may be over by now; this one takes ten seconds.
+    if run == "swing" {
+        assert!(plays(browser));
+        browser.key(" ");
+        assert!(!plays(browser), "space pauses");
+        let paused = frame(browser);
+        browser.value("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))");
+        assert_eq!(frame(browser), paused);
+    }
+}
+
+fn last_frame(browser: &mut Browser) -> u64 {
+    let last = browser.value("document.querySelector('.player input[type=range]').max");
+    last.as_str().unwrap().parse().unwrap()
+}
+
+fn a_curve_is_read_and_zoomed(browser: &mut Browser) {
+    browser.value("document.querySelector('.plot').focus()");
+    browser.key("ArrowRight");
+    browser.key("ArrowRight");
+    let said = browser.value("document.querySelector('.plot .readout').innerText");
+    assert!(
+        said.as_str().unwrap().contains("step ") && said.as_str().unwrap().contains("swing: "),
+        "{said}"
+    );
+    let curve = "document.querySelector('.plot .line').getAttribute('d')";
+    let whole = browser.value(curve);
+    browser.click(".chart .tools button:nth-child(2)", 0.5);
+    let nearer = browser.value(curve);
+    assert_ne!(nearer, whole, "zoomed in");
+    browser.click(".chart .tools button:nth-child(3)", 0.5);
+    assert_eq!(browser.value(curve), whole, "all of it again");
+}
+
+fn it_fits_a_phone_and_the_dark(browser: &mut Browser, page: &std::path::Path) {
+    browser.open(page, 390, true);
+    assert_eq!(browser.complaints(), [""; 0]);
+    assert_eq!(
+        browser.value("document.documentElement.scrollWidth"),
+        390,
+        "nothing sticks out"
+    );
+    let small = browser.value(
+        "[...document.querySelectorAll('button, select, input[type=range], nav a, summary')].filter((part) => part.getBoundingClientRect().height < 43).map((part) => part.outerHTML)",
+    );
+    assert_eq!(small, serde_json::json!([]), "a finger hits everything");
+    let [paper, ink] = ["backgroundColor", "color"].map(|name| {
+        let colour = browser.value(&format!("getComputedStyle(document.body).{name}"));
+        let parts = colour
+            .as_str()
+            .unwrap()
+            .trim_start_matches("rgb(")
+            .trim_end_matches(')')
+            .to_owned();
+        parts.split(", ").map(|part| part.parse::<u32>().unwrap()).sum::<u32>()
+    });
+    assert!(paper < 150 && ink > 600, "{paper} {ink}");
+    browser.value("document.querySelector('.play').focus()");
+    browser.key("Tab");
+    let outline = browser.value("getComputedStyle(document.activeElement).outlineStyle");
+    assert_eq!(outline, "solid", "where the focus is can be seen");
+}
+
+#[test]
+fn a_run_under_way_and_one_that_has_hardly_begun_are_reported() {
+    let place = Workplace::new();
+    let running = place.start("run", &["--steps", "1000000000"]);
+    running.learns_on();
+    let page = std::fs::read_to_string(report(&place, &["run"])).unwrap();
+    assert!(page.contains("\"state\":\"training\""));
+    assert!(place.output(&["stop", "run"]).status.success());
+    let run = running.run.clone();
+    running.wait();
+
+    // As an older build left it, and with nothing on record.
+    for file in [
+        "incidents.csv",
+        "evaluations.csv",
+        "episodes.csv",
+        "learner.csv",
+        "checkpoints/best.policy",
+        "checkpoints/last.policy",
+    ] {
+        let _ = std::fs::remove_file(run.join(file));
+    }
+    let output = place.output(&["report", "run"]);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let page = std::fs::read_to_string(run.join("report.html")).unwrap();
+    assert!(page.contains("\"incidents\":null") && page.contains("No policy has been judged yet."));
+    if let Some(mut browser) = Browser::start() {
+        browser.open(&run.join("report.html"), 800, false);
+        assert_eq!(browser.complaints(), [""; 0]);
+    }
+}
+
+#[test]
+fn what_cannot_be_reported_is_refused_in_one_line() {
+    let place = Workplace::new();
+    std::fs::create_dir(place.path().join("empty")).unwrap();
+    place.train(&["pendulum", "--run", "run", "--steps", "200", "--lockstep"]);
+    std::fs::write(place.path().join("letter.html"), "<!doctype html>\nDear reader").unwrap();
+    for (arguments, part) in [
+        (
+            &["nowhere"][..],
+            "nowhere is not a run directory: it has no config.toml",
+        ),
+        (&["run", "empty"], "empty is not a run directory"),
+        (&["run", "run/../run"], "is named twice"),
+        (
+            &["run", "--out", "letter.html"],
+            "letter.html is there and is no report",
+        ),
+        (
+            &["run", "--out", "empty"],
+            "empty is a directory: give --out the name of a file",
+        ),
+        (
+            &["run", "--out", "no/where.html"],
+            "cannot write no/where.html; choose another place with --out",
+        ),
+    ] {
+        let said = complaint(&place.output(&[&["report"], arguments].concat()));
+        assert!(
+            said.starts_with("error: ") && said.contains(part),
+            "{arguments:?}: {said}"
+        );
+    }
+    let kept = std::fs::read_to_string(place.path().join("letter.html")).unwrap();
+    assert!(kept.ends_with("Dear reader"));
+    std::fs::write(place.path().join("run/learner.csv"), "a,b\n1,2\n").unwrap();
+    let said = complaint(&place.output(&["report", "run"]));
+    assert!(said.contains("learner.csv is not a record of this program"), "{said}");
+}
