@@ -7,6 +7,7 @@ use clap::{Args, Parser, Subcommand};
 
 use crate::command::bench::Stage;
 use crate::command::eval::WhichPolicy;
+use crate::command::export::Format;
 use crate::command::reproduce;
 
 /// Shared-memory off-policy actor-learner: distributed reinforcement learning on one machine.
@@ -33,6 +34,8 @@ pub(crate) enum Command {
     Eval(EvalArgs),
     /// Draw a run's figures.
     Plot(PlotArgs),
+    /// Write a run's policy as a file that other programs read.
+    Export(ExportArgs),
     /// Run the thesis's experiments over several seeds, draw its figures, and report which of its claims hold.
     Reproduce(ReproduceArgs),
     /// Measure a stage of the system on this machine.
@@ -47,7 +50,7 @@ pub(crate) enum Command {
     Learner(RoleArgs),
 }
 
-#[derive(Args, Clone, Debug)]
+#[derive(Args, Clone, Debug, Default)]
 pub(crate) struct TrainArgs {
     /// What to train: frozen-lake, frozen-lake-sarsa, cart-pole, pendulum, point-mass-r1, point-mass-r2, point-mass-r3, or
     /// a configuration file (FILE.toml).
@@ -157,6 +160,21 @@ pub(crate) struct PlotArgs {
     pub(crate) run: PathBuf,
     /// Where to put the figures [default: the run directory].
     #[arg(long, value_name = "DIR")]
+    pub(crate) out: Option<PathBuf>,
+}
+
+#[derive(Args, Clone, Debug)]
+pub(crate) struct ExportArgs {
+    /// Run directory.
+    pub(crate) run: PathBuf,
+    /// The form of the file.
+    #[arg(long, value_enum)]
+    pub(crate) format: Format,
+    /// Which policy to write.
+    #[arg(long, value_enum, default_value_t)]
+    pub(crate) policy: WhichPolicy,
+    /// The file [default: <policy>.<format> in the run directory].
+    #[arg(long, value_name = "FILE")]
     pub(crate) out: Option<PathBuf>,
 }
 

@@ -2,6 +2,7 @@
 
 pub(crate) mod bench;
 pub(crate) mod eval;
+pub(crate) mod export;
 pub(crate) mod plot;
 pub(crate) mod reproduce;
 pub(crate) mod resume;

@@ -2,6 +2,7 @@
 
 mod cli;
 mod command;
+mod export;
 mod figure;
 mod launcher;
 mod plan;
@@ -53,6 +54,7 @@ fn run(command: &Command) -> anyhow::Result<ExitCode> {
         Command::Stop(args) => command::stop::run(args).map(done),
         Command::Eval(args) => command::eval::run(args).map(done),
         Command::Plot(args) => command::plot::run(args).map(done),
+        Command::Export(args) => command::export::run(args).map(done),
         Command::Reproduce(args) => command::reproduce::run(args),
         Command::Bench(args) => command::bench::run(args).map(done),
         Command::EnvServer(args) => role::run(Role::EnvServer, args).map(done),

@@ -1,0 +1,7 @@
+//! What surrounds training: the policy exported, runs listed, the shell's completions, the manual, and the terminal.
+
+#![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
+
+mod export;
+#[path = "../support/mod.rs"]
+mod support;
