@@ -36,6 +36,8 @@ pub(crate) enum Command {
     Plot(PlotArgs),
     /// Write a run's policy as a file that other programs read.
     Export(ExportArgs),
+    /// List the runs in a directory: their state, how far they are, their best return.
+    List(ListArgs),
     /// Run the thesis's experiments over several seeds, draw its figures, and report which of its claims hold.
     Reproduce(ReproduceArgs),
     /// Measure a stage of the system on this machine.
@@ -176,6 +178,16 @@ pub(crate) struct ExportArgs {
     /// The file [default: <policy>.<format> in the run directory].
     #[arg(long, value_name = "FILE")]
     pub(crate) out: Option<PathBuf>,
+}
+
+#[derive(Args, Clone, Debug)]
+pub(crate) struct ListArgs {
+    /// Directory with runs in it.
+    #[arg(default_value = "runs")]
+    pub(crate) directory: PathBuf,
+    /// Print one JSON object on standard output.
+    #[arg(long)]
+    pub(crate) json: bool,
 }
 
 /// What is interrupted goes on when the same is typed again; what is there is not run again.

@@ -5,6 +5,7 @@ mod command;
 mod export;
 mod figure;
 mod launcher;
+mod listing;
 mod plan;
 mod recorder;
 mod remote;
@@ -55,6 +56,7 @@ fn run(command: &Command) -> anyhow::Result<ExitCode> {
         Command::Eval(args) => command::eval::run(args).map(done),
         Command::Plot(args) => command::plot::run(args).map(done),
         Command::Export(args) => command::export::run(args).map(done),
+        Command::List(args) => command::list::run(args).map(done),
         Command::Reproduce(args) => command::reproduce::run(args),
         Command::Bench(args) => command::bench::run(args).map(done),
         Command::EnvServer(args) => role::run(Role::EnvServer, args).map(done),

@@ -3,5 +3,6 @@
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
 
 mod export;
+mod list;
 #[path = "../support/mod.rs"]
 mod support;
