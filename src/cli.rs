@@ -56,8 +56,12 @@ pub(crate) enum Command {
 pub(crate) struct TrainArgs {
     /// What to train: frozen-lake, frozen-lake-sarsa, cart-pole, pendulum, point-mass-r1, point-mass-r2, point-mass-r3, or
     /// a configuration file (FILE.toml).
-    #[arg(value_name = "PRESET|FILE.toml")]
+    #[arg(value_name = "PRESET|FILE.toml", default_value = "", hide_default_value = true)]
+    #[arg(required_unless_present = "help_config")]
     pub(crate) what: String,
+    /// Explain every key of the configuration, or those of the named preset or file, and train nothing.
+    #[arg(long)]
+    pub(crate) help_config: bool,
     /// Run directory to make [default: runs/<preset>-<n>].
     #[arg(long, value_name = "DIR")]
     pub(crate) run: Option<PathBuf>,

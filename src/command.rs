@@ -3,6 +3,7 @@
 pub(crate) mod bench;
 pub(crate) mod eval;
 pub(crate) mod export;
+mod help_config;
 pub(crate) mod list;
 pub(crate) mod plot;
 pub(crate) mod reproduce;

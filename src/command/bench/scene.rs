@@ -9,7 +9,7 @@ use shoal_common::run_dir::RunDir;
 use tempfile::TempDir;
 
 use super::peer::Peer;
-use crate::cli::{Telling, TrainArgs};
+use crate::cli::TrainArgs;
 use crate::plan::Plan;
 
 /// A run that exists until this is dropped.
@@ -38,11 +38,8 @@ impl Scene {
             seed: Some(1),
             actors: Some(1),
             envs: Some(1),
-            steps: None,
-            episodes: None,
-            lockstep: false,
             set: set.iter().map(|assignment| (*assignment).into()).collect(),
-            telling: Telling::default(),
+            ..TrainArgs::default()
         })?;
         std::fs::create_dir(run.checkpoints()).context("cannot make the directory for checkpoints")?;
         Ok(Self { config, run, directory })
