@@ -4,11 +4,14 @@ use std::path::PathBuf;
 
 use clap::builder::PossibleValuesParser;
 use clap::{Args, Parser, Subcommand};
+use clap_complete::Shell;
+use clap_complete::engine::ArgValueCompleter;
 
 use crate::command::bench::Stage;
 use crate::command::eval::WhichPolicy;
 use crate::command::export::Format;
 use crate::command::reproduce;
+use crate::completion;
 
 /// Shared-memory off-policy actor-learner: distributed reinforcement learning on one machine.
 #[derive(Debug, Parser)]
@@ -42,6 +45,10 @@ pub(crate) enum Command {
     Reproduce(ReproduceArgs),
     /// Measure a stage of the system on this machine.
     Bench(BenchArgs),
+    /// Print what has a shell complete the commands, presets and keys, to be read by its start-up file.
+    Completions(CompletionsArgs),
+    /// Write the manual pages.
+    Man(ManArgs),
     #[command(hide = true)]
     EnvServer(RoleArgs),
     #[command(hide = true)]
@@ -57,7 +64,7 @@ pub(crate) struct TrainArgs {
     /// What to train: frozen-lake, frozen-lake-sarsa, cart-pole, pendulum, point-mass-r1, point-mass-r2, point-mass-r3, or
     /// a configuration file (FILE.toml).
     #[arg(value_name = "PRESET|FILE.toml", default_value = "", hide_default_value = true)]
-    #[arg(required_unless_present = "help_config")]
+    #[arg(required_unless_present = "help_config", add = ArgValueCompleter::new(completion::what_to_train))]
     pub(crate) what: String,
     /// Explain every key of the configuration, or those of the named preset or file, and train nothing.
     #[arg(long)]
@@ -84,7 +91,7 @@ pub(crate) struct TrainArgs {
     #[arg(long)]
     pub(crate) lockstep: bool,
     /// Override a key of the configuration, as in --set ddpg.tau=0.005. May be repeated.
-    #[arg(long, value_name = "SECTION.KEY=VALUE")]
+    #[arg(long, value_name = "SECTION.KEY=VALUE", add = ArgValueCompleter::new(completion::settings))]
     pub(crate) set: Vec<String>,
     #[command(flatten)]
     pub(crate) telling: Telling,
@@ -225,6 +232,20 @@ pub(crate) struct BenchArgs {
     /// Print one JSON object on standard output.
     #[arg(long)]
     pub(crate) json: bool,
+}
+
+#[derive(Args, Clone, Debug)]
+pub(crate) struct CompletionsArgs {
+    /// The shell.
+    #[arg(value_enum)]
+    pub(crate) shell: Shell,
+}
+
+#[derive(Args, Clone, Debug)]
+pub(crate) struct ManArgs {
+    /// Where to put a page for each command [default: the first page, on standard output].
+    #[arg(long, value_name = "DIR")]
+    pub(crate) out: Option<PathBuf>,
 }
 
 /// How the launcher starts a role; everything else is in the run directory.

@@ -1,10 +1,12 @@
 //! What `shoal` does once the command line is read, a command a file.
 
 pub(crate) mod bench;
+pub(crate) mod completions;
 pub(crate) mod eval;
 pub(crate) mod export;
 mod help_config;
 pub(crate) mod list;
+pub(crate) mod man;
 pub(crate) mod plot;
 pub(crate) mod reproduce;
 pub(crate) mod resume;

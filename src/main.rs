@@ -2,6 +2,7 @@
 
 mod cli;
 mod command;
+mod completion;
 mod export;
 mod figure;
 mod launcher;
@@ -28,6 +29,7 @@ use shoal_common::report::Role;
 use crate::cli::{Cli, Command};
 
 fn main() -> ExitCode {
+    completion::answer();
     // Whatever this program makes is for its user alone.
     rustix::process::umask(rustix::fs::Mode::RWXG | rustix::fs::Mode::RWXO);
     // What goes wrong in shared memory is returned as an error and said once, by us.
@@ -59,6 +61,8 @@ fn run(command: &Command) -> anyhow::Result<ExitCode> {
         Command::List(args) => command::list::run(args).map(done),
         Command::Reproduce(args) => command::reproduce::run(args),
         Command::Bench(args) => command::bench::run(args).map(done),
+        Command::Completions(args) => command::completions::run(args).map(done),
+        Command::Man(args) => command::man::run(args).map(done),
         Command::EnvServer(args) => role::run(Role::EnvServer, args).map(done),
         Command::Actor(args) => role::run(Role::Actor, args).map(done),
         Command::Evaluator(args) => role::run(Role::Evaluator, args).map(done),

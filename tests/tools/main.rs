@@ -4,5 +4,6 @@
 
 mod export;
 mod list;
+mod shell;
 #[path = "../support/mod.rs"]
 mod support;
