@@ -45,6 +45,8 @@ pub(crate) enum Command {
     Reproduce(ReproduceArgs),
     /// Measure a stage of the system on this machine.
     Bench(BenchArgs),
+    /// Watch a run on the whole terminal, and scale or stop it by a key.
+    Top(TopArgs),
     /// Print what has a shell complete the commands, presets and keys, to be read by its start-up file.
     Completions(CompletionsArgs),
     /// Write the manual pages.
@@ -232,6 +234,12 @@ pub(crate) struct BenchArgs {
     /// Print one JSON object on standard output.
     #[arg(long)]
     pub(crate) json: bool,
+}
+
+#[derive(Args, Clone, Debug)]
+pub(crate) struct TopArgs {
+    /// Run directory.
+    pub(crate) run: PathBuf,
 }
 
 #[derive(Args, Clone, Debug)]

@@ -13,5 +13,6 @@ pub(crate) mod resume;
 pub(crate) mod scale;
 pub(crate) mod status;
 pub(crate) mod stop;
+pub(crate) mod top;
 pub(crate) mod train;
 mod training;

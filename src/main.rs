@@ -17,6 +17,7 @@ mod room;
 mod status;
 mod tensorboard;
 mod test_run;
+mod top;
 
 use std::io::Write;
 use std::process::ExitCode;
@@ -61,6 +62,7 @@ fn run(command: &Command) -> anyhow::Result<ExitCode> {
         Command::List(args) => command::list::run(args).map(done),
         Command::Reproduce(args) => command::reproduce::run(args),
         Command::Bench(args) => command::bench::run(args).map(done),
+        Command::Top(args) => command::top::run(args),
         Command::Completions(args) => command::completions::run(args).map(done),
         Command::Man(args) => command::man::run(args).map(done),
         Command::EnvServer(args) => role::run(Role::EnvServer, args).map(done),

@@ -7,3 +7,5 @@ mod list;
 mod shell;
 #[path = "../support/mod.rs"]
 mod support;
+mod terminal;
+mod top;
