@@ -4,10 +4,14 @@ use std::path::PathBuf;
 
 use clap::builder::PossibleValuesParser;
 use clap::{Args, Parser, Subcommand};
+use clap_complete::Shell;
+use clap_complete::engine::ArgValueCompleter;
 
 use crate::command::bench::Stage;
 use crate::command::eval::WhichPolicy;
+use crate::command::export::Format;
 use crate::command::reproduce;
+use crate::completion;
 
 /// Shared-memory off-policy actor-learner: distributed reinforcement learning on one machine.
 #[derive(Debug, Parser)]
@@ -35,10 +39,20 @@ pub(crate) enum Command {
     Plot(PlotArgs),
     /// Put what there is to see of one run, or of several side by side, into one file that can be sent to anybody.
     Report(ReportArgs),
+    /// Write a run's policy as a file that other programs read.
+    Export(ExportArgs),
+    /// List the runs in a directory: their state, how far they are, their best return.
+    List(ListArgs),
     /// Run the thesis's experiments over several seeds, draw its figures, and report which of its claims hold.
     Reproduce(ReproduceArgs),
     /// Measure a stage of the system on this machine.
     Bench(BenchArgs),
+    /// Watch a run on the whole terminal, and scale or stop it by a key.
+    Top(TopArgs),
+    /// Print what has a shell complete the commands, presets and keys, to be read by its start-up file.
+    Completions(CompletionsArgs),
+    /// Write the manual pages.
+    Man(ManArgs),
     #[command(hide = true)]
     EnvServer(RoleArgs),
     #[command(hide = true)]
@@ -49,12 +63,20 @@ pub(crate) enum Command {
     Learner(RoleArgs),
 }
 
-#[derive(Args, Clone, Debug)]
+#[derive(Args, Clone, Debug, Default)]
 pub(crate) struct TrainArgs {
     /// What to train: frozen-lake, frozen-lake-sarsa, cart-pole, pendulum, point-mass-r1, point-mass-r2, point-mass-r3,
     /// gym: and a Gymnasium environment (gym:HalfCheetah-v5), or a configuration file (FILE.toml).
-    #[arg(value_name = "PRESET|gym:ID|FILE.toml")]
+    #[arg(
+        value_name = "PRESET|gym:ID|FILE.toml",
+        default_value = "",
+        hide_default_value = true
+    )]
+    #[arg(required_unless_present = "help_config", add = ArgValueCompleter::new(completion::what_to_train))]
     pub(crate) what: String,
+    /// Explain every key of the configuration, or those of the named preset or file, and train nothing.
+    #[arg(long)]
+    pub(crate) help_config: bool,
     /// Run directory to make [default: runs/<preset>-<n>].
     #[arg(long, value_name = "DIR")]
     pub(crate) run: Option<PathBuf>,
@@ -77,7 +99,7 @@ pub(crate) struct TrainArgs {
     #[arg(long)]
     pub(crate) lockstep: bool,
     /// Override a key of the configuration, as in --set ddpg.tau=0.005. May be repeated.
-    #[arg(long, value_name = "SECTION.KEY=VALUE")]
+    #[arg(long, value_name = "SECTION.KEY=VALUE", add = ArgValueCompleter::new(completion::settings))]
     pub(crate) set: Vec<String>,
     #[command(flatten)]
     pub(crate) telling: Telling,
@@ -172,6 +194,31 @@ pub(crate) struct ReportArgs {
     pub(crate) out: Option<PathBuf>,
 }
 
+#[derive(Args, Clone, Debug)]
+pub(crate) struct ExportArgs {
+    /// Run directory.
+    pub(crate) run: PathBuf,
+    /// The form of the file.
+    #[arg(long, value_enum)]
+    pub(crate) format: Format,
+    /// Which policy to write.
+    #[arg(long, value_enum, default_value_t)]
+    pub(crate) policy: WhichPolicy,
+    /// The file [default: <policy>.<format> in the run directory].
+    #[arg(long, value_name = "FILE")]
+    pub(crate) out: Option<PathBuf>,
+}
+
+#[derive(Args, Clone, Debug)]
+pub(crate) struct ListArgs {
+    /// Directory with runs in it.
+    #[arg(default_value = "runs")]
+    pub(crate) directory: PathBuf,
+    /// Print one JSON object on standard output.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
 /// What is interrupted goes on when the same is typed again; what is there is not run again.
 #[derive(Args, Clone, Debug)]
 pub(crate) struct ReproduceArgs {
@@ -203,6 +250,26 @@ pub(crate) struct BenchArgs {
     /// Print one JSON object on standard output.
     #[arg(long)]
     pub(crate) json: bool,
+}
+
+#[derive(Args, Clone, Debug)]
+pub(crate) struct TopArgs {
+    /// Run directory.
+    pub(crate) run: PathBuf,
+}
+
+#[derive(Args, Clone, Debug)]
+pub(crate) struct CompletionsArgs {
+    /// The shell.
+    #[arg(value_enum)]
+    pub(crate) shell: Shell,
+}
+
+#[derive(Args, Clone, Debug)]
+pub(crate) struct ManArgs {
+    /// Where to put a page for each command [default: the first page, on standard output].
+    #[arg(long, value_name = "DIR")]
+    pub(crate) out: Option<PathBuf>,
 }
 
 /// How the launcher starts a role; everything else is in the run directory.

@@ -1,7 +1,12 @@
 //! What `shoal` does once the command line is read, a command a file.
 
 pub(crate) mod bench;
+pub(crate) mod completions;
 pub(crate) mod eval;
+pub(crate) mod export;
+mod help_config;
+pub(crate) mod list;
+pub(crate) mod man;
 pub(crate) mod plot;
 pub(crate) mod report;
 pub(crate) mod reproduce;
@@ -9,5 +14,6 @@ pub(crate) mod resume;
 pub(crate) mod scale;
 pub(crate) mod status;
 pub(crate) mod stop;
+pub(crate) mod top;
 pub(crate) mod train;
 mod training;

@@ -23,6 +23,7 @@ use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 use self::crew::Crew;
 use self::log::Log;
+pub(crate) use self::log::{EVERYBODY_ENDED, FAILED};
 use self::progress::Progress;
 pub(crate) use self::progress::thousands;
 use crate::recorder::Recorder;
@@ -151,6 +152,7 @@ struct Launcher<'a> {
     /// The end has begun.
     ends: bool,
     crew: Crew,
+    log: Log,
     recorder: Recorder,
     progress: Progress,
     signals: Signals,
@@ -181,7 +183,8 @@ impl<'a> Launcher<'a> {
             episode_reports: Reports::open(domain)?,
             evaluation_reports: Reports::open(domain)?,
             learner_reports: Reports::open(domain)?,
-            crew: Crew::new(&config, run, log)?,
+            crew: Crew::new(&config, run, log.clone())?,
+            log,
             recorder,
             progress: Progress::new(&config, run, quiet),
             config,
@@ -200,6 +203,10 @@ impl<'a> Launcher<'a> {
             Ok(()) => Answer::Accepted,
             Err(error) => Answer::Refused(format!("{error:#}")),
         });
+        if let Some(error) = ending.as_ref().err().or(ended.as_ref().err()) {
+            let why = format!("{error:#}").replace('\n', " ");
+            self.log.note("launcher", &format!("{FAILED}{why}"));
+        }
         let ending = ending?;
         ended?;
         self.recorder.flush()?;

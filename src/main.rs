@@ -2,9 +2,12 @@
 
 mod cli;
 mod command;
+mod completion;
 mod environment_server;
+mod export;
 mod figure;
 mod launcher;
+mod listing;
 mod peer;
 mod plan;
 mod recorder;
@@ -17,6 +20,7 @@ mod room;
 mod status;
 mod tensorboard;
 mod test_run;
+mod top;
 
 use std::io::Write;
 use std::process::ExitCode;
@@ -29,6 +33,7 @@ use shoal_common::report::Role;
 use crate::cli::{Cli, Command};
 
 fn main() -> ExitCode {
+    completion::answer();
     // Whatever this program makes is for its user alone.
     rustix::process::umask(rustix::fs::Mode::RWXG | rustix::fs::Mode::RWXO);
     // What goes wrong in shared memory is returned as an error and said once, by us.
@@ -57,8 +62,13 @@ fn run(command: &Command) -> anyhow::Result<ExitCode> {
         Command::Eval(args) => command::eval::run(args).map(done),
         Command::Plot(args) => command::plot::run(args).map(done),
         Command::Report(args) => command::report::run(args).map(done),
+        Command::Export(args) => command::export::run(args).map(done),
+        Command::List(args) => command::list::run(args).map(done),
         Command::Reproduce(args) => command::reproduce::run(args),
         Command::Bench(args) => command::bench::run(args).map(done),
+        Command::Top(args) => command::top::run(args),
+        Command::Completions(args) => command::completions::run(args).map(done),
+        Command::Man(args) => command::man::run(args).map(done),
         Command::EnvServer(args) => role::run(Role::EnvServer, args).map(done),
         Command::Actor(args) => role::run(Role::Actor, args).map(done),
         Command::Evaluator(args) => role::run(Role::Evaluator, args).map(done),

@@ -32,6 +32,23 @@ const FOR_A_TABLE: &str = include_str!("../presets/gym-table.toml");
 /// Sections that name the method.
 const METHODS: [&str; 4] = ["ddpg", "reinforce", "q-learning", "sarsa"];
 
+/// The key that the program chooses itself.
+pub(crate) const FILLED_IN: &str = "run.id";
+
+/// The presets' names.
+pub(crate) fn preset_names() -> impl Iterator<Item = &'static str> {
+    PRESETS.iter().map(|(name, _)| *name)
+}
+
+/// The configuration of a preset or a file, resolved, without options.
+pub(crate) fn resolved(what: &str) -> anyhow::Result<Config> {
+    let args = TrainArgs {
+        what: what.into(),
+        ..TrainArgs::default()
+    };
+    decide(&args).map(|(_, config)| config)
+}
+
 /// A run that can begin.
 #[derive(Debug)]
 pub(crate) struct Plan {
@@ -79,7 +96,7 @@ fn sections(what: &str) -> anyhow::Result<(String, Table)> {
     }
     let path = PathBuf::from(what);
     if path.extension().is_none_or(|extension| extension != "toml") {
-        let known: Vec<&str> = PRESETS.iter().map(|(name, _)| *name).collect();
+        let known: Vec<&str> = preset_names().collect();
         bail!(
             "there is no preset `{what}`: choose {}, a file that ends in .toml, or gym: and a Gymnasium environment",
             known.join(", ")
@@ -127,7 +144,7 @@ fn resolve(mut table: Table, args: &TrainArgs, origin: &str) -> anyhow::Result<C
             .filter(|(key, _)| key.contains('.'))
             .with_context(|| format!("--set {assignment}: must look like SECTION.KEY=VALUE"))?;
         let path: Vec<&str> = key.split('.').collect();
-        if path[0] == "spec" || key == "run.id" {
+        if path[0] == "spec" || key == FILLED_IN {
             bail!("--set {assignment}: {key} is not for choosing: the program fills it in");
         }
         put(&mut table, &path, value_of(value)).with_context(|| format!("--set {assignment}"))?;

@@ -42,7 +42,7 @@ pub(crate) struct Rollout<'a> {
 enum Stage {
     Here(Box<VectorEnvironment>),
     /// By another program, whose evaluation episodes start as this seed says. Begun with the first episode.
-    Elsewhere(Option<(u64, Conversation)>),
+    Elsewhere(Option<(u64, Box<Conversation>)>),
 }
 
 /// What a step gave.
@@ -132,7 +132,7 @@ impl Stage {
                     // One at a time.
                     *conversation = None;
                 }
-                let begin = || anyhow::Ok((seed, Conversation::begin(&config.environment, 1, seed)?));
+                let begin = || anyhow::Ok((seed, Box::new(Conversation::begin(&config.environment, 1, seed)?)));
                 let (_, conversation) = match conversation {
                     Some(begun) => begun,
                     None => conversation.insert(begin()?),

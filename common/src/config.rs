@@ -3,6 +3,7 @@
 
 mod algorithm;
 mod defaults;
+pub mod explanation;
 mod limits;
 mod sections;
 
@@ -11,6 +12,7 @@ pub use algorithm::{Algorithm, Ddpg, Exploration, Reinforce, Tabular, Weight};
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
@@ -42,24 +44,29 @@ pub struct Config {
 }
 
 /// Identity and length of the run.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Run {
     /// Names the run's services and shared memory; chosen when the run directory is made.
+    #[schemars(extend("unit" = "–", "source" = "ours"))]
     pub id: String,
     /// The root of every random stream.
+    #[schemars(extend("unit" = "–", "source" = "ours"))]
     pub seed: u64,
     /// Whether timing may decide anything.
+    #[schemars(extend("unit" = "–", "source" = "ours"))]
     pub mode: Mode,
     /// Environment steps over all actors after which training ends.
+    #[schemars(extend("unit" = "environment steps", "source" = "sections 4.1 to 5.3, each task its own"))]
     pub steps: u64,
     /// Episodes over all actors after which it ends, if that is earlier.
+    #[schemars(extend("unit" = "episodes", "source" = "sections 4.1 and 4.2"))]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub episodes: Option<u64>,
 }
 
 /// Whether timing may decide anything.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Mode {
     /// Actors and learner run side by side, within the ratio's tolerance.
@@ -69,69 +76,87 @@ pub enum Mode {
 }
 
 /// What is controlled: an environment's name, and the parameters that this environment understands.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Environment {
     /// One of the environments' names, or what another program makes an environment from, as `gym:Pendulum-v1`.
+    #[schemars(extend("unit" = "–", "source" = "chapters 4 and 5"))]
     pub name: String,
     /// The command that starts that program, an environment server as `docs/PROTOCOL.md` has it; empty for our own.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[schemars(extend("unit" = "–", "source" = "ours"))]
     pub server: Vec<String>,
     /// The environment's own parameters.
     #[serde(flatten)]
+    #[schemars(skip)]
     pub parameters: toml::Table,
 }
 
 /// Who explores, and in how large portions.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Actors {
     /// Actor processes, each with an environment server of its own.
+    #[schemars(extend("unit" = "processes", "source" = "ours"))]
     pub count: u32,
     /// Environments an actor steps at once.
+    #[schemars(extend("unit" = "environments", "source" = "ours"))]
     pub envs: u32,
     /// Steps of every environment that travel in one chunk: a chunk has `chunk_steps · envs` rows.
+    #[schemars(extend("unit" = "steps", "source" = "ours"))]
     pub chunk_steps: u32,
     /// Chunks an actor may have sent that the learner has not yet committed.
+    #[schemars(extend("unit" = "chunks", "source" = "ours"))]
     pub window: u32,
     /// The most actors the run can be scaled to.
+    #[schemars(extend("unit" = "processes", "source" = "ours"))]
     pub max: u32,
 }
 
 /// What is remembered, and how often it is used.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Replay {
     /// The newest so many transitions are sampled from.
+    #[schemars(extend("unit" = "transitions", "source" = "section 4.3.1"))]
     pub capacity: u64,
     /// Transitions collected before the first update.
+    #[schemars(extend("unit" = "transitions", "source" = "ours"))]
     pub warmup: u64,
     /// Updates for each environment step beyond the warm-up. The thesis: 1.
+    #[schemars(extend("unit" = "updates per environment step", "source" = "Algorithm 4"))]
     pub updates_per_step: f64,
     /// Steps the actors may be ahead of that ratio before the learner stops taking transitions.
+    #[schemars(extend("unit" = "environment steps", "source" = "ours"))]
     pub tolerance: u64,
 }
 
 /// How often the policy is judged.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Evaluation {
     /// Environment steps from one evaluation to the next.
+    #[schemars(extend("unit" = "environment steps", "source" = "ours"))]
     pub every: u64,
     /// Episodes of an evaluation, always from the same start states.
+    #[schemars(extend("unit" = "episodes", "source" = "ours"))]
     pub episodes: u32,
     /// Episodes of the last evaluation, whose mean is the run's result.
+    #[schemars(extend("unit" = "episodes", "source" = "ours"))]
     pub final_episodes: u32,
     /// Whether every policy that was judged is kept, not only the best.
+    #[schemars(extend("unit" = "–", "source" = "ours"))]
     pub keep_policies: bool,
 }
 
 /// How often the learner's state is saved.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Checkpoint {
     /// Seconds between checkpoints of a free run.
+    #[schemars(extend("unit" = "s", "source" = "ours"))]
     pub every_seconds: f64,
     /// Updates between checkpoints of a lockstep run.
+    #[schemars(extend("unit" = "updates", "source" = "ours"))]
     pub every_updates: u64,
 }
 

@@ -7,7 +7,9 @@ pub mod frozen_lake;
 pub mod pendulum;
 pub mod point_mass;
 
+use schemars::JsonSchema;
 use serde::{Serialize, de::DeserializeOwned};
+use shoal_common::config::explanation::{self, Key};
 use shoal_common::{space::EnvironmentSpec, stream::Stream};
 
 pub use error::{EnvironmentError, OutOfRange, RequestError};
@@ -80,9 +82,15 @@ pub fn resolve(name: &str, parameters: &toml::Table) -> Result<toml::Table, Envi
     find(name, parameters).map(|made| made.parameters)
 }
 
+/// What there is to know of each parameter of the environment of this name.
+pub fn explain(name: &str) -> Result<Vec<Key>, EnvironmentError> {
+    find(name, &toml::Table::new()).map(|made| (made.explain)())
+}
+
 struct Made {
     environment: Box<dyn Environment>,
     parameters: toml::Table,
+    explain: fn() -> Vec<Key>,
 }
 
 type Maker = fn(&toml::Table) -> Result<Made, String>;
@@ -95,7 +103,7 @@ fn find(name: &str, parameters: &toml::Table) -> Result<Made, EnvironmentError> 
     maker(parameters).map_err(|reason| EnvironmentError::Parameters { environment, reason })
 }
 
-fn made<P: Serialize + DeserializeOwned, E: Environment + 'static>(
+fn made<P: Serialize + DeserializeOwned + JsonSchema, E: Environment + 'static>(
     parameters: &toml::Table,
     new: impl FnOnce(P) -> Result<E, OutOfRange>,
 ) -> Result<Made, String> {
@@ -105,6 +113,7 @@ fn made<P: Serialize + DeserializeOwned, E: Environment + 'static>(
     Ok(Made {
         environment,
         parameters,
+        explain: explanation::keys::<P>,
     })
 }
 
@@ -166,9 +175,10 @@ mod tests {
     #[test]
     fn an_unknown_name_is_told_the_known_ones() {
         let message = refusal("pendulums", "");
+        let known = names().collect::<Vec<_>>().join(", ");
         assert_eq!(
             message,
-            "unknown environment `pendulums`: choose one of pendulum, point-mass, cart-pole, frozen-lake"
+            format!("unknown environment `pendulums`: choose one of {known}")
         );
     }
 

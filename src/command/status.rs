@@ -1,6 +1,7 @@
 //! `shoal status`: how a run gets on.
 
 use std::io::{IsTerminal, Write};
+use std::path::Path;
 use std::process::ExitCode;
 use std::time::Duration;
 
@@ -33,7 +34,7 @@ struct Printed<'a> {
 pub(crate) fn run(args: &StatusArgs) -> anyhow::Result<ExitCode> {
     let remote = Remote::open(&args.run)?;
     let Some(mut status) = remote.status()? else {
-        return rest(args, &remote);
+        return rest(&args.run, args.json, &remote);
     };
     if !args.watch {
         show(args, &status, &mut std::io::stdout().lock())?;
@@ -53,17 +54,17 @@ pub(crate) fn run(args: &StatusArgs) -> anyhow::Result<ExitCode> {
         }
     }
     screen.finish_and_clear();
-    rest(args, &remote)?;
+    rest(&args.run, args.json, &remote)?;
     Ok(ExitCode::SUCCESS)
 }
 
 /// Shows how a run stands that does not go on.
-fn rest(args: &StatusArgs, remote: &Remote) -> anyhow::Result<ExitCode> {
+pub(super) fn rest(run: &Path, json: bool, remote: &Remote) -> anyhow::Result<ExitCode> {
     // It may have been scaled, or been given more steps, since it was looked at first.
     let status = at_rest(&remote.run.config()?, &remote.run)?;
     let mut stdout = std::io::stdout().lock();
-    let here = args.run.display();
-    if args.json {
+    let here = run.display();
+    if json {
         let printed = Printed {
             running: false,
             status: &status,
@@ -100,7 +101,8 @@ fn screen() -> ProgressBar {
     screen
 }
 
-fn progress(status: &RunStatus) -> String {
+/// How far the run is, in words.
+pub(crate) fn progress(status: &RunStatus) -> String {
     let updates = thousands(status.updates);
     match status.episodes_limit {
         Some(limit) => format!(
@@ -141,10 +143,7 @@ fn table(status: &RunStatus) -> String {
     let evaluated = status
         .eval_return_mean
         .map_or_else(String::new, |mean| format!(", eval {mean:.2}"));
-    let waiting = status
-        .waiting
-        .as_deref()
-        .map_or("nobody waits", |waiting| waiting.split(':').next().unwrap_or(waiting));
+    let waiting = waits(status);
     format!(
         "{}, {} rows{evaluated}\n{:.0} updates/s, {:.0} steps/s, ratio {:.2} of {:.2}; {waiting}\n\n{table}",
         progress(status),
@@ -156,7 +155,14 @@ fn table(status: &RunStatus) -> String {
     )
 }
 
-fn in_words(state: RoleState) -> &'static str {
+/// Who waits for whom, in words.
+pub(crate) fn waits(status: &RunStatus) -> &str {
+    let waiting = status.waiting.as_deref();
+    waiting.map_or("nobody waits", |waiting| waiting.split(':').next().unwrap_or(waiting))
+}
+
+/// What a role does, in words.
+pub(crate) fn in_words(state: RoleState) -> &'static str {
     match state {
         RoleState::Starting => "starting",
         RoleState::Working => "working",

@@ -2,12 +2,17 @@
 
 use std::process::ExitCode;
 
+use super::help_config;
 use super::training::conduct;
 use crate::cli::TrainArgs;
 use crate::plan::Plan;
 
-/// Makes a run and trains it.
+/// Makes a run and trains it, or explains what can be set.
 pub(crate) fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
+    if args.help_config {
+        help_config::explain(&args.what)?;
+        return Ok(ExitCode::SUCCESS);
+    }
     let Plan { config, run, lock } = Plan::new(args)?;
     conduct(config, &run, lock, &args.telling)
 }

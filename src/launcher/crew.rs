@@ -14,7 +14,7 @@ use shoal_common::report::{Activity, Heartbeat, Identity, Role};
 use shoal_common::run_dir::RunDir;
 
 use super::incarnations::{last_committed, read_counter};
-use super::log::Log;
+use super::log::{EVERYBODY_ENDED, Log};
 use super::member::{Consequence, LIMIT, Member};
 use super::process::{Process, name};
 use crate::recorder::{Incident, What};
@@ -375,7 +375,7 @@ impl Crew {
     /// # Errors
     /// When the learner did not save its state at its end.
     pub(super) fn say_farewell(&self) -> anyhow::Result<()> {
-        self.log.note("launcher", "every role has ended");
+        self.log.note("launcher", EVERYBODY_ENDED);
         let Some(how) = &self.unsaved else { return Ok(()) };
         let lines = self.log.last_lines(&name(Identity {
             role: Role::Learner,

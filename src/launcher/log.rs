@@ -13,6 +13,12 @@ use anyhow::Context;
 /// Lines of each process that are kept for the message when it is given up.
 const KEPT: usize = 5;
 
+/// What the launcher writes when it ends in order.
+pub(crate) const EVERYBODY_ENDED: &str = "every role has ended";
+
+/// What a launcher's line begins with that ends for an error.
+pub(crate) const FAILED: &str = "the run failed: ";
+
 /// The log of a run; clones write to the same file.
 #[derive(Clone, Debug)]
 pub(super) struct Log(Arc<Mutex<Inner>>);

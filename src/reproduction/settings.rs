@@ -10,7 +10,7 @@ use shoal_common::run_dir::RunDir;
 use toml::Value;
 
 use super::experiment::{Effort, Experiment, Length};
-use crate::cli::{Telling, TrainArgs};
+use crate::cli::TrainArgs;
 use crate::plan;
 
 /// Keys with their sections, and values as TOML.
@@ -46,18 +46,14 @@ impl Settings {
         let length = experiment.stages.first().map(|stage| stage.length(effort));
         let (_, config) = plan::decide(&TrainArgs {
             what: experiment.preset.into(),
-            run: None,
             seed: Some(1),
-            actors: None,
-            envs: None,
             steps: length.and_then(|length| match length {
                 Length::Steps(steps) => Some(steps),
                 Length::Episodes(_) => None,
             }),
-            episodes: None,
             lockstep: true,
             set: experiment.settings(effort).map(Into::into).collect(),
-            telling: Telling::default(),
+            ..TrainArgs::default()
         })?;
         Self::of(&config)
     }

@@ -1,5 +1,6 @@
 //! What is learned, and how: one of the thesis's algorithms, with its own numbers.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// The algorithm of a run. Its section in `config.toml` has its name.
@@ -16,57 +17,73 @@ pub enum Algorithm {
 }
 
 /// Algorithm 4 with the numbers of section 4.3.1.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Ddpg {
     /// Units of the two hidden layers, of actor and critic alike.
+    #[schemars(extend("unit" = "units", "source" = "section 4.3.1"))]
     pub hidden: [usize; 2],
     /// γ, the discount of one step.
+    #[schemars(extend("unit" = "–", "source" = "section 4.3.1"))]
     pub gamma: f64,
     /// τ, how far the target networks follow in one update (equation 3.31).
+    #[schemars(extend("unit" = "–", "source" = "equation 3.31, section 4.3.1"))]
     pub tau: f64,
     /// Adam's step size for the actor, α_μ.
+    #[schemars(extend("unit" = "–", "source" = "section 4.3.1"))]
     pub actor_learning_rate: f64,
     /// Adam's step size for the critic, α_Q.
+    #[schemars(extend("unit" = "–", "source" = "section 4.3.1"))]
     pub critic_learning_rate: f64,
     /// N, transitions in a minibatch.
+    #[schemars(extend("unit" = "transitions", "source" = "Algorithm 4, section 4.3.1"))]
     pub batch: usize,
 }
 
 /// Ornstein-Uhlenbeck noise: x ← x − θ x + σ N(0, 1) at each step, added to the action in units of half its range.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Exploration {
     /// θ, the pull towards zero.
+    #[schemars(extend("unit" = "1 / step", "source" = "section 4.3.1"))]
     pub theta: f64,
     /// σ, the size of each step's impulse.
+    #[schemars(extend("unit" = "half action ranges", "source" = "section 4.3.1"))]
     pub sigma: f64,
 }
 
 /// Algorithm 3 with the numbers of section 4.2.1, and its variants of section 4.2.2.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Reinforce {
     /// Units of the policy's two hidden layers.
+    #[schemars(extend("unit" = "units", "source" = "section 4.2.1"))]
     pub hidden: [usize; 2],
     /// γ, the discount of one step.
+    #[schemars(extend("unit" = "–", "source" = "section 4.2.1"))]
     pub gamma: f64,
     /// Adam's step size for the policy, α.
+    #[schemars(extend("unit" = "–", "source" = "section 4.2.1"))]
     pub learning_rate: f64,
     /// What a step's ∇ ln π is multiplied by.
+    #[schemars(extend("unit" = "–", "source" = "section 4.2.2"))]
     pub weight: Weight,
     /// Whether that is also multiplied by γᵗ, as line 6 of Algorithm 3 has it.
+    #[schemars(extend("unit" = "–", "source" = "Algorithm 3"))]
     pub discount_steps: bool,
     /// Whether an episode that the time limit ended is learned from.
+    #[schemars(extend("unit" = "–", "source" = "section 4.2.2"))]
     pub learn_at_limit: bool,
     /// Units of the baseline's two hidden layers; only where it is the weight.
+    #[schemars(extend("unit" = "units", "source" = "ours"))]
     pub baseline_hidden: [usize; 2],
     /// Adam's step size for the baseline.
+    #[schemars(extend("unit" = "–", "source" = "ours"))]
     pub baseline_learning_rate: f64,
 }
 
 /// What a step's ∇ ln π is multiplied by.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Weight {
     /// The return G.
@@ -78,14 +95,17 @@ pub enum Weight {
 }
 
 /// Algorithms 1 and 2 with the numbers of section 4.1.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Tabular {
     /// γ, the discount of one step.
+    #[schemars(extend("unit" = "–", "source" = "section 4.1"))]
     pub gamma: f64,
     /// α, the step size.
+    #[schemars(extend("unit" = "–", "source" = "section 4.1"))]
     pub alpha: f64,
     /// ε, how often an actor takes any action instead of the best.
+    #[schemars(extend("unit" = "share of the steps", "source" = "section 4.1"))]
     pub epsilon: f64,
 }
 

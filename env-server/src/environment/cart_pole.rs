@@ -1,6 +1,7 @@
 //! The pole on a cart of section 4.2: Gymnasium's CartPole-v1, with the thesis's time limit.
 
 use rand::RngExt;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use shoal_common::{
     space::{EnvironmentSpec, Space},
@@ -30,10 +31,11 @@ pub const X_LIMIT: f64 = 2.4;
 const THETA_LIMIT: f64 = 12.0 / 180.0 * std::f64::consts::PI;
 
 /// What can be set.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Parameters {
     /// Steps after which an episode is truncated.
+    #[schemars(extend("unit" = "steps", "source" = "section 4.2.1"))]
     pub time_limit: u32,
 }
 

@@ -1,6 +1,7 @@
 //! The slippery 4×4 lake of section 4.1: Gymnasium's FrozenLake-v1.
 
 use rand::RngExt;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use shoal_common::{
     space::{EnvironmentSpec, Space},
@@ -22,10 +23,11 @@ pub const STATES: usize = SIDE * SIDE;
 pub const ACTIONS: usize = 4;
 
 /// What can be set.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Parameters {
     /// Steps after which an episode is truncated.
+    #[schemars(extend("unit" = "steps", "source" = "section 4.1"))]
     pub time_limit: u32,
 }
 

@@ -3,6 +3,7 @@
 use std::f64::consts::PI;
 
 use rand::RngExt;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use shoal_common::{
     space::{EnvironmentSpec, Space},
@@ -29,12 +30,14 @@ const MAX_SPEED: f64 = 8.0;
 const MAX_TORQUE: f64 = 2.0;
 
 /// What can be set.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Parameters {
     /// Episodes start with |θ̇| up to this, in rad/s. The thesis's 2 by default; Gymnasium's own is 1.
+    #[schemars(extend("unit" = "rad/s", "source" = "section 4.3"))]
     pub start_speed: f64,
     /// Steps after which an episode is truncated.
+    #[schemars(extend("unit" = "steps", "source" = "section 4.3"))]
     pub time_limit: u32,
 }
 

@@ -8,7 +8,7 @@ use shoal_common::report::Role;
 use shoal_common::run_dir::RunDir;
 use tempfile::TempDir;
 
-use crate::cli::{Telling, TrainArgs};
+use crate::cli::TrainArgs;
 use crate::peer::Peer;
 use crate::plan::Plan;
 
@@ -38,11 +38,8 @@ impl Scene {
             seed: Some(1),
             actors: Some(1),
             envs: Some(1),
-            steps: None,
-            episodes: None,
-            lockstep: false,
             set: set.iter().map(|assignment| (*assignment).into()).collect(),
-            telling: Telling::default(),
+            ..TrainArgs::default()
         })?;
         std::fs::create_dir(run.checkpoints()).context("cannot make the directory for checkpoints")?;
         Ok(Self { config, run, directory })

@@ -1,5 +1,6 @@
 //! What can be set of the point mass: flat in TOML, so that one key changes one number; here each reward with its own.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::{
@@ -9,7 +10,7 @@ use super::{
 
 /// What can be set. In TOML, `reward` is `"r1"`, `"r2"` or `"r3"` and the reward's parameters stand beside it; those of
 /// another reward are refused.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(try_from = "Flat", into = "Flat")]
 pub struct Parameters {
     /// m in kg.
@@ -77,30 +78,59 @@ impl Parameters {
     }
 }
 
-#[derive(Clone, Copy, Serialize, Deserialize)]
+#[derive(Clone, Copy, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 enum Name {
+    /// Equation 5.10.
     R1,
+    /// Equation 5.11.
     R2,
+    /// Equation 5.12.
     R3,
 }
 
 /// The TOML form.
-#[derive(Serialize, Deserialize)]
+#[derive(Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 struct Flat {
+    /// m, the vehicle's mass.
+    #[schemars(extend("unit" = "kg", "source" = "ours (docs/POINT_MASS.md)"))]
     mass: f64,
+    /// μ, the friction coefficient.
+    #[schemars(extend("unit" = "–", "source" = "ours (docs/POINT_MASS.md)"))]
     friction: f64,
+    /// F_s / F_c, how much more force it takes to start moving than to go on; at least 1.
+    #[schemars(extend("unit" = "–", "source" = "ours (docs/POINT_MASS.md)"))]
     stiction_ratio: f64,
+    /// g, the gravity of earth.
+    #[schemars(extend("unit" = "m/s²", "source" = "section 5.1"))]
     gravity: f64,
+    /// The vehicle is at the goal within this distance of it.
+    #[schemars(extend("unit" = "m", "source" = "equations 5.10 to 5.12"))]
     goal_radius: f64,
+    /// Steps after which an episode is truncated.
+    #[schemars(extend("unit" = "steps", "source" = "section 5.1"))]
     time_limit: u32,
+    /// The reward function.
+    #[schemars(extend("unit" = "–", "source" = "section 5.2"))]
     reward: Name,
+    /// a, the amplitude of the Gaussian.
+    #[schemars(extend("unit" = "–", "source" = "section 5.3"))]
     amplitude: Option<f64>,
+    /// σ², the variance of the Gaussian.
+    #[schemars(extend("unit" = "m²", "source" = "section 5.3"))]
     variance: Option<f64>,
+    /// c_d: of r1 the bonus at the goal; of r2 and r3 the weight of ḋ on the way there.
+    #[schemars(extend("unit" = "r1: –; r2, r3: s/m", "source" = "section 5.3"))]
     c_d: Option<f64>,
+    /// Weight of θ̇² (r2 and r3).
+    #[schemars(extend("unit" = "s² / half turns²", "source" = "section 5.3.2"))]
     c_theta_dot: Option<f64>,
+    /// Weight of Ḟ_u² (r2).
+    #[schemars(extend("unit" = "s²/N²", "source" = "equation 5.11"))]
     c_force_dot: Option<f64>,
+    /// Weight of F_u² (r3).
+    #[schemars(extend("unit" = "1/N²", "source" = "section 5.3.3"))]
     c_force: Option<f64>,
 }
 

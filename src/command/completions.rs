@@ -1,0 +1,22 @@
+//! `shoal completions`: what has a shell ask this program for completions.
+
+use std::io::Write;
+
+use anyhow::Context;
+use clap_complete::env::Shells;
+
+use crate::cli::CompletionsArgs;
+use crate::completion::VARIABLE;
+
+/// Prints the lines for the shell's start-up file. They call `shoal`, so they know of whatever it can do by then.
+pub(crate) fn run(args: &CompletionsArgs) -> anyhow::Result<()> {
+    let name = args.shell.to_string();
+    let shells = Shells::builtins();
+    let shell = shells
+        .completer(&name)
+        .with_context(|| format!("no completions for {name}"))?;
+    let mut lines = Vec::new();
+    shell.write_registration(VARIABLE, "shoal", "shoal", "shoal", &mut lines)?;
+    std::io::stdout().write_all(&lines)?;
+    Ok(())
+}

@@ -1,0 +1,41 @@
+//! `shoal export`: a run's policy for programs that know nothing of this one.
+
+use std::io::Write;
+
+use anyhow::Context;
+use clap::ValueEnum;
+use shoal_common::durable::write_atomically;
+use shoal_common::run_dir::RunDir;
+
+use crate::cli::ExportArgs;
+use crate::export::Portable;
+
+/// The form of the file.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Format {
+    /// A graph that any ONNX runtime computes, action scaling included.
+    Onnx,
+    /// The weights by PyTorch's names, with metadata.
+    Safetensors,
+}
+
+/// Writes the policy, and says where it is.
+pub(crate) fn run(args: &ExportArgs) -> anyhow::Result<()> {
+    let run = RunDir::open(&args.run)?;
+    let config = run.config()?;
+    let name = |value: Option<clap::builder::PossibleValue>| {
+        value.map_or_else(String::new, |value| value.get_name().to_owned())
+    };
+    let which = name(args.policy.to_possible_value());
+    let policy = Portable::new(&config, &args.policy.read(&run, &config)?, &which)?;
+    let bytes = match args.format {
+        Format::Onnx => policy.to_onnx(),
+        Format::Safetensors => policy.to_safetensors()?,
+    };
+    let file = format!("{which}.{}", name(args.format.to_possible_value()));
+    let out = args.out.clone().unwrap_or_else(|| args.run.join(file));
+    write_atomically(&out, |to| to.write_all(&bytes))
+        .with_context(|| format!("cannot write {}; choose another place with --out", out.display()))?;
+    writeln!(std::io::stdout(), "{}", out.display())?;
+    Ok(())
+}

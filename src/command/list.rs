@@ -1,0 +1,78 @@
+//! `shoal list`: the runs in a directory.
+
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, bail};
+use comfy_table::presets::NOTHING;
+use comfy_table::{CellAlignment, Table};
+use serde::Serialize;
+
+use crate::cli::ListArgs;
+use crate::launcher::thousands;
+use crate::listing::{Listed, State, runs_in};
+
+/// What `--json` prints.
+#[derive(Serialize)]
+struct Printed<'a> {
+    directory: &'a Path,
+    runs: &'a [Listed],
+}
+
+/// Lists the runs that lie in the directory itself.
+pub(crate) fn run(args: &ListArgs) -> anyhow::Result<()> {
+    let directory = &args.directory;
+    if !directory.is_dir() {
+        bail!(
+            "there is no directory {}: name the one that holds the runs, or start a run with `shoal train`",
+            directory.display()
+        );
+    }
+    let runs: Vec<PathBuf> =
+        runs_in(directory).with_context(|| format!("cannot read the directory {}", directory.display()))?;
+    let runs: Vec<Listed> = runs.iter().map(|run| Listed::new(run)).collect();
+    let mut stdout = std::io::stdout().lock();
+    if args.json {
+        let printed = Printed { directory, runs: &runs };
+        writeln!(stdout, "{}", serde_json::to_string(&printed)?)?;
+    } else if runs.is_empty() {
+        writeln!(stdout, "no runs in {}", directory.display())?;
+    } else {
+        writeln!(stdout, "{}", table(&runs))?;
+    }
+    Ok(())
+}
+
+fn table(runs: &[Listed]) -> Table {
+    let mut table = Table::new();
+    table.load_style(NOTHING);
+    table.set_header(["run", "state", "environment", "method", "steps", "of", "best return"]);
+    for run in runs {
+        let return_ = run.best_return.map_or_else(String::new, |best| format!("{best:.2}"));
+        let state = match (&run.state, &run.reason) {
+            (State::Damaged, Some(reason)) => format!("damaged: {reason}"),
+            (state, _) => state.name().to_owned(),
+        };
+        let number = |number: Option<u64>| number.map_or_else(String::new, thousands);
+        let (done, all) = match (run.episodes, run.episodes_limit) {
+            (Some(episodes), Some(limit)) => (Some(episodes), format!("{} episodes", thousands(limit))),
+            _ => (run.env_steps, number(run.steps)),
+        };
+        let row = [
+            &run.name,
+            &state,
+            &run.environment,
+            &run.algorithm,
+            &number(done),
+            &all,
+            &return_,
+        ];
+        table.add_row(row);
+    }
+    for column in [4, 6] {
+        if let Some(column) = table.column_mut(column) {
+            column.set_cell_alignment(CellAlignment::Right);
+        }
+    }
+    table
+}

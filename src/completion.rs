@@ -1,0 +1,148 @@
+//! What a shell may complete: presets, configuration files, and the keys of the configuration with their values.
+
+use std::ffi::OsStr;
+
+use clap::CommandFactory;
+use clap_complete::CompleteEnv;
+use clap_complete::engine::{CompletionCandidate, PathCompleter, ValueCompleter};
+use shoal_common::config::explanation::{Key, sections};
+use shoal_env_server::environment;
+use toml::{Table, Value};
+
+use crate::cli::Cli;
+use crate::plan::{FILLED_IN, preset_names};
+
+/// The variable that a shell sets where it asks for completions. (`COMPLETE` alone may be somebody else's.)
+pub(crate) const VARIABLE: &str = "SHOAL_COMPLETE";
+
+/// Answers a shell that asks for completions, and ends the process; does nothing where none asks.
+pub(crate) fn answer() {
+    CompleteEnv::with_factory(Cli::command).var(VARIABLE).complete();
+}
+
+/// Presets and configuration files.
+pub(crate) fn what_to_train(typed: &OsStr) -> Vec<CompletionCandidate> {
+    let typed_text = typed.to_string_lossy();
+    let presets = preset_names().filter(|name| name.starts_with(typed_text.as_ref()));
+    let files = PathCompleter::any()
+        .filter(|path| path.is_dir() || path.extension().is_some_and(|extension| extension == "toml"))
+        .complete(typed);
+    presets.map(CompletionCandidate::new).chain(files).collect()
+}
+
+/// Keys of the configuration; behind the `=`, what the key may be, or its default.
+pub(crate) fn settings(typed: &OsStr) -> Vec<CompletionCandidate> {
+    let typed = typed.to_string_lossy();
+    let settings = all_settings();
+    let Some((typed_key, _)) = typed.split_once('=') else {
+        let keys = settings
+            .into_iter()
+            .filter(|setting| setting.key.starts_with(typed.as_ref()));
+        return keys
+            .map(|setting| CompletionCandidate::new(format!("{}=", setting.key)).help(Some(setting.meaning.into())))
+            .collect();
+    };
+    let mut assignments: Vec<String> = settings
+        .into_iter()
+        .filter(|setting| setting.key == typed_key)
+        .flat_map(|setting| setting.values)
+        .map(|value| format!("{typed_key}={value}"))
+        .filter(|assignment| assignment.starts_with(typed.as_ref()))
+        .collect();
+    // A parameter that several environments have.
+    assignments.sort();
+    assignments.dedup();
+    assignments.into_iter().map(CompletionCandidate::new).collect()
+}
+
+struct Setting {
+    /// `section.key`
+    key: String,
+    meaning: String,
+    /// Its choices, or its default.
+    values: Vec<String>,
+}
+
+fn all_settings() -> Vec<Setting> {
+    let mut settings = Vec::new();
+    for section in sections() {
+        settings.extend(
+            section
+                .keys
+                .iter()
+                .map(|key| setting(section.name, key, &section.defaults)),
+        );
+    }
+    for name in environment::names() {
+        let defaults = environment::resolve(name, &Table::new()).unwrap_or_default();
+        let keys = environment::explain(name).unwrap_or_default();
+        settings.extend(keys.iter().map(|key| setting("environment", key, &defaults)));
+    }
+    settings.retain(|setting| setting.key != FILLED_IN);
+    if let Some(name) = settings.iter_mut().find(|setting| setting.key == "environment.name") {
+        name.values = environment::names().map(str::to_owned).collect();
+    }
+    let mut seen = std::collections::HashSet::new();
+    let (first, again): (Vec<_>, Vec<_>) = settings
+        .into_iter()
+        .partition(|setting| seen.insert(setting.key.clone()));
+    let mut settings = first;
+    for other in again {
+        if let Some(known) = settings.iter_mut().find(|known| known.key == other.key) {
+            known.values.extend(other.values);
+        }
+    }
+    settings
+}
+
+fn setting(section: &str, key: &Key, defaults: &Table) -> Setting {
+    let default = defaults.get(&key.name).map(|value| match value {
+        Value::String(word) => word.clone(),
+        other => other.to_string().replace(' ', ""),
+    });
+    Setting {
+        key: format!("{section}.{}", key.name),
+        meaning: key.meaning.clone(),
+        values: if key.choices.is_empty() {
+            default.into_iter().collect()
+        } else {
+            key.choices.clone()
+        },
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn values(candidates: Vec<CompletionCandidate>) -> Vec<String> {
+        let value = |candidate: &CompletionCandidate| candidate.get_value().to_string_lossy().into_owned();
+        candidates.iter().map(value).collect()
+    }
+
+    #[test]
+    fn presets_and_keys_are_completed() {
+        let presets = values(what_to_train(OsStr::new("point-mass")));
+        assert_eq!(presets, ["point-mass-r1", "point-mass-r2", "point-mass-r3"]);
+        assert_eq!(values(settings(OsStr::new("ddpg.ta"))), ["ddpg.tau="]);
+        assert_eq!(
+            values(settings(OsStr::new("environment.fric"))),
+            ["environment.friction="]
+        );
+        assert_eq!(
+            values(settings(OsStr::new("environment.time"))),
+            ["environment.time_limit="]
+        );
+        assert!(values(settings(OsStr::new("run.i"))).is_empty(), "not for choosing");
+    }
+
+    #[test]
+    fn behind_the_equals_sign_stand_the_choices_or_the_default() {
+        assert_eq!(values(settings(OsStr::new("ddpg.tau="))), ["ddpg.tau=0.001"]);
+        assert_eq!(values(settings(OsStr::new("run.mode=l"))), ["run.mode=lockstep"]);
+        assert_eq!(
+            values(settings(OsStr::new("environment.name=p"))),
+            ["environment.name=pendulum", "environment.name=point-mass"]
+        );
+    }
+}

@@ -1,0 +1,110 @@
+use rten::{Model, Value};
+use shoal_common::config::Config;
+use shoal_common::policy::{Policy, PolicyLayout, Scores, softmax, table};
+use shoal_common::policy_file::PolicyFile;
+
+use super::super::tests_support::{policies, some_observations};
+use super::*;
+
+/// What a runtime that is not ours makes of so many observations.
+fn computed(model: &Model, config: &Config, observations: &[f32], output: &str) -> Value {
+    let counted = model.find_node("state").is_some();
+    let input = model.node_id(if counted { "state" } else { "observation" }).unwrap();
+    let width = config.spec.observation.width();
+    let batch = observations.len() / width;
+    let value = if counted {
+        // This runtime takes indices of 64 bits as 32.
+        let states = observations.iter().map(|state| *state as i32).collect();
+        Value::from_shape(&[batch], states).unwrap()
+    } else {
+        Value::from_shape(&[batch, width], observations.to_vec()).unwrap()
+    };
+    let output = model.node_id(output).unwrap();
+    let mut outputs = model.run(vec![(input, value.into())], &[output], None).unwrap();
+    outputs.remove(0)
+}
+
+fn real(model: &Model, config: &Config, observations: &[f32], output: &str) -> ([usize; 2], Vec<f32>) {
+    computed(model, config, observations, output).into_shape_vec().unwrap()
+}
+
+fn close(found: &[f32], expected: &[f32]) {
+    assert_eq!(found.len(), expected.len());
+    for (found, expected) in found.iter().zip(expected) {
+        assert!((found - expected).abs() < 1e-5, "{found} for {expected}");
+    }
+}
+
+fn scores(config: &Config, policy: &PolicyFile, observations: &[f32], batch: usize) -> Vec<f32> {
+    let mut scores: Scores = match &config.algorithm {
+        shoal_common::config::Algorithm::Reinforce(reinforce) => softmax(reinforce, &config.spec, batch).unwrap(),
+        _ => table("q-learning", &config.spec, batch).unwrap(),
+    };
+    scores.of(&policy.parameters, observations).flatten().copied().collect()
+}
+
+#[test]
+fn another_runtime_computes_what_we_do_whatever_the_batch() {
+    for (config, policy) in policies() {
+        let bytes = Portable::new(&config, &policy, "best").unwrap().to_onnx();
+        let model = Model::load(bytes).unwrap();
+        let layout = PolicyLayout::new(&config.algorithm, &config.spec).unwrap();
+        for batch in [1, 2, 33] {
+            let observations = some_observations(&config, batch);
+            let mut actions = vec![0.0; batch * config.spec.action.width()];
+            let mut ours = Policy::new(&config.algorithm, &config.spec, batch).unwrap();
+            ours.act(&policy.parameters, &observations, &mut actions);
+            if let PolicyLayout::Deterministic(_) = layout {
+                let (shape, found) = real(&model, &config, &observations, "action");
+                assert_eq!(shape, [batch, config.spec.action.width()]);
+                close(&found, &actions);
+                continue;
+            }
+            let chosen = computed(&model, &config, &observations, "action");
+            let (shape, chosen) = chosen.into_shape_vec::<i32, 1>().unwrap();
+            assert_eq!(shape, [batch]);
+            assert_eq!(chosen, actions.iter().map(|a| *a as i32).collect::<Vec<_>>());
+            let scores = scores(&config, &policy, &observations, batch);
+            let PolicyLayout::Softmax(network) = layout else {
+                close(&real(&model, &config, &observations, "action_values").1, &scores);
+                continue;
+            };
+            close(&real(&model, &config, &observations, "logits").1, &scores);
+            let probabilities = scores.chunks_exact(network.outputs()).flat_map(|scores| {
+                let sum: f32 = scores.iter().map(|score| score.exp()).sum();
+                scores.iter().map(move |score| score.exp() / sum)
+            });
+            let expected: Vec<f32> = probabilities.collect();
+            close(&real(&model, &config, &observations, "probabilities").1, &expected);
+        }
+    }
+}
+
+#[test]
+fn of_equal_scores_the_first_is_taken_as_we_do() {
+    let (config, mut policy) = policies().pop().unwrap();
+    policy.parameters.fill(0.5);
+    let bytes = Portable::new(&config, &policy, "last").unwrap().to_onnx();
+    let chosen = computed(&Model::load(bytes).unwrap(), &config, &[3.0, 15.0], "action");
+    assert_eq!(chosen.into_shape_vec::<i32, 1>().unwrap().1, [0, 0]);
+}
+
+#[test]
+fn the_model_says_where_it_comes_from() {
+    let (config, policy) = policies().remove(0);
+    let bytes = Portable::new(&config, &policy, "best").unwrap().to_onnx();
+    let model = super::message::Model::decode(bytes.as_slice()).unwrap();
+    let said = |key: &str| {
+        model
+            .metadata_props
+            .iter()
+            .find(|said| said.key == key)
+            .unwrap()
+            .value
+            .clone()
+    };
+    assert_eq!(said("environment"), "pendulum");
+    assert_eq!(said("action_low"), "[-2.0]");
+    assert_eq!(said("evaluation_return"), "-150.5");
+    assert_eq!(said("policy_version"), "7");
+}

@@ -1,0 +1,117 @@
+//! A policy as a safetensors file: tensors with the names of a PyTorch module's `state_dict`, and what they are for.
+
+use safetensors::Dtype;
+use safetensors::tensor::TensorView;
+
+use super::{Body, Dense, Portable};
+
+/// `layers.<i>.weight` (outputs × inputs, row after row) and `layers.<i>.bias`; of a table, `action_values`
+/// (states × actions). Metadata says the rest.
+pub(super) fn file(policy: &Portable) -> anyhow::Result<Vec<u8>> {
+    let tensors = match &policy.body {
+        Body::Actions { layers, .. } | Body::Probabilities { layers } => of_layers(layers),
+        Body::Table {
+            states,
+            actions,
+            values,
+        } => vec![("action_values".into(), vec![*states, *actions], values.as_slice())],
+    };
+    let views: Result<Vec<_>, _> = tensors
+        .iter()
+        .map(|(name, shape, numbers)| {
+            let view = TensorView::new(Dtype::F32, shape.clone(), bytemuck::cast_slice(numbers));
+            view.map(|view| (name.as_str(), view))
+        })
+        .collect();
+    let about = policy.about.clone().into_iter().collect();
+    Ok(safetensors::serialize(views?, Some(about))?)
+}
+
+type Named<'a> = (String, Vec<usize>, &'a [f32]);
+
+fn of_layers(layers: &[Dense]) -> Vec<Named<'_>> {
+    let each = layers.iter().enumerate().flat_map(|(number, layer)| {
+        let outputs = layer.biases.len();
+        [
+            (
+                format!("layers.{number}.weight"),
+                vec![outputs, layer.inputs],
+                layer.weights.as_slice(),
+            ),
+            (format!("layers.{number}.bias"), vec![outputs], layer.biases.as_slice()),
+        ]
+    });
+    each.collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use safetensors::SafeTensors;
+    use shoal_common::policy::Policy;
+
+    use super::super::tests_support::{policies, some_observations};
+    use super::*;
+
+    fn numbers(tensors: &SafeTensors<'_>, name: &str) -> (Vec<usize>, Vec<f32>) {
+        let tensor = tensors.tensor(name).unwrap();
+        let numbers = tensor
+            .data()
+            .as_chunks::<4>()
+            .0
+            .iter()
+            .map(|bytes| f32::from_le_bytes(*bytes));
+        (tensor.shape().to_vec(), numbers.collect())
+    }
+
+    /// y = W x + b as `torch.nn.Linear` has it, with the tensors that are in the file.
+    fn linear(tensors: &SafeTensors<'_>, layer: usize, x: &[f32]) -> Vec<f32> {
+        let (shape, weights) = numbers(tensors, &format!("layers.{layer}.weight"));
+        let (_, biases) = numbers(tensors, &format!("layers.{layer}.bias"));
+        assert_eq!(shape, [biases.len(), x.len()]);
+        let rows = weights.chunks_exact(x.len()).zip(&biases);
+        rows.map(|(row, bias)| row.iter().zip(x).map(|(w, x)| w * x).sum::<f32>() + bias)
+            .collect()
+    }
+
+    #[test]
+    fn who_computes_with_the_tensors_and_the_metadata_acts_alike() {
+        for (config, policy) in policies() {
+            let bytes = Portable::new(&config, &policy, "best")
+                .unwrap()
+                .to_safetensors()
+                .unwrap();
+            let tensors = SafeTensors::deserialize(&bytes).unwrap();
+            let (_, header) = SafeTensors::read_metadata(&bytes).unwrap();
+            let about = header.metadata().clone().unwrap();
+            assert_eq!(about["environment"], config.environment.name);
+            let observations = some_observations(&config, 5);
+            let mut ours = Policy::new(&config.algorithm, &config.spec, 1).unwrap();
+            let width = config.spec.observation.width();
+            for observation in observations.chunks_exact(width) {
+                let mut expected = vec![0.0; config.spec.action.width()];
+                ours.act(&policy.parameters, observation, &mut expected);
+                if !about.contains_key("hidden_activation") {
+                    let (shape, values) = numbers(&tensors, "action_values");
+                    let row = &values[observation[0] as usize * shape[1]..][..shape[1]];
+                    assert_eq!(shoal_common::policy::highest(row) as f32, expected[0]);
+                    continue;
+                }
+                let mut x = observation.to_vec();
+                for layer in [0, 1] {
+                    x = linear(&tensors, layer, &x).iter().map(|z| z.max(0.0)).collect();
+                }
+                let z = linear(&tensors, 2, &x);
+                if config.algorithm.name() == "reinforce" {
+                    assert_eq!(shoal_common::policy::highest(&z) as f32, expected[0]);
+                    continue;
+                }
+                let bound = |name: &str| -> Vec<f32> { serde_json::from_str(&about[name]).unwrap() };
+                let (low, high) = (bound("action_low"), bound("action_high"));
+                for (i, z) in z.iter().enumerate() {
+                    let action = low[i] + (high[i] - low[i]) * (z.tanh() + 1.0) / 2.0;
+                    assert!((action - expected[i]).abs() < 1e-5, "{action} for {}", expected[i]);
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,60 @@
+//! A run's policy as a file for other programs.
+
+use rten::{Model, Value};
+
+use crate::support::{Workplace, complaint};
+
+#[test]
+fn a_trained_policy_is_written_in_both_forms_and_computes_elsewhere() {
+    let place = Workplace::new();
+    place.train(&["pendulum", "--steps", "400", "--run", "run"]);
+    let printed = |arguments: &[&str]| {
+        let output = place.output(&[&["export", "run"], arguments].concat());
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        String::from_utf8(output.stdout).unwrap()
+    };
+    assert_eq!(printed(&["--format", "onnx", "--policy", "last"]), "run/last.onnx\n");
+    let model = Model::load(std::fs::read(place.path().join("run/last.onnx")).unwrap()).unwrap();
+    let [input, output] = ["observation", "action"].map(|name| model.node_id(name).unwrap());
+    for batch in [1_usize, 5] {
+        let observations = Value::from_shape([batch, 3], vec![0.5; 3 * batch]).unwrap();
+        let mut actions = model.run(vec![(input, observations.into())], &[output], None).unwrap();
+        let (shape, actions) = actions.remove(0).into_shape_vec::<f32, 2>().unwrap();
+        assert_eq!(shape, [batch, 1]);
+        assert!(
+            actions.iter().all(|torque| (-2.0..=2.0).contains(torque)),
+            "{actions:?}"
+        );
+    }
+
+    assert_eq!(
+        printed(&["--format", "safetensors", "--out", "policy.safetensors"]),
+        "policy.safetensors\n"
+    );
+    let bytes = std::fs::read(place.path().join("policy.safetensors")).unwrap();
+    let tensors = safetensors::SafeTensors::deserialize(&bytes).unwrap();
+    assert_eq!(tensors.tensor("layers.0.weight").unwrap().shape(), [24, 3]);
+    assert_eq!(tensors.tensor("layers.2.weight").unwrap().shape(), [1, 16]);
+    assert_eq!(tensors.tensor("layers.2.bias").unwrap().shape(), [1]);
+}
+
+#[test]
+fn what_cannot_be_exported_is_said_on_one_line() {
+    let place = Workplace::new();
+    let said = complaint(&place.output(&["export", "nowhere", "--format", "onnx"]));
+    assert!(said.contains("nowhere is not a run directory"), "{said}");
+    place.train(&["pendulum", "--steps", "300", "--run", "run"]);
+    let said = complaint(&place.output(&["export", "run", "--format", "onnx", "--out", "missing/policy.onnx"]));
+    assert!(said.contains("missing/policy.onnx") && said.contains("--out"), "{said}");
+    std::fs::remove_file(place.path().join("run/checkpoints/best.policy")).unwrap();
+    let said = complaint(&place.output(&["export", "run", "--format", "safetensors"]));
+    assert!(
+        said.contains("best.policy") && said.contains("no policy here"),
+        "{said}"
+    );
+    assert_eq!(
+        place.output(&["export", "run"]).status.code(),
+        Some(2),
+        "a form must be named"
+    );
+}

@@ -1,0 +1,81 @@
+//! The runs in a directory.
+
+use serde_json::Value;
+
+use crate::support::{QUICK, Workplace, complaint, json};
+
+fn listed<'a>(list: &'a Value, name: &str) -> &'a Value {
+    let mut runs = list["runs"].as_array().unwrap().iter();
+    runs.find(|run| run["name"] == name)
+        .unwrap_or_else(|| panic!("{name} is not in {list}"))
+}
+
+#[test]
+fn every_run_is_listed_with_its_state() {
+    let place = Workplace::new();
+    let said = complaint(&place.output(&["list"]));
+    assert!(said.contains("there is no directory runs"), "{said}");
+    std::fs::create_dir(place.path().join("runs")).unwrap();
+    let empty = place.output(&["list"]);
+    assert_eq!(String::from_utf8_lossy(&empty.stdout), "no runs in runs\n");
+
+    place.train(&["pendulum", "--steps", "400", "--run", "runs/finished"]);
+    let endless = ["--steps", "100000000"];
+    let killed = place.start("runs/killed", &endless);
+    killed.learns_on();
+    killed.kill_everybody();
+    let stopped = place.start("runs/stopped", &endless);
+    stopped.learns_on();
+    assert!(place.output(&["stop", "runs/stopped"]).status.success());
+    stopped.wait();
+    std::fs::create_dir(place.path().join("runs/damaged")).unwrap();
+    std::fs::write(place.path().join("runs/damaged/config.toml"), "[run\n").unwrap();
+    std::fs::create_dir(place.path().join("runs/notes")).unwrap();
+    let running = place.start("runs/running", &endless);
+    running.learns_on();
+
+    let list = json(&place.output(&["list", "--json"]));
+    assert_eq!(list["runs"].as_array().unwrap().len(), 5, "{list}");
+    for name in ["finished", "killed", "stopped", "damaged", "running"] {
+        assert_eq!(listed(&list, name)["state"], name, "{list}");
+    }
+    let finished = listed(&list, "finished");
+    assert_eq!((&finished["env_steps"], &finished["steps"]), (&400.into(), &400.into()));
+    assert_eq!(
+        (&finished["environment"], &finished["algorithm"]),
+        (&"pendulum".into(), &"ddpg".into())
+    );
+    assert!(finished["best_return"].as_f64().unwrap() < 0.0);
+    assert!(
+        listed(&list, "damaged")["reason"]
+            .as_str()
+            .unwrap()
+            .contains("config.toml")
+    );
+    assert!(listed(&list, "running")["env_steps"].as_u64().unwrap() > 0);
+
+    let table = place.output(&["list", "runs"]);
+    let table = String::from_utf8(table.stdout).unwrap();
+    assert_eq!(table.lines().count(), 6, "{table}");
+    assert!(table.contains("best return") && table.contains("400"), "{table}");
+}
+
+#[test]
+fn a_run_that_failed_is_told_from_one_that_was_killed() {
+    let place = Workplace::new();
+    // Without room for its replay.
+    let script = format!(
+        "ulimit -f 8000; exec {} train pendulum --run runs/run {}",
+        env!("CARGO_BIN_EXE_shoal"),
+        QUICK[..2]
+            .iter()
+            .map(|word| format!("'{word}'"))
+            .collect::<Vec<_>>()
+            .join(" ")
+    );
+    let mut shell = std::process::Command::new("sh");
+    let output = shell.args(["-c", &script]).current_dir(place.path()).output().unwrap();
+    assert_eq!(output.status.code(), Some(1));
+    let list = json(&place.output(&["list", "--json"]));
+    assert_eq!(listed(&list, "run")["state"], "failed", "{list}");
+}

@@ -1,0 +1,203 @@
+//! A terminal for a program that wants one: a pseudo-terminal, and a reader that knows what it shows.
+
+use std::fs::{File, OpenOptions};
+use std::io::{Read, Write};
+use std::os::unix::ffi::OsStrExt;
+use std::os::unix::fs::OpenOptionsExt;
+use std::process::{Child, Command};
+use std::sync::{Arc, Mutex};
+
+use rustix::fs::OFlags;
+use rustix::process::{Pid, Signal, kill_process};
+use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
+use rustix::termios::{LocalModes, Winsize, tcgetattr, tcsetwinsize};
+
+use crate::support::{QUICK, Workplace, until};
+
+/// A terminal with a program on it, which is killed when this is dropped.
+pub(crate) struct Terminal {
+    child: Child,
+    master: File,
+    /// Kept open, so that the terminal's settings can be asked for when the program has ended.
+    slave: File,
+    before: LocalModes,
+    seen: Arc<Mutex<Seen>>,
+}
+
+struct Seen {
+    screen: vt100::Parser,
+    bytes: Vec<u8>,
+}
+
+impl Terminal {
+    /// Starts the program with these arguments on a terminal of its own of 80 × 24.
+    pub(crate) fn start(place: &Workplace, arguments: &[&str], no_colour: bool) -> Self {
+        let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).unwrap();
+        grantpt(&master).unwrap();
+        unlockpt(&master).unwrap();
+        let name = ptsname(&master, Vec::new()).unwrap();
+        let name = std::ffi::OsStr::from_bytes(name.as_bytes());
+        let slave = OpenOptions::new()
+            .read(true)
+            .write(true)
+            .custom_flags(OFlags::NOCTTY.bits() as i32)
+            .open(name)
+            .unwrap();
+        tcsetwinsize(&slave, window(24, 80)).unwrap();
+        let master = File::from(master);
+        let seen = Arc::new(Mutex::new(Seen {
+            screen: vt100::Parser::new(24, 80, 0),
+            bytes: Vec::new(),
+        }));
+        // A session of its own, so that the terminal is its and not the tester's.
+        let mut command = Command::new("setsid");
+        command
+            .args(["--ctty", env!("CARGO_BIN_EXE_shoal")])
+            .args(arguments)
+            .current_dir(place.path())
+            .env("TERM", "xterm-256color")
+            .env_remove("NO_COLOR")
+            .stdin(slave.try_clone().unwrap())
+            .stdout(slave.try_clone().unwrap())
+            .stderr(slave.try_clone().unwrap());
+        if no_colour {
+            command.env("NO_COLOR", "1");
+        }
+        let terminal = Self {
+            before: tcgetattr(&slave).unwrap().local_modes,
+            slave,
+            master,
+            seen,
+            child: command.spawn().unwrap(),
+        };
+        let (seen, mut from) = (Arc::clone(&terminal.seen), terminal.master.try_clone().unwrap());
+        std::thread::spawn(move || {
+            let mut bytes = [0; 4096];
+            while let Ok(count) = from.read(&mut bytes) {
+                if count == 0 {
+                    return;
+                }
+                let mut seen = seen.lock().unwrap();
+                seen.screen.process(&bytes[..count]);
+                seen.bytes.extend(&bytes[..count]);
+            }
+        });
+        terminal
+    }
+
+    pub(crate) fn resize(&self, rows: u16, columns: u16) {
+        self.seen.lock().unwrap().screen.screen_mut().set_size(rows, columns);
+        tcsetwinsize(&self.slave, window(rows, columns)).unwrap();
+    }
+
+    pub(crate) fn press(&mut self, keys: &str) {
+        self.master.write_all(keys.as_bytes()).unwrap();
+    }
+
+    /// What stands on the terminal now.
+    pub(crate) fn text(&self) -> String {
+        self.seen.lock().unwrap().screen.screen().contents()
+    }
+
+    /// Waits until this stands on the terminal.
+    pub(crate) fn shows(&self, text: &str) {
+        until(&format!("the terminal shows {text:?}"), || self.text().contains(text));
+    }
+
+    /// Everything that was written to it.
+    pub(crate) fn written(&self) -> String {
+        String::from_utf8_lossy(&self.seen.lock().unwrap().bytes).into_owned()
+    }
+
+    pub(crate) fn signal(&self, signal: Signal) {
+        kill_process(Pid::from_child(&self.child), signal).unwrap();
+    }
+
+    pub(crate) fn is_at_work(&mut self) -> bool {
+        self.child.try_wait().unwrap().is_none()
+    }
+
+    /// Waits for the program's end; its exit code. The terminal must be as it was.
+    pub(crate) fn end(&mut self) -> Option<i32> {
+        until("the program on the terminal has ended", || !self.is_at_work());
+        let now = tcgetattr(&self.slave).unwrap().local_modes;
+        assert_eq!(now, self.before, "lines are edited and echoed as before");
+        let seen = Arc::clone(&self.seen);
+        until("the picture is gone", || {
+            !seen.lock().unwrap().screen.screen().alternate_screen()
+        });
+        self.child.wait().unwrap().code()
+    }
+}
+
+fn window(rows: u16, columns: u16) -> Winsize {
+    Winsize {
+        ws_row: rows,
+        ws_col: columns,
+        ws_xpixel: 0,
+        ws_ypixel: 0,
+    }
+}
+
+impl Drop for Terminal {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+const SHORT: [&str; 4] = ["train", "pendulum", "--steps", "600"];
+
+/// Whether something sets a colour: of the letters or behind them.
+fn has_colour(written: &str) -> bool {
+    let sequences = written.split("\x1b[").skip(1);
+    let settings = sequences.filter_map(|rest| rest.split_once('m').map(|(numbers, _)| numbers));
+    settings
+        .filter(|numbers| numbers.bytes().all(|byte| byte.is_ascii_digit() || byte == b';'))
+        .flat_map(|numbers| numbers.split(';'))
+        .filter_map(|number| number.parse::<u32>().ok())
+        .any(|number| matches!(number, 30..=38 | 40..=48 | 90..=107))
+}
+
+#[test]
+fn the_live_line_has_colours_on_a_terminal_unless_none_are_wanted() {
+    let place = Workplace::new();
+    let written = |no_colour| {
+        let mut terminal = Terminal::start(&place, &[&SHORT[..], &QUICK[..]].concat(), no_colour);
+        assert_eq!(terminal.end(), Some(0));
+        terminal.shows("figures: shoal plot");
+        terminal.written()
+    };
+    let usual = written(false);
+    assert!(usual.contains("updates") && has_colour(&usual), "{usual}");
+    let plain = written(true);
+    assert!(plain.contains("updates") && !has_colour(&plain), "{plain}");
+}
+
+#[test]
+fn help_and_errors_have_no_colours_either() {
+    let place = Workplace::new();
+    for arguments in [
+        &["--help"][..],
+        &["train", "--nonsense"],
+        &["train", "pendulums"],
+        &["reproduce", "nothing"],
+    ] {
+        let mut terminal = Terminal::start(&place, arguments, true);
+        terminal.end();
+        until("something is said", || !terminal.text().trim().is_empty());
+        assert!(!has_colour(&terminal.written()), "{}", terminal.written());
+    }
+}
+
+#[test]
+fn without_a_terminal_there_is_no_live_line() {
+    let place = Workplace::new();
+    let output = place.output(&[&SHORT[..], &QUICK[..]].concat());
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert!(
+        output.status.success() && said.contains("figures: shoal plot"),
+        "{said}"
+    );
+    assert!(!said.contains(['\x1b', '\r']), "{said}");
+}

@@ -1,0 +1,93 @@
+//! `docs/TUTORIAL.md` does what it says: every command of it is run, and its environment is compiled and stepped.
+
+#![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
+
+#[allow(unreachable_pub, reason = "it is public where the tutorial puts it")]
+mod rail;
+#[path = "../support/mod.rs"]
+mod support;
+
+use std::process::Command;
+
+use shoal_common::stream::{Purpose, stream};
+use shoal_env_server::environment::{Environment, OutOfRange, RequestError, Step};
+
+use support::{Leftovers, Workplace};
+
+const TUTORIAL: &str = include_str!("../../docs/TUTORIAL.md");
+
+/// The contents of the fenced blocks in a language, in their order.
+fn blocks(language: &str) -> Vec<&'static str> {
+    let fence = format!("```{language}\n");
+    let after = TUTORIAL.split(fence.as_str()).skip(1);
+    after.map(|rest| rest.split_once("```").unwrap().0).collect()
+}
+
+#[test]
+fn every_command_does_what_the_tutorial_says() {
+    let place = Workplace::new();
+    let binaries = std::path::Path::new(env!("CARGO_BIN_EXE_shoal")).parent().unwrap();
+    let path = format!("{}:{}", binaries.display(), std::env::var("PATH").unwrap_or_default());
+    let blocks = blocks("sh");
+    assert!(blocks.len() >= 6, "the tutorial's commands are found");
+    // What a failure leaves running in the background ends in order.
+    let script = format!("trap 'kill $(jobs -p) 2>/dev/null || true' EXIT\n{}", blocks.concat());
+    let output = Command::new("timeout")
+        .args(["500", "bash", "-e", "-o", "pipefail", "-c", &script])
+        .current_dir(place.path())
+        .env("PATH", path)
+        .stdin(std::process::Stdio::null())
+        .output()
+        .unwrap();
+    let [printed, said] = [&output.stdout, &output.stderr].map(|text| String::from_utf8_lossy(text).into_owned());
+    assert!(output.status.success(), "{printed}\n{said}");
+    for part in [
+        "runs/first/swing-up.svg",
+        "first.onnx",
+        "actors: 4",
+        "stopped; to go on",
+    ] {
+        assert!(printed.contains(part), "{part}: {printed}\n{said}");
+    }
+    for file in ["runs/first/learning-curve.svg", "first.onnx", "first.safetensors"] {
+        assert!(place.path().join(file).exists(), "{file}");
+    }
+    let log = std::fs::read_to_string(place.path().join("runs/second/shoal.log")).unwrap();
+    assert!(log.contains("killed by signal 9"), "a learner was killed: {log}");
+    Leftovers::of(&place.path().join("runs/second")).vanish();
+}
+
+#[test]
+fn the_tutorials_environment_is_the_one_that_is_compiled() {
+    assert_eq!(blocks("rust"), [include_str!("rail.rs")]);
+}
+
+#[test]
+fn the_tutorials_environment_keeps_what_an_environment_promises() {
+    let mut rail = rail::Rail::new(rail::Parameters::default()).unwrap();
+    let spec = rail.spec();
+    let mut rng = stream(1, Purpose::Environment, 0, 0);
+    let mut observation = vec![f32::NAN; spec.observation.width()];
+    for episode in 0..5 {
+        rail.reset(&mut rng);
+        for step in 0..spec.time_limit {
+            let action = [f64::from((episode + step) % 3) - 1.0];
+            let mut state = vec![0.0; spec.state_width];
+            rail.save(&mut state);
+            let mut twin = rail.clone();
+            twin.restore(&state).unwrap();
+            let (here, there) = (rail.step(&action, &mut rng), twin.step(&action, &mut rng));
+            assert_eq!((here, here.terminated), (there, false));
+            assert!(here.reward <= 0.0);
+            rail.observe(&mut observation);
+            assert!(observation.iter().all(|number| number.abs() <= 2.0));
+        }
+    }
+    assert!(rail.reset_to(&[3.0, 0.0]).is_err() && rail.restore(&[1.0]).is_err());
+    let explained = shoal_common::config::explanation::keys::<rail::Parameters>();
+    assert!(
+        explained
+            .iter()
+            .all(|key| !key.meaning.is_empty() && !key.unit.is_empty())
+    );
+}
