@@ -9,8 +9,11 @@ use std::time::Duration;
 use anyhow::{Context, bail};
 use ratatui::DefaultTerminal;
 use ratatui::crossterm::event::{self, Event, KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::io::Errno;
 use shoal_common::config::{Config, Mode};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
+use signal_hook::iterator::Signals;
 
 use super::status::rest;
 use crate::cli::TopArgs;
@@ -19,6 +22,9 @@ use crate::top::{Link, Screen, draw};
 
 /// How long a key, a signal or news may lie unread.
 const LOOK: Duration = Duration::from_millis(200);
+
+/// How long the picture's loop may take to end after a signal: a look, and what `Link::close` waits for.
+const TO_THE_END: Duration = Duration::from_secs(3);
 
 /// Shows the run until `q` or a signal; the terminal is then as it was.
 pub(crate) fn run(args: &TopArgs) -> anyhow::Result<ExitCode> {
@@ -68,25 +74,15 @@ fn show(terminal: &mut DefaultTerminal, screen: &mut Screen, link: &Link, signal
                 .context("cannot draw on this terminal")?;
         }
         changed = false;
-        if event::poll(LOOK).context("cannot read the keyboard")? {
-            changed = true;
-            match event::read().context("cannot read the keyboard")? {
-                Event::Key(key) if leaves(&key) => return Ok(()),
-                Event::Key(KeyEvent {
-                    code: KeyCode::Char(key),
-                    kind: KeyEventKind::Press,
-                    ..
-                }) => {
-                    if let Some(order) = screen.press(key) {
-                        link.order(order);
-                    }
+        match awaited()? {
+            Input::Nothing => {}
+            Input::Something => {
+                changed = true;
+                if read_keys(screen, link)? {
+                    return Ok(());
                 }
-                Event::Key(_) => {
-                    // Any key closes what lies over the picture.
-                    let _ = screen.press('n');
-                }
-                _ => {}
             }
+            Input::Gone => signal.store(SIGHUP as usize, Ordering::Relaxed),
         }
         for news in link.heard()? {
             changed = true;
@@ -96,19 +92,76 @@ fn show(terminal: &mut DefaultTerminal, screen: &mut Screen, link: &Link, signal
     Ok(())
 }
 
+/// What a wait for the keyboard came to.
+enum Input {
+    Nothing,
+    Something,
+    /// There is no terminal any more.
+    Gone,
+}
+
+/// Waits a moment for a key. A terminal that has gone is told here, because who reads on never comes back from it.
+fn awaited() -> anyhow::Result<Input> {
+    let stdin = std::io::stdin();
+    let mut fds = [PollFd::new(&stdin, PollFlags::IN)];
+    let moment = Timespec {
+        tv_sec: 0,
+        tv_nsec: LOOK.subsec_nanos().into(),
+    };
+    match poll(&mut fds, Some(&moment)) {
+        // A signal: the window may have another size.
+        Err(Errno::INTR) => return Ok(Input::Something),
+        told => told.context("cannot wait for the keyboard")?,
+    };
+    let told = fds[0].revents();
+    Ok(if told.intersects(PollFlags::HUP | PollFlags::ERR | PollFlags::NVAL) {
+        Input::Gone
+    } else if told.contains(PollFlags::IN) {
+        Input::Something
+    } else {
+        Input::Nothing
+    })
+}
+
+/// Takes in the keys that were pressed; whether one of them leaves.
+fn read_keys(screen: &mut Screen, link: &Link) -> anyhow::Result<bool> {
+    while event::poll(Duration::ZERO).context("cannot read the keyboard")? {
+        let Event::Key(key) = event::read().context("cannot read the keyboard")? else {
+            continue;
+        };
+        if leaves(&key) {
+            return Ok(true);
+        }
+        // Any key closes what lies over the picture.
+        let pressed = key.code.as_char().filter(|_| key.kind == KeyEventKind::Press);
+        if let Some(order) = screen.press(pressed.unwrap_or(' ')) {
+            link.order(order);
+        }
+    }
+    Ok(false)
+}
+
 /// Ctrl-C comes as a key here.
 fn leaves(key: &KeyEvent) -> bool {
     let control = key.modifiers.contains(KeyModifiers::CONTROL);
     matches!(key.code, KeyCode::Char('q')) || (control && matches!(key.code, KeyCode::Char('c')))
 }
 
-/// The number of the signal that has come; 0 before one has.
+/// The number of the signal that has come; 0 before one has. Should the picture's loop hang, the process ends all the same.
 fn watched_signals() -> anyhow::Result<Arc<AtomicUsize>> {
     let signal = Arc::new(AtomicUsize::new(0));
-    for number in [SIGINT, SIGTERM, SIGHUP] {
-        signal_hook::flag::register_usize(number, Arc::clone(&signal), number as usize)
-            .context("cannot watch for signals")?;
-    }
+    let mut signals = Signals::new([SIGINT, SIGTERM, SIGHUP]).context("cannot watch for signals")?;
+    let received = Arc::clone(&signal);
+    let watch = move || {
+        if let Some(number) = signals.forever().next() {
+            received.store(number as usize, Ordering::Relaxed);
+            std::thread::sleep(TO_THE_END);
+            let _ = ratatui::try_restore();
+            std::process::exit(128 + number);
+        }
+    };
+    let watch = std::thread::Builder::new().name("signals".into()).spawn(watch);
+    watch.context("cannot watch for signals")?;
     Ok(signal)
 }
 

@@ -32,34 +32,12 @@ struct Seen {
 impl Terminal {
     /// Starts the program with these arguments on a terminal of its own of 80 × 24.
     pub(crate) fn start(place: &Workplace, arguments: &[&str], no_colour: bool) -> Self {
-        let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).unwrap();
-        grantpt(&master).unwrap();
-        unlockpt(&master).unwrap();
-        let name = ptsname(&master, Vec::new()).unwrap();
-        let name = std::ffi::OsStr::from_bytes(name.as_bytes());
-        let slave = OpenOptions::new()
-            .read(true)
-            .write(true)
-            .custom_flags(OFlags::NOCTTY.bits() as i32)
-            .open(name)
-            .unwrap();
-        tcsetwinsize(&slave, window(24, 80)).unwrap();
-        let master = File::from(master);
+        let (master, slave) = open();
         let seen = Arc::new(Mutex::new(Seen {
             screen: vt100::Parser::new(24, 80, 0),
             bytes: Vec::new(),
         }));
-        // A session of its own, so that the terminal is its and not the tester's.
-        let mut command = Command::new("setsid");
-        command
-            .args(["--ctty", env!("CARGO_BIN_EXE_shoal")])
-            .args(arguments)
-            .current_dir(place.path())
-            .env("TERM", "xterm-256color")
-            .env_remove("NO_COLOR")
-            .stdin(slave.try_clone().unwrap())
-            .stdout(slave.try_clone().unwrap())
-            .stderr(slave.try_clone().unwrap());
+        let mut command = on(&slave, place, arguments);
         if no_colour {
             command.env("NO_COLOR", "1");
         }
@@ -128,6 +106,40 @@ impl Terminal {
         });
         self.child.wait().unwrap().code()
     }
+}
+
+/// A terminal of 80 × 24, by its two ends.
+fn open() -> (File, File) {
+    let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).unwrap();
+    grantpt(&master).unwrap();
+    unlockpt(&master).unwrap();
+    let name = ptsname(&master, Vec::new()).unwrap();
+    let name = std::ffi::OsStr::from_bytes(name.as_bytes());
+    let slave = OpenOptions::new()
+        .read(true)
+        .write(true)
+        .custom_flags(OFlags::NOCTTY.bits() as i32)
+        .open(name)
+        .unwrap();
+    tcsetwinsize(&slave, window(24, 80)).unwrap();
+    let master = File::from(master);
+    (master, slave)
+}
+
+/// The program with these arguments, on a terminal.
+fn on(slave: &File, place: &Workplace, arguments: &[&str]) -> Command {
+    // A session of its own, so that the terminal is its and not the tester's.
+    let mut command = Command::new("setsid");
+    command
+        .args(["--ctty", env!("CARGO_BIN_EXE_shoal")])
+        .args(arguments)
+        .current_dir(place.path())
+        .env("TERM", "xterm-256color")
+        .env_remove("NO_COLOR")
+        .stdin(slave.try_clone().unwrap())
+        .stdout(slave.try_clone().unwrap())
+        .stderr(slave.try_clone().unwrap());
+    command
 }
 
 fn window(rows: u16, columns: u16) -> Winsize {
@@ -200,4 +212,21 @@ fn without_a_terminal_there_is_no_live_line() {
         "{said}"
     );
     assert!(!said.contains(['\x1b', '\r']), "{said}");
+}
+
+#[test]
+fn when_the_terminal_goes_away_nobody_goes_on_drawing() {
+    let place = Workplace::new();
+    let running = place.start("run", &["--steps", "100000000", "--actors", "1"]);
+    let (mut master, slave) = open();
+    let mut top = on(&slave, &place, &["top", "run"]).spawn().unwrap();
+    drop(slave);
+    let (mut seen, mut bytes) = (Vec::new(), [0; 4096]);
+    while !String::from_utf8_lossy(&seen).contains("learner") {
+        let count = master.read(&mut bytes).unwrap();
+        seen.extend(&bytes[..count]);
+    }
+    drop(master);
+    until("it has ended", || top.try_wait().unwrap().is_some());
+    running.learns_on();
 }
