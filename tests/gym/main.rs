@@ -2,6 +2,7 @@
 //! were skipped; with `SHOAL_REQUIRE_PYTHON` set they fail.
 
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
+#![allow(clippy::print_stderr, reason = "who skips a test says so")]
 
 #[path = "../support/mod.rs"]
 mod support;
