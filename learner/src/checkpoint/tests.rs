@@ -59,7 +59,7 @@ fn what_was_saved_is_loaded_to_the_bit() {
     assert_eq!(checkpoint.counters, counters(2));
     let actor = checkpoint.take("actor", 5).unwrap();
     assert_eq!(actor.map_bits(), WEIGHTS.to_vec().map_bits());
-    assert_eq!(checkpoint.take("empty", 0).unwrap(), []);
+    assert_eq!(checkpoint.take("empty", 0).unwrap(), [0.0_f32; 0]);
     let error = checkpoint.take("critic", 2).unwrap_err().to_string();
     assert!(error.contains("`critic` has 1 numbers instead of 2"), "{error}");
     assert!(
