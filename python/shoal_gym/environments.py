@@ -92,18 +92,21 @@ class Environments:
 
     def step(self, actions: NDArray[np.float32], blocks: Blocks) -> None:
         """Every environment takes a step; ``ValueError``, and nothing done, where an action is none."""
-        chosen = [self.action.read(numbers) for numbers in actions.reshape(len(self), self.action.width)]
+        chosen = self.action.elements(actions)
+        next_observations = self.observation.view(blocks.next_observations)
+        over = []
         for e, (environment, action) in enumerate(zip(self._environments, chosen)):
             observation, reward, terminated, truncated, _ = environment.step(action)
-            self.observation.write(observation, blocks.next_observations[e])
+            next_observations[e] = self.observation.number(observation)
             blocks.rewards[e] = reward
             blocks.terminated[e] = terminated
             # A terminal state is one, at whatever step it is reached.
             blocks.truncated[e] = truncated and not terminated
             if terminated or truncated:
-                self._begin(e, blocks)
-            else:
-                blocks.observations[e] = blocks.next_observations[e]
+                over.append(e)
+        blocks.observations[:] = blocks.next_observations
+        for e in over:
+            self._begin(e, blocks)
 
     def close(self) -> None:
         for environment in self._environments:
@@ -122,4 +125,4 @@ class Environments:
             self._next_training[e] += 1
         seed = int(np.random.SeedSequence(words).generate_state(1)[0])
         observation, _ = self._environments[e].reset(seed=seed)
-        self.observation.write(observation, blocks.observations[e])
+        self.observation.view(blocks.observations)[e] = self.observation.number(observation)

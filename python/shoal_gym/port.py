@@ -11,7 +11,7 @@ import iceoryx2 as iox2
 from . import protocol
 from .protocol import Activity, Heartbeat, RequestHeader, ResponseHeader
 
-POLLS = 100
+POLLS = 200
 """Polls before a waiting process blocks: the client's next request comes soon, where it has a core to itself."""
 
 NAP = 0.05

@@ -36,20 +36,21 @@ class Space:
             return []
         return [np.asarray(b, dtype=np.float32).reshape(-1) for b in (self.space.low, self.space.high)]
 
-    def write(self, element: Any, numbers: NDArray[np.float32]) -> None:
-        """Writes an element as ``width`` numbers."""
-        if self.discrete:
-            numbers[0] = int(element) - int(self.space.start)
-        else:
-            numbers[:] = np.reshape(element, -1)
+    def view(self, block: NDArray[np.float32]) -> NDArray[np.float32]:
+        """``block``, ``width`` numbers for each environment, with an element of the space for each."""
+        return block.reshape(len(block), *self.space.shape)
 
-    def read(self, numbers: NDArray[np.float32]) -> Any:
-        """The element that ``width`` numbers stand for, in memory of its own. ``ValueError`` for what is none."""
+    def number(self, element: Any) -> Any:
+        """What stands for an element in such a view."""
+        return int(element) - int(self.space.start) if self.discrete else element
+
+    def elements(self, numbers: NDArray[np.float32]) -> NDArray[Any]:
+        """The elements that ``width`` numbers each stand for, in memory of their own. ``ValueError`` for what is none."""
         if self.discrete:
-            index = int(numbers[0])
-            if index != numbers[0] or not 0 <= index < self.discrete:
-                raise ValueError(f"{numbers[0]} is no index below {self.discrete}")
-            return self.space.dtype.type(index + self.space.start)
+            indices = numbers.astype(self.space.dtype)
+            if (indices != numbers).any() or (indices < 0).any() or (indices >= self.discrete).any():
+                raise ValueError(f"{numbers} are no indices below {self.discrete}")
+            return indices + self.space.start
         if not np.isfinite(numbers).all():
-            raise ValueError(f"{numbers} is not finite")
-        return np.array(numbers, dtype=self.space.dtype).reshape(self.space.shape)
+            raise ValueError(f"{numbers} are not finite")
+        return numbers.astype(self.space.dtype).reshape(-1, *self.space.shape)
