@@ -10,7 +10,7 @@ use serde::Serialize;
 
 use crate::cli::ListArgs;
 use crate::launcher::thousands;
-use crate::listing::{Listed, State, runs_in};
+use crate::listing::{Listed, runs_in};
 
 /// What `--json` prints.
 #[derive(Serialize)]
@@ -39,6 +39,11 @@ pub(crate) fn run(args: &ListArgs) -> anyhow::Result<()> {
         writeln!(stdout, "no runs in {}", directory.display())?;
     } else {
         writeln!(stdout, "{}", table(&runs))?;
+        for run in &runs {
+            if let Some(reason) = &run.reason {
+                writeln!(stdout, "{}: {reason}", run.name)?;
+            }
+        }
     }
     Ok(())
 }
@@ -49,18 +54,14 @@ fn table(runs: &[Listed]) -> Table {
     table.set_header(["run", "state", "environment", "method", "steps", "of", "best return"]);
     for run in runs {
         let return_ = run.best_return.map_or_else(String::new, |best| format!("{best:.2}"));
-        let state = match (&run.state, &run.reason) {
-            (State::Damaged, Some(reason)) => format!("damaged: {reason}"),
-            (state, _) => state.name().to_owned(),
-        };
         let number = |number: Option<u64>| number.map_or_else(String::new, thousands);
         let (done, all) = match (run.episodes, run.episodes_limit) {
             (Some(episodes), Some(limit)) => (Some(episodes), format!("{} episodes", thousands(limit))),
             _ => (run.env_steps, number(run.steps)),
         };
         let row = [
-            &run.name,
-            &state,
+            run.name.as_str(),
+            run.state.name(),
             &run.environment,
             &run.algorithm,
             &number(done),
