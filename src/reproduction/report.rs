@@ -113,12 +113,15 @@ struct Stages<'a> {
     effort: Effort,
 }
 
-/// What somebody has written on a section, in `notes/<experiment>.md` of the folder, after the first experiment it is about.
+/// What somebody has written on a section, in `notes` of the folder, in a file named after all that the section is about:
+/// `point-mass-r2.md`, `point-mass-r2+point-mass-r2-longer.md`.
 fn notes(folder: &Folder, section: &Section) -> anyhow::Result<String> {
-    let Some((experiment, suffix)) = section.from.first() else {
-        return Ok(String::new());
-    };
-    let path = folder.path().join("notes").join(format!("{experiment}{suffix}.md"));
+    let about: Vec<String> = section
+        .from
+        .iter()
+        .map(|(experiment, suffix)| format!("{experiment}{suffix}"))
+        .collect();
+    let path = folder.path().join("notes").join(format!("{}.md", about.join("+")));
     match std::fs::read_to_string(&path) {
         Ok(text) => Ok(text),
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(String::new()),
