@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from .spaces import Space, Unsupported
+from .spaces import Unsupported, served
 
 
 class Purpose(enum.IntEnum):
@@ -58,8 +58,8 @@ class Environments:
         parameters = {"disable_env_checker": True, **parameters}
         self._environments = [gym.make(name, **parameters) for _ in range(count)]
         first = self._environments[0]
-        self.observation = Space.of(first.observation_space, "observations")
-        self.action = Space.of(first.action_space, "actions")
+        self.observation = served(first.observation_space, "observations")
+        self.action = served(first.action_space, "actions")
         limit = first.spec.max_episode_steps if first.spec else None
         if limit is None:
             raise Unsupported(
@@ -95,7 +95,7 @@ class Environments:
         chosen = self.action.elements(actions)
         next_observations = self.observation.view(blocks.next_observations)
         over = []
-        for e, (environment, action) in enumerate(zip(self._environments, chosen)):
+        for e, (environment, action) in enumerate(zip(self._environments, chosen, strict=True)):
             observation, reward, terminated, truncated, _ = environment.step(action)
             next_observations[e] = self.observation.number(observation)
             blocks.rewards[e] = reward

@@ -11,7 +11,7 @@ import numpy as np
 def steps_per_second(vector: gym.vector.VectorEnv, seconds: float) -> float:
     """Environment steps a second with the same action always, after a tenth of the time to warm up."""
     vector.reset(seed=1)
-    action = np.full(vector.action_space.shape, 0.5, vector.action_space.dtype)
+    action = np.full_like(vector.action_space.sample(), 0.5)
     steps, since = 0, None
     begun = time.perf_counter()
     while steps == 0 or time.perf_counter() - begun < seconds:

@@ -4,7 +4,8 @@ import ctypes
 import select
 import sys
 import time
-from typing import Any, Callable, TypeVar
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import iceoryx2 as iox2
 
@@ -133,7 +134,7 @@ class Port:
         while True:
             try:
                 return attempt()
-            except Exception as reason:  # noqa: BLE001: every error of iceoryx2 has a class of its own
+            except Exception as reason:  # Every error of iceoryx2 has a class of its own.
                 self._look_out()
                 if time.monotonic() - warned > 10.0:
                     warned = time.monotonic()

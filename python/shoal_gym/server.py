@@ -2,6 +2,7 @@
 
 import ctypes
 import sys
+from collections.abc import Callable
 from typing import Any
 
 import iceoryx2 as iox2
@@ -50,7 +51,7 @@ class Server:
                 bounds = self._environments.observation.bounds() + self._environments.action.bounds()
                 self._respond(request, np.concatenate(bounds) if bounds else np.empty(0, np.float32))
             case Ask.RESET:
-                self._begin(request, lambda blocks: self._environments.begin_next(blocks))
+                self._begin(request, self._environments.begin_next)
             case Ask.RESET_TO_TRAINING:
                 self._begin(request, lambda blocks: self._environments.begin_training(header.episode, blocks))
             case Ask.RESET_TO_EVALUATION:
@@ -63,7 +64,7 @@ class Server:
                 # Gymnasium's environments cannot say their state: there are no snapshots.
                 self._send(self._loan(request, 0), Verdict.REFUSED)
 
-    def _begin(self, request: Any, begin: Any) -> None:
+    def _begin(self, request: Any, begin: Callable[[Blocks], None]) -> None:
         response, blocks = self._loan_blocks(request)
         begin(blocks)
         self._started = True

@@ -91,7 +91,7 @@ pub(super) fn write(
         }
         for section in (family.sections)(folder, &album)? {
             if let Some(seeds) = stages.seeds_of(&section)? {
-                let notes = notes(folder, &section)?;
+                let notes = notes(folder, &section.from)?;
                 sections.push((section, seeds, notes));
             }
         }
@@ -115,9 +115,8 @@ struct Stages<'a> {
 
 /// What somebody has written on a section, in `notes` of the folder, in a file named after all that the section is about:
 /// `point-mass-r2.md`, `point-mass-r2+point-mass-r2-longer.md`.
-fn notes(folder: &Folder, section: &Section) -> anyhow::Result<String> {
-    let about: Vec<String> = section
-        .from
+fn notes(folder: &Folder, from: &[(&str, &str)]) -> anyhow::Result<String> {
+    let about: Vec<String> = from
         .iter()
         .map(|(experiment, suffix)| format!("{experiment}{suffix}"))
         .collect();
@@ -321,6 +320,20 @@ mod tests {
         let quick = of(&[true], Effort::Quick);
         assert!(quick.contains("quick look") && quick.contains("| not judged |") && !quick.contains("**holds**"));
         assert!(of(&[false], Effort::Full).contains("**does not hold**"));
+    }
+
+    #[test]
+    fn notes_stand_in_the_one_section_that_is_about_the_same() {
+        let directory = tempfile::tempdir().unwrap();
+        let folder = Folder::open(directory.path()).unwrap();
+        std::fs::create_dir(directory.path().join("notes")).unwrap();
+        for (name, text) in [("a.md", "of a"), ("a+a-longer.md", "of both")] {
+            std::fs::write(directory.path().join("notes").join(name), text).unwrap();
+        }
+        let of = |from: &[(&str, &str)]| notes(&folder, from).unwrap();
+        assert_eq!(of(&[("a", "")]), "of a");
+        assert_eq!(of(&[("a", ""), ("a", "-longer")]), "of both");
+        assert_eq!(of(&[("a", ""), ("b", "")]), "");
     }
 
     #[test]
