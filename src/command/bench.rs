@@ -18,6 +18,7 @@ use anyhow::{Context, bail};
 use comfy_table::Table;
 use comfy_table::presets::UTF8_BORDERS_ONLY;
 use serde::Serialize;
+use shoal_common::channel::Interruption;
 use shoal_common::stop::Stop;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use signal_hook::iterator::Signals;
@@ -27,6 +28,9 @@ use crate::cli::BenchArgs;
 /// Shortens or lengthens the measurement itself, in seconds: tests care for the form of the answer, not for the numbers.
 const SECONDS: &str = "SHOAL_BENCH_SECONDS";
 const DEFAULT_SECONDS: f64 = 6.0;
+
+/// What is said where somebody asked for the end.
+const INTERRUPTED: &str = "interrupted";
 
 /// A stage of the system.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -59,13 +63,18 @@ struct Patience {
 /// Measures a stage and tells the person, or a script, how fast it is.
 pub(crate) fn run(args: &BenchArgs) -> anyhow::Result<()> {
     let patience = Patience::new()?;
-    match args.stage {
-        Stage::Learner => tell(&learner::measure(&patience)?, args.json),
-        Stage::Transitions => tell(&transitions::measure(&patience)?, args.json),
-        Stage::Step => tell(&step::measure(&patience)?, args.json),
-        Stage::Policy => tell(&policy::measure(&patience)?, args.json),
-        Stage::Gym => tell(&gym::measure(&patience)?, args.json),
-    }
+    let told = match args.stage {
+        Stage::Learner => learner::measure(&patience).and_then(|it| tell(&it, args.json)),
+        Stage::Transitions => transitions::measure(&patience).and_then(|it| tell(&it, args.json)),
+        Stage::Step => step::measure(&patience).and_then(|it| tell(&it, args.json)),
+        Stage::Policy => policy::measure(&patience).and_then(|it| tell(&it, args.json)),
+        Stage::Gym => gym::measure(&patience).and_then(|it| tell(&it, args.json)),
+    };
+    // A wait that was interrupted says what it says to a role.
+    told.map_err(|error| match error.downcast_ref() {
+        Some(Interruption::Stopped) => anyhow::anyhow!(INTERRUPTED),
+        _ => error,
+    })
 }
 
 impl Patience {
@@ -91,7 +100,7 @@ impl Patience {
     /// An error once somebody has asked for the end: what was measured is cleared away on the way out.
     fn check(&self) -> anyhow::Result<()> {
         if self.stop.requested() {
-            bail!("interrupted");
+            bail!(INTERRUPTED);
         }
         Ok(())
     }

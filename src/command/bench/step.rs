@@ -88,7 +88,7 @@ fn times(config: &Config, domain: &Domain, server: &mut Peer, patience: &Patienc
                 server.check()?;
                 bail!("the environment server gave up its episodes");
             }
-            Err(Interruption::Stopped) => bail!("interrupted"),
+            Err(Interruption::Stopped) => bail!(super::INTERRUPTED),
             Err(Interruption::Channel(error)) => return Err(error.into()),
         }
         let after = Instant::now();
