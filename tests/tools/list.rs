@@ -56,7 +56,9 @@ fn every_run_is_listed_with_its_state() {
 
     let table = place.output(&["list", "runs"]);
     let table = String::from_utf8(table.stdout).unwrap();
-    assert_eq!(table.lines().count(), 6, "{table}");
+    assert_eq!(table.lines().count(), 7, "{table}");
+    let last = table.lines().last().unwrap();
+    assert!(last.starts_with("damaged: ") && last.contains("config.toml"), "{table}");
     assert!(table.contains("best return") && table.contains("400"), "{table}");
 }
 
