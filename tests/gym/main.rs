@@ -119,7 +119,7 @@ fn discrete_spaces_are_counted_from_zero_and_learned_by_a_table() {
         (spec.observation, spec.action),
         (Space::Discrete { n: 4 }, Space::Discrete { n: 3 })
     );
-    assert_eq!(support::json(&output)["eval_return_mean"], 1.0, "it walks to the end");
+    assert_eq!(support::json(&output)["eval_return_mean"], 3.0, "it walks to the end");
 }
 
 #[test]

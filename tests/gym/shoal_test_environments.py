@@ -49,7 +49,7 @@ class Odd(Ends):
 
 
 class Offset(gym.Env):
-    """Counts from 5 observations and from -1 actions; action 0 of three leads on, the others end."""
+    """Counts from 5 observations and from -1 actions; from 5 to 8 lead actions 0, 1, 0, each for a reward, and others end."""
 
     observation_space = gym.spaces.Discrete(4, start=5)
     action_space = gym.spaces.Discrete(3, start=-1)
@@ -61,8 +61,9 @@ class Offset(gym.Env):
 
     def step(self, action):
         assert self.action_space.contains(action), action
-        self.state += action == 0
-        return self.state, float(self.state == 8), bool(action != 0 or self.state == 8), False, {}
+        leads_on = action == (1 if self.state == 6 else 0)
+        self.state += leads_on
+        return self.state, float(leads_on), bool(not leads_on or self.state == 8), False, {}
 
 
 gym.register("Ends-v0", entry_point=Ends, max_episode_steps=5)
