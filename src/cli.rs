@@ -247,6 +247,9 @@ pub(crate) struct BenchArgs {
     /// What to measure.
     #[arg(value_enum)]
     pub(crate) stage: Stage,
+    /// With `actors`: how many actors to measure, one after the other [default: 1,2,4, and doubled up to the cores].
+    #[arg(long, value_name = "N,N,…", allow_hyphen_values = true)]
+    pub(crate) actors: Option<String>,
     /// Print one JSON object on standard output.
     #[arg(long)]
     pub(crate) json: bool,

@@ -7,8 +7,9 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
-use rustix::process::Pid;
-use shoal_common::report::Role;
+use rustix::process::{Pid, Signal, kill_process};
+use rustix::thread::{CpuSet, sched_setaffinity};
+use shoal_common::report::{Identity, Role};
 use shoal_common::run_dir::RunDir;
 
 /// How long a learner may take to bring its replay to the disk.
@@ -16,6 +17,9 @@ const FAREWELL: Duration = Duration::from_secs(15);
 
 /// How long one may take that is not needed any more.
 const DISMISSAL: Duration = Duration::from_secs(2);
+
+/// Exit code of a launcher that Ctrl-C has ended in order.
+const INTERRUPTED: i32 = 130;
 
 /// A process. It ends when its standard input closes, be it because this process is no more.
 #[derive(Debug)]
@@ -31,8 +35,24 @@ pub(crate) struct Peer {
 impl Peer {
     /// Starts this program again as `role` 0 of the run.
     pub(crate) fn role(role: Role, run: &RunDir) -> anyhow::Result<Self> {
+        let first = Identity {
+            role,
+            index: 0,
+            incarnation: 1,
+        };
+        Self::member(first, run)
+    }
+
+    /// Starts this program again as a role of the run.
+    pub(crate) fn member(identity: Identity, run: &RunDir) -> anyhow::Result<Self> {
+        let Identity {
+            role,
+            index,
+            incarnation,
+        } = identity;
         let mut command = Command::new("/proc/self/exe");
-        command.arg0("shoal").arg(role.name()).arg(run.path()).args(["0", "1"]);
+        command.arg0("shoal").arg(role.name()).arg(run.path());
+        command.args([index.to_string(), incarnation.to_string()]);
         Self::start(&mut command, role.name().into()).with_context(|| format!("cannot start the {}", role.name()))
     }
 
@@ -71,14 +91,55 @@ impl Peer {
         }
     }
 
+    /// Has the process's first thread run on these cores only; threads that it starts later do as well.
+    pub(crate) fn pin(&self, cores: &CpuSet) -> anyhow::Result<()> {
+        sched_setaffinity(Some(self.pid()), cores)
+            .with_context(|| format!("cannot choose a core for the {}", self.what))
+    }
+
+    /// Stops the process where it is, until [`Peer::go_on`].
+    pub(crate) fn pause(&self) -> anyhow::Result<()> {
+        self.signal(Signal::STOP)
+    }
+
+    /// Lets a paused process go on.
+    pub(crate) fn go_on(&self) -> anyhow::Result<()> {
+        self.signal(Signal::CONT)
+    }
+
+    fn signal(&self, signal: Signal) -> anyhow::Result<()> {
+        kill_process(self.pid(), signal).with_context(|| format!("cannot signal the {}", self.what))
+    }
+
+    /// Asks the process to end, and does not wait for it.
+    pub(crate) fn ask_to_end(&mut self) {
+        self.stdin = None;
+    }
+
     /// Asks the process to end, and waits for it.
     pub(crate) fn end(mut self) -> anyhow::Result<()> {
-        self.stdin = None;
-        let deadline = Instant::now() + FAREWELL;
+        self.ask_to_end();
+        match self.wait(FAREWELL)? {
+            status if status.success() => Ok(()),
+            status => self.ended_early(status),
+        }
+    }
+
+    /// Ends a launcher, which hears signals and not its standard input, and waits for it.
+    pub(crate) fn interrupt(mut self, patience: Duration) -> anyhow::Result<()> {
+        self.signal(Signal::INT)?;
+        let status = self.wait(patience)?;
+        match status.code() {
+            Some(0 | INTERRUPTED) => Ok(()),
+            _ => self.ended_early(status),
+        }
+    }
+
+    fn wait(&mut self, patience: Duration) -> anyhow::Result<ExitStatus> {
+        let deadline = Instant::now() + patience;
         loop {
             match self.child.try_wait()? {
-                Some(status) if status.success() => return Ok(()),
-                Some(status) => return self.ended_early(status),
+                Some(status) => return Ok(status),
                 None if Instant::now() >= deadline => bail!("the {} did not end when asked to", self.what),
                 None => std::thread::sleep(Duration::from_millis(2)),
             }

@@ -1,7 +1,14 @@
 //! `shoal bench`: how fast each stage is on this machine.
 
+mod actors;
+mod costs;
+mod crew;
+mod flow;
 mod gym;
 mod learner;
+mod memory;
+mod model;
+mod one_core;
 mod policy;
 mod product;
 mod rows;
@@ -9,6 +16,7 @@ mod scene;
 mod spin;
 mod step;
 mod transitions;
+mod whole_run;
 mod window;
 
 use std::io::Write;
@@ -43,6 +51,10 @@ pub(crate) enum Stage {
     Step,
     /// Actions a second.
     Policy,
+    /// Rows a second of several actors, environments and learner included, and what is to be expected of more.
+    Actors,
+    /// A training: how long it takes to its first update and after a crash, and how much memory its processes have.
+    Run,
     /// Steps of a Gymnasium environment through its server in Python, beside Gymnasium's own vectors.
     Gym,
 }
@@ -63,11 +75,16 @@ struct Patience {
 /// Measures a stage and tells the person, or a script, how fast it is.
 pub(crate) fn run(args: &BenchArgs) -> anyhow::Result<()> {
     let patience = Patience::new()?;
+    if args.actors.is_some() && args.stage != Stage::Actors {
+        bail!("--actors is for `shoal bench actors` alone");
+    }
     let told = match args.stage {
         Stage::Learner => learner::measure(&patience).and_then(|it| tell(&it, args.json)),
         Stage::Transitions => transitions::measure(&patience).and_then(|it| tell(&it, args.json)),
         Stage::Step => step::measure(&patience).and_then(|it| tell(&it, args.json)),
         Stage::Policy => policy::measure(&patience).and_then(|it| tell(&it, args.json)),
+        Stage::Actors => actors::measure(args.actors.as_deref(), &patience).and_then(|it| tell(&it, args.json)),
+        Stage::Run => whole_run::measure(&patience).and_then(|it| tell(&it, args.json)),
         Stage::Gym => gym::measure(&patience).and_then(|it| tell(&it, args.json)),
     };
     // A wait that was interrupted says what it says to a role.

@@ -1,6 +1,7 @@
 //! The run that a measurement is about: the preset `pendulum` in a temporary directory that goes with it.
 
 use anyhow::Context;
+use rustix::thread::CpuSet;
 use shoal_common::channel::Domain;
 use shoal_common::commit::ReplayLayout;
 use shoal_common::config::{Config, Ddpg};
@@ -8,9 +9,11 @@ use shoal_common::report::Role;
 use shoal_common::run_dir::RunDir;
 use tempfile::TempDir;
 
+use super::crew::Crew;
 use crate::cli::TrainArgs;
 use crate::peer::Peer;
 use crate::plan::Plan;
+use crate::room;
 
 /// A run that exists until this is dropped.
 #[derive(Debug)]
@@ -26,8 +29,13 @@ pub(super) fn ddpg(config: &Config) -> anyhow::Result<&Ddpg> {
 }
 
 impl Scene {
-    /// The preset with these settings, as `--set` takes them.
+    /// The preset with one actor of one environment and these settings, as `--set` takes them.
     pub(super) fn new(set: &[&str]) -> anyhow::Result<Self> {
+        Self::of(1, 1, set)
+    }
+
+    /// The preset with so many actors, so many environments of each, and these settings.
+    pub(super) fn of(actors: u32, envs: u32, set: &[&str]) -> anyhow::Result<Self> {
         let directory = tempfile::Builder::new()
             .prefix("shoal-bench-")
             .tempdir()
@@ -36,8 +44,8 @@ impl Scene {
             what: "pendulum".into(),
             run: Some(directory.path().join("run")),
             seed: Some(1),
-            actors: Some(1),
-            envs: Some(1),
+            actors: Some(actors),
+            envs: Some(envs),
             set: set.iter().map(|assignment| (*assignment).into()).collect(),
             ..TrainArgs::default()
         })?;
@@ -68,15 +76,39 @@ impl Scene {
         role: Role,
         act: impl FnOnce(&Domain, &mut Peer) -> anyhow::Result<T>,
     ) -> anyhow::Result<T> {
-        Domain::remove_abandoned()?;
-        let domain = Domain::join(&self.config.run.id, self.config.actors.max)?;
-        let acted = Peer::role(role, &self.run).and_then(|mut peer| {
-            let acted = act(&domain, &mut peer);
+        self.in_shared_memory(|domain| {
+            let mut peer = Peer::role(role, &self.run)?;
+            let acted = act(domain, &mut peer);
             let ended = peer.end();
             let acted = acted?;
             ended?;
             Ok(acted)
-        });
+        })
+    }
+
+    /// Does `act` while a learner, the run's actors and their environment servers are there; nothing of the run is left in
+    /// shared memory after it. `chosen` says on which cores a role shall run.
+    pub(super) fn with_crew<T>(
+        &self,
+        chosen: impl Fn(Role) -> Option<CpuSet>,
+        act: impl FnOnce(&Domain, &mut Crew) -> anyhow::Result<T>,
+    ) -> anyhow::Result<T> {
+        self.in_shared_memory(|domain| {
+            room::claim(&self.config, &self.run, domain)?;
+            let mut crew = Crew::start(&self.run, self.config.actors.count, chosen)?;
+            let acted = act(domain, &mut crew);
+            let ended = crew.end();
+            let acted = acted?;
+            ended?;
+            Ok(acted)
+        })
+    }
+
+    /// Does `act` as a member of the run; nothing of the run is left in shared memory after it.
+    pub(super) fn in_shared_memory<T>(&self, act: impl FnOnce(&Domain) -> anyhow::Result<T>) -> anyhow::Result<T> {
+        Domain::remove_abandoned()?;
+        let domain = Domain::join(&self.config.run.id, self.config.actors.max)?;
+        let acted = act(&domain);
         let left = domain.leave();
         let acted = acted?;
         left?;

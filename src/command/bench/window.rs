@@ -30,6 +30,10 @@ impl Windows {
         self.0.insert(place, rate);
     }
 
+    pub(super) fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+
     /// Panics where there was no window.
     pub(super) fn median(&self) -> f64 {
         self.0[self.0.len() / 2]

@@ -1,0 +1,120 @@
+//! How much of a core an actor leaves to its policy: an actor and its environment server share one core, and what they give
+//! is held against the policy alone on the same core. Both take turns, so that what else the machine does strikes both.
+
+use std::time::{Duration, Instant};
+
+use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
+use serde::Serialize;
+use shoal_common::report::Role;
+
+use super::Patience;
+use super::costs::Inference;
+use super::crew::Crew;
+use super::flow::Flow;
+use super::rows::ENVIRONMENTS;
+use super::scene::Scene;
+use super::window::{self, Windows};
+
+/// A turn of the actor and its server; a turn of the policy alone takes half of it.
+const TURN: Duration = Duration::from_millis(200);
+
+/// What the share should be.
+pub(super) const TARGET: f64 = 0.8;
+
+#[derive(Clone, Copy, Debug, Serialize)]
+pub(super) struct OneCore {
+    pub(super) pair_rows_per_second: f64,
+    pub(super) inference_rows_per_second: f64,
+    /// Median over turns of the first over the second.
+    pub(super) share: f64,
+    pub(super) share_least: f64,
+    pub(super) share_greatest: f64,
+    /// Whether the learner had another core.
+    pub(super) learner_apart: bool,
+}
+
+/// The core for the pair, and the one for everything else: the same where there is only one.
+struct Cores {
+    pair: CpuSet,
+    others: CpuSet,
+    all: CpuSet,
+}
+
+impl Cores {
+    fn choose() -> anyhow::Result<Self> {
+        let all = sched_getaffinity(None)?;
+        let mut usable = (0..CpuSet::MAX_CPU).filter(|core| all.is_set(*core)).map(|core| {
+            let mut set = CpuSet::new();
+            set.set(core);
+            set
+        });
+        // The last two: a machine's first core has its interrupts.
+        let first = usable.next().unwrap_or(all);
+        Ok(Self {
+            pair: usable.last().unwrap_or(first),
+            others: first,
+            all,
+        })
+    }
+}
+
+impl Drop for Cores {
+    fn drop(&mut self) {
+        let _ = sched_setaffinity(None, &self.all);
+    }
+}
+
+/// Measures for about `length`.
+pub(super) fn measure(length: Duration, patience: &Patience) -> anyhow::Result<OneCore> {
+    let scene = Scene::of(1, ENVIRONMENTS as u32, &super::actors::settings(1, false))?;
+    let mut inference = Inference::new(&scene.config)?;
+    let cores = Cores::choose()?;
+    let chosen = |role| {
+        Some(match role {
+            Role::Learner => cores.others,
+            _ => cores.pair,
+        })
+    };
+    scene.with_crew(chosen, |domain, crew| {
+        let mut flow = Flow::begin(&scene, domain, crew, patience)?;
+        let turns = window::count(length, 1.0, TURN.mul_f64(1.5));
+        let turn = TURN.min(length.div_f64(1.5));
+        take_turns(&mut flow, crew, &cores, turns, turn, &mut inference, patience)
+    })
+}
+
+fn take_turns(
+    flow: &mut Flow<'_>,
+    crew: &mut Crew,
+    cores: &Cores,
+    turns: usize,
+    turn: Duration,
+    inference: &mut Inference,
+    patience: &Patience,
+) -> anyhow::Result<OneCore> {
+    let (mut pair, mut alone, mut shares) = (Windows::default(), Windows::default(), Windows::default());
+    for _ in 0..turns {
+        sched_setaffinity(None, &cores.others)?;
+        // The pair has just been woken.
+        std::thread::sleep(turn / 10);
+        let (begun, before) = (Instant::now(), flow.rows());
+        flow.sleep(turn, crew, patience)?;
+        let rows = (flow.rows() - before) as f64 / begun.elapsed().as_secs_f64();
+        let rate = crew.with_actors_paused(|| -> anyhow::Result<f64> {
+            sched_setaffinity(None, &cores.pair)?;
+            inference.step();
+            Ok(window::rate(turn / 2, || inference.step()))
+        })??;
+        pair.add(rows);
+        alone.add(rate * ENVIRONMENTS as f64);
+        shares.add(rows / (rate * ENVIRONMENTS as f64));
+    }
+    Ok(OneCore {
+        pair_rows_per_second: pair.median(),
+        inference_rows_per_second: alone.median(),
+        share: shares.median(),
+        share_least: shares.least(),
+        share_greatest: shares.greatest(),
+        learner_apart: cores.pair != cores.others,
+    })
+}

@@ -1,0 +1,205 @@
+//! A training as somebody starts it, launcher and all: how long it takes to its first update, how long a learner that was
+//! killed takes to be replaced, and how much memory its processes have.
+
+use std::time::{Duration, Instant};
+
+use anyhow::Context;
+use rustix::process::{Pid, Signal, kill_process};
+use serde::Serialize;
+use shoal_common::report::Role;
+
+use self::training::{Began, Came, Training};
+use super::memory::Memory;
+use super::window::Windows;
+use super::{Figures, Patience};
+
+mod training;
+
+/// Part of the time in which runs are started; in the rest the learner of the last one is killed.
+const STARTING: f64 = 0.4;
+
+/// More would say no more.
+const MOST: usize = 20;
+
+/// What a start and a recovery should take, in seconds, and a process have, in bytes.
+const TARGET_SECONDS: f64 = 0.5;
+const TARGET_BYTES: u64 = 64_000_000;
+
+const MEGABYTE: f64 = 1e6;
+
+/// The fields of `bench run --json`. Times are in seconds.
+#[derive(Serialize)]
+pub(super) struct RunFigures {
+    starts: usize,
+    /// From the launcher's start to the first heartbeat of every role.
+    ready_seconds: Spread,
+    /// From the first row committed to the last row of the warm-up.
+    warm_up_seconds: Spread,
+    warm_up_rows: u64,
+    /// From the last row of the warm-up to the first policy that updates have changed.
+    first_update_seconds: Spread,
+    /// From the launcher's start to that policy, less the warm-up.
+    start_seconds: Spread,
+    kills: usize,
+    /// From the learner's `kill -9` to its successor's first heartbeat.
+    successor_ready_seconds: Spread,
+    /// From the learner's `kill -9` to its successor's first policy that updates have changed.
+    recovery_seconds: Spread,
+    target_seconds: f64,
+    roles: Vec<RoleMemory>,
+    target_private_bytes: u64,
+}
+
+#[derive(Serialize)]
+struct Spread {
+    median: f64,
+    worst: f64,
+}
+
+#[derive(Serialize)]
+struct RoleMemory {
+    role: String,
+    index: u32,
+    #[serde(flatten)]
+    memory: Memory,
+}
+
+pub(super) fn measure(patience: &Patience) -> anyhow::Result<RunFigures> {
+    let begun = Instant::now();
+    let mut starts = Vec::new();
+    loop {
+        let mut training = Training::start()?;
+        let measured = training.begin(patience).and_then(|began| {
+            starts.push(began);
+            let is_last = begun.elapsed() >= patience.length.mul_f64(STARTING) || starts.len() >= MOST;
+            is_last
+                .then(|| recoveries_and_memory(&mut training, begun, patience))
+                .transpose()
+        });
+        let ended = training.end();
+        let measured = measured?;
+        ended?;
+        if let Some((recoveries, roles)) = measured {
+            return Ok(RunFigures::new(&starts, &recoveries, roles));
+        }
+    }
+}
+
+/// Kills the learner until the time is over, at least once; and looks at everyone's memory before that.
+fn recoveries_and_memory(
+    training: &mut Training,
+    begun: Instant,
+    patience: &Patience,
+) -> anyhow::Result<(Vec<Came>, Vec<RoleMemory>)> {
+    let mut recoveries = Vec::new();
+    let mut roles = Vec::new();
+    while recoveries.is_empty() || (begun.elapsed() < patience.length && recoveries.len() < MOST) {
+        training.settle(patience)?;
+        let members = training.members()?;
+        if recoveries.is_empty() {
+            for (role, index, pid) in &members {
+                roles.push(RoleMemory {
+                    role: role.clone(),
+                    index: *index,
+                    memory: Memory::of(*pid, &training.replay()?)?,
+                });
+            }
+        }
+        let learner = members.iter().find(|(role, ..)| role == Role::Learner.name());
+        let pid = learner.and_then(|(.., pid)| Pid::from_raw(*pid as i32));
+        let pid = pid.context("the run has no learner to kill")?;
+        let killed = Instant::now();
+        kill_process(pid, Signal::KILL).context("cannot kill the learner")?;
+        recoveries.push(training.recover(killed, patience)?);
+    }
+    Ok((recoveries, roles))
+}
+
+impl RunFigures {
+    fn new(starts: &[Began], recoveries: &[Came], roles: Vec<RoleMemory>) -> Self {
+        let of_starts = |seconds: fn(&Began) -> Duration| Spread::of(starts.iter().map(seconds));
+        Self {
+            starts: starts.len(),
+            ready_seconds: of_starts(|began| began.ready),
+            warm_up_seconds: of_starts(Began::warm_up),
+            warm_up_rows: starts.first().map_or(0, |began| began.warm_up_rows),
+            first_update_seconds: of_starts(|began| began.update.saturating_sub(began.warm)),
+            start_seconds: of_starts(|began| began.update - began.warm_up()),
+            kills: recoveries.len(),
+            successor_ready_seconds: Spread::of(recoveries.iter().map(|came| came.ready)),
+            recovery_seconds: Spread::of(recoveries.iter().map(|came| came.update)),
+            target_seconds: TARGET_SECONDS,
+            roles,
+            target_private_bytes: TARGET_BYTES,
+        }
+    }
+}
+
+impl Spread {
+    /// Panics where there is nothing.
+    fn of(times: impl Iterator<Item = Duration>) -> Self {
+        let mut windows = Windows::default();
+        times.for_each(|time| windows.add(time.as_secs_f64()));
+        Self {
+            median: windows.median(),
+            worst: windows.greatest(),
+        }
+    }
+
+    fn show(&self) -> String {
+        format!("{:.3} s, at worst {:.3}", self.median, self.worst)
+    }
+}
+
+impl Figures for RunFigures {
+    fn lines(&self) -> Vec<(&'static str, String)> {
+        let roles = self.roles.iter().map(|RoleMemory { role, index, memory }| {
+            let megabytes = |bytes: u64| bytes as f64 / MEGABYTE;
+            format!(
+                "{role} {index}: {:.1} MB private, {:.1} proportional; shared memory {:.1}, files {:.1}, replay {:.1}",
+                megabytes(memory.private_bytes),
+                megabytes(memory.proportional_bytes),
+                megabytes(memory.shared_memory_bytes),
+                megabytes(memory.file_bytes),
+                megabytes(memory.replay_bytes)
+            )
+        });
+        vec![
+            (
+                "start to first update",
+                format!(
+                    "{} without the warm-up, target {TARGET_SECONDS}; {} starts",
+                    self.start_seconds.show(),
+                    self.starts
+                ),
+            ),
+            (
+                "of it",
+                format!(
+                    "every role ready after {}\nwarm-up of {} rows {}\nfrom there to the first update {}",
+                    self.ready_seconds.show(),
+                    self.warm_up_rows,
+                    self.warm_up_seconds.show(),
+                    self.first_update_seconds.show()
+                ),
+            ),
+            (
+                "killed learner to next update",
+                format!(
+                    "{}, target {TARGET_SECONDS}; {} kills\nits successor ready after {}",
+                    self.recovery_seconds.show(),
+                    self.kills,
+                    self.successor_ready_seconds.show()
+                ),
+            ),
+            (
+                "memory of each process",
+                format!(
+                    "{}\ntarget {:.0} MB private, the replay's rows apart",
+                    roles.collect::<Vec<_>>().join("\n"),
+                    TARGET_BYTES as f64 / MEGABYTE
+                ),
+            ),
+        ]
+    }
+}
