@@ -92,8 +92,121 @@ fn the_policy_acts_alone_and_in_batches() {
 }
 
 #[test]
+fn actors_are_counted_and_expected() {
+    let figures = figures("actors");
+    let cores = number(&figures, "cores");
+    assert_eq!(number(&figures, "environments_per_actor"), 64.0);
+    assert_eq!(number(&figures, "chunk_rows"), 512.0);
+    let counts = figures["counts"].as_array().unwrap();
+    let actors: Vec<f64> = counts.iter().map(|count| number(count, "actors")).collect();
+    assert_eq!(actors[..3], [1.0, 2.0, 4.0]);
+    for count in counts {
+        let [actors, processes] = ["actors", "processes"].map(|field| number(count, field));
+        assert_eq!(processes, 2.0 * actors + 1.0);
+        assert_eq!(count["more_processes_than_cores"], processes > cores);
+        for (way, updates) in [("collecting", false), ("learning", true)] {
+            let [rate, one] = [&count[way], &counts[0][way]];
+            let rows = |rate| number(rate, "rows_per_second");
+            let efficiency = rows(rate) / (actors * rows(one));
+            assert!((number(rate, "efficiency") - efficiency).abs() < 1e-9, "{figures}");
+            number(rate, "expected_rows_per_second");
+            assert_eq!(rate["updates_per_second"].as_f64().unwrap() > 0.0, updates, "{figures}");
+            assert_eq!(rate["expected_updates_per_second"].as_f64().unwrap() > 0.0, updates);
+        }
+    }
+    let one_core = &figures["one_core"];
+    number(one_core, "pair_rows_per_second");
+    number(one_core, "inference_rows_per_second");
+    let [least, share, greatest] = ["share_least", "share", "share_greatest"].map(|field| number(one_core, field));
+    assert!(least <= share && share <= greatest, "{figures}");
+    for stage in [
+        "inference",
+        "acting",
+        "environment_step",
+        "round_trip",
+        "writing_chunk",
+        "intake_of_chunk",
+        "update",
+    ] {
+        number(&figures["costs"], &format!("{stage}_us"));
+    }
+    let scaling = figures["scaling"].as_array().unwrap();
+    let asked: Vec<f64> = scaling.iter().map(|one| number(one, "actors")).collect();
+    assert_eq!(asked, [1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0]);
+    for pair in scaling.windows(2) {
+        let [few, many] = [0, 1].map(|i| number(&pair[i], "rows_per_second"));
+        assert!(few < many, "more actors, more rows: {figures}");
+        let [few, many] = [0, 1].map(|i| number(&pair[i], "efficiency"));
+        assert!(many < few + 1e-6, "{figures}");
+    }
+    for which in [
+        "first_bottleneck",
+        "first_bottleneck_with_updates",
+        "first_bottleneck_on_these_cores",
+    ] {
+        assert!(figures[which]["resource"].is_string());
+        number(&figures[which], "actors");
+    }
+}
+
+#[test]
+fn a_run_has_its_start_its_recoveries_and_its_memory() {
+    let figures = figures("run");
+    assert!(number(&figures, "starts") >= 1.0 && number(&figures, "kills") >= 1.0);
+    assert_eq!(number(&figures, "warm_up_rows"), 1000.0);
+    let time = |field: &str| {
+        let [median, worst] = ["median", "worst"].map(|which| number(&figures[field], which));
+        assert!(median <= worst, "{figures}");
+        median
+    };
+    assert!(time("start_seconds") >= time("first_update_seconds"));
+    assert!(time("recovery_seconds") >= time("successor_ready_seconds"));
+    time("ready_seconds");
+    time("warm_up_seconds");
+    let roles = figures["roles"].as_array().unwrap();
+    let named = |name| roles.iter().filter(|role| role["role"] == name).count();
+    assert_eq!(["learner", "evaluator", "actor", "env-server"].map(named), [1, 1, 2, 3]);
+    for role in roles {
+        for bytes in [
+            "private_bytes",
+            "proportional_bytes",
+            "shared_memory_bytes",
+            "file_bytes",
+        ] {
+            number(role, bytes);
+        }
+        let has_replay = role["replay_bytes"].as_u64().unwrap() > 20_000;
+        assert!(has_replay || role["role"] != "learner", "{figures}");
+    }
+}
+
+#[test]
+fn a_list_of_counts_that_is_none_is_refused_in_one_line() {
+    let temporary = TempDir::new().unwrap();
+    for (stage, counts) in [
+        ("actors", ""),
+        ("actors", "0"),
+        ("actors", "1,,2"),
+        ("actors", "two"),
+        ("actors", "-1"),
+        ("actors", "1025"),
+        ("policy", "1,2"),
+    ] {
+        let mut command = bench(stage, temporary.path(), "0.3");
+        let output = command.args(["--actors", counts]).output().unwrap();
+        assert!(
+            !output.status.success() && output.stdout.is_empty(),
+            "{stage} {counts:?}"
+        );
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert!(said.contains("--actors") && said.lines().count() == 1, "{said}");
+        assert_eq!(entries(temporary.path()), 0);
+    }
+}
+
+#[test]
 fn interrupted_it_leaves_nothing_behind() {
-    for stage in ["transitions", "step"] {
+    for stage in ["transitions", "step", "actors", "run"] {
         let temporary = TempDir::new().unwrap();
         let mut child = bench(stage, temporary.path(), "60")
             .stdout(Stdio::null())

@@ -1,5 +1,6 @@
 //! Waking each other: data channels never wake anybody, so whoever waits has a bell, and whoever has news for it rings.
 
+use std::cell::Cell;
 use std::fmt;
 use std::time::{Duration, Instant};
 
@@ -15,6 +16,14 @@ use crate::stop::Stop;
 /// Polls before a waiting process blocks. A peer that is at work on another core answers within them; on a shared core
 /// they cost it some microseconds.
 const POLLS: u32 = 200;
+
+/// Waits in a row over which polling was in vain, after which a process blocks without it: an answerer that shares the
+/// asker's core gets that core at once, and one that always takes longer is not waited for by burning a core. Fewer, and
+/// one that answers in time every other try would be given up too often.
+const IN_VAIN: u32 = 64;
+
+/// One of so many waits polls all the same: processes move from core to core.
+const TRIED_AGAIN: u32 = 32;
 
 /// How long a process blocks before it looks after its connections. Rings can be lost when their hearer restarts.
 const NAP: Duration = Duration::from_millis(50);
@@ -34,6 +43,35 @@ impl fmt::Display for Place {
 pub struct Bell {
     listener: Listener<ipc::Service>,
     place: Place,
+    polling: Polling,
+}
+
+/// Whether polling pays for who waits at a bell.
+#[derive(Debug, Default)]
+struct Polling {
+    /// Waits in a row that ended asleep.
+    in_vain: Cell<u32>,
+}
+
+impl Polling {
+    /// Polls before the next sleep; at least one, for what came before the sleep is not rung for again.
+    fn polls(&self) -> u32 {
+        let in_vain = self.in_vain.get();
+        if in_vain < IN_VAIN || in_vain.is_multiple_of(TRIED_AGAIN) {
+            POLLS
+        } else {
+            1
+        }
+    }
+
+    /// Takes note of how a wait ended. What was there at the first poll says nothing.
+    fn learn(&self, slept: bool, polls: u32) {
+        if slept {
+            self.in_vain.set(self.in_vain.get().wrapping_add(1));
+        } else if polls > 0 {
+            self.in_vain.set(0);
+        }
+    }
 }
 
 /// Rings the bell of another process.
@@ -61,7 +99,11 @@ impl Bell {
                 .create()
                 .map_err(|e| ChannelError::new(&channel, "listen", e))
         })?;
-        Ok(Self { listener, place })
+        Ok(Self {
+            listener,
+            place,
+            polling: Polling::default(),
+        })
     }
 
     /// Blocks until a ring or until `patience` is over; whether there was a ring.
@@ -103,8 +145,8 @@ impl Ringer {
     }
 }
 
-/// Waits until `poll` yields something: polls a short while, then sleeps at the bell; while it waits, `look_after` renews
-/// connections, some twenty times a second.
+/// Waits until `poll` yields something: polls a short while, where that has helped of late, then sleeps at the bell; while
+/// it waits, `look_after` renews connections, some twenty times a second.
 ///
 /// # Errors
 /// [`Interruption::Stopped`] once `stop` is requested, and whatever `poll` or `look_after` fail with.
@@ -116,9 +158,11 @@ pub fn wait_for<T>(
 ) -> Result<T, Interruption> {
     // The clock is not read for an answer that comes while it polls.
     let mut looked_after = None;
+    let most = bell.polling.polls();
     loop {
-        for _ in 0..POLLS {
+        for polls in 0..most {
             if let Some(found) = poll()? {
+                bell.polling.learn(looked_after.is_some(), polls);
                 return Ok(found);
             }
             std::hint::spin_loop();
@@ -151,4 +195,27 @@ fn service(domain: &Domain, channel: &str) -> Result<PortFactory<ipc::Service>, 
         .max_nodes(parties)
         .open_or_create()
         .map_err(|cause| ChannelError::new(channel, "open", cause))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn who_polls_in_vain_sleeps_at_once_and_tries_again_now_and_then() {
+        let polling = Polling::default();
+        let asleep = |times| {
+            (0..times).filter(|_| {
+                let polled = polling.polls() == POLLS;
+                polling.learn(true, 0);
+                polled
+            })
+        };
+        assert_eq!(asleep(IN_VAIN).count(), IN_VAIN as usize);
+        assert_eq!(asleep(4 * TRIED_AGAIN).count(), 4);
+        polling.learn(false, 0);
+        assert_eq!(polling.polls(), 1, "what was there at once says nothing");
+        polling.learn(false, 3);
+        assert_eq!(polling.polls(), POLLS);
+    }
 }

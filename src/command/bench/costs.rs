@@ -37,7 +37,8 @@ pub(super) struct Costs {
     pub(super) acting_us: f64,
     /// The environments alone, in the process that measures.
     pub(super) environment_step_us: f64,
-    /// To the environment server's process and back, the environments' step included.
+    /// To the environment server's process and back, the environments' step included, where a forward pass comes before
+    /// each, as an actor has it.
     pub(super) round_trip_us: f64,
     /// A chunk's rows, and sending it.
     pub(super) writing_chunk_us: f64,
@@ -102,7 +103,7 @@ pub(super) fn measure(length: Duration, patience: &Patience) -> anyhow::Result<C
 
     let environment_step_us = environment_step(config, each, patience)?;
     let round_trip_us = scene.with_peer(Role::EnvServer, |domain, server| {
-        round_trip(config, domain, server, each, patience)
+        round_trip(config, domain, server, &mut inference, each, patience)
     })?;
     let mut replay = Replay::create(&scene.run.replay_file(), &scene.replay_layout())?;
     let (writing_chunk_us, intake_of_chunk_us) =
@@ -160,10 +161,12 @@ fn environment_step(config: &Config, length: Duration, patience: &Patience) -> a
     Ok(taken)
 }
 
+/// The mean over all, as it adds up in an actor's time; after a forward pass each, over which the server falls asleep.
 fn round_trip(
     config: &Config,
     domain: &Domain,
     server: &mut Peer,
+    inference: &mut Inference,
     length: Duration,
     patience: &Patience,
 ) -> anyhow::Result<f64> {
@@ -172,14 +175,27 @@ fn round_trip(
     client.describe(&bell)?;
     client.reset(&bell, Begin::Next)?;
     let actions = vec![0.5; ENVIRONMENTS * config.spec.action.width()];
-    let mut failed = None;
-    let taken = microseconds(length, patience, || match client.step(&bell, &actions) {
-        Ok(Stepped::Taken(_)) => {}
-        Ok(Stepped::Lost) => failed = Some(anyhow::anyhow!("the environment server gave up its episodes")),
-        Err(error) => failed = Some(error.into()),
-    })?;
-    server.check()?;
-    failed.map_or(Ok(taken), Err)
+    let part = length / (WINDOWS + 1);
+    let mut windows = Windows::default();
+    for window in 0..=WINDOWS {
+        patience.check()?;
+        server.check()?;
+        let (begun, mut asked, mut taken) = (Instant::now(), 0.0, Duration::ZERO);
+        while asked == 0.0 || begun.elapsed() < part {
+            inference.step();
+            let before = Instant::now();
+            if let Stepped::Lost = client.step(&bell, &actions)? {
+                bail!("the environment server gave up its episodes");
+            }
+            taken += before.elapsed();
+            asked += 1.0;
+        }
+        // The first one warms up.
+        if window > 0 {
+            windows.add(taken.as_secs_f64() * 1e6 / asked);
+        }
+    }
+    Ok(windows.median())
 }
 
 /// What a chunk costs its actor, and the learner: both in this process, which sends a window of chunks and then takes them

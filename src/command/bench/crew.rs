@@ -42,7 +42,10 @@ impl Crew {
         let paused = explorers().try_for_each(|(_, peer)| peer.pause());
         let acted = paused.is_ok().then(act);
         // Whatever happened: one that is stopped would not end either.
-        let woken = explorers().fold(Ok(()), |woken, (_, peer)| woken.and(peer.go_on()));
+        let mut woken = Ok(());
+        for (_, peer) in explorers() {
+            woken = woken.and(peer.go_on());
+        }
         paused.and(woken)?;
         acted.ok_or_else(|| anyhow::anyhow!(super::INTERRUPTED))
     }

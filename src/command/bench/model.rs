@@ -105,7 +105,9 @@ impl Stages {
         let think = if 2.0 * n + 1.0 <= cores {
             self.think
         } else {
-            self.think.max(self.think_on_one_core)
+            // The system puts a pair on one core where cores are scarce. That is not always the slower way: an idle core has
+            // to be woken for each request.
+            self.think_on_one_core
         };
         if updates {
             // A learner that makes updates can always run.
@@ -164,7 +166,7 @@ impl Stages {
 
     /// What more actors meet first on so many cores, the learner making no updates.
     pub(super) fn first_bottleneck_on(&self, cores: u32) -> Bottleneck {
-        let think = self.think.max(self.think_on_one_core);
+        let think = self.think_on_one_core;
         let actors = f64::from(cores) * think / (think + self.intake);
         let intake = self.first_bottleneck_alone(false);
         if actors < intake.actors {

@@ -48,10 +48,10 @@ impl Cores {
             set.set(core);
             set
         });
-        // The last two: a machine's first core has its interrupts.
+        // Interrupts often go to a machine's first core.
         let first = usable.next().unwrap_or(all);
         Ok(Self {
-            pair: usable.last().unwrap_or(first),
+            pair: usable.next_back().unwrap_or(first),
             others: first,
             all,
         })
