@@ -213,6 +213,7 @@ mod tests {
         };
         assert_eq!(asleep(IN_VAIN).count(), IN_VAIN as usize);
         assert_eq!(asleep(4 * TRIED_AGAIN).count(), 4);
+        polling.learn(true, 0);
         polling.learn(false, 0);
         assert_eq!(polling.polls(), 1, "what was there at once says nothing");
         polling.learn(false, 3);
