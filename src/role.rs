@@ -172,6 +172,7 @@ pub(crate) fn learner_settings(
         chunk: config.chunk_layout(),
         spec: config.spec.clone(),
         algorithm: config.algorithm.clone(),
+        threads: config.learner.threads,
         envs: config.actors.envs,
         episodes: config.run.episodes,
         ratio: Ratio {

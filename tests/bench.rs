@@ -46,16 +46,21 @@ fn number(figures: &Value, field: &str) -> f64 {
 #[test]
 fn the_learner_is_held_against_the_matrix_products() {
     let figures = figures("learner");
-    let [rate, flop, limit, share] = [
-        "updates_per_second",
-        "flop_per_update",
-        "limit_gflops",
-        "share_of_limit",
-    ]
-    .map(|field| number(&figures, field));
-    assert_eq!((flop / 1e6).round(), 140.0);
-    assert!((share - flop * rate / (limit * 1e9)).abs() < 1e-9 * share, "{figures}");
-    assert_eq!(number(&figures, "batch"), 64.0);
+    for (figures, batch, megaflop) in [(&figures, 64.0, 140.0), (&figures["large_batch"], 256.0, 560.0)] {
+        let [rate, flop, limit, share] = [
+            "updates_per_second",
+            "flop_per_update",
+            "limit_gflops",
+            "share_of_limit",
+        ]
+        .map(|field| number(figures, field));
+        assert_eq!((flop / 1e6).round(), megaflop);
+        assert!((share - flop * rate / (limit * 1e9)).abs() < 1e-9 * share, "{figures}");
+        assert_eq!(number(figures, "batch"), batch);
+    }
+    let two = &figures["two_threads"];
+    let ratio = number(two, "updates_per_second") / number(&figures, "updates_per_second");
+    assert!((number(two, "speedup") - ratio).abs() < 1e-9 * ratio, "{figures}");
     assert_eq!(number(&figures, "replay_rows"), 1e6);
 }
 

@@ -35,6 +35,8 @@ pub struct Config {
     pub actors: Actors,
     /// What is learned, and how.
     pub algorithm: Algorithm,
+    /// With what it is computed.
+    pub learner: Learner,
     /// What is remembered, and how often it is used.
     pub replay: Replay,
     /// How often the policy is judged.
@@ -110,6 +112,16 @@ pub struct Actors {
     /// The most actors the run can be scaled to.
     #[schemars(extend("unit" = "processes", "source" = "ours"))]
     pub max: u32,
+}
+
+/// With what is learned: no number that is learned depends on it.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct Learner {
+    /// Threads that share the work of each DDPG update, 1 or 2: the same bits in little more than half of the time where
+    /// there is a core for the second.
+    #[schemars(extend("unit" = "threads", "source" = "ours"))]
+    pub threads: u32,
 }
 
 /// What is remembered, and how often it is used.

@@ -1,6 +1,7 @@
 //! Adam (Kingma and Ba 2015) and the soft target update, in one sweep over the parameters.
 
-use crate::aligned::Aligned;
+use crate::aligned::{Aligned, PAGE};
+use crate::threads::Threads;
 use pulp::Arch;
 
 const BETA_1: f64 = 0.9;
@@ -33,19 +34,39 @@ impl Adam {
     }
 
     /// Takes step number `t` (from 1) of `parameters` θ against `gradient`; then `target` ← τ θ + (1 − τ) `target`
-    /// (equation 3.31). All slices are as long as the network has parameters.
+    /// (equation 3.31). All slices are as long as the network has parameters; each thread has its share of them.
     ///
     /// Bias correction as in PyTorch: θ ← θ − α / (1 − β₁ᵗ) · m / (√v / √(1 − β₂ᵗ) + ε).
-    pub fn step(&mut self, t: u64, gradient: &[f32], parameters: &mut [f32], tau: f32, target: &mut [f32]) {
+    pub fn step(
+        &mut self,
+        threads: &Threads,
+        t: u64,
+        gradient: &[f32],
+        parameters: &mut [f32],
+        tau: f32,
+        target: &mut [f32],
+    ) {
         let bias = self.bias(t);
-        let moments = self.first_moment.iter_mut().zip(self.second_moment.iter_mut());
-        let weights = parameters.iter_mut().zip(target);
-        Arch::new().dispatch(|| {
-            for ((g, (m, v)), (weight, target)) in gradient.iter().zip(moments).zip(weights) {
-                *weight -= bias.step(*g, m, v);
-                *target += tau * (*weight - *target);
-            }
-        });
+        let cut = (threads.first_share(parameters.len().div_ceil(PAGE)) * PAGE).min(parameters.len());
+        let part = |gradient: &[f32], m: &mut [f32], v: &mut [f32], parameters: &mut [f32], target: &mut [f32]| {
+            let moments = m.iter_mut().zip(v);
+            let weights = parameters.iter_mut().zip(target);
+            Arch::new().dispatch(|| {
+                for ((g, (m, v)), (weight, target)) in gradient.iter().zip(moments).zip(weights) {
+                    *weight -= bias.step(*g, m, v);
+                    *target += tau * (*weight - *target);
+                }
+            });
+        };
+        let gradient = gradient.split_at(cut);
+        let m = self.first_moment.split_at_mut(cut);
+        let v = self.second_moment.split_at_mut(cut);
+        let parameters = parameters.split_at_mut(cut);
+        let target = target.split_at_mut(cut);
+        threads.both(
+            || part(gradient.0, m.0, v.0, parameters.0, target.0),
+            || part(gradient.1, m.1, v.1, parameters.1, target.1),
+        );
     }
 
     /// As [`step`](Self::step), of a network that no target follows.
@@ -125,7 +146,7 @@ mod tests {
             let gradient: Vec<f32> = (0..count)
                 .map(|i| ((t as f32 * 0.37 + i as f32).sin() + 0.2) * 10f32.powi(i as i32 % 9 - 6))
                 .collect();
-            adam.step(t, &gradient, &mut weights, 0.01, &mut targets);
+            adam.step(&Threads::ALONE, t, &gradient, &mut weights, 0.01, &mut targets);
             for i in 0..count {
                 expected[i] = references[i].step(1e-3, gradient[i].into(), expected[i]);
                 expected_targets[i] = 0.01 * expected[i] + 0.99 * expected_targets[i];
@@ -148,7 +169,7 @@ mod tests {
         for t in 1..=20 {
             let gradient = [0.3, -0.1 * t as f32, 0.0];
             alone.step_alone(t, &gradient, &mut weights);
-            beside.step(t, &gradient, &mut same, 0.1, &mut target);
+            beside.step(&Threads::ALONE, t, &gradient, &mut same, 0.1, &mut target);
         }
         assert_eq!(weights, same);
         assert_ne!(weights[..2], [0.5; 2]);
@@ -158,9 +179,10 @@ mod tests {
     fn moments_without_gradient_end_at_zero_and_are_never_denormal() {
         let mut adam = Adam::new(1e-3, 20);
         let (mut weights, mut targets) = (vec![0.0; 20], vec![0.0; 20]);
-        adam.step(1, &[1e-9; 20], &mut weights, 0.01, &mut targets);
+        adam.step(&Threads::ALONE, 1, &[1e-9; 20], &mut weights, 0.01, &mut targets);
         for t in 2..=30_000 {
             adam.step(
+                &Threads::ALONE,
                 t,
                 &[if t < 500 { 1e-22 } else { 0.0 }; 20],
                 &mut weights,

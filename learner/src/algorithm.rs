@@ -10,6 +10,7 @@ use crate::reinforce::Reinforce;
 use crate::replay::Replay;
 use crate::replayed_ddpg::ReplayedDdpg;
 use crate::tabular::{Method, Tabular};
+use crate::threads::Threads;
 
 /// A learning method: what it does with the rows of the replay, what actors act with, and what a checkpoint keeps of it.
 pub trait Algorithm {
@@ -25,6 +26,10 @@ pub trait Algorithm {
     /// Does what is due next, on the replay as it was at `rows` rows, and counts it: an update or several. To be called
     /// while the rows allow more updates than are done.
     fn update(&mut self, replay: &Replay, rows: u64) -> Losses;
+
+    /// Shares the work of updates among these threads from now on, where there is enough of it. Not a bit of what is
+    /// learned depends on them.
+    fn set_threads(&mut self, _: Threads) {}
 
     /// All that the next update depends on besides the rows, by name.
     fn state(&self) -> Vec<Section<'_>>;

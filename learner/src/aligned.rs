@@ -3,7 +3,7 @@
 use std::ops::{Deref, DerefMut};
 
 /// `f32`s in a page of 4096 bytes.
-const PAGE: usize = 1024;
+pub const PAGE: usize = 1024;
 /// `f32`s between the places within a page where two neighbouring streams start: 512 bytes.
 const STAGGER: usize = 128;
 

@@ -10,8 +10,9 @@ use crate::aligned::Aligned;
 use crate::digest::sha256;
 use crate::initialise::initialise;
 use crate::minibatch::Minibatch;
-use crate::pass::Pass;
+use crate::pass::{Pass, Samples};
 use crate::product;
+use crate::threads::Threads;
 use nalgebra::{DMatrix, DVector};
 use shoal_common::config;
 use shoal_common::network::{ActionRange, ActionRangeError, NetworkLayout};
@@ -119,24 +120,35 @@ impl Learned {
     }
 
     /// One step of Adam along −gradient, and the target's after it.
-    fn descend(&mut self, t: u64, tau: f32) {
+    fn descend(&mut self, threads: &Threads, t: u64, tau: f32) {
         self.adam
-            .step(t, &self.gradient, &mut self.parameters, tau, &mut self.target);
+            .step(threads, t, &self.gradient, &mut self.parameters, tau, &mut self.target);
     }
 }
+
+/// Samples, or units of the first hidden layer, that are worth being cut in two. faer adds up the terms of a transposed
+/// product in another order where a dimension is 1, or the whole product small, and nobody shall see in the bits
+/// how many threads there were.
+const LEAST_CUT: usize = 4;
+/// As [`LEAST_CUT`]: samples times units of the second hidden layer.
+const LEAST_WORK: usize = 8_192;
 
 /// The learner of DDPG: both networks, their targets, both optimisers.
 #[derive(Clone, Debug)]
 pub struct Ddpg {
     range: ActionRange,
     tau: f32,
+    threads: Threads,
     updates: u64,
     actor: Learned,
     critic: Learned,
     // Room for what an update computes on its way.
     mu: Pass,
     q: Pass,
+    target_mu: Pass,
+    target_q: Pass,
     actions: DMatrix<f32>,
+    target_actions: DMatrix<f32>,
     y: DVector<f32>,
     d_q: DMatrix<f32>,
     d_mu: DMatrix<f32>,
@@ -153,16 +165,28 @@ impl Ddpg {
         Ok(Self {
             range,
             tau: settings.tau as f32,
+            threads: Threads::ALONE,
             updates: 0,
             actor: Learned::new(mu, settings.actor_learning_rate, seed, 0),
             critic: Learned::new(q, settings.critic_learning_rate, seed, 1),
             mu: Pass::new(mu, batch),
             q: Pass::new(q, batch),
+            target_mu: Pass::new(mu, batch),
+            target_q: Pass::new(q, batch),
             actions: DMatrix::zeros(action, batch),
+            target_actions: DMatrix::zeros(action, batch),
             y: DVector::zeros(batch),
             d_q: DMatrix::zeros(1, batch),
             d_mu: DMatrix::zeros(action, batch),
         })
+    }
+
+    /// Shares the work of an update among these threads from now on, if there is enough of it. Not a bit of what is computed
+    /// depends on them.
+    pub fn set_threads(&mut self, threads: Threads) {
+        let ([h1, h2], batch) = (self.critic.layout.hidden(), self.y.len());
+        let enough = h1 >= LEAST_CUT && batch >= LEAST_CUT && h2 * batch >= LEAST_WORK;
+        self.threads = if enough { threads } else { Threads::ALONE };
     }
 
     /// One update from a minibatch of N transitions: lines 12 to 16. Returns L of line 13, −mean of Q(s, μ(s)), Q after its step,
@@ -171,12 +195,12 @@ impl Ddpg {
     pub fn update(&mut self, batch: &Minibatch) -> Losses {
         assert_eq!(batch.size(), self.y.len(), "transitions in the minibatch");
         let t = self.updates + 1;
-        self.set_targets(batch);
+        self.evaluate(batch);
         let (critic_loss, q_mean) = self.critic_gradient(batch);
         // Lines 13 and 15 in one sweep: Q' is not read again in this update. Likewise μ' of lines 14 and 16.
-        self.critic.descend(t, self.tau);
+        self.critic.descend(&self.threads, t, self.tau);
         let actor_loss = self.actor_gradient(&batch.s);
-        self.actor.descend(t, self.tau);
+        self.actor.descend(&self.threads, t, self.tau);
         self.updates = t;
         Losses {
             critic_loss,
@@ -185,53 +209,83 @@ impl Ddpg {
         }
     }
 
-    /// Line 12: y = r + discount · Q'(s', μ'(s')). Nothing is asked of a terminal s', whatever it holds.
-    fn set_targets(&mut self, batch: &Minibatch) {
-        let s_next = batch.s_next.as_slice();
-        act(&mut self.mu, &self.range, &self.actor.target, s_next, &mut self.actions);
-        self.q.forward(&self.critic.target, s_next, self.actions.as_slice());
+    /// What the four networks say before any of them changes: one thread asks Q(s, a) and μ(s), the other one
+    /// Q'(s', μ'(s')). Line 12: y = r + discount · Q'(s', μ'(s')). Nothing is asked of a terminal s', whatever it holds.
+    fn evaluate(&mut self, batch: &Minibatch) {
+        let (actor, critic, range) = (&self.actor, &self.critic, &self.range);
+        let (s, a, s_next) = (batch.s.as_slice(), batch.a.as_slice(), batch.s_next.as_slice());
+        let (mu, q, actions) = (&mut self.mu, &mut self.q, &mut self.actions);
+        let (target_mu, target_q, target_actions) = (&mut self.target_mu, &mut self.target_q, &mut self.target_actions);
+        self.threads.both(
+            || {
+                act(mu, range, &actor.parameters, s, actions);
+                q.forward(&critic.parameters, s, a);
+            },
+            || {
+                act(target_mu, range, &actor.target, s_next, target_actions);
+                target_q.forward(&critic.target, s_next, target_actions.as_slice());
+            },
+        );
         for (i, y) in self.y.iter_mut().enumerate() {
             let discount = batch.discount[i];
             *y = batch.r[i]
                 + if discount == 0.0 {
                     0.0
                 } else {
-                    discount * self.q.output[i]
+                    discount * self.target_q.output[i]
                 };
         }
     }
 
     /// Line 13: the gradient of L = 1/N Σ (y − Q(s, a))², through ∂L/∂Q = 2/N (Q − y). Returns L and the mean of Q.
     fn critic_gradient(&mut self, batch: &Minibatch) -> (f32, f32) {
-        let (s, a) = (batch.s.as_slice(), batch.a.as_slice());
-        self.q.forward(&self.critic.parameters, s, a);
         let scale = 2.0 / batch.size() as f32;
         for (d, (q, y)) in self.d_q.iter_mut().zip(self.q.output.iter().zip(&self.y)) {
             *d = scale * (q - y);
         }
+        let (parameters, gradient) = (&self.critic.parameters, &mut self.critic.gradient);
         self.q
-            .backward(&self.critic.parameters, s, &self.d_q, &mut self.critic.gradient);
+            .backward(&self.threads, parameters, batch.s.as_slice(), &self.d_q, gradient);
         let loss = mean(self.q.output.iter().zip(&self.y).map(|(q, y)| (y - q) * (y - q)));
         (loss, mean(self.q.output.iter().copied()))
     }
 
     /// Line 14 and equation 3.30: the gradient of −1/N Σ Q(s, μ(s)), which descending ascends Q, through the critic as line
-    /// 13 left it: ∇_a Q · ∇_θμ μ. Returns the loss.
+    /// 13 left it: ∇_a Q · ∇_θμ μ. Returns the loss. Up to the gradients of θ_μ, samples have nothing to do with each other,
+    /// and each thread has its share of them.
     fn actor_gradient(&mut self, s: &DMatrix<f32>) -> f32 {
-        let s = s.as_slice();
-        act(&mut self.mu, &self.range, &self.actor.parameters, s, &mut self.actions);
-        self.q.forward(&self.critic.parameters, s, self.actions.as_slice());
+        let (actor, critic, half) = (&self.actor, &self.critic, self.range.half());
         self.d_q.fill(-1.0 / self.y.len() as f32);
-        self.q
-            .backward_to_late_inputs(&self.critic.parameters, &self.d_q, &mut self.d_mu);
-        // a = centre + half · tanh z, so ∂a/∂z = half · (1 − tanh² z)
-        for (mut d, tanh) in self.d_mu.column_iter_mut().zip(self.mu.output.column_iter()) {
-            for (element, half) in self.range.half().iter().enumerate() {
-                d[element] *= half * (1.0 - tanh[element] * tanh[element]);
+        let cut = self.threads.first_share(self.y.len());
+        let per_sample = |matrix: &DMatrix<f32>| cut * matrix.nrows();
+        let part = |mut mu: Samples<'_>, mut q: Samples<'_>, s, actions, d_q, d_mu: &mut [f32]| {
+            q.forward(&critic.parameters, s, actions);
+            q.backward_to_second_layer(&critic.parameters, d_q);
+            q.backward_to_late_inputs(&critic.parameters, d_mu);
+            // a = centre + half · tanh z, so ∂a/∂z = half · (1 − tanh² z)
+            for (d, tanh) in d_mu
+                .chunks_exact_mut(half.len())
+                .zip(mu.output.chunks_exact(half.len()))
+            {
+                for ((d, tanh), half) in d.iter_mut().zip(tanh).zip(half) {
+                    *d *= half * (1.0 - tanh * tanh);
+                }
             }
-        }
+            mu.backward_to_second_layer(&actor.parameters, d_mu);
+        };
+        let (observations, actions) = (s.as_slice().split_at(per_sample(s)), &self.actions);
+        let actions = actions.as_slice().split_at(per_sample(actions));
+        let d_q = self.d_q.as_slice().split_at(cut);
+        let d_mu_cut = per_sample(&self.d_mu);
+        let d_mu = self.d_mu.as_mut_slice().split_at_mut(d_mu_cut);
+        let (mu, q) = (self.mu.samples().split_at(cut), self.q.samples().split_at(cut));
+        self.threads.both(
+            || part(mu.0, q.0, observations.0, actions.0, d_q.0, d_mu.0),
+            || part(mu.1, q.1, observations.1, actions.1, d_q.1, d_mu.1),
+        );
+        let (parameters, gradient) = (&self.actor.parameters, &mut self.actor.gradient);
         self.mu
-            .backward(&self.actor.parameters, s, &self.d_mu, &mut self.actor.gradient);
+            .gradients(&self.threads, parameters, s.as_slice(), &self.d_mu, gradient);
         -mean(self.q.output.iter().copied())
     }
 

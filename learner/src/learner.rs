@@ -23,6 +23,7 @@ use crate::algorithm::Algorithm;
 use crate::checkpoint::{Checkpoints, Counters};
 use crate::intake::Intake;
 use crate::replay::{Replay, SyncedRows};
+use crate::threads::Threads;
 pub use settings::{LearnerError, Settings};
 
 const REPORT_INTERVAL: Duration = Duration::from_millis(500);
@@ -108,6 +109,9 @@ pub(crate) struct Learner<'a> {
 impl<'a> Learner<'a> {
     fn new(domain: &'a Domain, settings: &'a Settings, stop: &'a Stop) -> Result<Self, LearnerError> {
         let mut algorithm = settings.method()?;
+        if settings.threads > 1 {
+            algorithm.set_threads(Threads::two()?);
+        }
         let bell = Bell::hang(domain, Place(Role::Learner, 0))?;
         let layout = settings.replay_layout();
         let replay = if settings.replay.exists() {

@@ -20,3 +20,4 @@ pub mod replay;
 pub mod replayed_ddpg;
 pub mod sampling;
 pub mod tabular;
+pub mod threads;

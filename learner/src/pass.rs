@@ -1,9 +1,12 @@
 //! One network over one batch: forward, keeping the activations, and by hand backward through them.
 
 use crate::product::{input_gradient, weight_gradient};
+use crate::threads::Threads;
+use faer::reborrow::{Reborrow, ReborrowMut};
+use faer::{MatMut, MatRef};
 use nalgebra::DMatrix;
 use pulp::Arch;
-use shoal_common::network::{Activations, NetworkLayout};
+use shoal_common::network::{Activations, NetworkLayout, matrix, matrix_mut};
 
 /// The activations of a forward pass and room for their gradients; one column a sample.
 #[derive(Clone, Debug)]
@@ -34,77 +37,164 @@ impl Pass {
 
     /// Computes `output` for inputs `x` and late inputs `late` (empty where the network has none).
     pub fn forward(&mut self, parameters: &[f32], x: &[f32], late: &[f32]) {
-        let to = Activations {
-            h1: self.h1.as_mut_slice(),
-            h2: self.h2.as_mut_slice(),
-            output: self.output.as_mut_slice(),
-        };
-        self.layout.forward(parameters, x, late, to);
+        self.samples().forward(parameters, x, late);
     }
 
     /// Writes ∂L/∂θ, laid out as the parameters θ, into `gradient`, given `d` = ∂L/∂output of the forward pass that
     /// went before, with the same parameters and inputs.
-    pub fn backward(&mut self, parameters: &[f32], x: &[f32], d: &DMatrix<f32>, gradient: &mut [f32]) {
-        let [_, second, third] = self.layout.layers(parameters);
-        let [g1, g2, g3] = self.layout.layer_ranges();
-        let [h1, h2] = self.layout.hidden();
-
-        weight_gradient(d, self.h2.as_slice(), &mut gradient[g3.weights]);
-        sum_columns(d.as_slice(), &mut gradient[g3.biases]);
-
-        input_gradient(third.weights, d, &mut self.d2);
-        mask_and_sum_columns(&mut self.d2, &self.h2, &mut gradient[g2.biases]);
-        weight_gradient(&self.d2, self.h1.as_slice(), &mut gradient[g2.weights]);
-
-        input_gradient(&second.weights[..h1 * h2], &self.d2, &mut self.d1);
-        mask_and_sum_columns(&mut self.d1, &self.h1, &mut gradient[g1.biases]);
-        weight_gradient(&self.d1, x, &mut gradient[g1.weights]);
+    pub fn backward(
+        &mut self,
+        threads: &Threads,
+        parameters: &[f32],
+        x: &[f32],
+        d: &DMatrix<f32>,
+        gradient: &mut [f32],
+    ) {
+        self.samples().backward_to_second_layer(parameters, d.as_slice());
+        self.gradients(threads, parameters, x, d, gradient);
     }
 
-    /// Writes ∂L/∂late into `to`, given `d` = ∂L/∂output of the forward pass that went before. Nothing below the second
-    /// hidden layer is looked at: late inputs reach no further down.
-    pub fn backward_to_late_inputs(&mut self, parameters: &[f32], d: &DMatrix<f32>, to: &mut DMatrix<f32>) {
-        let [_, second, third] = self.layout.layers(parameters);
-        let [h1, h2] = self.layout.hidden();
-        input_gradient(third.weights, d, &mut self.d2);
-        mask(&mut self.d2, &self.h2);
-        input_gradient(&second.weights[h1 * h2..], &self.d2, to);
+    /// All samples.
+    pub fn samples(&mut self) -> Samples<'_> {
+        Samples {
+            layout: &self.layout,
+            h1: self.h1.as_mut_slice(),
+            h2: self.h2.as_mut_slice(),
+            output: self.output.as_mut_slice(),
+            d2: self.d2.as_mut_slice(),
+        }
+    }
+
+    /// What is left of [`backward`](Self::backward) once [`Samples::backward_to_second_layer`] was called for all samples.
+    /// Each thread has its share of the first hidden layer's units: the weights they are multiplied by, and the
+    /// gradient that is passed down to them.
+    pub fn gradients(
+        &mut self,
+        threads: &Threads,
+        parameters: &[f32],
+        x: &[f32],
+        d: &DMatrix<f32>,
+        gradient: &mut [f32],
+    ) {
+        let [_, second, _] = self.layout.layers(parameters);
+        let [(inputs, h1), (inputs_2, h2), (_, outputs)] = self.layout.layer_sizes();
+        let [g1, g2, g3] = self.layout.layer_ranges();
+        let (gradient_1, rest) = gradient.split_at_mut(g1.biases.end);
+        let (gradient_2, gradient_3) = rest.split_at_mut(g2.biases.end - g1.biases.end);
+        let (w1, b1) = gradient_1.split_at_mut(g1.weights.len());
+        let (w2, b2) = gradient_2.split_at_mut(g2.weights.len());
+        let (w3, b3) = gradient_3.split_at_mut(g3.weights.len());
+
+        let (d2, d3) = (matrix(self.d2.as_slice(), h2), matrix(d.as_slice(), outputs));
+        weight_gradient(d3, matrix(self.h2.as_slice(), h2), matrix_mut(w3, outputs));
+        sum_columns(d3, b3);
+        sum_columns(d2, b2);
+
+        let cut = threads.first_share(h1);
+        let part = |w2: MatRef<'_, f32>, h1: MatRef<'_, f32>, mut d1: MatMut<'_, f32>, to: [MatMut<'_, f32>; 2], b1| {
+            let [to_w1, to_w2] = to;
+            weight_gradient(d2, h1, to_w2);
+            input_gradient(w2, d2, d1.rb_mut());
+            mask(d1.rb_mut(), h1);
+            sum_columns(d1.rb(), b1);
+            weight_gradient(d1.rb(), matrix(x, inputs), to_w1);
+        };
+        // The late inputs, which come last, are the second thread's, or the only one's.
+        let weights = matrix(&second.weights[..h1 * h2], h2).split_at_col(cut);
+        let units = matrix(self.h1.as_slice(), inputs_2).split_at_row(cut);
+        let d1 = matrix_mut(self.d1.as_mut_slice(), h1).split_at_row_mut(cut);
+        let w1 = matrix_mut(w1, h1).split_at_row_mut(cut);
+        let w2 = matrix_mut(w2, h2).split_at_col_mut(cut);
+        let b1 = b1.split_at_mut(cut);
+        threads.both(
+            || part(weights.0, units.0, d1.0, [w1.0, w2.0], b1.0),
+            || part(weights.1, units.1, d1.1, [w1.1, w2.1], b1.1),
+        );
     }
 }
 
-/// d ← d where the unit was active, else 0: from ∂L/∂h to ∂L/∂z through h = max(z, 0). `sum` becomes the sum of d's
-/// columns, ∂L/∂b. `h` may have more rows than `d`.
-fn mask_and_sum_columns(d: &mut DMatrix<f32>, h: &DMatrix<f32>, sum: &mut [f32]) {
-    let (units, rows) = (d.nrows(), h.nrows());
-    let columns = d
-        .as_mut_slice()
-        .chunks_exact_mut(units)
-        .zip(h.as_slice().chunks_exact(rows));
-    sum.fill(0.0);
+/// Some samples of a [`Pass`], neighbours of each other.
+#[derive(Debug)]
+pub struct Samples<'a> {
+    layout: &'a NetworkLayout,
+    h1: &'a mut [f32],
+    h2: &'a mut [f32],
+    /// The output layer's values, linear.
+    pub output: &'a mut [f32],
+    d2: &'a mut [f32],
+}
+
+impl<'a> Samples<'a> {
+    /// The first so many, and the others.
+    pub fn split_at(self, samples: usize) -> (Self, Self) {
+        let [_, (inputs_2, h2), (_, outputs)] = self.layout.layer_sizes();
+        let h1 = self.h1.split_at_mut(samples * inputs_2);
+        let [h2, d2] = [self.h2, self.d2].map(|numbers| numbers.split_at_mut(samples * h2));
+        let output = self.output.split_at_mut(samples * outputs);
+        let part = |h1: &'a mut [f32], h2, output, d2| Self {
+            layout: self.layout,
+            h1,
+            h2,
+            output,
+            d2,
+        };
+        (part(h1.0, h2.0, output.0, d2.0), part(h1.1, h2.1, output.1, d2.1))
+    }
+
+    /// As [`Pass::forward`], of these samples.
+    pub fn forward(&mut self, parameters: &[f32], x: &[f32], late: &[f32]) {
+        let to = Activations {
+            h1: self.h1,
+            h2: self.h2,
+            output: self.output,
+        };
+        self.layout.forward(parameters, x, late, to);
+    }
+
+    /// Computes ∂L/∂z of the second hidden layer, given `d` = ∂L/∂output of the forward pass that went before.
+    pub fn backward_to_second_layer(&mut self, parameters: &[f32], d: &[f32]) {
+        let [_, _, third] = self.layout.layers(parameters);
+        let [_, (_, h2), (_, outputs)] = self.layout.layer_sizes();
+        let mut d2 = matrix_mut(self.d2, h2);
+        input_gradient(matrix(third.weights, outputs), matrix(d, outputs), d2.rb_mut());
+        mask(d2, matrix(self.h2, h2));
+    }
+
+    /// Writes ∂L/∂late into `to`, once that of the second hidden layer is there. Nothing below that is looked at: late
+    /// inputs reach no further down.
+    pub fn backward_to_late_inputs(&self, parameters: &[f32], to: &mut [f32]) {
+        let [_, second, _] = self.layout.layers(parameters);
+        let [h1, h2] = self.layout.hidden();
+        let late = matrix(&second.weights[h1 * h2..], h2);
+        input_gradient(late, matrix(self.d2, h2), matrix_mut(to, self.layout.late_inputs()));
+    }
+}
+
+/// d ← d where the unit was active, else 0: from ∂L/∂h to ∂L/∂z through h = max(z, 0). `h` may have more rows than `d`.
+fn mask(d: MatMut<'_, f32>, h: MatRef<'_, f32>) {
     Arch::new().dispatch(|| {
-        for (d, h) in columns {
-            for ((d, h), sum) in d.iter_mut().zip(h).zip(sum.iter_mut()) {
+        for (d, h) in d.col_iter_mut().zip(h.col_iter()) {
+            let (Some(d), Some(h)) = (d.try_as_col_major_mut(), h.try_as_col_major()) else {
+                unreachable!("columns lie in one piece");
+            };
+            for (d, h) in d.as_slice_mut().iter_mut().zip(h.as_slice()) {
                 *d = if *h > 0.0 { *d } else { 0.0 };
-                *sum += *d;
             }
         }
     });
 }
 
-/// As [`mask_and_sum_columns`], without the sum.
-fn mask(d: &mut DMatrix<f32>, h: &DMatrix<f32>) {
+/// The sum over the samples, ∂L/∂b.
+fn sum_columns(d: MatRef<'_, f32>, sum: &mut [f32]) {
+    sum.fill(0.0);
     Arch::new().dispatch(|| {
-        for (d, h) in d.iter_mut().zip(h.iter()) {
-            *d = if *h > 0.0 { *d } else { 0.0 };
+        for d in d.col_iter() {
+            let Some(d) = d.try_as_col_major() else {
+                unreachable!("columns lie in one piece");
+            };
+            for (sum, d) in sum.iter_mut().zip(d.as_slice()) {
+                *sum += *d;
+            }
         }
     });
-}
-
-fn sum_columns(d: &[f32], sum: &mut [f32]) {
-    sum.fill(0.0);
-    for column in d.chunks_exact(sum.len()) {
-        for (sum, d) in sum.iter_mut().zip(column) {
-            *sum += d;
-        }
-    }
 }

@@ -1,34 +1,17 @@
 //! The matrix products of an update: those of the backward pass, and a list of all of them for the benchmark.
 
 use faer::linalg::matmul::matmul;
-use faer::{Accum, Par};
-use nalgebra::DMatrix;
-use shoal_common::network::{NetworkLayout, matrix, matrix_mut};
+use faer::{Accum, MatMut, MatRef, Par};
+use shoal_common::network::NetworkLayout;
 
 /// ∂L/∂W = d xᵀ, summed over the batch: `d` is ∂L/∂z of the layer's outputs, `x` its inputs, one column a sample.
-pub fn weight_gradient(d: &DMatrix<f32>, x: &[f32], gradient: &mut [f32]) {
-    let x = matrix(x, x.len() / d.ncols());
-    matmul(
-        matrix_mut(gradient, d.nrows()),
-        Accum::Replace,
-        matrix(d.as_slice(), d.nrows()),
-        x.transpose(),
-        1.0,
-        Par::Seq,
-    );
+pub fn weight_gradient(d: MatRef<'_, f32>, x: MatRef<'_, f32>, gradient: MatMut<'_, f32>) {
+    matmul(gradient, Accum::Replace, d, x.transpose(), 1.0, Par::Seq);
 }
 
 /// ∂L/∂x = Wᵀ d, column by column: the gradient a layer of weights `w` passes down to its inputs.
-pub fn input_gradient(w: &[f32], d: &DMatrix<f32>, to: &mut DMatrix<f32>) {
-    let inputs = to.nrows();
-    matmul(
-        matrix_mut(to.as_mut_slice(), inputs),
-        Accum::Replace,
-        matrix(w, d.nrows()).transpose(),
-        matrix(d.as_slice(), d.nrows()),
-        1.0,
-        Par::Seq,
-    );
+pub fn input_gradient(w: MatRef<'_, f32>, d: MatRef<'_, f32>, to: MatMut<'_, f32>) {
+    matmul(to, Accum::Replace, w.transpose(), d, 1.0, Par::Seq);
 }
 
 /// Which factor of a product is read transposed (all are stored column-major).
@@ -106,18 +89,20 @@ pub fn flop_per_update(actor: &NetworkLayout, critic: &NetworkLayout, batch: usi
 #[cfg(test)]
 mod tests {
     use super::*;
+    use faer::Mat;
 
     #[test]
     fn gradients_are_the_transposed_products() {
-        let d = DMatrix::from_fn(4, 5, |i, j| (i * 5 + j) as f32 - 7.0);
-        let x = DMatrix::from_fn(3, 5, |i, j| (i + 2 * j) as f32 - 3.0);
-        let w = DMatrix::from_fn(4, 3, |i, j| (3 * i + j) as f32 - 5.0);
-        let mut dw = DMatrix::from_element(4, 3, f32::NAN);
-        weight_gradient(&d, x.as_slice(), dw.as_mut_slice());
-        assert_eq!(dw, &d * x.transpose());
-        let mut dx = DMatrix::from_element(3, 5, f32::NAN);
-        input_gradient(w.as_slice(), &d, &mut dx);
-        assert_eq!(dx, w.transpose() * &d);
+        let d = Mat::from_fn(4, 5, |i, j| (i * 5 + j) as f32 - 7.0);
+        let x = Mat::from_fn(3, 5, |i, j| (i + 2 * j) as f32 - 3.0);
+        let w = Mat::from_fn(4, 3, |i, j| (3 * i + j) as f32 - 5.0);
+        let sum = |terms: &dyn Fn(usize) -> f32, count| (0..count).map(terms).sum::<f32>();
+        let mut dw = Mat::full(4, 3, f32::NAN);
+        weight_gradient(d.as_ref(), x.as_ref(), dw.as_mut());
+        assert_eq!(dw, Mat::from_fn(4, 3, |i, j| sum(&|k| d[(i, k)] * x[(j, k)], 5)));
+        let mut dx = Mat::full(3, 5, f32::NAN);
+        input_gradient(w.as_ref(), d.as_ref(), dx.as_mut());
+        assert_eq!(dx, Mat::from_fn(3, 5, |i, j| sum(&|k| w[(k, i)] * d[(k, j)], 4)));
     }
 
     #[test]

@@ -21,6 +21,7 @@ use crate::checkpoint::{Checkpoint, SectionError};
 use crate::initialise::glorot;
 use crate::pass::Pass;
 use crate::replay::Replay;
+use crate::threads::Threads;
 
 /// Added to a standard deviation before it divides. An episode whose returns are all equal then weighs nothing.
 const SPREAD_FLOOR: f32 = 1e-8;
@@ -57,8 +58,13 @@ impl Learned {
     /// One step of Adam against the gradient that the first `steps` columns of `d` make of the pass before.
     fn descend(&mut self, t: u64, steps: usize, s: &DMatrix<f32>) {
         self.d.columns_mut(steps, s.ncols() - steps).fill(0.0);
-        self.pass
-            .backward(&self.parameters, s.as_slice(), &self.d, &mut self.gradient);
+        self.pass.backward(
+            &Threads::ALONE,
+            &self.parameters,
+            s.as_slice(),
+            &self.d,
+            &mut self.gradient,
+        );
         self.adam.step_alone(t, &self.gradient, &mut self.parameters);
     }
 }

@@ -11,6 +11,7 @@ use crate::ddpg::{Ddpg, DdpgError, DdpgSettings, DdpgState};
 use crate::minibatch::Minibatch;
 use crate::replay::Replay;
 use crate::sampling::Sampler;
+use crate::threads::Threads;
 
 /// DDPG and its way of drawing from the replay.
 #[derive(Debug)]
@@ -58,6 +59,10 @@ impl Algorithm for ReplayedDdpg {
         self.sampler.indices(self.ddpg.updates(), window, &mut self.indices);
         self.batch.gather(replay, &self.indices);
         self.ddpg.update(&self.batch)
+    }
+
+    fn set_threads(&mut self, threads: Threads) {
+        self.ddpg.set_threads(threads);
     }
 
     fn state(&self) -> Vec<Section<'_>> {

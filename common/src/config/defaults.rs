@@ -1,6 +1,8 @@
 //! What a configuration is where nothing else is said: the thesis's numbers where it prints them (sections 4.1 to 4.3).
 
-use super::{Actors, Checkpoint, Ddpg, Evaluation, Exploration, Mode, Reinforce, Replay, Run, Tabular, Weight};
+use super::{
+    Actors, Checkpoint, Ddpg, Evaluation, Exploration, Learner, Mode, Reinforce, Replay, Run, Tabular, Weight,
+};
 
 impl Default for Run {
     fn default() -> Self {
@@ -45,6 +47,12 @@ impl Default for Ddpg {
             critic_learning_rate: 1e-3,
             batch: 64,
         }
+    }
+}
+
+impl Default for Learner {
+    fn default() -> Self {
+        Self { threads: 1 }
     }
 }
 

@@ -6,7 +6,7 @@ use serde::Serialize;
 use serde_json::Value;
 use toml::Table;
 
-use super::{Actors, Checkpoint, Ddpg, Environment, Evaluation, Exploration, Reinforce, Replay, Run, Tabular};
+use super::{Actors, Checkpoint, Ddpg, Environment, Evaluation, Exploration, Learner, Reinforce, Replay, Run, Tabular};
 
 /// What is to be known of a key.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -49,6 +49,7 @@ pub fn sections() -> Vec<Section> {
         section::<Reinforce>("reinforce"),
         section::<Tabular>("q-learning"),
         section::<Tabular>("sarsa"),
+        section::<Learner>("learner"),
         section::<Replay>("replay"),
         section::<Evaluation>("evaluation"),
         section::<Checkpoint>("checkpoint"),

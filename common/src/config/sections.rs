@@ -3,7 +3,8 @@
 use serde::{Deserialize, Serialize};
 
 use super::{
-    Actors, Algorithm, Checkpoint, Config, Ddpg, Environment, Evaluation, Exploration, Reinforce, Replay, Run, Tabular,
+    Actors, Algorithm, Checkpoint, Config, Ddpg, Environment, Evaluation, Exploration, Learner, Reinforce, Replay, Run,
+    Tabular,
 };
 use crate::space::EnvironmentSpec;
 
@@ -21,6 +22,8 @@ pub(super) struct Sections {
     #[serde(rename = "q-learning")]
     q_learning: Option<Tabular>,
     sarsa: Option<Tabular>,
+    #[serde(default)]
+    learner: Learner,
     #[serde(default)]
     replay: Replay,
     #[serde(default)]
@@ -64,6 +67,7 @@ impl TryFrom<Sections> for Config {
             spec: sections.spec,
             actors: sections.actors,
             algorithm,
+            learner: sections.learner,
             replay: sections.replay,
             evaluation: sections.evaluation,
             checkpoint: sections.checkpoint,
@@ -83,6 +87,7 @@ impl From<Config> for Sections {
             reinforce: None,
             q_learning: None,
             sarsa: None,
+            learner: config.learner,
             replay: config.replay,
             evaluation: config.evaluation,
             checkpoint: config.checkpoint,

@@ -146,7 +146,7 @@ fn assert_is_gradient_of(loss: impl Fn(&[f64]) -> f64, gradient: &[f32], paramet
 fn the_critics_gradient_is_that_of_its_loss() {
     for seed in 0..10 {
         let (mut ddpg, batch) = (learner(seed), minibatch(seed));
-        ddpg.set_targets(&batch);
+        ddpg.evaluate(&batch);
         let (loss, _) = ddpg.critic_gradient(&batch);
         let theta = &ddpg.critic.parameters;
         assert!((f64::from(loss) - critic_loss(&ddpg, &wide(theta), &batch)).abs() < 1e-5);
@@ -158,6 +158,7 @@ fn the_critics_gradient_is_that_of_its_loss() {
 fn the_actors_gradient_is_that_of_its_loss() {
     for seed in 0..10 {
         let (mut ddpg, batch) = (learner(seed), minibatch(seed));
+        ddpg.evaluate(&batch);
         let loss = ddpg.actor_gradient(&batch.s);
         let theta = &ddpg.actor.parameters;
         assert!((f64::from(loss) - actor_loss(&ddpg, &wide(theta), &batch)).abs() < 1e-5);
@@ -194,6 +195,43 @@ fn the_same_seed_gives_the_same_bits() {
     };
     assert_eq!(run(1), run(1));
     assert_ne!(run(1), run(2));
+}
+
+/// Products are cut where a kernel's blocks are not, at sizes that are no multiples of anything, and not where they are small.
+#[test]
+fn two_threads_compute_the_same_bits_as_one() {
+    for (hidden, size) in [
+        ([400, 300], 64),
+        ([131, 267], 33),
+        ([4, 2_049], 4),
+        ([5, 8_192], 2),
+        ([2, 300], 64),
+        ([9, 7], BATCH),
+    ] {
+        let settings = DdpgSettings {
+            hidden,
+            batch: size,
+            ..settings()
+        };
+        let run = |threads: Threads| {
+            let mut ddpg = Ddpg::new(&spec(), &settings, 1).unwrap();
+            ddpg.set_threads(threads);
+            let mut batch = Minibatch::new(RowLayout::new(3, 2), size);
+            for t in 0..10 {
+                let mut numbers = stream(t, Purpose::Environment, 0, 0);
+                for matrix in [&mut batch.s, &mut batch.a, &mut batch.s_next] {
+                    matrix.iter_mut().for_each(|x| *x = numbers.random_range(-2.0..2.0));
+                }
+                batch.r.iter_mut().for_each(|x| *x = numbers.random_range(-1.0..1.0));
+                batch.discount.fill(0.99);
+                ddpg.update(&batch);
+            }
+            ddpg.digest()
+        };
+        // A thread can have a second one beside it only once.
+        let shared = std::thread::scope(|scope| scope.spawn(|| run(Threads::two().unwrap())).join().unwrap());
+        assert_eq!(shared, run(Threads::ALONE), "{hidden:?}, batch {size}");
+    }
 }
 
 #[test]

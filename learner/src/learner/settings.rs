@@ -14,6 +14,7 @@ use crate::checkpoint::{CheckpointError, SectionError};
 use crate::intake::IntakeError;
 use crate::ratio::Ratio;
 use crate::replay::{ReplayError, ReplayLayout};
+use crate::threads::ThreadsError;
 
 /// What a learner is told.
 #[derive(Clone, Debug)]
@@ -38,6 +39,8 @@ pub struct Settings {
     pub spec: EnvironmentSpec,
     /// What is learned, and how.
     pub algorithm: config::Algorithm,
+    /// Threads that share an update, 1 or 2.
+    pub threads: u32,
     /// Environments of each actor.
     pub envs: u32,
     /// Episodes after which training ends, if that is before `steps`.
@@ -83,6 +86,9 @@ pub enum LearnerError {
     /// The algorithm cannot learn this.
     #[error(transparent)]
     Algorithm(#[from] AlgorithmError),
+    /// There is no second thread.
+    #[error(transparent)]
+    Threads(#[from] ThreadsError),
     /// The policy cannot be left behind.
     #[error(transparent)]
     PolicyFile(#[from] PolicyFileError),

@@ -5,13 +5,14 @@ use std::time::Duration;
 use anyhow::Context;
 use serde::Serialize;
 use shoal_common::commit::ChunkMark;
-use shoal_common::config::Config;
+use shoal_common::config::{self, Config};
 use shoal_common::stream::{Purpose, stream};
 use shoal_learner::algorithm::Algorithm;
 use shoal_learner::ddpg::Ddpg;
 use shoal_learner::product::products_of_update;
 use shoal_learner::replay::Replay;
 use shoal_learner::replayed_ddpg::ReplayedDdpg;
+use shoal_learner::threads::Threads;
 
 use super::product::Multiplication;
 use super::rows::{ENVIRONMENTS, Rows};
@@ -21,18 +22,33 @@ use super::{Figures, Patience};
 
 const WINDOW: Duration = Duration::from_millis(100);
 
-/// Updates, the fastest product and all products take turns: each gets a third of the time.
-const SHARE: f64 = 1.0 / 3.0;
+/// In one round of windows: updates, the fastest product and all products, at both sizes of a minibatch, and updates by
+/// two threads. Each gets as much of the time.
+const SHARE: f64 = 1.0 / 7.0;
+
+/// A minibatch that is not the configured one: large enough for Adam to weigh little.
+const LARGE_BATCH: usize = 256;
 
 /// Attempts at each shape by each kernel, of which the best counts when the kernels and shapes are compared.
 const ATTEMPTS: usize = 10;
 
 /// Part of the time that goes before: until Adam's moments and the caches are as they stay.
-const WARM_UP: f64 = 0.1;
+const WARM_UP: f64 = 0.05;
 
 /// The fields of `bench learner --json`.
 #[derive(Serialize)]
 pub(super) struct LearnerFigures {
+    #[serde(flatten)]
+    configured: Figure,
+    large_batch: Figure,
+    two_threads: TwoThreads,
+    replay_rows: u64,
+}
+
+/// One thread, with minibatches of one size.
+#[derive(Serialize)]
+struct Figure {
+    batch: usize,
     updates_per_second: f64,
     /// Of the matrix products alone.
     flop_per_update: u64,
@@ -44,9 +60,6 @@ pub(super) struct LearnerFigures {
     /// All products of an update one after the other, each by its fastest kernel, small ones and all.
     products_gflops: f64,
     share_of_products: f64,
-    batch: usize,
-    replay_rows: u64,
-    threads: u32,
     #[serde(skip)]
     updates: Windows,
     #[serde(skip)]
@@ -55,75 +68,141 @@ pub(super) struct LearnerFigures {
     products: Windows,
 }
 
+/// The configured minibatch, its updates shared by two threads.
+#[derive(Serialize)]
+struct TwoThreads {
+    updates_per_second: f64,
+    /// Against one thread.
+    speedup: f64,
+    #[serde(skip)]
+    updates: Windows,
+}
+
 pub(super) fn measure(patience: &Patience) -> anyhow::Result<LearnerFigures> {
     let scene = Scene::new(&[])?;
     let replay = Replay::create(&scene.run.replay_file(), &scene.replay_layout())?;
     // Mapped as ever, and gone from the directory whatever becomes of this process.
     let config = scene.remove_directory()?;
-    let mut learner = Learner::new(&config, replay, patience)?;
-    let (mut list, mut fastest) = multiplications(&config, &learner.method.ddpg, learner.batch);
+    let replay = filled(&config, replay, patience)?;
 
-    window::rate(patience.length.mul_f64(WARM_UP), || learner.update());
-    let (mut updates, mut limit, mut products) = (Windows::default(), Windows::default(), Windows::default());
-    let flop = learner.method.ddpg.flop_per_update();
+    let batch = ddpg(&config)?.batch;
+    let mut configured = Case::new(&config, batch)?;
+    let mut large = Case::new(&config, LARGE_BATCH)?;
+    let mut shared = method(&config, batch)?;
+    shared.set_threads(Threads::two()?);
+    let mut updates_of_two = Windows::default();
+    for method in [&mut configured.method, &mut large.method, &mut shared] {
+        window::rate(patience.length.mul_f64(WARM_UP), || update(method, &replay));
+    }
     for _ in 0..window::count(patience.length, SHARE, WINDOW) {
         patience.check()?;
-        updates.add(window::rate(WINDOW, || learner.update()));
-        limit.add(fastest.gflops(WINDOW));
-        products.add(window::rate(WINDOW, || list.multiply_all()) * flop as f64 / 1e9);
+        configured.measure(&replay);
+        updates_of_two.add(window::rate(WINDOW, || update(&mut shared, &replay)));
+        large.measure(&replay);
     }
 
-    let achieved = flop as f64 * updates.median() / 1e9;
+    let configured = configured.figure();
     Ok(LearnerFigures {
-        updates_per_second: updates.median(),
-        flop_per_update: flop,
-        limit_gflops: limit.median(),
-        share_of_limit: achieved / limit.median(),
-        limit_product: fastest.shape(),
-        limit_kernel: fastest.kernel.name(),
-        products_gflops: products.median(),
-        share_of_products: achieved / products.median(),
-        batch: learner.batch,
-        replay_rows: learner.replay.head(),
-        threads: 1,
-        updates,
-        limit,
-        products,
+        two_threads: TwoThreads {
+            updates_per_second: updates_of_two.median(),
+            speedup: updates_of_two.median() / configured.updates_per_second,
+            updates: updates_of_two,
+        },
+        configured,
+        large_batch: large.figure(),
+        replay_rows: replay.head(),
     })
 }
 
-/// What a learner updates with, as in its loop.
-struct Learner {
-    method: ReplayedDdpg,
-    batch: usize,
-    replay: Replay,
+/// A replay that is filled to its capacity.
+fn filled(config: &Config, mut replay: Replay, patience: &Patience) -> anyhow::Result<Replay> {
+    let row = config.row_layout();
+    let mut rows = Rows::new(config)?;
+    let mut chunk = vec![0.0; ENVIRONMENTS * row.width()];
+    for sequence in 1..=config.replay.capacity / ENVIRONMENTS as u64 {
+        patience.check()?;
+        rows.fill(&mut chunk)?;
+        let mark = ChunkMark {
+            incarnation: 1,
+            sequence,
+        };
+        replay.append_and_commit(0, mark, &chunk).context("the replay")?;
+    }
+    Ok(replay)
 }
 
-impl Learner {
-    /// New networks, and a replay that is filled to its capacity.
-    fn new(config: &Config, mut replay: Replay, patience: &Patience) -> anyhow::Result<Self> {
-        let row = config.row_layout();
-        let mut rows = Rows::new(config)?;
-        let mut chunk = vec![0.0; ENVIRONMENTS * row.width()];
-        for sequence in 1..=config.replay.capacity / ENVIRONMENTS as u64 {
-            patience.check()?;
-            rows.fill(&mut chunk)?;
-            let mark = ChunkMark {
-                incarnation: 1,
-                sequence,
-            };
-            replay.append_and_commit(0, mark, &chunk).context("the replay")?;
-        }
-        let ddpg = ddpg(config)?;
+/// New networks that learn from minibatches of this size.
+fn method(config: &Config, batch: usize) -> anyhow::Result<ReplayedDdpg> {
+    let settings = config::Ddpg {
+        batch,
+        ..ddpg(config)?.clone()
+    };
+    Ok(ReplayedDdpg::new(
+        &config.spec,
+        &settings,
+        config.run.seed,
+        config.replay.capacity,
+    )?)
+}
+
+/// An update as in the learner's loop.
+fn update(method: &mut ReplayedDdpg, replay: &Replay) {
+    std::hint::black_box(method.update(replay, replay.head()));
+}
+
+/// One size of a minibatch under measurement.
+struct Case {
+    method: ReplayedDdpg,
+    batch: usize,
+    list: List,
+    fastest: Multiplication,
+    updates: Windows,
+    limit: Windows,
+    products: Windows,
+}
+
+impl Case {
+    fn new(config: &Config, batch: usize) -> anyhow::Result<Self> {
+        let method = method(config, batch)?;
+        let (list, fastest) = multiplications(config, &method.ddpg, batch);
         Ok(Self {
-            method: ReplayedDdpg::new(&config.spec, ddpg, config.run.seed, config.replay.capacity)?,
-            batch: ddpg.batch,
-            replay,
+            method,
+            batch,
+            list,
+            fastest,
+            updates: Windows::default(),
+            limit: Windows::default(),
+            products: Windows::default(),
         })
     }
 
-    fn update(&mut self) {
-        std::hint::black_box(self.method.update(&self.replay, self.replay.head()));
+    /// A window of each.
+    fn measure(&mut self, replay: &Replay) {
+        let flop = self.method.ddpg.flop_per_update() as f64;
+        self.updates
+            .add(window::rate(WINDOW, || update(&mut self.method, replay)));
+        self.limit.add(self.fastest.gflops(WINDOW));
+        self.products
+            .add(window::rate(WINDOW, || self.list.multiply_all()) * flop / 1e9);
+    }
+
+    fn figure(self) -> Figure {
+        let flop = self.method.ddpg.flop_per_update();
+        let achieved = flop as f64 * self.updates.median() / 1e9;
+        Figure {
+            batch: self.batch,
+            updates_per_second: self.updates.median(),
+            flop_per_update: flop,
+            limit_gflops: self.limit.median(),
+            share_of_limit: achieved / self.limit.median(),
+            limit_product: self.fastest.shape(),
+            limit_kernel: self.fastest.kernel.name(),
+            products_gflops: self.products.median(),
+            share_of_products: achieved / self.products.median(),
+            updates: self.updates,
+            limit: self.limit,
+            products: self.products,
+        }
     }
 }
 
@@ -168,22 +247,21 @@ fn multiplications(config: &Config, ddpg: &Ddpg, batch: usize) -> (List, Multipl
     (List { distinct, order }, fastest)
 }
 
-impl Figures for LearnerFigures {
-    fn lines(&self) -> Vec<(&'static str, String)> {
-        vec![
-            ("updates a second", self.updates.show(1.0, 0)),
+impl Figure {
+    fn lines(&self) -> [(&'static str, String); 4] {
+        [
             (
-                "an update",
+                "updates a second",
                 format!(
-                    "{:.2} ms for {:.1} MFLOP, batch {}, {} rows in the replay, one thread",
+                    "{}, batch {}, one thread: {:.2} ms for {:.1} MFLOP",
+                    self.updates.show(1.0, 0),
+                    self.batch,
                     1e3 / self.updates_per_second,
                     self.flop_per_update as f64 / 1e6,
-                    self.batch,
-                    self.replay_rows
                 ),
             ),
             (
-                "its fastest product",
+                "  fastest product",
                 format!(
                     "{} GFLOP/s: {}, {}",
                     self.limit.show(1.0, 0),
@@ -191,14 +269,31 @@ impl Figures for LearnerFigures {
                     self.limit_kernel
                 ),
             ),
-            ("all its products", format!("{} GFLOP/s", self.products.show(1.0, 0))),
+            ("  all products", format!("{} GFLOP/s", self.products.show(1.0, 0))),
             (
-                "share of the limit",
+                "  share of the limit",
                 format!(
                     "{:.2} of the fastest product's rate, {:.2} of all products' rate",
                     self.share_of_limit, self.share_of_products
                 ),
             ),
         ]
+    }
+}
+
+impl Figures for LearnerFigures {
+    fn lines(&self) -> Vec<(&'static str, String)> {
+        let two = &self.two_threads;
+        let two = format!(
+            "{}, batch {}, two threads: {:.2} times one",
+            two.updates.show(1.0, 0),
+            self.configured.batch,
+            two.speedup
+        );
+        let mut lines = Vec::from(self.configured.lines());
+        lines.push(("updates a second", two));
+        lines.extend(self.large_batch.lines());
+        lines.push(("rows in the replay", self.replay_rows.to_string()));
+        lines
     }
 }
