@@ -82,6 +82,8 @@ fn a_step_has_its_median_and_its_tail() {
     number(&figures, "round_trips");
     number(&figures, "spin_median_us");
     assert_eq!(number(&figures, "environments"), 1.0);
+    let [median, p99] = ["one_core_median_us", "one_core_p99_us"].map(|field| number(&figures, field));
+    assert!(median <= p99, "{figures}");
 }
 
 #[test]
@@ -94,6 +96,42 @@ fn the_policy_acts_alone_and_in_batches() {
         let product = number(&figures, actions) * number(&figures, time) / 1e6;
         assert!((product - batch).abs() < 1e-9 * batch, "{figures}");
     }
+    let share = number(&figures, "reading_microseconds") / number(&figures, "microseconds_per_call_batch_1");
+    assert!(
+        (number(&figures, "share_of_reading") - share).abs() < 1e-9 * share,
+        "{figures}"
+    );
+    let [flop, limit, share] = ["flop_batch_64", "limit_gflops", "share_of_limit"].map(|field| number(&figures, field));
+    assert_eq!((flop / 1e5).round(), 156.0);
+    let gflops = flop / number(&figures, "microseconds_per_call_batch_64") / 1e3;
+    assert!((share - gflops / limit).abs() < 1e-9 * share, "{figures}");
+}
+
+/// Every stage alone is tested above: here they are together, and each line's verdict is that of its number.
+#[test]
+fn all_stages_make_one_table() {
+    let figures = figures("all");
+    for stage in ["learner", "transitions", "step", "policy", "actors", "run"] {
+        assert!(figures[stage].is_object(), "{stage} in {figures}");
+    }
+    let table = figures["table"].as_array().unwrap();
+    assert_eq!(table.len(), 14, "{figures}");
+    let line = |stage: &str| table.iter().find(|line| line["stage"] == stage).unwrap();
+    let learner = line("learner, batch 64");
+    let share = number(&figures["learner"], "share_of_limit");
+    assert_eq!(
+        (number(learner, "share"), &learner["target"]["met"]),
+        (share, &Value::Bool(share >= 0.75))
+    );
+    let rows = number(&figures["transitions"], "rows_per_second");
+    assert_eq!(line("transitions into the replay")["target"]["met"], rows >= 5e6);
+    let slow = number(&figures["step"], "one_core_median_us") > 15.0;
+    assert_eq!(line("environment step, one core")["target"]["met"], !slow);
+    assert!(
+        table
+            .iter()
+            .all(|line| line["ours"].as_str().is_some_and(|ours| !ours.is_empty()))
+    );
 }
 
 #[test]

@@ -46,6 +46,37 @@ fn the_same_seed_and_actors_give_the_same_bits_and_another_seed_others() {
     assert_ne!(run("6").0, first.0);
 }
 
+#[test]
+fn two_threads_of_a_learner_leave_the_bits_of_one() {
+    let place = Workplace::new();
+    let [one, two] = ["1", "2"].map(|threads| {
+        let setting = format!("learner.threads={threads}");
+        let running = place.start_as(
+            threads,
+            &[
+                "--lockstep",
+                "--steps",
+                "1600",
+                "--set",
+                &setting,
+                "--set",
+                // Enough to be shared.
+                "ddpg.hidden=[40,128]",
+                "--set",
+                "evaluation.final_episodes=1",
+            ],
+        );
+        let threads_of_learner = || {
+            let pid = running.pids("learner-0")[0];
+            std::fs::read_dir(format!("/proc/{pid}/task")).map_or(0, Iterator::count)
+        };
+        let count = threads_of_learner();
+        (end_of(running), count)
+    });
+    assert_eq!(one.0, two.0);
+    assert_eq!(two.1, one.1 + 1, "threads of the process");
+}
+
 const SHARED: [&str; 13] = [
     "--lockstep",
     "--actors",

@@ -118,8 +118,8 @@ pub struct Actors {
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Learner {
-    /// Threads that share the work of each DDPG update, 1 or 2: the same bits in little more than half of the time where
-    /// there is a core for the second.
+    /// Threads that share the work of an update where there is enough of it, 1 or 2. Not a bit of what is learned depends
+    /// on them.
     #[schemars(extend("unit" = "threads", "source" = "ours"))]
     pub threads: u32,
 }

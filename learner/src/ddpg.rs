@@ -273,11 +273,11 @@ impl Ddpg {
             }
             mu.backward_to_second_layer(&actor.parameters, d_mu);
         };
-        let (observations, actions) = (s.as_slice().split_at(per_sample(s)), &self.actions);
-        let actions = actions.as_slice().split_at(per_sample(actions));
+        let observations = s.as_slice().split_at(per_sample(s));
+        let actions = self.actions.as_slice().split_at(per_sample(&self.actions));
         let d_q = self.d_q.as_slice().split_at(cut);
-        let d_mu_cut = per_sample(&self.d_mu);
-        let d_mu = self.d_mu.as_mut_slice().split_at_mut(d_mu_cut);
+        let d_mu = per_sample(&self.d_mu);
+        let d_mu = self.d_mu.as_mut_slice().split_at_mut(d_mu);
         let (mu, q) = (self.mu.samples().split_at(cut), self.q.samples().split_at(cut));
         self.threads.both(
             || part(mu.0, q.0, observations.0, actions.0, d_q.0, d_mu.0),

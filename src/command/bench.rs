@@ -1,6 +1,7 @@
 //! `shoal bench`: how fast each stage is on this machine.
 
 mod actors;
+mod cores;
 mod costs;
 mod crew;
 mod flow;
@@ -15,6 +16,7 @@ mod rows;
 mod scene;
 mod spin;
 mod step;
+mod table;
 mod transitions;
 mod whole_run;
 mod window;
@@ -55,6 +57,8 @@ pub(crate) enum Stage {
     Actors,
     /// A training: how long it takes to its first update and after a crash, and how much memory its processes have.
     Run,
+    /// Every stage but `gym`, and one table of what they gave, the machine's limits, and what they should give.
+    All,
     /// Steps of a Gymnasium environment through its server in Python, beside Gymnasium's own vectors.
     Gym,
 }
@@ -63,6 +67,9 @@ pub(crate) enum Stage {
 trait Figures: Serialize {
     /// The same for people: what, and how much.
     fn lines(&self) -> Vec<(&'static str, String)>;
+
+    /// The most important of them, each beside its limit and its target.
+    fn table(&self) -> Vec<table::Line>;
 }
 
 /// How long to measure, and when to give up.
@@ -85,6 +92,7 @@ pub(crate) fn run(args: &BenchArgs) -> anyhow::Result<()> {
         Stage::Policy => policy::measure(&patience).and_then(|it| tell(&it, args.json)),
         Stage::Actors => actors::measure(args.actors.as_deref(), &patience).and_then(|it| tell(&it, args.json)),
         Stage::Run => whole_run::measure(&patience).and_then(|it| tell(&it, args.json)),
+        Stage::All => table::measure_all(args.json, &patience),
         Stage::Gym => gym::measure(&patience).and_then(|it| tell(&it, args.json)),
     };
     // A wait that was interrupted says what it says to a role.

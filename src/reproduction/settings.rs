@@ -1,4 +1,5 @@
-//! With which settings a run was made: its configuration but for its name, its seed and its length.
+//! With which settings a run was made: its configuration but for its name, its seed and its length, and for what no result
+//! depends on.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -23,7 +24,8 @@ impl Settings {
         let mut settings = BTreeMap::new();
         flatten("", toml::Value::try_from(config)?, &mut settings);
         settings.retain(|key, _| {
-            !["run.id", "run.seed", "run.steps", "run.episodes"].contains(&key.as_str()) && !key.starts_with("spec.")
+            !["run.id", "run.seed", "run.steps", "run.episodes"].contains(&key.as_str())
+                && !["spec.", "learner."].iter().any(|section| key.starts_with(section))
         });
         Ok(Self(settings))
     }

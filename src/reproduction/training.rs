@@ -79,7 +79,9 @@ pub(super) fn train(
                 .args(["train", experiment.preset, "--lockstep", "--run"])
                 .arg(run);
             command.args(["--seed", &seed.to_string()]);
-            for setting in experiment.settings(effort) {
+            // A run keeps to one core: the others have runs of their own.
+            let settings = experiment.settings(effort);
+            for setting in settings.chain(["learner.threads=1"]) {
                 command.args(["--set", setting]);
             }
         }

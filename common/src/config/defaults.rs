@@ -52,7 +52,7 @@ impl Default for Ddpg {
 
 impl Default for Learner {
     fn default() -> Self {
-        Self { threads: 1 }
+        Self { threads: 2 }
     }
 }
 

@@ -55,7 +55,7 @@ impl Config {
             }
             Algorithm::Sarsa(tabular) => check_tabular(["sarsa.gamma", "sarsa.alpha", "sarsa.epsilon"], tabular)?,
         }
-        check_threads(learner.threads, algorithm)?;
+        within("learner.threads", learner.threads, 1, 2)?;
         PolicyLayout::new(algorithm, spec).map_err(|cause| ConfigError::Control {
             algorithm: algorithm.name(),
             environment: self.environment.name.clone(),
@@ -120,18 +120,6 @@ fn check_ddpg(ddpg: &Ddpg, exploration: &Exploration) -> Result<(), ConfigError>
     within("ddpg.actor_learning_rate", ddpg.actor_learning_rate, 0.0, 1.0)?;
     within("ddpg.critic_learning_rate", ddpg.critic_learning_rate, 0.0, 1.0)?;
     within("ddpg.batch", ddpg.batch, 1, 65_536)
-}
-
-fn check_threads(threads: u32, algorithm: &Algorithm) -> Result<(), ConfigError> {
-    match algorithm {
-        Algorithm::Ddpg(..) => within("learner.threads", threads, 1, 2),
-        other if threads != 1 => Err(ConfigError::OutOfRange {
-            key: "learner.threads",
-            value: threads.to_string(),
-            expected: format!("1: {} has too little to compute for more", other.name()),
-        }),
-        _ => Ok(()),
-    }
 }
 
 fn check_reinforce(reinforce: &Reinforce) -> Result<(), ConfigError> {

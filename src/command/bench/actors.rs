@@ -90,6 +90,8 @@ pub(super) fn settings(actors: u32, updates: bool) -> Vec<&'static str> {
         "run.steps=1_000_000_000_000",
         // A checkpoint has the disk brought up to date: another stage's work.
         "checkpoint.every_seconds=86_400",
+        // What the model knows an update of.
+        "learner.threads=1",
     ];
     if actors > 16 {
         settings.push("actors.max=256");

@@ -17,6 +17,7 @@ use shoal_learner::threads::Threads;
 use super::product::Multiplication;
 use super::rows::{ENVIRONMENTS, Rows};
 use super::scene::{Scene, ddpg};
+use super::table::{Line, Target};
 use super::window::{self, Windows};
 use super::{Figures, Patience};
 
@@ -295,5 +296,43 @@ impl Figures for LearnerFigures {
         lines.extend(self.large_batch.lines());
         lines.push(("rows in the replay", self.replay_rows.to_string()));
         lines
+    }
+
+    fn table(&self) -> Vec<Line> {
+        let of = |figure: &Figure, stage, target| Line {
+            stage,
+            ours: format!("{:.0} updates/s", figure.updates_per_second),
+            limit: format!(
+                "{:.0}: its products at {:.0} GFLOP/s",
+                figure.updates_per_second / figure.share_of_limit,
+                figure.limit_gflops
+            ),
+            share: Some(figure.share_of_limit),
+            target,
+        };
+        let [small, large] = [self.configured.share_of_limit, self.large_batch.share_of_limit];
+        let two = &self.two_threads;
+        vec![
+            of(
+                &self.configured,
+                "learner, batch 64",
+                Target::at_least(0.75, small, "0.75 of the limit"),
+            ),
+            Line {
+                stage: "learner, batch 64, two threads",
+                ours: format!(
+                    "{:.0} updates/s, {:.2} times one thread",
+                    two.updates_per_second, two.speedup
+                ),
+                limit: "2 times".into(),
+                share: Some(two.speedup / 2.0),
+                target: Target::at_least(1.6, two.speedup, "1.6 times one thread"),
+            },
+            of(
+                &self.large_batch,
+                "learner, batch 256",
+                Target::at_least(0.85, large, "0.85 of the limit"),
+            ),
+        ]
     }
 }

@@ -3,11 +3,12 @@
 
 use std::time::{Duration, Instant};
 
-use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
+use rustix::thread::sched_setaffinity;
 use serde::Serialize;
 use shoal_common::report::Role;
 
 use super::Patience;
+use super::cores::Cores;
 use super::costs::Inference;
 use super::crew::Crew;
 use super::flow::Flow;
@@ -31,37 +32,6 @@ pub(super) struct OneCore {
     pub(super) share_greatest: f64,
     /// Whether the learner had another core.
     pub(super) learner_apart: bool,
-}
-
-/// The core for the pair, and the one for everything else: the same where there is only one.
-struct Cores {
-    pair: CpuSet,
-    others: CpuSet,
-    all: CpuSet,
-}
-
-impl Cores {
-    fn choose() -> anyhow::Result<Self> {
-        let all = sched_getaffinity(None)?;
-        let mut usable = (0..CpuSet::MAX_CPU).filter(|core| all.is_set(*core)).map(|core| {
-            let mut set = CpuSet::new();
-            set.set(core);
-            set
-        });
-        // Interrupts often go to a machine's first core.
-        let first = usable.next().unwrap_or(all);
-        Ok(Self {
-            pair: usable.next_back().unwrap_or(first),
-            others: first,
-            all,
-        })
-    }
-}
-
-impl Drop for Cores {
-    fn drop(&mut self) {
-        let _ = sched_setaffinity(None, &self.all);
-    }
 }
 
 /// Measures for about `length`.

@@ -1,20 +1,31 @@
-//! How many actions a second the policy gives, as an actor asks it.
+//! How many actions a second the policy gives, as an actor asks it, and how much of the machine that is.
 
 use std::time::Duration;
 
+use pulp::Arch;
 use serde::Serialize;
-use shoal_common::network::{ActionRange, PolicyNetwork};
+use shoal_common::network::{ActionRange, NetworkLayout, PolicyNetwork};
+use shoal_common::stream::{Purpose, stream};
 use shoal_learner::initialise::initialise;
+use shoal_learner::product::{Product, Transposed};
 
+use super::product::Multiplication;
 use super::rows::{ENVIRONMENTS, Rows};
 use super::scene::{Scene, ddpg};
+use super::table::{Line, Target};
 use super::window::{self, Windows};
 use super::{Figures, Patience};
 
 const WINDOW: Duration = Duration::from_millis(50);
 
+/// Four measurements take turns: both batches, and the limit of each.
+const SHARE: f64 = 0.25;
+
 /// Part of the time that goes before, to warm up.
 const WARM_UP: f64 = 0.05;
+
+/// Attempts of each kernel at the product that is the limit.
+const ATTEMPTS: usize = 10;
 
 /// The fields of `bench policy --json`.
 #[derive(Serialize)]
@@ -23,6 +34,13 @@ pub(super) struct PolicyFigures {
     actions_per_second_batch_64: f64,
     microseconds_per_call_batch_1: f64,
     microseconds_per_call_batch_64: f64,
+    /// What it takes to read every parameter once, where they lie after a call.
+    reading_microseconds: f64,
+    share_of_reading: f64,
+    flop_batch_64: u64,
+    /// The second layer's product, by the fastest kernel.
+    limit_gflops: f64,
+    share_of_limit: f64,
     parameters: usize,
     threads: u32,
     #[serde(skip)]
@@ -36,8 +54,10 @@ pub(super) fn measure(patience: &Patience) -> anyhow::Result<PolicyFigures> {
     let width = config.spec.observation.width();
     let mut actions = vec![0.0; ENVIRONMENTS * range.width()];
     let mut policy = PolicyNetwork::new(width, ddpg(&config)?.hidden, range, ENVIRONMENTS);
-    let parameters = initialise(policy.layout(), config.run.seed, 0);
+    let layout = *policy.layout();
+    let parameters = initialise(&layout, config.run.seed, 0);
     let rows = Rows::new(&config)?;
+    let mut product = widest_product(&layout, config.run.seed);
 
     let mut calls_of = |batch: usize, length| {
         let actions = &mut actions[..batch * policy.range().width()];
@@ -52,22 +72,60 @@ pub(super) fn measure(patience: &Patience) -> anyhow::Result<PolicyFigures> {
         calls_of(batch, patience.length.mul_f64(WARM_UP));
     }
     let mut calls: [Windows; 2] = Default::default();
-    for _ in 0..window::count(patience.length, 0.5, WINDOW) {
+    let (mut readings, mut limit) = (Windows::default(), Windows::default());
+    for _ in 0..window::count(patience.length, SHARE, WINDOW) {
         patience.check()?;
         for (windows, batch) in calls.iter_mut().zip(batches) {
             windows.add(calls_of(batch, WINDOW));
         }
+        readings.add(window::rate(WINDOW, || read(std::hint::black_box(&parameters))));
+        limit.add(product.gflops(WINDOW));
     }
     let [one, many] = [calls[0].median(), calls[1].median()];
+    let sizes = layout.layer_sizes();
+    let flop: usize = sizes.iter().map(|(i, o)| 2 * i * o * ENVIRONMENTS).sum();
     Ok(PolicyFigures {
         actions_per_second_batch_1: one,
         actions_per_second_batch_64: many * ENVIRONMENTS as f64,
         microseconds_per_call_batch_1: 1e6 / one,
         microseconds_per_call_batch_64: 1e6 / many,
+        reading_microseconds: 1e6 / readings.median(),
+        share_of_reading: one / readings.median(),
+        flop_batch_64: flop as u64,
+        limit_gflops: limit.median(),
+        share_of_limit: many * flop as f64 / 1e9 / limit.median(),
         parameters: parameters.len(),
         threads: 1,
         calls,
     })
+}
+
+/// The product of the second layer for a batch of 64, by the kernel that does it best: nearly all there is to compute.
+fn widest_product(layout: &NetworkLayout, seed: u64) -> Multiplication {
+    let (k, m) = layout.layer_sizes()[1];
+    let product = Product {
+        m,
+        k,
+        n: ENVIRONMENTS,
+        transposed: Transposed::Neither,
+    };
+    let mut product = Multiplication::new(product, &mut stream(seed, Purpose::Exploration, 1, 0));
+    (0..ATTEMPTS).for_each(|_| product.try_kernels());
+    product
+}
+
+/// Reads every number once, and does as little as can be with it.
+fn read(numbers: &[f32]) {
+    let sums = Arch::new().dispatch(|| {
+        let mut sums = [0.0_f32; 64];
+        for numbers in numbers.chunks_exact(64) {
+            for (sum, number) in sums.iter_mut().zip(numbers) {
+                *sum += number;
+            }
+        }
+        sums
+    });
+    std::hint::black_box(sums);
 }
 
 impl Figures for PolicyFigures {
@@ -82,10 +140,43 @@ impl Figures for PolicyFigures {
                 line(&self.calls[0], 1, self.microseconds_per_call_batch_1),
             ),
             (
+                "  share of the limit",
+                format!(
+                    "{:.2}: reading the parameters once takes {:.1} µs",
+                    self.share_of_reading, self.reading_microseconds
+                ),
+            ),
+            (
                 "a batch of 64",
                 line(&self.calls[1], ENVIRONMENTS, self.microseconds_per_call_batch_64),
             ),
+            (
+                "  share of the limit",
+                format!(
+                    "{:.2} of its largest product's rate, {:.0} GFLOP/s",
+                    self.share_of_limit, self.limit_gflops
+                ),
+            ),
             ("network", format!("{} parameters, one thread", self.parameters)),
+        ]
+    }
+
+    fn table(&self) -> Vec<Line> {
+        vec![
+            Line {
+                stage: "policy, one observation",
+                ours: format!("{:.1} µs", self.microseconds_per_call_batch_1),
+                limit: format!("{:.1} µs to read its weights", self.reading_microseconds),
+                share: Some(self.share_of_reading),
+                target: Target::none("as fast as reading"),
+            },
+            Line {
+                stage: "policy, batch 64",
+                ours: format!("{:.0} thousand actions/s", self.actions_per_second_batch_64 / 1e3),
+                limit: format!("{:.0} GFLOP/s, its largest product", self.limit_gflops),
+                share: Some(self.share_of_limit),
+                target: Target::at_least(0.75, self.share_of_limit, "0.75 of the limit"),
+            },
         ]
     }
 }

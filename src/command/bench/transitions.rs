@@ -16,6 +16,7 @@ use shoal_learner::sampling::Sampler;
 
 use super::rows::{ENVIRONMENTS, Rows};
 use super::scene::{Scene, ddpg};
+use super::table::{Line, Target};
 use super::window::{self, Windows};
 use super::{Figures, Patience};
 use crate::peer::Peer;
@@ -188,6 +189,29 @@ fn sample(replay: &Replay, config: &Config, patience: &Patience) -> anyhow::Resu
 }
 
 impl Figures for TransitionFigures {
+    fn table(&self) -> Vec<Line> {
+        let line = |stage, rows: f64, target| Line {
+            stage,
+            ours: format!("{:.1} million rows/s", rows / 1e6),
+            limit: String::new(),
+            share: None,
+            target,
+        };
+        let [moved, sampled] = [self.rows_per_second, self.sampled_rows_per_second];
+        vec![
+            line(
+                "transitions into the replay",
+                moved,
+                Target::at_least(5e6, moved, "5 million rows/s"),
+            ),
+            line(
+                "transitions sampled",
+                sampled,
+                Target::at_least(20e6, sampled, "20 million rows/s"),
+            ),
+        ]
+    }
+
     fn lines(&self) -> Vec<(&'static str, String)> {
         vec![
             (

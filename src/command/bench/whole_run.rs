@@ -10,6 +10,7 @@ use shoal_common::report::Role;
 
 use self::training::{Began, Came, Training};
 use super::memory::Memory;
+use super::table::{Line, Target};
 use super::window::Windows;
 use super::{Figures, Patience};
 
@@ -152,6 +153,33 @@ impl Spread {
 }
 
 impl Figures for RunFigures {
+    fn table(&self) -> Vec<Line> {
+        let seconds = |stage, spread: &Spread| Line {
+            stage,
+            ours: spread.show(),
+            limit: String::new(),
+            share: None,
+            target: Target::at_most(TARGET_SECONDS, spread.worst, "0.5 s"),
+        };
+        let most = self
+            .roles
+            .iter()
+            .map(|role| role.memory.private_bytes)
+            .max()
+            .unwrap_or(0);
+        vec![
+            seconds("start to first update", &self.start_seconds),
+            seconds("killed learner to next update", &self.recovery_seconds),
+            Line {
+                stage: "memory of the largest role",
+                ours: format!("{:.1} MB", most as f64 / MEGABYTE),
+                limit: String::new(),
+                share: None,
+                target: Target::at_most(TARGET_BYTES as f64, most as f64, "64 MB"),
+            },
+        ]
+    }
+
     fn lines(&self) -> Vec<(&'static str, String)> {
         let roles = self.roles.iter().map(|RoleMemory { role, index, memory }| {
             let megabytes = |bytes: u64| bytes as f64 / MEGABYTE;

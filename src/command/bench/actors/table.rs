@@ -1,6 +1,7 @@
 //! The same for people.
 
-use super::super::one_core::TARGET;
+use super::super::one_core::{OneCore, TARGET};
+use super::super::table::{Line, Target};
 use super::{ActorFigures, Bottleneck, Count, Figures, Rate, Scaling};
 
 const THOUSAND: f64 = 1e3;
@@ -43,6 +44,41 @@ impl Figures for ActorFigures {
                     saturated(&self.first_bottleneck_with_updates)
                 ),
             ),
+        ]
+    }
+
+    fn table(&self) -> Vec<Line> {
+        let OneCore {
+            pair_rows_per_second,
+            inference_rows_per_second,
+            share,
+            ..
+        } = self.one_core;
+        let rows = |rate: f64| format!("{:.0} thousand rows/s", rate / THOUSAND);
+        let most = self
+            .counts
+            .iter()
+            .map(|count| count.collecting.rows_per_second)
+            .fold(0.0, f64::max);
+        vec![
+            Line {
+                stage: "actor and server, one core",
+                ours: rows(pair_rows_per_second),
+                limit: format!("{}, the policy alone", rows(inference_rows_per_second)),
+                share: Some(share),
+                target: Target::at_least(TARGET, share, "0.8 of the limit"),
+            },
+            Line {
+                stage: "actors, all cores",
+                ours: rows(most),
+                limit: format!(
+                    "{}, the policy alone on {} cores",
+                    rows(inference_rows_per_second * f64::from(self.cores)),
+                    self.cores
+                ),
+                share: Some(most / (inference_rows_per_second * f64::from(self.cores))),
+                target: Target::none("10 times Gymnasium's vectors"),
+            },
         ]
     }
 }

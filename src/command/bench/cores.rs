@@ -1,0 +1,35 @@
+//! Which cores processes are bound to.
+
+use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
+
+/// The core for a pair, and the one for everything else: the same where there is only one. This process may run on all of
+/// its cores again when this is dropped.
+pub(super) struct Cores {
+    pub(super) pair: CpuSet,
+    pub(super) others: CpuSet,
+    all: CpuSet,
+}
+
+impl Cores {
+    pub(super) fn choose() -> anyhow::Result<Self> {
+        let all = sched_getaffinity(None)?;
+        let mut usable = (0..CpuSet::MAX_CPU).filter(|core| all.is_set(*core)).map(|core| {
+            let mut set = CpuSet::new();
+            set.set(core);
+            set
+        });
+        // Interrupts often go to a machine's first core.
+        let first = usable.next().unwrap_or(all);
+        Ok(Self {
+            pair: usable.next_back().unwrap_or(first),
+            others: first,
+            all,
+        })
+    }
+}
+
+impl Drop for Cores {
+    fn drop(&mut self) {
+        let _ = sched_setaffinity(None, &self.all);
+    }
+}
