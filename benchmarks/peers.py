@@ -7,8 +7,8 @@
 Compare with `shoal bench learner` and `shoal bench actors`, right before or after. Networks, batch and rates are those of the
 thesis's section 4.3.1. An update is what Shoal's is: sampling 64 rows of a million, critic, actor, both targets. JAX samples
 and makes 32 updates a call, the fastest way known. PyTorch flushes denormal numbers (it gets much slower without) and has
-Adam and target update fused over all parameters; once as autograd has it, once compiled (a C++ compiler must be there). The actors' policy is PyTorch's,
-64 environments a vector. The last line of standard output is one JSON object.
+Adam and target update fused over all parameters; compiled as it stands (`torch.compile`) it was slower. The actors' policy is
+PyTorch's, 64 environments a vector. The last line of standard output is one JSON object.
 """
 
 import argparse
@@ -108,7 +108,7 @@ def jax_updates(replay, together=32):
     return rate(work, together)
 
 
-def torch_updates(replay, compiled):
+def torch_updates(replay):
     import torch
 
     torch.set_num_threads(1)
@@ -128,7 +128,7 @@ def torch_updates(replay, compiled):
         torch.optim.Adam(network, lr=step, fused=True) for network, step in ((actor, ACTOR_RATE), (critic, CRITIC_RATE))
     ]
 
-    def losses_of_critic(s, a, r, s_next):
+    def loss_of_critic(s, a, r, s_next):
         with torch.no_grad():
             y = r + GAMMA * q(target_critic, s_next, mu(target_actor, s_next))
         return torch.nn.functional.mse_loss(q(critic, s, a), y)
@@ -136,13 +136,10 @@ def torch_updates(replay, compiled):
     def loss_of_actor(s):
         return -q([w.detach() for w in critic], s, mu(actor, s)).mean()
 
-    if compiled:
-        losses_of_critic, loss_of_actor = torch.compile(losses_of_critic), torch.compile(loss_of_actor)
-
     def work():
         rows = torch.from_numpy(replay.sample(BATCH))
         s, a, r, s_next = rows.split((OBSERVATION, ACTION, 1, OBSERVATION), dim=1)
-        for adam, loss in ((adams[1], lambda: losses_of_critic(s, a, r, s_next)), (adams[0], lambda: loss_of_actor(s))):
+        for adam, loss in ((adams[1], lambda: loss_of_critic(s, a, r, s_next)), (adams[0], lambda: loss_of_actor(s))):
             adam.zero_grad()
             loss().backward()
             adam.step()
@@ -182,8 +179,7 @@ def main():
         replay = Replay()
         figures = {
             "jax_updates_per_second": jax_updates(replay),
-            "torch_updates_per_second": torch_updates(replay, compiled=False),
-            "torch_compiled_updates_per_second": torch_updates(replay, compiled=True),
+            "torch_updates_per_second": torch_updates(replay),
         }
     else:
         figures = {f"{mode}_vector_rows_per_second": rows_of_gymnasium(mode) for mode in ("sync", "async")}
