@@ -9,7 +9,6 @@ use serde::{Deserialize, Serialize};
 use shoal_common::config::Environment;
 
 use super::step::quantile_of;
-use super::table::Line;
 use super::{Figures, Patience};
 use crate::environment_server::{Conversation, default_command};
 
@@ -105,10 +104,6 @@ fn gymnasium(environment: &Environment, length: Duration) -> anyhow::Result<Gymn
 }
 
 impl Figures for GymFigures {
-    fn table(&self) -> Vec<Line> {
-        Vec::new()
-    }
-
     fn lines(&self) -> Vec<(&'static str, String)> {
         let rate = |steps: f64| format!("{steps:.0} steps/s");
         vec![
