@@ -7,10 +7,11 @@ mod support;
 
 use std::time::Duration;
 
+use rand::RngExt;
 use shoal_actor::noise::OrnsteinUhlenbeck;
 use shoal_common::channel::environment::ResponseLayout;
 use shoal_common::commit::CommitReader;
-use shoal_common::config::{Algorithm, Config};
+use shoal_common::config::{Algorithm, Config, Warmup};
 use shoal_common::network::{ActionRange, PolicyNetwork};
 use shoal_common::stream::{Purpose, stream};
 use shoal_common::transition::Transition;
@@ -208,7 +209,12 @@ fn a_lockstep_run_broken_off_again_and_again_is_resumed_to_the_bits_of_a_whole_o
 
 #[test]
 fn one_actor_in_lockstep_is_algorithm_4_in_a_single_process() {
-    for preset in ["pendulum", "point-mass-r2"] {
+    for (preset, warmup) in [
+        ("pendulum", "policy"),
+        ("point-mass-r2", "policy"),
+        ("point-mass-r2", "uniform"),
+    ] {
+        let warmup = format!("exploration.warmup={warmup}");
         let place = Workplace::new();
         let result = place.train(&[
             preset,
@@ -227,9 +233,11 @@ fn one_actor_in_lockstep_is_algorithm_4_in_a_single_process() {
             "actors.chunk_steps=1",
             "--set",
             "evaluation.every=300",
+            "--set",
+            &warmup,
         ]);
         let config = Config::load(&place.path().join("run/config.toml")).unwrap();
-        assert_eq!(result["weights_sha256"], twin(&config), "{preset}");
+        assert_eq!(result["weights_sha256"], twin(&config), "{preset}, {warmup}");
     }
 }
 
@@ -237,7 +245,7 @@ fn one_actor_in_lockstep_is_algorithm_4_in_a_single_process() {
 fn twin(config: &Config) -> String {
     let seed = config.run.seed;
     let row = config.row_layout();
-    let Algorithm::Ddpg(ddpg, noise) = &config.algorithm else {
+    let Algorithm::Ddpg(ddpg, exploration) = &config.algorithm else {
         panic!("the twin is DDPG's")
     };
     let mut learner = Ddpg::new(&config.spec, &DdpgSettings::from(ddpg), seed).unwrap();
@@ -247,8 +255,8 @@ fn twin(config: &Config) -> String {
 
     let range = ActionRange::new(&config.spec.action).unwrap();
     let mut mu = PolicyNetwork::new(row.observation_width(), ddpg.hidden, range, 1);
-    let exploration = stream(seed, Purpose::Exploration, 0, 0);
-    let mut noise = OrnsteinUhlenbeck::new(noise, 1, row.action_width(), exploration);
+    let mut uniform = stream(seed, Purpose::Exploration, 0, 0);
+    let mut noise = OrnsteinUhlenbeck::new(exploration, 1, row.action_width(), uniform.clone());
 
     let environment = &config.environment;
     let mut environment = VectorEnvironment::new(&environment.name, &environment.parameters, 1, seed, 0, 0).unwrap();
@@ -260,9 +268,17 @@ fn twin(config: &Config) -> String {
     let mut a = vec![0.0; row.action_width()];
     environment.reset(Start::Next, &mut s).unwrap();
     for t in 0..config.run.steps {
-        mu.forward(learner.policy(), &s, &mut a);
-        noise.advance(t);
-        noise.disturb(&mut a, mu.range());
+        if learner.updates() == 0 && exploration.warmup == Warmup::Uniform {
+            uniform.set_stream(t);
+            uniform.set_word_pos(0);
+            for (i, a) in a.iter_mut().enumerate() {
+                *a = mu.range().action(i, uniform.random_range(-1.0..=1.0));
+            }
+        } else {
+            mu.forward(learner.policy(), &s, &mut a);
+            noise.advance(t);
+            noise.disturb(&mut a, mu.range());
+        }
 
         environment.step(&a, layout.split_mut(&mut response)).unwrap();
         let step = layout.split_mut(&mut response);

@@ -1,7 +1,7 @@
 //! How each algorithm's actors try what their policy would not do.
 
 use rand::RngExt;
-use shoal_common::config::Algorithm;
+use shoal_common::config::{Algorithm, Warmup};
 use shoal_common::network::PolicyNetwork;
 use shoal_common::policy::{self, PolicyError, PolicyLayout, Scores, highest};
 use shoal_common::space::EnvironmentSpec;
@@ -13,8 +13,9 @@ use crate::noise::OrnsteinUhlenbeck;
 /// number, so that a step done again gets the same ones.
 #[derive(Clone, Debug)]
 pub enum Exploration {
-    /// DDPG: the policy's action and noise (line 8 of Algorithm 4).
-    Noise(PolicyNetwork, OrnsteinUhlenbeck),
+    /// DDPG: the policy's action and noise (line 8 of Algorithm 4). The stream is there where actions are drawn uniformly
+    /// until something has been learned; a step takes its numbers either for these or for the noise.
+    Noise(PolicyNetwork, OrnsteinUhlenbeck, Option<Stream>),
     /// REINFORCE: an action drawn from π(·|s), the softmax of the scores (line 3 of Algorithm 3).
     Sample(Scores, Stream),
     /// Q-learning and SARSA: the action with the highest value, the first of equals, but with probability ε any of all
@@ -36,8 +37,9 @@ impl Exploration {
         Ok(match algorithm {
             Algorithm::Ddpg(ddpg, noise) => {
                 let network = policy::deterministic(ddpg, spec, environments)?;
+                let uniform = (noise.warmup == Warmup::Uniform).then(|| stream.clone());
                 let noise = OrnsteinUhlenbeck::new(noise, environments, spec.action.width(), stream);
-                Self::Noise(network, noise)
+                Self::Noise(network, noise, uniform)
             }
             Algorithm::Reinforce(reinforce) => Self::Sample(policy::softmax(reinforce, spec, environments)?, stream),
             Algorithm::QLearning(tabular) | Algorithm::Sarsa(tabular) => {
@@ -50,15 +52,28 @@ impl Exploration {
     /// What the policy's parameters are.
     pub fn layout(&self) -> PolicyLayout {
         match self {
-            Self::Noise(network, _) => PolicyLayout::Deterministic(*network.layout()),
+            Self::Noise(network, ..) => PolicyLayout::Deterministic(*network.layout()),
             Self::Sample(scores, _) | Self::EpsilonGreedy(scores, ..) => scores.layout(),
+        }
+    }
+
+    /// Chooses the actions of step number `step` as `act` does, but with a policy that no update has made.
+    pub fn warm_up(&mut self, parameters: &[f32], observations: &[f32], step: u64, actions: &mut [f32]) {
+        let Self::Noise(network, _, Some(stream)) = self else {
+            return self.act(parameters, observations, step, actions);
+        };
+        go_to(stream, step);
+        for action in actions.chunks_exact_mut(network.range().width()) {
+            for (i, a) in action.iter_mut().enumerate() {
+                *a = network.range().action(i, stream.random_range(-1.0..=1.0));
+            }
         }
     }
 
     /// Chooses the actions of step number `step`, one for each observation.
     pub fn act(&mut self, parameters: &[f32], observations: &[f32], step: u64, actions: &mut [f32]) {
         match self {
-            Self::Noise(network, noise) => {
+            Self::Noise(network, noise, _) => {
                 network.forward(parameters, observations, actions);
                 noise.advance(step);
                 noise.disturb(actions, network.range());
@@ -84,7 +99,7 @@ impl Exploration {
 
     /// Begins an episode of one environment (line 5 of Algorithm 4).
     pub fn begin_episode(&mut self, environment: usize) {
-        if let Self::Noise(_, noise) = self {
+        if let Self::Noise(_, noise, _) = self {
             noise.reset(environment);
         }
     }
@@ -92,14 +107,14 @@ impl Exploration {
     /// What the next step depends on besides its number, environment after environment.
     pub(crate) fn state(&self) -> &[f64] {
         match self {
-            Self::Noise(_, noise) => noise.state(),
+            Self::Noise(_, noise, _) => noise.state(),
             Self::Sample(..) | Self::EpsilonGreedy(..) => &[],
         }
     }
 
     /// Goes on from this state; another length than `state` has is none of this exploration.
     pub(crate) fn restore(&mut self, state: &[f64]) {
-        if let Self::Noise(_, noise) = self {
+        if let Self::Noise(_, noise, _) = self {
             noise.restore(state);
         }
     }
@@ -127,7 +142,7 @@ fn drawn(logits: &[f32], u: f64) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use shoal_common::config::{Reinforce, Tabular};
+    use shoal_common::config::{Ddpg, Reinforce, Tabular};
     use shoal_common::space::Space;
     use shoal_common::stream::{Purpose, stream};
 
@@ -190,6 +205,55 @@ mod tests {
         let drawn = counts(&mut policy, &parameters, &[0.5]);
         assert!(drawn[0].abs_diff(1_000) < 120 && drawn[2] == 0, "{drawn:?}");
         assert_eq!(counts(&mut policy, &parameters, &[0.5]), drawn);
+    }
+
+    #[test]
+    fn until_something_is_learned_actions_may_be_uniform_over_their_range_and_again_the_same_by_step() {
+        let spec = EnvironmentSpec {
+            observation: Space::boxed(&[(-1.0, 1.0)]),
+            action: Space::boxed(&[(-2.0, 2.0), (0.0, 8.0)]),
+            time_limit: 100,
+            state_width: 1,
+        };
+        let new = |warmup| {
+            let noise = shoal_common::config::Exploration {
+                warmup,
+                ..Default::default()
+            };
+            let algorithm = Algorithm::Ddpg(Ddpg::default(), noise);
+            Exploration::new(&algorithm, &spec, 1, stream(7, Purpose::Exploration, 0, 0)).unwrap()
+        };
+        type Act = fn(&mut Exploration, &[f32], &[f32], u64, &mut [f32]);
+        let choose = |exploration: &mut Exploration, act: Act, step| {
+            let parameters = vec![0.0; exploration.layout().parameters()];
+            let mut action = [f32::NAN; 2];
+            act(exploration, &parameters, &[0.5], step, &mut action);
+            action
+        };
+        let (warm_up, act): (Act, Act) = (Exploration::warm_up, Exploration::act);
+
+        let mut uniform = new(Warmup::Uniform);
+        let warm: Vec<_> = (0..1_000).map(|step| choose(&mut uniform, warm_up, step)).collect();
+        assert_eq!(choose(&mut uniform, warm_up, 77), warm[77]);
+        for (element, (low, high)) in [(-2.0, 2.0), (0.0, 8.0)].into_iter().enumerate() {
+            let quarter_of = |action: &[f32; 2]| ((action[element] - low) / (high - low) * 4.0) as usize;
+            for quarter in 0..4 {
+                let count = warm.iter().filter(|action| quarter_of(action) == quarter).count();
+                // 250, standard deviation 14.
+                assert!(
+                    count.abs_diff(250) < 70,
+                    "element {element}, quarter {quarter}: {count}"
+                );
+            }
+        }
+        let mut as_ever = new(Warmup::Policy);
+        let noisy = choose(&mut as_ever, warm_up, 0);
+        assert_eq!(
+            choose(&mut uniform, act, 0),
+            noisy,
+            "the noise begins at rest behind a uniform warm-up"
+        );
+        assert_eq!(choose(&mut new(Warmup::Policy), act, 0), noisy);
     }
 
     #[test]

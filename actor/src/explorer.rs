@@ -259,7 +259,12 @@ impl<'a> Explorer<'a> {
     /// Chooses an action for every environment.
     fn act(&mut self, current: &Observed) {
         if let Some(policy) = self.policy.held() {
-            self.exploration.act(
+            let act = match policy.header().updates {
+                0 => Exploration::warm_up,
+                _ => Exploration::act,
+            };
+            act(
+                &mut self.exploration,
                 policy.parameters(),
                 current.observations(),
                 self.step,

@@ -47,7 +47,7 @@ impl OrnsteinUhlenbeck {
     pub fn advance(&mut self, step: u64) {
         self.stream.set_stream(step);
         self.stream.set_word_pos(0);
-        let Exploration { theta, sigma } = self.settings;
+        let Exploration { theta, sigma, .. } = self.settings;
         for x in &mut self.x {
             let normal: f64 = self.stream.sample(StandardNormal);
             *x += -theta * *x + sigma * normal;

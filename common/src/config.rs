@@ -7,7 +7,7 @@ pub mod explanation;
 mod limits;
 mod sections;
 
-pub use algorithm::{Algorithm, Ddpg, Exploration, Reinforce, Tabular, Weight};
+pub use algorithm::{Algorithm, Ddpg, Exploration, Reinforce, Tabular, Warmup, Weight};
 
 use std::fmt::Display;
 use std::path::{Path, PathBuf};

@@ -50,6 +50,19 @@ pub struct Exploration {
     /// σ, the size of each step's impulse.
     #[schemars(extend("unit" = "half action ranges", "source" = "section 4.3.1"))]
     pub sigma: f64,
+    /// What actors do until the learner's first update, while `replay.warmup` fills.
+    #[schemars(extend("unit" = "–", "source" = "ours"))]
+    pub warmup: Warmup,
+}
+
+/// How actors act while nothing has been learned.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Warmup {
+    /// As ever: the policy's first weights, and noise.
+    Policy,
+    /// Each element of an action uniformly from its range.
+    Uniform,
 }
 
 /// Algorithm 3 with the numbers of section 4.2.1, and its variants of section 4.2.2.
@@ -110,6 +123,9 @@ pub struct Tabular {
 }
 
 impl Algorithm {
+    /// All their names, which are their sections'.
+    pub const NAMES: [&str; 4] = ["ddpg", "reinforce", "q-learning", "sarsa"];
+
     /// Its name, which is its section's.
     pub fn name(&self) -> &'static str {
         match self {

@@ -1,7 +1,7 @@
 //! What a configuration is where nothing else is said: the thesis's numbers where it prints them (sections 4.1 to 4.3).
 
 use super::{
-    Actors, Checkpoint, Ddpg, Evaluation, Exploration, Learner, Mode, Reinforce, Replay, Run, Tabular, Weight,
+    Actors, Checkpoint, Ddpg, Evaluation, Exploration, Learner, Mode, Reinforce, Replay, Run, Tabular, Warmup, Weight,
 };
 
 impl Default for Run {
@@ -33,6 +33,7 @@ impl Default for Exploration {
         Self {
             theta: 0.15,
             sigma: 0.2,
+            warmup: Warmup::Policy,
         }
     }
 }
