@@ -8,6 +8,7 @@ use iceoryx2::prelude::*;
 
 mod bell;
 pub mod control;
+mod descriptor;
 mod domain;
 pub mod environment;
 mod memory;
