@@ -5,7 +5,7 @@ use crate::threads::Threads;
 use faer::reborrow::{Reborrow, ReborrowMut};
 use faer::{MatMut, MatRef};
 use nalgebra::DMatrix;
-use pulp::Arch;
+use pulp::{Arch, Simd, WithSimd};
 use shoal_common::network::{Activations, NetworkLayout, matrix, matrix_mut};
 
 /// The activations of a forward pass and room for their gradients; one column a sample.
@@ -172,8 +172,21 @@ impl<'a> Samples<'a> {
 
 /// d ← d where the unit was active, else 0: from ∂L/∂h to ∂L/∂z through h = max(z, 0). `h` may have more rows than `d`.
 fn mask(d: MatMut<'_, f32>, h: MatRef<'_, f32>) {
-    Arch::new().dispatch(|| {
-        for (d, h) in d.col_iter_mut().zip(h.col_iter()) {
+    Arch::new().dispatch(Mask { d, h });
+}
+
+/// A closure of this length would be called by the dispatch, not inlined into it, and so go without vector instructions.
+struct Mask<'a> {
+    d: MatMut<'a, f32>,
+    h: MatRef<'a, f32>,
+}
+
+impl WithSimd for Mask<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _: S) {
+        for (d, h) in self.d.col_iter_mut().zip(self.h.col_iter()) {
             let (Some(d), Some(h)) = (d.try_as_col_major_mut(), h.try_as_col_major()) else {
                 unreachable!("columns lie in one piece");
             };
@@ -181,7 +194,7 @@ fn mask(d: MatMut<'_, f32>, h: MatRef<'_, f32>) {
                 *d = if *h > 0.0 { *d } else { 0.0 };
             }
         }
-    });
+    }
 }
 
 /// The sum over the samples, ∂L/∂b.
