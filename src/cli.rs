@@ -63,20 +63,25 @@ pub(crate) enum Command {
     Learner(RoleArgs),
 }
 
-#[derive(Args, Clone, Debug, Default)]
+#[derive(Args, Clone, Debug)]
 pub(crate) struct TrainArgs {
     /// What to train: frozen-lake, frozen-lake-sarsa, cart-pole, pendulum, point-mass-r1, point-mass-r2, point-mass-r3,
     /// gym: and a Gymnasium environment (gym:HalfCheetah-v5), or a configuration file (FILE.toml).
-    #[arg(
-        value_name = "PRESET|gym:ID|FILE.toml",
-        default_value = "",
-        hide_default_value = true
-    )]
-    #[arg(required_unless_present = "help_config", add = ArgValueCompleter::new(completion::what_to_train))]
-    pub(crate) what: String,
+    #[arg(value_name = "PRESET|gym:ID|FILE.toml", required_unless_present = "help_config")]
+    #[arg(add = ArgValueCompleter::new(completion::what_to_train))]
+    pub(crate) what: Option<String>,
     /// Explain every key of the configuration, or those of the named preset or file, and train nothing.
     #[arg(long)]
     pub(crate) help_config: bool,
+    #[command(flatten)]
+    pub(crate) choices: Choices,
+    #[command(flatten)]
+    pub(crate) telling: Telling,
+}
+
+/// What of a run can be said on the command line.
+#[derive(Args, Clone, Debug, Default)]
+pub(crate) struct Choices {
     /// Run directory to make [default: runs/<preset>-<n>].
     #[arg(long, value_name = "DIR")]
     pub(crate) run: Option<PathBuf>,
@@ -101,8 +106,6 @@ pub(crate) struct TrainArgs {
     /// Override a key of the configuration, as in --set ddpg.tau=0.005. May be repeated.
     #[arg(long, value_name = "SECTION.KEY=VALUE", add = ArgValueCompleter::new(completion::settings))]
     pub(crate) set: Vec<String>,
-    #[command(flatten)]
-    pub(crate) telling: Telling,
 }
 
 /// What a training run says.

@@ -10,6 +10,7 @@ use shoal_env_server::environment;
 use toml::{Table, Value};
 
 use crate::cli::Cli;
+use crate::environment_server::GYMNASIUM;
 use crate::plan::{FILLED_IN, preset_names};
 
 /// The variable that a shell sets where it asks for completions. (`COMPLETE` alone may be somebody else's.)
@@ -20,14 +21,16 @@ pub(crate) fn answer() {
     CompleteEnv::with_factory(Cli::command).var(VARIABLE).complete();
 }
 
-/// Presets and configuration files.
+/// Presets, the beginning of a Gymnasium environment, and configuration files.
 pub(crate) fn what_to_train(typed: &OsStr) -> Vec<CompletionCandidate> {
     let typed_text = typed.to_string_lossy();
-    let presets = preset_names().filter(|name| name.starts_with(typed_text.as_ref()));
+    let names = preset_names()
+        .chain([GYMNASIUM])
+        .filter(|name| name.starts_with(typed_text.as_ref()));
     let files = PathCompleter::any()
         .filter(|path| path.is_dir() || path.extension().is_some_and(|extension| extension == "toml"))
         .complete(typed);
-    presets.map(CompletionCandidate::new).chain(files).collect()
+    names.map(CompletionCandidate::new).chain(files).collect()
 }
 
 /// Keys of the configuration; behind the `=`, what the key may be, or its default.
@@ -124,6 +127,7 @@ mod tests {
     fn presets_and_keys_are_completed() {
         let presets = values(what_to_train(OsStr::new("point-mass")));
         assert_eq!(presets, ["point-mass-r1", "point-mass-r2", "point-mass-r3"]);
+        assert_eq!(values(what_to_train(OsStr::new("gy"))), ["gym:"]);
         assert_eq!(values(settings(OsStr::new("ddpg.ta"))), ["ddpg.tau="]);
         assert_eq!(
             values(settings(OsStr::new("environment.fric"))),

@@ -4,13 +4,13 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
-use shoal_common::config::{Actors, Config, Environment};
+use shoal_common::config::{Actors, Algorithm, Config, Environment};
 use shoal_common::run_dir::{RunDir, RunLock};
 use shoal_common::space::{EnvironmentSpec, Space};
 use shoal_env_server::environment;
 use toml::{Table, Value};
 
-use crate::cli::TrainArgs;
+use crate::cli::Choices;
 use crate::environment_server::{self, Conversation, GYMNASIUM};
 use crate::room;
 
@@ -29,9 +29,6 @@ const FOR_CONTINUOUS_ACTIONS: &str = include_str!("../presets/gym-continuous.tom
 const FOR_DISCRETE_ACTIONS: &str = include_str!("../presets/gym-discrete.toml");
 const FOR_A_TABLE: &str = include_str!("../presets/gym-table.toml");
 
-/// Sections that name the method.
-const METHODS: [&str; 4] = ["ddpg", "reinforce", "q-learning", "sarsa"];
-
 /// The key that the program chooses itself.
 pub(crate) const FILLED_IN: &str = "run.id";
 
@@ -42,11 +39,7 @@ pub(crate) fn preset_names() -> impl Iterator<Item = &'static str> {
 
 /// The configuration of a preset or a file, resolved, without options.
 pub(crate) fn resolved(what: &str) -> anyhow::Result<Config> {
-    let args = TrainArgs {
-        what: what.into(),
-        ..TrainArgs::default()
-    };
-    decide(&args).map(|(_, config)| config)
+    decide(what, &Choices::default()).map(|(_, config)| config)
 }
 
 /// A run that can begin.
@@ -59,11 +52,11 @@ pub(crate) struct Plan {
 
 impl Plan {
     /// Decides everything, and makes the run directory with its `config.toml` only when nothing is wrong.
-    pub(crate) fn new(args: &TrainArgs) -> anyhow::Result<Self> {
-        let (name, config) = decide(args)?;
-        let place = args.run.clone().unwrap_or_else(|| Path::new("runs").join(&name));
+    pub(crate) fn new(what: &str, choices: &Choices) -> anyhow::Result<Self> {
+        let (name, config) = decide(what, choices)?;
+        let place = choices.run.clone().unwrap_or_else(|| Path::new("runs").join(&name));
         room::check(&config, &RunDir::planned(&place))?;
-        let run = match &args.run {
+        let run = match &choices.run {
             Some(path) => RunDir::create(path)?,
             None => RunDir::create_next(Path::new("runs"), &name)?,
         };
@@ -77,10 +70,10 @@ impl Plan {
     }
 }
 
-/// The configuration that a run with these options has, and the name it gets. Nothing is made.
-pub(crate) fn decide(args: &TrainArgs) -> anyhow::Result<(String, Config)> {
-    let (name, table) = sections(&args.what)?;
-    Ok((name, resolve(table, args, &args.what)?))
+/// The configuration of a preset or a file with these choices, and the name that a run of it gets. Nothing is made.
+pub(crate) fn decide(what: &str, choices: &Choices) -> anyhow::Result<(String, Config)> {
+    let (name, table) = sections(what)?;
+    Ok((name, resolve(table, choices, what)?))
 }
 
 /// The sections of a preset or a file, and the name that a run of it gets.
@@ -112,33 +105,33 @@ fn sections(what: &str) -> anyhow::Result<(String, Table)> {
     Ok((name, table))
 }
 
-fn resolve(mut table: Table, args: &TrainArgs, origin: &str) -> anyhow::Result<Config> {
+fn resolve(mut table: Table, choices: &Choices, origin: &str) -> anyhow::Result<Config> {
     let mut set = |section: &str, key: &str, value: Value| put(&mut table, &[section, key], value);
-    if let Some(seed) = args.seed {
+    if let Some(seed) = choices.seed {
         let seed = i64::try_from(seed).context("--seed: must be below 2^63")?;
         set("run", "seed", seed.into())?;
     }
-    if let Some(steps) = args.steps {
+    if let Some(steps) = choices.steps {
         set(
             "run",
             "steps",
             i64::try_from(steps).context("--steps: must be below 2^63")?.into(),
         )?;
     }
-    if let Some(actors) = args.actors {
+    if let Some(actors) = choices.actors {
         set("actors", "count", i64::from(actors).into())?;
     }
-    if let Some(envs) = args.envs {
+    if let Some(envs) = choices.envs {
         set("actors", "envs", i64::from(envs).into())?;
     }
-    if let Some(episodes) = args.episodes {
+    if let Some(episodes) = choices.episodes {
         let episodes = i64::try_from(episodes).context("--episodes: must be below 2^63")?;
         set("run", "episodes", episodes.into())?;
     }
-    if args.lockstep {
+    if choices.lockstep {
         set("run", "mode", "lockstep".into())?;
     }
-    for assignment in &args.set {
+    for assignment in &choices.set {
         let (key, value) = assignment
             .split_once('=')
             .filter(|(key, _)| key.contains('.'))
@@ -226,8 +219,8 @@ fn suit(table: &mut Table, spec: &EnvironmentSpec) -> anyhow::Result<()> {
         (Space::Discrete { .. }, Space::Discrete { .. }) => FOR_A_TABLE,
     };
     let mut method: Table = text.parse()?;
-    let another = |name: &&str| table.contains_key(*name) && !method.contains_key(*name);
-    if METHODS.iter().any(another) {
+    let is_another = |name: &&str| table.contains_key(*name) && !method.contains_key(*name);
+    if Algorithm::NAMES.iter().any(is_another) {
         return Ok(());
     }
     if method.contains_key("reinforce") {
@@ -282,8 +275,7 @@ mod tests {
         let crate::cli::Command::Train(args) = cli.command else {
             unreachable!()
         };
-        let (_, table) = sections(&args.what)?;
-        resolve(table, &args, &args.what)
+        decide(&args.what.unwrap(), &args.choices).map(|(_, config)| config)
     }
 
     #[test]

@@ -11,8 +11,8 @@ use toml::{Table, Value};
 use crate::plan::{preset_names, resolved};
 
 /// Explains the keys of one preset or file, or where none is named, all that there are.
-pub(crate) fn explain(what: &str) -> anyhow::Result<()> {
-    let text = if what.is_empty() { everything()? } else { of(what)? };
+pub(crate) fn explain(what: Option<&str>) -> anyhow::Result<()> {
+    let text = what.map_or_else(everything, of)?;
     std::io::stdout().lock().write_all(text.as_bytes())?;
     Ok(())
 }

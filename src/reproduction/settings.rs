@@ -11,7 +11,7 @@ use shoal_common::run_dir::RunDir;
 use toml::Value;
 
 use super::experiment::{Effort, Experiment, Length};
-use crate::cli::TrainArgs;
+use crate::cli::Choices;
 use crate::plan;
 
 /// Keys with their sections, and values as TOML.
@@ -46,8 +46,7 @@ impl Settings {
     /// Those that a run of `experiment` would have.
     pub(super) fn expected(experiment: &Experiment, effort: Effort) -> anyhow::Result<Self> {
         let length = experiment.stages.first().map(|stage| stage.length(effort));
-        let (_, config) = plan::decide(&TrainArgs {
-            what: experiment.preset.into(),
+        let choices = Choices {
             seed: Some(1),
             steps: length.and_then(|length| match length {
                 Length::Steps(steps) => Some(steps),
@@ -55,8 +54,9 @@ impl Settings {
             }),
             lockstep: true,
             set: experiment.settings(effort).map(Into::into).collect(),
-            ..TrainArgs::default()
-        })?;
+            ..Choices::default()
+        };
+        let (_, config) = plan::decide(experiment.preset, &choices)?;
         Self::of(&config)
     }
 

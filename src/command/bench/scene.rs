@@ -10,7 +10,7 @@ use shoal_common::run_dir::RunDir;
 use tempfile::TempDir;
 
 use super::crew::Crew;
-use crate::cli::TrainArgs;
+use crate::cli::Choices;
 use crate::peer::Peer;
 use crate::plan::Plan;
 use crate::room;
@@ -40,15 +40,15 @@ impl Scene {
             .prefix("shoal-bench-")
             .tempdir()
             .context("cannot make a temporary directory")?;
-        let Plan { config, run, .. } = Plan::new(&TrainArgs {
-            what: "pendulum".into(),
+        let choices = Choices {
             run: Some(directory.path().join("run")),
             seed: Some(1),
             actors: Some(actors),
             envs: Some(envs),
             set: set.iter().map(|assignment| (*assignment).into()).collect(),
-            ..TrainArgs::default()
-        })?;
+            ..Choices::default()
+        };
+        let Plan { config, run, .. } = Plan::new("pendulum", &choices)?;
         std::fs::create_dir(run.checkpoints()).context("cannot make the directory for checkpoints")?;
         Ok(Self { config, run, directory })
     }
