@@ -123,7 +123,8 @@ impl Screen {
             }
             (Over::Stop | Over::Help, _) => {}
             (Over::Nothing, '?') => self.over = Over::Help,
-            (Over::Nothing, 's' | '+' | '=' | '-') if self.life != Life::Running => {
+            // A launcher that is silent may hear it all the same, or be busy for a moment only.
+            (Over::Nothing, 's' | '+' | '=' | '-') if matches!(self.life, Life::Unknown | Life::Ended) => {
                 self.say("nothing runs that could be scaled or stopped".into());
             }
             (Over::Nothing, 's') => self.over = Over::Stop,
@@ -177,6 +178,15 @@ mod tests {
         assert_eq!((screen.press('s'), screen.over), (None, Over::Stop));
         assert_eq!((screen.press('n'), screen.over), (None, Over::Nothing));
         assert_eq!(screen.press('y'), None);
+        screen.press('s');
+        assert_eq!(screen.press('y'), Some(Order::Stop));
+    }
+
+    #[test]
+    fn a_run_whose_launcher_is_silent_can_still_be_asked() {
+        let mut screen = running(1);
+        screen.hear(News::Silent("no answer".into()));
+        assert_eq!(screen.press('+'), Some(Order::Scale(2)));
         screen.press('s');
         assert_eq!(screen.press('y'), Some(Order::Stop));
     }
