@@ -100,8 +100,8 @@ struct OneSample<'a> {
 impl WithSimd for OneSample<'_> {
     type Output = ();
 
-    /// Reading W takes all the time there is. So columns that a rectified unit of 0 multiplies are left out, and four others
-    /// go by before z is stored.
+    /// Reading W takes all the time there is. So columns that a rectified unit of 0 multiplies are left out (also where they
+    /// hold what is not a number: the learner, whose batches are larger, sees that), and four others go by before z is stored.
     #[inline(always)]
     fn with_simd<S: Simd>(self, _: S) {
         let Self { z, w, x } = self;
