@@ -13,9 +13,8 @@ use crate::noise::OrnsteinUhlenbeck;
 /// number, so that a step done again gets the same ones.
 #[derive(Clone, Debug)]
 pub enum Exploration {
-    /// DDPG: the policy's action and noise (line 8 of Algorithm 4). The stream is there where actions are drawn uniformly
-    /// until something has been learned; a step takes its numbers either for these or for the noise.
-    Noise(PolicyNetwork, OrnsteinUhlenbeck, Option<Stream>),
+    /// DDPG: the policy's action and noise (line 8 of Algorithm 4).
+    Noise(PolicyNetwork, OrnsteinUhlenbeck),
     /// REINFORCE: an action drawn from π(·|s), the softmax of the scores (line 3 of Algorithm 3).
     Sample(Scores, Stream),
     /// Q-learning and SARSA: the action with the highest value, the first of equals, but with probability ε any of all
@@ -37,9 +36,8 @@ impl Exploration {
         Ok(match algorithm {
             Algorithm::Ddpg(ddpg, noise) => {
                 let network = policy::deterministic(ddpg, spec, environments)?;
-                let uniform = (noise.warmup == Warmup::Uniform).then(|| stream.clone());
                 let noise = OrnsteinUhlenbeck::new(noise, environments, spec.action.width(), stream);
-                Self::Noise(network, noise, uniform)
+                Self::Noise(network, noise)
             }
             Algorithm::Reinforce(reinforce) => Self::Sample(policy::softmax(reinforce, spec, environments)?, stream),
             Algorithm::QLearning(tabular) | Algorithm::Sarsa(tabular) => {
@@ -52,28 +50,25 @@ impl Exploration {
     /// What the policy's parameters are.
     pub fn layout(&self) -> PolicyLayout {
         match self {
-            Self::Noise(network, ..) => PolicyLayout::Deterministic(*network.layout()),
+            Self::Noise(network, _) => PolicyLayout::Deterministic(*network.layout()),
             Self::Sample(scores, _) | Self::EpsilonGreedy(scores, ..) => scores.layout(),
         }
     }
 
     /// Chooses the actions of step number `step` as `act` does, but with a policy that no update has made.
     pub fn warm_up(&mut self, parameters: &[f32], observations: &[f32], step: u64, actions: &mut [f32]) {
-        let Self::Noise(network, _, Some(stream)) = self else {
-            return self.act(parameters, observations, step, actions);
-        };
-        go_to(stream, step);
-        for action in actions.chunks_exact_mut(network.range().width()) {
-            for (i, a) in action.iter_mut().enumerate() {
-                *a = network.range().action(i, stream.random_range(-1.0..=1.0));
+        match self {
+            Self::Noise(network, noise) if noise.warmup() == Warmup::Uniform => {
+                noise.draw_uniformly(step, actions, network.range());
             }
+            _ => self.act(parameters, observations, step, actions),
         }
     }
 
     /// Chooses the actions of step number `step`, one for each observation.
     pub fn act(&mut self, parameters: &[f32], observations: &[f32], step: u64, actions: &mut [f32]) {
         match self {
-            Self::Noise(network, noise, _) => {
+            Self::Noise(network, noise) => {
                 network.forward(parameters, observations, actions);
                 noise.advance(step);
                 noise.disturb(actions, network.range());
@@ -99,7 +94,7 @@ impl Exploration {
 
     /// Begins an episode of one environment (line 5 of Algorithm 4).
     pub fn begin_episode(&mut self, environment: usize) {
-        if let Self::Noise(_, noise, _) = self {
+        if let Self::Noise(_, noise) = self {
             noise.reset(environment);
         }
     }
@@ -107,14 +102,14 @@ impl Exploration {
     /// What the next step depends on besides its number, environment after environment.
     pub(crate) fn state(&self) -> &[f64] {
         match self {
-            Self::Noise(_, noise, _) => noise.state(),
+            Self::Noise(_, noise) => noise.state(),
             Self::Sample(..) | Self::EpsilonGreedy(..) => &[],
         }
     }
 
     /// Goes on from this state; another length than `state` has is none of this exploration.
     pub(crate) fn restore(&mut self, state: &[f64]) {
-        if let Self::Noise(_, noise, _) = self {
+        if let Self::Noise(_, noise) = self {
             noise.restore(state);
         }
     }

@@ -2,7 +2,7 @@
 
 use rand::RngExt;
 use rand_distr::StandardNormal;
-use shoal_common::config::Exploration;
+use shoal_common::config::{Exploration, Warmup};
 use shoal_common::network::ActionRange;
 use shoal_common::stream::Stream;
 
@@ -43,15 +43,35 @@ impl OrnsteinUhlenbeck {
         self.x.copy_from_slice(state);
     }
 
+    /// How to act while nothing has been learned.
+    pub fn warmup(&self) -> Warmup {
+        self.settings.warmup
+    }
+
+    /// Draws every element of the actions uniformly from its range, with the numbers of step `step`. The processes stay as
+    /// they are.
+    pub fn draw_uniformly(&mut self, step: u64, actions: &mut [f32], range: &ActionRange) {
+        self.go_to(step);
+        for action in actions.chunks_exact_mut(range.width()) {
+            for (i, a) in action.iter_mut().enumerate() {
+                *a = range.action(i, self.stream.random_range(-1.0..=1.0));
+            }
+        }
+    }
+
     /// Advances every process by step number `step`: x ← x − θ x + σ N(0, 1).
     pub fn advance(&mut self, step: u64) {
-        self.stream.set_stream(step);
-        self.stream.set_word_pos(0);
+        self.go_to(step);
         let Exploration { theta, sigma, .. } = self.settings;
         for x in &mut self.x {
             let normal: f64 = self.stream.sample(StandardNormal);
             *x += -theta * *x + sigma * normal;
         }
+    }
+
+    fn go_to(&mut self, step: u64) {
+        self.stream.set_stream(step);
+        self.stream.set_word_pos(0);
     }
 
     /// Adds the noise to the actions, in units of half the range of each action element, and clips the sum to the range

@@ -19,7 +19,8 @@ fn every_run_is_listed_with_its_state() {
     let empty = place.output(&["list"]);
     assert_eq!(String::from_utf8_lossy(&empty.stdout), "no runs in runs\n");
 
-    place.train(&["pendulum", "--steps", "400", "--run", "runs/finished"]);
+    let length = ["--steps", "400", "--lockstep", "--set", "evaluation.every=100"];
+    place.train(&[&["pendulum", "--run", "runs/finished"][..], &length].concat());
     let endless = ["--steps", "100000000"];
     let killed = place.start("runs/killed", &endless);
     killed.learns_on();
@@ -45,7 +46,12 @@ fn every_run_is_listed_with_its_state() {
         (&finished["environment"], &finished["algorithm"]),
         (&"pendulum".into(), &"ddpg".into())
     );
-    assert!(finished["best_return"].as_f64().unwrap() < 0.0);
+    let evaluations = std::fs::read_to_string(place.path().join("runs/finished/evaluations.csv")).unwrap();
+    let returns = evaluations.lines().skip(1).map(|row| row.split(',').nth(4).unwrap());
+    let mut returns: Vec<f64> = returns.map(|mean| mean.parse().unwrap()).collect();
+    returns.sort_by(f64::total_cmp);
+    assert!(returns.first() < returns.last(), "more than one: {returns:?}");
+    assert_eq!(finished["best_return"].as_f64(), returns.last().copied());
     assert!(
         listed(&list, "damaged")["reason"]
             .as_str()
