@@ -22,6 +22,8 @@ import tempfile
 import time
 from pathlib import Path
 
+from wall_clock import returns_of
+
 ENVIRONMENT = "HalfCheetah-v5"
 EVERY = 10_000
 EPISODES = 10
@@ -116,18 +118,6 @@ def stable_baselines3(seed, core, seconds):
         device="cpu",
     ).learn(100_000_000, callback=judge)
     return judge.judged
-
-
-def returns_of(model, environments):
-    """Of one episode of each environment, from the same starts every time. HalfCheetah's all end at the time limit."""
-    observations, _ = environments.reset(seed=10_000)
-    total, over = 0.0, False
-    while not over:
-        actions, _ = model.predict(observations, deterministic=True)
-        observations, rewards, _, truncated, _ = environments.step(actions)
-        total = total + rewards
-        over = truncated.all()
-    return total
 
 
 def train(program, seed, minutes):
