@@ -8,24 +8,18 @@
 mod support;
 
 use std::path::Path;
-use std::process::Command;
 
 use rustix::process::Signal;
 use shoal_common::config::Config;
 use shoal_common::space::Space;
-use support::{Workplace, complaint, end_of, parse, until};
+use support::{Workplace, complaint, end_of, parse, python_serves, until};
 
 /// A module with environments for the tests.
 const OURS: &str = "gym:shoal_test_environments:";
 
 /// Where `python3` serves Gymnasium's environments, and finds those of the tests; `None` where it cannot.
 fn place() -> Option<Workplace> {
-    let found = Command::new("python3").args(["-c", "import shoal_gym.server"]).output();
-    if !found.is_ok_and(|output| output.status.success()) {
-        assert!(
-            std::env::var_os("SHOAL_REQUIRE_PYTHON").is_none(),
-            "python3 has no shoal_gym: pip install ./python"
-        );
+    if !python_serves() {
         eprintln!("skipped: python3 has no shoal_gym");
         return None;
     }

@@ -361,6 +361,17 @@ pub(crate) fn parse(printed: &str) -> serde_json::Value {
     serde_json::from_str(printed).unwrap()
 }
 
+/// Whether `python3` serves Gymnasium's environments. With `SHOAL_REQUIRE_PYTHON` set it must.
+pub(crate) fn python_serves() -> bool {
+    let found = Command::new("python3").args(["-c", "import shoal_gym.server"]).output();
+    let serves = found.is_ok_and(|output| output.status.success());
+    assert!(
+        serves || std::env::var_os("SHOAL_REQUIRE_PYTHON").is_none(),
+        "python3 has no shoal_gym: pip install ./python"
+    );
+    serves
+}
+
 /// Waits until something holds.
 pub(crate) fn until(what: &str, mut holds: impl FnMut() -> bool) {
     let begun = Instant::now();
