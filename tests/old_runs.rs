@@ -1,0 +1,198 @@
+//! Runs that earlier versions left behind are read, and gone on with. `tests/data/README.md` says what they are.
+//!
+//! An unpacked run has the id it was made with, so two copies of it must not go on at once: each archive has one test.
+
+#![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
+#![allow(clippy::print_stderr, reason = "a test says what it reads, and what it skips")]
+
+mod support;
+
+use std::path::Path;
+use std::process::Command;
+
+use rten::Model;
+use safetensors::SafeTensors;
+use serde_json::Value;
+use support::{Leftovers, Workplace, json, python_serves};
+
+/// The versions whose runs are kept, as their directories in `tests/data/` are named.
+const VERSIONS: [&str; 1] = ["2d50610"];
+
+/// How the kept run ended.
+#[derive(Clone, Copy, PartialEq)]
+enum Ended {
+    Finished,
+    Stopped,
+}
+
+#[test]
+fn a_free_run_that_is_finished_is_read_and_given_more_steps() {
+    every_version_of("free-finished", Ended::Finished);
+}
+
+#[test]
+fn a_free_run_that_was_stopped_is_read_and_goes_on_to_its_end() {
+    every_version_of("free-stopped", Ended::Stopped);
+}
+
+#[test]
+fn a_lockstep_run_that_is_finished_is_read_and_given_more_steps() {
+    every_version_of("lockstep-finished", Ended::Finished);
+}
+
+#[test]
+fn a_lockstep_run_that_was_stopped_is_read_and_goes_on_to_its_end() {
+    every_version_of("lockstep-stopped", Ended::Stopped);
+}
+
+#[test]
+fn a_gymnasium_run_that_is_finished_is_read_and_given_more_steps() {
+    every_version_of("gym-finished", Ended::Finished);
+}
+
+#[test]
+fn a_gymnasium_run_that_was_stopped_is_read_and_goes_on_to_its_end() {
+    every_version_of("gym-stopped", Ended::Stopped);
+}
+
+fn every_version_of(name: &str, ended: Ended) {
+    let playable = !name.starts_with("gym-") || python_serves();
+    if !playable {
+        eprintln!("skipped: eval and resume of {name}, python3 has no shoal_gym");
+    }
+    for version in VERSIONS {
+        eprintln!("{version}/{name}");
+        let place = unpacked(version, name);
+        let state = match ended {
+            Ended::Finished => "finished",
+            Ended::Stopped => "stopped",
+        };
+        is_listed_as(&place, state);
+        is_read(&place, playable);
+        if playable {
+            goes_on(&place, ended);
+            // Now its records have rows of both versions.
+            is_listed_as(&place, "finished");
+            is_read(&place, playable);
+        }
+    }
+}
+
+/// A place in which the archive's run lies as `run`.
+fn unpacked(version: &str, name: &str) -> Workplace {
+    let place = Workplace::new();
+    let archive = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("tests/data/{version}/{name}.tar.gz"));
+    let status = Command::new("tar")
+        .args(["--extract", "--gzip", "--no-same-owner", "--file"])
+        .arg(&archive)
+        .current_dir(place.path())
+        .status();
+    assert!(status.unwrap().success(), "{}", archive.display());
+    std::fs::rename(place.path().join(name), place.path().join("run")).unwrap();
+    place
+}
+
+/// What a command that must succeed printed.
+fn printed(place: &Workplace, arguments: &[&str]) -> String {
+    let output = place.output(arguments);
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{arguments:?}: {said}");
+    String::from_utf8(output.stdout).unwrap()
+}
+
+/// `shoal list` says that the run is in this state.
+fn is_listed_as(place: &Workplace, state: &str) {
+    let listed: Value = serde_json::from_str(&printed(place, &["list", ".", "--json"])).unwrap();
+    assert_eq!(listed["runs"][0]["state"], state, "{listed}");
+}
+
+/// The run's policies, records and settings are read by all commands that do. What plays episodes of an environment that
+/// cannot be served here is left out.
+fn is_read(place: &Workplace, playable: bool) {
+    if playable {
+        is_judged_as_before(place);
+    }
+
+    let figures = printed(place, &["plot", "run", "--out", "figures"]);
+    assert!(figures.contains("learning-curve.svg"), "{figures}");
+    for figure in figures.lines() {
+        let figure = std::fs::read_to_string(place.path().join(figure)).unwrap();
+        assert!(figure.contains("<polyline"), "something is drawn");
+    }
+
+    printed(place, &["report", "run", "--out", "page.html"]);
+    let page = std::fs::read_to_string(place.path().join("page.html")).unwrap();
+    let shown = page.split_once("id=\"data\">").unwrap().1;
+    let shown: Value = serde_json::from_str(shown.split_once("</script>").unwrap().0).unwrap();
+    let shown = &shown["runs"][0];
+    let rows = |what: &str| shown[what]["rows"].as_u64().unwrap();
+    assert!(rows("evaluations") > 0 && rows("exploration") > 0, "{shown}");
+    let played = shown["played"]["episodes"].as_array();
+    assert_eq!(played.is_some_and(|episodes| !episodes.is_empty()), playable, "{shown}");
+
+    for policy in ["best", "last"] {
+        let export = |form| {
+            let arguments = ["export", "run", "--policy", policy, "--out", "policy", "--format", form];
+            printed(place, &arguments);
+            std::fs::read(place.path().join("policy")).unwrap()
+        };
+        Model::load(export("onnx")).unwrap();
+        assert!(!SafeTensors::deserialize(&export("safetensors")).unwrap().is_empty());
+    }
+}
+
+/// The best policy does what the run's evaluator wrote down. Another processor may round otherwise.
+fn is_judged_as_before(place: &Workplace) {
+    let mut records = csv::Reader::from_path(place.path().join("run/evaluations.csv")).unwrap();
+    let columns = records.headers().unwrap().clone();
+    let column = |name| columns.iter().position(|column| column == name).unwrap();
+    let [best, episodes, mean] = ["best", "episodes", "return_mean"].map(column);
+    let judged = records
+        .records()
+        .map(Result::unwrap)
+        .filter(|row| &row[best] == "1")
+        .last();
+    let judged = judged.unwrap();
+
+    let judge = ["eval", "run", "--json", "--episodes", &judged[episodes]];
+    let now: Value = serde_json::from_str(&printed(place, &judge)).unwrap();
+    let now = now["return_mean"].as_f64().unwrap();
+    let then: f64 = judged[mean].parse().unwrap();
+    assert!((now - then).abs() <= 1e-3 * then.abs().max(1.0), "{now} and {then}");
+}
+
+/// Goes on to the end the run was to have, or to a later one, with all that was learned and collected before.
+fn goes_on(place: &Workplace, ended: Ended) {
+    let before = support::json(&place.output(&["status", "run", "--json"]));
+    let number = |field: &str| before[field].as_u64().unwrap();
+    let rows = number("replay_rows");
+    let mut resume = vec!["resume", "run", "--json"];
+    let mut steps = number("steps");
+    let more;
+    if ended == Ended::Finished {
+        steps += 1000;
+        more = steps.to_string();
+        resume.extend(["--steps", &more]);
+    }
+    assert!(0 < rows && rows < steps, "{before}");
+
+    let output = place.output(&resume);
+    let run = place.path().join("run");
+    let log = std::fs::read_to_string(run.join("shoal.log")).unwrap();
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(0), "{said}\n{log}");
+    let result = json(&output);
+    assert_eq!(result["env_steps"], steps);
+    assert!(result["eval_return_mean"].is_f64(), "{result}");
+    let updates = number("updates");
+    assert!(result["updates"].as_u64().unwrap() > updates, "{result}");
+    let going_on = format!("going on after {updates} updates and ");
+    let going_on = log
+        .lines()
+        .find(|line| line.contains(&going_on))
+        .unwrap_or_else(|| panic!("{log}"));
+    assert!(going_on.ends_with(&format!("of {rows} rows")), "{going_on}");
+    assert!(!log.contains("is damaged"), "{log}");
+    let left = Leftovers::of(&run);
+    assert!(left.processes().is_empty() && left.files().is_empty());
+}
