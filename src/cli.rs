@@ -1,5 +1,6 @@
 //! What can be typed. Nothing is decided here.
 
+use std::ffi::OsString;
 use std::path::PathBuf;
 
 use clap::builder::PossibleValuesParser;
@@ -61,6 +62,10 @@ pub(crate) enum Command {
     Evaluator(RoleArgs),
     #[command(hide = true)]
     Learner(RoleArgs),
+    #[command(hide = true)]
+    CleanUp(CleanUpArgs),
+    #[command(hide = true)]
+    Tied(TiedArgs),
 }
 
 #[derive(Args, Clone, Debug)]
@@ -276,6 +281,20 @@ pub(crate) struct ManArgs {
     /// Where to put a page for each command [default: the first page, on standard output].
     #[arg(long, value_name = "DIR")]
     pub(crate) out: Option<PathBuf>,
+}
+
+/// How a program is started that is to end with the process that starts it.
+#[derive(Args, Clone, Debug)]
+pub(crate) struct TiedArgs {
+    pub(crate) parent: u32,
+    #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
+    pub(crate) program: Vec<OsString>,
+}
+
+/// How the launcher has shared memory cleaned up.
+#[derive(Args, Clone, Debug)]
+pub(crate) struct CleanUpArgs {
+    pub(crate) run_id: String,
 }
 
 /// How the launcher starts a role; everything else is in the run directory.

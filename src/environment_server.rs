@@ -1,21 +1,25 @@
 //! Environment servers that are other programs (`docs/PROTOCOL.md`): how one is started, and a conversation with one
 //! outside of any run, to learn what it serves or to try a policy in it.
 
-use std::os::unix::process::CommandExt;
+use std::ffi::OsString;
+use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::path::PathBuf;
-use std::process::Command;
-use std::time::Duration;
+use std::process::{Command, ExitCode, ExitStatus, Stdio};
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
-use rustix::process::{PidfdFlags, pidfd_open};
+use rustix::io::Errno;
+use rustix::process::{
+    Pid, PidfdFlags, Signal, getpgrp, getpid, getppid, kill_process, kill_process_group, pidfd_open,
+    set_parent_process_death_signal,
+};
 use shoal_common::channel::environment::{Begin, EnvironmentClient, Observed, Stepped, describe};
-use shoal_common::channel::{Bell, Domain, Interruption, Place};
+use shoal_common::channel::{Bell, Domain, Interruption, Place, Services};
 use shoal_common::config::Environment;
 use shoal_common::report::Role;
 use shoal_common::space::EnvironmentSpec;
-use shoal_common::stop::Stop;
-use tempfile::TempDir;
+use shoal_common::stop::{GRACE, Stop};
 
 use crate::peer::Peer;
 
@@ -70,10 +74,92 @@ impl Post<'_> {
     }
 }
 
-/// Becomes the program: the process stays the launcher's child, with its standard input and error.
-pub(crate) fn become_it(mut command: Command) -> anyhow::Error {
-    let cause = command.exec();
-    anyhow::Error::from(cause).context(cannot_start(&command))
+/// The hidden command that becomes a program which does not outlive the process that started it.
+pub(crate) const TIED: &str = "tied";
+
+/// The command that starts `program` so: dead with this process, however that ends, and whatever the program is busy with.
+fn tied(program: &Command) -> Command {
+    let mut command = Command::new("/proc/self/exe");
+    command.arg0("shoal").args([TIED, &std::process::id().to_string()]);
+    command.arg(program.get_program()).args(program.get_args());
+    command
+}
+
+/// What that command does: dies with the process `parent`, and becomes the program.
+///
+/// # Errors
+/// When the program cannot be started.
+pub(crate) fn become_tied(parent: u32, words: &[OsString]) -> anyhow::Result<ExitCode> {
+    let Some((program, arguments)) = words.split_first() else {
+        bail!("there is no program to start");
+    };
+    set_parent_process_death_signal(Some(Signal::KILL)).context("cannot be tied to the process that starts it")?;
+    if getppid().map(Pid::as_raw_pid) != Some(parent as i32) {
+        bail!("the process that starts it has ended");
+    }
+    let mut command = Command::new(program);
+    let cause = command.args(arguments).exec();
+    Err(anyhow::Error::from(cause).context(cannot_start(&command)))
+}
+
+/// Plays the role by running the program, which has this process's standard input and error, and ends as it ends. A program
+/// that does not end when its standard input closes is ended, with all it has started, as a role of ours would be: not even
+/// one that is stuck outlives its run.
+///
+/// # Errors
+/// When it cannot be started or watched.
+pub(crate) fn serve_by(program: &Command) -> anyhow::Result<ExitCode> {
+    let mut child = tied(program)
+        .stdout(Stdio::null())
+        .spawn()
+        .with_context(|| cannot_start(program))?;
+    let process =
+        pidfd_open(Pid::from_child(&child), PidfdFlags::empty()).context("cannot watch the environment server")?;
+    // Closing is told without being asked for; what comes in is for the program.
+    let stdin = std::io::stdin();
+    let mut until = [
+        PollFd::new(&process, PollFlags::IN),
+        PollFd::new(&stdin, PollFlags::empty()),
+    ];
+    while until.iter().all(|event| event.revents().is_empty()) {
+        match poll(&mut until, None) {
+            Ok(_) | Err(Errno::INTR) => {}
+            Err(cause) => return Err(anyhow::Error::from(cause).context("cannot watch the environment server")),
+        }
+    }
+    let deadline = Instant::now() + GRACE;
+    loop {
+        let left = deadline.saturating_duration_since(Instant::now());
+        let patience = Timespec {
+            tv_sec: left.as_secs() as i64,
+            tv_nsec: left.subsec_nanos().into(),
+        };
+        match poll(&mut [PollFd::new(&process, PollFlags::IN)], Some(&patience)) {
+            Ok(0) => return kill_this_group(),
+            Ok(_) => return end_as(child.wait()?),
+            Err(Errno::INTR) => {}
+            Err(cause) => return Err(anyhow::Error::from(cause).context("cannot watch the environment server")),
+        }
+    }
+}
+
+fn kill_this_group() -> anyhow::Result<ExitCode> {
+    if getpgrp() == getpid() {
+        kill_process_group(getpgrp(), Signal::KILL)?;
+    }
+    kill_process(getpid(), Signal::KILL)?;
+    Ok(ExitCode::FAILURE)
+}
+
+/// Ends this process as another one has ended.
+fn end_as(status: ExitStatus) -> anyhow::Result<ExitCode> {
+    if let Some(signal) = status.signal().and_then(Signal::from_named_raw) {
+        kill_process(getpid(), signal)?;
+    }
+    Ok(status
+        .code()
+        .and_then(|code| u8::try_from(code).ok())
+        .map_or(ExitCode::FAILURE, ExitCode::from))
 }
 
 fn cannot_start(command: &Command) -> String {
@@ -89,9 +175,9 @@ pub(crate) struct Conversation {
     bell: Bell,
     spec: EnvironmentSpec,
     program: Peer,
-    // The last to go.
+    // The last to go, in this order.
+    _services: Services,
     _corner: Corner,
-    _directory: TempDir,
 }
 
 /// A corner of shared memory that is left tidy.
@@ -114,9 +200,9 @@ impl Conversation {
         Domain::remove_abandoned()?;
         let run_id = format!("{:08x}", rand::random::<u32>());
         let domain = Domain::join(&run_id, 1)?;
-        let directory = tempfile::tempdir().context("cannot make a temporary directory")?;
         let post = Post {
-            iceoryx2: directory.path().join("iceoryx2.toml"),
+            // Where everybody is killed it goes with the rest.
+            iceoryx2: domain.directory()?.join("iceoryx2.toml"),
             run_id: &run_id,
             index: 0,
             incarnation: 1,
@@ -126,13 +212,13 @@ impl Conversation {
             stream: 0,
         };
         match opened(&domain, &post, environment) {
-            Ok((client, bell, spec, program)) => Ok(Self {
+            Ok((services, client, bell, spec, program)) => Ok(Self {
                 client,
                 bell,
                 spec,
                 program,
+                _services: services,
                 _corner: Corner(Some(domain)),
-                _directory: directory,
             }),
             Err(error) => {
                 domain.leave()?;
@@ -151,7 +237,7 @@ impl Conversation {
     /// # Errors
     /// When the program has ended or refuses.
     pub(crate) fn begin_evaluation(&mut self, number: u64) -> anyhow::Result<Observed> {
-        let begun = self.client.reset(&self.bell, Begin::Evaluation(number));
+        let begun = self.client.reset(&self.bell, Begin::Evaluation(number), || ());
         answered(begun, &mut self.program)
     }
 
@@ -160,7 +246,7 @@ impl Conversation {
     /// # Errors
     /// When the program has ended or refuses.
     pub(crate) fn step(&mut self, actions: &[f32]) -> anyhow::Result<Observed> {
-        let stepped = self.client.step(&self.bell, actions);
+        let stepped = self.client.step(&self.bell, actions, || ());
         match answered(stepped, &mut self.program)? {
             Stepped::Taken(observed) => Ok(observed),
             Stepped::Lost => bail!("the environment server gave up its episodes"),
@@ -174,15 +260,19 @@ impl Drop for Conversation {
     }
 }
 
-type Opened = (EnvironmentClient, Bell, EnvironmentSpec, Peer);
+type Opened = (Services, EnvironmentClient, Bell, EnvironmentSpec, Peer);
 
 fn opened(domain: &Domain, post: &Post<'_>, environment: &Environment) -> anyhow::Result<Opened> {
-    let Some(mut command) = post.command(environment)? else {
+    let Some(command) = post.command(environment)? else {
         bail!("environment {} is not served by another program", environment.name);
     };
     std::fs::write(&post.iceoryx2, domain.iox_config()?).context("cannot write a temporary file")?;
+    let mut services = Services::new(domain)?;
+    services.create_common(domain)?;
+    services.create_environment(domain, post.index)?;
     let bell = Bell::hang(domain, post.client)?;
-    let mut program = Peer::start(&mut command, "environment server".into()).with_context(|| cannot_start(&command))?;
+    let mut program =
+        Peer::start(&mut tied(&command), "environment server".into()).with_context(|| cannot_start(&command))?;
     let heard = Stop::default();
     let stop = stopped_when_it_ends(&program, heard.clone())?;
     let described = describe(domain, post.index, &bell, stop.clone());
@@ -190,7 +280,7 @@ fn opened(domain: &Domain, post: &Post<'_>, environment: &Environment) -> anyhow
     let (spec, environments) = answered(described, &mut program).map_err(with_advice)?;
     let opened = EnvironmentClient::open(domain, post.index, &spec, environments, stop);
     let client = answered(opened.map_err(Interruption::from), &mut program)?;
-    Ok((client, bell, spec, program))
+    Ok((services, client, bell, spec, program))
 }
 
 /// Says what to do where Gymnasium's server is not installed.

@@ -1,5 +1,6 @@
 //! The launcher: starts the roles of a run, watches them, keeps the records, and ends all of them.
 
+mod cleaner;
 mod crew;
 mod desk;
 mod incarnations;
@@ -7,6 +8,7 @@ mod log;
 mod member;
 mod process;
 mod progress;
+mod stall;
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -21,11 +23,14 @@ use shoal_common::report::{EpisodeReport, EvaluationReport, Heartbeat, LearnerRe
 use shoal_common::run_dir::RunDir;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
+pub(crate) use self::cleaner::work as clean_up;
 use self::crew::Crew;
 use self::log::Log;
 pub(crate) use self::log::{EVERYBODY_ENDED, FAILED};
 use self::progress::Progress;
 pub(crate) use self::progress::thousands;
+use self::stall::Stalls;
+use crate::outcome::{self, State};
 use crate::recorder::Recorder;
 use crate::{room, status};
 
@@ -45,6 +50,10 @@ const OTHERS_END: Duration = Duration::from_secs(15);
 /// How long the roles of a launcher that was killed may take to end.
 const PREDECESSORS_END: Duration = Duration::from_secs(10);
 
+/// How often the run's shared memory may be made anew without an hour between.
+const RENEWALS: usize = 5;
+const HOUR: Duration = Duration::from_secs(3600);
+
 /// How a run came to its end.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Ending {
@@ -54,6 +63,8 @@ pub(crate) enum Ending {
     Stopped,
     /// By this signal; the learner saved its state.
     Interrupted(i32),
+    /// Dead processes occupy places in shared memory that cannot be freed: it goes on in shared memory that is made anew.
+    Renewed,
 }
 
 /// What is known of a run when it ends.
@@ -67,8 +78,32 @@ pub(crate) struct Outcome {
 }
 
 /// Runs all roles until the learner is through, a signal comes, or somebody asks for the end.
-pub(crate) fn run(config: Config, run: &RunDir, quiet: bool) -> anyhow::Result<Outcome> {
+pub(crate) fn run(mut config: Config, run: &RunDir, quiet: bool) -> anyhow::Result<Outcome> {
     let signals = Signals::register()?;
+    let (mut renewals, mut before, mut wall) = (Vec::new(), None, Duration::ZERO);
+    loop {
+        let outcome = run_once(config, run, &signals, quiet)?;
+        wall += outcome.wall;
+        let before = before.get_or_insert(outcome.before.clone());
+        if outcome.ending != Ending::Renewed {
+            let before = before.clone();
+            return Ok(Outcome {
+                before,
+                wall,
+                ..outcome
+            });
+        }
+        renewals.retain(|then: &Instant| then.elapsed() < HOUR);
+        renewals.push(Instant::now());
+        if renewals.len() > RENEWALS {
+            anyhow::bail!("the run's shared memory had to be made anew {RENEWALS} times within an hour");
+        }
+        // It may have been scaled.
+        config = run.config()?;
+    }
+}
+
+fn run_once(config: Config, run: &RunDir, signals: &Signals, quiet: bool) -> anyhow::Result<Outcome> {
     Domain::wait_for_the_last(&config.run.id, PREDECESSORS_END).map_err(|error| explain(error, run))?;
     Domain::remove_abandoned()?;
     let domain = Domain::join(&config.run.id, config.actors.max)?;
@@ -155,7 +190,8 @@ struct Launcher<'a> {
     log: Log,
     recorder: Recorder,
     progress: Progress,
-    signals: Signals,
+    signals: &'a Signals,
+    stalls: Stalls,
     begun: Instant,
     heartbeats: Reports<Heartbeat>,
     episode_reports: Reports<EpisodeReport>,
@@ -164,7 +200,13 @@ struct Launcher<'a> {
 }
 
 impl<'a> Launcher<'a> {
-    fn new(config: Config, run: &'a RunDir, domain: &'a Domain, signals: Signals, quiet: bool) -> anyhow::Result<Self> {
+    fn new(
+        config: Config,
+        run: &'a RunDir,
+        domain: &'a Domain,
+        signals: &'a Signals,
+        quiet: bool,
+    ) -> anyhow::Result<Self> {
         let log = Log::open(&run.log())?;
         write_iox_config(domain, run)?;
         std::fs::create_dir_all(run.checkpoints()).context("cannot make the directory for checkpoints")?;
@@ -172,9 +214,13 @@ impl<'a> Launcher<'a> {
             std::fs::create_dir_all(run.policies()).context("cannot make the directory for policies")?;
         }
         let recorder = Recorder::open(run, config.replay.warmup)?;
+        let rest = status::at_rest(&config, run)?;
+        outcome::Outcome::new(State::Running, rest.env_steps, rest.episodes).write(run)?;
+        // Makes the services that are opened below.
+        let crew = Crew::new(&config, run, domain, log.clone())?;
         Ok(Self {
             control: ControlPort::open(domain)?,
-            rest: status::at_rest(&config, run)?,
+            rest,
             to_end: None,
             ends: false,
             run,
@@ -183,7 +229,8 @@ impl<'a> Launcher<'a> {
             episode_reports: Reports::open(domain)?,
             evaluation_reports: Reports::open(domain)?,
             learner_reports: Reports::open(domain)?,
-            crew: Crew::new(&config, run, log.clone())?,
+            crew,
+            stalls: Stalls::new(Duration::from_secs(config.run.stall_seconds)),
             log,
             recorder,
             progress: Progress::new(&config, run, quiet),
@@ -206,30 +253,63 @@ impl<'a> Launcher<'a> {
         if let Some(error) = ending.as_ref().err().or(ended.as_ref().err()) {
             let why = format!("{error:#}").replace('\n', " ");
             self.log.note("launcher", &format!("{FAILED}{why}"));
+            // The error itself is what is to be told.
+            let _ = self
+                .outcome(State::Failed)
+                .map(|outcome| outcome.because(why).write(self.run));
         }
         let ending = ending?;
         ended?;
         self.recorder.flush()?;
+        // What the learner saved: its last report may have come too late to be heard.
+        let after = status::at_rest(&self.config, self.run)?;
+        let stopped = outcome::Outcome::new(State::Stopped, after.env_steps, after.episodes);
+        match ending {
+            Ending::Stopped => stopped.because("somebody asked for it").write(self.run)?,
+            Ending::Interrupted(signal) => stopped.because(format!("signal {signal}")).write(self.run)?,
+            // A finished run is still to be judged.
+            Ending::Finished | Ending::Renewed => {}
+        }
         Ok(Outcome {
             ending,
             wall: self.begun.elapsed(),
-            // What the learner saved: its last report may have come too late to be heard.
-            after: status::at_rest(&self.config, self.run)?,
+            after,
             before: self.rest,
         })
     }
 
+    fn outcome(&self, state: State) -> anyhow::Result<outcome::Outcome> {
+        let rest = status::at_rest(&self.config, self.run)?;
+        Ok(outcome::Outcome::new(state, rest.env_steps, rest.episodes))
+    }
+
     fn watch(&mut self) -> anyhow::Result<Ending> {
-        self.crew.start_all()?;
+        self.crew.start_all(self.domain)?;
         loop {
             if let Some(signal) = self.signals.received() {
                 return Ok(Ending::Interrupted(signal));
             }
+            self.crew.see_ends();
             self.read_reports()?;
             self.attend()?;
-            if self.crew.look_after(self.domain)? == crew::State::LearnerDone {
-                self.await_last_evaluation()?;
-                return Ok(Ending::Finished);
+            match self.crew.look_after(self.domain)? {
+                crew::State::AtWork => {}
+                crew::State::LearnerDone => {
+                    self.await_last_evaluation()?;
+                    return Ok(Ending::Finished);
+                }
+                crew::State::ShmOccupied if self.to_end.is_some() => {}
+                crew::State::ShmOccupied => {
+                    let why =
+                        "dead processes occupy places in shared memory: the run goes on in shared memory made anew";
+                    self.log.note("launcher", why);
+                    self.progress.note(why);
+                    return Ok(Ending::Renewed);
+                }
+            }
+            for stalled in self.crew.replace_stalled(&mut self.stalls) {
+                self.log.note("launcher", &stalled);
+                self.progress.note(&stalled);
             }
             // A learner that has just died shall come back and take in what was sent, before everybody ends.
             let may_end = |asked: Instant| self.crew.has_learner() || asked.elapsed() >= LEARNER_BACK;
@@ -254,7 +334,7 @@ impl<'a> Launcher<'a> {
             to_end,
             ..
         } = self;
-        control.attend(|question| -> anyhow::Result<Option<Answer>> {
+        control.attend(run.key()?, run.path(), |question| -> anyhow::Result<Option<Answer>> {
             match question {
                 Question::Status => Ok(Some(match desk::status(config, run, crew, progress, rest) {
                     Ok(status) => Answer::Status(status),

@@ -10,6 +10,7 @@ use shoal_common::channel::control::RunStatus;
 use shoal_common::run_dir::RunDir;
 
 use crate::launcher::{EVERYBODY_ENDED, FAILED};
+use crate::outcome::{self, Outcome};
 use crate::recorder::read_evaluations;
 use crate::remote::Remote;
 use crate::status::at_rest;
@@ -113,7 +114,7 @@ impl Listed {
             }
             Ok(None) => {
                 let status = at_rest(&run.config()?, run)?;
-                self.state = if status.is_done() { State::Finished } else { ended(run)? };
+                self.state = if status.finished { State::Finished } else { ended(run)? };
                 self.reached(&status);
             }
             Err(error) => {
@@ -153,8 +154,19 @@ fn by_number(a: &str, b: &str) -> Ordering {
     parts(a).cmp(&parts(b)).then_with(|| a.cmp(b))
 }
 
-/// How a run ended that has not reached its end: what its launcher wrote last.
-fn ended(run: &RunDir) -> io::Result<State> {
+/// How a run ended that has not reached its end.
+fn ended(run: &RunDir) -> anyhow::Result<State> {
+    Ok(match Outcome::read(run)?.map(|outcome| outcome.state) {
+        None => ended_by_its_log(run)?,
+        Some(outcome::State::Stopped) => State::Stopped,
+        Some(outcome::State::Failed) => State::Failed,
+        // Finished, and given more steps since, by a launcher that was killed before it said that it runs.
+        Some(outcome::State::Running | outcome::State::Finished) => State::Killed,
+    })
+}
+
+/// The same of a run of a build that wrote no outcome: what its launcher logged last.
+fn ended_by_its_log(run: &RunDir) -> io::Result<State> {
     let mut file = match File::open(run.log()) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(State::New),
         file => file?,

@@ -1,5 +1,7 @@
 //! Shoal: the launcher, and the only binary.
 
+mod child_group;
+mod child_output;
 mod cli;
 mod command;
 mod completion;
@@ -8,6 +10,7 @@ mod export;
 mod figure;
 mod launcher;
 mod listing;
+mod outcome;
 mod peer;
 mod plan;
 mod recorder;
@@ -69,10 +72,12 @@ fn run(command: &Command) -> anyhow::Result<ExitCode> {
         Command::Top(args) => command::top::run(args),
         Command::Completions(args) => command::completions::run(args).map(done),
         Command::Man(args) => command::man::run(args).map(done),
-        Command::EnvServer(args) => role::run(Role::EnvServer, args).map(done),
-        Command::Actor(args) => role::run(Role::Actor, args).map(done),
-        Command::Evaluator(args) => role::run(Role::Evaluator, args).map(done),
-        Command::Learner(args) => role::run(Role::Learner, args).map(done),
+        Command::EnvServer(args) => role::run(Role::EnvServer, args),
+        Command::Actor(args) => role::run(Role::Actor, args),
+        Command::Evaluator(args) => role::run(Role::Evaluator, args),
+        Command::Learner(args) => role::run(Role::Learner, args),
+        Command::Tied(args) => environment_server::become_tied(args.parent, &args.program),
+        Command::CleanUp(args) => launcher::clean_up(&args.run_id),
     }
 }
 

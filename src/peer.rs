@@ -1,9 +1,8 @@
 //! Another process that works for this one outside of any run: a role that is measured, an environment server that is asked.
 
-use std::io::{BufRead, BufReader};
 use std::os::unix::process::CommandExt;
-use std::process::{Child, ChildStdin, Command, ExitStatus, Stdio};
-use std::thread::JoinHandle;
+use std::process::{ChildStdin, Command, ExitStatus};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
@@ -11,6 +10,9 @@ use rustix::process::{Pid, Signal, kill_process};
 use rustix::thread::{CpuSet, sched_setaffinity};
 use shoal_common::report::{Identity, Role};
 use shoal_common::run_dir::RunDir;
+
+use crate::child_group::ChildGroup;
+use crate::child_output::ChildOutput;
 
 /// How long a learner may take to bring its replay to the disk.
 const FAREWELL: Duration = Duration::from_secs(15);
@@ -24,11 +26,11 @@ const INTERRUPTED: i32 = 130;
 /// A process. It ends when its standard input closes, be it because this process is no more.
 #[derive(Debug)]
 pub(crate) struct Peer {
-    child: Child,
-    /// Held apart from the child: waiting for a child closes its own.
+    group: ChildGroup,
     stdin: Option<ChildStdin>,
-    /// Gives the last line that the process wrote.
-    listener: Option<JoinHandle<Option<String>>>,
+    /// What the process writes, and its last line so far.
+    output: Option<ChildOutput>,
+    last_line: Arc<Mutex<Option<String>>>,
     what: String,
 }
 
@@ -58,34 +60,30 @@ impl Peer {
 
     /// Starts a process that messages call `what`.
     pub(crate) fn start(command: &mut Command, what: String) -> std::io::Result<Self> {
-        let mut child = command
-            .stdin(Stdio::piped())
-            .stdout(Stdio::null())
-            .stderr(Stdio::piped())
-            // Ctrl-C is for this process, which then ends the other one.
-            .process_group(0)
-            .spawn()?;
-        let stdin = child.stdin.take();
-        let listener = child
-            .stderr
-            .take()
-            .map(|stderr| std::thread::spawn(move || BufReader::new(stderr).lines().map_while(Result::ok).last()));
-        Ok(Self {
-            child,
+        let (group, stdin, stderr) = ChildGroup::start(command)?;
+        let mut peer = Self {
+            group,
             stdin,
-            listener,
+            output: None,
+            last_line: Arc::default(),
             what,
-        })
+        };
+        let last_line = Arc::clone(&peer.last_line);
+        let keep = move |line: &str| *last_line.lock().unwrap_or_else(PoisonError::into_inner) = Some(line.into());
+        peer.output = stderr
+            .map(|stderr| ChildOutput::read("peer", stderr, keep))
+            .transpose()?;
+        Ok(peer)
     }
 
     /// Its number.
     pub(crate) fn pid(&self) -> Pid {
-        Pid::from_child(&self.child)
+        self.group.pid()
     }
 
     /// An error if the process has ended, with what it said last.
     pub(crate) fn check(&mut self) -> anyhow::Result<()> {
-        match self.child.try_wait()? {
+        match self.group.exit_status() {
             Some(status) => self.ended_early(status),
             None => Ok(()),
         }
@@ -138,7 +136,7 @@ impl Peer {
     fn wait(&mut self, patience: Duration) -> anyhow::Result<ExitStatus> {
         let deadline = Instant::now() + patience;
         loop {
-            match self.child.try_wait()? {
+            match self.group.exit_status() {
                 Some(status) => return Ok(status),
                 None if Instant::now() >= deadline => bail!("the {} did not end when asked to", self.what),
                 None => std::thread::sleep(Duration::from_millis(2)),
@@ -150,24 +148,18 @@ impl Peer {
     pub(crate) fn dismiss(&mut self) {
         self.stdin = None;
         let deadline = Instant::now() + DISMISSAL;
-        while matches!(self.child.try_wait(), Ok(None)) && Instant::now() < deadline {
+        while self.group.exit_status().is_none() && Instant::now() < deadline {
             std::thread::sleep(Duration::from_millis(2));
         }
     }
 
     fn ended_early(&mut self, status: ExitStatus) -> anyhow::Result<()> {
-        let said = self.listener.take().and_then(|listener| listener.join().ok().flatten());
+        if let Some(output) = &self.output {
+            output.wait();
+        }
+        let said = self.last_line.lock().unwrap_or_else(PoisonError::into_inner).take();
         let said = said.unwrap_or_else(|| "it said nothing".into());
         let said = said.strip_prefix("error: ").unwrap_or(&said);
         bail!("the {} ended ({status}): {said}", self.what);
-    }
-}
-
-impl Drop for Peer {
-    fn drop(&mut self) {
-        if !matches!(self.child.try_wait(), Ok(Some(_))) {
-            let _ = self.child.kill();
-            let _ = self.child.wait();
-        }
     }
 }

@@ -37,9 +37,13 @@ impl Remote {
         }
         let domain = Domain::join(&self.config.run.id, self.config.actors.max)?;
         let lives = || self.run.goes_on().unwrap_or(true);
-        let answer = control::ask(&domain, question, patience, lives);
+        let answer = control::ask(&domain, self.run.key()?, question, patience, lives);
         domain.leave()?;
         match answer {
+            Ok(Answer::AnotherRun(there)) => {
+                let here = self.run.path().display();
+                bail!("{here} is a copy of {there}, which is going on; what was started here waits for that one to end")
+            }
             Ok(answer) => Ok(Some(answer)),
             Err(ControlError::Gone) => Ok(None),
             Err(error) => Err(error.into()),
@@ -85,7 +89,9 @@ impl Remote {
         match answer {
             Answer::Accepted => Ok(()),
             Answer::Refused(reason) => bail!("{reason}"),
-            other @ Answer::Status(_) => bail!("the launcher gave an answer that does not fit: {other:?}"),
+            other @ (Answer::Status(_) | Answer::AnotherRun(_)) => {
+                bail!("the launcher gave an answer that does not fit: {other:?}")
+            }
         }
     }
 

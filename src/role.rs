@@ -1,6 +1,7 @@
 //! One role of a run, in a process of its own: the run directory says everything, this hands each role its part of it.
 
 use std::ffi::CString;
+use std::process::ExitCode;
 
 use anyhow::Context;
 use shoal_actor::{evaluator, explorer};
@@ -20,7 +21,7 @@ use crate::environment_server::{self, Post};
 use crate::status::judged;
 
 /// Runs a role until it is through, or its standard input closes.
-pub(crate) fn run(role: Role, args: &RoleArgs) -> anyhow::Result<()> {
+pub(crate) fn run(role: Role, args: &RoleArgs) -> anyhow::Result<ExitCode> {
     // What is logged goes to the launcher, which may be gone already: then it is lost, and no reason to fail.
     tracing_subscriber::fmt()
         .with_writer(std::io::stderr)
@@ -34,7 +35,6 @@ pub(crate) fn run(role: Role, args: &RoleArgs) -> anyhow::Result<()> {
     if let Ok(name) = CString::new(format!("shoal-{}-{}", role.name(), args.index)) {
         let _ = rustix::thread::set_name(&name);
     }
-    let stop = Stop::when_stdin_closes().context("cannot watch standard input")?;
     let run = RunDir::open(&args.run)?;
     let config = run.config()?;
     let identity = Identity {
@@ -45,13 +45,15 @@ pub(crate) fn run(role: Role, args: &RoleArgs) -> anyhow::Result<()> {
     if role == Role::EnvServer
         && let Some(program) = server_post(&config, &run, identity).command(&config.environment)?
     {
-        return Err(environment_server::become_it(program));
+        return environment_server::serve_by(&program);
     }
+    let stop = Stop::when_stdin_closes().context("cannot watch standard input")?;
     let domain = Domain::join(&config.run.id, config.actors.max)?;
     let ended = work(&domain, &config, &run, identity, &stop);
     let left = domain.leave();
     ended?;
-    Ok(left?)
+    left?;
+    Ok(ExitCode::SUCCESS)
 }
 
 /// `info`, or what the environment variable `SHOAL_LOG` says: `debug` tells of every chunk that is sent.
@@ -175,11 +177,7 @@ pub(crate) fn learner_settings(
         threads: config.learner.threads,
         envs: config.actors.envs,
         episodes: config.run.episodes,
-        ratio: Ratio {
-            warmup: config.replay.warmup,
-            updates_per_step: config.replay.updates_per_step,
-            tolerance: config.replay.tolerance,
-        },
+        ratio: Ratio::from(&config.replay),
         capacity: config.replay.capacity,
         evaluation: config.evaluation.clone(),
         judged,

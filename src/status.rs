@@ -5,7 +5,9 @@ use shoal_common::commit::{CommitReader, OpenError};
 use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
 use shoal_learner::checkpoint::Checkpoints;
+use shoal_learner::ratio::Ratio;
 
+use crate::outcome::{Outcome, State};
 use crate::recorder::{RecordError, read_evaluations};
 
 /// How a run stands that nobody works on: what a learner would go on from.
@@ -30,7 +32,21 @@ pub(crate) fn at_rest(config: &Config, run: &RunDir) -> anyhow::Result<RunStatus
         ..Default::default()
     };
     status.ratio = ratio(&status, config.replay.warmup);
+    status.finished = is_finished(config, run, &status)?;
     Ok(status)
+}
+
+/// Whether a run that nobody works on has done all it was to do. A launcher that was killed, or stopped, after the last step
+/// has left updates or evaluations undone.
+fn is_finished(config: &Config, run: &RunDir, status: &RunStatus) -> anyhow::Result<bool> {
+    if !status.has_all_steps() {
+        return Ok(false);
+    }
+    if let Some(outcome) = Outcome::read(run)? {
+        return Ok(outcome.state == State::Finished);
+    }
+    // The run is of a build that did not write it down.
+    Ok(status.updates >= Ratio::from(&config.replay).allowed(status.env_steps))
 }
 
 /// Rows committed to a run's replay; 0 before there is one.

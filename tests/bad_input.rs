@@ -123,11 +123,8 @@ fn a_disk_that_is_too_small_for_the_replay_is_said_and_ends_the_run() {
         "ulimit -f 8000; exec {} train pendulum --run run --json",
         env!("CARGO_BIN_EXE_shoal")
     );
-    let output = std::process::Command::new("sh")
-        .args(["-c", &script])
-        .current_dir(place.path())
-        .output()
-        .unwrap();
+    let mut shell = std::process::Command::new("sh");
+    let output = support::output_of(shell.args(["-c", &script]).current_dir(place.path()));
     let said = complaint(&output);
     assert!(said.contains("learner-0") && said.contains("replay.bin"), "{said}");
     assert!(

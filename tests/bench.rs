@@ -2,12 +2,15 @@
 
 #![allow(clippy::unwrap_used, reason = "a failure anywhere in here is a failed test")]
 
+mod support;
+
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
+use support::output_of;
 use tempfile::TempDir;
 
 fn bench(stage: &str, temporary: &Path, seconds: &str) -> Command {
@@ -21,7 +24,7 @@ fn bench(stage: &str, temporary: &Path, seconds: &str) -> Command {
 /// Runs a stage for a moment: the JSON object that is the one line of its standard output.
 fn figures(stage: &str) -> Value {
     let temporary = TempDir::new().unwrap();
-    let Output { status, stdout, stderr } = bench(stage, temporary.path(), "0.3").output().unwrap();
+    let Output { status, stdout, stderr } = output_of(&mut bench(stage, temporary.path(), "0.3"));
     let (stdout, stderr) = (String::from_utf8(stdout).unwrap(), String::from_utf8(stderr).unwrap());
     assert!(status.success(), "{stage}: {status}: {stderr}");
     assert_eq!(stdout.lines().count(), 1, "{stdout}");
@@ -236,7 +239,7 @@ fn a_list_of_counts_that_is_none_is_refused_in_one_line() {
         ("policy", "1,2"),
     ] {
         let mut command = bench(stage, temporary.path(), "0.3");
-        let output = command.args(["--actors", counts]).output().unwrap();
+        let output = output_of(command.args(["--actors", counts]));
         assert!(
             !output.status.success() && output.stdout.is_empty(),
             "{stage} {counts:?}"
@@ -280,7 +283,7 @@ fn interrupted_it_leaves_nothing_behind() {
 fn a_time_that_is_none_is_refused_in_one_line() {
     let temporary = TempDir::new().unwrap();
     for seconds in ["soon", "0", "-1", "nan"] {
-        let output = bench("policy", temporary.path(), seconds).output().unwrap();
+        let output = output_of(&mut bench("policy", temporary.path(), seconds));
         assert!(!output.status.success() && output.stdout.is_empty());
         let said = String::from_utf8(output.stderr).unwrap();
         assert!(

@@ -303,10 +303,93 @@ fn a_role_that_cannot_start_is_given_up_with_its_last_words_and_the_run_can_be_r
     let (code, said) = resume_fails(&place);
     assert_eq!(code, Some(1));
     assert!(
-        said.contains("evaluator-0 failed 5 times") && said.contains("best.policy"),
+        said.contains("evaluator-0 failed") && said.contains("times and is given up") && said.contains("best.policy"),
         "{said}"
     );
     assert!(said.contains("shoal resume"), "{said}");
     std::fs::write(&best, bytes).unwrap();
     goes_on(&place, 500);
+}
+
+/// Networks and batches with which updates come long after their rows.
+const SLOW_UPDATES: [&str; 14] = [
+    "--steps",
+    "3000",
+    "--set",
+    "replay.tolerance=1000000",
+    "--set",
+    "replay.warmup=64",
+    "--set",
+    "ddpg.hidden=[300, 300]",
+    "--set",
+    "ddpg.batch=256",
+    "--set",
+    "evaluation.every=3000",
+    "--set",
+    "evaluation.final_episodes=3",
+];
+
+#[test]
+fn a_run_that_was_broken_off_after_its_last_row_is_finished_when_it_is_resumed() {
+    for stopped in [true, false] {
+        let place = Workplace::new();
+        let running = place.start_as("run", &SLOW_UPDATES);
+        until("all rows are there", || support::rows_of(&running) == 3000);
+        if stopped {
+            assert!(place.output(&["stop", "run"]).status.success());
+            assert_eq!(running.wait().0, Some(0));
+        } else {
+            running.kill_everybody();
+        }
+        let rest = || {
+            let output = place.output(&["status", "run", "--json"]);
+            assert_eq!(output.status.code(), Some(3));
+            support::json(&output)
+        };
+        let before = rest();
+        assert!(
+            before["updates"].as_u64().unwrap() < 2936,
+            "it was broken off too late: {before}"
+        );
+        assert_eq!(before["finished"], false);
+
+        let (code, printed, leftovers) = place.resume("run", &[]).wait();
+        assert_eq!(code, Some(0), "{}", place.said());
+        assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
+        let result = parse(&printed);
+        assert_eq!((&result["env_steps"], &result["updates"]), (&3000.into(), &2936.into()));
+        assert!(result["weights_sha256"].is_string() && result["eval_return_mean"].is_number());
+        let evaluations = std::fs::read_to_string(place.path().join("run/evaluations.csv")).unwrap();
+        assert!(evaluations.lines().last().unwrap().contains(",3000,"), "{evaluations}");
+
+        assert_eq!(rest()["finished"], true);
+        let said = complaint(&place.output(&["resume", "run"]));
+        assert!(said.contains("3000 of 3000 steps already"), "{said}");
+    }
+}
+
+#[test]
+fn a_copy_that_waits_for_the_original_is_no_way_to_stop_the_original() {
+    let place = Workplace::new();
+    let running = place.start("run", &ENDLESS);
+    running.learns_on();
+    let copied = std::process::Command::new("cp")
+        .args(["-r", "run", "copy"])
+        .current_dir(place.path())
+        .status();
+    assert!(copied.unwrap().success());
+    let mut waiting = place.shoal(&["resume", "copy"]).spawn().unwrap();
+    let mut said = String::new();
+    until("the copy's launcher waits", || {
+        said = complaint(&place.output(&["stop", "copy"]));
+        !said.contains("nothing runs")
+    });
+    assert!(
+        said.contains("is a copy of") && said.contains(running.run.to_str().unwrap()),
+        "{said}"
+    );
+    assert!(!place.output(&["scale", "copy", "--actors", "3"]).status.success());
+    until("the copy's launcher gives up", || waiting.try_wait().unwrap().is_some());
+    running.learns_on();
+    assert_eq!(place.status("run")["actors"], 2);
 }

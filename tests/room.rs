@@ -12,6 +12,7 @@ use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 
+use rustix::process::{Pid, Signal, kill_process};
 use support::{Leftovers, QUICK, Running, Workplace, complaint, json, until};
 
 const SHOAL: &str = env!("CARGO_BIN_EXE_shoal");
@@ -40,7 +41,7 @@ fn in_namespace(place: &Workplace, script: &str) -> Option<Output> {
         .env("QUICK", quick.join(" "))
         .current_dir(place.path())
         .stdin(Stdio::null());
-    Some(command.output().unwrap())
+    Some(support::output_of(&mut command))
 }
 
 /// A shared memory of 64 MB, and a user's directory that belongs to it: with the one outside, the next start would find
@@ -237,7 +238,7 @@ fn a_limit_of_open_files_is_raised_where_it_can_be_and_said_where_not() {
             .args(["-c", &script, "sh"])
             .args(QUICK)
             .current_dir(place.path());
-        command.output().unwrap()
+        support::output_of(&mut command)
     };
     let said = complaint(&limited("-n 64", "run"));
     assert!(
@@ -298,15 +299,15 @@ fn two_users_do_not_touch_each_other() {
     let program = other.path().join("shoal");
     fs::copy(SHOAL, &program).unwrap();
     chown(other.path(), Some(NOBODY), Some(NOBODY)).unwrap();
-    let output = Command::new(&program)
+    let mut command = Command::new(&program);
+    command
         .args(["train", "pendulum", "--steps", "300", "--run", "run", "--json"])
         .args(QUICK)
         .current_dir(other.path())
         .env("HOME", other.path())
         .uid(NOBODY)
-        .gid(NOBODY)
-        .output()
-        .unwrap();
+        .gid(NOBODY);
+    let output = support::output_of(&mut command);
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     assert_eq!(json(&output)["env_steps"], 300);
     for path in everything_in(&other.path().join("run")) {
@@ -317,4 +318,70 @@ fn two_users_do_not_touch_each_other() {
     let left = Leftovers::of(&other.path().join("run"));
     assert!(left.files().is_empty(), "{:?} of {}", left.files(), left.run_id());
     assert_eq!(state(), before, "the first run was not touched");
+}
+
+#[test]
+fn another_users_files_with_a_runs_name_change_nothing() {
+    const OWNER: u32 = 65534;
+    const OTHER: u32 = 20_002;
+    if !rustix::process::getuid().is_root() {
+        eprintln!("skipped: only root can be two users");
+        return;
+    }
+    let place = Workplace::new();
+    // The program's own directory may be closed to others.
+    fs::copy(SHOAL, place.path().join("shoal")).unwrap();
+    chown(place.path(), Some(OWNER), Some(OWNER)).unwrap();
+    let owner = |arguments: &[&str]| {
+        let mut command = Command::new(place.path().join("shoal"));
+        command
+            .args(arguments)
+            .current_dir(place.path())
+            .env("HOME", place.path());
+        command.uid(OWNER).gid(OWNER);
+        command
+    };
+    let quick = ["train", "pendulum", "--run", "run", "--steps", "100000000", "--quiet"];
+    let mut launcher = owner(&[&quick[..], &QUICK[..]].concat()).spawn().unwrap();
+    let run = place.path().join("run");
+    let log = || fs::read_to_string(run.join("shoal.log")).unwrap_or_default();
+    until("it is at work", || log().contains("every role is ready"));
+    let id = Leftovers::of(&run).run_id().to_owned();
+
+    let foreign = ["x", "y.global_mgmt", "promise_1", "0_0.connection"].map(|name| {
+        let path = PathBuf::from(format!("/dev/shm/shoal_{id}_{name}"));
+        fs::write(&path, "").unwrap();
+        chown(&path, Some(OTHER), Some(OTHER)).unwrap();
+        path
+    });
+    let works = |arguments: &[&str]| {
+        let output = support::output_of(&mut owner(arguments));
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    };
+    works(&["status", "run"]);
+    let started = || log().matches("started as process").count();
+    let before = started();
+    let actor = Leftovers::of(&run).processes();
+    kill_process(Pid::from_raw(*actor.last().unwrap()).unwrap(), Signal::KILL).unwrap();
+    until("a killed process is replaced", || started() > before);
+    works(&["stop", "run"]);
+    assert!(launcher.wait().unwrap().success());
+    works(&["resume", "run", "--steps", &(rows(&run) + 300).to_string(), "--quiet"]);
+    works(
+        &[
+            &["train", "pendulum", "--run", "next", "--steps", "300", "--quiet"],
+            &QUICK[..],
+        ]
+        .concat(),
+    );
+    for path in foreign {
+        fs::remove_file(path).unwrap();
+    }
+    assert!(Leftovers::of(&run).files().is_empty());
+}
+
+fn rows(run: &Path) -> u64 {
+    shoal_common::commit::CommitReader::open(&run.join("replay.bin"))
+        .unwrap()
+        .rows()
 }

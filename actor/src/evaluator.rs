@@ -198,12 +198,14 @@ impl<'a> Evaluator<'a> {
             ..
         } = self;
         let Some(held) = reader.held() else { return Ok(None) };
-        let mut current = client.reset(bell, Begin::Evaluation(first))?;
+        let mut current = client.reset(bell, Begin::Evaluation(first), || {
+            pulse.beat(Activity::WaitingForServer);
+        })?;
         let mut returns = vec![0.0; self.settings.envs];
         let mut under_way = vec![true; self.settings.envs];
         while under_way.contains(&true) {
             policy.act(held.parameters(), current.observations(), actions);
-            match client.step(bell, actions)? {
+            match client.step(bell, actions, || pulse.beat(Activity::WaitingForServer))? {
                 Stepped::Taken(next) => current = next,
                 Stepped::Lost => return Ok(None),
             }

@@ -163,7 +163,7 @@ impl<'a> Explorer<'a> {
     fn begin(&mut self) -> Result<Observed, Ended> {
         if self.settings.mode == Mode::Free {
             (0..self.settings.envs).for_each(|environment| self.begin_episode(environment));
-            return Ok(self.client.reset(&self.bell, Begin::Next)?);
+            return self.reset(Begin::Next);
         }
         self.chunk = None;
         self.ended.clear();
@@ -172,14 +172,20 @@ impl<'a> Explorer<'a> {
             self.exploration.restore(&standing.noise);
             self.returns.clone_from(&standing.returns);
             self.lengths.clone_from(&standing.lengths);
-            return Ok(self.client.restore(&self.bell, &standing.snapshot)?);
+            let idle = || self.pulse.beat(Activity::WaitingForServer);
+            return Ok(self.client.restore(&self.bell, &standing.snapshot, idle)?);
         }
         (0..self.settings.envs).for_each(|environment| self.begin_episode(environment));
         // Without a word of where it stood there is only the beginning that is the same for everyone.
         let sent = self.sender.sent();
         self.step = sent * (self.settings.chunk.rows / self.settings.envs) as u64;
         let begin = if sent == 0 { Begin::Training(0) } else { Begin::Next };
-        Ok(self.client.reset(&self.bell, begin)?)
+        self.reset(begin)
+    }
+
+    fn reset(&mut self, begin: Begin) -> Result<Observed, Ended> {
+        let idle = || self.pulse.beat(Activity::WaitingForServer);
+        Ok(self.client.reset(&self.bell, begin, idle)?)
     }
 
     fn run_until_the_server_is_lost(&mut self) -> Result<(), Ended> {
@@ -190,7 +196,8 @@ impl<'a> Explorer<'a> {
                 self.chunk = Some(self.sender.begin()?);
             }
             self.act(&current);
-            match self.client.step(&self.bell, &self.actions)? {
+            let idle = || self.pulse.beat(Activity::WaitingForServer);
+            match self.client.step(&self.bell, &self.actions, idle)? {
                 Stepped::Taken(next) => {
                     self.remember(&current, &next, version);
                     current = next;
@@ -319,7 +326,8 @@ impl<'a> Explorer<'a> {
         if self.settings.chunk.standing_words == 0 {
             return Ok(true);
         }
-        let Snapshot::Taken(snapshot) = self.client.snapshot(&self.bell)? else {
+        let idle = || self.pulse.beat(Activity::WaitingForServer);
+        let Snapshot::Taken(snapshot) = self.client.snapshot(&self.bell, idle)? else {
             return Ok(false);
         };
         let standing = Standing {
@@ -420,7 +428,7 @@ pub(crate) fn connect(
     stop: &Stop,
 ) -> Result<EnvironmentClient, Ended> {
     let client = EnvironmentClient::open(domain, index, spec, envs, stop.clone())?;
-    let (served, served_envs) = client.describe(bell)?;
+    let (served, served_envs) = client.describe(bell, || ())?;
     if served != *spec || served_envs != envs {
         let served = format!("{served_envs} times {served:?}");
         let configured = format!("{envs} times {spec:?}");

@@ -11,5 +11,5 @@ mod words;
 
 pub use layout::{IdentityFault, Places, ReplayLayout, SLOTS, SYNCED};
 pub use reader::{CommitReader, OpenError};
-pub use record::{ActorCommit, ChunkMark, Record};
+pub use record::{ActorCommit, ChunkMark, LAST_INCARNATION, Record};
 pub use words::{Words, WritableWords};

@@ -65,6 +65,10 @@ pub struct Run {
     #[schemars(extend("unit" = "episodes", "source" = "sections 4.1 and 4.2"))]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub episodes: Option<u64>,
+    /// How long a process may make no progress while those it waits for live and wait too; then it is replaced. One that is
+    /// stopped, or an environment that takes its time over a step, is not.
+    #[schemars(extend("unit" = "s", "source" = "ours"))]
+    pub stall_seconds: u64,
 }
 
 /// Whether timing may decide anything.

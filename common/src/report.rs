@@ -38,9 +38,14 @@ impl Role {
 impl Activity {
     /// Reads the number an activity travels as.
     fn from_code(code: u32) -> Option<Self> {
-        [Self::Working, Self::WaitingForPeer, Self::WaitingForRatio, Self::Done]
-            .into_iter()
-            .find(|activity| *activity as u32 == code)
+        let all = [
+            Self::Working,
+            Self::WaitingForPeer,
+            Self::WaitingForRatio,
+            Self::Done,
+            Self::WaitingForServer,
+        ];
+        all.into_iter().find(|activity| *activity as u32 == code)
     }
 }
 
@@ -61,12 +66,15 @@ pub struct Identity {
 pub enum Activity {
     /// Doing its work.
     Working,
-    /// Waiting for another role to appear or to answer: an actor for its policy, a learner for its first rows.
+    /// Waiting for another role to appear or to send: an actor for its policy, a learner for rows, an environment server
+    /// for a request.
     WaitingForPeer,
     /// An actor whose window is full, or a learner ahead of the ratio.
     WaitingForRatio,
     /// Through with everything.
     Done,
+    /// Waiting for its environment server's answer.
+    WaitingForServer,
 }
 
 /// A role lives: sent when it is ready, whenever its activity changes for long, and about twice a second.

@@ -2,7 +2,7 @@
 
 use std::fs::{DirBuilder, File};
 use std::io::{self, ErrorKind, Write};
-use std::os::unix::fs::DirBuilderExt;
+use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
 use std::thread;
 use std::time::{Duration, Instant};
@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 use rustix::fs::{FlockOperation, flock};
 use rustix::io::Errno;
 
+use crate::channel::control::RunKey;
 use crate::config::{Config, ConfigError};
 use crate::durable::write_atomically;
 
@@ -150,6 +151,22 @@ impl RunDir {
         }
     }
 
+    /// What tells it from its copies.
+    ///
+    /// # Errors
+    /// When the system refuses to tell.
+    pub fn key(&self) -> Result<RunKey, RunDirError> {
+        let metadata = std::fs::metadata(&self.path).map_err(|cause| RunDirError::Io {
+            action: "inspect",
+            path: self.path.clone(),
+            cause,
+        })?;
+        Ok(RunKey {
+            device: metadata.dev(),
+            inode: metadata.ino(),
+        })
+    }
+
     /// The resolved configuration.
     ///
     /// # Errors
@@ -242,6 +259,11 @@ impl RunDir {
     /// `tensorboard/`: the same as event files.
     pub fn tensorboard(&self) -> PathBuf {
         self.path.join("tensorboard")
+    }
+
+    /// `outcome.json`: how the run ended.
+    pub fn outcome(&self) -> PathBuf {
+        self.path.join("outcome.json")
     }
 
     /// `shoal.log`: what every process had to say.

@@ -1,10 +1,17 @@
 //! How a role learns that it shall end. Its standard input closes when the launcher wants it or is no more: one sign for
-//! both, and the system gives it even when the launcher is killed. A line on standard input before that lets it retire:
+//! both, and the system gives it even when the launcher is killed. A role that is still there some time after that, stuck in
+//! a call that does not return, is ended by the thread that watches. A line on standard input before that lets it retire:
 //! the run goes on, and it may take the time to hand over all it has.
 
 use std::io::{ErrorKind, Read};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU8, Ordering};
+use std::time::Duration;
+
+use rustix::process::{Signal, getpgrp, getpid, kill_process, kill_process_group};
+
+/// How long a role may take to end after its standard input has closed. The launcher gives it no longer either.
+pub const GRACE: Duration = Duration::from_secs(15);
 
 const RETIRE: u8 = 1;
 const END: u8 = 2;
@@ -14,7 +21,8 @@ const END: u8 = 2;
 pub struct Stop(Arc<AtomicU8>);
 
 impl Stop {
-    /// A stop that is requested once this process's standard input says or ends something.
+    /// A stop that is requested once this process's standard input says or ends something. [`GRACE`] after its end the
+    /// process is killed, if it is still there, and with it those of its process group, if it leads one.
     ///
     /// # Errors
     /// When the watching thread cannot be started.
@@ -33,6 +41,8 @@ impl Stop {
                 }
             }
             flag.request();
+            std::thread::sleep(GRACE);
+            kill_this_group();
         })?;
         Ok(stop)
     }
@@ -55,4 +65,14 @@ impl Stop {
     fn raise(&self, wish: u8) {
         self.0.fetch_max(wish, Ordering::Relaxed);
     }
+}
+
+/// Ends this process, and with it those of its process group where it leads one.
+fn kill_this_group() {
+    // Neither fails: the process is there, and its own.
+    let _ = if getpgrp() == getpid() {
+        kill_process_group(getpgrp(), Signal::KILL)
+    } else {
+        kill_process(getpid(), Signal::KILL)
+    };
 }

@@ -36,16 +36,19 @@ pub fn serve(
                     _ => Start::Next,
                 };
                 started = true;
+                pulse.begin_work();
                 request
                     .answer(|_, blocks| environments.reset(start, blocks.observations))?
                     .err()
             }
             Some(Ask::Step) if started => {
+                pulse.begin_work();
+                let refused = request
+                    .answer(|actions, blocks| environments.step(actions, blocks))?
+                    .err();
                 pulse.count(environments.count() as u64);
                 pulse.beat(Activity::Working);
-                request
-                    .answer(|actions, blocks| environments.step(actions, blocks))?
-                    .err()
+                refused
             }
             Some(Ask::Snapshot) if started => request.answer_snapshot(|words| environments.snapshot(words))?.err(),
             Some(Ask::Step | Ask::Snapshot) => {

@@ -105,7 +105,7 @@ mod tests {
         let mut replay = Replay::create(&directory.path().join("replay"), &layout).unwrap();
         let rows: Vec<f32> = (0..4 * layout.row.width()).map(|i| i as f32).collect();
         let mark = ChunkMark {
-            incarnation: 1,
+            incarnation: 0,
             sequence: 1,
         };
         replay.append_and_commit(0, mark, &rows).unwrap();

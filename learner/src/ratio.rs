@@ -1,5 +1,7 @@
 //! Updates per environment step, kept from both sides.
 
+use shoal_common::config;
+
 /// How many updates the rows collected so far allow.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Ratio {
@@ -9,6 +11,16 @@ pub struct Ratio {
     pub updates_per_step: f64,
     /// Rows by which the actors may be ahead.
     pub tolerance: u64,
+}
+
+impl From<&config::Replay> for Ratio {
+    fn from(replay: &config::Replay) -> Self {
+        Self {
+            warmup: replay.warmup,
+            updates_per_step: replay.updates_per_step,
+            tolerance: replay.tolerance,
+        }
+    }
 }
 
 impl Ratio {

@@ -7,7 +7,7 @@ import sys
 import gymnasium as gym
 
 from .environments import Environments
-from .port import Ended, Port
+from .port import Ended, Port, Unreachable
 from .server import longest, serve
 from .spaces import Unsupported
 
@@ -49,6 +49,9 @@ def main() -> int:
         serve(environments, port)
     except Ended:
         pass
+    except Unreachable as reason:
+        print(f"error: {reason}", file=sys.stderr)
+        return 1
     finally:
         environments.close()
     return 0

@@ -21,6 +21,9 @@ NAP = 0.05
 BEAT = 0.5
 """Seconds between heartbeats."""
 
+PATIENCE = 10.0
+"""Seconds for which a port may be refused: a predecessor that was killed has it until the launcher has cleaned up."""
+
 T = TypeVar("T")
 
 
@@ -28,8 +31,12 @@ class Ended(Exception):
     """The launcher wants this process to end, or is no more."""
 
 
+class Unreachable(Exception):
+    """A port in the run's shared memory cannot be had."""
+
+
 class Port:
-    """Services of the run are made by others: this only opens them, and waits until they are there."""
+    """The run's services are there before this process is started: it only opens them."""
 
     def __init__(
         self, config: str, run: str, index: int, incarnation: int, client: str, longest: int
@@ -91,8 +98,19 @@ class Port:
         except iox2.NotifierNotifyError:
             pass
 
+    def begin_work(self) -> None:
+        """Says that the environments are about to do something that this process may not survive; at once, where they have
+        not made a step yet. So the launcher tells a process that dies over its first step from one that was waiting."""
+        if self._heartbeat.steps == 0:
+            self._beaten = -BEAT
+            self.beat(Activity.WORKING)
+
     def count(self, steps: int) -> None:
-        """Counts so many environment steps more."""
+        """Counts so many environment steps more. The first are told at once: this process is able to work."""
+        if steps == 0:
+            return
+        if self._heartbeat.steps == 0:
+            self._beaten = -BEAT
         self._heartbeat.steps += steps
         self.beat(Activity.WORKING)
 
@@ -129,16 +147,15 @@ class Port:
         return self._node.service_builder(iox2.ServiceName.new(name))
 
     def _claim(self, attempt: Callable[[], T]) -> T:
-        """Tries until a service is there, and a predecessor that died has let go of its place."""
-        warned = time.monotonic()
+        """Tries for a while: a predecessor that was killed may still have the port."""
+        deadline = time.monotonic() + PATIENCE
         while True:
             try:
                 return attempt()
             except Exception as reason:  # Every error of iceoryx2 has a class of its own.
                 self._look_out()
-                if time.monotonic() - warned > 10.0:
-                    warned = time.monotonic()
-                    print(f"still waiting for the run's services: {reason!r}", file=sys.stderr, flush=True)
+                if time.monotonic() > deadline:
+                    raise Unreachable(f"cannot join the run's shared memory: {reason!r}") from reason
                 time.sleep(0.005)
 
     @staticmethod

@@ -25,6 +25,8 @@ def serve(environments: Environments, port: Port) -> None:
     server = Server(environments)
     while True:
         request = port.next_request()
+        if request.user_header().contents.ask != Ask.DESCRIBE:
+            port.begin_work()
         server.answer(request)
         port.ring()
         port.count(server.stepped())

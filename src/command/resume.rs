@@ -19,12 +19,15 @@ pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
     let rest = status::at_rest(&config, &run).with_context(|| format!("cannot resume {here}"))?;
     let (taken, over) = (rest.env_steps, rest.episodes);
     let steps = args.steps.unwrap_or(config.run.steps);
-    if taken >= steps {
-        bail!("{here} has taken {taken} of {steps} steps already: give it more with --steps");
-    }
     let episodes = args.episodes.or(config.run.episodes);
-    if let Some(episodes) = episodes.filter(|episodes| over >= *episodes) {
-        bail!("{here} has finished {over} of {episodes} episodes already: give it more with --episodes");
+    // Where all steps are taken, updates or the last evaluation may be left.
+    if rest.finished || (steps, episodes) != (config.run.steps, config.run.episodes) {
+        if taken >= steps {
+            bail!("{here} has taken {taken} of {steps} steps already: give it more with --steps");
+        }
+        if let Some(episodes) = episodes.filter(|episodes| over >= *episodes) {
+            bail!("{here} has finished {over} of {episodes} episodes already: give it more with --episodes");
+        }
     }
     if (steps, episodes) != (config.run.steps, config.run.episodes) {
         (config.run.steps, config.run.episodes) = (steps, episodes);

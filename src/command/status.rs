@@ -70,7 +70,7 @@ pub(super) fn rest(run: &Path, json: bool, remote: &Remote) -> anyhow::Result<Ex
             status: &status,
         };
         writeln!(stdout, "{}", serde_json::to_string(&printed)?)?;
-    } else if !status.is_done() {
+    } else if !status.finished {
         writeln!(
             stdout,
             "nothing runs in {here}; {}; to go on: shoal resume {here}",

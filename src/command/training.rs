@@ -16,6 +16,7 @@ use super::eval::{EvaluationSummary, WhichPolicy, evaluate};
 use super::plot;
 use crate::cli::Telling;
 use crate::launcher::{self, Ending, Outcome};
+use crate::outcome;
 
 /// What `--json` prints.
 #[derive(Serialize)]
@@ -41,9 +42,15 @@ pub(crate) fn conduct(config: Config, run: &RunDir, _lock: RunLock, telling: &Te
     let outcome = launcher::run(config.clone(), run, telling.quiet)?;
     let judged = match outcome.ending {
         Ending::Finished => judge(&config, run)?,
-        Ending::Stopped | Ending::Interrupted(_) => Vec::new(),
+        Ending::Stopped | Ending::Interrupted(_) | Ending::Renewed => Vec::new(),
     };
     plot::draw(run, &config, run.path())?;
+    if outcome.ending == Ending::Finished {
+        let RunStatus {
+            env_steps, episodes, ..
+        } = outcome.after;
+        outcome::Outcome::new(outcome::State::Finished, env_steps, episodes).write(run)?;
+    }
     let summary = Summary::new(&config, run, &outcome, judged.first().map(|(_, summary)| summary))?;
     if !telling.quiet {
         tell(&mut std::io::stderr().lock(), run, &outcome, &summary, &judged)?;
@@ -52,7 +59,7 @@ pub(crate) fn conduct(config: Config, run: &RunDir, _lock: RunLock, telling: &Te
         writeln!(std::io::stdout().lock(), "{}", serde_json::to_string(&summary)?)?;
     }
     Ok(match outcome.ending {
-        Ending::Finished | Ending::Stopped => ExitCode::SUCCESS,
+        Ending::Finished | Ending::Stopped | Ending::Renewed => ExitCode::SUCCESS,
         // As a shell reports a process that the signal ended.
         Ending::Interrupted(signal) => ExitCode::from(128 + signal as u8),
     })

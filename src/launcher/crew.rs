@@ -6,21 +6,26 @@ use std::process::ExitStatus;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
-use shoal_common::channel::Domain;
 use shoal_common::channel::control::RoleStatus;
+use shoal_common::channel::{Domain, Services};
 use shoal_common::config::Config;
 use shoal_common::durable::write_atomically;
 use shoal_common::report::{Activity, Heartbeat, Identity, Role};
 use shoal_common::run_dir::RunDir;
 
+use super::cleaner;
 use super::incarnations::{last_committed, read_counter};
 use super::log::{EVERYBODY_ENDED, Log};
-use super::member::{Consequence, LIMIT, Member};
+use super::member::{Consequence, Member};
 use super::process::{Process, name};
+use super::stall::Stalls;
 use crate::recorder::{Incident, What};
 
 /// How often the dead are cleaned up after whose end the launcher does not see: terminals that asked something.
 const CLEANING: Duration = Duration::from_secs(2);
+
+/// Clean-ups in a row that may leave places occupied. A process may be dead and not yet gone.
+const HOPELESS: u32 = 10;
 
 /// More processes than are started without any of them sending a chunk.
 const NEVER_SENT: u64 = 100_000;
@@ -30,12 +35,20 @@ const NEVER_SENT: u64 = 100_000;
 pub(super) enum State {
     AtWork,
     LearnerDone,
+    /// Dead processes have places in shared memory that cannot be freed.
+    ShmOccupied,
 }
 
 /// All processes of a run.
 #[derive(Debug)]
 pub(super) struct Crew {
     members: Vec<Member>,
+    services: Services,
+    /// Actors whose services there are.
+    served: u32,
+    window: u32,
+    /// Clean-ups in a row that left places occupied.
+    occupied: u32,
     /// Actors there are to be, and may ever be.
     actors: u32,
     max_actors: u32,
@@ -54,25 +67,33 @@ pub(super) struct Crew {
 }
 
 impl Crew {
-    pub(super) fn new(config: &Config, run: &RunDir, log: Log) -> anyhow::Result<Self> {
+    pub(super) fn new(config: &Config, run: &RunDir, domain: &Domain, log: Log) -> anyhow::Result<Self> {
         let counter = run.path().join("incarnations");
         let mut started = read_counter(&counter)?;
         let committed = last_committed(run)?;
         if started < committed {
             // The counter was lost. A lower incarnation's chunks would be taken for old ones, and its noise was used.
-            started = committed + NEVER_SENT;
+            started = committed.saturating_add(NEVER_SENT);
             log.note(
                 "launcher",
                 &format!("{} is lost or wrong; counting on from {started}", counter.display()),
             );
         }
-        let members = [
-            (Role::Learner, 0),
-            (Role::EnvServer, config.evaluation_server()),
-            (Role::Evaluator, 0),
+        let mut services = Services::new(domain)?;
+        services.create_common(domain)?;
+        services.create_environment(domain, config.evaluation_server())?;
+        let server = config.evaluation_server();
+        let members = vec![
+            Member::new(Role::Learner, 0),
+            Member::new(Role::EnvServer, server),
+            Member::new(Role::Evaluator, 0).with_server(server),
         ];
         Ok(Self {
-            members: members.map(|(role, index)| Member::new(role, index)).into(),
+            members,
+            services,
+            served: 0,
+            window: config.actors.window,
+            occupied: 0,
             actors: config.actors.count,
             max_actors: config.actors.max,
             log,
@@ -88,9 +109,10 @@ impl Crew {
     }
 
     /// Starts everyone.
-    pub(super) fn start_all(&mut self) -> anyhow::Result<()> {
+    pub(super) fn start_all(&mut self, domain: &Domain) -> anyhow::Result<()> {
+        self.serve(domain)?;
         (0..self.members.len()).try_for_each(|i| self.start(i))?;
-        self.recruit()
+        self.recruit(domain)
     }
 
     /// What has happened since this was asked last, in order.
@@ -98,8 +120,8 @@ impl Crew {
         std::mem::take(&mut self.incidents)
     }
 
-    /// Goes on with so many actors.
-    pub(super) fn scale(&mut self, actors: u32) -> anyhow::Result<()> {
+    /// Goes on with so many actors, who are started when this looks after everyone next.
+    pub(super) fn scale(&mut self, actors: u32) {
         self.log.note(
             "launcher",
             &format!("actors: {actors} from now on, {} before", self.actors),
@@ -107,7 +129,6 @@ impl Crew {
         let detail = format!("{} to {actors} actors", self.actors);
         self.incidents.push(Incident::of_launcher(What::Scaled, detail));
         self.actors = actors;
-        self.recruit()
     }
 
     /// Actors there are to be.
@@ -115,8 +136,18 @@ impl Crew {
         self.actors
     }
 
+    /// Makes the services of actors that have come.
+    fn serve(&mut self, domain: &Domain) -> anyhow::Result<()> {
+        while self.served < self.actors {
+            self.services.create_actor(domain, self.served, self.window)?;
+            self.served += 1;
+        }
+        Ok(())
+    }
+
     /// Makes and fills the places that are missing, each actor's with its environment server's.
-    fn recruit(&mut self) -> anyhow::Result<()> {
+    fn recruit(&mut self, domain: &Domain) -> anyhow::Result<()> {
+        self.serve(domain)?;
         for index in 0..self.actors {
             for role in [Role::EnvServer, Role::Actor] {
                 if !self.members.iter().any(|member| member.is(role, index)) {
@@ -190,36 +221,54 @@ impl Crew {
         members.into_iter().map(|member| member.status(newest)).collect()
     }
 
-    /// Notices who has ended, and starts them again when their time has come.
+    /// Sees whose processes have ended. What those said before is heard before [`look_after`](Self::look_after) acts on it.
+    pub(super) fn see_ends(&mut self) {
+        for member in self.members.iter_mut().filter(|member| member.ended.is_none()) {
+            member.ended = member.process.as_mut().and_then(Process::exit_status);
+        }
+    }
+
+    /// Acts on the ends that were seen, and starts processes again when their time has come.
     pub(super) fn look_after(&mut self, domain: &Domain) -> anyhow::Result<State> {
+        let mut state = State::AtWork;
+        if self.members.iter().any(|member| member.ended.is_some()) {
+            // Their places in shared memory are free for their successors.
+            state = self.clean(domain)?;
+        } else if self.cleaned.elapsed() >= CLEANING {
+            self.cleaned = Instant::now();
+            if domain.has_dead_nodes() || self.services.occupied_by_the_dead() > 0 {
+                state = self.clean(domain)?;
+            }
+        }
         for i in 0..self.members.len() {
-            if self.look_after_one(i, domain)? == State::LearnerDone {
+            if self.look_after_one(i)? == State::LearnerDone {
                 return Ok(State::LearnerDone);
             }
         }
         self.let_go();
-        self.recruit()?;
-        if self.cleaned.elapsed() >= CLEANING {
-            self.clean(domain);
+        self.recruit(domain)?;
+        Ok(state)
+    }
+
+    fn look_after_one(&mut self, i: usize) -> anyhow::Result<State> {
+        if let Some(status) = self.members[i].ended.take() {
+            if self.act_on_end(i, status)? == State::LearnerDone {
+                return Ok(State::LearnerDone);
+            }
+        }
+        let is_wanted = self.is_wanted(&self.members[i]);
+        let member = &mut self.members[i];
+        if member.process.is_none() && is_wanted && Instant::now() >= member.restart_at {
+            member.restarts += 1;
+            self.start(i)?;
+            self.note_incident(i, What::StartedAgain, String::new());
         }
         Ok(State::AtWork)
     }
 
-    fn look_after_one(&mut self, i: usize, domain: &Domain) -> anyhow::Result<State> {
-        let is_wanted = self.is_wanted(&self.members[i]);
+    fn act_on_end(&mut self, i: usize, status: ExitStatus) -> anyhow::Result<State> {
         let member = &mut self.members[i];
         let name = name(member.identity);
-        let Some(process) = &mut member.process else {
-            if is_wanted && Instant::now() >= member.restart_at {
-                member.restarts += 1;
-                self.start(i)?;
-                self.note_incident(i, What::StartedAgain, String::new());
-            }
-            return Ok(State::AtWork);
-        };
-        let Some(status) = process.exit_status() else {
-            return Ok(State::AtWork);
-        };
         if member.identity.role == Role::Learner && status.success() {
             member.process = None;
             self.learner_done = true;
@@ -231,10 +280,9 @@ impl Crew {
             member.restart_at = Instant::now();
             self.log.note(&name, &format!("retired: {}", ending(status)));
             self.note_incident(i, What::Retired, String::new());
-            self.clean(domain);
             return Ok(State::AtWork);
         }
-        let consequence = member.ended(status);
+        let consequence = member.has_ended(status);
         let what = if status.signal().is_some() {
             What::Killed
         } else {
@@ -246,18 +294,31 @@ impl Crew {
                 self.members[i].restart_at = Instant::now() + pause;
                 self.log
                     .note(&name, &format!("{}; starting it again in {pause:?}", ending(status)));
-                // Its places in shared memory are free for its successor.
-                self.clean(domain);
-                if pause.is_zero() {
-                    return self.look_after_one(i, domain);
-                }
                 Ok(State::AtWork)
             }
-            Consequence::GiveUp => {
+            Consequence::GiveUp(starts) => {
                 self.note_incident(i, What::GivenUp, String::new());
-                self.give_up(&name, status)
+                self.give_up(&name, starts, status)
             }
         }
+    }
+
+    /// Ends processes that should be working and do not, so that they are replaced; what is to be said of each.
+    pub(super) fn replace_stalled(&mut self, stalls: &mut Stalls) -> Vec<String> {
+        let stalled = stalls.find(&mut self.members);
+        let mut said = Vec::new();
+        for (i, why) in stalled {
+            let member = &mut self.members[i];
+            said.push(format!(
+                "{} makes no progress: {why}; it is replaced",
+                name(member.identity)
+            ));
+            if let Some(process) = &mut member.process {
+                process.kill();
+            }
+            self.note_incident(i, What::Stalled, why.into());
+        }
+        said
     }
 
     fn note_incident(&mut self, i: usize, what: What, detail: String) {
@@ -265,9 +326,23 @@ impl Crew {
             .push(Incident::of(self.members[i].identity, what, detail));
     }
 
-    fn clean(&mut self, domain: &Domain) {
-        domain.clean();
+    /// Frees what dead processes have in shared memory.
+    fn clean(&mut self, domain: &Domain) -> anyhow::Result<State> {
+        if let Err(error) = cleaner::clean_up(domain, &self.services) {
+            self.log.note("launcher", &format!("{error:#}"));
+        }
         self.cleaned = Instant::now();
+        if self.services.occupied_by_the_dead() == 0 {
+            self.occupied = 0;
+            return Ok(State::AtWork);
+        }
+        self.occupied += 1;
+        if self.occupied < HOPELESS {
+            // Soon again.
+            self.cleaned -= CLEANING;
+            return Ok(State::AtWork);
+        }
+        Ok(State::ShmOccupied)
     }
 
     /// Lets actors retire that are too many, and when they are gone their environment servers.
@@ -306,16 +381,17 @@ impl Crew {
         !matches!(role, Role::Actor | Role::EnvServer) || !(self.actors..self.max_actors).contains(&index)
     }
 
-    fn give_up(&self, name: &str, status: ExitStatus) -> anyhow::Result<State> {
+    fn give_up(&self, name: &str, starts: u32, status: ExitStatus) -> anyhow::Result<State> {
         let mut lines = self.log.last_lines(name);
         lines.dedup();
         let said = match lines.split_last() {
+            None if status.signal().is_some() => "it said nothing: something kills it; does memory run out?".into(),
             None => "it said nothing".into(),
             Some((last, [])) => last.strip_prefix("error: ").unwrap_or(last).to_owned(),
             Some(_) => format!("it said last\n  {}", lines.join("\n  ")),
         };
         bail!(
-            "{name} failed {LIMIT} times and is given up ({}); when its reason is gone, `shoal resume {}` goes on; {said}",
+            "{name} failed {starts} times and is given up ({}); when its reason is gone, `shoal resume {}` goes on; {said}",
             ending(status),
             self.run.display()
         );

@@ -60,7 +60,7 @@ pub(super) fn scale(config: &mut Config, run: &RunDir, crew: &mut Crew, actors: 
         return Ok(Answer::Refused(error.to_string()));
     }
     *config = scaled;
-    crew.scale(actors)?;
+    crew.scale(actors);
     Ok(Answer::Accepted)
 }
 

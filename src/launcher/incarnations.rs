@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use anyhow::Context;
-use shoal_common::commit::{CommitReader, OpenError};
+use shoal_common::commit::{CommitReader, LAST_INCARNATION, OpenError};
 use shoal_common::run_dir::RunDir;
 
 /// The greatest incarnation of an actor that is in the run's replay.
@@ -18,8 +18,6 @@ pub(super) fn last_committed(run: &RunDir) -> anyhow::Result<u64> {
 
 /// The number in the file at `path`, 0 where there is none.
 pub(super) fn read_counter(path: &Path) -> anyhow::Result<u64> {
-    /// More than any run starts, and far from overflowing when it is counted on.
-    const LIMIT: u64 = 1 << 60;
     let text = match std::fs::read(path) {
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(0),
         text => text.with_context(|| format!("cannot read {}", path.display()))?,
@@ -27,7 +25,7 @@ pub(super) fn read_counter(path: &Path) -> anyhow::Result<u64> {
     let number = std::str::from_utf8(&text)
         .ok()
         .and_then(|text| text.trim().parse().ok());
-    number.filter(|started| *started < LIMIT).with_context(|| {
+    number.filter(|started| *started < LAST_INCARNATION).with_context(|| {
         format!(
             "{} is damaged: write a number into it that is greater than every incarnation in the run's log",
             path.display()

@@ -10,17 +10,24 @@ use signal_hook::consts::{SIGABRT, SIGBUS, SIGFPE, SIGILL, SIGSEGV};
 
 use super::process::Process;
 
-/// Failures in a row after which a role is given up.
-pub(super) const LIMIT: u32 = 5;
+/// A process that has worked for so long, or an environment server that has taken so many steps, is able to work. One that
+/// fails sooner, again and again, is not.
+const ABLE: Duration = Duration::from_secs(30);
+const ABLE_STEPS: u64 = 1000;
 
-/// The pause before the first restart after a failure; each further one is twice as long.
+/// Starts without progress after which a role is given up, if they span [`SPAN_OF_FAILURES`] and twice its longest start.
+const LIMIT: u32 = 5;
+const SPAN_OF_FAILURES: Duration = Duration::from_secs(30);
+
+/// The pause before the first restart after a failure; each further one is twice as long, up to the longest.
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
+const LONGEST_PAUSE: Duration = Duration::from_secs(4);
 
-/// A process that has worked for so long has recovered from whatever made its predecessors fail.
-const RECOVERED: Duration = Duration::from_secs(30);
+/// How long a start may take at least, however fast earlier ones were.
+const START: Duration = Duration::from_secs(1);
 
 /// A process that was not heard of for so long is stopped or stuck: it has a word to say twice a second.
-const SILENT: Duration = Duration::from_secs(3);
+pub(super) const SILENT: Duration = Duration::from_secs(3);
 
 /// Heartbeats closer together say nothing of the rate.
 const SPAN: Duration = Duration::from_millis(400);
@@ -30,6 +37,8 @@ const SPAN: Duration = Duration::from_millis(400);
 pub(super) struct Member {
     pub(super) identity: Identity,
     pub(super) process: Option<Process>,
+    /// How the process ended, where that has been seen and not been acted upon.
+    pub(super) ended: Option<ExitStatus>,
     /// It was asked to hand over what it has, and is not to be replaced.
     pub(super) retires: bool,
     /// It was asked to end with the whole run.
@@ -37,9 +46,19 @@ pub(super) struct Member {
     pub(super) restarts: u32,
     pub(super) restart_at: Instant,
     begun: Instant,
-    /// Failures since the last time it worked.
+    /// Starts without progress since the last one with progress, and when the first of them was.
     failures: u32,
+    failing_since: Option<Instant>,
+    /// The longest time that a start took until the process was ready, and the same with those that never were.
+    usual_start: Option<Duration>,
+    longest_start: Duration,
     heard: Option<(Instant, Heartbeat)>,
+    /// When it was last seen to get on: to start, to take steps, or to have another policy.
+    pub(super) moved: Instant,
+    /// How often it was replaced because it made no progress, since it last did.
+    pub(super) stalls: u32,
+    /// The environment server that it asks, if it asks one.
+    server: Option<u32>,
     /// When its rate was taken, and its steps then.
     span: (Instant, u64),
     rate: f64,
@@ -50,13 +69,14 @@ pub(super) struct Member {
 pub(super) enum Consequence {
     /// Starts it again after a pause.
     Restart(Duration),
-    /// It cannot work.
-    GiveUp,
+    /// It cannot work: after so many starts without progress.
+    GiveUp(u32),
 }
 
 impl Member {
     /// A place that nobody has yet.
     pub(super) fn new(role: Role, index: u32) -> Self {
+        let now = Instant::now();
         Self {
             identity: Identity {
                 role,
@@ -64,16 +84,36 @@ impl Member {
                 incarnation: 0,
             },
             process: None,
+            ended: None,
             retires: false,
             ends: false,
             restarts: 0,
-            restart_at: Instant::now(),
-            begun: Instant::now(),
+            restart_at: now,
+            begun: now,
             failures: 0,
+            failing_since: None,
+            usual_start: None,
+            longest_start: Duration::ZERO,
             heard: None,
-            span: (Instant::now(), 0),
+            moved: now,
+            stalls: 0,
+            server: (role == Role::Actor).then_some(index),
+            span: (now, 0),
             rate: 0.0,
         }
+    }
+
+    /// The same, of a role that asks environment server `index`.
+    pub(super) fn with_server(self, index: u32) -> Self {
+        Self {
+            server: Some(index),
+            ..self
+        }
+    }
+
+    /// The environment server that it asks, if it asks one.
+    pub(super) fn server(&self) -> Option<u32> {
+        self.server
     }
 
     pub(super) fn is(&self, role: Role, index: u32) -> bool {
@@ -84,7 +124,12 @@ impl Member {
     pub(super) fn begin(&mut self, process: Process) {
         self.process = Some(process);
         self.retires = false;
-        self.begun = Instant::now();
+        self.begin_at(Instant::now());
+    }
+
+    fn begin_at(&mut self, now: Instant) {
+        self.begun = now;
+        self.moved = now;
         self.heard = None;
         self.rate = 0.0;
     }
@@ -99,37 +144,111 @@ impl Member {
 
     /// Takes note of a sign of life; how long it took to be ready, if this is the first.
     pub(super) fn hear(&mut self, heartbeat: &Heartbeat) -> Option<Duration> {
-        let now = Instant::now();
-        let first = self.heard.replace((now, *heartbeat)).is_none();
+        self.hear_at(heartbeat, Instant::now())
+    }
+
+    fn hear_at(&mut self, heartbeat: &Heartbeat, now: Instant) -> Option<Duration> {
+        let before = self.heard.replace((now, *heartbeat)).map(|(_, before)| before);
+        let first = before.is_none();
+        let position = |heartbeat: &Heartbeat| (heartbeat.steps, heartbeat.policy_version);
+        if before.is_none_or(|before| position(&before) != position(heartbeat)) {
+            self.moved = now;
+        }
+        if heartbeat.steps > 0 {
+            self.stalls = 0;
+        }
         let (then, steps) = self.span;
         if first || now - then >= SPAN {
             let made = heartbeat.steps.saturating_sub(steps) as f64;
             self.rate = if first { 0.0 } else { made / (now - then).as_secs_f64() };
             self.span = (now, heartbeat.steps);
         }
-        first.then(|| self.begun.elapsed())
+        let took = first.then(|| now - self.begun)?;
+        self.usual_start = self.usual_start.max(Some(took));
+        Some(took)
     }
 
     /// Its process has ended, and nobody had asked it to.
-    pub(super) fn ended(&mut self, status: ExitStatus) -> Consequence {
-        self.process = None;
-        // Killed while it worked is nobody's fault. A process that ends itself, or is ended by the system for what it
-        // did, would do it again.
+    pub(super) fn has_ended(&mut self, status: ExitStatus) -> Consequence {
+        self.has_ended_at(status, Instant::now())
+    }
+
+    /// A process that was able to work will be again. One that was killed while it waited or after its first step, or in its
+    /// usual start-up time, is not to blame. One that ended otherwise would do it again.
+    fn has_ended_at(&mut self, status: ExitStatus, now: Instant) -> Consequence {
+        (self.process, self.ended) = (None, None);
         let by_its_own = [SIGABRT, SIGBUS, SIGFPE, SIGILL, SIGSEGV];
         let was_killed = status.signal().is_some_and(|signal| !by_its_own.contains(&signal));
-        if self.is_ready() && was_killed {
-            self.failures = 0;
-            return Consequence::Restart(Duration::ZERO);
+        let lived = now - self.begun;
+        let steps = self.heard.map_or(0, |(_, heartbeat)| heartbeat.steps);
+        let served = self.identity.role == Role::EnvServer && steps >= ABLE_STEPS;
+        if self.is_ready() && (lived >= ABLE || served) {
+            (self.failures, self.failing_since) = (0, None);
+            return Consequence::Restart(if was_killed { Duration::ZERO } else { FIRST_PAUSE });
         }
-        if self.is_ready() && self.begun.elapsed() >= RECOVERED {
-            self.failures = 0;
+        let blameless = match self.activity() {
+            Some(activity) => steps > 0 || activity != Activity::Working,
+            None => {
+                self.longest_start = self.longest_start.max(lived);
+                lived <= START.max(self.usual_start.unwrap_or_default())
+            }
+        };
+        if was_killed && blameless {
+            return Consequence::Restart(if self.is_ready() { Duration::ZERO } else { FIRST_PAUSE });
         }
         self.failures += 1;
-        if self.failures >= LIMIT {
-            Consequence::GiveUp
-        } else {
-            Consequence::Restart(FIRST_PAUSE * 2_u32.pow(self.failures - 1))
+        let since = *self.failing_since.get_or_insert(self.begun);
+        let longest = self.longest_start.max(self.usual_start.unwrap_or_default());
+        if self.failures >= LIMIT && now - since >= SPAN_OF_FAILURES.max(2 * longest) {
+            return Consequence::GiveUp(self.failures);
         }
+        let doubled = FIRST_PAUSE * 2_u32.pow((self.failures - 1).min(10));
+        Consequence::Restart(doubled.min(LONGEST_PAUSE))
+    }
+
+    /// Whether it was heard of a moment ago and said then that it waits.
+    pub(super) fn waits(&self) -> bool {
+        let says_so = |activity| !matches!(activity, Activity::Working | Activity::Done);
+        self.is_heard() && self.activity().is_some_and(says_so)
+    }
+
+    /// Whether it has a process that is to go on working.
+    pub(super) fn is_present(&self) -> bool {
+        self.process.is_some() && self.ended.is_none() && !self.retires && !self.ends
+    }
+
+    /// Begins anew to count how long it makes no progress.
+    pub(super) fn excuse(&mut self) {
+        self.moved = Instant::now();
+        if let Some((then, _)) = &mut self.heard {
+            *then = self.moved;
+        }
+    }
+
+    /// How long nothing was heard of it.
+    pub(super) fn silent_for(&self) -> Duration {
+        self.heard.map_or(self.moved, |(then, _)| then).elapsed()
+    }
+
+    /// Whether its process is stopped.
+    pub(super) fn is_stopped(&self) -> bool {
+        matches!(self.state_in_kernel(), Some('T' | 't'))
+    }
+
+    /// Whether its process neither computes nor waits for a device.
+    pub(super) fn sleeps(&self) -> bool {
+        self.state_in_kernel() == Some('S')
+    }
+
+    fn state_in_kernel(&self) -> Option<char> {
+        let stat = std::fs::read_to_string(format!("/proc/{}/stat", self.process.as_ref()?.pid())).ok()?;
+        // Behind the name, which is in brackets and may hold anything.
+        stat.rsplit_once(") ")?.1.chars().next()
+    }
+
+    /// Whether it was heard of a moment ago.
+    pub(super) fn is_heard(&self) -> bool {
+        self.heard.is_some_and(|(then, _)| then.elapsed() < SILENT)
     }
 
     /// How it gets on, where the learner's newest policy is `newest`.
@@ -160,7 +279,7 @@ impl Member {
             _ if self.ends => RoleState::Ending,
             (_, None) => RoleState::Starting,
             (_, Some((_, heartbeat))) => match heartbeat.activity() {
-                Some(Activity::WaitingForPeer) => RoleState::WaitingForPeer,
+                Some(Activity::WaitingForPeer | Activity::WaitingForServer) => RoleState::WaitingForPeer,
                 Some(Activity::WaitingForRatio) => RoleState::WaitingForRatio,
                 Some(Activity::Done) => RoleState::Done,
                 Some(Activity::Working) | None => RoleState::Working,
@@ -184,36 +303,136 @@ mod tests {
         ExitStatus::from_raw(code << 8)
     }
 
-    fn ready(member: &mut Member) {
-        member.hear(&Heartbeat::new(member.identity));
+    /// A place whose time is told, and not waited for.
+    struct Place {
+        member: Member,
+        now: Instant,
+    }
+
+    impl Place {
+        fn new(role: Role) -> Self {
+            Self {
+                member: Member::new(role, 0),
+                now: Instant::now(),
+            }
+        }
+
+        /// A process lives for so long, is ready after so long, says this last, and then ends.
+        fn lives(&mut self, lived: Duration, ready: Option<Duration>, last: Heartbeat, end: ExitStatus) -> Consequence {
+            self.member.begin_at(self.now);
+            if let Some(ready) = ready {
+                self.member.hear_at(&last, self.now + ready);
+            }
+            self.now += lived;
+            let consequence = self.member.has_ended_at(end, self.now);
+            if let Consequence::Restart(pause) = consequence {
+                self.now += pause;
+            }
+            consequence
+        }
+
+        fn says(&self, activity: Activity, steps: u64) -> Heartbeat {
+            let mut heartbeat = Heartbeat::new(self.member.identity);
+            heartbeat.set_activity(activity);
+            heartbeat.steps = steps;
+            heartbeat
+        }
+    }
+
+    const READY: Duration = Duration::from_millis(20);
+
+    #[test]
+    fn who_fails_again_and_again_is_given_up_after_half_a_minute_of_growing_pauses() {
+        let mut place = Place::new(Role::Actor);
+        let (begun, mut pauses) = (place.now, Vec::new());
+        let last = place.says(Activity::Working, 0);
+        while let Consequence::Restart(pause) = place.lives(READY, None, last, with_code(1)) {
+            pauses.push(pause.as_millis());
+        }
+        assert_eq!(pauses[..7], [100, 200, 400, 800, 1600, 3200, 4000]);
+        let tried = place.now - begun;
+        assert!((30..40).contains(&tried.as_secs()), "{tried:?}");
     }
 
     #[test]
-    fn who_dies_again_and_again_before_it_is_ready_is_given_up_after_growing_pauses() {
-        let mut member = Member::new(Role::Actor, 0);
-        let ends: Vec<_> = (0..LIMIT).map(|_| member.ended(by_signal(KILLED))).collect();
-        let pauses = [100, 200, 400, 800].map(|ms| Consequence::Restart(Duration::from_millis(ms)));
-        assert_eq!(ends, [&pauses[..], &[Consequence::GiveUp]].concat());
+    fn who_takes_long_to_start_is_given_up_later() {
+        let mut place = Place::new(Role::EnvServer);
+        let begun = place.now;
+        let last = place.says(Activity::Working, 0);
+        let mut starts = 1;
+        while place.lives(Duration::from_secs(60), None, last, with_code(1)) != Consequence::GiveUp(starts) {
+            starts += 1;
+        }
+        assert_eq!(starts, LIMIT);
+        assert!(place.now - begun >= Duration::from_secs(300));
     }
 
     #[test]
-    fn being_killed_at_work_is_no_failure_and_forgives_earlier_ones() {
-        let mut member = Member::new(Role::Learner, 0);
-        for _ in 0..3 * LIMIT {
-            assert!(matches!(member.ended(with_code(1)), Consequence::Restart(pause) if pause > Duration::ZERO));
-            ready(&mut member);
-            assert_eq!(member.ended(by_signal(KILLED)), Consequence::Restart(Duration::ZERO));
-            member.heard = None;
+    fn being_killed_while_it_waits_or_starts_or_works_is_nobodys_fault() {
+        let mut place = Place::new(Role::Evaluator);
+        for _ in 0..1000 {
+            let (idle, at_work) = (
+                place.says(Activity::WaitingForPeer, 0),
+                place.says(Activity::Working, 9),
+            );
+            for (ready, last) in [(None, idle), (Some(READY), idle), (Some(READY), at_work)] {
+                let consequence = place.lives(10 * READY, ready, last, by_signal(KILLED));
+                let pause = if ready.is_some() { Duration::ZERO } else { FIRST_PAUSE };
+                assert_eq!(consequence, Consequence::Restart(pause));
+            }
         }
     }
 
     #[test]
-    fn failing_after_being_ready_counts_too_whether_by_exit_or_by_a_fault() {
-        for status in [with_code(1), by_signal(SIGBUS), by_signal(SIGSEGV)] {
-            let mut member = Member::new(Role::Learner, 0);
-            ready(&mut member);
-            let last = (0..LIMIT).map(|_| member.ended(status)).last();
-            assert_eq!(last, Some(Consequence::GiveUp), "{status}");
+    fn a_start_that_is_killed_after_it_should_have_been_ready_counts() {
+        let mut place = Place::new(Role::EnvServer);
+        let idle = place.says(Activity::WaitingForPeer, 0);
+        place.lives(READY, Some(READY), idle, by_signal(KILLED));
+        let killed = |place: &mut Place, lived| place.lives(lived, None, idle, by_signal(KILLED));
+        assert_eq!(killed(&mut place, START), Consequence::Restart(FIRST_PAUSE));
+        let counted = (0..100).find_map(|_| match killed(&mut place, 2 * START) {
+            Consequence::GiveUp(starts) => Some(starts),
+            Consequence::Restart(_) => None,
+        });
+        assert!(counted.is_some());
+    }
+
+    #[test]
+    fn who_dies_over_its_first_step_is_given_up_whatever_the_signal() {
+        for end in [by_signal(KILLED), by_signal(SIGSEGV), with_code(1)] {
+            let mut place = Place::new(Role::EnvServer);
+            let over_a_step = place.says(Activity::Working, 0);
+            let given_up = (0..100).any(|_| {
+                let consequence = place.lives(10 * READY, Some(READY), over_a_step, end);
+                matches!(consequence, Consequence::GiveUp(_))
+            });
+            assert!(given_up, "{end}");
+        }
+    }
+
+    #[test]
+    fn who_fails_after_a_few_steps_every_time_is_given_up() {
+        let mut place = Place::new(Role::EnvServer);
+        let at_work = place.says(Activity::Working, 3);
+        let mut ends = (0..100).map(|_| place.lives(10 * READY, Some(READY), at_work, with_code(1)));
+        assert!(ends.any(|end| matches!(end, Consequence::GiveUp(_))));
+    }
+
+    #[test]
+    fn a_learner_that_fails_whenever_it_saves_is_given_up() {
+        let mut place = Place::new(Role::Learner);
+        let at_work = place.says(Activity::Working, 3000);
+        let mut ends = (0..100).map(|_| place.lives(Duration::from_secs(5), Some(READY), at_work, with_code(1)));
+        assert!(ends.any(|end| matches!(end, Consequence::GiveUp(_))));
+    }
+
+    #[test]
+    fn who_fails_now_and_then_is_forgiven() {
+        let mut place = Place::new(Role::EnvServer);
+        let at_work = place.says(Activity::Working, 3000);
+        for _ in 0..1000 {
+            let consequence = place.lives(Duration::from_secs(1), Some(READY), at_work, with_code(1));
+            assert_eq!(consequence, Consequence::Restart(FIRST_PAUSE));
         }
     }
 }

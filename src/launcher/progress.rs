@@ -84,6 +84,11 @@ impl Progress {
         self.bar.set_message(message);
     }
 
+    /// Says something beside the bar, where somebody looks on.
+    pub(super) fn note(&self, text: &str) {
+        self.bar.println(text);
+    }
+
     pub(super) fn clear(&self) {
         self.bar.finish_and_clear();
     }

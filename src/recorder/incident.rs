@@ -12,6 +12,8 @@ pub(crate) enum What {
     Killed,
     /// It ended itself before its time.
     Failed,
+    /// It made no progress, and was ended to be replaced.
+    Stalled,
     /// It has a successor now.
     StartedAgain,
     /// It failed too often and gets no successor.

@@ -8,6 +8,7 @@ use super::Room;
 use super::numbers::{mean, parts, short, telling};
 use super::played::Played;
 use super::settings::{self, Setting};
+use crate::outcome::{self, Outcome};
 use crate::recorder::{
     Episode, Evaluation, IncidentRow, Learner, read_episodes, read_evaluations, read_incidents, read_learner,
 };
@@ -110,8 +111,10 @@ impl Run {
         let learner = read_learner(&run.learner_log())?;
         let explored = read_episodes(&run.episodes())?;
         let now = learner.last().cloned().unwrap_or_default();
-        let through =
+        let all_steps =
             now.env_steps >= config.run.steps || config.run.episodes.is_some_and(|episodes| now.episodes >= episodes);
+        let outcome = Outcome::read(run)?.is_none_or(|outcome| outcome.state == outcome::State::Finished);
+        let through = all_steps && outcome;
         Ok(Self {
             name,
             environment: kind(&config),

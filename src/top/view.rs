@@ -85,7 +85,7 @@ fn draw_head(frame: &mut Frame<'_>, screen: &Screen, area: Rect) {
         Life::Unknown => ("looking".to_owned(), Style::new()),
         Life::Running => ("running".to_owned(), colour(screen, Color::Green)),
         Life::Silent(_) => ("no answer".to_owned(), colour(screen, Color::Red)),
-        Life::Ended if status.is_done() => ("has ended: done".to_owned(), colour(screen, Color::Cyan)),
+        Life::Ended if status.finished => ("has ended: done".to_owned(), colour(screen, Color::Cyan)),
         Life::Ended => ("has ended".to_owned(), colour(screen, Color::Yellow)),
     };
     let line = Line::from(vec![

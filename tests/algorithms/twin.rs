@@ -161,7 +161,7 @@ pub(crate) fn reinforce(config: &Config) -> String {
             episode.extend(row);
         }
         let mark = ChunkMark {
-            incarnation: 1,
+            incarnation: 0,
             sequence: number + 1,
         };
         replay.append_and_commit(0, mark, &episode).unwrap();

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use shoal_common::channel::environment::{Ask, EnvironmentPort};
 use shoal_common::channel::policy::{PolicyHeader, PolicyPublisher};
 use shoal_common::channel::transitions::ChunkSender;
-use shoal_common::channel::{Bell, Domain, Place, Pulse, Ringer, wait_for};
+use shoal_common::channel::{Bell, Domain, Place, Pulse, Ringer, Services, wait_for};
 use shoal_common::commit::{CommitReader, OpenError};
 use shoal_common::report::{Identity, Role};
 use shoal_common::stop::Stop;
@@ -41,6 +41,7 @@ pub(crate) fn main() {
     let replay = PathBuf::from(std::env::var_os(DIRECTORY).unwrap()).join("replay.rows");
     let number = |word: &str| word.parse().unwrap();
     match role.split(' ').collect::<Vec<_>>()[..] {
+        ["host"] => host(&domain),
         ["actor", index, incarnation] => actor(&domain, &replay, number(index) as u32, number(incarnation)),
         ["learner", actors] => learner(&domain, &replay, number(actors) as u32, None),
         ["learner", actors, "stalls-at", step, after] => {
@@ -51,6 +52,7 @@ pub(crate) fn main() {
         ["env-server", "that-never-answers"] => env_server_that_never_answers(&domain),
         _ => panic!("no such role: {role}"),
     }
+    domain.leave().unwrap();
 }
 
 fn say(line: &str) {
@@ -82,6 +84,15 @@ fn stall(line: &str) -> ! {
     loop {
         std::thread::park();
     }
+}
+
+/// Holds the services of everybody else, as the launcher does.
+fn host(domain: &Domain) {
+    let mut services = Services::new(domain).unwrap();
+    services.create_common(domain).unwrap();
+    (0..MAX_ACTORS).for_each(|index| services.create_actor(domain, index, WINDOW).unwrap());
+    say("ready");
+    commands().iter().for_each(drop);
 }
 
 /// Commands: `send N` chunks, saying `sending S` after each and `full S` when it first naps before a full window;

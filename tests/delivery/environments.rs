@@ -33,15 +33,15 @@ impl Asker {
     }
 
     fn reset(&self) -> Observed {
-        self.client.reset(&self.bell, Begin::Next).expect("no hang")
+        self.client.reset(&self.bell, Begin::Next, || ()).expect("no hang")
     }
 
     fn step(&self) -> Stepped {
-        self.client.step(&self.bell, &ACTIONS).expect("no hang")
+        self.client.step(&self.bell, &ACTIONS, || ()).expect("no hang")
     }
 
     fn snapshot(&self) -> Snapshot {
-        self.client.snapshot(&self.bell).expect("no hang")
+        self.client.snapshot(&self.bell, || ()).expect("no hang")
     }
 
     fn taken(&self) -> Vec<u64> {
@@ -52,7 +52,7 @@ impl Asker {
     }
 
     fn restore(&self, words: &[u64]) -> Result<Observed, Interruption> {
-        self.client.restore(&self.bell, words)
+        self.client.restore(&self.bell, words, || ())
     }
 
     /// All that comes of so many steps, as bits.
@@ -249,7 +249,7 @@ fn a_training_episode_is_begun_by_its_number_whatever_came_before() {
     let _server = run.start("env-server");
     let asker = Asker::new(&domain);
     let begin = |begin| {
-        let observed = asker.client.reset(&asker.bell, begin).expect("no hang");
+        let observed = asker.client.reset(&asker.bell, begin, || ()).expect("no hang");
         observed.observations().to_vec()
     };
     let [first, second] = [begin(Begin::Next), begin(Begin::Next)];

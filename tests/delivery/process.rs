@@ -9,7 +9,7 @@ use std::time::Instant;
 use rustix::process::{Pid, Signal, kill_process};
 use shoal_common::channel::Domain;
 
-use crate::children::{DIRECTORY, MAX_ACTORS, ROLE, RUN};
+use crate::children::{DIRECTORY, ROLE, RUN};
 use crate::run::{DEADLINE, eventually};
 
 /// Begins a line that a child says, among those of its test harness.
@@ -95,9 +95,7 @@ impl Process {
     pub(crate) fn kill(&mut self) {
         self.child.kill().unwrap();
         self.child.wait().unwrap();
-        let launcher = Domain::join(&self.run, MAX_ACTORS).unwrap();
-        launcher.clean();
-        launcher.leave().unwrap();
+        Domain::clean_up(&self.run).unwrap();
     }
 
     /// Closes the child's standard input and waits until it has ended in good order.

@@ -1,6 +1,7 @@
 //! A run of a test: its name in shared memory, its directory, its processes.
 
 use std::path::PathBuf;
+use std::sync::Mutex;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::mpsc::{self, Sender};
 use std::time::{Duration, Instant};
@@ -20,6 +21,8 @@ pub(crate) const DEADLINE: Duration = Duration::from_secs(30);
 pub(crate) struct Run {
     id: String,
     directory: TempDir,
+    /// Holds the run's services.
+    host: Mutex<Option<Process>>,
 }
 
 /// A stop that is requested if the test hangs.
@@ -33,10 +36,23 @@ impl Run {
         iceoryx2::prelude::set_log_level(iceoryx2::prelude::LogLevel::Fatal);
         static RUNS: AtomicU32 = AtomicU32::new(0);
         let id = format!("t{}-{}", std::process::id(), RUNS.fetch_add(1, Ordering::Relaxed));
-        Self {
+        let run = Self {
             id,
             directory: TempDir::new().unwrap(),
-        }
+            host: Mutex::new(None),
+        };
+        *run.host.lock().unwrap() = Some(run.start("host"));
+        run
+    }
+
+    /// Ends in order what holds the run's services.
+    pub(crate) fn end_host(&self) {
+        self.host.lock().unwrap().take().unwrap().ends();
+    }
+
+    /// Kills it.
+    pub(crate) fn kill_host(&self) {
+        *self.host.lock().unwrap() = None;
     }
 
     /// Makes this process one of the run's.
@@ -89,6 +105,11 @@ impl Run {
 
 impl Drop for Run {
     fn drop(&mut self) {
+        let host = self.host.get_mut().ok().and_then(Option::take);
+        match host {
+            Some(host) if !std::thread::panicking() => host.ends(),
+            _ => {}
+        }
         let left = self.join().leave();
         if !std::thread::panicking() {
             left.unwrap();

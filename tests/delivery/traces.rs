@@ -36,6 +36,7 @@ fn a_run_whose_processes_end_or_are_killed_leaves_nothing() {
         }
     }
     domain.leave().unwrap();
+    run.end_host();
     assert!(run.traces().is_empty(), "{:?}", run.traces());
 }
 
@@ -50,6 +51,7 @@ fn processes_killed_while_they_start_leave_nothing() {
         process.kill();
     }
     domain.leave().unwrap();
+    run.end_host();
     assert!(run.traces().is_empty(), "{:?}", run.traces());
 }
 
@@ -60,6 +62,7 @@ fn an_abandoned_run_is_removed_and_a_living_one_goes_on() {
     let _others = everybody(&living);
     let mut actor = living.start("actor 1 1");
     drop(everybody(&dead));
+    dead.kill_host();
     // Another test may be the one that removes it.
     Domain::remove_abandoned().unwrap();
     assert!(dead.traces().is_empty(), "{:?}", dead.traces());

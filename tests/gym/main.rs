@@ -8,8 +8,9 @@
 mod support;
 
 use std::path::Path;
+use std::time::Duration;
 
-use rustix::process::Signal;
+use rustix::process::{Pid, Signal, kill_process};
 use shoal_common::config::Config;
 use shoal_common::space::Space;
 use support::{Workplace, complaint, end_of, parse, python_serves, until};
@@ -127,7 +128,7 @@ fn an_environment_that_fails_is_a_dead_role_whose_last_words_are_shown() {
         let said = String::from_utf8_lossy(&output.stderr);
         assert_eq!(output.status.code(), Some(1), "{said}");
         assert!(
-            said.contains("env-server") && said.contains("failed 5 times") && said.contains(word),
+            said.contains("env-server") && said.contains("times and is given up") && said.contains(word),
             "{said}"
         );
     }
@@ -193,7 +194,7 @@ fn servers_end_with_their_launcher_and_the_run_goes_on_when_it_is_resumed() {
 fn the_way_through_shared_memory_is_measured_beside_gymnasiums_own_vectors() {
     let Some(place) = place() else { return };
     let mut bench = place.shoal(&["bench", "gym", "--json"]);
-    let output = bench.env("SHOAL_BENCH_SECONDS", "0.4").output().unwrap();
+    let output = support::output_of(bench.env("SHOAL_BENCH_SECONDS", "0.4"));
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let figures = support::json(&output);
     let number = |field: &str| figures[field].as_f64().unwrap();
@@ -202,4 +203,135 @@ fn the_way_through_shared_memory_is_measured_beside_gymnasiums_own_vectors() {
     for vector in ["", "sync_vector_", "async_vector_"] {
         assert!(number(&format!("{vector}steps_per_second")) > 0.0, "{figures}");
     }
+}
+
+/// Processes whose command line holds these words, and that were started in the place.
+fn processes_of(place: &Workplace, words: &str) -> Vec<i32> {
+    let here = place.path().canonicalize().unwrap();
+    let listed = std::fs::read_dir("/proc").unwrap().flatten();
+    let pids = listed.filter_map(|entry| entry.file_name().to_str()?.parse::<i32>().ok());
+    pids.filter(|pid| {
+        let command = std::fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
+        let command = String::from_utf8_lossy(&command).replace('\0', " ");
+        let directory = std::fs::read_link(format!("/proc/{pid}/cwd")).unwrap_or_default();
+        command.contains(words) && directory == here
+    })
+    .collect()
+}
+
+#[test]
+fn a_process_that_an_environment_leaves_behind_holds_up_nobody() {
+    let Some(place) = place() else { return };
+    for alone in ["false", "true"] {
+        let run = format!("run-{alone}");
+        let alone = format!("environment.alone={alone}");
+        let arguments = [&SHORT[..], &["--steps", "100000000", "--set", &alone]].concat();
+        let running = place.start_in(&run, &format!("{OURS}Parent-v0"), &arguments);
+        running.learns_on();
+        running.kill("env-server-0");
+        until("it is replaced", || running.pids("env-server-0").len() == 2);
+        running.learns_on();
+        assert!(place.output(&["stop", &run]).status.success());
+        assert_eq!(running.wait().0, Some(0), "{}", place.said());
+        let left = processes_of(&place, "sleep 54321");
+        if alone.ends_with("false") {
+            assert_eq!(left, [] as [i32; 0], "its process group ends with it");
+        }
+        for pid in left {
+            kill_process(Pid::from_raw(pid).unwrap(), Signal::KILL).unwrap();
+        }
+    }
+}
+
+#[test]
+fn what_an_environment_writes_costs_bounded_memory_and_commands_no_terminal() {
+    let Some(place) = place() else { return };
+    let flood = [&SHORT[..], &["--steps", "100000000", "--set", "environment.how=flood"]].concat();
+    let running = place.start_in("flood", &format!("{OURS}Talks-v0"), &flood);
+    running.learns_on();
+    std::thread::sleep(Duration::from_secs(3));
+    let status = std::fs::read_to_string(format!("/proc/{}/status", running.launcher())).unwrap();
+    let peak = status.lines().find_map(|line| line.strip_prefix("VmHWM:")).unwrap();
+    let kilobytes: u64 = peak.trim().trim_end_matches(" kB").parse().unwrap();
+    assert!(kilobytes < 300_000, "the launcher had {kilobytes} kB");
+    running.signal(Signal::TERM);
+    assert_eq!(running.wait().0, Some(143), "{}", place.said());
+    let log = std::fs::metadata(place.path().join("flood/shoal.log")).unwrap().len();
+    assert!(log < 20_000_000, "{log} bytes of log");
+
+    let escapes = [&SHORT[..], &["--steps", "300", "--set", "environment.how=escapes"]].concat();
+    let running = place.start_in("escapes", &format!("{OURS}Talks-v0"), &escapes);
+    assert_eq!(running.wait().0, Some(0), "{}", place.said());
+    let log = std::fs::read_to_string(place.path().join("escapes/shoal.log")).unwrap();
+    assert!(log.contains("owned") && !log.contains('\x1b') && !log.contains('\x07'));
+}
+
+#[test]
+fn a_server_that_is_stuck_ends_with_its_launcher_all_the_same() {
+    let Some(place) = place() else { return };
+    let arguments = [&SHORT[..], &["--steps", "100000000"]].concat();
+    let running = place.start_in("run", &format!("{OURS}Sleeps-v0"), &arguments);
+    running.learns_on();
+    std::fs::write(place.path().join("sleep"), "").unwrap();
+    std::thread::sleep(Duration::from_secs(1));
+    running.signal(Signal::KILL);
+    until("no process is left", || {
+        running.leftovers().processes().is_empty() && processes_of(&place, "shoal_gym").is_empty()
+    });
+}
+
+#[test]
+fn a_killed_probe_leaves_no_process_and_no_file() {
+    let Some(place) = place() else { return };
+    let asleep = format!("{OURS}Sleeps-v0");
+    let arguments = ["train", &asleep, "--set", "environment.from_the_start=true"];
+    let mut probe = place.shoal(&arguments).env("TMPDIR", place.path()).spawn().unwrap();
+    until("the server starts", || !processes_of(&place, "shoal_gym").is_empty());
+    probe.kill().unwrap();
+    probe.wait().unwrap();
+    until("the server is gone", || processes_of(&place, "shoal_gym").is_empty());
+    let mut left: Vec<_> = std::fs::read_dir(place.path())
+        .unwrap()
+        .map(|entry| entry.unwrap().file_name())
+        .collect();
+    left.retain(|name| name != "shoal_test_environments.py" && name != "__pycache__");
+    assert!(left.is_empty(), "{left:?}");
+}
+
+#[test]
+fn a_server_that_lives_and_does_not_hear_is_replaced() {
+    let Some(place) = place() else { return };
+    let server = "from shoal_test_environments import deaf_server; raise SystemExit(deaf_server())";
+    let server = format!(
+        "environment.server={}",
+        serde_json::to_string(&["python3", "-c", server]).unwrap()
+    );
+    let arguments = ["--steps", "100000000", "--set", &server, "--set", "run.stall_seconds=3"];
+    let running = place.start_in("run", "gym:Pendulum-v1", &[&SHORT[..], &arguments].concat());
+    running.learns_on();
+    std::fs::write(place.path().join("deaf"), "").unwrap();
+    until("it is named", || running.log().contains("makes no progress"));
+    until("the server is replaced", || running.pids("env-server-0").len() > 1);
+    std::fs::remove_file(place.path().join("deaf")).unwrap();
+    running.learns_on();
+    running.learns_on();
+    let log = running.log();
+    assert!(
+        log.contains("actor-0 makes no progress") && log.contains("env-server-0 makes no progress"),
+        "{log}"
+    );
+    let incidents = std::fs::read_to_string(running.run.join("incidents.csv")).unwrap();
+    assert!(incidents.contains("stalled"), "{incidents}");
+}
+
+#[test]
+fn an_environment_that_takes_its_time_over_a_step_is_left_alone() {
+    let Some(place) = place() else { return };
+    let arguments = [&SHORT[..], &["--steps", "100000000", "--set", "run.stall_seconds=3"]].concat();
+    let running = place.start_in("run", &format!("{OURS}Sleeps-v0"), &arguments);
+    running.learns_on();
+    std::fs::write(place.path().join("sleep"), "").unwrap();
+    // Far longer than a stall, but it is no stall.
+    std::thread::sleep(Duration::from_secs(12));
+    assert!(!running.log().contains("makes no progress"), "{}", running.log());
 }

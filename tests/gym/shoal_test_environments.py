@@ -1,6 +1,8 @@
 """Environments that end, fail and cannot be served, for the tests."""
 
 import os
+import subprocess
+import time
 
 import gymnasium as gym
 import numpy as np
@@ -44,6 +46,43 @@ class Fails(Ends):
         return super().step(action)
 
 
+class Parent(Ends):
+    """Has started a process that lives for long and keeps standard error open."""
+
+    def __init__(self, alone=False):
+        super().__init__(after=0)
+        self.child = subprocess.Popen(["sleep", "54321"], start_new_session=alone)
+
+
+class Talks(Ends):
+    """Writes to standard error without an end, or what a terminal takes for commands."""
+
+    def __init__(self, how):
+        super().__init__(after=0)
+        self.how = how
+
+    def step(self, action):
+        if self.how == "flood":
+            os.write(2, b"x" * 1_000_000)
+        else:
+            os.write(2, b"\x1b]0;owned\x07\n")
+        return super().step(action)
+
+
+class Sleeps(Ends):
+    """Does not come back from a step, once there is a file of the name ``sleep``, or from being made."""
+
+    def __init__(self, from_the_start=False):
+        super().__init__(after=0)
+        if from_the_start:
+            time.sleep(54321)
+
+    def step(self, action):
+        if os.path.exists("sleep"):
+            time.sleep(54321)
+        return super().step(action)
+
+
 class Odd(Ends):
     observation_space = gym.spaces.Dict({"position": gym.spaces.Box(-1, 1, (1,))})
 
@@ -69,5 +108,27 @@ class Offset(gym.Env):
 gym.register("Ends-v0", entry_point=Ends, max_episode_steps=5)
 gym.register("Endless-v0", entry_point=Ends)
 gym.register("Fails-v0", entry_point=Fails, max_episode_steps=5)
+gym.register("Parent-v0", entry_point=Parent, max_episode_steps=5)
+gym.register("Talks-v0", entry_point=Talks, max_episode_steps=5)
+gym.register("Sleeps-v0", entry_point=Sleeps, max_episode_steps=5)
 gym.register("Odd-v0", entry_point=Odd, max_episode_steps=5)
 gym.register("Offset-v0", entry_point=Offset, max_episode_steps=5)
+
+
+def deaf_server():
+    """An environment server that goes on living and stops hearing, once there is a file of the name ``deaf``."""
+    from shoal_gym import port
+
+    hear = port.Port.next_request
+
+    def next_request(self):
+        while os.path.exists("deaf"):
+            self._look_out()
+            self.beat(port.Activity.WAITING_FOR_PEER)
+            time.sleep(0.05)
+        return hear(self)
+
+    port.Port.next_request = next_request
+    from shoal_gym.__main__ import main
+
+    return main()

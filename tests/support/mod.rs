@@ -12,6 +12,9 @@ use rustix::process::{Pid, Signal, kill_process, test_kill_process};
 /// After so long a test has failed, however slow the machine.
 const PATIENCE: Duration = Duration::from_secs(120);
 
+/// And after so long a command that may be a whole training.
+const LONG_PATIENCE: Duration = Duration::from_secs(600);
+
 /// Settings with which a run is quick: small networks, little warm-up, few episodes to judge by.
 pub(crate) const QUICK: [&str; 10] = [
     "--set",
@@ -67,7 +70,7 @@ impl Workplace {
 
     /// Runs the program to its end.
     pub(crate) fn output(&self, arguments: &[&str]) -> Output {
-        self.shoal(arguments).output().unwrap()
+        output_of(&mut self.shoal(arguments))
     }
 
     /// Trains quickly and returns what `--json` printed.
@@ -118,8 +121,10 @@ impl Workplace {
         };
         until("every role is ready", || {
             let ended = running.child.try_wait().unwrap();
-            assert!(ended.is_none(), "{}", self.said());
-            ready() > before
+            // A short run may be over by now.
+            let is_ready = ready() > before;
+            assert!(ended.is_none() || is_ready, "{}", self.said());
+            is_ready
         });
         running
     }
@@ -196,6 +201,11 @@ impl Running {
             }
         }
         until("everybody is dead", || self.leftovers().processes().is_empty());
+    }
+
+    /// The launcher's process number.
+    pub(crate) fn launcher(&self) -> u32 {
+        self.child.id()
     }
 
     /// Sends a signal to the launcher.
@@ -370,6 +380,21 @@ pub(crate) fn python_serves() -> bool {
         "python3 has no shoal_gym: pip install ./python"
     );
     serves
+}
+
+/// Runs a command to its end; one that hangs is killed, and the test has failed.
+pub(crate) fn output_of(command: &mut Command) -> Output {
+    let child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let pid = Pid::from_child(&child);
+    let (sender, ended) = std::sync::mpsc::channel();
+    std::thread::spawn(move || sender.send(child.wait_with_output()));
+    match ended.recv_timeout(LONG_PATIENCE) {
+        Ok(output) => output.unwrap(),
+        Err(_) => {
+            kill_process(pid, Signal::KILL).unwrap();
+            panic!("{command:?} does not end");
+        }
+    }
 }
 
 /// Waits until something holds.

@@ -2,7 +2,7 @@
 
 use serde_json::Value;
 
-use crate::support::{QUICK, Workplace, complaint, json};
+use crate::support::{QUICK, Workplace, complaint, json, output_of};
 
 fn listed<'a>(list: &'a Value, name: &str) -> &'a Value {
     let mut runs = list["runs"].as_array().unwrap().iter();
@@ -82,7 +82,7 @@ fn a_run_that_failed_is_told_from_one_that_was_killed() {
             .join(" ")
     );
     let mut shell = std::process::Command::new("sh");
-    let output = shell.args(["-c", &script]).current_dir(place.path()).output().unwrap();
+    let output = output_of(shell.args(["-c", &script]).current_dir(place.path()));
     assert_eq!(output.status.code(), Some(1));
     let list = json(&place.output(&["list", "--json"]));
     assert_eq!(listed(&list, "run")["state"], "failed", "{list}");

@@ -2,7 +2,7 @@
 
 use std::process::Command;
 
-use crate::support::{Workplace, complaint};
+use crate::support::{Workplace, complaint, output_of};
 
 /// What bash would offer for the last of these words, by the function that `shoal completions bash` defines.
 fn offered(place: &Workplace, words: &[&str]) -> String {
@@ -20,12 +20,11 @@ fn offered(place: &Workplace, words: &[&str]) -> String {
         binary.parent().unwrap().display(),
         std::env::var("PATH").unwrap_or_default()
     );
-    let output = Command::new("bash")
-        .args(["--norc", "-c", &script])
+    let mut bash = Command::new("bash");
+    bash.args(["--norc", "-c", &script])
         .current_dir(place.path())
-        .env("PATH", path)
-        .output()
-        .unwrap();
+        .env("PATH", path);
+    let output = output_of(&mut bash);
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     String::from_utf8(output.stdout).unwrap()
 }

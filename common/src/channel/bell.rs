@@ -7,11 +7,13 @@ use std::time::{Duration, Instant};
 use iceoryx2::port::listener::{Listener, ListenerWaitError};
 use iceoryx2::port::notifier::Notifier;
 use iceoryx2::prelude::*;
+use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::event::PortFactory;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
 
-use super::{ChannelError, Domain, Interruption, claim, descriptor, memory, service_name};
+use super::services::Held;
+use super::{ChannelError, Domain, Entry, Interruption, claim, descriptor, memory, service_name};
 use crate::report::Role;
 use crate::stop::Stop;
 
@@ -96,7 +98,7 @@ impl Bell {
     pub fn hang(domain: &Domain, place: Place) -> Result<Self, ChannelError> {
         let channel = place.to_string();
         let listener = claim(|| {
-            service(domain, &channel)?
+            service(domain, &channel, Entry::Open)?
                 .listener_builder()
                 .create()
                 .map_err(|e| ChannelError::new(&channel, "listen", e))
@@ -141,7 +143,7 @@ impl Ringer {
     pub fn new(domain: &Domain, place: Place) -> Result<Self, ChannelError> {
         let channel = place.to_string();
         let notifier = claim(|| {
-            service(domain, &channel)?
+            service(domain, &channel, Entry::Open)?
                 .notifier_builder()
                 .create()
                 .map_err(|e| ChannelError::new(&channel, "ring", e))
@@ -192,21 +194,37 @@ pub fn wait_for<T>(
     }
 }
 
+/// Makes the service of the bell at `place`.
+pub(super) fn create(domain: &Domain, place: Place) -> Result<Held, ChannelError> {
+    let service = service(domain, &place.to_string(), Entry::Create)?;
+    Ok(Held::new(move |see| {
+        let ports = service.dynamic_config();
+        ports.list_listeners(|port| see(port.node_id, port.listener_id.value()));
+        ports.list_notifiers(|port| see(port.node_id, port.notifier_id.value()));
+    }))
+}
+
 fn parties(max_actors: usize) -> usize {
     2 * max_actors + 8
 }
 
-fn service(domain: &Domain, channel: &str) -> Result<PortFactory<ipc::Service>, ChannelError> {
+fn service(domain: &Domain, channel: &str, entry: Entry) -> Result<PortFactory<ipc::Service>, ChannelError> {
     let parties = parties(domain.max_actors());
-    domain
+    let builder = domain
         .node()
         .service_builder(&service_name(domain, channel)?)
         .event()
         .max_listeners(2)
         .max_notifiers(parties)
-        .max_nodes(parties)
-        .open_or_create()
-        .map_err(|cause| ChannelError::new(channel, "open", cause))
+        .max_nodes(parties);
+    match entry {
+        Entry::Create => builder
+            .create()
+            .map_err(|cause| ChannelError::new(channel, "create", cause)),
+        Entry::Open => builder
+            .open()
+            .map_err(|cause| ChannelError::new(channel, "open", cause)),
+    }
 }
 
 #[cfg(test)]

@@ -1,5 +1,6 @@
 //! Control of a run, from any other terminal: questions to its launcher, and the launcher's answers.
 
+use std::path::Path;
 use std::time::{Duration, Instant};
 
 use iceoryx2::active_request::ActiveRequest;
@@ -8,11 +9,13 @@ use iceoryx2::prelude::*;
 use iceoryx2::service::header::request_response::{
     RequestHeader as IoxRequestHeader, ResponseHeader as IoxResponseHeader,
 };
+use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::request_response::PortFactory;
 
-pub use self::message::{Answer, Question, RoleState, RoleStatus, RunStatus};
-use self::message::{VERSION, decode, encode};
-use super::{ChannelError, Domain, claim, memory, service_name};
+pub use self::message::{Answer, Question, RoleState, RoleStatus, RunKey, RunStatus};
+use self::message::{Asked, VERSION, decode, encode};
+use super::services::Held;
+use super::{ChannelError, Domain, Entry, claim, memory, service_name};
 
 mod message;
 
@@ -78,7 +81,7 @@ impl ControlPort {
     /// When shared memory cannot be had.
     pub fn open(domain: &Domain) -> Result<Self, ChannelError> {
         let server = claim(|| {
-            service(domain)?
+            service(domain, Entry::Open)?
                 .server_builder()
                 .initial_max_slice_len(answer_length(domain.max_actors()))
                 .create()
@@ -90,12 +93,15 @@ impl ControlPort {
         })
     }
 
-    /// Answers everything that was asked since the last call; whom `answer` has no answer for waits.
+    /// Answers everything that was asked about `run`, which is in the directory `place`, since the last call; whom `answer`
+    /// has no answer for waits.
     ///
     /// # Errors
     /// When the channel does not work, or `answer` fails.
     pub fn attend<E: From<ChannelError>>(
         &mut self,
+        run: RunKey,
+        place: &Path,
         mut answer: impl FnMut(Question) -> Result<Option<Answer>, E>,
     ) -> Result<(), E> {
         loop {
@@ -105,7 +111,8 @@ impl ControlPort {
                 .map_err(|cause| ChannelError::new(CHANNEL, "hear a question", cause))?;
             let Some(request) = received else { return Ok(()) };
             let answer = match decode(request.user_header().version, request.payload()) {
-                Ok(question) => answer(question)?,
+                Ok(Asked { run: asked, .. }) if asked != run => Some(Answer::AnotherRun(place.display().to_string())),
+                Ok(Asked { question, .. }) => answer(question)?,
                 Err(reason) => Some(Answer::Refused(format!("the question cannot be read: {reason}"))),
             };
             match answer {
@@ -116,7 +123,7 @@ impl ControlPort {
     }
 
     /// Answers those who wait, and gives them a moment to hear it; for the end.
-    pub fn dismiss(mut self, answer: &Answer) {
+    pub fn dismiss(&mut self, answer: &Answer) {
         if self.waiting.is_empty() {
             return;
         }
@@ -138,12 +145,13 @@ fn send(request: &ControlRequest, answer: &Answer) {
     }
 }
 
-/// Asks the launcher of the run, for as long as `lives` says that there is one.
+/// Asks the launcher of `run`, for as long as `lives` says that there is one.
 ///
 /// # Errors
 /// When there is no answer within `patience`, or none that can be read.
 pub fn ask(
     domain: &Domain,
+    run: RunKey,
     question: Question,
     patience: Duration,
     lives: impl Fn() -> bool,
@@ -154,7 +162,7 @@ pub fn ask(
         cause,
     };
     let client = claim(|| {
-        service(domain)?
+        service(domain, Entry::Open)?
             .client_builder()
             .initial_max_slice_len(QUESTION)
             .create()
@@ -167,7 +175,7 @@ pub fn ask(
         request.user_header_mut().version = VERSION;
         request.send().map_err(|e| format!("{e:?}"))
     };
-    let question = encode(&question);
+    let question = encode(&Asked { run, question });
     let mut pending = ask(&question).map_err(failed)?;
     let mut looked = Instant::now();
     let mut gone = false;
@@ -211,10 +219,20 @@ fn answer_length(max_actors: usize) -> usize {
     ANSWER + ANSWER_OF_A_ROLE * (2 * max_actors + 3)
 }
 
+/// Makes the service.
+pub(super) fn create(domain: &Domain) -> Result<Held, ChannelError> {
+    let service = service(domain, Entry::Create)?;
+    Ok(Held::new(move |see| {
+        let ports = service.dynamic_config();
+        ports.list_clients(|port| see(port.node_id, port.client_id.value()));
+        ports.list_servers(|port| see(port.node_id, port.server_id.value()));
+    }))
+}
+
 type ControlService = PortFactory<ipc::Service, [u8], ControlHeader, [u8], ControlHeader>;
 
-fn service(domain: &Domain) -> Result<ControlService, ChannelError> {
-    domain
+fn service(domain: &Domain, entry: Entry) -> Result<ControlService, ChannelError> {
+    let builder = domain
         .node()
         .service_builder(&service_name(domain, CHANNEL)?)
         .request_response::<[u8], [u8]>()
@@ -225,7 +243,13 @@ fn service(domain: &Domain) -> Result<ControlService, ChannelError> {
         .max_nodes(NODES)
         .max_active_requests_per_client(ACTIVE_REQUESTS)
         .max_response_buffer_size(1)
-        .max_borrowed_responses_per_pending_response(1)
-        .open_or_create()
-        .map_err(|cause| ChannelError::new(CHANNEL, "open", cause))
+        .max_borrowed_responses_per_pending_response(1);
+    match entry {
+        Entry::Create => builder
+            .create()
+            .map_err(|cause| ChannelError::new(CHANNEL, "create", cause)),
+        Entry::Open => builder
+            .open()
+            .map_err(|cause| ChannelError::new(CHANNEL, "open", cause)),
+    }
 }

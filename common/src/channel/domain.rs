@@ -1,7 +1,7 @@
 //! A run's own corner of shared memory. Every run has a root directory and a file prefix of its own, below a directory
 //! that belongs to one user: two runs never meet, two users neither, and what a killed run left behind is known by name.
 
-use std::fs::{DirBuilder, File, Permissions};
+use std::fs::{DirBuilder, File, Metadata, Permissions};
 use std::io;
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
@@ -12,8 +12,12 @@ use iceoryx2::prelude::{
     SignalHandlingMode, ipc,
 };
 use rustix::fs::FlockOperation;
+use rustix::io::Errno;
 
 use super::memory;
+
+/// How long others may have the lock of the user's directory: each needs it for some milliseconds.
+const LOCK_PATIENCE: Duration = Duration::from_secs(10);
 
 pub(super) const SHARED_MEMORY: &str = "/dev/shm";
 
@@ -41,6 +45,9 @@ pub enum DomainError {
     /// Somebody else owns the directory that should be ours.
     #[error("{0} belongs to another user; remove it, or ask its owner to")]
     Foreign(PathBuf),
+    /// A process has the lock that each holds for a moment only.
+    #[error("{0} is locked by another shoal process that does not get on; is one stopped?")]
+    Locked(PathBuf),
     /// Processes of the run's last launcher are still there.
     #[error(
         "run {run_id} cannot go on: processes of it are still alive and do not end (stopped?): kill -9 {}",
@@ -70,7 +77,7 @@ impl Domain {
     pub fn join(run_id: &str, max_actors: u32) -> Result<Self, DomainError> {
         let root = user_root()?;
         // Held until the node exists, so that nobody who looks for abandoned runs takes this one for dead.
-        let _lock = lock(&root)?;
+        let _lock = make_and_lock(&root.join(run_id))?;
         let failed = |cause: String| DomainError::Join {
             run_id: run_id.into(),
             cause,
@@ -99,6 +106,14 @@ impl Domain {
         self.max_actors
     }
 
+    /// The directory of the run's files that are not in shared memory. What is put there goes with them.
+    ///
+    /// # Errors
+    /// When the user's directory cannot be used.
+    pub fn directory(&self) -> Result<PathBuf, DomainError> {
+        Ok(user_root()?.join(&self.run_id))
+    }
+
     /// Notes that this run may take so many bytes of shared memory, so that
     /// [`free_shared_memory`](super::free_shared_memory) does not offer them to the user's other runs.
     ///
@@ -116,12 +131,6 @@ impl Domain {
         toml::to_string(self.node.config())
     }
 
-    /// Removes from the run's services whatever processes left in them that are no more. For the launcher alone, whenever
-    /// it has seen a process end.
-    pub fn clean(&self) {
-        self.node.blocking_cleanup_dead_nodes(Duration::from_millis(100));
-    }
-
     pub(super) fn node(&self) -> &Node<ipc::Service> {
         &self.node
     }
@@ -135,7 +144,7 @@ impl Domain {
         let run_id = self.run_id.clone();
         drop(self);
         let root = user_root()?;
-        let _lock = lock(&root)?;
+        let _lock = lock(&root.join(&run_id))?;
         remove_if_dead(&root, &run_id)
     }
 
@@ -149,7 +158,7 @@ impl Domain {
         let deadline = Instant::now() + patience;
         loop {
             let left = {
-                let _lock = lock(&root)?;
+                let _lock = lock(&root.join(run_id))?;
                 living(&root, run_id)?
             };
             if left.is_empty() {
@@ -171,11 +180,12 @@ impl Domain {
     /// When the user's directory cannot be read, or files cannot be removed.
     pub fn remove_abandoned() -> Result<(), DomainError> {
         let root = user_root()?;
-        let _lock = lock(&root)?;
         let listing = std::fs::read_dir(&root).map_err(io_error("list", &root))?;
         for entry in listing.flatten() {
             if entry.path().is_dir()
                 && let Some(run_id) = entry.file_name().to_str()
+                // Where somebody has the lock, somebody is there.
+                && let Attempt::Locked(_lock) = try_lock(&entry.path())?
             {
                 remove_if_dead(&root, run_id)?;
             }
@@ -191,20 +201,27 @@ pub(super) fn prefix(run_id: &str) -> String {
 
 /// Closes the one file that iceoryx2 opens to everybody, whatever the umask: the one that counts the run's nodes.
 fn close_to_others(run_id: &str) -> Result<(), DomainError> {
-    let shared_memory = Path::new(SHARED_MEMORY);
-    let listing = std::fs::read_dir(shared_memory).map_err(io_error("list", shared_memory))?;
-    for entry in listing.flatten() {
-        let name = entry.file_name();
-        let name = name.to_string_lossy();
-        if name.starts_with(&prefix(run_id)) && name.ends_with(".global_mgmt") {
-            let path = entry.path();
+    for (path, _) in files_of(run_id).map_err(io_error("list", Path::new(SHARED_MEMORY)))? {
+        if path.extension().is_some_and(|extension| extension == "global_mgmt") {
             std::fs::set_permissions(&path, Permissions::from_mode(0o600)).map_err(io_error("close", &path))?;
         }
     }
     Ok(())
 }
 
-fn iox_config(root: &Path, run_id: &str) -> Result<Config, String> {
+/// The run's files in shared memory. Others may put files there whose names begin alike: theirs are left alone.
+pub(super) fn files_of(run_id: &str) -> io::Result<Vec<(PathBuf, Metadata)>> {
+    let (user, prefix) = (rustix::process::getuid().as_raw(), prefix(run_id));
+    let ours = std::fs::read_dir(SHARED_MEMORY)?
+        .flatten()
+        .filter(|entry| entry.file_name().to_string_lossy().starts_with(&prefix))
+        // One that has gone in between is none.
+        .filter_map(|entry| Some((entry.path(), entry.metadata().ok()?)))
+        .filter(|(_, metadata)| metadata.uid() == user);
+    Ok(ours.collect())
+}
+
+pub(super) fn iox_config(root: &Path, run_id: &str) -> Result<Config, String> {
     let directory = root.join(run_id);
     let root_path = IoxPath::new(directory.as_os_str().as_encoded_bytes()).map_err(|e| format!("{e:?}"))?;
     let mut config = Config::default();
@@ -251,12 +268,8 @@ fn remove_if_dead(root: &Path, run_id: &str) -> Result<(), DomainError> {
     }
     // No process of the run is left and its name is its own, so these files are nobody's. iceoryx2 itself never removes
     // the file that counts its nodes.
-    let shared_memory = Path::new(SHARED_MEMORY);
-    let listing = std::fs::read_dir(shared_memory).map_err(io_error("list", shared_memory))?;
-    for entry in listing.flatten() {
-        if entry.file_name().to_string_lossy().starts_with(&prefix(run_id)) {
-            remove(&entry.path(), |path| std::fs::remove_file(path))?;
-        }
+    for (path, _) in files_of(run_id).map_err(io_error("list", Path::new(SHARED_MEMORY)))? {
+        remove(&path, |path| std::fs::remove_file(path))?;
     }
     remove(&root.join(run_id), |path| std::fs::remove_dir_all(path))
 }
@@ -269,7 +282,7 @@ fn remove(path: &Path, how: impl Fn(&Path) -> io::Result<()>) -> Result<(), Doma
 }
 
 /// `/tmp/shoal-<user id>`, closed to everybody else.
-fn user_root() -> Result<PathBuf, DomainError> {
+pub(super) fn user_root() -> Result<PathBuf, DomainError> {
     let user = rustix::process::getuid().as_raw();
     let root = PathBuf::from(format!("/tmp/shoal-{user}"));
     match DirBuilder::new().mode(0o700).create(&root) {
@@ -283,13 +296,64 @@ fn user_root() -> Result<PathBuf, DomainError> {
     Ok(root)
 }
 
-fn lock(root: &Path) -> Result<File, DomainError> {
-    let file = File::open(root).map_err(io_error("open", root))?;
-    rustix::fs::flock(&file, FlockOperation::LockExclusive).map_err(|errno| io_error("lock", root)(errno.into()))?;
-    Ok(file)
+/// What became of asking for a run's lock.
+enum Attempt {
+    Locked(File),
+    /// Another process has it.
+    Held,
+    /// Nothing of the run is there.
+    Absent,
 }
 
-fn io_error(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> DomainError {
+/// The lock of the run in this directory, which no other run has to do with; `None` where there is no such run.
+fn lock(directory: &Path) -> Result<Option<File>, DomainError> {
+    let deadline = Instant::now() + LOCK_PATIENCE;
+    loop {
+        match try_lock(directory)? {
+            Attempt::Locked(lock) => return Ok(Some(lock)),
+            Attempt::Absent => return Ok(None),
+            Attempt::Held if Instant::now() < deadline => std::thread::sleep(Duration::from_millis(1)),
+            Attempt::Held => return Err(DomainError::Locked(directory.into())),
+        }
+    }
+}
+
+/// The same, of a run that is made where it is not there.
+fn make_and_lock(directory: &Path) -> Result<File, DomainError> {
+    loop {
+        match DirBuilder::new().mode(0o700).create(directory) {
+            Err(cause) if cause.kind() != io::ErrorKind::AlreadyExists => {
+                return Err(io_error("make", directory)(cause));
+            }
+            _ => {}
+        }
+        // The last of an earlier run may remove it at this moment.
+        if let Some(lock) = lock(directory)? {
+            return Ok(lock);
+        }
+    }
+}
+
+fn try_lock(directory: &Path) -> Result<Attempt, DomainError> {
+    loop {
+        let file = match File::open(directory) {
+            Err(cause) if cause.kind() == io::ErrorKind::NotFound => return Ok(Attempt::Absent),
+            opened => opened.map_err(io_error("open", directory))?,
+        };
+        match rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive) {
+            Ok(()) => {}
+            Err(Errno::WOULDBLOCK) => return Ok(Attempt::Held),
+            Err(errno) => return Err(io_error("lock", directory)(errno.into())),
+        }
+        // Who had it before may have removed the directory, and another one may be there now.
+        let inode = |metadata: io::Result<Metadata>| metadata.ok().map(|metadata| metadata.ino());
+        if inode(file.metadata()) == inode(directory.metadata()) {
+            return Ok(Attempt::Locked(file));
+        }
+    }
+}
+
+pub(super) fn io_error(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> DomainError {
     let path = path.to_owned();
     move |cause| DomainError::Io { action, path, cause }
 }

@@ -6,10 +6,12 @@ use iceoryx2::prelude::*;
 use iceoryx2::service::header::request_response::{
     RequestHeader as IoxRequestHeader, ResponseHeader as IoxResponseHeader,
 };
+use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::request_response::PortFactory;
 
+use super::services::Held;
 use super::words::NUMBERS_OF_A_WORD;
-use super::{ChannelError, Domain, memory, service_name};
+use super::{ChannelError, Domain, Entry, memory, service_name};
 use crate::space::EnvironmentSpec;
 
 mod client;
@@ -63,11 +65,21 @@ fn name(index: u32) -> String {
     format!("env/{index}")
 }
 
+/// Makes the service of the conversation with environment server `index`.
+pub(super) fn create(domain: &Domain, index: u32) -> Result<Held, ChannelError> {
+    let service = service(domain, &name(index), Entry::Create)?;
+    Ok(Held::new(move |see| {
+        let ports = service.dynamic_config();
+        ports.list_clients(|port| see(port.node_id, port.client_id.value()));
+        ports.list_servers(|port| see(port.node_id, port.server_id.value()));
+    }))
+}
+
 type EnvironmentService = PortFactory<ipc::Service, [f32], RequestHeader, [f32], ResponseHeader>;
 
 /// One client, one server: the port is the claim.
-fn service(domain: &Domain, channel: &str) -> Result<EnvironmentService, ChannelError> {
-    domain
+fn service(domain: &Domain, channel: &str, entry: Entry) -> Result<EnvironmentService, ChannelError> {
+    let builder = domain
         .node()
         .service_builder(&service_name(domain, channel)?)
         .request_response::<[f32], [f32]>()
@@ -79,7 +91,13 @@ fn service(domain: &Domain, channel: &str) -> Result<EnvironmentService, Channel
         .max_active_requests_per_client(ACTIVE_REQUESTS)
         .max_loaned_requests(LOANED_REQUESTS)
         .max_response_buffer_size(RESPONSE_BUFFER)
-        .max_borrowed_responses_per_pending_response(BORROWED_RESPONSES)
-        .open_or_create()
-        .map_err(|cause| ChannelError::new(channel, "open", cause))
+        .max_borrowed_responses_per_pending_response(BORROWED_RESPONSES);
+    match entry {
+        Entry::Create => builder
+            .create()
+            .map_err(|cause| ChannelError::new(channel, "create", cause)),
+        Entry::Open => builder
+            .open()
+            .map_err(|cause| ChannelError::new(channel, "open", cause)),
+    }
 }

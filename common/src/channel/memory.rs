@@ -26,6 +26,11 @@ const PARTY: usize = 96;
 /// length: that may be limited.)
 const PROMISE: &str = "promise_";
 
+/// Whether a file of this name is such a note.
+pub(super) fn is_promise(name: &str) -> bool {
+    name.contains(PROMISE)
+}
+
 /// Bytes of a port's data: so many chunks with headers `H` and `U` and a payload of so many bytes.
 pub(super) fn segment<H, U>(chunks: usize, payload: usize) -> u64 {
     let chunk = (size_of::<H>() + size_of::<U>() + payload).next_multiple_of(align_of::<u64>());

@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 use iceoryx2::prelude::*;
 
 mod bell;
+mod cleanup;
 pub mod control;
 mod descriptor;
 mod domain;
@@ -15,6 +16,7 @@ mod memory;
 pub mod policy;
 mod pulse;
 pub mod reports;
+mod services;
 pub mod transitions;
 mod words;
 
@@ -22,6 +24,7 @@ pub use bell::{Bell, Place, Ringer, wait_for};
 pub use domain::{Domain, DomainError};
 pub use memory::free_shared_memory;
 pub use pulse::Pulse;
+pub use services::Services;
 pub(crate) use words::NUMBERS_OF_A_WORD;
 
 /// A channel does not work: its service or port cannot be had, or memory is exhausted.
@@ -57,11 +60,20 @@ pub enum Interruption {
     Channel(#[from] ChannelError),
 }
 
+/// How a process comes to a service.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Entry {
+    /// Makes it: for the run's host alone, through [`Services`].
+    Create,
+    /// Opens it. It is there before whoever opens it is started.
+    Open,
+}
+
 /// How long a dead predecessor may occupy a port before we give up.
 const CLAIM_PATIENCE: Duration = Duration::from_secs(5);
 
-/// Opens a service or makes a port. A process that died may still hold the place until the launcher has cleaned up after
-/// it; two processes may also make and remove the same service at the same time. So: try again for a while.
+/// Opens a service and makes a port in it. A process that died may still hold the place until the launcher has cleaned up
+/// after it. So: try again for a while.
 fn claim<T>(mut attempt: impl FnMut() -> Result<T, ChannelError>) -> Result<T, ChannelError> {
     let deadline = Instant::now() + CLAIM_PATIENCE;
     loop {

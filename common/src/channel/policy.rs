@@ -7,9 +7,11 @@ use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::*;
 use iceoryx2::sample::Sample;
 use iceoryx2::service::header::publish_subscribe::Header;
+use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 
-use super::{ChannelError, Domain, claim, memory, service_name};
+use super::services::Held;
+use super::{ChannelError, Domain, Entry, claim, memory, service_name};
 
 const CHANNEL: &str = "policy";
 
@@ -64,7 +66,7 @@ impl PolicyPublisher {
     pub fn open(domain: &Domain, parameters: usize) -> Result<Self, ChannelError> {
         let samples = samples(domain.max_actors());
         let publisher = claim(|| {
-            service(domain)?
+            service(domain, Entry::Open)?
                 .publisher_builder()
                 .initial_max_slice_len(parameters)
                 .max_loaned_samples(1)
@@ -109,7 +111,7 @@ impl PolicyReader {
     /// When shared memory cannot be had.
     pub fn open(domain: &Domain, fingerprint: u64, parameters: usize) -> Result<Self, ChannelError> {
         let subscriber = claim(|| {
-            service(domain)?
+            service(domain, Entry::Open)?
                 .subscriber_builder()
                 .create()
                 .map_err(|cause| ChannelError::new(CHANNEL, "read", cause))
@@ -188,8 +190,18 @@ fn samples(max_actors: usize) -> usize {
     readers(max_actors) * BORROWED + waiting + being_written
 }
 
-fn service(domain: &Domain) -> Result<PortFactory<ipc::Service, [f32], PolicyHeader>, ChannelError> {
-    domain
+/// Makes the service.
+pub(super) fn create(domain: &Domain) -> Result<Held, ChannelError> {
+    let service = service(domain, Entry::Create)?;
+    Ok(Held::new(move |see| {
+        let ports = service.dynamic_config();
+        ports.list_publishers(|port| see(port.node_id, port.publisher_id.value()));
+        ports.list_subscribers(|port| see(port.node_id, port.subscriber_id.value()));
+    }))
+}
+
+fn service(domain: &Domain, entry: Entry) -> Result<PortFactory<ipc::Service, [f32], PolicyHeader>, ChannelError> {
+    let builder = domain
         .node()
         .service_builder(&service_name(domain, CHANNEL)?)
         .publish_subscribe::<[f32]>()
@@ -200,9 +212,15 @@ fn service(domain: &Domain) -> Result<PortFactory<ipc::Service, [f32], PolicyHea
         .enable_safe_overflow(true)
         .history_size(1)
         .subscriber_max_buffer_size(BUFFER)
-        .subscriber_max_borrowed_samples(BORROWED)
-        .open_or_create()
-        .map_err(|cause| ChannelError::new(CHANNEL, "open", cause))
+        .subscriber_max_borrowed_samples(BORROWED);
+    match entry {
+        Entry::Create => builder
+            .create()
+            .map_err(|cause| ChannelError::new(CHANNEL, "create", cause)),
+        Entry::Open => builder
+            .open()
+            .map_err(|cause| ChannelError::new(CHANNEL, "open", cause)),
+    }
 }
 
 #[cfg(test)]
@@ -214,6 +232,7 @@ mod tests {
         const MAX_ACTORS: u32 = 3;
         let run_id = format!("{:x}", std::process::id());
         let domain = Domain::join(&run_id, MAX_ACTORS).unwrap();
+        let service = create(&domain).unwrap();
         let publisher = PolicyPublisher::open(&domain, 100).unwrap();
         let readers: Vec<_> = (0..readers(MAX_ACTORS as usize))
             .map(|_| PolicyReader::open(&domain, 0, 100).unwrap().subscriber)
@@ -239,7 +258,7 @@ mod tests {
             assert_eq!(sample.user_header().version, *version);
             assert_eq!(sample.payload(), [*version as f32; 100]);
         }
-        drop((held, readers, publisher));
+        drop((held, readers, publisher, service));
         domain.leave().unwrap();
     }
 }

@@ -29,9 +29,22 @@ impl Pulse {
         })
     }
 
-    /// Counts `steps` more steps of the role's work.
+    /// Says that work begins which a process may not survive; at once, where none was ever done. So the launcher tells one
+    /// that dies over its first step from one that was waiting.
+    pub fn begin_work(&mut self) {
+        if self.heartbeat.steps == 0 {
+            self.beat_now(Activity::Working);
+        }
+    }
+
+    /// Counts `steps` more steps of the role's work. The first are told at once: a process that gets as far as that is able
+    /// to work.
     pub fn count(&mut self, steps: u64) {
+        let first = self.heartbeat.steps == 0;
         self.heartbeat.steps += steps;
+        if first {
+            self.beat_now(Activity::Working);
+        }
     }
 
     /// Says which policy the role uses.
@@ -49,7 +62,7 @@ impl Pulse {
         }
     }
 
-    /// Beats at once: for the last one.
+    /// Beats at once.
     pub fn beat_now(&mut self, activity: Activity) {
         self.last = None;
         self.beat(activity);

@@ -7,9 +7,11 @@ use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::*;
 use iceoryx2::service::header::publish_subscribe::Header;
+use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 
-use super::{ChannelError, Domain, claim, memory, service_name};
+use super::services::Held;
+use super::{ChannelError, Domain, Entry, claim, memory, service_name};
 use crate::report::{EpisodeReport, EvaluationReport, Heartbeat, JudgedReport, LearnerReport};
 
 /// Reports a reader has in hand: each is copied and let go.
@@ -83,7 +85,7 @@ impl<R: Report> Reporter<R> {
     /// When shared memory cannot be had.
     pub fn open(domain: &Domain) -> Result<Self, ChannelError> {
         let publisher = claim(|| {
-            service::<R>(domain)?
+            service::<R>(domain, Entry::Open)?
                 .publisher_builder()
                 .max_loaned_samples(LOANED)
                 .create()
@@ -114,7 +116,7 @@ impl<R: Report> Reports<R> {
     /// When shared memory cannot be had.
     pub fn open(domain: &Domain) -> Result<Self, ChannelError> {
         let subscriber = claim(|| {
-            service::<R>(domain)?
+            service::<R>(domain, Entry::Open)?
                 .subscriber_builder()
                 .create()
                 .map_err(|cause| ChannelError::new(R::CHANNEL, "read", cause))
@@ -147,9 +149,19 @@ fn parties(max_actors: usize) -> usize {
     2 * max_actors + 8
 }
 
-fn service<R: Report>(domain: &Domain) -> Result<PortFactory<ipc::Service, R, ()>, ChannelError> {
+/// Makes the service of reports of kind `R`.
+pub(super) fn create<R: Report>(domain: &Domain) -> Result<Held, ChannelError> {
+    let service = service::<R>(domain, Entry::Create)?;
+    Ok(Held::new(move |see| {
+        let ports = service.dynamic_config();
+        ports.list_publishers(|port| see(port.node_id, port.publisher_id.value()));
+        ports.list_subscribers(|port| see(port.node_id, port.subscriber_id.value()));
+    }))
+}
+
+fn service<R: Report>(domain: &Domain, entry: Entry) -> Result<PortFactory<ipc::Service, R, ()>, ChannelError> {
     let parties = parties(domain.max_actors());
-    domain
+    let builder = domain
         .node()
         .service_builder(&service_name(domain, R::CHANNEL)?)
         .publish_subscribe::<R>()
@@ -159,7 +171,13 @@ fn service<R: Report>(domain: &Domain) -> Result<PortFactory<ipc::Service, R, ()
         .enable_safe_overflow(true)
         .history_size(R::HISTORY)
         .subscriber_max_buffer_size(R::BUFFER)
-        .subscriber_max_borrowed_samples(BORROWED)
-        .open_or_create()
-        .map_err(|cause| ChannelError::new(R::CHANNEL, "open", cause))
+        .subscriber_max_borrowed_samples(BORROWED);
+    match entry {
+        Entry::Create => builder
+            .create()
+            .map_err(|cause| ChannelError::new(R::CHANNEL, "create", cause)),
+        Entry::Open => builder
+            .open()
+            .map_err(|cause| ChannelError::new(R::CHANNEL, "open", cause)),
+    }
 }

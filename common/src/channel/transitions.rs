@@ -18,8 +18,9 @@ use iceoryx2::service::header::publish_subscribe::Header;
 use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 
+use super::services::Held;
 use super::words::{numbers_of, words_of};
-use super::{Bell, ChannelError, Domain, Interruption, claim, memory, service_name, wait_for};
+use super::{Bell, ChannelError, Domain, Entry, Interruption, claim, memory, service_name, wait_for};
 use crate::commit::{ChunkMark, CommitReader};
 use crate::stop::Stop;
 use crate::transition::{ChunkLayout, Transition};
@@ -133,7 +134,7 @@ impl ChunkSender {
     ) -> Result<Greeting, ChannelError> {
         let channel = name(actor);
         let (service, publisher) = claim(|| {
-            let service = service(domain, &channel, window)?;
+            let service = service(domain, &channel, window, Entry::Open)?;
             let publisher = service
                 .publisher_builder()
                 .initial_max_slice_len(layout.len())
@@ -268,7 +269,7 @@ impl ChunkReceiver {
     pub fn open(domain: &Domain, actor: u32, layout: ChunkLayout, window: u32) -> Result<Self, ChannelError> {
         let channel = name(actor);
         let subscriber = claim(|| {
-            service(domain, &channel, window)?
+            service(domain, &channel, window, Entry::Open)?
                 .subscriber_builder()
                 .buffer_size(buffer(window))
                 .create()
@@ -362,10 +363,20 @@ fn buffer(window: u32) -> usize {
     2 * window as usize
 }
 
+/// Makes the service for the chunks of `actor`, of which `window` may be uncommitted.
+pub(super) fn create(domain: &Domain, actor: u32, window: u32) -> Result<Held, ChannelError> {
+    let service = service(domain, &name(actor), window, Entry::Create)?;
+    Ok(Held::new(move |see| {
+        let ports = service.dynamic_config();
+        ports.list_publishers(|port| see(port.node_id, port.publisher_id.value()));
+        ports.list_subscribers(|port| see(port.node_id, port.subscriber_id.value()));
+    }))
+}
+
 type ChunkService = PortFactory<ipc::Service, [f32], ChunkHeader>;
 
-fn service(domain: &Domain, channel: &str, window: u32) -> Result<ChunkService, ChannelError> {
-    domain
+fn service(domain: &Domain, channel: &str, window: u32, entry: Entry) -> Result<ChunkService, ChannelError> {
+    let builder = domain
         .node()
         .service_builder(&service_name(domain, channel)?)
         .publish_subscribe::<[f32]>()
@@ -376,7 +387,13 @@ fn service(domain: &Domain, channel: &str, window: u32) -> Result<ChunkService, 
         .enable_safe_overflow(false)
         .history_size(window as usize)
         .subscriber_max_buffer_size(buffer(window))
-        .subscriber_max_borrowed_samples(BORROWED)
-        .open_or_create()
-        .map_err(|cause| ChannelError::new(channel, "open", cause))
+        .subscriber_max_borrowed_samples(BORROWED);
+    match entry {
+        Entry::Create => builder
+            .create()
+            .map_err(|cause| ChannelError::new(channel, "create", cause)),
+        Entry::Open => builder
+            .open()
+            .map_err(|cause| ChannelError::new(channel, "open", cause)),
+    }
 }

@@ -16,6 +16,22 @@ pub struct ChunkMark {
     pub sequence: u64,
 }
 
+/// More processes than any run starts, and far from overflowing when it is counted on.
+pub const LAST_INCARNATION: u64 = 1 << 60;
+
+impl ChunkMark {
+    /// Whether it comes right after `committed`: it has the next sequence number of the same incarnation, or is a later
+    /// incarnation's first, which leaves the sequence as it is.
+    pub fn is_next(self, committed: Self) -> bool {
+        let Self { incarnation, sequence } = self;
+        if incarnation == committed.incarnation {
+            committed.sequence.checked_add(1) == Some(sequence)
+        } else {
+            (committed.incarnation..=LAST_INCARNATION).contains(&incarnation) && sequence == committed.sequence
+        }
+    }
+}
+
 /// What is committed of one actor.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ActorCommit {

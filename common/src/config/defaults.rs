@@ -12,6 +12,7 @@ impl Default for Run {
             mode: Mode::Free,
             steps: 120_000,
             episodes: None,
+            stall_seconds: 10,
         }
     }
 }

@@ -29,6 +29,7 @@ impl Config {
         } = self;
         named("run.id", &run.id)?;
         within("run.seed", run.seed, 0, i64::MAX as u64)?;
+        within("run.stall_seconds", run.stall_seconds, 1, 86_400)?;
         within("run.steps", run.steps, 1, 1_000_000_000_000)?;
         sized("spec.observation", &spec.observation)?;
         sized("spec.action", &spec.action)?;

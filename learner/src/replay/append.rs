@@ -32,13 +32,23 @@ pub struct Filled<'a> {
 
 impl Replay {
     /// Starts a chunk, or gives `None` if it or a later one of its actor was committed before.
+    ///
+    /// # Errors
+    /// When the actor is unknown, or the chunk is not the one that comes next: that has the next sequence number of the same
+    /// incarnation, or is a later incarnation's first, which has no rows and leaves the sequence as it is.
     pub fn begin(&mut self, actor: usize, mark: ChunkMark) -> Result<Option<Reserved<'_>>, ChunkError> {
         let actors = self.layout.actors;
         if actor >= actors {
             return Err(ChunkError::Actor { actor, actors });
         }
-        let new = mark > self.record.actor(actor).mark;
-        Ok(new.then_some(Reserved {
+        let committed = self.record.actor(actor).mark;
+        if mark <= committed {
+            return Ok(None);
+        }
+        if !mark.is_next(committed) {
+            return Err(ChunkError::OutOfOrder { actor, mark, committed });
+        }
+        Ok(Some(Reserved {
             replay: self,
             actor,
             mark,

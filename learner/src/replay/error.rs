@@ -3,6 +3,8 @@
 use std::io;
 use std::path::PathBuf;
 
+use super::ChunkMark;
+
 /// Why a replay file was not made, opened or synced. Nothing was overwritten.
 #[derive(Debug, thiserror::Error)]
 pub enum ReplayError {
@@ -71,6 +73,19 @@ pub enum ChunkError {
         actor: usize,
         /// How many there may be.
         actors: usize,
+    },
+    /// It is neither the next chunk of its actor nor the first one of the actor's next incarnation.
+    #[error(
+        "chunk {} of incarnation {} from actor {actor}, where chunk {} of incarnation {} was the last one: some are missing",
+        mark.sequence, mark.incarnation, committed.sequence, committed.incarnation
+    )]
+    OutOfOrder {
+        /// The actor's index.
+        actor: usize,
+        /// Which chunk it is.
+        mark: ChunkMark,
+        /// The actor's last committed one.
+        committed: ChunkMark,
     },
     /// It ends within a row.
     #[error("a chunk of {numbers} numbers from actor {actor}, which are no whole rows of {width}")]

@@ -11,10 +11,44 @@ fn a_chunk_is_committed_once_and_an_old_incarnation_no_more() {
     let mut append = |mark| replay.append_and_commit(0, mark, &chunk(0, mark, 2)).unwrap();
     assert_eq!(append(mark(0, 1)), Appended::Duplicate);
     assert_eq!(append(mark(0, 2)), Appended::Duplicate);
-    assert_eq!(append(mark(1, 1)), Appended::Accepted);
+    assert_eq!(append(mark(1, 2)), Appended::Accepted, "an incarnation's first");
     assert_eq!(append(mark(0, 3)), Appended::Duplicate);
-    assert_eq!(append(mark(1, 1)), Appended::Duplicate);
-    model.add(0, mark(1, 1), &chunk(0, mark(1, 1), 2));
+    assert_eq!(append(mark(1, 2)), Appended::Duplicate);
+    assert_eq!(append(mark(1, 3)), Appended::Accepted);
+    for mark in [mark(1, 2), mark(1, 3)] {
+        model.add(0, mark, &chunk(0, mark, 2));
+    }
+    model.check(&replay);
+}
+
+#[test]
+fn a_chunk_that_is_not_the_next_one_is_refused_and_nothing_written() {
+    let (directory, model) = filled(100, &[(0, 3), (1, 2), (0, 4)]);
+    let mut replay = Replay::open(&directory.replay(), &layout(100)).unwrap();
+    let last = u64::MAX;
+    // Of actor 0, chunk 2 of incarnation 0 was the last one.
+    for (incarnation, sequence) in [
+        (0, 4),
+        (0, last),
+        (1, 1),
+        (1, 3),
+        (7, 9),
+        (last, 2),
+        (last, 3),
+        (last, last),
+    ] {
+        let mark = mark(incarnation, sequence);
+        let refused = replay.append_and_commit(0, mark, &chunk(0, mark, 2)).unwrap_err();
+        let committed = replay.committed(0).mark;
+        assert_eq!(
+            refused,
+            ChunkError::OutOfOrder {
+                actor: 0,
+                mark,
+                committed
+            }
+        );
+    }
     model.check(&replay);
 }
 
@@ -22,7 +56,7 @@ fn a_chunk_is_committed_once_and_an_old_incarnation_no_more() {
 fn what_cannot_be_a_chunk_is_refused_and_nothing_written() {
     let (directory, model) = filled(10, &[(0, 10)]);
     let mut replay = Replay::open(&directory.replay(), &layout(10)).unwrap();
-    let mut append = |actor, rows: &[f32]| replay.append_and_commit(actor, mark(9, 9), rows).unwrap_err();
+    let mut append = |actor, rows: &[f32]| replay.append_and_commit(actor, mark(0, 2), rows).unwrap_err();
     assert_eq!(append(3, &[0.0; 6]), ChunkError::Actor { actor: 3, actors: 3 });
     assert_eq!(
         append(0, &[0.0; 7]),

@@ -172,8 +172,8 @@ fn round_trip(
 ) -> anyhow::Result<f64> {
     let bell = Bell::hang(domain, Place(Role::Actor, 0))?;
     let client = EnvironmentClient::open(domain, 0, &config.spec, ENVIRONMENTS, patience.stop.clone())?;
-    client.describe(&bell)?;
-    client.reset(&bell, Begin::Next)?;
+    client.describe(&bell, || ())?;
+    client.reset(&bell, Begin::Next, || ())?;
     let actions = vec![0.5; ENVIRONMENTS * config.spec.action.width()];
     let part = length / (WINDOWS + 1);
     let mut windows = Windows::default();
@@ -184,7 +184,7 @@ fn round_trip(
         while asked == 0.0 || begun.elapsed() < part {
             inference.step();
             let before = Instant::now();
-            if let Stepped::Lost = client.step(&bell, &actions)? {
+            if let Stepped::Lost = client.step(&bell, &actions, || ())? {
                 bail!("the environment server gave up its episodes");
             }
             taken += before.elapsed();

@@ -2,7 +2,7 @@
 
 use anyhow::Context;
 use rustix::thread::CpuSet;
-use shoal_common::channel::Domain;
+use shoal_common::channel::{Domain, Services};
 use shoal_common::commit::ReplayLayout;
 use shoal_common::config::{Config, Ddpg};
 use shoal_common::report::Role;
@@ -104,11 +104,20 @@ impl Scene {
         })
     }
 
+    /// The run's services, for as long as somebody uses them.
+    fn services(&self, domain: &Domain) -> anyhow::Result<Services> {
+        let mut services = Services::new(domain)?;
+        services.create_common(domain)?;
+        let actors = &self.config.actors;
+        (0..actors.count).try_for_each(|index| services.create_actor(domain, index, actors.window))?;
+        Ok(services)
+    }
+
     /// Does `act` as a member of the run; nothing of the run is left in shared memory after it.
     pub(super) fn in_shared_memory<T>(&self, act: impl FnOnce(&Domain) -> anyhow::Result<T>) -> anyhow::Result<T> {
         Domain::remove_abandoned()?;
         let domain = Domain::join(&self.config.run.id, self.config.actors.max)?;
-        let acted = act(&domain);
+        let acted = self.services(&domain).and_then(|_services| act(&domain));
         let left = domain.leave();
         let acted = acted?;
         left?;

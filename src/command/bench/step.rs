@@ -104,8 +104,8 @@ fn round_trips(
         Err(Interruption::Stopped) => patience.check(),
         Err(Interruption::Channel(error)) => server.check().and(Err(error.into())),
     };
-    ask(&|| client.describe(&bell).map(|_| ()))?;
-    ask(&|| client.reset(&bell, Begin::Next).map(|_| ()))?;
+    ask(&|| client.describe(&bell, || ()).map(|_| ()))?;
+    ask(&|| client.reset(&bell, Begin::Next, || ()).map(|_| ()))?;
 
     let actions = vec![0.5; environments * config.spec.action.width()];
     let mut times = Vec::new();
@@ -113,7 +113,7 @@ fn round_trips(
     let (begun, mut looked) = (Instant::now(), Instant::now());
     loop {
         let before = Instant::now();
-        match client.step(&bell, &actions) {
+        match client.step(&bell, &actions, || ()) {
             Ok(Stepped::Taken(_)) => {}
             Ok(Stepped::Lost) => {
                 server.check()?;

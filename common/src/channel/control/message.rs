@@ -5,7 +5,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 /// The form of the messages. Raise it with every change: launcher and asker may be of different builds.
-pub(super) const VERSION: u32 = 2;
+pub(super) const VERSION: u32 = 3;
 
 /// What can be asked of a launcher.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -21,6 +21,23 @@ pub enum Question {
     Stop,
 }
 
+/// A question, and the run it is about. A copy of a run directory has the run's name, and so reaches the original's
+/// launcher.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) struct Asked {
+    pub(super) run: RunKey,
+    pub(super) question: Question,
+}
+
+/// What tells a run directory from its copies: the device and the number of its inode.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RunKey {
+    /// The device.
+    pub device: u64,
+    /// The inode.
+    pub inode: u64,
+}
+
 /// What a launcher answers.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub enum Answer {
@@ -30,6 +47,8 @@ pub enum Answer {
     Accepted,
     /// It cannot be done, and why.
     Refused(String),
+    /// The launcher runs another directory, of which the one that was asked about is a copy.
+    AnotherRun(String),
 }
 
 /// How a run gets on.
@@ -65,11 +84,13 @@ pub struct RunStatus {
     pub eval_return_mean: Option<f64>,
     /// Who waits for whom; `None` where nobody waits.
     pub waiting: Option<String>,
+    /// Whether nothing is left to be done: no step, no update, no evaluation.
+    pub finished: bool,
 }
 
 impl RunStatus {
-    /// Whether the run has come to its end.
-    pub fn is_done(&self) -> bool {
+    /// Whether all steps or episodes that were asked for are taken. Updates may be left.
+    pub fn has_all_steps(&self) -> bool {
         self.env_steps >= self.steps || self.episodes_limit.is_some_and(|limit| self.episodes >= limit)
     }
 }

@@ -1,14 +1,18 @@
 //! The actor's end.
 
+use std::cell::Cell;
+use std::time::Instant;
+
+use iceoryx2::identifiers::UniqueServerId;
 use iceoryx2::pending_response::PendingResponse;
 use iceoryx2::port::client::Client;
 use iceoryx2::prelude::*;
 use iceoryx2::response::Response;
 
 use super::message::{Ask, Block, RequestHeader, ResponseHeader, ResponseLayout, Verdict};
-use super::{name, question_length, service};
+use super::{EnvironmentService, name, question_length, service};
 use crate::channel::words::{numbers_of, words_of};
-use crate::channel::{Bell, ChannelError, Domain, Interruption, Place, Ringer, claim, wait_for};
+use crate::channel::{Bell, CLAIM_PATIENCE, ChannelError, Domain, Entry, Interruption, Place, Ringer, claim, wait_for};
 use crate::report::Role;
 use crate::space::{EnvironmentSpec, Space};
 use crate::stop::Stop;
@@ -50,9 +54,12 @@ pub struct Observed {
     layout: ResponseLayout,
 }
 
-/// The actor's end.
+/// The actor's end. While it waits for an answer it calls `idle`, some twenty times a second.
 #[derive(Debug)]
 pub struct EnvironmentClient {
+    service: EnvironmentService,
+    /// The server that runs the episodes under way.
+    episodes: Cell<Option<UniqueServerId>>,
     client: Client<ipc::Service, [f32], RequestHeader, [f32], ResponseHeader>,
     channel: String,
     ringer: Ringer,
@@ -120,7 +127,7 @@ pub fn describe(
         time_limit: 0,
         state_width: 0,
     };
-    EnvironmentClient::open(domain, index, &spec, 0, stop)?.describe(bell)
+    EnvironmentClient::open(domain, index, &spec, 0, stop)?.describe(bell, || ())
 }
 
 impl EnvironmentClient {
@@ -139,15 +146,19 @@ impl EnvironmentClient {
         let channel = name(index);
         let snapshot_words = spec.snapshot_words(environments);
         let longest = question_length(spec, environments);
-        let client = claim(|| {
-            service(domain, &channel)?
+        let (service, client) = claim(|| {
+            let service = service(domain, &channel, Entry::Open)?;
+            let client = service
                 .client_builder()
                 .initial_max_slice_len(longest)
                 .create()
-                .map_err(|cause| ChannelError::new(&channel, "ask", cause))
+                .map_err(|cause| ChannelError::new(&channel, "ask", cause))?;
+            Ok((service, client))
         })?;
         let ringer = Ringer::new(domain, Place(Role::EnvServer, index))?;
         Ok(Self {
+            service,
+            episodes: Cell::new(None),
             client,
             channel,
             ringer,
@@ -161,8 +172,8 @@ impl EnvironmentClient {
     ///
     /// # Errors
     /// When interrupted.
-    pub fn describe(&self, bell: &Bell) -> Result<(EnvironmentSpec, usize), Interruption> {
-        let response = self.insist(bell, Ask::Describe, 0, &[])?;
+    pub fn describe(&self, bell: &Bell, idle: impl FnMut()) -> Result<(EnvironmentSpec, usize), Interruption> {
+        let response = self.insist(bell, Ask::Describe, 0, &[], idle)?;
         let (header, payload) = (response.user_header(), response.payload());
         let described = header.described(payload);
         described.ok_or_else(|| ChannelError::new(&self.channel, "describe", "the answer is too short").into())
@@ -172,21 +183,21 @@ impl EnvironmentClient {
     ///
     /// # Errors
     /// When interrupted.
-    pub fn reset(&self, bell: &Bell, begin: Begin) -> Result<Observed, Interruption> {
-        let response = match begin {
-            Begin::Next => self.insist(bell, Ask::Reset, 0, &[]),
-            Begin::Training(episode) => self.insist(bell, Ask::ResetToTraining, episode, &[]),
-            Begin::Evaluation(first) => self.insist(bell, Ask::ResetToEvaluation, first, &[]),
-        }?;
-        self.observed(response).map_err(Interruption::from)
+    pub fn reset(&self, bell: &Bell, begin: Begin, idle: impl FnMut()) -> Result<Observed, Interruption> {
+        let (ask, episode) = match begin {
+            Begin::Next => (Ask::Reset, 0),
+            Begin::Training(episode) => (Ask::ResetToTraining, episode),
+            Begin::Evaluation(first) => (Ask::ResetToEvaluation, first),
+        };
+        self.begun(self.insist(bell, ask, episode, &[], idle)?)
     }
 
     /// Every environment takes a step with its action.
     ///
     /// # Errors
-    /// When interrupted, or the server refuses the actions.
-    pub fn step(&self, bell: &Bell, actions: &[f32]) -> Result<Stepped, Interruption> {
-        match self.ask_within_episodes(bell, Ask::Step, actions)? {
+    /// When interrupted, or the server refuses the actions or has forgotten its episodes.
+    pub fn step(&self, bell: &Bell, actions: &[f32], idle: impl FnMut()) -> Result<Stepped, Interruption> {
+        match self.ask_within_episodes(bell, Ask::Step, actions, idle)? {
             Some(response) => Ok(Stepped::Taken(self.observed(response)?)),
             None => Ok(Stepped::Lost),
         }
@@ -196,8 +207,8 @@ impl EnvironmentClient {
     ///
     /// # Errors
     /// When interrupted, or the server refuses: its environments cannot say their state, or run evaluation episodes.
-    pub fn snapshot(&self, bell: &Bell) -> Result<Snapshot, Interruption> {
-        let Some(response) = self.ask_within_episodes(bell, Ask::Snapshot, &[])? else {
+    pub fn snapshot(&self, bell: &Bell, idle: impl FnMut()) -> Result<Snapshot, Interruption> {
+        let Some(response) = self.ask_within_episodes(bell, Ask::Snapshot, &[], idle)? else {
             return Ok(Snapshot::Lost);
         };
         let words = words_of(self.answered(&response)?);
@@ -212,13 +223,20 @@ impl EnvironmentClient {
     ///
     /// # Errors
     /// When interrupted, or the server refuses the words; it stays as it was then.
-    pub fn restore(&self, bell: &Bell, words: &[u64]) -> Result<Observed, Interruption> {
+    pub fn restore(&self, bell: &Bell, words: &[u64], idle: impl FnMut()) -> Result<Observed, Interruption> {
         if words.len() != self.snapshot_words {
             let cause = format!("{} words for a snapshot of {}", words.len(), self.snapshot_words);
             return Err(ChannelError::new(&self.channel, "restore", cause).into());
         }
-        let response = self.insist(bell, Ask::Restore, 0, numbers_of(words))?;
-        self.observed(response).map_err(Interruption::from)
+        self.begun(self.insist(bell, Ask::Restore, 0, numbers_of(words), idle)?)
+    }
+
+    /// The first observations of new episodes, which the server that sent them runs from now on.
+    fn begun(&self, response: Answer) -> Result<Observed, Interruption> {
+        let server = response.origin();
+        let observed = self.observed(response)?;
+        self.episodes.set(Some(server));
+        Ok(observed)
     }
 
     fn observed(&self, response: Answer) -> Result<Observed, ChannelError> {
@@ -245,60 +263,115 @@ impl EnvironmentClient {
     }
 
     /// Asks once: for requests about the episodes under way. `None` when the server that ran them is no more.
-    fn ask_within_episodes(&self, bell: &Bell, ask: Ask, payload: &[f32]) -> Result<Option<Answer>, Interruption> {
-        let pending = self.send(ask, 0, payload)?;
-        let answer = self.answer(bell, &pending)?;
-        Ok(answer.filter(|response| response.user_header().verdict != Verdict::NotStarted as u32))
+    fn ask_within_episodes(
+        &self,
+        bell: &Bell,
+        ask: Ask,
+        payload: &[f32],
+        idle: impl FnMut(),
+    ) -> Result<Option<Answer>, Interruption> {
+        if self.server() != self.episodes.get() {
+            return Ok(None);
+        }
+        let sent = self.send(ask, 0, payload)?;
+        let Some(response) = self.answer(bell, &sent, idle)? else {
+            return Ok(None);
+        };
+        if response.user_header().verdict != Verdict::NotStarted as u32 {
+            return Ok(Some(response));
+        }
+        if Some(response.origin()) == self.episodes.get() {
+            let cause = "the environment server has begun episodes and says that it has not: it breaks the protocol";
+            return Err(ChannelError::new(&self.channel, "ask", cause).into());
+        }
+        Ok(None)
     }
 
     /// Asks until some server answers: for requests that may be asked twice.
-    fn insist(&self, bell: &Bell, ask: Ask, episode: u64, payload: &[f32]) -> Result<Answer, Interruption> {
+    fn insist(
+        &self,
+        bell: &Bell,
+        ask: Ask,
+        episode: u64,
+        payload: &[f32],
+        mut idle: impl FnMut(),
+    ) -> Result<Answer, Interruption> {
+        let mut unreachable = None;
         loop {
-            let pending = self.send(ask, episode, payload)?;
-            if let Some(response) = self.answer(bell, &pending)? {
+            let sent = self.send(ask, episode, payload)?;
+            if let Some(response) = self.answer(bell, &sent, &mut idle)? {
                 return Ok(response);
+            }
+            if sent.server.is_none() || sent.is_delivered() {
+                unreachable = None;
+            } else if unreachable.get_or_insert_with(Instant::now).elapsed() >= CLAIM_PATIENCE {
+                let cause = "no connection to the environment server, which is there";
+                return Err(ChannelError::new(&self.channel, "ask", cause).into());
             }
         }
     }
 
-    fn send(&self, ask: Ask, episode: u64, payload: &[f32]) -> Result<Pending, ChannelError> {
-        let failed = |cause: String| ChannelError {
-            channel: self.channel.clone(),
-            action: "ask",
-            cause,
-        };
+    fn send(&self, ask: Ask, episode: u64, payload: &[f32]) -> Result<Sent, ChannelError> {
+        // Before the request is sent: where another server has come since, it counts as lost and is asked anew, and never
+        // the other way round.
+        let server = self.server();
         let mut request = self
             .client
             .loan_slice_uninit(payload.len())
-            .map_err(|cause| failed(format!("{cause:?}")))?;
+            .map_err(|cause| ChannelError::new(&self.channel, "ask", cause))?;
         *request.user_header_mut() = RequestHeader::new(ask, episode);
         let pending = request
             .write_from_slice(payload)
             .send()
-            .map_err(|cause| failed(format!("{cause:?}")))?;
+            .map_err(|cause| ChannelError::new(&self.channel, "ask", cause))?;
         self.ringer.ring();
-        Ok(pending)
+        Ok(Sent { pending, server })
     }
 
-    /// Waits for the answer; `None` when the server that was asked is no more.
-    fn answer(&self, bell: &Bell, pending: &Pending) -> Result<Option<Answer>, Interruption> {
-        let lost = std::cell::Cell::new(false);
+    /// Waits for the answer; `None` when the server that was asked is no more, or was not reached.
+    fn answer(&self, bell: &Bell, sent: &Sent, mut idle: impl FnMut()) -> Result<Option<Answer>, Interruption> {
+        let lost = Cell::new(false);
         let answer = wait_for(
             bell,
             &self.stop,
-            || match pending.receive() {
+            || match sent.pending.receive() {
                 Ok(Some(response)) => Ok(Some(Some(response))),
                 Ok(None) if lost.get() => Ok(Some(None)),
                 Ok(None) => Ok(None),
                 Err(cause) => Err(ChannelError::new(&self.channel, "hear the answer", cause)),
             },
             || {
-                // A dead server counts as connected until the launcher has cleaned up after it.
-                lost.set(!pending.is_connected());
+                idle();
+                // A dead server is there until the launcher has cleaned up after it. `is_connected` would not tell: it is
+                // true for as long as an answer of a dead server is in hand, and one always is.
+                lost.set(!sent.is_delivered() || self.server() != sent.server);
                 Ok(())
             },
         )?;
         Ok(answer)
+    }
+
+    /// The server that is there.
+    fn server(&self) -> Option<UniqueServerId> {
+        let mut found = None;
+        self.service.dynamic_config().list_servers(|server| {
+            found = Some(server.server_id);
+            CallbackProgression::Stop
+        });
+        found
+    }
+}
+
+/// A request under way.
+struct Sent {
+    pending: Pending,
+    /// The server that was there when it was sent.
+    server: Option<UniqueServerId>,
+}
+
+impl Sent {
+    fn is_delivered(&self) -> bool {
+        self.pending.number_of_server_connections() > 0
     }
 }
 

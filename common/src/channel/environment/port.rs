@@ -7,7 +7,7 @@ use iceoryx2::prelude::*;
 use super::message::{Ask, RequestHeader, ResponseHeader, ResponseLayout, StepBlocks, Verdict};
 use super::{LOANED_RESPONSES, answer_length, name, service};
 use crate::channel::words::{numbers_of, words_of};
-use crate::channel::{Bell, ChannelError, Domain, Interruption, Place, Ringer, claim, wait_for};
+use crate::channel::{Bell, ChannelError, Domain, Entry, Interruption, Place, Ringer, claim, wait_for};
 use crate::report::Role;
 use crate::space::{EnvironmentSpec, Space};
 use crate::stop::Stop;
@@ -46,7 +46,7 @@ impl EnvironmentPort {
         let layout = ResponseLayout::new(environments, spec.observation.width());
         let longest = answer_length(&spec, environments);
         let server = claim(|| {
-            service(domain, &channel)?
+            service(domain, &channel, Entry::Open)?
                 .server_builder()
                 .initial_max_slice_len(longest)
                 .max_loaned_responses_per_request(LOANED_RESPONSES)

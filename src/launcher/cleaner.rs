@@ -1,0 +1,84 @@
+//! Cleaning up in shared memory after the dead, in a process of its own: iceoryx2 has no time limit there that holds, and a
+//! launcher that hangs could not even be stopped.
+
+use std::os::unix::process::CommandExt;
+use std::process::{Child, Command, ExitCode, ExitStatus, Stdio};
+use std::time::Duration;
+
+use anyhow::{Context, bail};
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::process::{Pid, PidfdFlags, pidfd_open};
+use shoal_common::channel::{Domain, Services};
+
+/// The command that does it. Its argument is the run's name.
+pub(crate) const COMMAND: &str = "clean-up";
+
+/// How long a clean-up may take: it takes some milliseconds.
+const PATIENCE: Duration = Duration::from_secs(2);
+
+/// Clean-ups that are tried, where one is killed itself.
+const TRIES: u32 = 3;
+
+/// Has a process clean up after those that are no more.
+///
+/// # Errors
+/// When it cannot be done now; it can be tried again.
+pub(super) fn clean_up(domain: &Domain, services: &Services) -> anyhow::Result<()> {
+    let mut last = None;
+    for _ in 0..TRIES {
+        services.restore_port_tags(domain)?;
+        let status = run(domain.run_id())?;
+        match status {
+            Some(status) if status.success() => return Ok(()),
+            other => last = other,
+        }
+    }
+    match last {
+        Some(status) => bail!("cleaning up in shared memory did not succeed: {status}"),
+        None => bail!("cleaning up in shared memory took longer than {PATIENCE:?}"),
+    }
+}
+
+/// How the process ended; `None` where it had to be ended.
+fn run(run_id: &str) -> anyhow::Result<Option<ExitStatus>> {
+    let mut child = Command::new("/proc/self/exe")
+        .arg0("shoal")
+        .args([COMMAND, run_id])
+        .stdin(Stdio::null())
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .process_group(0)
+        .spawn()
+        .context("cannot start a process that cleans up")?;
+    let ended = has_ended_in_time(&child);
+    if !ended {
+        child.kill().context("cannot end a process that cleans up")?;
+    }
+    let status = child.wait().context("cannot wait for a process that cleans up")?;
+    Ok(ended.then_some(status))
+}
+
+fn has_ended_in_time(child: &Child) -> bool {
+    let patience = Timespec {
+        tv_sec: PATIENCE.as_secs() as i64,
+        tv_nsec: 0,
+    };
+    let Ok(process) = pidfd_open(Pid::from_child(child), PidfdFlags::empty()) else {
+        return false;
+    };
+    matches!(
+        poll(&mut [PollFd::new(&process, PollFlags::IN)], Some(&patience)),
+        Ok(1..)
+    )
+}
+
+/// What that process does.
+///
+/// # Errors
+/// When files cannot be listed or removed.
+pub(crate) fn work(run_id: &str) -> anyhow::Result<ExitCode> {
+    match Domain::clean_up(run_id)? {
+        0 => Ok(ExitCode::SUCCESS),
+        _ => Ok(ExitCode::FAILURE),
+    }
+}
