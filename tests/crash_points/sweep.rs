@@ -156,7 +156,8 @@ impl Sweep<'_> {
                 self.name(scene),
                 call.name()
             );
-            eprintln!("{text}");
+            // The whole of it comes at the end.
+            eprintln!("{}", text.lines().next().unwrap_or_default());
             table.failures.push(text);
         }
     }
