@@ -11,10 +11,13 @@ use shoal_learner::{algorithm, digest};
 
 use crate::calls::Call;
 use crate::place::{Place, Program, Watchdog};
+use crate::sweep::number;
 use crate::tracer::{Followed, Target, follow};
 
 /// A run takes less than a second; after so long it hangs.
-const LIMIT: Duration = Duration::from_secs(60);
+fn limit() -> Duration {
+    Duration::from_secs(number("SHOAL_CRASH_SECONDS").unwrap_or(60))
+}
 
 /// So long the roles of a launcher that was killed may take to end.
 const ENDING: Duration = Duration::from_secs(30);
@@ -198,7 +201,7 @@ impl Scene<'_> {
         let train: Vec<&str> = train.iter().map(String::as_str).collect();
         let traced = |name: &str, arguments: &[&str]| {
             std::thread::scope(|scope| {
-                let watchdog = Watchdog::new(scope, place, LIMIT);
+                let watchdog = Watchdog::new(scope, place, limit());
                 let settle = |command: &mut Command| place.settle(command, name);
                 let followed = follow(&place.words(arguments), settle, self.victim.target(), aim);
                 let found = watchdog.found();
@@ -213,7 +216,7 @@ impl Scene<'_> {
         };
         let mut run = place.start("train", &train);
         let asked = || {
-            if let Err(what) = until(LIMIT, "every role is ready", || {
+            if let Err(what) = until(limit(), "every role is ready", || {
                 place.read("run/shoal.log").contains("every role is ready")
             }) {
                 return Ok(Err(what));
@@ -222,7 +225,7 @@ impl Scene<'_> {
         };
         match asked() {
             Ok(Ok(followed)) => Ok(place
-                .wait(run, "train", LIMIT)
+                .wait(run, "train", limit())
                 .map(|code| Followed { code, ..followed })),
             failed => {
                 place.kill_all();
@@ -256,7 +259,7 @@ impl Scene<'_> {
             return Err(format!("the run ended with {}", followed.code));
         }
         if self.victim == Victim::Asker("stop") && steps(place, "train") < Some(self.victim.steps()) {
-            match place.run("resume", &["resume", "run", "--quiet", "--json"], LIMIT)? {
+            match place.run("resume", &["resume", "run", "--quiet", "--json"], limit())? {
                 0 => {}
                 code => return Err(format!("resumed, the run ended with {code}")),
             }
@@ -285,14 +288,14 @@ impl Scene<'_> {
         place.is_left_within(ENDING)?;
         let again = self.train("again");
         let again: Vec<&str> = again.iter().map(String::as_str).collect();
-        let another = || match place.run("again", &again, LIMIT)? {
+        let another = || match place.run("again", &again, limit())? {
             0 => Ok("again"),
             code => Err(format!("another run ended with {code}")),
         };
         if !place.path("run/config.toml").exists() {
             return another();
         }
-        match place.run("resume", &["resume", "run", "--quiet", "--json"], LIMIT)? {
+        match place.run("resume", &["resume", "run", "--quiet", "--json"], limit())? {
             0 => Ok("run"),
             // It had done everything, and what it left goes with the next start.
             1 if place.read("resume.err").contains("steps already") => another().map(|_| "run"),
@@ -319,7 +322,7 @@ fn answered(place: &Place<'_>, followed: Followed) -> Result<Followed, String> {
     if !matches!(followed.code, 0 | 3 | -9) {
         return Err(format!("the command ended with {}", followed.code));
     }
-    match place.run("status", &["status", "run", "--json"], LIMIT)? {
+    match place.run("status", &["status", "run", "--json"], limit())? {
         0 | 3 => Ok(followed),
         code => Err(format!("afterwards status ended with {code}")),
     }
