@@ -37,8 +37,8 @@ use crate::{room, status};
 /// How often the launcher looks round.
 const ROUND: Duration = Duration::from_millis(50);
 
-/// How long the evaluator may take over the last policy once the learner is through.
-const LAST_EVALUATION: Duration = Duration::from_secs(5);
+/// How long the last evaluation's report may take once the learner, which has waited for it, is through.
+const LAST_EVALUATION: Duration = Duration::from_secs(1);
 
 /// How long a learner may take to come back when the run is to end.
 const LEARNER_BACK: Duration = Duration::from_secs(5);

@@ -4,6 +4,7 @@ use std::time::{Duration, Instant};
 
 use shoal_common::report::Activity;
 
+use crate::judging::Judging;
 use crate::learner::{Ended, Learner};
 
 /// Updates from one publication to the next. Publishing copies the actor's weights once: about a thirtieth of an update.
@@ -14,6 +15,9 @@ const CHUNKS_AT_ONCE: u32 = 8;
 
 /// How long an idle learner sleeps before it looks after its connections.
 const NAP: Duration = Duration::from_millis(50);
+
+/// How long the evaluator may take over the last policy. Only a learner can give it to an evaluator that has come since.
+const LAST_EVALUATION: Duration = Duration::from_secs(5);
 
 pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Ended> {
     let ratio = learner.settings.ratio;
@@ -41,7 +45,8 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Ended> {
             learner.tell(Activity::Working);
         } else if learner.has_all_rows() {
             learner.publish()?;
-            return Ok(());
+            learner.announce();
+            return Judging::new(learner)?.wait(learner, Some(LAST_EVALUATION));
         } else {
             let activity = if learner.rows < ratio.warmup {
                 Activity::WaitingForPeer

@@ -9,6 +9,7 @@ pub mod digest;
 mod free;
 pub mod initialise;
 pub mod intake;
+mod judging;
 pub mod learner;
 mod lockstep;
 pub mod minibatch;

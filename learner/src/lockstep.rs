@@ -4,18 +4,15 @@
 //! and publishes version k. A learner that goes on from a checkpoint finds the rows of the rounds since then in the
 //! replay and does the same updates again.
 
-use shoal_common::channel::reports::Reports;
-use shoal_common::channel::{ChannelError, wait_for};
-use shoal_common::report::{Activity, JudgedReport};
+use shoal_common::channel::wait_for;
+use shoal_common::report::Activity;
 
 use crate::intake::IntakeError;
+use crate::judging::Judging;
 use crate::learner::{Ended, Learner, LearnerError};
 
 pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Ended> {
-    let mut judging = Judging {
-        reports: Reports::open(learner.domain)?,
-        judged: learner.settings.judged,
-    };
+    let mut judging = Judging::new(learner)?;
     let interval = learner.settings.checkpoint.every_updates;
     let needed = learner.rows.saturating_sub(learner.settings.capacity);
     if learner.replay.rows().start > needed || learner.replay.head() < learner.rows {
@@ -26,7 +23,7 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Ended> {
         learner.save()?;
     }
     learner.announce();
-    judging.wait(learner)?;
+    judging.wait(learner, None)?;
     while !learner.has_all_rows() {
         let (before, updates) = (learner.rows, learner.updates());
         let mut rows = before;
@@ -41,7 +38,7 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Ended> {
         }
         learner.publish()?;
         learner.announce();
-        judging.wait(learner)?;
+        judging.wait(learner, None)?;
         if learner.updates() / interval > updates / interval {
             learner.save()?;
         }
@@ -100,43 +97,4 @@ fn end_of_chunk(learner: &Learner<'_>, first: u64) -> Option<u64> {
         return last.map(|last| last + 1).or((head >= full).then_some(full));
     }
     (head >= full).then_some(full)
-}
-
-/// What is known of the evaluator's work.
-struct Judging {
-    reports: Reports<JudgedReport>,
-    /// The period of the policy judged last.
-    judged: Option<u64>,
-}
-
-impl Judging {
-    /// Waits until a policy of this period is judged: the one just published, if none was before.
-    fn wait(&mut self, learner: &mut Learner<'_>) -> Result<(), Ended> {
-        let due = Some(learner.settings.evaluation.period(learner.rows));
-        let Learner {
-            bell,
-            stop,
-            publisher,
-            pulse,
-            ..
-        } = learner;
-        if self.judged >= due {
-            return Ok(());
-        }
-        wait_for(
-            bell,
-            stop,
-            || -> Result<Option<()>, ChannelError> {
-                while let Some(report) = self.reports.receive()? {
-                    self.judged = self.judged.max(Some(report.period));
-                }
-                Ok((self.judged >= due).then_some(()))
-            },
-            || {
-                pulse.beat(Activity::WaitingForPeer);
-                publisher.look_after()
-            },
-        )?;
-        Ok(())
-    }
 }

@@ -251,10 +251,10 @@ impl Crew {
     }
 
     fn look_after_one(&mut self, i: usize) -> anyhow::Result<State> {
-        if let Some(status) = self.members[i].ended.take() {
-            if self.act_on_end(i, status)? == State::LearnerDone {
-                return Ok(State::LearnerDone);
-            }
+        if let Some(status) = self.members[i].ended.take()
+            && self.act_on_end(i, status)? == State::LearnerDone
+        {
+            return Ok(State::LearnerDone);
         }
         let is_wanted = self.is_wanted(&self.members[i]);
         let member = &mut self.members[i];

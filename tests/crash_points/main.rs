@@ -181,6 +181,11 @@ fn a_command_killed_before_a_call_does_not_disturb_the_run_that_it_asks() {
 }
 
 #[test]
+fn a_clean_up_that_is_killed_before_a_call_is_done_again() {
+    some(User::Own, &Mode::BOTH, &[Victim::CleanUp], [1, 2, 1]);
+}
+
+#[test]
 fn a_python_server_killed_before_a_call_is_replaced() {
     if python_serves() {
         some(User::Own, &[Mode::Free], &[Victim::Python(0)], [1, 1, 1]);

@@ -4,6 +4,7 @@ use std::fmt;
 use std::process::Command;
 use std::time::{Duration, Instant};
 
+use rustix::process::{Pid, Signal, kill_process};
 use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
 use shoal_learner::checkpoint::Checkpoints;
@@ -70,13 +71,16 @@ pub(crate) enum Victim {
     Launcher,
     /// A command that is given while the run goes on.
     Asker(&'static str),
+    /// The process that cleans up in shared memory after a killed actor. It is started here while the launcher is stopped,
+    /// which does it again then.
+    CleanUp,
 }
 
 /// The environment server of the evaluator comes after those of all actors that there may be.
 const EVALUATION: u32 = 4;
 
 impl Victim {
-    pub(crate) const ALL: [Self; 11] = [
+    pub(crate) const ALL: [Self; 12] = [
         Self::Role("learner", 0),
         Self::Role("actor", 0),
         Self::Role("env-server", 0),
@@ -86,6 +90,7 @@ impl Victim {
         Self::Asker("status"),
         Self::Asker("scale"),
         Self::Asker("stop"),
+        Self::CleanUp,
         Self::Python(0),
         Self::Python(EVALUATION),
     ];
@@ -100,7 +105,7 @@ impl Victim {
         match self {
             Self::Role(name, index) => Target::Role(name, index),
             Self::Python(index) => Target::Program(index),
-            Self::Launcher | Self::Asker(_) => Target::Command,
+            Self::Launcher | Self::Asker(_) | Self::CleanUp => Target::Command,
         }
     }
 
@@ -114,7 +119,7 @@ impl Victim {
 
     fn steps(self) -> u64 {
         match self {
-            Self::Asker(_) => STEPS_WHILE_ASKED,
+            Self::Asker(_) | Self::CleanUp => STEPS_WHILE_ASKED,
             _ => STEPS,
         }
     }
@@ -132,6 +137,7 @@ impl fmt::Display for Victim {
             Self::Python(index) => write!(f, "python-{index}"),
             Self::Launcher => write!(f, "launcher"),
             Self::Asker(command) => write!(f, "{command}"),
+            Self::CleanUp => write!(f, "clean-up"),
         }
     }
 }
@@ -211,17 +217,31 @@ impl Scene<'_> {
                 })
             })
         };
-        let Victim::Asker(command) = self.victim else {
-            return traced("train", &train);
+        let command = match self.victim {
+            Victim::Asker(command) => command,
+            Victim::CleanUp => "clean-up",
+            _ => return traced("train", &train),
         };
         let mut run = place.start("train", &train);
+        let launcher = Pid::from_child(&run);
         let asked = || {
             if let Err(what) = until(limit(), "every role is ready", || {
                 place.read("run/shoal.log").contains("every role is ready")
             }) {
                 return Ok(Err(what));
             }
-            traced(command, &asked(command)).map(|followed| followed.and_then(|followed| answered(place, followed)))
+            let followed = if self.victim == Victim::CleanUp {
+                let id = match after_an_actor(place, launcher) {
+                    Ok(id) => id,
+                    Err(what) => return Ok(Err(what)),
+                };
+                let followed = traced(command, &[command, &id]);
+                let _ = kill_process(launcher, Signal::CONT);
+                followed
+            } else {
+                traced(command, &asked(command))
+            };
+            followed.map(|followed| followed.and_then(|followed| answered(place, followed)))
         };
         match asked() {
             Ok(Ok(followed)) => Ok(place
@@ -309,6 +329,22 @@ fn about(followed: &Followed) -> &str {
     followed.hit.as_deref().unwrap_or("nobody was killed")
 }
 
+/// Stops the launcher and kills the actor, so that there is something to clean up; the run's name in shared memory.
+fn after_an_actor(place: &Place<'_>, launcher: Pid) -> Result<String, String> {
+    let actors = || {
+        let processes = place.processes().into_iter();
+        let mut actors = processes.filter(|(_, words)| words.starts_with("shoal actor "));
+        actors.next().and_then(|(pid, _)| Pid::from_raw(pid))
+    };
+    let config = Config::load(&place.path("run/config.toml")).map_err(|error| error.to_string())?;
+    let failed = |errno| format!("no signal can be sent: {errno}");
+    let actor = actors().ok_or("there is no actor")?;
+    kill_process(launcher, Signal::STOP).map_err(failed)?;
+    kill_process(actor, Signal::KILL).map_err(failed)?;
+    until(limit(), "the actor is dead", || actors().is_none())?;
+    Ok(config.run.id)
+}
+
 fn asked(command: &'static str) -> Vec<&'static str> {
     match command {
         "scale" => vec!["scale", "run", "--actors", "2"],
@@ -357,6 +393,7 @@ pub(crate) fn explain(place: &Place<'_>, what: String) -> String {
         ("status.err", 2),
         ("scale.err", 2),
         ("stop.err", 2),
+        ("clean-up.err", 2),
         ("resume.err", 4),
         ("again.err", 4),
         ("run/shoal.log", 12),
