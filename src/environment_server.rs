@@ -3,7 +3,7 @@
 
 use std::ffi::OsString;
 use std::os::unix::process::{CommandExt, ExitStatusExt};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{Command, ExitCode, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 
@@ -78,11 +78,22 @@ impl Post<'_> {
 pub(crate) const TIED: &str = "tied";
 
 /// The command that starts `program` so: dead with this process, however that ends, and whatever the program is busy with.
-fn tied(program: &Command) -> Command {
+///
+/// # Errors
+/// When there is no such program.
+fn tied(program: &Command) -> anyhow::Result<Command> {
+    let name = Path::new(program.get_program());
+    let in_path = || {
+        let path = std::env::var_os("PATH").unwrap_or_default();
+        std::env::split_paths(&path).any(|directory| directory.join(name).is_file())
+    };
+    if !name.is_file() && (name.components().count() > 1 || !in_path()) {
+        bail!("{}: there is no such file", cannot_start(program));
+    }
     let mut command = Command::new("/proc/self/exe");
     command.arg0("shoal").args([TIED, &std::process::id().to_string()]);
     command.arg(program.get_program()).args(program.get_args());
-    command
+    Ok(command)
 }
 
 /// What that command does: dies with the process `parent`, and becomes the program.
@@ -109,7 +120,7 @@ pub(crate) fn become_tied(parent: u32, words: &[OsString]) -> anyhow::Result<Exi
 /// # Errors
 /// When it cannot be started or watched.
 pub(crate) fn serve_by(program: &Command) -> anyhow::Result<ExitCode> {
-    let mut child = tied(program)
+    let mut child = tied(program)?
         .stdout(Stdio::null())
         .spawn()
         .with_context(|| cannot_start(program))?;
@@ -272,7 +283,7 @@ fn opened(domain: &Domain, post: &Post<'_>, environment: &Environment) -> anyhow
     services.create_environment(domain, post.index)?;
     let bell = Bell::hang(domain, post.client)?;
     let mut program =
-        Peer::start(&mut tied(&command), "environment server".into()).with_context(|| cannot_start(&command))?;
+        Peer::start(&mut tied(&command)?, "environment server".into()).with_context(|| cannot_start(&command))?;
     let heard = Stop::default();
     let stop = stopped_when_it_ends(&program, heard.clone())?;
     let described = describe(domain, post.index, &bell, stop.clone());

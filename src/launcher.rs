@@ -21,6 +21,7 @@ use shoal_common::channel::{Domain, DomainError};
 use shoal_common::config::Config;
 use shoal_common::report::{EpisodeReport, EvaluationReport, Heartbeat, LearnerReport, Role};
 use shoal_common::run_dir::RunDir;
+use shoal_common::stop::GRACE;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 pub(crate) use self::cleaner::work as clean_up;
@@ -47,8 +48,8 @@ const LEARNER_BACK: Duration = Duration::from_secs(5);
 const ACTORS_END: Duration = Duration::from_secs(3);
 const OTHERS_END: Duration = Duration::from_secs(15);
 
-/// How long the roles of a launcher that was killed may take to end.
-const PREDECESSORS_END: Duration = Duration::from_secs(10);
+/// How long the roles of a launcher that was killed may take to end: one that is stuck ends after [`GRACE`].
+const PREDECESSORS_END: Duration = GRACE.saturating_add(Duration::from_secs(5));
 
 /// How often the run's shared memory may be made anew without an hour between.
 const RENEWALS: usize = 5;

@@ -4,8 +4,8 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use anyhow::bail;
-use shoal_common::channel::Domain;
 use shoal_common::channel::control::{self, Answer, ControlError, Question, RunStatus};
+use shoal_common::channel::{Domain, Sweeper};
 use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
 
@@ -36,8 +36,10 @@ impl Remote {
             return Ok(None);
         }
         let domain = Domain::join(&self.config.run.id, self.config.actors.max)?;
+        let sweeper = Sweeper::start(&domain)?;
         let lives = || self.run.goes_on().unwrap_or(true);
         let answer = control::ask(&domain, self.run.key()?, question, patience, lives);
+        drop(sweeper);
         domain.leave()?;
         match answer {
             Ok(Answer::AnotherRun(there)) => {

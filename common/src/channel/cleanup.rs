@@ -12,7 +12,7 @@ use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{self, RecvTimeoutError, Sender};
 use std::thread::JoinHandle;
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
 use iceoryx2::identifiers::UniqueNodeId;
 use iceoryx2::prelude::{CallbackProgression, Config, Node, NodeState, ipc};
@@ -20,39 +20,47 @@ use rustix::process::{Pid, test_kill_process};
 
 use super::domain::{DomainError, SHARED_MEMORY, files_of, io_error, iox_config, prefix, user_root};
 use super::memory::is_promise;
-use super::{Domain, Services};
+use super::{ChannelError, Domain, Services};
 
 /// How often the sweeper looks. Whoever opens a half-made file is held up for so long at most.
 const SWEEP: Duration = Duration::from_millis(250);
 
-/// How long a clean-up waits for half-made files whose makers live: they take some microseconds.
-const MAKERS: Duration = Duration::from_millis(100);
+/// A file that is younger may be in the making, even where the system does not tell who has it open: that takes some
+/// microseconds.
+const YOUNG: Duration = Duration::from_millis(50);
+
+/// How long a clean-up waits for half-made files that may have living makers.
+const MAKERS: Duration = Duration::from_millis(200);
 
 /// How long iceoryx2 may wait for another process that cleans up after the same dead one.
 const OTHER_CLEANER: Duration = Duration::from_millis(100);
 
 /// A thread that removes what killed processes have half made, until this is dropped.
 #[derive(Debug)]
-pub(super) struct Sweeper {
+pub struct Sweeper {
     stop: Option<Sender<()>>,
     thread: Option<JoinHandle<()>>,
 }
 
 impl Sweeper {
-    /// Starts to sweep the files of run `run_id`.
+    /// Starts to sweep the files of a run: for its launcher, and for who asks a launcher that may be killed over the answer.
     ///
     /// # Errors
     /// When the thread cannot be started.
-    pub(super) fn start(run_id: &str) -> io::Result<Self> {
+    pub fn start(domain: &Domain) -> Result<Self, ChannelError> {
         let (stop, stopped) = mpsc::channel();
-        let run_id = run_id.to_owned();
-        let thread = std::thread::Builder::new().name("sweeper".into()).spawn(move || {
+        let run_id = domain.run_id().to_owned();
+        let sweep = move || {
             while stopped.recv_timeout(SWEEP) == Err(RecvTimeoutError::Timeout) {
                 if let Err(error) = remove_unfinished(&run_id) {
                     tracing::warn!("cannot look for files that killed processes have left: {error}");
                 }
             }
-        })?;
+        };
+        let thread = std::thread::Builder::new()
+            .name("sweeper".into())
+            .spawn(sweep)
+            .map_err(|cause| ChannelError::new("all", "be watched", cause))?;
         Ok(Self {
             stop: Some(stop),
             thread: Some(thread),
@@ -83,7 +91,7 @@ pub(super) fn remove_unfinished(run_id: &str) -> io::Result<bool> {
         match path.symlink_metadata() {
             Err(_) => {}
             Ok(now) if now.ino() != before.ino() || !is_unfinished(&path, &now) => {}
-            Ok(_) if open.contains(&path) => none_left = false,
+            Ok(now) if open.contains(&path) || is_young(&now) => none_left = false,
             Ok(_) => match std::fs::remove_file(&path) {
                 Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
                 _ => tracing::debug!(path = %path.display(), "removed a file whose maker was killed"),
@@ -98,6 +106,12 @@ fn is_unfinished(path: &Path, metadata: &Metadata) -> bool {
     let name = path.file_name().map(|name| name.to_string_lossy());
     let is_promise = name.is_some_and(|name| is_promise(&name));
     metadata.is_file() && !is_promise && (metadata.len() == 0 || metadata.mode() & 0o400 == 0)
+}
+
+fn is_young(metadata: &Metadata) -> bool {
+    let since = Duration::new(metadata.ctime().max(0) as u64, metadata.ctime_nsec() as u32);
+    // A clock that was set back says nothing.
+    (SystemTime::UNIX_EPOCH + since).elapsed().is_ok_and(|age| age < YOUNG)
 }
 
 /// Files of shared memory that some process has open.
@@ -198,4 +212,52 @@ fn lives(node: UniqueNodeId) -> bool {
         .ok()
         .and_then(|pid| Pid::from_raw(pid.value()));
     pid.is_some_and(|pid| test_kill_process(pid).is_ok())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs::File;
+    use std::os::unix::fs::PermissionsExt;
+
+    use super::*;
+
+    /// A file of a run of this test's own, removed with it.
+    struct Left(PathBuf);
+
+    impl Left {
+        fn new(name: &str, mode: u32, bytes: &[u8]) -> (Self, File) {
+            let path = Path::new(SHARED_MEMORY).join(format!("{}{name}", prefix(&run_id())));
+            std::fs::write(&path, bytes).unwrap();
+            let file = File::open(&path).unwrap();
+            file.set_permissions(std::fs::Permissions::from_mode(mode)).unwrap();
+            (Self(path), file)
+        }
+    }
+
+    impl Drop for Left {
+        fn drop(&mut self) {
+            let _ = std::fs::remove_file(&self.0);
+        }
+    }
+
+    fn run_id() -> String {
+        format!("u{}", std::process::id())
+    }
+
+    #[test]
+    fn what_a_dead_process_was_making_is_removed_and_nothing_else() {
+        let ((empty, making), (closed, filling)) = (
+            Left::new("1_2.connection", 0o200, b""),
+            Left::new("1_3.connection", 0o200, b"half"),
+        );
+        let (whole, _) = Left::new("1.data", 0o600, b"whole");
+        let (promise, _) = Left::new("promise_4096", 0o600, b"");
+        std::thread::sleep(2 * YOUNG);
+        assert!(!remove_unfinished(&run_id()).unwrap());
+        assert!(empty.0.exists() && closed.0.exists(), "their maker lives");
+        drop((making, filling));
+        assert!(remove_unfinished(&run_id()).unwrap());
+        assert!(!empty.0.exists() && !closed.0.exists());
+        assert!(whole.0.exists() && promise.0.exists());
+    }
 }

@@ -161,14 +161,23 @@ pub fn ask(
         action: "ask",
         cause,
     };
-    let client = claim(|| {
+    let deadline = Instant::now() + patience;
+    let make_client = || {
         service(domain, Entry::Open)?
             .client_builder()
             .initial_max_slice_len(QUESTION)
             .create()
             .map_err(|cause| ChannelError::new(CHANNEL, "ask", cause))
-    })?;
-    let deadline = Instant::now() + patience;
+    };
+    // A launcher that starts has not made the service yet, and one that ends has it no more.
+    let client = loop {
+        match make_client() {
+            Ok(client) => break client,
+            Err(error) if Instant::now() >= deadline => return Err(error.into()),
+            Err(_) if !lives() => return Err(ControlError::Gone),
+            Err(_) => std::thread::sleep(NAP),
+        }
+    };
     let ask = |bytes: &[u8]| {
         let mut request = client.loan_slice(bytes.len()).map_err(|e| format!("{e:?}"))?;
         request.payload_mut().copy_from_slice(bytes);

@@ -16,7 +16,7 @@ use rustix::io::Errno;
 
 use super::memory;
 
-/// How long others may have the lock of the user's directory: each needs it for some milliseconds.
+/// How long others may have a run's lock: each needs it for some milliseconds.
 const LOCK_PATIENCE: Duration = Duration::from_secs(10);
 
 pub(super) const SHARED_MEMORY: &str = "/dev/shm";
@@ -225,8 +225,8 @@ pub(super) fn iox_config(root: &Path, run_id: &str) -> Result<Config, String> {
     let directory = root.join(run_id);
     let root_path = IoxPath::new(directory.as_os_str().as_encoded_bytes()).map_err(|e| format!("{e:?}"))?;
     let mut config = Config::default();
-    // Cleaning up after the dead is the launcher's. iceoryx2 0.10 does not survive it everywhere when whoever cleans up is
-    // killed over it: then a port stays occupied for good. The launcher's death ends the run anyway.
+    // Cleaning up after the dead is the launcher's, which puts back before what iceoryx2 0.10 misses where an earlier
+    // clean-up was killed (`cleanup.rs`).
     config.global.node.cleanup_dead_nodes_on_creation = false;
     config.global.node.cleanup_dead_nodes_on_destruction = false;
     config.global.service.cleanup_dead_nodes_on_open = false;

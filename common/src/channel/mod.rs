@@ -21,6 +21,7 @@ pub mod transitions;
 mod words;
 
 pub use bell::{Bell, Place, Ringer, wait_for};
+pub use cleanup::Sweeper;
 pub use domain::{Domain, DomainError};
 pub use memory::free_shared_memory;
 pub use pulse::Pulse;

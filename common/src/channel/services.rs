@@ -46,10 +46,9 @@ impl Services {
     /// # Errors
     /// When no thread can be started.
     pub fn new(domain: &Domain) -> Result<Self, ChannelError> {
-        let sweeper = Sweeper::start(domain.run_id());
         Ok(Self {
             held: Vec::new(),
-            _sweeper: sweeper.map_err(|cause| ChannelError::new("all", "be watched", cause))?,
+            _sweeper: Sweeper::start(domain)?,
         })
     }
 
