@@ -70,9 +70,9 @@ fn when_the_launcher_is_killed_the_run_can_be_resumed_at_once() {
     assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
     for actor in 0..2 {
         let (sent, committed) = (support::sent(&run, actor), support::committed(&run, actor as usize));
-        // Between two launchers nobody writes down what an actor says of its last chunks.
+        // Between two launchers nobody writes down what an actor says of its last chunks: some tenth of a second's.
         assert!(
-            (sent..sent + 100).contains(&committed),
+            (sent..sent + 2000).contains(&committed),
             "actor {actor} sent {sent}, {committed} are there"
         );
     }

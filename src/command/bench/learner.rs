@@ -124,7 +124,7 @@ fn filled(config: &Config, mut replay: Replay, patience: &Patience) -> anyhow::R
         patience.check()?;
         rows.fill(&mut chunk)?;
         let mark = ChunkMark {
-            incarnation: 1,
+            incarnation: 0,
             sequence,
         };
         replay.append_and_commit(0, mark, &chunk).context("the replay")?;
