@@ -299,8 +299,8 @@ impl<'a> Launcher<'a> {
                     self.await_last_evaluation()?;
                     return Ok(Ending::Finished);
                 }
-                crew::State::ShmOccupied if self.to_end.is_some() => {}
-                crew::State::ShmOccupied => {
+                crew::State::SharedMemoryOccupied if self.to_end.is_some() => {}
+                crew::State::SharedMemoryOccupied => {
                     let why =
                         "dead processes occupy places in shared memory: the run goes on in shared memory made anew";
                     self.log.note("launcher", why);

@@ -4,6 +4,8 @@
 
 mod support;
 
+use std::path::PathBuf;
+
 use rustix::process::Signal;
 use support::{Workplace, parse, until};
 
@@ -132,5 +134,54 @@ fn a_role_that_cannot_work_is_given_up_and_its_last_words_are_passed_on() {
         last.contains("learner-0 failed") && last.contains("times and is given up") && last.contains("latest.ckpt"),
         "{said}"
     );
+    assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
+}
+
+/// Files with which iceoryx2 knows that a process is in the run: its directory, and what tells whether it lives.
+fn node_of(pid: i32) -> Vec<PathBuf> {
+    let open = std::fs::read_dir(format!("/proc/{pid}/fd")).unwrap().flatten();
+    let mut open = open.filter_map(|file| std::fs::read_link(file.path()).ok());
+    let details = open
+        .find(|file| file.to_string_lossy().ends_with("node.details"))
+        .unwrap();
+    let directory = details.parent().unwrap();
+    let id = directory.file_name().unwrap().to_string_lossy().into_owned();
+    let nodes = std::fs::read_dir(directory.parent().unwrap()).unwrap().flatten();
+    nodes
+        .map(|entry| entry.path())
+        .filter(|path| path.to_string_lossy().contains(&id))
+        .collect()
+}
+
+#[test]
+fn a_run_whose_shared_memory_cannot_be_cleaned_up_goes_on_in_other_shared_memory() {
+    let place = Workplace::new();
+    let running = place.start("run", &["--steps", "100000000"]);
+    running.learns_on();
+    let actor = *running.pids("actor-0").last().unwrap();
+    let node = node_of(actor);
+    assert!(node.len() > 1, "{node:?}");
+    // The launcher is to find the actor dead, and nothing to clean up by.
+    running.signal(Signal::STOP);
+    running.kill("actor-0");
+    until("the actor is dead", || {
+        let stat = std::fs::read_to_string(format!("/proc/{actor}/stat")).unwrap_or_default();
+        stat.contains(") Z ")
+    });
+    for path in node {
+        let removed = if path.is_dir() {
+            std::fs::remove_dir_all(&path)
+        } else {
+            std::fs::remove_file(&path)
+        };
+        removed.unwrap();
+    }
+    running.signal(Signal::CONT);
+    until("it is said", || running.log().contains("shared memory made anew"));
+    running.learns_on();
+    running.learns_on();
+    assert!(place.output(&["stop", "run"]).status.success());
+    let (code, _, leftovers) = running.wait();
+    assert_eq!(code, Some(0), "{}", place.said());
     assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
 }

@@ -36,7 +36,7 @@ pub(super) enum State {
     AtWork,
     LearnerDone,
     /// Dead processes have places in shared memory that cannot be freed.
-    ShmOccupied,
+    SharedMemoryOccupied,
 }
 
 /// All processes of a run.
@@ -342,7 +342,7 @@ impl Crew {
             self.cleaned -= CLEANING;
             return Ok(State::AtWork);
         }
-        Ok(State::ShmOccupied)
+        Ok(State::SharedMemoryOccupied)
     }
 
     /// Lets actors retire that are too many, and when they are gone their environment servers.
