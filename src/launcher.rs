@@ -251,7 +251,9 @@ impl<'a> Launcher<'a> {
             Ok(()) => Answer::Accepted,
             Err(error) => Answer::Refused(format!("{error:#}")),
         });
-        if let Some(error) = ending.as_ref().err().or(ended.as_ref().err()) {
+        let renewed = matches!(ending, Ok(Ending::Renewed));
+        let failure = ending.as_ref().err().or(ended.as_ref().err().filter(|_| !renewed));
+        if let Some(error) = failure {
             let why = format!("{error:#}").replace('\n', " ");
             self.log.note("launcher", &format!("{FAILED}{why}"));
             // The error itself is what is to be told.
@@ -260,7 +262,8 @@ impl<'a> Launcher<'a> {
                 .map(|outcome| outcome.because(why).write(self.run));
         }
         let ending = ending?;
-        ended?;
+        // Where shared memory is made anew, the learner goes on from its newest checkpoint.
+        ended.or_else(|error| if ending == Ending::Renewed { Ok(()) } else { Err(error) })?;
         self.recorder.flush()?;
         // What the learner saved: its last report may have come too late to be heard.
         let after = status::at_rest(&self.config, self.run)?;

@@ -35,7 +35,7 @@ impl Remote {
         if !self.run.goes_on()? {
             return Ok(None);
         }
-        let domain = Domain::join(&self.config.run.id, self.config.actors.max)?;
+        let domain = Domain::visit(&self.config.run.id, self.config.actors.max)?;
         let sweeper = Sweeper::start(&domain)?;
         let lives = || self.run.goes_on().unwrap_or(true);
         let answer = control::ask(&domain, self.run.key()?, question, patience, lives);

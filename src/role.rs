@@ -1,6 +1,7 @@
 //! One role of a run, in a process of its own: the run directory says everything, this hands each role its part of it.
 
 use std::ffi::CString;
+use std::io::Write;
 use std::process::ExitCode;
 
 use anyhow::Context;
@@ -52,7 +53,10 @@ pub(crate) fn run(role: Role, args: &RoleArgs) -> anyhow::Result<ExitCode> {
     let ended = work(&domain, &config, &run, identity, &stop);
     let left = domain.leave();
     ended?;
-    left?;
+    if let Err(error) = left {
+        // Whoever leaves later removes what is left.
+        let _ = writeln!(std::io::stderr(), "{error}");
+    }
     Ok(ExitCode::SUCCESS)
 }
 

@@ -195,6 +195,7 @@ impl<'a> Explorer<'a> {
             if self.chunk.is_none() {
                 self.chunk = Some(self.sender.begin()?);
             }
+            self.pulse.begin_work();
             self.act(&current);
             let idle = || self.pulse.beat(Activity::WaitingForServer);
             match self.client.step(&self.bell, &self.actions, idle)? {

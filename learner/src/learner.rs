@@ -184,6 +184,7 @@ impl<'a> Learner<'a> {
     /// Learns what is due next, on the replay as it was at `self.rows` rows.
     pub(crate) fn update(&mut self) -> Result<(), LearnerError> {
         let before = self.updates();
+        self.pulse.begin_work();
         let losses = self.algorithm.update(&self.replay, self.rows);
         if !(losses.critic_loss.is_finite() && losses.actor_loss.is_finite()) {
             return Err(LearnerError::Diverged {

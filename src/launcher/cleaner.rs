@@ -7,7 +7,8 @@ use std::time::Duration;
 
 use anyhow::{Context, bail};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
-use rustix::process::{Pid, PidfdFlags, pidfd_open};
+use rustix::io::Errno;
+use rustix::process::{Pid, PidfdFlags, Signal, pidfd_open, set_parent_process_death_signal};
 use shoal_common::channel::{Domain, Services};
 
 /// The command that does it. Its argument is the run's name.
@@ -66,10 +67,13 @@ fn has_ended_in_time(child: &Child) -> bool {
     let Ok(process) = pidfd_open(Pid::from_child(child), PidfdFlags::empty()) else {
         return false;
     };
-    matches!(
-        poll(&mut [PollFd::new(&process, PollFlags::IN)], Some(&patience)),
-        Ok(1..)
-    )
+    loop {
+        match poll(&mut [PollFd::new(&process, PollFlags::IN)], Some(&patience)) {
+            // A signal to the launcher says nothing of the child.
+            Err(Errno::INTR) => {}
+            ready => return matches!(ready, Ok(1..)),
+        }
+    }
 }
 
 /// What that process does.
@@ -77,6 +81,7 @@ fn has_ended_in_time(child: &Child) -> bool {
 /// # Errors
 /// When files cannot be listed or removed.
 pub(crate) fn work(run_id: &str) -> anyhow::Result<ExitCode> {
+    set_parent_process_death_signal(Some(Signal::KILL)).context("cannot be tied to the launcher")?;
     match Domain::clean_up(run_id)? {
         0 => Ok(ExitCode::SUCCESS),
         _ => Ok(ExitCode::FAILURE),

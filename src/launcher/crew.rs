@@ -24,8 +24,9 @@ use crate::recorder::{Incident, What};
 /// How often the dead are cleaned up after whose end the launcher does not see: terminals that asked something.
 const CLEANING: Duration = Duration::from_secs(2);
 
-/// Clean-ups in a row that may leave places occupied. A process may be dead and not yet gone.
-const HOPELESS: u32 = 10;
+/// How long clean-ups may leave places occupied, and how soon the next one follows. A process may be dead and not yet gone.
+const HOPELESS: Duration = Duration::from_secs(2);
+const SOON: Duration = Duration::from_millis(200);
 
 /// More processes than are started without any of them sending a chunk.
 const NEVER_SENT: u64 = 100_000;
@@ -47,8 +48,10 @@ pub(super) struct Crew {
     /// Actors whose services there are.
     served: u32,
     window: u32,
-    /// Clean-ups in a row that left places occupied.
-    occupied: u32,
+    /// Since when clean-ups have left places occupied.
+    occupied: Option<Instant>,
+    /// How long it has cleaned up since stalls were looked for last.
+    busy: Duration,
     /// Actors there are to be, and may ever be.
     actors: u32,
     max_actors: u32,
@@ -93,7 +96,8 @@ impl Crew {
             services,
             served: 0,
             window: config.actors.window,
-            occupied: 0,
+            occupied: None,
+            busy: Duration::ZERO,
             actors: config.actors.count,
             max_actors: config.actors.max,
             log,
@@ -234,7 +238,7 @@ impl Crew {
         if self.members.iter().any(|member| member.ended.is_some()) {
             // Their places in shared memory are free for their successors.
             state = self.clean(domain)?;
-        } else if self.cleaned.elapsed() >= CLEANING {
+        } else if self.cleaned.elapsed() >= self.occupied.map_or(CLEANING, |_| SOON) {
             self.cleaned = Instant::now();
             if domain.has_dead_nodes() || self.services.occupied_by_the_dead() > 0 {
                 state = self.clean(domain)?;
@@ -305,7 +309,7 @@ impl Crew {
 
     /// Ends processes that should be working and do not, so that they are replaced; what is to be said of each.
     pub(super) fn replace_stalled(&mut self, stalls: &mut Stalls) -> Vec<String> {
-        let stalled = stalls.find(&mut self.members);
+        let stalled = stalls.find(&mut self.members, std::mem::take(&mut self.busy));
         let mut said = Vec::new();
         for (i, why) in stalled {
             let member = &mut self.members[i];
@@ -328,21 +332,22 @@ impl Crew {
 
     /// Frees what dead processes have in shared memory.
     fn clean(&mut self, domain: &Domain) -> anyhow::Result<State> {
-        if let Err(error) = cleaner::clean_up(domain, &self.services) {
+        let begun = Instant::now();
+        let cleaned = cleaner::clean_up(domain, &self.services);
+        self.cleaned = Instant::now();
+        self.busy += begun.elapsed();
+        if let Err(error) = &cleaned {
             self.log.note("launcher", &format!("{error:#}"));
         }
-        self.cleaned = Instant::now();
         if self.services.occupied_by_the_dead() == 0 {
-            self.occupied = 0;
+            self.occupied = None;
             return Ok(State::AtWork);
         }
-        self.occupied += 1;
-        if self.occupied < HOPELESS {
-            // Soon again.
-            self.cleaned -= CLEANING;
-            return Ok(State::AtWork);
+        let since = *self.occupied.get_or_insert(begun);
+        if cleaned.is_ok() && since.elapsed() >= HOPELESS {
+            return Ok(State::SharedMemoryOccupied);
         }
-        Ok(State::SharedMemoryOccupied)
+        Ok(State::AtWork)
     }
 
     /// Lets actors retire that are too many, and when they are gone their environment servers.

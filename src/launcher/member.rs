@@ -53,7 +53,7 @@ pub(super) struct Member {
     usual_start: Option<Duration>,
     longest_start: Duration,
     heard: Option<(Instant, Heartbeat)>,
-    /// When it was last seen to get on: to start, to take steps, or to have another policy.
+    /// When it was last seen to get on: to start, to take steps, to have another policy, or to do something else.
     pub(super) moved: Instant,
     /// How often it was replaced because it made no progress, since it last did.
     pub(super) stalls: u32,
@@ -150,7 +150,7 @@ impl Member {
     fn hear_at(&mut self, heartbeat: &Heartbeat, now: Instant) -> Option<Duration> {
         let before = self.heard.replace((now, *heartbeat)).map(|(_, before)| before);
         let first = before.is_none();
-        let position = |heartbeat: &Heartbeat| (heartbeat.steps, heartbeat.policy_version);
+        let position = |heartbeat: &Heartbeat| (heartbeat.steps, heartbeat.policy_version, heartbeat.activity());
         if before.is_none_or(|before| position(&before) != position(heartbeat)) {
             self.moved = now;
         }
@@ -232,18 +232,27 @@ impl Member {
 
     /// Whether its process is stopped.
     pub(super) fn is_stopped(&self) -> bool {
-        matches!(self.state_in_kernel(), Some('T' | 't'))
+        self.states_in_kernel().iter().any(|state| matches!(state, 'T' | 't'))
     }
 
-    /// Whether its process neither computes nor waits for a device.
+    /// Whether no thread of its process computes or waits for a device.
     pub(super) fn sleeps(&self) -> bool {
-        self.state_in_kernel() == Some('S')
+        let states = self.states_in_kernel();
+        !states.is_empty() && states.iter().all(|state| *state == 'S')
     }
 
-    fn state_in_kernel(&self) -> Option<char> {
-        let stat = std::fs::read_to_string(format!("/proc/{}/stat", self.process.as_ref()?.pid())).ok()?;
-        // Behind the name, which is in brackets and may hold anything.
-        stat.rsplit_once(") ")?.1.chars().next()
+    /// The state of each thread of its process, as `ps` has it.
+    fn states_in_kernel(&self) -> Vec<char> {
+        let Some(process) = &self.process else {
+            return Vec::new();
+        };
+        let threads = std::fs::read_dir(format!("/proc/{}/task", process.pid()));
+        let state = |thread: std::fs::DirEntry| {
+            let stat = std::fs::read_to_string(thread.path().join("stat")).ok()?;
+            // Behind the name, which is in brackets and may hold anything.
+            stat.rsplit_once(") ")?.1.chars().next()
+        };
+        threads.into_iter().flatten().flatten().filter_map(state).collect()
     }
 
     /// Whether it was heard of a moment ago.

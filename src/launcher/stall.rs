@@ -31,10 +31,11 @@ impl Stalls {
         }
     }
 
-    /// Who is to be replaced, and why.
-    pub(super) fn find(&mut self, members: &mut [Member]) -> Vec<(usize, &'static str)> {
+    /// Who is to be replaced, and why. Since this was asked last the launcher was `busy` for so long.
+    pub(super) fn find(&mut self, members: &mut [Member], busy: Duration) -> Vec<(usize, &'static str)> {
         let now = Instant::now();
-        if now - std::mem::replace(&mut self.looked, now) >= AWAY {
+        let since = now - std::mem::replace(&mut self.looked, now);
+        if since.saturating_sub(busy) >= AWAY {
             members.iter_mut().for_each(Member::excuse);
             return Vec::new();
         }
@@ -72,7 +73,7 @@ impl Stalls {
         let silent = member.silent_for() >= WORK * self.patience;
         let idle_server = member
             .server()
-            .is_none_or(|index| find(members, Role::EnvServer, index).is_some_and(Member::waits));
+            .is_none_or(|index| find(members, Role::EnvServer, index).is_some_and(|server| self.is_idle(server)));
         (silent && idle_server && member.sleeps()).then_some("nothing was heard of it, and it sleeps")
     }
 

@@ -190,8 +190,17 @@ impl Services {
             let directory = nodes.join(node.value().to_string());
             let tag = directory.join(format!("{}{port}.port_tag", prefix(domain.run_id())));
             if restored.is_ok() && !lives(node) && directory.is_dir() && !tag.exists() {
-                let made = OpenOptions::new().write(true).create_new(true).mode(0o400).open(&tag);
-                restored = made.map(drop).map_err(io_error("make", &tag));
+                let made = OpenOptions::new()
+                    .write(true)
+                    .create(true)
+                    .truncate(false)
+                    .mode(0o600)
+                    .open(&tag);
+                restored = match made {
+                    // Another clean-up has done all there is to do.
+                    Err(cause) if cause.kind() == io::ErrorKind::NotFound => Ok(()),
+                    made => made.map(drop).map_err(io_error("make", &tag)),
+                };
             }
         });
         restored

@@ -7,8 +7,9 @@ use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
+use iceoryx2::node::NodeView;
 use iceoryx2::prelude::{
-    CallbackProgression, Config, FileName, Node, NodeBuilder, NodeState, Path as IoxPath, SemanticString,
+    CallbackProgression, Config, FileName, Node, NodeBuilder, NodeName, NodeState, Path as IoxPath, SemanticString,
     SignalHandlingMode, ipc,
 };
 use rustix::fs::FlockOperation;
@@ -18,6 +19,9 @@ use super::memory;
 
 /// How long others may have a run's lock: each needs it for some milliseconds.
 const LOCK_PATIENCE: Duration = Duration::from_secs(10);
+
+/// The name of processes that are in a run only to ask its launcher something.
+const VISITOR: &str = "visitor";
 
 pub(super) const SHARED_MEMORY: &str = "/dev/shm";
 
@@ -75,6 +79,18 @@ impl Domain {
     /// # Errors
     /// When the user's directory cannot be made, or shared memory cannot be had.
     pub fn join(run_id: &str, max_actors: u32) -> Result<Self, DomainError> {
+        Self::enter(run_id, max_actors, "")
+    }
+
+    /// The same for who only asks the run's launcher something. The run does not wait for its visitors to end.
+    ///
+    /// # Errors
+    /// As [`join`](Self::join).
+    pub fn visit(run_id: &str, max_actors: u32) -> Result<Self, DomainError> {
+        Self::enter(run_id, max_actors, VISITOR)
+    }
+
+    fn enter(run_id: &str, max_actors: u32, name: &str) -> Result<Self, DomainError> {
         let root = user_root()?;
         // Held until the node exists, so that nobody who looks for abandoned runs takes this one for dead.
         let _lock = make_and_lock(&root.join(run_id))?;
@@ -83,7 +99,9 @@ impl Domain {
             cause,
         };
         let config = iox_config(&root, run_id).map_err(failed)?;
+        let name = NodeName::new(name).map_err(|cause| failed(format!("{cause:?}")))?;
         let node = NodeBuilder::new()
+            .name(&name)
             .config(&config)
             .signal_handling_mode(SignalHandlingMode::Disabled)
             .create::<ipc::Service>()
@@ -144,8 +162,11 @@ impl Domain {
         let run_id = self.run_id.clone();
         drop(self);
         let root = user_root()?;
-        let _lock = lock(&root.join(&run_id))?;
-        remove_if_dead(&root, &run_id)
+        // Where the directory is gone, another one was the last, and removed the files before it.
+        match lock(&root.join(&run_id))? {
+            Some(_lock) => remove_if_dead(&root, &run_id),
+            None => Ok(()),
+        }
     }
 
     /// Waits until no process of an earlier launcher is left in the run `run_id`: whose launcher was killed, they are about
@@ -235,7 +256,7 @@ pub(super) fn iox_config(root: &Path, run_id: &str) -> Result<Config, String> {
     Ok(config)
 }
 
-/// Process numbers of those in the run that live, stopped ones included.
+/// Process numbers of those in the run that live, stopped ones included, and visitors not.
 fn living(root: &Path, run_id: &str) -> Result<Vec<i32>, DomainError> {
     let failed = |cause: String| DomainError::Join {
         run_id: run_id.into(),
@@ -247,7 +268,10 @@ fn living(root: &Path, run_id: &str) -> Result<Vec<i32>, DomainError> {
         let pid = state.node_id().pid::<ipc::Service>().map_or(0, |pid| pid.value());
         let lives = match state {
             NodeState::Dead(_) => false,
-            NodeState::Alive(_) => true,
+            NodeState::Alive(node) => {
+                let name = node.details().as_ref().map(|details| details.name().as_str());
+                name != Some(VISITOR)
+            }
             // As one is that was killed while it joined.
             NodeState::Inaccessible(_) | NodeState::Undefined(_) => {
                 rustix::process::Pid::from_raw(pid).is_some_and(|pid| rustix::process::test_kill_process(pid).is_ok())
