@@ -320,6 +320,20 @@ fn two_users_do_not_touch_each_other() {
     assert_eq!(state(), before, "the first run was not touched");
 }
 
+/// Files and a process that are gone when the test is, however it ends.
+struct Gone(Vec<PathBuf>, std::process::Child);
+
+impl Drop for Gone {
+    fn drop(&mut self) {
+        for path in &self.0 {
+            let _ = fs::remove_file(path);
+        }
+        // Its roles end with it.
+        let _ = self.1.kill();
+        let _ = self.1.wait();
+    }
+}
+
 #[test]
 fn another_users_files_with_a_runs_name_change_nothing() {
     const OWNER: u32 = 65534;
@@ -342,18 +356,18 @@ fn another_users_files_with_a_runs_name_change_nothing() {
         command
     };
     let quick = ["train", "pendulum", "--run", "run", "--steps", "100000000", "--quiet"];
-    let mut launcher = owner(&[&quick[..], &QUICK[..]].concat()).spawn().unwrap();
+    let mut gone = Gone(Vec::new(), owner(&[&quick[..], &QUICK[..]].concat()).spawn().unwrap());
     let run = place.path().join("run");
     let log = || fs::read_to_string(run.join("shoal.log")).unwrap_or_default();
     until("it is at work", || log().contains("every role is ready"));
     let id = Leftovers::of(&run).run_id().to_owned();
 
-    let foreign = ["x", "y.global_mgmt", "promise_1", "0_0.connection"].map(|name| {
+    for name in ["x", "y.global_mgmt", "promise_1", "0_0.connection"] {
         let path = PathBuf::from(format!("/dev/shm/shoal_{id}_{name}"));
         fs::write(&path, "").unwrap();
         chown(&path, Some(OTHER), Some(OTHER)).unwrap();
-        path
-    });
+        gone.0.push(path);
+    }
     let works = |arguments: &[&str]| {
         let output = support::output_of(&mut owner(arguments));
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
@@ -365,7 +379,7 @@ fn another_users_files_with_a_runs_name_change_nothing() {
     kill_process(Pid::from_raw(*actor.last().unwrap()).unwrap(), Signal::KILL).unwrap();
     until("a killed process is replaced", || started() > before);
     works(&["stop", "run"]);
-    assert!(launcher.wait().unwrap().success());
+    assert!(gone.1.wait().unwrap().success());
     works(&["resume", "run", "--steps", &(rows(&run) + 300).to_string(), "--quiet"]);
     works(
         &[
@@ -374,7 +388,7 @@ fn another_users_files_with_a_runs_name_change_nothing() {
         ]
         .concat(),
     );
-    for path in foreign {
+    for path in gone.0.drain(..) {
         fs::remove_file(path).unwrap();
     }
     assert!(Leftovers::of(&run).files().is_empty());
