@@ -40,7 +40,8 @@ fn config(place: &Workplace) -> Config {
 #[test]
 fn gymnasiums_pendulum_is_trained_while_its_servers_are_killed() {
     let Some(place) = place() else { return };
-    let steps = ["--steps", "6000"];
+    // Long enough for two kills: who is killed while the run ends has no successor.
+    let steps = ["--steps", "20000"];
     let running = place.start_in("run", "gym:Pendulum-v1", &[&SHORT[..], &steps].concat());
     for who in ["env-server-0", "env-server-16"] {
         running.learns_on();
@@ -51,7 +52,7 @@ fn gymnasiums_pendulum_is_trained_while_its_servers_are_killed() {
     let (code, printed, leftovers) = running.wait();
     assert_eq!(code, Some(0), "{}", place.said());
     assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
-    assert_eq!(parse(&printed)["env_steps"], 6000);
+    assert_eq!(parse(&printed)["env_steps"], 20000);
 
     let spec = config(&place).spec;
     assert_eq!(spec.observation, Space::boxed(&[(-1.0, 1.0), (-1.0, 1.0), (-8.0, 8.0)]));
