@@ -15,8 +15,7 @@
 //! `SHOAL_CRASH_UPTO` (200) restrict the first; `SHOAL_CRASH_SECONDS` (60) says after how long a run hangs;
 //! `SHOAL_CRASH_BURSTS` (10) and `SHOAL_CRASH_SEED` (1) belong to the second, `SHOAL_CRASH_STEPS` to the third.
 //!
-//! Runs of one user wait for each other where they enter and leave shared memory. So a run that hangs there may hold up
-//! those beside it; with `SHOAL_CRASH_JOBS=1` each failure is its own.
+//! With `SHOAL_CRASH_JOBS=1` no run has a neighbour, and each failure is its own.
 //!
 //! Processes are traced (`ptrace`); where the machine does not allow it, these tests say so and show nothing.
 
