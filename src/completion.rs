@@ -2,23 +2,21 @@
 
 use std::ffi::OsStr;
 
-use clap::CommandFactory;
+use clap::Command;
 use clap_complete::CompleteEnv;
 use clap_complete::engine::{CompletionCandidate, PathCompleter, ValueCompleter};
 use shoal_common::config::explanation::{Key, sections};
 use shoal_env_server::environment;
+use shoal_run::external_environment::GYMNASIUM;
+use shoal_run::plan::{FILLED_IN, preset_names};
 use toml::{Table, Value};
-
-use crate::cli::Cli;
-use crate::environment_server::GYMNASIUM;
-use crate::plan::{FILLED_IN, preset_names};
 
 /// The variable that a shell sets where it asks for completions. (`COMPLETE` alone may be somebody else's.)
 pub(crate) const VARIABLE: &str = "SHOAL_COMPLETE";
 
 /// Answers a shell that asks for completions, and ends the process; does nothing where none asks.
-pub(crate) fn answer() {
-    CompleteEnv::with_factory(Cli::command).var(VARIABLE).complete();
+pub(crate) fn answer(command: fn() -> Command) {
+    CompleteEnv::with_factory(command).var(VARIABLE).complete();
 }
 
 /// Presets, the beginning of a Gymnasium environment, and configuration files.

@@ -22,6 +22,9 @@ use shoal_common::config::Config;
 use shoal_common::report::{EpisodeReport, EvaluationReport, Heartbeat, LearnerReport, Role};
 use shoal_common::run_dir::RunDir;
 use shoal_common::stop::GRACE;
+use shoal_run::outcome::{self, State};
+use shoal_run::recorder::Recorder;
+use shoal_run::{preflight, status};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 pub(crate) use self::cleaner::work as clean_up;
@@ -29,11 +32,7 @@ use self::crew::Crew;
 use self::log::Log;
 pub(crate) use self::log::{EVERYBODY_ENDED, FAILED};
 use self::progress::Progress;
-pub(crate) use self::progress::thousands;
 use self::stall::Stalls;
-use crate::outcome::{self, State};
-use crate::recorder::Recorder;
-use crate::{room, status};
 
 /// How often the launcher looks round.
 const ROUND: Duration = Duration::from_millis(50);
@@ -108,7 +107,7 @@ fn run_once(config: Config, run: &RunDir, signals: &Signals, quiet: bool) -> any
     Domain::wait_for_the_last(&config.run.id, PREDECESSORS_END).map_err(|error| explain(error, run))?;
     Domain::remove_abandoned()?;
     let domain = Domain::join(&config.run.id, config.actors.max)?;
-    let outcome = room::claim(&config, run, &domain)
+    let outcome = preflight::claim(&config, run, &domain)
         .and_then(|()| Launcher::new(config, run, &domain, signals, quiet))
         .and_then(Launcher::run);
     // Even where something failed: no role is left by now.

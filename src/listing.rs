@@ -8,12 +8,12 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 use shoal_common::channel::control::RunStatus;
 use shoal_common::run_dir::RunDir;
+use shoal_run::outcome::{self, Outcome};
+use shoal_run::recorder::read_evaluations;
+use shoal_run::remote::Remote;
+use shoal_run::status::at_rest;
 
 use crate::launcher::{EVERYBODY_ENDED, FAILED};
-use crate::outcome::{self, Outcome};
-use crate::recorder::read_evaluations;
-use crate::remote::Remote;
-use crate::status::at_rest;
 
 /// Bytes at the end of a log that its last launcher's last line lies in.
 const END_OF_LOG: u64 = 1 << 16;

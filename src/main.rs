@@ -1,42 +1,25 @@
-//! Shoal: the launcher, and the only binary.
+//! Shoal: the only binary. Each command is a file of `command/`.
 
-mod child_group;
-mod child_output;
 mod cli;
 mod command;
 mod completion;
-mod environment_server;
-mod export;
-mod figure;
 mod launcher;
 mod listing;
-mod outcome;
-mod peer;
-mod plan;
-mod recorder;
-mod remote;
-mod report;
-mod reproduction;
 mod role;
-mod rollout;
-mod room;
-mod status;
-mod tensorboard;
-mod test_run;
 mod top;
 
 use std::io::Write;
 use std::process::ExitCode;
 use std::sync::Arc;
 
-use clap::Parser;
+use clap::{CommandFactory, Parser};
 use iceoryx2::prelude::{LogLevel, set_log_level};
 use shoal_common::report::Role;
 
 use crate::cli::{Cli, Command};
 
 fn main() -> ExitCode {
-    completion::answer();
+    completion::answer(Cli::command);
     // Whatever this program makes is for its user alone.
     rustix::process::umask(rustix::fs::Mode::RWXG | rustix::fs::Mode::RWXO);
     // What goes wrong in shared memory is returned as an error and said once, by us.
@@ -71,12 +54,12 @@ fn run(command: &Command) -> anyhow::Result<ExitCode> {
         Command::Bench(args) => command::bench::run(args).map(done),
         Command::Top(args) => command::top::run(args),
         Command::Completions(args) => command::completions::run(args).map(done),
-        Command::Man(args) => command::man::run(args).map(done),
+        Command::Man(args) => command::man::run(args, Cli::command()).map(done),
         Command::EnvServer(args) => role::run(Role::EnvServer, args),
         Command::Actor(args) => role::run(Role::Actor, args),
         Command::Evaluator(args) => role::run(Role::Evaluator, args),
         Command::Learner(args) => role::run(Role::Learner, args),
-        Command::Tied(args) => environment_server::become_tied(args.parent, &args.program),
+        Command::Tied(args) => shoal_run::external_environment::become_tied(args.parent, &args.program),
         Command::CleanUp(args) => launcher::clean_up(&args.run_id),
     }
 }

@@ -14,12 +14,11 @@ use shoal_common::run_dir::RunDir;
 use shoal_common::stop::Stop;
 use shoal_env_server::vector::VectorEnvironment;
 use shoal_learner::learner;
-use shoal_learner::ratio::Ratio;
+use shoal_run::external_environment::{self, Post};
+use shoal_run::status::{judged, learner_settings};
 use tracing_subscriber::filter::LevelFilter;
 
 use crate::cli::RoleArgs;
-use crate::environment_server::{self, Post};
-use crate::status::judged;
 
 /// Runs a role until it is through, or its standard input closes.
 pub(crate) fn run(role: Role, args: &RoleArgs) -> anyhow::Result<ExitCode> {
@@ -46,7 +45,7 @@ pub(crate) fn run(role: Role, args: &RoleArgs) -> anyhow::Result<ExitCode> {
     if role == Role::EnvServer
         && let Some(program) = server_post(&config, &run, identity).command(&config.environment)?
     {
-        return environment_server::serve_by(&program);
+        return external_environment::serve_by(&program);
     }
     let stop = Stop::when_stdin_closes().context("cannot watch standard input")?;
     let domain = Domain::join(&config.run.id, config.actors.max)?;
@@ -158,37 +157,5 @@ fn evaluator_settings(config: &Config, run: &RunDir, identity: Identity, judged:
         algorithm: config.algorithm.clone(),
         run: run.clone(),
         judged,
-    }
-}
-
-pub(crate) fn learner_settings(
-    config: &Config,
-    run: &RunDir,
-    identity: Identity,
-    judged: Option<u64>,
-) -> learner::Settings {
-    learner::Settings {
-        identity,
-        seed: config.run.seed,
-        mode: config.run.mode,
-        steps: config.run.steps,
-        actors: config.actors.count,
-        max_actors: config.actors.max,
-        window: config.actors.window,
-        chunk: config.chunk_layout(),
-        spec: config.spec.clone(),
-        algorithm: config.algorithm.clone(),
-        threads: config.learner.threads,
-        envs: config.actors.envs,
-        episodes: config.run.episodes,
-        ratio: Ratio::from(&config.replay),
-        capacity: config.replay.capacity,
-        evaluation: config.evaluation.clone(),
-        judged,
-        checkpoint: config.checkpoint.clone(),
-        fingerprint: config.fingerprint(),
-        replay: run.replay_file(),
-        checkpoints: run.checkpoints(),
-        last_policy: run.last_policy(),
     }
 }

@@ -5,9 +5,8 @@ mod view;
 
 use std::collections::VecDeque;
 
-use shoal_common::channel::control::RunStatus;
-
 pub(crate) use link::{Link, News, Order};
+use shoal_common::channel::control::RunStatus;
 pub(crate) use view::draw;
 
 /// Looks that the throughput is kept of.

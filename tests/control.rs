@@ -131,7 +131,7 @@ fn what_was_sent_is_taken_in_at_the_end_however_far_the_learner_is_behind() {
     // Two windows of 512 rows: more than a second's work.
     until("the actors wait", || {
         let sent = support::sent(&running.run, 0);
-        sent >= support::committed(&running.run, 0) + 512
+        sent >= support::committed(&running.run, 0) + 512 && support::sent(&running.run, 1) > 0
     });
     let run = running.run.clone();
     assert!(place.output(&["stop", "run"]).status.success());

@@ -1,6 +1,6 @@
 //! What an environment is, and the list of those there are.
 
-mod angle;
+pub mod angle;
 pub mod cart_pole;
 mod error;
 pub mod frozen_lake;

@@ -3,10 +3,18 @@
 use std::io::Write;
 
 use anyhow::Context;
+use clap::Args;
+use clap_complete::Shell;
 use clap_complete::env::Shells;
 
-use crate::cli::CompletionsArgs;
 use crate::completion::VARIABLE;
+
+#[derive(Args, Clone, Debug)]
+pub(crate) struct CompletionsArgs {
+    /// The shell.
+    #[arg(value_enum)]
+    pub(crate) shell: Shell,
+}
 
 /// Prints the lines for the shell's start-up file. They call `shoal`, so they know of whatever it can do by then.
 pub(crate) fn run(args: &CompletionsArgs) -> anyhow::Result<()> {

@@ -1,14 +1,30 @@
 //! `shoal export`: a run's policy for programs that know nothing of this one.
 
 use std::io::Write;
+use std::path::PathBuf;
 
 use anyhow::Context;
+use clap::Args;
 use clap::ValueEnum;
 use shoal_common::durable::write_atomically;
 use shoal_common::run_dir::RunDir;
+use shoal_report::export::Portable;
+use shoal_run::evaluation::WhichPolicy;
 
-use crate::cli::ExportArgs;
-use crate::export::Portable;
+#[derive(Args, Clone, Debug)]
+pub(crate) struct ExportArgs {
+    /// Run directory.
+    pub(crate) run: PathBuf,
+    /// The form of the file.
+    #[arg(long, value_enum)]
+    pub(crate) format: Format,
+    /// Which policy to write.
+    #[arg(long, value_enum, default_value_t)]
+    pub(crate) policy: WhichPolicy,
+    /// The file [default: <policy>.<format> in the run directory].
+    #[arg(long, value_name = "FILE")]
+    pub(crate) out: Option<PathBuf>,
+}
 
 /// The form of the file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]

@@ -6,9 +6,8 @@ use std::io::Write as _;
 use shoal_common::config::Config;
 use shoal_common::config::explanation::{Key, sections};
 use shoal_env_server::environment;
+use shoal_run::plan::{preset_names, resolved};
 use toml::{Table, Value};
-
-use crate::plan::{preset_names, resolved};
 
 /// Explains the keys of one preset or file, or where none is named, all that there are.
 pub(crate) fn explain(what: Option<&str>) -> anyhow::Result<()> {

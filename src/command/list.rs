@@ -4,13 +4,23 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
+use clap::Args;
 use comfy_table::presets::NOTHING;
 use comfy_table::{CellAlignment, Table};
 use serde::Serialize;
+use shoal_run::numbers::thousands;
 
-use crate::cli::ListArgs;
-use crate::launcher::thousands;
 use crate::listing::{Listed, runs_in};
+
+#[derive(Args, Clone, Debug)]
+pub(crate) struct ListArgs {
+    /// Directory with runs in it.
+    #[arg(default_value = "runs")]
+    pub(crate) directory: PathBuf,
+    /// Print one JSON object on standard output.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
 
 /// What `--json` prints.
 #[derive(Serialize)]

@@ -1,27 +1,33 @@
 //! `shoal man`: the manual pages.
 
 use std::io::Write;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use clap::CommandFactory;
+use clap::Args;
+use clap::Command;
 use clap_mangen::Man;
 
-use crate::cli::{Cli, ManArgs};
+#[derive(Args, Clone, Debug)]
+pub(crate) struct ManArgs {
+    /// Where to put a page for each command [default: the first page, on standard output].
+    #[arg(long, value_name = "DIR")]
+    pub(crate) out: Option<PathBuf>,
+}
 
 /// Writes a page for each command into a directory, or the first page to standard output.
-pub(crate) fn run(args: &ManArgs) -> anyhow::Result<()> {
+pub(crate) fn run(args: &ManArgs, command: Command) -> anyhow::Result<()> {
     match &args.out {
         Some(directory) => {
-            write(directory).with_context(|| format!("cannot write the manual to {}", directory.display()))?;
+            write(directory, command).with_context(|| format!("cannot write the manual to {}", directory.display()))?;
             writeln!(std::io::stdout(), "{}", directory.join("shoal.1").display())?;
         }
-        None => Man::new(Cli::command()).render(&mut std::io::stdout().lock())?,
+        None => Man::new(command).render(&mut std::io::stdout().lock())?,
     }
     Ok(())
 }
 
-fn write(directory: &Path) -> std::io::Result<()> {
+fn write(directory: &Path, command: Command) -> std::io::Result<()> {
     std::fs::create_dir_all(directory)?;
-    clap_mangen::generate_to(Cli::command(), directory)
+    clap_mangen::generate_to(command, directory)
 }

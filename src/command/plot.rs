@@ -1,19 +1,21 @@
 //! `shoal plot`: the pictures of a run.
 
 use std::io::Write;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use anyhow::Context;
-use shoal_common::config::Config;
+use clap::Args;
 use shoal_common::run_dir::RunDir;
+use shoal_report::plots;
 
-use super::eval::WhichPolicy;
-use crate::cli::PlotArgs;
-use crate::figure;
-use crate::recorder::read_evaluations;
-use crate::rollout::Rollout;
-use crate::test_run::pendulum::SwingUp;
-use crate::test_run::point_mass::{Drive, FAR_STARTS, NEAR_STARTS};
+#[derive(Args, Clone, Debug)]
+pub(crate) struct PlotArgs {
+    /// Run directory.
+    pub(crate) run: PathBuf,
+    /// Where to put the figures [default: the run directory].
+    #[arg(long, value_name = "DIR")]
+    pub(crate) out: Option<PathBuf>,
+}
 
 /// Draws what there is to draw of a run, and says where it is.
 pub(crate) fn run(args: &PlotArgs) -> anyhow::Result<()> {
@@ -22,115 +24,8 @@ pub(crate) fn run(args: &PlotArgs) -> anyhow::Result<()> {
     let out = args.out.as_deref().unwrap_or(run.path());
     std::fs::create_dir_all(out).with_context(|| format!("cannot make {}", out.display()))?;
     let mut stdout = std::io::stdout().lock();
-    for picture in draw(&run, &config, out)? {
+    for picture in plots::draw(&run, &config, out)? {
         writeln!(stdout, "{}", picture.display())?;
     }
     Ok(())
-}
-
-/// Draws the evaluations of a run so far, and what its best policy does if there is one yet; gives the files.
-pub(crate) fn draw(run: &RunDir, config: &Config, out: &Path) -> anyhow::Result<Vec<PathBuf>> {
-    let mut pictures = vec![out.join("learning-curve.svg")];
-    figure::learning_curve(&read_evaluations(&run.evaluations())?, &pictures[0])?;
-    if run.best_policy().exists() {
-        pictures.extend(behaviour(run, config, out)?);
-    }
-    Ok(pictures)
-}
-
-/// Draws what the best policy does, and gives the files.
-fn behaviour(run: &RunDir, config: &Config, out: &Path) -> anyhow::Result<Vec<PathBuf>> {
-    let name = config.environment.name.as_str();
-    if !["pendulum", "point-mass"].contains(&name) {
-        return Ok(Vec::new());
-    }
-    let policy = WhichPolicy::Best.read(run, config)?;
-    let mut rollout = Rollout::new(config, &policy.parameters)?;
-    if name == "pendulum" {
-        let path = out.join("swing-up.svg");
-        figure::swing_up(&SwingUp::run(&mut rollout)?, &path)?;
-        return Ok(vec![path]);
-    }
-    let files = ["test-runs.svg", "test-runs-far.svg", "trajectories.svg"].map(|file| out.join(file));
-    figure::test_runs(&Drive::run_from(&mut rollout, starts_shown(config))?, &files[0])?;
-    let mut runs = Drive::run_from(&mut rollout, &FAR_STARTS)?;
-    figure::test_runs(&runs, &files[1])?;
-    runs.extend(Drive::run_from(&mut rollout, &NEAR_STARTS)?);
-    figure::trajectories(&runs, &files[2])?;
-    Ok(files.into())
-}
-
-/// The two starts of the thesis's figure for the run's reward: 5.5 (r1), 5.7 (r2), 5.9 (r3).
-fn starts_shown(config: &Config) -> &'static [[f64; 2]] {
-    let reward = config
-        .environment
-        .parameters
-        .get("reward")
-        .and_then(toml::Value::as_str);
-    if reward == Some("r2") {
-        &NEAR_STARTS[2..]
-    } else {
-        &NEAR_STARTS[..2]
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use shoal_common::policy_file::PolicyFile;
-
-    use super::*;
-    use crate::rollout::policy_layout;
-    use crate::rollout::tests::small;
-
-    fn files_of(environment: &str) -> Vec<String> {
-        let parent = tempfile::tempdir().unwrap();
-        let run_dir = RunDir::create(&parent.path().join("run")).unwrap();
-        let (config, parameters) = small(environment);
-        std::fs::write(run_dir.config_file(), config.to_toml().unwrap()).unwrap();
-        std::fs::create_dir(run_dir.checkpoints()).unwrap();
-        let fingerprint = policy_layout(&config).unwrap().fingerprint();
-        let policy = PolicyFile {
-            fingerprint,
-            version: 1,
-            env_steps: 1,
-            return_mean: 0.0,
-            return_std: 0.0,
-            episodes: 1,
-            parameters,
-        };
-        policy.write(&run_dir.best_policy()).unwrap();
-        let out = parent.path().join("pictures");
-        run(&PlotArgs {
-            run: run_dir.path().into(),
-            out: Some(out.clone()),
-        })
-        .unwrap();
-        let entries = std::fs::read_dir(out).unwrap();
-        let mut files: Vec<_> = entries.map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
-        files.sort();
-        files
-    }
-
-    #[test]
-    fn every_environment_has_its_pictures() {
-        assert_eq!(files_of("name = \"pendulum\""), ["learning-curve.svg", "swing-up.svg"]);
-        let point_mass = files_of("name = \"point-mass\"\nreward = \"r2\"");
-        assert_eq!(
-            point_mass,
-            [
-                "learning-curve.svg",
-                "test-runs-far.svg",
-                "test-runs.svg",
-                "trajectories.svg"
-            ]
-        );
-    }
-
-    #[test]
-    fn the_starts_are_those_of_the_rewards_figure() {
-        let starts = |reward: &str| starts_shown(&small(&format!("name = \"point-mass\"\nreward = \"{reward}\"")).0);
-        assert_eq!(starts("r1"), [[2.0, -2.0], [-2.0, 2.0]]);
-        assert_eq!(starts("r2"), [[2.0, 2.0], [-2.0, -2.0]]);
-        assert_eq!(starts("r3"), starts("r1"));
-    }
 }

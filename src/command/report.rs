@@ -4,11 +4,20 @@ use std::io::{ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail, ensure};
+use clap::Args;
 use shoal_common::durable::write_atomically;
 use shoal_common::run_dir::RunDir;
+use shoal_report::page::{self, MARK};
 
-use crate::cli::ReportArgs;
-use crate::report::{self, MARK};
+#[derive(Args, Clone, Debug)]
+pub(crate) struct ReportArgs {
+    /// Run directories; of one environment they are compared.
+    #[arg(value_name = "RUN", required = true)]
+    pub(crate) runs: Vec<PathBuf>,
+    /// The file to write [default: report.html in the run directory; of several runs, in the working directory].
+    #[arg(long, value_name = "FILE")]
+    pub(crate) out: Option<PathBuf>,
+}
 
 /// The report's name where none is given.
 const NAME: &str = "report.html";
@@ -22,7 +31,7 @@ pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<()> {
         (None, _) => NAME.into(),
     };
     refuse_what_is_no_report(&out)?;
-    let report = report::gather(&runs)?;
+    let report = page::gather(&runs)?;
     for (reason, names) in report.not_played() {
         writeln!(
             std::io::stderr().lock(),
@@ -70,7 +79,7 @@ fn refuse_what_is_no_report(out: &Path) -> anyhow::Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::rollout::tests::small;
+    use shoal_run::testing::small;
 
     #[test]
     fn a_report_replaces_a_report_and_nothing_else() {

@@ -4,15 +4,39 @@ use std::io::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use crate::cli::ReproduceArgs;
-use crate::reproduction::{self, Effort, Ending, Order};
+use clap::Args;
+use clap::builder::PossibleValuesParser;
+use shoal_reproduce::{Effort, Ending, Order};
+
+/// What is interrupted goes on when the same is typed again; what is there is not run again.
+#[derive(Args, Clone, Debug)]
+pub(crate) struct ReproduceArgs {
+    /// What to run; everything where nothing is named.
+    #[arg(value_name = "EXPERIMENT", value_parser = PossibleValuesParser::new(choices()))]
+    pub(crate) experiments: Vec<String>,
+    /// Seeds 1 to N of each experiment [default: 5, of frozen-lake and cart-pole 10 to 30; with --quick 2].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    pub(crate) seeds: Option<u32>,
+    /// Trainings at a time [default: half the cores, for each keeps about two busy].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
+    pub(crate) jobs: Option<u16>,
+    /// A first look in a few minutes: tiny networks, hardly any steps; nothing is judged.
+    #[arg(long)]
+    pub(crate) quick: bool,
+    /// Where runs, results and figures lie [default: runs/reproduction; with --quick runs/reproduction-quick].
+    #[arg(long, value_name = "DIR")]
+    pub(crate) out: Option<PathBuf>,
+    /// Where to write the report [default: REPORT.md in that directory].
+    #[arg(long, value_name = "FILE")]
+    pub(crate) report: Option<PathBuf>,
+}
 
 /// What stands for every experiment on the command line.
 const ALL: &str = "all";
 
 /// What can be asked for.
 pub(crate) fn choices() -> Vec<&'static str> {
-    reproduction::names().chain([ALL]).collect()
+    shoal_reproduce::names().chain([ALL]).collect()
 }
 
 /// As many trainings at a time as keep this machine busy: each takes about two cores.
@@ -39,7 +63,7 @@ pub(crate) fn run(args: &ReproduceArgs) -> anyhow::Result<ExitCode> {
         folder,
         report,
     };
-    let ending = reproduction::run(&order)?;
+    let ending = shoal_reproduce::run(&order)?;
     writeln!(std::io::stdout().lock(), "{}", order.report.display())?;
     let mut stderr = std::io::stderr().lock();
     Ok(match ending {

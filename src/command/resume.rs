@@ -1,13 +1,29 @@
 //! `shoal resume`: a run that was stopped, or whose processes were killed, goes on.
 
+use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::{Context, bail};
+use clap::Args;
 use shoal_common::run_dir::RunDir;
+use shoal_run::status;
 
+use super::training::Telling;
 use super::training::conduct;
-use crate::cli::ResumeArgs;
-use crate::status;
+
+#[derive(Args, Clone, Debug)]
+pub(crate) struct ResumeArgs {
+    /// Run directory.
+    pub(crate) run: PathBuf,
+    /// Environment steps over all actors, those already taken included [default: as before].
+    #[arg(long, value_name = "N")]
+    pub(crate) steps: Option<u64>,
+    /// Episodes over all actors, those already over included [default: as before].
+    #[arg(long, value_name = "M")]
+    pub(crate) episodes: Option<u64>,
+    #[command(flatten)]
+    pub(crate) telling: Telling,
+}
 
 /// Goes on with the run's own replay, counters and noise, to the steps it was to take or to others.
 pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {

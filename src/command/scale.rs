@@ -1,14 +1,23 @@
 //! `shoal scale`: more actors, or fewer, while training goes on.
 
 use std::io::Write;
+use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use anyhow::bail;
+use clap::Args;
 use shoal_common::channel::control::{RoleState, RunStatus};
 use shoal_common::report::Role;
+use shoal_run::remote::Remote;
 
-use crate::cli::ScaleArgs;
-use crate::remote::Remote;
+#[derive(Args, Clone, Debug)]
+pub(crate) struct ScaleArgs {
+    /// Run directory.
+    pub(crate) run: PathBuf,
+    /// Actor processes from now on.
+    #[arg(long, value_name = "N")]
+    pub(crate) actors: u32,
+}
 
 /// Actors that retire hand over what they have first: the learner may take its time over it.
 const PATIENCE: Duration = Duration::from_secs(60);

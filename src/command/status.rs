@@ -1,20 +1,31 @@
 //! `shoal status`: how a run gets on.
 
 use std::io::{IsTerminal, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Duration;
 
+use clap::Args;
 use comfy_table::presets::NOTHING;
 use comfy_table::{CellAlignment, Table};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
 use shoal_common::channel::control::{RoleState, RunStatus};
+use shoal_run::numbers::thousands;
+use shoal_run::remote::Remote;
+use shoal_run::status::at_rest;
 
-use crate::cli::StatusArgs;
-use crate::launcher::thousands;
-use crate::remote::Remote;
-use crate::status::at_rest;
+#[derive(Args, Clone, Debug)]
+pub(crate) struct StatusArgs {
+    /// Run directory.
+    pub(crate) run: PathBuf,
+    /// Print one JSON object on standard output.
+    #[arg(long)]
+    pub(crate) json: bool,
+    /// Again every second, until the run ends.
+    #[arg(long)]
+    pub(crate) watch: bool,
+}
 
 /// From one look to the next.
 const EVERY: Duration = Duration::from_secs(1);

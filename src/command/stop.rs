@@ -1,9 +1,16 @@
 //! `shoal stop`: ends a run in order.
 
 use std::io::Write;
+use std::path::PathBuf;
 
-use crate::cli::StopArgs;
-use crate::remote::Remote;
+use clap::Args;
+use shoal_run::remote::Remote;
+
+#[derive(Args, Clone, Debug)]
+pub(crate) struct StopArgs {
+    /// Run directory.
+    pub(crate) run: PathBuf,
+}
 
 /// Asks the launcher for the end, and waits until it is there.
 pub(crate) fn run(args: &StopArgs) -> anyhow::Result<()> {

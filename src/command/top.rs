@@ -1,24 +1,31 @@
 //! `shoal top`: a run on the whole terminal, until somebody leaves.
 
 use std::io::IsTerminal;
+use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
 use anyhow::{Context, bail};
+use clap::Args;
 use ratatui::DefaultTerminal;
 use ratatui::crossterm::event::{self, Event, KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
 use shoal_common::config::{Config, Mode};
+use shoal_run::remote::Remote;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use signal_hook::iterator::Signals;
 
 use super::status::rest;
-use crate::cli::TopArgs;
-use crate::remote::Remote;
 use crate::top::{Link, Screen, draw};
+
+#[derive(Args, Clone, Debug)]
+pub(crate) struct TopArgs {
+    /// Run directory.
+    pub(crate) run: PathBuf,
+}
 
 /// How long a key, a signal or news may lie unread.
 const LOOK: Duration = Duration::from_millis(200);

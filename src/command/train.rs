@@ -1,13 +1,87 @@
 //! `shoal train`: a new run, from its plan to its result.
 
+use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::Context;
+use clap::Args;
+use clap_complete::engine::ArgValueCompleter;
+use shoal_run::plan::{Plan, RunOverrides};
 
 use super::help_config;
+use super::training::Telling;
 use super::training::conduct;
-use crate::cli::TrainArgs;
-use crate::plan::Plan;
+use crate::completion;
+
+#[derive(Args, Clone, Debug)]
+pub(crate) struct TrainArgs {
+    /// What to train: frozen-lake, frozen-lake-sarsa, cart-pole, pendulum, point-mass-r1, point-mass-r2, point-mass-r3,
+    /// gym: and a Gymnasium environment (gym:HalfCheetah-v5), or a configuration file (FILE.toml).
+    #[arg(value_name = "PRESET|gym:ID|FILE.toml", required_unless_present = "help_config")]
+    #[arg(add = ArgValueCompleter::new(completion::what_to_train))]
+    pub(crate) what: Option<String>,
+    /// Explain every key of the configuration, or those of the named preset or file, and train nothing.
+    #[arg(long)]
+    pub(crate) help_config: bool,
+    #[command(flatten)]
+    pub(crate) overrides: RunArgs,
+    #[command(flatten)]
+    pub(crate) telling: Telling,
+}
+
+/// What of a run can be said on the command line.
+#[derive(Args, Clone, Debug, Default)]
+pub(crate) struct RunArgs {
+    /// Run directory to make [default: runs/<preset>-<n>].
+    #[arg(long, value_name = "DIR")]
+    pub(crate) run: Option<PathBuf>,
+    /// Root of every random stream.
+    #[arg(long)]
+    pub(crate) seed: Option<u64>,
+    /// Actor processes.
+    #[arg(long, value_name = "N")]
+    pub(crate) actors: Option<u32>,
+    /// Environments of each actor.
+    #[arg(long, value_name = "E")]
+    pub(crate) envs: Option<u32>,
+    /// Environment steps over all actors.
+    #[arg(long, value_name = "N")]
+    pub(crate) steps: Option<u64>,
+    /// Episodes over all actors, where they come before the steps.
+    #[arg(long, value_name = "M")]
+    pub(crate) episodes: Option<u64>,
+    /// Take turns: the same seed and actor count give the same bits.
+    #[arg(long)]
+    pub(crate) lockstep: bool,
+    /// Override a key of the configuration, as in --set ddpg.tau=0.005. May be repeated.
+    #[arg(long, value_name = "SECTION.KEY=VALUE", add = ArgValueCompleter::new(completion::settings))]
+    pub(crate) set: Vec<String>,
+}
+
+impl RunArgs {
+    fn overrides(&self) -> RunOverrides {
+        let Self {
+            run,
+            seed,
+            actors,
+            envs,
+            steps,
+            episodes,
+            lockstep,
+            set,
+        } = self.clone();
+        RunOverrides {
+            run,
+            seed,
+            actors,
+            envs,
+            steps,
+            episodes,
+            lockstep,
+            set,
+        }
+    }
+}
 
 /// Makes a run and trains it, or explains what can be set.
 pub(crate) fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
@@ -16,6 +90,6 @@ pub(crate) fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
         return Ok(ExitCode::SUCCESS);
     }
     let what = args.what.as_deref().context("say what to train")?;
-    let Plan { config, run, lock } = Plan::new(what, &args.choices)?;
+    let Plan { config, run, lock } = Plan::new(what, &args.overrides.overrides())?;
     conduct(config, &run, lock, &args.telling)
 }

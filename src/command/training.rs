@@ -3,6 +3,7 @@
 use std::io::Write;
 use std::process::ExitCode;
 
+use clap::Args;
 use comfy_table::Table;
 use comfy_table::presets::UTF8_BORDERS_ONLY;
 use serde::Serialize;
@@ -11,12 +12,23 @@ use shoal_common::config::Config;
 use shoal_common::run_dir::{RunDir, RunLock};
 use shoal_learner::checkpoint::Checkpoints;
 use shoal_learner::{algorithm, digest};
+use shoal_report::plots;
+use shoal_run::evaluation::{EvaluationSummary, WhichPolicy, evaluate};
+use shoal_run::numbers::thousands;
+use shoal_run::outcome;
 
-use super::eval::{EvaluationSummary, WhichPolicy, evaluate};
-use super::plot;
-use crate::cli::Telling;
 use crate::launcher::{self, Ending, Outcome};
-use crate::outcome;
+
+/// What a training run says.
+#[derive(Args, Clone, Debug, Default)]
+pub(crate) struct Telling {
+    /// No live line and no table.
+    #[arg(long)]
+    pub(crate) quiet: bool,
+    /// Print one JSON object on standard output at the end, and everything else on standard error.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
 
 /// What `--json` prints.
 #[derive(Serialize)]
@@ -44,7 +56,7 @@ pub(crate) fn conduct(config: Config, run: &RunDir, _lock: RunLock, telling: &Te
         Ending::Finished => judge(&config, run)?,
         Ending::Stopped | Ending::Interrupted(_) | Ending::Renewed => Vec::new(),
     };
-    plot::draw(run, &config, run.path())?;
+    plots::draw(run, &config, run.path())?;
     if outcome.ending == Ending::Finished {
         let RunStatus {
             env_steps, episodes, ..
@@ -135,9 +147,9 @@ fn tell(
 ) -> std::io::Result<()> {
     let mut table = Table::new();
     table.load_style(UTF8_BORDERS_ONLY);
-    table.add_row(["environment steps", &launcher::thousands(summary.env_steps)]);
-    table.add_row(["updates", &launcher::thousands(summary.updates)]);
-    table.add_row(["episodes", &launcher::thousands(summary.episodes)]);
+    table.add_row(["environment steps", &thousands(summary.env_steps)]);
+    table.add_row(["updates", &thousands(summary.updates)]);
+    table.add_row(["episodes", &thousands(summary.episodes)]);
     table.add_row(["time", &format!("{:.1} s", summary.wall_seconds)]);
     table.add_row([
         "rates",

@@ -12,6 +12,7 @@ use shoal_common::config::Config;
 use shoal_common::durable::write_atomically;
 use shoal_common::report::{Activity, Heartbeat, Identity, Role};
 use shoal_common::run_dir::RunDir;
+use shoal_run::recorder::{Incident, What};
 
 use super::cleaner;
 use super::incarnations::{last_committed, read_counter};
@@ -19,7 +20,6 @@ use super::log::{EVERYBODY_ENDED, Log};
 use super::member::{Consequence, Member};
 use super::process::{Process, name};
 use super::stall::Stalls;
-use crate::recorder::{Incident, What};
 
 /// How often the dead are cleaned up after whose end the launcher does not see: terminals that asked something.
 const CLEANING: Duration = Duration::from_secs(2);

@@ -5,10 +5,10 @@ use shoal_common::commit::OpenError;
 use shoal_common::config::{Config, Mode};
 use shoal_common::report::{Activity, Role};
 use shoal_common::run_dir::RunDir;
+use shoal_run::status;
 
 use super::crew::Crew;
 use super::progress::Progress;
-use crate::status;
 
 /// How the run gets on, which stood at `rest` when it began.
 pub(super) fn status(

@@ -7,10 +7,10 @@ use std::process::{ChildStdin, Command, ExitStatus};
 
 use anyhow::Context;
 use shoal_common::report::Identity;
+use shoal_run::process::ChildGroup;
+use shoal_run::process::ChildOutput;
 
 use super::log::Log;
-use crate::child_group::ChildGroup;
-use crate::child_output::ChildOutput;
 
 /// A running process of a role. It is told to end by closing its standard input; dropped, it is killed.
 #[derive(Debug)]

@@ -6,6 +6,7 @@ use indicatif::{HumanDuration, ProgressBar, ProgressDrawTarget, ProgressStyle};
 use shoal_common::config::Config;
 use shoal_common::report::{EvaluationReport, LearnerReport};
 use shoal_common::run_dir::RunDir;
+use shoal_run::numbers::thousands;
 
 use super::crew::Crew;
 use super::desk::waiting;
@@ -161,9 +162,4 @@ impl Progress {
         let seconds = (*now - *then).as_secs_f64();
         (seconds > 0.0).then(|| count(new).saturating_sub(count(old)) as f64 / seconds)
     }
-}
-
-/// 120000 as 120,000.
-pub(crate) fn thousands(number: u64) -> String {
-    indicatif::HumanCount(number).to_string()
 }

@@ -6,10 +6,9 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use shoal_common::channel::control::RunStatus;
-
-use crate::recorder::read_evaluations;
-use crate::remote::Remote;
-use crate::status::at_rest;
+use shoal_run::recorder::read_evaluations;
+use shoal_run::remote::Remote;
+use shoal_run::status::at_rest;
 
 /// From one look to the next.
 const EVERY: Duration = Duration::from_secs(1);

@@ -10,10 +10,10 @@ use ratatui::widgets::{
     Axis, Block, Borders, Cell, Chart, Clear, Dataset, Gauge, GraphType, Paragraph, Row, Sparkline, Table,
 };
 use shoal_common::channel::control::{RoleState, RoleStatus};
+use shoal_run::numbers::thousands;
 
 use super::{Life, Over, Screen};
 use crate::command::status::{in_words, progress, waits};
-use crate::launcher::thousands;
 
 /// Rows above the roles, and the row of keys below everything.
 const HEAD: u16 = 4;

@@ -3,7 +3,7 @@
 use std::f64::consts::{PI, TAU};
 
 /// The same direction within [−π, π].
-pub(super) fn wrap(angle: f64) -> f64 {
+pub fn wrap(angle: f64) -> f64 {
     (angle + PI).rem_euclid(TAU) - PI
 }
 

@@ -1,0 +1,186 @@
+//! How long an environment's step takes from an actor's process and back, through an environment server's.
+
+use std::time::{Duration, Instant};
+
+use anyhow::bail;
+use rustix::thread::sched_setaffinity;
+use serde::Serialize;
+use shoal_common::channel::environment::{Begin, EnvironmentClient, Stepped};
+use shoal_common::channel::{Bell, Domain, Interruption, Place};
+use shoal_common::config::Config;
+use shoal_common::report::Role;
+use shoal_run::process::Peer;
+
+use super::cores::Cores;
+use super::scene::Scene;
+use super::spin;
+use super::table::{Line, Target};
+use super::{Figures, Patience};
+
+/// How often the other process is looked after.
+const LOOK: Duration = Duration::from_millis(50);
+
+/// Part of the time that goes before, to warm up.
+const WARM_UP: f64 = 0.1;
+
+/// Part of the time that goes to round trips between two cores, and within one.
+const SHARES: [f64; 2] = [0.6, 0.3];
+
+/// Part of the time that goes to the bare spin, half of it before the round trips and half after them: which cores a
+/// virtual machine is given, and how far apart they are, may change in between.
+const SPIN: f64 = 0.1;
+
+/// The fields of `bench step --json`.
+#[derive(Serialize)]
+pub(super) struct StepFigures {
+    median_us: f64,
+    p99_us: f64,
+    least_us: f64,
+    p90_us: f64,
+    /// Median of two threads that wait for each other's word in memory.
+    spin_median_us: f64,
+    round_trips: usize,
+    environments: u32,
+    /// Both processes bound to the same core.
+    one_core_median_us: f64,
+    one_core_p99_us: f64,
+}
+
+pub(super) fn measure(patience: &Patience) -> anyhow::Result<StepFigures> {
+    let scene = Scene::new(&[])?;
+    let mut spins = spin::times(patience.length.mul_f64(SPIN / 2.0));
+    let [apart, together] = SHARES.map(|share| patience.length.mul_f64(share));
+    let mut times = scene.with_peer(Role::EnvServer, |domain, server| {
+        round_trips(&scene.config, domain, server, apart, patience)
+    })?;
+    let mut on_one_core = on_one_core(together, patience)?;
+    spins.extend(spin::times(patience.length.mul_f64(SPIN / 2.0)));
+    spins.sort_unstable();
+    times.sort_unstable();
+    on_one_core.sort_unstable();
+    let microseconds = |quantile| quantile_of(&times, quantile);
+    Ok(StepFigures {
+        median_us: microseconds(0.5),
+        p99_us: microseconds(0.99),
+        least_us: microseconds(0.0),
+        p90_us: microseconds(0.9),
+        spin_median_us: quantile_of(&spins, 0.5),
+        round_trips: times.len(),
+        environments: scene.config.actors.envs,
+        one_core_median_us: quantile_of(&on_one_core, 0.5),
+        one_core_p99_us: quantile_of(&on_one_core, 0.99),
+    })
+}
+
+/// Times of round trips while this process and the server share a core.
+fn on_one_core(length: Duration, patience: &Patience) -> anyhow::Result<Vec<u32>> {
+    let scene = Scene::new(&[])?;
+    let cores = Cores::choose()?;
+    scene.with_peer(Role::EnvServer, |domain, server| {
+        server.pin(&cores.pair)?;
+        sched_setaffinity(None, &cores.pair)?;
+        round_trips(&scene.config, domain, server, length, patience)
+    })
+}
+
+/// In µs; `sorted` are ns, and at least one.
+pub(super) fn quantile_of(sorted: &[u32], quantile: f64) -> f64 {
+    f64::from(sorted[((sorted.len() - 1) as f64 * quantile) as usize]) / 1e3
+}
+
+/// Times of round trips, in ns; at least one.
+fn round_trips(
+    config: &Config,
+    domain: &Domain,
+    server: &mut Peer,
+    length: Duration,
+    patience: &Patience,
+) -> anyhow::Result<Vec<u32>> {
+    let environments = config.actors.envs as usize;
+    let bell = Bell::hang(domain, Place(Role::Actor, 0))?;
+    let client = EnvironmentClient::open(domain, 0, &config.spec, environments, patience.stop.clone())?;
+    let mut ask = |request: &dyn Fn() -> Result<(), Interruption>| match request() {
+        Ok(()) => Ok(()),
+        Err(Interruption::Stopped) => patience.check(),
+        Err(Interruption::Channel(error)) => server.check().and(Err(error.into())),
+    };
+    ask(&|| client.describe(&bell, || ()).map(|_| ()))?;
+    ask(&|| client.reset(&bell, Begin::Next, || ()).map(|_| ()))?;
+
+    let actions = vec![0.5; environments * config.spec.action.width()];
+    let mut times = Vec::new();
+    let warm_up = length.mul_f64(WARM_UP);
+    let (begun, mut looked) = (Instant::now(), Instant::now());
+    loop {
+        let before = Instant::now();
+        match client.step(&bell, &actions, || ()) {
+            Ok(Stepped::Taken(_)) => {}
+            Ok(Stepped::Lost) => {
+                server.check()?;
+                bail!("the environment server gave up its episodes");
+            }
+            Err(Interruption::Stopped) => bail!(super::INTERRUPTED),
+            Err(Interruption::Channel(error)) => return Err(error.into()),
+        }
+        let after = Instant::now();
+        if before.duration_since(begun) >= warm_up {
+            times.push((after - before).as_nanos().try_into().unwrap_or(u32::MAX));
+        }
+        if after - looked >= LOOK {
+            looked = after;
+            patience.check()?;
+        }
+        if !times.is_empty() && after - begun >= length {
+            return Ok(times);
+        }
+    }
+}
+
+impl Figures for StepFigures {
+    fn table(&self) -> Vec<Line> {
+        let [apart, together] = [self.median_us, self.one_core_median_us];
+        vec![
+            Line {
+                stage: "environment step, two cores",
+                ours: format!("{apart:.2} µs"),
+                limit: format!("{:.2} µs, two threads that spin", self.spin_median_us),
+                share: Some(self.spin_median_us / apart),
+                target: Target::at_most(2.5, apart, "2.5 µs"),
+            },
+            Line {
+                stage: "environment step, one core",
+                ours: format!("{together:.2} µs"),
+                limit: String::new(),
+                share: None,
+                target: Target::at_most(15.0, together, "15 µs"),
+            },
+        ]
+    }
+
+    fn lines(&self) -> Vec<(&'static str, String)> {
+        vec![
+            ("median", format!("{:.2} µs", self.median_us)),
+            ("90 of 100 within", format!("{:.2} µs", self.p90_us)),
+            ("99 of 100 within", format!("{:.2} µs", self.p99_us)),
+            ("fastest", format!("{:.2} µs", self.least_us)),
+            (
+                "sharing a core",
+                format!(
+                    "{:.2} µs in the median, 99 of 100 within {:.2} µs",
+                    self.one_core_median_us, self.one_core_p99_us
+                ),
+            ),
+            (
+                "limit",
+                format!(
+                    "{:.2} µs: the median of two threads that spin on a word",
+                    self.spin_median_us
+                ),
+            ),
+            (
+                "round trips",
+                format!("{}, {} environment each", self.round_trips, self.environments),
+            ),
+        ]
+    }
+}

@@ -1,0 +1,196 @@
+//! A policy as other programs read it: what there is to tell of it, whatever the form of the file.
+
+mod onnx;
+mod tensors;
+
+use std::collections::BTreeMap;
+
+use shoal_common::config::Config;
+use shoal_common::network::{ActionRange, NetworkLayout};
+use shoal_common::policy::PolicyLayout;
+use shoal_common::policy_file::PolicyFile;
+use shoal_common::space::Space;
+use shoal_run::rollout::policy_layout;
+
+/// A policy without anything of ours that it would need to run.
+#[derive(Clone, Debug)]
+pub struct Portable {
+    body: Body,
+    /// What it is and where it comes from, by name; a list is written as JSON.
+    about: BTreeMap<String, String>,
+}
+
+/// What an observation goes through.
+#[derive(Clone, Debug)]
+enum Body {
+    /// DDPG's μ: the layers, tanh, and the scaling to the range of the actions.
+    Actions { layers: Vec<Dense>, range: ActionRange },
+    /// REINFORCE's π: the layers, and softmax.
+    Probabilities { layers: Vec<Dense> },
+    /// Action-values Q(s, a), state after state.
+    Table {
+        states: usize,
+        actions: usize,
+        values: Vec<f32>,
+    },
+}
+
+/// A layer as PyTorch's `Linear` keeps it: y = W x + b.
+#[derive(Clone, Debug)]
+struct Dense {
+    inputs: usize,
+    /// W, outputs × inputs, row after row.
+    weights: Vec<f32>,
+    biases: Vec<f32>,
+}
+
+impl Portable {
+    /// The policy in `file`, which is that of a run of `config`; `which` is its name in the run.
+    pub fn new(config: &Config, file: &PolicyFile, which: &str) -> anyhow::Result<Self> {
+        let body = match policy_layout(config)? {
+            PolicyLayout::Deterministic(network) => Body::Actions {
+                layers: layers(&network, &file.parameters),
+                range: ActionRange::new(&config.spec.action)?,
+            },
+            PolicyLayout::Softmax(network) => Body::Probabilities {
+                layers: layers(&network, &file.parameters),
+            },
+            PolicyLayout::Table { states, actions } => Body::Table {
+                states,
+                actions,
+                values: file.parameters.clone(),
+            },
+        };
+        let about = about(config, file, which, &body)?;
+        Ok(Self { body, about })
+    }
+
+    /// The bytes of an ONNX model.
+    pub fn to_onnx(&self) -> Vec<u8> {
+        onnx::model(self)
+    }
+
+    /// The bytes of a safetensors file.
+    pub fn to_safetensors(&self) -> anyhow::Result<Vec<u8>> {
+        tensors::file(self)
+    }
+}
+
+fn layers(network: &NetworkLayout, parameters: &[f32]) -> Vec<Dense> {
+    let layers = network.layers(parameters).into_iter().zip(network.layer_sizes());
+    let dense = layers.map(|(layer, (inputs, outputs))| Dense {
+        inputs,
+        // Ours are column after column.
+        weights: (0..outputs * inputs)
+            .map(|at| layer.weights[(at % inputs) * outputs + at / inputs])
+            .collect(),
+        biases: layer.biases.to_vec(),
+    });
+    dense.collect()
+}
+
+fn about(config: &Config, file: &PolicyFile, which: &str, body: &Body) -> anyhow::Result<BTreeMap<String, String>> {
+    let mut about = BTreeMap::from([
+        ("environment".to_owned(), config.environment.name.clone()),
+        ("algorithm".to_owned(), config.algorithm.name().to_owned()),
+        ("policy".to_owned(), which.to_owned()),
+        ("policy_version".to_owned(), file.version.to_string()),
+        ("environment_steps".to_owned(), file.env_steps.to_string()),
+    ]);
+    let mut tell = |name: &str, what: String| {
+        about.insert(name.to_owned(), what);
+    };
+    if file.episodes > 0 {
+        tell("evaluation_return", file.return_mean.to_string());
+    }
+    if !matches!(body, Body::Table { .. }) {
+        tell("hidden_activation", "relu".into());
+    }
+    match body {
+        Body::Actions { .. } => {
+            tell(
+                "output_activation",
+                "tanh, then scaled to action_low .. action_high".into(),
+            );
+            if let Space::Box { low, high } = &config.spec.action {
+                tell("action_low", serde_json::to_string(low)?);
+                tell("action_high", serde_json::to_string(high)?);
+            }
+        }
+        Body::Probabilities { .. } => tell("output_activation", "softmax".into()),
+        Body::Table { .. } => tell("contents", "action values, a row for each state".into()),
+    }
+    Ok(about)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn weights_stand_row_after_row() {
+        let network = NetworkLayout::policy(3, [2, 1], 1);
+        let parameters: Vec<f32> = (0..network.parameters()).map(|i| i as f32).collect();
+        let first = &layers(&network, &parameters)[0];
+        assert_eq!(first.weights, [0.0, 2.0, 4.0, 1.0, 3.0, 5.0]);
+        assert_eq!(first.biases, [6.0, 7.0]);
+    }
+}
+
+#[cfg(test)]
+mod tests_support {
+    //! Runs of every method, with policies that are no special case.
+
+    use shoal_env_server::environment::make;
+
+    use super::*;
+
+    /// A configuration for each kind of policy, and a policy of it.
+    pub(super) fn policies() -> Vec<(Config, PolicyFile)> {
+        let tasks = [
+            "[environment]\nname = \"pendulum\"\n[ddpg]\nhidden = [40, 30]\n",
+            "[environment]\nname = \"point-mass\"\nreward = \"r3\"\n[ddpg]\nhidden = [7, 5]\n",
+            "mode = \"lockstep\"\n[environment]\nname = \"cart-pole\"\n[actors]\nchunk_steps = 200\n\
+             [reinforce]\n[replay]\nwarmup = 0\n",
+            "[environment]\nname = \"frozen-lake\"\n[q-learning]\n[replay]\nwarmup = 0\n",
+        ];
+        tasks
+            .map(|task| with_policy(&format!("[run]\nid = \"1a\"\n{task}")))
+            .into()
+    }
+
+    fn with_policy(text: &str) -> (Config, PolicyFile) {
+        let mut table: toml::Table = text.parse().unwrap();
+        let name = table["environment"]["name"].as_str().unwrap().to_owned();
+        let mut parameters = table["environment"].as_table().unwrap().clone();
+        parameters.remove("name");
+        let spec = make(&name, &parameters).unwrap().spec();
+        table.insert("spec".into(), toml::Value::try_from(spec).unwrap());
+        let config = Config::from_table(table, "test").unwrap();
+        let layout = policy_layout(&config).unwrap();
+        let policy = PolicyFile {
+            fingerprint: layout.fingerprint(),
+            version: 7,
+            env_steps: 1_000,
+            return_mean: -150.5,
+            return_std: 90.0,
+            episodes: 10,
+            parameters: numbers(layout.parameters(), 1),
+        };
+        (config, policy)
+    }
+
+    /// So many observations of the environment, one after the other.
+    pub(super) fn some_observations(config: &Config, count: usize) -> Vec<f32> {
+        match config.spec.observation {
+            Space::Discrete { n } => (0..count).map(|i| (i * 5 % n as usize) as f32).collect(),
+            Space::Box { .. } => numbers(count * config.spec.observation.width(), 2),
+        }
+    }
+
+    fn numbers(count: usize, salt: usize) -> Vec<f32> {
+        (0..count)
+            .map(|i| ((i * 7919 + salt * 104_729) % 2003) as f32 / 1001.5 - 1.0)
+            .collect()
+    }
+}

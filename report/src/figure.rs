@@ -1,0 +1,21 @@
+//! The pictures of a run, as SVG files, and the same as PNG files.
+
+mod canvas;
+mod comparison;
+mod lake;
+mod learning_curve;
+mod learning_curves;
+mod lines;
+mod panel;
+mod pendulum;
+mod point_mass;
+mod raster;
+
+pub use comparison::{Agent, actions_beside, paths_beside};
+pub use lake::lake;
+pub use learning_curve::learning_curve;
+pub use learning_curves::{learning_curves, quantile};
+pub use lines::{Frame, Setting, lines, lines_apart, pointwise};
+pub use pendulum::swing_up;
+pub use point_mass::{test_runs, trajectories};
+pub use raster::rasterise;

@@ -1,0 +1,100 @@
+//! Agents beside each other, as in figures 5.10 and 5.11.
+
+use std::path::Path;
+
+use shoal_run::analysis::point_mass::Drive;
+
+use super::canvas::{BLUE, save};
+use super::panel::{Axis, Panel, Series};
+use super::point_mass::{CELL, draw_actions, draw_distance, extent, goal, starts};
+
+/// What an agent is called, and what it does.
+pub struct Agent<'a> {
+    /// What the legend calls it.
+    pub name: String,
+    /// Its episodes, one from each start.
+    pub drives: Vec<&'a Drive>,
+}
+
+/// Draws the paths of each agent in a diagram of its own.
+pub fn paths_beside(agents: &[Agent<'_>], path: &Path) -> anyhow::Result<()> {
+    let everywhere = agents
+        .iter()
+        .flat_map(|agent| &agent.drives)
+        .flat_map(|drive| drive.path());
+    let range = extent(everywhere);
+    let size = (agents.len().max(1) as u32 * 420, 450);
+    save(path, size, |sheet| {
+        for (agent, cell) in agents.iter().zip(sheet.split_evenly((1, agents.len().max(1)))) {
+            let ways = agent.drives.iter().map(|drive| Series {
+                width: 1.5,
+                ..Series::line("", BLUE, drive.path().collect())
+            });
+            let begins = agent.drives.iter().map(|drive| (drive.start[0], drive.start[1]));
+            Panel {
+                title: &agent.name,
+                note: "",
+                x: Axis {
+                    label: "x (m)",
+                    range: range.clone(),
+                },
+                y: Axis {
+                    label: "y (m)",
+                    range: range.clone(),
+                },
+                series: ways.chain([starts(begins.collect()), goal()]).collect(),
+                equal_scale: true,
+            }
+            .draw(&cell)?;
+        }
+        Ok(())
+    })
+}
+
+/// Draws what each agent does on its first drive in a row of its own: actions, and distance to the goal.
+pub fn actions_beside(agents: &[Agent<'_>], path: &Path) -> anyhow::Result<()> {
+    let firsts: Vec<(&str, &Drive)> = agents
+        .iter()
+        .filter_map(|agent| Some((agent.name.as_str(), *agent.drives.first()?)))
+        .collect();
+    let farthest = firsts
+        .iter()
+        .flat_map(|(_, drive)| drive.distances())
+        .fold(1.0, f64::max);
+    let rows = firsts.len().max(1);
+    save(path, (1160, rows as u32 * CELL.1), |sheet| {
+        for ((name, drive), row) in firsts.iter().zip(sheet.split_evenly((rows, 2)).chunks_exact(2)) {
+            draw_actions(&format!("{name}: control actions"), drive, &row[0])?;
+            draw_distance(&format!("{name}: distance to goal"), drive, farthest, &row[1])?;
+        }
+        Ok(())
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use shoal_run::testing::drive;
+
+    #[test]
+    fn agents_are_drawn_beside_each_other() {
+        let dir = tempfile::tempdir().unwrap();
+        let drives = [
+            drive([2.0, -2.0], 0.0, 1.0, 2.0, 1.0),
+            drive([-2.0, 2.0], 0.1, 0.1, 1.0, 0.0),
+        ];
+        let agents: Vec<_> = ["r1", "r2", "r3"]
+            .map(|name| Agent {
+                name: name.into(),
+                drives: drives.iter().collect(),
+            })
+            .into();
+        for agents in [&agents[..], &[]] {
+            let [paths, actions] = ["paths.svg", "actions.svg"].map(|file| dir.path().join(file));
+            paths_beside(agents, &paths).unwrap();
+            actions_beside(agents, &actions).unwrap();
+            let svg = std::fs::read_to_string(actions).unwrap();
+            assert_eq!(svg.contains("r2: control actions"), !agents.is_empty());
+        }
+    }
+}

@@ -1,0 +1,139 @@
+//! Curves of different settings in one diagram, or a diagram for each with the runs behind its curve.
+
+use std::path::Path;
+
+use plotters::prelude::RGBColor;
+
+use super::canvas::{BLUE, GREEN, INK, PURPLE, VERMILION, save};
+use super::panel::{Axis, Panel, Series};
+
+const COLORS: [RGBColor; 4] = [BLUE, VERMILION, GREEN, PURPLE];
+
+/// What several diagrams of a figure have in common.
+pub struct Frame<'a> {
+    /// Above the diagram.
+    pub title: &'a str,
+    /// Label and greatest value; the least is 0.
+    pub x: (&'a str, f64),
+    /// Label, least and greatest value.
+    pub y: (&'a str, f64, f64),
+    /// A height to compare with.
+    pub level: Option<(&'a str, f64)>,
+}
+
+/// A setting: the curve that stands for its runs, and theirs.
+pub struct Setting {
+    /// What the legend calls it.
+    pub label: String,
+    /// The curve that stands for all runs.
+    pub curve: Vec<(f64, f64)>,
+    /// The curve of each run.
+    pub runs: Vec<Vec<(f64, f64)>>,
+}
+
+impl<'a> Frame<'a> {
+    fn panel(&self, title: &'a str, series: Vec<Series<'a>>) -> Panel<'a> {
+        let (x, most) = self.x;
+        let (y, least, greatest) = self.y;
+        let level = self.level.map(|(label, height)| Series {
+            opacity: 0.7,
+            width: 1.0,
+            ..Series::line(label, INK, vec![(0.0, height), (most, height)])
+        });
+        Panel {
+            title,
+            note: "",
+            x: Axis {
+                label: x,
+                range: 0.0..most,
+            },
+            y: Axis {
+                label: y,
+                range: least..greatest,
+            },
+            series: level.into_iter().chain(series).collect(),
+            equal_scale: false,
+        }
+    }
+}
+
+/// Draws the curves of all settings in one diagram. More than four have colours in common.
+pub fn lines(frame: &Frame<'_>, settings: &[Setting], path: &Path) -> anyhow::Result<()> {
+    let series = settings.iter().zip(COLORS.iter().cycle());
+    let series = series.map(|(setting, color)| Series::line(&setting.label, *color, setting.curve.clone()));
+    let panel = frame.panel(frame.title, series.collect());
+    save(path, (860, 470), |sheet| panel.draw(sheet))
+}
+
+/// Draws each setting in a diagram of its own, two in a row: its runs thin, its curve thick.
+pub fn lines_apart(frame: &Frame<'_>, settings: &[Setting], path: &Path) -> anyhow::Result<()> {
+    let rows = settings.len().div_ceil(2).max(1);
+    save(path, (1160, 380 * rows as u32), |sheet| {
+        for (setting, cell) in settings.iter().zip(sheet.split_evenly((rows, 2))) {
+            let runs = setting.runs.iter().enumerate().map(|(i, run)| Series {
+                opacity: 0.35,
+                width: 0.9,
+                ..Series::line(if i == 0 { "each seed" } else { "" }, BLUE, run.clone())
+            });
+            let curve = Series {
+                width: 2.4,
+                ..Series::line("median", BLUE, setting.curve.clone())
+            };
+            frame.panel(&setting.label, runs.chain([curve]).collect()).draw(&cell)?;
+        }
+        Ok(())
+    })
+}
+
+/// One curve of several with the same points on the x axis, as far as all of them go: at each point what `of` makes of
+/// their values, sorted.
+pub fn pointwise(curves: &[Vec<(f64, f64)>], of: impl Fn(&[f64]) -> f64) -> Vec<(f64, f64)> {
+    let common = curves.iter().map(Vec::len).min().unwrap_or(0);
+    let at = |i: usize| {
+        let mut values: Vec<f64> = curves.iter().map(|curve| curve[i].1).collect();
+        values.sort_by(f64::total_cmp);
+        (curves[0][i].0, of(&values))
+    };
+    (0..common).map(at).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn curves_are_joined_as_far_as_all_of_them_go() {
+        let curves = [vec![(1.0, 4.0), (2.0, 5.0)], vec![(1.0, 2.0)]];
+        assert_eq!(pointwise(&curves, |sorted| sorted[0]), [(1.0, 2.0)]);
+        assert_eq!(pointwise(&[], |_| 0.0), []);
+    }
+
+    #[test]
+    fn settings_have_their_names_and_the_level_is_drawn() {
+        let frame = Frame {
+            title: "CartPole",
+            x: ("episode", 5_000.0),
+            y: ("return", 0.0, 210.0),
+            level: Some(("solved", 195.0)),
+        };
+        let settings: Vec<Setting> = ["plain", "normalised", "skipping"]
+            .into_iter()
+            .map(|label| Setting {
+                label: label.into(),
+                curve: vec![(0.0, 20.0), (5_000.0, 200.0)],
+                runs: vec![vec![(0.0, 10.0), (5_000.0, 180.0)]],
+            })
+            .collect();
+        let dir = tempfile::tempdir().unwrap();
+        for (file, settings) in [("together.svg", &settings[..]), ("none.svg", &[])] {
+            lines(&frame, settings, &dir.path().join(file)).unwrap();
+            lines_apart(&frame, settings, &dir.path().join(format!("apart-{file}"))).unwrap();
+        }
+        for file in ["together.svg", "apart-together.svg"] {
+            let svg = std::fs::read_to_string(dir.path().join(file)).unwrap();
+            for label in ["plain", "normalised", "skipping", "solved", "episode"] {
+                assert!(svg.lines().any(|line| line.trim() == label), "{file}: {label}");
+            }
+        }
+    }
+}

@@ -1,0 +1,226 @@
+//! The vehicle on its way to the goal: test runs as in figures 5.5, 5.7, 5.9 and A.4 to A.11, and all paths in one as in figure 5.10.
+
+use std::f64::consts::PI;
+use std::ops::Range;
+use std::path::Path;
+
+use shoal_run::analysis::point_mass::Drive;
+
+use super::canvas::{Area, BLUE, GREEN, INK, VERMILION, save};
+use super::panel::{Axis, Look, Panel, Series, range_of};
+
+/// Width and height of a diagram, in pixels.
+pub(super) const CELL: (u32, u32) = (400, 330);
+
+pub(super) fn distances(run: &Drive) -> Vec<(f64, f64)> {
+    over_steps(run.distances())
+}
+
+/// Draws each run in a row of its own: path, distance, actions, rewards.
+pub fn test_runs(runs: &[Drive], path: &Path) -> anyhow::Result<()> {
+    let rewards = range_of(
+        runs.iter()
+            .flat_map(|run| run.rewards.iter().copied())
+            .chain([0.0, 1.0]),
+    );
+    let farthest = runs.iter().flat_map(distances).map(|(_, d)| d).fold(1.0, f64::max);
+    let size = (4 * CELL.0, (runs.len().max(1) as u32) * CELL.1);
+    save(path, size, |sheet| {
+        let cells = sheet.split_evenly((runs.len().max(1), 4));
+        for (run, row) in runs.iter().zip(cells.chunks_exact(4)) {
+            draw_path(run, &row[0])?;
+            draw_distance("Distance to goal", run, farthest, &row[1])?;
+            draw_actions("Control actions", run, &row[2])?;
+            draw_rewards(run, rewards.clone(), &row[3])?;
+        }
+        Ok(())
+    })
+}
+
+/// Draws the paths of all runs in one diagram, and their distances in another.
+pub fn trajectories(runs: &[Drive], path: &Path) -> anyhow::Result<()> {
+    let extent = extent(runs.iter().flat_map(Drive::path));
+    let thin = |points| Series {
+        opacity: 0.75,
+        width: 1.4,
+        ..Series::line("", BLUE, points)
+    };
+    let mut ways: Vec<_> = runs.iter().map(|run| thin(run.path().collect())).collect();
+    ways.push(starts(runs.iter().map(|run| (run.start[0], run.start[1])).collect()));
+    ways.push(goal());
+    let farthest = runs.iter().flat_map(distances).map(|(_, d)| d).fold(1.0, f64::max);
+    let mean = runs.iter().map(Drive::final_distance).sum::<f64>() / runs.len().max(1) as f64;
+    let note = format!("mean at the end: {mean:.3} m");
+    let paths = Panel {
+        title: "Trajectories",
+        note: "",
+        x: Axis {
+            label: "x (m)",
+            range: extent.clone(),
+        },
+        y: Axis {
+            label: "y (m)",
+            range: extent,
+        },
+        series: ways,
+        equal_scale: true,
+    };
+    let distances = Panel {
+        title: "Distance to goal",
+        note: &note,
+        x: time_steps(runs.iter().map(|run| run.steps()).max()),
+        y: Axis {
+            label: "distance (m)",
+            range: 0.0..1.05 * farthest,
+        },
+        series: runs.iter().map(|run| thin(distances(run))).collect(),
+        equal_scale: false,
+    };
+    save(path, (1160, 560), |sheet| {
+        let (left, right) = sheet.split_horizontally(sheet.dim_in_pixel().0 / 2);
+        paths.draw(&left)?;
+        distances.draw(&right)
+    })
+}
+
+pub(super) fn draw_path(run: &Drive, area: &Area<'_>) -> anyhow::Result<()> {
+    let [x, y] = run.start;
+    let extent = extent(run.path());
+    let panel = Panel {
+        title: &format!("From ({x}, {y})").replace('-', "\u{2212}"),
+        note: "",
+        x: Axis {
+            label: "x (m)",
+            range: extent.clone(),
+        },
+        y: Axis {
+            label: "y (m)",
+            range: extent,
+        },
+        series: vec![
+            Series::line("", BLUE, run.path().collect()),
+            starts(vec![(x, y)]),
+            goal(),
+        ],
+        equal_scale: true,
+    };
+    panel.draw(area)
+}
+
+pub(super) fn draw_distance(title: &str, run: &Drive, farthest: f64, area: &Area<'_>) -> anyhow::Result<()> {
+    let panel = Panel {
+        title,
+        note: &format!("{:.3} m at the end", run.final_distance()),
+        x: time_steps(Some(run.steps())),
+        y: Axis {
+            label: "distance (m)",
+            range: 0.0..1.05 * farthest,
+        },
+        series: vec![Series::line("", BLUE, distances(run))],
+        equal_scale: false,
+    };
+    panel.draw(area)
+}
+
+pub(super) fn draw_actions(title: &str, run: &Drive, area: &Area<'_>) -> anyhow::Result<()> {
+    let direction = over_steps(run.direction.iter().map(|theta| theta / PI));
+    let force = over_steps(run.force.iter().copied());
+    let panel = Panel {
+        title,
+        note: "",
+        x: time_steps(Some(run.steps())),
+        y: Axis {
+            label: "force (N), direction (half turns)",
+            range: -1.1..2.1,
+        },
+        series: vec![
+            Series {
+                width: 1.4,
+                ..Series::line("force", BLUE, force)
+            },
+            Series {
+                width: 1.4,
+                ..Series::line("direction, scaled to [\u{2212}1, 1]", VERMILION, direction)
+            },
+        ],
+        equal_scale: false,
+    };
+    panel.draw(area)
+}
+
+fn draw_rewards(run: &Drive, range: Range<f64>, area: &Area<'_>) -> anyhow::Result<()> {
+    let panel = Panel {
+        title: "Rewards",
+        note: &format!("return {:.1}", run.episode_return()).replace('-', "\u{2212}"),
+        x: time_steps(Some(run.steps())),
+        y: Axis { label: "reward", range },
+        series: vec![Series::line("", GREEN, over_steps(run.rewards.iter().copied()))],
+        equal_scale: false,
+    };
+    panel.draw(area)
+}
+
+pub(super) fn starts<'a>(points: Vec<(f64, f64)>) -> Series<'a> {
+    Series {
+        look: Look::Rings,
+        ..Series::line("start", INK, points)
+    }
+}
+
+pub(super) fn goal<'a>() -> Series<'a> {
+    Series {
+        look: Look::Crosses,
+        width: 2.2,
+        ..Series::line("goal", VERMILION, vec![(0.0, 0.0)])
+    }
+}
+
+pub(super) fn over_steps(values: impl Iterator<Item = f64>) -> Vec<(f64, f64)> {
+    values.enumerate().map(|(t, value)| (t as f64, value)).collect()
+}
+
+pub(super) fn time_steps<'a>(steps: Option<usize>) -> Axis<'a> {
+    Axis {
+        label: "time step",
+        range: 0.0..steps.unwrap_or(1).max(1) as f64,
+    }
+}
+
+/// A square around the goal that holds all the points.
+pub(super) fn extent(points: impl Iterator<Item = (f64, f64)>) -> Range<f64> {
+    let reach = points
+        .flat_map(|(x, y)| [x.abs(), y.abs()])
+        .filter(|r| r.is_finite())
+        .fold(0.5, f64::max);
+    -1.15 * reach..1.15 * reach
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use shoal_run::testing::drive;
+
+    fn run(start: [f64; 2]) -> Drive {
+        drive(start, 0.01, 0.3, 1.5, 0.1)
+    }
+
+    #[test]
+    fn runs_make_a_row_of_diagrams_each() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("test-runs.svg");
+        test_runs(&[run([2.0, -2.0]), run([-2.0, 2.0])], &path).unwrap();
+        let svg = std::fs::read_to_string(path).unwrap();
+        for label in ["x (m)", "distance (m)", "force (N), direction (half turns)", "reward"] {
+            assert_eq!(svg.lines().filter(|line| line.trim() == label).count(), 2, "{label}");
+        }
+        assert!(svg.contains("From (2, \u{2212}2)") && svg.contains("From (\u{2212}2, 2)"));
+    }
+
+    #[test]
+    fn many_or_no_paths_make_one_picture() {
+        let dir = tempfile::tempdir().unwrap();
+        let starts = [[3.0, 3.0], [3.0, 0.0], [3.0, -3.0], [0.0, -3.0], [2.0, 2.0]];
+        trajectories(&starts.map(run), &dir.path().join("trajectories.svg")).unwrap();
+        trajectories(&[], &dir.path().join("none.svg")).unwrap();
+    }
+}

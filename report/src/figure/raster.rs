@@ -1,0 +1,93 @@
+//! An SVG picture as a PNG picture, with a font of our own, so that it looks the same on every machine.
+
+use std::io::Write;
+use std::path::Path;
+use std::sync::Arc;
+
+use anyhow::Context;
+use epaint_default_fonts::UBUNTU_LIGHT;
+use resvg::tiny_skia::{Pixmap, Transform};
+use resvg::usvg::fontdb::Database;
+use resvg::usvg::{Options, Tree};
+use shoal_common::durable::write_atomically;
+
+/// Pixels of the PNG for each pixel of the shown SVG.
+const SCALE: f32 = 1.5;
+
+/// Writes the picture `svg` once more as `png`.
+pub fn rasterise(svg: &Path, png: &Path) -> anyhow::Result<()> {
+    let text = std::fs::read_to_string(svg).with_context(|| format!("cannot read {}", svg.display()))?;
+    let picture = draw(&text).with_context(|| format!("cannot rasterise {}", svg.display()))?;
+    let bytes = picture.encode_png()?;
+    write_atomically(png, |file| file.write_all(&bytes)).with_context(|| format!("cannot write {}", png.display()))
+}
+
+fn draw(svg: &str) -> anyhow::Result<Pixmap> {
+    let tree = Tree::from_str(svg, &options())?;
+    let size = tree.size().to_int_size().scale_by(SCALE).context("it is empty")?;
+    let mut picture = Pixmap::new(size.width(), size.height()).context("it is empty")?;
+    resvg::render(&tree, Transform::from_scale(SCALE, SCALE), &mut picture.as_mut());
+    Ok(picture)
+}
+
+/// The one font stands for every family.
+fn options() -> Options<'static> {
+    let mut fonts = Database::new();
+    fonts.load_font_data(UBUNTU_LIGHT.to_vec());
+    let family = fonts
+        .faces()
+        .next()
+        .and_then(|face| face.families.first())
+        .map(|(name, _)| name.clone());
+    let family = family.unwrap_or_default();
+    fonts.set_sans_serif_family(&family);
+    Options {
+        fontdb: Arc::new(fonts),
+        font_family: family,
+        ..Options::default()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn drawn(text: &str) -> Pixmap {
+        let svg = format!(
+            "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"60\" height=\"30\"><text x=\"5\" y=\"22\" \
+            font-family=\"Helvetica, Arial, sans-serif\" font-size=\"20\">{text}</text></svg>"
+        );
+        draw(&svg).unwrap()
+    }
+
+    #[test]
+    fn every_letter_of_the_figures_shows() {
+        let (nothing, missing) = (drawn(" "), drawn("\u{10FFFD}"));
+        for letter in "aZ09(/)±πθ\u{2212}".chars() {
+            let letter = (letter, drawn(&letter.to_string()));
+            assert!(letter.1 != nothing && letter.1 != missing, "{}", letter.0);
+        }
+        assert_eq!(drawn("\u{10FFFC}"), missing, "what no font has looks alike");
+    }
+
+    #[test]
+    fn the_picture_has_its_size_and_is_a_png() {
+        let dir = tempfile::tempdir().unwrap();
+        let [svg, png] = ["a.svg", "a.png"].map(|file| dir.path().join(file));
+        std::fs::write(
+            &svg,
+            "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"60\" height=\"30\"></svg>",
+        )
+        .unwrap();
+        rasterise(&svg, &png).unwrap();
+        let bytes = std::fs::read(&png).unwrap();
+        assert!(bytes.starts_with(b"\x89PNG"));
+        assert_eq!(
+            (&bytes[16..20], &bytes[20..24]),
+            (&90_u32.to_be_bytes()[..], &45_u32.to_be_bytes()[..])
+        );
+        std::fs::write(&svg, "no picture").unwrap();
+        let error = format!("{:#}", rasterise(&svg, &png).unwrap_err());
+        assert!(error.contains("a.svg") && !error.contains('\n'), "{error}");
+    }
+}

@@ -1,0 +1,200 @@
+//! Runs beside each other: those of one environment in one picture, repetitions with their median and spread.
+
+use serde::Serialize;
+use shoal_run::recorder::Evaluation;
+
+use super::numbers::short;
+use super::run::Run;
+use super::settings::{Setting, in_common};
+use crate::figure::quantile;
+
+/// Places at which repetitions are compared.
+const PLACES: usize = 200;
+
+/// Settings named to tell sets of runs apart.
+const TOLD: usize = 3;
+
+/// The runs of one environment.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Comparison {
+    pub(super) environment: String,
+    pub(super) sets: Vec<Set>,
+}
+
+/// Runs with equal settings: repetitions of each other.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Set {
+    pub(super) label: String,
+    /// Their places in the report.
+    pub(super) runs: Vec<usize>,
+    /// Over environment steps and over seconds, as far as all of them have come; nothing for a single run.
+    pub(super) by_steps: Option<Spread>,
+    pub(super) by_time: Option<Spread>,
+}
+
+/// The median, and between which values the rest lies.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub(super) struct Spread {
+    /// What the band is.
+    pub(super) band: &'static str,
+    pub(super) x: Vec<f64>,
+    pub(super) low: Vec<f64>,
+    pub(super) median: Vec<f64>,
+    pub(super) high: Vec<f64>,
+}
+
+/// Sorts the runs by environment and settings, in the order in which they came.
+pub(super) fn compare(runs: &[Run]) -> Vec<Comparison> {
+    let mut comparisons: Vec<Comparison> = Vec::new();
+    for (i, run) in runs.iter().enumerate() {
+        let of_environment = comparisons
+            .iter()
+            .position(|found| found.environment == run.environment);
+        let comparison = of_environment.unwrap_or_else(|| {
+            let environment = run.environment.clone();
+            comparisons.push(Comparison {
+                environment,
+                sets: Vec::new(),
+            });
+            comparisons.len() - 1
+        });
+        let sets = &mut comparisons[comparison].sets;
+        let alike = |set: &&mut Set| in_common(&runs[set.runs[0]].settings).eq(in_common(&run.settings));
+        match sets.iter_mut().find(alike) {
+            Some(set) => set.runs.push(i),
+            None => sets.push(Set {
+                label: String::new(),
+                runs: vec![i],
+                by_steps: None,
+                by_time: None,
+            }),
+        }
+    }
+    for comparison in &mut comparisons {
+        let labels: Vec<String> = (0..comparison.sets.len())
+            .map(|i| label(&comparison.sets, i, runs))
+            .collect();
+        for (set, label) in comparison.sets.iter_mut().zip(labels) {
+            set.label = label;
+            let curves = |x: fn(&Evaluation) -> f64| -> Vec<Vec<(f64, f64)>> {
+                set.runs.iter().map(|i| curve(&runs[*i].judged, x)).collect()
+            };
+            set.by_steps = spread(&curves(|row| row.env_steps as f64));
+            set.by_time = spread(&curves(|row| row.wall_seconds));
+        }
+    }
+    comparisons
+}
+
+/// A run's name, or how many there are and what sets them apart from the other sets.
+fn label(sets: &[Set], i: usize, runs: &[Run]) -> String {
+    let first = |set: &Set| &runs[set.runs[0]];
+    let set = &sets[i];
+    if set.runs.len() == 1 {
+        return first(set).name.clone();
+    }
+    let mut label = format!("{} runs of {}", set.runs.len(), first(set).algorithm);
+    let differs = |(key, value): &&Setting| {
+        sets.iter().any(|other| {
+            let there = first(other).settings.iter().find(|(name, _)| name == key);
+            there.is_none_or(|(_, there)| there != value)
+        })
+    };
+    for (key, value) in in_common(&first(set).settings).filter(differs).take(TOLD) {
+        label += &format!(", {key} = {value}");
+    }
+    label
+}
+
+/// (x, mean return) by increasing x.
+fn curve(rows: &[Evaluation], x: fn(&Evaluation) -> f64) -> Vec<(f64, f64)> {
+    let points = rows.iter().map(|row| (x(row), row.return_mean));
+    let mut curve: Vec<_> = points.filter(|(x, y)| x.is_finite() && y.is_finite()).collect();
+    curve.sort_by(|a, b| a.0.total_cmp(&b.0));
+    curve
+}
+
+/// Of two curves or more, where all of them are.
+fn spread(curves: &[Vec<(f64, f64)>]) -> Option<Spread> {
+    if curves.len() < 2 {
+        return None;
+    }
+    let (mut from, mut to) = (f64::NEG_INFINITY, f64::INFINITY);
+    for curve in curves {
+        from = from.max(curve.first()?.0);
+        to = to.min(curve.last()?.0);
+    }
+    if from >= to {
+        return None;
+    }
+    // The quartiles of two or three are hardly inside of them.
+    let (band, low, high) = match curves.len() {
+        2 | 3 => ("least to greatest", 0.0, 1.0),
+        _ => ("middle half", 0.25, 0.75),
+    };
+    let mut spread = Spread {
+        band,
+        x: Vec::new(),
+        low: Vec::new(),
+        median: Vec::new(),
+        high: Vec::new(),
+    };
+    for place in 0..PLACES {
+        let x = from + (to - from) * place as f64 / (PLACES - 1) as f64;
+        let mut values: Vec<f64> = curves.iter().map(|curve| at(curve, x)).collect();
+        values.sort_by(f64::total_cmp);
+        spread.x.push(short(x));
+        for (into, share) in [
+            (&mut spread.low, low),
+            (&mut spread.median, 0.5),
+            (&mut spread.high, high),
+        ] {
+            into.push(short(quantile(&values, share)));
+        }
+    }
+    Some(spread)
+}
+
+/// The curve's value at `x`, on the line between its neighbours.
+fn at(curve: &[(f64, f64)], x: f64) -> f64 {
+    let after = curve.partition_point(|(place, _)| *place <= x).min(curve.len() - 1);
+    let (left, right) = (curve[after.saturating_sub(1)], curve[after]);
+    if right.0 <= left.0 {
+        return right.1;
+    }
+    let share = ((x - left.0) / (right.0 - left.0)).clamp(0.0, 1.0);
+    left.1 + share * (right.1 - left.1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn curves_are_compared_where_all_of_them_are() {
+        let long = vec![(0.0, 0.0), (100.0, 100.0), (200.0, 0.0)];
+        let late = vec![(50.0, 10.0), (100.0, 10.0)];
+        let spread = super::spread(&[long.clone(), late.clone()]).unwrap();
+        assert_eq!((spread.x[0], spread.x[PLACES - 1]), (50.0, 100.0));
+        assert_eq!((spread.low[0], spread.median[0], spread.high[0]), (10.0, 30.0, 50.0));
+        assert_eq!(
+            (
+                spread.low[PLACES - 1],
+                spread.median[PLACES - 1],
+                spread.high[PLACES - 1]
+            ),
+            (10.0, 55.0, 100.0)
+        );
+        assert_eq!(super::spread(std::slice::from_ref(&long)), None);
+        assert_eq!(super::spread(&[long, vec![]]), None, "a run that was never judged");
+        assert_eq!(super::spread(&[late, vec![(300.0, 1.0), (400.0, 1.0)]]), None);
+    }
+
+    #[test]
+    fn of_many_the_middle_half_is_shown() {
+        let curves: Vec<_> = (0..5).map(|y| vec![(0.0, f64::from(y)), (1.0, f64::from(y))]).collect();
+        let spread = spread(&curves).unwrap();
+        assert_eq!((spread.low[7], spread.median[7], spread.high[7]), (1.0, 2.0, 3.0));
+        assert_eq!(spread.band, "middle half");
+    }
+}

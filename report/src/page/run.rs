@@ -1,0 +1,264 @@
+//! What is shown of one run.
+
+use serde::Serialize;
+use shoal_common::config::{Config, Mode};
+use shoal_common::run_dir::RunDir;
+use shoal_run::outcome::{self, Outcome};
+use shoal_run::recorder::{
+    Episode, Evaluation, IncidentRow, Learner, read_episodes, read_evaluations, read_incidents, read_learner,
+};
+
+use super::Room;
+use super::numbers::{mean, parts, short, telling};
+use super::played::Played;
+use super::settings::{self, Setting};
+
+/// Incidents listed of a run.
+const INCIDENTS: usize = 400;
+
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Run {
+    /// Tells it from the other runs of the report.
+    pub(super) name: String,
+    /// The environment, with what sets its kind of reward apart.
+    pub(super) environment: String,
+    pub(super) algorithm: &'static str,
+    seed: u64,
+    mode: Mode,
+    state: State,
+    pub(super) settings: Vec<Setting>,
+    env_steps: u64,
+    planned_steps: u64,
+    episodes: u64,
+    planned_episodes: Option<u64>,
+    updates: u64,
+    wall_seconds: f64,
+    updates_per_step: f64,
+    best: Option<Judged>,
+    last: Option<Judged>,
+    evaluations: Curve,
+    exploration: Curve,
+    learner: Rates,
+    incidents: Option<Incidents>,
+    pub(super) played: Played,
+    /// All of them, for medians.
+    #[serde(skip)]
+    pub(super) judged: Vec<Evaluation>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+enum State {
+    Training,
+    Finished,
+    Unfinished,
+}
+
+/// An evaluation.
+#[derive(Clone, Copy, Debug, Serialize)]
+struct Judged {
+    env_steps: u64,
+    mean: f64,
+    std: f64,
+    episodes: u32,
+}
+
+/// Returns over steps and time.
+#[derive(Clone, Debug, Serialize)]
+struct Curve {
+    steps: Vec<u64>,
+    /// In s.
+    time: Vec<f64>,
+    mean: Vec<f64>,
+    /// Of the episodes of one evaluation; empty where each point is no evaluation.
+    std: Vec<f64>,
+    /// What stands for a point: all rows there are, or fewer.
+    rows: usize,
+}
+
+/// A rate over less than so many seconds says nothing.
+const SPAN: f64 = 0.2;
+
+/// What the learner told of itself, averaged where there was more than there is room for. NaN where there was nothing.
+#[derive(Clone, Debug, Serialize)]
+struct Rates {
+    steps: Vec<u64>,
+    /// In s.
+    time: Vec<f64>,
+    ratio: Vec<f64>,
+    env_steps_per_second: Vec<f64>,
+    updates_per_second: Vec<f64>,
+    critic_loss: Vec<f64>,
+    actor_loss: Vec<f64>,
+    q_mean: Vec<f64>,
+}
+
+#[derive(Clone, Debug, Serialize)]
+struct Incidents {
+    rows: Vec<IncidentRow>,
+    /// Those that there was no room for, later than the others.
+    more: usize,
+    restarts: usize,
+    kills: usize,
+}
+
+impl Run {
+    pub(super) fn read(run: &RunDir, name: String, room: Room) -> anyhow::Result<Self> {
+        let config = configuration(run)?;
+        // Asked first: what a run that ends meanwhile writes last is read below.
+        let goes_on = run.goes_on()?;
+        let judged = read_evaluations(&run.evaluations())?;
+        let learner = read_learner(&run.learner_log())?;
+        let explored = read_episodes(&run.episodes())?;
+        let now = learner.last().cloned().unwrap_or_default();
+        let all_steps =
+            now.env_steps >= config.run.steps || config.run.episodes.is_some_and(|episodes| now.episodes >= episodes);
+        let outcome = Outcome::read(run)?.is_none_or(|outcome| outcome.state == outcome::State::Finished);
+        let through = all_steps && outcome;
+        Ok(Self {
+            name,
+            environment: kind(&config),
+            algorithm: config.algorithm.name(),
+            seed: config.run.seed,
+            mode: config.run.mode,
+            state: match (goes_on, through) {
+                (true, _) => State::Training,
+                (false, true) => State::Finished,
+                (false, false) => State::Unfinished,
+            },
+            settings: settings::of(&config)?,
+            env_steps: now.env_steps,
+            planned_steps: config.run.steps,
+            // Older builds counted them in this record alone.
+            episodes: now.episodes.max(explored.len() as u64),
+            planned_episodes: config.run.episodes,
+            updates: now.updates,
+            wall_seconds: short(now.wall_seconds),
+            updates_per_step: config.replay.updates_per_step,
+            best: judged.iter().rev().find(|row| row.best == 1).map(Judged::of),
+            last: judged.last().map(Judged::of),
+            evaluations: Curve::of_evaluations(&judged, room.points),
+            exploration: Curve::of_episodes(&explored, room.points),
+            learner: Rates::of(learner, room.points),
+            incidents: read_incidents(&run.incidents())?.map(Incidents::of),
+            played: Played::of(run, &config, room.episodes),
+            judged,
+        })
+    }
+}
+
+impl Judged {
+    fn of(row: &Evaluation) -> Self {
+        Self {
+            env_steps: row.env_steps,
+            mean: short(row.return_mean),
+            std: short(row.return_std),
+            episodes: row.episodes,
+        }
+    }
+}
+
+impl Curve {
+    fn of_evaluations(rows: &[Evaluation], points: usize) -> Self {
+        let means: Vec<f64> = rows.iter().map(|row| row.return_mean).collect();
+        let shown: Vec<&Evaluation> = telling(&means, points).into_iter().map(|i| &rows[i]).collect();
+        Self {
+            steps: shown.iter().map(|row| row.env_steps).collect(),
+            time: shown.iter().map(|row| short(row.wall_seconds)).collect(),
+            mean: shown.iter().map(|row| short(row.return_mean)).collect(),
+            std: shown.iter().map(|row| short(row.return_std)).collect(),
+            rows: rows.len(),
+        }
+    }
+
+    /// Means over episodes that ended one after the other.
+    fn of_episodes(rows: &[Episode], points: usize) -> Self {
+        let shown: Vec<&[Episode]> = parts(rows.len(), points).map(|part| &rows[part]).collect();
+        let last = |part: &&[Episode]| part.last().cloned().unwrap_or_default();
+        Self {
+            steps: shown.iter().map(|part| last(part).env_steps).collect(),
+            time: shown.iter().map(|part| short(last(part).wall_seconds)).collect(),
+            mean: shown
+                .iter()
+                .map(|part| mean(part.iter().map(|row| row.episode_return)))
+                .collect(),
+            std: Vec::new(),
+            rows: rows.len(),
+        }
+    }
+}
+
+impl Rates {
+    fn of(mut rows: Vec<Learner>, points: usize) -> Self {
+        let hasty = |pair: &[Learner]| pair[1].wall_seconds - pair[0].wall_seconds < SPAN;
+        let hasty: Vec<usize> = (1..rows.len()).filter(|i| hasty(&rows[i - 1..=*i])).collect();
+        for i in hasty {
+            (rows[i].env_steps_per_second, rows[i].updates_per_second) = (None, None);
+        }
+        let shown: Vec<&[Learner]> = parts(rows.len(), points).map(|part| &rows[part]).collect();
+        let last = |part: &&[Learner]| part.last().cloned().unwrap_or_default();
+        let column = |of: fn(&Learner) -> Option<f64>| -> Vec<f64> {
+            shown.iter().map(|part| mean(part.iter().filter_map(of))).collect()
+        };
+        Self {
+            steps: shown.iter().map(|part| last(part).env_steps).collect(),
+            time: shown.iter().map(|part| short(last(part).wall_seconds)).collect(),
+            ratio: column(|row| row.ratio),
+            env_steps_per_second: column(|row| row.env_steps_per_second),
+            updates_per_second: column(|row| row.updates_per_second),
+            critic_loss: column(|row| row.critic_loss),
+            actor_loss: column(|row| row.actor_loss),
+            q_mean: column(|row| row.q_mean),
+        }
+    }
+}
+
+impl Incidents {
+    fn of(mut rows: Vec<IncidentRow>) -> Self {
+        use shoal_run::recorder::What;
+        let count = |what| rows.iter().filter(|row| row.what == what).count();
+        let (restarts, kills) = (count(What::StartedAgain), count(What::Killed));
+        let more = rows.len().saturating_sub(INCIDENTS);
+        rows.truncate(INCIDENTS);
+        Self {
+            rows,
+            more,
+            restarts,
+            kills,
+        }
+    }
+}
+
+/// Of several runs, the one whose configuration is refused is named.
+fn configuration(run: &RunDir) -> anyhow::Result<Config> {
+    let path = run.config_file().display().to_string();
+    run.config().map_err(|error| match error.to_string() {
+        said if said.contains(&path) => error.into(),
+        said => anyhow::anyhow!("{path}: {said}"),
+    })
+}
+
+/// The environment's name and those of its parameters that are words: returns of different rewards do not compare.
+fn kind(config: &Config) -> String {
+    let environment = &config.environment;
+    let words = environment.parameters.values().filter_map(toml::Value::as_str);
+    [environment.name.as_str()]
+        .into_iter()
+        .chain(words)
+        .collect::<Vec<_>>()
+        .join(" ")
+}
+
+/// A name for each run: its directory's, with the directory above where two are called alike.
+pub(super) fn names(runs: &[RunDir]) -> Vec<String> {
+    let short: Vec<String> = runs.iter().map(RunDir::name).collect();
+    let name = |(run, name): (&RunDir, &String)| {
+        let alike = short.iter().filter(|other| *other == name).count() > 1;
+        let above = run.path().parent().filter(|_| alike);
+        match above.and_then(|above| above.file_name()) {
+            Some(above) => format!("{}/{name}", above.to_string_lossy()),
+            None => name.clone(),
+        }
+    };
+    runs.iter().zip(&short).map(name).collect()
+}

@@ -1,0 +1,56 @@
+//! A run's settings as lines of a table.
+
+use shoal_common::config::Config;
+
+/// A key with its sections, as `--set` takes it, and its value.
+pub(super) type Setting = (String, String);
+
+/// Settings in which runs that are repetitions of each other may differ.
+const NOT_WHAT_IS_COMPARED: [&str; 3] = ["run.seed", "run.steps", "run.episodes"];
+
+/// All settings in the order of `config.toml`, but for the run's name in shared memory.
+pub(super) fn of(config: &Config) -> anyhow::Result<Vec<Setting>> {
+    let table: toml::Table = config.to_toml()?.parse()?;
+    let mut settings = Vec::new();
+    flatten("", &table, &mut settings);
+    settings.retain(|(key, _)| key != "run.id");
+    Ok(settings)
+}
+
+fn flatten(prefix: &str, table: &toml::Table, into: &mut Vec<Setting>) {
+    for (key, value) in table {
+        let key = format!("{prefix}{key}");
+        match value {
+            toml::Value::Table(table) => flatten(&format!("{key}."), table, into),
+            toml::Value::String(text) => into.push((key, text.clone())),
+            other => into.push((key, other.to_string())),
+        }
+    }
+}
+
+/// What repetitions have in common.
+pub(super) fn in_common(settings: &[Setting]) -> impl Iterator<Item = &Setting> {
+    let counts = |(key, _): &&Setting| !NOT_WHAT_IS_COMPARED.contains(&key.as_str());
+    settings.iter().filter(counts)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use shoal_run::testing::small;
+
+    #[test]
+    fn every_setting_is_a_line_as_it_would_be_typed() {
+        let (config, _) = small("name = \"point-mass\"\nreward = \"r2\"");
+        let settings = of(&config).unwrap();
+        for (key, value) in [
+            ("environment.reward", "r2"),
+            ("ddpg.hidden", "[4, 3]"),
+            ("run.mode", "free"),
+        ] {
+            assert!(settings.contains(&(key.into(), value.into())), "{key}: {settings:?}");
+        }
+        assert!(!settings.iter().any(|(key, _)| key == "run.id"));
+        assert!(!in_common(&settings).any(|(key, _)| key == "run.seed"));
+    }
+}

@@ -1,0 +1,189 @@
+use shoal_common::config::Config;
+use shoal_common::policy_file::PolicyFile;
+use shoal_env_server::environment::{make, names};
+use shoal_run::rollout::policy_layout;
+use shoal_run::testing::small;
+
+use super::*;
+
+/// A run directory as a launcher makes it, with a policy where one is given.
+fn directory(parent: &std::path::Path, name: &str, config: &Config, parameters: Option<Vec<f32>>) -> RunDir {
+    let run = RunDir::create(&parent.join(name)).unwrap();
+    run.write_config(config).unwrap();
+    std::fs::create_dir(run.checkpoints()).unwrap();
+    if let Some(parameters) = parameters {
+        let policy = PolicyFile {
+            fingerprint: policy_layout(config).unwrap().fingerprint(),
+            version: 1,
+            env_steps: 1_000,
+            return_mean: 0.0,
+            return_std: 0.0,
+            episodes: 1,
+            parameters,
+        };
+        policy.write(&run.best_policy()).unwrap();
+    }
+    run
+}
+
+/// The data as the page's script finds it.
+fn data(page: &str) -> serde_json::Value {
+    let (_, after) = page
+        .split_once("<script type=\"application/json\" id=\"data\">")
+        .unwrap();
+    let (data, _) = after.split_once("</script>").unwrap();
+    serde_json::from_str(data).unwrap()
+}
+
+/// A small configuration for an environment, with a method that can control it.
+fn configuration(name: &str) -> Config {
+    let method = match name {
+        "cart-pole" => {
+            "[run]\nid = \"1a\"\nmode = \"lockstep\"\n[actors]\nchunk_steps = 200\n[replay]\nwarmup = 0\n[reinforce]\nhidden = [4, 3]\n"
+        }
+        "frozen-lake" => "[run]\nid = \"1a\"\n[replay]\nwarmup = 0\n[q-learning]\n",
+        _ => "[run]\nid = \"1a\"\n[ddpg]\nhidden = [4, 3]\n",
+    };
+    let mut table: toml::Table = format!("{method}[environment]\nname = \"{name}\"\n").parse().unwrap();
+    let spec = make(name, &toml::Table::new()).unwrap().spec();
+    table.insert("spec".into(), toml::Value::try_from(spec).unwrap());
+    Config::from_table(table, "test").unwrap()
+}
+
+#[test]
+fn every_environment_is_played() {
+    let parent = tempfile::tempdir().unwrap();
+    for (i, name) in names().enumerate() {
+        let config = configuration(name);
+        let parameters = vec![0.0; policy_layout(&config).unwrap().parameters()];
+        let run = directory(parent.path(), &format!("run-{i}"), &config, Some(parameters));
+        let data = data(&gather(&[run]).unwrap().page().unwrap());
+        let played = &data["runs"][0]["played"];
+        assert_eq!(played["why_not"], serde_json::Value::Null, "{name}");
+        assert_eq!(played["scene"]["kind"], name);
+        assert_eq!(played["episodes"].as_array().unwrap().len(), 6, "{name}");
+        let episode = &played["episodes"][0];
+        let steps = episode["steps"].as_u64().unwrap() as usize;
+        assert_eq!(
+            episode["signals"][0]["values"].as_array().unwrap().len(),
+            steps + 1,
+            "{name}"
+        );
+    }
+}
+
+#[test]
+fn what_cannot_be_played_is_said_in_a_sentence_and_the_rest_is_shown() {
+    let parent = tempfile::tempdir().unwrap();
+    let (mut config, parameters) = small("name = \"pendulum\"");
+    let begun = directory(parent.path(), "begun", &config, None);
+    let damaged = directory(parent.path(), "damaged", &config, None);
+    std::fs::write(damaged.best_policy(), "no policy").unwrap();
+    config.environment.name = "walker".into();
+    config.environment.server = vec!["no-such-program".into()];
+    let served = directory(parent.path(), "served", &config, Some(parameters));
+    let report = gather(&[begun, damaged, served]).unwrap();
+    let reasons = report.not_played();
+    assert_eq!(reasons.len(), 3);
+    for ((reason, runs), (name, part)) in reasons.iter().zip([
+        ("begun", "No policy has been judged yet."),
+        ("damaged", "best.policy"),
+        ("served", "cannot start the environment server no-such-program"),
+    ]) {
+        assert!(
+            *runs == [name] && reason.contains(part) && !reason.contains('\n'),
+            "{runs:?}: {reason}"
+        );
+    }
+    let data = data(&report.page().unwrap());
+    assert_eq!(
+        data["comparisons"].as_array().unwrap().len(),
+        2,
+        "one for each environment"
+    );
+    assert_eq!(data["runs"][2]["state"], "unfinished");
+}
+
+#[test]
+fn no_name_gets_out_of_the_data_and_nothing_is_loaded() {
+    let parent = tempfile::tempdir().unwrap();
+    let (config, parameters) = small("name = \"pendulum\"");
+    let name = "</script><script>alert(1)<!-- {{script}}";
+    let run = directory(parent.path(), &name.replace('/', "∕"), &config, Some(parameters));
+    let mut report = gather(&[run]).unwrap();
+    report.runs[0].name = name.into();
+    let page = report.page().unwrap();
+    assert!(page.starts_with(MARK));
+    assert!(
+        !page.contains("alert(1)<") && !page.contains("<script>alert"),
+        "the name is data"
+    );
+    assert_eq!(data(&page)["runs"][0]["name"], name);
+    assert_eq!(page.matches("<script").count(), 2);
+    for foreign in ["http://", "https://", "src=", "@import", "url("] {
+        // The namespace of SVG is a name and no place; a part of the page itself may be referred to.
+        let found = page.replace("http://www.w3.org/2000/svg", "").replace("url(#", "");
+        assert!(!found.contains(foreign), "{foreign}");
+    }
+}
+
+#[test]
+fn a_long_run_makes_a_small_page_and_keeps_its_peak() {
+    let parent = tempfile::tempdir().unwrap();
+    let (config, parameters) = small("name = \"point-mass\"\nreward = \"r3\"");
+    let run = directory(parent.path(), "long", &config, Some(parameters));
+    let mut evaluations =
+        String::from("wall_seconds,env_steps,updates,policy_version,return_mean,return_std,episodes,best\n");
+    let mut learner = String::from(
+        "wall_seconds,env_steps,episodes,updates,policy_version,critic_loss,actor_loss,q_mean,updates_per_second,env_steps_per_second,ratio\n",
+    );
+    let mut incidents = String::from("wall_seconds,env_steps,role,index,what,detail\n");
+    for i in 0..20_000 {
+        let mean = if i == 12_345 {
+            777.0
+        } else {
+            -1_000.123_456_789 / f64::from(i + 1)
+        };
+        evaluations += &format!("{i}.123,{},{i},{i},{mean},12.345678,10,0\n", i * 1_000);
+        learner += &format!(
+            "{i}.123,{},{i},{i},{i},0.123456789,,0.5,500.123456,501.0,1.0\n",
+            i * 1_000
+        );
+        incidents += &format!("{i}.5,{},actor,{},killed,killed by signal 9\n", i * 1_000, i % 4);
+    }
+    std::fs::write(run.evaluations(), evaluations).unwrap();
+    std::fs::write(run.learner_log(), learner).unwrap();
+    std::fs::write(run.incidents(), incidents).unwrap();
+    let page = gather(&[run]).unwrap().page().unwrap();
+    assert!(page.len() < 1_000_000, "{} bytes", page.len());
+    let data = data(&page);
+    let run = &data["runs"][0];
+    let means = run["evaluations"]["mean"].as_array().unwrap();
+    assert!(means.iter().any(|mean| mean == 777.0) && means.len() <= POINTS);
+    assert_eq!(run["incidents"]["kills"], 20_000);
+    assert_eq!(run["learner"]["actor_loss"][0], serde_json::Value::Null);
+}
+
+#[test]
+fn many_runs_share_the_room_there_is() {
+    let sizes: Vec<_> = [1, 3, 5, 30, 500]
+        .iter()
+        .map(|runs| Room::of(29, *runs))
+        .map(|r| (r.points, r.episodes))
+        .collect();
+    assert_eq!(sizes, [(800, 6), (800, 6), (800, 4), (133, 0), (60, 0)]);
+    assert_eq!(Room::of(0, 500).episodes, 1);
+}
+
+#[test]
+fn a_damaged_record_is_refused_in_one_line_that_names_it() {
+    let parent = tempfile::tempdir().unwrap();
+    let (config, _) = small("name = \"pendulum\"");
+    let run = directory(parent.path(), "run", &config, None);
+    std::fs::write(run.incidents(), "wall_seconds,env_steps\nwhen,3\n").unwrap();
+    let error = format!("{:#}", gather(&[run]).unwrap_err());
+    assert!(
+        error.contains("incidents.csv is not a record of this program") && !error.contains('\n'),
+        "{error}"
+    );
+}

@@ -1,0 +1,110 @@
+//! Experiments that belong together: what is kept of a run, and what the report says of it.
+
+use std::collections::BTreeMap;
+
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use shoal_common::config::Config;
+use shoal_common::policy_file::PolicyFile;
+use shoal_common::run_dir::RunDir;
+use shoal_run::recorder::{Episode, read_episodes};
+
+use super::experiment::{Experiment, Length, Stage};
+use super::folder::Folder;
+use super::report::{Album, Section};
+use super::result::{self, SeedResult};
+use super::settings::Settings;
+
+/// Experiments of one kind. Adding one takes this trait and a line in [`super::FAMILIES`].
+pub(super) trait Family {
+    /// What is kept of a run beside its evaluations: all that figures and claims need.
+    type Tests: Serialize + DeserializeOwned;
+
+    /// What is run.
+    const EXPERIMENTS: &'static [Experiment];
+
+    /// Tries the policies of a run that has just reached the end of `stage`.
+    fn test(policies: &Policies, stage: &Stage) -> anyhow::Result<Self::Tests>;
+
+    /// Judges the thesis's claims and draws its figures again, from results alone.
+    fn sections(results: &Results<Self::Tests>, album: &Album) -> anyhow::Result<Vec<Section>>;
+}
+
+/// What a run has learned.
+pub(super) struct Policies {
+    pub(super) config: Config,
+    /// With the best evaluation.
+    pub(super) best: PolicyFile,
+    /// As the learner left it.
+    pub(super) last: PolicyFile,
+    /// Where its records are.
+    pub(super) run: RunDir,
+}
+
+impl Policies {
+    /// The training's episodes in their order, of a run with one actor, one environment, and at most one episode in a chunk:
+    /// then a policy is behind one of them at most. A chunk that was sent and not learned from when a run was interrupted is
+    /// collected again, and its episode recorded again; and one that began when the run was over is none of it.
+    pub(super) fn episodes(&self) -> anyhow::Result<Vec<Episode>> {
+        let mut episodes = read_episodes(&self.run.episodes())?;
+        episodes.dedup_by_key(|episode| episode.policy_version);
+        episodes.truncate(self.config.run.episodes.unwrap_or(u64::MAX) as usize);
+        Ok(episodes)
+    }
+}
+
+/// The results of a family that lie in a folder.
+pub(super) struct Results<T> {
+    by_name: BTreeMap<(&'static str, &'static str), Vec<SeedResult<T>>>,
+}
+
+impl<T> Results<T> {
+    /// Those of an experiment's stage, in the order of their seeds.
+    pub(super) fn of(&self, experiment: &'static str, suffix: &'static str) -> &[SeedResult<T>] {
+        self.by_name.get(&(experiment, suffix)).map_or(&[], Vec::as_slice)
+    }
+
+    #[cfg(test)]
+    pub(super) fn new() -> Self {
+        let by_name = BTreeMap::new();
+        Self { by_name }
+    }
+
+    #[cfg(test)]
+    pub(super) fn put(&mut self, experiment: &'static str, suffix: &'static str, results: Vec<SeedResult<T>>) {
+        self.by_name.insert((experiment, suffix), results);
+    }
+}
+
+/// A family without its type, for lists.
+#[derive(Debug)]
+pub(super) struct Entry {
+    pub(super) experiments: &'static [Experiment],
+    /// Makes and writes the result of a run that has reached the end of a stage.
+    pub(super) keep: fn(&Folder, &'static Experiment, &Stage, u64, Length, &Settings) -> anyhow::Result<()>,
+    /// What the report says, from the results in the folder.
+    pub(super) sections: fn(&Folder, &Album) -> anyhow::Result<Vec<Section>>,
+}
+
+/// The entry of a family in a list.
+pub(super) const fn entry<F: Family>() -> Entry {
+    Entry {
+        experiments: F::EXPERIMENTS,
+        keep: result::keep::<F>,
+        sections: sections::<F>,
+    }
+}
+
+fn sections<F: Family>(folder: &Folder, album: &Album) -> anyhow::Result<Vec<Section>> {
+    let mut by_name = BTreeMap::new();
+    for experiment in F::EXPERIMENTS {
+        for stage in experiment.stages {
+            let seeds = folder.seeds(experiment, stage)?;
+            let read = seeds
+                .into_iter()
+                .map(|seed| result::read(&folder.result(experiment, stage, seed)));
+            by_name.insert((experiment.name, stage.suffix), read.collect::<anyhow::Result<_>>()?);
+        }
+    }
+    F::sections(&Results { by_name }, album)
+}

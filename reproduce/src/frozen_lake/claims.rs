@@ -1,0 +1,284 @@
+//! What section 4.1 claims.
+
+use shoal_run::analysis::lake::{Values, Walk, dangers, greedy, mistakes};
+
+use super::super::claim::{Claim, Scope, spread};
+use super::super::result::SeedResult;
+use super::{EPISODES, Sweep, Tests};
+
+/// Probabilities of the goal that differ by less count as the same.
+const SAME: f64 = 0.05;
+
+pub(super) fn all(
+    epsilon: &[Sweep<'_>; 3],
+    alpha: &[Sweep<'_>; 4],
+    sarsa: &[SeedResult<Tests>],
+    q_star: &Values,
+    best: Walk,
+) -> Vec<Claim> {
+    let [low, (_, good), high] = *epsilon;
+    vec![
+        optimal(good, q_star),
+        slow(epsilon, best),
+        early(low.1, good, high.1),
+        late(good, high.1),
+        state_six(good),
+        alike(good, q_star),
+        learning_rates(alpha),
+        on_policy(good, sarsa, q_star),
+    ]
+}
+
+fn together(thesis: &'static str, criterion: &'static str, ours: String, held: Option<bool>) -> Claim {
+    Claim {
+        thesis,
+        criterion,
+        ours,
+        scope: Scope::Together,
+        held: held.into_iter().collect(),
+    }
+}
+
+/// In the mean over the seeds, from one episode to another; not a number where there are none.
+fn reached(seeds: &[SeedResult<Tests>], from: u64, to: u64) -> f64 {
+    mean(seeds, |tests| tests.reached(from, to))
+}
+
+/// Over the seeds; not a number where there are none.
+fn mean(seeds: &[SeedResult<Tests>], of: impl Fn(&Tests) -> f64) -> f64 {
+    seeds.iter().map(|seed| of(&seed.tests)).sum::<f64>() / seeds.len() as f64
+}
+
+/// A mean, or that there is none.
+fn say(mean: f64, decimals: usize) -> String {
+    if mean.is_nan() {
+        return "no results".into();
+    }
+    format!("{mean:.decimals$}")
+}
+
+fn at_end(seeds: &[SeedResult<Tests>]) -> f64 {
+    reached(seeds, EPISODES - 1_000, EPISODES)
+}
+
+fn optimal(good: &[SeedResult<Tests>], q_star: &Values) -> Claim {
+    let wrong: Vec<Vec<usize>> = good
+        .iter()
+        .map(|seed| mistakes(&greedy(&seed.tests.q), q_star))
+        .collect();
+    let right = wrong.iter().filter(|states| states.is_empty()).count();
+    let mut where_wrong: Vec<String> = wrong.iter().flatten().map(usize::to_string).collect();
+    where_wrong.sort_by_key(|state| state.parse::<usize>().unwrap_or(0));
+    let elsewhere = match where_wrong.as_slice() {
+        [] => String::new(),
+        states => format!("; states with another action: {}", states.join(", ")),
+    };
+    together(
+        "The optimal policy is learned with the good setting (ε = 0.4, α = 0.03)",
+        "the greedy policy is value iteration's in every state, ties counted as equal, in at least 9 of 10 seeds",
+        format!("{right} of {} seeds{elsewhere}", good.len()),
+        (!good.is_empty()).then_some(10 * right >= 9 * good.len()),
+    )
+}
+
+fn slow(epsilon: &[Sweep<'_>; 3], best: Walk) -> Claim {
+    let ends = epsilon.map(|(label, seeds)| (label, at_end(seeds)));
+    let there = epsilon.iter().all(|(_, seeds)| !seeds.is_empty());
+    together(
+        "The lowest ε of 0.1 does not converge within the 10,000 episodes",
+        "over the last 1,000 episodes its mean probability of the goal is more than 0.05 below the best policy's, and those of \
+         the other two are not",
+        ends.map(|(label, end)| format!("{label}: {}", say(end, 2))).join("; "),
+        there.then(|| {
+            let converged = ends.map(|(_, end)| end > best.reached - SAME);
+            converged == [false, true, true]
+        }),
+    )
+}
+
+fn early(low: &[SeedResult<Tests>], good: &[SeedResult<Tests>], high: &[SeedResult<Tests>]) -> Claim {
+    let [low, middle, high_mean] = [low, good, high].map(|seeds| reached(seeds, 500, 2_000));
+    together(
+        "ε = 0.7 looks as though it will be the best exploration rate early on",
+        "its mean probability of the goal between episodes 500 and 2,000 is the highest",
+        format!(
+            "0.1: {}; 0.4: {}; 0.7: {}",
+            say(low, 3),
+            say(middle, 3),
+            say(high_mean, 3)
+        ),
+        (!good.is_empty() && !high.is_empty()).then_some(high_mean > middle && high_mean > low),
+    )
+}
+
+fn late(good: &[SeedResult<Tests>], high: &[SeedResult<Tests>]) -> Claim {
+    let [middle, high_mean] = [good, high].map(|seeds| reached(seeds, 5_000, 8_000));
+    let start = |seeds: &[SeedResult<Tests>]| {
+        let values = seeds.iter().map(|seed| highest(&seed.tests, 0));
+        spread(values, 2)
+    };
+    together(
+        "ε = 0.7 is surpassed by ε = 0.4",
+        "between episodes 5,000 and 8,000 the mean probability of the goal is higher with 0.4",
+        format!(
+            "0.4: {}; 0.7: {}; the learned value of the start (q* 0.786) ends at {} and {}",
+            say(middle, 3),
+            say(high_mean, 3),
+            start(good),
+            start(high)
+        ),
+        (!good.is_empty() && !high.is_empty()).then_some(middle > high_mean),
+    )
+}
+
+fn highest(tests: &Tests, state: usize) -> f64 {
+    tests.q[4 * state..][..4]
+        .iter()
+        .map(|q| f64::from(*q))
+        .fold(f64::NEG_INFINITY, f64::max)
+}
+
+fn state_six(good: &[SeedResult<Tests>]) -> Claim {
+    let frozen = [0, 1, 2, 3, 4, 6, 8, 9, 10, 13, 14];
+    let lowest = |seed: &SeedResult<Tests>| {
+        let by_value = |a: &&usize, b: &&usize| highest(&seed.tests, **a).total_cmp(&highest(&seed.tests, **b));
+        frozen.iter().min_by(by_value).copied()
+    };
+    let dangerous = |seed: &SeedResult<Tests>| dangers(&greedy(&seed.tests.q)) == [6];
+    let count = |holds: &dyn Fn(&SeedResult<Tests>) -> bool| good.iter().filter(|seed| holds(seed)).count();
+    Claim {
+        thesis: "Following the policy, the only state with any possibility of falling into a hole is state 6, and its Q-values are \
+                 the lowest of all",
+        criterion: "both are so",
+        ours: format!(
+            "only 6 is dangerous in {}, its value the lowest in {} of {} seeds",
+            count(&dangerous),
+            count(&|seed| lowest(seed) == Some(6)),
+            good.len()
+        ),
+        scope: Scope::EachSeed,
+        held: good
+            .iter()
+            .map(|seed| dangerous(seed) && lowest(seed) == Some(6))
+            .collect(),
+    }
+}
+
+fn alike(good: &[SeedResult<Tests>], q_star: &Values) -> Claim {
+    let difference = |seed: &SeedResult<Tests>| f64::from((seed.tests.q[4 * 6] - seed.tests.q[4 * 6 + 2]).abs());
+    let [left, right] = [0, 2].map(|action| mean(good, |tests| f64::from(tests.q[4 * 6 + action])));
+    together(
+        "q*(6, left) = q*(6, right); the learned Q is only close to optimal",
+        "the two differ by less than 0.1 in the mean over the seeds",
+        format!(
+            "left {}, right {} in the mean (both {:.3} in q*); within a seed they differ by {}",
+            say(left, 3),
+            say(right, 3),
+            q_star[6][0],
+            spread(good.iter().map(difference), 2)
+        ),
+        (!good.is_empty()).then_some((left - right).abs() < 0.1),
+    )
+}
+
+fn learning_rates(alpha: &[Sweep<'_>; 4]) -> Claim {
+    let ends = alpha.map(|(label, seeds)| (label, at_end(seeds)));
+    let there = alpha.iter().all(|(_, seeds)| !seeds.is_empty());
+    together(
+        "A low learning rate leads to slow convergence, a high one may not converge; α = 0.03 is appropriate",
+        "over the last 1,000 episodes the mean probability of the goal is highest with 0.03, by more than 0.05 before 0.01 and 0.3",
+        ends.map(|(label, end)| format!("{label}: {}", say(end, 2))).join("; "),
+        there.then(|| {
+            let [low, good, middle, high] = ends.map(|(_, end)| end);
+            good > middle && good - low > SAME && good - high > SAME
+        }),
+    )
+}
+
+fn on_policy(good: &[SeedResult<Tests>], sarsa: &[SeedResult<Tests>], q_star: &Values) -> Claim {
+    let best = q_star[0].iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    let [off, on] = [good, sarsa].map(|seeds| mean(seeds, |tests| highest(tests, 0)));
+    together(
+        "Q-learning approximates q* directly, without depending on the policy being followed; SARSA estimates the value of the \
+         policy that explores (section 3.3.2)",
+        "with the same ε and α the learned value of the start is nearer to q* with Q-learning, and SARSA's is below half of it",
+        format!("Q-learning {}, SARSA {}, q* {best:.2}", say(off, 2), say(on, 2)),
+        (!good.is_empty() && !sarsa.is_empty()).then_some((best - off).abs() < (best - on).abs() && on < best / 2.0),
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::super::result::tests::result;
+    use super::super::{EXPERIMENTS, Judged};
+    use super::*;
+    use shoal_run::analysis::lake;
+
+    /// A seed that has learned so much of the goal by this episode, and ends with these action-values.
+    fn seed(number: u64, rises: &[(u64, f64)], q: &Values) -> SeedResult<Tests> {
+        let judged = rises.iter().map(|(episodes, reached)| Judged {
+            episodes: *episodes,
+            exact: Walk {
+                reached: *reached,
+                steps: 50.0,
+            },
+        });
+        let tests = Tests {
+            q: q.iter().flatten().map(|q| *q as f32).collect(),
+            judged: judged.collect(),
+        };
+        result(&EXPERIMENTS[0], number, 0.7, tests)
+    }
+
+    #[test]
+    fn what_the_thesis_saw_holds_and_its_opposite_does_not() {
+        let q_star = lake::optimal(0.999);
+        let best = Walk {
+            reached: 0.74,
+            steps: 50.0,
+        };
+        let half = q_star.map(|state| state.map(|q| 0.4 * q));
+        let of = |rises: &[(u64, f64)], q: &Values| vec![seed(1, rises, q), seed(2, rises, q)];
+        let good = of(&[(0, 0.0), (1_000, 0.2), (5_000, 0.73)], &q_star);
+        let slow = of(&[(0, 0.0), (5_000, 0.3)], &q_star);
+        let quick = of(&[(0, 0.3), (5_000, 0.71)], &q_star);
+        let (low, high) = (of(&[(0, 0.2)], &half), of(&[(0, 0.5)], &half));
+        let epsilon = [("0.1", &slow[..]), ("0.4", &good[..]), ("0.7", &quick[..])];
+        let alpha = [
+            ("0.01", &low[..]),
+            ("0.03", &good[..]),
+            ("0.1", &quick[..]),
+            ("0.3", &high[..]),
+        ];
+        let held = |claims: Vec<Claim>| -> Vec<bool> {
+            claims
+                .into_iter()
+                .map(|claim| claim.held.iter().all(|held| *held) && !claim.held.is_empty())
+                .collect()
+        };
+        assert_eq!(held(all(&epsilon, &alpha, &low, &q_star, best)), [true; 8]);
+
+        // Everything the other way round: the quick one is slow, nothing is learned, and SARSA knows better.
+        let mut flat = q_star;
+        flat[6] = [0.9, 0.0, 0.5, 0.0];
+        flat[2] = [0.0, 1.0, 0.0, 0.0];
+        let bad = of(&[(0, 0.5), (5_000, 0.2)], &flat);
+        let epsilon = [("0.1", &quick[..]), ("0.4", &bad[..]), ("0.7", &slow[..])];
+        let alpha = [
+            ("0.01", &good[..]),
+            ("0.03", &bad[..]),
+            ("0.1", &low[..]),
+            ("0.3", &high[..]),
+        ];
+        let mut wrong = held(all(&epsilon, &alpha, &good, &q_star, best));
+        // The value of the start is the same.
+        assert_eq!(wrong.pop(), Some(false));
+        assert_eq!(wrong, [false, false, false, false, false, false, false]);
+        let nothing = [("", &[][..]); 3];
+        assert!(
+            all(&nothing, &[("", &[][..]); 4], &[], &q_star, best)
+                .iter()
+                .all(|claim| claim.held.is_empty())
+        );
+    }
+}

@@ -1,0 +1,195 @@
+//! The pendulum of section 4.3.2.
+
+use serde::{Deserialize, Serialize};
+use shoal_report::figure;
+use shoal_run::analysis::pendulum::{Measures, SwingUp};
+use shoal_run::rollout::Rollout;
+
+use super::claim::{Claim, Scope, spread};
+use super::experiment::{Experiment, Length, Stage};
+use super::family::{Family, Policies, Results};
+use super::report::{Album, Section};
+use super::result::{SeedResult, representative};
+
+/// 600 episodes of 200 steps.
+pub(super) const EXPERIMENTS: [Experiment; 1] = [Experiment {
+    name: "pendulum",
+    asked_as: "pendulum",
+    preset: "pendulum",
+    settings: &[],
+    quick: &[
+        "ddpg.hidden=[32, 24]",
+        "replay.capacity=4000",
+        "evaluation.every=400",
+        "evaluation.episodes=4",
+        "evaluation.final_episodes=10",
+    ],
+    seeds: 5,
+    stages: &[Stage {
+        suffix: "",
+        length: Length::Steps(120_000),
+        quick_length: Length::Steps(4_000),
+    }],
+}];
+
+/// The swing-up from rest at the bottom.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(super) struct Tests {
+    swing_up: SwingUp,
+    best: Measures,
+    last: Measures,
+}
+
+/// See [`EXPERIMENTS`].
+pub(super) struct Pendulum;
+
+impl Family for Pendulum {
+    type Tests = Tests;
+    const EXPERIMENTS: &'static [Experiment] = &EXPERIMENTS;
+
+    fn test(policies: &Policies, _: &Stage) -> anyhow::Result<Tests> {
+        let run = |parameters| SwingUp::run(&mut Rollout::new(&policies.config, parameters)?);
+        let best = run(&policies.best.parameters)?;
+        Ok(Tests {
+            best: best.measures(),
+            last: run(&policies.last.parameters)?.measures(),
+            swing_up: best.rounded(),
+        })
+    }
+
+    fn sections(results: &Results<Tests>, album: &Album) -> anyhow::Result<Vec<Section>> {
+        let seeds = results.of("pendulum", "");
+        let curves: Vec<_> = seeds.iter().map(SeedResult::curve).collect();
+        let mut figures = vec![album.add(
+            "pendulum-learning-curve",
+            "Mean return of the evaluations during training, every seed (figure 4.8)",
+            |path| figure::learning_curves("Pendulum", &curves, None, path),
+        )?];
+        if let Some(middle) = representative(seeds) {
+            figures.push(album.add(
+                "pendulum-swing-up",
+                format!(
+                    "The swing-up from rest at θ = π, seed {} (figure 4.9)",
+                    middle.header.seed
+                ),
+                |path| figure::swing_up(&middle.tests.swing_up, path),
+            )?);
+        }
+        Ok(vec![Section {
+            title: "Pendulum (section 4.3.2)",
+            from: vec![("pendulum", "")],
+            remark: "\"At rest\" is the last 50 of the 200 steps of the test run. Angles are distances from upright. \
+                     Figures of a single run show the seed whose final evaluation is the median."
+                .into(),
+            claims: claims(seeds),
+            figures,
+        }])
+    }
+}
+
+fn claims(seeds: &[SeedResult<Tests>]) -> Vec<Claim> {
+    let around_150 = |value: f64| (-190.0..=-110.0).contains(&value);
+    let measured = |of: fn(&Measures) -> f64, decimals, unit| {
+        let [best, last] = [0, 1].map(|i| {
+            let measures = |seed: &SeedResult<Tests>| of([&seed.tests.best, &seed.tests.last][i]);
+            spread(seeds.iter().map(measures), decimals)
+        });
+        format!("{best}{unit} (last policy {last}{unit})")
+    };
+    let judge = |thesis, criterion, ours, holds: fn(&Measures) -> bool| Claim {
+        thesis,
+        criterion,
+        ours,
+        scope: Scope::EachSeed,
+        held: seeds.iter().map(|seed| holds(&seed.tests.best)).collect(),
+    };
+    vec![
+        Claim {
+            thesis: "The agent improves until converging to a mean reward of approximately −150",
+            criterion: "both the final evaluation (100 fixed episodes) and the mean of the last fifth of the evaluations \
+                        during training lie between −190 and −110",
+            ours: format!(
+                "final evaluation {} (last policy {}); last fifth of the evaluations {}",
+                spread(seeds.iter().map(|seed| seed.best.evaluation.return_mean), 1),
+                spread(seeds.iter().map(|seed| seed.last.evaluation.return_mean), 1),
+                spread(seeds.iter().map(SeedResult::late_mean), 1)
+            ),
+            scope: Scope::EachSeed,
+            held: seeds
+                .iter()
+                .map(|seed| around_150(seed.best.evaluation.return_mean) && around_150(seed.late_mean()))
+                .collect(),
+        },
+        judge(
+            "The pendulum swings back and forth a few times to gain momentum",
+            "it turns back at least once before it is up",
+            format!("turns: {}", measured(|it| it.reversals.into(), 0, "")),
+            |it| it.reversals >= 1,
+        ),
+        judge(
+            "The angle and angular velocity converge to zero",
+            "at rest the angle stays below 0.1 rad, the angular velocity below 0.1 rad/s",
+            format!(
+                "greatest angle at rest {}; greatest velocity {}",
+                measured(|it| it.angle_at_rest, 3, " rad"),
+                measured(|it| it.velocity_at_rest, 3, " rad/s")
+            ),
+            |it| it.angle_at_rest < 0.1 && it.velocity_at_rest < 0.1,
+        ),
+        judge(
+            "The applied torque converges to a small value",
+            "at rest the torque is below 0.2 N m in the mean of its size (its range is ±2)",
+            format!(
+                "torque at rest {}; its change from step to step {}",
+                measured(|it| it.torque_at_rest, 3, " N m"),
+                measured(|it| it.chatter_at_rest, 3, " N m")
+            ),
+            |it| it.torque_at_rest < 0.2,
+        ),
+    ]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::result::tests::result;
+    use super::*;
+    use shoal_run::testing::swing;
+
+    fn seed(number: u64, return_mean: f64, swing_up: SwingUp) -> SeedResult<Tests> {
+        let measures = swing_up.measures();
+        let tests = Tests {
+            best: measures.clone(),
+            last: measures,
+            swing_up: swing_up.rounded(),
+        };
+        result(&EXPERIMENTS[0], number, return_mean, tests)
+    }
+
+    #[test]
+    fn what_the_thesis_saw_holds_and_its_opposite_does_not() {
+        let good = seed(1, -150.0, swing(0.01, 0.05));
+        let bad = seed(2, -900.0, swing(0.5, 1.0));
+        let held: Vec<_> = claims(&[good, bad]).into_iter().map(|claim| claim.held).collect();
+        assert_eq!(held, [[true, false], [true, true], [true, false], [true, false]]);
+        assert!(claims(&[]).iter().all(|claim| claim.held.is_empty()));
+    }
+
+    #[test]
+    fn results_make_a_section_with_figures() {
+        let directory = tempfile::tempdir().unwrap();
+        let album = Album::in_directory(directory.path().into()).unwrap();
+        let mut results = Results::new();
+        assert_eq!(Pendulum::sections(&results, &album).unwrap()[0].figures.len(), 1);
+        results.put(
+            "pendulum",
+            "",
+            vec![seed(1, -150.0, swing(0.0, 0.1)), seed(2, -160.0, swing(0.0, 0.1))],
+        );
+        assert_eq!(Pendulum::sections(&results, &album).unwrap()[0].figures.len(), 2);
+        for file in ["pendulum-learning-curve", "pendulum-swing-up"] {
+            for ending in ["svg", "png"] {
+                assert!(directory.path().join(format!("{file}.{ending}")).exists());
+            }
+        }
+    }
+}

@@ -1,0 +1,191 @@
+//! The vehicle of chapter 5 with its three rewards, and the training of r2 that goes on for too long (appendix A).
+
+mod claims;
+mod figures;
+
+use serde::{Deserialize, Serialize};
+use shoal_run::analysis::point_mass::{Drive, FAR_STARTS, Measures, NEAR_STARTS};
+use shoal_run::rollout::Rollout;
+
+use super::experiment::{Experiment, Length, Stage};
+use super::family::{Family, Policies, Results};
+use super::report::{Album, Section};
+
+/// The run of r2 after its additional training.
+const LONGER: &str = "-longer";
+
+const QUICK: &[&str] = &[
+    "ddpg.hidden=[32, 24]",
+    "replay.capacity=20000",
+    "evaluation.every=800",
+    "evaluation.episodes=4",
+    "evaluation.final_episodes=10",
+];
+
+/// 4000 episodes of 200 steps for r1, 2000 for r2 and r3, and 4000 for r2 in appendix A.1.
+pub(super) const EXPERIMENTS: [Experiment; 3] = [
+    experiment("point-mass-r1", &[stage("", 800_000, 8_000)]),
+    experiment(
+        "point-mass-r2",
+        &[stage("", 400_000, 8_000), stage(LONGER, 800_000, 16_000)],
+    ),
+    experiment("point-mass-r3", &[stage("", 400_000, 8_000)]),
+];
+
+const fn experiment(name: &'static str, stages: &'static [Stage]) -> Experiment {
+    Experiment {
+        name,
+        asked_as: name,
+        preset: name,
+        settings: &[],
+        quick: QUICK,
+        seeds: 5,
+        stages,
+    }
+}
+
+const fn stage(suffix: &'static str, steps: u64, quick_steps: u64) -> Stage {
+    Stage {
+        suffix,
+        length: Length::Steps(steps),
+        quick_length: Length::Steps(quick_steps),
+    }
+}
+
+/// Drives from the starts of section 5.3 and then those of appendix A.2.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(super) struct Tests {
+    best: Vec<Measures>,
+    last: Vec<Measures>,
+    /// Of the best policy.
+    drives: Vec<Drive>,
+    /// Of the last policy from the starts of section 5.3, where the thesis shows that one (appendix A.1).
+    last_drives: Vec<Drive>,
+}
+
+/// See [`EXPERIMENTS`].
+pub(super) struct PointMass;
+
+impl Family for PointMass {
+    type Tests = Tests;
+    const EXPERIMENTS: &'static [Experiment] = &EXPERIMENTS;
+
+    fn test(policies: &Policies, stage: &Stage) -> anyhow::Result<Tests> {
+        let starts = [&NEAR_STARTS[..], &FAR_STARTS[..]].concat();
+        let run = |parameters| Drive::run_from(&mut Rollout::new(&policies.config, parameters)?, &starts);
+        let best = run(&policies.best.parameters)?;
+        let last = run(&policies.last.parameters)?;
+        let shown = if stage.suffix == LONGER { NEAR_STARTS.len() } else { 0 };
+        Ok(Tests {
+            best: best.iter().map(Drive::measures).collect(),
+            last: last.iter().map(Drive::measures).collect(),
+            drives: best.into_iter().map(Drive::rounded).collect(),
+            last_drives: last.into_iter().take(shown).map(Drive::rounded).collect(),
+        })
+    }
+
+    fn sections(results: &Results<Tests>, album: &Album) -> anyhow::Result<Vec<Section>> {
+        let [r1, r2, r3] = ["point-mass-r1", "point-mass-r2", "point-mass-r3"].map(|name| results.of(name, ""));
+        let longer = results.of("point-mass-r2", LONGER);
+        let section = |title, from: &[(&'static str, &'static str)], remark: &str, claims, figures| Section {
+            title,
+            from: from.into(),
+            remark: remark.into(),
+            claims,
+            figures,
+        };
+        Ok(vec![
+            section(
+                "Point mass with reward r1 (section 5.3.1)",
+                &[("point-mass-r1", "")],
+                "Numbers of test runs are means over the four starts of section 5.3 unless others are named. \"At rest\" is \
+                 the last 50 of a run's 200 steps. Turning is the sum of all changes of θ, taken the short way round.",
+                claims::of_r1(r1),
+                figures::of_reward(album, &figures::R1, r1)?,
+            ),
+            section(
+                "Point mass with reward r2 (section 5.3.2)",
+                &[("point-mass-r2", "")],
+                "",
+                claims::of_r2(r1, r2),
+                figures::of_reward(album, &figures::R2, r2)?,
+            ),
+            section(
+                "Point mass with reward r3 (section 5.3.3, appendix A.2)",
+                &[("point-mass-r3", "")],
+                "",
+                claims::of_r3(r1, r2, r3),
+                figures::of_r3(album, r3)?,
+            ),
+            section(
+                "The three agents beside each other (section 5.4)",
+                &[("point-mass-r1", ""), ("point-mass-r2", ""), ("point-mass-r3", "")],
+                "Seeds are compared by their number; a seed that one of the rewards lacks is left out.",
+                claims::of_comparison(r1, r2, r3),
+                figures::of_comparison(album, [r1, r2, r3])?,
+            ),
+            section(
+                "Reward r2 with additional training (section 5.3.2, appendix A.1)",
+                &[("point-mass-r2", ""), ("point-mass-r2", LONGER)],
+                "The same runs, resumed. The agent of appendix A.1 is the one at the end of the additional training: here \
+                 the last policy, not the best by evaluation.",
+                claims::of_longer(r2, longer),
+                figures::of_longer(album, longer)?,
+            ),
+        ])
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::result::SeedResult;
+    use super::super::result::tests::result;
+    use super::*;
+    use shoal_run::testing::drive;
+
+    /// A seed whose drives come to rest so, and turn and push so.
+    pub(super) fn seed(number: u64, rest: f64, shake: f64, force: f64, held: f64) -> SeedResult<Tests> {
+        let starts = [&NEAR_STARTS[..], &FAR_STARTS[..]].concat();
+        let drives: Vec<_> = starts
+            .iter()
+            .map(|start| drive(*start, rest, shake, force, held))
+            .collect();
+        let measures: Vec<_> = drives.iter().map(Drive::measures).collect();
+        let tests = Tests {
+            best: measures.clone(),
+            last: measures,
+            last_drives: drives[..4].iter().cloned().map(Drive::rounded).collect(),
+            drives: drives.into_iter().map(Drive::rounded).collect(),
+        };
+        result(&EXPERIMENTS[1], number, 100.0, tests)
+    }
+
+    #[test]
+    fn results_make_sections_with_all_figures() {
+        let directory = tempfile::tempdir().unwrap();
+        let album = Album::in_directory(directory.path().into()).unwrap();
+        let mut results = Results::new();
+        let figures = |results: &Results<Tests>| -> Vec<usize> {
+            let sections = PointMass::sections(results, &album).unwrap();
+            sections.iter().map(|section| section.figures.len()).collect()
+        };
+        assert_eq!(figures(&results), [0, 0, 0, 0, 0]);
+        results.put(
+            "point-mass-r2",
+            "",
+            vec![seed(1, 0.03, 0.1, 1.0, 0.0), seed(2, 0.02, 0.1, 1.0, 0.0)],
+        );
+        assert_eq!(figures(&results), [0, 2, 0, 2, 0]);
+        for experiment in ["point-mass-r1", "point-mass-r3"] {
+            results.put(experiment, "", vec![seed(1, 0.01, 0.3, 1.0, 0.5)]);
+        }
+        results.put("point-mass-r2", LONGER, vec![seed(1, 0.01, 2.0, 1.0, 0.5)]);
+        assert_eq!(figures(&results), [2, 2, 4, 2, 2]);
+    }
+
+    #[test]
+    fn a_result_stays_small() {
+        let text = serde_json::to_string(&seed(1, 0.0123, 0.1234, 1.234, 0.1234).tests).unwrap();
+        assert!(text.len() < 130_000, "{}", text.len());
+    }
+}

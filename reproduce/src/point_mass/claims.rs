@@ -1,0 +1,387 @@
+//! The claims of section 5.3 and appendix A.
+
+use shoal_run::analysis::point_mass::{Measures, NEAR_STARTS, REACHED};
+
+use super::super::claim::{Claim, Scope, percent, spread};
+use super::super::result::SeedResult;
+use super::Tests;
+
+type Seed = SeedResult<Tests>;
+
+/// A number of one drive.
+type Number = fn(&Measures) -> f64;
+
+const DISTANCE: Number = |it| it.final_distance;
+const TURNING: Number = |it| it.turning;
+const TURNING_AT_REST: Number = |it| it.turning_at_rest;
+const FORCE_AT_REST: Number = |it| it.force_at_rest;
+const FORCE_ON_THE_WAY: Number = |it| it.force_on_the_way;
+
+/// The drives from the starts of section 5.3.
+fn near(measures: &[Measures]) -> &[Measures] {
+    &measures[..NEAR_STARTS.len().min(measures.len())]
+}
+
+/// The drives from the starts of appendix A.2.
+fn far(measures: &[Measures]) -> &[Measures] {
+    &measures[NEAR_STARTS.len().min(measures.len())..]
+}
+
+fn mean(measures: &[Measures], number: Number) -> f64 {
+    measures.iter().map(number).sum::<f64>() / measures.len() as f64
+}
+
+fn greatest(measures: &[Measures], number: Number) -> f64 {
+    measures.iter().map(number).fold(0.0, f64::max)
+}
+
+/// Of the best policy, in the mean of the starts of section 5.3.
+fn near_mean(seed: &Seed, number: Number) -> f64 {
+    mean(near(&seed.tests.best), number)
+}
+
+/// The median over the seeds: of the best policy, and of the last.
+fn both(seeds: &[Seed], number: Number, decimals: usize, unit: &str) -> String {
+    if seeds.is_empty() {
+        return "no results".into();
+    }
+    format!(
+        "{} {unit} (last policy {} {unit})",
+        spread(seeds.iter().map(|seed| near_mean(seed, number)), decimals),
+        spread(seeds.iter().map(|seed| mean(near(&seed.tests.last), number)), decimals)
+    )
+}
+
+fn claim(
+    thesis: &'static str,
+    criterion: &'static str,
+    ours: String,
+    seeds: &[Seed],
+    holds: impl Fn(&Seed) -> bool,
+) -> Claim {
+    Claim {
+        thesis,
+        criterion,
+        ours,
+        scope: Scope::EachSeed,
+        held: seeds.iter().map(holds).collect(),
+    }
+}
+
+/// The seeds that both have.
+fn pairs<'a>(a: &'a [Seed], b: &'a [Seed]) -> impl Iterator<Item = (&'a Seed, &'a Seed)> {
+    a.iter()
+        .filter_map(|one| Some((one, b.iter().find(|other| other.header.seed == one.header.seed)?)))
+}
+
+/// What the final evaluation says of the way to the goal.
+fn reached(seeds: &[Seed]) -> String {
+    let shares = seeds.iter().filter_map(|seed| seed.best.evaluation.reached_fraction);
+    let distances = seeds.iter().filter_map(|seed| seed.best.evaluation.final_distance_mean);
+    format!(
+        "from 100 random starts {} m, and {} % end within {REACHED} m",
+        spread(distances, 3),
+        spread(shares.map(|share| 100.0 * share), 0)
+    )
+}
+
+fn arrives(seeds: &[Seed], thesis: &'static str) -> Claim {
+    let farthest = |seed: &Seed| greatest(near(&seed.tests.best), DISTANCE);
+    claim(
+        thesis,
+        "from each of the four starts of section 5.3 it ends within 0.05 m of the goal",
+        format!(
+            "farthest of the four at the end: {} m; {}",
+            spread(seeds.iter().map(farthest), 3),
+            reached(seeds)
+        ),
+        seeds,
+        |seed| farthest(seed) < REACHED,
+    )
+}
+
+pub(super) fn of_r1(seeds: &[Seed]) -> Vec<Claim> {
+    vec![
+        arrives(
+            seeds,
+            "The vehicle learns to move from its start position to the goal; the position error converges to zero",
+        ),
+        claim(
+            "Once the vehicle has stopped at the goal, the applied force does not go to zero",
+            "the mean force at rest is above 0.1 N (its range is 0 to 2)",
+            format!("force at rest {}", both(seeds, FORCE_AT_REST, 3, "N")),
+            seeds,
+            |seed| near_mean(seed, FORCE_AT_REST) > 0.1,
+        ),
+        claim(
+            "… and the direction is shaky",
+            "at rest the direction changes by more than 0.1 rad a step (5 rad in 50 steps)",
+            format!("turning at rest {}", both(seeds, TURNING_AT_REST, 1, "rad")),
+            seeds,
+            |seed| near_mean(seed, TURNING_AT_REST) > 5.0,
+        ),
+    ]
+}
+
+/// Steps after which a seed had learned nearly all it ever did, if that brings the vehicle to the goal.
+fn converged_by(seed: &Seed) -> Option<u64> {
+    let starts = near(&seed.tests.best);
+    let arrived = starts.iter().filter(|it| it.final_distance < REACHED).count();
+    seed.learned_by().filter(|_| 2 * arrived >= starts.len())
+}
+
+pub(super) fn of_r2(r1: &[Seed], r2: &[Seed]) -> Vec<Claim> {
+    let steady: Number = |it| it.drift_at_rest;
+    let rose = |seeds: &[Seed]| {
+        let steps = seeds.iter().filter_map(converged_by);
+        let never = seeds.iter().filter(|seed| converged_by(seed).is_none()).count();
+        let episodes = spread(steps.map(|steps| steps as f64 / 200.0), 0);
+        if never > 0 {
+            format!("{episodes}, and {never} never")
+        } else {
+            episodes
+        }
+    };
+    let sooner = |(r1, r2): (&Seed, &Seed)| match (converged_by(r1), converged_by(r2)) {
+        (Some(r1), Some(r2)) => r2 < r1,
+        (_, r2) => r2.is_some(),
+    };
+    vec![
+        Claim {
+            thesis: "Reward r2 causes the solution to converge after only 2000 episodes, significantly less than with r1",
+            criterion: "the first evaluation that has made nine tenths of the way from the run's first to its best one comes \
+                        in fewer episodes than with r1 and the same seed (never, where the best policy arrives from fewer than \
+                        two of the four starts)",
+            ours: format!("episodes with r2: {}; with r1: {}", rose(r2), rose(r1)),
+            scope: Scope::EachSeed,
+            held: pairs(r1, r2).map(sooner).collect(),
+        },
+        claim(
+            "F_u approaches a steady value close to zero",
+            "the mean force at rest is below 0.2 N, a tenth of its range",
+            format!("force at rest {}", both(r2, FORCE_AT_REST, 3, "N")),
+            r2,
+            |seed| near_mean(seed, FORCE_AT_REST) < 0.2,
+        ),
+        claim(
+            "The vehicle remains stationary, which leads to a steady state error in position",
+            "at rest its distance to the goal changes by less than 0.01 m, and at the end it is between 0.005 m and 0.5 m",
+            format!(
+                "distance at the end {}; change at rest {}; {}",
+                both(r2, DISTANCE, 3, "m"),
+                both(r2, steady, 3, "m"),
+                reached(r2)
+            ),
+            r2,
+            |seed| near_mean(seed, steady) < 0.01 && (0.005..0.5).contains(&near_mean(seed, DISTANCE)),
+        ),
+    ]
+}
+
+pub(super) fn of_r3(r1: &[Seed], r2: &[Seed], r3: &[Seed]) -> Vec<Claim> {
+    let less_than = |others: &[Seed]| -> Vec<(u64, bool)> {
+        let less = |(other, r3): (&Seed, &Seed)| near_mean(r3, FORCE_ON_THE_WAY) < near_mean(other, FORCE_ON_THE_WAY);
+        pairs(others, r3).map(|pair| (pair.1.header.seed, less(pair))).collect()
+    };
+    let farthest = |seed: &Seed| greatest(far(&seed.tests.best), DISTANCE);
+    let least_arrived = r3.iter().map(|seed| {
+        let far = far(&seed.tests.best);
+        far.iter().filter(|it| it.final_distance < REACHED).count() as f64 / far.len() as f64
+    });
+    let least_arrived = least_arrived.fold(1.0, f64::min);
+    vec![
+        arrives(r3, "The position error converges to zero"),
+        claim(
+            "F_u becomes zero when the vehicle is stopping",
+            "the mean force at rest is below 0.1 N (its range is 0 to 2)",
+            format!("force at rest {}", both(r3, FORCE_AT_REST, 3, "N")),
+            r3,
+            |seed| near_mean(seed, FORCE_AT_REST) < 0.1,
+        ),
+        Claim {
+            thesis: "The agent applies less force than previously",
+            criterion: "the mean force until the goal is reached is smaller than with r1 and than with r2 and the same seed",
+            ours: format!(
+                "force on the way with r3: {}; with r1: {}; with r2: {}",
+                both(r3, FORCE_ON_THE_WAY, 2, "N"),
+                both(r1, FORCE_ON_THE_WAY, 2, "N"),
+                both(r2, FORCE_ON_THE_WAY, 2, "N")
+            ),
+            scope: Scope::EachSeed,
+            held: less_than(r1)
+                .into_iter()
+                .filter_map(|(seed, less)| {
+                    let than_r2 = less_than(r2).into_iter().find(|(other, _)| *other == seed)?.1;
+                    Some(less && than_r2)
+                })
+                .collect(),
+        },
+        claim(
+            "Paths taken when the starting position is further from the goal (appendix A.2) end at the goal too",
+            "from each of the eight starts of appendix A.2 it ends within 0.05 m of the goal",
+            format!(
+                "farthest of the eight at the end: {} m; of the eight, {} arrive with the worst seed",
+                spread(r3.iter().map(farthest), 3),
+                percent(least_arrived)
+            ),
+            r3,
+            |seed| farthest(seed) < REACHED,
+        ),
+    ]
+}
+
+pub(super) fn of_comparison(r1: &[Seed], r2: &[Seed], r3: &[Seed]) -> Vec<Claim> {
+    let turning = |seed: &Seed| mean(&seed.tests.best, TURNING);
+    let say = |seeds: &[Seed]| spread(seeds.iter().map(turning), 1);
+    let calmer = |thesis, criterion, than: &[Seed], seeds: &[Seed], names: [&str; 2]| Claim {
+        thesis,
+        criterion,
+        ours: format!(
+            "turning from all twelve starts: {} rad with {}, {} rad with {}",
+            say(seeds),
+            names[0],
+            say(than),
+            names[1]
+        ),
+        scope: Scope::EachSeed,
+        held: pairs(than, seeds)
+            .map(|(than, it)| turning(it) < turning(than))
+            .collect(),
+    };
+    vec![
+        calmer(
+            "With r2, θ is less erratic than with r1",
+            "less turning than with r1 and the same seed",
+            r1,
+            r2,
+            ["r2", "r1"],
+        ),
+        calmer(
+            "With r3, the direction is less erratic than with r1",
+            "less turning than with r1 and the same seed",
+            r1,
+            r3,
+            ["r3", "r1"],
+        ),
+        calmer(
+            "With r3, the direction is less erratic than with r2",
+            "less turning than with r2 and the same seed",
+            r2,
+            r3,
+            ["r3", "r2"],
+        ),
+    ]
+}
+
+/// `before` are the runs at the end of the first training, `after` the same at the end of the additional one.
+pub(super) fn of_longer(before: &[Seed], after: &[Seed]) -> Vec<Claim> {
+    let value = |before: &Seed, after: &Seed, number: Number| {
+        (near_mean(before, number), mean(near(&after.tests.last), number))
+    };
+    let judge = |thesis, criterion, what: &str, number: Number, decimals, holds: fn(f64, f64) -> bool| Claim {
+        thesis,
+        criterion,
+        ours: format!(
+            "{what}: best policy of the first training {}; last policy of the additional one {}",
+            spread(pairs(before, after).map(|(b, a)| value(b, a, number).0), decimals),
+            spread(pairs(before, after).map(|(b, a)| value(b, a, number).1), decimals)
+        ),
+        scope: Scope::EachSeed,
+        held: pairs(before, after)
+            .map(|(b, a)| value(b, a, number))
+            .map(|(b, a)| holds(b, a))
+            .collect(),
+    };
+    vec![
+        judge(
+            "With additional training the agent has learned to reduce the position error",
+            "the last policy of the additional training ends nearer to the goal than the best one of the first training",
+            "distance at the end in m",
+            DISTANCE,
+            3,
+            |before, after| after < before,
+        ),
+        judge(
+            "… but it no longer understands how to reduce the derivative of the input",
+            "the last policy of the additional training turns more than the best one of the first training",
+            "turning in rad",
+            TURNING,
+            1,
+            |before, after| after > before,
+        ),
+        Claim {
+            thesis: "Early stopping is the most important regularisation: an agent that trains for too long gets worse",
+            criterion: "in the final evaluation the last policy of the additional training has a smaller return than the best \
+                        one of the first training",
+            ours: format!(
+                "best policy of the first training {}; last policy of it {}; last policy of the additional one {}; best \
+                 policy of both {}",
+                spread(before.iter().map(|seed| seed.best.evaluation.return_mean), 1),
+                spread(before.iter().map(|seed| seed.last.evaluation.return_mean), 1),
+                spread(after.iter().map(|seed| seed.last.evaluation.return_mean), 1),
+                spread(after.iter().map(|seed| seed.best.evaluation.return_mean), 1)
+            ),
+            scope: Scope::EachSeed,
+            held: pairs(before, after)
+                .map(|(before, after)| after.last.evaluation.return_mean < before.best.evaluation.return_mean)
+                .collect(),
+        },
+    ]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests::seed;
+    use super::*;
+
+    fn held(claims: Vec<Claim>) -> Vec<Vec<bool>> {
+        claims.into_iter().map(|claim| claim.held).collect()
+    }
+
+    #[test]
+    fn r1_arrives_and_is_shaky() {
+        let seeds = [seed(1, 0.01, 0.5, 1.8, 0.5), seed(2, 2.0, 0.01, 0.5, 0.01)];
+        assert_eq!(held(of_r1(&seeds)), [[true, false]; 3]);
+        assert!(held(of_r1(&[])).iter().all(Vec::is_empty));
+    }
+
+    #[test]
+    fn r2_is_sooner_and_stands_beside_the_goal() {
+        let mut late = [seed(1, 0.01, 0.5, 1.8, 0.5), seed(2, 0.01, 0.5, 1.8, 0.5)];
+        late[1].evaluations.truncate(4);
+        let r2 = [seed(1, 0.03, 0.05, 1.0, 0.02), seed(2, 0.001, 0.05, 1.0, 0.5)];
+        // The synthetic curves rise alike; the first seed of r1 only later.
+        for it in &mut late[0].evaluations {
+            it.steps *= 2;
+        }
+        assert_eq!(held(of_r2(&late, &r2)), [[true, false]; 3]);
+        assert!(held(of_r2(&[], &r2))[0].is_empty(), "nothing to compare with");
+        let never = [seed(1, 2.0, 0.5, 1.8, 0.5)];
+        assert_eq!(
+            held(of_r2(&never, &r2))[0],
+            [true],
+            "who learned nothing did not converge at once"
+        );
+        let never_r2 = [seed(1, 2.0, 0.05, 1.0, 0.02)];
+        assert_eq!(held(of_r2(&late, &never_r2))[0], [false]);
+    }
+
+    #[test]
+    fn r3_arrives_from_far_with_little_force() {
+        let r1 = [seed(1, 0.01, 0.5, 1.8, 0.5), seed(2, 0.01, 0.5, 1.8, 0.5)];
+        let r2 = [seed(1, 0.03, 0.1, 1.5, 0.0), seed(2, 0.03, 0.1, 0.5, 0.0)];
+        let r3 = [seed(1, 0.01, 0.05, 1.0, 0.0), seed(2, 0.2, 0.05, 1.0, 0.5)];
+        assert_eq!(held(of_r3(&r1, &r2, &r3)), [[true, false]; 4]);
+        assert_eq!(held(of_r3(&r1, &r2[1..], &r3))[2], [false], "only what all three have");
+        assert_eq!(held(of_comparison(&r1, &r2, &r3)), [[true, true]; 3]);
+        assert_eq!(held(of_comparison(&r2, &r1, &r3))[0], [false, false]);
+    }
+
+    #[test]
+    fn too_much_training_is_seen() {
+        let before = [seed(1, 0.05, 0.1, 1.0, 0.0), seed(2, 0.05, 0.1, 1.0, 0.0)];
+        let mut after = [seed(1, 0.01, 1.0, 1.0, 0.5), seed(2, 0.1, 0.05, 1.0, 0.5)];
+        after[1].last.evaluation.return_mean = 200.0;
+        assert_eq!(held(of_longer(&before, &after)), [[true, false]; 3]);
+    }
+}

@@ -1,0 +1,142 @@
+//! The figures of chapter 5 and appendix A.
+
+use std::ops::Range;
+
+use shoal_report::figure::{self, Agent};
+
+use super::super::report::{Album, Figure};
+use super::super::result::{SeedResult, representative};
+use super::Tests;
+
+/// What the figures of a reward show.
+pub(super) struct OfReward {
+    name: &'static str,
+    curve: &'static str,
+    tests: &'static str,
+    /// Which drives of a result the thesis shows.
+    shown: Range<usize>,
+}
+
+pub(super) const R1: OfReward = OfReward {
+    name: "r1",
+    curve: "5.4",
+    tests: "5.5",
+    shown: 0..2,
+};
+pub(super) const R2: OfReward = OfReward {
+    name: "r2",
+    curve: "5.6",
+    tests: "5.7",
+    shown: 2..4,
+};
+const R3: OfReward = OfReward {
+    name: "r3",
+    curve: "5.8",
+    tests: "5.9",
+    shown: 0..2,
+};
+
+/// The drives from the starts of section 5.3, and of the two halves of appendix A.2.
+const NEAR: Range<usize> = 0..4;
+const FAR: [(Range<usize>, &str, &str); 2] = [(4..8, "far-1", "A.4 to A.7"), (8..12, "far-2", "A.8 to A.11")];
+
+/// The learning curves, and two test runs.
+pub(super) fn of_reward(album: &Album, of: &OfReward, seeds: &[SeedResult<Tests>]) -> anyhow::Result<Vec<Figure>> {
+    let Some(middle) = representative(seeds) else {
+        return Ok(Vec::new());
+    };
+    let OfReward {
+        name,
+        curve,
+        tests,
+        shown,
+    } = of;
+    let curves: Vec<_> = seeds.iter().map(SeedResult::curve).collect();
+    Ok(vec![
+        album.add(
+            &format!("point-mass-{name}-learning-curve"),
+            format!("Mean return of the evaluations during training with {name}, every seed (figure {curve})"),
+            |path| figure::learning_curves(&format!("Point mass with {name}"), &curves, None, path),
+        )?,
+        album.add(
+            &format!("point-mass-{name}-test-runs"),
+            format!(
+                "Two test runs with {name}, seed {} (figure {tests})",
+                middle.header.seed
+            ),
+            |path| figure::test_runs(&middle.tests.drives[shown.clone()], path),
+        )?,
+    ])
+}
+
+/// The same, and the runs from far away.
+pub(super) fn of_r3(album: &Album, seeds: &[SeedResult<Tests>]) -> anyhow::Result<Vec<Figure>> {
+    let mut figures = of_reward(album, &R3, seeds)?;
+    if let Some(middle) = representative(seeds) {
+        for (range, file, numbers) in FAR {
+            let caption = format!(
+                "Test runs with r3 from far away, seed {} (figures {numbers})",
+                middle.header.seed
+            );
+            figures.push(album.add(&format!("point-mass-r3-{file}"), caption, |path| {
+                figure::test_runs(&middle.tests.drives[range], path)
+            })?);
+        }
+    }
+    Ok(figures)
+}
+
+/// Paths, actions and distances of the agents that are there.
+pub(super) fn of_comparison(album: &Album, rewards: [&[SeedResult<Tests>]; 3]) -> anyhow::Result<Vec<Figure>> {
+    let named = ["r1", "r2", "r3"].into_iter().zip(rewards);
+    let agents: Vec<Agent<'_>> = named
+        .filter_map(|(name, seeds)| {
+            let middle = representative(seeds)?;
+            Some(Agent {
+                name: format!("{name} (seed {})", middle.header.seed),
+                drives: middle.tests.drives[NEAR].iter().collect(),
+            })
+        })
+        .collect();
+    if agents.is_empty() {
+        return Ok(Vec::new());
+    }
+    Ok(vec![
+        album.add(
+            "point-mass-paths",
+            "Paths from the four starts of section 5.3 (figure 5.10)",
+            |path| figure::paths_beside(&agents, path),
+        )?,
+        album.add(
+            "point-mass-actions",
+            "Actions and position error from (2, \u{2212}2) (figure 5.11)",
+            |path| figure::actions_beside(&agents, path),
+        )?,
+    ])
+}
+
+/// What became of r2.
+pub(super) fn of_longer(album: &Album, seeds: &[SeedResult<Tests>]) -> anyhow::Result<Vec<Figure>> {
+    let Some(middle) = representative(seeds) else {
+        return Ok(Vec::new());
+    };
+    let curves: Vec<_> = seeds.iter().map(SeedResult::curve).collect();
+    // Where the curves end, in half.
+    let end = middle.evaluations.last().map_or(0, |it| it.steps);
+    let half = (end / 2, "end of the first training");
+    Ok(vec![
+        album.add(
+            "point-mass-r2-longer-test-runs",
+            format!(
+                "Two test runs of the last policy after additional training with r2, seed {} (figures A.1 and A.2)",
+                middle.header.seed
+            ),
+            |path| figure::test_runs(&middle.tests.last_drives[R2.shown.clone()], path),
+        )?,
+        album.add(
+            "point-mass-r2-longer-learning-curve",
+            "Mean return of the evaluations during training with r2, with additional training (figure A.3)",
+            |path| figure::learning_curves("Point mass with r2, trained for longer", &curves, Some(half), path),
+        )?,
+    ])
+}

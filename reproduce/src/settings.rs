@@ -1,0 +1,128 @@
+//! With which settings a run was made: its configuration but for its name, its seed and its length, and for what no result
+//! depends on.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use anyhow::bail;
+use serde::{Deserialize, Serialize};
+use shoal_common::config::Config;
+use shoal_common::run_dir::RunDir;
+use shoal_run::plan;
+use shoal_run::plan::RunOverrides;
+use toml::Value;
+
+use super::experiment::{Effort, Experiment, Length};
+
+/// Keys with their sections, and values as TOML.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) struct Settings(BTreeMap<String, String>);
+
+impl Settings {
+    /// Those of a run.
+    pub(super) fn of(config: &Config) -> anyhow::Result<Self> {
+        let mut settings = BTreeMap::new();
+        flatten("", toml::Value::try_from(config)?, &mut settings);
+        settings.retain(|key, _| {
+            !["run.id", "run.seed", "run.steps", "run.episodes"].contains(&key.as_str())
+                && !["spec.", "learner."].iter().any(|section| key.starts_with(section))
+        });
+        Ok(Self(settings))
+    }
+
+    /// Those of the run in a directory, which must be of this seed.
+    pub(super) fn of_run(run: &Path, seed: u64) -> anyhow::Result<Self> {
+        let config = RunDir::open(run)?.config()?;
+        if config.run.seed != seed {
+            bail!(
+                "{} has seed {}, not {seed}: remove it, or choose another directory with --out",
+                run.display(),
+                config.run.seed
+            );
+        }
+        Self::of(&config)
+    }
+
+    /// Those that a run of `experiment` would have.
+    pub(super) fn expected(experiment: &Experiment, effort: Effort) -> anyhow::Result<Self> {
+        let length = experiment.stages.first().map(|stage| stage.length(effort));
+        let overrides = RunOverrides {
+            seed: Some(1),
+            steps: length.and_then(|length| match length {
+                Length::Steps(steps) => Some(steps),
+                Length::Episodes(_) => None,
+            }),
+            lockstep: true,
+            set: experiment.settings(effort).map(Into::into).collect(),
+            ..RunOverrides::default()
+        };
+        let (_, config) = plan::decide(experiment.preset, &overrides)?;
+        Self::of(&config)
+    }
+
+    /// Refuses what was made with other settings. A key that only one of them knows is of another version of this program
+    /// and says nothing.
+    pub(super) fn check(&self, made: &Path, expected: &Self) -> anyhow::Result<()> {
+        for (key, found) in &self.0 {
+            if let Some(wanted) = expected.0.get(key).filter(|wanted| *wanted != found) {
+                bail!(
+                    "{} was made with {key} = {found}, which is now {wanted}: remove it, or choose another directory with --out",
+                    made.display()
+                );
+            }
+        }
+        Ok(())
+    }
+
+    #[cfg(test)]
+    pub(super) fn from_pairs(pairs: &[(&str, &str)]) -> Self {
+        Self(
+            pairs
+                .iter()
+                .map(|(key, value)| ((*key).into(), (*value).into()))
+                .collect(),
+        )
+    }
+}
+
+fn flatten(prefix: &str, value: Value, into: &mut BTreeMap<String, String>) {
+    match value {
+        Value::Table(table) => {
+            for (key, value) in table {
+                let key = if prefix.is_empty() {
+                    key
+                } else {
+                    format!("{prefix}.{key}")
+                };
+                flatten(&key, value, into);
+            }
+        }
+        value => {
+            into.insert(prefix.into(), value.to_string());
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn settings_leave_out_name_seed_and_length() {
+        let experiment = &super::super::pendulum::EXPERIMENTS[0];
+        let [full, quick] = [Effort::Full, Effort::Quick].map(|e| Settings::expected(experiment, e).unwrap());
+        assert_eq!(full.0["ddpg.hidden"], "[400, 300]");
+        assert_eq!(full.0["run.mode"], "\"lockstep\"");
+        assert!(
+            !full.0.keys().any(|key| key == "run.seed" || key.starts_with("spec")),
+            "{full:?}"
+        );
+        assert_eq!(Settings::expected(experiment, Effort::Full).unwrap(), full);
+        let refused = quick.check(Path::new("seed-1.json"), &full).unwrap_err().to_string();
+        assert!(
+            refused.contains("seed-1.json") && refused.contains("which is now") && !refused.contains('\n'),
+            "{refused}"
+        );
+        full.check(Path::new("x"), &full).unwrap();
+    }
+}

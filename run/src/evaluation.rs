@@ -1,0 +1,140 @@
+//! How good a run's policies are.
+
+use serde::{Deserialize, Serialize};
+use shoal_actor::evaluator::mean_and_std;
+use shoal_common::config::Config;
+use shoal_common::policy_file::PolicyFile;
+use shoal_common::run_dir::RunDir;
+
+use crate::analysis::point_mass::REACHED;
+use crate::rollout::{Rollout, Trajectory, policy_layout};
+
+/// One of a run's policies.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+pub enum WhichPolicy {
+    /// With the best evaluation so far.
+    #[default]
+    Best,
+    /// As the learner left it.
+    Last,
+}
+
+impl WhichPolicy {
+    /// Reads this policy of a run; it must be for the run's network.
+    pub fn read(self, run: &RunDir, config: &Config) -> anyhow::Result<PolicyFile> {
+        let path = match self {
+            Self::Best => run.best_policy(),
+            Self::Last => run.last_policy(),
+        };
+        Ok(PolicyFile::read(&path, &policy_layout(config)?)?)
+    }
+}
+
+/// How a policy did; the fields of `eval --json`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct EvaluationSummary {
+    /// Mean of the episodes' returns.
+    pub return_mean: f64,
+    /// Standard deviation of the sample (n − 1). 0 for a single episode.
+    pub return_std: f64,
+    /// How many episodes.
+    pub episodes: u32,
+    /// Of a point mass: the mean distance to the goal at the end, in m.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub final_distance_mean: Option<f64>,
+    /// Of a point mass: the share of episodes that end within 0.05 m of the goal.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub reached_fraction: Option<f64>,
+}
+
+/// Runs the evaluation episodes 0 … `episodes` − 1 of `seed`, the same start states every time.
+pub fn evaluate(config: &Config, parameters: &[f32], episodes: u32, seed: u64) -> anyhow::Result<EvaluationSummary> {
+    let mut rollout = Rollout::new(config, parameters)?;
+    let (mut returns, mut distances) = (Vec::new(), Vec::new());
+    for number in 0..episodes {
+        let trajectory = rollout.evaluation_episode(seed, number.into())?;
+        returns.push(trajectory.episode_return());
+        distances.extend(final_distance(config, &trajectory));
+    }
+    let reached = distances.iter().filter(|d| **d < REACHED).count() as f64;
+    let point_mass = !distances.is_empty();
+    let (return_mean, return_std) = mean_and_std(&returns);
+    Ok(EvaluationSummary {
+        return_mean,
+        return_std,
+        episodes,
+        final_distance_mean: point_mass.then(|| mean_and_std(&distances).0),
+        reached_fraction: point_mass.then(|| reached / distances.len() as f64),
+    })
+}
+
+/// d at an episode's end: the fifth number of a point mass's observation (equation 5.7).
+fn final_distance(config: &Config, trajectory: &Trajectory) -> Option<f64> {
+    (config.environment.name == "point-mass").then(|| trajectory.observations.last()?.get(4).copied().map(f64::from))?
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::small;
+    use shoal_common::config::Algorithm;
+
+    #[test]
+    fn the_same_seed_gives_the_same_evaluation() {
+        let (config, parameters) = small("name = \"pendulum\"");
+        let first = evaluate(&config, &parameters, 5, 1).unwrap();
+        assert_eq!(evaluate(&config, &parameters, 5, 1).unwrap(), first);
+        assert_ne!(
+            evaluate(&config, &parameters, 5, 2).unwrap().return_mean,
+            first.return_mean
+        );
+        assert!((-2_000.0..0.0).contains(&first.return_mean) && first.return_std > 0.0);
+        let keys = serde_json::to_string(&first).unwrap();
+        assert!(!keys.contains("distance") && !keys.contains("reached"), "{keys}");
+    }
+
+    #[test]
+    fn a_vehicle_that_never_moves_ends_where_it_started() {
+        let (config, mut parameters) = small("name = \"point-mass\"\nreward = \"r1\"");
+        // The last bias is the force's: tanh(−20) is the least force, 0.
+        *parameters.last_mut().unwrap() = -20.0;
+        let summary = evaluate(&config, &parameters, 50, 3).unwrap();
+        // The mean distance of a square's points from its centre is 0.765 half sides.
+        let distance = summary.final_distance_mean.unwrap();
+        assert!((2.4..3.7).contains(&distance), "{distance}");
+        assert_eq!(summary.reached_fraction, Some(0.0));
+    }
+
+    #[test]
+    fn a_policy_of_another_network_is_refused_in_one_line() {
+        let parent = tempfile::tempdir().unwrap();
+        let run = RunDir::create(&parent.path().join("run")).unwrap();
+        let (mut config, parameters) = small("name = \"pendulum\"");
+        std::fs::write(run.config_file(), config.to_toml().unwrap()).unwrap();
+        std::fs::create_dir(run.checkpoints()).unwrap();
+        let missing = WhichPolicy::Best.read(&run, &config).unwrap_err().to_string();
+        assert!(missing.contains("best.policy") && !missing.contains('\n'), "{missing}");
+
+        let fingerprint = policy_layout(&config).unwrap().fingerprint();
+        let policy = PolicyFile {
+            fingerprint,
+            version: 3,
+            env_steps: 1_000,
+            return_mean: -1_200.0,
+            return_std: 300.0,
+            episodes: 10,
+            parameters,
+        };
+        policy.write(&run.last_policy()).unwrap();
+        assert_eq!(WhichPolicy::Last.read(&run, &config).unwrap(), policy);
+        let Algorithm::Ddpg(ddpg, _) = &mut config.algorithm else {
+            unreachable!()
+        };
+        ddpg.hidden = [5, 3];
+        let foreign = WhichPolicy::Last.read(&run, &config).unwrap_err().to_string();
+        assert!(
+            foreign.contains("another network") && !foreign.contains('\n'),
+            "{foreign}"
+        );
+    }
+}

@@ -1,0 +1,338 @@
+//! Environment servers that are other programs (`docs/PROTOCOL.md`): how one is started, and a conversation with one
+//! outside of any run, to learn what it serves or to try a policy in it.
+
+use std::ffi::OsString;
+use std::os::unix::process::{CommandExt, ExitStatusExt};
+use std::path::{Path, PathBuf};
+use std::process::{Command, ExitCode, ExitStatus, Stdio};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, bail};
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::io::Errno;
+use rustix::process::{
+    Pid, PidfdFlags, Signal, getpgrp, getpid, getppid, kill_process, kill_process_group, pidfd_open,
+    set_parent_process_death_signal,
+};
+use shoal_common::channel::environment::{Begin, EnvironmentClient, Observed, Stepped, describe};
+use shoal_common::channel::{Bell, Domain, Interruption, Place, Services};
+use shoal_common::config::Environment;
+use shoal_common::report::Role;
+use shoal_common::space::EnvironmentSpec;
+use shoal_common::stop::{GRACE, Stop};
+
+use crate::process::Peer;
+
+/// Environments whose name begins with this are Gymnasium's.
+pub const GYMNASIUM: &str = "gym:";
+
+/// How long a program may take until it says what it serves: a simulator's libraries have to be loaded.
+const PATIENCE: Duration = Duration::from_secs(120);
+
+/// The command that serves environments of this name where the configuration names none.
+pub fn default_command(name: &str) -> Option<Vec<String>> {
+    let gymnasium = || ["python3", "-m", "shoal_gym"].map(Into::into).into();
+    name.starts_with(GYMNASIUM).then(gymnasium)
+}
+
+/// Which server of which run a program is to be.
+pub struct Post<'a> {
+    /// The file that says where the run lies in shared memory.
+    pub iceoryx2: PathBuf,
+    /// The run's id.
+    pub run_id: &'a str,
+    /// Which server of the run it is.
+    pub index: u32,
+    /// How often this server was started, this time included.
+    pub incarnation: u64,
+    /// Who asks it.
+    pub client: Place,
+    /// How many environments it steps at once.
+    pub environments: u32,
+    /// The root of its random streams.
+    pub seed: u64,
+    /// Which random streams its training episodes come from, besides seed and index.
+    pub stream: u64,
+}
+
+impl Post<'_> {
+    /// What starts the program; `None` where the environment is one of our own.
+    pub fn command(&self, environment: &Environment) -> anyhow::Result<Option<Command>> {
+        let Some((program, arguments)) = environment.server.split_first() else {
+            return Ok(None);
+        };
+        let mut command = Command::new(program);
+        command
+            .args(arguments)
+            .arg("--iceoryx2")
+            .arg(&self.iceoryx2)
+            .args(["--run", self.run_id])
+            .args(["--index", &self.index.to_string()])
+            .args(["--incarnation", &self.incarnation.to_string()])
+            .args(["--client", &format!("{}/{}", self.client.0.name(), self.client.1)])
+            .args(["--environments", &self.environments.to_string()])
+            .args(["--seed", &self.seed.to_string()])
+            .args(["--stream", &self.stream.to_string()])
+            .args(["--name", &environment.name])
+            .args(["--parameters", &serde_json::to_string(&environment.parameters)?]);
+        Ok(Some(command))
+    }
+}
+
+/// The hidden command that becomes a program which does not outlive the process that started it.
+pub const TIED: &str = "tied";
+
+/// The command that starts `program` so: dead with this process, however that ends, and whatever the program is busy with.
+///
+/// # Errors
+/// When there is no such program.
+fn tied(program: &Command) -> anyhow::Result<Command> {
+    let name = Path::new(program.get_program());
+    let in_path = || {
+        let path = std::env::var_os("PATH").unwrap_or_default();
+        std::env::split_paths(&path).any(|directory| directory.join(name).is_file())
+    };
+    if !name.is_file() && (name.components().count() > 1 || !in_path()) {
+        bail!("{}: there is no such file", cannot_start(program));
+    }
+    let mut command = Command::new("/proc/self/exe");
+    command.arg0("shoal").args([TIED, &std::process::id().to_string()]);
+    command.arg(program.get_program()).args(program.get_args());
+    Ok(command)
+}
+
+/// What that command does: dies with the process `parent`, and becomes the program.
+///
+/// # Errors
+/// When the program cannot be started.
+pub fn become_tied(parent: u32, words: &[OsString]) -> anyhow::Result<ExitCode> {
+    let Some((program, arguments)) = words.split_first() else {
+        bail!("there is no program to start");
+    };
+    set_parent_process_death_signal(Some(Signal::KILL)).context("cannot be tied to the process that starts it")?;
+    if getppid().map(Pid::as_raw_pid) != Some(parent as i32) {
+        bail!("the process that starts it has ended");
+    }
+    let mut command = Command::new(program);
+    let cause = command.args(arguments).exec();
+    Err(anyhow::Error::from(cause).context(cannot_start(&command)))
+}
+
+/// Plays the role by running the program, which has this process's standard input and error, and ends as it ends. A program
+/// that does not end when its standard input closes is ended, with all it has started, as a role of ours would be: not even
+/// one that is stuck outlives its run.
+///
+/// # Errors
+/// When it cannot be started or watched.
+pub fn serve_by(program: &Command) -> anyhow::Result<ExitCode> {
+    let mut child = tied(program)?
+        .stdout(Stdio::null())
+        .spawn()
+        .with_context(|| cannot_start(program))?;
+    let process =
+        pidfd_open(Pid::from_child(&child), PidfdFlags::empty()).context("cannot watch the environment server")?;
+    // Closing is told without being asked for; what comes in is for the program.
+    let stdin = std::io::stdin();
+    let mut until = [
+        PollFd::new(&process, PollFlags::IN),
+        PollFd::new(&stdin, PollFlags::empty()),
+    ];
+    while until.iter().all(|event| event.revents().is_empty()) {
+        match poll(&mut until, None) {
+            Ok(_) | Err(Errno::INTR) => {}
+            Err(cause) => return Err(anyhow::Error::from(cause).context("cannot watch the environment server")),
+        }
+    }
+    let deadline = Instant::now() + GRACE;
+    loop {
+        let left = deadline.saturating_duration_since(Instant::now());
+        let patience = Timespec {
+            tv_sec: left.as_secs() as i64,
+            tv_nsec: left.subsec_nanos().into(),
+        };
+        match poll(&mut [PollFd::new(&process, PollFlags::IN)], Some(&patience)) {
+            Ok(0) => return kill_this_group(),
+            Ok(_) => return end_as(child.wait()?),
+            Err(Errno::INTR) => {}
+            Err(cause) => return Err(anyhow::Error::from(cause).context("cannot watch the environment server")),
+        }
+    }
+}
+
+fn kill_this_group() -> anyhow::Result<ExitCode> {
+    if getpgrp() == getpid() {
+        kill_process_group(getpgrp(), Signal::KILL)?;
+    }
+    kill_process(getpid(), Signal::KILL)?;
+    Ok(ExitCode::FAILURE)
+}
+
+/// Ends this process as another one has ended.
+fn end_as(status: ExitStatus) -> anyhow::Result<ExitCode> {
+    if let Some(signal) = status.signal().and_then(Signal::from_named_raw) {
+        kill_process(getpid(), signal)?;
+    }
+    Ok(status
+        .code()
+        .and_then(|code| u8::try_from(code).ok())
+        .map_or(ExitCode::FAILURE, ExitCode::from))
+}
+
+fn cannot_start(command: &Command) -> String {
+    format!(
+        "cannot start the environment server {}",
+        command.get_program().display()
+    )
+}
+
+/// A program that serves environments to this process, until this is dropped.
+pub struct Conversation {
+    client: EnvironmentClient,
+    bell: Bell,
+    spec: EnvironmentSpec,
+    program: Peer,
+    // The last to go, in this order.
+    _services: Services,
+    _corner: Corner,
+}
+
+/// A corner of shared memory that is left tidy.
+struct Corner(Option<Domain>);
+
+impl Drop for Corner {
+    fn drop(&mut self) {
+        // What cannot be removed now is removed by the next who comes.
+        let _ = self.0.take().map(Domain::leave);
+    }
+}
+
+impl Conversation {
+    /// Starts the environment's server, with so many environments, and asks what it serves. Its evaluation episodes start
+    /// as `seed` says.
+    ///
+    /// # Errors
+    /// When it cannot be started, ends, or does not answer; with what it said last.
+    pub fn begin(environment: &Environment, environments: u32, seed: u64) -> anyhow::Result<Self> {
+        Domain::remove_abandoned()?;
+        let run_id = format!("{:08x}", rand::random::<u32>());
+        let domain = Domain::join(&run_id, 1)?;
+        let post = Post {
+            // Where everybody is killed it goes with the rest.
+            iceoryx2: domain.directory()?.join("iceoryx2.toml"),
+            run_id: &run_id,
+            index: 0,
+            incarnation: 1,
+            client: Place(Role::Evaluator, 0),
+            environments,
+            seed,
+            stream: 0,
+        };
+        match opened(&domain, &post, environment) {
+            Ok((services, client, bell, spec, program)) => Ok(Self {
+                client,
+                bell,
+                spec,
+                program,
+                _services: services,
+                _corner: Corner(Some(domain)),
+            }),
+            Err(error) => {
+                domain.leave()?;
+                Err(error)
+            }
+        }
+    }
+
+    /// What the program says of its environments.
+    pub fn spec(&self) -> &EnvironmentSpec {
+        &self.spec
+    }
+
+    /// Begins evaluation episode `number`.
+    ///
+    /// # Errors
+    /// When the program has ended or refuses.
+    pub fn begin_evaluation(&mut self, number: u64) -> anyhow::Result<Observed> {
+        let begun = self.client.reset(&self.bell, Begin::Evaluation(number), || ());
+        answered(begun, &mut self.program)
+    }
+
+    /// Every environment takes a step with its action.
+    ///
+    /// # Errors
+    /// When the program has ended or refuses.
+    pub fn step(&mut self, actions: &[f32]) -> anyhow::Result<Observed> {
+        let stepped = self.client.step(&self.bell, actions, || ());
+        match answered(stepped, &mut self.program)? {
+            Stepped::Taken(observed) => Ok(observed),
+            Stepped::Lost => bail!("the environment server gave up its episodes"),
+        }
+    }
+}
+
+impl Drop for Conversation {
+    fn drop(&mut self) {
+        self.program.dismiss();
+    }
+}
+
+type Opened = (Services, EnvironmentClient, Bell, EnvironmentSpec, Peer);
+
+fn opened(domain: &Domain, post: &Post<'_>, environment: &Environment) -> anyhow::Result<Opened> {
+    let Some(command) = post.command(environment)? else {
+        bail!("environment {} is not served by another program", environment.name);
+    };
+    std::fs::write(&post.iceoryx2, domain.iox_config()?).context("cannot write a temporary file")?;
+    let mut services = Services::new(domain)?;
+    services.create_common(domain)?;
+    services.create_environment(domain, post.index)?;
+    let bell = Bell::hang(domain, post.client)?;
+    let mut program =
+        Peer::start(&mut tied(&command)?, "environment server".into()).with_context(|| cannot_start(&command))?;
+    let heard = Stop::default();
+    let stop = stopped_when_it_ends(&program, heard.clone())?;
+    let described = describe(domain, post.index, &bell, stop.clone());
+    heard.request();
+    let (spec, environments) = answered(described, &mut program).map_err(with_advice)?;
+    let opened = EnvironmentClient::open(domain, post.index, &spec, environments, stop);
+    let client = answered(opened.map_err(Interruption::from), &mut program)?;
+    Ok((services, client, bell, spec, program))
+}
+
+/// Says what to do where Gymnasium's server is not installed.
+fn with_advice(error: anyhow::Error) -> anyhow::Error {
+    if error.to_string().contains("No module named shoal_gym") {
+        return anyhow::anyhow!("{error}; install it, as python/README.md says: pip install ./python");
+    }
+    error
+}
+
+/// A stop that is requested once the program has ended, or was not `heard` of for too long.
+fn stopped_when_it_ends(program: &Peer, heard: Stop) -> anyhow::Result<Stop> {
+    let stop = Stop::default();
+    let flag = stop.clone();
+    let process = pidfd_open(program.pid(), PidfdFlags::empty()).context("cannot watch the environment server")?;
+    std::thread::Builder::new()
+        .name("watch".into())
+        .spawn(move || {
+            let patience = Timespec {
+                tv_sec: PATIENCE.as_secs() as i64,
+                tv_nsec: 0,
+            };
+            let ended = || poll(&mut [PollFd::new(&process, PollFlags::IN)], Some(&patience));
+            while ended() == Ok(0) && heard.requested() {}
+            flag.request();
+        })
+        .context("cannot watch the environment server")?;
+    Ok(stop)
+}
+
+fn answered<T>(answer: Result<T, Interruption>, program: &mut Peer) -> anyhow::Result<T> {
+    answer.or_else(|interruption| {
+        program.check()?;
+        match interruption {
+            Interruption::Stopped => bail!("the environment server did not answer within {PATIENCE:?}"),
+            Interruption::Channel(error) => Err(error.into()),
+        }
+    })
+}

@@ -1,0 +1,378 @@
+//! From what was typed to a run that is decided: presets, files and overrides become one resolved configuration, and
+//! below this line nobody reads options any more.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, bail};
+use shoal_common::config::{Actors, Algorithm, Config, Environment};
+use shoal_common::run_dir::{RunDir, RunLock};
+use shoal_common::space::{EnvironmentSpec, Space};
+use shoal_env_server::environment;
+use toml::{Table, Value};
+
+use crate::external_environment::{self, Conversation, GYMNASIUM};
+use crate::preflight;
+
+const PRESETS: [(&str, &str); 7] = [
+    ("pendulum", include_str!("../../presets/pendulum.toml")),
+    ("point-mass-r1", include_str!("../../presets/point-mass-r1.toml")),
+    ("point-mass-r2", include_str!("../../presets/point-mass-r2.toml")),
+    ("point-mass-r3", include_str!("../../presets/point-mass-r3.toml")),
+    ("frozen-lake", include_str!("../../presets/frozen-lake.toml")),
+    (
+        "frozen-lake-sarsa",
+        include_str!("../../presets/frozen-lake-sarsa.toml"),
+    ),
+    ("cart-pole", include_str!("../../presets/cart-pole.toml")),
+];
+
+/// What a Gymnasium environment is trained with, by the kinds of its observations and actions.
+const FOR_CONTINUOUS_ACTIONS: &str = include_str!("../../presets/gym-continuous.toml");
+const FOR_DISCRETE_ACTIONS: &str = include_str!("../../presets/gym-discrete.toml");
+const FOR_A_TABLE: &str = include_str!("../../presets/gym-table.toml");
+
+/// The key that the program chooses itself.
+pub const FILLED_IN: &str = "run.id";
+
+/// The presets' names.
+pub fn preset_names() -> impl Iterator<Item = &'static str> {
+    PRESETS.iter().map(|(name, _)| *name)
+}
+
+/// The configuration of a preset or a file, resolved, without options.
+pub fn resolved(what: &str) -> anyhow::Result<Config> {
+    decide(what, &RunOverrides::default()).map(|(_, config)| config)
+}
+
+/// What of a preset or a file is decided otherwise for one run.
+#[derive(Clone, Debug, Default)]
+pub struct RunOverrides {
+    /// Run directory to make; `runs/<name>-<n>` where there is none.
+    pub run: Option<PathBuf>,
+    /// `run.seed`.
+    pub seed: Option<u64>,
+    /// `actors.count`.
+    pub actors: Option<u32>,
+    /// `actors.envs`.
+    pub envs: Option<u32>,
+    /// `run.steps`.
+    pub steps: Option<u64>,
+    /// `run.episodes`.
+    pub episodes: Option<u64>,
+    /// Whether `run.mode` is lockstep.
+    pub lockstep: bool,
+    /// Any key, as `SECTION.KEY=VALUE`.
+    pub set: Vec<String>,
+}
+
+/// A run that can begin.
+#[derive(Debug)]
+pub struct Plan {
+    /// Everything that was decided.
+    pub config: Config,
+    /// The directory that was made for it.
+    pub run: RunDir,
+    /// Held for as long as the run is this process's.
+    pub lock: RunLock,
+}
+
+impl Plan {
+    /// Decides everything, and makes the run directory with its `config.toml` only when nothing is wrong.
+    pub fn new(what: &str, overrides: &RunOverrides) -> anyhow::Result<Self> {
+        let (name, config) = decide(what, overrides)?;
+        let place = overrides.run.clone().unwrap_or_else(|| Path::new("runs").join(&name));
+        preflight::check(&config, &RunDir::planned(&place))?;
+        let run = match &overrides.run {
+            Some(path) => RunDir::create(path)?,
+            None => RunDir::create_next(Path::new("runs"), &name)?,
+        };
+        let lock = run.lock()?;
+        if let Err(error) = run.write_config(&config) {
+            // An empty directory would be in the way of the next try.
+            let _ = std::fs::remove_dir_all(run.path());
+            return Err(error.into());
+        }
+        Ok(Self { config, run, lock })
+    }
+}
+
+/// The configuration of a preset or a file with these overrides, and the name that a run of it gets. Nothing is made.
+pub fn decide(what: &str, overrides: &RunOverrides) -> anyhow::Result<(String, Config)> {
+    let (name, table) = sections(what)?;
+    Ok((name, resolve(table, overrides, what)?))
+}
+
+/// The sections of a preset or a file, and the name that a run of it gets.
+fn sections(what: &str) -> anyhow::Result<(String, Table)> {
+    if let Some((name, text)) = PRESETS.into_iter().find(|(name, _)| *name == what) {
+        return Ok((name.into(), text.parse().with_context(|| format!("preset {name}"))?));
+    }
+    if let Some(id) = what.strip_prefix(GYMNASIUM) {
+        let mut table = Table::new();
+        put(&mut table, &["environment", "name"], what.into())?;
+        let is_plain = |c: char| c.is_ascii_alphanumeric() || "-._".contains(c);
+        return Ok((format!("gym-{}", id.replace(|c| !is_plain(c), "-")), table));
+    }
+    let path = PathBuf::from(what);
+    if path.extension().is_none_or(|extension| extension != "toml") {
+        let known: Vec<&str> = preset_names().collect();
+        bail!(
+            "there is no preset `{what}`: choose {}, a file that ends in .toml, or gym: and a Gymnasium environment",
+            known.join(", ")
+        );
+    }
+    let text = std::fs::read_to_string(&path).with_context(|| format!("cannot read {what}"))?;
+    let table = text
+        .parse::<Table>()
+        .map_err(|error| anyhow::anyhow!("{what}: {}", one_line(&error)))?;
+    let name = path
+        .file_stem()
+        .map_or_else(|| "run".into(), |stem| stem.to_string_lossy().into_owned());
+    Ok((name, table))
+}
+
+fn resolve(mut table: Table, overrides: &RunOverrides, origin: &str) -> anyhow::Result<Config> {
+    let mut set = |section: &str, key: &str, value: Value| put(&mut table, &[section, key], value);
+    if let Some(seed) = overrides.seed {
+        let seed = i64::try_from(seed).context("--seed: must be below 2^63")?;
+        set("run", "seed", seed.into())?;
+    }
+    if let Some(steps) = overrides.steps {
+        set(
+            "run",
+            "steps",
+            i64::try_from(steps).context("--steps: must be below 2^63")?.into(),
+        )?;
+    }
+    if let Some(actors) = overrides.actors {
+        set("actors", "count", i64::from(actors).into())?;
+    }
+    if let Some(envs) = overrides.envs {
+        set("actors", "envs", i64::from(envs).into())?;
+    }
+    if let Some(episodes) = overrides.episodes {
+        let episodes = i64::try_from(episodes).context("--episodes: must be below 2^63")?;
+        set("run", "episodes", episodes.into())?;
+    }
+    if overrides.lockstep {
+        set("run", "mode", "lockstep".into())?;
+    }
+    for assignment in &overrides.set {
+        let (key, value) = assignment
+            .split_once('=')
+            .filter(|(key, _)| key.contains('.'))
+            .with_context(|| format!("--set {assignment}: must look like SECTION.KEY=VALUE"))?;
+        let path: Vec<&str> = key.split('.').collect();
+        if path[0] == "spec" || key == FILLED_IN {
+            bail!("--set {assignment}: {key} is not for choosing: the program fills it in");
+        }
+        put(&mut table, &path, value_of(value)).with_context(|| format!("--set {assignment}"))?;
+    }
+    // More actors than a run is usually laid out for: lay it out for them.
+    if let Some(count) = table
+        .get("actors")
+        .and_then(|actors| actors.get("count"))
+        .and_then(Value::as_integer)
+        && count > i64::from(Actors::default().max)
+        && table.get("actors").is_some_and(|actors| actors.get("max").is_none())
+    {
+        put(&mut table, &["actors", "max"], count.into())?;
+    }
+    // The name in shared memory must not be that of another run, whatever the seed.
+    put(
+        &mut table,
+        &["run", "id"],
+        format!("{:08x}", rand::random::<u32>()).into(),
+    )?;
+    describe_environment(&mut table)?;
+    let mut config = Config::from_table(table, origin)?;
+    // Also a short run ends with its policy judged.
+    config.evaluation.every = config.evaluation.every.min(config.run.steps);
+    Ok(config)
+}
+
+/// Fills in what the environment says of itself: of ours every parameter too, and for Gymnasium's a method that suits
+/// it, where no other is named.
+fn describe_environment(table: &mut Table) -> anyhow::Result<()> {
+    let Some(Value::Table(section)) = table.get_mut("environment") else {
+        bail!("the section [environment] is missing: it must have a name");
+    };
+    let Some(Value::String(name)) = section.remove("name") else {
+        bail!(
+            "environment.name is missing: it must be one of {}, or begin with {GYMNASIUM}",
+            environment::names().collect::<Vec<_>>().join(", ")
+        );
+    };
+    let server = match section.remove("server") {
+        Some(command) => Some(
+            command
+                .try_into()
+                .map_err(|error| anyhow::anyhow!("environment.server: {}", one_line(&error)))?,
+        ),
+        None => external_environment::default_command(&name),
+    };
+    let (environment, spec) = if let Some(server) = server {
+        let environment = Environment {
+            name,
+            server,
+            parameters: section.clone(),
+        };
+        let spec = Conversation::begin(&environment, 1, 0)?.spec().clone();
+        (environment, spec)
+    } else {
+        let parameters = environment::resolve(&name, section)?;
+        let spec = environment::make(&name, &parameters)?.spec();
+        let environment = Environment {
+            name,
+            server: vec![],
+            parameters,
+        };
+        (environment, spec)
+    };
+    if environment.name.starts_with(GYMNASIUM) {
+        suit(table, &spec)?;
+    }
+    table.insert("environment".into(), Value::try_from(environment)?);
+    table.insert("spec".into(), Value::try_from(spec)?);
+    Ok(())
+}
+
+/// Puts a method's settings beside those that are there, by what the environment's spaces allow.
+fn suit(table: &mut Table, spec: &EnvironmentSpec) -> anyhow::Result<()> {
+    let text = match (&spec.observation, &spec.action) {
+        (_, Space::Box { .. }) => FOR_CONTINUOUS_ACTIONS,
+        (Space::Box { .. }, Space::Discrete { .. }) => FOR_DISCRETE_ACTIONS,
+        (Space::Discrete { .. }, Space::Discrete { .. }) => FOR_A_TABLE,
+    };
+    let mut method: Table = text.parse()?;
+    let is_another = |name: &&str| table.contains_key(*name) && !method.contains_key(*name);
+    if Algorithm::NAMES.iter().any(is_another) {
+        return Ok(());
+    }
+    if method.contains_key("reinforce") {
+        // A chunk is an episode.
+        put(&mut method, &["actors", "chunk_steps"], spec.time_limit.into())?;
+    }
+    for (section, values) in method {
+        let there = table.entry(section).or_insert_with(|| Table::new().into());
+        if let (Value::Table(there), Value::Table(values)) = (there, values) {
+            values.into_iter().for_each(|(key, value)| {
+                there.entry(key).or_insert(value);
+            });
+        }
+    }
+    Ok(())
+}
+
+fn put(table: &mut Table, path: &[&str], value: Value) -> anyhow::Result<()> {
+    match path {
+        [] => Ok(()),
+        [key] => {
+            table.insert((*key).into(), value);
+            Ok(())
+        }
+        [section, rest @ ..] => match table.entry(*section).or_insert_with(|| Table::new().into()) {
+            Value::Table(inner) => put(inner, rest, value),
+            _ => bail!("`{section}` is a value, not a section"),
+        },
+    }
+}
+
+/// A TOML value, or a string where it is none: `reward=r2` needs no quotes.
+fn value_of(text: &str) -> Value {
+    format!("value = {text}")
+        .parse::<Table>()
+        .ok()
+        .and_then(|mut table| table.remove("value"))
+        .unwrap_or_else(|| text.into())
+}
+
+fn one_line(error: &toml::de::Error) -> String {
+    error.message().replace('\n', " ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use shoal_common::config::Mode;
+
+    fn plan(what: &str, set: &[&str]) -> anyhow::Result<Config> {
+        let overrides = RunOverrides {
+            set: set.iter().map(|assignment| (*assignment).into()).collect(),
+            ..RunOverrides::default()
+        };
+        decide(what, &overrides).map(|(_, config)| config)
+    }
+
+    #[test]
+    fn every_preset_is_a_configuration() {
+        for (name, _) in PRESETS {
+            let config = plan(name, &[]).unwrap();
+            let limit = if name.starts_with("frozen-lake") { 100 } else { 200 };
+            assert_eq!(config.spec.time_limit, limit, "{name}");
+            assert!(
+                !config.environment.parameters.is_empty(),
+                "every parameter is filled in: {:?}",
+                config.environment
+            );
+        }
+    }
+
+    #[test]
+    fn overrides_reach_the_configuration() {
+        let overrides = RunOverrides {
+            seed: Some(7),
+            steps: Some(500),
+            actors: Some(3),
+            envs: Some(2),
+            lockstep: true,
+            set: [
+                "environment.reward=r2",
+                "environment.friction=0.03",
+                "ddpg.hidden=[20, 10]",
+            ]
+            .map(Into::into)
+            .into(),
+            ..RunOverrides::default()
+        };
+        let (name, config) = decide("point-mass-r3", &overrides).unwrap();
+        assert_eq!(name, "point-mass-r3");
+        assert_eq!(
+            (
+                config.run.seed,
+                config.run.steps,
+                config.run.mode,
+                config.actors.count,
+                config.actors.envs
+            ),
+            (7, 500, Mode::Lockstep, 3, 2)
+        );
+        assert_eq!(config.environment.parameters["reward"].as_str(), Some("r2"));
+        assert_eq!(config.environment.parameters["friction"].as_float(), Some(0.03));
+        assert_eq!(config.algorithm.ddpg().unwrap().hidden, [20, 10]);
+    }
+
+    #[test]
+    fn what_is_wrong_is_said_on_one_line() {
+        for (what, set, part) in [
+            ("pendulums", "", "no preset `pendulums`"),
+            ("missing.toml", "", "missing.toml"),
+            ("pendulum", "ddpg.gama=1", "gama"),
+            ("pendulum", "dpg.gamma=1", "dpg"),
+            ("pendulum", "gamma=1", "SECTION.KEY=VALUE"),
+            ("pendulum", "spec.time_limit=50", "not for choosing"),
+            ("pendulum", "ddpg.gamma=2", "ddpg.gamma = 2: must be from 0 to 1"),
+            ("pendulum", "ddpg.gamma=high", "high"),
+            ("pendulum", "environment.start_sped=1", "start_sped"),
+            ("pendulum", "environment.name=pendule", "pendule"),
+            ("pendulum", "actors.count=0", "actors.count = 0"),
+        ] {
+            let set: Vec<&str> = (!set.is_empty()).then_some(set).into_iter().collect();
+            let message = format!("{:#}", plan(what, &set).unwrap_err());
+            assert!(
+                message.contains(part) && !message.contains('\n'),
+                "{what} {set:?}: {message}"
+            );
+        }
+    }
+}

@@ -1,0 +1,165 @@
+//! Another process that works for this one outside of any run: a role that is measured, an environment server that is asked.
+
+use std::os::unix::process::CommandExt;
+use std::process::{ChildStdin, Command, ExitStatus};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, bail};
+use rustix::process::{Pid, Signal, kill_process};
+use rustix::thread::{CpuSet, sched_setaffinity};
+use shoal_common::report::{Identity, Role};
+use shoal_common::run_dir::RunDir;
+
+use crate::process::ChildGroup;
+use crate::process::ChildOutput;
+
+/// How long a learner may take to bring its replay to the disk.
+const FAREWELL: Duration = Duration::from_secs(15);
+
+/// How long one may take that is not needed any more.
+const DISMISSAL: Duration = Duration::from_secs(2);
+
+/// Exit code of a launcher that Ctrl-C has ended in order.
+const INTERRUPTED: i32 = 130;
+
+/// A process. It ends when its standard input closes, be it because this process is no more.
+#[derive(Debug)]
+pub struct Peer {
+    group: ChildGroup,
+    stdin: Option<ChildStdin>,
+    /// What the process writes, and its last line so far.
+    output: Option<ChildOutput>,
+    last_line: Arc<Mutex<Option<String>>>,
+    what: String,
+}
+
+impl Peer {
+    /// Starts this program again as `role` 0 of the run.
+    pub fn role(role: Role, run: &RunDir) -> anyhow::Result<Self> {
+        let first = Identity {
+            role,
+            index: 0,
+            incarnation: 1,
+        };
+        Self::member(first, run)
+    }
+
+    /// Starts this program again as a role of the run.
+    pub fn member(identity: Identity, run: &RunDir) -> anyhow::Result<Self> {
+        let Identity {
+            role,
+            index,
+            incarnation,
+        } = identity;
+        let mut command = Command::new("/proc/self/exe");
+        command.arg0("shoal").arg(role.name()).arg(run.path());
+        command.args([index.to_string(), incarnation.to_string()]);
+        Self::start(&mut command, role.name().into()).with_context(|| format!("cannot start the {}", role.name()))
+    }
+
+    /// Starts a process that messages call `what`.
+    pub fn start(command: &mut Command, what: String) -> std::io::Result<Self> {
+        let (group, stdin, stderr) = ChildGroup::start(command)?;
+        let mut peer = Self {
+            group,
+            stdin,
+            output: None,
+            last_line: Arc::default(),
+            what,
+        };
+        let last_line = Arc::clone(&peer.last_line);
+        let keep = move |line: &str| *last_line.lock().unwrap_or_else(PoisonError::into_inner) = Some(line.into());
+        peer.output = stderr
+            .map(|stderr| ChildOutput::read("peer", stderr, keep))
+            .transpose()?;
+        Ok(peer)
+    }
+
+    /// Its number.
+    pub fn pid(&self) -> Pid {
+        self.group.pid()
+    }
+
+    /// An error if the process has ended, with what it said last.
+    pub fn check(&mut self) -> anyhow::Result<()> {
+        match self.group.exit_status() {
+            Some(status) => self.ended_early(status),
+            None => Ok(()),
+        }
+    }
+
+    /// Has the process's first thread run on these cores only; threads that it starts later do as well.
+    pub fn pin(&self, cores: &CpuSet) -> anyhow::Result<()> {
+        sched_setaffinity(Some(self.pid()), cores)
+            .with_context(|| format!("cannot choose a core for the {}", self.what))
+    }
+
+    /// Stops the process where it is, until [`Peer::go_on`].
+    pub fn pause(&self) -> anyhow::Result<()> {
+        self.signal(Signal::STOP)
+    }
+
+    /// Lets a paused process go on.
+    pub fn go_on(&self) -> anyhow::Result<()> {
+        self.signal(Signal::CONT)
+    }
+
+    fn signal(&self, signal: Signal) -> anyhow::Result<()> {
+        kill_process(self.pid(), signal).with_context(|| format!("cannot signal the {}", self.what))
+    }
+
+    /// Asks the process to end, and does not wait for it.
+    pub fn ask_to_end(&mut self) {
+        self.stdin = None;
+    }
+
+    /// Asks the process to end, and waits for it.
+    pub fn end(mut self) -> anyhow::Result<()> {
+        self.ask_to_end();
+        match self.wait(FAREWELL)? {
+            status if status.success() => Ok(()),
+            status => self.ended_early(status),
+        }
+    }
+
+    /// Ends a launcher, which hears signals and not its standard input, and waits for it.
+    pub fn interrupt(mut self, patience: Duration) -> anyhow::Result<()> {
+        self.signal(Signal::INT)?;
+        let status = self.wait(patience)?;
+        match status.code() {
+            Some(0 | INTERRUPTED) => Ok(()),
+            _ => self.ended_early(status),
+        }
+    }
+
+    fn wait(&mut self, patience: Duration) -> anyhow::Result<ExitStatus> {
+        let deadline = Instant::now() + patience;
+        loop {
+            match self.group.exit_status() {
+                Some(status) => return Ok(status),
+                None if Instant::now() >= deadline => bail!("the {} did not end when asked to", self.what),
+                None => std::thread::sleep(Duration::from_millis(2)),
+            }
+        }
+    }
+
+    /// Asks the process to end; one that does not is killed when this is dropped.
+    pub fn dismiss(&mut self) {
+        self.stdin = None;
+        let deadline = Instant::now() + DISMISSAL;
+        while self.group.exit_status().is_none() && Instant::now() < deadline {
+            std::thread::sleep(Duration::from_millis(2));
+        }
+    }
+
+    fn ended_early(&mut self, status: ExitStatus) -> anyhow::Result<()> {
+        if let Some(output) = &self.output {
+            output.wait();
+        }
+        let said = self.last_line.lock().unwrap_or_else(PoisonError::into_inner).take();
+        let said = said.unwrap_or_else(|| "it said nothing".into());
+        let said = said.strip_prefix("error: ").unwrap_or(&said);
+        bail!("the {} ended ({status}): {said}", self.what);
+    }
+}

@@ -1,0 +1,295 @@
+//! The run's records: four tables, and the numbers of three of them for TensorBoard.
+
+mod incident;
+mod table;
+mod tensorboard;
+
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+pub use incident::{Incident, IncidentRow, What};
+use serde::{Deserialize, Serialize};
+use shoal_common::report::{EpisodeReport, EvaluationReport, LearnerReport};
+use shoal_common::run_dir::RunDir;
+pub use table::RecordError;
+use table::Table;
+
+use self::tensorboard::EventFile;
+
+/// What a `kill -9` of the launcher may cost.
+const UNWRITTEN: Duration = Duration::from_millis(500);
+
+/// A row of `episodes.csv`.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Episode {
+    /// Seconds the run had taken, over all its launchers.
+    pub wall_seconds: f64,
+    /// Environment steps over all actors by then.
+    pub env_steps: u64,
+    actor: u32,
+    environment: u32,
+    /// Steps it took.
+    pub steps: u32,
+    /// 1 where the environment terminated, 0 where the time limit truncated.
+    pub terminated: u32,
+    /// Sum of its rewards.
+    #[serde(rename = "return")]
+    pub episode_return: f64,
+    /// Version of the policy at its end.
+    pub policy_version: u64,
+}
+
+/// A row of `evaluations.csv`.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Evaluation {
+    /// Seconds the run had taken, over all its launchers.
+    pub wall_seconds: f64,
+    /// Environment steps the policy was learned from.
+    pub env_steps: u64,
+    /// Updates it was made by.
+    pub updates: u64,
+    /// Its version.
+    pub policy_version: u64,
+    /// Mean of the episodes' returns.
+    pub return_mean: f64,
+    /// Their standard deviation (n − 1).
+    pub return_std: f64,
+    /// Episodes run.
+    pub episodes: u32,
+    /// 1 where no earlier one was as good.
+    pub best: u32,
+}
+
+/// A row of `learner.csv`. Empty where there is nothing to tell: no update since the row before, or none before it.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Learner {
+    /// Seconds the run had taken, over all its launchers.
+    pub wall_seconds: f64,
+    /// Rows committed to the replay.
+    pub env_steps: u64,
+    /// Episodes over; older builds did not say.
+    #[serde(default)]
+    pub episodes: u64,
+    /// Updates done.
+    pub updates: u64,
+    policy_version: u64,
+    /// The last loss of what estimates values.
+    pub critic_loss: Option<f64>,
+    /// The last loss of the policy.
+    pub actor_loss: Option<f64>,
+    /// The last mean of the estimated values.
+    pub q_mean: Option<f64>,
+    /// Since the row before.
+    pub updates_per_second: Option<f64>,
+    /// Since the row before.
+    pub env_steps_per_second: Option<f64>,
+    /// Updates for each environment step beyond the warm-up.
+    pub ratio: Option<f64>,
+}
+
+/// Writes the records of a run. A resumed run's are continued: one header, and seconds that count on.
+#[derive(Debug)]
+pub struct Recorder {
+    episodes: Table,
+    evaluations: Table,
+    learner: Table,
+    incidents: Table,
+    events: EventFile,
+    events_path: std::path::PathBuf,
+    warmup: u64,
+    /// Seconds of the run's launchers before this one.
+    earlier: f64,
+    /// Environment steps by the newest report.
+    env_steps: u64,
+    previous: Option<(Duration, LearnerReport)>,
+    flushed: Instant,
+}
+
+impl Recorder {
+    /// Opens the records of `run`, whose learner begins after `warmup` environment steps.
+    pub fn open(run: &RunDir, warmup: u64) -> Result<Self, RecordError> {
+        let episodes = Table::open::<Episode>(&run.episodes())?;
+        let evaluations = Table::open::<Evaluation>(&run.evaluations())?;
+        let learner = Table::open::<Learner>(&run.learner_log())?;
+        let incidents = Table::open::<IncidentRow>(&run.incidents())?;
+        let last = table::last::<Learner>(&run.learner_log())?;
+        let (earlier, env_steps) = last.as_ref().map_or((0.0, 0), |row| (row.wall_seconds, row.env_steps));
+        let events = EventFile::create(&run.tensorboard()).map_err(|cause| RecordError::Write {
+            path: run.tensorboard(),
+            cause,
+        })?;
+        let (events_path, flushed) = (run.tensorboard(), Instant::now());
+        let mut recorder = Self {
+            episodes,
+            evaluations,
+            learner,
+            incidents,
+            events,
+            events_path,
+            warmup,
+            earlier,
+            env_steps,
+            previous: None,
+            flushed,
+        };
+        if last.is_some() {
+            let resumed = Incident::of_launcher(What::Resumed, String::new());
+            recorder.incident(&resumed, Duration::ZERO)?;
+        }
+        Ok(recorder)
+    }
+
+    /// An exploration episode has ended, `wall` after this launcher's start.
+    pub fn episode(&mut self, report: &EpisodeReport, wall: Duration) -> Result<(), RecordError> {
+        self.episodes.write(&Episode {
+            wall_seconds: self.seconds(wall),
+            env_steps: report.env_steps,
+            actor: report.actor,
+            environment: report.environment,
+            steps: report.steps,
+            terminated: report.terminated,
+            episode_return: report.episode_return,
+            policy_version: report.policy_version,
+        })?;
+        let scalars = [
+            ("episode/return", report.episode_return),
+            ("episode/steps", report.steps.into()),
+        ];
+        self.scalars(report.env_steps, &scalars)?;
+        if self.flushed.elapsed() >= UNWRITTEN {
+            self.flush()
+        } else {
+            Ok(())
+        }
+    }
+
+    /// A policy has been judged.
+    pub fn evaluation(&mut self, report: &EvaluationReport, wall: Duration) -> Result<(), RecordError> {
+        self.evaluations.write(&Evaluation {
+            wall_seconds: self.seconds(wall),
+            env_steps: report.env_steps,
+            updates: report.updates,
+            policy_version: report.policy_version,
+            return_mean: report.return_mean,
+            return_std: report.return_std,
+            episodes: report.episodes,
+            best: report.best,
+        })?;
+        let scalars = [
+            ("evaluation/return_mean", report.return_mean),
+            ("evaluation/return_std", report.return_std),
+        ];
+        self.scalars(report.env_steps, &scalars)?;
+        self.flush()
+    }
+
+    /// The learner has got on. Reports that come twice a second also bring the other records to the files.
+    pub fn learner(&mut self, report: &LearnerReport, wall: Duration) -> Result<(), RecordError> {
+        let averaged = |mean: f64| (report.averaged > 0).then_some(mean);
+        let rate = |count: fn(&LearnerReport) -> u64| {
+            let (before, previous) = self.previous.as_ref()?;
+            let seconds = wall.checked_sub(*before)?.as_secs_f64();
+            // A restarted learner begins again at its checkpoint.
+            let done = count(report).checked_sub(count(previous))?;
+            (seconds > 0.0).then_some(done as f64 / seconds)
+        };
+        let explored = report.env_steps.saturating_sub(self.warmup);
+        let row = Learner {
+            wall_seconds: self.seconds(wall),
+            env_steps: report.env_steps,
+            episodes: report.episodes,
+            updates: report.updates,
+            policy_version: report.policy_version,
+            critic_loss: averaged(report.critic_loss),
+            actor_loss: averaged(report.actor_loss),
+            q_mean: averaged(report.q_mean),
+            updates_per_second: rate(|report| report.updates),
+            env_steps_per_second: rate(|report| report.env_steps),
+            ratio: (explored > 0).then(|| report.updates as f64 / explored as f64),
+        };
+        self.env_steps = report.env_steps;
+        self.previous = Some((wall, *report));
+        self.learner.write(&row)?;
+        let scalars = [
+            ("learner/critic_loss", row.critic_loss),
+            ("learner/actor_loss", row.actor_loss),
+            ("learner/q_mean", row.q_mean),
+            ("learner/updates_per_second", row.updates_per_second),
+            ("learner/env_steps_per_second", row.env_steps_per_second),
+            ("learner/ratio", row.ratio),
+        ];
+        self.scalars(
+            report.env_steps,
+            &scalars.map(|(tag, value)| (tag, value.unwrap_or(f64::NAN))),
+        )?;
+        self.flush()
+    }
+
+    /// Something became of a process. It is in the file when this returns.
+    pub fn incident(&mut self, incident: &Incident, wall: Duration) -> Result<(), RecordError> {
+        self.incidents.write(&IncidentRow {
+            wall_seconds: self.seconds(wall),
+            env_steps: self.env_steps,
+            role: incident.role.into(),
+            index: incident.index,
+            what: incident.what,
+            detail: incident.detail.clone(),
+        })?;
+        self.incidents.flush()
+    }
+
+    /// Hands everything to the system, which keeps it whatever becomes of this process.
+    pub fn flush(&mut self) -> Result<(), RecordError> {
+        self.flushed = Instant::now();
+        for table in [&mut self.episodes, &mut self.evaluations, &mut self.learner] {
+            table.flush()?;
+        }
+        self.events.flush().map_err(|cause| RecordError::Write {
+            path: self.events_path.clone(),
+            cause,
+        })
+    }
+
+    fn scalars(&mut self, env_steps: u64, scalars: &[(&str, f64)]) -> Result<(), RecordError> {
+        let path = &self.events_path;
+        self.events
+            .scalars(env_steps, scalars)
+            .map_err(|cause| RecordError::Write {
+                path: path.clone(),
+                cause,
+            })
+    }
+
+    /// Whole milliseconds are enough.
+    fn seconds(&self, wall: Duration) -> f64 {
+        ((self.earlier + wall.as_secs_f64()) * 1e3).round() / 1e3
+    }
+}
+
+/// The rows of an `evaluations.csv`, none where there is no such file.
+pub fn read_evaluations(path: &Path) -> Result<Vec<Evaluation>, RecordError> {
+    table::rows(path)
+}
+
+/// The rows of an `episodes.csv`, none where there is no such file.
+pub fn read_episodes(path: &Path) -> Result<Vec<Episode>, RecordError> {
+    table::rows(path)
+}
+
+/// The rows of a `learner.csv`, none where there is no such file.
+pub fn read_learner(path: &Path) -> Result<Vec<Learner>, RecordError> {
+    table::rows(path)
+}
+
+/// The rows of an `incidents.csv`; nothing where there is no such file: older builds kept none.
+pub fn read_incidents(path: &Path) -> Result<Option<Vec<IncidentRow>>, RecordError> {
+    path.exists().then(|| table::rows(path)).transpose()
+}
+
+/// Environment steps and episodes of a run by its records; none before the first row.
+pub fn recorded(run: &RunDir) -> Result<Option<(u64, u64)>, RecordError> {
+    Ok(table::last::<Learner>(&run.learner_log())?.map(|row| (row.env_steps, row.episodes)))
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,177 @@
+//! A CSV file that grows by rows of one kind.
+
+use std::fs::{File, OpenOptions};
+use std::io::{self, BufRead, BufReader, Read, Seek, SeekFrom};
+use std::path::{Path, PathBuf};
+
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+
+/// Why a record was not written or read.
+#[derive(Debug, thiserror::Error)]
+pub enum RecordError {
+    /// The system refused.
+    #[error("cannot write {path}: {cause}; free some space or check the rights of the directory")]
+    Write {
+        /// The file.
+        path: PathBuf,
+        /// The system's reason.
+        cause: io::Error,
+    },
+    /// The system refused.
+    #[error("cannot read {path}: {cause}")]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// The system's reason.
+        cause: io::Error,
+    },
+    /// The file is not what its name says.
+    #[error("{path} is not a record of this program: {reason}")]
+    Malformed {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
+}
+
+/// A table open for appending.
+#[derive(Debug)]
+pub(super) struct Table {
+    path: PathBuf,
+    rows: csv::Writer<File>,
+}
+
+impl Table {
+    /// Opens the table at `path`, a new one where there is none. A last line that a crash cut short is removed; a file that
+    /// is no such table is left as it is.
+    pub(super) fn open<Row: Serialize + Default>(path: &Path) -> Result<Self, RecordError> {
+        let write = |cause| RecordError::Write {
+            path: path.to_owned(),
+            cause,
+        };
+        let mut file = OpenOptions::new()
+            .read(true)
+            .write(true)
+            .create(true)
+            .truncate(false)
+            .open(path)
+            .map_err(write)?;
+        let (end, lines) = whole_lines(&file).map_err(write)?;
+        let expected = header_of::<Row>(path)?;
+        let found = first_line(&file, expected.len()).map_err(write)?;
+        if (end > 0 && found != expected) || !expected.starts_with(&found) {
+            let [found, expected] = [found, expected].map(|line| String::from_utf8_lossy(&line).trim_end().to_owned());
+            let reason = format!("its first line is {found:?}, not {expected:?}");
+            return Err(RecordError::Malformed {
+                path: path.to_owned(),
+                reason,
+            });
+        }
+        file.set_len(end)
+            .and_then(|()| file.seek(SeekFrom::End(0)))
+            .map_err(write)?;
+        Ok(Self::onto(path, file, lines))
+    }
+
+    /// Onto a file that has so many whole lines, its header included.
+    pub(super) fn onto(path: &Path, file: File, lines: u64) -> Self {
+        let rows = csv::WriterBuilder::new().has_headers(lines == 0).from_writer(file);
+        Self {
+            path: path.to_owned(),
+            rows,
+        }
+    }
+
+    pub(super) fn write(&mut self, row: &impl Serialize) -> Result<(), RecordError> {
+        self.rows
+            .serialize(row)
+            .map_err(|error| record_error(&self.path, error))?;
+        Ok(())
+    }
+
+    pub(super) fn flush(&mut self) -> Result<(), RecordError> {
+        self.rows.flush().map_err(|cause| RecordError::Write {
+            path: self.path.clone(),
+            cause,
+        })
+    }
+}
+
+/// All rows of the table at `path`, none where there is no file. A last line without an end is not a row yet.
+pub(super) fn rows<Row: DeserializeOwned>(path: &Path) -> Result<Vec<Row>, RecordError> {
+    let read = |cause| RecordError::Read {
+        path: path.to_owned(),
+        cause,
+    };
+    let mut text = match std::fs::read_to_string(path) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
+        text => text.map_err(read)?,
+    };
+    text.truncate(text.rfind('\n').map_or(0, |end| end + 1));
+    let rows = csv::Reader::from_reader(text.as_bytes())
+        .into_deserialize()
+        .collect::<Result<_, _>>();
+    rows.map_err(|error| malformed(path, &error))
+}
+
+/// The last row of the table at `path`.
+pub(super) fn last<Row: DeserializeOwned>(path: &Path) -> Result<Option<Row>, RecordError> {
+    rows(path).map(|mut rows: Vec<Row>| rows.pop())
+}
+
+/// Where the whole lines end, and how many they are.
+fn whole_lines(file: &File) -> io::Result<(u64, u64)> {
+    let (mut end, mut lines, mut line) = (0, 0, Vec::new());
+    let mut reader = BufReader::with_capacity(1 << 16, file);
+    loop {
+        line.clear();
+        let read = reader.read_until(b'\n', &mut line)?;
+        if line.last() != Some(&b'\n') {
+            return Ok((end, lines));
+        }
+        end += read as u64;
+        lines += 1;
+    }
+}
+
+/// The first line with its end, or as much of it as shows that it is not `length` bytes long.
+fn first_line(mut file: &File, length: usize) -> io::Result<Vec<u8>> {
+    let mut line = Vec::new();
+    file.rewind()?;
+    BufReader::new(file.take(length as u64 + 1)).read_until(b'\n', &mut line)?;
+    Ok(line)
+}
+
+/// The line that a table of such rows begins with.
+fn header_of<Row: Serialize + Default>(path: &Path) -> Result<Vec<u8>, RecordError> {
+    let mut writer = csv::Writer::from_writer(Vec::new());
+    writer
+        .serialize(Row::default())
+        .map_err(|error| malformed(path, &error))?;
+    let mut text = writer.into_inner().unwrap_or_default();
+    text.truncate(text.iter().position(|byte| *byte == b'\n').map_or(0, |end| end + 1));
+    Ok(text)
+}
+
+fn record_error(path: &Path, error: csv::Error) -> RecordError {
+    match error.into_kind() {
+        csv::ErrorKind::Io(cause) => RecordError::Write {
+            path: path.to_owned(),
+            cause,
+        },
+        kind => RecordError::Malformed {
+            path: path.to_owned(),
+            reason: format!("{kind:?}"),
+        },
+    }
+}
+
+fn malformed(path: &Path, error: &csv::Error) -> RecordError {
+    let reason = error.to_string().replace('\n', " ");
+    RecordError::Malformed {
+        path: path.to_owned(),
+        reason,
+    }
+}

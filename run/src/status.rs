@@ -1,0 +1,107 @@
+//! How a run stands, as far as its directory tells.
+
+use shoal_common::channel::control::RunStatus;
+use shoal_common::commit::{CommitReader, OpenError};
+use shoal_common::config::Config;
+use shoal_common::report::Identity;
+use shoal_common::run_dir::RunDir;
+use shoal_learner::checkpoint::Checkpoints;
+use shoal_learner::learner;
+use shoal_learner::ratio::Ratio;
+
+use crate::outcome::{Outcome, State};
+use crate::recorder::{RecordError, read_evaluations};
+
+/// How a run stands that nobody works on: what a learner would go on from.
+pub fn at_rest(config: &Config, run: &RunDir) -> anyhow::Result<RunStatus> {
+    let counters = Checkpoints::new(&run.checkpoints(), config.fingerprint())
+        .load_newest()?
+        .map(|loaded| loaded.checkpoint.counters)
+        .unwrap_or_default();
+    let mut status = RunStatus {
+        env_steps: counters.rows,
+        steps: config.run.steps,
+        episodes: counters.episodes,
+        episodes_limit: config.run.episodes,
+        updates: counters.updates,
+        replay_rows: replay_rows(run)?,
+        actors: config.actors.count,
+        updates_per_step: config.replay.updates_per_step,
+        policy_version: counters.policy_version,
+        eval_return_mean: read_evaluations(&run.evaluations())?
+            .last()
+            .map(|last| last.return_mean),
+        ..Default::default()
+    };
+    status.ratio = ratio(&status, config.replay.warmup);
+    status.finished = is_finished(config, run, &status)?;
+    Ok(status)
+}
+
+/// Whether a run that nobody works on has done all it was to do. A launcher that was killed, or stopped, after the last step
+/// has left updates or evaluations undone.
+fn is_finished(config: &Config, run: &RunDir, status: &RunStatus) -> anyhow::Result<bool> {
+    if !status.has_all_steps() {
+        return Ok(false);
+    }
+    if let Some(outcome) = Outcome::read(run)? {
+        return Ok(outcome.state == State::Finished);
+    }
+    // The run is of a build that did not write it down.
+    Ok(status.updates >= Ratio::from(&config.replay).allowed(status.env_steps))
+}
+
+/// Rows committed to a run's replay; 0 before there is one.
+pub fn replay_rows(run: &RunDir) -> Result<u64, OpenError> {
+    match CommitReader::open(&run.replay_file()) {
+        Ok(reader) => Ok(reader.rows()),
+        Err(OpenError::NotYet { .. }) => Ok(0),
+        Err(error) => Err(error),
+    }
+}
+
+/// The period of the policy that was judged last, by the run's records: the launcher has them written before it starts
+/// anybody again.
+pub fn judged(config: &Config, run: &RunDir) -> Result<Option<u64>, RecordError> {
+    let evaluations = read_evaluations(&run.evaluations())?;
+    let periods = evaluations
+        .iter()
+        .map(|evaluation| config.evaluation.period(evaluation.env_steps));
+    Ok(periods.max())
+}
+
+/// Updates for each environment step beyond the warm-up.
+pub fn ratio(status: &RunStatus, warmup: u64) -> f64 {
+    match status.env_steps.saturating_sub(warmup) {
+        0 => 0.0,
+        beyond => status.updates as f64 / beyond as f64,
+    }
+}
+
+/// What the learner of a run is told.
+pub fn learner_settings(config: &Config, run: &RunDir, identity: Identity, judged: Option<u64>) -> learner::Settings {
+    learner::Settings {
+        identity,
+        seed: config.run.seed,
+        mode: config.run.mode,
+        steps: config.run.steps,
+        actors: config.actors.count,
+        max_actors: config.actors.max,
+        window: config.actors.window,
+        chunk: config.chunk_layout(),
+        spec: config.spec.clone(),
+        algorithm: config.algorithm.clone(),
+        threads: config.learner.threads,
+        envs: config.actors.envs,
+        episodes: config.run.episodes,
+        ratio: Ratio::from(&config.replay),
+        capacity: config.replay.capacity,
+        evaluation: config.evaluation.clone(),
+        judged,
+        checkpoint: config.checkpoint.clone(),
+        fingerprint: config.fingerprint(),
+        replay: run.replay_file(),
+        checkpoints: run.checkpoints(),
+        last_policy: run.last_policy(),
+    }
+}

@@ -1,0 +1,56 @@
+//! What the tests of several crates need.
+
+#![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
+
+use std::f64::consts::PI;
+
+use shoal_common::config::Config;
+use shoal_env_server::environment::angle::wrap;
+use shoal_env_server::environment::make;
+
+use crate::analysis::pendulum::SwingUp;
+use crate::analysis::point_mass::Drive;
+use crate::rollout::policy_layout;
+
+/// A small configuration for tests, and a policy for it that always takes the action in the middle of its range.
+pub fn small(environment: &str) -> (Config, Vec<f32>) {
+    let text = format!("[run]\nid = \"1a\"\n[environment]\n{environment}\n[ddpg]\nhidden = [4, 3]\n");
+    let mut table: toml::Table = text.parse().unwrap();
+    let mut parameters = table["environment"].as_table().unwrap().clone();
+    let name = parameters.remove("name").unwrap();
+    let spec = make(name.as_str().unwrap(), &parameters).unwrap().spec();
+    table.insert("spec".into(), toml::Value::try_from(spec).unwrap());
+    let config = Config::from_table(table, "test").unwrap();
+    let parameters = vec![0.0; policy_layout(&config).unwrap().parameters()];
+    (config, parameters)
+}
+
+/// A drive that comes to rest `rest` m from the goal, turning back and forth by `shake` rad a step, with this force on
+/// the way and `held` at rest.
+pub fn drive(start: [f64; 2], rest: f64, shake: f64, force: f64, held: f64) -> Drive {
+    let left = |t: u32| rest / start[0].hypot(start[1]) + (1.0 - f64::from(t.min(80)) / 80.0);
+    Drive {
+        start,
+        x: (0..=200).map(|t| start[0] * left(t)).collect(),
+        y: (0..=200).map(|t| start[1] * left(t)).collect(),
+        direction: (0..200).map(|t| wrap(PI - 0.1 + shake * f64::from(t % 2))).collect(),
+        force: (0..200).map(|t| if t < 80 { force } else { held }).collect(),
+        rewards: vec![0.5; 200],
+    }
+}
+
+/// An episode that swings for 60 steps and then stands still, up to `rest`, held by `torque`.
+pub fn swing(rest: f64, torque: f64) -> SwingUp {
+    let angle = |t: u32| {
+        let left = 1.0 - f64::from(t.min(60)) / 60.0;
+        PI * left + 2.0 * left * (f64::from(t) / 8.0).sin() + rest
+    };
+    SwingUp {
+        angle: (0..=200).map(angle).collect(),
+        velocity: (0..=200).map(|t| (angle(t + 1) - angle(t)) / 0.05).collect(),
+        torque: (0..200)
+            .map(|t| if t < 60 { 2.0 } else { torque * f64::from(1 - t % 2 * 2) })
+            .collect(),
+        rewards: vec![-1.0; 200],
+    }
+}
