@@ -10,22 +10,22 @@ mod process;
 mod progress;
 mod stall;
 
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::os::fd::AsFd;
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use shoal_common::channel::control::{Answer, ControlPort, Question, RunStatus};
-use shoal_common::channel::reports::Reports;
+use shoal_common::channel::reports::{Report, Reports};
 use shoal_common::channel::{Domain, DomainError};
 use shoal_common::config::Config;
 use shoal_common::report::{EpisodeReport, EvaluationReport, Heartbeat, LearnerReport, Role};
 use shoal_common::run_dir::RunDir;
 use shoal_common::stop::GRACE;
 use shoal_run::outcome::{self, State};
+use shoal_run::process::wait_for_any;
 use shoal_run::recorder::Recorder;
+use shoal_run::signals::Signals;
 use shoal_run::{preflight, status};
-use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 pub(crate) use self::cleaner::work as clean_up;
 use self::crew::Crew;
@@ -34,8 +34,13 @@ pub(crate) use self::log::{EVERYBODY_ENDED, FAILED};
 use self::progress::Progress;
 use self::stall::Stalls;
 
-/// How often the launcher looks round.
-const ROUND: Duration = Duration::from_millis(50);
+/// How often the launcher reads reports and looks round where nothing wakes it. It begins with the shortest tick, and a tick is
+/// longer than the one before where reports come slowly: the oldest of a full buffer are lost.
+const TICK: Duration = Duration::from_millis(500);
+const SHORTEST_TICK: Duration = Duration::from_millis(20);
+
+/// How full a buffer of reports may become in a tick that is followed by a longer one.
+const SLOWLY: f64 = 0.1;
 
 /// How long the last evaluation's report may take once the learner, which has waited for it, is through.
 const LAST_EVALUATION: Duration = Duration::from_secs(1);
@@ -142,39 +147,6 @@ fn explain(error: DomainError, run: &RunDir) -> anyhow::Error {
     }
 }
 
-/// The signals that end a run. Once this is dropped they end the process again, as they do everywhere else.
-struct Signals {
-    flags: Vec<(i32, Arc<AtomicBool>)>,
-    over: Arc<AtomicBool>,
-}
-
-impl Signals {
-    fn register() -> anyhow::Result<Self> {
-        let (mut flags, over) = (Vec::new(), Arc::new(AtomicBool::new(false)));
-        for signal in [SIGINT, SIGTERM, SIGHUP] {
-            let flag = Arc::new(AtomicBool::new(false));
-            signal_hook::flag::register_conditional_default(signal, Arc::clone(&over))
-                .and_then(|_| signal_hook::flag::register(signal, Arc::clone(&flag)))
-                .context("cannot watch for signals")?;
-            flags.push((signal, flag));
-        }
-        Ok(Self { flags, over })
-    }
-
-    fn received(&self) -> Option<i32> {
-        self.flags
-            .iter()
-            .find(|(_, flag)| flag.load(Ordering::Relaxed))
-            .map(|(signal, _)| *signal)
-    }
-}
-
-impl Drop for Signals {
-    fn drop(&mut self) {
-        self.over.store(true, Ordering::Relaxed);
-    }
-}
-
 struct Launcher<'a> {
     config: Config,
     run: &'a RunDir,
@@ -193,6 +165,7 @@ struct Launcher<'a> {
     signals: &'a Signals,
     stalls: Stalls,
     begun: Instant,
+    tick: Duration,
     heartbeats: Reports<Heartbeat>,
     episode_reports: Reports<EpisodeReport>,
     evaluation_reports: Reports<EvaluationReport>,
@@ -237,6 +210,7 @@ impl<'a> Launcher<'a> {
             config,
             signals,
             begun: Instant::now(),
+            tick: SHORTEST_TICK,
         })
     }
 
@@ -292,7 +266,6 @@ impl<'a> Launcher<'a> {
             if let Some(signal) = self.signals.received() {
                 return Ok(Ending::Interrupted(signal));
             }
-            self.crew.see_ends();
             self.read_reports()?;
             self.attend()?;
             match self.crew.look_after(self.domain)? {
@@ -320,8 +293,20 @@ impl<'a> Launcher<'a> {
                 return Ok(Ending::Stopped);
             }
             self.progress.draw(&self.crew);
-            std::thread::sleep(ROUND);
+            self.sleep(self.tick.min(self.crew.idle_for()));
         }
+    }
+
+    /// Sleeps until a process ends, a signal comes or somebody asks, but no longer than `most`.
+    fn sleep(&mut self, most: Duration) {
+        let mut wakers: Vec<_> = self.crew.ends().collect();
+        wakers.push(self.signals.as_fd());
+        if wait_for_any(&wakers, most) {
+            self.tick = SHORTEST_TICK;
+        }
+        // What it has woken for is not to wake it again.
+        self.signals.received();
+        self.crew.see_ends();
     }
 
     /// Answers who asks from another terminal. Who asks for the end is answered when it is there.
@@ -364,7 +349,7 @@ impl<'a> Launcher<'a> {
             if status::judged(&self.config, self.run)? >= Some(self.config.evaluation.period(last)) {
                 break;
             }
-            std::thread::sleep(ROUND);
+            self.sleep(SHORTEST_TICK);
         }
         Ok(())
     }
@@ -388,7 +373,7 @@ impl<'a> Launcher<'a> {
             }
             // No question keeps a run from ending.
             let _ = self.attend();
-            std::thread::sleep(Duration::from_millis(5));
+            self.sleep(deadline.saturating_duration_since(Instant::now()).min(TICK));
         }
     }
 
@@ -400,28 +385,35 @@ impl<'a> Launcher<'a> {
         while let Some(heartbeat) = self.heartbeats.receive()? {
             self.crew.hear(&heartbeat);
         }
-        each(&self.episode_reports, |report| {
-            Ok(self.recorder.episode(&report, wall)?)
-        })?;
-        each(&self.evaluation_reports, |report| {
-            self.progress.heard_evaluation(&report);
-            Ok(self.recorder.evaluation(&report, wall)?)
-        })?;
-        each(&self.learner_reports, |report| {
-            self.progress.heard_learner(&report, wall);
-            Ok(self.recorder.learner(&report, wall)?)
-        })
+        let filled = [
+            each(&self.episode_reports, |report| {
+                Ok(self.recorder.episode(&report, wall)?)
+            })?,
+            each(&self.evaluation_reports, |report| {
+                self.progress.heard_evaluation(&report);
+                Ok(self.recorder.evaluation(&report, wall)?)
+            })?,
+            each(&self.learner_reports, |report| {
+                self.progress.heard_learner(&report, wall);
+                Ok(self.recorder.learner(&report, wall)?)
+            })?,
+        ];
+        self.tick = match filled.into_iter().fold(0.0, f64::max) {
+            0.0..=SLOWLY => (self.tick * 3 / 2).min(TICK),
+            filled => self.tick.mul_f64(SLOWLY / filled).max(SHORTEST_TICK),
+        };
+        Ok(())
     }
 }
 
-fn each<R: shoal_common::channel::reports::Report>(
-    reports: &Reports<R>,
-    mut use_it: impl FnMut(R) -> anyhow::Result<()>,
-) -> anyhow::Result<()> {
+/// Uses all reports that are there; how full one sender's buffer would be with them.
+fn each<R: Report>(reports: &Reports<R>, mut use_it: impl FnMut(R) -> anyhow::Result<()>) -> anyhow::Result<f64> {
+    let mut count = 0;
     while let Some(report) = reports.receive()? {
         use_it(report)?;
+        count += 1;
     }
-    Ok(())
+    Ok(f64::from(count) / R::BUFFER as f64)
 }
 
 /// With this file, iceoryx2's own tools find the run's services when they are started in the run directory, and so do

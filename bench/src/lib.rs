@@ -30,8 +30,7 @@ use comfy_table::presets::UTF8_BORDERS_ONLY;
 use serde::Serialize;
 use shoal_common::channel::Interruption;
 use shoal_common::stop::Stop;
-use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
-use signal_hook::iterator::Signals;
+use shoal_run::signals::Signals;
 
 /// Shortens or lengthens the measurement itself, in seconds: tests care for the form of the answer, not for the numbers.
 const SECONDS: &str = "SHOAL_BENCH_SECONDS";
@@ -115,10 +114,13 @@ impl Patience {
         let seconds = seconds.with_context(|| format!("{SECONDS} must be a number of seconds from 0.01 to 600"))?;
         let stop = Stop::default();
         let flag = stop.clone();
-        let mut signals = Signals::new([SIGINT, SIGTERM, SIGHUP]).context("cannot watch for signals")?;
+        let signals = Signals::register()?;
         std::thread::Builder::new()
             .name("signals".into())
-            .spawn(move || signals.forever().for_each(|_| flag.request()))
+            .spawn(move || {
+                while signals.wait(Duration::from_secs(60)).is_none() {}
+                flag.request();
+            })
             .context("cannot watch for signals")?;
         Ok(Self {
             length: Duration::from_secs_f64(seconds),

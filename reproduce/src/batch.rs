@@ -1,12 +1,11 @@
 //! Which seeds are due, so many of them at a time, until all are through or a signal comes.
 
 use std::collections::{BTreeMap, VecDeque};
-use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, PoisonError, mpsc};
+use std::sync::{Mutex, PoisonError, mpsc};
 use std::time::Duration;
 
-use anyhow::{Context, bail};
-use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
+use anyhow::bail;
+use shoal_run::signals::Signals;
 
 use super::Ending;
 use super::experiment::{Effort, Experiment, Length};
@@ -62,7 +61,7 @@ impl Batch<'_> {
         at_once: usize,
         write: impl Fn(&BTreeMap<Name, String>) -> anyhow::Result<()>,
     ) -> anyhow::Result<Ending> {
-        let signal = watch()?;
+        let signals = Signals::register()?;
         let due: VecDeque<Job> = self.jobs.iter().copied().filter(|job| self.is_due(job)).collect();
         let mut progress = Progress::new(self.folder, self.effort, self.jobs.len(), &due)?;
         let queue = Mutex::new(due);
@@ -70,8 +69,8 @@ impl Batch<'_> {
         std::thread::scope(|scope| {
             let (events, heard) = mpsc::channel();
             for _ in 0..at_once {
-                let (events, queue, signal) = (events.clone(), &queue, &*signal);
-                scope.spawn(move || self.work(queue, signal, &events));
+                let (events, queue, signals) = (events.clone(), &queue, &signals);
+                scope.spawn(move || self.work(queue, signals, &events));
             }
             drop(events);
             loop {
@@ -100,10 +99,10 @@ impl Batch<'_> {
         });
         progress.clear();
         write(&failures)?;
-        Ok(match (signal.load(Ordering::Relaxed), failures.len()) {
-            (0, 0) => Ending::Complete,
-            (0, failed) => Ending::Failed(failed),
-            (signal, _) => Ending::Interrupted(signal as i32),
+        Ok(match (signals.received(), failures.len()) {
+            (None, 0) => Ending::Complete,
+            (None, failed) => Ending::Failed(failed),
+            (Some(signal), _) => Ending::Interrupted(signal),
         })
     }
 
@@ -115,15 +114,15 @@ impl Batch<'_> {
     }
 
     /// Takes one job after the other until there is none, or a signal has come.
-    fn work(&self, queue: &Mutex<VecDeque<Job>>, signal: &AtomicUsize, events: &mpsc::Sender<Event>) {
+    fn work(&self, queue: &Mutex<VecDeque<Job>>, signals: &Signals, events: &mpsc::Sender<Event>) {
         let next = || {
             let mut queue = queue.lock().unwrap_or_else(PoisonError::into_inner);
-            queue.pop_front().filter(|_| signal.load(Ordering::Relaxed) == 0)
+            queue.pop_front().filter(|_| signals.received().is_none())
         };
         while let Some(job) = next() {
             // Nobody listens only where the report could not be written; then the seed is brought through all the same.
             let _ = events.send(Event::Begun(job));
-            match self.bring_through(job, signal, events) {
+            match self.bring_through(job, signals, events) {
                 Ok(Trained::Through) => _ = events.send(Event::Through(job)),
                 Ok(Trained::Interrupted) => return,
                 Err(error) => _ = events.send(Event::Failed(job, error)),
@@ -131,7 +130,7 @@ impl Batch<'_> {
         }
     }
 
-    fn bring_through(&self, job: Job, signal: &AtomicUsize, events: &mpsc::Sender<Event>) -> anyhow::Result<Trained> {
+    fn bring_through(&self, job: Job, signals: &Signals, events: &mpsc::Sender<Event>) -> anyhow::Result<Trained> {
         let Job {
             family,
             experiment,
@@ -150,7 +149,7 @@ impl Batch<'_> {
                     run.display()
                 );
             }
-            if train(experiment, self.effort, seed, length, &run, signal)? == Trained::Interrupted {
+            if train(experiment, self.effort, seed, length, &run, &|| signals.received())? == Trained::Interrupted {
                 return Ok(Trained::Interrupted);
             }
             (family.keep)(
@@ -165,14 +164,4 @@ impl Batch<'_> {
         }
         Ok(Trained::Through)
     }
-}
-
-/// The signal that has come, 0 before.
-fn watch() -> anyhow::Result<Arc<AtomicUsize>> {
-    let signal = Arc::new(AtomicUsize::new(0));
-    for number in [SIGINT, SIGTERM, SIGHUP] {
-        signal_hook::flag::register_usize(number, Arc::clone(&signal), number as usize)
-            .context("cannot watch for signals")?;
-    }
-    Ok(signal)
 }

@@ -1,23 +1,21 @@
 //! One training: this program, started again as `train` or `resume`.
 
-use std::fs::File;
-use std::io::{Read, Seek};
 use std::os::unix::process::CommandExt;
 use std::path::Path;
-use std::process::{Child, Command, Stdio};
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::process::Command;
 use std::time::Duration;
 
 use anyhow::{Context, bail};
-use rustix::process::{Pid, Signal, kill_process};
+use rustix::process::Signal;
 use shoal_common::run_dir::{RunDir, RunDirError};
 use shoal_run::evaluation::WhichPolicy;
+use shoal_run::process::Peer;
 use shoal_run::status;
 
 use super::experiment::{Effort, Experiment, Length, Progress};
 
-/// How often a training is looked at.
-const ROUND: Duration = Duration::from_millis(50);
+/// How often it is looked whether a signal has come.
+const ROUND: Duration = Duration::from_millis(100);
 
 /// How a run directory stands.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -61,14 +59,17 @@ impl Standing {
     }
 }
 
-/// Brings the run to this length, from wherever it stands. A `signal` other than 0 ends it in order.
+/// The signal that is to end everything in order, if one has come.
+pub(super) type Interrupted<'a> = &'a dyn Fn() -> Option<i32>;
+
+/// Brings the run to this length, from wherever it stands, or ends it in order before.
 pub(super) fn train(
     experiment: &Experiment,
     effort: Effort,
     seed: u64,
     length: Length,
     run: &Path,
-    signal: &AtomicUsize,
+    interrupted: Interrupted<'_>,
 ) -> anyhow::Result<Trained> {
     let mut command = Command::new("/proc/self/exe");
     command.arg0("shoal");
@@ -90,7 +91,7 @@ pub(super) fn train(
         }
     }
     command.args(length.argument()).arg("--quiet");
-    conduct(&mut command, signal)
+    conduct(&mut command, interrupted)
 }
 
 /// Whether a run has come to this length, and ended in order there: then it leaves its last policy.
@@ -106,77 +107,58 @@ fn has_ended(run: &Path, length: Length, progress: Progress) -> anyhow::Result<b
     })
 }
 
-fn conduct(command: &mut Command, signal: &AtomicUsize) -> anyhow::Result<Trained> {
-    let mut said = tempfile::tempfile().context("cannot make a temporary file")?;
-    let mut child = command
-        .stdin(Stdio::null())
-        .stdout(Stdio::null())
-        .stderr(said.try_clone().context("cannot share a temporary file")?)
-        // Ctrl-C is for this process, which ends the trainings in order.
-        .process_group(0)
-        .spawn()
-        .context("cannot start a training")?;
-    let status = wait(&mut child, signal).context("cannot wait for a training")?;
-    if signal.load(Ordering::Relaxed) != 0 {
+fn conduct(command: &mut Command, interrupted: Interrupted<'_>) -> anyhow::Result<Trained> {
+    let mut training = Peer::start(command, "training".into()).context("cannot start a training")?;
+    let mut told = false;
+    let status = loop {
+        if let Some(status) = training.wait(ROUND) {
+            break status;
+        }
+        if interrupted().is_some() && !told {
+            told = true;
+            // Who does not hear it has ended.
+            let _ = training.signal(Signal::TERM);
+        }
+    };
+    if interrupted().is_some() {
         return Ok(Trained::Interrupted);
     }
     if !status.success() {
         bail!(
             "{}",
-            last_line(&mut said).unwrap_or_else(|| format!("a training ended with {status}"))
+            training
+                .last_words()
+                .unwrap_or_else(|| format!("a training ended with {status}"))
         );
     }
     Ok(Trained::Through)
-}
-
-fn wait(child: &mut Child, signal: &AtomicUsize) -> std::io::Result<std::process::ExitStatus> {
-    let mut told = false;
-    loop {
-        if let Some(status) = child.try_wait()? {
-            return Ok(status);
-        }
-        if signal.load(Ordering::Relaxed) != 0 && !told {
-            told = true;
-            // Who does not hear it has ended.
-            let _ = kill_process(Pid::from_child(child), Signal::TERM);
-        }
-        std::thread::sleep(ROUND);
-    }
-}
-
-fn last_line(said: &mut File) -> Option<String> {
-    let mut text = String::new();
-    said.rewind().ok()?;
-    said.read_to_string(&mut text).ok()?;
-    let line = text.lines().rfind(|line| !line.trim().is_empty())?;
-    Some(line.trim().trim_start_matches("error: ").to_owned())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn shell(script: &str, signal: usize) -> anyhow::Result<Trained> {
-        conduct(Command::new("sh").args(["-c", script]), &AtomicUsize::new(signal))
+    fn shell(script: &str, signal: Option<i32>) -> anyhow::Result<Trained> {
+        conduct(Command::new("sh").args(["-c", script]), &|| signal)
     }
 
     #[test]
     fn a_training_that_fails_is_told_by_its_last_line() {
-        assert_eq!(shell("exit 0", 0).unwrap(), Trained::Through);
+        assert_eq!(shell("exit 0", None).unwrap(), Trained::Through);
         let error = shell(
             "echo 'warning: hot' >&2; echo 'error: no room' >&2; echo >&2; exit 1",
-            0,
+            None,
         )
         .unwrap_err();
         assert_eq!(error.to_string(), "no room");
-        assert!(shell("exit 3", 0).unwrap_err().to_string().contains("3"));
+        assert!(shell("exit 3", None).unwrap_err().to_string().contains("3"));
     }
 
     #[test]
     fn a_signal_ends_the_training_in_order() {
         let begun = std::time::Instant::now();
         assert_eq!(
-            shell("sleep 60 & trap 'kill $!; exit 143' TERM; wait", 15).unwrap(),
+            shell("sleep 60 & trap 'kill $!; exit 143' TERM; wait", Some(15)).unwrap(),
             Trained::Interrupted
         );
         assert!(begun.elapsed() < Duration::from_secs(30));

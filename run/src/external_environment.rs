@@ -2,6 +2,7 @@
 //! outside of any run, to learn what it serves or to try a policy in it.
 
 use std::ffi::OsString;
+use std::os::fd::AsFd;
 use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::path::{Path, PathBuf};
 use std::process::{Command, ExitCode, ExitStatus, Stdio};
@@ -21,7 +22,7 @@ use shoal_common::report::Role;
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::stop::{GRACE, Stop};
 
-use crate::process::Peer;
+use crate::process::{Peer, wait_for_any};
 
 /// Environments whose name begins with this are Gymnasium's.
 pub const GYMNASIUM: &str = "gym:";
@@ -146,11 +147,8 @@ pub fn serve_by(program: &Command) -> anyhow::Result<ExitCode> {
     let deadline = Instant::now() + GRACE;
     loop {
         let left = deadline.saturating_duration_since(Instant::now());
-        let patience = Timespec {
-            tv_sec: left.as_secs() as i64,
-            tv_nsec: left.subsec_nanos().into(),
-        };
-        match poll(&mut [PollFd::new(&process, PollFlags::IN)], Some(&patience)) {
+        let left = Timespec::try_from(left).context("cannot wait so long")?;
+        match poll(&mut [PollFd::new(&process, PollFlags::IN)], Some(&left)) {
             Ok(0) => return kill_this_group(),
             Ok(_) => return end_as(child.wait()?),
             Err(Errno::INTR) => {}
@@ -311,16 +309,13 @@ fn with_advice(error: anyhow::Error) -> anyhow::Error {
 fn stopped_when_it_ends(program: &Peer, heard: Stop) -> anyhow::Result<Stop> {
     let stop = Stop::default();
     let flag = stop.clone();
-    let process = pidfd_open(program.pid(), PidfdFlags::empty()).context("cannot watch the environment server")?;
+    let process = program.as_fd().try_clone_to_owned();
+    let process = process.context("cannot watch the environment server")?;
     std::thread::Builder::new()
         .name("watch".into())
         .spawn(move || {
-            let patience = Timespec {
-                tv_sec: PATIENCE.as_secs() as i64,
-                tv_nsec: 0,
-            };
-            let ended = || poll(&mut [PollFd::new(&process, PollFlags::IN)], Some(&patience));
-            while ended() == Ok(0) && heard.requested() {}
+            let ended = || wait_for_any(&[process.as_fd()], PATIENCE);
+            while !ended() && heard.requested() {}
             flag.request();
         })
         .context("cannot watch the environment server")?;

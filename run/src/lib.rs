@@ -12,6 +12,7 @@ pub mod process;
 pub mod recorder;
 pub mod remote;
 pub mod rollout;
+pub mod signals;
 pub mod status;
 #[cfg(any(test, feature = "testing"))]
 pub mod testing;

@@ -7,6 +7,7 @@ use std::process::ExitCode;
 use clap::Args;
 use clap::builder::PossibleValuesParser;
 use shoal_reproduce::{Effort, Ending, Order};
+use shoal_run::signals::exit_code;
 
 /// What is interrupted goes on when the same is typed again; what is there is not run again.
 #[derive(Args, Clone, Debug)]
@@ -80,8 +81,7 @@ pub(crate) fn run(args: &ReproduceArgs) -> anyhow::Result<ExitCode> {
                 stderr,
                 "interrupted; every training is saved: type the same again to go on"
             )?;
-            // As a shell reports a process that the signal ended.
-            ExitCode::from(128 + signal as u8)
+            exit_code(signal)
         }
     })
 }

@@ -15,8 +15,8 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
 use shoal_common::config::{Config, Mode};
 use shoal_run::remote::Remote;
-use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
-use signal_hook::iterator::Signals;
+use shoal_run::signals::{Signals, exit_code};
+use signal_hook::consts::SIGHUP;
 
 use super::status::rest;
 use crate::top::{Link, Screen, draw};
@@ -57,8 +57,7 @@ pub(crate) fn run(args: &TopArgs) -> anyhow::Result<ExitCode> {
     shown?;
     match signal.load(Ordering::Relaxed) {
         0 => Ok(ExitCode::SUCCESS),
-        // As a shell reports a process that the signal ended.
-        signal => Ok(ExitCode::from(128 + signal as u8)),
+        signal => Ok(exit_code(signal as i32)),
     }
 }
 
@@ -111,10 +110,7 @@ enum Input {
 fn awaited() -> anyhow::Result<Input> {
     let stdin = std::io::stdin();
     let mut fds = [PollFd::new(&stdin, PollFlags::IN)];
-    let moment = Timespec {
-        tv_sec: 0,
-        tv_nsec: LOOK.subsec_nanos().into(),
-    };
+    let moment = Timespec::try_from(LOOK).context("cannot wait for the keyboard")?;
     match poll(&mut fds, Some(&moment)) {
         // A signal: the window may have another size.
         Err(Errno::INTR) => return Ok(Input::Something),
@@ -157,15 +153,18 @@ fn leaves(key: &KeyEvent) -> bool {
 /// The number of the signal that has come; 0 before one has. Should the picture's loop hang, the process ends all the same.
 fn watched_signals() -> anyhow::Result<Arc<AtomicUsize>> {
     let signal = Arc::new(AtomicUsize::new(0));
-    let mut signals = Signals::new([SIGINT, SIGTERM, SIGHUP]).context("cannot watch for signals")?;
+    let signals = Signals::register()?;
     let received = Arc::clone(&signal);
     let watch = move || {
-        if let Some(number) = signals.forever().next() {
-            received.store(number as usize, Ordering::Relaxed);
-            std::thread::sleep(TO_THE_END);
-            let _ = ratatui::try_restore();
-            std::process::exit(128 + number);
-        }
+        let number = loop {
+            if let Some(number) = signals.wait(LOOK) {
+                break number;
+            }
+        };
+        received.store(number as usize, Ordering::Relaxed);
+        std::thread::sleep(TO_THE_END);
+        let _ = ratatui::try_restore();
+        std::process::exit(128 + number);
     };
     let watch = std::thread::Builder::new().name("signals".into()).spawn(watch);
     watch.context("cannot watch for signals")?;

@@ -16,6 +16,7 @@ use shoal_report::plots;
 use shoal_run::evaluation::{EvaluationSummary, WhichPolicy, evaluate};
 use shoal_run::numbers::thousands;
 use shoal_run::outcome;
+use shoal_run::signals::exit_code;
 
 use crate::launcher::{self, Ending, Outcome};
 
@@ -73,7 +74,7 @@ pub(crate) fn conduct(config: Config, run: &RunDir, _lock: RunLock, telling: &Te
     Ok(match outcome.ending {
         Ending::Finished | Ending::Stopped | Ending::Renewed => ExitCode::SUCCESS,
         // As a shell reports a process that the signal ended.
-        Ending::Interrupted(signal) => ExitCode::from(128 + signal as u8),
+        Ending::Interrupted(signal) => exit_code(signal),
     })
 }
 

@@ -2,14 +2,13 @@
 //! launcher that hangs could not even be stopped.
 
 use std::os::unix::process::CommandExt;
-use std::process::{Child, Command, ExitCode, ExitStatus, Stdio};
+use std::process::{Command, ExitCode, ExitStatus};
 use std::time::Duration;
 
 use anyhow::{Context, bail};
-use rustix::event::{PollFd, PollFlags, Timespec, poll};
-use rustix::io::Errno;
-use rustix::process::{Pid, PidfdFlags, Signal, pidfd_open, set_parent_process_death_signal};
+use rustix::process::{Signal, set_parent_process_death_signal};
 use shoal_common::channel::{Domain, Services};
+use shoal_run::process::ChildGroup;
 
 /// The command that does it. Its argument is the run's name.
 pub(crate) const COMMAND: &str = "clean-up";
@@ -42,38 +41,11 @@ pub(super) fn clean_up(domain: &Domain, services: &Services) -> anyhow::Result<(
 
 /// How the process ended; `None` where it had to be ended.
 fn run(run_id: &str) -> anyhow::Result<Option<ExitStatus>> {
-    let mut child = Command::new("/proc/self/exe")
-        .arg0("shoal")
-        .args([COMMAND, run_id])
-        .stdin(Stdio::null())
-        .stdout(Stdio::null())
-        .stderr(Stdio::null())
-        .process_group(0)
-        .spawn()
-        .context("cannot start a process that cleans up")?;
-    let ended = has_ended_in_time(&child);
-    if !ended {
-        child.kill().context("cannot end a process that cleans up")?;
-    }
-    let status = child.wait().context("cannot wait for a process that cleans up")?;
-    Ok(ended.then_some(status))
-}
-
-fn has_ended_in_time(child: &Child) -> bool {
-    let patience = Timespec {
-        tv_sec: PATIENCE.as_secs() as i64,
-        tv_nsec: 0,
-    };
-    let Ok(process) = pidfd_open(Pid::from_child(child), PidfdFlags::empty()) else {
-        return false;
-    };
-    loop {
-        match poll(&mut [PollFd::new(&process, PollFlags::IN)], Some(&patience)) {
-            // A signal to the launcher says nothing of the child.
-            Err(Errno::INTR) => {}
-            ready => return matches!(ready, Ok(1..)),
-        }
-    }
+    let mut command = Command::new("/proc/self/exe");
+    command.arg0("shoal").args([COMMAND, run_id]);
+    // What it writes is lost: its exit code says all.
+    let (mut child, _, _) = ChildGroup::start(&mut command).context("cannot start a process that cleans up")?;
+    Ok(child.wait(PATIENCE))
 }
 
 /// What that process does.

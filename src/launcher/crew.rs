@@ -1,5 +1,6 @@
 //! All processes of a run: who is there, who is ready, who has to be started again, and who is given up.
 
+use std::os::fd::BorrowedFd;
 use std::os::unix::process::ExitStatusExt;
 use std::path::PathBuf;
 use std::process::ExitStatus;
@@ -225,6 +226,25 @@ impl Crew {
         members.into_iter().map(|member| member.status(newest)).collect()
     }
 
+    /// What wakes the launcher when a process ends.
+    pub(super) fn ends(&self) -> impl Iterator<Item = BorrowedFd<'_>> {
+        self.members
+            .iter()
+            .filter_map(|member| member.process.as_ref().and_then(Process::end))
+    }
+
+    /// How long nothing is to be done for the members unless a process ends.
+    pub(super) fn idle_for(&self) -> Duration {
+        let since_clean = self.cleaned.elapsed();
+        let cleaning = self.occupied.map_or(CLEANING, |_| SOON).saturating_sub(since_clean);
+        let missing = |member: &&Member| member.process.is_none() && self.is_wanted(member);
+        let now = Instant::now();
+        let restarts = self.members.iter().filter(missing);
+        restarts
+            .map(|member| member.restart_at.saturating_duration_since(now))
+            .fold(cleaning, Duration::min)
+    }
+
     /// Sees whose processes have ended. What those said before is heard before [`look_after`](Self::look_after) acts on it.
     pub(super) fn see_ends(&mut self) {
         for member in self.members.iter_mut().filter(|member| member.ended.is_none()) {
@@ -356,6 +376,15 @@ impl Crew {
             member.identity.role == Role::EnvServer
                 && !members.iter().any(|actor| actor.is(Role::Actor, member.identity.index))
         };
+        let mut members = std::mem::take(&mut self.members);
+        members.retain(|member| {
+            let stays = member.process.is_some() || self.is_wanted(member);
+            if !stays {
+                self.log.note(&name(member.identity), "not needed any more");
+            }
+            stays
+        });
+        self.members = members;
         for i in 0..self.members.len() {
             if self.is_wanted(&self.members[i]) || self.members[i].retires {
                 continue;
@@ -368,15 +397,6 @@ impl Crew {
                 process.ask_to_retire();
             }
         }
-        let mut members = std::mem::take(&mut self.members);
-        members.retain(|member| {
-            let stays = member.process.is_some() || self.is_wanted(member);
-            if !stays {
-                self.log.note(&name(member.identity), "not needed any more");
-            }
-            stays
-        });
-        self.members = members;
     }
 
     /// Whether it is not an actor, or an actor's environment server, of which there are enough.

@@ -1,6 +1,7 @@
 //! One role's process: started, listened to, ended.
 
 use std::io::Write;
+use std::os::fd::{AsFd, BorrowedFd};
 use std::os::unix::process::CommandExt;
 use std::path::Path;
 use std::process::{ChildStdin, Command, ExitStatus};
@@ -58,6 +59,11 @@ impl Process {
             // Who does not hear it has ended.
             let _ = stdin.write_all(b"retire\n");
         }
+    }
+
+    /// Readable once it has ended; `None` where that was seen.
+    pub(super) fn end(&self) -> Option<BorrowedFd<'_>> {
+        self.group.is_alive().then(|| self.group.as_fd())
     }
 
     /// Asks it to end.

@@ -10,7 +10,7 @@ use shoal_common::report::{Activity, Role};
 use super::member::{Member, SILENT};
 
 /// A launcher that was away for so long was stopped, and the others perhaps too: nobody is accused then.
-const AWAY: Duration = Duration::from_secs(1);
+const AWAY: Duration = Duration::from_secs(2);
 
 /// How many times as long a process that waits for nobody may say nothing: it may be at work.
 const WORK: u32 = 3;

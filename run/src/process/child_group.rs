@@ -1,19 +1,23 @@
 //! A child process and all it starts: none of its process group outlives it.
 
 use std::io;
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::os::unix::process::CommandExt;
 use std::process::{Child, ChildStderr, ChildStdin, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 
-use rustix::process::{Pid, Signal, WaitId, WaitIdOptions, kill_process_group, waitid};
+use rustix::process::{Pid, PidfdFlags, Signal, WaitId, WaitIdOptions, kill_process_group, pidfd_open, waitid};
+
+use super::wait_for_any;
 
 /// How long a process may take to be gone that was killed: more only where the kernel waits for a device.
 const GONE: Duration = Duration::from_secs(5);
 
-/// A child process that leads a process group. Dropped, it is killed.
+/// A child process that leads a process group. Dropped, it is killed. As a descriptor it is readable once it has ended.
 #[derive(Debug)]
 pub struct ChildGroup {
     child: Child,
+    descriptor: OwnedFd,
     ended: Option<ExitStatus>,
 }
 
@@ -32,7 +36,21 @@ impl ChildGroup {
             .spawn()?;
         // Held apart from the child: waiting for a child closes its own.
         let (stdin, stderr) = (child.stdin.take(), child.stderr.take());
-        Ok((Self { child, ended: None }, stdin, stderr))
+        // It has not been waited for, so the number is still its own.
+        let descriptor = match pidfd_open(Pid::from_child(&child), PidfdFlags::empty()) {
+            Ok(descriptor) => descriptor,
+            Err(error) => {
+                child.kill()?;
+                child.wait()?;
+                return Err(error.into());
+            }
+        };
+        let group = Self {
+            child,
+            descriptor,
+            ended: None,
+        };
+        Ok((group, stdin, stderr))
     }
 
     /// Its number.
@@ -53,6 +71,24 @@ impl ChildGroup {
         self.ended
     }
 
+    /// Waits for its end, but no longer than `patience`; how it ended, if it has.
+    pub fn wait(&mut self, patience: Duration) -> Option<ExitStatus> {
+        let deadline = Instant::now() + patience;
+        loop {
+            let status = self.exit_status();
+            let left = deadline.saturating_duration_since(Instant::now());
+            if status.is_some() || left.is_zero() {
+                return status;
+            }
+            wait_for_any(&[self.as_fd()], left);
+        }
+    }
+
+    /// Whether its end is still to be seen.
+    pub fn is_alive(&self) -> bool {
+        self.ended.is_none()
+    }
+
     /// Ends it and its group without asking.
     pub fn kill(&mut self) {
         if self.ended.is_none() {
@@ -65,9 +101,12 @@ impl ChildGroup {
 impl Drop for ChildGroup {
     fn drop(&mut self) {
         self.kill();
-        let deadline = Instant::now() + GONE;
-        while self.exit_status().is_none() && Instant::now() < deadline {
-            std::thread::sleep(Duration::from_millis(1));
-        }
+        self.wait(GONE);
+    }
+}
+
+impl AsFd for ChildGroup {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.descriptor.as_fd()
     }
 }

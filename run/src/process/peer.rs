@@ -1,9 +1,10 @@
 //! Another process that works for this one outside of any run: a role that is measured, an environment server that is asked.
 
+use std::os::fd::{AsFd, BorrowedFd};
 use std::os::unix::process::CommandExt;
 use std::process::{ChildStdin, Command, ExitStatus};
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use anyhow::{Context, bail};
 use rustix::process::{Pid, Signal, kill_process};
@@ -32,6 +33,12 @@ pub struct Peer {
     output: Option<ChildOutput>,
     last_line: Arc<Mutex<Option<String>>>,
     what: String,
+}
+
+impl AsFd for Peer {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.group.as_fd()
+    }
 }
 
 impl Peer {
@@ -69,7 +76,11 @@ impl Peer {
             what,
         };
         let last_line = Arc::clone(&peer.last_line);
-        let keep = move |line: &str| *last_line.lock().unwrap_or_else(PoisonError::into_inner) = Some(line.into());
+        let keep = move |line: &str| {
+            if !line.trim().is_empty() {
+                *last_line.lock().unwrap_or_else(PoisonError::into_inner) = Some(line.trim().into());
+            }
+        };
         peer.output = stderr
             .map(|stderr| ChildOutput::read("peer", stderr, keep))
             .transpose()?;
@@ -105,7 +116,11 @@ impl Peer {
         self.signal(Signal::CONT)
     }
 
-    fn signal(&self, signal: Signal) -> anyhow::Result<()> {
+    /// Sends the process a signal.
+    ///
+    /// # Errors
+    /// When it cannot be reached.
+    pub fn signal(&self, signal: Signal) -> anyhow::Result<()> {
         kill_process(self.pid(), signal).with_context(|| format!("cannot signal the {}", self.what))
     }
 
@@ -117,7 +132,7 @@ impl Peer {
     /// Asks the process to end, and waits for it.
     pub fn end(mut self) -> anyhow::Result<()> {
         self.ask_to_end();
-        match self.wait(FAREWELL)? {
+        match self.await_end(FAREWELL)? {
             status if status.success() => Ok(()),
             status => self.ended_early(status),
         }
@@ -126,40 +141,40 @@ impl Peer {
     /// Ends a launcher, which hears signals and not its standard input, and waits for it.
     pub fn interrupt(mut self, patience: Duration) -> anyhow::Result<()> {
         self.signal(Signal::INT)?;
-        let status = self.wait(patience)?;
+        let status = self.await_end(patience)?;
         match status.code() {
             Some(0 | INTERRUPTED) => Ok(()),
             _ => self.ended_early(status),
         }
     }
 
-    fn wait(&mut self, patience: Duration) -> anyhow::Result<ExitStatus> {
-        let deadline = Instant::now() + patience;
-        loop {
-            match self.group.exit_status() {
-                Some(status) => return Ok(status),
-                None if Instant::now() >= deadline => bail!("the {} did not end when asked to", self.what),
-                None => std::thread::sleep(Duration::from_millis(2)),
-            }
-        }
+    /// Waits for its end, but no longer than `patience`; how it ended, if it has.
+    pub fn wait(&mut self, patience: Duration) -> Option<ExitStatus> {
+        self.group.wait(patience)
+    }
+
+    fn await_end(&mut self, patience: Duration) -> anyhow::Result<ExitStatus> {
+        let ended = self.group.wait(patience);
+        ended.with_context(|| format!("the {} did not end when asked to", self.what))
     }
 
     /// Asks the process to end; one that does not is killed when this is dropped.
     pub fn dismiss(&mut self) {
         self.stdin = None;
-        let deadline = Instant::now() + DISMISSAL;
-        while self.group.exit_status().is_none() && Instant::now() < deadline {
-            std::thread::sleep(Duration::from_millis(2));
-        }
+        self.group.wait(DISMISSAL);
     }
 
     fn ended_early(&mut self, status: ExitStatus) -> anyhow::Result<()> {
+        let said = self.last_words().unwrap_or_else(|| "it said nothing".into());
+        bail!("the {} ended ({status}): {said}", self.what);
+    }
+
+    /// The last line that it wrote on standard error, if it has ended and wrote any.
+    pub fn last_words(&mut self) -> Option<String> {
         if let Some(output) = &self.output {
             output.wait();
         }
-        let said = self.last_line.lock().unwrap_or_else(PoisonError::into_inner).take();
-        let said = said.unwrap_or_else(|| "it said nothing".into());
-        let said = said.strip_prefix("error: ").unwrap_or(&said);
-        bail!("the {} ended ({status}): {said}", self.what);
+        let said = self.last_line.lock().unwrap_or_else(PoisonError::into_inner).take()?;
+        Some(said.strip_prefix("error: ").unwrap_or(&said).to_owned())
     }
 }

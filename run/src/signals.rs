@@ -1,0 +1,101 @@
+//! The signals that end this program in order.
+
+use std::io::{self, Read};
+use std::os::fd::{AsFd, BorrowedFd};
+use std::os::unix::net::UnixStream;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::time::Duration;
+
+use anyhow::Context;
+use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
+
+use crate::process::wait_for_any;
+
+/// SIGINT, SIGTERM and SIGHUP are received from now on. Once this is dropped they end the process again, as they do everywhere
+/// else.
+#[derive(Debug)]
+pub struct Signals {
+    last: Arc<AtomicUsize>,
+    over: Arc<AtomicBool>,
+    /// Readable when a signal has come since it was asked for.
+    wake: UnixStream,
+}
+
+impl Signals {
+    /// Begins to receive them.
+    ///
+    /// # Errors
+    /// When the system does not let this process.
+    pub fn register() -> anyhow::Result<Self> {
+        let registered = || -> io::Result<Self> {
+            let (last, over) = (Arc::default(), Arc::new(AtomicBool::new(false)));
+            let (wake, write) = UnixStream::pair()?;
+            wake.set_nonblocking(true)?;
+            for signal in [SIGINT, SIGTERM, SIGHUP] {
+                // In this order: who wakes up finds the number.
+                signal_hook::flag::register_conditional_default(signal, Arc::clone(&over))?;
+                signal_hook::flag::register_usize(signal, Arc::clone(&last), signal as usize)?;
+                signal_hook::low_level::pipe::register(signal, write.try_clone()?)?;
+            }
+            Ok(Self { last, over, wake })
+        };
+        registered().context("cannot watch for signals")
+    }
+
+    /// The last signal that has come.
+    pub fn received(&self) -> Option<i32> {
+        // It wakes once for each signal. Nothing is read where none has come.
+        let _ = (&self.wake).read(&mut [0; 64]);
+        match self.last.load(Ordering::Relaxed) {
+            0 => None,
+            signal => Some(signal as i32),
+        }
+    }
+
+    /// Waits for a signal; the one that has come, if one has.
+    pub fn wait(&self, patience: Duration) -> Option<i32> {
+        if self.last.load(Ordering::Relaxed) == 0 {
+            wait_for_any(&[self.as_fd()], patience);
+        }
+        self.received()
+    }
+}
+
+impl AsFd for Signals {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.wake.as_fd()
+    }
+}
+
+impl Drop for Signals {
+    fn drop(&mut self) {
+        self.over.store(true, Ordering::Relaxed);
+    }
+}
+
+/// The exit code by which a shell tells that a signal ended a process.
+pub fn exit_code(signal: i32) -> std::process::ExitCode {
+    std::process::ExitCode::from(128 + signal as u8)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rustix::event::PollFlags;
+
+    #[test]
+    fn a_signal_wakes_who_waits_and_is_remembered() {
+        let signals = Signals::register().unwrap();
+        assert_eq!(signals.received(), None);
+        assert_eq!(signals.wait(Duration::from_millis(1)), None);
+        std::thread::scope(|scope| {
+            scope.spawn(|| signal_hook::low_level::raise(SIGHUP).unwrap());
+            assert_eq!(signals.wait(Duration::from_secs(60)), Some(SIGHUP));
+        });
+        assert_eq!(signals.received(), Some(SIGHUP));
+        // It has been read: who polls is not woken by it again.
+        let mut ready = [rustix::event::PollFd::new(&signals, PollFlags::IN)];
+        assert_eq!(rustix::event::poll(&mut ready, Some(&Default::default())), Ok(0));
+    }
+}
