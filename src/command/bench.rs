@@ -28,7 +28,8 @@ use anyhow::{Context, bail};
 use comfy_table::Table;
 use comfy_table::presets::UTF8_BORDERS_ONLY;
 use serde::Serialize;
-use shoal_common::channel::Interruption;
+use shoal_common::channel::ChannelError;
+use shoal_common::exit::Exit;
 use shoal_common::stop::Stop;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use signal_hook::iterator::Signals;
@@ -87,7 +88,7 @@ pub(crate) fn run(args: &BenchArgs) -> anyhow::Result<()> {
     if args.actors.is_some() && args.stage != Stage::Actors {
         bail!("--actors is for `shoal bench actors` alone");
     }
-    let told = match args.stage {
+    match args.stage {
         Stage::Learner => learner::measure(&patience).and_then(|it| tell(&it, args.json)),
         Stage::Transitions => transitions::measure(&patience).and_then(|it| tell(&it, args.json)),
         Stage::Step => step::measure(&patience).and_then(|it| tell(&it, args.json)),
@@ -96,12 +97,15 @@ pub(crate) fn run(args: &BenchArgs) -> anyhow::Result<()> {
         Stage::Run => whole_run::measure(&patience).and_then(|it| tell(&it, args.json)),
         Stage::All => table::measure_all(args.json, &patience),
         Stage::Gym => gym::measure(&patience).and_then(|it| tell(&it, args.json)),
-    };
-    // A wait that was interrupted says what it says to a role.
-    told.map_err(|error| match error.downcast_ref() {
-        Some(Interruption::Stopped) => anyhow::anyhow!(INTERRUPTED),
-        _ => error,
-    })
+    }
+}
+
+/// A wait that ended early: somebody has asked for the end, or a channel does not work.
+fn interrupted(exit: Exit<ChannelError>) -> anyhow::Error {
+    match exit {
+        Exit::Stopped => anyhow::anyhow!(INTERRUPTED),
+        Exit::Failed(error) => error.into(),
+    }
 }
 
 impl Patience {
