@@ -1,6 +1,6 @@
 //! Why an actor or an evaluator cannot go on.
 
-use shoal_common::channel::{ChannelError, Interruption};
+use shoal_common::channel::ChannelError;
 use shoal_common::commit::OpenError;
 use shoal_common::policy::PolicyError;
 use shoal_common::policy_file::PolicyFileError;
@@ -30,35 +30,4 @@ pub enum ActorError {
         /// What it should serve.
         configured: String,
     },
-}
-
-/// Ends a role's loop: asked to, or for a reason.
-pub(crate) enum Ended {
-    Stopped,
-    Failed(ActorError),
-}
-
-impl From<Interruption> for Ended {
-    fn from(interruption: Interruption) -> Self {
-        match interruption {
-            Interruption::Stopped => Self::Stopped,
-            Interruption::Channel(error) => Self::Failed(error.into()),
-        }
-    }
-}
-
-impl<E: Into<ActorError>> From<E> for Ended {
-    fn from(error: E) -> Self {
-        Self::Failed(error.into())
-    }
-}
-
-impl Ended {
-    /// Being asked to end is no failure.
-    pub(crate) fn into_result(self) -> Result<(), ActorError> {
-        match self {
-            Self::Stopped => Ok(()),
-            Self::Failed(error) => Err(error),
-        }
-    }
 }

@@ -1,12 +1,14 @@
 //! The evaluator: runs the newest policy without noise, always from the same start states, and keeps the best one.
 
 use std::path::Path;
+use std::rc::Rc;
 
 use shoal_common::channel::environment::{Begin, EnvironmentClient, Stepped};
-use shoal_common::channel::policy::{PolicyHeader, PolicyReader};
+use shoal_common::channel::policy::{self, PolicyHeader, PolicyReader};
 use shoal_common::channel::reports::Reporter;
-use shoal_common::channel::{Bell, Domain, Place, Pulse, Ringer, wait_for};
+use shoal_common::channel::{Bell, ChannelError, Domain, Place, Pulse, Ringer, wait_for};
 use shoal_common::config::{Algorithm, Evaluation};
+use shoal_common::exit::Exit;
 use shoal_common::policy::Policy;
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::report::{Activity, EvaluationReport, Identity, JudgedReport, Role};
@@ -14,7 +16,7 @@ use shoal_common::run_dir::RunDir;
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::stop::Stop;
 
-use crate::error::{ActorError, Ended};
+use crate::error::ActorError;
 use crate::explorer::connect;
 
 /// What an evaluator is told.
@@ -60,11 +62,11 @@ pub fn mean_and_std(returns: &[f64]) -> (f64, f64) {
 pub fn evaluate(domain: &Domain, settings: &Settings, stop: &Stop) -> Result<(), ActorError> {
     let mut evaluator = match Evaluator::new(domain, settings, stop) {
         Ok(evaluator) => evaluator,
-        Err(ended) => return ended.into_result(),
+        Err(exit) => return exit.into_result(),
     };
     loop {
-        if let Err(ended) = evaluator.judge_next() {
-            return ended.into_result();
+        if let Err(exit) = evaluator.judge_next() {
+            return exit.into_result();
         }
     }
 }
@@ -87,7 +89,7 @@ struct Evaluator<'a> {
 }
 
 impl<'a> Evaluator<'a> {
-    fn new(domain: &Domain, settings: &'a Settings, stop: &'a Stop) -> Result<Self, Ended> {
+    fn new(domain: &Domain, settings: &'a Settings, stop: &'a Stop) -> Result<Self, Exit<ActorError>> {
         let policy = Policy::new(&settings.algorithm, &settings.spec, settings.envs)?;
         let layout = policy.layout();
         let bell = Bell::hang(domain, Place(Role::Evaluator, settings.identity.index))?;
@@ -121,12 +123,13 @@ impl<'a> Evaluator<'a> {
         })
     }
 
-    fn judge_next(&mut self) -> Result<(), Ended> {
-        let header = self.await_due_policy()?;
+    fn judge_next(&mut self) -> Result<(), Exit<ActorError>> {
+        let published = self.await_due_policy().map_err(Exit::widen)?;
+        let header = published.header();
         let mut returns = Vec::new();
         while (returns.len() as u32) < self.settings.evaluation.episodes {
             // A server that dies takes its episodes with it; they are run again.
-            if let Some(some) = self.run_episodes(returns.len() as u64)? {
+            if let Some(some) = self.run_episodes(published.parameters(), returns.len() as u64)? {
                 returns.extend(some);
             }
         }
@@ -134,12 +137,12 @@ impl<'a> Evaluator<'a> {
         let (return_mean, return_std) = mean_and_std(&returns);
         let best = self.best.is_none_or(|best| return_mean > best);
         if best {
-            self.keep(&header, return_mean, return_std, &self.settings.run.best_policy())?;
+            self.keep(&published, return_mean, return_std, &self.settings.run.best_policy())?;
             self.best = Some(return_mean);
         }
         if self.settings.evaluation.keep_policies {
             let path = self.settings.run.judged_policy(header.env_steps);
-            self.keep(&header, return_mean, return_std, &path)?;
+            self.keep(&published, return_mean, return_std, &path)?;
         }
         let period = self.settings.evaluation.period(header.env_steps);
         self.judged = Some(period);
@@ -158,7 +161,7 @@ impl<'a> Evaluator<'a> {
     }
 
     /// Waits for a policy of a period that was not judged yet.
-    fn await_due_policy(&mut self) -> Result<PolicyHeader, Ended> {
+    fn await_due_policy(&mut self) -> Result<Rc<policy::Policy>, Exit<ChannelError>> {
         let Self {
             reader,
             judged,
@@ -171,10 +174,10 @@ impl<'a> Evaluator<'a> {
             ..
         } = self;
         let due = |header: &PolicyHeader| judged.is_none_or(|j| settings.evaluation.period(header.env_steps) > j);
-        let header = wait_for(
+        let published = wait_for(
             bell,
             stop,
-            || Ok(reader.latest()?.map(|policy| *policy.header()).filter(due)),
+            || Ok(reader.latest()?.filter(|policy| due(policy.header()))),
             || {
                 pulse.beat(Activity::WaitingForPeer);
                 reports.look_after();
@@ -182,30 +185,31 @@ impl<'a> Evaluator<'a> {
                 Ok(())
             },
         )?;
-        self.pulse.set_policy_version(header.version);
-        Ok(header)
+        self.pulse.set_policy_version(published.header().version);
+        Ok(published)
     }
 
-    /// Returns of the episodes from `first` on, one in each environment; `None` when the server was lost over them.
-    fn run_episodes(&mut self, first: u64) -> Result<Option<Vec<f64>>, Ended> {
+    /// Returns of the episodes from `first` on under these parameters, one in each environment; `None` when the server was
+    /// lost over them.
+    fn run_episodes(&mut self, parameters: &[f32], first: u64) -> Result<Option<Vec<f64>>, Exit<ActorError>> {
         let Self {
             client,
             bell,
-            reader,
             policy,
             pulse,
             actions,
             ..
         } = self;
-        let Some(held) = reader.held() else { return Ok(None) };
-        let mut current = client.reset(bell, Begin::Evaluation(first), || {
+        let begun = client.reset(bell, Begin::Evaluation(first), || {
             pulse.beat(Activity::WaitingForServer);
-        })?;
+        });
+        let mut current = begun.map_err(Exit::widen)?;
         let mut returns = vec![0.0; self.settings.envs];
         let mut under_way = vec![true; self.settings.envs];
         while under_way.contains(&true) {
-            policy.act(held.parameters(), current.observations(), actions);
-            match client.step(bell, actions, || pulse.beat(Activity::WaitingForServer))? {
+            policy.act(parameters, current.observations(), actions);
+            let stepped = client.step(bell, actions, || pulse.beat(Activity::WaitingForServer));
+            match stepped.map_err(Exit::widen)? {
                 Stepped::Taken(next) => current = next,
                 Stepped::Lost => return Ok(None),
             }
@@ -218,16 +222,20 @@ impl<'a> Evaluator<'a> {
             pulse.count(self.settings.envs as u64);
             pulse.beat(Activity::Working);
             if self.stop.requested() {
-                return Err(Ended::Stopped);
+                return Err(Exit::Stopped);
             }
         }
         Ok(Some(returns))
     }
 
-    fn keep(&self, header: &PolicyHeader, return_mean: f64, return_std: f64, path: &Path) -> Result<(), ActorError> {
-        let Some(held) = self.reader.held() else {
-            return Ok(());
-        };
+    fn keep(
+        &self,
+        published: &policy::Policy,
+        return_mean: f64,
+        return_std: f64,
+        path: &Path,
+    ) -> Result<(), ActorError> {
+        let header = published.header();
         let file = PolicyFile {
             fingerprint: header.fingerprint,
             version: header.version,
@@ -235,7 +243,7 @@ impl<'a> Evaluator<'a> {
             return_mean,
             return_std,
             episodes: self.settings.evaluation.episodes.into(),
-            parameters: held.parameters().to_vec(),
+            parameters: published.parameters().to_vec(),
         };
         Ok(file.write(path)?)
     }

@@ -11,15 +11,17 @@
 //! ```
 
 use std::path::PathBuf;
+use std::rc::Rc;
 use std::time::{Duration, Instant};
 
 use shoal_common::channel::environment::{Begin, EnvironmentClient, Observed, Snapshot, Stepped};
-use shoal_common::channel::policy::PolicyReader;
+use shoal_common::channel::policy::{Policy, PolicyReader};
 use shoal_common::channel::reports::Reporter;
 use shoal_common::channel::transitions::{Chunk, ChunkSender};
-use shoal_common::channel::{Bell, ChannelError, Domain, Interruption, Place, Pulse, Ringer, wait_for};
+use shoal_common::channel::{Bell, ChannelError, Domain, Place, Pulse, Ringer, wait_for};
 use shoal_common::commit::{CommitReader, OpenError};
 use shoal_common::config::{Algorithm, Mode};
+use shoal_common::exit::Exit;
 use shoal_common::policy::PolicyLayout;
 use shoal_common::report::{Activity, EpisodeReport, Identity, Role};
 use shoal_common::space::EnvironmentSpec;
@@ -27,7 +29,7 @@ use shoal_common::stop::Stop;
 use shoal_common::stream::{Purpose, stream};
 use shoal_common::transition::{ChunkLayout, Transition};
 
-use crate::error::{ActorError, Ended};
+use crate::error::ActorError;
 use crate::exploration::Exploration;
 use crate::standing::Standing;
 
@@ -64,11 +66,11 @@ pub struct Settings {
 pub fn explore(domain: &Domain, settings: &Settings, stop: &Stop) -> Result<(), ActorError> {
     let mut explorer = match Explorer::new(domain, settings, stop) {
         Ok(explorer) => explorer,
-        Err(ended) => return ended.into_result(),
+        Err(exit) => return exit.into_result(),
     };
     match explorer.run() {
-        Ended::Stopped => explorer.say_farewell(),
-        failed @ Ended::Failed(_) => failed.into_result(),
+        Exit::Stopped => explorer.say_farewell(),
+        Exit::Failed(error) => Err(error),
     }
 }
 
@@ -81,7 +83,10 @@ struct Explorer<'a> {
     policy: PolicyReader,
     exploration: Exploration,
     sender: ChunkSender,
-    chunk: Option<Chunk>,
+    /// The chunk under way.
+    chunk: Chunk,
+    /// Version of the policy that its last row was collected with; of the one before it, while it is empty.
+    policy_version: u64,
     commits: CommitReader,
     pulse: Pulse,
     episodes: Reporter<EpisodeReport>,
@@ -99,7 +104,7 @@ struct Explorer<'a> {
 }
 
 impl<'a> Explorer<'a> {
-    fn new(domain: &Domain, settings: &'a Settings, stop: &'a Stop) -> Result<Self, Ended> {
+    fn new(domain: &Domain, settings: &'a Settings, stop: &'a Stop) -> Result<Self, Exit<ActorError>> {
         let Identity { index, incarnation, .. } = settings.identity;
         let row = settings.chunk.row;
         let layout = PolicyLayout::new(&settings.algorithm, &settings.spec)?;
@@ -113,7 +118,9 @@ impl<'a> Explorer<'a> {
         let greeting = ChunkSender::open(domain, index, incarnation, settings.chunk, settings.window)?;
         let learner = Ringer::new(domain, Place(Role::Learner, 0))?;
         learner.ring();
-        let sender = greeting.wait(&commits, &bell, stop, || pulse.beat(Activity::WaitingForPeer))?;
+        let sender = greeting
+            .wait(&commits, &bell, stop, || pulse.beat(Activity::WaitingForPeer))
+            .map_err(Exit::widen)?;
         // In lockstep nothing may depend on how often an actor was started: it goes on where the last chunk left it.
         let incarnation = match settings.mode {
             Mode::Lockstep => 0,
@@ -138,8 +145,9 @@ impl<'a> Explorer<'a> {
             standing,
             hurried: None,
             ended: Vec::new(),
+            chunk: sender.begin()?,
+            policy_version: 0,
             sender,
-            chunk: None,
             commits,
             pulse,
             episodes: Reporter::open(domain)?,
@@ -150,22 +158,22 @@ impl<'a> Explorer<'a> {
         })
     }
 
-    fn run(&mut self) -> Ended {
+    fn run(&mut self) -> Exit<ActorError> {
         loop {
-            if let Err(ended) = self.run_until_the_server_is_lost() {
-                return ended;
+            if let Err(exit) = self.run_until_the_server_is_lost() {
+                return exit;
             }
             tracing::warn!("the environment server was restarted");
         }
     }
 
     /// Begins new episodes, and gives up those under way; in lockstep goes on with those after the last chunk.
-    fn begin(&mut self) -> Result<Observed, Ended> {
+    fn begin(&mut self) -> Result<Observed, Exit<ActorError>> {
         if self.settings.mode == Mode::Free {
             (0..self.settings.envs).for_each(|environment| self.begin_episode(environment));
             return self.reset(Begin::Next);
         }
-        self.chunk = None;
+        self.chunk.clear();
         self.ended.clear();
         if let Some(standing) = &self.standing {
             self.step = standing.step;
@@ -173,7 +181,8 @@ impl<'a> Explorer<'a> {
             self.returns.clone_from(&standing.returns);
             self.lengths.clone_from(&standing.lengths);
             let idle = || self.pulse.beat(Activity::WaitingForServer);
-            return Ok(self.client.restore(&self.bell, &standing.snapshot, idle)?);
+            let restored = self.client.restore(&self.bell, &standing.snapshot, idle);
+            return restored.map_err(Exit::widen);
         }
         (0..self.settings.envs).for_each(|environment| self.begin_episode(environment));
         // Without a word of where it stood there is only the beginning that is the same for everyone.
@@ -183,24 +192,22 @@ impl<'a> Explorer<'a> {
         self.reset(begin)
     }
 
-    fn reset(&mut self, begin: Begin) -> Result<Observed, Ended> {
+    fn reset(&mut self, begin: Begin) -> Result<Observed, Exit<ActorError>> {
         let idle = || self.pulse.beat(Activity::WaitingForServer);
-        Ok(self.client.reset(&self.bell, begin, idle)?)
+        self.client.reset(&self.bell, begin, idle).map_err(Exit::widen)
     }
 
-    fn run_until_the_server_is_lost(&mut self) -> Result<(), Ended> {
+    fn run_until_the_server_is_lost(&mut self) -> Result<(), Exit<ActorError>> {
         let mut current = self.begin()?;
         loop {
-            let version = self.await_policy()?;
-            if self.chunk.is_none() {
-                self.chunk = Some(self.sender.begin()?);
-            }
+            let policy = self.await_policy().map_err(Exit::widen)?;
             self.pulse.begin_work();
-            self.act(&current);
+            self.act(&policy, &current);
             let idle = || self.pulse.beat(Activity::WaitingForServer);
-            match self.client.step(&self.bell, &self.actions, idle)? {
+            let stepped = self.client.step(&self.bell, &self.actions, idle);
+            match stepped.map_err(Exit::widen)? {
                 Stepped::Taken(next) => {
-                    self.remember(&current, &next, version);
+                    self.remember(&current, &next, policy.header().version);
                     current = next;
                 }
                 Stepped::Lost => return Ok(()),
@@ -212,11 +219,11 @@ impl<'a> Explorer<'a> {
                 if !self.take_stand()? {
                     return Ok(());
                 }
-                self.await_room()?;
-                self.send(version)?;
+                self.await_room().map_err(Exit::widen)?;
+                self.send()?;
             }
             if self.stop.requested() {
-                return Err(Ended::Stopped);
+                return Err(Exit::Stopped);
             }
         }
     }
@@ -224,11 +231,11 @@ impl<'a> Explorer<'a> {
     /// Whether the chunk is full, or holds the one episode that it is for.
     fn chunk_is_complete(&self) -> bool {
         let episode_is_over = self.settings.algorithm.learns_from_episodes() && !self.ended.is_empty();
-        self.chunk.as_ref().is_some_and(Chunk::is_full) || episode_is_over
+        self.chunk.is_full() || episode_is_over
     }
 
-    /// The version of the policy to act with: the newest, or in lockstep the one after the last round.
-    fn await_policy(&mut self) -> Result<u64, Ended> {
+    /// The policy to act with: the newest, or in lockstep the one after the last round.
+    fn await_policy(&mut self) -> Result<Rc<Policy>, Exit<ChannelError>> {
         let wanted = match self.settings.mode {
             Mode::Free => 0,
             Mode::Lockstep => self.sender.sent(),
@@ -241,14 +248,11 @@ impl<'a> Explorer<'a> {
             stop,
             ..
         } = self;
-        let newest = |policy: &mut PolicyReader| -> Result<Option<u64>, _> {
-            Ok(policy
-                .latest()?
-                .map(|policy| policy.header().version)
-                .filter(|version| *version >= wanted))
+        let newest = |reader: &mut PolicyReader| -> Result<Option<Rc<Policy>>, _> {
+            Ok(reader.latest()?.filter(|policy| policy.header().version >= wanted))
         };
-        let version = match newest(policy)? {
-            Some(version) => version,
+        let newest = match newest(policy)? {
+            Some(newest) => newest,
             None => wait_for(
                 bell,
                 stop,
@@ -260,31 +264,30 @@ impl<'a> Explorer<'a> {
                 },
             )?,
         };
-        self.pulse.set_policy_version(version);
-        Ok(version)
+        self.pulse.set_policy_version(newest.header().version);
+        Ok(newest)
     }
 
     /// Chooses an action for every environment.
-    fn act(&mut self, current: &Observed) {
-        if let Some(policy) = self.policy.held() {
-            let act = match policy.header().updates {
-                0 => Exploration::warm_up,
-                _ => Exploration::act,
-            };
-            act(
-                &mut self.exploration,
-                policy.parameters(),
-                current.observations(),
-                self.step,
-                &mut self.actions,
-            );
-        }
+    fn act(&mut self, policy: &Policy, current: &Observed) {
+        let act = match policy.header().updates {
+            0 => Exploration::warm_up,
+            _ => Exploration::act,
+        };
+        act(
+            &mut self.exploration,
+            policy.parameters(),
+            current.observations(),
+            self.step,
+            &mut self.actions,
+        );
     }
 
     /// Line 10 of Algorithm 4, for every environment.
     fn remember(&mut self, current: &Observed, next: &Observed, version: u64) {
         let width = self.settings.chunk.row.action_width();
         let gamma = self.settings.algorithm.gamma() as f32;
+        self.policy_version = version;
         for e in 0..self.settings.envs {
             let (terminated, truncated) = (next.terminated(e), next.truncated(e));
             let transition = Transition {
@@ -295,9 +298,7 @@ impl<'a> Explorer<'a> {
                 s_next: next.next_observation(e),
                 last: terminated || truncated,
             };
-            if let Some(chunk) = &mut self.chunk {
-                chunk.push(&transition);
-            }
+            self.chunk.push(&transition);
             self.returns[e] += f64::from(transition.r);
             self.lengths[e] += 1;
             if transition.last {
@@ -323,12 +324,13 @@ impl<'a> Explorer<'a> {
 
     /// Says behind the chunk's rows where the actor stands after them, where that is asked for; whether the environment
     /// server is still there to say its part.
-    fn take_stand(&mut self) -> Result<bool, Ended> {
+    fn take_stand(&mut self) -> Result<bool, Exit<ActorError>> {
         if self.settings.chunk.standing_words == 0 {
             return Ok(true);
         }
         let idle = || self.pulse.beat(Activity::WaitingForServer);
-        let Snapshot::Taken(snapshot) = self.client.snapshot(&self.bell, idle)? else {
+        let snapshot = self.client.snapshot(&self.bell, idle).map_err(Exit::widen)?;
+        let Snapshot::Taken(snapshot) = snapshot else {
             return Ok(false);
         };
         let standing = Standing {
@@ -338,15 +340,13 @@ impl<'a> Explorer<'a> {
             returns: self.returns.clone(),
             lengths: self.lengths.clone(),
         };
-        if let Some(chunk) = &mut self.chunk {
-            chunk.set_standing(&standing.words());
-        }
+        self.chunk.set_standing(&standing.words());
         self.standing = Some(standing);
         Ok(true)
     }
 
     /// Waits until another chunk may be sent.
-    fn await_room(&mut self) -> Result<(), Interruption> {
+    fn await_room(&mut self) -> Result<(), Exit<ChannelError>> {
         let Self {
             sender,
             commits,
@@ -377,12 +377,12 @@ impl<'a> Explorer<'a> {
         Ok(())
     }
 
-    fn send(&mut self, version: u64) -> Result<(), ChannelError> {
-        if let Some(chunk) = self.chunk.take() {
-            self.sender.send(chunk, version)?;
-            self.learner.ring();
-            self.ended.drain(..).for_each(|episode| self.episodes.send(episode));
-        }
+    /// Sends the chunk under way, and begins the next one.
+    fn send(&mut self) -> Result<(), ChannelError> {
+        let chunk = std::mem::replace(&mut self.chunk, self.sender.begin()?);
+        self.sender.send(chunk, self.policy_version)?;
+        self.learner.ring();
+        self.ended.drain(..).for_each(|episode| self.episodes.send(episode));
         Ok(())
     }
 
@@ -390,11 +390,10 @@ impl<'a> Explorer<'a> {
     /// for a moment where the run ends. In lockstep a round is whole or not at all.
     fn say_farewell(&mut self) -> Result<(), ActorError> {
         if self.settings.mode == Mode::Free
-            && self.chunk.as_ref().is_some_and(|chunk| !chunk.is_empty())
+            && !self.chunk.is_empty()
             && self.await_commits(u64::from(self.settings.window) - 1)?
         {
-            let version = self.policy.held().map_or(0, |policy| policy.header().version);
-            self.send(version)?;
+            self.send()?;
         }
         self.await_commits(0)?;
         self.pulse.beat_now(Activity::Done);
@@ -427,13 +426,13 @@ pub(crate) fn connect(
     spec: &EnvironmentSpec,
     envs: usize,
     stop: &Stop,
-) -> Result<EnvironmentClient, Ended> {
+) -> Result<EnvironmentClient, Exit<ActorError>> {
     let client = EnvironmentClient::open(domain, index, spec, envs, stop.clone())?;
-    let (served, served_envs) = client.describe(bell, || ())?;
+    let (served, served_envs) = client.describe(bell, || ()).map_err(Exit::widen)?;
     if served != *spec || served_envs != envs {
         let served = format!("{served_envs} times {served:?}");
         let configured = format!("{envs} times {spec:?}");
-        return Err(Ended::Failed(ActorError::Server {
+        return Err(Exit::Failed(ActorError::Server {
             index,
             served,
             configured,
@@ -442,11 +441,16 @@ pub(crate) fn connect(
     Ok(client)
 }
 
-fn wait_for_replay(settings: &Settings, bell: &Bell, stop: &Stop, pulse: &mut Pulse) -> Result<CommitReader, Ended> {
+fn wait_for_replay(
+    settings: &Settings,
+    bell: &Bell,
+    stop: &Stop,
+    pulse: &mut Pulse,
+) -> Result<CommitReader, Exit<ActorError>> {
     loop {
         match CommitReader::open(&settings.replay) {
             Ok(reader) => return Ok(reader),
-            Err(OpenError::NotYet { .. }) if stop.requested() => return Err(Ended::Stopped),
+            Err(OpenError::NotYet { .. }) if stop.requested() => return Err(Exit::Stopped),
             Err(OpenError::NotYet { .. }) => {
                 bell.wait(Duration::from_millis(20))?;
                 pulse.beat(Activity::WaitingForPeer);

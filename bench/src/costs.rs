@@ -20,10 +20,10 @@ use shoal_learner::intake::Intake;
 use shoal_learner::replay::Replay;
 use shoal_run::process::Peer;
 
-use super::Patience;
 use super::rows::{ENVIRONMENTS, Rows};
 use super::scene::{Scene, ddpg};
 use super::window::{self, Windows};
+use super::{Patience, interrupted};
 
 /// Windows of each stage, of which the median counts.
 const WINDOWS: u32 = 5;
@@ -172,8 +172,8 @@ fn round_trip(
 ) -> anyhow::Result<f64> {
     let bell = Bell::hang(domain, Place(Role::Actor, 0))?;
     let client = EnvironmentClient::open(domain, 0, &config.spec, ENVIRONMENTS, patience.stop.clone())?;
-    client.describe(&bell, || ())?;
-    client.reset(&bell, Begin::Next, || ())?;
+    client.describe(&bell, || ()).map_err(interrupted)?;
+    client.reset(&bell, Begin::Next, || ()).map_err(interrupted)?;
     let actions = vec![0.5; ENVIRONMENTS * config.spec.action.width()];
     let part = length / (WINDOWS + 1);
     let mut windows = Windows::default();
@@ -184,7 +184,7 @@ fn round_trip(
         while asked == 0.0 || begun.elapsed() < part {
             inference.step();
             let before = Instant::now();
-            if let Stepped::Lost = client.step(&bell, &actions, || ())? {
+            if let Stepped::Lost = client.step(&bell, &actions, || ()).map_err(interrupted)? {
                 bail!("the environment server gave up its episodes");
             }
             taken += before.elapsed();
@@ -220,7 +220,9 @@ fn chunks(
     let greeting = ChunkSender::open(domain, 0, 1, config.chunk_layout(), window)?;
     intake.drain(replay, window, |_| false)?;
     let commits = CommitReader::open(&scene.run.replay_file())?;
-    let mut sender = greeting.wait(&commits, &bell, &patience.stop, || {})?;
+    let mut sender = greeting
+        .wait(&commits, &bell, &patience.stop, || {})
+        .map_err(interrupted)?;
 
     let (mut writing, mut taking_in) = (Windows::default(), Windows::default());
     let begun = Instant::now();

@@ -28,7 +28,8 @@ use anyhow::{Context, bail};
 use comfy_table::Table;
 use comfy_table::presets::UTF8_BORDERS_ONLY;
 use serde::Serialize;
-use shoal_common::channel::Interruption;
+use shoal_common::channel::ChannelError;
+use shoal_common::exit::Exit;
 use shoal_common::stop::Stop;
 use shoal_run::signals::Signals;
 
@@ -88,7 +89,7 @@ pub fn run(stage: Stage, actors: Option<&str>, json: bool) -> anyhow::Result<()>
     if actors.is_some() && stage != Stage::Actors {
         bail!("--actors is for `shoal bench actors` alone");
     }
-    let told = match stage {
+    match stage {
         Stage::Learner => learner::measure(&patience).and_then(|it| tell(&it, json)),
         Stage::Transitions => transitions::measure(&patience).and_then(|it| tell(&it, json)),
         Stage::Step => step::measure(&patience).and_then(|it| tell(&it, json)),
@@ -97,12 +98,15 @@ pub fn run(stage: Stage, actors: Option<&str>, json: bool) -> anyhow::Result<()>
         Stage::Run => whole_run::measure(&patience).and_then(|it| tell(&it, json)),
         Stage::All => table::measure_all(json, &patience),
         Stage::Gym => gym::measure(&patience).and_then(|it| tell(&it, json)),
-    };
-    // A wait that was interrupted says what it says to a role.
-    told.map_err(|error| match error.downcast_ref() {
-        Some(Interruption::Stopped) => anyhow::anyhow!(INTERRUPTED),
-        _ => error,
-    })
+    }
+}
+
+/// A wait that ended early: somebody has asked for the end, or a channel does not work.
+fn interrupted(exit: Exit<ChannelError>) -> anyhow::Error {
+    match exit {
+        Exit::Stopped => anyhow::anyhow!(INTERRUPTED),
+        Exit::Failed(error) => error.into(),
+    }
 }
 
 impl Patience {

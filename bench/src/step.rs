@@ -6,8 +6,9 @@ use anyhow::bail;
 use rustix::thread::sched_setaffinity;
 use serde::Serialize;
 use shoal_common::channel::environment::{Begin, EnvironmentClient, Stepped};
-use shoal_common::channel::{Bell, Domain, Interruption, Place};
+use shoal_common::channel::{Bell, ChannelError, Domain, Place};
 use shoal_common::config::Config;
+use shoal_common::exit::Exit;
 use shoal_common::report::Role;
 use shoal_run::process::Peer;
 
@@ -99,10 +100,10 @@ fn round_trips(
     let environments = config.actors.envs as usize;
     let bell = Bell::hang(domain, Place(Role::Actor, 0))?;
     let client = EnvironmentClient::open(domain, 0, &config.spec, environments, patience.stop.clone())?;
-    let mut ask = |request: &dyn Fn() -> Result<(), Interruption>| match request() {
+    let mut ask = |request: &dyn Fn() -> Result<(), Exit<ChannelError>>| match request() {
         Ok(()) => Ok(()),
-        Err(Interruption::Stopped) => patience.check(),
-        Err(Interruption::Channel(error)) => server.check().and(Err(error.into())),
+        Err(Exit::Stopped) => patience.check(),
+        Err(Exit::Failed(error)) => server.check().and(Err(error.into())),
     };
     ask(&|| client.describe(&bell, || ()).map(|_| ()))?;
     ask(&|| client.reset(&bell, Begin::Next, || ()).map(|_| ()))?;
@@ -119,8 +120,8 @@ fn round_trips(
                 server.check()?;
                 bail!("the environment server gave up its episodes");
             }
-            Err(Interruption::Stopped) => bail!(super::INTERRUPTED),
-            Err(Interruption::Channel(error)) => return Err(error.into()),
+            Err(Exit::Stopped) => bail!(super::INTERRUPTED),
+            Err(Exit::Failed(error)) => return Err(error.into()),
         }
         let after = Instant::now();
         if before.duration_since(begun) >= warm_up {

@@ -5,9 +5,10 @@ use std::time::{Duration, Instant};
 
 use serde::Serialize;
 use shoal_common::channel::transitions::ChunkSender;
-use shoal_common::channel::{Bell, Domain, Interruption, Place, Ringer, wait_for};
+use shoal_common::channel::{Bell, Domain, Place, Ringer, wait_for};
 use shoal_common::commit::{CommitReader, OpenError};
 use shoal_common::config::Config;
+use shoal_common::exit::Exit;
 use shoal_common::report::Role;
 use shoal_common::run_dir::RunDir;
 use shoal_learner::minibatch::Minibatch;
@@ -90,17 +91,15 @@ fn move_rows(
     let bell = Bell::hang(domain, Place(Role::Actor, 0))?;
     let ringer = Ringer::new(domain, Place(Role::Learner, 0))?;
     let commits = wait_for_replay(run, &bell, learner, patience)?;
-    let mut sender = ChunkSender::open(domain, 0, 1, config.chunk_layout(), config.actors.window)?.wait(
-        &commits,
-        &bell,
-        &patience.stop,
-        || {
+    let greeting = ChunkSender::open(domain, 0, 1, config.chunk_layout(), config.actors.window)?;
+    let mut sender = greeting
+        .wait(&commits, &bell, &patience.stop, || {
             // A learner that has ended commits nothing.
             if learner.check().is_err() {
                 patience.stop.request();
             }
-        },
-    )?;
+        })
+        .map_err(super::interrupted)?;
 
     let [warm_up, moving, _] = SHARES;
     let mut windows = Windows::default();
@@ -121,11 +120,10 @@ fn move_rows(
                     sender.look_after()
                 },
             );
-            if let Err(Interruption::Stopped) = waited {
+            if let Err(Exit::Stopped) = waited {
                 learner.check()?;
-                patience.check()?;
             }
-            waited?;
+            waited.map_err(super::interrupted)?;
             let mut chunk = sender.begin()?;
             for numbers in numbers.chunks_exact(row.width()) {
                 chunk.push(&row.read(numbers));

@@ -1,6 +1,6 @@
 //! A transition as it stands in a chunk and in the replay: `s, a, r, discount, s', last`, all `f32`.
 
-use crate::channel::NUMBERS_OF_A_WORD;
+use crate::packing::NUMBERS_OF_A_WORD;
 
 /// Where each field of a transition's row lies. The one statement of the layout; everyone else asks it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

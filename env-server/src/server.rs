@@ -1,7 +1,7 @@
 //! The environment server's loop: answers one actor's requests by stepping its environments.
 
 use shoal_common::channel::environment::{Ask, EnvironmentPort};
-use shoal_common::channel::{ChannelError, Interruption, Pulse};
+use shoal_common::channel::{ChannelError, Pulse};
 use shoal_common::report::Activity;
 use shoal_common::stop::Stop;
 
@@ -23,8 +23,7 @@ pub fn serve(
     loop {
         let request = match port.next(stop, || pulse.beat(Activity::WaitingForPeer)) {
             Ok(request) => request,
-            Err(Interruption::Stopped) => return Ok(()),
-            Err(Interruption::Channel(error)) => return Err(error),
+            Err(exit) => return exit.into_result(),
         };
         let refused = match request.ask() {
             Some(ask @ (Ask::Reset | Ask::ResetToTraining | Ask::ResetToEvaluation)) => {

@@ -2,10 +2,11 @@
 
 use std::time::{Duration, Instant};
 
+use shoal_common::exit::Exit;
 use shoal_common::report::Activity;
 
 use crate::judging::Judging;
-use crate::learner::{Ended, Learner};
+use crate::learner::{Learner, LearnerError};
 
 /// Updates from one publication to the next. Publishing copies the actor's weights once: about a thirtieth of an update.
 const PUBLISH_EVERY: u64 = 4;
@@ -19,7 +20,7 @@ const NAP: Duration = Duration::from_millis(50);
 /// How long the evaluator may take over the last policy. Only a learner can give it to an evaluator that has come since.
 const LAST_EVALUATION: Duration = Duration::from_secs(5);
 
-pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Ended> {
+pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
     let ratio = learner.settings.ratio;
     let every = Duration::from_secs_f64(learner.settings.checkpoint.every_seconds);
     let mut saved = Instant::now();
@@ -27,7 +28,7 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Ended> {
     learner.count_rows(learner.replay.head());
     loop {
         if learner.stop.requested() {
-            return Err(Ended::Stopped);
+            return Err(Exit::Stopped);
         }
         learner.call_the_roll()?;
         let updates = learner.updates();

@@ -4,9 +4,10 @@ use std::time::{Duration, Instant};
 
 use shoal_common::channel::reports::Reports;
 use shoal_common::channel::{ChannelError, wait_for};
+use shoal_common::exit::Exit;
 use shoal_common::report::{Activity, JudgedReport};
 
-use crate::learner::{Ended, Learner};
+use crate::learner::{Learner, LearnerError};
 
 /// What is known of the evaluator's work.
 pub(crate) struct Judging {
@@ -16,7 +17,7 @@ pub(crate) struct Judging {
 }
 
 impl Judging {
-    pub(crate) fn new(learner: &Learner<'_>) -> Result<Self, Ended> {
+    pub(crate) fn new(learner: &Learner<'_>) -> Result<Self, LearnerError> {
         Ok(Self {
             reports: Reports::open(learner.domain)?,
             judged: learner.settings.judged,
@@ -25,7 +26,11 @@ impl Judging {
 
     /// Waits until a policy of this period is judged, the one just published if none was before, but no longer than
     /// `patience`. An evaluator that dies over it has a successor, which is given the same policy.
-    pub(crate) fn wait(&mut self, learner: &mut Learner<'_>, patience: Option<Duration>) -> Result<(), Ended> {
+    pub(crate) fn wait(
+        &mut self,
+        learner: &mut Learner<'_>,
+        patience: Option<Duration>,
+    ) -> Result<(), Exit<LearnerError>> {
         let due = Some(learner.settings.evaluation.period(learner.rows));
         let Learner {
             bell,
@@ -38,7 +43,7 @@ impl Judging {
             return Ok(());
         }
         let begun = Instant::now();
-        wait_for(
+        let waited = wait_for(
             bell,
             stop,
             || -> Result<Option<()>, ChannelError> {
@@ -52,7 +57,7 @@ impl Judging {
                 pulse.beat(Activity::WaitingForPeer);
                 publisher.look_after()
             },
-        )?;
-        Ok(())
+        );
+        waited.map_err(Exit::widen)
     }
 }

@@ -13,8 +13,9 @@ use std::time::{Duration, Instant};
 
 use shoal_common::channel::policy::{PolicyHeader, PolicyPublisher};
 use shoal_common::channel::reports::{Reporter, Reports};
-use shoal_common::channel::{Bell, Domain, Interruption, Place, Pulse, Ringer};
+use shoal_common::channel::{Bell, Domain, Place, Pulse, Ringer};
 use shoal_common::config::Mode;
+use shoal_common::exit::Exit;
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::report::{Activity, Heartbeat, LearnerReport, Role};
 use shoal_common::stop::Stop;
@@ -37,27 +38,6 @@ const QUIET: Duration = Duration::from_millis(200);
 /// How long it takes in at most what the actors have sent before the end.
 const LAST_CHUNKS: Duration = Duration::from_secs(2);
 
-/// How a loop came to its end.
-pub(crate) enum Ended {
-    Stopped,
-    Failed(LearnerError),
-}
-
-impl From<Interruption> for Ended {
-    fn from(interruption: Interruption) -> Self {
-        match interruption {
-            Interruption::Stopped => Self::Stopped,
-            Interruption::Channel(error) => Self::Failed(error.into()),
-        }
-    }
-}
-
-impl<E: Into<LearnerError>> From<E> for Ended {
-    fn from(error: E) -> Self {
-        Self::Failed(error.into())
-    }
-}
-
 /// Learns until the run's steps are taken and learned from, or until `stop`; either way the state is saved.
 ///
 /// # Errors
@@ -70,13 +50,13 @@ pub fn learn(domain: &Domain, settings: &Settings, stop: &Stop) -> Result<(), Le
     };
     match ended {
         Ok(()) => learner.finish(),
-        Err(Ended::Stopped) => {
+        Err(Exit::Stopped) => {
             if settings.mode == Mode::Free {
                 learner.take_the_last()?;
             }
             learner.finish()
         }
-        Err(Ended::Failed(error)) => Err(error),
+        Err(Exit::Failed(error)) => Err(error),
     }
 }
 
@@ -305,10 +285,16 @@ impl<'a> Learner<'a> {
         } else if self.sync.as_ref().is_none_or(JoinHandle::is_finished) {
             self.end_sync();
             let pending = self.replay.start_sync()?;
-            self.sync = std::thread::Builder::new()
-                .name("sync".into())
-                .spawn(|| pending.run())
-                .ok();
+            self.sync = match std::thread::Builder::new().name("sync".into()).spawn(|| pending.run()) {
+                Ok(thread) => Some(thread),
+                // The next checkpoint brings these rows to the disk too.
+                Err(cause) => {
+                    tracing::warn!(
+                        "the replay is not brought to the disk this time: no thread can be started: {cause}"
+                    );
+                    None
+                }
+            };
         }
         let counters = Counters {
             updates: self.updates(),
@@ -323,7 +309,8 @@ impl<'a> Learner<'a> {
         match self.sync.take().map(JoinHandle::join) {
             Some(Ok(Ok(synced))) => self.replay.finish_sync(synced),
             Some(Ok(Err(cause))) => tracing::warn!("the replay could not be brought to the disk: {cause}"),
-            Some(Err(_)) | None => {}
+            Some(Err(panic)) => std::panic::resume_unwind(panic),
+            None => {}
         }
     }
 

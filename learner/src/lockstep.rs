@@ -5,13 +5,14 @@
 //! replay and does the same updates again.
 
 use shoal_common::channel::wait_for;
+use shoal_common::exit::Exit;
 use shoal_common::report::Activity;
 
 use crate::intake::IntakeError;
 use crate::judging::Judging;
-use crate::learner::{Ended, Learner, LearnerError};
+use crate::learner::{Learner, LearnerError};
 
-pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Ended> {
+pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
     let mut judging = Judging::new(learner)?;
     let interval = learner.settings.checkpoint.every_updates;
     let needed = learner.rows.saturating_sub(learner.settings.capacity);
@@ -43,14 +44,14 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Ended> {
             learner.save()?;
         }
         if learner.stop.requested() {
-            return Err(Ended::Stopped);
+            return Err(Exit::Stopped);
         }
     }
     Ok(())
 }
 
 /// Waits until the actor's chunk of this round is in the replay, which begins at row `first`; returns the row after it.
-fn await_chunk(learner: &mut Learner<'_>, actor: usize, first: u64) -> Result<u64, Ended> {
+fn await_chunk(learner: &mut Learner<'_>, actor: usize, first: u64) -> Result<u64, Exit<LearnerError>> {
     loop {
         if let Some(end) = end_of_chunk(learner, first) {
             return Ok(end);
@@ -76,8 +77,8 @@ fn await_chunk(learner: &mut Learner<'_>, actor: usize, first: u64) -> Result<u6
                 pulse.beat(Activity::WaitingForPeer);
                 publisher.look_after()
             },
-        )?;
-        taken?;
+        );
+        taken.map_err(Exit::widen)??;
         learner.tell(Activity::Working);
     }
 }

@@ -76,8 +76,10 @@ impl Algorithm for ReplayedDdpg {
             sections.push(checkpoint.take(name, length)?);
         }
         let parts = std::array::from_fn(|i| sections[i].as_slice());
-        // Each has the length it has here.
-        let _ = self.ddpg.restore(&DdpgState { updates, parts });
+        #[expect(clippy::expect_used, reason = "`take` gave each part the length that it has here")]
+        self.ddpg
+            .restore(&DdpgState { updates, parts })
+            .expect("the parts have the lengths of the networks");
         Ok(())
     }
 }

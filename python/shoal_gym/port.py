@@ -24,6 +24,29 @@ BEAT = 0.5
 PATIENCE = 10.0
 """Seconds for which a port may be refused: a predecessor that was killed has it until the launcher has cleaned up."""
 
+REFUSALS = (
+    iox2.RequestResponseOpenError,
+    iox2.ServerCreateError,
+    iox2.EventOpenError,
+    iox2.ListenerCreateError,
+    iox2.NotifierCreateError,
+)
+"""How iceoryx2 refuses a service or a port in it."""
+
+PASSING = frozenset(
+    {
+        # Every place is taken, perhaps by a process that was killed and is not cleaned up after yet.
+        "ExceedsMaxNumberOfNodes",
+        "ExceedsMaxSupportedServers",
+        "ExceedsMaxSupportedListeners",
+        "ExceedsMaxSupportedNotifiers",
+        # A process was killed over making it, which the launcher will remove.
+        "HangsInCreation",
+        "Interrupt",
+    }
+)
+"""Refusals that may pass, by the names that iceoryx2's Python package gives them: it has no other way to tell them apart."""
+
 T = TypeVar("T")
 
 
@@ -33,6 +56,22 @@ class Ended(Exception):
 
 class Unreachable(Exception):
     """A port in the run's shared memory cannot be had."""
+
+
+def claim(attempt: Callable[[], T], look_out: Callable[[], None]) -> T:
+    """Makes a port. A refusal that may pass is tried again for a while, with ``look_out`` before each new try; any other one
+    is final.
+
+    Raises ``Unreachable`` with the refusal."""
+    deadline = time.monotonic() + PATIENCE
+    while True:
+        try:
+            return attempt()
+        except REFUSALS as refusal:
+            if str(refusal) not in PASSING or time.monotonic() > deadline:
+                raise Unreachable(f"cannot join the run's shared memory: {refusal!r}") from refusal
+        look_out()
+        time.sleep(0.005)
 
 
 class Port:
@@ -49,7 +88,7 @@ class Port:
             .signal_handling_mode(iox2.SignalHandlingMode.Disabled)
             .create(iox2.ServiceType.Ipc)
         )
-        self._server = self._claim(
+        self._server = claim(
             lambda: self._service(protocol.conversation(run, index))
             .request_response(iox2.Slice[ctypes.c_float], iox2.Slice[ctypes.c_float])
             .request_header(RequestHeader)
@@ -58,17 +97,20 @@ class Port:
             .server_builder()
             .initial_max_slice_len(longest)
             .max_loaned_responses_per_request(2)
-            .create()
+            .create(),
+            self._look_out,
         )
-        self._bell = self._claim(
+        self._bell = claim(
             lambda: self._service(protocol.bell(run, f"env-server/{index}"))
             .event()
             .open()
             .listener_builder()
-            .create()
+            .create(),
+            self._look_out,
         )
-        self._ringer = self._claim(
-            lambda: self._service(protocol.bell(run, client)).event().open().notifier_builder().create()
+        self._ringer = claim(
+            lambda: self._service(protocol.bell(run, client)).event().open().notifier_builder().create(),
+            self._look_out,
         )
         self._heart: Any = None
         self._heartbeats = protocol.heartbeats(run)
@@ -145,18 +187,6 @@ class Port:
 
     def _service(self, name: str) -> Any:
         return self._node.service_builder(iox2.ServiceName.new(name))
-
-    def _claim(self, attempt: Callable[[], T]) -> T:
-        """Tries for a while: a predecessor that was killed may still have the port."""
-        deadline = time.monotonic() + PATIENCE
-        while True:
-            try:
-                return attempt()
-            except Exception as reason:  # Every error of iceoryx2 has a class of its own.
-                self._look_out()
-                if time.monotonic() > deadline:
-                    raise Unreachable(f"cannot join the run's shared memory: {reason!r}") from reason
-                time.sleep(0.005)
 
     @staticmethod
     def _look_out() -> None:

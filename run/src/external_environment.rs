@@ -16,8 +16,9 @@ use rustix::process::{
     set_parent_process_death_signal,
 };
 use shoal_common::channel::environment::{Begin, EnvironmentClient, Observed, Stepped, describe};
-use shoal_common::channel::{Bell, Domain, Interruption, Place, Services};
+use shoal_common::channel::{Bell, ChannelError, Domain, Place, Services};
 use shoal_common::config::Environment;
+use shoal_common::exit::Exit;
 use shoal_common::report::Role;
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::stop::{GRACE, Stop};
@@ -293,7 +294,7 @@ fn opened(domain: &Domain, post: &Post<'_>, environment: &Environment) -> anyhow
     heard.request();
     let (spec, environments) = answered(described, &mut program).map_err(with_advice)?;
     let opened = EnvironmentClient::open(domain, post.index, &spec, environments, stop);
-    let client = answered(opened.map_err(Interruption::from), &mut program)?;
+    let client = answered(opened.map_err(Exit::from), &mut program)?;
     Ok((services, client, bell, spec, program))
 }
 
@@ -322,12 +323,12 @@ fn stopped_when_it_ends(program: &Peer, heard: Stop) -> anyhow::Result<Stop> {
     Ok(stop)
 }
 
-fn answered<T>(answer: Result<T, Interruption>, program: &mut Peer) -> anyhow::Result<T> {
-    answer.or_else(|interruption| {
+fn answered<T>(answer: Result<T, Exit<ChannelError>>, program: &mut Peer) -> anyhow::Result<T> {
+    answer.or_else(|exit| {
         program.check()?;
-        match interruption {
-            Interruption::Stopped => bail!("the environment server did not answer within {PATIENCE:?}"),
-            Interruption::Channel(error) => Err(error.into()),
+        match exit {
+            Exit::Stopped => bail!("the environment server did not answer within {PATIENCE:?}"),
+            Exit::Failed(error) => Err(error.into()),
         }
     })
 }

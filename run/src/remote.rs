@@ -38,12 +38,17 @@ impl Remote {
             return Ok(None);
         }
         let domain = Domain::visit(&self.config.run.id, self.config.actors.max)?;
-        let sweeper = Sweeper::start(&domain)?;
+        let answer = self.ask_in(&domain, question, patience);
+        let left = domain.leave();
+        let answer = answer?;
+        left?;
+        Ok(answer)
+    }
+
+    fn ask_in(&self, domain: &Domain, question: Question, patience: Duration) -> anyhow::Result<Option<Answer>> {
+        let _sweeper = Sweeper::start(domain)?;
         let lives = || self.run.goes_on().unwrap_or(true);
-        let answer = control::ask(&domain, self.run.key()?, question, patience, lives);
-        drop(sweeper);
-        domain.leave()?;
-        match answer {
+        match control::ask(domain, self.run.key()?, question, patience, lives) {
             Ok(Answer::AnotherRun(there)) => {
                 let here = self.run.path().display();
                 bail!("{here} is a copy of {there}, which is going on; what was started here waits for that one to end")

@@ -4,7 +4,8 @@ use std::time::Duration;
 
 use rustix::process::Signal;
 use shoal_common::channel::environment::{Begin, EnvironmentClient, Observed, Snapshot, Stepped};
-use shoal_common::channel::{Bell, Domain, Interruption, Place};
+use shoal_common::channel::{Bell, ChannelError, Domain, Place};
+use shoal_common::exit::Exit;
 use shoal_common::report::Role;
 
 use crate::children::{ENVS, pendulums};
@@ -51,7 +52,7 @@ impl Asker {
         }
     }
 
-    fn restore(&self, words: &[u64]) -> Result<Observed, Interruption> {
+    fn restore(&self, words: &[u64]) -> Result<Observed, Exit<ChannelError>> {
         self.client.restore(&self.bell, words, || ())
     }
 

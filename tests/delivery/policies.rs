@@ -32,7 +32,7 @@ fn reads(reader: &mut PolicyReader, incarnation: u64, version: u64) {
         reader
             .latest()
             .unwrap()
-            .is_some_and(|policy| is(policy, incarnation, version))
+            .is_some_and(|policy| is(&policy, incarnation, version))
     });
 }
 
@@ -52,7 +52,7 @@ fn a_policy_stays_as_it_is_when_its_learner_is_killed_and_the_next_learners_foll
     reads(&mut late, 0, 7);
     learner.kill();
     for reader in [&mut early, &mut late] {
-        assert!(is(reader.latest().unwrap().unwrap(), 0, 7));
+        assert!(is(&reader.latest().unwrap().unwrap(), 0, 7));
     }
 
     let mut learner = run.start("policy-publisher 1");
@@ -86,5 +86,5 @@ fn a_policy_published_between_a_readers_looks_is_found_though_its_learner_died()
     let mut learner = run.start("policy-publisher 5");
     publishes(&mut learner, 9);
     reads(&mut reader, 5, 9);
-    assert!(is(reader.latest().unwrap().unwrap(), 5, 9));
+    assert!(is(&reader.latest().unwrap().unwrap(), 5, 9));
 }

@@ -8,12 +8,13 @@
 mod support;
 
 use std::path::Path;
+use std::process::Command;
 use std::time::Duration;
 
 use rustix::process::{Pid, Signal, kill_process};
 use shoal_common::config::Config;
 use shoal_common::space::Space;
-use support::{Workplace, complaint, end_of, parse, python_serves, until};
+use support::{Workplace, complaint, end_of, output_of, parse, python_serves, until};
 
 /// A module with environments for the tests.
 const OURS: &str = "gym:shoal_test_environments:";
@@ -35,6 +36,21 @@ const SHORT: [&str; 4] = ["--set", "evaluation.every=1000", "--envs", "2"];
 
 fn config(place: &Workplace) -> Config {
     Config::load(&place.path().join("run/config.toml")).unwrap()
+}
+
+#[test]
+fn the_package_passes_its_own_tests() {
+    if !python_serves() {
+        eprintln!("skipped: python3 has no shoal_gym");
+        return;
+    }
+    let mut tests = Command::new("python3");
+    tests
+        .args(["-B", "-m", "unittest", "discover", "-s", "tests"])
+        .current_dir(Path::new(env!("CARGO_MANIFEST_DIR")).join("python"));
+    let output = output_of(&mut tests);
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success() && !said.contains("Ran 0 tests"), "{said}");
 }
 
 #[test]

@@ -2,6 +2,7 @@
 
 use std::cell::Cell;
 use std::fmt;
+use std::io;
 use std::time::{Duration, Instant};
 
 use iceoryx2::port::listener::{Listener, ListenerWaitError};
@@ -12,8 +13,11 @@ use iceoryx2::service::port_factory::event::PortFactory;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
 
-use super::services::Held;
-use super::{ChannelError, Domain, Entry, Interruption, claim, descriptor, memory, service_name};
+use super::domain::Domain;
+use super::error::{Cause, ChannelError};
+use super::service::{Entry, Held, claim, service_name};
+use super::{descriptor, memory};
+use crate::exit::Exit;
 use crate::report::Role;
 use crate::stop::Stop;
 
@@ -115,7 +119,6 @@ impl Bell {
     /// # Errors
     /// When waiting is impossible.
     pub fn wait(&self, patience: Duration) -> Result<bool, ChannelError> {
-        let failed = |cause: &dyn fmt::Debug| ChannelError::new(self.place.to_string(), "wait", cause);
         // The listener's own `timed_wait` does the same with twice as many system calls.
         let patience = Timespec {
             tv_sec: patience.as_secs() as i64,
@@ -125,13 +128,17 @@ impl Bell {
         match poll(&mut ready, Some(&patience)) {
             // A process that was stopped and goes on has only been interrupted.
             Ok(_) | Err(Errno::INTR) => {}
-            Err(cause) => return Err(failed(&cause)),
+            Err(errno) => return Err(self.failed(io::Error::from(errno))),
         }
         let mut rang = false;
         match self.listener.try_wait(|_| rang = true) {
             Ok(_) | Err(ListenerWaitError::InterruptSignal) => Ok(rang),
-            Err(cause) => Err(failed(&cause)),
+            Err(cause) => Err(self.failed(cause)),
         }
+    }
+
+    fn failed(&self, cause: impl Cause) -> ChannelError {
+        ChannelError::new(self.place.to_string(), "wait", cause)
     }
 }
 
@@ -163,13 +170,13 @@ impl Ringer {
 /// it waits, `look_after` renews connections, some twenty times a second.
 ///
 /// # Errors
-/// [`Interruption::Stopped`] once `stop` is requested, and whatever `poll` or `look_after` fail with.
+/// [`Exit::Stopped`] once `stop` is requested, and whatever `poll` or `look_after` fail with.
 pub fn wait_for<T>(
     bell: &Bell,
     stop: &Stop,
     mut poll: impl FnMut() -> Result<Option<T>, ChannelError>,
     mut look_after: impl FnMut() -> Result<(), ChannelError>,
-) -> Result<T, Interruption> {
+) -> Result<T, Exit<ChannelError>> {
     // The clock is not read for an answer that comes while it polls.
     let mut looked_after = None;
     let most = bell.polling.polls();
@@ -182,7 +189,7 @@ pub fn wait_for<T>(
             std::hint::spin_loop();
         }
         if stop.requested() {
-            return Err(Interruption::Stopped);
+            return Err(Exit::Stopped);
         }
         let since = looked_after.get_or_insert_with(Instant::now);
         bell.wait(NAP)?;
@@ -217,14 +224,7 @@ fn service(domain: &Domain, channel: &str, entry: Entry) -> Result<PortFactory<i
         .max_listeners(2)
         .max_notifiers(parties)
         .max_nodes(parties);
-    match entry {
-        Entry::Create => builder
-            .create()
-            .map_err(|cause| ChannelError::new(channel, "create", cause)),
-        Entry::Open => builder
-            .open()
-            .map_err(|cause| ChannelError::new(channel, "open", cause)),
-    }
+    entry.service(channel, builder, |b| b.create(), |b| b.open())
 }
 
 #[cfg(test)]

@@ -6,9 +6,9 @@
 //! file is put back before iceoryx2 cleans up.
 
 use std::collections::HashSet;
-use std::fs::{Metadata, OpenOptions};
+use std::fs::Metadata;
 use std::io;
-use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{self, RecvTimeoutError, Sender};
 use std::thread::JoinHandle;
@@ -18,9 +18,10 @@ use iceoryx2::identifiers::UniqueNodeId;
 use iceoryx2::prelude::{CallbackProgression, Config, Node, NodeState, ipc};
 use rustix::process::{Pid, test_kill_process};
 
-use super::domain::{DomainError, SHARED_MEMORY, files_of, io_error, iox_config, prefix, user_root};
+use super::domain::{Domain, DomainError, io_error, iox_config, user_root};
+use super::error::ChannelError;
+use super::files::{SHARED_MEMORY, files_of};
 use super::memory::is_promise;
-use super::{ChannelError, Domain, Services};
 
 /// How often the sweeper looks. Whoever opens a half-made file is held up for so long at most.
 const SWEEP: Duration = Duration::from_millis(250);
@@ -177,45 +178,8 @@ fn clean_up_dead_nodes(config: &Config) -> u32 {
     failed + u32::from(listed.is_err())
 }
 
-impl Services {
-    /// Puts back what tells iceoryx2 of dead processes' ports, where it is gone and the port is not. To be called before a
-    /// clean-up.
-    ///
-    /// # Errors
-    /// When a file cannot be made.
-    pub fn restore_port_tags(&self, domain: &Domain) -> Result<(), DomainError> {
-        let nodes = domain.directory()?.join("nodes");
-        let mut restored = Ok(());
-        self.each_port(|node, port| {
-            let directory = nodes.join(node.value().to_string());
-            let tag = directory.join(format!("{}{port}.port_tag", prefix(domain.run_id())));
-            if restored.is_ok() && !lives(node) && directory.is_dir() && !tag.exists() {
-                let made = OpenOptions::new()
-                    .write(true)
-                    .create(true)
-                    .truncate(false)
-                    .mode(0o600)
-                    .open(&tag);
-                restored = match made {
-                    // Another clean-up has done all there is to do.
-                    Err(cause) if cause.kind() == io::ErrorKind::NotFound => Ok(()),
-                    made => made.map(drop).map_err(io_error("make", &tag)),
-                };
-            }
-        });
-        restored
-    }
-
-    /// Ports that dead processes occupy.
-    pub fn occupied_by_the_dead(&self) -> usize {
-        let mut occupied = 0;
-        self.each_port(|node, _| occupied += usize::from(!lives(node)));
-        occupied
-    }
-}
-
 /// Whether the process that made the node lives.
-fn lives(node: UniqueNodeId) -> bool {
+pub(super) fn lives(node: UniqueNodeId) -> bool {
     let pid = node
         .pid::<ipc::Service>()
         .ok()
@@ -228,6 +192,7 @@ mod tests {
     use std::fs::File;
     use std::os::unix::fs::PermissionsExt;
 
+    use super::super::files::prefix;
     use super::*;
 
     /// A file of a run of this test's own, removed with it.

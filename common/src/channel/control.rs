@@ -14,8 +14,10 @@ use iceoryx2::service::port_factory::request_response::PortFactory;
 
 pub use self::message::{Answer, Question, RoleState, RoleStatus, RunKey, RunStatus};
 use self::message::{Asked, VERSION, decode, encode};
-use super::services::Held;
-use super::{ChannelError, Domain, Entry, claim, memory, service_name};
+use super::domain::Domain;
+use super::error::{Cause, ChannelError, ChannelErrorKind};
+use super::memory;
+use super::service::{Entry, Held, claim, service_name};
 
 mod message;
 
@@ -134,7 +136,10 @@ impl ControlPort {
 
 /// An asker that has gone, or has no memory left, is no reason for the launcher to fail.
 fn send(request: &ControlRequest, answer: &Answer) {
-    let bytes = encode(answer);
+    let bytes = match encode(answer) {
+        Ok(bytes) => bytes,
+        Err(cause) => return tracing::warn!("a question went without an answer, which cannot be written: {cause}"),
+    };
     let sent = request.loan_slice(bytes.len()).map(|mut response| {
         response.payload_mut().copy_from_slice(&bytes);
         response.user_header_mut().version = VERSION;
@@ -156,40 +161,35 @@ pub fn ask(
     patience: Duration,
     lives: impl Fn() -> bool,
 ) -> Result<Answer, ControlError> {
-    let failed = |cause: String| ChannelError {
-        channel: CHANNEL.into(),
-        action: "ask",
-        cause,
-    };
     let deadline = Instant::now() + patience;
     let make_client = || {
         service(domain, Entry::Open)?
             .client_builder()
             .initial_max_slice_len(QUESTION)
             .create()
-            .map_err(|cause| ChannelError::new(CHANNEL, "ask", cause))
+            .map_err(cannot_ask)
     };
     // A launcher that starts has not made the service yet, and one that ends has it no more.
     let client = loop {
         match make_client() {
             Ok(client) => break client,
-            Err(error) if Instant::now() >= deadline => return Err(error.into()),
             Err(_) if !lives() => return Err(ControlError::Gone),
+            Err(error) if will_not_pass(&error) || Instant::now() >= deadline => return Err(error.into()),
             Err(_) => std::thread::sleep(NAP),
         }
     };
     let ask = |bytes: &[u8]| {
-        let mut request = client.loan_slice(bytes.len()).map_err(|e| format!("{e:?}"))?;
+        let mut request = client.loan_slice(bytes.len()).map_err(cannot_ask)?;
         request.payload_mut().copy_from_slice(bytes);
         request.user_header_mut().version = VERSION;
-        request.send().map_err(|e| format!("{e:?}"))
+        request.send().map_err(cannot_ask)
     };
-    let question = encode(&Asked { run, question });
-    let mut pending = ask(&question).map_err(failed)?;
+    let question = encode(&Asked { run, question }).map_err(cannot_ask)?;
+    let mut pending = ask(&question)?;
     let mut looked = Instant::now();
     let mut gone = false;
     loop {
-        let received = pending.receive().map_err(|cause| failed(format!("{cause:?}")))?;
+        let received = pending.receive().map_err(cannot_ask)?;
         if let Some(response) = received {
             return decode(response.user_header().version, response.payload()).map_err(ControlError::Unreadable);
         }
@@ -206,9 +206,21 @@ pub fn ask(
         }
         // The launcher may have opened its end only now.
         if pending.number_of_server_connections() == 0 {
-            pending = ask(&question).map_err(failed)?;
+            pending = ask(&question)?;
         }
     }
+}
+
+fn cannot_ask(cause: impl Cause) -> ChannelError {
+    ChannelError::new(CHANNEL, "ask", cause)
+}
+
+/// A launcher that makes its shared memory anew changes everything but these.
+fn will_not_pass(error: &ChannelError) -> bool {
+    matches!(
+        error.kind,
+        ChannelErrorKind::Permission | ChannelErrorKind::Incompatible
+    )
 }
 
 /// Bytes of shared memory that the conversation reserves in a run of up to so many actors.
@@ -253,12 +265,5 @@ fn service(domain: &Domain, entry: Entry) -> Result<ControlService, ChannelError
         .max_active_requests_per_client(ACTIVE_REQUESTS)
         .max_response_buffer_size(1)
         .max_borrowed_responses_per_pending_response(1);
-    match entry {
-        Entry::Create => builder
-            .create()
-            .map_err(|cause| ChannelError::new(CHANNEL, "create", cause)),
-        Entry::Open => builder
-            .open()
-            .map_err(|cause| ChannelError::new(CHANNEL, "open", cause)),
-    }
+    entry.service(CHANNEL, builder, |b| b.create(), |b| b.open())
 }

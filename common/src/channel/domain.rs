@@ -15,6 +15,7 @@ use iceoryx2::prelude::{
 use rustix::fs::FlockOperation;
 use rustix::io::Errno;
 
+use super::files::{SHARED_MEMORY, files_of, prefix};
 use super::memory;
 
 /// How long others may have a run's lock: each needs it for some milliseconds.
@@ -22,8 +23,6 @@ const LOCK_PATIENCE: Duration = Duration::from_secs(10);
 
 /// The name of processes that are in a run only to ask its launcher something.
 const VISITOR: &str = "visitor";
-
-pub(super) const SHARED_MEMORY: &str = "/dev/shm";
 
 /// Membership of a process in a run: what all its channels are opened through.
 #[derive(Debug)]
@@ -215,11 +214,6 @@ impl Domain {
     }
 }
 
-/// File names of the run in shared memory begin with this.
-pub(super) fn prefix(run_id: &str) -> String {
-    format!("shoal_{run_id}_")
-}
-
 /// Closes the one file that iceoryx2 opens to everybody, whatever the umask: the one that counts the run's nodes.
 fn close_to_others(run_id: &str) -> Result<(), DomainError> {
     for (path, _) in files_of(run_id).map_err(io_error("list", Path::new(SHARED_MEMORY)))? {
@@ -228,18 +222,6 @@ fn close_to_others(run_id: &str) -> Result<(), DomainError> {
         }
     }
     Ok(())
-}
-
-/// The run's files in shared memory. Others may put files there whose names begin alike: theirs are left alone.
-pub(super) fn files_of(run_id: &str) -> io::Result<Vec<(PathBuf, Metadata)>> {
-    let (user, prefix) = (rustix::process::getuid().as_raw(), prefix(run_id));
-    let ours = std::fs::read_dir(SHARED_MEMORY)?
-        .flatten()
-        .filter(|entry| entry.file_name().to_string_lossy().starts_with(&prefix))
-        // One that has gone in between is none.
-        .filter_map(|entry| Some((entry.path(), entry.metadata().ok()?)))
-        .filter(|(_, metadata)| metadata.uid() == user);
-    Ok(ours.collect())
 }
 
 pub(super) fn iox_config(root: &Path, run_id: &str) -> Result<Config, String> {

@@ -8,7 +8,7 @@ use std::io;
 use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::Path;
 
-use super::domain::{SHARED_MEMORY, prefix};
+use super::files::{SHARED_MEMORY, prefix};
 
 /// The unit in which a file takes memory, in bytes.
 const PAGE: usize = 4096;

@@ -1,6 +1,8 @@
 //! The policy, from the learner to everyone who acts: the latest wins. Readers evaluate it where it lies, in the learner's
 //! memory, and go on with it when the learner dies.
 
+use std::rc::Rc;
+
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::port::update_connections::UpdateConnections;
@@ -10,8 +12,10 @@ use iceoryx2::service::header::publish_subscribe::Header;
 use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 
-use super::services::Held;
-use super::{ChannelError, Domain, Entry, claim, memory, service_name};
+use super::domain::Domain;
+use super::error::{ChannelError, PeerError};
+use super::memory;
+use super::service::{Entry, Held, claim, service_name};
 
 const CHANNEL: &str = "policy";
 
@@ -47,7 +51,7 @@ pub struct PolicyPublisher {
 #[derive(Debug)]
 pub struct PolicyReader {
     subscriber: Subscriber<ipc::Service, [f32], PolicyHeader>,
-    current: Option<Policy>,
+    current: Option<Rc<Policy>>,
     fingerprint: u64,
     parameters: usize,
 }
@@ -124,31 +128,28 @@ impl PolicyReader {
         })
     }
 
-    /// The newest policy there is; the same again when no newer one has come, `None` before the first.
+    /// The newest policy there is; the same again when no newer one has come, `None` before the first. The one before it
+    /// must be let go before this is called again: a reader has no more than these two in hand.
     ///
     /// # Errors
     /// When the learner's memory cannot be mapped, or its policy has another layout.
-    pub fn latest(&mut self) -> Result<Option<&Policy>, ChannelError> {
+    pub fn latest(&mut self) -> Result<Option<Rc<Policy>>, ChannelError> {
         while let Some(sample) = self
             .subscriber
             .receive()
             .map_err(|cause| ChannelError::new(CHANNEL, "read", cause))?
         {
             if sample.user_header().fingerprint != self.fingerprint || sample.payload().len() != self.parameters {
-                return Err(ChannelError::new(
-                    CHANNEL,
-                    "read",
-                    "the learner's networks have another layout",
-                ));
+                return Err(ChannelError::new(CHANNEL, "read", PeerError::PolicyLayout));
             }
-            self.current = Some(Policy { sample });
+            self.current = Some(Rc::new(Policy { sample }));
         }
-        Ok(self.current.as_ref())
+        Ok(self.current.clone())
     }
 
     /// The policy that [`latest`](Self::latest) gave last, however old it is by now.
     pub fn held(&self) -> Option<&Policy> {
-        self.current.as_ref()
+        self.current.as_deref()
     }
 }
 
@@ -213,14 +214,7 @@ fn service(domain: &Domain, entry: Entry) -> Result<PortFactory<ipc::Service, [f
         .history_size(1)
         .subscriber_max_buffer_size(BUFFER)
         .subscriber_max_borrowed_samples(BORROWED);
-    match entry {
-        Entry::Create => builder
-            .create()
-            .map_err(|cause| ChannelError::new(CHANNEL, "create", cause)),
-        Entry::Open => builder
-            .open()
-            .map_err(|cause| ChannelError::new(CHANNEL, "open", cause)),
-    }
+    entry.service(CHANNEL, builder, |b| b.create(), |b| b.open())
 }
 
 #[cfg(test)]

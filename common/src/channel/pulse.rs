@@ -2,8 +2,9 @@
 
 use std::time::{Duration, Instant};
 
+use super::domain::Domain;
+use super::error::ChannelError;
 use super::reports::Reporter;
-use super::{ChannelError, Domain};
 use crate::report::{Activity, Heartbeat, Identity};
 
 const INTERVAL: Duration = Duration::from_millis(500);

@@ -10,8 +10,10 @@ use iceoryx2::service::header::publish_subscribe::Header;
 use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 
-use super::services::Held;
-use super::{ChannelError, Domain, Entry, claim, memory, service_name};
+use super::domain::Domain;
+use super::error::ChannelError;
+use super::memory;
+use super::service::{Entry, Held, claim, service_name};
 use crate::report::{EpisodeReport, EvaluationReport, Heartbeat, JudgedReport, LearnerReport};
 
 /// Reports a reader has in hand: each is copied and let go.
@@ -172,12 +174,5 @@ fn service<R: Report>(domain: &Domain, entry: Entry) -> Result<PortFactory<ipc::
         .history_size(R::HISTORY)
         .subscriber_max_buffer_size(R::BUFFER)
         .subscriber_max_borrowed_samples(BORROWED);
-    match entry {
-        Entry::Create => builder
-            .create()
-            .map_err(|cause| ChannelError::new(R::CHANNEL, "create", cause)),
-        Entry::Open => builder
-            .open()
-            .map_err(|cause| ChannelError::new(R::CHANNEL, "open", cause)),
-    }
+    entry.service(R::CHANNEL, builder, |b| b.create(), |b| b.open())
 }

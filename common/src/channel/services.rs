@@ -1,37 +1,21 @@
 //! The services of a run. Whoever hosts it makes each of them before a process that opens it is started, and holds them to
 //! the end; all others only open. So a process that is killed while it starts leaves no half-made service behind.
 
-use std::fmt;
+use std::fs::OpenOptions;
+use std::io;
+use std::os::unix::fs::OpenOptionsExt;
 
 use iceoryx2::identifiers::UniqueNodeId;
 use iceoryx2::prelude::CallbackProgression;
 
-use super::cleanup::Sweeper;
-use super::{ChannelError, Domain, Place, bell, control, environment, policy, reports, transitions};
+use super::bell::Place;
+use super::cleanup::{Sweeper, lives};
+use super::domain::{Domain, DomainError, io_error};
+use super::error::ChannelError;
+use super::files::prefix;
+use super::service::Held;
+use super::{bell, control, environment, policy, reports, transitions};
 use crate::report::{EpisodeReport, EvaluationReport, Heartbeat, JudgedReport, LearnerReport, Role};
-
-/// Is shown each port of a service: the node that made it, and its number.
-pub(super) type SeePort<'a> = &'a mut dyn FnMut(UniqueNodeId, u128) -> CallbackProgression;
-
-/// A service that is held, whatever its payload.
-pub(super) struct Held {
-    list_ports: Box<dyn Fn(SeePort<'_>)>,
-}
-
-impl Held {
-    /// Holds the service that `list_ports` owns, and whose ports it shows.
-    pub(super) fn new(list_ports: impl Fn(SeePort<'_>) + 'static) -> Self {
-        Self {
-            list_ports: Box::new(list_ports),
-        }
-    }
-}
-
-impl fmt::Debug for Held {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Held").finish_non_exhaustive()
-    }
-}
 
 /// The services of a run that this process has made. They are gone when this is dropped and nobody else has them open.
 #[derive(Debug)]
@@ -105,12 +89,47 @@ impl Services {
         Ok(())
     }
 
+    /// Puts back what tells iceoryx2 of dead processes' ports, where it is gone and the port is not. To be called before a
+    /// clean-up.
+    ///
+    /// # Errors
+    /// When a file cannot be made.
+    pub fn restore_port_tags(&self, domain: &Domain) -> Result<(), DomainError> {
+        let nodes = domain.directory()?.join("nodes");
+        let mut restored = Ok(());
+        self.each_port(|node, port| {
+            let directory = nodes.join(node.value().to_string());
+            let tag = directory.join(format!("{}{port}.port_tag", prefix(domain.run_id())));
+            if restored.is_ok() && !lives(node) && directory.is_dir() && !tag.exists() {
+                let made = OpenOptions::new()
+                    .write(true)
+                    .create(true)
+                    .truncate(false)
+                    .mode(0o600)
+                    .open(&tag);
+                restored = match made {
+                    // Another clean-up has done all there is to do.
+                    Err(cause) if cause.kind() == io::ErrorKind::NotFound => Ok(()),
+                    made => made.map(drop).map_err(io_error("make", &tag)),
+                };
+            }
+        });
+        restored
+    }
+
+    /// Ports that dead processes occupy.
+    pub fn occupied_by_the_dead(&self) -> usize {
+        let mut occupied = 0;
+        self.each_port(|node, _| occupied += usize::from(!lives(node)));
+        occupied
+    }
+
     /// Shows every port of every service.
-    pub(super) fn each_port(&self, mut see: impl FnMut(UniqueNodeId, u128)) {
+    fn each_port(&self, mut see: impl FnMut(UniqueNodeId, u128)) {
         let mut see = |node, port| {
             see(node, port);
             CallbackProgression::Continue
         };
-        self.held.iter().for_each(|held| (held.list_ports)(&mut see));
+        self.held.iter().for_each(|held| held.list_ports(&mut see));
     }
 }

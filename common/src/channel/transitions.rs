@@ -18,10 +18,14 @@ use iceoryx2::service::header::publish_subscribe::Header;
 use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 
-use super::services::Held;
-use super::words::{numbers_of, words_of};
-use super::{Bell, ChannelError, Domain, Entry, Interruption, claim, memory, service_name, wait_for};
+use super::bell::{Bell, wait_for};
+use super::domain::Domain;
+use super::error::{ChannelError, PeerError};
+use super::memory;
+use super::service::{Entry, Held, claim, service_name};
 use crate::commit::{ChunkMark, CommitReader};
+use crate::exit::Exit;
+use crate::packing::{numbers_of, words_of};
 use crate::stop::Stop;
 use crate::transition::{ChunkLayout, Transition};
 
@@ -100,7 +104,7 @@ impl Greeting {
         bell: &Bell,
         stop: &Stop,
         mut idle: impl FnMut(),
-    ) -> Result<ChunkSender, Interruption> {
+    ) -> Result<ChunkSender, Exit<ChannelError>> {
         let Self(mut sender) = self;
         let newest = wait_for(
             bell,
@@ -245,6 +249,11 @@ impl Chunk {
         self.sample.payload_mut()[rows..].copy_from_slice(numbers_of(words));
     }
 
+    /// Takes the rows back, so that it is filled anew.
+    pub fn clear(&mut self) {
+        self.filled = 0;
+    }
+
     /// Rows written.
     pub fn len(&self) -> usize {
         self.filled
@@ -294,12 +303,8 @@ impl ChunkReceiver {
         let Some(sample) = received else { return Ok(None) };
         let (rows, numbers) = (sample.user_header().rows as usize, sample.payload().len());
         if rows > self.layout.rows || numbers != self.layout.len() {
-            let cause = format!("a chunk of {numbers} numbers claims {rows} rows");
-            return Err(ChannelError {
-                channel: self.channel.clone(),
-                action: "receive",
-                cause,
-            });
+            let cause = PeerError::ChunkLength { numbers, rows };
+            return Err(ChannelError::new(&self.channel, "receive", cause));
         }
         Ok(Some(ReceivedChunk {
             sample,
@@ -388,12 +393,5 @@ fn service(domain: &Domain, channel: &str, window: u32, entry: Entry) -> Result<
         .history_size(window as usize)
         .subscriber_max_buffer_size(buffer(window))
         .subscriber_max_borrowed_samples(BORROWED);
-    match entry {
-        Entry::Create => builder
-            .create()
-            .map_err(|cause| ChannelError::new(channel, "create", cause)),
-        Entry::Open => builder
-            .open()
-            .map_err(|cause| ChannelError::new(channel, "open", cause)),
-    }
+    entry.service(channel, builder, |b| b.create(), |b| b.open())
 }

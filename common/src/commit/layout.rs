@@ -2,7 +2,6 @@
 
 use std::ops::Range;
 
-use super::record::Record;
 use super::words::Words;
 use crate::transition::RowLayout;
 
@@ -21,6 +20,11 @@ const WORD: usize = size_of::<u64>();
 const BLOCK: usize = 4096;
 /// Words of the identity, its seal included.
 const IDENTITY_WORDS: usize = 10;
+
+/// Words of a commit record before those of the actors: generation, head, tail.
+pub(super) const RECORD_WORDS: usize = 3;
+/// Words of an actor in a commit record, before those that say where it stood: incarnation, sequence, rows.
+pub(super) const ACTOR_WORDS: usize = 3;
 
 /// More actors than any run has. A file that claims more, and is as long as it says, asks its reader for memory without
 /// end.
@@ -94,7 +98,8 @@ impl ReplayLayout {
             return None;
         }
         let ring = usize::try_from(self.ring).ok()?;
-        let slot = Record::words_of(self)?
+        let slot = self
+            .record_words()?
             .checked_add(1)?
             .checked_mul(WORD)?
             .checked_next_multiple_of(BLOCK)?;
@@ -119,6 +124,12 @@ impl ReplayLayout {
             rows,
             end,
         })
+    }
+
+    /// Words of a commit record; `None` if there are more than can be counted.
+    fn record_words(&self) -> Option<usize> {
+        let stride = self.standing_words.checked_add(ACTOR_WORDS)?;
+        self.actors.checked_mul(stride)?.checked_add(RECORD_WORDS)
     }
 
     /// The words a file of this layout begins with.

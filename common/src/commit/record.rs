@@ -2,7 +2,7 @@
 
 use std::sync::atomic::{Ordering, fence};
 
-use super::layout::ReplayLayout;
+use super::layout::{ACTOR_WORDS, RECORD_WORDS, ReplayLayout};
 use super::words::{Words, WritableWords};
 
 /// Identifies a chunk of one actor. Ordered: a later incarnation comes after every chunk of the earlier ones.
@@ -53,8 +53,8 @@ pub struct Record {
 const GENERATION: usize = 0;
 const HEAD: usize = 1;
 const TAIL: usize = 2;
-const ACTORS: usize = 3;
-const ACTOR_WORDS: usize = 3;
+/// Where the actors' words begin.
+const ACTORS: usize = RECORD_WORDS;
 
 const WORD: usize = size_of::<u64>();
 /// A slot's seal while its record is being written. No finished record has it: see `seal`.
@@ -70,11 +70,6 @@ impl Record {
             words: vec![0; ACTORS + stride * layout.actors],
             stride,
         }
-    }
-
-    pub(super) fn words_of(layout: &ReplayLayout) -> Option<usize> {
-        let stride = layout.standing_words.checked_add(ACTOR_WORDS)?;
-        layout.actors.checked_mul(stride)?.checked_add(ACTORS)
     }
 
     /// Counts the records ever written: the greater one is the newer.

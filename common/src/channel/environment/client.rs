@@ -10,9 +10,13 @@ use iceoryx2::prelude::*;
 use iceoryx2::response::Response;
 
 use super::message::{Ask, Block, RequestHeader, ResponseHeader, ResponseLayout, Verdict};
-use super::{EnvironmentService, name, question_length, service};
-use crate::channel::words::{numbers_of, words_of};
-use crate::channel::{Bell, CLAIM_PATIENCE, ChannelError, Domain, Entry, Interruption, Place, Ringer, claim, wait_for};
+use super::service::{EnvironmentService, name, question_length, service};
+use crate::channel::bell::{Bell, Place, Ringer, wait_for};
+use crate::channel::domain::Domain;
+use crate::channel::error::{ChannelError, PeerError};
+use crate::channel::service::{CLAIM_PATIENCE, Entry, claim};
+use crate::exit::Exit;
+use crate::packing::{numbers_of, words_of};
 use crate::report::Role;
 use crate::space::{EnvironmentSpec, Space};
 use crate::stop::Stop;
@@ -119,7 +123,7 @@ pub fn describe(
     index: u32,
     bell: &Bell,
     stop: Stop,
-) -> Result<(EnvironmentSpec, usize), Interruption> {
+) -> Result<(EnvironmentSpec, usize), Exit<ChannelError>> {
     let unknown = Space::boxed(&[]);
     let spec = EnvironmentSpec {
         observation: unknown.clone(),
@@ -172,18 +176,18 @@ impl EnvironmentClient {
     ///
     /// # Errors
     /// When interrupted.
-    pub fn describe(&self, bell: &Bell, idle: impl FnMut()) -> Result<(EnvironmentSpec, usize), Interruption> {
+    pub fn describe(&self, bell: &Bell, idle: impl FnMut()) -> Result<(EnvironmentSpec, usize), Exit<ChannelError>> {
         let response = self.insist(bell, Ask::Describe, 0, &[], idle)?;
         let (header, payload) = (response.user_header(), response.payload());
         let described = header.described(payload);
-        described.ok_or_else(|| ChannelError::new(&self.channel, "describe", "the answer is too short").into())
+        described.ok_or_else(|| ChannelError::new(&self.channel, "describe", PeerError::ShortAnswer).into())
     }
 
     /// Every environment begins an episode.
     ///
     /// # Errors
     /// When interrupted.
-    pub fn reset(&self, bell: &Bell, begin: Begin, idle: impl FnMut()) -> Result<Observed, Interruption> {
+    pub fn reset(&self, bell: &Bell, begin: Begin, idle: impl FnMut()) -> Result<Observed, Exit<ChannelError>> {
         let (ask, episode) = match begin {
             Begin::Next => (Ask::Reset, 0),
             Begin::Training(episode) => (Ask::ResetToTraining, episode),
@@ -196,7 +200,7 @@ impl EnvironmentClient {
     ///
     /// # Errors
     /// When interrupted, or the server refuses the actions or has forgotten its episodes.
-    pub fn step(&self, bell: &Bell, actions: &[f32], idle: impl FnMut()) -> Result<Stepped, Interruption> {
+    pub fn step(&self, bell: &Bell, actions: &[f32], idle: impl FnMut()) -> Result<Stepped, Exit<ChannelError>> {
         match self.ask_within_episodes(bell, Ask::Step, actions, idle)? {
             Some(response) => Ok(Stepped::Taken(self.observed(response)?)),
             None => Ok(Stepped::Lost),
@@ -207,7 +211,7 @@ impl EnvironmentClient {
     ///
     /// # Errors
     /// When interrupted, or the server refuses: its environments cannot say their state, or run evaluation episodes.
-    pub fn snapshot(&self, bell: &Bell, idle: impl FnMut()) -> Result<Snapshot, Interruption> {
+    pub fn snapshot(&self, bell: &Bell, idle: impl FnMut()) -> Result<Snapshot, Exit<ChannelError>> {
         let Some(response) = self.ask_within_episodes(bell, Ask::Snapshot, &[], idle)? else {
             return Ok(Snapshot::Lost);
         };
@@ -223,16 +227,19 @@ impl EnvironmentClient {
     ///
     /// # Errors
     /// When interrupted, or the server refuses the words; it stays as it was then.
-    pub fn restore(&self, bell: &Bell, words: &[u64], idle: impl FnMut()) -> Result<Observed, Interruption> {
+    pub fn restore(&self, bell: &Bell, words: &[u64], idle: impl FnMut()) -> Result<Observed, Exit<ChannelError>> {
         if words.len() != self.snapshot_words {
-            let cause = format!("{} words for a snapshot of {}", words.len(), self.snapshot_words);
+            let cause = PeerError::SnapshotLength {
+                found: words.len(),
+                expected: self.snapshot_words,
+            };
             return Err(ChannelError::new(&self.channel, "restore", cause).into());
         }
         self.begun(self.insist(bell, Ask::Restore, 0, numbers_of(words), idle)?)
     }
 
     /// The first observations of new episodes, which the server that sent them runs from now on.
-    fn begun(&self, response: Answer) -> Result<Observed, Interruption> {
+    fn begun(&self, response: Answer) -> Result<Observed, Exit<ChannelError>> {
         let server = response.origin();
         let observed = self.observed(response)?;
         self.episodes.set(Some(server));
@@ -259,7 +266,7 @@ impl EnvironmentClient {
     }
 
     fn refused(&self) -> ChannelError {
-        ChannelError::new(&self.channel, "ask", "the environment server refused the request")
+        ChannelError::new(&self.channel, "ask", PeerError::Refused)
     }
 
     /// Asks once: for requests about the episodes under way. `None` when the server that ran them is no more.
@@ -269,7 +276,7 @@ impl EnvironmentClient {
         ask: Ask,
         payload: &[f32],
         idle: impl FnMut(),
-    ) -> Result<Option<Answer>, Interruption> {
+    ) -> Result<Option<Answer>, Exit<ChannelError>> {
         if self.server() != self.episodes.get() {
             return Ok(None);
         }
@@ -281,8 +288,7 @@ impl EnvironmentClient {
             return Ok(Some(response));
         }
         if Some(response.origin()) == self.episodes.get() {
-            let cause = "the environment server has begun episodes and says that it has not: it breaks the protocol";
-            return Err(ChannelError::new(&self.channel, "ask", cause).into());
+            return Err(ChannelError::new(&self.channel, "ask", PeerError::EpisodesDenied).into());
         }
         Ok(None)
     }
@@ -295,7 +301,7 @@ impl EnvironmentClient {
         episode: u64,
         payload: &[f32],
         mut idle: impl FnMut(),
-    ) -> Result<Answer, Interruption> {
+    ) -> Result<Answer, Exit<ChannelError>> {
         let mut unreachable = None;
         loop {
             let sent = self.send(ask, episode, payload)?;
@@ -305,8 +311,7 @@ impl EnvironmentClient {
             if sent.server.is_none() || sent.is_delivered() {
                 unreachable = None;
             } else if unreachable.get_or_insert_with(Instant::now).elapsed() >= CLAIM_PATIENCE {
-                let cause = "no connection to the environment server, which is there";
-                return Err(ChannelError::new(&self.channel, "ask", cause).into());
+                return Err(ChannelError::new(&self.channel, "ask", PeerError::NoConnection).into());
             }
         }
     }
@@ -329,7 +334,7 @@ impl EnvironmentClient {
     }
 
     /// Waits for the answer; `None` when the server that was asked is no more, or was not reached.
-    fn answer(&self, bell: &Bell, sent: &Sent, mut idle: impl FnMut()) -> Result<Option<Answer>, Interruption> {
+    fn answer(&self, bell: &Bell, sent: &Sent, mut idle: impl FnMut()) -> Result<Option<Answer>, Exit<ChannelError>> {
         let lost = Cell::new(false);
         let answer = wait_for(
             bell,

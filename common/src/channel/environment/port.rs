@@ -5,9 +5,13 @@ use iceoryx2::port::server::Server;
 use iceoryx2::prelude::*;
 
 use super::message::{Ask, RequestHeader, ResponseHeader, ResponseLayout, StepBlocks, Verdict};
-use super::{LOANED_RESPONSES, answer_length, name, service};
-use crate::channel::words::{numbers_of, words_of};
-use crate::channel::{Bell, ChannelError, Domain, Entry, Interruption, Place, Ringer, claim, wait_for};
+use super::service::{LOANED_RESPONSES, answer_length, name, service};
+use crate::channel::bell::{Bell, Place, Ringer, wait_for};
+use crate::channel::domain::Domain;
+use crate::channel::error::ChannelError;
+use crate::channel::service::{Entry, claim};
+use crate::exit::Exit;
+use crate::packing::{numbers_of, words_of};
 use crate::report::Role;
 use crate::space::{EnvironmentSpec, Space};
 use crate::stop::Stop;
@@ -69,7 +73,7 @@ impl EnvironmentPort {
     ///
     /// # Errors
     /// When interrupted.
-    pub fn next(&self, stop: &Stop, mut idle: impl FnMut()) -> Result<Request<'_>, Interruption> {
+    pub fn next(&self, stop: &Stop, mut idle: impl FnMut()) -> Result<Request<'_>, Exit<ChannelError>> {
         loop {
             let request = wait_for(
                 &self.bell,
