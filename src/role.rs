@@ -13,8 +13,8 @@ use shoal_common::report::{Identity, Role};
 use shoal_common::run_dir::RunDir;
 use shoal_common::stop::Stop;
 use shoal_env_server::vector::VectorEnvironment;
-use shoal_learner::learner;
-use shoal_learner::ratio::Ratio;
+use shoal_learner::process as learner;
+use shoal_learner::process::ratio::Ratio;
 use tracing_subscriber::filter::LevelFilter;
 
 use crate::cli::RoleArgs;

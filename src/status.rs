@@ -4,8 +4,8 @@ use shoal_common::channel::control::RunStatus;
 use shoal_common::commit::{CommitReader, OpenError};
 use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
-use shoal_learner::checkpoint::Checkpoints;
-use shoal_learner::ratio::Ratio;
+use shoal_learner::process::checkpoint::Checkpoints;
+use shoal_learner::process::ratio::Ratio;
 
 use crate::outcome::{Outcome, State};
 use crate::recorder::{RecordError, read_evaluations};

@@ -10,9 +10,9 @@ use shoal_common::commit::{CommitReader, OpenError};
 use shoal_common::config::Config;
 use shoal_common::report::Role;
 use shoal_common::run_dir::RunDir;
-use shoal_learner::minibatch::Minibatch;
+use shoal_learner::algorithms::minibatch::Minibatch;
+use shoal_learner::algorithms::sampling::Sampler;
 use shoal_learner::replay::Replay;
-use shoal_learner::sampling::Sampler;
 
 use super::rows::{ENVIRONMENTS, Rows};
 use super::scene::{Scene, ddpg};

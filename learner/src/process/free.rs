@@ -4,8 +4,8 @@ use std::time::{Duration, Instant};
 
 use shoal_common::report::Activity;
 
-use crate::judging::Judging;
-use crate::learner::{Ended, Learner};
+use super::judging::Judging;
+use super::learner::{Ended, Learner};
 
 /// Updates from one publication to the next. Publishing copies the actor's weights once: about a thirtieth of an update.
 const PUBLISH_EVERY: u64 = 4;

@@ -6,7 +6,7 @@ use shoal_common::channel::reports::Reports;
 use shoal_common::channel::{ChannelError, wait_for};
 use shoal_common::report::{Activity, JudgedReport};
 
-use crate::learner::{Ended, Learner};
+use super::learner::{Ended, Learner};
 
 /// What is known of the evaluator's work.
 pub(crate) struct Judging {

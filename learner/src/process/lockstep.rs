@@ -7,9 +7,10 @@
 use shoal_common::channel::wait_for;
 use shoal_common::report::Activity;
 
-use crate::intake::IntakeError;
-use crate::judging::Judging;
-use crate::learner::{Ended, Learner, LearnerError};
+use super::intake::IntakeError;
+use super::judging::Judging;
+use super::learner::{Ended, Learner};
+use super::settings::LearnerError;
 
 pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Ended> {
     let mut judging = Judging::new(learner)?;

@@ -1,7 +1,7 @@
 //! Adam (Kingma and Ba 2015) and the soft target update, in one sweep over the parameters.
 
-use crate::aligned::{Aligned, PAGE};
-use crate::threads::Threads;
+use super::aligned::{Aligned, PAGE};
+use super::threads::Threads;
 use pulp::Arch;
 
 const BETA_1: f64 = 0.9;
