@@ -13,7 +13,7 @@ use shoal_common::report::{Identity, Role};
 use shoal_common::run_dir::RunDir;
 use shoal_common::stop::Stop;
 use shoal_env_server::vector::VectorEnvironment;
-use shoal_learner::learner;
+use shoal_learner::process as learner;
 use shoal_run::external_environment::{self, Post};
 use shoal_run::status::{judged, learner_settings};
 use tracing_subscriber::filter::LevelFilter;

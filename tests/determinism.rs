@@ -16,9 +16,9 @@ use shoal_common::network::{ActionRange, PolicyNetwork};
 use shoal_common::stream::{Purpose, stream};
 use shoal_common::transition::Transition;
 use shoal_env_server::vector::{Start, VectorEnvironment};
-use shoal_learner::ddpg::{Ddpg, DdpgSettings};
-use shoal_learner::minibatch::Minibatch;
-use shoal_learner::sampling::Sampler;
+use shoal_learner::algorithms::ddpg::{Ddpg, DdpgSettings};
+use shoal_learner::algorithms::minibatch::Minibatch;
+use shoal_learner::algorithms::sampling::Sampler;
 use support::{Workplace, comes_further, end_of, rows_of, until};
 
 #[test]

@@ -19,7 +19,7 @@ use shoal_env_server::environment::{
     frozen_lake,
     pendulum::{self, Pendulum},
 };
-use shoal_learner::{
+use shoal_learner::algorithms::{
     ddpg::{Ddpg, DdpgSettings, DdpgState},
     minibatch::Minibatch,
 };

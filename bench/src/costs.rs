@@ -14,9 +14,10 @@ use shoal_common::network::{ActionRange, PolicyNetwork};
 use shoal_common::report::Role;
 use shoal_common::stream::{Purpose, stream};
 use shoal_env_server::vector::{Start, VectorEnvironment};
-use shoal_learner::algorithm::{self, Room};
-use shoal_learner::initialise::initialise;
-use shoal_learner::intake::Intake;
+use shoal_learner::algorithms::algorithm::Room;
+use shoal_learner::algorithms::registry;
+use shoal_learner::networks::initialise::initialise;
+use shoal_learner::process::intake::Intake;
 use shoal_learner::replay::Replay;
 use shoal_run::process::Peer;
 
@@ -115,7 +116,7 @@ pub(super) fn measure(length: Duration, patience: &Patience) -> anyhow::Result<C
         actors: 1,
         envs: config.actors.envs,
     };
-    let mut method = algorithm::new(&config.algorithm, &config.spec, config.run.seed, room)?;
+    let mut method = registry::new(&config.algorithm, &config.spec, config.run.seed, room)?;
     let head = replay.head();
     let update_us = microseconds(each, patience, || {
         std::hint::black_box(method.update(&replay, head));

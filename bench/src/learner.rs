@@ -7,12 +7,12 @@ use serde::Serialize;
 use shoal_common::commit::ChunkMark;
 use shoal_common::config::{self, Config};
 use shoal_common::stream::{Purpose, stream};
-use shoal_learner::algorithm::Algorithm;
-use shoal_learner::ddpg::Ddpg;
-use shoal_learner::product::products_of_update;
+use shoal_learner::algorithms::algorithm::Algorithm;
+use shoal_learner::algorithms::ddpg::Ddpg;
+use shoal_learner::algorithms::ddpg::replayed::ReplayedDdpg;
+use shoal_learner::networks::product::products_of_update;
+use shoal_learner::networks::threads::Threads;
 use shoal_learner::replay::Replay;
-use shoal_learner::replayed_ddpg::ReplayedDdpg;
-use shoal_learner::threads::Threads;
 
 use super::product::Multiplication;
 use super::rows::{ENVIRONMENTS, Rows};

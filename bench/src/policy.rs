@@ -6,8 +6,8 @@ use pulp::Arch;
 use serde::Serialize;
 use shoal_common::network::{ActionRange, NetworkLayout, PolicyNetwork};
 use shoal_common::stream::{Purpose, stream};
-use shoal_learner::initialise::initialise;
-use shoal_learner::product::{Product, Transposed};
+use shoal_learner::networks::initialise::initialise;
+use shoal_learner::networks::product::{Product, Transposed};
 
 use super::product::Multiplication;
 use super::rows::{ENVIRONMENTS, Rows};

@@ -12,8 +12,8 @@ use nalgebra::{DMatrixView, DMatrixViewMut, Dyn};
 use rand::RngExt;
 use shoal_common::network::{matrix, matrix_mut};
 use shoal_common::stream::Stream;
-use shoal_learner::aligned::Aligned;
-use shoal_learner::product::{Product, Transposed};
+use shoal_learner::networks::aligned::Aligned;
+use shoal_learner::networks::product::{Product, Transposed};
 
 use super::window;
 

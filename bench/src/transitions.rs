@@ -11,9 +11,9 @@ use shoal_common::config::Config;
 use shoal_common::exit::Exit;
 use shoal_common::report::Role;
 use shoal_common::run_dir::RunDir;
-use shoal_learner::minibatch::Minibatch;
+use shoal_learner::algorithms::minibatch::Minibatch;
+use shoal_learner::algorithms::sampling::Sampler;
 use shoal_learner::replay::Replay;
-use shoal_learner::sampling::Sampler;
 use shoal_run::process::Peer;
 
 use super::rows::{ENVIRONMENTS, Rows};

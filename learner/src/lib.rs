@@ -1,24 +1,7 @@
-//! Replay, gradients, Adam, the algorithms (DDPG, REINFORCE, Q-learning, SARSA), checkpoints.
+//! The learner: what it computes with ([`networks`]), what it learns from ([`replay`]), how it learns ([`algorithms`]), and
+//! the process that does so ([`process`]). Each imports from those before it and from none after it.
 
-pub mod adam;
-pub mod algorithm;
-pub mod aligned;
-pub mod checkpoint;
-pub mod ddpg;
-pub mod digest;
-mod free;
-pub mod initialise;
-pub mod intake;
-mod judging;
-pub mod learner;
-mod lockstep;
-pub mod minibatch;
-pub mod pass;
-pub mod product;
-pub mod ratio;
-pub mod reinforce;
+pub mod algorithms;
+pub mod networks;
+pub mod process;
 pub mod replay;
-pub mod replayed_ddpg;
-pub mod sampling;
-pub mod tabular;
-pub mod threads;

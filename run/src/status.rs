@@ -5,9 +5,9 @@ use shoal_common::commit::{CommitReader, OpenError};
 use shoal_common::config::Config;
 use shoal_common::report::Identity;
 use shoal_common::run_dir::RunDir;
-use shoal_learner::checkpoint::Checkpoints;
-use shoal_learner::learner;
-use shoal_learner::ratio::Ratio;
+use shoal_learner::process as learner;
+use shoal_learner::process::checkpoint::Checkpoints;
+use shoal_learner::process::ratio::Ratio;
 
 use crate::outcome::{Outcome, State};
 use crate::recorder::{RecordError, read_evaluations};

@@ -10,8 +10,9 @@ use serde::Serialize;
 use shoal_common::channel::control::RunStatus;
 use shoal_common::config::Config;
 use shoal_common::run_dir::{RunDir, RunLock};
-use shoal_learner::checkpoint::Checkpoints;
-use shoal_learner::{algorithm, digest};
+use shoal_learner::algorithms::registry;
+use shoal_learner::networks::digest;
+use shoal_learner::process::checkpoint::Checkpoints;
 use shoal_report::plots;
 use shoal_run::evaluation::{EvaluationSummary, WhichPolicy, evaluate};
 use shoal_run::numbers::thousands;
@@ -134,7 +135,7 @@ fn weights_sha256(config: &Config, run: &RunDir) -> anyhow::Result<Option<String
     let loaded = Checkpoints::new(&run.checkpoints(), config.fingerprint()).load_newest()?;
     Ok(loaded.map(|loaded| {
         let section = |name| loaded.checkpoint.sections.iter().find(|(found, _)| found == name);
-        let weights = algorithm::weights(&config.algorithm).iter().filter_map(section);
+        let weights = registry::weights(&config.algorithm).iter().filter_map(section);
         digest::sha256(&weights.map(|(_, numbers)| numbers.as_slice()).collect::<Vec<_>>())
     }))
 }

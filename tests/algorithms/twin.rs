@@ -7,8 +7,9 @@ use shoal_common::stream::{Purpose, stream};
 use shoal_common::transition::Transition;
 use shoal_env_server::environment::frozen_lake::{ACTIONS, STATES};
 use shoal_env_server::vector::{Start, VectorEnvironment};
-use shoal_learner::algorithm::{self, Room};
-use shoal_learner::digest::sha256;
+use shoal_learner::algorithms::algorithm::Room;
+use shoal_learner::algorithms::registry;
+use shoal_learner::networks::digest::sha256;
 use shoal_learner::replay::{ChunkMark, Replay, ReplayLayout};
 
 /// An environment, and how one acts in it.
@@ -127,7 +128,7 @@ pub(crate) fn reinforce(config: &Config) -> String {
         actors: 1,
         envs: 1,
     };
-    let mut learner = algorithm::new(&config.algorithm, &config.spec, config.run.seed, room).unwrap();
+    let mut learner = registry::new(&config.algorithm, &config.spec, config.run.seed, room).unwrap();
     let layout = ReplayLayout {
         row: chunk.row,
         ring: config.replay.capacity,
@@ -167,7 +168,7 @@ pub(crate) fn reinforce(config: &Config) -> String {
         replay.append_and_commit(0, mark, &episode).unwrap();
         learner.update(&replay, replay.head());
     }
-    let weights = algorithm::weights(&config.algorithm);
+    let weights = registry::weights(&config.algorithm);
     let state = learner.state();
     let learned = state.iter().filter(|(name, _)| weights.contains(name));
     sha256(&learned.map(|(_, numbers)| *numbers).collect::<Vec<_>>())

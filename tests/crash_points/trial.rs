@@ -7,8 +7,9 @@ use std::time::{Duration, Instant};
 use rustix::process::{Pid, Signal, kill_process};
 use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
-use shoal_learner::checkpoint::Checkpoints;
-use shoal_learner::{algorithm, digest};
+use shoal_learner::algorithms::registry;
+use shoal_learner::networks::digest;
+use shoal_learner::process::checkpoint::Checkpoints;
 
 use crate::calls::Call;
 use crate::place::{Place, Program, Watchdog};
@@ -380,7 +381,7 @@ pub(crate) fn weights(place: &Place<'_>, run: &str) -> Result<String, String> {
     let loaded = loaded.map_err(|error| failed(&error))?;
     let checkpoint = loaded.ok_or_else(|| failed(&"there is no checkpoint"))?.checkpoint;
     let section = |name| checkpoint.sections.iter().find(|(found, _)| found == name);
-    let weights = algorithm::weights(&config.algorithm).iter().filter_map(section);
+    let weights = registry::weights(&config.algorithm).iter().filter_map(section);
     let weights: Vec<_> = weights.map(|(_, numbers)| numbers.as_slice()).collect();
     Ok(digest::sha256(&weights))
 }

@@ -15,7 +15,7 @@ use shoal_common::report::{Identity, Role};
 use shoal_common::stop::Stop;
 use shoal_env_server::server::serve;
 use shoal_env_server::vector::VectorEnvironment;
-use shoal_learner::intake::Intake;
+use shoal_learner::process::intake::Intake;
 use shoal_learner::replay::{Replay, ReplayError, Step};
 
 use crate::chunks::{ROWS, WINDOW, chunk_layout, fill, replay_layout};

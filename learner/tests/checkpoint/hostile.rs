@@ -9,7 +9,7 @@ use proptest::prelude::*;
 use proptest::sample::Index;
 use rustix::process::{Resource, Rlimit, setrlimit};
 use shoal_common::durable::{self, Kind};
-use shoal_learner::checkpoint::{CheckpointError, Checkpoints, Counters, Loaded};
+use shoal_learner::process::checkpoint::{CheckpointError, Checkpoints, Counters, Loaded};
 use tempfile::TempDir;
 
 const NAMES: [&str; 2] = ["latest.ckpt", "previous.ckpt"];

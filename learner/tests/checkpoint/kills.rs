@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, ExitStatus, Stdio};
 
 use rustix::process::{Signal, getpid, kill_process};
-use shoal_learner::checkpoint::{Checkpoint, Checkpoints, Counters, SaveStep};
+use shoal_learner::process::checkpoint::{Checkpoint, Checkpoints, Counters, SaveStep};
 use tempfile::TempDir;
 
 const DIRECTORY: &str = "SHOAL_TEST_DIRECTORY";

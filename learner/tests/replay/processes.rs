@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use shoal_common::commit::{CommitReader, OpenError, Record};
 use shoal_common::transition::RowLayout;
-use shoal_learner::checkpoint::{CheckpointError, Checkpoints, Counters};
+use shoal_learner::process::checkpoint::{CheckpointError, Checkpoints, Counters};
 use shoal_learner::replay::{ChunkMark, Replay, ReplayError, ReplayLayout};
 use tempfile::TempDir;
 

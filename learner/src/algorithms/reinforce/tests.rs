@@ -256,12 +256,9 @@ fn a_state_reads_back_and_goes_on_with_the_same_bits() {
         .state()
         .into_iter()
         .map(|(name, numbers)| (name.into(), numbers.into()));
-    let mut checkpoint = Checkpoint {
-        sections: sections.collect(),
-        ..Checkpoint::default()
-    };
+    let mut saved = SavedState::from(sections.collect::<Vec<_>>());
     let mut resumed = Reinforce::new(&settings(Weight::Baseline), &spec(), 2, ROOM).unwrap();
-    resumed.restore(18, &mut checkpoint).unwrap();
+    resumed.restore(18, &mut saved).unwrap();
     for learner in [&mut straight, &mut resumed] {
         for round in &rounds[2..] {
             learner.learn(&round.steps());

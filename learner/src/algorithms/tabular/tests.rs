@@ -96,15 +96,12 @@ fn a_state_reads_back_and_anothers_is_refused() {
         .state()
         .into_iter()
         .map(|(name, numbers)| (name.into(), numbers.into()));
-    let mut checkpoint = Checkpoint {
-        sections: sections.collect(),
-        ..Checkpoint::default()
-    };
+    let sections: Vec<_> = sections.collect();
+    let saved = |sections: &[_]| SavedState::from(sections.to_vec());
     let mut new = table(Method::Sarsa, 0.5);
-    new.restore(7, &mut checkpoint.clone()).unwrap();
+    new.restore(7, &mut saved(&sections)).unwrap();
     assert_eq!((&new.q, &new.pending, new.updates()), (&old.q, &old.pending, 7));
-    checkpoint.sections.remove(0);
-    assert!(new.restore(7, &mut checkpoint).is_err());
+    assert!(new.restore(7, &mut saved(&sections[1..])).is_err());
 }
 
 #[test]

@@ -7,7 +7,8 @@ use shoal_common::channel::{ChannelError, wait_for};
 use shoal_common::exit::Exit;
 use shoal_common::report::{Activity, JudgedReport};
 
-use crate::learner::{Learner, LearnerError};
+use super::learner::Learner;
+use super::settings::LearnerError;
 
 /// What is known of the evaluator's work.
 pub(crate) struct Judging {

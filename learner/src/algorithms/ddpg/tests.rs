@@ -1,9 +1,10 @@
-use super::*;
 use rand::RngExt;
 use shoal_common::network::PolicyNetwork;
 use shoal_common::space::Space;
 use shoal_common::stream::{Purpose, Stream, stream};
 use shoal_common::transition::{RowLayout, Transition};
+
+use super::*;
 
 const BATCH: usize = 5;
 

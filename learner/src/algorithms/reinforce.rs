@@ -14,14 +14,13 @@ use shoal_common::policy::{self, PolicyError, PolicyLayout};
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::transition::Transition;
 
-use crate::adam::Adam;
-use crate::algorithm::{Algorithm, Losses, Room, Section};
-use crate::aligned::Aligned;
-use crate::checkpoint::{Checkpoint, SectionError};
-use crate::initialise::glorot;
-use crate::pass::Pass;
+use super::algorithm::{Algorithm, Losses, Room, SavedState, Section, SectionError};
+use crate::networks::adam::Adam;
+use crate::networks::aligned::Aligned;
+use crate::networks::initialise::glorot;
+use crate::networks::pass::Pass;
+use crate::networks::threads::Threads;
 use crate::replay::Replay;
-use crate::threads::Threads;
 
 /// Added to a standard deviation before it divides. An episode whose returns are all equal then weighs nothing.
 const SPREAD_FLOOR: f32 = 1e-8;
@@ -256,7 +255,7 @@ impl Algorithm for Reinforce {
         networks.chain([(Self::STEPS, self.steps.as_slice())]).collect()
     }
 
-    fn restore(&mut self, updates: u64, checkpoint: &mut Checkpoint) -> Result<(), SectionError> {
+    fn restore(&mut self, updates: u64, saved: &mut SavedState) -> Result<(), SectionError> {
         let names = Self::WEIGHTS.into_iter().zip(Self::MOMENTS);
         for (network, (name, [first, second])) in std::iter::once(&mut self.policy).chain(&mut self.baseline).zip(names)
         {
@@ -265,11 +264,11 @@ impl Algorithm for Reinforce {
                 (&mut network.adam.first_moment, first),
                 (&mut network.adam.second_moment, second),
             ] {
-                let kept = checkpoint.take(name, numbers.len())?;
+                let kept = saved.take(name, numbers.len())?;
                 numbers.copy_from_slice(&kept);
             }
         }
-        self.steps = [checkpoint.take(Self::STEPS, 1)?[0]];
+        self.steps = [saved.take(Self::STEPS, 1)?[0]];
         self.rows = updates;
         Ok(())
     }

@@ -9,12 +9,13 @@ use shoal_common::report::Identity;
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::transition::ChunkLayout;
 
-use crate::algorithm::{self, Algorithm, AlgorithmError, Room};
-use crate::checkpoint::{CheckpointError, SectionError};
-use crate::intake::IntakeError;
-use crate::ratio::Ratio;
+use super::checkpoint::CheckpointError;
+use super::intake::IntakeError;
+use super::ratio::Ratio;
+use crate::algorithms::algorithm::{Algorithm, Room, SectionError};
+use crate::algorithms::registry::{self, AlgorithmError};
+use crate::networks::threads::ThreadsError;
 use crate::replay::{ReplayError, ReplayLayout};
-use crate::threads::ThreadsError;
 
 /// What a learner is told.
 #[derive(Clone, Debug)]
@@ -132,7 +133,7 @@ impl Settings {
             actors: self.actors,
             envs: self.envs,
         };
-        algorithm::new(&self.algorithm, &self.spec, self.seed, room)
+        registry::new(&self.algorithm, &self.spec, self.seed, room)
     }
 
     /// What the replay of this run holds.

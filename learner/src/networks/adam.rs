@@ -1,8 +1,9 @@
 //! Adam (Kingma and Ba 2015) and the soft target update, in one sweep over the parameters.
 
-use crate::aligned::{Aligned, PAGE};
-use crate::threads::Threads;
 use pulp::Arch;
+
+use super::aligned::{Aligned, PAGE};
+use super::threads::Threads;
 
 const BETA_1: f64 = 0.9;
 const BETA_2: f64 = 0.999;

@@ -1,11 +1,4 @@
-//! The learner's process: what free and lockstep runs share. Their loops are in [`crate::free`] and [`crate::lockstep`].
-//!
-//! ```text
-//! chunks ─▶ replay ─▶ algorithm.update ─▶ policy
-//!           (mapped)              └─▶ checkpoint
-//! ```
-
-mod settings;
+//! What free and lockstep runs share: the learner with its replay, its method, its channels and its checkpoints.
 
 use std::io;
 use std::thread::JoinHandle;
@@ -15,17 +8,16 @@ use shoal_common::channel::policy::{PolicyHeader, PolicyPublisher};
 use shoal_common::channel::reports::{Reporter, Reports};
 use shoal_common::channel::{Bell, Domain, Place, Pulse, Ringer};
 use shoal_common::config::Mode;
-use shoal_common::exit::Exit;
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::report::{Activity, Heartbeat, LearnerReport, Role};
 use shoal_common::stop::Stop;
 
-use crate::algorithm::Algorithm;
-use crate::checkpoint::{Checkpoints, Counters};
-use crate::intake::Intake;
+use super::checkpoint::{Checkpoints, Counters};
+use super::intake::Intake;
+use super::settings::{LearnerError, Settings};
+use crate::algorithms::algorithm::{Algorithm, SavedState};
+use crate::networks::threads::Threads;
 use crate::replay::{Replay, SyncedRows};
-use crate::threads::Threads;
-pub use settings::{LearnerError, Settings};
 
 const REPORT_INTERVAL: Duration = Duration::from_millis(500);
 
@@ -37,28 +29,6 @@ const QUIET: Duration = Duration::from_millis(200);
 
 /// How long it takes in at most what the actors have sent before the end.
 const LAST_CHUNKS: Duration = Duration::from_secs(2);
-
-/// Learns until the run's steps are taken and learned from, or until `stop`; either way the state is saved.
-///
-/// # Errors
-/// When a channel, the replay or a checkpoint cannot be used, or learning diverges.
-pub fn learn(domain: &Domain, settings: &Settings, stop: &Stop) -> Result<(), LearnerError> {
-    let mut learner = Learner::new(domain, settings, stop)?;
-    let ended = match settings.mode {
-        Mode::Free => crate::free::run(&mut learner),
-        Mode::Lockstep => crate::lockstep::run(&mut learner),
-    };
-    match ended {
-        Ok(()) => learner.finish(),
-        Err(Exit::Stopped) => {
-            if settings.mode == Mode::Free {
-                learner.take_the_last()?;
-            }
-            learner.finish()
-        }
-        Err(Exit::Failed(error)) => Err(error),
-    }
-}
 
 /// A learner at work.
 pub(crate) struct Learner<'a> {
@@ -87,7 +57,7 @@ pub(crate) struct Learner<'a> {
 }
 
 impl<'a> Learner<'a> {
-    fn new(domain: &'a Domain, settings: &'a Settings, stop: &'a Stop) -> Result<Self, LearnerError> {
+    pub(crate) fn new(domain: &'a Domain, settings: &'a Settings, stop: &'a Stop) -> Result<Self, LearnerError> {
         let mut algorithm = settings.method()?;
         if settings.threads > 1 {
             algorithm.set_threads(Threads::two()?);
@@ -104,10 +74,10 @@ impl<'a> Learner<'a> {
         let mut checkpoints = Checkpoints::new(&settings.checkpoints, settings.fingerprint);
         let counters = match checkpoints.load_newest()? {
             None => Counters::default(),
-            Some(mut loaded) => {
+            Some(loaded) => {
                 loaded.warnings.iter().for_each(|warning| tracing::warn!("{warning}"));
                 let counters = loaded.checkpoint.counters;
-                algorithm.restore(counters.updates, &mut loaded.checkpoint)?;
+                algorithm.restore(counters.updates, &mut SavedState::from(loaded.checkpoint.sections))?;
                 tracing::info!(
                     "going on after {} updates and {} of {} rows",
                     counters.updates,
@@ -226,7 +196,7 @@ impl<'a> Learner<'a> {
     }
 
     /// Takes in what the actors had sent when the end came, whatever the ratio says: its updates are for who goes on.
-    fn take_the_last(&mut self) -> Result<(), LearnerError> {
+    pub(crate) fn take_the_last(&mut self) -> Result<(), LearnerError> {
         let begun = Instant::now();
         let mut quiet = begun;
         while quiet.elapsed() < QUIET && begun.elapsed() < LAST_CHUNKS {
@@ -314,7 +284,7 @@ impl<'a> Learner<'a> {
         }
     }
 
-    fn finish(mut self) -> Result<(), LearnerError> {
+    pub(crate) fn finish(mut self) -> Result<(), LearnerError> {
         self.save()?;
         self.end_sync();
         self.replay.flush()?;

@@ -1,12 +1,13 @@
 //! One network over one batch: forward, keeping the activations, and by hand backward through them.
 
-use crate::product::{input_gradient, weight_gradient};
-use crate::threads::Threads;
-use faer::reborrow::{Reborrow, ReborrowMut};
 use faer::{MatMut, MatRef};
 use nalgebra::DMatrix;
 use pulp::{Arch, Simd, WithSimd};
 use shoal_common::network::{Activations, NetworkLayout, matrix, matrix_mut};
+
+use super::columns::{Columns, ColumnsMut, sum_columns};
+use super::product::{input_gradient, weight_gradient};
+use super::threads::Threads;
 
 /// The activations of a forward pass and room for their gradients; one column a sample.
 #[derive(Clone, Debug)]
@@ -85,24 +86,32 @@ impl Pass {
         let (w2, b2) = gradient_2.split_at_mut(g2.weights.len());
         let (w3, b3) = gradient_3.split_at_mut(g3.weights.len());
 
-        let (d2, d3) = (matrix(self.d2.as_slice(), h2), matrix(d.as_slice(), outputs));
-        weight_gradient(d3, matrix(self.h2.as_slice(), h2), matrix_mut(w3, outputs));
-        sum_columns(d3, b3);
-        sum_columns(d2, b2);
+        let batch = self.d2.ncols();
+        let (d2, d3) = (
+            Columns::new(self.d2.as_slice(), h2),
+            Columns::new(d.as_slice(), outputs),
+        );
+        weight_gradient(d3.as_mat(), matrix(self.h2.as_slice(), h2), matrix_mut(w3, outputs));
+        sum_columns(d3.iter(), b3);
+        sum_columns(d2.iter(), b2);
 
         let cut = threads.first_share(h1);
-        let part = |w2: MatRef<'_, f32>, h1: MatRef<'_, f32>, mut d1: MatMut<'_, f32>, to: [MatMut<'_, f32>; 2], b1| {
-            let [to_w1, to_w2] = to;
-            weight_gradient(d2, h1, to_w2);
-            input_gradient(w2, d2, d1.rb_mut());
-            mask(d1.rb_mut(), h1);
-            sum_columns(d1.rb(), b1);
-            weight_gradient(d1.rb(), matrix(x, inputs), to_w1);
-        };
+        let part =
+            |w2: MatRef<'_, f32>, h1: Columns<'_>, mut d1: ColumnsMut<'_>, to: [MatMut<'_, f32>; 2], b1: &mut [f32]| {
+                let [to_w1, to_w2] = to;
+                weight_gradient(d2.as_mat(), h1.as_mat(), to_w2);
+                input_gradient(w2, d2.as_mat(), d1.as_mat_mut());
+                mask(d1.iter_mut(), h1.iter());
+                d1.sum_into(b1);
+                weight_gradient(d1.as_mat(), matrix(x, inputs), to_w1);
+            };
         // The late inputs, which come last, are the second thread's, or the only one's.
         let weights = matrix(&second.weights[..h1 * h2], h2).split_at_col(cut);
-        let units = matrix(self.h1.as_slice(), inputs_2).split_at_row(cut);
-        let d1 = matrix_mut(self.d1.as_mut_slice(), h1).split_at_row_mut(cut);
+        let units = Columns::new(self.h1.as_slice(), inputs_2);
+        let units = (units.rows(0, cut), units.rows(cut, inputs_2 - cut));
+        // A matrix for each thread, not rows of the same one: each has its columns in one piece.
+        let (first_d1, rest) = ColumnsMut::take(self.d1.as_mut_slice(), cut, batch);
+        let d1 = (first_d1, ColumnsMut::take(rest, h1 - cut, batch).0);
         let w1 = matrix_mut(w1, h1).split_at_row_mut(cut);
         let w2 = matrix_mut(w2, h2).split_at_col_mut(cut);
         let b1 = b1.split_at_mut(cut);
@@ -155,9 +164,12 @@ impl<'a> Samples<'a> {
     pub fn backward_to_second_layer(&mut self, parameters: &[f32], d: &[f32]) {
         let [_, _, third] = self.layout.layers(parameters);
         let [_, (_, h2), (_, outputs)] = self.layout.layer_sizes();
-        let mut d2 = matrix_mut(self.d2, h2);
-        input_gradient(matrix(third.weights, outputs), matrix(d, outputs), d2.rb_mut());
-        mask(d2, matrix(self.h2, h2));
+        input_gradient(
+            matrix(third.weights, outputs),
+            matrix(d, outputs),
+            matrix_mut(self.d2, h2),
+        );
+        mask(self.d2.chunks_exact_mut(h2), self.h2.chunks_exact(h2));
     }
 
     /// Writes ∂L/∂late into `to`, once that of the second hidden layer is there. Nothing below that is looked at: late
@@ -170,44 +182,27 @@ impl<'a> Samples<'a> {
     }
 }
 
-/// d ← d where the unit was active, else 0: from ∂L/∂h to ∂L/∂z through h = max(z, 0). `h` may have more rows than `d`.
-fn mask(d: MatMut<'_, f32>, h: MatRef<'_, f32>) {
+/// d ← d where the unit was active, else 0, column by column: from ∂L/∂h to ∂L/∂z through h = max(z, 0). A column of `h`
+/// may be longer than that of `d`.
+fn mask<'a>(d: impl Iterator<Item = &'a mut [f32]>, h: impl Iterator<Item = &'a [f32]>) {
     Arch::new().dispatch(Mask { d, h });
 }
 
 /// A closure of this length would be called by the dispatch, not inlined into it, and so go without vector instructions.
-struct Mask<'a> {
-    d: MatMut<'a, f32>,
-    h: MatRef<'a, f32>,
+struct Mask<D, H> {
+    d: D,
+    h: H,
 }
 
-impl WithSimd for Mask<'_> {
+impl<'a, D: Iterator<Item = &'a mut [f32]>, H: Iterator<Item = &'a [f32]>> WithSimd for Mask<D, H> {
     type Output = ();
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, _: S) {
-        for (d, h) in self.d.col_iter_mut().zip(self.h.col_iter()) {
-            let (Some(d), Some(h)) = (d.try_as_col_major_mut(), h.try_as_col_major()) else {
-                unreachable!("columns lie in one piece");
-            };
-            for (d, h) in d.as_slice_mut().iter_mut().zip(h.as_slice()) {
+        for (d, h) in self.d.zip(self.h) {
+            for (d, h) in d.iter_mut().zip(h) {
                 *d = if *h > 0.0 { *d } else { 0.0 };
             }
         }
     }
-}
-
-/// The sum over the samples, ∂L/∂b.
-fn sum_columns(d: MatRef<'_, f32>, sum: &mut [f32]) {
-    sum.fill(0.0);
-    Arch::new().dispatch(|| {
-        for d in d.col_iter() {
-            let Some(d) = d.try_as_col_major() else {
-                unreachable!("columns lie in one piece");
-            };
-            for (sum, d) in sum.iter_mut().zip(d.as_slice()) {
-                *sum += *d;
-            }
-        }
-    });
 }

@@ -5,13 +5,12 @@ use shoal_common::policy::PolicyLayout;
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::transition::RowLayout;
 
-use crate::algorithm::{Algorithm, Losses, Section};
-use crate::checkpoint::{Checkpoint, SectionError};
-use crate::ddpg::{Ddpg, DdpgError, DdpgSettings, DdpgState};
-use crate::minibatch::Minibatch;
+use super::{Ddpg, DdpgError, DdpgSettings, DdpgState};
+use crate::algorithms::algorithm::{Algorithm, Losses, SavedState, Section, SectionError};
+use crate::algorithms::minibatch::Minibatch;
+use crate::algorithms::sampling::Sampler;
+use crate::networks::threads::Threads;
 use crate::replay::Replay;
-use crate::sampling::Sampler;
-use crate::threads::Threads;
 
 /// DDPG and its way of drawing from the replay.
 #[derive(Debug)]
@@ -69,11 +68,11 @@ impl Algorithm for ReplayedDdpg {
         DdpgState::PARTS.into_iter().zip(self.ddpg.state().parts).collect()
     }
 
-    fn restore(&mut self, updates: u64, checkpoint: &mut Checkpoint) -> Result<(), SectionError> {
+    fn restore(&mut self, updates: u64, saved: &mut SavedState) -> Result<(), SectionError> {
         let lengths = self.ddpg.state().parts.map(<[f32]>::len);
         let mut sections = Vec::new();
         for (name, length) in DdpgState::PARTS.into_iter().zip(lengths) {
-            sections.push(checkpoint.take(name, length)?);
+            sections.push(saved.take(name, length)?);
         }
         let parts = std::array::from_fn(|i| sections[i].as_slice());
         #[expect(clippy::expect_used, reason = "`take` gave each part the length that it has here")]

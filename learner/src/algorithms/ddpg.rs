@@ -4,19 +4,22 @@
 //! and Q', batch size N, target y, loss L, target rate τ. Lines 1, 2 and 11 to 16 are here; the others run in the actors
 //! and the environment servers.
 
-use crate::adam::Adam;
-pub use crate::algorithm::Losses;
-use crate::aligned::Aligned;
-use crate::digest::sha256;
-use crate::initialise::initialise;
-use crate::minibatch::Minibatch;
-use crate::pass::{Pass, Samples};
-use crate::product;
-use crate::threads::Threads;
+pub mod replayed;
+
 use nalgebra::{DMatrix, DVector};
 use shoal_common::config;
 use shoal_common::network::{ActionRange, ActionRangeError, NetworkLayout};
 use shoal_common::space::EnvironmentSpec;
+
+use super::algorithm::Losses;
+use super::minibatch::Minibatch;
+use crate::networks::adam::Adam;
+use crate::networks::aligned::Aligned;
+use crate::networks::digest::sha256;
+use crate::networks::initialise::initialise;
+use crate::networks::pass::{Pass, Samples};
+use crate::networks::product;
+use crate::networks::threads::Threads;
 
 /// What a person may choose about the algorithm. The discount γ is not here: it is in each transition.
 #[derive(Clone, Debug, PartialEq)]

@@ -5,8 +5,9 @@ use std::time::{Duration, Instant};
 use shoal_common::exit::Exit;
 use shoal_common::report::Activity;
 
-use crate::judging::Judging;
-use crate::learner::{Learner, LearnerError};
+use super::judging::Judging;
+use super::learner::Learner;
+use super::settings::LearnerError;
 
 /// Updates from one publication to the next. Publishing copies the actor's weights once: about a thirtieth of an update.
 const PUBLISH_EVERY: u64 = 4;

@@ -8,9 +8,10 @@ use shoal_common::channel::wait_for;
 use shoal_common::exit::Exit;
 use shoal_common::report::Activity;
 
-use crate::intake::IntakeError;
-use crate::judging::Judging;
-use crate::learner::{Learner, LearnerError};
+use super::intake::IntakeError;
+use super::judging::Judging;
+use super::learner::Learner;
+use super::settings::LearnerError;
 
 pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
     let mut judging = Judging::new(learner)?;

@@ -1,7 +1,8 @@
 //! One line that tells two sets of weights apart.
 
-use sha2::{Digest, Sha256};
 use std::fmt::Write;
+
+use sha2::{Digest, Sha256};
 
 /// SHA-256, in hexadecimal, over the numbers of `networks` in their order, each as little-endian `f32`.
 pub fn sha256(networks: &[&[f32]]) -> String {

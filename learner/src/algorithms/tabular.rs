@@ -5,8 +5,7 @@ use shoal_common::policy::{self, PolicyError, PolicyLayout};
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::transition::Transition;
 
-use crate::algorithm::{Algorithm, Losses, Room, Section};
-use crate::checkpoint::{Checkpoint, SectionError};
+use super::algorithm::{Algorithm, Losses, Room, SavedState, Section, SectionError};
 use crate::replay::Replay;
 
 /// Which value of s' a step is led by.
@@ -192,9 +191,9 @@ impl Algorithm for Tabular {
         vec![(Self::WEIGHTS[0], &self.q), (Self::PENDING, &self.pending)]
     }
 
-    fn restore(&mut self, updates: u64, checkpoint: &mut Checkpoint) -> Result<(), SectionError> {
-        self.q = checkpoint.take(Self::WEIGHTS[0], self.q.len())?;
-        self.pending = checkpoint.take(Self::PENDING, self.pending.len())?;
+    fn restore(&mut self, updates: u64, saved: &mut SavedState) -> Result<(), SectionError> {
+        self.q = saved.take(Self::WEIGHTS[0], self.q.len())?;
+        self.pending = saved.take(Self::PENDING, self.pending.len())?;
         self.rows = updates;
         Ok(())
     }

@@ -41,33 +41,6 @@ pub struct Checkpoint {
     pub sections: Vec<(String, Vec<f32>)>,
 }
 
-/// A checkpoint is whole and does not hold what the algorithm expects.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("the checkpoint's section `{name}` {reason}; it was written by another version of the program")]
-pub struct SectionError {
-    name: String,
-    reason: String,
-}
-
-impl Checkpoint {
-    /// Takes out a section, which must have `length` numbers.
-    pub fn take(&mut self, name: &str, length: usize) -> Result<Vec<f32>, SectionError> {
-        let error = |reason| SectionError {
-            name: name.into(),
-            reason,
-        };
-        let at = self
-            .sections
-            .iter()
-            .position(|(n, _)| n == name)
-            .ok_or_else(|| error("is missing".into()))?;
-        match self.sections[at].1.len() {
-            found if found == length => Ok(self.sections.swap_remove(at).1),
-            found => Err(error(format!("has {found} numbers instead of {length}"))),
-        }
-    }
-}
-
 /// Why a checkpoint was not written or read. Those on the disk are as they were.
 #[derive(Debug, thiserror::Error)]
 pub enum CheckpointError {

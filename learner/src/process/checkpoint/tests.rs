@@ -4,6 +4,7 @@ use proptest::prelude::*;
 use tempfile::TempDir;
 
 use super::*;
+use crate::algorithms::algorithm::SavedState;
 
 const WEIGHTS: [f32; 5] = [1.0, -0.0, f32::MIN_POSITIVE, f32::INFINITY, 1e-40];
 
@@ -51,19 +52,17 @@ fn an_empty_directory_has_no_checkpoint() {
 #[test]
 fn what_was_saved_is_loaded_to_the_bit() {
     let (directory, latest, previous) = two();
-    let Loaded {
-        mut checkpoint,
-        warnings,
-    } = load(&directory).unwrap().unwrap();
+    let Loaded { checkpoint, warnings } = load(&directory).unwrap().unwrap();
     assert!(warnings.is_empty());
     assert_eq!(checkpoint.counters, counters(2));
-    let actor = checkpoint.take("actor", 5).unwrap();
+    let mut saved = SavedState::from(checkpoint.sections);
+    let actor = saved.take("actor", 5).unwrap();
     assert_eq!(actor.map_bits(), WEIGHTS.to_vec().map_bits());
-    assert_eq!(checkpoint.take("empty", 0).unwrap(), [0.0_f32; 0]);
-    let error = checkpoint.take("critic", 2).unwrap_err().to_string();
+    assert_eq!(saved.take("empty", 0).unwrap(), [0.0_f32; 0]);
+    let error = saved.take("critic", 2).unwrap_err().to_string();
     assert!(error.contains("`critic` has 1 numbers instead of 2"), "{error}");
     assert!(
-        checkpoint
+        saved
             .take("actor", 5)
             .unwrap_err()
             .to_string()

@@ -1,0 +1,45 @@
+//! The learner's process.
+//!
+//! ```text
+//! chunks ─▶ replay ─▶ algorithm.update ─▶ policy
+//!           (mapped)              └─▶ checkpoint
+//! ```
+
+pub mod checkpoint;
+mod free;
+pub mod intake;
+mod judging;
+mod learner;
+mod lockstep;
+pub mod ratio;
+mod settings;
+
+use shoal_common::channel::Domain;
+use shoal_common::config::Mode;
+use shoal_common::exit::Exit;
+use shoal_common::stop::Stop;
+
+use self::learner::Learner;
+pub use self::settings::{LearnerError, Settings};
+
+/// Learns until the run's steps are taken and learned from, or until `stop`; either way the state is saved.
+///
+/// # Errors
+/// When a channel, the replay or a checkpoint cannot be used, or learning diverges.
+pub fn learn(domain: &Domain, settings: &Settings, stop: &Stop) -> Result<(), LearnerError> {
+    let mut learner = Learner::new(domain, settings, stop)?;
+    let ended = match settings.mode {
+        Mode::Free => free::run(&mut learner),
+        Mode::Lockstep => lockstep::run(&mut learner),
+    };
+    match ended {
+        Ok(()) => learner.finish(),
+        Err(Exit::Stopped) => {
+            if settings.mode == Mode::Free {
+                learner.take_the_last()?;
+            }
+            learner.finish()
+        }
+        Err(Exit::Failed(error)) => Err(error),
+    }
+}
