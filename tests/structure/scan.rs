@@ -1,0 +1,330 @@
+//! Reads Rust sources as far as imports need it: modules, `use` trees, and paths that begin with a module. Code for tests
+//! (`#[cfg(test)]`) is left out.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+/// A word, or one character of punctuation.
+type Token = String;
+
+/// The names that a module gets from elsewhere, by the name they have in it.
+type Names = BTreeMap<String, Vec<String>>;
+
+/// One crate, read from its root file.
+#[derive(Default)]
+pub(crate) struct Sources {
+    modules: BTreeMap<Vec<String>, Module>,
+    /// The first segment of every path that no module of the crate begins: names of crates, types, functions.
+    pub(crate) foreign: BTreeMap<String, BTreeSet<PathBuf>>,
+}
+
+/// A module, inline or a file.
+#[derive(Default)]
+struct Module {
+    file: PathBuf,
+    imported: Names,
+    /// Paths as they are written, from the module they are written in.
+    paths: BTreeSet<Vec<String>>,
+}
+
+/// From a file to the files that it imports from.
+pub(crate) type Imports = BTreeMap<PathBuf, BTreeSet<PathBuf>>;
+
+impl Sources {
+    /// Reads a crate. Files are named relative to `base`.
+    pub(crate) fn read(base: &Path, root: &Path) -> Self {
+        let mut sources = Self::default();
+        let directory = root.parent().unwrap().to_owned();
+        sources.read_file(base, root, &directory, Vec::new());
+        sources
+    }
+
+    /// Reads a module's file; those of its own modules lie in `directory`.
+    fn read_file(&mut self, base: &Path, file: &Path, directory: &Path, module: Vec<String>) {
+        let text = std::fs::read_to_string(file).unwrap_or_else(|error| panic!("{}: {error}", file.display()));
+        let tokens = tokens(&text);
+        let name = file.strip_prefix(base).unwrap().to_owned();
+        let mut children = Vec::new();
+        self.read_items(&tokens, &name, module, &mut children);
+        for child in children {
+            let below = directory.join(child.last().unwrap());
+            let flat = below.with_extension("rs");
+            let file = if flat.exists() { flat } else { below.join("mod.rs") };
+            self.read_file(base, &file, &below, child);
+        }
+    }
+
+    /// Reads what stands in one module, up to its end; modules that have files of their own are added to `children`.
+    fn read_items(&mut self, tokens: &[Token], file: &Path, module: Vec<String>, children: &mut Vec<Vec<String>>) {
+        let known = self.modules.entry(module.clone()).or_default();
+        known.file = file.to_owned();
+        let mut at = 0;
+        while at < tokens.len() {
+            let word = tokens[at].as_str();
+            if starts_test_code(&tokens[at..]) {
+                at = after_item(tokens, at);
+            } else if word == "use" {
+                let end = at + tokens[at..].iter().position(|token| token == ";").unwrap();
+                let known = self.modules.get_mut(&module).unwrap();
+                use_tree(&tokens[at + 1..end], &[], &mut |name, path| {
+                    known.paths.insert(path.clone());
+                    known.imported.insert(name, path);
+                });
+                at = end;
+            } else if word == "mod" && is_name(tokens.get(at + 1)) {
+                let child = [&module[..], &[tokens[at + 1].clone()]].concat();
+                if tokens[at + 2] == "{" {
+                    let end = closing(tokens, at + 2);
+                    assert!(
+                        !tokens[at + 3..end].windows(3).any(|it| it[0] == "mod" && it[2] == ";"),
+                        "{}: a file below an inline module: this test does not follow it",
+                        file.display()
+                    );
+                    self.read_items(&tokens[at + 3..end], file, child, children);
+                    at = end;
+                } else {
+                    children.push(child);
+                    at += 2;
+                }
+            } else if is_name(Some(&tokens[at])) && tokens.get(at + 1).is_some_and(|token| token == "::") {
+                let mut path = vec![tokens[at].clone()];
+                while tokens.get(at + 1).is_some_and(|token| token == "::") && is_name(tokens.get(at + 2)) {
+                    path.push(tokens[at + 2].clone());
+                    at += 2;
+                }
+                self.modules.get_mut(&module).unwrap().paths.insert(path);
+            }
+            at += 1;
+        }
+    }
+
+    /// Who imports from whom.
+    pub(crate) fn imports(&mut self) -> Imports {
+        let mut imports = Imports::new();
+        let mut foreign: BTreeMap<String, BTreeSet<PathBuf>> = BTreeMap::new();
+        for (name, module) in &self.modules {
+            let targets = imports.entry(module.file.clone()).or_default();
+            for path in &module.paths {
+                match self.file_of(name, path, 0) {
+                    Some(file) if *file == module.file => {}
+                    Some(file) => drop(targets.insert(file.clone())),
+                    None => drop(foreign.entry(path[0].clone()).or_default().insert(module.file.clone())),
+                }
+            }
+        }
+        self.foreign = foreign;
+        imports
+    }
+
+    /// The file that declares what a path in a module means; what a module has from elsewhere is followed to there. `None`
+    /// for what is not of this crate.
+    fn file_of(&self, module: &[String], path: &[String], depth: u32) -> Option<&PathBuf> {
+        // Names may be imported in a circle, which the compiler refuses.
+        if depth > 16 {
+            return None;
+        }
+        let mut here = module.to_vec();
+        let mut rest = path;
+        match path[0].as_str() {
+            "crate" => (here, rest) = (Vec::new(), &path[1..]),
+            "self" => rest = &path[1..],
+            "super" => {}
+            first => {
+                let child = [module, &[first.to_owned()]].concat();
+                let imported = self.modules[module].imported.get(first);
+                if let Some(origin) = imported.filter(|origin| *origin != path && origin[..] != path[..1]) {
+                    return self.file_of(module, &[&origin[..], &path[1..]].concat(), depth + 1);
+                }
+                if !self.modules.contains_key(&child) {
+                    return None;
+                }
+            }
+        }
+        while let Some((first, others)) = rest.split_first() {
+            if first == "super" {
+                here.pop()?;
+                rest = others;
+                continue;
+            }
+            let child = [&here[..], &[first.clone()]].concat();
+            if self.modules.contains_key(&child) {
+                (here, rest) = (child, others);
+                continue;
+            }
+            // Something that this module only hands on.
+            if let Some(origin) = self.modules[&here].imported.get(first) {
+                let origin = [&origin[..], others].concat();
+                let is_of_this_crate = self.file_of(&here, &origin, depth + 1);
+                return is_of_this_crate.or(Some(&self.modules[&here].file));
+            }
+            break;
+        }
+        Some(&self.modules[&here].file)
+    }
+}
+
+fn is_name(token: Option<&Token>) -> bool {
+    token.is_some_and(|token| token.starts_with(|c: char| c.is_alphabetic() || c == '_'))
+}
+
+fn starts_test_code(tokens: &[Token]) -> bool {
+    let starts = |words: &[&str]| tokens.iter().take(words.len()).eq(words.iter());
+    starts(&["#", "[", "cfg", "(", "test", ")"]) || starts(&["#", "[", "test", "]"])
+}
+
+/// The last token of the item whose first attribute begins here.
+fn after_item(tokens: &[Token], mut at: usize) -> usize {
+    while tokens[at] == "#" {
+        at = closing(tokens, at + 1) + 1;
+    }
+    let is_use = tokens[at..].iter().take(6).any(|token| token == "use");
+    while at < tokens.len() && tokens[at] != ";" {
+        if tokens[at] == "{" && !is_use {
+            return closing(tokens, at);
+        }
+        at += 1;
+    }
+    at
+}
+
+/// Where what is opened here is closed.
+fn closing(tokens: &[Token], opening: usize) -> usize {
+    let mut depth = 0;
+    for (at, token) in tokens.iter().enumerate().skip(opening) {
+        match token.as_str() {
+            "{" | "[" | "(" => depth += 1,
+            "}" | "]" | ")" => depth -= 1,
+            _ => {}
+        }
+        if depth == 0 {
+            return at;
+        }
+    }
+    panic!("a bracket is not closed")
+}
+
+/// Every name that a `use` brings in, with the path it is brought in from. A glob brings in no name that is known here, so
+/// it counts as the module itself.
+fn use_tree(tokens: &[Token], before: &[String], found: &mut impl FnMut(String, Vec<String>)) {
+    let mut path = before.to_vec();
+    let mut at = 0;
+    while at < tokens.len() {
+        match tokens[at].as_str() {
+            "::" => {}
+            "{" => {
+                let end = closing(tokens, at);
+                let mut start = at + 1;
+                let mut depth = 0;
+                for (place, token) in tokens.iter().enumerate().take(end + 1).skip(at + 1) {
+                    match token.as_str() {
+                        "{" => depth += 1,
+                        "}" if place < end => depth -= 1,
+                        _ => {}
+                    }
+                    if place == end || (depth == 0 && token == ",") {
+                        if start < place {
+                            use_tree(&tokens[start..place], &path, found);
+                        }
+                        start = place + 1;
+                    }
+                }
+                return;
+            }
+            "as" => return found(tokens[at + 1].clone(), path),
+            "*" => return found(format!("* of {}", path.join("::")), path),
+            "self" if !path.is_empty() => {}
+            name => path.push(name.to_owned()),
+        }
+        at += 1;
+    }
+    found(path.last().unwrap().clone(), path);
+}
+
+/// The words and punctuation of a text without its comments, strings, characters and lifetimes.
+fn tokens(text: &str) -> Vec<Token> {
+    let text: Vec<char> = text.chars().collect();
+    let is_word = |at: usize| text.get(at).is_some_and(|c| c.is_alphanumeric() || *c == '_');
+    let starts = |at: usize, what: &str| what.chars().enumerate().all(|(i, c)| text.get(at + i) == Some(&c));
+    let mut tokens = Vec::new();
+    let mut at = 0;
+    while at < text.len() {
+        if starts(at, "//") {
+            while at < text.len() && text[at] != '\n' {
+                at += 1;
+            }
+        } else if starts(at, "/*") {
+            let mut depth = 0;
+            loop {
+                if starts(at, "/*") {
+                    (depth, at) = (depth + 1, at + 2);
+                } else if starts(at, "*/") {
+                    (depth, at) = (depth - 1, at + 2);
+                } else {
+                    at += 1;
+                }
+                if depth == 0 {
+                    break;
+                }
+            }
+        } else if let Some(end) = raw_string(&text, at) {
+            at = end;
+        } else if text[at] == '"' {
+            at += 1;
+            while text[at] != '"' {
+                at += if text[at] == '\\' { 2 } else { 1 };
+            }
+            at += 1;
+        } else if text[at] == '\'' {
+            if text[at + 1] == '\\' {
+                at += 3;
+                while text[at] != '\'' {
+                    at += 1;
+                }
+                at += 1;
+            } else if text.get(at + 2) == Some(&'\'') {
+                at += 3;
+            } else {
+                // A lifetime.
+                at += 1;
+                while is_word(at) {
+                    at += 1;
+                }
+            }
+        } else if is_word(at) {
+            let start = at;
+            while is_word(at) {
+                at += 1;
+            }
+            tokens.push(text[start..at].iter().collect());
+        } else if starts(at, "::") {
+            tokens.push("::".into());
+            at += 2;
+        } else {
+            if !text[at].is_whitespace() {
+                tokens.push(text[at].to_string());
+            }
+            at += 1;
+        }
+    }
+    tokens
+}
+
+/// Where the raw string that begins here has ended.
+fn raw_string(text: &[char], start: usize) -> Option<usize> {
+    let mut at = start;
+    if text[at] == 'b' {
+        at += 1;
+    }
+    if text.get(at) != Some(&'r') {
+        return None;
+    }
+    at += 1;
+    let hashes = text[at..].iter().take_while(|c| **c == '#').count();
+    at += hashes;
+    if text.get(at) != Some(&'"') {
+        return None;
+    }
+    let is_end = |at: usize| text[at] == '"' && (1..=hashes).all(|i| text.get(at + i) == Some(&'#'));
+    let end = (at + 1..text.len()).find(|at| is_end(*at))?;
+    Some(end + hashes + 1)
+}
