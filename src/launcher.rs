@@ -300,7 +300,7 @@ impl<'a> Launcher<'a> {
     /// Sleeps until a process ends, a signal comes or somebody asks, but no longer than `most`.
     fn sleep(&mut self, most: Duration) {
         let mut wakers: Vec<_> = self.crew.ends().collect();
-        wakers.push(self.signals.as_fd());
+        wakers.extend([self.signals.as_fd(), self.control.as_fd()]);
         if wait_for_any(&wakers, most) {
             self.tick = SHORTEST_TICK;
         }

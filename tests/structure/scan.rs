@@ -146,7 +146,7 @@ impl Sources {
                 rest = others;
                 continue;
             }
-            let child = [&here[..], &[first.clone()]].concat();
+            let child = [&here[..], std::slice::from_ref(first)].concat();
             if self.modules.contains_key(&child) {
                 (here, rest) = (child, others);
                 continue;

@@ -3,6 +3,7 @@
 use std::cell::Cell;
 use std::fmt;
 use std::io;
+use std::os::fd::{AsFd, BorrowedFd};
 use std::time::{Duration, Instant};
 
 use iceoryx2::port::listener::{Listener, ListenerWaitError};
@@ -40,6 +41,9 @@ const NAP: Duration = Duration::from_millis(50);
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Place(pub Role, pub u32);
 
+/// The channel of the launcher's own bell, which is no role.
+const LAUNCHER: &str = "bell/launcher";
+
 impl fmt::Display for Place {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "bell/{}/{}", self.0.name(), self.1)
@@ -50,7 +54,7 @@ impl fmt::Display for Place {
 #[derive(Debug)]
 pub struct Bell {
     listener: Listener<ipc::Service>,
-    place: Place,
+    channel: String,
     polling: Polling,
 }
 
@@ -100,7 +104,18 @@ impl Bell {
     /// # Errors
     /// When shared memory cannot be had.
     pub fn hang(domain: &Domain, place: Place) -> Result<Self, ChannelError> {
-        let channel = place.to_string();
+        Self::on(domain, place.to_string())
+    }
+
+    /// Hangs the launcher's bell.
+    ///
+    /// # Errors
+    /// When shared memory cannot be had.
+    pub(super) fn of_launcher(domain: &Domain) -> Result<Self, ChannelError> {
+        Self::on(domain, LAUNCHER.into())
+    }
+
+    fn on(domain: &Domain, channel: String) -> Result<Self, ChannelError> {
         let listener = claim(|| {
             service(domain, &channel, Entry::Open)?
                 .listener_builder()
@@ -109,7 +124,7 @@ impl Bell {
         })?;
         Ok(Self {
             listener,
-            place,
+            channel,
             polling: Polling::default(),
         })
     }
@@ -119,17 +134,20 @@ impl Bell {
     /// # Errors
     /// When waiting is impossible.
     pub fn wait(&self, patience: Duration) -> Result<bool, ChannelError> {
-        // The listener's own `timed_wait` does the same with twice as many system calls.
-        let patience = Timespec {
-            tv_sec: patience.as_secs() as i64,
-            tv_nsec: patience.subsec_nanos().into(),
-        };
-        let mut ready = [PollFd::from_borrowed_fd(descriptor::of(&self.listener), PollFlags::IN)];
-        match poll(&mut ready, Some(&patience)) {
+        // The listener's own `timed_wait` does the same with twice as many system calls. No wait is so long that it could not
+        // be said.
+        let patience = Timespec::try_from(patience).ok();
+        let mut ready = [PollFd::from_borrowed_fd(self.as_fd(), PollFlags::IN)];
+        match poll(&mut ready, patience.as_ref()) {
             // A process that was stopped and goes on has only been interrupted.
             Ok(_) | Err(Errno::INTR) => {}
             Err(errno) => return Err(self.failed(io::Error::from(errno))),
         }
+        self.rang()
+    }
+
+    /// Whether there was a ring since this was asked last. It does not block.
+    pub(super) fn rang(&self) -> Result<bool, ChannelError> {
         let mut rang = false;
         match self.listener.try_wait(|_| rang = true) {
             Ok(_) | Err(ListenerWaitError::InterruptSignal) => Ok(rang),
@@ -138,7 +156,13 @@ impl Bell {
     }
 
     fn failed(&self, cause: impl Cause) -> ChannelError {
-        ChannelError::new(self.place.to_string(), "wait", cause)
+        ChannelError::new(self.channel.clone(), "wait", cause)
+    }
+}
+
+impl AsFd for Bell {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        descriptor::of(&self.listener)
     }
 }
 
@@ -149,12 +173,19 @@ impl Ringer {
     /// When shared memory cannot be had.
     pub fn new(domain: &Domain, place: Place) -> Result<Self, ChannelError> {
         let channel = place.to_string();
-        let notifier = claim(|| {
-            service(domain, &channel, Entry::Open)?
-                .notifier_builder()
-                .create()
-                .map_err(|e| ChannelError::new(&channel, "ring", e))
-        })?;
+        claim(|| Self::on(domain, &channel))
+    }
+
+    /// Holds the cord of the launcher's bell, if it can be had at once: a launcher without one looks for itself.
+    pub(super) fn to_launcher(domain: &Domain) -> Option<Self> {
+        Self::on(domain, LAUNCHER).ok()
+    }
+
+    fn on(domain: &Domain, channel: &str) -> Result<Self, ChannelError> {
+        let notifier = service(domain, channel, Entry::Open)?
+            .notifier_builder()
+            .create()
+            .map_err(|e| ChannelError::new(channel, "ring", e))?;
         Ok(Self { notifier })
     }
 
@@ -203,7 +234,16 @@ pub fn wait_for<T>(
 
 /// Makes the service of the bell at `place`.
 pub(super) fn create(domain: &Domain, place: Place) -> Result<Held, ChannelError> {
-    let service = service(domain, &place.to_string(), Entry::Create)?;
+    create_on(domain, &place.to_string())
+}
+
+/// Makes the service of the launcher's bell.
+pub(super) fn create_of_launcher(domain: &Domain) -> Result<Held, ChannelError> {
+    create_on(domain, LAUNCHER)
+}
+
+fn create_on(domain: &Domain, channel: &str) -> Result<Held, ChannelError> {
+    let service = service(domain, channel, Entry::Create)?;
     Ok(Held::new(move |see| {
         let ports = service.dynamic_config();
         ports.list_listeners(|port| see(port.node_id, port.listener_id.value()));

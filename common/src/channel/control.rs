@@ -1,5 +1,6 @@
 //! Control of a run, from any other terminal: questions to its launcher, and the launcher's answers.
 
+use std::os::fd::{AsFd, BorrowedFd};
 use std::path::Path;
 use std::time::{Duration, Instant};
 
@@ -14,6 +15,7 @@ use iceoryx2::service::port_factory::request_response::PortFactory;
 
 pub use self::message::{Answer, Question, RoleState, RoleStatus, RunKey, RunStatus};
 use self::message::{Asked, VERSION, decode, encode};
+use super::bell::{Bell, Ringer};
 use super::domain::Domain;
 use super::error::{Cause, ChannelError, ChannelErrorKind};
 use super::memory;
@@ -36,7 +38,7 @@ const QUESTION: usize = 64;
 const ANSWER: usize = 1024;
 const ANSWER_OF_A_ROLE: usize = 96;
 
-/// How long the asker sleeps between looks. The launcher looks twenty times a second.
+/// How long the asker sleeps between looks. It rings for the launcher, which answers at once where it has nothing else to do.
 const NAP: Duration = Duration::from_millis(5);
 
 /// How often it asks itself whether there is still a launcher.
@@ -46,6 +48,7 @@ const LOOK: Duration = Duration::from_millis(100);
 #[derive(Debug)]
 pub struct ControlPort {
     server: Server<ipc::Service, [u8], ControlHeader, [u8], ControlHeader>,
+    bell: Bell,
     /// Who will be answered later.
     waiting: Vec<ControlRequest>,
 }
@@ -76,6 +79,13 @@ pub enum ControlError {
     Unreadable(String),
 }
 
+/// Readable when somebody has asked.
+impl AsFd for ControlPort {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.bell.as_fd()
+    }
+}
+
 impl ControlPort {
     /// The answering end.
     ///
@@ -91,6 +101,7 @@ impl ControlPort {
         })?;
         Ok(Self {
             server,
+            bell: Bell::of_launcher(domain)?,
             waiting: Vec::new(),
         })
     }
@@ -106,6 +117,8 @@ impl ControlPort {
         place: &Path,
         mut answer: impl FnMut(Question) -> Result<Option<Answer>, E>,
     ) -> Result<(), E> {
+        // Before the questions are looked for: who asks later rings again.
+        self.bell.rang()?;
         loop {
             let received = self
                 .server
@@ -185,7 +198,10 @@ pub fn ask(
         request.send().map_err(cannot_ask)
     };
     let question = encode(&Asked { run, question }).map_err(cannot_ask)?;
+    let launcher = Ringer::to_launcher(domain);
+    let ring = || launcher.iter().for_each(Ringer::ring);
     let mut pending = ask(&question)?;
+    ring();
     let mut looked = Instant::now();
     let mut gone = false;
     loop {
@@ -207,6 +223,7 @@ pub fn ask(
         // The launcher may have opened its end only now.
         if pending.number_of_server_connections() == 0 {
             pending = ask(&question)?;
+            ring();
         }
     }
 }
@@ -266,4 +283,50 @@ fn service(domain: &Domain, entry: Entry) -> Result<ControlService, ChannelError
         .max_response_buffer_size(1)
         .max_borrowed_responses_per_pending_response(1);
     entry.service(CHANNEL, builder, |b| b.create(), |b| b.open())
+}
+
+#[cfg(test)]
+mod tests {
+    use rustix::event::{PollFd, PollFlags, Timespec, poll};
+
+    use super::*;
+    use crate::channel::Services;
+
+    #[test]
+    fn who_asks_wakes_the_launcher() {
+        let run_id = format!("a{:x}", std::process::id());
+        let domain = Domain::join(&run_id, 1).unwrap();
+        let mut services = Services::new(&domain).unwrap();
+        services.create_common(&domain).unwrap();
+        let mut port = ControlPort::open(&domain).unwrap();
+        let run = RunKey { device: 1, inode: 2 };
+        let a_minute = Timespec { tv_sec: 60, tv_nsec: 0 };
+        std::thread::scope(|scope| {
+            let asker = scope.spawn(|| {
+                let visitor = Domain::visit(&run_id, 1).unwrap();
+                let answer = ask(&visitor, run, Question::Stop, Duration::from_secs(60), || true);
+                visitor.leave().unwrap();
+                answer
+            });
+            let mut asked = 0;
+            while asked == 0 {
+                let woken = poll(&mut [PollFd::new(&port, PollFlags::IN)], Some(&a_minute)).unwrap();
+                assert_eq!(woken, 1, "nobody rang");
+                port.attend::<ChannelError>(run, Path::new("run"), |question| {
+                    assert_eq!(question, Question::Stop);
+                    asked += 1;
+                    Ok(Some(Answer::Accepted))
+                })
+                .unwrap();
+            }
+            assert_eq!(asker.join().unwrap().unwrap(), Answer::Accepted);
+            let at_once = Timespec::default();
+            assert_eq!(
+                poll(&mut [PollFd::new(&port, PollFlags::IN)], Some(&at_once)).unwrap(),
+                0
+            );
+        });
+        drop((port, services));
+        domain.leave().unwrap();
+    }
 }

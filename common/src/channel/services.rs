@@ -36,12 +36,13 @@ impl Services {
         })
     }
 
-    /// Makes what a run has once: control, policy, reports, and what wakes learner and evaluator.
+    /// Makes what a run has once: control, policy, reports, and what wakes launcher, learner and evaluator.
     ///
     /// # Errors
     /// When a service is there already, or shared memory cannot be had.
     pub fn create_common(&mut self, domain: &Domain) -> Result<(), ChannelError> {
         self.held.extend([
+            bell::create_of_launcher(domain)?,
             control::create(domain)?,
             policy::create(domain)?,
             reports::create::<Heartbeat>(domain)?,

@@ -38,7 +38,8 @@ pub(super) fn shared_memory(config: &Config) -> u64 {
         + reports::reserved::<EvaluationReport>(max, 1)
         + reports::reserved::<JudgedReport>(max, 1)
         + reports::reserved::<LearnerReport>(max, 1)
-        + roles as u64 * Bell::reserved(max)
+        // One for each role, and the launcher's.
+        + (roles as u64 + 1) * Bell::reserved(max)
 }
 
 /// Bytes of disk that the run's directory may come to need beyond what is in it; `None` where that is more than there can
