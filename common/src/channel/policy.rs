@@ -146,11 +146,6 @@ impl PolicyReader {
         }
         Ok(self.current.clone())
     }
-
-    /// The policy that [`latest`](Self::latest) gave last, however old it is by now.
-    pub fn held(&self) -> Option<&Policy> {
-        self.current.as_deref()
-    }
 }
 
 impl Policy {
