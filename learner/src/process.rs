@@ -14,7 +14,7 @@ mod lockstep;
 pub mod ratio;
 mod settings;
 
-pub use settings::{LearnerError, Settings};
+pub use settings::{LearnerError, Settings, SizeError, disk_bytes};
 
 use shoal_common::channel::Domain;
 use shoal_common::config::Mode;
@@ -28,14 +28,14 @@ use learner::{Ended, Learner};
 /// When a channel, the replay or a checkpoint cannot be used, or learning diverges.
 pub fn learn(domain: &Domain, settings: &Settings, stop: &Stop) -> Result<(), LearnerError> {
     let mut learner = Learner::new(domain, settings, stop)?;
-    let ended = match settings.mode {
+    let ended = match settings.config.run.mode {
         Mode::Free => free::run(&mut learner),
         Mode::Lockstep => lockstep::run(&mut learner),
     };
     match ended {
         Ok(()) => learner.finish(),
         Err(Ended::Stopped) => {
-            if settings.mode == Mode::Free {
+            if settings.config.run.mode == Mode::Free {
                 learner.take_the_last()?;
             }
             learner.finish()

@@ -200,7 +200,7 @@ mod tests {
         };
         super::run(&args).unwrap();
 
-        let Algorithm::Ddpg(ddpg, _) = &mut config.algorithm else {
+        let Algorithm::Ddpg(ddpg) = &mut config.algorithm else {
             unreachable!()
         };
         ddpg.hidden = [5, 3];

@@ -6,6 +6,7 @@ use shoal_common::report::Activity;
 
 use super::judging::Judging;
 use super::learner::{Ended, Learner};
+use super::ratio::Ratio;
 
 /// Updates from one publication to the next. Publishing copies the actor's weights once: about a thirtieth of an update.
 const PUBLISH_EVERY: u64 = 4;
@@ -20,8 +21,8 @@ const NAP: Duration = Duration::from_millis(50);
 const LAST_EVALUATION: Duration = Duration::from_secs(5);
 
 pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Ended> {
-    let ratio = learner.settings.ratio;
-    let every = Duration::from_secs_f64(learner.settings.checkpoint.every_seconds);
+    let ratio = Ratio::from(&learner.settings.config.replay);
+    let every = Duration::from_secs_f64(learner.settings.config.checkpoint.every_seconds);
     let mut saved = Instant::now();
     // After a crash the replay is ahead of the checkpoint: those rows count.
     learner.count_rows(learner.replay.head());

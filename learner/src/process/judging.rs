@@ -26,7 +26,7 @@ impl Judging {
     /// Waits until a policy of this period is judged, the one just published if none was before, but no longer than
     /// `patience`. An evaluator that dies over it has a successor, which is given the same policy.
     pub(crate) fn wait(&mut self, learner: &mut Learner<'_>, patience: Option<Duration>) -> Result<(), Ended> {
-        let due = Some(learner.settings.evaluation.period(learner.rows));
+        let due = Some(learner.settings.config.evaluation.period(learner.rows));
         let Learner {
             bell,
             stop,
