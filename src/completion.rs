@@ -79,7 +79,7 @@ fn all_settings() -> Vec<Setting> {
         let keys = environment::explain(name).unwrap_or_default();
         settings.extend(keys.iter().map(|key| setting("environment", key, &defaults)));
     }
-    settings.retain(|setting| setting.key != FILLED_IN);
+    settings.retain(|setting| !FILLED_IN.contains(&setting.key.as_str()));
     if let Some(name) = settings.iter_mut().find(|setting| setting.key == "environment.name") {
         name.values = environment::names().map(str::to_owned).collect();
     }

@@ -13,9 +13,9 @@ use shoal_common::report::{Identity, Role};
 use shoal_common::run_dir::RunDir;
 use shoal_common::stop::Stop;
 use shoal_env_server::vector::VectorEnvironment;
-use shoal_learner::process as learner;
+use shoal_learner::process;
 use shoal_run::external_environment::{self, Post};
-use shoal_run::status::{judged, learner_settings};
+use shoal_run::status::judged;
 use tracing_subscriber::filter::LevelFilter;
 
 use crate::cli::RoleArgs;
@@ -68,21 +68,23 @@ fn log_level() -> LevelFilter {
 fn work(domain: &Domain, config: &Config, run: &RunDir, identity: Identity, stop: &Stop) -> anyhow::Result<()> {
     match identity.role {
         Role::EnvServer => serve(domain, config, &server_post(config, run, identity), identity, stop),
-        Role::Actor => Ok(explorer::explore(
-            domain,
-            &explorer_settings(config, run, identity),
-            stop,
-        )?),
-        Role::Evaluator => Ok(evaluator::evaluate(
-            domain,
-            &evaluator_settings(config, run, identity, judged(config, run)?),
-            stop,
-        )?),
-        Role::Learner => Ok(learner::learn(
-            domain,
-            &learner_settings(config, run, identity, judged(config, run)?),
-            stop,
-        )?),
+        Role::Actor => {
+            let settings = explorer::Settings::new(config, run, identity);
+            Ok(explorer::explore(domain, &settings, stop)?)
+        }
+        Role::Evaluator => {
+            let settings = evaluator::Settings::new(config, run, identity, judged(config, run)?);
+            Ok(evaluator::evaluate(domain, &settings, stop)?)
+        }
+        Role::Learner => {
+            let settings = process::Settings {
+                identity,
+                config: config.clone(),
+                run: run.clone(),
+                judged: judged(config, run)?,
+            };
+            Ok(process::learn(domain, &settings, stop)?)
+        }
     }
 }
 
@@ -131,31 +133,4 @@ fn serve(domain: &Domain, config: &Config, post: &Post<'_>, identity: Identity, 
         pulse,
         stop,
     )?)
-}
-
-fn explorer_settings(config: &Config, run: &RunDir, identity: Identity) -> explorer::Settings {
-    explorer::Settings {
-        identity,
-        seed: config.run.seed,
-        mode: config.run.mode,
-        spec: config.spec.clone(),
-        envs: config.actors.envs as usize,
-        chunk: config.chunk_layout(),
-        window: config.actors.window,
-        algorithm: config.algorithm.clone(),
-        replay: run.replay_file(),
-    }
-}
-
-fn evaluator_settings(config: &Config, run: &RunDir, identity: Identity, judged: Option<u64>) -> evaluator::Settings {
-    evaluator::Settings {
-        identity,
-        spec: config.spec.clone(),
-        server: config.evaluation_server(),
-        envs: config.evaluation_envs() as usize,
-        evaluation: config.evaluation.clone(),
-        algorithm: config.algorithm.clone(),
-        run: run.clone(),
-        judged,
-    }
 }

@@ -16,7 +16,7 @@ use shoal_common::network::{ActionRange, PolicyNetwork};
 use shoal_common::stream::{Purpose, stream};
 use shoal_common::transition::Transition;
 use shoal_env_server::vector::{Start, VectorEnvironment};
-use shoal_learner::algorithms::ddpg::{Ddpg, DdpgSettings};
+use shoal_learner::algorithms::ddpg::Ddpg;
 use shoal_learner::algorithms::minibatch::Minibatch;
 use shoal_learner::algorithms::sampling::Sampler;
 use support::{Workplace, comes_further, end_of, rows_of, until};
@@ -245,10 +245,11 @@ fn one_actor_in_lockstep_is_algorithm_4_in_a_single_process() {
 fn twin(config: &Config) -> String {
     let seed = config.run.seed;
     let row = config.row_layout();
-    let Algorithm::Ddpg(ddpg, exploration) = &config.algorithm else {
+    let Algorithm::Ddpg(ddpg) = &config.algorithm else {
         panic!("the twin is DDPG's")
     };
-    let mut learner = Ddpg::new(&config.spec, &DdpgSettings::from(ddpg), seed).unwrap();
+    let exploration = &ddpg.exploration;
+    let mut learner = Ddpg::new(&config.spec, ddpg, seed).unwrap();
     let sampler = Sampler::new(seed);
     let mut batch = Minibatch::new(row, ddpg.batch);
     let mut indices = vec![0; ddpg.batch];

@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 
 use serde_json::Value;
 use shoal_common::{
+    config,
     network::NetworkLayout,
     space::{EnvironmentSpec, Space},
     stream::{Purpose, stream},
@@ -20,7 +21,7 @@ use shoal_env_server::environment::{
     pendulum::{self, Pendulum},
 };
 use shoal_learner::algorithms::{
-    ddpg::{Ddpg, DdpgSettings, DdpgState},
+    ddpg::{Ddpg, DdpgState},
     minibatch::Minibatch,
 };
 
@@ -269,12 +270,13 @@ fn ddpg_update(file: &Value) -> Result<(), Failure> {
             expected.len()
         ));
     }
-    let settings = DdpgSettings {
+    let settings = config::Ddpg {
         tau: read(file, "tau", serde_json::from_value)?,
         actor_learning_rate: read(file, "actor_lr", serde_json::from_value)?,
         critic_learning_rate: read(file, "critic_lr", serde_json::from_value)?,
         hidden: read(file, "hidden", serde_json::from_value)?,
         batch: batches[0].size(),
+        ..config::Ddpg::default()
     };
     let mut ddpg = Ddpg::new(&spec, &settings, 0).map_err(|e| e.to_string())?;
     let initial = networks(&file["initial"], &ddpg)?;

@@ -7,7 +7,7 @@ use shoal_common::channel::environment::{Begin, EnvironmentClient, Stepped};
 use shoal_common::channel::policy::{self, PolicyHeader, PolicyReader};
 use shoal_common::channel::reports::Reporter;
 use shoal_common::channel::{Bell, ChannelError, Domain, Place, Pulse, Ringer, wait_for};
-use shoal_common::config::{Algorithm, Evaluation};
+use shoal_common::config::{Algorithm, Config, Evaluation};
 use shoal_common::exit::Exit;
 use shoal_common::policy::Policy;
 use shoal_common::policy_file::PolicyFile;
@@ -38,6 +38,22 @@ pub struct Settings {
     pub run: RunDir,
     /// The period of the policy that an evaluator before this one judged last.
     pub judged: Option<u64>,
+}
+
+impl Settings {
+    /// What the evaluator of this run is told; `judged` is the period of the policy that one before it judged last.
+    pub fn new(config: &Config, run: &RunDir, identity: Identity, judged: Option<u64>) -> Self {
+        Self {
+            identity,
+            spec: config.spec.clone(),
+            server: config.evaluation_server(),
+            envs: config.evaluation_envs() as usize,
+            evaluation: config.evaluation.clone(),
+            algorithm: config.algorithm.clone(),
+            run: run.clone(),
+            judged,
+        }
+    }
 }
 
 /// Mean and standard deviation (of the sample; 0 for fewer than two) of returns.
@@ -90,7 +106,7 @@ struct Evaluator<'a> {
 
 impl<'a> Evaluator<'a> {
     fn new(domain: &Domain, settings: &'a Settings, stop: &'a Stop) -> Result<Self, Exit<ActorError>> {
-        let policy = Policy::new(&settings.algorithm, &settings.spec, settings.envs)?;
+        let policy = settings.algorithm.policy(&settings.spec, settings.envs)?;
         let layout = policy.layout();
         let bell = Bell::hang(domain, Place(Role::Evaluator, settings.identity.index))?;
         let mut pulse = Pulse::new(domain, settings.identity)?;

@@ -1,10 +1,9 @@
-//! How each algorithm's actors try what their policy would not do.
+//! How actors try what their policy would not do: a way for each kind of exploration.
 
 use rand::RngExt;
-use shoal_common::config::{Algorithm, Warmup};
+use shoal_common::algorithms::{Behaviour, Warmup};
 use shoal_common::network::PolicyNetwork;
-use shoal_common::policy::{self, PolicyError, PolicyLayout, Scores, highest};
-use shoal_common::space::EnvironmentSpec;
+use shoal_common::policy::{PolicyLayout, Scores, highest};
 use shoal_common::stream::Stream;
 
 use crate::noise::OrnsteinUhlenbeck;
@@ -23,28 +22,16 @@ pub enum Exploration {
 }
 
 impl Exploration {
-    /// The exploration of `algorithm` in `environments` environments like `spec`.
-    ///
-    /// # Errors
-    /// When the algorithm cannot control them.
-    pub fn new(
-        algorithm: &Algorithm,
-        spec: &EnvironmentSpec,
-        environments: usize,
-        stream: Stream,
-    ) -> Result<Self, PolicyError> {
-        Ok(match algorithm {
-            Algorithm::Ddpg(ddpg, noise) => {
-                let network = policy::deterministic(ddpg, spec, environments)?;
-                let noise = OrnsteinUhlenbeck::new(noise, environments, spec.action.width(), stream);
+    /// How to act in `environments` environments: with as many as the behaviour's policy has room for.
+    pub fn new(behaviour: Behaviour, environments: usize, stream: Stream) -> Self {
+        match behaviour {
+            Behaviour::Noise(network, noise) => {
+                let noise = OrnsteinUhlenbeck::new(&noise, environments, network.range().width(), stream);
                 Self::Noise(network, noise)
             }
-            Algorithm::Reinforce(reinforce) => Self::Sample(policy::softmax(reinforce, spec, environments)?, stream),
-            Algorithm::QLearning(tabular) | Algorithm::Sarsa(tabular) => {
-                let values = policy::table(algorithm.name(), spec, environments)?;
-                Self::EpsilonGreedy(values, stream, tabular.epsilon)
-            }
-        })
+            Behaviour::Sample(scores) => Self::Sample(scores, stream),
+            Behaviour::EpsilonGreedy(scores, epsilon) => Self::EpsilonGreedy(scores, stream, epsilon),
+        }
     }
 
     /// What the policy's parameters are.
@@ -137,8 +124,8 @@ fn drawn(logits: &[f32], u: f64) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use shoal_common::config::{Ddpg, Reinforce, Tabular};
-    use shoal_common::space::Space;
+    use shoal_common::config::{Algorithm, Ddpg, Reinforce, Tabular};
+    use shoal_common::space::{EnvironmentSpec, Space};
     use shoal_common::stream::{Purpose, stream};
 
     fn lake(epsilon: f64) -> Exploration {
@@ -153,7 +140,7 @@ mod tests {
             ..Tabular::default()
         };
         let stream = stream(7, Purpose::Exploration, 0, 0);
-        Exploration::new(&Algorithm::QLearning(tabular), &spec, 1, stream).unwrap()
+        Exploration::new(Algorithm::QLearning(tabular).behaviour(&spec, 1).unwrap(), 1, stream)
     }
 
     /// How often each action was chosen in 4,000 steps.
@@ -194,7 +181,7 @@ mod tests {
             hidden: [1, 1],
             ..Reinforce::default()
         });
-        let mut policy = Exploration::new(&algorithm, &spec, 1, stream).unwrap();
+        let mut policy = Exploration::new(algorithm.behaviour(&spec, 1).unwrap(), 1, stream);
         // The logits are 0 and ln 3, whatever is observed: probabilities 1/4 and 3/4.
         let parameters = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 3_f32.ln()];
         let drawn = counts(&mut policy, &parameters, &[0.5]);
@@ -215,8 +202,12 @@ mod tests {
                 warmup,
                 ..Default::default()
             };
-            let algorithm = Algorithm::Ddpg(Ddpg::default(), noise);
-            Exploration::new(&algorithm, &spec, 1, stream(7, Purpose::Exploration, 0, 0)).unwrap()
+            let algorithm = Algorithm::Ddpg(Ddpg {
+                exploration: noise,
+                ..Ddpg::default()
+            });
+            let behaviour = algorithm.behaviour(&spec, 1).unwrap();
+            Exploration::new(behaviour, 1, stream(7, Purpose::Exploration, 0, 0))
         };
         type Act = fn(&mut Exploration, &[f32], &[f32], u64, &mut [f32]);
         let choose = |exploration: &mut Exploration, act: Act, step| {

@@ -14,16 +14,17 @@ use std::path::PathBuf;
 use std::rc::Rc;
 use std::time::{Duration, Instant};
 
+use shoal_common::algorithms::Experience;
 use shoal_common::channel::environment::{Begin, EnvironmentClient, Observed, Snapshot, Stepped};
 use shoal_common::channel::policy::{Policy, PolicyReader};
 use shoal_common::channel::reports::Reporter;
 use shoal_common::channel::transitions::{Chunk, ChunkSender};
 use shoal_common::channel::{Bell, ChannelError, Domain, Place, Pulse, Ringer, wait_for};
 use shoal_common::commit::{CommitReader, OpenError};
-use shoal_common::config::{Algorithm, Mode};
+use shoal_common::config::{Algorithm, Config, Mode};
 use shoal_common::exit::Exit;
-use shoal_common::policy::PolicyLayout;
 use shoal_common::report::{Activity, EpisodeReport, Identity, Role};
+use shoal_common::run_dir::RunDir;
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::stop::Stop;
 use shoal_common::stream::{Purpose, stream};
@@ -57,6 +58,23 @@ pub struct Settings {
     pub algorithm: Algorithm,
     /// The replay, whose commit record tells what has arrived.
     pub replay: PathBuf,
+}
+
+impl Settings {
+    /// What an actor of this run is told.
+    pub fn new(config: &Config, run: &RunDir, identity: Identity) -> Self {
+        Self {
+            identity,
+            seed: config.run.seed,
+            mode: config.run.mode,
+            spec: config.spec.clone(),
+            envs: config.actors.envs as usize,
+            chunk: config.chunk_layout(),
+            window: config.actors.window,
+            algorithm: config.algorithm.clone(),
+            replay: run.replay_file(),
+        }
+    }
 }
 
 /// Explores until `stop`.
@@ -107,7 +125,7 @@ impl<'a> Explorer<'a> {
     fn new(domain: &Domain, settings: &'a Settings, stop: &'a Stop) -> Result<Self, Exit<ActorError>> {
         let Identity { index, incarnation, .. } = settings.identity;
         let row = settings.chunk.row;
-        let layout = PolicyLayout::new(&settings.algorithm, &settings.spec)?;
+        let layout = settings.algorithm.policy_layout(&settings.spec)?;
         let bell = Bell::hang(domain, Place(Role::Actor, index))?;
         let mut pulse = Pulse::new(domain, settings.identity)?;
         let client = connect(domain, &bell, index, &settings.spec, settings.envs, stop)?;
@@ -127,7 +145,11 @@ impl<'a> Explorer<'a> {
             Mode::Free => incarnation,
         };
         let stream = stream(settings.seed, Purpose::Exploration, index.into(), incarnation);
-        let exploration = Exploration::new(&settings.algorithm, &settings.spec, settings.envs, stream)?;
+        let exploration = Exploration::new(
+            settings.algorithm.behaviour(&settings.spec, settings.envs)?,
+            settings.envs,
+            stream,
+        );
         let standing = if settings.mode == Mode::Lockstep && sender.sent() > 0 {
             let words = commits.standing(index as usize);
             Standing::read(&words, &settings.chunk, settings.envs, exploration.state().len())
@@ -230,7 +252,8 @@ impl<'a> Explorer<'a> {
 
     /// Whether the chunk is full, or holds the one episode that it is for.
     fn chunk_is_complete(&self) -> bool {
-        let episode_is_over = self.settings.algorithm.learns_from_episodes() && !self.ended.is_empty();
+        let episode_is_over =
+            self.settings.algorithm.spec().experience == Experience::Episodes && !self.ended.is_empty();
         self.chunk.is_full() || episode_is_over
     }
 

@@ -14,7 +14,6 @@ use shoal_common::network::{ActionRange, PolicyNetwork};
 use shoal_common::report::Role;
 use shoal_common::stream::{Purpose, stream};
 use shoal_env_server::vector::{Start, VectorEnvironment};
-use shoal_learner::algorithms::algorithm::Room;
 use shoal_learner::algorithms::registry;
 use shoal_learner::networks::initialise::initialise;
 use shoal_learner::process::intake::Intake;
@@ -88,7 +87,11 @@ pub(super) fn measure(length: Duration, patience: &Patience) -> anyhow::Result<C
     let inference_us = microseconds(each, patience, || inference.step())?;
 
     let stream = stream(config.run.seed, Purpose::Exploration, 0, 0);
-    let mut exploration = Exploration::new(&config.algorithm, &config.spec, ENVIRONMENTS, stream)?;
+    let mut exploration = Exploration::new(
+        config.algorithm.behaviour(&config.spec, ENVIRONMENTS)?,
+        ENVIRONMENTS,
+        stream,
+    );
     let mut step = 0;
     let acting_us = microseconds(each, patience, || {
         let Inference {
@@ -110,13 +113,7 @@ pub(super) fn measure(length: Duration, patience: &Patience) -> anyhow::Result<C
     let (writing_chunk_us, intake_of_chunk_us) =
         scene.in_shared_memory(|domain| chunks(&scene, domain, &mut replay, each, patience))?;
 
-    let room = Room {
-        capacity: config.replay.capacity,
-        chunk_rows: config.chunk_rows(),
-        actors: 1,
-        envs: config.actors.envs,
-    };
-    let mut method = registry::new(&config.algorithm, &config.spec, config.run.seed, room)?;
+    let mut method = registry::new(config)?;
     let head = replay.head();
     let update_us = microseconds(each, patience, || {
         std::hint::black_box(method.update(&replay, head));

@@ -7,7 +7,6 @@ use shoal_common::channel::Domain;
 use shoal_common::channel::policy::{PolicyHeader, PolicyReader};
 use shoal_common::commit::{CommitReader, OpenError};
 use shoal_common::config::Config;
-use shoal_common::policy::PolicyLayout;
 use shoal_common::run_dir::RunDir;
 
 use super::Patience;
@@ -106,7 +105,7 @@ pub(super) fn commits_of(run: &RunDir) -> anyhow::Result<Option<CommitReader>> {
 
 /// Reads the run's policies. There is room for one reader besides the roles.
 pub(super) fn policy_reader(config: &Config, domain: &Domain) -> anyhow::Result<PolicyReader> {
-    let layout = PolicyLayout::new(&config.algorithm, &config.spec)?;
+    let layout = config.algorithm.policy_layout(&config.spec)?;
     Ok(PolicyReader::open(domain, layout.fingerprint(), layout.parameters())?)
 }
 

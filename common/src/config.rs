@@ -1,29 +1,42 @@
 //! The run's configuration, as it stands in `config.toml` once everything is decided. Each section belongs to one part of
 //! the system, and a role is handed the sections it needs, never the whole.
 
-mod algorithm;
-mod defaults;
+mod actors;
+mod checkpoint;
+mod environment;
+mod evaluation;
 pub mod explanation;
-mod limits;
+mod identity;
+mod learner;
+mod replay;
+mod run;
 mod sections;
 
-pub use algorithm::{Algorithm, Ddpg, Exploration, Reinforce, Tabular, Warmup, Weight};
+pub use crate::algorithms::{Algorithm, Ddpg, Exploration, Reinforce, Tabular, Warmup, Weight};
+pub use crate::section::OutOfRange;
+pub use actors::Actors;
+pub use checkpoint::Checkpoint;
+pub use environment::Environment;
+pub use evaluation::Evaluation;
+pub use identity::IdentityFormat;
+pub use learner::Learner;
+pub use replay::Replay;
+pub use run::{Mode, Run};
 
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
-use sha2::{Digest, Sha256};
+use serde::Deserialize;
 
 use self::sections::Sections;
+use crate::algorithms::Experience;
 use crate::policy::PolicyError;
 use crate::space::EnvironmentSpec;
 use crate::transition::{ChunkLayout, RowLayout};
 
 /// Everything a run was started with.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(try_from = "Sections", into = "Sections")]
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(try_from = "Sections")]
 pub struct Config {
     /// Identity and length of the run.
     pub run: Run,
@@ -43,145 +56,6 @@ pub struct Config {
     pub evaluation: Evaluation,
     /// How often the learner's state is saved.
     pub checkpoint: Checkpoint,
-}
-
-/// Identity and length of the run.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(default, deny_unknown_fields)]
-pub struct Run {
-    /// Names the run's services and shared memory; chosen when the run directory is made.
-    #[schemars(extend("unit" = "–", "source" = "ours"))]
-    pub id: String,
-    /// The root of every random stream.
-    #[schemars(extend("unit" = "–", "source" = "ours"))]
-    pub seed: u64,
-    /// Whether timing may decide anything.
-    #[schemars(extend("unit" = "–", "source" = "ours"))]
-    pub mode: Mode,
-    /// Environment steps over all actors after which training ends.
-    #[schemars(extend("unit" = "environment steps", "source" = "sections 4.1 to 5.3, each task its own"))]
-    pub steps: u64,
-    /// Episodes over all actors after which it ends, if that is earlier.
-    #[schemars(extend("unit" = "episodes", "source" = "sections 4.1 and 4.2"))]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub episodes: Option<u64>,
-    /// How long a process may make no progress while those it waits for live and wait too; then it is replaced. One that is
-    /// stopped, or an environment that takes its time over a step, is not.
-    #[schemars(extend("unit" = "s", "source" = "ours"))]
-    pub stall_seconds: u64,
-}
-
-/// Whether timing may decide anything.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "lowercase")]
-pub enum Mode {
-    /// Actors and learner run side by side, within the ratio's tolerance.
-    Free,
-    /// Actors and learner take turns: the same seed and actor count give the same bits.
-    Lockstep,
-}
-
-/// What is controlled: an environment's name, and the parameters that this environment understands.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-pub struct Environment {
-    /// One of the environments' names, or what another program makes an environment from, as `gym:Pendulum-v1`.
-    #[schemars(extend("unit" = "–", "source" = "chapters 4 and 5"))]
-    pub name: String,
-    /// The command that starts that program, an environment server as `docs/PROTOCOL.md` has it; empty for our own.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    #[schemars(extend("unit" = "–", "source" = "ours"))]
-    pub server: Vec<String>,
-    /// The environment's own parameters.
-    #[serde(flatten)]
-    #[schemars(skip)]
-    pub parameters: toml::Table,
-}
-
-/// Who explores, and in how large portions.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(default, deny_unknown_fields)]
-pub struct Actors {
-    /// Actor processes, each with an environment server of its own.
-    #[schemars(extend("unit" = "processes", "source" = "ours"))]
-    pub count: u32,
-    /// Environments an actor steps at once.
-    #[schemars(extend("unit" = "environments", "source" = "ours"))]
-    pub envs: u32,
-    /// Steps of every environment that travel in one chunk: a chunk has `chunk_steps · envs` rows.
-    #[schemars(extend("unit" = "steps", "source" = "ours"))]
-    pub chunk_steps: u32,
-    /// Chunks an actor may have sent that the learner has not yet committed.
-    #[schemars(extend("unit" = "chunks", "source" = "ours"))]
-    pub window: u32,
-    /// The most actors the run can be scaled to.
-    #[schemars(extend("unit" = "processes", "source" = "ours"))]
-    pub max: u32,
-}
-
-/// With what is learned: no number that is learned depends on it.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(default, deny_unknown_fields)]
-pub struct Learner {
-    /// Threads that share the work of an update where there is enough of it, 1 or 2. Not a bit of what is learned depends
-    /// on them.
-    #[schemars(extend("unit" = "threads", "source" = "ours"))]
-    pub threads: u32,
-}
-
-/// What is remembered, and how often it is used.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(default, deny_unknown_fields)]
-pub struct Replay {
-    /// The newest so many transitions are sampled from.
-    #[schemars(extend("unit" = "transitions", "source" = "section 4.3.1"))]
-    pub capacity: u64,
-    /// Transitions collected before the first update.
-    #[schemars(extend("unit" = "transitions", "source" = "ours"))]
-    pub warmup: u64,
-    /// Updates for each environment step beyond the warm-up. The thesis: 1.
-    #[schemars(extend("unit" = "updates per environment step", "source" = "Algorithm 4"))]
-    pub updates_per_step: f64,
-    /// Steps the actors may be ahead of that ratio before the learner stops taking transitions.
-    #[schemars(extend("unit" = "environment steps", "source" = "ours"))]
-    pub tolerance: u64,
-}
-
-/// How often the policy is judged.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(default, deny_unknown_fields)]
-pub struct Evaluation {
-    /// Environment steps from one evaluation to the next.
-    #[schemars(extend("unit" = "environment steps", "source" = "ours"))]
-    pub every: u64,
-    /// Episodes of an evaluation, always from the same start states.
-    #[schemars(extend("unit" = "episodes", "source" = "ours"))]
-    pub episodes: u32,
-    /// Episodes of the last evaluation, whose mean is the run's result.
-    #[schemars(extend("unit" = "episodes", "source" = "ours"))]
-    pub final_episodes: u32,
-    /// Whether every policy that was judged is kept, not only the best.
-    #[schemars(extend("unit" = "–", "source" = "ours"))]
-    pub keep_policies: bool,
-}
-
-/// How often the learner's state is saved.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(default, deny_unknown_fields)]
-pub struct Checkpoint {
-    /// Seconds between checkpoints of a free run.
-    #[schemars(extend("unit" = "s", "source" = "ours"))]
-    pub every_seconds: f64,
-    /// Updates between checkpoints of a lockstep run.
-    #[schemars(extend("unit" = "updates", "source" = "ours"))]
-    pub every_updates: u64,
-}
-
-impl Evaluation {
-    /// The period that a policy learned from so many environment steps falls into. A policy is judged when no policy of
-    /// its period or a later one was.
-    pub fn period(&self, env_steps: u64) -> u64 {
-        env_steps / self.every
-    }
 }
 
 /// Why a configuration cannot be used.
@@ -204,15 +78,8 @@ pub enum ConfigError {
         message: String,
     },
     /// A value is outside what makes sense.
-    #[error("{key} = {value}: must be {expected}")]
-    OutOfRange {
-        /// The key, with its section.
-        key: &'static str,
-        /// The value found.
-        value: String,
-        /// What would be accepted.
-        expected: String,
-    },
+    #[error(transparent)]
+    OutOfRange(#[from] OutOfRange),
     /// The algorithm does not fit the environment.
     #[error("{algorithm} cannot control {environment}: {cause}; choose another algorithm or another environment")]
     Control {
@@ -295,33 +162,61 @@ impl Config {
         let envs = self.actors.envs as usize;
         match (self.run.mode, self.spec.snapshot_words(envs)) {
             (Mode::Free, _) | (_, 0) => 0,
-            // The actor's own step, and of each environment the state of the noise and the return and length of its episode.
-            (Mode::Lockstep, snapshot) => snapshot + 1 + envs * (self.noise_width() + 2),
+            // The actor's own step, and of each environment the exploration's state and the return and length of its episode.
+            (Mode::Lockstep, snapshot) => {
+                let exploration = self.algorithm.settings().exploration_state_width(&self.spec);
+                snapshot + 1 + envs * (exploration + 2)
+            }
         }
     }
 
-    /// Numbers in the exploration noise's state for each environment.
-    pub fn noise_width(&self) -> usize {
-        match self.algorithm {
-            Algorithm::Ddpg(..) => self.spec.action.width(),
-            _ => 0,
-        }
+    /// Whether every value makes sense, by itself and beside the others.
+    ///
+    /// # Errors
+    /// For the first that does not.
+    pub fn check(&self) -> Result<(), ConfigError> {
+        self.run.check()?;
+        environment::check_spec(&self.spec)?;
+        self.actors.check()?;
+        self.algorithm.check()?;
+        self.algorithm
+            .policy_layout(&self.spec)
+            .map_err(|cause| ConfigError::Control {
+                algorithm: self.algorithm.name(),
+                environment: self.environment.name.clone(),
+                cause,
+            })?;
+        self.replay.check(&self.algorithm)?;
+        self.check_collection()?;
+        self.learner.check_bounds("learner")?;
+        self.evaluation.check_bounds("evaluation")?;
+        Ok(self.checkpoint.check_bounds("checkpoint")?)
     }
 
-    /// A number for all that the rows of the replay and the weights of a checkpoint depend on. Length of the run, number
-    /// of actors and intervals are not among it: those may change when a run is resumed.
-    pub fn fingerprint(&self) -> u64 {
-        let algorithm = match &self.algorithm {
-            // As it was written when there was no other.
-            Algorithm::Ddpg(ddpg, exploration) => format!("{ddpg:?} {exploration:?}"),
-            other => format!("{other:?}"),
+    /// What the algorithm asks of the way its transitions are collected.
+    fn check_collection(&self) -> Result<(), OutOfRange> {
+        let spec = self.algorithm.spec();
+        let only = |key: &str, value: String, only: &str, why: &str| OutOfRange {
+            key: key.into(),
+            value,
+            expected: format!("{only}: {} {why}", spec.name),
         };
-        let identity = format!(
-            "{} {} {:?} {} {:?} {algorithm}",
-            self.run.id, self.run.seed, self.run.mode, self.environment.name, self.environment.parameters,
-        );
-        let digest = Sha256::digest(identity.as_bytes());
-        digest.iter().take(8).fold(0, |word, &byte| word << 8 | u64::from(byte))
+        if !spec.off_policy && self.run.mode == Mode::Free {
+            let why = "learns from what the newest policy does and from nothing older";
+            return Err(only("run.mode", "free".into(), "lockstep", why));
+        }
+        if spec.experience == Experience::Episodes {
+            let why = "learns from whole episodes, each in a chunk of its own";
+            let (limit, steps) = (self.spec.time_limit, self.actors.chunk_steps);
+            if steps != limit {
+                let limit = format!("{limit}, the time limit");
+                return Err(only("actors.chunk_steps", steps.to_string(), &limit, why));
+            }
+            if self.actors.envs != 1 {
+                return Err(only("actors.envs", self.actors.envs.to_string(), "1", why));
+            }
+        }
+        Ok(())
     }
 }
 

@@ -1,5 +1,6 @@
 //! What crosses a process boundary of Shoal, or is shared by every role.
 
+pub mod algorithms;
 pub mod channel;
 pub mod commit;
 pub mod config;
@@ -11,6 +12,7 @@ pub mod policy;
 pub mod policy_file;
 pub mod report;
 pub mod run_dir;
+pub mod section;
 pub mod space;
 pub mod stop;
 pub mod stream;

@@ -1,10 +1,9 @@
-//! The policy of each algorithm as everyone evaluates it who acts: from a flat slice of parameters, in place.
+//! The kinds of policy, as everyone evaluates them who acts: from a flat slice of parameters, in place.
 
 mod scores;
 
 pub use scores::Scores;
 
-use crate::config::{Algorithm, Ddpg, Reinforce};
 use crate::network::{ActionRange, ActionRangeError, NetworkLayout, PolicyNetwork};
 use crate::space::{EnvironmentSpec, Space};
 
@@ -53,14 +52,6 @@ pub enum PolicyError {
 }
 
 impl PolicyLayout {
-    /// The policy that `algorithm` learns in an environment like `spec`.
-    ///
-    /// # Errors
-    /// When it cannot control that environment.
-    pub fn new(algorithm: &Algorithm, spec: &EnvironmentSpec) -> Result<Self, PolicyError> {
-        Ok(Policy::new(algorithm, spec, 0)?.layout())
-    }
-
     /// How many parameters there are.
     pub fn parameters(&self) -> usize {
         match self {
@@ -90,18 +81,6 @@ pub enum Policy {
 }
 
 impl Policy {
-    /// The policy that `algorithm` learns in an environment like `spec`, for at most `batch` observations a call.
-    ///
-    /// # Errors
-    /// When it cannot control that environment.
-    pub fn new(algorithm: &Algorithm, spec: &EnvironmentSpec, batch: usize) -> Result<Self, PolicyError> {
-        Ok(match algorithm {
-            Algorithm::Ddpg(ddpg, _) => Self::Deterministic(deterministic(ddpg, spec, batch)?),
-            Algorithm::Reinforce(reinforce) => Self::Scored(softmax(reinforce, spec, batch)?),
-            Algorithm::QLearning(_) | Algorithm::Sarsa(_) => Self::Scored(table(algorithm.name(), spec, batch)?),
-        })
-    }
-
     /// What its parameters are.
     pub fn layout(&self) -> PolicyLayout {
         match self {
@@ -127,33 +106,38 @@ impl Policy {
     }
 }
 
-/// DDPG's policy in an environment like `spec`, for at most `batch` observations a call.
+/// A deterministic policy with these hidden layers in an environment like `spec`, for at most `batch` observations a call.
 ///
 /// # Errors
 /// When the actions are no real numbers in finite ranges.
-pub fn deterministic(ddpg: &Ddpg, spec: &EnvironmentSpec, batch: usize) -> Result<PolicyNetwork, PolicyError> {
+pub fn deterministic(hidden: [usize; 2], spec: &EnvironmentSpec, batch: usize) -> Result<PolicyNetwork, PolicyError> {
     let range = ActionRange::new(&spec.action)?;
-    let width = spec.observation.width();
-    Ok(PolicyNetwork::new(width, ddpg.hidden, range, batch))
+    Ok(PolicyNetwork::new(spec.observation.width(), hidden, range, batch))
 }
 
-/// REINFORCE's policy in an environment like `spec`, for at most `batch` observations a call.
+/// A softmax policy with these hidden layers in an environment like `spec`, for at most `batch` observations a call;
+/// `algorithm` is named where it does not fit.
 ///
 /// # Errors
 /// When the actions cannot be counted, or the observations are no real numbers.
-pub fn softmax(reinforce: &Reinforce, spec: &EnvironmentSpec, batch: usize) -> Result<Scores, PolicyError> {
-    let algorithm = "reinforce";
+pub fn softmax(
+    algorithm: &'static str,
+    hidden: [usize; 2],
+    spec: &EnvironmentSpec,
+    batch: usize,
+) -> Result<Scores, PolicyError> {
     let actions = counted_actions(algorithm, spec)?;
     match spec.observation {
         Space::Discrete { n } => Err(PolicyError::RealStates { algorithm, n }),
         Space::Box { .. } => {
-            let network = NetworkLayout::policy(spec.observation.width(), reinforce.hidden, actions);
+            let network = NetworkLayout::policy(spec.observation.width(), hidden, actions);
             Ok(Scores::softmax(network, batch))
         }
     }
 }
 
-/// The action-values of the tabular `algorithm` in an environment like `spec`, for at most `batch` observations a call.
+/// A table of action-values in an environment like `spec`, for at most `batch` observations a call; `algorithm` is named where
+/// it does not fit.
 ///
 /// # Errors
 /// When states or actions cannot be counted.
@@ -186,7 +170,6 @@ pub fn highest(scores: &[f32]) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::{Exploration, Tabular};
 
     fn spec(observation: Space, action: Space) -> EnvironmentSpec {
         EnvironmentSpec {
@@ -197,31 +180,10 @@ mod tests {
         }
     }
 
-    fn algorithms() -> [Algorithm; 4] {
-        [
-            Algorithm::Ddpg(Ddpg::default(), Exploration::default()),
-            Algorithm::Reinforce(Reinforce::default()),
-            Algorithm::QLearning(Tabular::default()),
-            Algorithm::Sarsa(Tabular::default()),
-        ]
-    }
-
-    #[test]
-    fn each_algorithm_takes_the_spaces_it_can_control() {
-        let real = || Space::boxed(&[(-1.0, 1.0); 4]);
-        let counted = || Space::Discrete { n: 3 };
-        let takes = |observation: fn() -> Space, action: fn() -> Space| {
-            algorithms().map(|algorithm| PolicyLayout::new(&algorithm, &spec(observation(), action())).is_ok())
-        };
-        assert_eq!(takes(real, real), [true, false, false, false]);
-        assert_eq!(takes(real, counted), [false, true, false, false]);
-        assert_eq!(takes(counted, counted), [false, false, true, true]);
-    }
-
     #[test]
     fn a_table_is_read_state_after_state_and_the_first_of_equals_taken() {
         let lake = spec(Space::Discrete { n: 3 }, Space::Discrete { n: 2 });
-        let mut policy = Policy::new(&Algorithm::QLearning(Tabular::default()), &lake, 4).unwrap();
+        let mut policy = Policy::Scored(table("q-learning", &lake, 4).unwrap());
         assert_eq!(policy.layout().parameters(), 6);
         let mut actions = [f32::NAN; 4];
         policy.act(&[0.0, 1.0, 0.5, 0.5, 2.0, 1.0], &[0.0, 1.0, 2.0, 0.0], &mut actions);

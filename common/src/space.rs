@@ -36,6 +36,14 @@ impl Space {
             Self::Discrete { .. } => 1,
         }
     }
+
+    /// How many indices there are, or how many numbers an element has: the outputs of a network that has one for each.
+    pub fn size(&self) -> usize {
+        match self {
+            Self::Box { low, .. } => low.len(),
+            Self::Discrete { n } => *n as usize,
+        }
+    }
 }
 
 /// What an agent has to know of an environment before its first step.

@@ -20,7 +20,7 @@ use shoal_common::exit::Exit;
 use shoal_common::stop::Stop;
 
 use self::learner::Learner;
-pub use self::settings::{LearnerError, Settings};
+pub use self::settings::{LearnerError, Settings, SizeError, disk_bytes};
 
 /// Learns until the run's steps are taken and learned from, or until `stop`; either way the state is saved.
 ///
@@ -28,14 +28,14 @@ pub use self::settings::{LearnerError, Settings};
 /// When a channel, the replay or a checkpoint cannot be used, or learning diverges.
 pub fn learn(domain: &Domain, settings: &Settings, stop: &Stop) -> Result<(), LearnerError> {
     let mut learner = Learner::new(domain, settings, stop)?;
-    let ended = match settings.mode {
+    let ended = match settings.config.run.mode {
         Mode::Free => free::run(&mut learner),
         Mode::Lockstep => lockstep::run(&mut learner),
     };
     match ended {
         Ok(()) => learner.finish(),
         Err(Exit::Stopped) => {
-            if settings.mode == Mode::Free {
+            if settings.config.run.mode == Mode::Free {
                 learner.take_the_last()?;
             }
             learner.finish()

@@ -196,7 +196,7 @@ const REMARK: &str = "The environment is Gymnasium's: the pole falls at ±12° o
 /// Whether the last policy's scores are the same for all of many states within reach.
 fn is_dead(policies: &Policies) -> anyhow::Result<bool> {
     const STATES: usize = 200;
-    let Policy::Scored(mut scores) = Policy::new(&policies.config.algorithm, &policies.config.spec, STATES)? else {
+    let Policy::Scored(mut scores) = policies.config.algorithm.policy(&policies.config.spec, STATES)? else {
         return Ok(false);
     };
     let mut numbers = stream(policies.config.run.seed, Purpose::Sampling, 0, 0);

@@ -4,7 +4,8 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
-use shoal_common::config::{Actors, Algorithm, Config, Environment};
+use shoal_common::algorithms::Experience;
+use shoal_common::config::{Actors, Algorithm, Config, Environment, IdentityFormat};
 use shoal_common::run_dir::{RunDir, RunLock};
 use shoal_common::space::{EnvironmentSpec, Space};
 use shoal_env_server::environment;
@@ -31,8 +32,8 @@ const FOR_CONTINUOUS_ACTIONS: &str = include_str!("../../presets/gym-continuous.
 const FOR_DISCRETE_ACTIONS: &str = include_str!("../../presets/gym-discrete.toml");
 const FOR_A_TABLE: &str = include_str!("../../presets/gym-table.toml");
 
-/// The key that the program chooses itself.
-pub const FILLED_IN: &str = "run.id";
+/// The keys that the program fills in itself.
+pub const FILLED_IN: [&str; 2] = ["run.id", "run.identity_format"];
 
 /// The presets' names.
 pub fn preset_names() -> impl Iterator<Item = &'static str> {
@@ -163,7 +164,7 @@ fn resolve(mut table: Table, overrides: &RunOverrides, origin: &str) -> anyhow::
             .filter(|(key, _)| key.contains('.'))
             .with_context(|| format!("--set {assignment}: must look like SECTION.KEY=VALUE"))?;
         let path: Vec<&str> = key.split('.').collect();
-        if path[0] == "spec" || key == FILLED_IN {
+        if path[0] == "spec" || FILLED_IN.contains(&key) {
             bail!("--set {assignment}: {key} is not for choosing: the program fills it in");
         }
         put(&mut table, &path, value_of(value)).with_context(|| format!("--set {assignment}"))?;
@@ -184,6 +185,8 @@ fn resolve(mut table: Table, overrides: &RunOverrides, origin: &str) -> anyhow::
         &["run", "id"],
         format!("{:08x}", rand::random::<u32>()).into(),
     )?;
+    let format = i64::from(u32::from(IdentityFormat::NEWEST));
+    put(&mut table, &["run", "identity_format"], format.into())?;
     describe_environment(&mut table)?;
     let mut config = Config::from_table(table, origin)?;
     // Also a short run ends with its policy judged.
@@ -245,11 +248,15 @@ fn suit(table: &mut Table, spec: &EnvironmentSpec) -> anyhow::Result<()> {
         (Space::Discrete { .. }, Space::Discrete { .. }) => FOR_A_TABLE,
     };
     let mut method: Table = text.parse()?;
-    let is_another = |name: &&str| table.contains_key(*name) && !method.contains_key(*name);
-    if Algorithm::NAMES.iter().any(is_another) {
+    let algorithms = Algorithm::all();
+    let is_another = |name: &str| table.contains_key(name) && !method.contains_key(name);
+    if algorithms.iter().any(|algorithm| is_another(algorithm.name())) {
         return Ok(());
     }
-    if method.contains_key("reinforce") {
+    let chosen = algorithms
+        .iter()
+        .find(|algorithm| method.contains_key(algorithm.name()));
+    if chosen.is_some_and(|algorithm| algorithm.spec().experience == Experience::Episodes) {
         // A chunk is an episode.
         put(&mut method, &["actors", "chunk_steps"], spec.time_limit.into())?;
     }

@@ -59,9 +59,7 @@ fn check_shared_memory(config: &Config) -> anyhow::Result<()> {
 
 fn check_disk(config: &Config, run: &RunDir) -> anyhow::Result<()> {
     let place = existing(run.path());
-    let Some(need) = needs::disk(config, run) else {
-        bail!("replay.capacity = {}: no file can be so large", config.replay.capacity);
-    };
+    let need = needs::disk(config, run)?;
     let status =
         rustix::fs::statvfs(&place).with_context(|| format!("cannot ask how much room {} has", place.display()))?;
     let free = status.f_bavail * status.f_frsize;

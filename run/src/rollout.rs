@@ -194,11 +194,17 @@ fn same_spec(config: &Config, said: &EnvironmentSpec) -> anyhow::Result<()> {
 
 /// What a policy file of this run must hold.
 pub fn policy_layout(config: &Config) -> anyhow::Result<PolicyLayout> {
-    PolicyLayout::new(&config.algorithm, &config.spec).with_context(|| config.environment.name.clone())
+    config
+        .algorithm
+        .policy_layout(&config.spec)
+        .with_context(|| config.environment.name.clone())
 }
 
 fn policy_of(config: &Config) -> anyhow::Result<Policy> {
-    Policy::new(&config.algorithm, &config.spec, 1).with_context(|| config.environment.name.clone())
+    config
+        .algorithm
+        .policy(&config.spec, 1)
+        .with_context(|| config.environment.name.clone())
 }
 
 #[cfg(test)]

@@ -3,9 +3,7 @@
 use shoal_common::channel::control::RunStatus;
 use shoal_common::commit::{CommitReader, OpenError};
 use shoal_common::config::Config;
-use shoal_common::report::Identity;
 use shoal_common::run_dir::RunDir;
-use shoal_learner::process as learner;
 use shoal_learner::process::checkpoint::Checkpoints;
 use shoal_learner::process::ratio::Ratio;
 
@@ -75,33 +73,5 @@ pub fn ratio(status: &RunStatus, warmup: u64) -> f64 {
     match status.env_steps.saturating_sub(warmup) {
         0 => 0.0,
         beyond => status.updates as f64 / beyond as f64,
-    }
-}
-
-/// What the learner of a run is told.
-pub fn learner_settings(config: &Config, run: &RunDir, identity: Identity, judged: Option<u64>) -> learner::Settings {
-    learner::Settings {
-        identity,
-        seed: config.run.seed,
-        mode: config.run.mode,
-        steps: config.run.steps,
-        actors: config.actors.count,
-        max_actors: config.actors.max,
-        window: config.actors.window,
-        chunk: config.chunk_layout(),
-        spec: config.spec.clone(),
-        algorithm: config.algorithm.clone(),
-        threads: config.learner.threads,
-        envs: config.actors.envs,
-        episodes: config.run.episodes,
-        ratio: Ratio::from(&config.replay),
-        capacity: config.replay.capacity,
-        evaluation: config.evaluation.clone(),
-        judged,
-        checkpoint: config.checkpoint.clone(),
-        fingerprint: config.fingerprint(),
-        replay: run.replay_file(),
-        checkpoints: run.checkpoints(),
-        last_policy: run.last_policy(),
     }
 }

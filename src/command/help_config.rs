@@ -143,6 +143,7 @@ fn tell(text: &mut String, key: &Key, value: Option<&Value>) {
         unit,
         source,
         choices,
+        bounds,
     } = key;
     let value = match value {
         Some(Value::String(word)) if word.is_empty() => String::new(),
@@ -153,6 +154,9 @@ fn tell(text: &mut String, key: &Key, value: Option<&Value>) {
     let _ = writeln!(text, "      {meaning}");
     if !choices.is_empty() {
         let _ = writeln!(text, "      One of {}.", choices.join(", "));
+    }
+    if !bounds.is_empty() {
+        let _ = writeln!(text, "      A number {bounds}.");
     }
 }
 

@@ -7,7 +7,6 @@ use shoal_common::stream::{Purpose, stream};
 use shoal_common::transition::Transition;
 use shoal_env_server::environment::frozen_lake::{ACTIONS, STATES};
 use shoal_env_server::vector::{Start, VectorEnvironment};
-use shoal_learner::algorithms::algorithm::Room;
 use shoal_learner::algorithms::registry;
 use shoal_learner::networks::digest::sha256;
 use shoal_learner::replay::{ChunkMark, Replay, ReplayLayout};
@@ -39,7 +38,7 @@ impl World {
         let streams = stream(seed, Purpose::Exploration, 0, 0);
         let mut world = Self {
             environment: VectorEnvironment::new(&environment.name, &environment.parameters, 1, seed, 0, 0).unwrap(),
-            exploration: Exploration::new(&config.algorithm, spec, 1, streams).unwrap(),
+            exploration: Exploration::new(config.algorithm.behaviour(spec, 1).unwrap(), 1, streams),
             response: vec![0.0; ResponseLayout::new(1, spec.observation.width()).len()],
             t: 0,
             s: vec![0.0; spec.observation.width()],
@@ -122,13 +121,7 @@ pub(crate) fn tabular(config: &Config) -> (String, u64, usize) {
 pub(crate) fn reinforce(config: &Config) -> String {
     let place = tempfile::tempdir().unwrap();
     let chunk = config.chunk_layout();
-    let room = Room {
-        capacity: config.replay.capacity,
-        chunk_rows: chunk.rows,
-        actors: 1,
-        envs: 1,
-    };
-    let mut learner = registry::new(&config.algorithm, &config.spec, config.run.seed, room).unwrap();
+    let mut learner = registry::new(config).unwrap();
     let layout = ReplayLayout {
         row: chunk.row,
         ring: config.replay.capacity,

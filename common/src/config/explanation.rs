@@ -1,109 +1,36 @@
-//! What each key of a configuration means, in words. The words are the doc comments of the fields; unit and source stand
-//! beside them as attributes.
+//! Every section that somebody may write, with its keys.
 
-use schemars::{JsonSchema, schema_for};
-use serde::Serialize;
-use serde_json::Value;
-use toml::Table;
+pub use crate::section::{Key, Section, keys};
 
-use super::{Actors, Checkpoint, Ddpg, Environment, Evaluation, Exploration, Learner, Reinforce, Replay, Run, Tabular};
+use super::{Actors, Algorithm, Checkpoint, Environment, Evaluation, Exploration, Learner, Replay, Run};
+use crate::section::describe;
 
-/// What is to be known of a key.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Key {
-    /// The key within its section.
-    pub name: String,
-    /// What it is: whole sentences on one line.
-    pub meaning: String,
-    /// What a number of it counts or measures; `–` for a pure number and for what is no number.
-    pub unit: String,
-    /// Where its default comes from: a place in the thesis, or `ours`.
-    pub source: String,
-    /// What it may be, where that can be listed.
-    pub choices: Vec<String>,
-}
-
-/// A section of `config.toml`, but for an environment's own parameters.
-#[derive(Clone, Debug)]
-pub struct Section {
-    /// Its name.
-    pub name: &'static str,
-    /// Its keys.
-    pub keys: Vec<Key>,
-    /// What the keys are where nothing else is said; some have no default.
-    pub defaults: Table,
-}
-
-/// Every section that somebody may write, those of all algorithms included.
+/// Every section that somebody may write, those of all algorithms included, but without an environment's own parameters.
 pub fn sections() -> Vec<Section> {
-    vec![
-        section::<Run>("run"),
-        Section {
-            name: "environment",
-            keys: keys::<Environment>(),
-            defaults: Table::new(),
-        },
-        section::<Actors>("actors"),
-        section::<Ddpg>("ddpg"),
-        section::<Exploration>("exploration"),
-        section::<Reinforce>("reinforce"),
-        section::<Tabular>("q-learning"),
-        section::<Tabular>("sarsa"),
-        section::<Learner>("learner"),
-        section::<Replay>("replay"),
-        section::<Evaluation>("evaluation"),
-        section::<Checkpoint>("checkpoint"),
-    ]
-}
-
-fn section<T: JsonSchema + Default + Serialize>(name: &'static str) -> Section {
-    Section {
-        name,
-        keys: keys::<T>(),
-        // Every default is a number, a word or a list of them.
-        defaults: Table::try_from(T::default()).unwrap_or_default(),
-    }
-}
-
-/// The keys of a section whose type is `T`; what is not said of one is empty.
-pub fn keys<T: JsonSchema>() -> Vec<Key> {
-    let schema = schema_for!(T).to_value();
-    let text = |property: &Value, what: &str| property[what].as_str().unwrap_or_default().replace('\n', " ");
-    let properties = schema["properties"].as_object().into_iter().flatten();
-    let key = properties.map(|(name, property)| Key {
-        name: name.clone(),
-        meaning: text(property, "description"),
-        unit: text(property, "unit"),
-        source: text(property, "source"),
-        choices: choices(&schema, property),
-    });
-    key.collect()
-}
-
-/// The words that a property may be.
-fn choices(schema: &Value, property: &Value) -> Vec<String> {
-    if property["type"] == "boolean" {
-        return vec!["false".into(), "true".into()];
-    }
-    let place = property["$ref"].as_str().and_then(|place| place.strip_prefix('#'));
-    let Some(named) = place.and_then(|place| schema.pointer(place)) else {
-        return Vec::new();
+    let environment = Section {
+        name: "environment",
+        keys: keys::<Environment>(),
+        defaults: toml::Table::new(),
     };
-    let words = |list: &Value, of: fn(&Value) -> Option<&str>| -> Vec<String> {
-        let list = list.as_array().into_iter().flatten();
-        list.filter_map(of).map(str::to_owned).collect()
-    };
-    let mut all = words(&named["enum"], Value::as_str);
-    all.extend(words(&named["oneOf"], |one| one["const"].as_str()));
+    let mut all = vec![describe::<Run>("run"), environment, describe::<Actors>("actors")];
+    all.extend(Algorithm::sections());
+    all.extend([
+        describe::<Exploration>("exploration"),
+        describe::<Learner>("learner"),
+        describe::<Replay>("replay"),
+        describe::<Evaluation>("evaluation"),
+        describe::<Checkpoint>("checkpoint"),
+    ]);
     all
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::{Ddpg, Reinforce};
 
     #[test]
-    fn a_key_is_explained_by_its_comment_and_its_attributes() {
+    fn a_key_is_explained_by_its_declaration() {
         let ddpg = keys::<Ddpg>();
         let tau = ddpg.iter().find(|key| key.name == "tau").unwrap();
         assert_eq!(
@@ -111,15 +38,20 @@ mod tests {
             "τ, how far the target networks follow in one update (equation 3.31)."
         );
         assert_eq!(
-            (tau.unit.as_str(), tau.source.as_str()),
-            ("–", "equation 3.31, section 4.3.1")
+            (tau.unit.as_str(), tau.source.as_str(), tau.bounds.as_str()),
+            ("–", "equation 3.31, section 4.3.1", "above 0 and at most 1")
         );
         let weight = keys::<Reinforce>()
             .into_iter()
             .find(|key| key.name == "weight")
             .unwrap();
         assert_eq!(weight.choices, ["return", "normalised", "baseline"]);
+        assert_eq!(weight.bounds, "");
         let mode = keys::<Run>().into_iter().find(|key| key.name == "mode").unwrap();
         assert_eq!(mode.choices, ["free", "lockstep"]);
+        assert!(
+            ddpg.iter().all(|key| key.name != "exploration"),
+            "it has a section of its own"
+        );
     }
 }

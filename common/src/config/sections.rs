@@ -1,15 +1,15 @@
 //! The configuration as it is written: a section for each part, and of the algorithms' sections one at most.
 
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Serialize, Serializer};
+use toml::{Table, Value};
 
 use super::{
-    Actors, Algorithm, Checkpoint, Config, Ddpg, Environment, Evaluation, Exploration, Learner, Reinforce, Replay, Run,
-    Tabular,
+    Actors, Algorithm, Checkpoint, Config, Environment, Evaluation, Exploration, Learner, Replay, Run, explanation,
 };
 use crate::space::EnvironmentSpec;
 
-#[derive(Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+/// What is read.
+#[derive(Deserialize)]
 pub(super) struct Sections {
     run: Run,
     environment: Environment,
@@ -17,11 +17,6 @@ pub(super) struct Sections {
     #[serde(default)]
     actors: Actors,
     exploration: Option<Exploration>,
-    ddpg: Option<Ddpg>,
-    reinforce: Option<Reinforce>,
-    #[serde(rename = "q-learning")]
-    q_learning: Option<Tabular>,
-    sarsa: Option<Tabular>,
     #[serde(default)]
     learner: Learner,
     #[serde(default)]
@@ -30,37 +25,44 @@ pub(super) struct Sections {
     evaluation: Evaluation,
     #[serde(default)]
     checkpoint: Checkpoint,
+    /// Those of algorithms, and what is no section.
+    #[serde(flatten)]
+    others: Table,
+}
+
+/// What is written.
+#[derive(Serialize)]
+struct Written<'a> {
+    run: &'a Run,
+    environment: &'a Environment,
+    spec: &'a EnvironmentSpec,
+    actors: &'a Actors,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    exploration: Option<&'a Exploration>,
+    /// A section with the algorithm's name.
+    #[serde(flatten)]
+    algorithm: &'a Algorithm,
+    learner: &'a Learner,
+    replay: &'a Replay,
+    evaluation: &'a Evaluation,
+    checkpoint: &'a Checkpoint,
 }
 
 impl TryFrom<Sections> for Config {
     type Error = String;
 
     fn try_from(sections: Sections) -> Result<Self, String> {
-        let named: Vec<Algorithm> = [
-            sections.reinforce.map(Algorithm::Reinforce),
-            sections.q_learning.map(Algorithm::QLearning),
-            sections.sarsa.map(Algorithm::Sarsa),
-        ]
-        .into_iter()
-        .flatten()
-        .collect();
-        let algorithm = match (named.as_slice(), sections.ddpg, sections.exploration) {
-            ([], ddpg, exploration) => Algorithm::Ddpg(ddpg.unwrap_or_default(), exploration.unwrap_or_default()),
-            ([one], None, None) => one.clone(),
-            ([one], None, Some(_)) => {
+        let mut algorithm = one_algorithm(sections.others)?;
+        if let Some(exploration) = sections.exploration {
+            // Only DDPG's noise has a section of its own.
+            let Algorithm::Ddpg(ddpg) = &mut algorithm else {
                 return Err(format!(
                     "[exploration] is the noise of ddpg, and this is a configuration for {}",
-                    one.name()
+                    algorithm.name()
                 ));
-            }
-            ([one, ..], ddpg, _) => {
-                let other = if ddpg.is_some() { "ddpg" } else { named[1].name() };
-                return Err(format!(
-                    "there are sections for two algorithms, [{}] and [{other}]: keep one",
-                    one.name()
-                ));
-            }
-        };
+            };
+            ddpg.exploration = exploration;
+        }
         Ok(Self {
             run: sections.run,
             environment: sections.environment,
@@ -75,32 +77,45 @@ impl TryFrom<Sections> for Config {
     }
 }
 
-impl From<Config> for Sections {
-    fn from(config: Config) -> Self {
-        let mut sections = Self {
-            run: config.run,
-            environment: config.environment,
-            spec: config.spec,
-            actors: config.actors,
-            exploration: None,
-            ddpg: None,
-            reinforce: None,
-            q_learning: None,
-            sarsa: None,
-            learner: config.learner,
-            replay: config.replay,
-            evaluation: config.evaluation,
-            checkpoint: config.checkpoint,
-        };
-        match config.algorithm {
-            Algorithm::Ddpg(ddpg, exploration) => {
-                (sections.ddpg, sections.exploration) = (Some(ddpg), Some(exploration));
-            }
-            Algorithm::Reinforce(reinforce) => sections.reinforce = Some(reinforce),
-            Algorithm::QLearning(tabular) => sections.q_learning = Some(tabular),
-            Algorithm::Sarsa(tabular) => sections.sarsa = Some(tabular),
+/// The algorithm that has a section, or the default one where none has.
+fn one_algorithm(mut sections: Table) -> Result<Algorithm, String> {
+    let names = Algorithm::all().into_iter().map(|algorithm| algorithm.name());
+    let named: Vec<(&str, Value)> = names.filter_map(|name| Some((name, sections.remove(name)?))).collect();
+    if let Some(unknown) = sections.keys().next() {
+        let known = explanation::sections().into_iter().map(|section| section.name);
+        let known: Vec<String> = known.chain(["spec"]).map(|name| format!("`{name}`")).collect();
+        return Err(format!(
+            "unknown field `{unknown}`, expected one of {}",
+            known.join(", ")
+        ));
+    }
+    if let [(one, _), (other, _), ..] = named.as_slice() {
+        return Err(format!(
+            "there are sections for two algorithms, [{one}] and [{other}]: keep one"
+        ));
+    }
+    let read = named
+        .into_iter()
+        .find_map(|(name, section)| Algorithm::read(name, section));
+    read.unwrap_or_else(|| Ok(Algorithm::default()))
+        .map_err(|error| error.message().to_owned())
+}
+
+impl Serialize for Config {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        Written {
+            run: &self.run,
+            environment: &self.environment,
+            spec: &self.spec,
+            actors: &self.actors,
+            exploration: self.algorithm.ddpg().map(|ddpg| &ddpg.exploration),
+            algorithm: &self.algorithm,
+            learner: &self.learner,
+            replay: &self.replay,
+            evaluation: &self.evaluation,
+            checkpoint: &self.checkpoint,
         }
-        sections
+        .serialize(serializer)
     }
 }
 
@@ -128,9 +143,10 @@ mod tests {
     #[test]
     fn one_algorithm_is_enough() {
         for (text, part) in [
-            ("[ddpg]\n[sarsa]", "[sarsa] and [ddpg]"),
+            ("[sarsa]\n[ddpg]", "[ddpg] and [sarsa]"),
             ("[reinforce]\n[q-learning]", "[reinforce] and [q-learning]"),
             ("[reinforce]\n[exploration]", "[exploration] is the noise of ddpg"),
+            ("[td4]", "unknown field `td4`, expected one of `run`, "),
         ] {
             let message = algorithm(text).unwrap_err();
             assert!(message.contains(part), "{message}");

@@ -1,11 +1,28 @@
 //! What a learning method is to the learner's process.
 
-use shoal_common::policy::PolicyLayout;
+use shoal_common::config::Config;
+use shoal_common::policy::{PolicyError, PolicyLayout};
+use shoal_common::space::EnvironmentSpec;
 
 use crate::networks::threads::Threads;
 use crate::replay::Replay;
 
-/// A learning method: what it does with the rows of the replay, what actors act with, and what a checkpoint keeps of it.
+/// A learning method by its settings, before it learns.
+pub trait Method {
+    /// The learner of an environment like `spec`, before its first update; its first weights are drawn from `seed`.
+    ///
+    /// # Errors
+    /// When the method cannot control that environment.
+    fn start(&self, spec: &EnvironmentSpec, seed: u64, room: Room) -> Result<Box<dyn Algorithm>, PolicyError>;
+
+    /// Names of the sections that hold what was learned, as opposed to what the learning remembers.
+    fn weights(&self) -> &'static [&'static str];
+
+    /// Numbers in all sections of the learner's state.
+    fn state_numbers(&self, spec: &EnvironmentSpec, room: Room) -> usize;
+}
+
+/// A learner at work: what it does with the rows of the replay, what actors act with, and what a checkpoint keeps of it.
 pub trait Algorithm {
     /// The policy's parameters.
     fn policy(&self) -> &[f32];
@@ -61,6 +78,17 @@ pub struct Room {
     pub envs: u32,
 }
 
+impl From<&Config> for Room {
+    fn from(config: &Config) -> Self {
+        Self {
+            capacity: config.replay.capacity,
+            chunk_rows: config.chunk_rows(),
+            actors: config.actors.count,
+            envs: config.actors.envs,
+        }
+    }
+}
+
 /// A method's state as a checkpoint gives it back: numbers by name.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct SavedState(Vec<(String, Vec<f32>)>);
@@ -79,24 +107,30 @@ impl From<Vec<(String, Vec<f32>)>> for SavedState {
     }
 }
 
+impl SectionError {
+    /// A section has not as many numbers as it should.
+    pub(super) fn of_length(name: &str, found: usize, expected: usize) -> Self {
+        Self {
+            name: name.into(),
+            reason: format!("has {found} numbers instead of {expected}"),
+        }
+    }
+}
+
 impl SavedState {
     /// Takes out a section.
     ///
     /// # Errors
     /// When it is not there, or has not `length` numbers.
     pub fn take(&mut self, name: &str, length: usize) -> Result<Vec<f32>, SectionError> {
-        let error = |reason| SectionError {
+        let at = self.0.iter().position(|(found, _)| found == name);
+        let at = at.ok_or_else(|| SectionError {
             name: name.into(),
-            reason,
-        };
-        let at = self
-            .0
-            .iter()
-            .position(|(found, _)| found == name)
-            .ok_or_else(|| error("is missing".into()))?;
+            reason: "is missing".into(),
+        })?;
         match self.0[at].1.len() {
             found if found == length => Ok(self.0.swap_remove(at).1),
-            found => Err(error(format!("has {found} numbers instead of {length}"))),
+            found => Err(SectionError::of_length(name, found, length)),
         }
     }
 }

@@ -8,10 +8,11 @@ pub mod replayed;
 
 use nalgebra::{DMatrix, DVector};
 use shoal_common::config;
-use shoal_common::network::{ActionRange, ActionRangeError, NetworkLayout};
+use shoal_common::network::{ActionRange, NetworkLayout};
+use shoal_common::policy::PolicyError;
 use shoal_common::space::EnvironmentSpec;
 
-use super::algorithm::Losses;
+use super::algorithm::{Losses, SectionError};
 use super::minibatch::Minibatch;
 use crate::networks::adam::Adam;
 use crate::networks::aligned::Aligned;
@@ -20,61 +21,6 @@ use crate::networks::initialise::initialise;
 use crate::networks::pass::{Pass, Samples};
 use crate::networks::product;
 use crate::networks::threads::Threads;
-
-/// What a person may choose about the algorithm. The discount γ is not here: it is in each transition.
-#[derive(Clone, Debug, PartialEq)]
-pub struct DdpgSettings {
-    /// Target rate τ, in (0, 1].
-    pub tau: f64,
-    /// Adam's step for θ_μ.
-    pub actor_learning_rate: f64,
-    /// Adam's step for θ_Q.
-    pub critic_learning_rate: f64,
-    /// Units in the hidden layers of both networks.
-    pub hidden: [usize; 2],
-    /// Transitions in a minibatch, N.
-    pub batch: usize,
-}
-
-impl From<&config::Ddpg> for DdpgSettings {
-    fn from(ddpg: &config::Ddpg) -> Self {
-        Self {
-            tau: ddpg.tau,
-            actor_learning_rate: ddpg.actor_learning_rate,
-            critic_learning_rate: ddpg.critic_learning_rate,
-            hidden: ddpg.hidden,
-            batch: ddpg.batch,
-        }
-    }
-}
-
-/// Why a [`Ddpg`] cannot be made or restored.
-#[derive(Clone, Debug, PartialEq, thiserror::Error)]
-pub enum DdpgError {
-    /// The environment's actions are not real numbers in finite ranges.
-    #[error("DDPG cannot control this environment: {0}")]
-    Action(#[from] ActionRangeError),
-    /// A setting is outside its range.
-    #[error("DDPG's {setting} is {value}, but must be {must}")]
-    Setting {
-        /// Its name in [`DdpgSettings`].
-        setting: &'static str,
-        /// What it is.
-        value: f64,
-        /// What it must be.
-        must: &'static str,
-    },
-    /// Numbers to restore belong to networks of other sizes.
-    #[error("{part} holds {found} numbers, but these networks need {expected}")]
-    Length {
-        /// Which of [`DdpgState`]'s parts.
-        part: &'static str,
-        /// Numbers it holds.
-        found: usize,
-        /// Numbers it must hold.
-        expected: usize,
-    },
-}
 
 /// Everything an update changes, as a checkpoint keeps it.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -158,9 +104,11 @@ pub struct Ddpg {
 }
 
 impl Ddpg {
-    /// New networks, drawn from `seed`.
-    pub fn new(spec: &EnvironmentSpec, settings: &DdpgSettings, seed: u64) -> Result<Self, DdpgError> {
-        check(settings)?;
+    /// New networks, drawn from `seed`. The settings are those of a checked configuration.
+    ///
+    /// # Errors
+    /// When the environment's actions are not real numbers in finite ranges.
+    pub fn new(spec: &EnvironmentSpec, settings: &config::Ddpg, seed: u64) -> Result<Self, PolicyError> {
         let range = ActionRange::new(&spec.action)?;
         let (observation, action, batch) = (spec.observation.width(), range.width(), settings.batch);
         let mu = NetworkLayout::policy(observation, settings.hidden, action);
@@ -341,7 +289,10 @@ impl Ddpg {
     }
 
     /// Starts again from given networks (actor, critic, target actor, target critic), with optimisers that took no step.
-    pub fn restart_from(&mut self, networks: [&[f32]; 4]) -> Result<(), DdpgError> {
+    ///
+    /// # Errors
+    /// When they are of other sizes; nothing is changed then.
+    pub fn restart_from(&mut self, networks: [&[f32]; 4]) -> Result<(), SectionError> {
         let [actor, critic] =
             [self.actor.parameters.len(), self.critic.parameters.len()].map(|length| vec![0.0; length]);
         let [mu, q, target_mu, target_q] = networks;
@@ -351,15 +302,14 @@ impl Ddpg {
         })
     }
 
-    /// Goes back to a state, of this or of another [`Ddpg`] with networks of the same sizes. An error changes nothing.
-    pub fn restore(&mut self, state: &DdpgState<'_>) -> Result<(), DdpgError> {
+    /// Goes back to a state, of this or of another [`Ddpg`] with networks of the same sizes.
+    ///
+    /// # Errors
+    /// When the sizes are others; nothing is changed then.
+    pub fn restore(&mut self, state: &DdpgState<'_>) -> Result<(), SectionError> {
         for ((part, own), given) in DdpgState::PARTS.into_iter().zip(self.state().parts).zip(state.parts) {
             if given.len() != own.len() {
-                return Err(DdpgError::Length {
-                    part,
-                    found: given.len(),
-                    expected: own.len(),
-                });
+                return Err(SectionError::of_length(part, given.len(), own.len()));
             }
         }
         let (actor, critic) = (&mut self.actor, &mut self.critic);
@@ -396,38 +346,6 @@ fn act(mu: &mut Pass, range: &ActionRange, parameters: &[f32], s: &[f32], action
 fn mean(numbers: impl ExactSizeIterator<Item = f32>) -> f32 {
     let count = numbers.len() as f32;
     numbers.sum::<f32>() / count
-}
-
-fn check(settings: &DdpgSettings) -> Result<(), DdpgError> {
-    let rate = |rate: f64| rate.is_finite() && rate > 0.0;
-    let [h1, h2] = settings.hidden;
-    let size = "at least 1";
-    let checks = [
-        (
-            "tau",
-            settings.tau,
-            settings.tau > 0.0 && settings.tau <= 1.0,
-            "above 0 and at most 1",
-        ),
-        (
-            "actor_learning_rate",
-            settings.actor_learning_rate,
-            rate(settings.actor_learning_rate),
-            "above 0",
-        ),
-        (
-            "critic_learning_rate",
-            settings.critic_learning_rate,
-            rate(settings.critic_learning_rate),
-            "above 0",
-        ),
-        ("hidden", h1.min(h2) as f64, h1.min(h2) > 0, size),
-        ("batch", settings.batch as f64, settings.batch > 0, size),
-    ];
-    match checks.into_iter().find(|(_, _, good, _)| !good) {
-        Some((setting, value, _, must)) => Err(DdpgError::Setting { setting, value, must }),
-        None => Ok(()),
-    }
 }
 
 #[cfg(test)]

@@ -1,49 +1,76 @@
-//! The learning methods there are.
+//! The learning methods there are: a line for each.
 
-use shoal_common::config;
+use shoal_common::config::{self, Config};
 use shoal_common::policy::PolicyError;
-use shoal_common::space::EnvironmentSpec;
 
-use super::algorithm::{Algorithm, Room};
-use super::ddpg::replayed::ReplayedDdpg;
-use super::ddpg::{DdpgError, DdpgState};
-use super::reinforce::Reinforce;
-use super::tabular::{Method, Tabular};
+use super::algorithm::{Algorithm, Method, Room};
+use super::tabular;
 
-/// Why a method cannot learn.
-#[derive(Debug, thiserror::Error)]
-pub enum AlgorithmError {
-    /// It cannot control the environment.
-    #[error(transparent)]
-    Policy(#[from] PolicyError),
-    /// DDPG cannot be made so.
-    #[error(transparent)]
-    Ddpg(#[from] DdpgError),
+/// The method that learns by the settings of a configuration.
+fn method(algorithm: &config::Algorithm) -> Box<dyn Method + '_> {
+    match algorithm {
+        config::Algorithm::Ddpg(settings) => Box::new(settings),
+        config::Algorithm::Reinforce(settings) => Box::new(settings),
+        config::Algorithm::QLearning(settings) => Box::new(tabular::QLearning(settings)),
+        config::Algorithm::Sarsa(settings) => Box::new(tabular::Sarsa(settings)),
+    }
 }
 
-/// The method of a configuration, before its first update.
+/// The learner of a configuration, before its first update.
 ///
 /// # Errors
-/// When it cannot control the environment, or a number is out of range.
-pub fn new(
-    algorithm: &config::Algorithm,
-    spec: &EnvironmentSpec,
-    seed: u64,
-    room: Room,
-) -> Result<Box<dyn Algorithm>, AlgorithmError> {
-    Ok(match algorithm {
-        config::Algorithm::Ddpg(ddpg, _) => Box::new(ReplayedDdpg::new(spec, ddpg, seed, room.capacity)?),
-        config::Algorithm::Reinforce(reinforce) => Box::new(Reinforce::new(reinforce, spec, seed, room)?),
-        config::Algorithm::QLearning(tabular) => Box::new(Tabular::new(Method::QLearning, tabular, spec, room)?),
-        config::Algorithm::Sarsa(tabular) => Box::new(Tabular::new(Method::Sarsa, tabular, spec, room)?),
-    })
+/// When the method cannot control the environment.
+pub fn new(config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
+    method(&config.algorithm).start(&config.spec, config.run.seed, Room::from(config))
 }
 
-/// Names of the sections that hold what was learned, as opposed to what the learning remembers.
+/// Names of the sections of a checkpoint that hold what was learned, as opposed to what the learning remembers.
 pub fn weights(algorithm: &config::Algorithm) -> &'static [&'static str] {
-    match algorithm {
-        config::Algorithm::Ddpg(..) => &DdpgState::PARTS[..4],
-        config::Algorithm::Reinforce(_) => &Reinforce::WEIGHTS,
-        config::Algorithm::QLearning(_) | config::Algorithm::Sarsa(_) => &Tabular::WEIGHTS,
+    method(algorithm).weights()
+}
+
+/// Numbers in the state of that learner, without making it.
+pub fn state_numbers(config: &Config) -> usize {
+    method(&config.algorithm).state_numbers(&config.spec, Room::from(config))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn config(rest: &str) -> Config {
+        let text = format!("[run]\nid = \"1a\"\nmode = \"lockstep\"\n[environment]\nname = \"x\"\n{rest}");
+        Config::from_table(text.parse().unwrap(), "test").unwrap()
+    }
+
+    #[test]
+    fn the_size_of_a_state_and_its_weights_are_known_before_it_is_made() {
+        let real = "box = { low = [-1.0, -1.0], high = [1.0, 1.0] }";
+        let in_order = "[replay]\nwarmup = 0\n[spec]\ntime_limit = 8";
+        for (rest, observation, action) in [
+            ("[ddpg]\nhidden = [7, 5]\n[spec]\ntime_limit = 8", real, real),
+            (&format!("[reinforce]\n{in_order}"), real, "discrete.n = 3"),
+            (
+                &format!("[reinforce]\nweight = \"baseline\"\n{in_order}"),
+                real,
+                "discrete.n = 3",
+            ),
+            (
+                &format!("[actors]\nenvs = 3\n[q-learning]\n{in_order}"),
+                "discrete.n = 5",
+                "discrete.n = 3",
+            ),
+            (&format!("[sarsa]\n{in_order}"), "discrete.n = 5", "discrete.n = 3"),
+        ] {
+            let config = config(&format!("{rest}\nobservation.{observation}\naction.{action}\n"));
+            let learner = new(&config).unwrap();
+            let state = learner.state();
+            let numbers: usize = state.iter().map(|(_, numbers)| numbers.len()).sum();
+            assert_eq!(state_numbers(&config), numbers, "{rest}");
+            let named = |name: &&str| state.iter().any(|(section, _)| section == name);
+            let weights = weights(&config.algorithm);
+            // The baseline's are there where there is one.
+            assert!(weights.iter().filter(|name| **name != "baseline").all(named), "{rest}");
+        }
     }
 }

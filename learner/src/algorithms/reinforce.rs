@@ -8,13 +8,14 @@
 //! `docs/REPRODUCTION.md`.
 
 use nalgebra::DMatrix;
+use shoal_common::algorithms::AlgorithmSettings;
 use shoal_common::config::{self, Weight};
 use shoal_common::network::NetworkLayout;
 use shoal_common::policy::{self, PolicyError, PolicyLayout};
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::transition::Transition;
 
-use super::algorithm::{Algorithm, Losses, Room, SavedState, Section, SectionError};
+use super::algorithm::{Algorithm, Losses, Method, Room, SavedState, Section, SectionError};
 use crate::networks::adam::Adam;
 use crate::networks::aligned::Aligned;
 use crate::networks::initialise::glorot;
@@ -84,7 +85,7 @@ pub struct Reinforce {
 
 impl Reinforce {
     /// Names of the sections that hold what was learned.
-    pub(crate) const WEIGHTS: [&'static str; 2] = ["policy", "baseline"];
+    const WEIGHTS: [&'static str; 2] = ["policy", "baseline"];
     const MOMENTS: [[&'static str; 2]; 2] = [
         ["policy's first moment", "policy's second moment"],
         ["baseline's first moment", "baseline's second moment"],
@@ -102,7 +103,7 @@ impl Reinforce {
         room: Room,
     ) -> Result<Self, PolicyError> {
         let observation = spec.observation.width();
-        let actions = policy::softmax(settings, spec, 0)?.actions();
+        let actions = policy::softmax("reinforce", settings.hidden, spec, 0)?.actions();
         let steps = room.chunk_rows * room.actors as usize;
         let network = NetworkLayout::policy(observation, settings.hidden, actions);
         let baseline = (settings.weight == Weight::Baseline).then(|| {
@@ -218,6 +219,22 @@ fn mean_and_spread(numbers: &[f32]) -> (f32, f32) {
 fn ln_sum_exp(logits: &[f32]) -> f32 {
     let greatest = logits.iter().copied().fold(f32::NEG_INFINITY, f32::max);
     greatest + logits.iter().map(|logit| (logit - greatest).exp()).sum::<f32>().ln()
+}
+
+impl Method for &config::Reinforce {
+    fn start(&self, spec: &EnvironmentSpec, seed: u64, room: Room) -> Result<Box<dyn Algorithm>, PolicyError> {
+        Ok(Box::new(Reinforce::new(self, spec, seed, room)?))
+    }
+
+    fn weights(&self) -> &'static [&'static str] {
+        &Reinforce::WEIGHTS
+    }
+
+    fn state_numbers(&self, spec: &EnvironmentSpec, _: Room) -> usize {
+        // Each network and two moments; and the steps of Adam.
+        let networks = self.learned(spec).into_iter();
+        networks.map(|(_, shape)| 3 * shape.parameters()).sum::<usize>() + 1
+    }
 }
 
 impl Algorithm for Reinforce {

@@ -1,26 +1,74 @@
 //! Tabular temporal-difference control: SARSA (Algorithm 1) and Q-learning (Algorithm 2), section 3.3.2.
 
+use shoal_common::algorithms::AlgorithmSettings;
 use shoal_common::config;
 use shoal_common::policy::{self, PolicyError, PolicyLayout};
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::transition::Transition;
 
-use super::algorithm::{Algorithm, Losses, Room, SavedState, Section, SectionError};
+use super::algorithm::{Algorithm, Losses, Method, Room, SavedState, Section, SectionError};
 use crate::replay::Replay;
 
 /// Which value of s' a step is led by.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Method {
+pub enum Lead {
     /// max Q(s', ·): equation 3.13.
-    QLearning,
+    Greatest,
     /// Q(s', a') of the action that was taken there: equation 3.12.
-    Sarsa,
+    Taken,
+}
+
+/// Q-learning with these settings.
+#[derive(Debug)]
+pub struct QLearning<'a>(pub &'a config::Tabular);
+
+/// SARSA with these settings.
+#[derive(Debug)]
+pub struct Sarsa<'a>(pub &'a config::Tabular);
+
+impl Method for QLearning<'_> {
+    fn start(&self, spec: &EnvironmentSpec, _: u64, room: Room) -> Result<Box<dyn Algorithm>, PolicyError> {
+        Ok(Box::new(Tabular::new(Lead::Greatest, self.0, spec, room)?))
+    }
+
+    fn weights(&self) -> &'static [&'static str] {
+        &Tabular::WEIGHTS
+    }
+
+    fn state_numbers(&self, spec: &EnvironmentSpec, room: Room) -> usize {
+        state_numbers(self.0, spec, room)
+    }
+}
+
+impl Method for Sarsa<'_> {
+    fn start(&self, spec: &EnvironmentSpec, _: u64, room: Room) -> Result<Box<dyn Algorithm>, PolicyError> {
+        Ok(Box::new(Tabular::new(Lead::Taken, self.0, spec, room)?))
+    }
+
+    fn weights(&self) -> &'static [&'static str] {
+        &Tabular::WEIGHTS
+    }
+
+    fn state_numbers(&self, spec: &EnvironmentSpec, room: Room) -> usize {
+        state_numbers(self.0, spec, room)
+    }
+}
+
+/// The table, and a pending step for each environment.
+fn state_numbers(settings: &config::Tabular, spec: &EnvironmentSpec, room: Room) -> usize {
+    let tables = settings.learned(spec).into_iter();
+    tables.map(|(_, shape)| shape.parameters()).sum::<usize>() + slots(room) * PENDING
+}
+
+/// Environments of all actors.
+fn slots(room: Room) -> usize {
+    room.actors as usize * room.envs as usize
 }
 
 /// Action-values Q(s, a), learned from each transition once, in the order they happened.
 #[derive(Clone, Debug)]
 pub struct Tabular {
-    method: Method,
+    lead: Lead,
     alpha: f32,
     layout: PolicyLayout,
     actions: usize,
@@ -47,7 +95,7 @@ const PENDING: usize = 6;
 
 impl Tabular {
     /// Names of the sections that hold what was learned.
-    pub(crate) const WEIGHTS: [&'static str; 1] = ["action-values"];
+    const WEIGHTS: [&'static str; 1] = ["action-values"];
     const PENDING: &'static str = "steps without successor";
 
     /// A table of zeros for an environment like `spec`.
@@ -55,24 +103,23 @@ impl Tabular {
     /// # Errors
     /// When states or actions cannot be counted.
     pub fn new(
-        method: Method,
+        lead: Lead,
         settings: &config::Tabular,
         spec: &EnvironmentSpec,
         room: Room,
     ) -> Result<Self, PolicyError> {
-        let name = match method {
-            Method::QLearning => "q-learning",
-            Method::Sarsa => "sarsa",
+        let name = match lead {
+            Lead::Greatest => "q-learning",
+            Lead::Taken => "sarsa",
         };
         let scores = policy::table(name, spec, 0)?;
-        let slots = room.actors as usize * room.envs as usize;
         Ok(Self {
-            method,
+            lead,
             alpha: settings.alpha as f32,
             layout: scores.layout(),
             actions: scores.actions(),
             q: vec![0.0; scores.layout().parameters()],
-            pending: vec![0.0; slots * PENDING],
+            pending: vec![0.0; slots(room) * PENDING],
             room,
             rows: 0,
         })
@@ -87,7 +134,7 @@ impl Tabular {
             discount: transition.discount,
             s_next: self.state_of(transition.s_next[0]),
         };
-        if self.method == Method::QLearning {
+        if self.lead == Lead::Greatest {
             let values = self.values(step.s_next);
             let greatest = values[policy::highest(values)];
             return self.improve(&step, greatest);

@@ -7,6 +7,7 @@ use shoal_common::report::Activity;
 
 use super::judging::Judging;
 use super::learner::Learner;
+use super::ratio::Ratio;
 use super::settings::LearnerError;
 
 /// Updates from one publication to the next. Publishing copies the actor's weights once: about a thirtieth of an update.
@@ -22,8 +23,8 @@ const NAP: Duration = Duration::from_millis(50);
 const LAST_EVALUATION: Duration = Duration::from_secs(5);
 
 pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
-    let ratio = learner.settings.ratio;
-    let every = Duration::from_secs_f64(learner.settings.checkpoint.every_seconds);
+    let ratio = Ratio::from(&learner.settings.config.replay);
+    let every = Duration::from_secs_f64(learner.settings.config.checkpoint.every_seconds);
     let mut saved = Instant::now();
     // After a crash the replay is ahead of the checkpoint: those rows count.
     learner.count_rows(learner.replay.head());

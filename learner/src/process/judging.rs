@@ -32,7 +32,7 @@ impl Judging {
         learner: &mut Learner<'_>,
         patience: Option<Duration>,
     ) -> Result<(), Exit<LearnerError>> {
-        let due = Some(learner.settings.evaluation.period(learner.rows));
+        let due = Some(learner.settings.config.evaluation.period(learner.rows));
         let Learner {
             bell,
             stop,

@@ -7,15 +7,16 @@ use std::time::{Duration, Instant};
 use shoal_common::channel::policy::{PolicyHeader, PolicyPublisher};
 use shoal_common::channel::reports::{Reporter, Reports};
 use shoal_common::channel::{Bell, Domain, Place, Pulse, Ringer};
-use shoal_common::config::Mode;
+use shoal_common::config::{Mode, Run};
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::report::{Activity, Heartbeat, LearnerReport, Role};
 use shoal_common::stop::Stop;
 
 use super::checkpoint::{Checkpoints, Counters};
 use super::intake::Intake;
-use super::settings::{LearnerError, Settings};
+use super::settings::{LearnerError, Settings, replay_layout};
 use crate::algorithms::algorithm::{Algorithm, SavedState};
+use crate::algorithms::registry;
 use crate::networks::threads::Threads;
 use crate::replay::{Replay, SyncedRows};
 
@@ -58,20 +59,21 @@ pub(crate) struct Learner<'a> {
 
 impl<'a> Learner<'a> {
     pub(crate) fn new(domain: &'a Domain, settings: &'a Settings, stop: &'a Stop) -> Result<Self, LearnerError> {
-        let mut algorithm = settings.method()?;
-        if settings.threads > 1 {
+        let (config, run) = (&settings.config, &settings.run);
+        let mut algorithm = registry::new(config)?;
+        if config.learner.threads > 1 {
             algorithm.set_threads(Threads::two()?);
         }
         let bell = Bell::hang(domain, Place(Role::Learner, 0))?;
-        let layout = settings.replay_layout();
-        let replay = if settings.replay.exists() {
-            Replay::open(&settings.replay, &layout)?
+        let (layout, file) = (replay_layout(config), run.replay_file());
+        let replay = if file.exists() {
+            Replay::open(&file, &layout)?
         } else {
-            Replay::create(&settings.replay, &layout)?
+            Replay::create(&file, &layout)?
         };
         replay.warnings().iter().for_each(|warning| tracing::warn!("{warning}"));
 
-        let mut checkpoints = Checkpoints::new(&settings.checkpoints, settings.fingerprint);
+        let mut checkpoints = Checkpoints::new(&run.checkpoints(), layout.fingerprint);
         let counters = match checkpoints.load_newest()? {
             None => Counters::default(),
             Some(loaded) => {
@@ -87,7 +89,7 @@ impl<'a> Learner<'a> {
                 if replay.head() < counters.rows {
                     tracing::warn!(
                         "{} has {} rows, and its checkpoint was made with {}: those are collected again",
-                        settings.replay.display(),
+                        file.display(),
                         replay.head(),
                         counters.rows
                     );
@@ -100,7 +102,13 @@ impl<'a> Learner<'a> {
         let learner = Self {
             publisher: PolicyPublisher::open(domain, algorithm.policy().len())?,
             evaluator: Ringer::new(domain, Place(Role::Evaluator, 0))?,
-            intake: Intake::open(domain, settings.actors, settings.window, settings.chunk, settings.steps)?,
+            intake: Intake::open(
+                domain,
+                config.actors.count,
+                config.actors.window,
+                config.chunk_layout(),
+                config.run.steps,
+            )?,
             policy_version: counters.policy_version,
             rows: counters.rows,
             episodes: counters.episodes,
@@ -160,7 +168,7 @@ impl<'a> Learner<'a> {
 
     /// Whether the steps are taken that were to be taken, or the episodes.
     pub(crate) fn has_all_rows(&self) -> bool {
-        let Settings { steps, episodes, .. } = *self.settings;
+        let Run { steps, episodes, .. } = self.settings.config.run;
         self.rows >= steps || episodes.is_some_and(|episodes| self.episodes >= episodes)
     }
 
@@ -188,7 +196,7 @@ impl<'a> Learner<'a> {
         }
         self.called = Instant::now();
         while let Some(heartbeat) = self.heartbeats.receive()? {
-            if heartbeat.role() == Some(Role::Actor) && heartbeat.index < self.settings.max_actors {
+            if heartbeat.role() == Some(Role::Actor) && heartbeat.index < self.settings.config.actors.max {
                 self.intake.widen(self.domain, heartbeat.index + 1)?;
             }
         }
@@ -250,7 +258,7 @@ impl<'a> Learner<'a> {
     /// Saves the state. The replay is brought to the disk by and by, in lockstep before: there the state is worth nothing
     /// without its rows.
     pub(crate) fn save(&mut self) -> Result<(), LearnerError> {
-        if self.settings.mode == Mode::Lockstep {
+        if self.settings.config.run.mode == Mode::Lockstep {
             self.replay.flush()?;
         } else if self.sync.as_ref().is_none_or(JoinHandle::is_finished) {
             self.end_sync();
@@ -297,7 +305,7 @@ impl<'a> Learner<'a> {
             episodes: 0,
             parameters: self.algorithm.policy().to_vec(),
         }
-        .write(&self.settings.last_policy)?;
+        .write(&self.settings.run.last_policy())?;
         self.send_report();
         self.pulse.beat_now(Activity::Done);
         Ok(())

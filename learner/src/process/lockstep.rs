@@ -4,6 +4,7 @@
 //! and publishes version k. A learner that goes on from a checkpoint finds the rows of the rounds since then in the
 //! replay and does the same updates again.
 
+use shoal_common::algorithms::Experience;
 use shoal_common::channel::wait_for;
 use shoal_common::exit::Exit;
 use shoal_common::report::Activity;
@@ -11,14 +12,16 @@ use shoal_common::report::Activity;
 use super::intake::IntakeError;
 use super::judging::Judging;
 use super::learner::Learner;
+use super::ratio::Ratio;
 use super::settings::LearnerError;
 
 pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
     let mut judging = Judging::new(learner)?;
-    let interval = learner.settings.checkpoint.every_updates;
-    let needed = learner.rows.saturating_sub(learner.settings.capacity);
+    let config = &learner.settings.config;
+    let (interval, ratio) = (config.checkpoint.every_updates, Ratio::from(&config.replay));
+    let needed = learner.rows.saturating_sub(config.replay.capacity);
     if learner.replay.rows().start > needed || learner.replay.head() < learner.rows {
-        let path = learner.settings.replay.clone();
+        let path = learner.settings.run.replay_file();
         return Err(LearnerError::RowsLost { path, needed }.into());
     }
     if learner.updates() == 0 {
@@ -34,7 +37,7 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
         }
         // Only now: whoever is interrupted within a round goes on from its beginning.
         learner.count_rows(rows);
-        while learner.updates() < learner.settings.ratio.allowed(learner.rows) {
+        while learner.updates() < ratio.allowed(learner.rows) {
             learner.update()?;
             learner.tell(Activity::Working);
         }
@@ -88,12 +91,13 @@ fn await_chunk(learner: &mut Learner<'_>, actor: usize, first: u64) -> Result<u6
 /// was cut off where the run's steps end.
 fn end_of_chunk(learner: &Learner<'_>, first: u64) -> Option<u64> {
     let Learner { settings, replay, .. } = learner;
+    let (config, steps) = (&settings.config, settings.config.run.steps);
     let head = replay.head();
     if head <= first {
-        return (first >= settings.steps).then_some(first);
+        return (first >= steps).then_some(first);
     }
-    let full = (first + settings.chunk.rows as u64).min(settings.steps);
-    if settings.algorithm.learns_from_episodes() {
+    let full = (first + config.chunk_rows() as u64).min(steps);
+    if config.algorithm.spec().experience == Experience::Episodes {
         let row = replay.layout().row;
         let last = (first..head.min(full)).find(|index| row.read(replay.row(*index)).last);
         return last.map(|last| last + 1).or((head >= full).then_some(full));

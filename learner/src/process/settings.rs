@@ -3,17 +3,16 @@
 use std::path::PathBuf;
 
 use shoal_common::channel::ChannelError;
-use shoal_common::config::{self, Mode};
+use shoal_common::config::{Config, Mode};
+use shoal_common::policy::PolicyError;
 use shoal_common::policy_file::PolicyFileError;
 use shoal_common::report::Identity;
-use shoal_common::space::EnvironmentSpec;
-use shoal_common::transition::ChunkLayout;
+use shoal_common::run_dir::RunDir;
 
 use super::checkpoint::CheckpointError;
 use super::intake::IntakeError;
-use super::ratio::Ratio;
-use crate::algorithms::algorithm::{Algorithm, Room, SectionError};
-use crate::algorithms::registry::{self, AlgorithmError};
+use crate::algorithms::algorithm::SectionError;
+use crate::algorithms::registry;
 use crate::networks::threads::ThreadsError;
 use crate::replay::{ReplayError, ReplayLayout};
 
@@ -22,48 +21,12 @@ use crate::replay::{ReplayError, ReplayLayout};
 pub struct Settings {
     /// Which process this is.
     pub identity: Identity,
-    /// The run's seed.
-    pub seed: u64,
-    /// Whether to take turns with the actors.
-    pub mode: Mode,
-    /// Environment steps after which training ends.
-    pub steps: u64,
-    /// Actors that take part.
-    pub actors: u32,
-    /// Actors there may ever be.
-    pub max_actors: u32,
-    /// Chunks an actor may have sent and not committed.
-    pub window: u32,
-    /// What a chunk has room for.
-    pub chunk: ChunkLayout,
-    /// What is controlled.
-    pub spec: EnvironmentSpec,
-    /// What is learned, and how.
-    pub algorithm: config::Algorithm,
-    /// Threads that share an update, 1 or 2.
-    pub threads: u32,
-    /// Environments of each actor.
-    pub envs: u32,
-    /// Episodes after which training ends, if that is before `steps`.
-    pub episodes: Option<u64>,
-    /// Updates per step.
-    pub ratio: Ratio,
-    /// Transitions that minibatches are sampled from.
-    pub capacity: u64,
-    /// When policies are judged.
-    pub evaluation: config::Evaluation,
+    /// The run's configuration.
+    pub config: Config,
+    /// The run's directory, where the replay, the checkpoints and the last policy are.
+    pub run: RunDir,
     /// The period of the policy that was judged last.
     pub judged: Option<u64>,
-    /// When the state is saved.
-    pub checkpoint: config::Checkpoint,
-    /// Fingerprint of the run's configuration.
-    pub fingerprint: u64,
-    /// Where the replay lies.
-    pub replay: PathBuf,
-    /// Where checkpoints are kept.
-    pub checkpoints: PathBuf,
-    /// Where the policy is left at the end.
-    pub last_policy: PathBuf,
 }
 
 /// Why a learner cannot go on.
@@ -84,9 +47,9 @@ pub enum LearnerError {
     /// A checkpoint is of another program.
     #[error(transparent)]
     Section(#[from] SectionError),
-    /// The algorithm cannot learn this.
+    /// The algorithm cannot control the environment.
     #[error(transparent)]
-    Algorithm(#[from] AlgorithmError),
+    Algorithm(#[from] PolicyError),
     /// There is no second thread.
     #[error(transparent)]
     Threads(#[from] ThreadsError),
@@ -109,58 +72,71 @@ pub enum LearnerError {
     },
 }
 
-impl Settings {
-    /// Bytes that the learner's files need on the disk beyond what is there already; `None` where a replay so large is not
-    /// possible, or nothing can be learned.
-    pub fn disk_bytes(&self) -> Option<u64> {
-        let replay = if self.replay.exists() {
-            0
-        } else {
-            self.replay_layout().places()?.end as u64
-        };
-        let algorithm = self.method().ok()?;
-        let checkpoint: usize = algorithm.state().iter().map(|(_, numbers)| numbers.len()).sum();
-        // The latest, the one before it, and the next one while it is written; the best policy and the last likewise.
-        let numbers = 3 * checkpoint + 3 * algorithm.policy().len();
-        Some(replay + (size_of::<f32>() * numbers) as u64)
-    }
+/// Why the files of a run cannot have a size.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum SizeError {
+    /// The replay would be larger than a file can be.
+    #[error("replay.capacity = {capacity}: no file can be so large; remember less")]
+    Replay {
+        /// Transitions that it should hold.
+        capacity: u64,
+    },
+    /// All files together would be larger than can be counted.
+    #[error("the run's files would have more than 2⁶⁴ bytes; remember less (replay.capacity = {capacity})")]
+    Sum {
+        /// Transitions that the replay should hold.
+        capacity: u64,
+    },
+}
 
-    /// The learning method, before its first update.
-    pub(super) fn method(&self) -> Result<Box<dyn Algorithm>, AlgorithmError> {
-        let room = Room {
-            capacity: self.capacity,
-            chunk_rows: self.chunk.rows,
-            actors: self.actors,
-            envs: self.envs,
-        };
-        registry::new(&self.algorithm, &self.spec, self.seed, room)
-    }
+/// Bytes that the learner's files need on the disk beyond what is there already, for a run in the directory `run`.
+///
+/// # Errors
+/// When a replay so large is not possible.
+pub fn disk_bytes(config: &Config, run: &RunDir) -> Result<u64, SizeError> {
+    let capacity = config.replay.capacity;
+    let replay = if run.replay_file().exists() {
+        0
+    } else {
+        let places = replay_layout(config).places().ok_or(SizeError::Replay { capacity })?;
+        places.end as u64
+    };
+    let policy = config.algorithm.settings().learned(&config.spec);
+    let policy = policy.first().map_or(0, |(_, shape)| shape.parameters());
+    // The latest, the one before it, and the next one while it is written; the best policy and the last likewise.
+    let numbers = 3 * (registry::state_numbers(config) + policy) as u64;
+    let sum = numbers
+        .checked_mul(size_of::<f32>() as u64)
+        .and_then(|bytes| bytes.checked_add(replay));
+    sum.ok_or(SizeError::Sum { capacity })
+}
 
-    /// What the replay of this run holds.
-    pub(super) fn replay_layout(&self) -> ReplayLayout {
-        ReplayLayout {
-            row: self.chunk.row,
-            ring: self.ring_rows(),
-            actors: self.max_actors as usize,
-            standing_words: self.chunk.standing_words,
-            fingerprint: self.fingerprint,
+/// What the replay of a run holds.
+pub(super) fn replay_layout(config: &Config) -> ReplayLayout {
+    let chunk = config.chunk_layout();
+    ReplayLayout {
+        row: chunk.row,
+        ring: ring_rows(config),
+        actors: config.actors.max as usize,
+        standing_words: chunk.standing_words,
+        fingerprint: config.fingerprint(),
+    }
+}
+
+/// Rows the ring holds: the sampling window, and in lockstep the rows of two checkpoint intervals beyond it, because a learner
+/// that goes on from a checkpoint samples them again.
+fn ring_rows(config: &Config) -> u64 {
+    let chunk = config.chunk_rows() as u64;
+    let slack = match config.run.mode {
+        Mode::Free => 0,
+        Mode::Lockstep => {
+            // Without updates there are no checkpoints to go back to.
+            let interval = config.checkpoint.every_updates as f64 / config.replay.updates_per_step;
+            let rows = if interval.is_finite() { 2.0 * interval } else { 0.0 };
+            let round = chunk * u64::from(config.actors.count);
+            (rows as u64).saturating_add(2 * round)
         }
-    }
-
-    /// Rows the ring holds: the sampling window, and in lockstep the rows of two checkpoint intervals beyond it, because
-    /// a learner that goes on from a checkpoint samples them again.
-    fn ring_rows(&self) -> u64 {
-        let slack = match self.mode {
-            Mode::Free => 0,
-            Mode::Lockstep => {
-                // Without updates there are no checkpoints to go back to.
-                let interval = self.checkpoint.every_updates as f64 / self.ratio.updates_per_step;
-                let rows = if interval.is_finite() { 2.0 * interval } else { 0.0 };
-                let round = self.chunk.rows as u64 * u64::from(self.actors);
-                (rows as u64).saturating_add(2 * round)
-            }
-        };
-        // A ring must have room for a chunk, however small the window.
-        self.capacity.saturating_add(slack).max(self.chunk.rows as u64)
-    }
+    };
+    // A ring must have room for a chunk, however small the window.
+    config.replay.capacity.saturating_add(slack).max(chunk)
 }

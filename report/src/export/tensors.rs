@@ -47,7 +47,6 @@ fn of_layers(layers: &[Dense]) -> Vec<Named<'_>> {
 #[cfg(test)]
 mod tests {
     use safetensors::SafeTensors;
-    use shoal_common::policy::Policy;
 
     use super::super::tests_support::{policies, some_observations};
     use super::*;
@@ -85,7 +84,7 @@ mod tests {
             let about = header.metadata().clone().unwrap();
             assert_eq!(about["environment"], config.environment.name);
             let observations = some_observations(&config, 5);
-            let mut ours = Policy::new(&config.algorithm, &config.spec, 1).unwrap();
+            let mut ours = config.algorithm.policy(&config.spec, 1).unwrap();
             let width = config.spec.observation.width();
             for observation in observations.chunks_exact(width) {
                 let mut expected = vec![0.0; config.spec.action.width()];

@@ -2,11 +2,9 @@
 
 use shoal_common::channel::{Bell, control, environment, policy, reports, transitions};
 use shoal_common::config::Config;
-use shoal_common::policy::PolicyLayout;
-use shoal_common::report::{EpisodeReport, EvaluationReport, Heartbeat, Identity, JudgedReport, LearnerReport, Role};
+use shoal_common::report::{EpisodeReport, EvaluationReport, Heartbeat, JudgedReport, LearnerReport};
 use shoal_common::run_dir::RunDir;
-
-use crate::status::learner_settings;
+use shoal_learner::process::{self, SizeError};
 
 /// Log, records, figures and configuration of a run of usual length. They grow with the run, and a disk that fills up with
 /// them is an error and no SIGBUS.
@@ -42,28 +40,30 @@ pub(super) fn shared_memory(config: &Config) -> u64 {
         + (roles as u64 + 1) * Bell::reserved(max)
 }
 
-/// Bytes of disk that the run's directory may come to need beyond what is in it; `None` where that is more than there can
-/// be.
-pub(super) fn disk(config: &Config, run: &RunDir) -> Option<u64> {
-    let learner = Identity {
-        role: Role::Learner,
-        index: 0,
-        incarnation: 0,
-    };
-    let kept = if config.evaluation.keep_policies {
-        let policies = config.run.steps / config.evaluation.every + 1;
-        policies.checked_mul((size_of::<f32>() * parameters(config)) as u64 + POLICY_HEADER)?
+/// Bytes of disk that the run's directory may come to need beyond what is in it.
+///
+/// # Errors
+/// Where that is more than there can be.
+pub(super) fn disk(config: &Config, run: &RunDir) -> Result<u64, SizeError> {
+    let learner = process::disk_bytes(config, run)?;
+    let policies = if config.evaluation.keep_policies {
+        config.run.steps / config.evaluation.every + 1
     } else {
         0
     };
-    learner_settings(config, run, learner, None)
-        .disk_bytes()?
-        .checked_add(RECORDS + kept)
+    let kept = policies.checked_mul((size_of::<f32>() * parameters(config)) as u64 + POLICY_HEADER);
+    let sum = kept.and_then(|kept| learner.checked_add(kept)?.checked_add(RECORDS));
+    sum.ok_or(SizeError::Sum {
+        capacity: config.replay.capacity,
+    })
 }
 
 /// Parameters of the policy. Who cannot control the environment is refused elsewhere.
 fn parameters(config: &Config) -> usize {
-    PolicyLayout::new(&config.algorithm, &config.spec).map_or(0, |layout| layout.parameters())
+    config
+        .algorithm
+        .policy_layout(&config.spec)
+        .map_or(0, |layout| layout.parameters())
 }
 
 /// Files that the hungriest process of the run may have open.

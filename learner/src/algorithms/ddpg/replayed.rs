@@ -1,12 +1,13 @@
 //! DDPG over the replay: minibatches drawn at random from the newest rows (line 11 of Algorithm 4).
 
+use shoal_common::algorithms::AlgorithmSettings;
 use shoal_common::config;
-use shoal_common::policy::PolicyLayout;
+use shoal_common::policy::{PolicyError, PolicyLayout};
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::transition::RowLayout;
 
-use super::{Ddpg, DdpgError, DdpgSettings, DdpgState};
-use crate::algorithms::algorithm::{Algorithm, Losses, SavedState, Section, SectionError};
+use super::{Ddpg, DdpgState};
+use crate::algorithms::algorithm::{Algorithm, Losses, Method, Room, SavedState, Section, SectionError};
 use crate::algorithms::minibatch::Minibatch;
 use crate::algorithms::sampling::Sampler;
 use crate::networks::threads::Threads;
@@ -27,16 +28,32 @@ impl ReplayedDdpg {
     /// New networks, drawn from `seed`, that learn from the newest `capacity` rows.
     ///
     /// # Errors
-    /// When DDPG cannot control an environment like `spec`, or a setting is out of range.
-    pub fn new(spec: &EnvironmentSpec, settings: &config::Ddpg, seed: u64, capacity: u64) -> Result<Self, DdpgError> {
+    /// When DDPG cannot control an environment like `spec`.
+    pub fn new(spec: &EnvironmentSpec, settings: &config::Ddpg, seed: u64, capacity: u64) -> Result<Self, PolicyError> {
         let row = RowLayout::new(spec.observation.width(), spec.action.width());
         Ok(Self {
-            ddpg: Ddpg::new(spec, &DdpgSettings::from(settings), seed)?,
+            ddpg: Ddpg::new(spec, settings, seed)?,
             sampler: Sampler::new(seed),
             batch: Minibatch::new(row, settings.batch),
             indices: vec![0; settings.batch],
             capacity,
         })
+    }
+}
+
+impl Method for &config::Ddpg {
+    fn start(&self, spec: &EnvironmentSpec, seed: u64, room: Room) -> Result<Box<dyn Algorithm>, PolicyError> {
+        Ok(Box::new(ReplayedDdpg::new(spec, self, seed, room.capacity)?))
+    }
+
+    fn weights(&self) -> &'static [&'static str] {
+        &DdpgState::PARTS[..4]
+    }
+
+    fn state_numbers(&self, spec: &EnvironmentSpec, _: Room) -> usize {
+        // Each network, its target and two moments.
+        let networks = self.learned(spec).into_iter();
+        networks.map(|(_, shape)| 4 * shape.parameters()).sum()
     }
 }
 
@@ -75,10 +92,6 @@ impl Algorithm for ReplayedDdpg {
             sections.push(saved.take(name, length)?);
         }
         let parts = std::array::from_fn(|i| sections[i].as_slice());
-        #[expect(clippy::expect_used, reason = "`take` gave each part the length that it has here")]
-        self.ddpg
-            .restore(&DdpgState { updates, parts })
-            .expect("the parts have the lengths of the networks");
-        Ok(())
+        self.ddpg.restore(&DdpgState { updates, parts })
     }
 }

@@ -18,12 +18,12 @@ fn lake(states: u32, actions: u32) -> EnvironmentSpec {
     }
 }
 
-fn table(method: Method, alpha: f64) -> Tabular {
+fn table(lead: Lead, alpha: f64) -> Tabular {
     let settings = config::Tabular {
         alpha,
         ..config::Tabular::default()
     };
-    Tabular::new(method, &settings, &lake(3, 2), ROOM).unwrap()
+    Tabular::new(lead, &settings, &lake(3, 2), ROOM).unwrap()
 }
 
 /// s, a, r, discount, s', last
@@ -43,7 +43,7 @@ fn teach(table: &mut Tabular, slot: usize, (s, a, r, discount, s_next, last): Ro
 
 #[test]
 fn q_learning_takes_the_best_of_the_next_state() {
-    let mut table = table(Method::QLearning, 0.5);
+    let mut table = table(Lead::Greatest, 0.5);
     table.q = vec![1.0, 2.0, 10.0, 30.0, 0.0, 0.0];
     teach(&mut table, 0, (0, 1, 4.0, 0.5, 1, false));
     // 2 + ½ (4 + ½ · 30 − 2)
@@ -59,7 +59,7 @@ fn q_learning_takes_the_best_of_the_next_state() {
 
 #[test]
 fn sarsa_takes_the_action_that_was_taken_next_in_the_same_environment() {
-    let mut table = table(Method::Sarsa, 0.5);
+    let mut table = table(Lead::Taken, 0.5);
     table.q = vec![1.0, 2.0, 10.0, 30.0, 0.0, 0.0];
     teach(&mut table, 0, (0, 1, 4.0, 0.5, 1, false));
     // Another environment's step is not its successor.
@@ -82,14 +82,14 @@ fn sarsa_takes_the_action_that_was_taken_next_in_the_same_environment() {
 #[test]
 fn a_row_is_of_the_environment_that_its_place_says() {
     // Two actors with two environments each, two steps a chunk.
-    let table = table(Method::Sarsa, 0.5);
+    let table = table(Lead::Taken, 0.5);
     let slots: Vec<usize> = (0..12).map(|row| table.slot(row)).collect();
     assert_eq!(slots, [0, 1, 0, 1, 2, 3, 2, 3, 0, 1, 0, 1]);
 }
 
 #[test]
 fn a_state_reads_back_and_anothers_is_refused() {
-    let mut old = table(Method::Sarsa, 0.5);
+    let mut old = table(Lead::Taken, 0.5);
     teach(&mut old, 3, (0, 1, 4.0, 0.5, 1, false));
     teach(&mut old, 1, (1, 1, 4.0, 0.0, 1, true));
     let sections = old
@@ -98,7 +98,7 @@ fn a_state_reads_back_and_anothers_is_refused() {
         .map(|(name, numbers)| (name.into(), numbers.into()));
     let sections: Vec<_> = sections.collect();
     let saved = |sections: &[_]| SavedState::from(sections.to_vec());
-    let mut new = table(Method::Sarsa, 0.5);
+    let mut new = table(Lead::Taken, 0.5);
     new.restore(7, &mut saved(&sections)).unwrap();
     assert_eq!((&new.q, &new.pending, new.updates()), (&old.q, &old.pending, 7));
     assert!(new.restore(7, &mut saved(&sections[1..])).is_err());
@@ -110,7 +110,7 @@ fn real_numbers_are_no_states() {
         observation: Space::boxed(&[(-1.0, 1.0)]),
         ..lake(1, 2)
     };
-    let refused = Tabular::new(Method::Sarsa, &config::Tabular::default(), &pendulum, ROOM);
+    let refused = Tabular::new(Lead::Taken, &config::Tabular::default(), &pendulum, ROOM);
     assert!(
         refused
             .unwrap_err()

@@ -1,6 +1,6 @@
 use rten::{Model, Value};
 use shoal_common::config::Config;
-use shoal_common::policy::{Policy, PolicyLayout, Scores, softmax, table};
+use shoal_common::policy::{PolicyLayout, Scores, softmax, table};
 use shoal_common::policy_file::PolicyFile;
 
 use super::super::tests_support::{policies, some_observations};
@@ -37,7 +37,9 @@ fn close(found: &[f32], expected: &[f32]) {
 
 fn scores(config: &Config, policy: &PolicyFile, observations: &[f32], batch: usize) -> Vec<f32> {
     let mut scores: Scores = match &config.algorithm {
-        shoal_common::config::Algorithm::Reinforce(reinforce) => softmax(reinforce, &config.spec, batch).unwrap(),
+        shoal_common::config::Algorithm::Reinforce(reinforce) => {
+            softmax("reinforce", reinforce.hidden, &config.spec, batch).unwrap()
+        }
         _ => table("q-learning", &config.spec, batch).unwrap(),
     };
     scores.of(&policy.parameters, observations).flatten().copied().collect()
@@ -48,11 +50,11 @@ fn another_runtime_computes_what_we_do_whatever_the_batch() {
     for (config, policy) in policies() {
         let bytes = Portable::new(&config, &policy, "best").unwrap().to_onnx();
         let model = Model::load(bytes).unwrap();
-        let layout = PolicyLayout::new(&config.algorithm, &config.spec).unwrap();
+        let layout = config.algorithm.policy_layout(&config.spec).unwrap();
         for batch in [1, 2, 33] {
             let observations = some_observations(&config, batch);
             let mut actions = vec![0.0; batch * config.spec.action.width()];
-            let mut ours = Policy::new(&config.algorithm, &config.spec, batch).unwrap();
+            let mut ours = config.algorithm.policy(&config.spec, batch).unwrap();
             ours.act(&policy.parameters, &observations, &mut actions);
             if let PolicyLayout::Deterministic(_) = layout {
                 let (shape, found) = real(&model, &config, &observations, "action");

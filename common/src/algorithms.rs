@@ -1,0 +1,199 @@
+//! The algorithms: the registry, and for each a file with its section of the configuration, its policy and its exploration.
+//! How each learns is the learner's.
+
+mod algorithm;
+mod behaviour;
+mod ddpg;
+mod exploration;
+mod reinforce;
+mod tabular;
+
+pub use algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Shape};
+pub use behaviour::Behaviour;
+pub use ddpg::Ddpg;
+pub use exploration::{Exploration, Warmup};
+pub use reinforce::{Reinforce, Weight};
+pub use tabular::Tabular;
+
+use serde::{Deserialize, Serialize};
+
+use crate::policy::{Policy, PolicyError, PolicyLayout};
+use crate::section::{OutOfRange, Section, describe};
+use crate::space::EnvironmentSpec;
+
+macro_rules! registry {
+    ($($(#[$attribute:meta])* $variant:ident($settings:ty) is $spec:expr;)*) => {
+        /// The algorithm of a run, with its settings. Its section in `config.toml` has its name.
+        #[derive(Clone, Debug, PartialEq, Serialize)]
+        #[serde(rename_all = "kebab-case")]
+        pub enum Algorithm {
+            $($(#[$attribute])* $variant($settings)),*
+        }
+
+        impl Algorithm {
+            /// Each algorithm with the settings it has where nothing else is said.
+            pub fn all() -> Vec<Self> {
+                vec![$(Self::$variant(<$settings>::default())),*]
+            }
+
+            /// What it is, whatever its numbers are.
+            pub fn spec(&self) -> AlgorithmSpec {
+                match self {
+                    $(Self::$variant(_) => $spec),*
+                }
+            }
+
+            /// Its settings, to whoever need not know which algorithm it is.
+            pub fn settings(&self) -> &dyn AlgorithmSettings {
+                match self {
+                    $(Self::$variant(settings) => settings),*
+                }
+            }
+
+            /// The keys of every algorithm's section.
+            pub fn sections() -> Vec<Section> {
+                vec![$(describe::<$settings>($spec.name)),*]
+            }
+
+            /// The algorithm of that name with the settings that its section has; `None` where there is none of that name.
+            ///
+            /// # Errors
+            /// When a key is unknown or of the wrong type.
+            pub fn read(name: &str, section: toml::Value) -> Option<Result<Self, toml::de::Error>> {
+                $(if name == $spec.name {
+                    return Some(<$settings>::deserialize(section).map(Self::$variant));
+                })*
+                None
+            }
+        }
+    };
+}
+
+// The registry: a line for each algorithm. The variant's name is that of the section (`QLearning`: `[q-learning]`).
+registry! {
+    /// `[ddpg]` and `[exploration]`.
+    Ddpg(Ddpg) is ddpg::SPEC;
+    /// `[reinforce]`.
+    Reinforce(Reinforce) is reinforce::SPEC;
+    /// `[q-learning]`.
+    QLearning(Tabular) is tabular::Q_LEARNING;
+    /// `[sarsa]`.
+    Sarsa(Tabular) is tabular::SARSA;
+}
+
+impl Default for Algorithm {
+    /// What is learned with where no algorithm has a section.
+    fn default() -> Self {
+        Self::Ddpg(Ddpg::default())
+    }
+}
+
+impl Algorithm {
+    /// Its name, which is its section's.
+    pub fn name(&self) -> &'static str {
+        self.spec().name
+    }
+
+    /// γ, the discount of one step.
+    pub fn gamma(&self) -> f64 {
+        self.settings().gamma()
+    }
+
+    /// DDPG's settings, where it is that.
+    pub fn ddpg(&self) -> Option<&Ddpg> {
+        match self {
+            Self::Ddpg(ddpg) => Some(ddpg),
+            _ => None,
+        }
+    }
+
+    /// Whether every number of its sections makes sense.
+    ///
+    /// # Errors
+    /// For the first one that does not.
+    pub fn check(&self) -> Result<(), OutOfRange> {
+        self.settings().check(self.name())
+    }
+
+    /// How its actors act in `batch` environments like `spec`.
+    ///
+    /// # Errors
+    /// When it cannot control them.
+    pub fn behaviour(&self, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError> {
+        self.settings().behaviour(self.name(), spec, batch)
+    }
+
+    /// The policy that it learns in an environment like `spec`, for at most `batch` observations a call.
+    ///
+    /// # Errors
+    /// When it cannot control that environment.
+    pub fn policy(&self, spec: &EnvironmentSpec, batch: usize) -> Result<Policy, PolicyError> {
+        Ok(self.behaviour(spec, batch)?.into_policy())
+    }
+
+    /// What the parameters of that policy are.
+    ///
+    /// # Errors
+    /// When it cannot control that environment.
+    pub fn policy_layout(&self, spec: &EnvironmentSpec) -> Result<PolicyLayout, PolicyError> {
+        Ok(self.policy(spec, 0)?.layout())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::space::Space;
+
+    fn spec(observation: Space, action: Space) -> EnvironmentSpec {
+        EnvironmentSpec {
+            observation,
+            action,
+            time_limit: 100,
+            state_width: 0,
+        }
+    }
+
+    #[test]
+    fn each_algorithm_takes_the_spaces_it_can_control() {
+        let real = || Space::boxed(&[(-1.0, 1.0); 4]);
+        let counted = || Space::Discrete { n: 3 };
+        let takes = |observation: fn() -> Space, action: fn() -> Space| -> Vec<bool> {
+            let spec = spec(observation(), action());
+            let all = Algorithm::all().into_iter();
+            all.map(|algorithm| algorithm.policy_layout(&spec).is_ok()).collect()
+        };
+        assert_eq!(takes(real, real), [true, false, false, false]);
+        assert_eq!(takes(real, counted), [false, true, false, false]);
+        assert_eq!(takes(counted, counted), [false, false, true, true]);
+    }
+
+    #[test]
+    fn an_algorithm_is_written_and_read_under_its_name() {
+        for algorithm in Algorithm::all() {
+            let written = toml::Table::try_from(&algorithm).unwrap();
+            assert_eq!(written.keys().collect::<Vec<_>>(), [algorithm.name()]);
+            let section = written[algorithm.name()].clone();
+            assert_eq!(Algorithm::read(algorithm.name(), section).unwrap().unwrap(), algorithm);
+        }
+        assert!(Algorithm::read("exploration", toml::Table::new().into()).is_none());
+    }
+
+    #[test]
+    fn the_policy_is_among_what_is_learned() {
+        let (real, counted) = (|| Space::boxed(&[(-1.0, 1.0); 4]), || Space::Discrete { n: 3 });
+        let specs = [
+            spec(real(), real()),
+            spec(real(), counted()),
+            spec(counted(), counted()),
+        ];
+        for algorithm in Algorithm::all() {
+            let fits = specs
+                .iter()
+                .find_map(|spec| Some((spec, algorithm.policy_layout(spec).ok()?)));
+            let (spec, layout) = fits.unwrap();
+            let first = algorithm.settings().learned(spec)[0].1;
+            assert_eq!(first.parameters(), layout.parameters(), "{}", algorithm.name());
+        }
+    }
+}

@@ -1,0 +1,76 @@
+//! `[ddpg]`: deep deterministic policy gradient.
+
+use super::algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Shape};
+use super::behaviour::Behaviour;
+use super::exploration::Exploration;
+use crate::network::NetworkLayout;
+use crate::policy::{self, PolicyError};
+use crate::section::{OutOfRange, above, from, section};
+use crate::space::EnvironmentSpec;
+
+/// DDPG.
+pub(super) const SPEC: AlgorithmSpec = AlgorithmSpec {
+    name: "ddpg",
+    off_policy: true,
+    experience: Experience::Minibatches,
+};
+
+section! {
+    /// Algorithm 4 with the numbers of section 4.3.1.
+    pub struct Ddpg {
+        /// Units of the two hidden layers, of actor and critic alike.
+        hidden: [usize; 2] = [400, 300], bounds: from(1, 8_192), unit: "units", source: "section 4.3.1";
+        /// γ, the discount of one step.
+        gamma: f64 = 0.99, bounds: from(0.0, 1.0), unit: "–", source: "section 4.3.1";
+        /// τ, how far the target networks follow in one update (equation 3.31).
+        tau: f64 = 0.001, bounds: above(0.0, 1.0), unit: "–", source: "equation 3.31, section 4.3.1";
+        /// Adam's step size for the actor, α_μ.
+        actor_learning_rate: f64 = 1e-4, bounds: above(0.0, 1.0), unit: "–", source: "section 4.3.1";
+        /// Adam's step size for the critic, α_Q.
+        critic_learning_rate: f64 = 1e-3, bounds: above(0.0, 1.0), unit: "–", source: "section 4.3.1";
+        /// N, transitions in a minibatch.
+        batch: usize = 64, bounds: from(1, 65_536), unit: "transitions", source: "Algorithm 4, section 4.3.1";
+        /// The noise of its actors: a section of its own, `[exploration]`.
+        #[serde(skip)]
+        #[schemars(skip)]
+        exploration: Exploration = Exploration::default();
+    }
+}
+
+impl AlgorithmSettings for Ddpg {
+    fn check(&self, section: &str) -> Result<(), OutOfRange> {
+        self.exploration.check_bounds("exploration")?;
+        self.check_bounds(section)
+    }
+
+    fn gamma(&self) -> f64 {
+        self.gamma
+    }
+
+    fn behaviour(&self, _: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError> {
+        let network = policy::deterministic(self.hidden, spec, batch)?;
+        Ok(Behaviour::Noise(network, self.exploration.clone()))
+    }
+
+    fn exploration_state_width(&self, spec: &EnvironmentSpec) -> usize {
+        spec.action.width()
+    }
+
+    fn least_capacity(&self) -> u64 {
+        self.batch as u64
+    }
+
+    fn learned(&self, spec: &EnvironmentSpec) -> Vec<(&'static str, Shape)> {
+        let (observation, action) = (spec.observation.width(), spec.action.width());
+        vec![
+            (
+                "actor",
+                Shape::Network(NetworkLayout::policy(observation, self.hidden, action)),
+            ),
+            (
+                "critic",
+                Shape::Network(NetworkLayout::critic(observation, self.hidden, action)),
+            ),
+        ]
+    }
+}

@@ -1,0 +1,76 @@
+//! `[reinforce]`: REINFORCE.
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use super::algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Shape};
+use super::behaviour::Behaviour;
+use crate::network::NetworkLayout;
+use crate::policy::{self, PolicyError};
+use crate::section::{OutOfRange, from, section};
+use crate::space::EnvironmentSpec;
+
+/// REINFORCE.
+pub(super) const SPEC: AlgorithmSpec = AlgorithmSpec {
+    name: "reinforce",
+    off_policy: false,
+    experience: Experience::Episodes,
+};
+
+section! {
+    /// Algorithm 3 with the numbers of section 4.2.1, and its variants of section 4.2.2.
+    pub struct Reinforce {
+        /// Units of the policy's two hidden layers.
+        hidden: [usize; 2] = [10, 2], bounds: from(1, 8_192), unit: "units", source: "section 4.2.1";
+        /// γ, the discount of one step.
+        gamma: f64 = 0.95, bounds: from(0.0, 1.0), unit: "–", source: "section 4.2.1";
+        /// Adam's step size for the policy, α.
+        learning_rate: f64 = 0.01, bounds: from(0.0, 1.0), unit: "–", source: "section 4.2.1";
+        /// What a step's ∇ ln π is multiplied by.
+        weight: Weight = Weight::Normalised, unit: "–", source: "section 4.2.2";
+        /// Whether that is also multiplied by γᵗ, as line 6 of Algorithm 3 has it.
+        discount_steps: bool = false, unit: "–", source: "Algorithm 3";
+        /// Whether an episode that the time limit ended is learned from.
+        learn_at_limit: bool = true, unit: "–", source: "section 4.2.2";
+        /// Units of the baseline's two hidden layers; only where it is the weight.
+        baseline_hidden: [usize; 2] = [32, 32], bounds: from(1, 8_192), unit: "units", source: "ours";
+        /// Adam's step size for the baseline.
+        baseline_learning_rate: f64 = 0.01, bounds: from(0.0, 1.0), unit: "–", source: "ours";
+    }
+}
+
+/// What a step's ∇ ln π is multiplied by.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Weight {
+    /// The return G.
+    Return,
+    /// G, less its mean over the episode and divided by its standard deviation.
+    Normalised,
+    /// δ = G − V(s), V learned beside the policy (equation 3.25).
+    Baseline,
+}
+
+impl AlgorithmSettings for Reinforce {
+    fn check(&self, section: &str) -> Result<(), OutOfRange> {
+        self.check_bounds(section)
+    }
+
+    fn gamma(&self) -> f64 {
+        self.gamma
+    }
+
+    fn behaviour(&self, name: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError> {
+        Ok(Behaviour::Sample(policy::softmax(name, self.hidden, spec, batch)?))
+    }
+
+    fn learned(&self, spec: &EnvironmentSpec) -> Vec<(&'static str, Shape)> {
+        let observation = spec.observation.width();
+        let network = |hidden, outputs| Shape::Network(NetworkLayout::policy(observation, hidden, outputs));
+        let mut learned = vec![("policy", network(self.hidden, spec.action.size()))];
+        if self.weight == Weight::Baseline {
+            learned.push(("baseline", network(self.baseline_hidden, 1)));
+        }
+        learned
+    }
+}

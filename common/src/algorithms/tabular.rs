@@ -1,0 +1,53 @@
+//! `[q-learning]` and `[sarsa]`: tabular temporal-difference control. Both have the same keys.
+
+use super::algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Shape};
+use super::behaviour::Behaviour;
+use crate::policy::{self, PolicyError};
+use crate::section::{OutOfRange, from, section};
+use crate::space::EnvironmentSpec;
+
+/// Q-learning.
+pub(super) const Q_LEARNING: AlgorithmSpec = AlgorithmSpec {
+    name: "q-learning",
+    off_policy: true,
+    experience: Experience::Transitions,
+};
+
+/// SARSA.
+pub(super) const SARSA: AlgorithmSpec = AlgorithmSpec {
+    name: "sarsa",
+    off_policy: false,
+    experience: Experience::Transitions,
+};
+
+section! {
+    /// Algorithms 1 and 2 with the numbers of section 4.1.
+    pub struct Tabular {
+        /// γ, the discount of one step.
+        gamma: f64 = 0.999, bounds: from(0.0, 1.0), unit: "–", source: "section 4.1";
+        /// α, the step size.
+        alpha: f64 = 0.03, bounds: from(0.0, 1.0), unit: "–", source: "section 4.1";
+        /// ε, how often an actor takes any action instead of the best.
+        epsilon: f64 = 0.4, bounds: from(0.0, 1.0), unit: "share of the steps", source: "section 4.1";
+    }
+}
+
+impl AlgorithmSettings for Tabular {
+    fn check(&self, section: &str) -> Result<(), OutOfRange> {
+        self.check_bounds(section)
+    }
+
+    fn gamma(&self) -> f64 {
+        self.gamma
+    }
+
+    fn behaviour(&self, name: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError> {
+        let values = policy::table(name, spec, batch)?;
+        Ok(Behaviour::EpsilonGreedy(values, self.epsilon))
+    }
+
+    fn learned(&self, spec: &EnvironmentSpec) -> Vec<(&'static str, Shape)> {
+        let (states, actions) = (spec.observation.size(), spec.action.size());
+        vec![("action-values", Shape::Table { states, actions })]
+    }
+}

@@ -1,0 +1,13 @@
+//! `[checkpoint]`.
+
+use crate::section::{from, section};
+
+section! {
+    /// How often the learner's state is saved.
+    pub struct Checkpoint {
+        /// Seconds between checkpoints of a free run.
+        every_seconds: f64 = 5.0, bounds: from(0.0, 86_400.0), unit: "s", source: "ours";
+        /// Updates between checkpoints of a lockstep run.
+        every_updates: u64 = 5_000, bounds: from(1, 1_000_000_000), unit: "updates", source: "ours";
+    }
+}

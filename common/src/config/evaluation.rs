@@ -1,0 +1,26 @@
+//! `[evaluation]`.
+
+use crate::section::{from, section};
+
+section! {
+    /// How often the policy is judged.
+    #[derive(Eq)]
+    pub struct Evaluation {
+        /// Environment steps from one evaluation to the next.
+        every: u64 = 2_000, bounds: from(1, u64::MAX), unit: "environment steps", source: "ours";
+        /// Episodes of an evaluation, always from the same start states.
+        episodes: u32 = 10, bounds: from(1, 10_000), unit: "episodes", source: "ours";
+        /// Episodes of the last evaluation, whose mean is the run's result.
+        final_episodes: u32 = 100, bounds: from(1, 100_000), unit: "episodes", source: "ours";
+        /// Whether every policy that was judged is kept, not only the best.
+        keep_policies: bool = false, unit: "–", source: "ours";
+    }
+}
+
+impl Evaluation {
+    /// The period that a policy learned from so many environment steps falls into. A policy is judged when no policy of
+    /// its period or a later one was.
+    pub fn period(&self, env_steps: u64) -> u64 {
+        env_steps / self.every
+    }
+}

@@ -1,0 +1,103 @@
+//! The identity of runs made before its form had a number: what Rust's `{:?}` wrote of the configuration's parts at that time.
+//! It is written out here field by field, so that no change of a type can change it.
+
+use toml::{Table, Value};
+
+use super::super::{Config, Mode};
+use super::sorted;
+use crate::algorithms::{Algorithm, Ddpg, Exploration, Reinforce, Tabular, Warmup, Weight};
+
+/// The text; `None` for an algorithm that there was not then.
+pub(super) fn text(config: &Config) -> Option<String> {
+    let Config { run, environment, .. } = config;
+    let mode = match run.mode {
+        Mode::Free => "Free",
+        Mode::Lockstep => "Lockstep",
+    };
+    let algorithm = match &config.algorithm {
+        Algorithm::Ddpg(settings) => ddpg(settings),
+        Algorithm::Reinforce(settings) => reinforce(settings),
+        Algorithm::QLearning(settings) => format!("QLearning({})", tabular(settings)),
+        Algorithm::Sarsa(settings) => format!("Sarsa({})", tabular(settings)),
+        #[allow(unreachable_patterns, reason = "an algorithm that comes later has no such text")]
+        _ => return None,
+    };
+    Some(format!(
+        "{} {} {mode} {} {} {algorithm}",
+        run.id,
+        run.seed,
+        environment.name,
+        table(&environment.parameters)
+    ))
+}
+
+fn ddpg(settings: &Ddpg) -> String {
+    let Ddpg {
+        hidden: [h1, h2],
+        gamma,
+        tau,
+        actor_learning_rate,
+        critic_learning_rate,
+        batch,
+        exploration: Exploration { theta, sigma, warmup },
+    } = settings;
+    let warmup = match warmup {
+        Warmup::Policy => "Policy",
+        Warmup::Uniform => "Uniform",
+    };
+    format!(
+        "Ddpg {{ hidden: [{h1}, {h2}], gamma: {gamma:?}, tau: {tau:?}, actor_learning_rate: {actor_learning_rate:?}, \
+         critic_learning_rate: {critic_learning_rate:?}, batch: {batch} }} \
+         Exploration {{ theta: {theta:?}, sigma: {sigma:?}, warmup: {warmup} }}"
+    )
+}
+
+fn reinforce(settings: &Reinforce) -> String {
+    let Reinforce {
+        hidden: [h1, h2],
+        gamma,
+        learning_rate,
+        weight,
+        discount_steps,
+        learn_at_limit,
+        baseline_hidden: [b1, b2],
+        baseline_learning_rate,
+    } = settings;
+    let weight = match weight {
+        Weight::Return => "Return",
+        Weight::Normalised => "Normalised",
+        Weight::Baseline => "Baseline",
+    };
+    format!(
+        "Reinforce(Reinforce {{ hidden: [{h1}, {h2}], gamma: {gamma:?}, learning_rate: {learning_rate:?}, \
+         weight: {weight}, discount_steps: {discount_steps}, learn_at_limit: {learn_at_limit}, \
+         baseline_hidden: [{b1}, {b2}], baseline_learning_rate: {baseline_learning_rate:?} }})"
+    )
+}
+
+fn tabular(settings: &Tabular) -> String {
+    let Tabular { gamma, alpha, epsilon } = settings;
+    format!("Tabular {{ gamma: {gamma:?}, alpha: {alpha:?}, epsilon: {epsilon:?} }}")
+}
+
+fn table(table: &Table) -> String {
+    let entry = |(name, value): (&String, &Value)| format!("{name:?}: {}", self::value(value));
+    let entries: Vec<_> = sorted(table).into_iter().map(entry).collect();
+    format!("{{{}}}", entries.join(", "))
+}
+
+fn value(value: &Value) -> String {
+    match value {
+        Value::String(text) => format!("String({text:?})"),
+        Value::Integer(number) => format!("Integer({number})"),
+        Value::Float(number) => format!("Float({number:?})"),
+        Value::Boolean(truth) => format!("Boolean({truth})"),
+        // No environment had such a parameter.
+        Value::Datetime(time) => format!("Datetime({time:?})"),
+        Value::Array(values) => {
+            let values: Vec<_> = values.iter().map(self::value).collect();
+            format!("Array([{}])", values.join(", "))
+        }
+        Value::Table(entries) => format!("Table({})", table(entries)),
+    }
+}

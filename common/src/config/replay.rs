@@ -1,0 +1,61 @@
+//! `[replay]`.
+
+use crate::algorithms::{Algorithm, Experience};
+use crate::section::{OutOfRange, from, section};
+
+/// Transitions that the replay may be asked to hold.
+const MOST: u64 = 1_000_000_000;
+
+section! {
+    /// What is remembered, and how often it is used.
+    pub struct Replay {
+        /// The newest so many transitions are sampled from.
+        capacity: u64 = 1_000_000, bounds: from(1, MOST), unit: "transitions", source: "section 4.3.1";
+        /// Transitions collected before the first update.
+        warmup: u64 = 1_000, bounds: from(0, MOST), unit: "transitions", source: "ours";
+        /// Updates for each environment step beyond the warm-up. The thesis: 1.
+        updates_per_step: f64 = 1.0, bounds: from(0.0, 1_000.0), unit: "updates per environment step", source: "Algorithm 4";
+        /// Steps the actors may be ahead of that ratio before the learner stops taking transitions.
+        tolerance: u64 = 512, bounds: from(1, MOST), unit: "environment steps", source: "ours";
+    }
+}
+
+impl Replay {
+    /// Whether every number makes sense, for this algorithm.
+    ///
+    /// # Errors
+    /// For the first one that does not.
+    pub fn check(&self, algorithm: &Algorithm) -> Result<(), OutOfRange> {
+        self.check_bounds("replay")?;
+        let Self {
+            capacity,
+            warmup,
+            updates_per_step,
+            ..
+        } = self;
+        match algorithm.spec().experience {
+            Experience::Minibatches => {
+                let least = algorithm.settings().least_capacity();
+                from(least, MOST).check("replay.capacity", capacity)?;
+                from(1, *capacity).check("replay.warmup", warmup)
+            }
+            Experience::Transitions | Experience::Episodes => {
+                let only = |key: &str, value: String, only: &str| OutOfRange {
+                    key: key.into(),
+                    value,
+                    expected: format!(
+                        "{only}: {} learns from each step once, from the first on",
+                        algorithm.name()
+                    ),
+                };
+                if *warmup != 0 {
+                    return Err(only("replay.warmup", warmup.to_string(), "0"));
+                }
+                if *updates_per_step != 1.0 {
+                    return Err(only("replay.updates_per_step", updates_per_step.to_string(), "1"));
+                }
+                Ok(())
+            }
+        }
+    }
+}

@@ -1,0 +1,62 @@
+//! A section of the configuration, each key declared once: its name and type, its default, its bounds, its unit, where the
+//! default comes from, and what it means. Reading, validation, `--help-config` and completions all go by that declaration.
+
+mod bounds;
+mod explanation;
+
+pub use bounds::{Bounded, Bounds, OutOfRange, above, from, in_words};
+pub use explanation::{Key, Section, describe, keys};
+
+/// Declares the struct of a section. A key is written as
+///
+/// ```text
+/// /// What it means: whole sentences.
+/// gamma: f64 = 0.99, bounds: from(0.0, 1.0), unit: "–", source: "section 4.3.1";
+/// ```
+///
+/// `bounds` is left out where there is nothing to be compared (a word, `true` or `false`) or where the bounds are another
+/// key's value; then the section or [`Config::check`](crate::config::Config::check) compares. The struct gets a default, serde's
+/// and schemars' traits, and `check_bounds`.
+macro_rules! section {
+    (
+        $(#[$attribute:meta])*
+        pub struct $name:ident {
+            $(
+                $(#[$of_field:meta])*
+                $field:ident: $type:ty = $default:expr
+                $(, bounds: $bounds:expr)?
+                $(, unit: $unit:literal, source: $source:literal)?;
+            )*
+        }
+    ) => {
+        $(#[$attribute])*
+        #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize, schemars::JsonSchema)]
+        #[serde(default, deny_unknown_fields)]
+        pub struct $name {
+            $(
+                $(#[$of_field])*
+                $(#[schemars(extend("unit" = $unit, "source" = $source))])?
+                $(#[schemars(extend("bounds" = $crate::section::in_words::<$type>(&$bounds)))])?
+                pub $field: $type,
+            )*
+        }
+
+        impl Default for $name {
+            fn default() -> Self {
+                Self { $($field: $default),* }
+            }
+        }
+
+        impl $name {
+            /// Whether every number is within the bounds that are declared for it.
+            ///
+            /// # Errors
+            /// For the first one that is not; `section` is the section's name in the configuration.
+            pub fn check_bounds(&self, section: &str) -> Result<(), $crate::section::OutOfRange> {
+                $($($crate::section::Bounded::check(&self.$field, section, stringify!($field), &$bounds)?;)?)*
+                Ok(())
+            }
+        }
+    };
+}
+pub(crate) use section;
