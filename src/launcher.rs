@@ -345,8 +345,8 @@ impl<'a> Launcher<'a> {
         while patience.elapsed() < LAST_EVALUATION && self.signals.received().is_none() {
             self.read_reports()?;
             self.attend()?;
-            // What is judged is in the records, this launcher's or an earlier one's.
-            if status::judged(&self.config, self.run)? >= Some(self.config.evaluation.period(last)) {
+            let period = |steps| self.config.evaluation.period(steps);
+            if self.recorder.evaluated().map(period) >= Some(period(last)) {
                 break;
             }
             self.sleep(SHORTEST_TICK);

@@ -2,6 +2,7 @@
 
 use shoal_common::channel::ChannelError;
 use shoal_common::commit::OpenError;
+use shoal_common::evaluator_state::EvaluatorStateError;
 use shoal_common::policy::PolicyError;
 use shoal_common::policy_file::PolicyFileError;
 
@@ -17,6 +18,12 @@ pub enum ActorError {
     /// The best policy cannot be kept.
     #[error(transparent)]
     PolicyFile(#[from] PolicyFileError),
+    /// What the evaluator left cannot be read.
+    #[error(transparent)]
+    EvaluatorState(#[from] EvaluatorStateError),
+    /// What the evaluator leaves cannot be written.
+    #[error("cannot write the evaluator's state: {0}; free some space or check the rights of the run directory")]
+    State(std::io::Error),
     /// The policy cannot act in this environment.
     #[error(transparent)]
     Actions(#[from] PolicyError),

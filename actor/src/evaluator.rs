@@ -8,6 +8,7 @@ use shoal_common::channel::policy::{self, PolicyHeader, PolicyReader};
 use shoal_common::channel::reports::Reporter;
 use shoal_common::channel::{Bell, ChannelError, Domain, Place, Pulse, Ringer, wait_for};
 use shoal_common::config::{Algorithm, Config, Evaluation};
+use shoal_common::evaluator_state::EvaluatorState;
 use shoal_common::exit::Exit;
 use shoal_common::policy::Policy;
 use shoal_common::policy_file::PolicyFile;
@@ -96,6 +97,7 @@ struct Evaluator<'a> {
     reader: PolicyReader,
     policy: Policy,
     reports: Reporter<EvaluationReport>,
+    state: EvaluatorState,
     judgements: Reporter<JudgedReport>,
     pulse: Pulse,
     actions: Vec<f32>,
@@ -118,6 +120,10 @@ impl<'a> Evaluator<'a> {
             None
         };
         pulse.beat(Activity::WaitingForPeer);
+        let state = EvaluatorState::read(&settings.run.evaluator_state())?;
+        let reports = Reporter::open(domain)?;
+        // The launcher leaves out what it has written down.
+        state.evaluations().for_each(|evaluation| reports.send(*evaluation));
         let judgements = Reporter::open(domain)?;
         if let Some(period) = settings.judged {
             judgements.send(JudgedReport { period });
@@ -128,8 +134,9 @@ impl<'a> Evaluator<'a> {
             learner: Ringer::new(domain, Place(Role::Learner, 0))?,
             client,
             reader,
-            reports: Reporter::open(domain)?,
+            reports,
             judgements,
+            state,
             pulse,
             actions: vec![0.0; settings.envs * settings.spec.action.width()],
             policy,
@@ -162,7 +169,7 @@ impl<'a> Evaluator<'a> {
         }
         let period = self.settings.evaluation.period(header.env_steps);
         self.judged = Some(period);
-        self.reports.send(EvaluationReport {
+        let evaluation = EvaluationReport {
             policy_version: header.version,
             env_steps: header.env_steps,
             updates: header.updates,
@@ -170,7 +177,12 @@ impl<'a> Evaluator<'a> {
             return_std,
             episodes: self.settings.evaluation.episodes,
             best: best.into(),
-        });
+        };
+        // First: a successor reports it where this process dies over it.
+        self.state
+            .add(evaluation, &self.settings.run.evaluator_state())
+            .map_err(ActorError::State)?;
+        self.reports.send(evaluation);
         self.judgements.send(JudgedReport { period });
         self.learner.ring();
         Ok(())

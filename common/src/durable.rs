@@ -22,6 +22,15 @@ impl Prepared {
         path: &Path,
         write: impl FnOnce(&mut BufWriter<File>) -> Result<(), E>,
     ) -> Result<Self, E> {
+        let (prepared, file) = Self::unsynced(path, write)?;
+        file.sync_all()?;
+        Ok(prepared)
+    }
+
+    fn unsynced<E: From<io::Error>>(
+        path: &Path,
+        write: impl FnOnce(&mut BufWriter<File>) -> Result<(), E>,
+    ) -> Result<(Self, File), E> {
         let mut temporary = path.as_os_str().to_owned();
         temporary.push(".new");
         let temporary = PathBuf::from(temporary);
@@ -39,18 +48,20 @@ impl Prepared {
         file.set_permissions(Permissions::from_mode(0o600))?;
         let mut writer = BufWriter::with_capacity(1 << 16, file);
         write(&mut writer)?;
-        writer
-            .into_inner()
-            .map_err(io::IntoInnerError::into_error)?
-            .sync_all()?;
-        Ok(prepared)
+        let file = writer.into_inner().map_err(io::IntoInnerError::into_error)?;
+        Ok((prepared, file))
     }
 
     /// Gives the file its name, replacing in one step what had it.
     pub fn publish(mut self) -> io::Result<()> {
+        self.rename()?;
+        sync_directory_of(&self.path)
+    }
+
+    fn rename(&mut self) -> io::Result<()> {
         fs::rename(&self.temporary, &self.path)?;
         self.published = true;
-        sync_directory_of(&self.path)
+        Ok(())
     }
 }
 
@@ -69,6 +80,16 @@ pub fn write_atomically<E: From<io::Error>>(
     write: impl FnOnce(&mut BufWriter<File>) -> Result<(), E>,
 ) -> Result<(), E> {
     Ok(Prepared::write(path, write)?.publish()?)
+}
+
+/// Writes a file so that at any moment `path` is what it was before or all of what `write` gives, whichever process dies. It does
+/// not wait for the disk: a power loss may leave the file damaged.
+pub fn write_at_once<E: From<io::Error>>(
+    path: &Path,
+    write: impl FnOnce(&mut BufWriter<File>) -> Result<(), E>,
+) -> Result<(), E> {
+    let (mut prepared, _) = Prepared::unsynced(path, write)?;
+    Ok(prepared.rename()?)
 }
 
 /// Makes the names in the directory of `path` survive a power loss.

@@ -5,6 +5,7 @@ pub mod channel;
 pub mod commit;
 pub mod config;
 pub mod durable;
+pub mod evaluator_state;
 pub mod exit;
 pub mod network;
 mod packing;

@@ -1,6 +1,7 @@
 //! What the roles tell the launcher while they work: small plain structs, one kind a channel.
 
 use iceoryx2::prelude::ZeroCopySend;
+use serde::{Deserialize, Serialize};
 
 /// A process of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -154,7 +155,7 @@ pub struct EpisodeReport {
 }
 
 /// A policy has been judged.
-#[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, ZeroCopySend)]
 #[repr(C)]
 pub struct EvaluationReport {
     /// The policy's version.

@@ -221,6 +221,11 @@ impl RunDir {
         self.checkpoints().join("best.policy")
     }
 
+    /// `checkpoints/evaluator.state`: what the evaluator leaves to its successor.
+    pub fn evaluator_state(&self) -> PathBuf {
+        self.checkpoints().join("evaluator.state")
+    }
+
     /// `policies`: every policy that was judged, where those are kept.
     pub fn policies(&self) -> PathBuf {
         self.path.join("policies")

@@ -127,7 +127,7 @@ mod tests {
         };
         policy.write(&run.last_policy()).unwrap();
         assert_eq!(WhichPolicy::Last.read(&run, &config).unwrap(), policy);
-        let Algorithm::Ddpg(ddpg, _) = &mut config.algorithm else {
+        let Algorithm::Ddpg(ddpg) = &mut config.algorithm else {
             unreachable!()
         };
         ddpg.hidden = [5, 3];

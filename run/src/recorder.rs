@@ -101,6 +101,8 @@ pub struct Recorder {
     earlier: f64,
     /// Environment steps by the newest report.
     env_steps: u64,
+    /// Environment steps of the newest policy whose evaluation is written down.
+    evaluated: Option<u64>,
     previous: Option<(Duration, LearnerReport)>,
     flushed: Instant,
 }
@@ -112,6 +114,10 @@ impl Recorder {
         let evaluations = Table::open::<Evaluation>(&run.evaluations())?;
         let learner = Table::open::<Learner>(&run.learner_log())?;
         let incidents = Table::open::<IncidentRow>(&run.incidents())?;
+        let evaluated = read_evaluations(&run.evaluations())?
+            .iter()
+            .map(|row| row.env_steps)
+            .max();
         let last = table::last::<Learner>(&run.learner_log())?;
         let (earlier, env_steps) = last.as_ref().map_or((0.0, 0), |row| (row.wall_seconds, row.env_steps));
         let events = EventFile::create(&run.tensorboard()).map_err(|cause| RecordError::Write {
@@ -129,6 +135,7 @@ impl Recorder {
             warmup,
             earlier,
             env_steps,
+            evaluated,
             previous: None,
             flushed,
         };
@@ -163,8 +170,17 @@ impl Recorder {
         }
     }
 
-    /// A policy has been judged.
+    /// Environment steps of the newest policy whose evaluation is written down.
+    pub fn evaluated(&self) -> Option<u64> {
+        self.evaluated
+    }
+
+    /// A policy has been judged. An evaluator that was started again reports what those before it did: that is left out.
     pub fn evaluation(&mut self, report: &EvaluationReport, wall: Duration) -> Result<(), RecordError> {
+        if self.evaluated >= Some(report.env_steps) {
+            return Ok(());
+        }
+        self.evaluated = Some(report.env_steps);
         self.evaluations.write(&Evaluation {
             wall_seconds: self.seconds(wall),
             env_steps: report.env_steps,

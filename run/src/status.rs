@@ -3,12 +3,13 @@
 use shoal_common::channel::control::RunStatus;
 use shoal_common::commit::{CommitReader, OpenError};
 use shoal_common::config::Config;
+use shoal_common::evaluator_state::EvaluatorState;
 use shoal_common::run_dir::RunDir;
 use shoal_learner::process::checkpoint::Checkpoints;
 use shoal_learner::process::ratio::Ratio;
 
 use crate::outcome::{Outcome, State};
-use crate::recorder::{RecordError, read_evaluations};
+use crate::recorder::read_evaluations;
 
 /// How a run stands that nobody works on: what a learner would go on from.
 pub fn at_rest(config: &Config, run: &RunDir) -> anyhow::Result<RunStatus> {
@@ -58,14 +59,17 @@ pub fn replay_rows(run: &RunDir) -> Result<u64, OpenError> {
     }
 }
 
-/// The period of the policy that was judged last, by the run's records: the launcher has them written before it starts
-/// anybody again.
-pub fn judged(config: &Config, run: &RunDir) -> Result<Option<u64>, RecordError> {
-    let evaluations = read_evaluations(&run.evaluations())?;
-    let periods = evaluations
-        .iter()
-        .map(|evaluation| config.evaluation.period(evaluation.env_steps));
-    Ok(periods.max())
+/// The period of the policy that was judged last: as the evaluator left it, and where a build did not have it do so, by the run's
+/// records.
+///
+/// # Errors
+/// When they cannot be read.
+pub fn judged(config: &Config, run: &RunDir) -> anyhow::Result<Option<u64>> {
+    let state = EvaluatorState::read(&run.evaluator_state())?;
+    let recorded = read_evaluations(&run.evaluations())?;
+    let steps = state.last().map(|last| last.env_steps);
+    let steps = steps.into_iter().chain(recorded.iter().map(|row| row.env_steps)).max();
+    Ok(steps.map(|steps| config.evaluation.period(steps)))
 }
 
 /// Updates for each environment step beyond the warm-up.
