@@ -31,6 +31,30 @@ fn what_cannot_be_trained_is_refused_before_anything_is_made() {
             &["pendulum", "--set", "ddpg.gamma=1.1"],
             "ddpg.gamma = 1.1: must be from 0 to 1",
         ),
+        (
+            &["pendulum", "--set", "ddpg.tau=0"],
+            "error: ddpg.tau = 0: must be above 0 and at most 1",
+        ),
+        (
+            &["pendulum", "--set", "ddpg.actor_learning_rate=0"],
+            "error: ddpg.actor_learning_rate = 0: must be above 0 and at most 1",
+        ),
+        (
+            &["pendulum", "--set", "ddpg.critic_learning_rate=0.0"],
+            "error: ddpg.critic_learning_rate = 0: must be above 0 and at most 1",
+        ),
+        (
+            &["pendulum", "--set", "ddpg.hidden=[400, 0]"],
+            "error: ddpg.hidden[1] = 0: must be from 1 to 8192",
+        ),
+        (
+            &["pendulum", "--set", "replay.capacity=1000000001"],
+            "error: replay.capacity = 1000000001: must be from 1 to 1000000000",
+        ),
+        (
+            &["pendulum", "--set", "run.identity_format=0"],
+            "run.identity_format is not for choosing",
+        ),
         (&["pendulum", "--set", "environment.start_sped=1"], "start_sped"),
         (&["point-mass-r1", "--set", "environment.friction=-1"], "friction"),
         (
@@ -43,7 +67,7 @@ fn what_cannot_be_trained_is_refused_before_anything_is_made() {
         ),
         (
             &["frozen-lake", "--set", "ddpg.tau=1"],
-            "sections for two algorithms, [q-learning] and [ddpg]: keep one",
+            "sections for two algorithms, [ddpg] and [q-learning]: keep one",
         ),
         (
             &["frozen-lake", "--set", "reinforce.gamma=0.9"],

@@ -13,6 +13,7 @@ use std::process::Command;
 use rten::Model;
 use safetensors::SafeTensors;
 use serde_json::Value;
+use shoal_common::config::Config;
 use support::{Leftovers, Workplace, json, python_serves};
 
 /// The versions whose runs are kept, as their directories in `tests/data/` are named.
@@ -67,6 +68,7 @@ fn every_version_of(name: &str, ended: Ended) {
             Ended::Finished => "finished",
             Ended::Stopped => "stopped",
         };
+        is_the_run_that_its_replay_is_of(&place);
         is_listed_as(&place, state);
         is_read(&place, playable);
         if playable {
@@ -90,6 +92,15 @@ fn unpacked(version: &str, name: &str) -> Workplace {
     assert!(status.unwrap().success(), "{}", archive.display());
     std::fs::rename(place.path().join(name), place.path().join("run")).unwrap();
     place
+}
+
+/// The configuration has the fingerprint that stands in the header of the replay (`ARCHITECTURE.md`, "The replay file").
+fn is_the_run_that_its_replay_is_of(place: &Workplace) {
+    const FINGERPRINT: usize = 8;
+    let header = std::fs::read(place.path().join("run/replay.bin")).unwrap();
+    let word = header[FINGERPRINT * 8..][..8].try_into().unwrap();
+    let config = Config::load(&place.path().join("run/config.toml")).unwrap();
+    assert_eq!(config.fingerprint(), u64::from_le_bytes(word), "{}", config.identity());
 }
 
 /// What a command that must succeed printed.

@@ -1,5 +1,5 @@
-//! The run's configuration, as it stands in `config.toml` once everything is decided. Each section belongs to one part of
-//! the system, and a role is handed the sections it needs, never the whole.
+//! The run's configuration, as it stands in `config.toml` once everything is decided. A section is a
+//! file here, or in `algorithms/`, and each of its keys is declared there once.
 
 mod actors;
 mod checkpoint;
@@ -7,6 +7,7 @@ mod environment;
 mod evaluation;
 pub mod explanation;
 mod identity;
+mod identity_format;
 mod learner;
 mod replay;
 mod run;
@@ -18,7 +19,7 @@ pub use actors::Actors;
 pub use checkpoint::Checkpoint;
 pub use environment::Environment;
 pub use evaluation::Evaluation;
-pub use identity::IdentityFormat;
+pub use identity_format::IdentityFormat;
 pub use learner::Learner;
 pub use replay::Replay;
 pub use run::{Mode, Run};
@@ -26,17 +27,13 @@ pub use run::{Mode, Run};
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
-use serde::Deserialize;
-
-use self::sections::Sections;
 use crate::algorithms::Experience;
 use crate::policy::PolicyError;
 use crate::space::EnvironmentSpec;
 use crate::transition::{ChunkLayout, RowLayout};
 
 /// Everything a run was started with.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
-#[serde(try_from = "Sections")]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Config {
     /// Identity and length of the run.
     pub run: Run,

@@ -2,7 +2,14 @@
 
 pub use crate::section::{Key, Section, keys};
 
-use super::{Actors, Algorithm, Checkpoint, Environment, Evaluation, Exploration, Learner, Replay, Run};
+use super::actors::Actors;
+use super::checkpoint::Checkpoint;
+use super::environment::Environment;
+use super::evaluation::Evaluation;
+use super::learner::Learner;
+use super::replay::Replay;
+use super::run::Run;
+use crate::algorithms::{Algorithm, Exploration};
 use crate::section::describe;
 
 /// Every section that somebody may write, those of all algorithms included, but without an environment's own parameters.

@@ -3,7 +3,7 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::identity::IdentityFormat;
+use super::identity_format::IdentityFormat;
 use crate::section::{OutOfRange, from, section};
 
 section! {

@@ -1,6 +1,6 @@
 //! The configuration as it is written: a section for each part, and of the algorithms' sections one at most.
 
-use serde::{Deserialize, Serialize, Serializer};
+use serde::{Deserialize, Deserializer, Serialize, Serializer, de};
 use toml::{Table, Value};
 
 use super::{
@@ -10,7 +10,7 @@ use crate::space::EnvironmentSpec;
 
 /// What is read.
 #[derive(Deserialize)]
-pub(super) struct Sections {
+struct Sections {
     run: Run,
     environment: Environment,
     spec: EnvironmentSpec,
@@ -46,6 +46,12 @@ struct Written<'a> {
     replay: &'a Replay,
     evaluation: &'a Evaluation,
     checkpoint: &'a Checkpoint,
+}
+
+impl<'de> Deserialize<'de> for Config {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        Self::try_from(Sections::deserialize(deserializer)?).map_err(de::Error::custom)
+    }
 }
 
 impl TryFrom<Sections> for Config {

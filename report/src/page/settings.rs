@@ -8,12 +8,15 @@ pub(super) type Setting = (String, String);
 /// Settings in which runs that are repetitions of each other may differ.
 const NOT_WHAT_IS_COMPARED: [&str; 3] = ["run.seed", "run.steps", "run.episodes"];
 
-/// All settings in the order of `config.toml`, but for the run's name in shared memory.
+/// What the program fills in: the run's name in shared memory, and the form of its identity.
+const FILLED_IN: [&str; 2] = ["run.id", "run.identity_format"];
+
+/// All settings in the order of `config.toml`, but for what the program fills in.
 pub(super) fn of(config: &Config) -> anyhow::Result<Vec<Setting>> {
     let table: toml::Table = config.to_toml()?.parse()?;
     let mut settings = Vec::new();
     flatten("", &table, &mut settings);
-    settings.retain(|(key, _)| key != "run.id");
+    settings.retain(|(key, _)| !FILLED_IN.contains(&key.as_str()));
     Ok(settings)
 }
 

@@ -3,9 +3,9 @@
 
 use toml::{Table, Value};
 
-use super::super::{Config, Mode};
 use super::sorted;
 use crate::algorithms::{Algorithm, Ddpg, Exploration, Reinforce, Tabular, Warmup, Weight};
+use crate::config::{Config, Mode};
 
 /// The text; `None` for an algorithm that there was not then.
 pub(super) fn text(config: &Config) -> Option<String> {
