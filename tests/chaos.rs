@@ -46,6 +46,7 @@ fn now() -> f64 {
 fn rage(place: &Workplace, running: &Running, rng: &mut Stream, length: Duration) -> (Vec<Kill>, usize) {
     let (begun, mut kills, mut scalings) = (Instant::now(), Vec::new(), 0);
     while begun.elapsed() < length {
+        // From one kill to the next: at any moment of whatever goes on.
         std::thread::sleep(Duration::from_millis(rng.random_range(300..1500)));
         if rng.random_bool(0.2) {
             let actors = rng.random_range(1..=MAX_ACTORS).to_string();

@@ -5,8 +5,6 @@
 
 mod support;
 
-use std::time::Duration;
-
 use rand::RngExt;
 use shoal_actor::noise::OrnsteinUhlenbeck;
 use shoal_common::channel::environment::ResponseLayout;
@@ -19,7 +17,7 @@ use shoal_env_server::vector::{Start, VectorEnvironment};
 use shoal_learner::algorithms::ddpg::Ddpg;
 use shoal_learner::algorithms::minibatch::Minibatch;
 use shoal_learner::algorithms::sampling::Sampler;
-use support::{Workplace, comes_further, end_of, rows_of, until};
+use support::{Workplace, comes_further, end_of, until};
 
 #[test]
 fn the_same_seed_and_actors_give_the_same_bits_and_another_seed_others() {
@@ -138,24 +136,38 @@ fn an_evaluator_killed_while_a_new_learner_does_its_rounds_again_holds_nobody_up
         "--set",
         "replay.warmup=64",
         "--set",
-        // Judged only when the new learner has begun with those rounds.
+        // Long enough to be seen at it.
         "evaluation.episodes=10000",
         "--set",
         "evaluation.final_episodes=3",
     ];
     let whole = end_of(place.start_as("whole", &arguments));
     let running = place.start_as("killed", &arguments);
-    let evaluations = running.run.join("evaluations.csv");
-    until("the rows of a period are there", || rows_of(&running) >= 3000);
-    // Its policy is published, and the evaluator is at it.
-    std::thread::sleep(Duration::from_millis(20));
+    // Versions of the policies that were judged.
+    let judged = || {
+        let evaluations = csv::Reader::from_path(running.run.join("evaluations.csv"));
+        let versions = evaluations
+            .unwrap()
+            .into_records()
+            .map(|row| row.unwrap()[3].parse().unwrap());
+        versions.collect::<Vec<u64>>()
+    };
+    until("the policies of two periods are judged", || judged().len() == 2);
+    let before = judged()[1];
+    until("the evaluator is at the next one", || {
+        place.role("killed", "evaluator-0")["policy_version"].as_u64() > Some(before)
+    });
+    // It goes on with it when the new learner has begun with its rounds.
+    running.stop("evaluator-0");
+    assert_eq!(judged().len(), 2, "or this test shows nothing");
     running.kill("learner-0");
     until("there is a new learner", || running.pids("learner-0").len() == 2);
-    std::thread::sleep(Duration::from_millis(150));
-    running.stop("learner-0");
-    until("the policy is judged", || {
-        std::fs::read_to_string(&evaluations).unwrap().lines().count() == 4
+    until("it is at work", || {
+        place.role("killed", "learner-0")["state"] == "working"
     });
+    running.stop("learner-0");
+    running.go_on("evaluator-0");
+    until("the policy is judged", || judged().len() == 3);
     running.kill("evaluator-0");
     until("there is a new evaluator", || running.pids("evaluator-0").len() == 2);
     running.go_on("learner-0");
@@ -165,16 +177,17 @@ fn an_evaluator_killed_while_a_new_learner_does_its_rounds_again_holds_nobody_up
 #[test]
 fn an_actor_killed_before_its_first_chunk_begins_again_as_if_it_had_never_been() {
     let place = Workplace::new();
-    // Long chunks, so that the kills come before the first one is sent.
-    let arguments = [&SHARED[..], &["--set", "actors.chunk_steps=4000"]].concat();
+    // The longest chunks there are, so that the kills come before the first one is sent.
+    let arguments = [&SHARED[..], &["--set", "actors.chunk_steps=4096"]].concat();
     let whole = end_of(place.start("whole", &arguments));
     let running = place.start("killed", &arguments);
     let commits = CommitReader::open(&running.run.join("replay.bin")).unwrap();
     for (actor, who) in ["actor-0", "actor-1"].into_iter().enumerate() {
-        let starts = running.pids(who).len();
+        // Then it begins its first chunk. The learner takes the second actor's greeting after the first one's chunk.
         until("the learner knows of it", || commits.committed(actor).incarnation > 0);
-        std::thread::sleep(Duration::from_millis(10));
+        running.stop(who);
         assert_eq!(commits.actor(actor).rows, 0, "or this test shows nothing");
+        let starts = running.pids(who).len();
         running.kill(who);
         until("it is replaced", || running.pids(who).len() > starts);
     }
@@ -201,10 +214,7 @@ fn a_lockstep_run_broken_off_again_and_again_is_resumed_to_the_bits_of_a_whole_o
         drop(running);
         running = place.resume("killed", &[]);
     }
-    // An evaluation may have died with the launcher before it was written down.
-    let (weights_again, evaluations_again) = end_of(running);
-    assert_eq!(weights_again, weights);
-    assert_eq!(evaluations_again.len(), evaluations.len());
+    assert_eq!(end_of(running), (weights, evaluations));
 }
 
 #[test]

@@ -6,7 +6,7 @@ mod support;
 
 use std::os::unix::fs::FileExt;
 use std::path::Path;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use rustix::process::Signal;
 use shoal_common::commit::CommitReader;
@@ -130,15 +130,17 @@ fn stopped_for(length: Duration) {
     running.learns_on();
     for who in ["actor-0", "env-server-0", "evaluator-0", "env-server-16", "learner-0"] {
         running.stop(who);
-        std::thread::sleep(length);
-        let status = place.status("run");
-        let mut roles = status["roles"].as_array().unwrap().iter();
-        let stopped = roles.find(|role| format!("{}-{}", role["role"].as_str().unwrap(), role["index"]) == who);
-        assert_eq!(stopped.unwrap()["state"], "silent", "{who}: {status}");
+        let begun = Instant::now();
+        until("it is said to be silent", || {
+            place.role("run", who)["state"] == "silent"
+        });
+        // How long it is stopped is the test.
+        std::thread::sleep(length.saturating_sub(begun.elapsed()));
         running.go_on(who);
         running.learns_on();
     }
     running.signal(Signal::STOP);
+    // So is this.
     std::thread::sleep(length);
     running.signal(Signal::CONT);
     running.learns_on();
@@ -204,11 +206,7 @@ fn a_copy_of_a_run_that_goes_on_is_told_from_it() {
     let place = Workplace::new();
     let running = place.start("run", &ENDLESS);
     running.learns_on();
-    let copied = std::process::Command::new("cp")
-        .args(["-r", "run", "copy"])
-        .current_dir(place.path())
-        .status();
-    assert!(copied.unwrap().success());
+    place.copy("run", "copy");
     let said = complaint(&place.output(&["resume", "copy"]));
     assert!(
         said.contains("is a copy of") && said.contains(running.run.to_str().unwrap()),
@@ -373,11 +371,7 @@ fn a_copy_that_waits_for_the_original_is_no_way_to_stop_the_original() {
     let place = Workplace::new();
     let running = place.start("run", &ENDLESS);
     running.learns_on();
-    let copied = std::process::Command::new("cp")
-        .args(["-r", "run", "copy"])
-        .current_dir(place.path())
-        .status();
-    assert!(copied.unwrap().success());
+    place.copy("run", "copy");
     let mut waiting = place.shoal(&["resume", "copy"]).spawn().unwrap();
     let mut said = String::new();
     until("the copy's launcher waits", || {

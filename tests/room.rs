@@ -1,47 +1,77 @@
 //! Whether there is room is asked before anything starts, and what is made is for its owner alone. Small file systems are
-//! mounted in a namespace of their own; where the machine allows none, those tests say so and show nothing.
+//! mounted in a namespace of their own; where the machine allows none, those tests are ignored.
 
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
-#![allow(clippy::print_stderr, reason = "a test that could not be done says so")]
 
+#[path = "support/suite.rs"]
+mod suite;
 mod support;
 
 use std::fs;
 use std::os::unix::fs::{MetadataExt, chown};
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output, Stdio};
+use std::process::{Command, ExitCode, Output, Stdio};
+use std::sync::OnceLock;
 
 use rustix::process::{Pid, Signal, kill_process};
+use suite::{Need, ROOT, test};
 use support::{Leftovers, QUICK, Running, Workplace, complaint, json, until};
 
 const SHOAL: &str = env!("CARGO_BIN_EXE_shoal");
 const ENDLESS: [&str; 2] = ["--steps", "100000000"];
 const PAGE: u64 = 4096;
 
-/// Runs a shell script that may mount what it likes, with `$SHOAL` the program and `$QUICK` the quick settings; `None`
-/// where the machine does not allow that.
-fn in_namespace(place: &Workplace, script: &str) -> Option<Output> {
-    let ways: [&[&str]; 2] = [&["--mount"], &["--user", "--map-root-user", "--mount"]];
+fn main() -> ExitCode {
+    suite::run(vec![
+        test!(what_a_run_reserves_is_at_most_what_was_computed_and_at_least_half_of_it),
+        test!(
+            the_default_run_fits_into_a_container_and_one_of_64_actors_is_refused_there,
+            NAMESPACE
+        ),
+        test!(what_another_run_was_promised_is_not_free, NAMESPACE),
+        test!(a_full_disk_is_said_before_anything_is_made, NAMESPACE),
+        test!(a_disk_that_fills_up_ends_the_run_with_one_line, NAMESPACE),
+        test!(a_directory_that_cannot_be_written_is_said, NAMESPACE),
+        test!(a_limit_of_open_files_is_raised_where_it_can_be_and_said_where_not),
+        test!(everything_a_run_makes_is_for_its_owner_alone),
+        test!(two_users_do_not_touch_each_other, ROOT),
+        test!(another_users_files_with_a_runs_name_change_nothing, ROOT),
+    ])
+}
+
+/// The right to mount file systems that nobody else sees.
+static NAMESPACE: Need = Need::new(
+    "this machine allows no mount namespace",
+    || way_to_mount().is_some(),
+    None,
+);
+
+/// The options of `unshare` with which this machine allows to mount; looked for once.
+fn way_to_mount() -> Option<&'static [&'static str]> {
+    const WAYS: [&[&str]; 2] = [&["--mount"], &["--user", "--map-root-user", "--mount"]];
+    static WAY: OnceLock<Option<&[&str]>> = OnceLock::new();
     let allowed = |way: &&[&str]| {
         let mount = ["sh", "-c", "mount -t tmpfs tmpfs /mnt"];
         let tried = Command::new("unshare").args(*way).args(mount).output();
         tried.is_ok_and(|output| output.status.success())
     };
-    let Some(way) = ways.into_iter().find(allowed) else {
-        eprintln!("skipped: this machine allows no mount namespace");
-        return None;
-    };
+    *WAY.get_or_init(|| WAYS.into_iter().find(allowed))
+}
+
+/// Runs a shell script that may mount what it likes, with `$SHOAL` the program and `$QUICK` the quick settings: for tests
+/// that need a [`NAMESPACE`].
+fn in_namespace(place: &Workplace, script: &str) -> Output {
     let quick: Vec<String> = QUICK.iter().map(|argument| argument.replace(' ', "")).collect();
     let mut command = Command::new("unshare");
     command
-        .args(way)
+        .args(way_to_mount().unwrap())
         .args(["sh", "-ec", script])
         .env("SHOAL", SHOAL)
         .env("QUICK", quick.join(" "))
         .current_dir(place.path())
         .stdin(Stdio::null());
-    Some(support::output_of(&mut command))
+    support::output_of(&mut command)
 }
 
 /// A shared memory of 64 MB, and a user's directory that belongs to it: with the one outside, the next start would find
@@ -74,7 +104,6 @@ fn is_private(path: &Path) -> bool {
     fs::symlink_metadata(path).is_ok_and(|metadata| metadata.mode() & 0o077 == 0) || !path.exists()
 }
 
-#[test]
 fn what_a_run_reserves_is_at_most_what_was_computed_and_at_least_half_of_it() {
     for arguments in [
         &["--actors", "1", "--set", "actors.max=1"][..],
@@ -117,7 +146,6 @@ fn what_a_run_reserves_is_at_most_what_was_computed_and_at_least_half_of_it() {
             .iter()
             .map(|path| fs::metadata(path).unwrap().len().next_multiple_of(PAGE))
             .sum();
-        eprintln!("{arguments:?}: {reserved} bytes reserved, {computed} computed");
         assert!(
             reserved <= computed && computed <= 2 * reserved,
             "{arguments:?}: {reserved} bytes reserved, {computed} computed"
@@ -125,15 +153,12 @@ fn what_a_run_reserves_is_at_most_what_was_computed_and_at_least_half_of_it() {
     }
 }
 
-#[test]
 fn the_default_run_fits_into_a_container_and_one_of_64_actors_is_refused_there() {
     let place = Workplace::new();
-    let Some(output) = in_namespace(
+    let output = in_namespace(
         &place,
         &format!("{CONTAINER} exec $SHOAL train pendulum --steps 1300 --run run --json"),
-    ) else {
-        return;
-    };
+    );
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     assert_eq!(json(&output)["env_steps"], 1300);
 
@@ -141,7 +166,7 @@ fn the_default_run_fits_into_a_container_and_one_of_64_actors_is_refused_there()
         &place,
         &format!("{CONTAINER} exec $SHOAL train pendulum --steps 1300 --run large --json --actors 64"),
     );
-    let said = complaint(&refused.unwrap());
+    let said = complaint(&refused);
     assert!(
         said.contains("MiB of /dev/shm for up to 64 actors, and 64.0 MiB are free: lay it out for at most "),
         "{said}"
@@ -149,7 +174,6 @@ fn the_default_run_fits_into_a_container_and_one_of_64_actors_is_refused_there()
     assert!(!place.path().join("large").exists(), "nothing was made");
 }
 
-#[test]
 fn what_another_run_was_promised_is_not_free() {
     let place = Workplace::new();
     let script = "$SHOAL train pendulum --steps 100000000 --run first --quiet & first=$!
@@ -157,15 +181,12 @@ fn what_another_run_was_promised_is_not_free() {
         $SHOAL train pendulum --steps 100 --run second --json || code=$?
         kill $first; wait $first || true
         exit $code";
-    let Some(output) = in_namespace(&place, &[CONTAINER, script].concat()) else {
-        return;
-    };
+    let output = in_namespace(&place, &[CONTAINER, script].concat());
     let said = complaint(&output);
     assert!(said.contains("of /dev/shm"), "{said}");
     assert!(!place.path().join("second").exists(), "nothing was made");
 }
 
-#[test]
 fn a_full_disk_is_said_before_anything_is_made() {
     let place = Workplace::new();
     fs::create_dir(place.path().join("small")).unwrap();
@@ -173,9 +194,7 @@ fn a_full_disk_is_said_before_anything_is_made() {
         $SHOAL train pendulum --run small/run --json || code=$?
         ls small
         exit $code";
-    let Some(output) = in_namespace(&place, script) else {
-        return;
-    };
+    let output = in_namespace(&place, script);
     let said = complaint(&output);
     assert!(
         said.contains("of disk and") && said.contains("small has 8.0 MiB"),
@@ -183,7 +202,6 @@ fn a_full_disk_is_said_before_anything_is_made() {
     );
 }
 
-#[test]
 fn a_disk_that_fills_up_ends_the_run_with_one_line() {
     let place = Workplace::new();
     fs::create_dir(place.path().join("small")).unwrap();
@@ -193,21 +211,16 @@ fn a_disk_that_fills_up_ends_the_run_with_one_line() {
         cat /dev/zero > small/filler 2>/dev/null || true
         timeout 60 tail --pid=$run -f /dev/null
         wait $run";
-    let Some(output) = in_namespace(&place, script) else {
-        return;
-    };
+    let output = in_namespace(&place, script);
     let said = complaint(&output);
     assert!(said.contains("No space left on device"), "{said}");
 }
 
-#[test]
 fn a_directory_that_cannot_be_written_is_said() {
     let place = Workplace::new();
     fs::create_dir(place.path().join("closed")).unwrap();
     let script = "mount -t tmpfs -o ro tmpfs closed; exec $SHOAL train pendulum --run closed/run --json";
-    let Some(output) = in_namespace(&place, script) else {
-        return;
-    };
+    let output = in_namespace(&place, script);
     let said = complaint(&output);
     assert!(
         said.contains("closed/run") && said.contains("Read-only file system"),
@@ -220,15 +233,14 @@ fn a_directory_that_cannot_be_written_is_said() {
         &place,
         &format!("{closed} exec $SHOAL eval run --policy last --episodes 2 --json"),
     );
-    assert_eq!(json(&judged.unwrap())["episodes"], 2, "to read is enough");
-    let said = complaint(&in_namespace(&place, &format!("{closed} exec $SHOAL plot run")).unwrap());
+    assert_eq!(json(&judged)["episodes"], 2, "to read is enough");
+    let said = complaint(&in_namespace(&place, &format!("{closed} exec $SHOAL plot run")));
     assert!(
         said.contains(".svg") && said.contains("Read-only file system"),
         "{said}"
     );
 }
 
-#[test]
 fn a_limit_of_open_files_is_raised_where_it_can_be_and_said_where_not() {
     let place = Workplace::new();
     let limited = |limit: &str, run: &str| {
@@ -250,7 +262,6 @@ fn a_limit_of_open_files_is_raised_where_it_can_be_and_said_where_not() {
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
 }
 
-#[test]
 fn everything_a_run_makes_is_for_its_owner_alone() {
     let place = Workplace::new();
     let running = place.start("run", &ENDLESS);
@@ -275,13 +286,8 @@ fn everything_a_run_makes_is_for_its_owner_alone() {
     assert_eq!(open(figures), none);
 }
 
-#[test]
 fn two_users_do_not_touch_each_other() {
     const NOBODY: u32 = 65534;
-    if !rustix::process::getuid().is_root() {
-        eprintln!("skipped: only root can be two users");
-        return;
-    }
     let (place, other) = (Workplace::new(), Workplace::new());
     let running = place.start("run", &ENDLESS);
     until("everybody is at work", || running.learned("updates") > 0);
@@ -334,14 +340,9 @@ impl Drop for Gone {
     }
 }
 
-#[test]
 fn another_users_files_with_a_runs_name_change_nothing() {
     const OWNER: u32 = 65534;
     const OTHER: u32 = 20_002;
-    if !rustix::process::getuid().is_root() {
-        eprintln!("skipped: only root can be two users");
-        return;
-    }
     let place = Workplace::new();
     // The program's own directory may be closed to others.
     fs::copy(SHOAL, place.path().join("shoal")).unwrap();

@@ -103,7 +103,8 @@ struct Evaluator<'a> {
     actions: Vec<f32>,
     /// The period of the policy judged last.
     judged: Option<u64>,
-    best: Option<f64>,
+    /// Mean return and version of the best policy.
+    best: Option<(f64, u64)>,
 }
 
 impl<'a> Evaluator<'a> {
@@ -115,7 +116,8 @@ impl<'a> Evaluator<'a> {
         let client = connect(domain, &bell, settings.server, &settings.spec, settings.envs, stop)?;
         let reader = PolicyReader::open(domain, layout.fingerprint(), layout.parameters())?;
         let best = if settings.run.best_policy().exists() {
-            Some(PolicyFile::read(&settings.run.best_policy(), &layout)?.return_mean)
+            let best = PolicyFile::read(&settings.run.best_policy(), &layout)?;
+            Some((best.return_mean, best.version))
         } else {
             None
         };
@@ -158,10 +160,13 @@ impl<'a> Evaluator<'a> {
         }
         returns.truncate(self.settings.evaluation.episodes as usize);
         let (return_mean, return_std) = mean_and_std(&returns);
-        let best = self.best.is_none_or(|best| return_mean > best);
+        // An evaluator may have died when it had kept this policy and not said so.
+        let best = self
+            .best
+            .is_none_or(|(mean, version)| return_mean > mean || version == header.version);
         if best {
             self.keep(&published, return_mean, return_std, &self.settings.run.best_policy())?;
-            self.best = Some(return_mean);
+            self.best = Some((return_mean, header.version));
         }
         if self.settings.evaluation.keep_policies {
             let path = self.settings.run.judged_policy(header.env_steps);

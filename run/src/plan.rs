@@ -330,17 +330,17 @@ mod tests {
     fn the_identity_of_every_preset_is_the_text_that_was_released() {
         let mut all = String::new();
         for (name, _) in PRESETS {
-            let config = plan(&[name]).unwrap();
+            let config = plan(name, &[]).unwrap();
             all += &format!("# {name}\n{}\n", config.identity());
-            let other_rate = plan(&[name, "--set", "evaluation.every=77", "--steps", "1234"]).unwrap();
+            let other_rate = plan(name, &["evaluation.every=77", "run.steps=1234"]).unwrap();
             assert_eq!(other_rate.identity(), config.identity(), "{name}");
             assert_ne!(
-                plan(&[name, "--seed", "5"]).unwrap().identity(),
+                plan(name, &["run.seed=5"]).unwrap().identity(),
                 config.identity(),
                 "{name}"
             );
         }
-        assert_eq!(all, include_str!("../tests/data/identity-1.txt"));
+        assert_eq!(all, include_str!("../../tests/data/identity-1.txt"));
     }
 
     #[test]

@@ -17,31 +17,66 @@
 //!
 //! With `SHOAL_CRASH_JOBS=1` no run has a neighbour, and each failure is its own.
 //!
-//! Processes are traced (`ptrace`); where the machine does not allow it, these tests say so and show nothing.
+//! Processes are traced (`ptrace`); where the machine does not allow it, these tests are ignored.
 
-#![cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
 #![allow(
     clippy::print_stderr,
-    reason = "a test that could not be done says so, and a long one how it gets on"
+    reason = "a test says what came of its kills, and a long one how it gets on"
 )]
 
 mod calls;
 mod place;
 mod schedules;
+#[path = "../support/suite.rs"]
+mod suite;
 mod sweep;
 mod tracer;
 mod trial;
 
-use std::process::Command;
+use std::process::{Command, ExitCode};
 use std::time::Duration;
 
 use calls::Call;
-use place::{User, is_root};
+use place::User;
 use schedules::Schedule;
+use suite::{Need, PYTHON, ROOT, test};
 use sweep::{Sweep, Table, in_parallel, list, number};
 use tracer::{Target, follow};
 use trial::{Mode, Victim};
+
+/// The right to trace one's children.
+static TRACING: Need = Need::new("this machine allows no tracing", tracer::is_allowed, None);
+
+fn main() -> ExitCode {
+    suite::run(vec![
+        test!(who_is_killed_before_a_call_has_not_made_it, TRACING),
+        test!(
+            a_role_killed_before_a_call_of_its_start_is_replaced_and_the_run_ends_as_it_was_to,
+            TRACING
+        ),
+        test!(an_evaluator_killed_before_a_call_of_its_start_is_replaced, TRACING),
+        test!(in_lockstep_the_run_ends_with_the_same_bits_too, TRACING),
+        test!(
+            when_the_launcher_is_killed_before_a_call_its_roles_end_and_the_run_goes_on_when_it_is_resumed,
+            TRACING
+        ),
+        test!(
+            a_command_killed_before_a_call_does_not_disturb_the_run_that_it_asks,
+            TRACING
+        ),
+        test!(a_clean_up_that_is_killed_before_a_call_is_done_again, TRACING),
+        test!(a_python_server_killed_before_a_call_is_replaced, TRACING, PYTHON),
+        test!(an_ordinary_users_run_goes_on_where_roots_does, TRACING, ROOT),
+        // Hours: kills before every call.
+        test!(every_crash_point, TRACING).with_ignored_flag(true),
+        test!(who_is_killed_faster_than_it_can_begin_is_at_work_again_soon_after),
+        // Ten minutes and more: hostile schedules of kills.
+        test!(hostile_schedules_of_kills_never_stop_a_run).with_ignored_flag(true),
+        // Up to an hour each: a kill every 100 ms, all the way.
+        test!(a_million_steps_are_taken_under_a_kill_every_tenth_of_a_second).with_ignored_flag(true),
+    ])
+}
 
 /// A selection for one run gives up after so many failures: each may take a minute.
 const FEW: usize = 3;
@@ -106,21 +141,6 @@ const ROLES: [Victim; 4] = [
     Victim::Role("env-server", 4),
 ];
 
-/// Whether `python3` serves Gymnasium's environments.
-fn python_serves() -> bool {
-    let found = Command::new("python3").args(["-c", "import shoal_gym.server"]).output();
-    let serves = found.is_ok_and(|output| output.status.success());
-    if !serves {
-        assert!(
-            std::env::var_os("SHOAL_REQUIRE_PYTHON").is_none(),
-            "python3 has no shoal_gym: pip install ./python"
-        );
-        eprintln!("skipped: python3 has no shoal_gym");
-    }
-    serves
-}
-
-#[test]
 fn who_is_killed_before_a_call_has_not_made_it() {
     let directory = tempfile::tempdir().unwrap();
     let words = ["sh", "-c", ": > first; : > second; : > third"].map(String::from);
@@ -137,13 +157,9 @@ fn who_is_killed_before_a_call_has_not_made_it() {
         (followed, names)
     };
     let (followed, names) = made(2);
-    match followed {
-        Err(errno) => return eprintln!("skipped: this machine allows no tracing ({errno})"),
-        Ok(followed) => {
-            assert_eq!((followed.code, followed.hit.as_deref()), (-9, Some("second")));
-            assert_eq!(followed.counts[&Call::Create], 2);
-        }
-    }
+    let followed = followed.unwrap();
+    assert_eq!((followed.code, followed.hit.as_deref()), (-9, Some("second")));
+    assert_eq!(followed.counts[&Call::Create], 2);
     assert_eq!(names, ["first"]);
     let (followed, names) = made(4);
     let followed = followed.unwrap();
@@ -151,56 +167,41 @@ fn who_is_killed_before_a_call_has_not_made_it() {
     assert_eq!(names, ["first", "second", "third"]);
 }
 
-#[test]
 fn a_role_killed_before_a_call_of_its_start_is_replaced_and_the_run_ends_as_it_was_to() {
     some(User::Own, &[Mode::Free], &ROLES, [2, 3, 1]);
 }
 
-#[test]
 fn an_evaluator_killed_before_a_call_of_its_start_is_replaced() {
     // A free run may wait some seconds for its last evaluation.
     some(User::Own, &[Mode::Free], &[EVALUATOR], [1, 1, 0]);
 }
 
-#[test]
 fn in_lockstep_the_run_ends_with_the_same_bits_too() {
     let everybody = [&ROLES[..], &[EVALUATOR]].concat();
     some(User::Own, &[Mode::Lockstep], &everybody, [1, 1, 1]);
 }
 
-#[test]
 fn when_the_launcher_is_killed_before_a_call_its_roles_end_and_the_run_goes_on_when_it_is_resumed() {
     some(User::Own, &Mode::BOTH, &[Victim::Launcher], [1, 1, 1]);
 }
 
-#[test]
 fn a_command_killed_before_a_call_does_not_disturb_the_run_that_it_asks() {
     let askers = ["status", "scale", "stop"].map(Victim::Asker);
     some(User::Own, &[Mode::Free], &askers, [1, 1, 0]);
 }
 
-#[test]
 fn a_clean_up_that_is_killed_before_a_call_is_done_again() {
     some(User::Own, &Mode::BOTH, &[Victim::CleanUp], [1, 2, 1]);
 }
 
-#[test]
 fn a_python_server_killed_before_a_call_is_replaced() {
-    if python_serves() {
-        some(User::Own, &[Mode::Free], &[Victim::Python(0)], [1, 1, 1]);
-    }
+    some(User::Own, &[Mode::Free], &[Victim::Python(0)], [1, 1, 1]);
 }
 
-#[test]
 fn an_ordinary_users_run_goes_on_where_roots_does() {
-    if !is_root() {
-        return eprintln!("skipped: only root can be two users");
-    }
     some(User::Nobody, &[Mode::Free], &ROLES, [1, 2, 0]);
 }
 
-#[test]
-#[ignore = "hours: kills before every call"]
 fn every_crash_point() {
     let upto: u32 = number("SHOAL_CRASH_UPTO").unwrap_or(200);
     let chosen = |variable: &str, name: &str| list(variable).is_none_or(|names| names.iter().any(|it| it == name));
@@ -208,7 +209,9 @@ fn every_crash_point() {
     let mut victims: Vec<_> = Victim::ALL.into();
     victims.retain(|victim| chosen("SHOAL_CRASH_ROLES", &victim.to_string()));
     assert!(!victims.is_empty(), "SHOAL_CRASH_ROLES names nobody");
-    if victims.iter().any(|victim| matches!(victim, Victim::Python(_))) && !python_serves() {
+    let has_python = victims.iter().any(|victim| matches!(victim, Victim::Python(_)));
+    if let Some(missing) = PYTHON.missing().filter(|_| has_python) {
+        eprintln!("left out: {missing}");
         victims.retain(|victim| !matches!(victim, Victim::Python(_)));
     }
     let mut modes: Vec<_> = Mode::BOTH.into();
@@ -223,8 +226,8 @@ fn every_crash_point() {
         if !chosen("SHOAL_CRASH_USERS", name) {
             continue;
         }
-        if user == User::Nobody && !is_root() {
-            eprintln!("skipped: only root can be two users");
+        if let Some(missing) = ROOT.missing().filter(|_| user == User::Nobody) {
+            eprintln!("left out: {missing}");
             continue;
         }
         let sweep = Sweep {
@@ -282,20 +285,15 @@ fn schedules(sets: &[&'static [&'static str]], actors: &[u32], bursts: u32, seed
     );
 }
 
-#[test]
 fn who_is_killed_faster_than_it_can_begin_is_at_work_again_soon_after() {
     schedules(&[&["env-server"], &[]], &[1], 3, 1);
 }
 
-#[test]
-#[ignore = "ten minutes and more: hostile schedules of kills"]
 fn hostile_schedules_of_kills_never_stop_a_run() {
     let bursts = number("SHOAL_CRASH_BURSTS").unwrap_or(10);
     schedules(&SETS, &[1, 2], bursts, number("SHOAL_CRASH_SEED").unwrap_or(1));
 }
 
-#[test]
-#[ignore = "up to an hour each: a kill every 100 ms, all the way"]
 fn a_million_steps_are_taken_under_a_kill_every_tenth_of_a_second() {
     let steps = number("SHOAL_CRASH_STEPS").unwrap_or(1_000_000);
     let limit = Duration::from_secs(3600);

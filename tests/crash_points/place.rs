@@ -59,11 +59,6 @@ impl Program {
     }
 }
 
-/// Whether there is a second user to be.
-pub(crate) fn is_root() -> bool {
-    rustix::process::getuid().is_root()
-}
-
 /// A directory in which a run is made, by one user.
 pub(crate) struct Place<'a> {
     directory: TempDir,

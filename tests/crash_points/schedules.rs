@@ -75,6 +75,7 @@ impl Schedule {
         for _ in 0..bursts {
             let begun = Instant::now();
             while begun.elapsed() < BURST {
+                // The pauses are the schedule.
                 std::thread::sleep(Duration::from_millis(rng.random_range(PAUSES)));
                 *kills += u32::from(self.kill_one(place, &mut rng));
             }
@@ -120,6 +121,7 @@ impl Schedule {
                 && begun.elapsed() < limit
                 && launcher.try_wait().unwrap().is_none()
             {
+                // The pauses are the schedule.
                 std::thread::sleep(every);
                 kills += u32::from(self.kill_one(&place, &mut rng));
             }

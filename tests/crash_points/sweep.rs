@@ -84,7 +84,7 @@ struct Point<'a> {
 }
 
 impl Sweep<'_> {
-    /// Does it all; nothing where the machine allows no tracing.
+    /// Does it all.
     pub(crate) fn run(&self) -> Table {
         let program = Program::of(self.user);
         let mut table = Table::default();
@@ -104,10 +104,9 @@ impl Sweep<'_> {
         let mut known = Vec::new();
         for (scene, calm) in calms {
             match calm {
-                Err(errno) => {
-                    eprintln!("skipped: this machine allows no tracing ({errno})");
-                    return table;
-                }
+                Err(errno) => table
+                    .failures
+                    .push(format!("{}, cannot be traced: {errno}", self.name(scene))),
                 Ok(Err(what)) => table
                     .failures
                     .push(format!("{}, nobody killed: {what}", self.name(scene))),

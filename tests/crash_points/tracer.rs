@@ -41,6 +41,13 @@ pub(crate) struct Followed {
     pub(crate) counts: BTreeMap<Call, u32>,
 }
 
+/// Whether this machine, and this kind of processor, allows to trace a child.
+pub(crate) fn is_allowed() -> bool {
+    let nothing = ["true".to_owned()];
+    cfg!(any(target_arch = "x86_64", target_arch = "aarch64"))
+        && follow(&nothing, |_| (), Target::Command, None).is_ok()
+}
+
 /// Starts the program with these arguments as `setting` says, and waits until it has ended; whoever calls this sees to it
 /// that it ends. `Err` where the machine allows no tracing.
 pub(crate) fn follow(

@@ -87,6 +87,7 @@ fn actors_killed_at_any_moment_lose_no_chunk_that_was_sent() {
         let mut actor = run.start(&format!("actor 0 {incarnation}"));
         actor.told("send 800");
         actor.says("sending 3");
+        // Each time at another moment of its work.
         std::thread::sleep(Duration::from_micros(incarnation * 777));
         actor.kill();
         sent.push(actor.last_words("sending").unwrap_or(3));

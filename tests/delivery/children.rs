@@ -199,6 +199,7 @@ fn learner(domain: &Domain, path: &std::path::Path, actors: u32, stalls_at: Opti
             Err(TryRecvError::Empty) => {}
         }
         if crawls {
+            // Its being slow is what it is for.
             std::thread::sleep(Duration::from_millis(1));
             quota += ROWS as u64;
         }

@@ -1,5 +1,6 @@
 //! Environment servers that die or pause between question and answer.
 
+use std::sync::mpsc::{Receiver, Sender, channel};
 use std::time::Duration;
 
 use rustix::process::Signal;
@@ -9,7 +10,7 @@ use shoal_common::exit::Exit;
 use shoal_common::report::Role;
 
 use crate::children::{ENVS, pendulums};
-use crate::run::{Run, Watchdog};
+use crate::run::{DEADLINE, Run, Watchdog};
 
 const ACTIONS: [f32; ENVS as usize] = [0.5; ENVS as usize];
 
@@ -34,11 +35,20 @@ impl Asker {
     }
 
     fn reset(&self) -> Observed {
-        self.client.reset(&self.bell, Begin::Next, || ()).expect("no hang")
+        self.reset_while(|| ())
+    }
+
+    /// `idle` is called again and again while it waits.
+    fn reset_while(&self, idle: impl FnMut()) -> Observed {
+        self.client.reset(&self.bell, Begin::Next, idle).expect("no hang")
     }
 
     fn step(&self) -> Stepped {
-        self.client.step(&self.bell, &ACTIONS, || ()).expect("no hang")
+        self.step_while(|| ())
+    }
+
+    fn step_while(&self, idle: impl FnMut()) -> Stepped {
+        self.client.step(&self.bell, &ACTIONS, idle).expect("no hang")
     }
 
     fn snapshot(&self) -> Snapshot {
@@ -53,7 +63,11 @@ impl Asker {
     }
 
     fn restore(&self, words: &[u64]) -> Result<Observed, Exit<ChannelError>> {
-        self.client.restore(&self.bell, words, || ())
+        self.restore_while(words, || ())
+    }
+
+    fn restore_while(&self, words: &[u64], idle: impl FnMut()) -> Result<Observed, Exit<ChannelError>> {
+        self.client.restore(&self.bell, words, idle)
     }
 
     /// All that comes of so many steps, as bits.
@@ -80,6 +94,21 @@ impl Asker {
             };
             assert!((0..ENVS as usize).all(|e| !observed.terminated(e) && observed.reward(e) < 0.0));
         }
+    }
+}
+
+/// What a client does while it waits.
+fn tells(waits: &Sender<()>) -> impl FnMut() {
+    move || {
+        // It may wait longer than anybody listens.
+        let _ = waits.send(());
+    }
+}
+
+/// Returns when a client has napped over its question several times.
+fn waits_several_times(waiting: Receiver<()>) {
+    for _ in 0..5 {
+        waiting.recv_timeout(DEADLINE).expect("the client waits");
     }
 }
 
@@ -117,11 +146,12 @@ fn a_step_asked_while_no_server_lives_is_lost_and_a_reset_waits_for_one() {
     server.kill();
     assert!(matches!(asker.step(), Stepped::Lost));
     std::thread::scope(|scope| {
+        let (waits, waiting) = channel();
         let starter = scope.spawn(|| {
-            std::thread::sleep(Duration::from_millis(200));
+            waits_several_times(waiting);
             run.start("env-server")
         });
-        asker.reset();
+        asker.reset_while(tells(&waits));
         let _server = starter.join().unwrap();
         asker.steps(10);
     });
@@ -136,6 +166,7 @@ fn servers_killed_at_any_moment_never_hold_the_client_up() {
     for kill in 0..6 {
         asker.reset();
         let killer = std::thread::spawn(move || {
+            // Each time at another moment of a step.
             std::thread::sleep(Duration::from_micros(kill * 1_777));
             server.kill();
         });
@@ -157,12 +188,13 @@ fn a_server_that_is_stopped_for_a_while_answers_when_it_goes_on() {
     asker.reset();
     asker.steps(3);
     server.signal(Signal::STOP);
+    let (waits, waiting) = channel();
     let waker = std::thread::spawn(move || {
-        std::thread::sleep(Duration::from_secs(1));
+        waits_several_times(waiting);
         server.signal(Signal::CONT);
         server
     });
-    asker.steps(1);
+    assert!(matches!(asker.step_while(tells(&waits)), Stepped::Taken(_)));
     let server = waker.join().unwrap();
     asker.steps(3);
     server.ends();
@@ -215,11 +247,12 @@ fn a_snapshot_whose_server_is_killed_before_it_answers_is_lost_and_a_restore_wai
         });
         assert_eq!(asker.snapshot(), Snapshot::Lost);
         killer.join().unwrap();
+        let (waits, waiting) = channel();
         let starter = scope.spawn(|| {
-            std::thread::sleep(Duration::from_millis(200));
+            waits_several_times(waiting);
             run.start("env-server")
         });
-        asker.restore(&words).unwrap();
+        asker.restore_while(&words, tells(&waits)).unwrap();
         let _server = starter.join().unwrap();
         assert_eq!(asker.future(10), whole);
     });

@@ -47,6 +47,7 @@ fn processes_killed_while_they_start_leave_nothing() {
     let roles = ["learner 1", "actor 0 1", "policy-publisher 0", "env-server"];
     for moment in 0..24 {
         let mut process = run.launch(roles[moment as usize % roles.len()]);
+        // Each time at another moment of its start.
         std::thread::sleep(Duration::from_micros(moment * 555));
         process.kill();
     }

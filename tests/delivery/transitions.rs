@@ -70,6 +70,7 @@ fn a_learner_killed_at_any_moment_commits_each_chunk_once() {
         if kill % 2 == 0 {
             learner.says("ready");
         }
+        // Each time at another moment of its work.
         std::thread::sleep(Duration::from_micros(kill * 777));
         learner.kill();
     }

@@ -1,35 +1,68 @@
-//! Environments of Gymnasium, served from Python. Where `python3` lacks the package shoal-gym these tests say that they
-//! were skipped; with `SHOAL_REQUIRE_PYTHON` set they fail.
+//! Environments of Gymnasium, served from Python. Where `python3` lacks the package shoal-gym these tests are ignored; with
+//! `SHOAL_REQUIRE_PYTHON` set they fail.
 
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
-#![allow(clippy::print_stderr, reason = "who skips a test says so")]
 
+#[path = "../support/suite.rs"]
+mod suite;
 #[path = "../support/mod.rs"]
 mod support;
 
 use std::path::Path;
-use std::process::Command;
+use std::process::{Command, ExitCode};
 use std::time::Duration;
 
 use rustix::process::{Pid, Signal, kill_process};
 use shoal_common::config::Config;
 use shoal_common::space::Space;
-use support::{Workplace, complaint, end_of, output_of, parse, python_serves, until};
+use suite::{PYTHON, test};
+use support::{Workplace, comes_further, complaint, end_of, output_of, parse, until};
+
+fn main() -> ExitCode {
+    suite::run(vec![
+        test!(the_package_passes_its_own_tests, PYTHON),
+        test!(gymnasiums_pendulum_is_trained_while_its_servers_are_killed, PYTHON),
+        test!(seeds_reach_the_environments_and_lockstep_gives_the_same_bits, PYTHON),
+        test!(what_ends_by_itself_and_what_the_limit_ends_are_kept_apart, PYTHON),
+        test!(discrete_spaces_are_counted_from_zero_and_learned_by_a_table, PYTHON),
+        test!(
+            an_environment_that_fails_is_a_dead_role_whose_last_words_are_shown,
+            PYTHON
+        ),
+        test!(
+            what_cannot_be_served_is_refused_in_one_line_before_anything_is_made,
+            PYTHON
+        ),
+        test!(
+            servers_end_with_their_launcher_and_the_run_goes_on_when_it_is_resumed,
+            PYTHON
+        ),
+        test!(
+            the_way_through_shared_memory_is_measured_beside_gymnasiums_own_vectors,
+            PYTHON
+        ),
+        test!(a_process_that_an_environment_leaves_behind_holds_up_nobody, PYTHON),
+        test!(
+            what_an_environment_writes_costs_bounded_memory_and_commands_no_terminal,
+            PYTHON
+        ),
+        test!(a_server_that_is_stuck_ends_with_its_launcher_all_the_same, PYTHON),
+        test!(a_killed_probe_leaves_no_process_and_no_file, PYTHON),
+        test!(a_server_that_lives_and_does_not_hear_is_replaced, PYTHON),
+        test!(an_environment_that_takes_its_time_over_a_step_is_left_alone, PYTHON),
+    ])
+}
 
 /// A module with environments for the tests.
 const OURS: &str = "gym:shoal_test_environments:";
 
-/// Where `python3` serves Gymnasium's environments, and finds those of the tests; `None` where it cannot.
-fn place() -> Option<Workplace> {
-    if !python_serves() {
-        eprintln!("skipped: python3 has no shoal_gym");
-        return None;
-    }
+/// A place where `python3` finds the environments of the tests.
+fn place() -> Workplace {
     let place = Workplace::new();
     let module = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/gym/shoal_test_environments.py");
     // Python finds modules where it is started.
     std::fs::copy(module, place.path().join("shoal_test_environments.py")).unwrap();
-    Some(place)
+    place
 }
 
 const SHORT: [&str; 4] = ["--set", "evaluation.every=1000", "--envs", "2"];
@@ -38,12 +71,7 @@ fn config(place: &Workplace) -> Config {
     Config::load(&place.path().join("run/config.toml")).unwrap()
 }
 
-#[test]
 fn the_package_passes_its_own_tests() {
-    if !python_serves() {
-        eprintln!("skipped: python3 has no shoal_gym");
-        return;
-    }
     let mut tests = Command::new("python3");
     tests
         .args(["-B", "-m", "unittest", "discover", "-s", "tests"])
@@ -53,9 +81,8 @@ fn the_package_passes_its_own_tests() {
     assert!(output.status.success() && !said.contains("Ran 0 tests"), "{said}");
 }
 
-#[test]
 fn gymnasiums_pendulum_is_trained_while_its_servers_are_killed() {
-    let Some(place) = place() else { return };
+    let place = place();
     // Long enough for two kills: who is killed while the run ends has no successor.
     let steps = ["--steps", "20000"];
     let running = place.start_in("run", "gym:Pendulum-v1", &[&SHORT[..], &steps].concat());
@@ -85,9 +112,8 @@ fn gymnasiums_pendulum_is_trained_while_its_servers_are_killed() {
     assert!(page.contains("\"terminated\":false"), "episodes are played");
 }
 
-#[test]
 fn seeds_reach_the_environments_and_lockstep_gives_the_same_bits() {
-    let Some(place) = place() else { return };
+    let place = place();
     let environment = format!("{OURS}Ends-v0");
     let weights = |name: &str, seed: &str| {
         let arguments = ["--lockstep", "--steps", "400", "--seed", seed];
@@ -100,9 +126,8 @@ fn seeds_reach_the_environments_and_lockstep_gives_the_same_bits() {
     assert_eq!((spec.observation.width(), spec.action.width()), (4, 2), "flattened");
 }
 
-#[test]
 fn what_ends_by_itself_and_what_the_limit_ends_are_kept_apart() {
-    let Some(place) = place() else { return };
+    let place = place();
     for (after, steps, terminated) in [("3", "3", "1"), ("0", "5", "0"), ("5", "5", "1")] {
         let name = format!("after-{after}");
         let after = format!("environment.after={after}");
@@ -119,9 +144,8 @@ fn what_ends_by_itself_and_what_the_limit_ends_are_kept_apart() {
     }
 }
 
-#[test]
 fn discrete_spaces_are_counted_from_zero_and_learned_by_a_table() {
-    let Some(place) = place() else { return };
+    let place = place();
     let arguments = ["--steps", "3000", "--set", "q-learning.epsilon=0.5"];
     let plain = ["train", &format!("{OURS}Offset-v0"), "--run", "run", "--json"];
     let output = place.output(&[&plain[..], &arguments].concat());
@@ -134,9 +158,8 @@ fn discrete_spaces_are_counted_from_zero_and_learned_by_a_table() {
     assert_eq!(support::json(&output)["eval_return_mean"], 3.0, "it walks to the end");
 }
 
-#[test]
 fn an_environment_that_fails_is_a_dead_role_whose_last_words_are_shown() {
-    let Some(place) = place() else { return };
+    let place = place();
     for (how, word) in [("raise", "the motor is on fire"), ("abort", "killed by signal 6")] {
         let run = format!("run-{how}");
         let how = format!("environment.how={how}");
@@ -151,9 +174,8 @@ fn an_environment_that_fails_is_a_dead_role_whose_last_words_are_shown() {
     }
 }
 
-#[test]
 fn what_cannot_be_served_is_refused_in_one_line_before_anything_is_made() {
-    let Some(place) = place() else { return };
+    let place = place();
     let odd = format!("{OURS}Odd-v0");
     let endless = format!("{OURS}Endless-v0");
     let fails = format!("{OURS}Fails-v0");
@@ -191,9 +213,8 @@ fn what_cannot_be_served_is_refused_in_one_line_before_anything_is_made() {
     }
 }
 
-#[test]
 fn servers_end_with_their_launcher_and_the_run_goes_on_when_it_is_resumed() {
-    let Some(place) = place() else { return };
+    let place = place();
     let endless = ["--steps", "100000000"];
     let running = place.start_in("run", "gym:Pendulum-v1", &[&SHORT[..], &endless].concat());
     running.learns_on();
@@ -207,9 +228,8 @@ fn servers_end_with_their_launcher_and_the_run_goes_on_when_it_is_resumed() {
     assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
 }
 
-#[test]
 fn the_way_through_shared_memory_is_measured_beside_gymnasiums_own_vectors() {
-    let Some(place) = place() else { return };
+    let place = place();
     let mut bench = place.shoal(&["bench", "gym", "--json"]);
     let output = support::output_of(bench.env("SHOAL_BENCH_SECONDS", "0.4"));
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
@@ -236,9 +256,8 @@ fn processes_of(place: &Workplace, words: &str) -> Vec<i32> {
     .collect()
 }
 
-#[test]
 fn a_process_that_an_environment_leaves_behind_holds_up_nobody() {
-    let Some(place) = place() else { return };
+    let place = place();
     for alone in ["false", "true"] {
         let run = format!("run-{alone}");
         let alone = format!("environment.alone={alone}");
@@ -260,13 +279,12 @@ fn a_process_that_an_environment_leaves_behind_holds_up_nobody() {
     }
 }
 
-#[test]
 fn what_an_environment_writes_costs_bounded_memory_and_commands_no_terminal() {
-    let Some(place) = place() else { return };
+    let place = place();
     let flood = [&SHORT[..], &["--steps", "100000000", "--set", "environment.how=flood"]].concat();
     let running = place.start_in("flood", &format!("{OURS}Talks-v0"), &flood);
-    running.learns_on();
-    std::thread::sleep(Duration::from_secs(3));
+    // A megabyte a step: more than the launcher may have.
+    comes_further(&running, 400);
     let status = std::fs::read_to_string(format!("/proc/{}/status", running.launcher())).unwrap();
     let peak = status.lines().find_map(|line| line.strip_prefix("VmHWM:")).unwrap();
     let kilobytes: u64 = peak.trim().trim_end_matches(" kB").parse().unwrap();
@@ -283,23 +301,21 @@ fn what_an_environment_writes_costs_bounded_memory_and_commands_no_terminal() {
     assert!(log.contains("owned") && !log.contains('\x1b') && !log.contains('\x07'));
 }
 
-#[test]
 fn a_server_that_is_stuck_ends_with_its_launcher_all_the_same() {
-    let Some(place) = place() else { return };
+    let place = place();
     let arguments = [&SHORT[..], &["--steps", "100000000"]].concat();
     let running = place.start_in("run", &format!("{OURS}Sleeps-v0"), &arguments);
     running.learns_on();
     std::fs::write(place.path().join("sleep"), "").unwrap();
-    std::thread::sleep(Duration::from_secs(1));
+    until("a server is asleep in a step", || place.path().join("asleep").exists());
     running.signal(Signal::KILL);
     until("no process is left", || {
         running.leftovers().processes().is_empty() && processes_of(&place, "shoal_gym").is_empty()
     });
 }
 
-#[test]
 fn a_killed_probe_leaves_no_process_and_no_file() {
-    let Some(place) = place() else { return };
+    let place = place();
     let asleep = format!("{OURS}Sleeps-v0");
     let arguments = ["train", &asleep, "--set", "environment.from_the_start=true"];
     let mut probe = place.shoal(&arguments).env("TMPDIR", place.path()).spawn().unwrap();
@@ -315,9 +331,8 @@ fn a_killed_probe_leaves_no_process_and_no_file() {
     assert!(left.is_empty(), "{left:?}");
 }
 
-#[test]
 fn a_server_that_lives_and_does_not_hear_is_replaced() {
-    let Some(place) = place() else { return };
+    let place = place();
     let server = "from shoal_test_environments import deaf_server; raise SystemExit(deaf_server())";
     let server = format!(
         "environment.server={}",
@@ -341,9 +356,8 @@ fn a_server_that_lives_and_does_not_hear_is_replaced() {
     assert!(incidents.contains("stalled"), "{incidents}");
 }
 
-#[test]
 fn an_environment_that_takes_its_time_over_a_step_is_left_alone() {
-    let Some(place) = place() else { return };
+    let place = place();
     let arguments = [&SHORT[..], &["--steps", "100000000", "--set", "run.stall_seconds=3"]].concat();
     let running = place.start_in("run", &format!("{OURS}Sleeps-v0"), &arguments);
     running.learns_on();

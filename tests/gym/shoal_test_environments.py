@@ -70,7 +70,10 @@ class Talks(Ends):
 
 
 class Sleeps(Ends):
-    """Does not come back from a step, once there is a file of the name ``sleep``, or from being made."""
+    """Does not come back from a step, once there is a file of the name ``sleep``, or from being made.
+
+    The file ``asleep`` says that it sleeps in a step.
+    """
 
     def __init__(self, from_the_start=False):
         super().__init__(after=0)
@@ -79,6 +82,7 @@ class Sleeps(Ends):
 
     def step(self, action):
         if os.path.exists("sleep"):
+            open("asleep", "w").close()
             time.sleep(54321)
         return super().step(action)
 

@@ -11,13 +11,19 @@ use std::time::Duration;
 use rustix::process::{Pid, Signal, kill_process_group};
 use serde_json::{Value, json};
 
+use crate::suite::Need;
+
 /// After so long without a word Chromium is stuck.
 const PATIENCE: Duration = Duration::from_secs(120);
 
-/// Where this is set, a test that finds no Chromium has failed.
-const REQUIRED: &str = "SHOAL_REQUIRE_BROWSER";
-
 const NAMES: [&str; 4] = ["chromium", "chromium-browser", "google-chrome", "chrome"];
+
+/// A Chromium in the search path.
+pub(crate) static CHROMIUM: Need = Need::new(
+    "there is no Chromium here",
+    || program().is_some(),
+    Some("SHOAL_REQUIRE_BROWSER"),
+);
 
 /// A browser with one page.
 pub(crate) struct Browser {
@@ -30,21 +36,17 @@ pub(crate) struct Browser {
     _profile: tempfile::TempDir,
 }
 
+/// The name of the Chromium that is in the search path.
+fn program() -> Option<&'static str> {
+    let path = std::env::var_os("PATH").unwrap_or_default();
+    let is_there = |name: &&str| std::env::split_paths(&path).any(|directory| directory.join(name).is_file());
+    NAMES.into_iter().find(is_there)
+}
+
 impl Browser {
-    /// None where there is no Chromium; that is said, or is a failure where one is required.
-    pub(crate) fn start() -> Option<Self> {
-        let path = std::env::var_os("PATH").unwrap_or_default();
-        let found = NAMES
-            .iter()
-            .find(|name| std::env::split_paths(&path).any(|directory| directory.join(name).is_file()));
-        let Some(name) = found else {
-            assert!(
-                std::env::var_os(REQUIRED).is_none(),
-                "{REQUIRED} is set and there is no Chromium"
-            );
-            eprintln!("skipped: there is no Chromium here, so nobody has looked at the report's page");
-            return None;
-        };
+    /// Starts [`CHROMIUM`], which must be there.
+    pub(crate) fn start() -> Self {
+        let name = program().unwrap();
         let profile = tempfile::tempdir().unwrap();
         // Chromium reads from descriptor 3 and writes to 4.
         let mut child = Command::new("sh")
@@ -95,7 +97,7 @@ impl Browser {
         for domain in ["Page", "Network", "Runtime", "Log"] {
             browser.call(&format!("{domain}.enable"), json!({}));
         }
-        Some(browser)
+        browser
     }
 
     /// Loads a file, in a window so wide.

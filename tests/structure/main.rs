@@ -174,6 +174,37 @@ fn an_environment_server_is_built_without_the_matrix_products() {
     }
 }
 
+/// A test with a harness of its own is never run by the standard one, so `#[test]` would silently do nothing there.
+#[test]
+fn suites_with_a_harness_of_their_own_have_no_standard_tests() {
+    let manifest: toml::Table = std::fs::read_to_string(root().join("Cargo.toml"))
+        .unwrap()
+        .parse()
+        .unwrap();
+    let suites = manifest["test"].as_array().unwrap();
+    assert!(!suites.is_empty());
+    for suite in suites {
+        let main = root().join(suite["path"].as_str().unwrap());
+        let files = if main.ends_with("main.rs") {
+            let folder = std::fs::read_dir(main.parent().unwrap()).unwrap();
+            folder.map(|entry| entry.unwrap().path()).collect()
+        } else {
+            vec![main]
+        };
+        for file in files
+            .iter()
+            .filter(|file| file.extension().is_some_and(|it| it == "rs"))
+        {
+            let text = std::fs::read_to_string(file).unwrap();
+            assert!(
+                !text.contains("#[test]"),
+                "{}: give it to `run` in `main`",
+                file.display()
+            );
+        }
+    }
+}
+
 /// A workspace of these files.
 fn invented(files: &[(&str, &str)]) -> (tempfile::TempDir, Vec<Package>) {
     let place = tempfile::tempdir().unwrap();

@@ -138,6 +138,23 @@ impl Workplace {
     pub(crate) fn status(&self, name: &str) -> serde_json::Value {
         json(&self.output(&["status", name, "--json"]))
     }
+
+    /// What it prints of a role, like `actor-0`, of a run that goes on.
+    pub(crate) fn role(&self, name: &str, who: &str) -> serde_json::Value {
+        let status = self.status(name);
+        let roles = status["roles"].as_array().unwrap();
+        let is_meant =
+            |role: &&serde_json::Value| format!("{}-{}", role["role"].as_str().unwrap(), role["index"]) == who;
+        let found = roles.iter().find(is_meant);
+        found.unwrap_or_else(|| panic!("no {who}: {status}")).clone()
+    }
+
+    /// Copies the run directory `from` as it stands, under way or not.
+    pub(crate) fn copy(&self, from: &str, to: &str) {
+        let mut command = Command::new("cp");
+        let copied = command.args(["-r", from, to]).current_dir(self.path()).status();
+        assert!(copied.unwrap().success(), "{from} cannot be copied");
+    }
 }
 
 impl Running {
@@ -369,17 +386,6 @@ pub(crate) fn parse(printed: &str) -> serde_json::Value {
         "exactly one line on standard output: {printed}"
     );
     serde_json::from_str(printed).unwrap()
-}
-
-/// Whether `python3` serves Gymnasium's environments. With `SHOAL_REQUIRE_PYTHON` set it must.
-pub(crate) fn python_serves() -> bool {
-    let found = Command::new("python3").args(["-c", "import shoal_gym.server"]).output();
-    let serves = found.is_ok_and(|output| output.status.success());
-    assert!(
-        serves || std::env::var_os("SHOAL_REQUIRE_PYTHON").is_none(),
-        "python3 has no shoal_gym: pip install ./python"
-    );
-    serves
 }
 
 /// Runs a command to its end; one that hangs is killed, and the test has failed.

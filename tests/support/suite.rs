@@ -1,0 +1,111 @@
+//! Suites some of whose tests need what not every machine has. The standard harness cannot say `ignored` once it runs; this
+//! one can, with the reason. Such a suite has `harness = false` in `Cargo.toml`, and its `main` lists its tests. Filters,
+//! `--list`, `--ignored`, `--exact` and `--test-threads` work as usual; output is not captured.
+
+#![allow(dead_code, reason = "every suite uses its own part of this")]
+
+use std::process::{Command, ExitCode};
+use std::sync::OnceLock;
+
+use libtest_mimic::{Arguments, Completion, Trial};
+
+/// Something that not every machine has.
+pub(crate) struct Need {
+    missing: &'static str,
+    look: fn() -> bool,
+    required_by: Option<&'static str>,
+    found: OnceLock<bool>,
+}
+
+/// What a test can end with, where it does not fail.
+pub(crate) trait Done {
+    fn done(self) -> Completion;
+}
+
+/// Gymnasium's environments, served by `python3`.
+pub(crate) static PYTHON: Need = Need::new(
+    "python3 has no shoal_gym: pip install ./python",
+    || succeeds(Command::new("python3").args(["-c", "import shoal_gym.server"])),
+    Some("SHOAL_REQUIRE_PYTHON"),
+);
+
+/// The right to be two users.
+pub(crate) static ROOT: Need = Need::new(
+    "only root can be two users",
+    || rustix::process::getuid().is_root(),
+    None,
+);
+
+impl Need {
+    /// `missing` is what is said where `look` finds nothing. Where the variable `required_by` is set that is a failure.
+    pub(crate) const fn new(missing: &'static str, look: fn() -> bool, required_by: Option<&'static str>) -> Self {
+        Self {
+            missing,
+            look,
+            required_by,
+            found: OnceLock::new(),
+        }
+    }
+
+    /// What is missing on this machine; `None` where nothing is. It is looked for once.
+    ///
+    /// # Panics
+    /// Where it is missing and required.
+    pub(crate) fn missing(&self) -> Option<&'static str> {
+        if *self.found.get_or_init(self.look) {
+            return None;
+        }
+        if let Some(variable) = self.required_by {
+            assert!(
+                std::env::var_os(variable).is_none(),
+                "{variable} is set, and {}",
+                self.missing
+            );
+        }
+        Some(self.missing)
+    }
+}
+
+impl Done for () {
+    fn done(self) -> Completion {
+        Completion::Completed
+    }
+}
+
+impl Done for Completion {
+    fn done(self) -> Completion {
+        self
+    }
+}
+
+/// A test by its function, and what it needs.
+macro_rules! test {
+    ($test:ident $(, $need:expr)*) => {
+        $crate::suite::trial(stringify!($test), vec![$(&$need),*], $test)
+    };
+}
+pub(crate) use test;
+
+/// A test that is ignored where something that it needs is missing.
+pub(crate) fn trial<D: Done + 'static>(name: &str, needs: Vec<&'static Need>, test: fn() -> D) -> Trial {
+    Trial::ignorable_test(name, move || {
+        Ok(match needs.iter().find_map(|need| need.missing()) {
+            Some(missing) => Completion::ignored_with(missing),
+            None => test().done(),
+        })
+    })
+}
+
+/// Runs the tests that the command line asks for.
+pub(crate) fn run(tests: Vec<Trial>) -> ExitCode {
+    let mut arguments = Arguments::from_args();
+    // As the standard harness does.
+    let threads = std::env::var("RUST_TEST_THREADS").ok();
+    let threads = threads.map(|threads| threads.parse().unwrap());
+    arguments.test_threads = arguments.test_threads.or(threads);
+    libtest_mimic::run(&arguments, tests).exit_code()
+}
+
+fn succeeds(command: &mut Command) -> bool {
+    command.output().is_ok_and(|output| output.status.success())
+}
