@@ -4,9 +4,14 @@
 
 mod support;
 
+use std::fs::File;
+use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ExitStatus, Stdio};
 
+use flate2::Compression;
+use flate2::read::GzDecoder;
+use flate2::write::GzEncoder;
 use rustix::process::{Pid, Signal, kill_process};
 use support::{Leftovers, Workplace, complaint, until};
 
@@ -55,11 +60,45 @@ fn runs(place: &Workplace) -> [PathBuf; 2] {
     ["seed-1", "seed-2"].map(|seed| place.path().join("kept/pendulum").join(seed))
 }
 
+/// The lines of an experiment's results: its head, then a result in each.
+fn lines(results: &Path) -> Vec<String> {
+    lines_of(&std::fs::read(results).unwrap())
+}
+
+fn lines_of(bytes: &[u8]) -> Vec<String> {
+    let mut text = String::new();
+    GzDecoder::new(bytes).read_to_string(&mut text).unwrap();
+    text.lines().map(Into::into).collect()
+}
+
+/// The seeds and stages whose results are there.
+fn kept(results: &Path) -> Vec<(u64, String)> {
+    let of = |line: &String| {
+        let result: serde_json::Value = serde_json::from_str(line).unwrap();
+        (
+            result["seed"].as_u64().unwrap(),
+            result["stage"].as_str().unwrap().into(),
+        )
+    };
+    lines(results)[1..].iter().map(of).collect()
+}
+
+/// Puts every result of the first stage into a file of its own, as earlier versions did, and removes the one file.
+fn as_before(results: &Path, directory: &Path) {
+    std::fs::create_dir_all(directory).unwrap();
+    for ((seed, _), line) in kept(results).iter().zip(&lines(results)[1..]) {
+        let old = line.replacen("\"stage\":\"\",", "", 1) + "\n";
+        std::fs::write(directory.join(format!("seed-{seed}.json")), old).unwrap();
+    }
+    std::fs::remove_file(results).unwrap();
+}
+
 #[test]
 fn what_is_interrupted_goes_on_and_nothing_is_run_twice() {
     let place = Workplace::new();
     let [first, second] = runs(&place);
-    let result = place.path().join("kept/pendulum/seed-2.json");
+    let results = place.path().join("kept/pendulum.jsonl.gz");
+    let seeds = |seeds: &[u64]| seeds.iter().map(|seed| (*seed, String::new())).collect::<Vec<_>>();
 
     let reproducing = Reproducing::start(&place, &PENDULUM);
     until("the second seed trains", || starts(&second) == 1);
@@ -67,7 +106,7 @@ fn what_is_interrupted_goes_on_and_nothing_is_run_twice() {
     assert!(meanwhile.contains("another `shoal reproduce`"), "{meanwhile}");
     reproducing.signal(Signal::INT);
     assert_eq!(reproducing.wait().code(), Some(130), "{}", place.said());
-    assert!(place.path().join("kept/pendulum/seed-1.json").exists() && !result.exists());
+    assert_eq!(kept(&results), seeds(&[1]));
     Leftovers::of(&second).vanish();
     let report = || std::fs::read_to_string(place.path().join("kept/REPORT.md")).unwrap();
     assert!(report().contains("seeds 1; missing: 2"), "{}", report());
@@ -83,19 +122,23 @@ fn what_is_interrupted_goes_on_and_nothing_is_run_twice() {
         "{}",
         report()
     );
-    for figure in ["pendulum-learning-curve", "pendulum-swing-up"] {
-        for (ending, magic) in [("svg", &b"<svg"[..]), ("png", b"\x89PNG")] {
-            let bytes = std::fs::read(place.path().join(format!("kept/figures/{figure}.{ending}"))).unwrap();
-            assert!(bytes.starts_with(magic), "{figure}.{ending}");
-        }
+    let figure = |file: &str| place.path().join("kept/figures").join(file);
+    for name in ["pendulum-learning-curve", "pendulum-swing-up"] {
+        assert!(
+            std::fs::read(figure(&format!("{name}.svg")))
+                .unwrap()
+                .starts_with(b"<svg")
+        );
+        assert!(!figure(&format!("{name}.png")).exists(), "nobody asked for it");
     }
 
     // Results alone are enough for the report, wherever it goes.
-    let kept = std::fs::read(&result).unwrap();
+    assert_eq!(kept(&results), seeds(&[1, 2]));
+    let bytes = std::fs::read(&results).unwrap();
     for run in [&first, &second] {
         std::fs::remove_dir_all(run).unwrap();
     }
-    let elsewhere = [&PENDULUM[..], &["--report", "told/REPORT.md"]].concat();
+    let elsewhere = [&PENDULUM[..], &["--report", "told/REPORT.md", "--png"]].concat();
     assert!(
         Reproducing::start(&place, &elsewhere).wait().success(),
         "{}",
@@ -103,20 +146,48 @@ fn what_is_interrupted_goes_on_and_nothing_is_run_twice() {
     );
     assert!(!first.exists() && !second.exists(), "nothing was due");
     let told = std::fs::read_to_string(place.path().join("told/REPORT.md")).unwrap();
-    assert!(told.contains("(../kept/figures/pendulum-swing-up.png)"), "{told}");
+    for link in [
+        "![The swing-up",
+        "](../kept/figures/pendulum-swing-up.svg)",
+        "([PNG](../kept/figures/pendulum-swing-up.png))",
+    ] {
+        assert!(told.contains(link), "{link}: {told}");
+    }
+    assert!(
+        std::fs::read(figure("pendulum-swing-up.png"))
+            .unwrap()
+            .starts_with(b"\x89PNG")
+    );
 
     // In lockstep a seed's result is the same, interrupted or not.
-    std::fs::remove_file(&result).unwrap();
+    let mut without = GzEncoder::new(File::create(&results).unwrap(), Compression::fast());
+    for line in &lines_of(&bytes)[..2] {
+        writeln!(without, "{line}").unwrap();
+    }
+    without.finish().unwrap();
+    assert_eq!(kept(&results), seeds(&[1]));
     assert!(
         Reproducing::start(&place, &PENDULUM).wait().success(),
         "{}",
         place.said()
     );
-    assert_eq!(starts(&second), 1);
-    assert_eq!(
-        String::from_utf8(std::fs::read(&result).unwrap()),
-        String::from_utf8(kept)
+    assert!(!first.exists() && starts(&second) == 1);
+    assert_eq!(lines(&results), lines_of(&bytes));
+    assert!(
+        std::fs::read(&results).unwrap() == bytes,
+        "the same results are the same bytes"
     );
+
+    // What earlier versions kept counts, and is taken over.
+    as_before(&results, first.parent().unwrap());
+    assert!(
+        Reproducing::start(&place, &PENDULUM).wait().success(),
+        "{}",
+        place.said()
+    );
+    assert!(!first.exists() && starts(&second) == 1, "nothing was due");
+    assert_eq!(lines(&results), lines_of(&bytes));
+    assert!(!place.path().join("kept/pendulum/seed-1.json").exists() && report().contains("seeds 1, 2\n"));
 }
 
 #[test]
@@ -135,16 +206,23 @@ fn a_seed_that_fails_is_missing_and_the_others_go_on() {
     assert_eq!(std::fs::read_to_string(first.join("notes.txt")).unwrap(), "mine");
     assert_eq!(starts(&second), 1);
 
-    // What was made otherwise is neither used nor overwritten.
-    let result = place.path().join("kept/pendulum/seed-2.json");
-    let kept = std::fs::read(&result).unwrap();
+    // What was made otherwise is neither used nor overwritten, in whichever form it is.
+    let results = place.path().join("kept/pendulum.jsonl.gz");
+    let bytes = std::fs::read(&results).unwrap();
     let full = ["reproduce", "pendulum", "--out", "kept"];
     let refused = complaint(&place.output(&full));
     assert!(
-        refused.contains("seed-2.json") && refused.contains("--out"),
+        refused.contains("pendulum.jsonl.gz (seed 2)") && refused.contains("--out"),
         "{refused}"
     );
-    assert_eq!(std::fs::read(&result).unwrap(), kept);
+    assert_eq!(std::fs::read(&results).unwrap(), bytes);
+    as_before(&results, first.parent().unwrap());
+    let refused = complaint(&place.output(&full));
+    assert!(
+        refused.contains("pendulum/seed-2.json") && refused.contains("--out"),
+        "{refused}"
+    );
+    assert!(place.path().join("kept/pendulum/seed-2.json").exists() && !results.exists());
 }
 
 #[test]
@@ -179,21 +257,25 @@ fn every_experiment_of_the_thesis_can_be_glanced_at() {
         ("point-mass-r2-longer-learning-curve", "A.3"),
         ("point-mass-r3-far-2", "A.8"),
     ] {
-        let line = report.lines().find(|line| line.contains(&format!("{figure}.png")));
+        let line = report.lines().find(|line| line.contains(&format!("{figure}.svg")));
         assert!(
             line.is_some_and(|line| line.contains(of_the_thesis)),
             "{figure}: {report}"
         );
         assert!(
-            place.path().join(format!("kept/figures/{figure}.png")).exists(),
+            place.path().join(format!("kept/figures/{figure}.svg")).exists(),
             "{figure}"
         );
     }
     // Every policy that was judged on the lake is there, and the table at the end.
-    let lake = place.path().join("kept/frozen-lake");
-    let judged = std::fs::read_dir(lake.join("seed-1/policies")).unwrap().count();
-    let kept: serde_json::Value = serde_json::from_slice(&std::fs::read(lake.join("seed-1.json")).unwrap()).unwrap();
+    let judged = place.path().join("kept/frozen-lake/seed-1/policies");
+    let judged = std::fs::read_dir(judged).unwrap().count();
+    let result = &lines(&place.path().join("kept/frozen-lake.jsonl.gz"))[1];
+    let result: serde_json::Value = serde_json::from_str(result).unwrap();
     assert!(judged > 1, "{judged}");
-    assert_eq!(kept["tests"]["judged"].as_array().unwrap().len(), judged);
-    assert_eq!(kept["tests"]["q"].as_array().unwrap().len(), 64);
+    assert_eq!(result["tests"]["judged"].as_array().unwrap().len(), judged);
+    assert_eq!(result["tests"]["q"].as_array().unwrap().len(), 64);
+    // Each experiment has one file, with all its stages.
+    let stages = ["", "-longer"].map(|stage| (1, stage.to_string()));
+    assert_eq!(kept(&place.path().join("kept/point-mass-r2.jsonl.gz")), stages);
 }

@@ -107,10 +107,8 @@ impl Batch<'_> {
     }
 
     fn is_due(&self, job: &Job) -> bool {
-        let stages = job.experiment.stages.iter();
-        stages
-            .map(|stage| self.folder.result(job.experiment, stage, job.seed))
-            .any(|result| !result.exists())
+        let mut stages = job.experiment.stages.iter();
+        stages.any(|stage| !self.folder.has(job.experiment, stage, job.seed))
     }
 
     /// Takes one job after the other until there is none, or a signal has come.
@@ -138,7 +136,7 @@ impl Batch<'_> {
         } = job;
         let run = self.folder.run(experiment, seed);
         for stage in experiment.stages {
-            if self.folder.result(experiment, stage, seed).exists() {
+            if self.folder.has(experiment, stage, seed) {
                 continue;
             }
             let length = stage.length(self.effort);

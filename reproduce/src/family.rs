@@ -80,7 +80,7 @@ impl<T> Results<T> {
 #[derive(Debug)]
 pub(super) struct Entry {
     pub(super) experiments: &'static [Experiment],
-    /// Makes and writes the result of a run that has reached the end of a stage.
+    /// Makes and keeps the result of a run that has reached the end of a stage.
     pub(super) keep: fn(&Folder, &'static Experiment, &Stage, u64, Length, &Settings) -> anyhow::Result<()>,
     /// What the report says, from the results in the folder.
     pub(super) sections: fn(&Folder, &Album) -> anyhow::Result<Vec<Section>>,
@@ -99,11 +99,7 @@ fn sections<F: Family>(folder: &Folder, album: &Album) -> anyhow::Result<Vec<Sec
     let mut by_name = BTreeMap::new();
     for experiment in F::EXPERIMENTS {
         for stage in experiment.stages {
-            let seeds = folder.seeds(experiment, stage)?;
-            let read = seeds
-                .into_iter()
-                .map(|seed| result::read(&folder.result(experiment, stage, seed)));
-            by_name.insert((experiment.name, stage.suffix), read.collect::<anyhow::Result<_>>()?);
+            by_name.insert((experiment.name, stage.suffix), folder.read(experiment, stage)?);
         }
     }
     F::sections(&Results { by_name }, album)

@@ -1,39 +1,59 @@
-//! The folder of a reproduction: run directories and results by experiment and seed. One command works in it at a time.
+//! The folder of a reproduction: results by experiment, and run directories by experiment and seed. One command works in it
+//! at a time.
 
+use std::collections::BTreeMap;
 use std::fs::File;
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use anyhow::{Context, bail};
 use rustix::fs::{FlockOperation, flock};
 use rustix::io::Errno;
+use serde::Serialize;
+use serde::de::DeserializeOwned;
 
 use super::experiment::{Effort, Experiment, Stage};
-use super::result::Header;
+use super::result::{self, Header, SeedResult};
+use super::results_file::{ResultsFile, numbered};
 use super::settings::Settings;
 
 /// A folder that is this process's.
 #[derive(Debug)]
 pub(super) struct Folder {
     path: PathBuf,
+    /// Of every experiment that the folder was opened for. Seeds side by side add to one file.
+    results: Mutex<BTreeMap<&'static str, ResultsFile>>,
     /// Holds the lock until it is dropped; the system releases it when this process dies.
     _lock: File,
 }
 
 impl Folder {
-    /// Makes the folder if it is not there, and claims it.
-    pub(super) fn open(path: &Path) -> anyhow::Result<Self> {
+    /// Makes the folder if it is not there, claims it, and reads the results of these experiments.
+    pub(super) fn open(
+        path: &Path,
+        experiments: impl IntoIterator<Item = &'static Experiment>,
+    ) -> anyhow::Result<Self> {
         let here = path.display();
         std::fs::create_dir_all(path).with_context(|| format!("cannot make {here}"))?;
         // Children have another working directory if they like.
         let path = std::fs::canonicalize(path).with_context(|| format!("cannot resolve {here}"))?;
         let lock = File::open(&path).with_context(|| format!("cannot open {here}"))?;
         match flock(&lock, FlockOperation::NonBlockingLockExclusive) {
-            Ok(()) => Ok(Self { path, _lock: lock }),
+            Ok(()) => {}
             Err(Errno::WOULDBLOCK) => {
                 bail!("another `shoal reproduce` works in {here}: wait for it, or choose another directory with --out")
             }
-            Err(errno) => Err(errno).with_context(|| format!("cannot lock {here}")),
+            Err(errno) => return Err(errno).with_context(|| format!("cannot lock {here}")),
         }
+        let results = experiments
+            .into_iter()
+            .map(|experiment| Ok((experiment.name, ResultsFile::read(&path, experiment)?)))
+            .collect::<anyhow::Result<_>>()?;
+        Ok(Self {
+            path,
+            results: Mutex::new(results),
+            _lock: lock,
+        })
     }
 
     pub(super) fn path(&self) -> &Path {
@@ -45,87 +65,114 @@ impl Folder {
         self.path.join(experiment.name).join(format!("seed-{seed}"))
     }
 
-    /// The result of a seed at the end of a stage.
-    pub(super) fn result(&self, experiment: &Experiment, stage: &Stage, seed: u64) -> PathBuf {
-        let file = format!("seed-{seed}{}.json", stage.suffix);
-        self.path.join(experiment.name).join(file)
+    /// Whether the result of a seed at the end of a stage is there.
+    pub(super) fn has(&self, experiment: &Experiment, stage: &Stage, seed: u64) -> bool {
+        self.results()[experiment.name].has(stage, seed)
     }
 
     /// The seeds whose results are there, in order.
-    pub(super) fn seeds(&self, experiment: &Experiment, stage: &Stage) -> anyhow::Result<Vec<u64>> {
-        let mut seeds: Vec<u64> = self.numbered(experiment, &format!("{}.json", stage.suffix))?;
-        seeds.sort_unstable();
-        Ok(seeds)
+    pub(super) fn seeds(&self, experiment: &Experiment, stage: &Stage) -> Vec<u64> {
+        let results = self.results();
+        results[experiment.name].of(stage).map(|(seed, _)| seed).collect()
+    }
+
+    /// The results of a stage, in the order of seeds.
+    pub(super) fn read<T: DeserializeOwned>(
+        &self,
+        experiment: &Experiment,
+        stage: &Stage,
+    ) -> anyhow::Result<Vec<SeedResult<T>>> {
+        let results = self.results();
+        results[experiment.name]
+            .of(stage)
+            .map(|(_, line)| result::read(line))
+            .collect()
+    }
+
+    /// Keeps a result. When this returns, it is on the disk.
+    pub(super) fn add<T: Serialize>(
+        &self,
+        experiment: &Experiment,
+        stage: &Stage,
+        result: &SeedResult<T>,
+    ) -> anyhow::Result<()> {
+        let text = serde_json::to_string(result)?;
+        let mut results = self.results();
+        let file = results.get_mut(experiment.name);
+        file.context("the folder was opened for other experiments")?
+            .add(&text, stage)
     }
 
     /// Refuses a folder with results or runs of this experiment that were made otherwise than they would be now.
     pub(super) fn check(&self, experiment: &Experiment, effort: Effort, settings: &Settings) -> anyhow::Result<()> {
         for stage in experiment.stages {
-            for seed in self.seeds(experiment, stage)? {
-                let path = self.result(experiment, stage, seed);
-                Header::read(&path)?.check(&path, experiment, seed, stage.length(effort), settings)?;
+            for (seed, line) in self.results()[experiment.name].of(stage) {
+                let length = stage.length(effort);
+                Header::read(line)?.check(&line.place, experiment, seed, length, settings)?;
             }
         }
-        for seed in self.numbered(experiment, "")? {
+        for seed in numbered(&self.path.join(experiment.name), "")? {
             let run = self.run(experiment, seed);
             if run.join("config.toml").is_file() {
-                Settings::of_run(&run, seed)?.check(&run, settings)?;
+                Settings::of_run(&run, seed)?.check(&run.display().to_string(), settings)?;
             }
         }
         Ok(())
     }
 
-    /// The numbers N of what is called `seed-N<ending>` in an experiment's directory.
-    fn numbered(&self, experiment: &Experiment, ending: &str) -> anyhow::Result<Vec<u64>> {
-        let directory = self.path.join(experiment.name);
-        if !directory.exists() {
-            return Ok(Vec::new());
-        }
-        let reading = || format!("cannot read {}", directory.display());
-        let mut numbers = Vec::new();
-        for entry in std::fs::read_dir(&directory).with_context(reading)? {
-            let name = entry.with_context(reading)?.file_name();
-            let number = name
-                .to_str()
-                .and_then(|name| name.strip_prefix("seed-")?.strip_suffix(ending));
-            numbers.extend(number.and_then(|number| number.parse::<u64>().ok()));
-        }
-        Ok(numbers)
+    /// Moves what earlier versions kept in a file for each result into the one file of its experiment.
+    pub(super) fn take_over(&self) -> anyhow::Result<()> {
+        self.results().values_mut().try_for_each(ResultsFile::take_over)
+    }
+
+    fn results(&self) -> MutexGuard<'_, BTreeMap<&'static str, ResultsFile>> {
+        self.results.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use super::super::point_mass::EXPERIMENTS;
+    use super::super::result::tests::result;
     use super::*;
 
     #[test]
     fn a_folder_has_one_command_at_a_time() {
         let parent = tempfile::tempdir().unwrap();
         let path = parent.path().join("results");
-        let folder = Folder::open(&path).unwrap();
-        let error = Folder::open(&path).unwrap_err().to_string();
+        let folder = Folder::open(&path, []).unwrap();
+        let error = Folder::open(&path, []).unwrap_err().to_string();
         assert!(error.contains("--out") && !error.contains('\n'), "{error}");
         drop(folder);
-        Folder::open(&path).unwrap();
+        Folder::open(&path, []).unwrap();
     }
 
     #[test]
-    fn results_are_found_by_their_names() {
-        let parent = tempfile::tempdir().unwrap();
-        let folder = Folder::open(parent.path()).unwrap();
-        let experiment = &super::super::point_mass::EXPERIMENTS[1];
-        std::fs::create_dir_all(folder.run(experiment, 12)).unwrap();
-        for name in [
-            "seed-12.json",
-            "seed-2.json",
-            "seed-2-longer.json",
-            "seed-2.json.new",
-            "notes.txt",
-        ] {
-            std::fs::write(parent.path().join(experiment.name).join(name), "").unwrap();
-        }
-        assert_eq!(folder.seeds(experiment, &experiment.stages[0]).unwrap(), [2, 12]);
-        assert_eq!(folder.seeds(experiment, &experiment.stages[1]).unwrap(), [2]);
-        assert_eq!(folder.numbered(experiment, "").unwrap(), [12]);
+    fn seeds_side_by_side_are_all_kept() {
+        let directory = tempfile::tempdir().unwrap();
+        let experiment = &EXPERIMENTS[1];
+        let folder = Folder::open(directory.path(), [experiment]).unwrap();
+        std::thread::scope(|scope| {
+            for seed in 1..=8 {
+                let folder = &folder;
+                scope.spawn(move || {
+                    let result = result(experiment, seed, seed as f64, ());
+                    folder.add(experiment, &experiment.stages[0], &result).unwrap();
+                });
+            }
+        });
+        drop(folder);
+        let folder = Folder::open(directory.path(), [experiment]).unwrap();
+        let [first, second] = experiment.stages else {
+            panic!("two stages")
+        };
+        assert_eq!(folder.seeds(experiment, first), (1..=8).collect::<Vec<_>>());
+        assert!(folder.has(experiment, first, 8) && !folder.has(experiment, second, 8));
+        let read = folder.read::<()>(experiment, first).unwrap();
+        assert!(
+            (1..=8)
+                .zip(&read)
+                .all(|(seed, it)| *it == result(experiment, seed, seed as f64, ()))
+        );
     }
 }

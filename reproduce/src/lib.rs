@@ -14,6 +14,7 @@ mod point_mass;
 mod progress;
 mod report;
 mod result;
+mod results_file;
 mod settings;
 mod training;
 
@@ -50,6 +51,8 @@ pub struct Order {
     pub effort: Effort,
     /// Where runs, results and figures lie.
     pub folder: PathBuf,
+    /// Whether every figure is drawn as PNG as well as SVG.
+    pub png: bool,
     /// The file that the report is written to.
     pub report: PathBuf,
 }
@@ -74,7 +77,7 @@ pub fn names() -> impl Iterator<Item = &'static str> {
 
 /// Runs what is due, keeps each result, and writes the report from all results of the folder.
 pub fn run(order: &Order) -> anyhow::Result<Ending> {
-    let folder = Folder::open(&order.folder)?;
+    let folder = Folder::open(&order.folder, experiments().map(|(_, experiment)| experiment))?;
     let settings = expected(order.effort)?;
     let wanted = experiments()
         .filter(|(_, it)| order.experiments.is_empty() || order.experiments.iter().any(|name| name == it.asked_as));
@@ -92,6 +95,7 @@ pub fn run(order: &Order) -> anyhow::Result<Ending> {
     for (_, experiment) in experiments() {
         folder.check(experiment, order.effort, &settings[experiment.name])?;
     }
+    folder.take_over()?;
     let write = |failures: &BTreeMap<_, _>| {
         report::write(&FAMILIES, &folder, order, &jobs, failures)
             .with_context(|| format!("cannot write the report {}", order.report.display()))

@@ -177,7 +177,7 @@ mod tests {
     #[test]
     fn results_make_a_section_with_figures() {
         let directory = tempfile::tempdir().unwrap();
-        let album = Album::in_directory(directory.path().into()).unwrap();
+        let album = Album::in_directory(directory.path().into(), true).unwrap();
         let mut results = Results::new();
         assert_eq!(Pendulum::sections(&results, &album).unwrap()[0].figures.len(), 1);
         results.put(

@@ -163,7 +163,7 @@ mod tests {
     #[test]
     fn results_make_sections_with_all_figures() {
         let directory = tempfile::tempdir().unwrap();
-        let album = Album::in_directory(directory.path().into()).unwrap();
+        let album = Album::in_directory(directory.path().into(), false).unwrap();
         let mut results = Results::new();
         let figures = |results: &Results<Tests>| -> Vec<usize> {
             let sections = PointMass::sections(results, &album).unwrap();

@@ -33,20 +33,24 @@ pub(super) struct Figure {
     /// Without an ending.
     file: String,
     caption: String,
+    /// Whether it is there as PNG as well.
+    png: bool,
 }
 
 /// Where figures are drawn.
 pub(super) struct Album {
     directory: PathBuf,
+    /// Whether each is drawn as PNG as well.
+    png: bool,
 }
 
 impl Album {
-    pub(super) fn in_directory(directory: PathBuf) -> anyhow::Result<Self> {
+    pub(super) fn in_directory(directory: PathBuf, png: bool) -> anyhow::Result<Self> {
         std::fs::create_dir_all(&directory).with_context(|| format!("cannot make {}", directory.display()))?;
-        Ok(Self { directory })
+        Ok(Self { directory, png })
     }
 
-    /// Has `draw` draw the figure `name` as SVG, and makes the PNG from it if it has changed.
+    /// Has `draw` draw the figure `name` as SVG. A PNG of what it was before is removed, and made anew if it is wanted.
     pub(super) fn add(
         &self,
         name: &str,
@@ -57,12 +61,16 @@ impl Album {
         let before = std::fs::read(&svg).ok();
         draw(&svg)?;
         let changed = before.is_none() || before != std::fs::read(&svg).ok();
-        if changed || !png.exists() {
+        if changed && png.exists() {
+            std::fs::remove_file(&png).with_context(|| format!("cannot remove {}", png.display()))?;
+        }
+        if self.png && !png.exists() {
             figure::rasterise(&svg, &png)?;
         }
         Ok(Figure {
             file: name.into(),
             caption: caption.into(),
+            png: self.png,
         })
     }
 }
@@ -76,7 +84,7 @@ pub(super) fn write(
     failures: &BTreeMap<Name, String>,
 ) -> anyhow::Result<()> {
     let figures = folder.path().join("figures");
-    let album = Album::in_directory(figures.clone())?;
+    let album = Album::in_directory(figures.clone(), order.png)?;
     let mut sections = Vec::new();
     for family in families {
         let stages = Stages {
@@ -86,11 +94,11 @@ pub(super) fn write(
             failures,
             effort: order.effort,
         };
-        if !stages.are_of_interest()? {
+        if !stages.are_of_interest() {
             continue;
         }
         for section in (family.sections)(folder, &album)? {
-            if let Some(seeds) = stages.seeds_of(&section)? {
+            if let Some(seeds) = stages.seeds_of(&section) {
                 let notes = notes(folder, &section.from)?;
                 sections.push((section, seeds, notes));
             }
@@ -130,19 +138,13 @@ fn notes(folder: &Folder, from: &[(&str, &str)]) -> anyhow::Result<String> {
 
 impl Stages<'_> {
     /// Whether anything of the family was asked for or is there.
-    fn are_of_interest(&self) -> anyhow::Result<bool> {
-        for experiment in self.family.experiments {
-            for stage in experiment.stages {
-                if self.line(experiment, stage)?.1 {
-                    return Ok(true);
-                }
-            }
-        }
-        Ok(false)
+    fn are_of_interest(&self) -> bool {
+        let mut experiments = self.family.experiments.iter();
+        experiments.any(|experiment| experiment.stages.iter().any(|stage| self.line(experiment, stage).1))
     }
 
     /// Which seeds a section is made from, and which are missing; none where nobody asked for it and nothing is there.
-    fn seeds_of(&self, section: &Section) -> anyhow::Result<Option<Vec<String>>> {
+    fn seeds_of(&self, section: &Section) -> Option<Vec<String>> {
         let (mut lines, mut of_interest) = (Vec::new(), false);
         for (name, suffix) in &section.from {
             let experiment = self
@@ -152,16 +154,16 @@ impl Stages<'_> {
                 .find(|experiment| experiment.name == *name);
             let found = experiment.and_then(|it| Some((it, it.stages.iter().find(|stage| stage.suffix == *suffix)?)));
             if let Some((experiment, stage)) = found {
-                let (line, interesting) = self.line(experiment, stage)?;
+                let (line, interesting) = self.line(experiment, stage);
                 lines.push(line);
                 of_interest |= interesting;
             }
         }
-        Ok(of_interest.then_some(lines))
+        of_interest.then_some(lines)
     }
 
-    fn line(&self, experiment: &Experiment, stage: &Stage) -> anyhow::Result<(String, bool)> {
-        let there = self.folder.seeds(experiment, stage)?;
+    fn line(&self, experiment: &Experiment, stage: &Stage) -> (String, bool) {
+        let there = self.folder.seeds(experiment, stage);
         let asked = self.jobs.iter().filter(|job| job.experiment.name == experiment.name);
         let missing: Vec<u64> = asked.map(|job| job.seed).filter(|seed| !there.contains(seed)).collect();
         let say = |seeds: &[u64]| seeds.iter().map(u64::to_string).collect::<Vec<_>>().join(", ");
@@ -183,7 +185,7 @@ impl Stages<'_> {
                 line += &format!("; seed {seed} failed: {said}");
             }
         }
-        Ok((line, !there.is_empty() || !missing.is_empty()))
+        (line, !there.is_empty() || !missing.is_empty())
     }
 }
 
@@ -242,13 +244,15 @@ fn compose(sections: &[(Section, Vec<String>, String)], effort: Effort, figures:
         if !notes.is_empty() {
             let _ = write!(text, "\n{}\n", notes.trim_end());
         }
-        for Figure { file, caption } in &section.figures {
+        for Figure { file, caption, png } in &section.figures {
             let place = figures.join(file);
             let place = place.display();
-            let _ = write!(
-                text,
-                "\n![{caption}]({place}.png)\n\n*{caption}* ([SVG]({place}.svg))\n"
-            );
+            let link = if *png {
+                format!(" ([PNG]({place}.png))")
+            } else {
+                String::new()
+            };
+            let _ = write!(text, "\n![{caption}]({place}.svg)\n\n*{caption}*{link}\n");
         }
     }
     text
@@ -286,7 +290,7 @@ mod tests {
 
     #[test]
     fn a_report_says_what_holds_and_what_is_missing() {
-        let section = |held: &[bool]| Section {
+        let section = |held: &[bool], png| Section {
             title: "Pendulum",
             from: vec![("pendulum", "")],
             remark: "Upright is 0.".into(),
@@ -300,32 +304,34 @@ mod tests {
             figures: vec![Figure {
                 file: "swing".into(),
                 caption: "Figure 4.9".into(),
+                png,
             }],
         };
-        let of = |held: &[bool], effort| {
+        let of = |held: &[bool], effort, png| {
             let seeds = vec!["`pendulum`: seeds 1; missing: 2".into()];
             let notes = "It leans a little.\n".into();
-            compose(&[(section(held), seeds, notes)], effort, Path::new("figures"))
+            compose(&[(section(held, png), seeds, notes)], effort, Path::new("figures"))
         };
-        let full = of(&[true], Effort::Full);
+        let full = of(&[true], Effort::Full, false);
         for part in [
             "Of 1 claims 1 hold, 0 do not, 0 are not judged.",
             "| it swings up | 0.01 | it is up | **holds** for the only seed |",
             "missing: 2",
             "It leans a little.",
-            "![Figure 4.9](figures/swing.png)",
+            "![Figure 4.9](figures/swing.svg)\n\n*Figure 4.9*\n",
         ] {
             assert!(full.contains(part), "{part}: {full}");
         }
-        let quick = of(&[true], Effort::Quick);
+        let quick = of(&[true], Effort::Quick, true);
         assert!(quick.contains("quick look") && quick.contains("| not judged |") && !quick.contains("**holds**"));
-        assert!(of(&[false], Effort::Full).contains("**does not hold**"));
+        assert!(quick.contains("*Figure 4.9* ([PNG](figures/swing.png))"), "{quick}");
+        assert!(of(&[false], Effort::Full, false).contains("**does not hold**"));
     }
 
     #[test]
     fn notes_stand_in_the_one_section_that_is_about_the_same() {
         let directory = tempfile::tempdir().unwrap();
-        let folder = Folder::open(directory.path()).unwrap();
+        let folder = Folder::open(directory.path(), []).unwrap();
         std::fs::create_dir(directory.path().join("notes")).unwrap();
         for (name, text) in [("a.md", "of a"), ("a+a-longer.md", "of both")] {
             std::fs::write(directory.path().join("notes").join(name), text).unwrap();
@@ -337,21 +343,25 @@ mod tests {
     }
 
     #[test]
-    fn a_figure_is_rasterised_once() {
+    fn a_figure_is_rasterised_once_and_only_where_that_is_wanted() {
         let directory = tempfile::tempdir().unwrap();
-        let album = Album::in_directory(directory.path().join("figures")).unwrap();
-        let png = directory.path().join("figures/a.png");
-        let draw = |value: f64| {
+        let path = |ending| directory.path().join(format!("a.{ending}"));
+        let draw = |png: bool, value: f64| {
+            let album = Album::in_directory(directory.path().into(), png).unwrap();
             let curve = vec![vec![(1_000, value), (2_000, 1.0)]];
-            album
-                .add("a", "A", |path| figure::learning_curves("A", &curve, None, path))
-                .unwrap();
-            std::fs::read(&png).unwrap()
+            let figure = album.add("a", "A", |path| figure::learning_curves("A", &curve, None, path));
+            assert_eq!(figure.unwrap().png, png);
+            assert!(path("svg").exists());
+            std::fs::read(path("png")).ok()
         };
-        let first = draw(1.0);
-        std::fs::write(&png, "mine").unwrap();
-        assert_eq!(draw(1.0), b"mine", "nothing has changed");
-        assert_ne!(draw(2.0), b"mine");
-        assert_eq!(first, draw(1.0));
+        assert_eq!(draw(false, 1.0), None);
+        let first = draw(true, 1.0);
+        assert!(first.as_ref().is_some_and(|bytes| bytes.starts_with(b"\x89PNG")));
+        std::fs::write(path("png"), "mine").unwrap();
+        assert_eq!(draw(true, 1.0).unwrap(), b"mine", "nothing has changed");
+        assert_eq!(draw(false, 1.0).unwrap(), b"mine", "nothing has changed");
+        assert_ne!(draw(true, 2.0).unwrap(), b"mine");
+        assert_eq!(draw(false, 3.0), None, "none that shows something else");
+        assert_eq!(first, draw(true, 1.0));
     }
 }

@@ -1,12 +1,8 @@
-//! What is kept of a seed: a small file from which claims are judged and figures drawn long after the run is gone.
-
-use std::io::Write;
-use std::path::Path;
+//! What is kept of a seed: little, but enough to judge claims and to draw figures long after the run is gone.
 
 use anyhow::{Context, bail};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
-use shoal_common::durable::write_atomically;
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::run_dir::RunDir;
 use shoal_run::evaluation::{EvaluationSummary, WhichPolicy, evaluate};
@@ -15,6 +11,7 @@ use shoal_run::recorder::read_evaluations;
 use super::experiment::{Experiment, Length, Stage};
 use super::family::{Family, Policies};
 use super::folder::Folder;
+use super::results_file::Line;
 use super::settings::Settings;
 
 /// The form of a result; raise it with every change of what a key means.
@@ -96,27 +93,27 @@ impl Header {
         }
     }
 
-    /// Reads how the result at `path` came about.
-    pub(super) fn read(path: &Path) -> anyhow::Result<Self> {
+    /// Reads how a result came about.
+    pub(super) fn read(line: &Line) -> anyhow::Result<Self> {
         /// What a result of any version has.
         #[derive(Deserialize)]
         struct Versioned {
             schema: u32,
         }
-        let Versioned { schema } = parse(path)?;
+        let Versioned { schema } = parse(line)?;
         if schema != SCHEMA {
             bail!(
-                "{} has schema {schema}, this program writes {SCHEMA}: remove it, or choose another directory with --out",
-                path.display()
+                "{} has schema {schema}, this program writes {SCHEMA}: move it away, or choose another directory with --out",
+                line.place
             );
         }
-        parse(path)
+        parse(line)
     }
 
-    /// Refuses a result that is not the one that would be made now under its name.
+    /// Refuses a result at `place` that is not the one that would be made now under its name.
     pub(super) fn check(
         &self,
-        path: &Path,
+        place: &str,
         experiment: &Experiment,
         seed: u64,
         length: Length,
@@ -129,17 +126,16 @@ impl Header {
         if found != wanted {
             let say = |(name, seed, length): (&str, u64, Length)| format!("{name}, seed {seed}, {length}");
             bail!(
-                "{} is the result of {}, not of {}: remove it, or choose another directory with --out",
-                path.display(),
+                "{place} is the result of {}, not of {}: move it away, or choose another directory with --out",
                 say(found),
                 say(wanted)
             );
         }
-        self.settings.check(path, settings)
+        self.settings.check(place, settings)
     }
 }
 
-/// Makes the result of a run that has reached the end of `stage`, and writes it: whole or not at all.
+/// Makes the result of a run that has reached the end of `stage`, and keeps it in the folder.
 pub(super) fn keep<F: Family>(
     folder: &Folder,
     experiment: &'static Experiment,
@@ -151,7 +147,7 @@ pub(super) fn keep<F: Family>(
     let run = RunDir::open(&folder.run(experiment, seed))?;
     let config = run.config()?;
     // Said by the run itself; it was checked to be what was expected.
-    Settings::of_run(run.path(), seed)?.check(run.path(), settings)?;
+    Settings::of_run(run.path(), seed)?.check(&run.path().display().to_string(), settings)?;
     let policies = Policies {
         best: WhichPolicy::Best.read(&run, &config)?,
         last: WhichPolicy::Last.read(&run, &config)?,
@@ -183,25 +179,19 @@ pub(super) fn keep<F: Family>(
         last: judge(&policies.last)?,
         tests: F::test(&policies, stage)?,
     };
-    write(&result, &folder.result(experiment, stage, seed))
-}
-
-pub(super) fn write<T: Serialize>(result: &SeedResult<T>, path: &Path) -> anyhow::Result<()> {
-    let text = serde_json::to_string(result)?;
-    write_atomically(path, |file| writeln!(file, "{text}")).with_context(|| format!("cannot write {}", path.display()))
+    folder.add(experiment, stage, &result)
 }
 
 /// Reads a whole result.
-pub(super) fn read<T: DeserializeOwned>(path: &Path) -> anyhow::Result<SeedResult<T>> {
-    parse(path)
+pub(super) fn read<T: DeserializeOwned>(line: &Line) -> anyhow::Result<SeedResult<T>> {
+    parse(line)
 }
 
-fn parse<T: DeserializeOwned>(path: &Path) -> anyhow::Result<T> {
-    let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
-    serde_json::from_str(&text).with_context(|| {
+fn parse<T: DeserializeOwned>(line: &Line) -> anyhow::Result<T> {
+    serde_json::from_str(&line.text).with_context(|| {
         format!(
-            "{} is no result of this program: remove it to have it made again",
-            path.display()
+            "{} is no result of this program: move it away to have it made again",
+            line.place
         )
     })
 }
@@ -258,27 +248,29 @@ pub(super) mod tests {
         &super::super::pendulum::EXPERIMENTS[0]
     }
 
+    fn line(text: &str) -> Line {
+        Line::at("pendulum.jsonl.gz (seed 3)", text)
+    }
+
     #[test]
     fn a_result_reads_back() {
-        let directory = tempfile::tempdir().unwrap();
-        let path = directory.path().join("seed-3.json");
         let made = result(experiment(), 3, -150.25, vec![0.1, 3.25, -2e-5]);
-        write(&made, &path).unwrap();
-        assert_eq!(read::<Vec<f64>>(&path).unwrap(), made);
-        let header = Header::read(&path).unwrap();
+        let line = line(&serde_json::to_string(&made).unwrap());
+        assert_eq!(read::<Vec<f64>>(&line).unwrap(), made);
+        let header = Header::read(&line).unwrap();
         assert_eq!(header, made.header);
         let settings = |tau| Settings::from_pairs(&[("ddpg.tau", tau), ("ddpg.new", "1")]);
         header
-            .check(&path, experiment(), 3, Length::Steps(120_000), &settings("0.001"))
+            .check(&line.place, experiment(), 3, Length::Steps(120_000), &settings("0.001"))
             .unwrap();
 
         let refused = |seed, steps, tau| {
             let error = header
-                .check(&path, experiment(), seed, Length::Steps(steps), &settings(tau))
+                .check(&line.place, experiment(), seed, Length::Steps(steps), &settings(tau))
                 .unwrap_err()
                 .to_string();
             assert!(
-                error.contains("seed-3.json") && error.contains("--out") && !error.contains('\n'),
+                error.contains("pendulum.jsonl.gz (seed 3)") && error.contains("--out") && !error.contains('\n'),
                 "{error}"
             );
             error
@@ -290,17 +282,14 @@ pub(super) mod tests {
 
     #[test]
     fn another_schema_and_no_result_at_all_are_refused() {
-        let directory = tempfile::tempdir().unwrap();
-        let path = directory.path().join("seed-1.json");
         for (text, part) in [
             ("{\"schema\": 99}", "schema 99"),
             ("{\"schema\"", "no result"),
             ("[]", "no result"),
         ] {
-            std::fs::write(&path, text).unwrap();
-            let error = format!("{:#}", Header::read(&path).unwrap_err());
+            let error = format!("{:#}", Header::read(&line(text)).unwrap_err());
             assert!(
-                error.contains(part) && error.contains("remove it") && !error.contains('\n'),
+                error.contains(part) && error.contains("move it away") && !error.contains('\n'),
                 "{error}"
             );
         }

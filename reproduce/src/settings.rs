@@ -60,14 +60,13 @@ impl Settings {
         Self::of(&config)
     }
 
-    /// Refuses what was made with other settings. A key that only one of them knows is of another version of this program
+    /// Refuses what was made with other settings; `made` says where it lies. A key that only one of them knows is of another version of this program
     /// and says nothing.
-    pub(super) fn check(&self, made: &Path, expected: &Self) -> anyhow::Result<()> {
+    pub(super) fn check(&self, made: &str, expected: &Self) -> anyhow::Result<()> {
         for (key, found) in &self.0 {
             if let Some(wanted) = expected.0.get(key).filter(|wanted| *wanted != found) {
                 bail!(
-                    "{} was made with {key} = {found}, which is now {wanted}: remove it, or choose another directory with --out",
-                    made.display()
+                    "{made} was made with {key} = {found}, which is now {wanted}: move it away, or choose another directory with --out"
                 );
             }
         }
@@ -118,11 +117,11 @@ mod tests {
             "{full:?}"
         );
         assert_eq!(Settings::expected(experiment, Effort::Full).unwrap(), full);
-        let refused = quick.check(Path::new("seed-1.json"), &full).unwrap_err().to_string();
+        let refused = quick.check("seed-1.json", &full).unwrap_err().to_string();
         assert!(
             refused.contains("seed-1.json") && refused.contains("which is now") && !refused.contains('\n'),
             "{refused}"
         );
-        full.check(Path::new("x"), &full).unwrap();
+        full.check("x", &full).unwrap();
     }
 }

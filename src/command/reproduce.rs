@@ -27,6 +27,9 @@ pub(crate) struct ReproduceArgs {
     /// Where runs, results and figures lie [default: runs/reproduction; with --quick runs/reproduction-quick].
     #[arg(long, value_name = "DIR")]
     pub(crate) out: Option<PathBuf>,
+    /// Draw every figure as PNG too, beside the SVG.
+    #[arg(long)]
+    pub(crate) png: bool,
     /// Where to write the report [default: REPORT.md in that directory].
     #[arg(long, value_name = "FILE")]
     pub(crate) report: Option<PathBuf>,
@@ -62,6 +65,7 @@ pub(crate) fn run(args: &ReproduceArgs) -> anyhow::Result<ExitCode> {
         jobs: args.jobs.map_or_else(usual_jobs, usize::from),
         effort,
         folder,
+        png: args.png,
         report,
     };
     let ending = shoal_reproduce::run(&order)?;

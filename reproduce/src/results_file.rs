@@ -1,0 +1,498 @@
+//! The results of an experiment: one file, `<experiment>.jsonl.gz`. Its first line is the [`Head`]; every other line is
+//! the result of a seed at the end of a stage, in the order of seeds and stages.
+//!
+//! Before there was such a file, each result had one of its own, `<experiment>/seed-N<stage>.json`. Those are still read,
+//! and [`ResultsFile::take_over`] moves them.
+
+use std::collections::BTreeMap;
+use std::collections::btree_map;
+use std::fs::File;
+use std::io::{self, Read, Write};
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, bail};
+use flate2::Compression;
+use flate2::read::MultiGzDecoder;
+use flate2::write::GzEncoder;
+use serde::{Deserialize, Serialize};
+use shoal_common::durable::write_atomically;
+
+use super::experiment::{Experiment, Stage};
+
+/// The form of the file; raise it with every change. 1 was a file for each result.
+const FORMAT: u32 = 2;
+
+/// The first line.
+#[derive(Debug, Serialize, Deserialize)]
+struct Head {
+    format: u32,
+    experiment: String,
+}
+
+/// Which of an experiment's results it is.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Deserialize)]
+struct Key {
+    seed: u64,
+    /// The stage's suffix.
+    stage: String,
+}
+
+/// A result as it is kept.
+#[derive(Debug)]
+pub(super) struct Line {
+    /// JSON on one line. It is never written anew from numbers, so that every digit stays.
+    pub(super) text: String,
+    /// Where it lies, for messages.
+    pub(super) place: String,
+    /// The file of its own that it still has.
+    old: Option<PathBuf>,
+}
+
+#[cfg(test)]
+impl Line {
+    pub(super) fn at(place: &str, text: &str) -> Self {
+        Self {
+            text: text.into(),
+            place: place.into(),
+            old: None,
+        }
+    }
+}
+
+/// All results of an experiment.
+#[derive(Debug)]
+pub(super) struct ResultsFile {
+    path: PathBuf,
+    /// Where runs lie, and where each result lay in a file of its own.
+    directory: PathBuf,
+    head: Head,
+    lines: BTreeMap<Key, Line>,
+}
+
+impl ResultsFile {
+    /// Reads what there is of the experiment in a folder, in either form; there may be nothing.
+    pub(super) fn read(folder: &Path, experiment: &Experiment) -> anyhow::Result<Self> {
+        let mut results = Self {
+            path: folder.join(format!("{}.jsonl.gz", experiment.name)),
+            directory: folder.join(experiment.name),
+            head: Head {
+                format: FORMAT,
+                experiment: experiment.name.into(),
+            },
+            lines: BTreeMap::new(),
+        };
+        match File::open(&results.path) {
+            Ok(file) => results.unpack(file)?,
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+            Err(error) => return Err(error).with_context(|| format!("cannot read {}", results.path.display())),
+        }
+        for stage in experiment.stages {
+            let ending = format!("{}.json", stage.suffix);
+            for seed in numbered(&results.directory, &ending)? {
+                results.find_old(seed, &ending, stage)?;
+            }
+        }
+        Ok(results)
+    }
+
+    fn unpack(&mut self, file: File) -> anyhow::Result<()> {
+        let here = self.path.display().to_string();
+        let hint = "restore it, or move it away to have its results made again";
+        let damaged = || format!("{here} is damaged, or no results of this program: {hint}");
+        let mut text = String::new();
+        MultiGzDecoder::new(file)
+            .read_to_string(&mut text)
+            .with_context(damaged)?;
+        let mut lines = text.lines();
+        /// What the first line has in every format.
+        #[derive(Deserialize)]
+        struct Versioned {
+            format: u32,
+        }
+        let head = lines.next().unwrap_or_default();
+        let Versioned { format } = serde_json::from_str(head).with_context(damaged)?;
+        if format != FORMAT {
+            bail!("{here} has format {format}, this program reads {FORMAT}: choose another directory with --out");
+        }
+        let head: Head = serde_json::from_str(head).with_context(damaged)?;
+        if head.experiment != self.head.experiment {
+            bail!("{here} has the results of {}: {hint}", head.experiment);
+        }
+        for text in lines {
+            let key: Key = serde_json::from_str(text).with_context(damaged)?;
+            let place = place(&self.path, &key);
+            let line = Line {
+                text: text.into(),
+                place: place.clone(),
+                old: None,
+            };
+            if self.lines.insert(key, line).is_some() {
+                bail!("{place} is there twice: {hint}");
+            }
+        }
+        Ok(())
+    }
+
+    /// Reads a result that has a file of its own.
+    fn find_old(&mut self, seed: u64, ending: &str, stage: &Stage) -> anyhow::Result<()> {
+        let path = self.directory.join(format!("seed-{seed}{ending}"));
+        let here = path.display();
+        let text = std::fs::read_to_string(&path).with_context(|| format!("cannot read {here}"))?;
+        let (key, text) = line(&text, stage)
+            .with_context(|| format!("{here} is no result of this program: move it away to have it made again"))?;
+        if key.seed != seed {
+            bail!(
+                "{here} is the result of seed {}: give it its name again, or move it away",
+                key.seed
+            );
+        }
+        match self.lines.entry(key) {
+            btree_map::Entry::Vacant(vacant) => {
+                vacant.insert(Line {
+                    text,
+                    place: here.to_string(),
+                    old: Some(path),
+                });
+            }
+            // Somebody was killed after it was written there and before it was removed here.
+            btree_map::Entry::Occupied(mut kept) if kept.get().text == text => kept.get_mut().old = Some(path),
+            btree_map::Entry::Occupied(kept) => {
+                bail!("{here} and {} differ: move one of them away", kept.get().place)
+            }
+        }
+        Ok(())
+    }
+
+    /// Moves what still has files of its own into the one file. What is removed is on the disk there before.
+    pub(super) fn take_over(&mut self) -> anyhow::Result<()> {
+        let old: Vec<PathBuf> = self.lines.values_mut().filter_map(|line| line.old.take()).collect();
+        if old.is_empty() {
+            return Ok(());
+        }
+        self.write()?;
+        for path in &old {
+            std::fs::remove_file(path).with_context(|| format!("cannot remove {}", path.display()))?;
+        }
+        // It stays where runs lie in it.
+        let _ = std::fs::remove_dir(&self.directory);
+        for (key, line) in &mut self.lines {
+            line.place = place(&self.path, key);
+        }
+        Ok(())
+    }
+
+    /// Adds a result, an object as JSON on one line, and writes the file.
+    pub(super) fn add(&mut self, result: &str, stage: &Stage) -> anyhow::Result<()> {
+        let (key, text) = line(result, stage)?;
+        let place = place(&self.path, &key);
+        self.lines.insert(key.clone(), Line { text, place, old: None });
+        let written = self.write();
+        if written.is_err() {
+            self.lines.remove(&key);
+        }
+        written
+    }
+
+    /// Whether there is a result of this seed.
+    pub(super) fn has(&self, stage: &Stage, seed: u64) -> bool {
+        self.of(stage).any(|(there, _)| there == seed)
+    }
+
+    /// Seeds and results of a stage, in the order of seeds.
+    pub(super) fn of(&self, stage: &Stage) -> impl Iterator<Item = (u64, &Line)> {
+        self.lines
+            .iter()
+            .filter(|(key, _)| key.stage == stage.suffix)
+            .map(|(key, line)| (key.seed, line))
+    }
+
+    /// Writes the file: whole or not at all. Its bytes depend on the results alone.
+    fn write(&self) -> anyhow::Result<()> {
+        let head = serde_json::to_string(&self.head)?;
+        write_atomically(&self.path, |file| -> io::Result<()> {
+            // Without a name and a time.
+            let mut gzip = GzEncoder::new(file, Compression::best());
+            writeln!(gzip, "{head}")?;
+            for line in self.lines.values() {
+                writeln!(gzip, "{}", line.text)?;
+            }
+            gzip.finish()?;
+            Ok(())
+        })
+        .with_context(|| format!("cannot write {}", self.path.display()))
+    }
+}
+
+/// Where a result lies in the file at `path`.
+fn place(path: &Path, key: &Key) -> String {
+    format!("{} (seed {}{})", path.display(), key.seed, key.stage)
+}
+
+/// The line of a result, an object as JSON, at the end of this stage: the same, digit for digit, with the stage before
+/// its other keys.
+fn line(result: &str, stage: &Stage) -> anyhow::Result<(Key, String)> {
+    // JSON has line breaks only between its parts.
+    let result: String = result.lines().map(str::trim).collect();
+    let rest = result.strip_prefix('{').context("it is no JSON object")?;
+    let suffix = serde_json::to_string(stage.suffix)?;
+    let line = format!("{{\"stage\":{suffix},{rest}");
+    Ok((serde_json::from_str(&line)?, line))
+}
+
+/// The numbers N of what is called `seed-N<ending>` in a directory, in order; none where there is no directory.
+pub(super) fn numbered(directory: &Path, ending: &str) -> anyhow::Result<Vec<u64>> {
+    if !directory.exists() {
+        return Ok(Vec::new());
+    }
+    let reading = || format!("cannot read {}", directory.display());
+    let mut numbers = Vec::new();
+    for entry in std::fs::read_dir(directory).with_context(reading)? {
+        let name = entry.with_context(reading)?.file_name();
+        let number = name
+            .to_str()
+            .and_then(|name| name.strip_prefix("seed-")?.strip_suffix(ending));
+        // A name with another spelling of a number is not ours.
+        let number = number.and_then(|text| text.parse().ok().filter(|number: &u64| number.to_string() == text));
+        numbers.extend(number);
+    }
+    numbers.sort_unstable();
+    Ok(numbers)
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::Value;
+
+    use super::super::family::Family;
+    use super::super::pendulum::Pendulum;
+    use super::super::point_mass::EXPERIMENTS;
+    use super::super::result::tests::result;
+    use super::super::result::{self, Header, SeedResult};
+    use super::*;
+
+    /// The experiment with two stages.
+    const TWICE: &Experiment = &EXPERIMENTS[1];
+
+    /// A result of [`TWICE`] as it was kept in a file of its own.
+    fn text(seed: u64, of: f64) -> String {
+        serde_json::to_string(&result(TWICE, seed, of, ())).unwrap()
+    }
+
+    fn unpacked(path: &Path) -> String {
+        let mut text = String::new();
+        MultiGzDecoder::new(File::open(path).unwrap())
+            .read_to_string(&mut text)
+            .unwrap();
+        text
+    }
+
+    fn pack(path: &Path, text: &str) {
+        let mut gzip = GzEncoder::new(File::create(path).unwrap(), Compression::fast());
+        gzip.write_all(text.as_bytes()).unwrap();
+        gzip.finish().unwrap();
+    }
+
+    fn refused(folder: &Path) -> String {
+        let error = format!("{:#}", ResultsFile::read(folder, TWICE).unwrap_err());
+        assert!(error.contains("point-mass-r2") && !error.contains('\n'), "{error}");
+        error
+    }
+
+    #[test]
+    fn results_are_lines_in_the_order_of_seeds_and_stages() {
+        let folder = tempfile::tempdir().unwrap();
+        let [first, second] = TWICE.stages else {
+            panic!("two stages")
+        };
+        let mut results = ResultsFile::read(folder.path(), TWICE).unwrap();
+        for (stage, seed) in [(first, 10), (second, 2), (first, 2)] {
+            results.add(&text(seed, 0.1 + 0.2), stage).unwrap();
+        }
+        let path = folder.path().join("point-mass-r2.jsonl.gz");
+        let there = unpacked(&path);
+        let lines: Vec<Value> = there.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+        assert_eq!(
+            (&lines[0]["format"], &lines[0]["experiment"]),
+            (&2.into(), &"point-mass-r2".into())
+        );
+        let keys: Vec<_> = lines[1..]
+            .iter()
+            .map(|line| (line["seed"].as_u64().unwrap(), line["stage"].as_str().unwrap()))
+            .collect();
+        assert_eq!(keys, [(2, ""), (2, "-longer"), (10, "")]);
+        assert!(there.contains("0.30000000000000004"), "every digit");
+        // Neither a name nor a time: flags, and seconds since 1970.
+        let bytes = std::fs::read(&path).unwrap();
+        assert_eq!(bytes[3..8], [0; 5]);
+
+        // However it came about.
+        let other = tempfile::tempdir().unwrap();
+        let mut again = ResultsFile::read(other.path(), TWICE).unwrap();
+        for (stage, seed) in [(first, 2), (first, 10), (second, 2)] {
+            again.add(&text(seed, 0.1 + 0.2), stage).unwrap();
+        }
+        assert_eq!(
+            std::fs::read(other.path().join("point-mass-r2.jsonl.gz")).unwrap(),
+            bytes
+        );
+        let read = ResultsFile::read(folder.path(), TWICE).unwrap();
+        let seeds = |stage| read.of(stage).map(|(seed, _)| seed).collect::<Vec<_>>();
+        assert_eq!((seeds(first), seeds(second)), (vec![2, 10], vec![2]));
+        assert!(read.has(second, 2) && !read.has(second, 10));
+    }
+
+    #[test]
+    fn what_cannot_be_written_is_not_there() {
+        let folder = tempfile::tempdir().unwrap();
+        let stage = &TWICE.stages[0];
+        let mut results = ResultsFile::read(folder.path(), TWICE).unwrap();
+        results.add(&text(1, 1.0), stage).unwrap();
+        let kept = std::fs::read(folder.path().join("point-mass-r2.jsonl.gz")).unwrap();
+        // Where it is written before it gets its name.
+        std::fs::create_dir(folder.path().join("point-mass-r2.jsonl.gz.new")).unwrap();
+        let error = results.add(&text(2, 1.0), stage).unwrap_err().to_string();
+        assert!(
+            error.contains("cannot write") && error.contains("point-mass-r2.jsonl.gz"),
+            "{error}"
+        );
+        assert!(results.has(stage, 1) && !results.has(stage, 2));
+        assert_eq!(
+            std::fs::read(folder.path().join("point-mass-r2.jsonl.gz")).unwrap(),
+            kept
+        );
+    }
+
+    #[test]
+    fn a_file_for_each_result_is_taken_over_and_removed() {
+        let folder = tempfile::tempdir().unwrap();
+        let [first, second] = TWICE.stages else {
+            panic!("two stages")
+        };
+        ResultsFile::read(folder.path(), TWICE)
+            .unwrap()
+            .add(&text(3, 3.0), first)
+            .unwrap();
+        let directory = folder.path().join("point-mass-r2");
+        std::fs::create_dir_all(directory.join("seed-1")).unwrap();
+        let old = |name: &str, text: &str| std::fs::write(directory.join(name), text).unwrap();
+        old("seed-12.json", &format!("{}\n", text(12, 0.1 + 0.2)));
+        old("seed-1.json", &text(1, 1.0).replace(",\"", ",\n  \""));
+        old("seed-1-longer.json", &text(1, 2.0));
+        // As a command that was killed in between leaves it.
+        old("seed-3.json", &text(3, 3.0));
+        old("seed-4.json.new", "half");
+        old("notes.txt", "mine");
+
+        let mut results = ResultsFile::read(folder.path(), TWICE).unwrap();
+        let keys: Vec<_> = results.of(first).map(|(seed, _)| seed).collect();
+        assert_eq!(keys, [1, 3, 12]);
+        assert!(
+            results.has(second, 1) && directory.join("seed-1.json").exists(),
+            "nothing is moved yet"
+        );
+        results.take_over().unwrap();
+        let mut left: Vec<_> = std::fs::read_dir(&directory)
+            .unwrap()
+            .map(|entry| entry.unwrap().file_name().into_string().unwrap())
+            .collect();
+        left.sort();
+        assert_eq!(left, ["notes.txt", "seed-1", "seed-4.json.new"]);
+        let all = unpacked(&folder.path().join("point-mass-r2.jsonl.gz"));
+        let wanted = [(1, 1.0, ""), (1, 2.0, "-longer"), (3, 3.0, ""), (12, 0.1 + 0.2, "")]
+            .map(|(seed, of, stage)| text(seed, of).replacen('{', &format!("{{\"stage\":\"{stage}\","), 1));
+        assert_eq!(all.lines().skip(1).collect::<Vec<_>>(), wanted);
+        assert!(
+            results
+                .of(first)
+                .all(|(_, line)| line.place.contains("point-mass-r2.jsonl.gz (seed "))
+        );
+
+        // Two that differ: nobody chooses.
+        old("seed-12.json", &text(12, 5.0));
+        assert!(refused(folder.path()).contains("differ"));
+        old("seed-12.json", &text(13, 5.0));
+        assert!(refused(folder.path()).contains("the result of seed 13"));
+        old("seed-12.json", "{\"schema\"");
+        assert!(refused(folder.path()).contains("no result of this program"));
+        assert_eq!(unpacked(&folder.path().join("point-mass-r2.jsonl.gz")), all);
+    }
+
+    #[test]
+    fn a_result_of_the_program_before_the_one_file_reads() {
+        let folder = tempfile::tempdir().unwrap();
+        let old = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/data/123d5ad/pendulum/seed-1.json");
+        let directory = folder.path().join("pendulum");
+        std::fs::create_dir(&directory).unwrap();
+        std::fs::copy(&old, directory.join("seed-1.json")).unwrap();
+        let pendulum = &Pendulum::EXPERIMENTS[0];
+        ResultsFile::read(folder.path(), pendulum).unwrap().take_over().unwrap();
+        assert!(!directory.exists(), "it was left empty");
+
+        let results = ResultsFile::read(folder.path(), pendulum).unwrap();
+        let lines: Vec<_> = results.of(&pendulum.stages[0]).collect();
+        let [(1, line)] = lines[..] else { panic!("{lines:?}") };
+        let kept = std::fs::read_to_string(&old).unwrap();
+        assert_eq!(line.text.replacen("\"stage\":\"\",", "", 1), kept.trim_end());
+        Header::read(line).unwrap();
+        let read: SeedResult<<Pendulum as Family>::Tests> = result::read(line).unwrap();
+        assert_eq!(read.evaluations.last().unwrap().steps, 4_000);
+    }
+
+    #[test]
+    fn what_lies_beside_the_file_is_found_by_its_name() {
+        let directory = tempfile::tempdir().unwrap();
+        for name in [
+            "seed-12.json",
+            "seed-2.json",
+            "seed-2-longer.json",
+            "seed-02.json",
+            "seed-2.json.new",
+            "seed-7",
+        ] {
+            std::fs::write(directory.path().join(name), "").unwrap();
+        }
+        let of = |ending| numbered(directory.path(), ending).unwrap();
+        assert_eq!(
+            (of(".json"), of("-longer.json"), of("")),
+            (vec![2, 12], vec![2], vec![7])
+        );
+        assert!(numbered(&directory.path().join("absent"), "").unwrap().is_empty());
+    }
+
+    #[test]
+    fn what_is_no_such_file_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("point-mass-r2.jsonl.gz");
+        ResultsFile::read(folder.path(), TWICE)
+            .unwrap()
+            .add(&text(1, 1.0), &TWICE.stages[0])
+            .unwrap();
+        let (whole, lines) = (std::fs::read(&path).unwrap(), unpacked(&path));
+        let damaged = "damaged, or no results";
+        for bytes in [
+            &b"no gzip"[..],
+            &whole[..whole.len() - 3],
+            &[&whole[..], b"more"].concat(),
+        ] {
+            std::fs::write(&path, bytes).unwrap();
+            assert!(refused(folder.path()).contains(damaged));
+        }
+        let result = lines.lines().nth(1).unwrap();
+        for (text, part) in [
+            ("", damaged),
+            ("{}\n", damaged),
+            ("{\"format\":99}\n", "format 99, this program reads 2"),
+            (
+                &lines.replacen("point-mass-r2", "point-mass-r1", 1),
+                "the results of point-mass-r1",
+            ),
+            (&format!("{lines}{result}\n"), "(seed 1) is there twice"),
+            (&format!("{lines}{{\"seed\":2}}\n"), damaged),
+        ] {
+            pack(&path, text);
+            assert!(refused(folder.path()).contains(part), "{part}");
+        }
+        pack(&path, &lines);
+        ResultsFile::read(folder.path(), TWICE).unwrap();
+    }
+}
