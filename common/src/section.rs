@@ -15,7 +15,7 @@ pub use explanation::{Key, Section, describe, keys};
 /// ```
 ///
 /// `bounds` is left out where there is nothing to be compared (a word, `true` or `false`) or where the bounds are another
-/// key's value; then the section or [`Config::check`](crate::config::Config::check) compares. The struct gets a default, serde's
+/// key's value; then the section's `check` or `Config::check` compares. The struct gets a default, serde's
 /// and schemars' traits, and `check_bounds`.
 macro_rules! section {
     (

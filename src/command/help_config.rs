@@ -6,7 +6,7 @@ use std::io::Write as _;
 use shoal_common::config::Config;
 use shoal_common::config::explanation::{Key, sections};
 use shoal_env_server::environment;
-use shoal_run::plan::{preset_names, resolved};
+use shoal_run::plan::{FILLED_IN, preset_names, resolved};
 use toml::{Table, Value};
 
 /// Explains the keys of one preset or file, or where none is named, all that there are.
@@ -79,6 +79,11 @@ fn everything() -> anyhow::Result<String> {
     Ok(text)
 }
 
+/// Whether the program fills the key in for each run.
+fn is_filled_in(section: &str, key: &Key) -> bool {
+    FILLED_IN.contains(&format!("{section}.{}", key.name).as_str())
+}
+
 /// What presets have instead of the default, with their names.
 fn differing<'a>(
     presets: &[(&'a str, Table)],
@@ -86,8 +91,7 @@ fn differing<'a>(
     environment: Option<&str>,
 ) -> Vec<(String, Vec<&'a str>)> {
     let mut differing: Vec<(String, Vec<&str>)> = Vec::new();
-    // Chosen anew for each run.
-    if entry.section == "run" && entry.key.name == "id" {
+    if is_filled_in(&entry.section, &entry.key) {
         return differing;
     }
     for (name, table) in presets {
@@ -120,7 +124,8 @@ fn of(what: &str) -> anyhow::Result<String> {
     for (title, entries) in entries()? {
         let chosen = entries.iter().filter_map(|entry| {
             let value = table.get(&entry.section)?.as_table()?.get(&entry.key.name)?;
-            Some((&entry.key, value))
+            // What the program fills in has no value to show.
+            Some((&entry.key, (!is_filled_in(&entry.section, &entry.key)).then_some(value)))
         });
         let chosen: Vec<_> = chosen.collect();
         if chosen.is_empty() || (title.contains(" of ") && title != environment) {
@@ -128,8 +133,6 @@ fn of(what: &str) -> anyhow::Result<String> {
         }
         let _ = writeln!(text, "\n{title}");
         for (key, value) in chosen {
-            // The one that the program chooses for each run has no value to show.
-            let value = (key.name != "id").then_some(value);
             tell(&mut text, key, value);
         }
     }
