@@ -146,7 +146,7 @@ impl Sources {
                 rest = others;
                 continue;
             }
-            let child = [&here[..], &[first.clone()]].concat();
+            let child = [&here[..], &rest[..1]].concat();
             if self.modules.contains_key(&child) {
                 (here, rest) = (child, others);
                 continue;
