@@ -2,6 +2,7 @@
 //! mounted in a namespace of their own; where the machine allows none, those tests are ignored.
 
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
+#![allow(clippy::print_stderr, reason = "a test says what it measured")]
 
 #[path = "support/suite.rs"]
 mod suite;

@@ -130,7 +130,7 @@ impl Sources {
             "self" => rest = &path[1..],
             "super" => {}
             first => {
-                let child = [module, &[first.to_owned()]].concat();
+                let child = [module, &path[..1]].concat();
                 let imported = self.modules[module].imported.get(first);
                 if let Some(origin) = imported.filter(|origin| *origin != path && origin[..] != path[..1]) {
                     return self.file_of(module, &[&origin[..], &path[1..]].concat(), depth + 1);
@@ -146,7 +146,7 @@ impl Sources {
                 rest = others;
                 continue;
             }
-            let child = [&here[..], std::slice::from_ref(first)].concat();
+            let child = [&here[..], &rest[..1]].concat();
             if self.modules.contains_key(&child) {
                 (here, rest) = (child, others);
                 continue;

@@ -1,6 +1,7 @@
 //! Suites some of whose tests need what not every machine has. The standard harness cannot say `ignored` once it runs; this
-//! one can, with the reason. Such a suite has `harness = false` in `Cargo.toml`, and its `main` lists its tests. Filters,
-//! `--list`, `--ignored`, `--exact` and `--test-threads` work as usual; output is not captured.
+//! one can, with the reason. Such a suite has `harness = false` in `Cargo.toml`, and its `main` lists its tests; one that is
+//! not listed is dead code, of which the compiler warns. A filter, `--list`, `--ignored`, `--exact`, `--skip` and
+//! `--test-threads` work as usual. Output is not captured, and there is at most one filter.
 
 #![allow(dead_code, reason = "every suite uses its own part of this")]
 
