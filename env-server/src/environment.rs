@@ -6,6 +6,7 @@ mod error;
 pub mod frozen_lake;
 pub mod pendulum;
 pub mod point_mass;
+mod signal;
 
 use schemars::JsonSchema;
 use serde::{Serialize, de::DeserializeOwned};
@@ -13,6 +14,7 @@ use shoal_common::config::explanation::{self, Key};
 use shoal_common::{space::EnvironmentSpec, stream::Stream};
 
 pub use error::{EnvironmentError, OutOfRange, RequestError};
+pub use signal::{Goal, Picture, Signal, Source};
 
 /// Every environment: its name, and how it is made from its parameters. A new one is its file, its `mod` line above and
 /// its line here.
@@ -55,6 +57,27 @@ pub trait Environment: Send {
     /// everything that the future depends on. (A state that a NaN action led to may be refused.)
     fn restore(&mut self, state: &[f64]) -> Result<(), RequestError> {
         self.reset_to(state)
+    }
+
+    /// What the numbers of an observation and an action mean, in the order in which people are shown them. Those that are
+    /// worth watching are enough. Always the same for one environment.
+    fn signals(&self) -> Vec<Signal> {
+        Signal::by_number(&self.spec())
+    }
+
+    /// Δt of a step in s, where the environment has a time.
+    fn time_step(&self) -> Option<f64> {
+        None
+    }
+
+    /// What success is, where more can be said of it than the return says.
+    fn goal(&self) -> Option<Goal> {
+        None
+    }
+
+    /// What the report draws of an episode. It reads signals by their keys, so `signals` must have those.
+    fn picture(&self) -> Picture {
+        Picture::None
     }
 }
 
@@ -118,6 +141,9 @@ fn made<P: Serialize + DeserializeOwned + JsonSchema, E: Environment + 'static>(
 }
 
 #[cfg(test)]
+mod names_elsewhere;
+
+#[cfg(test)]
 mod tests {
     use super::*;
     use shoal_common::space::Space;
@@ -157,6 +183,50 @@ mod tests {
                 assert!(inside, "{name} observed {observation:?}");
             }
             environment.step(&vec![f64::NAN; spec.action.width()], &mut rng);
+        }
+    }
+
+    #[test]
+    fn every_signal_has_a_key_of_its_own_and_a_number_it_comes_from() {
+        for name in names() {
+            let environment = make(name, &toml::Table::new()).unwrap();
+            let spec = environment.spec();
+            let signals = environment.signals();
+            let (seen, done) = (spec.observation.width(), spec.action.width());
+            for (i, Signal { key, label, source, .. }) in signals.iter().enumerate() {
+                assert!(!key.is_empty() && !label.is_empty(), "{name}");
+                assert!(
+                    key.chars()
+                        .all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '-'),
+                    "{name}: {key}"
+                );
+                assert!(
+                    !["reward", "return"].contains(&key.as_str()),
+                    "{name}: {key} is a signal that every environment has"
+                );
+                assert!(signals[..i].iter().all(|other| other.key != *key), "{name}: {key}");
+                assert!(
+                    match *source {
+                        Source::Observation(i) => i < seen,
+                        Source::Action(i) => i < done,
+                        Source::Angle { cos, sin } => cos < seen && sin < seen,
+                    },
+                    "{name}: {key}"
+                );
+            }
+            for key in environment.picture().keys() {
+                let signal = signals.iter().find(|signal| signal.key == *key);
+                assert!(signal.is_some(), "{name}: its picture needs a signal `{key}`");
+                let scale = environment.picture().scales().contains(key);
+                assert!(
+                    !scale || signal.unwrap().range(&spec).is_some(),
+                    "{name}: its picture needs a range of `{key}`"
+                );
+            }
+            if let Some(goal) = environment.goal() {
+                assert!(goal.within > 0.0 && signals.contains(&goal.distance), "{name}");
+            }
+            assert!(environment.time_step().is_none_or(|seconds| seconds > 0.0), "{name}");
         }
     }
 

@@ -2,6 +2,7 @@
 
 mod canvas;
 mod comparison;
+mod episode;
 mod lake;
 mod learning_curve;
 mod learning_curves;
@@ -12,6 +13,7 @@ mod point_mass;
 mod raster;
 
 pub use comparison::{Agent, actions_beside, paths_beside};
+pub use episode::episode;
 pub use lake::lake;
 pub use learning_curve::learning_curve;
 pub use learning_curves::{learning_curves, quantile};

@@ -4,8 +4,8 @@ mod comparison;
 mod numbers;
 mod played;
 mod run;
-mod scene;
 mod settings;
+mod signals;
 
 use std::time::SystemTime;
 

@@ -1,11 +1,12 @@
 //! The figures of one run: what `shoal plot` draws, and every training at its end.
 
+mod thesis;
+
 use std::path::{Path, PathBuf};
 
 use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
-use shoal_run::analysis::pendulum::SwingUp;
-use shoal_run::analysis::point_mass::{Drive, FAR_STARTS, NEAR_STARTS};
+use shoal_run::description::Description;
 use shoal_run::evaluation::WhichPolicy;
 use shoal_run::recorder::read_evaluations;
 use shoal_run::rollout::Rollout;
@@ -22,40 +23,22 @@ pub fn draw(run: &RunDir, config: &Config, out: &Path) -> anyhow::Result<Vec<Pat
     Ok(pictures)
 }
 
-/// Draws what the best policy does, and gives the files.
+/// Draws what the best policy does, and gives the files: the thesis's figures, or the signals of the first evaluation episode
+/// of the run's seed. Nothing where another program serves the environment: it would have to be started for this alone.
 fn behaviour(run: &RunDir, config: &Config, out: &Path) -> anyhow::Result<Vec<PathBuf>> {
-    let name = config.environment.name.as_str();
-    if !["pendulum", "point-mass"].contains(&name) {
+    if !config.environment.server.is_empty() {
         return Ok(Vec::new());
     }
     let policy = WhichPolicy::Best.read(run, config)?;
     let mut rollout = Rollout::new(config, &policy.parameters)?;
-    if name == "pendulum" {
-        let path = out.join("swing-up.svg");
-        figure::swing_up(&SwingUp::run(&mut rollout)?, &path)?;
-        return Ok(vec![path]);
+    if let Some(files) = thesis::behaviour(config, &mut rollout, out)? {
+        return Ok(files);
     }
-    let files = ["test-runs.svg", "test-runs-far.svg", "trajectories.svg"].map(|file| out.join(file));
-    figure::test_runs(&Drive::run_from(&mut rollout, starts_shown(config))?, &files[0])?;
-    let mut runs = Drive::run_from(&mut rollout, &FAR_STARTS)?;
-    figure::test_runs(&runs, &files[1])?;
-    runs.extend(Drive::run_from(&mut rollout, &NEAR_STARTS)?);
-    figure::trajectories(&runs, &files[2])?;
-    Ok(files.into())
-}
-
-/// The two starts of the thesis's figure for the run's reward: 5.5 (r1), 5.7 (r2), 5.9 (r3).
-fn starts_shown(config: &Config) -> &'static [[f64; 2]] {
-    let reward = config
-        .environment
-        .parameters
-        .get("reward")
-        .and_then(toml::Value::as_str);
-    if reward == Some("r2") {
-        &NEAR_STARTS[2..]
-    } else {
-        &NEAR_STARTS[..2]
-    }
+    let path = out.join("episode.svg");
+    let Description { signals, time_step, .. } = Description::of(config)?;
+    let trajectory = rollout.evaluation_episode(config.run.seed, 0)?;
+    figure::episode(&signals, time_step, &trajectory, &path)?;
+    Ok(vec![path])
 }
 
 #[cfg(test)]
@@ -63,13 +46,14 @@ mod tests {
     use shoal_common::policy_file::PolicyFile;
 
     use super::*;
+    use shoal_run::plan::resolved;
     use shoal_run::rollout::policy_layout;
     use shoal_run::testing::small;
 
-    fn files_of(environment: &str) -> Vec<String> {
+    /// The figures of a run with a policy, by name.
+    fn files_of((config, parameters): (Config, Vec<f32>)) -> Vec<String> {
         let parent = tempfile::tempdir().unwrap();
         let run_dir = RunDir::create(&parent.path().join("run")).unwrap();
-        let (config, parameters) = small(environment);
         std::fs::write(run_dir.config_file(), config.to_toml().unwrap()).unwrap();
         std::fs::create_dir(run_dir.checkpoints()).unwrap();
         let fingerprint = policy_layout(&config).unwrap().fingerprint();
@@ -92,10 +76,18 @@ mod tests {
         files
     }
 
+    /// A preset's configuration, and a policy for it.
+    fn of_preset(name: &str) -> (Config, Vec<f32>) {
+        let config = resolved(name).unwrap();
+        let parameters = vec![0.0; policy_layout(&config).unwrap().parameters()];
+        (config, parameters)
+    }
+
     #[test]
     fn every_environment_has_its_pictures() {
-        assert_eq!(files_of("name = \"pendulum\""), ["learning-curve.svg", "swing-up.svg"]);
-        let point_mass = files_of("name = \"point-mass\"\nreward = \"r2\"");
+        let pendulum = files_of(small("name = \"pendulum\""));
+        assert_eq!(pendulum, ["learning-curve.svg", "swing-up.svg"]);
+        let point_mass = files_of(small("name = \"point-mass\"\nreward = \"r2\""));
         assert_eq!(
             point_mass,
             [
@@ -105,13 +97,16 @@ mod tests {
                 "trajectories.svg"
             ]
         );
+        for name in ["cart-pole", "frozen-lake"] {
+            let files = files_of(of_preset(name));
+            assert_eq!(files, ["episode.svg", "learning-curve.svg"], "{name}");
+        }
     }
 
     #[test]
-    fn the_starts_are_those_of_the_rewards_figure() {
-        let starts = |reward: &str| starts_shown(&small(&format!("name = \"point-mass\"\nreward = \"{reward}\"")).0);
-        assert_eq!(starts("r1"), [[2.0, -2.0], [-2.0, 2.0]]);
-        assert_eq!(starts("r2"), [[2.0, 2.0], [-2.0, -2.0]]);
-        assert_eq!(starts("r3"), starts("r1"));
+    fn an_environment_of_another_program_has_its_learning_curve() {
+        let (mut config, parameters) = small("name = \"pendulum\"");
+        config.environment.server = vec!["no-such-program".into()];
+        assert_eq!(files_of((config, parameters)), ["learning-curve.svg"]);
     }
 }

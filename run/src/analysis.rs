@@ -1,4 +1,4 @@
-//! What the numbers of an episode of our own environments mean, and what the thesis measures of one.
+//! What the thesis measures of an episode of its environments.
 
 pub mod lake;
 pub mod pendulum;

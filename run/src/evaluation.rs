@@ -5,9 +5,10 @@ use shoal_actor::evaluator::mean_and_std;
 use shoal_common::config::Config;
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::run_dir::RunDir;
+use shoal_env_server::environment::Goal;
 
-use crate::analysis::point_mass::REACHED;
-use crate::rollout::{Rollout, Trajectory, policy_layout};
+use crate::description::Description;
+use crate::rollout::{Rollout, policy_layout};
 
 /// One of a run's policies.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
@@ -39,10 +40,10 @@ pub struct EvaluationSummary {
     pub return_std: f64,
     /// How many episodes.
     pub episodes: u32,
-    /// Of a point mass: the mean distance to the goal at the end, in m.
+    /// Where the environment has a goal: the mean distance to it at the end, in the distance's unit.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub final_distance_mean: Option<f64>,
-    /// Of a point mass: the share of episodes that end within 0.05 m of the goal.
+    /// Where the environment has a goal: the share of episodes that reach it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub reached_fraction: Option<f64>,
 }
@@ -50,27 +51,24 @@ pub struct EvaluationSummary {
 /// Runs the evaluation episodes 0 … `episodes` − 1 of `seed`, the same start states every time.
 pub fn evaluate(config: &Config, parameters: &[f32], episodes: u32, seed: u64) -> anyhow::Result<EvaluationSummary> {
     let mut rollout = Rollout::new(config, parameters)?;
+    let goal = Description::of(config)?.goal;
     let (mut returns, mut distances) = (Vec::new(), Vec::new());
     for number in 0..episodes {
         let trajectory = rollout.evaluation_episode(seed, number.into())?;
         returns.push(trajectory.episode_return());
-        distances.extend(final_distance(config, &trajectory));
+        if let Some(goal) = &goal {
+            distances.extend(trajectory.values(goal.distance.source).last().copied());
+        }
     }
-    let reached = distances.iter().filter(|d| **d < REACHED).count() as f64;
-    let point_mass = !distances.is_empty();
+    let reached = |goal: Goal| distances.iter().filter(|d| **d < goal.within).count() as f64;
     let (return_mean, return_std) = mean_and_std(&returns);
     Ok(EvaluationSummary {
         return_mean,
         return_std,
         episodes,
-        final_distance_mean: point_mass.then(|| mean_and_std(&distances).0),
-        reached_fraction: point_mass.then(|| reached / distances.len() as f64),
+        final_distance_mean: goal.is_some().then(|| mean_and_std(&distances).0),
+        reached_fraction: goal.map(|goal| reached(goal) / f64::from(episodes)),
     })
-}
-
-/// d at an episode's end: the fifth number of a point mass's observation (equation 5.7).
-fn final_distance(config: &Config, trajectory: &Trajectory) -> Option<f64> {
-    (config.environment.name == "point-mass").then(|| trajectory.observations.last()?.get(4).copied().map(f64::from))?
 }
 
 #[cfg(test)]

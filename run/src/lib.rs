@@ -2,6 +2,7 @@
 //! policies do.
 
 pub mod analysis;
+pub mod description;
 pub mod evaluation;
 pub mod external_environment;
 pub mod numbers;

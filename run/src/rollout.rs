@@ -6,6 +6,8 @@ use shoal_common::channel::environment::StepBlocks;
 use shoal_common::config::Config;
 use shoal_common::policy::{Policy, PolicyLayout};
 use shoal_common::space::EnvironmentSpec;
+use shoal_env_server::environment::Source;
+use shoal_env_server::environment::angle::followed;
 use shoal_env_server::vector::{Start, VectorEnvironment};
 
 use crate::external_environment::Conversation;
@@ -27,6 +29,23 @@ impl Trajectory {
     /// The sum of the rewards, undiscounted.
     pub fn episode_return(&self) -> f64 {
         self.rewards.iter().sum()
+    }
+
+    /// A signal's values: T + 1 of what is observed, T of an action. NaN where there is no such number.
+    pub fn values(&self, source: Source) -> Vec<f64> {
+        let number = |row: &Vec<f32>, i: usize| row.get(i).map_or(f64::NAN, |number| f64::from(*number));
+        match source {
+            Source::Observation(i) => self.observations.iter().map(|row| number(row, i)).collect(),
+            Source::Action(i) => self.actions.iter().map(|row| number(row, i)).collect(),
+            Source::Angle { cos, sin } => {
+                let seen = self
+                    .observations
+                    .iter()
+                    .map(|row| number(row, sin).atan2(number(row, cos)));
+                let first = seen.clone().next().unwrap_or_default();
+                followed(seen, first)
+            }
+        }
     }
 }
 

@@ -8,7 +8,8 @@ use comfy_table::Table;
 use comfy_table::presets::UTF8_BORDERS_ONLY;
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::run_dir::RunDir;
-use shoal_run::analysis::point_mass::REACHED;
+use shoal_env_server::environment::Goal;
+use shoal_run::description::Description;
 use shoal_run::evaluation::{EvaluationSummary, WhichPolicy, evaluate};
 
 #[derive(Args, Clone, Debug)]
@@ -36,7 +37,8 @@ pub(crate) fn run(args: &EvalArgs) -> anyhow::Result<()> {
     let policy = args.policy.read(&run, &config)?;
     let seed = args.seed.unwrap_or(config.run.seed);
     let summary = evaluate(&config, &policy.parameters, args.episodes, seed)?;
-    let table = table(&summary, &policy, seed);
+    let goal = Description::of(&config)?.goal;
+    let table = table(&summary, &policy, seed, goal.as_ref());
     if args.json {
         writeln!(std::io::stderr().lock(), "{table}")?;
         writeln!(std::io::stdout().lock(), "{}", serde_json::to_string(&summary)?)?;
@@ -46,7 +48,7 @@ pub(crate) fn run(args: &EvalArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn table(summary: &EvaluationSummary, policy: &PolicyFile, seed: u64) -> Table {
+fn table(summary: &EvaluationSummary, policy: &PolicyFile, seed: u64, goal: Option<&Goal>) -> Table {
     let mut table = Table::new();
     table.load_style(UTF8_BORDERS_ONLY);
     let mut row = |name: &str, value: String| {
@@ -70,17 +72,21 @@ fn table(summary: &EvaluationSummary, policy: &PolicyFile, seed: u64) -> Table {
             summary.return_mean, summary.return_std
         ),
     );
-    if let Some(distance) = summary.final_distance_mean {
-        row("distance at the end", format!("{distance:.4} m in the mean"));
-    }
-    if let Some(reached) = summary.reached_fraction {
-        row(
-            "goal reached",
-            format!(
-                "{:.0} % of the episodes (within {REACHED} m at the end)",
-                100.0 * reached
-            ),
-        );
+    if let Some(goal) = goal {
+        let unit = goal.distance.unit;
+        if let Some(distance) = summary.final_distance_mean {
+            row("distance at the end", format!("{distance:.4} {unit} in the mean"));
+        }
+        if let Some(reached) = summary.reached_fraction {
+            row(
+                "goal reached",
+                format!(
+                    "{:.0} % of the episodes (within {} {unit} at the end)",
+                    100.0 * reached,
+                    goal.within
+                ),
+            );
+        }
     }
     table
 }

@@ -10,7 +10,7 @@ mod support;
 use std::process::Command;
 
 use shoal_common::stream::{Purpose, stream};
-use shoal_env_server::environment::{Environment, OutOfRange, RequestError, Step};
+use shoal_env_server::environment::{Environment, OutOfRange, RequestError, Signal, Step};
 
 use support::{Leftovers, Workplace};
 
@@ -84,6 +84,10 @@ fn the_tutorials_environment_keeps_what_an_environment_promises() {
         }
     }
     assert!(rail.reset_to(&[3.0, 0.0]).is_err() && rail.restore(&[1.0]).is_err());
+    let signals = rail.signals();
+    let keys: Vec<_> = signals.iter().map(|signal| signal.key.as_str()).collect();
+    assert_eq!(keys, ["position", "velocity", "force"]);
+    assert_eq!(signals[2].range(&spec), Some([-1.0, 1.0]));
     let explained = shoal_common::config::explanation::keys::<rail::Parameters>();
     assert!(
         explained

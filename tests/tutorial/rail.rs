@@ -8,7 +8,7 @@ use shoal_common::{
     stream::Stream,
 };
 
-use super::{Environment, OutOfRange, RequestError, Step};
+use super::{Environment, OutOfRange, RequestError, Signal, Step};
 
 /// Δt in s.
 const DT: f64 = 0.05;
@@ -95,5 +95,13 @@ impl Environment for Rail {
 
     fn save(&self, state: &mut [f64]) {
         state.copy_from_slice(&[self.x, self.v]);
+    }
+
+    fn signals(&self) -> Vec<Signal> {
+        vec![
+            Signal::observation(0, "position", "m"),
+            Signal::observation(1, "velocity", "m/s"),
+            Signal::action(0, "force", "N"),
+        ]
     }
 }

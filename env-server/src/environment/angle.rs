@@ -7,6 +7,16 @@ pub fn wrap(angle: f64) -> f64 {
     (angle + PI).rem_euclid(TAU) - PI
 }
 
+/// The same angles without jumps, as they follow one another from `start` on. It turns by less than half a turn a step.
+pub fn followed(angles: impl Iterator<Item = f64>, start: f64) -> Vec<f64> {
+    angles
+        .scan(start, |angle, seen| {
+            *angle += wrap(seen - *angle);
+            Some(*angle)
+        })
+        .collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -9,7 +9,7 @@ use shoal_common::{
 };
 
 use super::{
-    Environment, RequestError, Step,
+    Environment, Picture, RequestError, Signal, Step,
     error::{OutOfRange, check_time_limit},
 };
 
@@ -20,13 +20,13 @@ const M_CART: f64 = 1.0;
 /// Mass of the pole in kg.
 const M_POLE: f64 = 0.1;
 /// Half the pole's length in m.
-pub const L: f64 = 0.5;
+const L: f64 = 0.5;
 /// Size of the push in N.
 const FORCE: f64 = 10.0;
 /// Δt in s.
-pub const DT: f64 = 0.02;
+const DT: f64 = 0.02;
 /// The cart leaves the track beyond this |x|, in m.
-pub const X_LIMIT: f64 = 2.4;
+const X_LIMIT: f64 = 2.4;
 /// The pole has fallen beyond this |θ|: 12° in rad. (The thesis's table shows twice this: the observation's range.)
 const THETA_LIMIT: f64 = 12.0 / 180.0 * std::f64::consts::PI;
 
@@ -123,6 +123,25 @@ impl Environment for CartPole {
 
     fn save(&self, state: &mut [f64]) {
         state.copy_from_slice(&self.state);
+    }
+
+    fn signals(&self) -> Vec<Signal> {
+        vec![
+            Signal::observation(0, "position", "m"),
+            Signal::observation(2, "angle", "rad").label("angle from upright"),
+            Signal::action(0, "push", "").label("push (0 ←, 1 →)"),
+        ]
+    }
+
+    fn time_step(&self) -> Option<f64> {
+        Some(DT)
+    }
+
+    fn picture(&self) -> Picture {
+        Picture::Cart {
+            track: X_LIMIT,
+            pole: 2.0 * L,
+        }
     }
 }
 

@@ -9,7 +9,7 @@ use shoal_common::{
 };
 
 use super::{
-    Environment, RequestError, Step,
+    Environment, Picture, RequestError, Signal, Step,
     error::{OutOfRange, check_time_limit},
 };
 
@@ -160,6 +160,19 @@ impl Environment for FrozenLake {
 
     fn save(&self, state: &mut [f64]) {
         state[0] = self.state as f64;
+    }
+
+    fn signals(&self) -> Vec<Signal> {
+        vec![
+            Signal::observation(0, "field", ""),
+            Signal::action(0, "direction", "").label("direction meant (0 ←, 1 ↓, 2 →, 3 ↑)"),
+        ]
+    }
+
+    fn picture(&self) -> Picture {
+        Picture::Grid {
+            map: MAP.iter().map(|field| char::from(*field)).collect(),
+        }
     }
 }
 

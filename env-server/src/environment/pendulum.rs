@@ -11,7 +11,7 @@ use shoal_common::{
 };
 
 use super::{
-    Environment, RequestError, Step,
+    Environment, Picture, RequestError, Signal, Step,
     angle::wrap,
     error::{OutOfRange, check, check_time_limit},
 };
@@ -128,6 +128,22 @@ impl Environment for Pendulum {
 
     fn save(&self, state: &mut [f64]) {
         state.copy_from_slice(&self.state());
+    }
+
+    fn signals(&self) -> Vec<Signal> {
+        vec![
+            Signal::angle(0, 1, "angle").label("angle from upright"),
+            Signal::observation(2, "angular-velocity", "rad/s").label("angular velocity"),
+            Signal::action(0, "torque", "N m"),
+        ]
+    }
+
+    fn time_step(&self) -> Option<f64> {
+        Some(DT)
+    }
+
+    fn picture(&self) -> Picture {
+        Picture::Rod
     }
 }
 

@@ -11,19 +11,21 @@ use shoal_common::{
     stream::Stream,
 };
 
-use super::{Environment, RequestError, Step, angle::wrap, error::OutOfRange};
+use super::{Environment, Goal, Picture, RequestError, Signal, Step, angle::wrap, error::OutOfRange};
 
 pub use parameters::Parameters;
 pub use reward::{Motion, Reward};
 
 /// Δt in s.
-pub const DT: f64 = 0.05;
+const DT: f64 = 0.05;
 /// Walls at this |x| and |y|, in m.
 const WALL: f64 = 4.0;
 /// Greatest |ẋ| and |ẏ|, in m/s.
 const MAX_SPEED: f64 = 1.0;
 /// Greatest F_u, in N.
 const MAX_FORCE: f64 = 2.0;
+/// Nearer than this at an episode's end the vehicle has reached the goal, in m.
+pub const REACHED: f64 = 0.05;
 
 /// A vehicle on a plane whose goal is the origin. Observation (x̃, ỹ, ẋ, ẏ, d, ḋ) of equation (5.7), action (θ, F_u) of
 /// equation (5.8) with θ in rad and F_u in N, never terminates. Episodes start at rest.
@@ -100,6 +102,11 @@ impl PointMass {
             return 0.0;
         }
         (self.x.position * self.x.velocity + self.y.position * self.y.velocity) / d
+    }
+
+    /// d as it is observed.
+    fn distance() -> Signal {
+        Signal::observation(4, "distance", "m").label("distance to the goal")
     }
 
     /// x, y, ẋ, ẏ, and the action before.
@@ -216,6 +223,31 @@ impl Environment for PointMass {
         self.reset_to(&state[..4])?;
         self.before = before;
         Ok(())
+    }
+
+    fn signals(&self) -> Vec<Signal> {
+        vec![
+            Signal::observation(0, "x", "m"),
+            Signal::observation(1, "y", "m"),
+            Self::distance(),
+            Signal::action(1, "force", "N"),
+            Signal::action(0, "direction", "rad").label("direction of the force"),
+        ]
+    }
+
+    fn time_step(&self) -> Option<f64> {
+        Some(DT)
+    }
+
+    fn goal(&self) -> Option<Goal> {
+        Some(Goal {
+            distance: Self::distance(),
+            within: REACHED,
+        })
+    }
+
+    fn picture(&self) -> Picture {
+        Picture::Plane
     }
 }
 

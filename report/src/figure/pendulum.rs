@@ -3,13 +3,11 @@
 use std::f64::consts::TAU;
 use std::path::Path;
 
+use shoal_env_server::environment::pendulum::DT;
 use shoal_run::analysis::pendulum::SwingUp;
 
 use super::canvas::{BLUE, INK, VERMILION, save};
 use super::panel::{Axis, Panel, Series, range_of};
-
-/// Δt in s.
-const DT: f64 = 0.05;
 
 /// Draws the torque, and the angle and angular velocity.
 pub fn swing_up(swing: &SwingUp, path: &Path) -> anyhow::Result<()> {

@@ -3,12 +3,14 @@
 use serde::Serialize;
 use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
+use shoal_env_server::environment::Picture;
+use shoal_run::description::Description;
 use shoal_run::evaluation::WhichPolicy;
 use shoal_run::numbers::thousands;
 use shoal_run::rollout::{Rollout, Trajectory};
 
 use super::numbers::short;
-use super::scene::{Scene, Signal};
+use super::signals::{Trace, traces};
 
 /// Pictures of an episode; of a longer one every second step is left out, or more.
 const FRAMES: usize = 1_000;
@@ -21,7 +23,9 @@ const STEPS: usize = 20_000;
 pub(super) struct Played {
     /// One sentence for the reader.
     pub(super) why_not: Option<String>,
-    scene: Scene,
+    picture: Picture,
+    /// Δt of a step in s, where the environment has a time.
+    time_step: Option<f64>,
     /// Which policy acts.
     policy: String,
     pub(super) episodes: Vec<Episode>,
@@ -37,7 +41,7 @@ pub(super) struct Episode {
     #[serde(rename = "return")]
     episode_return: f64,
     terminated: bool,
-    pub(super) signals: Vec<Signal>,
+    pub(super) signals: Vec<Trace>,
 }
 
 impl Played {
@@ -63,13 +67,19 @@ impl Played {
 
     fn try_of(run: &RunDir, config: &Config, which: WhichPolicy, episodes: usize) -> anyhow::Result<Self> {
         let policy = which.read(run, config)?;
-        let scene = Scene::of(config);
+        let Description {
+            signals,
+            time_step,
+            picture,
+            ..
+        } = Description::of(config)?;
         let mut rollout = Rollout::new(config, &policy.parameters)?;
         let limit = config.spec.time_limit.max(1) as usize;
         let mut played = Vec::new();
         for number in 0..episodes.min(STEPS / limit).max(1) {
             let trajectory = rollout.evaluation_episode(config.run.seed, number as u64)?;
-            played.push(Episode::of(number, &trajectory, &scene));
+            let of_frames = |frames: &[usize]| traces(&signals, &config.spec, &trajectory, frames);
+            played.push(Episode::of(number, &trajectory, of_frames));
         }
         let called = match which {
             WhichPolicy::Best => "best",
@@ -77,7 +87,8 @@ impl Played {
         };
         Ok(Self {
             why_not: None,
-            scene,
+            picture,
+            time_step,
             policy: format!(
                 "the {called} policy, learned from {} environment steps",
                 thousands(policy.env_steps)
@@ -88,7 +99,8 @@ impl Played {
 }
 
 impl Episode {
-    fn of(number: usize, trajectory: &Trajectory, scene: &Scene) -> Self {
+    /// The traces are asked for at the frames that the episode is shown by.
+    fn of(number: usize, trajectory: &Trajectory, of_frames: impl Fn(&[usize]) -> Vec<Trace>) -> Self {
         let steps = trajectory.actions.len();
         let stride = steps.div_ceil(FRAMES).max(1);
         let frames: Vec<usize> = (0..steps).step_by(stride).chain([steps]).collect();
@@ -98,7 +110,7 @@ impl Episode {
             stride,
             episode_return: short(trajectory.episode_return()),
             terminated: trajectory.terminated,
-            signals: scene.signals(trajectory, &frames),
+            signals: of_frames(&frames),
         }
     }
 }

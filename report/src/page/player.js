@@ -54,16 +54,17 @@ class Player {
     this.pause();
     this.run = run;
     const { played } = run;
-    const { scene } = played;
+    const { picture } = played;
     this.episode = played.episodes[number];
     this.frames = this.episode.signals[0].values.length;
-    this.dt = scene.dt ?? null;
+    this.dt = played.time_step;
     const told = (episode, i) => [i, `${episode.number + 1}: return ${text(episode.return)}, ${plural(episode.steps, "step")}${episode.terminated ? ", terminated" : ""}`];
     this.episodes.replaceChildren(this.choice("Episode", played.episodes.map(told), number, (i) => this.load(run, i)));
-    const { element, draw } = SCENES[scene.kind](scene, this.episode);
+    const byKey = Object.fromEntries(this.episode.signals.map((signal) => [signal.key, signal]));
+    const { element, draw } = SCENES[picture.kind](picture, byKey);
     this.drawScene = draw;
     this.stage.replaceChildren(element);
-    this.element.classList.toggle("without-picture", scene.kind === "lines");
+    this.element.classList.toggle("without-picture", picture.kind === "none");
     this.cursors = this.episode.signals.map((signal) => this.strip(signal));
     this.policy.textContent = `${run.name}: ${played.policy}, without exploration, from the starts that every evaluation has.`;
     set(this.slider, { max: this.frames - 1 });
@@ -97,7 +98,7 @@ class Player {
     const element = html(
       "div",
       { class: "strip" },
-      html("p", {}, html("span", {}, signal.name + (signal.unit ? ` (${signal.unit})` : "")), value),
+      html("p", {}, html("span", {}, signal.label + (signal.unit ? ` (${signal.unit})` : "")), value),
       drawing,
       html("p", { class: "ends" }, `${text(least)} to ${text(most)}${unit}`),
     );

@@ -1,7 +1,5 @@
-/* What an episode looks like: a picture for each environment that has one. `draw(i)` shows its frame i. */
-
-/** The values of the episode's signal whose name begins so. */
-const signalOf = (episode, name) => episode.signals.find((signal) => signal.name.startsWith(name)).values;
+/* What an episode looks like: the pictures that environments name, by the `kind` of `Picture` (env-server). Each reads the
+   episode's signals by their keys. `draw(i)` shows its frame i. */
 
 /** An arrow from (x, y) by (dx, dy); nothing where it is too short to see. */
 function arrow(shape, x, y, dx, dy, head) {
@@ -16,15 +14,16 @@ function arrow(shape, x, y, dx, dy, head) {
 
 const line = (points) => (points.length ? `M${points.map(([x, y]) => `${x.toFixed(3)} ${y.toFixed(3)}`).join("L")}` : "");
 
-function picture(box, label, ...parts) {
+function drawing(box, label, ...parts) {
   const width = Number(box.split(" ")[2]);
   return svg("svg", { viewBox: box, role: "img", "aria-label": label, class: "scene", "font-size": width * 0.035 }, ...parts);
 }
 
 const SCENES = {
-  pendulum(scene, episode) {
-    const angles = signalOf(episode, "angle");
-    const torques = signalOf(episode, "torque");
+  rod(picture, signals) {
+    const angles = signals.angle.values;
+    const torques = signals.torque.values;
+    const greatest = signals.torque.range[1];
     // Upright is 0, and angles grow against the clock.
     const bob = (i) => [-Math.sin(angles[i]), -Math.cos(angles[i])];
     const trail = svg("path", { class: "trail" });
@@ -32,7 +31,7 @@ const SCENES = {
     const weight = svg("circle", { class: "body", r: 0.11, "data-part": "moves" });
     const torque = svg("path", { class: "force" });
     const caption = svg("text", { class: "note", x: -1.55, y: 1.5 });
-    const element = picture(
+    const element = drawing(
       "-1.6 -1.3 3.2 2.9",
       "The pendulum; upright is up, the arc at the joint is the torque",
       svg("circle", { class: "guide", r: 1 }),
@@ -49,7 +48,7 @@ const SCENES = {
       set(rod, { x2: x, y2: y });
       set(weight, { cx: x, cy: y });
       set(trail, { d: line(Array.from({ length: Math.min(i, 25) + 1 }, (_, back) => bob(i - back))) });
-      const share = (torques[i] ?? 0) / scene.torque;
+      const share = (torques[i] ?? 0) / greatest;
       const [radius, turn] = [0.32, Math.min(1, Math.abs(share)) * 2.4];
       const at = (angle) => [-Math.sin(angle) * radius, -Math.cos(angle) * radius];
       const end = at(Math.sign(share) * turn);
@@ -69,12 +68,12 @@ const SCENES = {
     return { element, draw };
   },
 
-  "point-mass"(scene, episode) {
-    const [xs, ys] = [signalOf(episode, "x"), signalOf(episode, "y")];
-    const [forces, directions] = [signalOf(episode, "force"), signalOf(episode, "direction")];
+  plane(picture, signals) {
+    const [xs, ys] = [signals.x.values, signals.y.values];
+    const [forces, directions] = [signals.force.values, signals.direction.values];
+    const [wall, greatest] = [signals.x.range[1], signals.force.range[1]];
     const place = (i) => [xs[i], -ys[i]];
     const all = xs.map((_, i) => place(i));
-    const { wall } = scene;
     const grid = svg("g", { class: "grid" });
     for (const at of ticks(-wall, wall, 8)) {
       grid.append(svg("line", { x1: at, x2: at, y1: -wall, y2: wall }), svg("line", { x1: -wall, x2: wall, y1: at, y2: at }));
@@ -84,7 +83,7 @@ const SCENES = {
     const done = svg("path", { class: "trail" });
     const force = svg("path", { class: "force" });
     const caption = label(-wall, wall * 1.1, "", "start");
-    const element = picture(
+    const element = drawing(
       `${-wall * 1.03} ${-wall * 1.03} ${wall * 2.06} ${wall * 2.2}`,
       "The vehicle from above; the cross is the goal, the arrow the force",
       grid,
@@ -102,7 +101,7 @@ const SCENES = {
       const [x, y] = place(i);
       set(vehicle, { cx: x, cy: y });
       set(done, { d: line(all.slice(0, i + 1)) });
-      const length = ((forces[i] ?? 0) / scene.force) * wall * 0.3;
+      const length = ((forces[i] ?? 0) / greatest) * wall * 0.3;
       const angle = directions[i] ?? 0;
       arrow(force, x, y, Math.cos(angle) * length, -Math.sin(angle) * length, wall * 0.05);
       const degrees = Math.round(((angle * 180) / Math.PI + 360) % 360);
@@ -111,16 +110,16 @@ const SCENES = {
     return { element, draw };
   },
 
-  "cart-pole"(scene, episode) {
-    const [xs, angles, pushes] = [signalOf(episode, "position"), signalOf(episode, "angle"), signalOf(episode, "push")];
-    const { track, pole } = scene;
+  cart(picture, signals) {
+    const [xs, angles, pushes] = [signals.position.values, signals.angle.values, signals.push.values];
+    const { track, pole } = picture;
     const cart = svg("rect", { class: "cart", width: 0.5, height: 0.26, y: -0.26, rx: 0.04 });
     const rod = svg("line", { class: "rod", y1: -0.26 });
     const tip = svg("circle", { class: "body", r: 0.07, "data-part": "moves" });
     const push = svg("path", { class: "force" });
     const caption = svg("text", { class: "note", x: -track, y: 0.45 });
     const end = (x) => svg("line", { class: "wall", x1: x, x2: x, y1: -0.12, y2: 0.12 });
-    const element = picture(
+    const element = drawing(
       `${-track - 0.3} ${-pole - 0.5} ${2 * track + 0.6} ${pole + 1.1}`,
       "The cart on its track with the pole; the arrow is the push",
       svg("line", { class: "wall", x1: -track, x2: track, y1: 0, y2: 0 }),
@@ -145,12 +144,12 @@ const SCENES = {
     return { element, draw };
   },
 
-  "frozen-lake"(scene, episode) {
-    const [fields, meant] = [signalOf(episode, "field"), signalOf(episode, "direction")];
-    const side = Math.round(Math.sqrt(scene.map.length));
+  grid(picture, signals) {
+    const [fields, meant] = [signals.field.values, signals.direction.values];
+    const side = Math.round(Math.sqrt(picture.map.length));
     const middle = (field) => [(field % side) + 0.5, Math.floor(field / side) + 0.5];
     const names = { S: "start", F: "", H: "hole", G: "goal" };
-    const lake = [...scene.map].flatMap((kind, field) => {
+    const lake = [...picture.map].flatMap((kind, field) => {
       const [x, y] = middle(field);
       return [
         svg("rect", { class: `field ${kind}`, x: x - 0.5, y: y - 0.5, width: 1, height: 1 }),
@@ -162,7 +161,7 @@ const SCENES = {
     const wish = svg("path", { class: "force" });
     const caption = svg("text", { class: "note", x: 0, y: side + 0.28 });
     const label = "The lake from above; the dot walks, the arrow is where it means to go, and it may slip";
-    const element = picture(`-0.05 -0.05 ${side + 0.1} ${side + 0.45}`, label, lake, trail, walker, wish, caption);
+    const element = drawing(`-0.05 -0.05 ${side + 0.1} ${side + 0.45}`, label, lake, trail, walker, wish, caption);
     const ways = [[-1, 0, "left"], [0, 1, "down"], [1, 0, "right"], [0, -1, "up"]];
     const draw = (i) => {
       const [x, y] = middle(fields[i]);
@@ -175,7 +174,7 @@ const SCENES = {
     return { element, draw };
   },
 
-  lines() {
+  none() {
     return { element: html("p", {}, "This environment has no picture; these are the numbers that the policy sees and gives."), draw() {} };
   },
 };

@@ -60,7 +60,12 @@ fn every_environment_is_played() {
         let data = data(&gather(&[run]).unwrap().page().unwrap());
         let played = &data["runs"][0]["played"];
         assert_eq!(played["why_not"], serde_json::Value::Null, "{name}");
-        assert_eq!(played["scene"]["kind"], name);
+        let environment = make(name, &toml::Table::new()).unwrap();
+        assert_eq!(
+            played["picture"],
+            serde_json::to_value(environment.picture()).unwrap(),
+            "{name}"
+        );
         assert_eq!(played["episodes"].as_array().unwrap().len(), 6, "{name}");
         let episode = &played["episodes"][0];
         let steps = episode["steps"].as_u64().unwrap() as usize;

@@ -3,7 +3,7 @@
 use std::f64::consts::PI;
 
 use serde::{Deserialize, Serialize};
-use shoal_env_server::environment::angle::wrap;
+use shoal_env_server::environment::angle::{followed, wrap};
 
 use super::{AT_REST, mean, round, tail};
 use crate::rollout::{Rollout, Trajectory};
@@ -49,13 +49,10 @@ impl SwingUp {
 
     /// From observations (cos θ, sin θ, θ̇) that start at `theta`. It turns by less than half a turn a step.
     pub fn of(trajectory: &Trajectory, theta: f64) -> Self {
-        let follow = |angle: &mut f64, observation: &Vec<f32>| {
-            let seen = f64::from(observation[1]).atan2(observation[0].into());
-            *angle += wrap(seen - *angle);
-            Some(*angle)
-        };
+        let observations = trajectory.observations.iter();
+        let seen = observations.map(|o| f64::from(o[1]).atan2(o[0].into()));
         Self {
-            angle: trajectory.observations.iter().scan(theta, follow).collect(),
+            angle: followed(seen, theta),
             velocity: trajectory.observations.iter().map(|o| o[2].into()).collect(),
             torque: trajectory.actions.iter().map(|a| a[0].into()).collect(),
             rewards: trajectory.rewards.clone(),

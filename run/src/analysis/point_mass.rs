@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 use shoal_env_server::environment::angle::wrap;
+pub use shoal_env_server::environment::point_mass::REACHED;
 
 use super::{AT_REST, mean, round, tail};
 use crate::rollout::{Rollout, Trajectory};
@@ -19,9 +20,6 @@ pub const FAR_STARTS: [[f64; 2]; 8] = [
     [-3.0, 3.0],
     [0.0, 3.0],
 ];
-
-/// Nearer than this the vehicle is at the goal, in m.
-pub const REACHED: f64 = 0.05;
 
 /// An episode of T steps from a chosen start position, at rest.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

@@ -1,0 +1,67 @@
+//! The thesis's own figures of one run. They start in states that the thesis names, so they belong to its environments by name.
+
+use std::path::{Path, PathBuf};
+
+use shoal_common::config::Config;
+use shoal_run::analysis::pendulum::SwingUp;
+use shoal_run::analysis::point_mass::{Drive, FAR_STARTS, NEAR_STARTS};
+use shoal_run::rollout::Rollout;
+
+use crate::figure;
+
+/// Draws what the policy does from the thesis's starts, and gives the files; `None` where the thesis has no such figure.
+pub(super) fn behaviour(
+    config: &Config,
+    rollout: &mut Rollout<'_>,
+    out: &Path,
+) -> anyhow::Result<Option<Vec<PathBuf>>> {
+    Ok(match config.environment.name.as_str() {
+        "pendulum" => Some(swing_up(rollout, out)?),
+        "point-mass" => Some(drives(config, rollout, out)?),
+        _ => None,
+    })
+}
+
+fn swing_up(rollout: &mut Rollout<'_>, out: &Path) -> anyhow::Result<Vec<PathBuf>> {
+    let path = out.join("swing-up.svg");
+    figure::swing_up(&SwingUp::run(rollout)?, &path)?;
+    Ok(vec![path])
+}
+
+fn drives(config: &Config, rollout: &mut Rollout<'_>, out: &Path) -> anyhow::Result<Vec<PathBuf>> {
+    let files = ["test-runs.svg", "test-runs-far.svg", "trajectories.svg"].map(|file| out.join(file));
+    figure::test_runs(&Drive::run_from(rollout, starts_shown(config))?, &files[0])?;
+    let mut runs = Drive::run_from(rollout, &FAR_STARTS)?;
+    figure::test_runs(&runs, &files[1])?;
+    runs.extend(Drive::run_from(rollout, &NEAR_STARTS)?);
+    figure::trajectories(&runs, &files[2])?;
+    Ok(files.into())
+}
+
+/// The two starts of the thesis's figure for the run's reward: 5.5 (r1), 5.7 (r2), 5.9 (r3).
+fn starts_shown(config: &Config) -> &'static [[f64; 2]] {
+    let reward = config
+        .environment
+        .parameters
+        .get("reward")
+        .and_then(toml::Value::as_str);
+    if reward == Some("r2") {
+        &NEAR_STARTS[2..]
+    } else {
+        &NEAR_STARTS[..2]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use shoal_run::testing::small;
+
+    #[test]
+    fn the_starts_are_those_of_the_rewards_figure() {
+        let starts = |reward: &str| starts_shown(&small(&format!("name = \"point-mass\"\nreward = \"{reward}\"")).0);
+        assert_eq!(starts("r1"), [[2.0, -2.0], [-2.0, 2.0]]);
+        assert_eq!(starts("r2"), [[2.0, 2.0], [-2.0, -2.0]]);
+        assert_eq!(starts("r3"), starts("r1"));
+    }
+}
