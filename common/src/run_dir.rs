@@ -9,10 +9,10 @@ use std::time::{Duration, Instant};
 
 use rustix::fs::{FlockOperation, flock};
 use rustix::io::Errno;
+use shoal_base::durable::write_atomically;
+use shoal_channel::control::RunKey;
 
-use crate::channel::control::RunKey;
 use crate::config::{Config, ConfigError};
-use crate::durable::write_atomically;
 
 /// A run directory that exists.
 #[derive(Clone, Debug, PartialEq, Eq)]

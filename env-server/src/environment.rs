@@ -8,12 +8,12 @@ pub mod pendulum;
 pub mod point_mass;
 mod signal;
 
+pub use error::{EnvironmentError, OutOfRange, RequestError};
 use schemars::JsonSchema;
 use serde::{Serialize, de::DeserializeOwned};
-use shoal_common::config::explanation::{self, Key};
-use shoal_common::{space::EnvironmentSpec, stream::Stream};
-
-pub use error::{EnvironmentError, OutOfRange, RequestError};
+use shoal_base::section::{self, Key};
+use shoal_base::space::EnvironmentSpec;
+use shoal_base::stream::Stream;
 pub use signal::{Goal, Picture, Signal, Source};
 
 /// Every environment: its name, and how it is made from its parameters. A new one is its file, its `mod` line above and
@@ -136,7 +136,7 @@ fn made<P: Serialize + DeserializeOwned + JsonSchema, E: Environment + 'static>(
     Ok(Made {
         environment,
         parameters,
-        explain: explanation::keys::<P>,
+        explain: section::keys::<P>,
     })
 }
 
@@ -146,8 +146,8 @@ mod names_elsewhere;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use shoal_common::space::Space;
-    use shoal_common::stream::{Purpose, stream};
+    use shoal_base::space::Space;
+    use shoal_base::stream::{Purpose, stream};
 
     fn table(text: &str) -> toml::Table {
         text.parse().unwrap()

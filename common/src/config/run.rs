@@ -2,9 +2,10 @@
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use shoal_base::section;
+use shoal_base::section::{OutOfRange, from};
 
 use super::identity_format::IdentityFormat;
-use crate::section::{OutOfRange, from, section};
 
 section! {
     /// Identity and length of the run.

@@ -3,18 +3,18 @@
 use iceoryx2::active_request::ActiveRequest;
 use iceoryx2::port::server::Server;
 use iceoryx2::prelude::*;
+use shoal_base::exit::Exit;
+use shoal_base::packing::{numbers_of, words_of};
+use shoal_base::report::Role;
+use shoal_base::space::{EnvironmentSpec, Space};
+use shoal_base::stop::Stop;
 
 use super::message::{Ask, RequestHeader, ResponseHeader, ResponseLayout, StepBlocks, Verdict};
 use super::service::{LOANED_RESPONSES, answer_length, name, service};
-use crate::channel::bell::{Bell, Place, Ringer, wait_for};
-use crate::channel::domain::Domain;
-use crate::channel::error::ChannelError;
-use crate::channel::service::{Entry, claim};
-use crate::exit::Exit;
-use crate::packing::{numbers_of, words_of};
-use crate::report::Role;
-use crate::space::{EnvironmentSpec, Space};
-use crate::stop::Stop;
+use crate::bell::{Bell, Place, Ringer, wait_for};
+use crate::domain::Domain;
+use crate::error::ChannelError;
+use crate::service::{Entry, claim};
 
 /// The server's end.
 #[derive(Debug)]

@@ -17,6 +17,7 @@ pub use explanation::{Key, Section, describe, keys};
 /// `bounds` is left out where there is nothing to be compared (a word, `true` or `false`) or where the bounds are another
 /// key's value; then the section's `check` or `Config::check` compares. The struct gets a default, serde's
 /// and schemars' traits, and `check_bounds`.
+#[macro_export]
 macro_rules! section {
     (
         $(#[$attribute:meta])*
@@ -59,4 +60,3 @@ macro_rules! section {
         }
     };
 }
-pub(crate) use section;

@@ -2,8 +2,9 @@
 
 use std::ops::Range;
 
+use shoal_base::transition::RowLayout;
+
 use super::words::Words;
-use crate::transition::RowLayout;
 
 #[cfg(not(all(target_endian = "little", target_pointer_width = "64")))]
 compile_error!("the replay file and the checkpoints are written as they stand in memory: 64-bit little-endian only");

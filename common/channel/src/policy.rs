@@ -154,7 +154,7 @@ impl Policy {
         self.sample.user_header()
     }
 
-    /// Its parameters, in the layout of [`crate::network`].
+    /// Its parameters, in the layout of the network.
     pub fn parameters(&self) -> &[f32] {
         self.sample.payload()
     }

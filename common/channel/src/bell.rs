@@ -13,14 +13,14 @@ use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::event::PortFactory;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
+use shoal_base::exit::Exit;
+use shoal_base::report::Role;
+use shoal_base::stop::Stop;
 
 use super::domain::Domain;
 use super::error::{Cause, ChannelError};
 use super::service::{Entry, Held, claim, service_name};
 use super::{descriptor, memory};
-use crate::exit::Exit;
-use crate::report::Role;
-use crate::stop::Stop;
 
 /// Polls before a waiting process blocks. A peer that is at work on another core answers within them; on a shared core
 /// they cost it some microseconds.

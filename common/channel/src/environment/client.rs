@@ -8,18 +8,18 @@ use iceoryx2::pending_response::PendingResponse;
 use iceoryx2::port::client::Client;
 use iceoryx2::prelude::*;
 use iceoryx2::response::Response;
+use shoal_base::exit::Exit;
+use shoal_base::packing::{numbers_of, words_of};
+use shoal_base::report::Role;
+use shoal_base::space::{EnvironmentSpec, Space};
+use shoal_base::stop::Stop;
 
 use super::message::{Ask, Block, RequestHeader, ResponseHeader, ResponseLayout, Verdict};
 use super::service::{EnvironmentService, name, question_length, service};
-use crate::channel::bell::{Bell, Place, Ringer, wait_for};
-use crate::channel::domain::Domain;
-use crate::channel::error::{ChannelError, PeerError};
-use crate::channel::service::{CLAIM_PATIENCE, Entry, claim};
-use crate::exit::Exit;
-use crate::packing::{numbers_of, words_of};
-use crate::report::Role;
-use crate::space::{EnvironmentSpec, Space};
-use crate::stop::Stop;
+use crate::bell::{Bell, Place, Ringer, wait_for};
+use crate::domain::Domain;
+use crate::error::{ChannelError, PeerError};
+use crate::service::{CLAIM_PATIENCE, Entry, claim};
 
 /// Which episodes a reset begins.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -45,7 +45,7 @@ pub enum Stepped {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Snapshot {
     /// The words to restore from: as many as
-    /// [`EnvironmentSpec::snapshot_words`](crate::space::EnvironmentSpec::snapshot_words) counts.
+    /// [`EnvironmentSpec::snapshot_words`](shoal_base::space::EnvironmentSpec::snapshot_words) counts.
     Taken(Vec<u64>),
     /// The server died, and another one has taken its place: the episodes under way are lost.
     Lost,

@@ -6,14 +6,14 @@ use iceoryx2::service::header::request_response::{
 };
 use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::request_response::PortFactory;
+use shoal_base::packing::NUMBERS_OF_A_WORD;
+use shoal_base::space::EnvironmentSpec;
 
 use super::message::{RequestHeader, ResponseHeader, ResponseLayout};
-use crate::channel::domain::Domain;
-use crate::channel::error::ChannelError;
-use crate::channel::memory;
-use crate::channel::service::{Entry, Held, service_name};
-use crate::packing::NUMBERS_OF_A_WORD;
-use crate::space::EnvironmentSpec;
+use crate::domain::Domain;
+use crate::error::ChannelError;
+use crate::memory;
+use crate::service::{Entry, Held, service_name};
 
 /// Requests that may wait for their answers: one, and those that a killed server left unanswered.
 const ACTIVE_REQUESTS: usize = 4;
@@ -59,7 +59,7 @@ pub(super) fn name(index: u32) -> String {
 }
 
 /// Makes the service of the conversation with environment server `index`.
-pub(in crate::channel) fn create(domain: &Domain, index: u32) -> Result<Held, ChannelError> {
+pub(crate) fn create(domain: &Domain, index: u32) -> Result<Held, ChannelError> {
     let service = service(domain, &name(index), Entry::Create)?;
     Ok(Held::new(move |see| {
         let ports = service.dynamic_config();

@@ -17,6 +17,10 @@ use iceoryx2::sample_mut::SampleMut;
 use iceoryx2::service::header::publish_subscribe::Header;
 use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
+use shoal_base::exit::Exit;
+use shoal_base::packing::{numbers_of, words_of};
+use shoal_base::stop::Stop;
+use shoal_base::transition::{ChunkLayout, Transition};
 
 use super::bell::{Bell, wait_for};
 use super::domain::Domain;
@@ -24,10 +28,6 @@ use super::error::{ChannelError, PeerError};
 use super::memory;
 use super::service::{Entry, Held, claim, service_name};
 use crate::commit::{ChunkMark, CommitReader};
-use crate::exit::Exit;
-use crate::packing::{numbers_of, words_of};
-use crate::stop::Stop;
-use crate::transition::{ChunkLayout, Transition};
 
 /// Chunks the learner has in hand.
 const BORROWED: usize = 2;

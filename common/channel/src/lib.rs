@@ -3,6 +3,7 @@
 
 mod bell;
 mod cleanup;
+pub mod commit;
 pub mod control;
 mod descriptor;
 mod domain;

@@ -13,10 +13,10 @@
 mod forward;
 mod policy;
 
+use std::ops::Range;
+
 pub use forward::{Activations, Layer, matrix, matrix_mut};
 pub use policy::{ActionRange, ActionRangeError, PolicyNetwork};
-
-use std::ops::Range;
 
 /// The sizes of a network, and with them the place of each of its parameters.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

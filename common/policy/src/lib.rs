@@ -1,11 +1,13 @@
 //! The kinds of policy, as everyone evaluates them who acts: from a flat slice of parameters, in place.
 
+pub mod network;
+pub mod policy_file;
 mod scores;
 
 pub use scores::Scores;
+use shoal_base::space::{EnvironmentSpec, Space};
 
 use crate::network::{ActionRange, ActionRangeError, NetworkLayout, PolicyNetwork};
-use crate::space::{EnvironmentSpec, Space};
 
 /// What a policy's parameters are: what every process of a run must agree on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

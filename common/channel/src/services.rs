@@ -7,6 +7,7 @@ use std::os::unix::fs::OpenOptionsExt;
 
 use iceoryx2::identifiers::UniqueNodeId;
 use iceoryx2::prelude::CallbackProgression;
+use shoal_base::report::{EpisodeReport, EvaluationReport, Heartbeat, JudgedReport, LearnerReport, Role};
 
 use super::bell::Place;
 use super::cleanup::{Sweeper, lives};
@@ -15,7 +16,6 @@ use super::error::ChannelError;
 use super::files::prefix;
 use super::service::Held;
 use super::{bell, control, environment, policy, reports, transitions};
-use crate::report::{EpisodeReport, EvaluationReport, Heartbeat, JudgedReport, LearnerReport, Role};
 
 /// The services of a run that this process has made. They are gone when this is dropped and nobody else has them open.
 #[derive(Debug)]

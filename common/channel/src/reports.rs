@@ -9,12 +9,12 @@ use iceoryx2::prelude::*;
 use iceoryx2::service::header::publish_subscribe::Header;
 use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
+use shoal_base::report::{EpisodeReport, EvaluationReport, Heartbeat, JudgedReport, LearnerReport};
 
 use super::domain::Domain;
 use super::error::ChannelError;
 use super::memory;
 use super::service::{Entry, Held, claim, service_name};
-use crate::report::{EpisodeReport, EvaluationReport, Heartbeat, JudgedReport, LearnerReport};
 
 /// Reports a reader has in hand: each is copied and let go.
 const BORROWED: usize = 1;

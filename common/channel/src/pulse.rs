@@ -2,10 +2,11 @@
 
 use std::time::{Duration, Instant};
 
+use shoal_base::report::{Activity, Heartbeat, Identity};
+
 use super::domain::Domain;
 use super::error::ChannelError;
 use super::reports::Reporter;
-use crate::report::{Activity, Heartbeat, Identity};
 
 const INTERVAL: Duration = Duration::from_millis(500);
 

@@ -1,9 +1,10 @@
 //! The forward pass: one product a layer, then bias and activation in one sweep.
 
-use super::NetworkLayout;
 use faer::linalg::matmul::matmul;
 use faer::{Accum, MatMut, MatRef, Par};
 use pulp::{Arch, Simd, WithSimd};
+
+use super::NetworkLayout;
 
 /// A layer's weights (outputs × inputs, column-major) and biases, borrowed from the parameter slice.
 #[derive(Clone, Copy, Debug)]

@@ -3,8 +3,9 @@
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-use crate::durable::{self, Kind, SealError};
-use crate::policy::PolicyLayout;
+use shoal_base::durable::{self, Kind, SealError};
+
+use crate::PolicyLayout;
 
 const KIND: Kind = Kind {
     magic: *b"SHOALPOL",

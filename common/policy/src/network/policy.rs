@@ -1,7 +1,8 @@
 //! The policy μ as an actor evaluates it: the network's tanh output scaled to the action's range.
 
+use shoal_base::space::Space;
+
 use super::{Activations, NetworkLayout};
-use crate::space::Space;
 
 /// The middle and half the width of each action element's range: tanh outputs become actions in environment units.
 #[derive(Clone, Debug, PartialEq)]

@@ -1,15 +1,15 @@
 //! Words of 64 bits among numbers of 32: how a `u64` travels in a payload of `f32`.
 
 /// Numbers that carry the bits of a word.
-pub(crate) const NUMBERS_OF_A_WORD: usize = 2;
+pub const NUMBERS_OF_A_WORD: usize = 2;
 
 /// Words as they travel.
-pub(crate) fn numbers_of(words: &[u64]) -> &[f32] {
+pub fn numbers_of(words: &[u64]) -> &[f32] {
     bytemuck::cast_slice(words)
 }
 
 /// The words whose bits came, wherever in memory they lie.
-pub(crate) fn words_of(numbers: &[f32]) -> Vec<u64> {
+pub fn words_of(numbers: &[f32]) -> Vec<u64> {
     let (words, _) = numbers.as_chunks::<NUMBERS_OF_A_WORD>();
     words.iter().map(|numbers| bytemuck::cast(*numbers)).collect()
 }

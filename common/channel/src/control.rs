@@ -290,7 +290,7 @@ mod tests {
     use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
     use super::*;
-    use crate::channel::Services;
+    use crate::Services;
 
     #[test]
     fn who_asks_wakes_the_launcher() {

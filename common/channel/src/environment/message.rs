@@ -2,8 +2,7 @@
 //! another language.
 
 use iceoryx2::prelude::ZeroCopySend;
-
-use crate::space::{EnvironmentSpec, Space};
+use shoal_base::space::{EnvironmentSpec, Space};
 
 /// What a request asks for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
