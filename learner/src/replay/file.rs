@@ -13,7 +13,7 @@ use rustix::process::{Resource, getrlimit};
 use shoal_common::commit::{Places, Record, ReplayLayout, SYNCED, Words, WritableWords};
 use shoal_common::durable::sync_directory_of;
 
-use super::ReplayError;
+use super::error::ReplayError;
 
 /// Makes an empty replay: under a temporary name, then renamed, so that a file with the replay's name is whole.
 pub(super) fn create(path: &Path, layout: &ReplayLayout) -> Result<(File, Places), ReplayError> {
