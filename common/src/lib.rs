@@ -14,7 +14,7 @@ pub mod config;
 pub mod evaluator_state;
 pub mod run_dir;
 
-pub use shoal_base::{durable, exit, report, section, space, stop, stream, transition};
+pub use shoal_base::{durable, exit, file_lock, report, section, space, stop, stream, transition};
 pub use shoal_channel as channel;
 pub use shoal_channel::commit;
 pub use shoal_policy as policy;

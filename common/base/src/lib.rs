@@ -2,6 +2,7 @@
 
 pub mod durable;
 pub mod exit;
+pub mod file_lock;
 pub mod packing;
 pub mod report;
 pub mod section;

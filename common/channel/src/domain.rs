@@ -12,8 +12,7 @@ use iceoryx2::prelude::{
     CallbackProgression, Config, FileName, Node, NodeBuilder, NodeName, NodeState, Path as IoxPath, SemanticString,
     SignalHandlingMode, ipc,
 };
-use rustix::fs::FlockOperation;
-use rustix::io::Errno;
+use shoal_base::file_lock;
 
 use super::files::{SHARED_MEMORY, files_of, prefix};
 use super::memory;
@@ -346,10 +345,8 @@ fn try_lock(directory: &Path) -> Result<Attempt, DomainError> {
             Err(cause) if cause.kind() == io::ErrorKind::NotFound => return Ok(Attempt::Absent),
             opened => opened.map_err(io_error("open", directory))?,
         };
-        match rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive) {
-            Ok(()) => {}
-            Err(Errno::WOULDBLOCK) => return Ok(Attempt::Held),
-            Err(errno) => return Err(io_error("lock", directory)(errno.into())),
+        if !file_lock::lock(&file, Duration::ZERO).map_err(io_error("lock", directory))? {
+            return Ok(Attempt::Held);
         }
         // Who had it before may have removed the directory, and another one may be there now.
         let inode = |metadata: io::Result<Metadata>| metadata.ok().map(|metadata| metadata.ino());

@@ -89,13 +89,6 @@ pub struct RunStatus {
     pub finished: bool,
 }
 
-impl RunStatus {
-    /// Whether all steps or episodes that were asked for are taken. Updates may be left.
-    pub fn has_all_steps(&self) -> bool {
-        self.env_steps >= self.steps || self.episodes_limit.is_some_and(|limit| self.episodes >= limit)
-    }
-}
-
 /// How a process of a run gets on.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RoleStatus {
