@@ -255,6 +255,11 @@ impl RunDir {
         self.path.join("tensorboard")
     }
 
+    /// `incarnations`: how many processes were ever started for the run, written down before each of them is.
+    pub fn incarnations(&self) -> PathBuf {
+        self.path.join("incarnations")
+    }
+
     /// `outcome.json`: how the run ended.
     pub fn outcome(&self) -> PathBuf {
         self.path.join("outcome.json")

@@ -72,7 +72,7 @@ pub(super) struct Crew {
 
 impl Crew {
     pub(super) fn new(config: &Config, run: &RunDir, domain: &Domain, log: Log) -> anyhow::Result<Self> {
-        let counter = run.path().join("incarnations");
+        let counter = run.incarnations();
         let mut started = read_counter(&counter)?;
         let committed = last_committed(run)?;
         if started < committed {

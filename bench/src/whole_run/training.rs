@@ -114,8 +114,10 @@ impl Training {
     pub(super) fn begin(&mut self, patience: &Patience) -> anyhow::Result<Began> {
         let run = RunDir::planned(&self.directory.path().join("run"));
         let begun = self.begun;
-        // Who joins before the launcher has would be taken for what another launcher left.
-        self.wait(patience, "no log", |_| Ok(run.log().exists().then_some(())))?;
+        // Who joins before the launcher has would be taken for what another launcher left; and the services are there when the
+        // first process is started, whose number is written down before.
+        let counter = run.incarnations();
+        self.wait(patience, "no process", |_| Ok(counter.exists().then_some(())))?;
         let mut seat = Seat::take(&run)?;
         let actors = seat.remote.config.actors.count;
         let roles = 3 + 2 * actors as usize;
