@@ -15,10 +15,10 @@ pub use exploration::{Exploration, Warmup};
 pub use reinforce::{Reinforce, Weight};
 pub use tabular::Tabular;
 
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 
 use crate::policy::{Policy, PolicyError, PolicyLayout};
-use crate::section::{OutOfRange, Section, describe};
+use crate::section::{self, OutOfRange, Section, describe};
 use crate::space::EnvironmentSpec;
 
 macro_rules! registry {
@@ -58,10 +58,10 @@ macro_rules! registry {
             /// The algorithm of that name with the settings that its section has; `None` where there is none of that name.
             ///
             /// # Errors
-            /// When a key is unknown or of the wrong type.
+            /// When a key is unknown or of the wrong type: the key, its value, and what is wrong.
             pub fn read(name: &str, section: toml::Value) -> Option<Result<Self, toml::de::Error>> {
                 $(if name == $spec.name {
-                    return Some(<$settings>::deserialize(section).map(Self::$variant));
+                    return Some(section::read(name, section).map(Self::$variant));
                 })*
                 None
             }
