@@ -206,7 +206,7 @@ fn a_stopped_run_goes_on_where_it_was() {
     let stop_again = place.output(&["stop", "run"]);
     assert!(!stop_again.status.success() && said(&stop_again).contains("nothing runs"));
 
-    let steps = before["env_steps"].as_u64().unwrap() + 9000;
+    let steps = before["env_steps"].as_u64().unwrap() + 20_000;
     let running = place.resume("run", &["--steps", &steps.to_string()]);
     assert_eq!(
         roles(&place.status("run"), "actor").len(),

@@ -9,12 +9,12 @@ use serde::Serialize;
 use super::costs::{self, Costs};
 use super::crew::Crew;
 use super::flow::{Flow, LOOK};
+use super::measurement::{Figures, Patience};
 use super::model::{Bottleneck, Stages};
 use super::one_core::{self, OneCore};
 use super::rows::ENVIRONMENTS;
-use super::scene::Scene;
+use super::scene::{Scene, counted_settings};
 use super::window::Windows;
-use super::{Figures, Patience};
 
 mod table;
 
@@ -82,27 +82,6 @@ struct Scaling {
     learning_rows_per_second: f64,
     learning_updates_per_second: f64,
     learning_efficiency: f64,
-}
-
-/// Settings of a run that is counted.
-pub(super) fn settings(actors: u32, updates: bool) -> Vec<&'static str> {
-    let mut settings = vec![
-        "run.steps=1_000_000_000_000",
-        // A checkpoint has the disk brought up to date: another stage's work.
-        "checkpoint.every_seconds=86_400",
-        // What the model knows an update of.
-        "learner.threads=1",
-    ];
-    if actors > 16 {
-        settings.push("actors.max=256");
-    }
-    if updates {
-        // Rows come faster than updates, so that one for each row is more than can be made; and no actor waits for them.
-        settings.extend(["replay.updates_per_step=1", "replay.tolerance=1_000_000_000"]);
-    } else {
-        settings.push("replay.updates_per_step=0");
-    }
-    settings
 }
 
 /// The counts that somebody typed, or those that make sense here; always with one actor, which the others are held against.
@@ -201,7 +180,7 @@ fn scaling(stages: &Stages, actors: u32, rows: f64) -> Scaling {
 
 /// Rows a second of so many actors, and the learner's updates a second.
 fn count(actors: u32, updates: bool, length: Duration, patience: &Patience) -> anyhow::Result<(Windows, f64)> {
-    let scene = Scene::of(actors, ENVIRONMENTS as u32, &settings(actors, updates))?;
+    let scene = Scene::of(actors, ENVIRONMENTS as u32, &counted_settings(actors, updates))?;
     scene.with_crew(
         |_| None,
         |domain, crew| {

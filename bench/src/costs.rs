@@ -20,10 +20,10 @@ use shoal_learner::process::intake::Intake;
 use shoal_learner::replay::Replay;
 use shoal_run::process::Peer;
 
+use super::measurement::{Patience, interrupted};
 use super::rows::{ENVIRONMENTS, Rows};
 use super::scene::{Scene, ddpg};
 use super::window::{self, Windows};
-use super::{Patience, interrupted};
 
 /// Windows of each stage, of which the median counts.
 const WINDOWS: u32 = 5;

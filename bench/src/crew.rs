@@ -46,7 +46,7 @@ impl Crew {
             woken = woken.and(peer.go_on());
         }
         paused.and(woken)?;
-        acted.ok_or_else(|| anyhow::anyhow!(super::INTERRUPTED))
+        acted.ok_or_else(|| anyhow::anyhow!(super::measurement::INTERRUPTED))
     }
 
     /// Asks everyone to end, the actors first, so that the learner still takes what they send; and waits for them.

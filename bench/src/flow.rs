@@ -9,8 +9,8 @@ use shoal_common::commit::{CommitReader, OpenError};
 use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
 
-use super::Patience;
 use super::crew::Crew;
+use super::measurement::Patience;
 use super::scene::Scene;
 
 /// How often it is looked whether something has come.

@@ -9,8 +9,8 @@ use serde::{Deserialize, Serialize};
 use shoal_common::config::Environment;
 use shoal_run::external_environment::{Conversation, default_command};
 
+use super::measurement::{Figures, Patience};
 use super::step::quantile_of;
-use super::{Figures, Patience};
 
 const NAME: &str = "gym:Pendulum-v1";
 

@@ -14,12 +14,12 @@ use shoal_learner::networks::product::products_of_update;
 use shoal_learner::networks::threads::Threads;
 use shoal_learner::replay::Replay;
 
+use super::measurement::{Figures, Patience};
 use super::product::Multiplication;
 use super::rows::{ENVIRONMENTS, Rows};
 use super::scene::{Scene, ddpg};
-use super::table::{Line, Target};
+use super::target::{Line, Target};
 use super::window::{self, Windows};
-use super::{Figures, Patience};
 
 const WINDOW: Duration = Duration::from_millis(100);
 

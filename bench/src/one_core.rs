@@ -7,13 +7,13 @@ use rustix::thread::sched_setaffinity;
 use serde::Serialize;
 use shoal_common::report::Role;
 
-use super::Patience;
 use super::cores::Cores;
 use super::costs::Inference;
 use super::crew::Crew;
 use super::flow::Flow;
+use super::measurement::Patience;
 use super::rows::ENVIRONMENTS;
-use super::scene::Scene;
+use super::scene::{Scene, counted_settings};
 use super::window::{self, Windows};
 
 /// A turn of the actor and its server; a turn of the policy alone takes half of it.
@@ -36,7 +36,7 @@ pub(super) struct OneCore {
 
 /// Measures for about `length`.
 pub(super) fn measure(length: Duration, patience: &Patience) -> anyhow::Result<OneCore> {
-    let scene = Scene::of(1, ENVIRONMENTS as u32, &super::actors::settings(1, false))?;
+    let scene = Scene::of(1, ENVIRONMENTS as u32, &counted_settings(1, false))?;
     let mut inference = Inference::new(&scene.config)?;
     let cores = Cores::choose()?;
     let chosen = |role| {

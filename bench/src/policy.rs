@@ -9,12 +9,12 @@ use shoal_common::stream::{Purpose, stream};
 use shoal_learner::networks::initialise::initialise;
 use shoal_learner::networks::product::{Product, Transposed};
 
+use super::measurement::{Figures, Patience};
 use super::product::Multiplication;
 use super::rows::{ENVIRONMENTS, Rows};
 use super::scene::{Scene, ddpg};
-use super::table::{Line, Target};
+use super::target::{Line, Target};
 use super::window::{self, Windows};
-use super::{Figures, Patience};
 
 const WINDOW: Duration = Duration::from_millis(50);
 

@@ -124,3 +124,24 @@ impl Scene {
         Ok(acted)
     }
 }
+
+/// Settings of a run that is counted.
+pub(super) fn counted_settings(actors: u32, updates: bool) -> Vec<&'static str> {
+    let mut settings = vec![
+        "run.steps=1_000_000_000_000",
+        // A checkpoint has the disk brought up to date: another stage's work.
+        "checkpoint.every_seconds=86_400",
+        // What the model knows an update of.
+        "learner.threads=1",
+    ];
+    if actors > 16 {
+        settings.push("actors.max=256");
+    }
+    if updates {
+        // Rows come faster than updates, so that one for each row is more than can be made; and no actor waits for them.
+        settings.extend(["replay.updates_per_step=1", "replay.tolerance=1_000_000_000"]);
+    } else {
+        settings.push("replay.updates_per_step=0");
+    }
+    settings
+}

@@ -13,10 +13,10 @@ use shoal_common::report::Role;
 use shoal_run::process::Peer;
 
 use super::cores::Cores;
+use super::measurement::{Figures, Patience};
 use super::scene::Scene;
 use super::spin;
-use super::table::{Line, Target};
-use super::{Figures, Patience};
+use super::target::{Line, Target};
 
 /// How often the other process is looked after.
 const LOOK: Duration = Duration::from_millis(50);
@@ -120,7 +120,7 @@ fn round_trips(
                 server.check()?;
                 bail!("the environment server gave up its episodes");
             }
-            Err(Exit::Stopped) => bail!(super::INTERRUPTED),
+            Err(Exit::Stopped) => bail!(super::measurement::INTERRUPTED),
             Err(Exit::Failed(error)) => return Err(error.into()),
         }
         let after = Instant::now();

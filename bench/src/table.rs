@@ -4,59 +4,11 @@ use std::io::Write;
 
 use comfy_table::Table;
 use comfy_table::presets::UTF8_BORDERS_ONLY;
-use serde::Serialize;
 use serde_json::{Map, Value};
 
-use super::{Figures, Patience, actors, learner, policy, step, transitions, whole_run};
-
-/// A row of the table.
-#[derive(Debug, Serialize)]
-pub(super) struct Line {
-    pub(super) stage: &'static str,
-    pub(super) ours: String,
-    /// What the machine gives, measured in the same run; empty where there is no such figure.
-    pub(super) limit: String,
-    /// Ours over the limit.
-    pub(super) share: Option<f64>,
-    pub(super) target: Target,
-}
-
-/// What a figure should be.
-#[derive(Debug, Serialize)]
-pub(super) struct Target {
-    text: &'static str,
-    /// Whether it is; nothing where it is more a direction than a number.
-    met: Option<bool>,
-}
-
-impl Target {
-    pub(super) fn at_least(least: f64, found: f64, text: &'static str) -> Self {
-        Self {
-            text,
-            met: Some(found >= least),
-        }
-    }
-
-    pub(super) fn at_most(most: f64, found: f64, text: &'static str) -> Self {
-        Self {
-            text,
-            met: Some(found <= most),
-        }
-    }
-
-    pub(super) fn none(text: &'static str) -> Self {
-        Self { text, met: None }
-    }
-
-    fn show(&self) -> String {
-        let verdict = match self.met {
-            Some(true) => ": met",
-            Some(false) => ": not met",
-            None => "",
-        };
-        format!("{}{verdict}", self.text)
-    }
-}
+use super::measurement::{Figures, Patience};
+use super::target::Line;
+use super::{actors, learner, policy, step, transitions, whole_run};
 
 /// What the stages gave, by name, and the lines of the table.
 struct All {

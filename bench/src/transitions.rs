@@ -16,11 +16,11 @@ use shoal_learner::algorithms::sampling::Sampler;
 use shoal_learner::replay::Replay;
 use shoal_run::process::Peer;
 
+use super::measurement::{Figures, Patience};
 use super::rows::{ENVIRONMENTS, Rows};
 use super::scene::{Scene, ddpg};
-use super::table::{Line, Target};
+use super::target::{Line, Target};
 use super::window::{self, Windows};
-use super::{Figures, Patience};
 
 const WINDOW: Duration = Duration::from_millis(100);
 const SAMPLING_WINDOW: Duration = Duration::from_millis(20);
@@ -99,7 +99,7 @@ fn move_rows(
                 patience.stop.request();
             }
         })
-        .map_err(super::interrupted)?;
+        .map_err(super::measurement::interrupted)?;
 
     let [warm_up, moving, _] = SHARES;
     let mut windows = Windows::default();
@@ -123,7 +123,7 @@ fn move_rows(
             if let Err(Exit::Stopped) = waited {
                 learner.check()?;
             }
-            waited.map_err(super::interrupted)?;
+            waited.map_err(super::measurement::interrupted)?;
             let mut chunk = sender.begin()?;
             for numbers in numbers.chunks_exact(row.width()) {
                 chunk.push(&row.read(numbers));

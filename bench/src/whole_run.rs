@@ -9,10 +9,10 @@ use serde::Serialize;
 use shoal_common::report::Role;
 
 use self::training::{Began, Came, Training};
+use super::measurement::{Figures, Patience};
 use super::memory::Memory;
-use super::table::{Line, Target};
+use super::target::{Line, Target};
 use super::window::Windows;
-use super::{Figures, Patience};
 
 mod training;
 

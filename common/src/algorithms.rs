@@ -13,13 +13,11 @@ pub use behaviour::Behaviour;
 pub use ddpg::Ddpg;
 pub use exploration::{Exploration, Warmup};
 pub use reinforce::{Reinforce, Weight};
-pub use tabular::Tabular;
-
 use serde::Serialize;
-
-use crate::policy::{Policy, PolicyError, PolicyLayout};
-use crate::section::{self, OutOfRange, Section, describe};
-use crate::space::EnvironmentSpec;
+use shoal_base::section::{self, OutOfRange, Section, describe};
+use shoal_base::space::EnvironmentSpec;
+use shoal_policy::{Policy, PolicyError, PolicyLayout};
+pub use tabular::Tabular;
 
 macro_rules! registry {
     ($($(#[$attribute:meta])* $variant:ident($settings:ty) is $spec:expr;)*) => {
@@ -143,7 +141,7 @@ impl Algorithm {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::space::Space;
+    use shoal_base::space::Space;
 
     fn spec(observation: Space, action: Space) -> EnvironmentSpec {
         EnvironmentSpec {

@@ -13,8 +13,9 @@ mod replay;
 mod run;
 mod sections;
 
-pub use crate::algorithms::{Algorithm, Ddpg, Exploration, Reinforce, Tabular, Warmup, Weight};
-pub use crate::section::OutOfRange;
+use std::fmt::Display;
+use std::path::{Path, PathBuf};
+
 pub use actors::Actors;
 pub use checkpoint::Checkpoint;
 pub use environment::Environment;
@@ -23,14 +24,13 @@ pub use identity_format::IdentityFormat;
 pub use learner::Learner;
 pub use replay::Replay;
 pub use run::{Mode, Run};
-
-use std::fmt::Display;
-use std::path::{Path, PathBuf};
+pub use shoal_base::section::OutOfRange;
+use shoal_base::space::EnvironmentSpec;
+use shoal_base::transition::{ChunkLayout, RowLayout};
+use shoal_policy::PolicyError;
 
 use crate::algorithms::Experience;
-use crate::policy::PolicyError;
-use crate::space::EnvironmentSpec;
-use crate::transition::{ChunkLayout, RowLayout};
+pub use crate::algorithms::{Algorithm, Ddpg, Exploration, Reinforce, Tabular, Warmup, Weight};
 
 /// Everything a run was started with.
 #[derive(Clone, Debug, PartialEq)]

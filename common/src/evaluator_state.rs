@@ -5,9 +5,9 @@ use std::collections::VecDeque;
 use std::io::{self, Write};
 use std::path::Path;
 
-use crate::channel::reports::Report;
-use crate::durable::{Kind, SealError, read_sealed, seal, write_at_once};
-use crate::report::EvaluationReport;
+use shoal_base::durable::{Kind, SealError, read_sealed, seal, write_at_once};
+use shoal_base::report::EvaluationReport;
+use shoal_channel::reports::Report;
 
 const KIND: Kind = Kind {
     magic: *b"SHOALEVA",

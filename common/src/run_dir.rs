@@ -4,15 +4,13 @@ use std::fs::{DirBuilder, File};
 use std::io::{self, ErrorKind, Write};
 use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
-use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use rustix::fs::{FlockOperation, flock};
-use rustix::io::Errno;
+use shoal_base::durable::write_atomically;
+use shoal_base::file_lock;
+use shoal_channel::control::RunKey;
 
-use crate::channel::control::RunKey;
 use crate::config::{Config, ConfigError};
-use crate::durable::write_atomically;
 
 /// A run directory that exists.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -122,14 +120,9 @@ impl RunDir {
         };
         let file = File::open(&self.path).map_err(io)?;
         // Somebody who only looks whether the run goes on holds the lock for a moment.
-        let patience = Instant::now() + Duration::from_millis(200);
-        loop {
-            match flock(&file, FlockOperation::NonBlockingLockExclusive) {
-                Ok(()) => return Ok(RunLock { _file: file }),
-                Err(Errno::WOULDBLOCK) if Instant::now() < patience => thread::sleep(Duration::from_millis(5)),
-                Err(Errno::WOULDBLOCK) => return Err(RunDirError::Busy(self.path.clone())),
-                Err(errno) => return Err(io(errno.into())),
-            }
+        match file_lock::lock(&file, Duration::from_millis(200)).map_err(io)? {
+            true => Ok(RunLock { _file: file }),
+            false => Err(RunDirError::Busy(self.path.clone())),
         }
     }
 
@@ -144,11 +137,7 @@ impl RunDir {
             cause,
         };
         let file = File::open(&self.path).map_err(io)?;
-        match flock(&file, FlockOperation::NonBlockingLockShared) {
-            Ok(()) => Ok(false),
-            Err(Errno::WOULDBLOCK) => Ok(true),
-            Err(errno) => Err(io(errno.into())),
-        }
+        file_lock::is_locked(&file).map_err(io)
     }
 
     /// What tells it from its copies.

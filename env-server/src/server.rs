@@ -1,9 +1,9 @@
 //! The environment server's loop: answers one actor's requests by stepping its environments.
 
-use shoal_common::channel::environment::{Ask, EnvironmentPort};
-use shoal_common::channel::{ChannelError, Pulse};
-use shoal_common::report::Activity;
-use shoal_common::stop::Stop;
+use shoal_base::report::Activity;
+use shoal_base::stop::Stop;
+use shoal_channel::environment::{Ask, EnvironmentPort};
+use shoal_channel::{ChannelError, Pulse};
 
 use crate::vector::{Start, VectorEnvironment};
 

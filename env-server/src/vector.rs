@@ -3,11 +3,9 @@
 
 mod snapshot;
 
-use shoal_common::{
-    channel::environment::StepBlocks,
-    space::{EnvironmentSpec, Space},
-    stream::{Purpose, Stream, stream},
-};
+use shoal_base::space::{EnvironmentSpec, Space};
+use shoal_base::stream::{Purpose, Stream, stream};
+use shoal_channel::environment::StepBlocks;
 
 use crate::environment::{Environment, EnvironmentError, RequestError, make};
 

@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
 
 use proptest::prelude::*;
-use shoal_common::stream::{Purpose, stream};
+use shoal_base::stream::{Purpose, stream};
 use shoal_env_server::environment::{make, names, resolve};
 use toml::{Table, Value};
 

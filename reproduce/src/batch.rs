@@ -7,33 +7,15 @@ use std::time::Duration;
 use anyhow::bail;
 use shoal_run::signals::Signals;
 
-use super::Ending;
-use super::experiment::{Effort, Experiment, Length};
-use super::family::Entry;
+use super::experiment::{Effort, Length};
 use super::folder::Folder;
+use super::order::{Ending, Job, Name};
 use super::progress::Progress;
 use super::settings::Settings;
 use super::training::{Standing, Trained, train};
 
 /// How often the live line is drawn.
 const ROUND: Duration = Duration::from_secs(1);
-
-/// One seed of one experiment, through all its stages.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Job {
-    pub(super) family: &'static Entry,
-    pub(super) experiment: &'static Experiment,
-    pub(super) seed: u64,
-}
-
-/// What names a job.
-pub(super) type Name = (&'static str, u64);
-
-impl Job {
-    pub(super) fn name(&self) -> Name {
-        (self.experiment.name, self.seed)
-    }
-}
 
 /// Seeds to bring through, in a folder.
 pub(super) struct Batch<'a> {

@@ -6,10 +6,10 @@ use shoal_common::policy::Policy;
 use shoal_common::stream::{Purpose, stream};
 use shoal_report::figure::{self, Frame, Setting};
 
+use super::album::{Album, Section};
 use super::claim::{Claim, Scope, median, percent, spread};
 use super::experiment::{Experiment, Length, Stage};
 use super::family::{Family, Policies, Results};
-use super::report::{Album, Section};
 use super::result::SeedResult;
 
 /// Episodes that the moving average of figure 4.6 is over.

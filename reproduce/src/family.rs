@@ -7,12 +7,13 @@ use serde::de::DeserializeOwned;
 use shoal_common::config::Config;
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::run_dir::RunDir;
-use shoal_run::recorder::{Episode, read_episodes};
+use shoal_run::evaluation::{WhichPolicy, evaluate};
+use shoal_run::recorder::{Episode, read_episodes, read_evaluations};
 
+use super::album::{Album, Section};
 use super::experiment::{Experiment, Length, Stage};
 use super::folder::Folder;
-use super::report::{Album, Section};
-use super::result::{self, SeedResult};
+use super::result::{Evaluation, Header, Policy, SeedResult};
 use super::settings::Settings;
 
 /// Experiments of one kind. Adding one takes this trait and a line in [`super::FAMILIES`].
@@ -90,9 +91,56 @@ pub(super) struct Entry {
 pub(super) const fn entry<F: Family>() -> Entry {
     Entry {
         experiments: F::EXPERIMENTS,
-        keep: result::keep::<F>,
+        keep: keep::<F>,
         sections: sections::<F>,
     }
+}
+
+/// Makes the result of a run that has reached the end of `stage`, and keeps it in the folder.
+fn keep<F: Family>(
+    folder: &Folder,
+    experiment: &'static Experiment,
+    stage: &Stage,
+    seed: u64,
+    length: Length,
+    settings: &Settings,
+) -> anyhow::Result<()> {
+    let run = RunDir::open(&folder.run(experiment, seed))?;
+    let config = run.config()?;
+    // Said by the run itself; it was checked to be what was expected.
+    Settings::of_run(run.path(), seed)?.check(&run.path().display().to_string(), settings)?;
+    let policies = Policies {
+        best: WhichPolicy::Best.read(&run, &config)?,
+        last: WhichPolicy::Last.read(&run, &config)?,
+        config,
+        run,
+    };
+    let run = &policies.run;
+    let judge = |policy: &PolicyFile| -> anyhow::Result<Policy> {
+        let config = &policies.config;
+        let episodes = config.evaluation.final_episodes;
+        Ok(Policy {
+            steps: policy.env_steps,
+            evaluation: evaluate(config, &policy.parameters, episodes, config.run.seed)?,
+        })
+    };
+    let rows = read_evaluations(&run.evaluations())?.into_iter();
+    let mut evaluations: Vec<Evaluation> = rows
+        .map(|row| Evaluation {
+            steps: row.env_steps,
+            mean: row.return_mean,
+            std: row.return_std,
+        })
+        .collect();
+    evaluations.sort_by_key(|evaluation| evaluation.steps);
+    let result = SeedResult {
+        header: Header::new(experiment, seed, length, &Settings::of(&policies.config)?),
+        evaluations,
+        best: judge(&policies.best)?,
+        last: judge(&policies.last)?,
+        tests: F::test(&policies, stage)?,
+    };
+    folder.add(experiment, stage, &result)
 }
 
 fn sections<F: Family>(folder: &Folder, album: &Album) -> anyhow::Result<Vec<Section>> {

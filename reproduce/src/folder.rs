@@ -5,12 +5,12 @@ use std::collections::BTreeMap;
 use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 use anyhow::{Context, bail};
-use rustix::fs::{FlockOperation, flock};
-use rustix::io::Errno;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
+use shoal_common::file_lock;
 
 use super::experiment::{Effort, Experiment, Stage};
 use super::result::{self, Header, SeedResult};
@@ -38,12 +38,8 @@ impl Folder {
         // Children have another working directory if they like.
         let path = std::fs::canonicalize(path).with_context(|| format!("cannot resolve {here}"))?;
         let lock = File::open(&path).with_context(|| format!("cannot open {here}"))?;
-        match flock(&lock, FlockOperation::NonBlockingLockExclusive) {
-            Ok(()) => {}
-            Err(Errno::WOULDBLOCK) => {
-                bail!("another `shoal reproduce` works in {here}: wait for it, or choose another directory with --out")
-            }
-            Err(errno) => return Err(errno).with_context(|| format!("cannot lock {here}")),
+        if !file_lock::lock(&lock, Duration::ZERO).with_context(|| format!("cannot lock {here}"))? {
+            bail!("another `shoal reproduce` works in {here}: wait for it, or choose another directory with --out");
         }
         let results = experiments
             .into_iter()

@@ -11,9 +11,9 @@ use shoal_run::analysis::lake::{LIMIT, Walk, greedy, optimal};
 use shoal_run::recorder::read_evaluations;
 use shoal_run::rollout::policy_layout;
 
+use super::album::{Album, Figure, Section};
 use super::experiment::{Experiment, Length, Stage};
 use super::family::{Family, Policies, Results};
-use super::report::{Album, Figure, Section};
 use super::result::{SeedResult, representative};
 
 /// γ of every experiment here.

@@ -2,6 +2,7 @@
 //!
 //! A new experiment is a file with a [`family::Family`] and a line in [`FAMILIES`].
 
+mod album;
 mod batch;
 mod cart_pole;
 mod claim;
@@ -9,6 +10,7 @@ mod experiment;
 mod family;
 mod folder;
 mod frozen_lake;
+mod order;
 mod pendulum;
 mod point_mass;
 mod progress;
@@ -19,15 +21,16 @@ mod settings;
 mod training;
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
 
 use anyhow::Context;
 
-use self::batch::{Batch, Job};
+use self::batch::Batch;
 pub use self::experiment::Effort;
 use self::experiment::Experiment;
 use self::family::{Entry, entry};
 use self::folder::Folder;
+use self::order::Job;
+pub use self::order::{Ending, Order};
 use self::settings::Settings;
 
 /// Every family, in the report's order.
@@ -37,36 +40,6 @@ const FAMILIES: [Entry; 4] = [
     entry::<pendulum::Pendulum>(),
     entry::<point_mass::PointMass>(),
 ];
-
-/// What is to be reproduced, and how.
-#[derive(Clone, Debug)]
-pub struct Order {
-    /// Names of experiments; all of them where it is empty.
-    pub experiments: Vec<String>,
-    /// Seeds 1 to this one; as many as each experiment has by itself where it is none.
-    pub seeds: Option<u32>,
-    /// Trainings at a time.
-    pub jobs: usize,
-    /// How much of each experiment is run.
-    pub effort: Effort,
-    /// Where runs, results and figures lie.
-    pub folder: PathBuf,
-    /// Whether every figure is drawn as PNG as well as SVG.
-    pub png: bool,
-    /// The file that the report is written to.
-    pub report: PathBuf,
-}
-
-/// How it went.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Ending {
-    /// Every result that was asked for is there.
-    Complete,
-    /// So many seeds have failed.
-    Failed(usize),
-    /// By this signal; every training has saved its state.
-    Interrupted(i32),
-}
 
 /// The experiments that can be asked for.
 pub fn names() -> impl Iterator<Item = &'static str> {

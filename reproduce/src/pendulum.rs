@@ -5,10 +5,10 @@ use shoal_report::figure;
 use shoal_run::analysis::pendulum::{Measures, SwingUp};
 use shoal_run::rollout::Rollout;
 
+use super::album::{Album, Section};
 use super::claim::{Claim, Scope, spread};
 use super::experiment::{Experiment, Length, Stage};
 use super::family::{Family, Policies, Results};
-use super::report::{Album, Section};
 use super::result::{SeedResult, representative};
 
 /// 600 episodes of 200 steps.

@@ -7,9 +7,9 @@ use serde::{Deserialize, Serialize};
 use shoal_run::analysis::point_mass::{Drive, FAR_STARTS, Measures, NEAR_STARTS};
 use shoal_run::rollout::Rollout;
 
+use super::album::{Album, Section};
 use super::experiment::{Experiment, Length, Stage};
 use super::family::{Family, Policies, Results};
-use super::report::{Album, Section};
 
 /// The run of r2 after its additional training.
 const LONGER: &str = "-longer";

@@ -10,9 +10,9 @@ use shoal_common::run_dir::RunDir;
 use shoal_run::numbers::thousands;
 use shoal_run::recorder::recorded;
 
-use super::batch::{Job, Name};
 use super::experiment::{self, Effort, Length};
 use super::folder::Folder;
+use super::order::{Job, Name};
 use super::training::Standing;
 
 /// The live line, and what is to be known for it.

@@ -3,14 +3,9 @@
 use anyhow::{Context, bail};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
-use shoal_common::policy_file::PolicyFile;
-use shoal_common::run_dir::RunDir;
-use shoal_run::evaluation::{EvaluationSummary, WhichPolicy, evaluate};
-use shoal_run::recorder::read_evaluations;
+use shoal_run::evaluation::EvaluationSummary;
 
-use super::experiment::{Experiment, Length, Stage};
-use super::family::{Family, Policies};
-use super::folder::Folder;
+use super::experiment::{Experiment, Length};
 use super::results_file::Line;
 use super::settings::Settings;
 
@@ -133,53 +128,6 @@ impl Header {
         }
         self.settings.check(place, settings)
     }
-}
-
-/// Makes the result of a run that has reached the end of `stage`, and keeps it in the folder.
-pub(super) fn keep<F: Family>(
-    folder: &Folder,
-    experiment: &'static Experiment,
-    stage: &Stage,
-    seed: u64,
-    length: Length,
-    settings: &Settings,
-) -> anyhow::Result<()> {
-    let run = RunDir::open(&folder.run(experiment, seed))?;
-    let config = run.config()?;
-    // Said by the run itself; it was checked to be what was expected.
-    Settings::of_run(run.path(), seed)?.check(&run.path().display().to_string(), settings)?;
-    let policies = Policies {
-        best: WhichPolicy::Best.read(&run, &config)?,
-        last: WhichPolicy::Last.read(&run, &config)?,
-        config,
-        run,
-    };
-    let run = &policies.run;
-    let judge = |policy: &PolicyFile| -> anyhow::Result<Policy> {
-        let config = &policies.config;
-        let episodes = config.evaluation.final_episodes;
-        Ok(Policy {
-            steps: policy.env_steps,
-            evaluation: evaluate(config, &policy.parameters, episodes, config.run.seed)?,
-        })
-    };
-    let rows = read_evaluations(&run.evaluations())?.into_iter();
-    let mut evaluations: Vec<Evaluation> = rows
-        .map(|row| Evaluation {
-            steps: row.env_steps,
-            mean: row.return_mean,
-            std: row.return_std,
-        })
-        .collect();
-    evaluations.sort_by_key(|evaluation| evaluation.steps);
-    let result = SeedResult {
-        header: Header::new(experiment, seed, length, &Settings::of(&policies.config)?),
-        evaluations,
-        best: judge(&policies.best)?,
-        last: judge(&policies.last)?,
-        tests: F::test(&policies, stage)?,
-    };
-    folder.add(experiment, stage, &result)
 }
 
 /// Reads a whole result.

@@ -40,7 +40,7 @@ pub fn at_rest(config: &Config, run: &RunDir) -> anyhow::Result<RunStatus> {
 /// Whether a run that nobody works on has done all it was to do. A launcher that was killed, or stopped, after the last step
 /// has left updates or evaluations undone.
 fn is_finished(config: &Config, run: &RunDir, status: &RunStatus) -> anyhow::Result<bool> {
-    if !status.has_all_steps() {
+    if !config.run.has_all_steps(status.env_steps, status.episodes) {
         return Ok(false);
     }
     if let Some(outcome) = Outcome::read(run)? {

@@ -177,7 +177,14 @@ fn after_item(tokens: &[Token], mut at: usize) -> usize {
     while tokens[at] == "#" {
         at = closing(tokens, at + 1) + 1;
     }
-    let is_use = tokens[at..].iter().take(6).any(|token| token == "use");
+    // Behind a visibility, which may be `pub(crate)`.
+    if tokens[at] == "pub" {
+        at += 1;
+        if tokens[at] == "(" {
+            at = closing(tokens, at) + 1;
+        }
+    }
+    let is_use = tokens[at] == "use";
     while at < tokens.len() && tokens[at] != ";" {
         if tokens[at] == "{" && !is_use {
             return closing(tokens, at);

@@ -1,7 +1,7 @@
 //! The same for people.
 
 use super::super::one_core::{OneCore, TARGET};
-use super::super::table::{Line, Target};
+use super::super::target::{Line, Target};
 use super::{ActorFigures, Bottleneck, Count, Figures, Rate, Scaling};
 
 const THOUSAND: f64 = 1e3;

@@ -16,8 +16,8 @@ use shoal_run::process::Peer;
 use shoal_run::remote::Remote;
 use tempfile::TempDir;
 
-use super::super::Patience;
 use super::super::flow::{LOOK, commits_of, newest, policy_reader};
+use super::super::measurement::Patience;
 
 /// How long a learner is at work before it is killed: the launcher has heard of it by then.
 const SETTLED: Duration = Duration::from_millis(700);

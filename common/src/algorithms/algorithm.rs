@@ -2,11 +2,12 @@
 
 use std::fmt::{self, Display, Formatter};
 
+use shoal_base::section::OutOfRange;
+use shoal_base::space::EnvironmentSpec;
+use shoal_policy::PolicyError;
+use shoal_policy::network::{Activation, Hidden, NetworkLayout};
+
 use super::behaviour::Behaviour;
-use crate::network::{Activation, Hidden, NetworkLayout};
-use crate::policy::PolicyError;
-use crate::section::OutOfRange;
-use crate::space::EnvironmentSpec;
 
 /// What an algorithm is, whatever its numbers are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -1,8 +1,9 @@
 //! How an algorithm's actors act: its policy, and what they do to try what the policy would not.
 
+use shoal_policy::network::PolicyNetwork;
+use shoal_policy::{Policy, Scores};
+
 use super::exploration::Exploration;
-use crate::network::PolicyNetwork;
-use crate::policy::{Policy, Scores};
 
 /// A policy with the exploration around it. Which kind of policy goes with which exploration is said by the variants, so that
 /// no other pair can be made.

@@ -1,12 +1,14 @@
 //! `[ddpg]`: deep deterministic policy gradient.
 
+use shoal_base::section;
+use shoal_base::section::{OutOfRange, above, from};
+use shoal_base::space::EnvironmentSpec;
+use shoal_policy::PolicyError;
+use shoal_policy::network::{Activation, Hidden, Layers, NetworkLayout};
+
 use super::algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Shape};
 use super::behaviour::Behaviour;
 use super::exploration::Exploration;
-use crate::network::{Activation, Hidden, Layers, NetworkLayout};
-use crate::policy::{self, PolicyError};
-use crate::section::{OutOfRange, above, from, section};
-use crate::space::EnvironmentSpec;
 
 /// DDPG.
 pub(super) const SPEC: AlgorithmSpec = AlgorithmSpec {
@@ -61,7 +63,7 @@ impl AlgorithmSettings for Ddpg {
     }
 
     fn behaviour(&self, _: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError> {
-        let network = policy::deterministic(self.hidden_layers(), spec, batch)?;
+        let network = shoal_policy::deterministic(self.hidden_layers(), spec, batch)?;
         Ok(Behaviour::Noise(network, self.exploration.clone()))
     }
 

@@ -2,8 +2,8 @@
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-
-use crate::section::{from, section};
+use shoal_base::section;
+use shoal_base::section::from;
 
 section! {
     /// Ornstein-Uhlenbeck noise: x ← x − θ x + σ N(0, 1) at each step, added to the action in units of half its range.

@@ -2,13 +2,14 @@
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use shoal_base::section;
+use shoal_base::section::{OutOfRange, from};
+use shoal_base::space::EnvironmentSpec;
+use shoal_policy::PolicyError;
+use shoal_policy::network::{Activation, Hidden, Layers, NetworkLayout};
 
 use super::algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Shape};
 use super::behaviour::Behaviour;
-use crate::network::{Activation, Hidden, Layers, NetworkLayout};
-use crate::policy::{self, PolicyError};
-use crate::section::{OutOfRange, from, section};
-use crate::space::EnvironmentSpec;
 
 /// REINFORCE.
 pub(super) const SPEC: AlgorithmSpec = AlgorithmSpec {
@@ -81,7 +82,7 @@ impl AlgorithmSettings for Reinforce {
     }
 
     fn behaviour(&self, name: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError> {
-        Ok(Behaviour::Sample(policy::softmax(
+        Ok(Behaviour::Sample(shoal_policy::softmax(
             name,
             self.hidden_layers(),
             spec,

@@ -1,10 +1,12 @@
 //! `[q-learning]` and `[sarsa]`: tabular temporal-difference control. Both have the same keys.
 
+use shoal_base::section;
+use shoal_base::section::{OutOfRange, from};
+use shoal_base::space::EnvironmentSpec;
+use shoal_policy::PolicyError;
+
 use super::algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Shape};
 use super::behaviour::Behaviour;
-use crate::policy::{self, PolicyError};
-use crate::section::{OutOfRange, from, section};
-use crate::space::EnvironmentSpec;
 
 /// Q-learning.
 pub(super) const Q_LEARNING: AlgorithmSpec = AlgorithmSpec {
@@ -42,7 +44,7 @@ impl AlgorithmSettings for Tabular {
     }
 
     fn behaviour(&self, name: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError> {
-        let values = policy::table(name, spec, batch)?;
+        let values = shoal_policy::table(name, spec, batch)?;
         Ok(Behaviour::EpsilonGreedy(values, self.epsilon))
     }
 

@@ -1,6 +1,7 @@
 //! `[actors]`.
 
-use crate::section::{OutOfRange, from, section};
+use shoal_base::section;
+use shoal_base::section::{OutOfRange, from};
 
 section! {
     /// Who explores, and in how large portions.

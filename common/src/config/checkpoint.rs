@@ -1,6 +1,7 @@
 //! `[checkpoint]`.
 
-use crate::section::{from, section};
+use shoal_base::section;
+use shoal_base::section::from;
 
 section! {
     /// How often the learner's state is saved.

@@ -2,9 +2,8 @@
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-
-use crate::section::{OutOfRange, from};
-use crate::space::{EnvironmentSpec, Space};
+use shoal_base::section::{OutOfRange, from};
+use shoal_base::space::{EnvironmentSpec, Space};
 
 /// Numbers in an observation or an action: many more than any environment has, and few enough that sizes computed from
 /// them stay far from overflowing.

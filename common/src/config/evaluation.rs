@@ -1,6 +1,7 @@
 //! `[evaluation]`.
 
-use crate::section::{from, section};
+use shoal_base::section;
+use shoal_base::section::from;
 
 section! {
     /// How often the policy is judged.

@@ -1,6 +1,7 @@
 //! Every section that somebody may write, with its keys.
 
-pub use crate::section::{Key, Section, keys};
+use shoal_base::section::describe;
+pub use shoal_base::section::{Key, Section, keys};
 
 use super::actors::Actors;
 use super::checkpoint::Checkpoint;
@@ -10,7 +11,6 @@ use super::learner::Learner;
 use super::replay::Replay;
 use super::run::Run;
 use crate::algorithms::{Algorithm, Exploration};
-use crate::section::describe;
 
 /// Every section that somebody may write, those of all algorithms included, but without an environment's own parameters.
 pub fn sections() -> Vec<Section> {

@@ -12,12 +12,12 @@ mod legacy;
 use std::fmt::Write as _;
 
 use sha2::{Digest, Sha256};
+use shoal_base::space::Space;
 use toml::{Table, Value};
 
 use super::Config;
 use super::identity_format::IdentityFormat;
 use super::run::Mode;
-use crate::space::Space;
 
 impl Config {
     /// What the rows of the replay and the weights of a checkpoint depend on, as text.

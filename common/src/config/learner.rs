@@ -1,6 +1,7 @@
 //! `[learner]`.
 
-use crate::section::{from, section};
+use shoal_base::section;
+use shoal_base::section::from;
 
 section! {
     /// With what is learned: no number that is learned depends on it.

@@ -1,7 +1,9 @@
 //! `[replay]`.
 
+use shoal_base::section;
+use shoal_base::section::{OutOfRange, from};
+
 use crate::algorithms::{Algorithm, Experience};
-use crate::section::{OutOfRange, from, section};
 
 /// Transitions that the replay may be asked to hold.
 const MOST: u64 = 1_000_000_000;

@@ -2,9 +2,10 @@
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use shoal_base::section;
+use shoal_base::section::{OutOfRange, from};
 
 use super::identity_format::IdentityFormat;
-use crate::section::{OutOfRange, from, section};
 
 section! {
     /// Identity and length of the run.
@@ -42,6 +43,11 @@ pub enum Mode {
 }
 
 impl Run {
+    /// Whether so many environment steps, or episodes, are all that were asked for. Updates may be left.
+    pub fn has_all_steps(&self, env_steps: u64, episodes: u64) -> bool {
+        env_steps >= self.steps || self.episodes.is_some_and(|limit| episodes >= limit)
+    }
+
     /// Whether every value makes sense.
     ///
     /// # Errors

@@ -1,12 +1,12 @@
 //! The configuration as it is written: a section for each part, and of the algorithms' sections one at most.
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer, de};
+use shoal_base::space::EnvironmentSpec;
 use toml::{Table, Value};
 
 use super::{
     Actors, Algorithm, Checkpoint, Config, Environment, Evaluation, Exploration, Learner, Replay, Run, explanation,
 };
-use crate::space::EnvironmentSpec;
 
 /// What is read.
 #[derive(Deserialize)]

@@ -3,7 +3,7 @@
 use rand::RngExt;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use shoal_common::{
+use shoal_base::{
     space::{EnvironmentSpec, Space},
     stream::Stream,
 };
@@ -148,7 +148,7 @@ impl Environment for CartPole {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use shoal_common::stream::{Purpose, stream};
+    use shoal_base::stream::{Purpose, stream};
 
     fn at(state: [f64; 4]) -> CartPole {
         let mut cart_pole = CartPole::new(Parameters::default()).unwrap();

@@ -3,7 +3,7 @@
 use rand::RngExt;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use shoal_common::{
+use shoal_base::{
     space::{EnvironmentSpec, Space},
     stream::Stream,
 };
@@ -179,7 +179,7 @@ impl Environment for FrozenLake {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use shoal_common::stream::{Purpose, stream};
+    use shoal_base::stream::{Purpose, stream};
 
     #[test]
     fn the_table_has_equation_4_1() {

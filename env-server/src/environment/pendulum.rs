@@ -5,7 +5,7 @@ use std::f64::consts::PI;
 use rand::RngExt;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use shoal_common::{
+use shoal_base::{
     space::{EnvironmentSpec, Space},
     stream::Stream,
 };
@@ -150,7 +150,7 @@ impl Environment for Pendulum {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use shoal_common::stream::{Purpose, stream};
+    use shoal_base::stream::{Purpose, stream};
 
     fn at(theta: f64, theta_dot: f64) -> Pendulum {
         let mut pendulum = Pendulum::new(Parameters::default()).unwrap();

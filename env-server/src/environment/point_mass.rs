@@ -5,16 +5,15 @@ mod reward;
 
 use std::f64::consts::PI;
 
+pub use parameters::Parameters;
 use rand::RngExt;
-use shoal_common::{
+pub use reward::{Motion, Reward};
+use shoal_base::{
     space::{EnvironmentSpec, Space},
     stream::Stream,
 };
 
 use super::{Environment, Goal, Picture, RequestError, Signal, Step, angle::wrap, error::OutOfRange};
-
-pub use parameters::Parameters;
-pub use reward::{Motion, Reward};
 
 /// Δt in s.
 const DT: f64 = 0.05;
@@ -256,7 +255,7 @@ mod tests {
     use std::f64::consts::FRAC_PI_2;
 
     use super::*;
-    use shoal_common::stream::{Purpose, stream};
+    use shoal_base::stream::{Purpose, stream};
 
     /// F_c of these tests' vehicle: μ m g.
     const F_C: f64 = 0.02 * 9.81;

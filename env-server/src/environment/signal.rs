@@ -1,7 +1,7 @@
 //! What an environment's numbers mean: its signals, its goal, and what is drawn of it.
 
 use serde::Serialize;
-use shoal_common::space::{EnvironmentSpec, Space};
+use shoal_base::space::{EnvironmentSpec, Space};
 
 /// How many numbers of an observation, and how many of an action, are signals where nothing names them.
 const BY_NUMBER: usize = 8;

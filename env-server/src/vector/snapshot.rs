@@ -17,7 +17,7 @@ impl VectorEnvironment {
     }
 
     /// Writes the training episodes under way: for each environment the words that
-    /// [`snapshot_words`](shoal_common::space::EnvironmentSpec::snapshot_words) counts, the state as the bits of its numbers.
+    /// [`snapshot_words`](shoal_base::space::EnvironmentSpec::snapshot_words) counts, the state as the bits of its numbers.
     ///
     /// There are none of evaluation episodes: whoever loses those begins them again by their number.
     /// Panics unless `words` has `snapshot_words()` words.

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use shoal_common::channel::policy::{PolicyHeader, PolicyPublisher};
 use shoal_common::channel::reports::{Reporter, Reports};
 use shoal_common::channel::{Bell, Domain, Place, Pulse, Ringer};
-use shoal_common::config::{Mode, Run};
+use shoal_common::config::Mode;
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::report::{Activity, Heartbeat, LearnerReport, Role};
 use shoal_common::stop::Stop;
@@ -168,8 +168,7 @@ impl<'a> Learner<'a> {
 
     /// Whether the steps are taken that were to be taken, or the episodes.
     pub(crate) fn has_all_rows(&self) -> bool {
-        let Run { steps, episodes, .. } = self.settings.config.run;
-        self.rows >= steps || episodes.is_some_and(|episodes| self.episodes >= episodes)
+        self.settings.config.run.has_all_steps(self.rows, self.episodes)
     }
 
     /// Publishes the policy as it is now, as a new version.

@@ -2,7 +2,11 @@
 
 use std::sync::atomic::{Ordering, compiler_fence, fence};
 
-use super::{ChunkError, ChunkMark, Replay, Step, observe};
+use shoal_common::commit::ChunkMark;
+
+use super::error::ChunkError;
+use super::step::{Step, observe};
+use super::store::Replay;
 
 /// What became of a chunk.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -3,7 +3,7 @@
 use std::io;
 use std::path::PathBuf;
 
-use super::ChunkMark;
+use shoal_common::commit::ChunkMark;
 
 /// Why a replay file was not made, opened or synced. Nothing was overwritten.
 #[derive(Debug, thiserror::Error)]

@@ -1,19 +1,19 @@
 //! Making and opening the file: space, rights, lock, and whether it is the file that is meant.
 
-use std::fs::{self, File, OpenOptions, Permissions, TryLockError};
+use std::fs::{self, File, OpenOptions, Permissions};
 use std::io::{self, Write};
 use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
 use std::path::{Path, PathBuf};
-use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use rustix::fs::{CWD, FallocateFlags, RenameFlags, fallocate, renameat_with};
 use rustix::io::Errno;
 use rustix::process::{Resource, getrlimit};
 use shoal_common::commit::{Places, Record, ReplayLayout, SYNCED, Words, WritableWords};
 use shoal_common::durable::sync_directory_of;
+use shoal_common::file_lock;
 
-use super::ReplayError;
+use super::error::ReplayError;
 
 /// Makes an empty replay: under a temporary name, then renamed, so that a file with the replay's name is whole.
 pub(super) fn create(path: &Path, layout: &ReplayLayout) -> Result<(File, Places), ReplayError> {
@@ -105,14 +105,9 @@ fn places(path: &Path, layout: &ReplayLayout) -> Result<Places, ReplayError> {
 /// The lock goes with the open file and its mappings: the kernel drops it when the process is gone, however it went.
 fn lock(path: &Path, file: &File) -> Result<(), ReplayError> {
     // A process killed a moment ago, or a child forked and not yet executed, may still hold it.
-    let patience = Instant::now() + Duration::from_secs(1);
-    loop {
-        match file.try_lock() {
-            Ok(()) => return Ok(()),
-            Err(TryLockError::Error(source)) => return Err(io(path, "lock")(source)),
-            Err(TryLockError::WouldBlock) if Instant::now() > patience => return Err(ReplayError::InUse(path.into())),
-            Err(TryLockError::WouldBlock) => thread::sleep(Duration::from_millis(5)),
-        }
+    match file_lock::lock(file, Duration::from_secs(1)).map_err(io(path, "lock"))? {
+        true => Ok(()),
+        false => Err(ReplayError::InUse(path.into())),
     }
 }
 

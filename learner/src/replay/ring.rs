@@ -7,7 +7,8 @@ use std::ops::Range;
 use memmap2::{MmapMut, MmapOptions};
 use shoal_common::commit::{Places, ReplayLayout};
 
-use super::{Step, check};
+use super::check;
+use super::step::Step;
 
 /// The places of the ring. Row `index` stands in place `index` mod `ring`.
 pub(super) struct Ring {

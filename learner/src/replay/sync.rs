@@ -9,7 +9,9 @@ use std::io;
 
 use shoal_common::commit::{Record, SYNCED};
 
-use super::{Replay, ReplayError, Step, observe, step_of_record};
+use super::error::ReplayError;
+use super::step::{Step, observe, step_of_record};
+use super::store::Replay;
 
 /// The replay as it was at some moment, to be brought to the disk by any thread.
 #[must_use = "nothing is synced before `run`"]

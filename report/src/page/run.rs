@@ -111,8 +111,7 @@ impl Run {
         let learner = read_learner(&run.learner_log())?;
         let explored = read_episodes(&run.episodes())?;
         let now = learner.last().cloned().unwrap_or_default();
-        let all_steps =
-            now.env_steps >= config.run.steps || config.run.episodes.is_some_and(|episodes| now.episodes >= episodes);
+        let all_steps = config.run.has_all_steps(now.env_steps, now.episodes);
         let outcome = Outcome::read(run)?.is_none_or(|outcome| outcome.state == outcome::State::Finished);
         let through = all_steps && outcome;
         Ok(Self {

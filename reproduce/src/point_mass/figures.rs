@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use shoal_report::figure::{self, Agent};
 
-use super::super::report::{Album, Figure};
+use super::super::album::{Album, Figure};
 use super::super::result::{SeedResult, representative};
 use super::Tests;
 

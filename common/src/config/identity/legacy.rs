@@ -6,7 +6,7 @@ use toml::{Table, Value};
 use super::sorted;
 use crate::algorithms::{Algorithm, Ddpg, Exploration, Reinforce, Tabular, Warmup, Weight};
 use crate::config::{Config, Mode};
-use crate::network::Activation;
+use shoal_policy::network::Activation;
 
 /// The text; `None` for an algorithm or a network that there was not then.
 pub(super) fn text(config: &Config) -> Option<String> {

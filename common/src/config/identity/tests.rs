@@ -1,5 +1,5 @@
 use super::*;
-use crate::network::Activation;
+use shoal_policy::network::Activation;
 
 /// Runs that commit 2d50610 made, as `tests/data/2d50610` has them, and the fingerprint in the header of each one's replay.
 const OLD: [(&str, u64, &str); 4] = [

@@ -2,12 +2,12 @@ use std::f64::consts::TAU;
 
 use proptest::prelude::*;
 use rand::RngExt;
+use shoal_base::space::{EnvironmentSpec, Space};
+use shoal_base::stream::{Purpose, Stream, stream};
 
 use super::*;
 use crate::environment::{Environment, Step, make, names};
 use crate::vector::{Start, tests::Bench};
-use shoal_common::space::{EnvironmentSpec, Space};
-use shoal_common::stream::{Purpose, Stream, stream};
 
 const NAME: [u64; 3] = [11, 2, 3];
 /// Crosses the ends of episodes of every environment.

@@ -1,0 +1,223 @@
+//! The layout of the replay file. Offsets are chained: each is the end of what comes before it.
+
+use std::ops::Range;
+
+use shoal_base::transition::RowLayout;
+
+use super::words::Words;
+
+#[cfg(not(all(target_endian = "little", target_pointer_width = "64")))]
+compile_error!("the replay file and the checkpoints are written as they stand in memory: 64-bit little-endian only");
+
+/// "SHOALRPL", read as a number.
+const MAGIC: u64 = u64::from_le_bytes(*b"SHOALRPL");
+/// The format this build reads and writes. Raise it with every change of the layout or of a checksum.
+const VERSION: u64 = 2;
+
+/// Bytes of a header word; every field of the header is one.
+const WORD: usize = size_of::<u64>();
+/// The unit of the layout, in bytes: what is written at different times never shares one, so that a power loss that
+/// tears one leaves its neighbours whole.
+const BLOCK: usize = 4096;
+/// Words of the identity, its seal included.
+const IDENTITY_WORDS: usize = 10;
+
+/// Words of a commit record before those of the actors: generation, head, tail.
+pub(super) const RECORD_WORDS: usize = 3;
+/// Words of an actor in a commit record, before those that say where it stood: incarnation, sequence, rows.
+pub(super) const ACTOR_WORDS: usize = 3;
+
+/// More actors than any run has. A file that claims more, and is as long as it says, asks its reader for memory without
+/// end.
+const MOST_ACTORS: usize = 1 << 16;
+
+/// More words than tell where any actor stands, for the same reason.
+const MOST_STANDING_WORDS: usize = 1 << 24;
+
+/// Slots that hold a commit record: two for what is committed (a record of generation g goes to slot g mod 2), then
+/// two for what is known to have reached the disk.
+pub const SLOTS: usize = 4;
+/// The first of the two slots for what has reached the disk.
+pub const SYNCED: usize = 2;
+
+/// What a replay file holds. Two files with equal layouts are interchangeable; a file of another layout is refused.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ReplayLayout {
+    /// The fields of a row.
+    pub row: RowLayout,
+    /// Rows the ring has room for: the sampling window, and the slack beyond it.
+    pub ring: u64,
+    /// Actors there may ever be; their indices are `0 .. actors`.
+    pub actors: usize,
+    /// Words that say where an actor stood after its last chunk; 0 where nobody asks.
+    pub standing_words: usize,
+    /// Identifies the configuration the rows were collected under; the caller's to choose.
+    pub fingerprint: u64,
+}
+
+/// Where everything lies in a replay file, in bytes from its beginning.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Places {
+    /// The word that names the published generation.
+    pub selector: usize,
+    /// The word that says up to which row the ring is being written.
+    pub reach: usize,
+    /// The slots of commit records.
+    pub slots: [usize; SLOTS],
+    /// End of the header: what the readers map.
+    pub header: usize,
+    /// The rows' checks, one `u32` a place of the ring.
+    pub checks: Range<usize>,
+    /// The rows.
+    pub rows: Range<usize>,
+    /// Length of the file.
+    pub end: usize,
+}
+
+/// Why a file's identity cannot be what this build expects.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum IdentityFault {
+    /// The file does not begin as a replay file does.
+    #[error("it is not a replay file")]
+    Magic,
+    /// A replay file of another format.
+    #[error("its format version is {0}, this program reads version {VERSION}")]
+    Version(u64),
+    /// The identity's checksum does not fit.
+    #[error("its header is damaged (checksum)")]
+    Checksum,
+    /// The identity is whole and its numbers are not possible.
+    #[error("its header asks for an impossible size")]
+    Size,
+}
+
+impl ReplayLayout {
+    /// Where everything lies, or `None` if the ring or the actors are none, the actors too many, or the file would be
+    /// larger than a file can be.
+    pub fn places(&self) -> Option<Places> {
+        if self.ring == 0 || !(1..=MOST_ACTORS).contains(&self.actors) || self.standing_words > MOST_STANDING_WORDS {
+            return None;
+        }
+        let ring = usize::try_from(self.ring).ok()?;
+        let slot = self
+            .record_words()?
+            .checked_add(1)?
+            .checked_mul(WORD)?
+            .checked_next_multiple_of(BLOCK)?;
+        let row = self.row.width().checked_mul(size_of::<f32>())?;
+
+        let selector = BLOCK;
+        let reach = selector + WORD;
+        let first = selector + BLOCK;
+        let header = first.checked_add(slot.checked_mul(SLOTS)?)?;
+        let checks = header..header.checked_add(ring.checked_mul(size_of::<u32>())?)?;
+        let rows = checks.end.checked_next_multiple_of(BLOCK)?;
+        let rows = rows..rows.checked_add(ring.checked_mul(row)?)?;
+        let end = rows.end.checked_next_multiple_of(BLOCK)?;
+        i64::try_from(end).ok()?;
+        let slots = std::array::from_fn(|i| first + i * slot);
+        Some(Places {
+            selector,
+            reach,
+            slots,
+            header,
+            checks,
+            rows,
+            end,
+        })
+    }
+
+    /// Words of a commit record; `None` if there are more than can be counted.
+    fn record_words(&self) -> Option<usize> {
+        let stride = self.standing_words.checked_add(ACTOR_WORDS)?;
+        self.actors.checked_mul(stride)?.checked_add(RECORD_WORDS)
+    }
+
+    /// The words a file of this layout begins with.
+    pub fn identity(&self) -> Vec<u64> {
+        let mut words = vec![
+            MAGIC,
+            VERSION,
+            self.row.observation_width() as u64,
+            self.row.action_width() as u64,
+            self.row.width() as u64,
+            self.ring,
+            self.actors as u64,
+            self.standing_words as u64,
+            self.fingerprint,
+        ];
+        words.push(crc32fast::hash(bytemuck::cast_slice(&words)).into());
+        words
+    }
+
+    /// Reads the layout from a file's first block; the words may be any bytes.
+    pub fn read(words: &Words) -> Result<Self, IdentityFault> {
+        let identity: Vec<u64> = (0..IDENTITY_WORDS).map(|i| words.load(i * WORD)).collect();
+        if identity[0] != MAGIC {
+            return Err(IdentityFault::Magic);
+        }
+        if identity[1] != VERSION {
+            return Err(IdentityFault::Version(identity[1]));
+        }
+        let (fields, seal) = identity.split_at(IDENTITY_WORDS - 1);
+        if seal[0] != u64::from(crc32fast::hash(bytemuck::cast_slice(fields))) {
+            return Err(IdentityFault::Checksum);
+        }
+        // The bound keeps `RowLayout::width` from overflowing.
+        let size = |word: u64| u32::try_from(word).map(|n| n as usize).map_err(|_| IdentityFault::Size);
+        let layout = Self {
+            row: RowLayout::new(size(fields[2])?, size(fields[3])?),
+            ring: fields[5],
+            actors: size(fields[6])?,
+            standing_words: size(fields[7])?,
+            fingerprint: fields[8],
+        };
+        if fields[4] != layout.row.width() as u64 {
+            return Err(IdentityFault::Size);
+        }
+        Ok(layout)
+    }
+
+    /// Names the first thing in which a file of layout `found` differs from this one.
+    pub fn difference(&self, found: &Self) -> Option<String> {
+        let differs = |before: &str, expected: usize, found: usize, after: &str| {
+            (expected != found).then(|| format!("{before} {found} {after}, this run's {expected}"))
+        };
+        let (row, found_row) = (&self.row, &found.row);
+        differs(
+            "its observations have",
+            row.observation_width(),
+            found_row.observation_width(),
+            "numbers",
+        )
+        .or_else(|| {
+            differs(
+                "its actions have",
+                row.action_width(),
+                found_row.action_width(),
+                "numbers",
+            )
+        })
+        .or_else(|| differs("its ring has", self.ring as usize, found.ring as usize, "rows"))
+        .or_else(|| differs("it has room for", self.actors, found.actors, "actors"))
+        .or_else(|| {
+            differs(
+                "where an actor stands takes",
+                self.standing_words,
+                found.standing_words,
+                "words",
+            )
+        })
+        .or_else(|| {
+            (self.fingerprint != found.fingerprint).then(|| {
+                format!(
+                    "it was written under another configuration (fingerprint {:016x}, this run's is {:016x})",
+                    found.fingerprint, self.fingerprint
+                )
+            })
+        })
+    }
+}
+
+/// Bytes of the file that hold its identity.
+pub(super) const IDENTITY_BYTES: usize = BLOCK;

@@ -1,0 +1,384 @@
+//! The actor's end.
+
+use std::cell::Cell;
+use std::time::Instant;
+
+use iceoryx2::identifiers::UniqueServerId;
+use iceoryx2::pending_response::PendingResponse;
+use iceoryx2::port::client::Client;
+use iceoryx2::prelude::*;
+use iceoryx2::response::Response;
+use shoal_base::exit::Exit;
+use shoal_base::packing::{numbers_of, words_of};
+use shoal_base::report::Role;
+use shoal_base::space::{EnvironmentSpec, Space};
+use shoal_base::stop::Stop;
+
+use super::message::{Ask, Block, RequestHeader, ResponseHeader, ResponseLayout, Verdict};
+use super::service::{EnvironmentService, name, question_length, service};
+use crate::bell::{Bell, Place, Ringer, wait_for};
+use crate::domain::Domain;
+use crate::error::{ChannelError, PeerError};
+use crate::service::{CLAIM_PATIENCE, Entry, claim};
+
+/// Which episodes a reset begins.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Begin {
+    /// The next one of each environment.
+    Next,
+    /// This one of each environment's own stream.
+    Training(u64),
+    /// Of environment `e`, the evaluation episode that far after this one.
+    Evaluation(u64),
+}
+
+/// What an environment server can say to a step.
+#[derive(Debug)]
+pub enum Stepped {
+    /// Every environment took the step.
+    Taken(Observed),
+    /// The server died, and another one has taken its place: the episodes under way are lost.
+    Lost,
+}
+
+/// What an environment server can say when a snapshot is asked for.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Snapshot {
+    /// The words to restore from: as many as
+    /// [`EnvironmentSpec::snapshot_words`](shoal_base::space::EnvironmentSpec::snapshot_words) counts.
+    Taken(Vec<u64>),
+    /// The server died, and another one has taken its place: the episodes under way are lost.
+    Lost,
+}
+
+/// A response in the server's memory.
+#[derive(Debug)]
+pub struct Observed {
+    response: Response<ipc::Service, [f32], ResponseHeader>,
+    layout: ResponseLayout,
+}
+
+/// The actor's end. While it waits for an answer it calls `idle`, some twenty times a second.
+#[derive(Debug)]
+pub struct EnvironmentClient {
+    service: EnvironmentService,
+    /// The server that runs the episodes under way.
+    episodes: Cell<Option<UniqueServerId>>,
+    client: Client<ipc::Service, [f32], RequestHeader, [f32], ResponseHeader>,
+    channel: String,
+    ringer: Ringer,
+    layout: ResponseLayout,
+    snapshot_words: usize,
+    stop: Stop,
+}
+
+impl Observed {
+    fn block(&self, block: Block) -> &[f32] {
+        self.layout.block(block, self.response.payload())
+    }
+
+    fn of_environment(&self, e: usize, block: Block) -> &[f32] {
+        let block = self.block(block);
+        let width = block.len() / self.layout.environments;
+        &block[e * width..][..width]
+    }
+
+    /// What to act on next, environment after environment: the columns of a batch.
+    pub fn observations(&self) -> &[f32] {
+        self.block(Block::Observations)
+    }
+
+    /// What environment `e` is to act on next.
+    pub fn observation(&self, e: usize) -> &[f32] {
+        self.of_environment(e, Block::Observations)
+    }
+
+    /// s' of environment `e`.
+    pub fn next_observation(&self, e: usize) -> &[f32] {
+        self.of_environment(e, Block::NextObservations)
+    }
+
+    /// Reward of environment `e`.
+    pub fn reward(&self, e: usize) -> f32 {
+        self.block(Block::Rewards)[e]
+    }
+
+    /// Whether environment `e` reached a terminal state.
+    pub fn terminated(&self, e: usize) -> bool {
+        self.block(Block::Terminated)[e] != 0.0
+    }
+
+    /// Whether the time limit ended the episode of environment `e`.
+    pub fn truncated(&self, e: usize) -> bool {
+        self.block(Block::Truncated)[e] != 0.0
+    }
+}
+
+/// Asks environment server `index`, of which nothing is known, for its spaces and the number of its environments.
+///
+/// # Errors
+/// When interrupted.
+pub fn describe(
+    domain: &Domain,
+    index: u32,
+    bell: &Bell,
+    stop: Stop,
+) -> Result<(EnvironmentSpec, usize), Exit<ChannelError>> {
+    let unknown = Space::boxed(&[]);
+    let spec = EnvironmentSpec {
+        observation: unknown.clone(),
+        action: unknown,
+        time_limit: 0,
+        state_width: 0,
+    };
+    EnvironmentClient::open(domain, index, &spec, 0, stop)?.describe(bell, || ())
+}
+
+impl EnvironmentClient {
+    /// Opens the conversation with environment server `index`, which is expected to step so many environments of this
+    /// kind. Whether it does, [`describe`](Self::describe) tells. Waiting for an answer ends when `stop` is requested.
+    ///
+    /// # Errors
+    /// When shared memory cannot be had.
+    pub fn open(
+        domain: &Domain,
+        index: u32,
+        spec: &EnvironmentSpec,
+        environments: usize,
+        stop: Stop,
+    ) -> Result<Self, ChannelError> {
+        let channel = name(index);
+        let snapshot_words = spec.snapshot_words(environments);
+        let longest = question_length(spec, environments);
+        let (service, client) = claim(|| {
+            let service = service(domain, &channel, Entry::Open)?;
+            let client = service
+                .client_builder()
+                .initial_max_slice_len(longest)
+                .create()
+                .map_err(|cause| ChannelError::new(&channel, "ask", cause))?;
+            Ok((service, client))
+        })?;
+        let ringer = Ringer::new(domain, Place(Role::EnvServer, index))?;
+        Ok(Self {
+            service,
+            episodes: Cell::new(None),
+            client,
+            channel,
+            ringer,
+            layout: ResponseLayout::new(environments, spec.observation.width()),
+            snapshot_words,
+            stop,
+        })
+    }
+
+    /// Asks the server for its spaces and the number of its environments.
+    ///
+    /// # Errors
+    /// When interrupted.
+    pub fn describe(&self, bell: &Bell, idle: impl FnMut()) -> Result<(EnvironmentSpec, usize), Exit<ChannelError>> {
+        let response = self.insist(bell, Ask::Describe, 0, &[], idle)?;
+        let (header, payload) = (response.user_header(), response.payload());
+        let described = header.described(payload);
+        described.ok_or_else(|| ChannelError::new(&self.channel, "describe", PeerError::ShortAnswer).into())
+    }
+
+    /// Every environment begins an episode.
+    ///
+    /// # Errors
+    /// When interrupted.
+    pub fn reset(&self, bell: &Bell, begin: Begin, idle: impl FnMut()) -> Result<Observed, Exit<ChannelError>> {
+        let (ask, episode) = match begin {
+            Begin::Next => (Ask::Reset, 0),
+            Begin::Training(episode) => (Ask::ResetToTraining, episode),
+            Begin::Evaluation(first) => (Ask::ResetToEvaluation, first),
+        };
+        self.begun(self.insist(bell, ask, episode, &[], idle)?)
+    }
+
+    /// Every environment takes a step with its action.
+    ///
+    /// # Errors
+    /// When interrupted, or the server refuses the actions or has forgotten its episodes.
+    pub fn step(&self, bell: &Bell, actions: &[f32], idle: impl FnMut()) -> Result<Stepped, Exit<ChannelError>> {
+        match self.ask_within_episodes(bell, Ask::Step, actions, idle)? {
+            Some(response) => Ok(Stepped::Taken(self.observed(response)?)),
+            None => Ok(Stepped::Lost),
+        }
+    }
+
+    /// Asks for the training episodes under way, which stay as they are.
+    ///
+    /// # Errors
+    /// When interrupted, or the server refuses: its environments cannot say their state, or run evaluation episodes.
+    pub fn snapshot(&self, bell: &Bell, idle: impl FnMut()) -> Result<Snapshot, Exit<ChannelError>> {
+        let Some(response) = self.ask_within_episodes(bell, Ask::Snapshot, &[], idle)? else {
+            return Ok(Snapshot::Lost);
+        };
+        let words = words_of(self.answered(&response)?);
+        if words.len() != self.snapshot_words {
+            return Err(self.refused().into());
+        }
+        Ok(Snapshot::Taken(words))
+    }
+
+    /// Every environment goes on with its training episode of a snapshot; what to act on next is the answer, as after
+    /// [`reset`](Self::reset).
+    ///
+    /// # Errors
+    /// When interrupted, or the server refuses the words; it stays as it was then.
+    pub fn restore(&self, bell: &Bell, words: &[u64], idle: impl FnMut()) -> Result<Observed, Exit<ChannelError>> {
+        if words.len() != self.snapshot_words {
+            let cause = PeerError::SnapshotLength {
+                found: words.len(),
+                expected: self.snapshot_words,
+            };
+            return Err(ChannelError::new(&self.channel, "restore", cause).into());
+        }
+        self.begun(self.insist(bell, Ask::Restore, 0, numbers_of(words), idle)?)
+    }
+
+    /// The first observations of new episodes, which the server that sent them runs from now on.
+    fn begun(&self, response: Answer) -> Result<Observed, Exit<ChannelError>> {
+        let server = response.origin();
+        let observed = self.observed(response)?;
+        self.episodes.set(Some(server));
+        Ok(observed)
+    }
+
+    fn observed(&self, response: Answer) -> Result<Observed, ChannelError> {
+        if self.answered(&response)?.len() != self.layout.len() {
+            return Err(self.refused());
+        }
+        Ok(Observed {
+            response,
+            layout: self.layout,
+        })
+    }
+
+    /// The payload of what is no refusal.
+    fn answered<'a>(&self, response: &'a Answer) -> Result<&'a [f32], ChannelError> {
+        if response.user_header().verdict == Verdict::Answered as u32 {
+            Ok(response.payload())
+        } else {
+            Err(self.refused())
+        }
+    }
+
+    fn refused(&self) -> ChannelError {
+        ChannelError::new(&self.channel, "ask", PeerError::Refused)
+    }
+
+    /// Asks once: for requests about the episodes under way. `None` when the server that ran them is no more.
+    fn ask_within_episodes(
+        &self,
+        bell: &Bell,
+        ask: Ask,
+        payload: &[f32],
+        idle: impl FnMut(),
+    ) -> Result<Option<Answer>, Exit<ChannelError>> {
+        if self.server() != self.episodes.get() {
+            return Ok(None);
+        }
+        let sent = self.send(ask, 0, payload)?;
+        let Some(response) = self.answer(bell, &sent, idle)? else {
+            return Ok(None);
+        };
+        if response.user_header().verdict != Verdict::NotStarted as u32 {
+            return Ok(Some(response));
+        }
+        if Some(response.origin()) == self.episodes.get() {
+            return Err(ChannelError::new(&self.channel, "ask", PeerError::EpisodesDenied).into());
+        }
+        Ok(None)
+    }
+
+    /// Asks until some server answers: for requests that may be asked twice.
+    fn insist(
+        &self,
+        bell: &Bell,
+        ask: Ask,
+        episode: u64,
+        payload: &[f32],
+        mut idle: impl FnMut(),
+    ) -> Result<Answer, Exit<ChannelError>> {
+        let mut unreachable = None;
+        loop {
+            let sent = self.send(ask, episode, payload)?;
+            if let Some(response) = self.answer(bell, &sent, &mut idle)? {
+                return Ok(response);
+            }
+            if sent.server.is_none() || sent.is_delivered() {
+                unreachable = None;
+            } else if unreachable.get_or_insert_with(Instant::now).elapsed() >= CLAIM_PATIENCE {
+                return Err(ChannelError::new(&self.channel, "ask", PeerError::NoConnection).into());
+            }
+        }
+    }
+
+    fn send(&self, ask: Ask, episode: u64, payload: &[f32]) -> Result<Sent, ChannelError> {
+        // Before the request is sent: where another server has come since, it counts as lost and is asked anew, and never
+        // the other way round.
+        let server = self.server();
+        let mut request = self
+            .client
+            .loan_slice_uninit(payload.len())
+            .map_err(|cause| ChannelError::new(&self.channel, "ask", cause))?;
+        *request.user_header_mut() = RequestHeader::new(ask, episode);
+        let pending = request
+            .write_from_slice(payload)
+            .send()
+            .map_err(|cause| ChannelError::new(&self.channel, "ask", cause))?;
+        self.ringer.ring();
+        Ok(Sent { pending, server })
+    }
+
+    /// Waits for the answer; `None` when the server that was asked is no more, or was not reached.
+    fn answer(&self, bell: &Bell, sent: &Sent, mut idle: impl FnMut()) -> Result<Option<Answer>, Exit<ChannelError>> {
+        let lost = Cell::new(false);
+        let answer = wait_for(
+            bell,
+            &self.stop,
+            || match sent.pending.receive() {
+                Ok(Some(response)) => Ok(Some(Some(response))),
+                Ok(None) if lost.get() => Ok(Some(None)),
+                Ok(None) => Ok(None),
+                Err(cause) => Err(ChannelError::new(&self.channel, "hear the answer", cause)),
+            },
+            || {
+                idle();
+                // A dead server is there until the launcher has cleaned up after it. `is_connected` would not tell: it is
+                // true for as long as an answer of a dead server is in hand, and one always is.
+                lost.set(!sent.is_delivered() || self.server() != sent.server);
+                Ok(())
+            },
+        )?;
+        Ok(answer)
+    }
+
+    /// The server that is there.
+    fn server(&self) -> Option<UniqueServerId> {
+        let mut found = None;
+        self.service.dynamic_config().list_servers(|server| {
+            found = Some(server.server_id);
+            CallbackProgression::Stop
+        });
+        found
+    }
+}
+
+/// A request under way.
+struct Sent {
+    pending: Pending,
+    /// The server that was there when it was sent.
+    server: Option<UniqueServerId>,
+}
+
+impl Sent {
+    fn is_delivered(&self) -> bool {
+        self.pending.number_of_server_connections() > 0
+    }
+}
+
+type Pending = PendingResponse<ipc::Service, [f32], RequestHeader, [f32], ResponseHeader>;
+type Answer = Response<ipc::Service, [f32], ResponseHeader>;

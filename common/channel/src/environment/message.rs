@@ -1,0 +1,250 @@
+//! What travels between an actor and its environment server. `docs/PROTOCOL.md` has it for whoever writes a server in
+//! another language.
+
+use iceoryx2::prelude::ZeroCopySend;
+use shoal_base::space::{EnvironmentSpec, Space};
+
+/// What a request asks for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u32)]
+pub enum Ask {
+    /// The spaces and the number of environments.
+    Describe = 0,
+    /// Every environment begins an episode of its own stream.
+    Reset = 1,
+    /// Environment `e` begins the evaluation episode `episode + e`, whose start is the same always and everywhere.
+    ResetToEvaluation = 2,
+    /// Every environment takes a step with its action.
+    Step = 3,
+    /// The training episodes under way, as words.
+    Snapshot = 4,
+    /// The environments go on with the training episodes of a snapshot.
+    Restore = 5,
+    /// Every environment begins the training episode `episode` of its own stream, and counts on from there.
+    ResetToTraining = 6,
+}
+
+impl Ask {
+    pub(super) const ALL: [Self; 7] = [
+        Self::Describe,
+        Self::Reset,
+        Self::ResetToEvaluation,
+        Self::Step,
+        Self::Snapshot,
+        Self::Restore,
+        Self::ResetToTraining,
+    ];
+}
+
+/// Header of a request. Its payload is the actions, environment after environment, for [`Ask::Step`], the words of the
+/// snapshot for [`Ask::Restore`], and empty otherwise.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ZeroCopySend)]
+#[type_name("ShoalEnvironmentRequest")]
+#[repr(C)]
+pub struct RequestHeader {
+    pub(super) ask: u32,
+    pub(super) reserved: u32,
+    /// The episode of [`Ask::ResetToTraining`], the first one of [`Ask::ResetToEvaluation`].
+    pub episode: u64,
+}
+
+impl RequestHeader {
+    pub(super) fn new(ask: Ask, episode: u64) -> Self {
+        Self {
+            ask: ask as u32,
+            reserved: 0,
+            episode,
+        }
+    }
+}
+
+/// How a request was taken.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u32)]
+pub(super) enum Verdict {
+    Answered = 0,
+    /// A step or a snapshot before a reset or a restore: the server is not the one that the episode began with.
+    NotStarted = 1,
+    /// The request has the wrong length, says what cannot be, or is of an unknown kind.
+    Refused = 2,
+}
+
+/// Header of a response. The payload answers [`Ask::Describe`] with the least and greatest values of an observation and of
+/// an action (for boxes), [`Ask::Snapshot`] with its words, and everything else with the blocks of [`ResponseLayout`].
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ZeroCopySend)]
+#[type_name("ShoalEnvironmentResponse")]
+#[repr(C)]
+pub struct ResponseHeader {
+    pub(super) verdict: u32,
+    /// Environments the server steps.
+    pub environments: u32,
+    /// Values of a discrete observation; 0 for a box.
+    pub discrete_observations: u32,
+    /// Numbers in an observation.
+    pub observation_width: u32,
+    /// Values of a discrete action; 0 for a box.
+    pub discrete_actions: u32,
+    /// Numbers in an action.
+    pub action_width: u32,
+    /// Steps after which an episode is truncated.
+    pub time_limit: u32,
+    /// Numbers in an environment's state; 0 where it cannot be said.
+    pub state_width: u32,
+}
+
+impl ResponseHeader {
+    /// What the server says of itself, where `bounds` is its answer to [`Ask::Describe`]: the spaces, and how many
+    /// environments there are. `None` for an answer that is too short.
+    pub(super) fn described(&self, bounds: &[f32]) -> Option<(EnvironmentSpec, usize)> {
+        let mut rest = bounds;
+        let mut space = |discrete: u32, width: u32| {
+            if discrete > 0 {
+                return Some(Space::Discrete { n: discrete });
+            }
+            let width = width as usize;
+            let (low, high) = (rest.get(..width)?, rest.get(width..)?.get(..width)?);
+            rest = &rest[2 * width..];
+            Some(Space::Box {
+                low: low.into(),
+                high: high.into(),
+            })
+        };
+        let spec = EnvironmentSpec {
+            observation: space(self.discrete_observations, self.observation_width)?,
+            action: space(self.discrete_actions, self.action_width)?,
+            time_limit: self.time_limit,
+            state_width: self.state_width as usize,
+        };
+        Some((spec, self.environments as usize))
+    }
+}
+
+/// Where the blocks of a response lie, each of them environment after environment.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ResponseLayout {
+    pub(super) environments: usize,
+    observation: usize,
+}
+
+/// A block of a response, in the order they lie in.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Block {
+    Observations,
+    NextObservations,
+    Rewards,
+    Terminated,
+    Truncated,
+}
+
+/// The blocks of a response to [`Ask::Step`], to be written. A reset or restore fills `observations` alone.
+#[derive(Debug)]
+pub struct StepBlocks<'a> {
+    /// What to act on next: where an episode has ended, the first observation of the next one.
+    pub observations: &'a mut [f32],
+    /// The observation after the step, s', whether or not the episode ended with it.
+    pub next_observations: &'a mut [f32],
+    /// Reward of the step.
+    pub rewards: &'a mut [f32],
+    /// 1 where the step led to a terminal state, 0 elsewhere.
+    pub terminated: &'a mut [f32],
+    /// 1 where the time limit ended the episode, 0 elsewhere.
+    pub truncated: &'a mut [f32],
+}
+
+impl ResponseLayout {
+    /// Blocks for so many environments with observations of this width.
+    pub fn new(environments: usize, observation: usize) -> Self {
+        Self {
+            environments,
+            observation,
+        }
+    }
+
+    /// Numbers in each [`Block`], in their order.
+    fn lengths(&self) -> [usize; 5] {
+        let (scalars, observations) = (self.environments, self.environments * self.observation);
+        [observations, observations, scalars, scalars, scalars]
+    }
+
+    /// Numbers in a response.
+    pub fn len(&self) -> usize {
+        self.lengths().iter().sum()
+    }
+
+    /// Whether a response holds nothing.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// A block of a response of `len()` numbers.
+    pub(super) fn block<'a>(&self, block: Block, response: &'a [f32]) -> &'a [f32] {
+        let lengths = self.lengths();
+        let (before, here) = lengths.split_at(block as usize);
+        &response[before.iter().sum()..][..here[0]]
+    }
+
+    /// The blocks of a response of `len()` numbers.
+    pub fn split_mut<'a>(&self, response: &'a mut [f32]) -> StepBlocks<'a> {
+        let lengths = self.lengths();
+        let (observations, rest) = response.split_at_mut(lengths[Block::Observations as usize]);
+        let (next_observations, rest) = rest.split_at_mut(lengths[Block::NextObservations as usize]);
+        let (rewards, rest) = rest.split_at_mut(lengths[Block::Rewards as usize]);
+        let (terminated, truncated) = rest.split_at_mut(lengths[Block::Terminated as usize]);
+        StepBlocks {
+            observations,
+            next_observations,
+            rewards,
+            terminated,
+            truncated,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_server_says_of_itself_is_read_as_far_as_it_goes() {
+        let header = ResponseHeader {
+            environments: 3,
+            observation_width: 2,
+            discrete_actions: 4,
+            action_width: 1,
+            time_limit: 200,
+            ..ResponseHeader::default()
+        };
+        let (spec, environments) = header.described(&[-1.0, -2.0, 1.0, 2.0]).unwrap();
+        assert_eq!(spec.observation, Space::boxed(&[(-1.0, 1.0), (-2.0, 2.0)]));
+        assert_eq!(
+            (spec.action, spec.time_limit, environments),
+            (Space::Discrete { n: 4 }, 200, 3)
+        );
+        assert_eq!(header.described(&[-1.0, -2.0, 1.0]), None);
+    }
+
+    #[test]
+    fn what_is_written_into_a_block_is_read_from_it() {
+        let layout = ResponseLayout::new(2, 3);
+        let mut response = vec![f32::NAN; layout.len()];
+        let blocks = layout.split_mut(&mut response);
+        blocks.observations.fill(0.0);
+        blocks.next_observations.fill(1.0);
+        blocks.rewards.fill(2.0);
+        blocks.terminated.fill(3.0);
+        blocks.truncated.fill(4.0);
+        use Block::{NextObservations, Observations, Rewards, Terminated, Truncated};
+        for (value, (block, length)) in [
+            (Observations, 6),
+            (NextObservations, 6),
+            (Rewards, 2),
+            (Terminated, 2),
+            (Truncated, 2),
+        ]
+        .into_iter()
+        .enumerate()
+        {
+            assert_eq!(layout.block(block, &response), vec![value as f32; length]);
+        }
+    }
+}

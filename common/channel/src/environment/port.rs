@@ -1,0 +1,218 @@
+//! The environment server's end.
+
+use iceoryx2::active_request::ActiveRequest;
+use iceoryx2::port::server::Server;
+use iceoryx2::prelude::*;
+use shoal_base::exit::Exit;
+use shoal_base::packing::{numbers_of, words_of};
+use shoal_base::report::Role;
+use shoal_base::space::{EnvironmentSpec, Space};
+use shoal_base::stop::Stop;
+
+use super::message::{Ask, RequestHeader, ResponseHeader, ResponseLayout, StepBlocks, Verdict};
+use super::service::{LOANED_RESPONSES, answer_length, name, service};
+use crate::bell::{Bell, Place, Ringer, wait_for};
+use crate::domain::Domain;
+use crate::error::ChannelError;
+use crate::service::{Entry, claim};
+
+/// The server's end.
+#[derive(Debug)]
+pub struct EnvironmentPort {
+    server: Server<ipc::Service, [f32], RequestHeader, [f32], ResponseHeader>,
+    channel: String,
+    bell: Bell,
+    ringer: Ringer,
+    layout: ResponseLayout,
+    spec: EnvironmentSpec,
+}
+
+/// A request that waits for its answer.
+#[derive(Debug)]
+pub struct Request<'a> {
+    request: ActiveRequest<ipc::Service, [f32], RequestHeader, [f32], ResponseHeader>,
+    port: &'a EnvironmentPort,
+}
+
+impl EnvironmentPort {
+    /// The answering end of environment server `index`, which serves so many environments of this kind to `client`.
+    ///
+    /// # Errors
+    /// When shared memory cannot be had, or another server lives at this place.
+    pub fn open(
+        domain: &Domain,
+        index: u32,
+        spec: EnvironmentSpec,
+        environments: usize,
+        client: Place,
+    ) -> Result<Self, ChannelError> {
+        let channel = name(index);
+        let layout = ResponseLayout::new(environments, spec.observation.width());
+        let longest = answer_length(&spec, environments);
+        let server = claim(|| {
+            service(domain, &channel, Entry::Open)?
+                .server_builder()
+                .initial_max_slice_len(longest)
+                .max_loaned_responses_per_request(LOANED_RESPONSES)
+                .create()
+                .map_err(|cause| ChannelError::new(&channel, "answer", cause))
+        })?;
+        let bell = Bell::hang(domain, Place(Role::EnvServer, index))?;
+        let ringer = Ringer::new(domain, client)?;
+        Ok(Self {
+            server,
+            channel,
+            bell,
+            ringer,
+            layout,
+            spec,
+        })
+    }
+
+    /// Waits for the next request that is not answered here; `idle` is called at each pause.
+    ///
+    /// # Errors
+    /// When interrupted.
+    pub fn next(&self, stop: &Stop, mut idle: impl FnMut()) -> Result<Request<'_>, Exit<ChannelError>> {
+        loop {
+            let request = wait_for(
+                &self.bell,
+                stop,
+                || {
+                    self.server
+                        .receive()
+                        .map_err(|cause| ChannelError::new(&self.channel, "hear a request", cause))
+                },
+                || {
+                    idle();
+                    Ok(())
+                },
+            )?;
+            let request = Request { request, port: self };
+            match request.ask() {
+                Some(Ask::Describe) => request.describe()?,
+                Some(_) => return Ok(request),
+                None => request.refuse()?,
+            }
+        }
+    }
+}
+
+impl Request<'_> {
+    /// What is asked; `None` for what this build does not know.
+    pub fn ask(&self) -> Option<Ask> {
+        let code = self.request.user_header().ask;
+        Ask::ALL.into_iter().find(|ask| *ask as u32 == code)
+    }
+
+    /// The evaluation episode that environment 0 shall begin, or the training episode that each shall.
+    pub fn episode(&self) -> u64 {
+        self.request.user_header().episode
+    }
+
+    /// Answers with what `write` makes of the actions, environment after environment; where it fails, the request is
+    /// refused, and the failure returned.
+    ///
+    /// # Errors
+    /// When shared memory is exhausted.
+    pub fn answer<E>(
+        self,
+        write: impl FnOnce(&[f32], StepBlocks<'_>) -> Result<(), E>,
+    ) -> Result<Result<(), E>, ChannelError> {
+        let layout = self.port.layout;
+        let mut result = Ok(());
+        self.respond(layout.len(), |payload| {
+            result = write(self.request.payload(), layout.split_mut(payload));
+            if result.is_ok() {
+                Verdict::Answered
+            } else {
+                Verdict::Refused
+            }
+        })?;
+        Ok(result)
+    }
+
+    /// The words of the snapshot to go on from.
+    pub fn words(&self) -> Vec<u64> {
+        words_of(self.request.payload())
+    }
+
+    /// Answers with the snapshot that `write` writes; where it fails, the request is refused, and the failure returned.
+    ///
+    /// # Errors
+    /// When shared memory is exhausted.
+    pub fn answer_snapshot<E>(
+        self,
+        write: impl FnOnce(&mut [u64]) -> Result<(), E>,
+    ) -> Result<Result<(), E>, ChannelError> {
+        let EnvironmentPort { spec, layout, .. } = self.port;
+        let mut words = vec![0; spec.snapshot_words(layout.environments)];
+        if let Err(error) = write(&mut words) {
+            self.refuse()?;
+            return Ok(Err(error));
+        }
+        let numbers = numbers_of(&words);
+        self.respond(numbers.len(), |payload| {
+            payload.copy_from_slice(numbers);
+            Verdict::Answered
+        })?;
+        Ok(Ok(()))
+    }
+
+    /// Answers that no episode is under way.
+    ///
+    /// # Errors
+    /// When shared memory is exhausted.
+    pub fn not_started(self) -> Result<(), ChannelError> {
+        self.respond(0, |_| Verdict::NotStarted)
+    }
+
+    /// Answers that the request makes no sense.
+    ///
+    /// # Errors
+    /// When shared memory is exhausted.
+    pub fn refuse(self) -> Result<(), ChannelError> {
+        self.respond(0, |_| Verdict::Refused)
+    }
+
+    fn describe(self) -> Result<(), ChannelError> {
+        let mut bounds = Vec::new();
+        for space in [&self.port.spec.observation, &self.port.spec.action] {
+            if let Space::Box { low, high } = space {
+                bounds.extend(low);
+                bounds.extend(high);
+            }
+        }
+        self.respond(bounds.len(), |payload| {
+            payload.copy_from_slice(&bounds);
+            Verdict::Answered
+        })
+    }
+
+    fn respond(&self, length: usize, write: impl FnOnce(&mut [f32]) -> Verdict) -> Result<(), ChannelError> {
+        let EnvironmentPort {
+            spec, layout, channel, ..
+        } = self.port;
+        let discrete = |space: &Space| if let Space::Discrete { n } = space { *n } else { 0 };
+        let mut response = self
+            .request
+            .loan_slice(length)
+            .map_err(|cause| ChannelError::new(channel, "answer", cause))?;
+        let verdict = write(response.payload_mut());
+        *response.user_header_mut() = ResponseHeader {
+            verdict: verdict as u32,
+            environments: layout.environments as u32,
+            discrete_observations: discrete(&spec.observation),
+            observation_width: spec.observation.width() as u32,
+            discrete_actions: discrete(&spec.action),
+            action_width: spec.action.width() as u32,
+            time_limit: spec.time_limit,
+            state_width: spec.state_width as u32,
+        };
+        response
+            .send()
+            .map_err(|cause| ChannelError::new(channel, "answer", cause))?;
+        self.port.ringer.ring();
+        Ok(())
+    }
+}

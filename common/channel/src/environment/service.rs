@@ -1,0 +1,89 @@
+//! The conversation's service: its name, its limits, and the memory it reserves.
+
+use iceoryx2::prelude::*;
+use iceoryx2::service::header::request_response::{
+    RequestHeader as IoxRequestHeader, ResponseHeader as IoxResponseHeader,
+};
+use iceoryx2::service::port_factory::PortFactory as _;
+use iceoryx2::service::port_factory::request_response::PortFactory;
+use shoal_base::packing::NUMBERS_OF_A_WORD;
+use shoal_base::space::EnvironmentSpec;
+
+use super::message::{RequestHeader, ResponseHeader, ResponseLayout};
+use crate::domain::Domain;
+use crate::error::ChannelError;
+use crate::memory;
+use crate::service::{Entry, Held, service_name};
+
+/// Requests that may wait for their answers: one, and those that a killed server left unanswered.
+const ACTIVE_REQUESTS: usize = 4;
+const LOANED_REQUESTS: usize = 2;
+/// Answers of a request that may wait.
+const RESPONSE_BUFFER: usize = 2;
+/// Answers of a request in hand: the observation acted on is held until its transition is written.
+const BORROWED_RESPONSES: usize = 4;
+pub(super) const LOANED_RESPONSES: usize = 2;
+/// Processes that may take part in one conversation.
+const NODES: usize = 8;
+
+/// Bytes of shared memory that the conversation with one server of so many such environments reserves.
+pub fn reserved(spec: &EnvironmentSpec, environments: usize) -> u64 {
+    // A client may have let go of as many requests as it may wait for, and the server still hold them.
+    let requests = 2 * ACTIVE_REQUESTS + LOANED_REQUESTS;
+    let of_a_request = RESPONSE_BUFFER + BORROWED_RESPONSES + LOANED_RESPONSES;
+    let responses = 2 * ACTIVE_REQUESTS * of_a_request;
+    let (question, answer) = (question_length(spec, environments), answer_length(spec, environments));
+    memory::service(NODES)
+        + memory::segment::<IoxRequestHeader, RequestHeader>(requests, size_of::<f32>() * question)
+        + memory::segment::<IoxResponseHeader, ResponseHeader>(responses, size_of::<f32>() * answer)
+        + memory::connection(1, ACTIVE_REQUESTS, requests, requests)
+        + memory::connection(2 * ACTIVE_REQUESTS, RESPONSE_BUFFER, BORROWED_RESPONSES, responses)
+}
+
+/// The most numbers in a request: actions, or a snapshot.
+pub(super) fn question_length(spec: &EnvironmentSpec, environments: usize) -> usize {
+    let snapshot = NUMBERS_OF_A_WORD * spec.snapshot_words(environments);
+    (environments * spec.action.width()).max(snapshot)
+}
+
+/// The most numbers in a response: those of [`ResponseLayout`], of a description, or of a snapshot.
+pub(super) fn answer_length(spec: &EnvironmentSpec, environments: usize) -> usize {
+    let described = 2 * (spec.observation.width() + spec.action.width());
+    let snapshot = NUMBERS_OF_A_WORD * spec.snapshot_words(environments);
+    let blocks = ResponseLayout::new(environments, spec.observation.width()).len();
+    blocks.max(described).max(snapshot)
+}
+
+pub(super) fn name(index: u32) -> String {
+    format!("env/{index}")
+}
+
+/// Makes the service of the conversation with environment server `index`.
+pub(crate) fn create(domain: &Domain, index: u32) -> Result<Held, ChannelError> {
+    let service = service(domain, &name(index), Entry::Create)?;
+    Ok(Held::new(move |see| {
+        let ports = service.dynamic_config();
+        ports.list_clients(|port| see(port.node_id, port.client_id.value()));
+        ports.list_servers(|port| see(port.node_id, port.server_id.value()));
+    }))
+}
+
+pub(super) type EnvironmentService = PortFactory<ipc::Service, [f32], RequestHeader, [f32], ResponseHeader>;
+
+/// One client, one server: the port is the claim.
+pub(super) fn service(domain: &Domain, channel: &str, entry: Entry) -> Result<EnvironmentService, ChannelError> {
+    let builder = domain
+        .node()
+        .service_builder(&service_name(domain, channel)?)
+        .request_response::<[f32], [f32]>()
+        .request_user_header::<RequestHeader>()
+        .response_user_header::<ResponseHeader>()
+        .max_clients(1)
+        .max_servers(1)
+        .max_nodes(NODES)
+        .max_active_requests_per_client(ACTIVE_REQUESTS)
+        .max_loaned_requests(LOANED_REQUESTS)
+        .max_response_buffer_size(RESPONSE_BUFFER)
+        .max_borrowed_responses_per_pending_response(BORROWED_RESPONSES);
+    entry.service(channel, builder, |b| b.create(), |b| b.open())
+}

@@ -1,0 +1,253 @@
+//! The policy, from the learner to everyone who acts: the latest wins. Readers evaluate it where it lies, in the learner's
+//! memory, and go on with it when the learner dies.
+
+use std::rc::Rc;
+
+use iceoryx2::port::publisher::Publisher;
+use iceoryx2::port::subscriber::Subscriber;
+use iceoryx2::port::update_connections::UpdateConnections;
+use iceoryx2::prelude::*;
+use iceoryx2::sample::Sample;
+use iceoryx2::service::header::publish_subscribe::Header;
+use iceoryx2::service::port_factory::PortFactory as _;
+use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
+
+use super::domain::Domain;
+use super::error::{ChannelError, PeerError};
+use super::memory;
+use super::service::{Entry, Held, claim, service_name};
+
+const CHANNEL: &str = "policy";
+
+/// Policies that wait for a reader: the newest.
+const BUFFER: usize = 1;
+
+/// Policies a reader has in hand: one in use, and the next one before the first is let go.
+const BORROWED: usize = 2;
+
+/// What a reader knows of a policy.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ZeroCopySend)]
+#[repr(C)]
+pub struct PolicyHeader {
+    /// The learner's start that published it.
+    pub incarnation: u64,
+    /// Grows with each publication, and goes on from the checkpoint when a learner is restarted.
+    pub version: u64,
+    /// Environment steps it was learned from.
+    pub env_steps: u64,
+    /// Updates it was made by.
+    pub updates: u64,
+    /// Fingerprint of the parameters' layout.
+    pub fingerprint: u64,
+}
+
+/// The learner's end.
+#[derive(Debug)]
+pub struct PolicyPublisher {
+    publisher: Publisher<ipc::Service, [f32], PolicyHeader>,
+}
+
+/// A reader's end, holding on to the newest policy it was given.
+#[derive(Debug)]
+pub struct PolicyReader {
+    subscriber: Subscriber<ipc::Service, [f32], PolicyHeader>,
+    current: Option<Rc<Policy>>,
+    fingerprint: u64,
+    parameters: usize,
+}
+
+/// A policy in the learner's memory; it stays as it is for as long as this lives, and longer than the learner.
+#[derive(Debug)]
+pub struct Policy {
+    sample: Sample<ipc::Service, [f32], PolicyHeader>,
+}
+
+impl PolicyPublisher {
+    /// The publishing end, for policies of so many parameters.
+    ///
+    /// # Errors
+    /// When shared memory cannot be had, or another learner lives.
+    pub fn open(domain: &Domain, parameters: usize) -> Result<Self, ChannelError> {
+        let samples = samples(domain.max_actors());
+        let publisher = claim(|| {
+            service(domain, Entry::Open)?
+                .publisher_builder()
+                .initial_max_slice_len(parameters)
+                .max_loaned_samples(1)
+                .override_sample_preallocation(move |_| samples)
+                .create()
+                .map_err(|cause| ChannelError::new(CHANNEL, "publish", cause))
+        })?;
+        Ok(Self { publisher })
+    }
+
+    /// Publishes a policy.
+    ///
+    /// # Errors
+    /// When shared memory is exhausted.
+    pub fn publish(&self, parameters: &[f32], header: PolicyHeader) -> Result<(), ChannelError> {
+        let mut loan = self
+            .publisher
+            .loan_slice_uninit(parameters.len())
+            .map_err(|cause| ChannelError::new(CHANNEL, "publish", cause))?;
+        *loan.user_header_mut() = header;
+        loan.write_from_slice(parameters)
+            .send()
+            .map(|_| ())
+            .map_err(|cause| ChannelError::new(CHANNEL, "publish", cause))
+    }
+
+    /// Hands the newest policy to readers that have come since. To be called while waiting.
+    ///
+    /// # Errors
+    /// When the connection cannot be made.
+    pub fn look_after(&self) -> Result<(), ChannelError> {
+        self.publisher
+            .update_connections()
+            .map_err(|cause| ChannelError::new(CHANNEL, "reconnect", cause))
+    }
+}
+
+impl PolicyReader {
+    /// The reading end, for policies whose layout has this fingerprint and number of parameters.
+    ///
+    /// # Errors
+    /// When shared memory cannot be had.
+    pub fn open(domain: &Domain, fingerprint: u64, parameters: usize) -> Result<Self, ChannelError> {
+        let subscriber = claim(|| {
+            service(domain, Entry::Open)?
+                .subscriber_builder()
+                .create()
+                .map_err(|cause| ChannelError::new(CHANNEL, "read", cause))
+        })?;
+        Ok(Self {
+            subscriber,
+            current: None,
+            fingerprint,
+            parameters,
+        })
+    }
+
+    /// The newest policy there is; the same again when no newer one has come, `None` before the first. The one before it
+    /// must be let go before this is called again: a reader has no more than these two in hand.
+    ///
+    /// # Errors
+    /// When the learner's memory cannot be mapped, or its policy has another layout.
+    pub fn latest(&mut self) -> Result<Option<Rc<Policy>>, ChannelError> {
+        while let Some(sample) = self
+            .subscriber
+            .receive()
+            .map_err(|cause| ChannelError::new(CHANNEL, "read", cause))?
+        {
+            if sample.user_header().fingerprint != self.fingerprint || sample.payload().len() != self.parameters {
+                return Err(ChannelError::new(CHANNEL, "read", PeerError::PolicyLayout));
+            }
+            self.current = Some(Rc::new(Policy { sample }));
+        }
+        Ok(self.current.clone())
+    }
+}
+
+impl Policy {
+    /// What is known of the policy.
+    pub fn header(&self) -> &PolicyHeader {
+        self.sample.user_header()
+    }
+
+    /// Its parameters, in the layout of the network.
+    pub fn parameters(&self) -> &[f32] {
+        self.sample.payload()
+    }
+}
+
+/// Bytes of shared memory that policies of so many parameters reserve in a run of up to so many actors. Twice what one
+/// learner needs: readers go on with the policy of a learner that was killed, and its memory stays until they have
+/// another.
+pub fn reserved(max_actors: usize, parameters: usize) -> u64 {
+    let (samples, readers) = (samples(max_actors), readers(max_actors));
+    let learner = memory::segment::<Header, PolicyHeader>(samples, size_of::<f32>() * parameters)
+        + readers as u64 * memory::connection(1, BUFFER, BORROWED, samples);
+    memory::service(readers + nodes(max_actors)) + 2 * learner
+}
+
+/// The evaluator, the actors, and one more.
+fn readers(max_actors: usize) -> usize {
+    max_actors + 2
+}
+
+fn nodes(max_actors: usize) -> usize {
+    max_actors + 4
+}
+
+/// Policies that can be in use at once. What waits for the readers is one policy, the newest, for all of them, and while
+/// it is being replaced two; iceoryx2 would reserve one for each reader.
+fn samples(max_actors: usize) -> usize {
+    let (waiting, being_written) = (2, 1);
+    readers(max_actors) * BORROWED + waiting + being_written
+}
+
+/// Makes the service.
+pub(super) fn create(domain: &Domain) -> Result<Held, ChannelError> {
+    let service = service(domain, Entry::Create)?;
+    Ok(Held::new(move |see| {
+        let ports = service.dynamic_config();
+        ports.list_publishers(|port| see(port.node_id, port.publisher_id.value()));
+        ports.list_subscribers(|port| see(port.node_id, port.subscriber_id.value()));
+    }))
+}
+
+fn service(domain: &Domain, entry: Entry) -> Result<PortFactory<ipc::Service, [f32], PolicyHeader>, ChannelError> {
+    let builder = domain
+        .node()
+        .service_builder(&service_name(domain, CHANNEL)?)
+        .publish_subscribe::<[f32]>()
+        .user_header::<PolicyHeader>()
+        .max_publishers(1)
+        .max_subscribers(readers(domain.max_actors()))
+        .max_nodes(nodes(domain.max_actors()))
+        .enable_safe_overflow(true)
+        .history_size(1)
+        .subscriber_max_buffer_size(BUFFER)
+        .subscriber_max_borrowed_samples(BORROWED);
+    entry.service(CHANNEL, builder, |b| b.create(), |b| b.open())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn there_is_room_for_the_next_policy_while_every_reader_holds_two_that_nobody_else_holds() {
+        const MAX_ACTORS: u32 = 3;
+        let run_id = format!("{:x}", std::process::id());
+        let domain = Domain::join(&run_id, MAX_ACTORS).unwrap();
+        let service = create(&domain).unwrap();
+        let publisher = PolicyPublisher::open(&domain, 100).unwrap();
+        let readers: Vec<_> = (0..readers(MAX_ACTORS as usize))
+            .map(|_| PolicyReader::open(&domain, 0, 100).unwrap().subscriber)
+            .collect();
+        let publish = |version| {
+            let header = PolicyHeader {
+                version,
+                ..PolicyHeader::default()
+            };
+            publisher.publish(&[version as f32; 100], header).unwrap();
+        };
+        let mut held = Vec::new();
+        let mut version = 0;
+        for reader in readers.iter().flat_map(|reader| [reader; BORROWED]) {
+            version += 1;
+            publish(version);
+            held.push((version, reader.receive().unwrap().unwrap()));
+        }
+        for further in 1..10 {
+            publish(version + further);
+        }
+        for (version, sample) in &held {
+            assert_eq!(sample.user_header().version, *version);
+            assert_eq!(sample.payload(), [*version as f32; 100]);
+        }
+        drop((held, readers, publisher, service));
+        domain.leave().unwrap();
+    }
+}

@@ -1,0 +1,160 @@
+//! The policy μ as an actor evaluates it: the network's tanh output scaled to the action's range.
+
+use shoal_base::space::Space;
+
+use super::{Hidden, Network, NetworkLayout};
+
+/// The middle and half the width of each action element's range: tanh outputs become actions in environment units.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ActionRange {
+    centre: Vec<f32>,
+    half: Vec<f32>,
+}
+
+/// Why a policy with tanh outputs cannot act in a space.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum ActionRangeError {
+    /// The actions are indices.
+    #[error("the action space is discrete ({n} actions), but a deterministic policy needs real-valued actions (a box)")]
+    Discrete {
+        /// How many actions there are.
+        n: u32,
+    },
+    /// A box without elements.
+    #[error("the action space is a box without elements")]
+    Empty,
+    /// The bounds are infinite, not numbers, or leave no room between them.
+    #[error(
+        "action element {element} ranges from {low} to {high}, but a policy needs finite bounds, the lower below the upper"
+    )]
+    Bounds {
+        /// Which element, from 0.
+        element: usize,
+        /// Its lower bound.
+        low: f32,
+        /// Its upper bound.
+        high: f32,
+    },
+}
+
+impl ActionRange {
+    /// The range of `space`, which must be a box with finite bounds.
+    pub fn new(space: &Space) -> Result<Self, ActionRangeError> {
+        let (low, high) = match space {
+            Space::Box { low, high } => (low, high),
+            Space::Discrete { n } => return Err(ActionRangeError::Discrete { n: *n }),
+        };
+        if low.is_empty() {
+            return Err(ActionRangeError::Empty);
+        }
+        for (element, (&low, &high)) in low.iter().zip(high).enumerate() {
+            let half = high / 2.0 - low / 2.0;
+            if !(half.is_finite() && half > 0.0) {
+                return Err(ActionRangeError::Bounds { element, low, high });
+            }
+        }
+        let pairs = || low.iter().zip(high);
+        Ok(Self {
+            centre: pairs().map(|(low, high)| low / 2.0 + high / 2.0).collect(),
+            half: pairs().map(|(low, high)| high / 2.0 - low / 2.0).collect(),
+        })
+    }
+
+    /// Elements of an action.
+    pub fn width(&self) -> usize {
+        self.centre.len()
+    }
+
+    /// Half the width of each element's range: what exploration noise is scaled by, and ∂action/∂tanh.
+    pub fn half(&self) -> &[f32] {
+        &self.half
+    }
+
+    /// The nearest to `a` that element `element` of an action may be.
+    pub fn clip(&self, element: usize, a: f32) -> f32 {
+        a.clamp(self.action(element, -1.0), self.action(element, 1.0))
+    }
+
+    /// Element `element` of an action from the tanh output `t`.
+    pub fn action(&self, element: usize, t: f32) -> f32 {
+        self.centre[element] + self.half[element] * t
+    }
+}
+
+/// The policy μ with room for a batch of observations. Its parameters are not its own: each call borrows them.
+#[derive(Clone, Debug)]
+pub struct PolicyNetwork {
+    network: Network,
+    range: ActionRange,
+}
+
+impl PolicyNetwork {
+    /// A policy from `observation` numbers to actions in `range`, for at most `batch` observations a call.
+    pub fn new(observation: usize, hidden: Hidden, range: ActionRange, batch: usize) -> Self {
+        let layout = NetworkLayout::policy(observation, hidden, range.width());
+        Self {
+            network: Network::new(layout, batch),
+            range,
+        }
+    }
+
+    /// How the parameters of [`forward`](Self::forward) are laid out.
+    pub fn layout(&self) -> &NetworkLayout {
+        self.network.layout()
+    }
+
+    /// The range of its actions.
+    pub fn range(&self) -> &ActionRange {
+        &self.range
+    }
+
+    /// Writes μ(s) in environment units into `actions` for every observation s in `observations`, one after the other.
+    ///
+    /// Panics when the slices do not fit the layout, or hold more than the batch. Nothing is allocated.
+    pub fn forward(&mut self, parameters: &[f32], observations: &[f32], actions: &mut [f32]) {
+        self.network.forward(parameters, observations, actions);
+        for action in actions.chunks_exact_mut(self.range.width()) {
+            for (element, z) in action.iter_mut().enumerate() {
+                *z = self.range.action(element, z.tanh());
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn actions_stay_within_the_range_and_reach_both_ends() {
+        let space = Space::boxed(&[(-1.0, 3.0), (-2.0, 2.0)]);
+        let mut policy = PolicyNetwork::new(1, Hidden::relu([1, 1]), ActionRange::new(&space).unwrap(), 3);
+        // h1 = h2 = max(s, 0); z = ±1000 h2
+        let parameters = [1.0, 0.0, 1.0, 0.0, 1000.0, -1000.0, 0.0, 0.0];
+        let mut actions = [f32::NAN; 6];
+        policy.forward(&parameters, &[1.0, 0.0, -1.0], &mut actions);
+        assert_eq!(actions, [3.0, -2.0, 1.0, 0.0, 1.0, 0.0]);
+    }
+
+    #[test]
+    fn spaces_without_a_finite_range_are_refused() {
+        assert_eq!(
+            ActionRange::new(&Space::Discrete { n: 4 }),
+            Err(ActionRangeError::Discrete { n: 4 })
+        );
+        assert_eq!(ActionRange::new(&Space::boxed(&[])), Err(ActionRangeError::Empty));
+        for (low, high) in [
+            (0.0, f32::INFINITY),
+            (f32::NEG_INFINITY, 0.0),
+            (f32::NAN, 1.0),
+            (1.0, 1.0),
+            (2.0, 1.0),
+        ] {
+            let space = Space::boxed(&[(-1.0, 1.0), (low, high)]);
+            assert!(matches!(
+                ActionRange::new(&space),
+                Err(ActionRangeError::Bounds { element: 1, .. })
+            ));
+        }
+    }
+}

@@ -1,0 +1,168 @@
+//! The replay as its writer has it: the mapped file, its ring of rows and its record.
+
+use std::fs::File;
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{Ordering, compiler_fence};
+
+use shoal_common::commit::{ActorCommit, Places, Record, ReplayLayout, WritableWords};
+
+use super::error::ReplayError;
+use super::ring::Ring;
+use super::step::{Hook, Step, observe, step_of_record};
+use super::{file, recovery};
+
+/// The replay of a run. Holding one is the right to write the file: a second one is refused while it lives.
+pub struct Replay {
+    pub(super) path: PathBuf,
+    pub(super) layout: ReplayLayout,
+    pub(super) places: Places,
+    pub(super) file: File,
+    pub(super) words: WritableWords,
+    pub(super) ring: Ring,
+    /// What is committed, as in the published slot; its tail is already that of a chunk being filled.
+    pub(super) record: Record,
+    /// Which of the two slots for synced records is written next, and the newest generation in them.
+    pub(super) next_synced: usize,
+    pub(super) synced_generation: u64,
+    pub(super) warnings: Vec<String>,
+    pub(super) hook: Option<Hook>,
+}
+
+impl Replay {
+    /// Makes the replay of a new run, with all its space reserved. Never replaces a file; leaves none behind on error.
+    pub fn create(path: &Path, layout: &ReplayLayout) -> Result<Self, ReplayError> {
+        let (file, places) = file::create(path, layout)?;
+        Self::map(path, layout, places, file)
+    }
+
+    /// Maps the replay of a run that goes on, and repairs what a crash has left (see `warnings`). A file that is not
+    /// exactly of this layout and configuration is refused and left as it is.
+    pub fn open(path: &Path, layout: &ReplayLayout) -> Result<Self, ReplayError> {
+        let (file, places) = file::open(path, layout)?;
+        Self::map(path, layout, places, file)
+    }
+
+    fn map(path: &Path, layout: &ReplayLayout, places: Places, file: File) -> Result<Self, ReplayError> {
+        let io = |source| ReplayError::Io {
+            path: path.into(),
+            doing: "map",
+            source,
+        };
+        let words = WritableWords::map(&file, places.header).map_err(io)?;
+        let ring = Ring::map(&file, layout, &places).map_err(io)?;
+        let found = recovery::recover(words.read(), &places, layout, &ring).map_err(|reason| ReplayError::Refused {
+            path: path.into(),
+            reason,
+        })?;
+        let mut replay = Self {
+            path: path.into(),
+            layout: layout.clone(),
+            places,
+            file,
+            words,
+            ring,
+            record: found.record,
+            next_synced: found.next_synced,
+            synced_generation: found.synced_generation,
+            warnings: found.warnings,
+            hook: None,
+        };
+        replay.words.store(replay.places.selector, found.selector);
+        replay.publish(found.next_generation);
+        replay.words.store(replay.places.reach, replay.record.head());
+        let forgotten = replay.ring.forget_outside(replay.rows());
+        if forgotten || !replay.warnings.is_empty() {
+            // A later power loss must not bring back what was given up here.
+            replay.file.sync_data().map_err(|source| replay.cannot_sync(source))?;
+        }
+        Ok(replay)
+    }
+
+    /// What opening the file had to repair or give up, one line each, for the run's log. Empty after a mere `kill -9`.
+    pub fn warnings(&self) -> &[String] {
+        &self.warnings
+    }
+
+    /// The file.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// What the file holds.
+    pub fn layout(&self) -> &ReplayLayout {
+        &self.layout
+    }
+
+    /// Rows ever committed; the next one has this number.
+    pub fn head(&self) -> u64 {
+        self.record.head()
+    }
+
+    /// The rows that can be read.
+    pub fn rows(&self) -> Range<u64> {
+        self.record.tail()..self.record.head()
+    }
+
+    /// What is committed of an actor.
+    ///
+    /// # Panics
+    /// As indexing a slice does: `actor` must be less than the layout's `actors`.
+    pub fn committed(&self, actor: usize) -> ActorCommit {
+        self.record.actor(actor)
+    }
+
+    /// A row, in place.
+    ///
+    /// # Panics
+    /// As indexing a slice does: `index` must be in `rows()`.
+    #[inline]
+    pub fn row(&self, index: u64) -> &[f32] {
+        let rows = self.rows();
+        assert!(
+            rows.contains(&index),
+            "row {index} of a replay that holds the rows {rows:?}"
+        );
+        self.ring.row(index)
+    }
+
+    /// The rows a minibatch is drawn from when the replay is to be seen as it was at `logical_head` rows: the newest
+    /// `capacity` before it. Shorter where there are not so many, where rows were lost, and where the ring has gone on
+    /// too far; a caller for whom the last matters compares its start with `logical_head - capacity`.
+    pub fn window(&self, logical_head: u64, capacity: u64) -> Range<u64> {
+        let rows = self.rows();
+        let end = logical_head.clamp(rows.start, rows.end);
+        end.saturating_sub(capacity).max(rows.start)..end
+    }
+
+    /// Calls `hook` after each step of every later write. A seam for crash tests.
+    pub fn on_step(&mut self, hook: impl FnMut(Step) + Send + 'static) {
+        self.hook = Some(Box::new(hook));
+    }
+
+    /// Writes `self.record` into the slot of `generation` and makes it the one the readers use.
+    pub(super) fn publish(&mut self, generation: u64) {
+        let published = self.words.read().load(self.places.selector);
+        assert_ne!(generation % 2, published % 2, "the published slot is never written");
+        self.record.set_generation(generation);
+        let slot = self.places.slots[(generation % 2) as usize];
+        let hook = &mut self.hook;
+        self.record
+            .store(&mut self.words, slot, |step| observe(hook, step_of_record(step)));
+        // SYNC POINT with the first Acquire fence of `CommitReader::consistent`; the Release fence is `Record::store`'s last.
+        self.words.store(self.places.selector, generation);
+        // A kill cannot come between two instructions in another order than the compiler gave them: keep it from
+        // moving the next chunk's rows, plain stores, up over this one.
+        compiler_fence(Ordering::SeqCst);
+        observe(hook, Step::Published);
+    }
+}
+
+impl std::fmt::Debug for Replay {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Replay")
+            .field("path", &self.path)
+            .field("rows", &self.rows())
+            .finish_non_exhaustive()
+    }
+}
