@@ -142,6 +142,11 @@ mod tests {
     fn behind_the_equals_sign_stand_the_choices_or_the_default() {
         assert_eq!(values(settings(OsStr::new("ddpg.tau="))), ["ddpg.tau=0.001"]);
         assert_eq!(values(settings(OsStr::new("run.mode=l"))), ["run.mode=lockstep"]);
+        assert_eq!(values(settings(OsStr::new("ddpg.hidden="))), ["ddpg.hidden=[400,300]"]);
+        assert_eq!(
+            values(settings(OsStr::new("ddpg.activation="))),
+            ["ddpg.activation=relu", "ddpg.activation=tanh"]
+        );
         assert_eq!(
             values(settings(OsStr::new("environment.name=p"))),
             ["environment.name=pendulum", "environment.name=point-mass"]

@@ -48,6 +48,30 @@ fn what_cannot_be_trained_is_refused_before_anything_is_made() {
             "error: ddpg.hidden[1] = 0: must be from 1 to 8192",
         ),
         (
+            &["pendulum", "--set", "ddpg.hidden=[64, 64, 8193]"],
+            "error: ddpg.hidden[2] = 8193: must be from 1 to 8192",
+        ),
+        (
+            &["pendulum", "--set", "ddpg.hidden=[]"],
+            "ddpg.hidden = []: must be a list of 1 to 8 numbers",
+        ),
+        (
+            &["pendulum", "--set", "ddpg.hidden=[1, 2, 3, 4, 5, 6, 7, 8, 9]"],
+            "ddpg.hidden = [1, 2, 3, 4, 5, 6, 7, 8, 9]: must be a list of 1 to 8 numbers",
+        ),
+        (
+            &["pendulum", "--set", "ddpg.hidden=64"],
+            "ddpg.hidden = 64: invalid type: integer `64`",
+        ),
+        (
+            &["cart-pole", "--set", "reinforce.baseline_hidden=[]"],
+            "reinforce.baseline_hidden = []: must be a list of 1 to 8 numbers",
+        ),
+        (
+            &["pendulum", "--set", "ddpg.activation=sigmoid"],
+            "ddpg.activation = \"sigmoid\": unknown variant `sigmoid`, expected `relu` or `tanh`",
+        ),
+        (
             &["pendulum", "--set", "replay.capacity=1000000001"],
             "error: replay.capacity = 1000000001: must be from 1 to 1000000000",
         ),

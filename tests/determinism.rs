@@ -17,7 +17,7 @@ use shoal_env_server::vector::{Start, VectorEnvironment};
 use shoal_learner::algorithms::ddpg::Ddpg;
 use shoal_learner::algorithms::minibatch::Minibatch;
 use shoal_learner::algorithms::sampling::Sampler;
-use support::{Workplace, comes_further, end_of, until};
+use support::{QUICK, Workplace, comes_further, end_of, json, until};
 
 #[test]
 fn the_same_seed_and_actors_give_the_same_bits_and_another_seed_others() {
@@ -251,6 +251,37 @@ fn one_actor_in_lockstep_is_algorithm_4_in_a_single_process() {
     }
 }
 
+#[test]
+fn three_tanh_layers_have_the_bits_of_a_single_process_with_one_thread_and_with_two() {
+    let place = Workplace::new();
+    for threads in ["1", "2"] {
+        let learner_threads = format!("learner.threads={threads}");
+        let arguments = [
+            &[
+                "train",
+                "pendulum",
+                "--run",
+                threads,
+                "--json",
+                "--lockstep",
+                "--actors",
+                "1",
+                "--envs",
+                "1",
+            ],
+            &["--steps", "900", "--seed", "11"][..],
+            &QUICK,
+            // Enough to be shared.
+            &["--set", "ddpg.hidden=[40, 128, 130]", "--set", "ddpg.activation=tanh"],
+            &["--set", "actors.chunk_steps=1", "--set", &learner_threads],
+        ];
+        let output = place.output(&arguments.concat());
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let config = Config::load(&place.path().join(threads).join("config.toml")).unwrap();
+        assert_eq!(json(&output)["weights_sha256"], twin(&config), "{threads} threads");
+    }
+}
+
 /// Algorithm 4, plainly. Returns the SHA-256 of all the weights it ends with.
 fn twin(config: &Config) -> String {
     let seed = config.run.seed;
@@ -265,7 +296,7 @@ fn twin(config: &Config) -> String {
     let mut indices = vec![0; ddpg.batch];
 
     let range = ActionRange::new(&config.spec.action).unwrap();
-    let mut mu = PolicyNetwork::new(row.observation_width(), ddpg.hidden, range, 1);
+    let mut mu = PolicyNetwork::new(row.observation_width(), ddpg.hidden_layers(), range, 1);
     let mut uniform = stream(seed, Purpose::Exploration, 0, 0);
     let mut noise = OrnsteinUhlenbeck::new(exploration, 1, row.action_width(), uniform.clone());
 

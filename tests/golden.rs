@@ -321,11 +321,7 @@ fn networks(recorded: &Value, ddpg: &Ddpg) -> Result<[Vec<f32>; 4], Failure> {
 /// A recorded network's parameters in the learner's order. Its weights are lists of rows, one an output.
 fn flat(network: &Value, layout: &NetworkLayout) -> Result<Vec<f32>, Failure> {
     let mut parameters = Vec::with_capacity(layout.parameters());
-    for ((inputs, outputs), [w, b]) in layout
-        .layer_sizes()
-        .into_iter()
-        .zip([["w1", "b1"], ["w2", "b2"], ["w3", "b3"]])
-    {
+    for ((inputs, outputs), [w, b]) in layout.layer_sizes().zip([["w1", "b1"], ["w2", "b2"], ["w3", "b3"]]) {
         let weights: Vec<Vec<f32>> = read(network, w, serde_json::from_value)?;
         let biases: Vec<f32> = read(network, b, serde_json::from_value)?;
         if weights.len() != outputs || biases.len() != outputs || weights.iter().any(|row| row.len() != inputs) {

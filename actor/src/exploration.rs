@@ -178,7 +178,7 @@ mod tests {
         };
         let stream = stream(7, Purpose::Exploration, 0, 0);
         let algorithm = Algorithm::Reinforce(Reinforce {
-            hidden: [1, 1],
+            hidden: [1, 1].into(),
             ..Reinforce::default()
         });
         let mut policy = Exploration::new(algorithm.behaviour(&spec, 1).unwrap(), 1, stream);

@@ -60,7 +60,7 @@ impl Inference {
         let range = ActionRange::new(&config.spec.action)?;
         let actions = vec![0.0; ENVIRONMENTS * range.width()];
         let width = config.spec.observation.width();
-        let policy = PolicyNetwork::new(width, ddpg(config)?.hidden, range, ENVIRONMENTS);
+        let policy = PolicyNetwork::new(width, ddpg(config)?.hidden_layers(), range, ENVIRONMENTS);
         Ok(Self {
             parameters: initialise(policy.layout(), config.run.seed, 0),
             observations: Rows::new(config)?.observations().to_vec(),

@@ -53,7 +53,7 @@ pub(super) fn measure(patience: &Patience) -> anyhow::Result<PolicyFigures> {
     let range = ActionRange::new(&config.spec.action)?;
     let width = config.spec.observation.width();
     let mut actions = vec![0.0; ENVIRONMENTS * range.width()];
-    let mut policy = PolicyNetwork::new(width, ddpg(&config)?.hidden, range, ENVIRONMENTS);
+    let mut policy = PolicyNetwork::new(width, ddpg(&config)?.hidden_layers(), range, ENVIRONMENTS);
     let layout = *policy.layout();
     let parameters = initialise(&layout, config.run.seed, 0);
     let rows = Rows::new(&config)?;
@@ -83,7 +83,7 @@ pub(super) fn measure(patience: &Patience) -> anyhow::Result<PolicyFigures> {
     }
     let [one, many] = [calls[0].median(), calls[1].median()];
     let sizes = layout.layer_sizes();
-    let flop: usize = sizes.iter().map(|(i, o)| 2 * i * o * ENVIRONMENTS).sum();
+    let flop: usize = sizes.map(|(i, o)| 2 * i * o * ENVIRONMENTS).sum();
     Ok(PolicyFigures {
         actions_per_second_batch_1: one,
         actions_per_second_batch_64: many * ENVIRONMENTS as f64,
@@ -102,7 +102,7 @@ pub(super) fn measure(patience: &Patience) -> anyhow::Result<PolicyFigures> {
 
 /// The product of the second layer for a batch of 64, by the kernel that does it best: nearly all there is to compute.
 fn widest_product(layout: &NetworkLayout, seed: u64) -> Multiplication {
-    let (k, m) = layout.layer_sizes()[1];
+    let (k, m) = layout.layer_size(1);
     let product = Product {
         m,
         k,

@@ -13,8 +13,8 @@ pub use behaviour::Behaviour;
 pub use ddpg::Ddpg;
 pub use exploration::{Exploration, Warmup};
 pub use reinforce::{Reinforce, Weight};
-use serde::{Deserialize, Serialize};
-use shoal_base::section::{OutOfRange, Section, describe};
+use serde::Serialize;
+use shoal_base::section::{self, OutOfRange, Section, describe};
 use shoal_base::space::EnvironmentSpec;
 use shoal_policy::{Policy, PolicyError, PolicyLayout};
 pub use tabular::Tabular;
@@ -56,10 +56,10 @@ macro_rules! registry {
             /// The algorithm of that name with the settings that its section has; `None` where there is none of that name.
             ///
             /// # Errors
-            /// When a key is unknown or of the wrong type.
+            /// When a key is unknown or of the wrong type: the key, its value, and what is wrong.
             pub fn read(name: &str, section: toml::Value) -> Option<Result<Self, toml::de::Error>> {
                 $(if name == $spec.name {
-                    return Some(<$settings>::deserialize(section).map(Self::$variant));
+                    return Some(section::read(name, section).map(Self::$variant));
                 })*
                 None
             }

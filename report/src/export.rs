@@ -6,7 +6,7 @@ mod tensors;
 use std::collections::BTreeMap;
 
 use shoal_common::config::Config;
-use shoal_common::network::{ActionRange, NetworkLayout};
+use shoal_common::network::{ActionRange, Activation, NetworkLayout};
 use shoal_common::policy::PolicyLayout;
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::space::Space;
@@ -23,16 +23,23 @@ pub struct Portable {
 /// What an observation goes through.
 #[derive(Clone, Debug)]
 enum Body {
-    /// DDPG's μ: the layers, tanh, and the scaling to the range of the actions.
-    Actions { layers: Vec<Dense>, range: ActionRange },
-    /// REINFORCE's π: the layers, and softmax.
-    Probabilities { layers: Vec<Dense> },
+    /// DDPG's μ: the network, tanh, and the scaling to the range of the actions.
+    Actions { network: Network, range: ActionRange },
+    /// REINFORCE's π: the network, and softmax.
+    Probabilities { network: Network },
     /// Action-values Q(s, a), state after state.
     Table {
         states: usize,
         actions: usize,
         values: Vec<f32>,
     },
+}
+
+/// Layers one after the other, with the activation between them.
+#[derive(Clone, Debug)]
+struct Network {
+    activation: Activation,
+    layers: Vec<Dense>,
 }
 
 /// A layer as PyTorch's `Linear` keeps it: y = W x + b.
@@ -49,11 +56,11 @@ impl Portable {
     pub fn new(config: &Config, file: &PolicyFile, which: &str) -> anyhow::Result<Self> {
         let body = match policy_layout(config)? {
             PolicyLayout::Deterministic(network) => Body::Actions {
-                layers: layers(&network, &file.parameters),
+                network: Network::new(&network, &file.parameters),
                 range: ActionRange::new(&config.spec.action)?,
             },
             PolicyLayout::Softmax(network) => Body::Probabilities {
-                layers: layers(&network, &file.parameters),
+                network: Network::new(&network, &file.parameters),
             },
             PolicyLayout::Table { states, actions } => Body::Table {
                 states,
@@ -76,17 +83,22 @@ impl Portable {
     }
 }
 
-fn layers(network: &NetworkLayout, parameters: &[f32]) -> Vec<Dense> {
-    let layers = network.layers(parameters).into_iter().zip(network.layer_sizes());
-    let dense = layers.map(|(layer, (inputs, outputs))| Dense {
-        inputs,
-        // Ours are column after column.
-        weights: (0..outputs * inputs)
-            .map(|at| layer.weights[(at % inputs) * outputs + at / inputs])
-            .collect(),
-        biases: layer.biases.to_vec(),
-    });
-    dense.collect()
+impl Network {
+    fn new(layout: &NetworkLayout, parameters: &[f32]) -> Self {
+        let layers = layout.layers(parameters).zip(layout.layer_sizes());
+        let dense = layers.map(|(layer, (inputs, outputs))| Dense {
+            inputs,
+            // Ours are column after column.
+            weights: (0..outputs * inputs)
+                .map(|at| layer.weights[(at % inputs) * outputs + at / inputs])
+                .collect(),
+            biases: layer.biases.to_vec(),
+        });
+        Self {
+            activation: layout.hidden().activation,
+            layers: dense.collect(),
+        }
+    }
 }
 
 fn about(config: &Config, file: &PolicyFile, which: &str, body: &Body) -> anyhow::Result<BTreeMap<String, String>> {
@@ -103,8 +115,12 @@ fn about(config: &Config, file: &PolicyFile, which: &str, body: &Body) -> anyhow
     if file.episodes > 0 {
         tell("evaluation_return", file.return_mean.to_string());
     }
-    if !matches!(body, Body::Table { .. }) {
-        tell("hidden_activation", "relu".into());
+    if let Body::Actions { network, .. } | Body::Probabilities { network } = body {
+        let activation = match network.activation {
+            Activation::Relu => "relu",
+            Activation::Tanh => "tanh",
+        };
+        tell("hidden_activation", activation.into());
     }
     match body {
         Body::Actions { .. } => {
@@ -125,13 +141,15 @@ fn about(config: &Config, file: &PolicyFile, which: &str, body: &Body) -> anyhow
 
 #[cfg(test)]
 mod tests {
+    use shoal_common::network::Hidden;
+
     use super::*;
 
     #[test]
     fn weights_stand_row_after_row() {
-        let network = NetworkLayout::policy(3, [2, 1], 1);
-        let parameters: Vec<f32> = (0..network.parameters()).map(|i| i as f32).collect();
-        let first = &layers(&network, &parameters)[0];
+        let layout = NetworkLayout::policy(3, Hidden::relu([2, 1]), 1);
+        let parameters: Vec<f32> = (0..layout.parameters()).map(|i| i as f32).collect();
+        let first = &Network::new(&layout, &parameters).layers[0];
         assert_eq!(first.weights, [0.0, 2.0, 4.0, 1.0, 3.0, 5.0]);
         assert_eq!(first.biases, [6.0, 7.0]);
     }
@@ -150,6 +168,12 @@ mod tests_support {
         let tasks = [
             "[environment]\nname = \"pendulum\"\n[ddpg]\nhidden = [40, 30]\n",
             "[environment]\nname = \"point-mass\"\nreward = \"r3\"\n[ddpg]\nhidden = [7, 5]\n",
+            "[environment]\nname = \"pendulum\"\n[ddpg]\nhidden = [40]\n",
+            "[environment]\nname = \"point-mass\"\n[ddpg]\nhidden = [7]\nactivation = \"tanh\"\n",
+            "[environment]\nname = \"pendulum\"\n[ddpg]\nhidden = [9, 8, 7]\n",
+            "[environment]\nname = \"point-mass\"\n[ddpg]\nhidden = [9, 8, 7]\nactivation = \"tanh\"\n",
+            "mode = \"lockstep\"\n[environment]\nname = \"cart-pole\"\n[actors]\nchunk_steps = 200\n\
+             [reinforce]\nhidden = [6, 5, 4]\nactivation = \"tanh\"\n[replay]\nwarmup = 0\n",
             "mode = \"lockstep\"\n[environment]\nname = \"cart-pole\"\n[actors]\nchunk_steps = 200\n\
              [reinforce]\n[replay]\nwarmup = 0\n",
             "[environment]\nname = \"frozen-lake\"\n[q-learning]\n[replay]\nwarmup = 0\n",

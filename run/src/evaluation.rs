@@ -128,7 +128,7 @@ mod tests {
         let Algorithm::Ddpg(ddpg) = &mut config.algorithm else {
             unreachable!()
         };
-        ddpg.hidden = [5, 3];
+        ddpg.hidden = [5, 3].into();
         let foreign = WhichPolicy::Last.read(&run, &config).unwrap_err().to_string();
         assert!(
             foreign.contains("another network") && !foreign.contains('\n'),

@@ -374,7 +374,7 @@ mod tests {
         );
         assert_eq!(config.environment.parameters["reward"].as_str(), Some("r2"));
         assert_eq!(config.environment.parameters["friction"].as_float(), Some(0.03));
-        assert_eq!(config.algorithm.ddpg().unwrap().hidden, [20, 10]);
+        assert_eq!(*config.algorithm.ddpg().unwrap().hidden, [20, 10]);
     }
 
     #[test]

@@ -4,6 +4,7 @@
 
 mod export;
 mod list;
+mod networks;
 mod shell;
 #[path = "../support/mod.rs"]
 mod support;

@@ -7,6 +7,26 @@ mod explanation;
 pub use bounds::{Bounded, Bounds, OutOfRange, above, from, in_words};
 pub use explanation::{Key, Section, describe, keys};
 
+use serde::de::{DeserializeOwned, Error};
+use toml::{Table, Value};
+
+/// Reads the section `name`, whose type is `T`; no key of it has to be there.
+///
+/// # Errors
+/// When a key is unknown or of the wrong type. The error begins with the key and its value where it is that of one key.
+pub fn read<T: DeserializeOwned>(name: &str, section: Value) -> Result<T, toml::de::Error> {
+    // An error does not say of which key it is; so each is read alone, and what is wrong is found again.
+    let alone = |(key, value): (&String, &Value)| {
+        let only = Table::from_iter([(key.clone(), value.clone())]);
+        let error = T::deserialize(only).err()?;
+        Some(Error::custom(format!("{name}.{key} = {value}: {}", error.message())))
+    };
+    T::deserialize(section.clone()).map_err(|error| {
+        let mut keys = section.as_table().into_iter().flatten();
+        keys.find_map(alone).unwrap_or(error)
+    })
+}
+
 /// Declares the struct of a section. A key is written as
 ///
 /// ```text

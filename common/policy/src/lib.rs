@@ -7,7 +7,7 @@ mod scores;
 pub use scores::Scores;
 use shoal_base::space::{EnvironmentSpec, Space};
 
-use crate::network::{ActionRange, ActionRangeError, NetworkLayout, PolicyNetwork};
+use crate::network::{ActionRange, ActionRangeError, Hidden, NetworkLayout, PolicyNetwork};
 
 /// What a policy's parameters are: what every process of a run must agree on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -112,7 +112,7 @@ impl Policy {
 ///
 /// # Errors
 /// When the actions are no real numbers in finite ranges.
-pub fn deterministic(hidden: [usize; 2], spec: &EnvironmentSpec, batch: usize) -> Result<PolicyNetwork, PolicyError> {
+pub fn deterministic(hidden: Hidden, spec: &EnvironmentSpec, batch: usize) -> Result<PolicyNetwork, PolicyError> {
     let range = ActionRange::new(&spec.action)?;
     Ok(PolicyNetwork::new(spec.observation.width(), hidden, range, batch))
 }
@@ -124,7 +124,7 @@ pub fn deterministic(hidden: [usize; 2], spec: &EnvironmentSpec, batch: usize) -
 /// When the actions cannot be counted, or the observations are no real numbers.
 pub fn softmax(
     algorithm: &'static str,
-    hidden: [usize; 2],
+    hidden: Hidden,
     spec: &EnvironmentSpec,
     batch: usize,
 ) -> Result<Scores, PolicyError> {
@@ -194,7 +194,7 @@ mod tests {
 
     #[test]
     fn parameters_of_one_kind_are_not_taken_for_another() {
-        let network = NetworkLayout::policy(4, [10, 2], 2);
+        let network = NetworkLayout::policy(4, Hidden::relu([10, 2]), 2);
         let (deterministic, softmax) = (PolicyLayout::Deterministic(network), PolicyLayout::Softmax(network));
         assert_ne!(deterministic.fingerprint(), softmax.fingerprint());
         assert_eq!(

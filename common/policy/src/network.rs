@@ -1,28 +1,34 @@
 //! The networks' shape, stated once for every process: where each weight lies in a flat parameter slice, and the forward
 //! pass that reads the slice in place, be it the learner's own memory or a sample in shared memory.
 //!
-//! Every network has two hidden layers of ReLU units and a linear output. Its parameters are
+//! Every network has 1 to 8 hidden layers of ReLU or tanh units and a linear output. Its parameters are, with two of them,
 //!
 //! ```text
 //! [ W1 | b1 | W2 | b2 | W3 | b3 ]        each W column-major, outputs × inputs
 //! ```
 //!
 //! *Late inputs* enter at the second hidden layer: they are the last columns of W2. A critic takes its action there
-//! (thesis, section 4.3.1); a policy has none. A batch of vectors is a column-major matrix, one vector after the other.
+//! (thesis, section 4.3.1); a policy has none. Where there is one hidden layer they enter at that one, as the last columns of
+//! W1: at the output layer a critic would be linear in the action, and the best action the same in every state.
+//! A batch of vectors is a column-major matrix, one vector after the other.
 
+mod acting;
 mod forward;
+mod hidden;
 mod policy;
 
 use std::ops::Range;
 
+pub use acting::Network;
 pub use forward::{Activations, Layer, matrix, matrix_mut};
+pub use hidden::{Activation, Hidden, Layers, LayersError};
 pub use policy::{ActionRange, ActionRangeError, PolicyNetwork};
 
 /// The sizes of a network, and with them the place of each of its parameters.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct NetworkLayout {
     inputs: usize,
-    hidden: [usize; 2],
+    hidden: Hidden,
     late_inputs: usize,
     outputs: usize,
 }
@@ -38,7 +44,7 @@ pub struct LayerRange {
 
 impl NetworkLayout {
     /// A policy μ: observations to actions.
-    pub fn policy(observation: usize, hidden: [usize; 2], action: usize) -> Self {
+    pub fn policy(observation: usize, hidden: Hidden, action: usize) -> Self {
         Self {
             inputs: observation,
             hidden,
@@ -48,7 +54,7 @@ impl NetworkLayout {
     }
 
     /// An action-value function Q: observations, and actions as late inputs, to one value.
-    pub fn critic(observation: usize, hidden: [usize; 2], action: usize) -> Self {
+    pub fn critic(observation: usize, hidden: Hidden, action: usize) -> Self {
         Self {
             inputs: observation,
             hidden,
@@ -62,8 +68,8 @@ impl NetworkLayout {
         self.inputs
     }
 
-    /// Units in each hidden layer.
-    pub fn hidden(&self) -> [usize; 2] {
+    /// The hidden layers.
+    pub fn hidden(&self) -> Hidden {
         self.hidden
     }
 
@@ -77,48 +83,89 @@ impl NetworkLayout {
         self.outputs
     }
 
-    /// The `(inputs, outputs)` of each of the three layers; the second layer's inputs end with the late ones.
-    pub fn layer_sizes(&self) -> [(usize, usize); 3] {
-        let [h1, h2] = self.hidden;
-        [(self.inputs, h1), (h1 + self.late_inputs, h2), (h2, self.outputs)]
+    /// The layer that the late inputs enter, from 0: the second one, or the only hidden one. `None` where there are none.
+    pub fn late_layer(&self) -> Option<usize> {
+        let second = self.hidden.layers.len().min(2) - 1;
+        (self.late_inputs > 0).then_some(second)
     }
 
-    /// Where each of the three layers lies in the parameter slice.
-    pub fn layer_ranges(&self) -> [LayerRange; 3] {
-        let mut end = 0;
-        self.layer_sizes().map(|(inputs, outputs)| {
-            let weights = end..end + outputs * inputs;
+    /// The `(inputs, outputs)` of a layer, from 0; its inputs end with the late ones where they enter there. The hidden layers
+    /// come first, and the output layer is the last.
+    pub fn layer_size(&self, layer: usize) -> (usize, usize) {
+        let units = &*self.hidden.layers;
+        let below = layer.checked_sub(1).map_or(self.inputs, |below| units[below]);
+        let late = if self.late_layer() == Some(layer) {
+            self.late_inputs
+        } else {
+            0
+        };
+        (below + late, units.get(layer).copied().unwrap_or(self.outputs))
+    }
+
+    /// The `(inputs, outputs)` of every layer: of the hidden ones and the output layer.
+    pub fn layer_sizes(&self) -> impl Iterator<Item = (usize, usize)> {
+        (0..=self.hidden.layers.len()).map(|layer| self.layer_size(layer))
+    }
+
+    /// Where every layer lies in the parameter slice.
+    pub fn layer_ranges(&self) -> impl Iterator<Item = LayerRange> {
+        self.layer_sizes().scan(0, |end, (inputs, outputs)| {
+            let weights = *end..*end + outputs * inputs;
             let biases = weights.end..weights.end + outputs;
-            end = biases.end;
-            LayerRange { weights, biases }
+            *end = biases.end;
+            Some(LayerRange { weights, biases })
         })
+    }
+
+    /// Where a layer, from 0, lies in the parameter slice.
+    pub fn layer_range(&self, layer: usize) -> LayerRange {
+        let start = self.layer_sizes().take(layer).map(parameters).sum();
+        let (inputs, outputs) = self.layer_size(layer);
+        let weights = start..start + outputs * inputs;
+        LayerRange {
+            biases: weights.end..weights.end + outputs,
+            weights,
+        }
     }
 
     /// Parameters of the network: the length of its slice.
     pub fn parameters(&self) -> usize {
-        self.layer_sizes()
-            .iter()
-            .map(|(inputs, outputs)| (inputs + 1) * outputs)
-            .sum()
+        self.layer_sizes().map(parameters).sum()
     }
 
-    /// The three layers of a slice of `parameters()` numbers.
-    pub fn layers<'a>(&self, parameters: &'a [f32]) -> [Layer<'a>; 3] {
-        self.layer_ranges().map(|range| Layer {
-            weights: &parameters[range.weights],
-            biases: &parameters[range.biases],
-        })
+    /// Every layer of a slice of `parameters()` numbers.
+    pub fn layers<'a>(&self, parameters: &'a [f32]) -> impl Iterator<Item = Layer<'a>> {
+        self.layer_ranges().map(|range| Layer::at(range, parameters))
+    }
+
+    /// A layer, from 0, of a slice of `parameters()` numbers.
+    pub fn layer<'a>(&self, layer: usize, parameters: &'a [f32]) -> Layer<'a> {
+        Layer::at(self.layer_range(layer), parameters)
     }
 
     /// A number that two layouts share only if they read parameters alike (FNV-1a over the sizes).
+    ///
+    /// That of two ReLU layers is the one of files from before there were others. Any other list is followed by
+    /// its length and the activation, so that no two layouts give the same numbers.
     pub fn fingerprint(&self) -> u64 {
-        let [h1, h2] = self.hidden;
-        let sizes = [self.inputs, h1, h2, self.late_inputs, self.outputs];
-        let bytes = sizes.iter().flat_map(|&size| (size as u64).to_le_bytes());
+        let Hidden { layers, activation } = self.hidden;
+        let marks = match (layers.len(), activation) {
+            (2, Activation::Relu) => None,
+            (count, Activation::Relu) => Some([count, 0]),
+            (count, Activation::Tanh) => Some([count, 1]),
+        };
+        let sizes = [self.inputs].into_iter().chain(layers.iter().copied());
+        let sizes = sizes.chain([self.late_inputs, self.outputs]);
+        let bytes = (sizes.chain(marks.into_iter().flatten())).flat_map(|size| (size as u64).to_le_bytes());
         bytes.fold(0xcbf2_9ce4_8422_2325, |hash, byte| {
             (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3)
         })
     }
+}
+
+/// Parameters of a layer of this size.
+fn parameters((inputs, outputs): (usize, usize)) -> usize {
+    (inputs + 1) * outputs
 }
 
 #[cfg(test)]
@@ -127,31 +174,44 @@ mod tests {
 
     #[test]
     fn the_ranges_cover_the_parameters_without_gap_or_overlap() {
-        let layout = NetworkLayout::critic(3, [5, 4], 2);
-        let mut end = 0;
-        for range in layout.layer_ranges() {
-            assert_eq!(range.weights.start, end);
-            assert_eq!(range.biases.start, range.weights.end);
-            end = range.biases.end;
+        for (hidden, expected) in [
+            (Hidden::relu([5]), (3 + 2) * 5 + 5 + 5 + 1),
+            (Hidden::relu([5, 4]), 3 * 5 + 5 + (5 + 2) * 4 + 4 + 4 + 1),
+            (Hidden::tanh([5, 4, 6]), 3 * 5 + 5 + (5 + 2) * 4 + 4 + 4 * 6 + 6 + 6 + 1),
+        ] {
+            let layout = NetworkLayout::critic(3, hidden, 2);
+            let mut end = 0;
+            for (number, range) in layout.layer_ranges().enumerate() {
+                assert_eq!(range, layout.layer_range(number));
+                assert_eq!(range.weights.start, end);
+                assert_eq!(range.biases.start, range.weights.end);
+                end = range.biases.end;
+            }
+            assert_eq!(end, layout.parameters());
+            assert_eq!(end, expected);
         }
-        assert_eq!(end, layout.parameters());
-        assert_eq!(end, 3 * 5 + 5 + (5 + 2) * 4 + 4 + 4 + 1);
     }
 
     #[test]
     fn fingerprints_tell_layouts_apart() {
-        let policy = NetworkLayout::policy(3, [400, 300], 1);
-        assert_eq!(
-            policy.fingerprint(),
-            NetworkLayout::policy(3, [400, 300], 1).fingerprint()
-        );
-        for other in [
-            NetworkLayout::policy(4, [400, 300], 1),
-            NetworkLayout::policy(3, [300, 400], 1),
-            NetworkLayout::policy(3, [400, 300], 2),
-            NetworkLayout::critic(3, [400, 300], 1),
-        ] {
-            assert_ne!(policy.fingerprint(), other.fingerprint());
-        }
+        let layouts = [
+            NetworkLayout::policy(3, Hidden::relu([400, 300]), 1),
+            NetworkLayout::policy(4, Hidden::relu([400, 300]), 1),
+            NetworkLayout::policy(3, Hidden::relu([300, 400]), 1),
+            NetworkLayout::policy(3, Hidden::relu([400, 300]), 2),
+            NetworkLayout::critic(3, Hidden::relu([400, 300]), 1),
+            NetworkLayout::policy(3, Hidden::tanh([400, 300]), 1),
+            NetworkLayout::policy(3, Hidden::relu([400]), 1),
+            NetworkLayout::policy(3, Hidden::tanh([400]), 1),
+            NetworkLayout::policy(3, Hidden::relu([400, 300, 300]), 1),
+            // The same numbers in the same order as a critic of two layers.
+            NetworkLayout::critic(3, Hidden::relu([400, 300]), 2),
+            NetworkLayout::critic(3, Hidden::tanh([400, 300]), 2),
+            NetworkLayout::critic(3, Hidden::relu([400, 300, 2]), 1),
+        ];
+        let fingerprints: std::collections::HashSet<u64> = layouts.iter().map(NetworkLayout::fingerprint).collect();
+        assert_eq!(fingerprints.len(), layouts.len());
+        // In the headers of policies that earlier versions wrote.
+        assert_eq!(layouts[0].fingerprint(), 0x879f_248f_4c7e_52a3);
     }
 }

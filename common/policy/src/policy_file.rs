@@ -135,13 +135,13 @@ const HEAD_WORDS: usize = 7;
 mod tests {
     use std::fs;
 
-    use crate::network::NetworkLayout;
+    use crate::network::{Hidden, NetworkLayout};
     use std::os::unix::fs::PermissionsExt;
 
     use super::*;
 
     fn layout() -> PolicyLayout {
-        PolicyLayout::Deterministic(NetworkLayout::policy(1, [1, 1], 1))
+        PolicyLayout::Deterministic(NetworkLayout::policy(1, Hidden::relu([1, 1]), 1))
     }
 
     fn policy() -> PolicyFile {
@@ -183,10 +183,13 @@ mod tests {
         let path = directory.path().join("best.policy");
         policy().write(&path).unwrap();
         assert!(
-            PolicyFile::read(&path, &PolicyLayout::Deterministic(NetworkLayout::policy(2, [1, 1], 1)))
-                .unwrap_err()
-                .to_string()
-                .contains("another network")
+            PolicyFile::read(
+                &path,
+                &PolicyLayout::Deterministic(NetworkLayout::policy(2, Hidden::relu([1, 1]), 1))
+            )
+            .unwrap_err()
+            .to_string()
+            .contains("another network")
         );
         let whole = fs::read(&path).unwrap();
         for at in 0..whole.len() {

@@ -1,33 +1,28 @@
 //! A score for every action: the logits of a softmax policy, or the row of a table of action-values.
 
 use super::PolicyLayout;
-use crate::network::{Activations, NetworkLayout};
+use crate::network::{Network, NetworkLayout};
 
 /// Says what every action is worth, for a batch of observations.
 #[derive(Clone, Debug)]
 pub struct Scores {
     source: Source,
     actions: usize,
-    h1: Vec<f32>,
-    h2: Vec<f32>,
     scores: Vec<f32>,
 }
 
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 enum Source {
-    Network(NetworkLayout),
+    Network(Network),
     Table { states: usize },
 }
 
 impl Scores {
     /// The logits of a softmax policy, for at most `batch` observations a call.
     pub(super) fn softmax(network: NetworkLayout, batch: usize) -> Self {
-        let [h1, h2] = network.hidden().map(|units| vec![0.0; units * batch]);
         Self {
-            source: Source::Network(network),
+            source: Source::Network(Network::new(network, batch)),
             actions: network.outputs(),
-            h1,
-            h2,
             scores: vec![0.0; network.outputs() * batch],
         }
     }
@@ -37,18 +32,16 @@ impl Scores {
         Self {
             source: Source::Table { states },
             actions,
-            h1: Vec::new(),
-            h2: Vec::new(),
             scores: vec![0.0; actions * batch],
         }
     }
 
     /// What the parameters of [`of`](Self::of) are.
     pub fn layout(&self) -> PolicyLayout {
-        match self.source {
-            Source::Network(network) => PolicyLayout::Softmax(network),
+        match &self.source {
+            Source::Network(network) => PolicyLayout::Softmax(*network.layout()),
             Source::Table { states } => PolicyLayout::Table {
-                states,
+                states: *states,
                 actions: self.actions,
             },
         }
@@ -65,21 +58,15 @@ impl Scores {
     /// the batch. Nothing is allocated.
     pub fn of(&mut self, parameters: &[f32], observations: &[f32]) -> impl Iterator<Item = &[f32]> {
         let actions = self.actions;
-        let batch = match self.source {
+        let batch = match &mut self.source {
             Source::Network(network) => {
-                let batch = observations.len() / network.inputs();
-                let [h1, h2] = network.hidden().map(|units| units * batch);
-                let to = Activations {
-                    h1: &mut self.h1[..h1],
-                    h2: &mut self.h2[..h2],
-                    output: &mut self.scores[..actions * batch],
-                };
-                network.forward(parameters, observations, &[], to);
+                let batch = observations.len() / network.layout().inputs();
+                network.forward(parameters, observations, &mut self.scores[..actions * batch]);
                 batch
             }
             Source::Table { states } => {
                 for (scores, state) in self.scores.chunks_exact_mut(actions).zip(observations) {
-                    let state = (*state as usize).min(states - 1);
+                    let state = (*state as usize).min(*states - 1);
                     scores.copy_from_slice(&parameters[state * actions..][..actions]);
                 }
                 observations.len()

@@ -5,7 +5,7 @@ use std::fmt::{self, Display, Formatter};
 use shoal_base::section::OutOfRange;
 use shoal_base::space::EnvironmentSpec;
 use shoal_policy::PolicyError;
-use shoal_policy::network::NetworkLayout;
+use shoal_policy::network::{Activation, Hidden, NetworkLayout};
 
 use super::behaviour::Behaviour;
 
@@ -93,11 +93,18 @@ impl Display for Shape {
     fn fmt(&self, to: &mut Formatter<'_>) -> fmt::Result {
         match self {
             Self::Network(network) => {
-                let [h1, h2] = network.hidden();
-                write!(to, "network {} {h1} {h2} {}", network.inputs(), network.outputs())?;
+                let Hidden { layers, activation } = network.hidden();
+                write!(to, "network {}", network.inputs())?;
+                layers.iter().try_for_each(|units| write!(to, " {units}"))?;
+                write!(to, " {}", network.outputs())?;
                 match network.late_inputs() {
-                    0 => Ok(()),
-                    late => write!(to, " late {late}"),
+                    0 => {}
+                    late => write!(to, " late {late}")?,
+                }
+                match activation {
+                    // Of runs from before there were others.
+                    Activation::Relu => Ok(()),
+                    Activation::Tanh => write!(to, " tanh"),
                 }
             }
             Self::Table { states, actions } => write!(to, "table {states} {actions}"),

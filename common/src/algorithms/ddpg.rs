@@ -4,7 +4,7 @@ use shoal_base::section;
 use shoal_base::section::{OutOfRange, above, from};
 use shoal_base::space::EnvironmentSpec;
 use shoal_policy::PolicyError;
-use shoal_policy::network::NetworkLayout;
+use shoal_policy::network::{Activation, Hidden, Layers, NetworkLayout};
 
 use super::algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Shape};
 use super::behaviour::Behaviour;
@@ -20,8 +20,11 @@ pub(super) const SPEC: AlgorithmSpec = AlgorithmSpec {
 section! {
     /// Algorithm 4 with the numbers of section 4.3.1.
     pub struct Ddpg {
-        /// Units of the two hidden layers, of actor and critic alike.
-        hidden: [usize; 2] = [400, 300], bounds: from(1, 8_192), unit: "units", source: "section 4.3.1";
+        /// Units of each hidden layer, of actor and critic alike: a list of 1 to 8 layers. The critic takes the action in at the
+        /// second one, or at the only one.
+        hidden: Layers = Layers::from([400, 300]), bounds: from(1, 8_192), unit: "units", source: "section 4.3.1";
+        /// What the units of the hidden layers do.
+        activation: Activation = Activation::Relu, unit: "–", source: "section 4.3.1";
         /// γ, the discount of one step.
         gamma: f64 = 0.99, bounds: from(0.0, 1.0), unit: "–", source: "section 4.3.1";
         /// τ, how far the target networks follow in one update (equation 3.31).
@@ -39,6 +42,16 @@ section! {
     }
 }
 
+impl Ddpg {
+    /// The hidden layers of actor and critic.
+    pub fn hidden_layers(&self) -> Hidden {
+        Hidden {
+            layers: self.hidden,
+            activation: self.activation,
+        }
+    }
+}
+
 impl AlgorithmSettings for Ddpg {
     fn check(&self, section: &str) -> Result<(), OutOfRange> {
         self.exploration.check_bounds("exploration")?;
@@ -50,7 +63,7 @@ impl AlgorithmSettings for Ddpg {
     }
 
     fn behaviour(&self, _: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError> {
-        let network = shoal_policy::deterministic(self.hidden, spec, batch)?;
+        let network = shoal_policy::deterministic(self.hidden_layers(), spec, batch)?;
         Ok(Behaviour::Noise(network, self.exploration.clone()))
     }
 
@@ -64,15 +77,8 @@ impl AlgorithmSettings for Ddpg {
 
     fn learned(&self, spec: &EnvironmentSpec) -> Vec<(&'static str, Shape)> {
         let (observation, action) = (spec.observation.width(), spec.action.width());
-        vec![
-            (
-                "actor",
-                Shape::Network(NetworkLayout::policy(observation, self.hidden, action)),
-            ),
-            (
-                "critic",
-                Shape::Network(NetworkLayout::critic(observation, self.hidden, action)),
-            ),
-        ]
+        let actor = NetworkLayout::policy(observation, self.hidden_layers(), action);
+        let critic = NetworkLayout::critic(observation, self.hidden_layers(), action);
+        vec![("actor", Shape::Network(actor)), ("critic", Shape::Network(critic))]
     }
 }

@@ -6,7 +6,7 @@ use shoal_base::section;
 use shoal_base::section::{OutOfRange, from};
 use shoal_base::space::EnvironmentSpec;
 use shoal_policy::PolicyError;
-use shoal_policy::network::NetworkLayout;
+use shoal_policy::network::{Activation, Hidden, Layers, NetworkLayout};
 
 use super::algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Shape};
 use super::behaviour::Behaviour;
@@ -21,8 +21,10 @@ pub(super) const SPEC: AlgorithmSpec = AlgorithmSpec {
 section! {
     /// Algorithm 3 with the numbers of section 4.2.1, and its variants of section 4.2.2.
     pub struct Reinforce {
-        /// Units of the policy's two hidden layers.
-        hidden: [usize; 2] = [10, 2], bounds: from(1, 8_192), unit: "units", source: "section 4.2.1";
+        /// Units of each of the policy's hidden layers: a list of 1 to 8 layers.
+        hidden: Layers = Layers::from([10, 2]), bounds: from(1, 8_192), unit: "units", source: "section 4.2.1";
+        /// What the units of the hidden layers do, of policy and baseline alike.
+        activation: Activation = Activation::Relu, unit: "–", source: "section 4.2.1";
         /// γ, the discount of one step.
         gamma: f64 = 0.95, bounds: from(0.0, 1.0), unit: "–", source: "section 4.2.1";
         /// Adam's step size for the policy, α.
@@ -33,8 +35,8 @@ section! {
         discount_steps: bool = false, unit: "–", source: "Algorithm 3";
         /// Whether an episode that the time limit ended is learned from.
         learn_at_limit: bool = true, unit: "–", source: "section 4.2.2";
-        /// Units of the baseline's two hidden layers; only where it is the weight.
-        baseline_hidden: [usize; 2] = [32, 32], bounds: from(1, 8_192), unit: "units", source: "ours";
+        /// Units of each of the baseline's hidden layers, 1 to 8 of them; only where it is the weight.
+        baseline_hidden: Layers = Layers::from([32, 32]), bounds: from(1, 8_192), unit: "units", source: "ours";
         /// Adam's step size for the baseline.
         baseline_learning_rate: f64 = 0.01, bounds: from(0.0, 1.0), unit: "–", source: "ours";
     }
@@ -52,6 +54,24 @@ pub enum Weight {
     Baseline,
 }
 
+impl Reinforce {
+    /// The policy's hidden layers.
+    pub fn hidden_layers(&self) -> Hidden {
+        Hidden {
+            layers: self.hidden,
+            activation: self.activation,
+        }
+    }
+
+    /// The baseline's hidden layers.
+    pub fn baseline_hidden_layers(&self) -> Hidden {
+        Hidden {
+            layers: self.baseline_hidden,
+            activation: self.activation,
+        }
+    }
+}
+
 impl AlgorithmSettings for Reinforce {
     fn check(&self, section: &str) -> Result<(), OutOfRange> {
         self.check_bounds(section)
@@ -64,7 +84,7 @@ impl AlgorithmSettings for Reinforce {
     fn behaviour(&self, name: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError> {
         Ok(Behaviour::Sample(shoal_policy::softmax(
             name,
-            self.hidden,
+            self.hidden_layers(),
             spec,
             batch,
         )?))
@@ -73,9 +93,9 @@ impl AlgorithmSettings for Reinforce {
     fn learned(&self, spec: &EnvironmentSpec) -> Vec<(&'static str, Shape)> {
         let observation = spec.observation.width();
         let network = |hidden, outputs| Shape::Network(NetworkLayout::policy(observation, hidden, outputs));
-        let mut learned = vec![("policy", network(self.hidden, spec.action.size()))];
+        let mut learned = vec![("policy", network(self.hidden_layers(), spec.action.size()))];
         if self.weight == Weight::Baseline {
-            learned.push(("baseline", network(self.baseline_hidden, 1)));
+            learned.push(("baseline", network(self.baseline_hidden_layers(), 1)));
         }
         learned
     }

@@ -98,7 +98,7 @@ fn usable(config: &Config) {
     let (observation, action) = (row.observation_width(), row.action_width());
     if let Some(ddpg) = config.algorithm.ddpg() {
         let batch = ddpg.batch.max(config.actors.envs as usize);
-        let network = NetworkLayout::critic(observation, ddpg.hidden, action);
+        let network = NetworkLayout::critic(observation, ddpg.hidden_layers(), action);
         assert!(network.parameters().checked_mul(size_of::<f32>() * batch).is_some());
     }
     assert!(config.evaluation_server() < 257 && (1..=64).contains(&config.evaluation_envs()));

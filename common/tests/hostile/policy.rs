@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use proptest::prelude::*;
 use shoal_common::durable::{self, Kind};
-use shoal_common::network::NetworkLayout;
+use shoal_common::network::{Hidden, NetworkLayout};
 use shoal_common::policy::PolicyLayout;
 use shoal_common::policy_file::{PolicyFile, PolicyFileError};
 use tempfile::TempDir;
@@ -13,7 +13,7 @@ use tempfile::TempDir;
 use crate::bytes::{damage, extreme};
 
 fn layout() -> PolicyLayout {
-    PolicyLayout::Deterministic(NetworkLayout::policy(2, [3, 2], 1))
+    PolicyLayout::Deterministic(NetworkLayout::policy(2, Hidden::relu([3, 2]), 1))
 }
 
 fn policy() -> PolicyFile {

@@ -75,11 +75,11 @@ impl Learned {
     }
 }
 
-/// Samples, or units of the first hidden layer, that are worth being cut in two. faer adds up the terms of a transposed
-/// product in another order where a dimension is 1, or the whole product small, and nobody shall see in the bits
-/// how many threads there were.
+/// Samples, or units of a hidden layer, that are worth being cut in two: of each hidden layer but the last, or of the only one. faer adds up
+/// the terms of a transposed product in another order where a dimension is 1, or the whole product small, and nobody shall see
+/// in the bits how many threads there were.
 const LEAST_CUT: usize = 4;
-/// As [`LEAST_CUT`]: samples times units of the second hidden layer.
+/// As [`LEAST_CUT`]: samples times units, of each hidden layer but the first, or of the only one.
 const LEAST_WORK: usize = 8_192;
 
 /// The learner of DDPG: both networks, their targets, both optimisers.
@@ -111,8 +111,8 @@ impl Ddpg {
     pub fn new(spec: &EnvironmentSpec, settings: &config::Ddpg, seed: u64) -> Result<Self, PolicyError> {
         let range = ActionRange::new(&spec.action)?;
         let (observation, action, batch) = (spec.observation.width(), range.width(), settings.batch);
-        let mu = NetworkLayout::policy(observation, settings.hidden, action);
-        let q = NetworkLayout::critic(observation, settings.hidden, action);
+        let mu = NetworkLayout::policy(observation, settings.hidden_layers(), action);
+        let q = NetworkLayout::critic(observation, settings.hidden_layers(), action);
         Ok(Self {
             range,
             tau: settings.tau as f32,
@@ -135,8 +135,12 @@ impl Ddpg {
     /// Shares the work of an update among these threads from now on, if there is enough of it. Not a bit of what is computed
     /// depends on them.
     pub fn set_threads(&mut self, threads: Threads) {
-        let ([h1, h2], batch) = (self.critic.layout.hidden(), self.y.len());
-        let enough = h1 >= LEAST_CUT && batch >= LEAST_CUT && h2 * batch >= LEAST_WORK;
+        let (layers, batch) = (self.critic.layout.hidden().layers, self.y.len());
+        let others = layers.len() - 1;
+        let (all_but_last, all_but_first) = (&layers[..others.max(1)], &layers[others.min(1)..]);
+        let enough = batch >= LEAST_CUT
+            && all_but_last.iter().all(|units| *units >= LEAST_CUT)
+            && all_but_first.iter().all(|units| units * batch >= LEAST_WORK);
         self.threads = if enough { threads } else { Threads::ALONE };
     }
 
@@ -211,8 +215,7 @@ impl Ddpg {
         let per_sample = |matrix: &DMatrix<f32>| cut * matrix.nrows();
         let part = |mut mu: Samples<'_>, mut q: Samples<'_>, s, actions, d_q, d_mu: &mut [f32]| {
             q.forward(&critic.parameters, s, actions);
-            q.backward_to_second_layer(&critic.parameters, d_q);
-            q.backward_to_late_inputs(&critic.parameters, d_mu);
+            q.backward_to_late_inputs(&critic.parameters, d_q, d_mu);
             // a = centre + half · tanh z, so ∂a/∂z = half · (1 − tanh² z)
             for (d, tanh) in d_mu
                 .chunks_exact_mut(half.len())
@@ -222,7 +225,7 @@ impl Ddpg {
                     *d *= half * (1.0 - tanh * tanh);
                 }
             }
-            mu.backward_to_second_layer(&actor.parameters, d_mu);
+            mu.backward(&actor.parameters, d_mu, 1);
         };
         let observations = s.as_slice().split_at(per_sample(s));
         let actions = self.actions.as_slice().split_at(per_sample(&self.actions));

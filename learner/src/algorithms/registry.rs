@@ -49,6 +49,8 @@ mod tests {
         let in_order = "[replay]\nwarmup = 0\n[spec]\ntime_limit = 8";
         for (rest, observation, action) in [
             ("[ddpg]\nhidden = [7, 5]\n[spec]\ntime_limit = 8", real, real),
+            ("[ddpg]\nhidden = [7]\n[spec]\ntime_limit = 8", real, real),
+            ("[ddpg]\nhidden = [7, 5, 6]\n[spec]\ntime_limit = 8", real, real),
             (&format!("[reinforce]\n{in_order}"), real, "discrete.n = 3"),
             (
                 &format!("[reinforce]\nweight = \"baseline\"\n{in_order}"),

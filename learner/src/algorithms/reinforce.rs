@@ -103,11 +103,11 @@ impl Reinforce {
         room: Room,
     ) -> Result<Self, PolicyError> {
         let observation = spec.observation.width();
-        let actions = policy::softmax("reinforce", settings.hidden, spec, 0)?.actions();
+        let actions = policy::softmax("reinforce", settings.hidden_layers(), spec, 0)?.actions();
         let steps = room.chunk_rows * room.actors as usize;
-        let network = NetworkLayout::policy(observation, settings.hidden, actions);
+        let network = NetworkLayout::policy(observation, settings.hidden_layers(), actions);
         let baseline = (settings.weight == Weight::Baseline).then(|| {
-            let network = NetworkLayout::policy(observation, settings.baseline_hidden, 1);
+            let network = NetworkLayout::policy(observation, settings.baseline_hidden_layers(), 1);
             Learned::new(network, settings.baseline_learning_rate, seed, 1, steps)
         });
         Ok(Self {

@@ -13,10 +13,14 @@ const OUTPUT_BOUND: f32 = 3e-3;
 /// `index` tells the networks of one run apart.
 pub fn initialise(layout: &NetworkLayout, seed: u64, index: u64) -> Vec<f32> {
     let mut stream = stream(seed, Purpose::Initialisation, index, 0);
-    let sizes = layout.layer_sizes();
-    let bounds = [fan_in_bound(sizes[0].0), fan_in_bound(sizes[1].0), OUTPUT_BOUND];
+    let output_layer = layout.hidden().layers.len();
     let mut parameters = Vec::with_capacity(layout.parameters());
-    for ((inputs, outputs), bound) in sizes.into_iter().zip(bounds) {
+    for (layer, (inputs, outputs)) in layout.layer_sizes().enumerate() {
+        let bound = if layer == output_layer {
+            OUTPUT_BOUND
+        } else {
+            fan_in_bound(inputs)
+        };
         parameters.extend((0..(inputs + 1) * outputs).map(|_| (2.0 * stream.random::<f32>() - 1.0) * bound));
     }
     parameters
@@ -29,7 +33,7 @@ pub fn initialise(layout: &NetworkLayout, seed: u64, index: u64) -> Vec<f32> {
 pub fn glorot(layout: &NetworkLayout, seed: u64, index: u64) -> Vec<f32> {
     let mut stream = stream(seed, Purpose::Initialisation, index, 0);
     let mut parameters = vec![0.0; layout.parameters()];
-    for (range, (inputs, outputs)) in layout.layer_ranges().into_iter().zip(layout.layer_sizes()) {
+    for (range, (inputs, outputs)) in layout.layer_ranges().zip(layout.layer_sizes()) {
         let bound = (6.0 / (inputs + outputs) as f32).sqrt();
         for weight in &mut parameters[range.weights] {
             *weight = (2.0 * stream.random::<f32>() - 1.0) * bound;
@@ -45,13 +49,14 @@ fn fan_in_bound(inputs: usize) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use shoal_common::network::Hidden;
 
     #[test]
     fn glorot_weights_fill_their_bounds_and_biases_are_zero() {
-        let layout = NetworkLayout::policy(4, [60, 40], 2);
+        let layout = NetworkLayout::policy(4, Hidden::relu([60, 40]), 2);
         let parameters = glorot(&layout, 7, 0);
         let bounds = [6.0 / 64.0, 6.0 / 100.0, 6.0 / 42.0].map(f32::sqrt);
-        for (range, bound) in layout.layer_ranges().into_iter().zip(bounds) {
+        for (range, bound) in layout.layer_ranges().zip(bounds) {
             let largest = parameters[range.weights]
                 .iter()
                 .fold(0.0_f32, |most, x| most.max(x.abs()));
@@ -62,22 +67,28 @@ mod tests {
 
     #[test]
     fn each_layer_fills_its_bounds_and_keeps_them() {
-        let layout = NetworkLayout::critic(3, [40, 30], 2);
-        let parameters = initialise(&layout, 7, 1);
-        assert_eq!(parameters.len(), layout.parameters());
-        let bounds = [1.0 / 3f32.sqrt(), 1.0 / 42f32.sqrt(), 3e-3];
-        for (range, bound) in layout.layer_ranges().into_iter().zip(bounds) {
-            let layer = &parameters[range.weights.start..range.biases.end];
-            let greatest = layer.iter().fold(0f32, |greatest, x| greatest.max(x.abs()));
-            assert!(greatest <= bound && greatest > 0.9 * bound, "{greatest} for {bound}");
-            let mean = layer.iter().sum::<f32>() / layer.len() as f32;
-            assert!(mean.abs() < 0.3 * bound, "mean {mean} for {bound}");
+        for (hidden, inputs) in [
+            (Hidden::relu([40, 30]), vec![3.0, 42.0]),
+            (Hidden::relu([40]), vec![5.0]),
+            (Hidden::tanh([40, 30, 20]), vec![3.0, 42.0, 30.0]),
+        ] {
+            let layout = NetworkLayout::critic(3, hidden, 2);
+            let parameters = initialise(&layout, 7, 1);
+            assert_eq!(parameters.len(), layout.parameters());
+            let bounds = inputs.into_iter().map(|inputs: f32| 1.0 / inputs.sqrt()).chain([3e-3]);
+            for (range, bound) in layout.layer_ranges().zip(bounds) {
+                let layer = &parameters[range.weights.start..range.biases.end];
+                let greatest = layer.iter().fold(0f32, |greatest, x| greatest.max(x.abs()));
+                assert!(greatest <= bound && greatest > 0.9 * bound, "{greatest} for {bound}");
+                let mean = layer.iter().sum::<f32>() / layer.len() as f32;
+                assert!(mean.abs() < 0.3 * bound, "mean {mean} for {bound}");
+            }
         }
     }
 
     #[test]
     fn seed_and_index_name_the_weights() {
-        let layout = NetworkLayout::policy(3, [8, 6], 1);
+        let layout = NetworkLayout::policy(3, Hidden::relu([8, 6]), 1);
         assert_eq!(initialise(&layout, 1, 0), initialise(&layout, 1, 0));
         assert_ne!(initialise(&layout, 1, 0), initialise(&layout, 2, 0));
         assert_ne!(initialise(&layout, 1, 0), initialise(&layout, 1, 1));

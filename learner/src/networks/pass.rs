@@ -3,36 +3,40 @@
 use faer::{MatMut, MatRef};
 use nalgebra::DMatrix;
 use pulp::{Arch, Simd, WithSimd};
-use shoal_common::network::{Activations, NetworkLayout, matrix, matrix_mut};
+use shoal_common::network::{Activation, Activations, Hidden, Layers, NetworkLayout, matrix, matrix_mut};
 
 use super::columns::{Columns, ColumnsMut, sum_columns};
 use super::product::{input_gradient, weight_gradient};
 use super::threads::Threads;
 
 /// The activations of a forward pass and room for their gradients; one column a sample.
+///
+/// Layers are counted from 0: the hidden ones, and then the output layer.
 #[derive(Clone, Debug)]
 pub struct Pass {
     layout: NetworkLayout,
-    h1: DMatrix<f32>,
-    h2: DMatrix<f32>,
+    /// The inputs with the late ones below them, where these enter at the first layer; else without rows.
+    joined: DMatrix<f32>,
+    /// Each hidden layer; below it the late inputs where they enter at the next layer.
+    h: Vec<DMatrix<f32>>,
     /// The output layer's values, linear.
     pub output: DMatrix<f32>,
-    d1: DMatrix<f32>,
-    d2: DMatrix<f32>,
+    /// ∂L/∂z of each hidden layer.
+    d: Vec<DMatrix<f32>>,
 }
 
 impl Pass {
     /// Room for `batch` samples.
     pub fn new(layout: NetworkLayout, batch: usize) -> Self {
         let zeros = |rows| DMatrix::zeros(rows, batch);
-        let [(_, h1), (inputs_2, h2), (_, outputs)] = layout.layer_sizes();
         Self {
+            joined: zeros(rows_of_joined(&layout)),
+            h: (layout.layer_sizes().skip(1))
+                .map(|(inputs, _)| zeros(inputs))
+                .collect(),
+            output: zeros(layout.outputs()),
+            d: layout.hidden().layers.iter().map(|units| zeros(*units)).collect(),
             layout,
-            h1: zeros(inputs_2),
-            h2: zeros(h2),
-            output: zeros(outputs),
-            d1: zeros(h1),
-            d2: zeros(h2),
         }
     }
 
@@ -51,7 +55,18 @@ impl Pass {
         d: &DMatrix<f32>,
         gradient: &mut [f32],
     ) {
-        self.samples().backward_to_second_layer(parameters, d.as_slice());
+        // Below the last hidden layer the products are large enough to be shared. With two of them there is none.
+        if self.d.len() > 2 {
+            let cut = threads.first_share(d.ncols());
+            let d = d.as_slice().split_at(cut * d.nrows());
+            let (mut first, mut second) = self.samples().split_at(cut);
+            threads.both(
+                || first.backward(parameters, d.0, 1),
+                || second.backward(parameters, d.1, 1),
+            );
+        } else {
+            self.samples().backward(parameters, d.as_slice(), 1);
+        }
         self.gradients(threads, parameters, x, d, gradient);
     }
 
@@ -59,16 +74,16 @@ impl Pass {
     pub fn samples(&mut self) -> Samples<'_> {
         Samples {
             layout: &self.layout,
-            h1: self.h1.as_mut_slice(),
-            h2: self.h2.as_mut_slice(),
+            joined: self.joined.as_mut_slice(),
+            h: each_layer(&mut self.h),
             output: self.output.as_mut_slice(),
-            d2: self.d2.as_mut_slice(),
+            d: each_layer(&mut self.d),
         }
     }
 
-    /// What is left of [`backward`](Self::backward) once [`Samples::backward_to_second_layer`] was called for all samples.
-    /// Each thread has its share of the first hidden layer's units: the weights they are multiplied by, and the
-    /// gradient that is passed down to them.
+    /// What is left of [`backward`](Self::backward) once [`Samples::backward`] was called for all samples, down to the second
+    /// layer. Each thread has its share of the units that a layer's weights are multiplied by, and of the gradient that
+    /// is passed down to the first layer.
     pub fn gradients(
         &mut self,
         threads: &Threads,
@@ -77,22 +92,57 @@ impl Pass {
         d: &DMatrix<f32>,
         gradient: &mut [f32],
     ) {
-        let [_, second, _] = self.layout.layers(parameters);
-        let [(inputs, h1), (inputs_2, h2), (_, outputs)] = self.layout.layer_sizes();
-        let [g1, g2, g3] = self.layout.layer_ranges();
-        let (gradient_1, rest) = gradient.split_at_mut(g1.biases.end);
-        let (gradient_2, gradient_3) = rest.split_at_mut(g2.biases.end - g1.biases.end);
+        let Self {
+            layout,
+            joined,
+            h,
+            d: dz,
+            ..
+        } = self;
+        let activation = layout.hidden().activation;
+        let batch = d.ncols();
+        let last = h.len();
+        // The first layer's, which comes below, and those of the layers above it.
+        let (d1, dz) = dz.split_at_mut(1);
+        // The output layer has none of its own.
+        let d_of = |layer: usize| dz.get(layer - 1).unwrap_or(d);
+
+        let mut rest = gradient;
+        for layer in (2..=last).rev() {
+            let (inputs, outputs) = layout.layer_size(layer);
+            let range = layout.layer_range(layer);
+            let (below, own) = rest.split_at_mut(range.weights.start);
+            rest = below;
+            let (w, b) = own.split_at_mut(range.weights.len());
+            let d = Columns::new(d_of(layer).as_slice(), outputs);
+            let h = Columns::new(h[layer - 1].as_slice(), inputs);
+            if layer == last {
+                weight_gradient(d.as_mat(), h.as_mat(), matrix_mut(w, outputs));
+            } else {
+                let cut = threads.first_share(inputs);
+                let h = (h.rows(0, cut), h.rows(cut, inputs - cut));
+                let w = matrix_mut(w, outputs).split_at_col_mut(cut);
+                threads.both(
+                    || weight_gradient(d.as_mat(), h.0.as_mat(), w.0),
+                    || weight_gradient(d.as_mat(), h.1.as_mat(), w.1),
+                );
+            }
+            sum_columns(d.iter(), b);
+        }
+
+        // The two lowest layers.
+        let [(inputs, h1), (inputs_2, h2)] = [0, 1].map(|layer| layout.layer_size(layer));
+        let second = layout.layer(1, parameters);
+        let [g1, g2] = [0, 1].map(|layer| layout.layer_range(layer));
+        let (gradient_1, gradient_2) = rest.split_at_mut(g1.biases.end);
         let (w1, b1) = gradient_1.split_at_mut(g1.weights.len());
         let (w2, b2) = gradient_2.split_at_mut(g2.weights.len());
-        let (w3, b3) = gradient_3.split_at_mut(g3.weights.len());
-
-        let batch = self.d2.ncols();
-        let (d2, d3) = (
-            Columns::new(self.d2.as_slice(), h2),
-            Columns::new(d.as_slice(), outputs),
-        );
-        weight_gradient(d3.as_mat(), matrix(self.h2.as_slice(), h2), matrix_mut(w3, outputs));
-        sum_columns(d3.iter(), b3);
+        let x = if layout.late_layer() == Some(0) {
+            joined.as_slice()
+        } else {
+            x
+        };
+        let d2 = Columns::new(d_of(1).as_slice(), h2);
         sum_columns(d2.iter(), b2);
 
         let cut = threads.first_share(h1);
@@ -101,16 +151,16 @@ impl Pass {
                 let [to_w1, to_w2] = to;
                 weight_gradient(d2.as_mat(), h1.as_mat(), to_w2);
                 input_gradient(w2, d2.as_mat(), d1.as_mat_mut());
-                mask(d1.iter_mut(), h1.iter());
+                through(activation, d1.iter_mut(), h1.iter());
                 d1.sum_into(b1);
                 weight_gradient(d1.as_mat(), matrix(x, inputs), to_w1);
             };
         // The late inputs, which come last, are the second thread's, or the only one's.
         let weights = matrix(&second.weights[..h1 * h2], h2).split_at_col(cut);
-        let units = Columns::new(self.h1.as_slice(), inputs_2);
+        let units = Columns::new(h[0].as_slice(), inputs_2);
         let units = (units.rows(0, cut), units.rows(cut, inputs_2 - cut));
         // A matrix for each thread, not rows of the same one: each has its columns in one piece.
-        let (first_d1, rest) = ColumnsMut::take(self.d1.as_mut_slice(), cut, batch);
+        let (first_d1, rest) = ColumnsMut::take(d1[0].as_mut_slice(), cut, batch);
         let d1 = (first_d1, ColumnsMut::take(rest, h1 - cut, batch).0);
         let w1 = matrix_mut(w1, h1).split_at_row_mut(cut);
         let w2 = matrix_mut(w2, h2).split_at_col_mut(cut);
@@ -122,86 +172,151 @@ impl Pass {
     }
 }
 
+/// Rows of the inputs with the late ones below them: 0 where these do not enter at the first layer.
+fn rows_of_joined(layout: &NetworkLayout) -> usize {
+    match layout.late_layer() {
+        Some(0) => layout.layer_size(0).0,
+        _ => 0,
+    }
+}
+
+/// A matrix for each hidden layer, and behind them nothing.
+type EachLayer<'a> = [&'a mut [f32]; Layers::MOST];
+
+fn each_layer(matrices: &mut [DMatrix<f32>]) -> EachLayer<'_> {
+    let mut each = EachLayer::default();
+    for (slice, matrix) in each.iter_mut().zip(matrices) {
+        *slice = matrix.as_mut_slice();
+    }
+    each
+}
+
+/// Each matrix cut behind so many columns; `rows` are those of each.
+fn split_each<'a>(
+    matrices: EachLayer<'a>,
+    columns: usize,
+    rows: impl Iterator<Item = usize>,
+) -> (EachLayer<'a>, EachLayer<'a>) {
+    let mut parts = (EachLayer::default(), EachLayer::default());
+    let halves = parts.0.iter_mut().zip(&mut parts.1);
+    for ((first, second), (matrix, rows)) in halves.zip(matrices.into_iter().zip(rows)) {
+        (*first, *second) = matrix.split_at_mut(columns * rows);
+    }
+    parts
+}
+
 /// Some samples of a [`Pass`], neighbours of each other.
 #[derive(Debug)]
 pub struct Samples<'a> {
     layout: &'a NetworkLayout,
-    h1: &'a mut [f32],
-    h2: &'a mut [f32],
+    joined: &'a mut [f32],
+    h: EachLayer<'a>,
     /// The output layer's values, linear.
     pub output: &'a mut [f32],
-    d2: &'a mut [f32],
+    d: EachLayer<'a>,
 }
 
 impl<'a> Samples<'a> {
     /// The first so many, and the others.
     pub fn split_at(self, samples: usize) -> (Self, Self) {
-        let [_, (inputs_2, h2), (_, outputs)] = self.layout.layer_sizes();
-        let h1 = self.h1.split_at_mut(samples * inputs_2);
-        let [h2, d2] = [self.h2, self.d2].map(|numbers| numbers.split_at_mut(samples * h2));
-        let output = self.output.split_at_mut(samples * outputs);
-        let part = |h1: &'a mut [f32], h2, output, d2| Self {
-            layout: self.layout,
-            h1,
-            h2,
+        let layout = self.layout;
+        let joined = self.joined.split_at_mut(samples * rows_of_joined(layout));
+        let h = split_each(self.h, samples, layout.layer_sizes().skip(1).map(|(inputs, _)| inputs));
+        let output = self.output.split_at_mut(samples * layout.outputs());
+        let d = split_each(self.d, samples, layout.hidden().layers.iter().copied());
+        let part = |joined, h, output, d| Self {
+            layout,
+            joined,
+            h,
             output,
-            d2,
+            d,
         };
-        (part(h1.0, h2.0, output.0, d2.0), part(h1.1, h2.1, output.1, d2.1))
+        (part(joined.0, h.0, output.0, d.0), part(joined.1, h.1, output.1, d.1))
     }
 
     /// As [`Pass::forward`], of these samples.
     pub fn forward(&mut self, parameters: &[f32], x: &[f32], late: &[f32]) {
         let to = Activations {
-            h1: self.h1,
-            h2: self.h2,
+            joined: self.joined,
+            hidden: self.h.iter_mut().map(|h| &mut **h),
             output: self.output,
         };
         self.layout.forward(parameters, x, late, to);
     }
 
-    /// Computes ∂L/∂z of the second hidden layer, given `d` = ∂L/∂output of the forward pass that went before.
-    pub fn backward_to_second_layer(&mut self, parameters: &[f32], d: &[f32]) {
-        let [_, _, third] = self.layout.layers(parameters);
-        let [_, (_, h2), (_, outputs)] = self.layout.layer_sizes();
-        input_gradient(
-            matrix(third.weights, outputs),
-            matrix(d, outputs),
-            matrix_mut(self.d2, h2),
-        );
-        mask(self.d2.chunks_exact_mut(h2), self.h2.chunks_exact(h2));
+    /// Computes ∂L/∂z of the hidden layers, from the last one down to `lowest`, given `d` = ∂L/∂output of the forward pass
+    /// that went before. Nothing where `lowest` is the output layer.
+    pub fn backward(&mut self, parameters: &[f32], d: &[f32], lowest: usize) {
+        let layout = self.layout;
+        let Hidden { layers, activation } = layout.hidden();
+        let mut d_above = d;
+        let hidden = self.d.iter_mut().zip(&self.h).zip(layers.iter()).enumerate();
+        for (layer, ((d, h), units)) in hidden.skip(lowest).rev() {
+            let (inputs, outputs) = layout.layer_size(layer + 1);
+            let w = &layout.layer(layer + 1, parameters).weights[..units * outputs];
+            input_gradient(matrix(w, outputs), matrix(d_above, outputs), matrix_mut(d, *units));
+            through(activation, d.chunks_exact_mut(*units), h.chunks_exact(inputs));
+            d_above = &**d;
+        }
     }
 
-    /// Writes ∂L/∂late into `to`, once that of the second hidden layer is there. Nothing below that is looked at: late
-    /// inputs reach no further down.
-    pub fn backward_to_late_inputs(&self, parameters: &[f32], to: &mut [f32]) {
-        let [_, second, _] = self.layout.layers(parameters);
-        let [h1, h2] = self.layout.hidden();
-        let late = matrix(&second.weights[h1 * h2..], h2);
-        input_gradient(late, matrix(self.d2, h2), matrix_mut(to, self.layout.late_inputs()));
+    /// Writes ∂L/∂late into `to`, given `d` = ∂L/∂output. Layers below the one that they enter are not looked at: late inputs
+    /// reach no further down. Nothing where there are none.
+    pub fn backward_to_late_inputs(&mut self, parameters: &[f32], d: &[f32], to: &mut [f32]) {
+        let layout = self.layout;
+        let Some(layer) = layout.late_layer() else {
+            return;
+        };
+        self.backward(parameters, d, layer);
+        let (inputs, units) = layout.layer_size(layer);
+        let own_inputs = inputs - layout.late_inputs();
+        let late = &layout.layer(layer, parameters).weights[own_inputs * units..];
+        input_gradient(
+            matrix(late, units),
+            matrix(self.d[layer], units),
+            matrix_mut(to, layout.late_inputs()),
+        );
     }
 }
 
-/// d ← d where the unit was active, else 0, column by column: from ∂L/∂h to ∂L/∂z through h = max(z, 0). A column of `h`
-/// may be longer than that of `d`.
-fn mask<'a>(d: impl Iterator<Item = &'a mut [f32]>, h: impl Iterator<Item = &'a [f32]>) {
-    Arch::new().dispatch(Mask { d, h });
+/// From ∂L/∂h to ∂L/∂z, column by column, by what h says of the activation's slope there. A column of `h` may be longer than
+/// that of `d`.
+fn through<'a>(activation: Activation, d: impl Iterator<Item = &'a mut [f32]>, h: impl Iterator<Item = &'a [f32]>) {
+    match activation {
+        Activation::Relu => Arch::new().dispatch(Slope {
+            d,
+            h,
+            of: |d, h| if h > 0.0 { d } else { 0.0 },
+        }),
+        Activation::Tanh => Arch::new().dispatch(Slope {
+            d,
+            h,
+            of: |d, h| d * (1.0 - h * h),
+        }),
+    }
 }
 
 /// A closure of this length would be called by the dispatch, not inlined into it, and so go without vector instructions.
-struct Mask<D, H> {
+struct Slope<D, H, F> {
     d: D,
     h: H,
+    /// ∂L/∂z of ∂L/∂h and h.
+    of: F,
 }
 
-impl<'a, D: Iterator<Item = &'a mut [f32]>, H: Iterator<Item = &'a [f32]>> WithSimd for Mask<D, H> {
+impl<'a, D, H, F> WithSimd for Slope<D, H, F>
+where
+    D: Iterator<Item = &'a mut [f32]>,
+    H: Iterator<Item = &'a [f32]>,
+    F: Fn(f32, f32) -> f32,
+{
     type Output = ();
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, _: S) {
         for (d, h) in self.d.zip(self.h) {
             for (d, h) in d.iter_mut().zip(h) {
-                *d = if *h > 0.0 { *d } else { 0.0 };
+                *d = (self.of)(*d, *h);
             }
         }
     }

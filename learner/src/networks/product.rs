@@ -51,25 +51,30 @@ impl Product {
 /// them in nine products of the size 300 × 400 × 64.
 pub fn products_of_update(actor: &NetworkLayout, critic: &NetworkLayout, batch: usize) -> Vec<Product> {
     let product = |m, k, n, transposed| Product { m, k, n, transposed };
-    let forward = |net: &NetworkLayout| {
-        net.layer_sizes()
-            .map(|(i, o)| product(o, i, batch, Transposed::Neither))
+    let forward = |net: &NetworkLayout| -> Vec<Product> {
+        let sizes = net.layer_sizes();
+        sizes.map(|(i, o)| product(o, i, batch, Transposed::Neither)).collect()
     };
-    let backward = |net: &NetworkLayout| {
-        let [(inputs_1, h1), (inputs_2, h2), (_, outputs)] = net.layer_sizes();
-        [
-            product(outputs, batch, h2, Transposed::Right),
-            product(h2, outputs, batch, Transposed::Left),
-            product(h2, batch, inputs_2, Transposed::Right),
-            product(h1, h2, batch, Transposed::Left),
-            product(h1, batch, inputs_1, Transposed::Right),
-        ]
+    // What a layer's gradient passes down to the units below it.
+    let down = |net: &NetworkLayout, layer: usize| {
+        let units = net.hidden().layers[layer - 1];
+        product(units, net.layer_size(layer).1, batch, Transposed::Left)
     };
-    let [_, h2] = critic.hidden();
-    let action_gradient = [
-        product(h2, critic.outputs(), batch, Transposed::Left),
-        product(critic.late_inputs(), h2, batch, Transposed::Left),
-    ];
+    let output_layer = |net: &NetworkLayout| net.hidden().layers.len();
+    let backward = |net: &NetworkLayout| -> Vec<Product> {
+        let of_layer = |layer| {
+            let (inputs, outputs) = net.layer_size(layer);
+            let weights = product(outputs, batch, inputs, Transposed::Right);
+            [weights].into_iter().chain((layer > 0).then(|| down(net, layer)))
+        };
+        (0..=output_layer(net)).rev().flat_map(of_layer).collect()
+    };
+    let action_gradient: Vec<Product> = critic.late_layer().map_or_else(Vec::new, |late| {
+        let above = (late + 1..=output_layer(critic)).rev();
+        let units = critic.layer_size(late).1;
+        let actions = product(critic.late_inputs(), units, batch, Transposed::Left);
+        above.map(|layer| down(critic, layer)).chain([actions]).collect()
+    });
     let target = [forward(actor), forward(critic)];
     let ascent = [forward(actor), forward(critic)];
     (target.into_iter().flatten())
@@ -90,6 +95,7 @@ pub fn flop_per_update(actor: &NetworkLayout, critic: &NetworkLayout, batch: usi
 mod tests {
     use super::*;
     use faer::Mat;
+    use shoal_common::network::Hidden;
 
     #[test]
     fn gradients_are_the_transposed_products() {
@@ -108,8 +114,8 @@ mod tests {
     #[test]
     fn an_update_of_the_thesis_takes_140_million_operations() {
         let (actor, critic) = (
-            NetworkLayout::policy(3, [400, 300], 1),
-            NetworkLayout::critic(3, [400, 300], 1),
+            NetworkLayout::policy(3, Hidden::relu([400, 300]), 1),
+            NetworkLayout::critic(3, Hidden::relu([400, 300]), 1),
         );
         let products = products_of_update(&actor, &critic, 64);
         assert_eq!(products.iter().filter(|p| p.flop() > 15_000_000).count(), 9);

@@ -8,7 +8,7 @@ use message::{
 };
 use prost::Message;
 
-use super::{Body, Dense, Portable};
+use super::{Activation, Body, Network, Portable};
 
 /// Of the file's form and of the operators: old enough for every runtime, and new enough for `ArgMax` to say which of
 /// equals it takes.
@@ -29,13 +29,13 @@ pub(super) fn model(policy: &Portable) -> Vec<u8> {
         ..Graph::default()
     };
     match &policy.body {
-        Body::Actions { layers, range } => {
+        Body::Actions { network, range } => {
             let elements = 0..range.width();
             let half = range.half().to_vec();
             let centre: Vec<f32> = elements.map(|element| range.action(element, 0.0)).collect();
             let outputs = half.len();
-            graph.takes("observation", FLOAT, &[layers[0].inputs]);
-            graph.network(layers, "z");
+            graph.takes("observation", FLOAT, &[network.layers[0].inputs]);
+            graph.network(network, "z");
             graph.does("Tanh", &["z"], "tanh", vec![]);
             graph.holds("action_half_width", &[outputs], &half);
             graph.does("Mul", &["tanh", "action_half_width"], "scaled", vec![]);
@@ -43,12 +43,12 @@ pub(super) fn model(policy: &Portable) -> Vec<u8> {
             graph.does("Add", &["scaled", "action_centre"], "action", vec![]);
             graph.gives("action", FLOAT, &[outputs]);
         }
-        Body::Probabilities { layers } => {
-            graph.takes("observation", FLOAT, &[layers[0].inputs]);
-            graph.network(layers, "logits");
+        Body::Probabilities { network } => {
+            graph.takes("observation", FLOAT, &[network.layers[0].inputs]);
+            graph.network(network, "logits");
             graph.does("Softmax", &["logits"], "probabilities", vec![integer("axis", 1)]);
             graph.first_of_the_highest("logits");
-            let actions = layers.last().map_or(0, |last| last.biases.len());
+            let actions = network.layers.last().map_or(0, |last| last.biases.len());
             graph.gives("logits", FLOAT, &[actions]);
             graph.gives("probabilities", FLOAT, &[actions]);
             graph.gives("action", INT64, &[]);
@@ -82,8 +82,13 @@ pub(super) fn model(policy: &Portable) -> Vec<u8> {
 }
 
 impl Graph {
-    /// The layers, with ReLU between them; the last one's output is named `output`.
-    fn network(&mut self, layers: &[Dense], output: &str) {
+    /// The layers, with the activation between them; the last one's output is named `output`.
+    fn network(&mut self, network: &Network, output: &str) {
+        let Network { activation, layers } = network;
+        let activation = match activation {
+            Activation::Relu => "Relu",
+            Activation::Tanh => "Tanh",
+        };
         let mut x = "observation".to_owned();
         for (number, layer) in layers.iter().enumerate() {
             let [weight, bias] = ["weight", "bias"].map(|what| format!("layers.{number}.{what}"));
@@ -94,7 +99,7 @@ impl Graph {
             self.does("Gemm", &[&x, &weight, &bias], &z, vec![integer("transB", 1)]);
             if !last {
                 x = format!("h{number}");
-                self.does("Relu", &[&z], &x, vec![]);
+                self.does(activation, &[&z], &x, vec![]);
             }
         }
     }

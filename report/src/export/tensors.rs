@@ -5,11 +5,11 @@ use safetensors::tensor::TensorView;
 
 use super::{Body, Dense, Portable};
 
-/// `layers.<i>.weight` (outputs × inputs, row after row) and `layers.<i>.bias`; of a table, `action_values`
+/// `layers.<i>.weight` (outputs × inputs, row after row) and `layers.<i>.bias` for every layer from 0 on, the output layer last; of a table, `action_values`
 /// (states × actions). Metadata says the rest.
 pub(super) fn file(policy: &Portable) -> anyhow::Result<Vec<u8>> {
     let tensors = match &policy.body {
-        Body::Actions { layers, .. } | Body::Probabilities { layers } => of_layers(layers),
+        Body::Actions { network, .. } | Body::Probabilities { network } => of_layers(&network.layers),
         Body::Table {
             states,
             actions,
@@ -96,10 +96,16 @@ mod tests {
                     continue;
                 }
                 let mut x = observation.to_vec();
-                for layer in [0, 1] {
-                    x = linear(&tensors, layer, &x).iter().map(|z| z.max(0.0)).collect();
+                let activation: fn(f32) -> f32 = match about["hidden_activation"].as_str() {
+                    "relu" => |z| z.max(0.0),
+                    "tanh" => f32::tanh,
+                    other => panic!("{other} is no activation"),
+                };
+                let last = tensors.len() / 2 - 1;
+                for layer in 0..last {
+                    x = linear(&tensors, layer, &x).into_iter().map(activation).collect();
                 }
-                let z = linear(&tensors, 2, &x);
+                let z = linear(&tensors, last, &x);
                 if config.algorithm.name() == "reinforce" {
                     assert_eq!(shoal_common::policy::highest(&z) as f32, expected[0]);
                     continue;

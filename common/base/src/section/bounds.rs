@@ -96,7 +96,7 @@ macro_rules! bounded_numbers {
 }
 bounded_numbers!(f64 u32 u64 usize);
 
-impl<T: Bounded, const N: usize> Bounded for [T; N] {
+impl<T: Bounded> Bounded for [T] {
     type Number = T::Number;
 
     fn check(&self, section: &str, key: &str, bounds: &Bounds<T::Number>) -> Result<(), OutOfRange> {

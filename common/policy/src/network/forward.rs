@@ -4,7 +4,7 @@ use faer::linalg::matmul::matmul;
 use faer::{Accum, MatMut, MatRef, Par};
 use pulp::{Arch, Simd, WithSimd};
 
-use super::NetworkLayout;
+use super::{Activation, LayerRange, NetworkLayout};
 
 /// A layer's weights (outputs × inputs, column-major) and biases, borrowed from the parameter slice.
 #[derive(Clone, Copy, Debug)]
@@ -15,13 +15,22 @@ pub struct Layer<'a> {
     pub biases: &'a [f32],
 }
 
+impl<'a> Layer<'a> {
+    pub(super) fn at(range: LayerRange, parameters: &'a [f32]) -> Self {
+        Self {
+            weights: &parameters[range.weights],
+            biases: &parameters[range.biases],
+        }
+    }
+}
+
 /// Where a forward pass leaves what each layer reads or gives, one column a sample.
 #[derive(Debug)]
-pub struct Activations<'a> {
-    /// First hidden layer, after ReLU; below it the late inputs.
-    pub h1: &'a mut [f32],
-    /// Second hidden layer, after ReLU.
-    pub h2: &'a mut [f32],
+pub struct Activations<'a, H> {
+    /// The inputs, and below them the late ones, where these enter at the first layer; empty where they do not.
+    pub joined: &'a mut [f32],
+    /// Each hidden layer, after its activation; below it the late inputs where they enter at the next layer.
+    pub hidden: H,
     /// Output layer: linear.
     pub output: &'a mut [f32],
 }
@@ -40,44 +49,64 @@ pub fn matrix_mut(slice: &mut [f32], rows: usize) -> MatMut<'_, f32> {
 impl NetworkLayout {
     /// Computes the network's output for a batch of `inputs` and `late_inputs` (empty where the layout has none).
     ///
-    /// The batch is as wide as the output has columns; every slice must fit it. The same numbers give the same bits
-    /// wherever the slices lie in memory. Nothing is allocated.
-    pub fn forward(&self, parameters: &[f32], inputs: &[f32], late_inputs: &[f32], to: Activations<'_>) {
-        let [first, second, third] = self.layers(parameters);
-        let [(inputs_1, h1), (inputs_2, h2), (_, outputs)] = self.layer_sizes();
-
-        let one = inputs.len() == inputs_1;
-        if one {
-            one_sample(&mut to.h1[..h1], first.weights, inputs);
-        } else {
-            let z1 = matrix_mut(to.h1, inputs_2).subrows_mut(0, h1);
-            product(z1, matrix(first.weights, h1), matrix(inputs, inputs_1));
-        }
-        add_bias_and_rectify(to.h1, inputs_2, first.biases);
-        if self.late_inputs() > 0 {
-            let columns = to.h1.chunks_exact_mut(inputs_2);
-            for (column, late) in columns.zip(late_inputs.chunks_exact(self.late_inputs())) {
-                column[h1..].copy_from_slice(late);
+    /// The batch is as wide as the output has columns; every slice must fit it, and of `to.hidden` there are as many as hidden
+    /// layers at least. The same numbers give the same bits wherever the slices lie in memory. Nothing is allocated.
+    pub fn forward<'a>(
+        &self,
+        parameters: &[f32],
+        inputs: &'a [f32],
+        late_inputs: &[f32],
+        to: Activations<'a, impl Iterator<Item = &'a mut [f32]>>,
+    ) {
+        let late_layer = self.late_layer();
+        let one = inputs.len() == self.inputs;
+        let mut x = inputs;
+        if late_layer == Some(0) {
+            let rows = self.inputs + self.late_inputs;
+            for (column, x) in to.joined.chunks_exact_mut(rows).zip(inputs.chunks_exact(self.inputs)) {
+                column[..self.inputs].copy_from_slice(x);
             }
+            self.join(to.joined, rows, late_inputs);
+            x = to.joined;
+        }
+        for (number, (units, h)) in self.hidden.layers.iter().zip(to.hidden).enumerate() {
+            let layer = self.layer(number, parameters);
+            let (rows_of_x, rows) = (self.layer_size(number).0, self.layer_size(number + 1).0);
+            if one {
+                one_sample(&mut h[..*units], layer.weights, x);
+            } else {
+                let z = matrix_mut(h, rows).subrows_mut(0, *units);
+                product(z, matrix(layer.weights, *units), matrix(x, rows_of_x));
+            }
+            match self.hidden.activation {
+                Activation::Relu => add_bias_and_rectify(h, rows, layer.biases),
+                Activation::Tanh => add_bias_and_squash(h, rows, layer.biases),
+            }
+            if late_layer == Some(number + 1) {
+                self.join(h, rows, late_inputs);
+            }
+            x = h;
         }
 
-        if one {
-            one_sample(to.h2, second.weights, to.h1);
-        } else {
-            let h1 = matrix(to.h1, inputs_2);
-            product(matrix_mut(to.h2, h2), matrix(second.weights, h2), h1);
-        }
-        add_bias_and_rectify(to.h2, h2, second.biases);
-
+        let last = self.hidden.layers.len();
+        let (layer, (rows_of_x, outputs)) = (self.layer(last, parameters), self.layer_size(last));
         product(
             matrix_mut(to.output, outputs),
-            matrix(third.weights, outputs),
-            matrix(to.h2, h2),
+            matrix(layer.weights, outputs),
+            matrix(x, rows_of_x),
         );
-        for column in to.output.chunks_exact_mut(self.outputs()) {
-            for (z, b) in column.iter_mut().zip(third.biases) {
+        for column in to.output.chunks_exact_mut(outputs) {
+            for (z, b) in column.iter_mut().zip(layer.biases) {
                 *z += b;
             }
+        }
+    }
+
+    /// Writes the late inputs into the last of the `rows` numbers of every column of `x`.
+    fn join(&self, x: &mut [f32], rows: usize, late_inputs: &[f32]) {
+        let late = self.late_inputs;
+        for (column, late_inputs) in x.chunks_exact_mut(rows).zip(late_inputs.chunks_exact(late)) {
+            column[rows - late..].copy_from_slice(late_inputs);
         }
     }
 }
@@ -131,8 +160,18 @@ fn add_bias_and_rectify(z: &mut [f32], rows: usize, biases: &[f32]) {
     });
 }
 
+/// As [`add_bias_and_rectify`]: z ← tanh(z + b).
+fn add_bias_and_squash(z: &mut [f32], rows: usize, biases: &[f32]) {
+    for column in z.chunks_exact_mut(rows) {
+        for (z, b) in column.iter_mut().zip(biases) {
+            *z = (*z + b).tanh();
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
+    use super::super::Hidden;
     use super::*;
 
     fn numbers(count: usize, salt: usize) -> Vec<f32> {
@@ -143,26 +182,28 @@ mod tests {
 
     fn run(layout: &NetworkLayout, parameters: &[f32], inputs: &[f32], late: &[f32]) -> Vec<f32> {
         let batch = inputs.len() / layout.inputs();
-        let [h1, h2] = [layout.layer_sizes()[1].0, layout.hidden()[1]].map(|rows| rows * batch);
-        let (mut h1, mut h2, mut output) = (vec![0.0; h1], vec![0.0; h2], vec![0.0; layout.outputs() * batch]);
-        layout.forward(
-            parameters,
-            inputs,
-            late,
-            Activations {
-                h1: &mut h1,
-                h2: &mut h2,
-                output: &mut output,
-            },
-        );
+        let joined = if layout.late_layer() == Some(0) {
+            layout.layer_size(0).0
+        } else {
+            0
+        };
+        let rows = layout.layer_sizes().skip(1).map(|(rows, _)| rows);
+        let mut hidden: Vec<Vec<f32>> = rows.map(|rows| vec![0.0; rows * batch]).collect();
+        let mut output = vec![0.0; layout.outputs() * batch];
+        let to = Activations {
+            joined: &mut vec![0.0; joined * batch],
+            hidden: hidden.iter_mut().map(Vec::as_mut_slice),
+            output: &mut output,
+        };
+        layout.forward(parameters, inputs, late, to);
         output
     }
 
     /// One sample, by the definition, in `f64`.
     fn by_definition(layout: &NetworkLayout, parameters: &[f32], input: &[f32], late: &[f32]) -> Vec<f64> {
         let mut x: Vec<f64> = input.iter().map(|&x| x.into()).collect();
-        for (number, layer) in layout.layers(parameters).into_iter().enumerate() {
-            if number == 1 {
+        for (number, layer) in layout.layers(parameters).enumerate() {
+            if number == if layout.hidden().layers.len() == 1 { 0 } else { 1 } {
                 x.extend(late.iter().map(|&a| f64::from(a)));
             }
             let outputs = layer.biases.len();
@@ -172,7 +213,11 @@ mod tests {
                         .map(|j| f64::from(layer.weights[j * outputs + i]) * x[j])
                         .sum();
                     let z = sum + f64::from(layer.biases[i]);
-                    if number < 2 { z.max(0.0) } else { z }
+                    match layout.hidden().activation {
+                        _ if number == layout.hidden().layers.len() => z,
+                        Activation::Relu => z.max(0.0),
+                        Activation::Tanh => z.tanh(),
+                    }
                 })
                 .collect();
         }
@@ -182,10 +227,17 @@ mod tests {
     #[test]
     fn a_batch_is_what_the_definition_says_of_each_sample() {
         for (layout, batch) in [
-            (NetworkLayout::policy(3, [40, 30], 2), 1),
-            (NetworkLayout::policy(6, [40, 30], 1), 7),
-            (NetworkLayout::critic(3, [40, 30], 1), 64),
-            (NetworkLayout::critic(6, [41, 29], 2), 5),
+            (NetworkLayout::policy(3, Hidden::relu([40, 30]), 2), 1),
+            (NetworkLayout::policy(6, Hidden::relu([40, 30]), 1), 7),
+            (NetworkLayout::critic(3, Hidden::relu([40, 30]), 1), 64),
+            (NetworkLayout::critic(6, Hidden::tanh([41, 29]), 2), 5),
+            (NetworkLayout::critic(6, Hidden::relu([41]), 2), 1),
+            (NetworkLayout::critic(6, Hidden::tanh([41]), 2), 5),
+            (NetworkLayout::policy(6, Hidden::tanh([41]), 2), 1),
+            (NetworkLayout::policy(3, Hidden::tanh([20, 41, 13]), 2), 1),
+            (NetworkLayout::critic(3, Hidden::relu([20, 41, 13]), 2), 33),
+            (NetworkLayout::critic(3, Hidden::tanh([9, 8, 7, 6, 5, 6, 7, 8]), 2), 1),
+            (NetworkLayout::critic(3, Hidden::tanh([9, 8, 7, 6, 5, 6, 7, 8]), 2), 6),
         ] {
             let parameters = numbers(layout.parameters(), 1);
             let inputs = numbers(layout.inputs() * batch, 2);
@@ -203,8 +255,15 @@ mod tests {
 
     #[test]
     fn where_the_parameters_lie_does_not_change_a_bit() {
-        for batch in [1, 2, 8, 64] {
-            let layout = NetworkLayout::critic(3, [400, 300], 1);
+        for (batch, hidden) in [1, 2, 8, 64].into_iter().flat_map(|batch| {
+            let lists = [
+                Hidden::relu([400, 300]),
+                Hidden::tanh([400]),
+                Hidden::relu([64, 33, 64]),
+            ];
+            lists.map(|hidden| (batch, hidden))
+        }) {
+            let layout = NetworkLayout::critic(3, hidden, 1);
             let parameters = numbers(layout.parameters(), 1);
             let (inputs, late) = (numbers(3 * batch, 2), numbers(batch, 3));
             let expected = run(&layout, &parameters, &inputs, &late);
@@ -214,7 +273,7 @@ mod tests {
                 assert_eq!(
                     run(&layout, &moved[shift..], &inputs, &late),
                     expected,
-                    "batch {batch}, shift {shift}"
+                    "{hidden:?}, batch {batch}, shift {shift}"
                 );
             }
         }
@@ -222,9 +281,11 @@ mod tests {
 
     #[test]
     fn what_is_not_a_number_is_not_rectified_away() {
-        let layout = NetworkLayout::policy(1, [2, 2], 1);
-        let mut parameters = vec![1.0; layout.parameters()];
-        parameters[0] = f32::NAN;
-        assert!(run(&layout, &parameters, &[1.0], &[])[0].is_nan());
+        for hidden in [Hidden::relu([2, 2]), Hidden::tanh([2, 2, 2])] {
+            let layout = NetworkLayout::policy(1, hidden, 1);
+            let mut parameters = vec![1.0; layout.parameters()];
+            parameters[0] = f32::NAN;
+            assert!(run(&layout, &parameters, &[1.0], &[])[0].is_nan());
+        }
     }
 }

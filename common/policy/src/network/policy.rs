@@ -2,7 +2,7 @@
 
 use shoal_base::space::Space;
 
-use super::{Activations, NetworkLayout};
+use super::{Hidden, Network, NetworkLayout};
 
 /// The middle and half the width of each action element's range: tanh outputs become actions in environment units.
 #[derive(Clone, Debug, PartialEq)]
@@ -84,27 +84,23 @@ impl ActionRange {
 /// The policy μ with room for a batch of observations. Its parameters are not its own: each call borrows them.
 #[derive(Clone, Debug)]
 pub struct PolicyNetwork {
-    layout: NetworkLayout,
+    network: Network,
     range: ActionRange,
-    h1: Vec<f32>,
-    h2: Vec<f32>,
 }
 
 impl PolicyNetwork {
     /// A policy from `observation` numbers to actions in `range`, for at most `batch` observations a call.
-    pub fn new(observation: usize, hidden: [usize; 2], range: ActionRange, batch: usize) -> Self {
-        let [h1, h2] = hidden.map(|units| vec![0.0; units * batch]);
+    pub fn new(observation: usize, hidden: Hidden, range: ActionRange, batch: usize) -> Self {
+        let layout = NetworkLayout::policy(observation, hidden, range.width());
         Self {
-            layout: NetworkLayout::policy(observation, hidden, range.width()),
+            network: Network::new(layout, batch),
             range,
-            h1,
-            h2,
         }
     }
 
     /// How the parameters of [`forward`](Self::forward) are laid out.
     pub fn layout(&self) -> &NetworkLayout {
-        &self.layout
+        self.network.layout()
     }
 
     /// The range of its actions.
@@ -116,14 +112,7 @@ impl PolicyNetwork {
     ///
     /// Panics when the slices do not fit the layout, or hold more than the batch. Nothing is allocated.
     pub fn forward(&mut self, parameters: &[f32], observations: &[f32], actions: &mut [f32]) {
-        let batch = observations.len() / self.layout.inputs();
-        let [h1, h2] = self.layout.hidden().map(|units| units * batch);
-        let to = Activations {
-            h1: &mut self.h1[..h1],
-            h2: &mut self.h2[..h2],
-            output: actions,
-        };
-        self.layout.forward(parameters, observations, &[], to);
+        self.network.forward(parameters, observations, actions);
         for action in actions.chunks_exact_mut(self.range.width()) {
             for (element, z) in action.iter_mut().enumerate() {
                 *z = self.range.action(element, z.tanh());
@@ -139,7 +128,7 @@ mod tests {
     #[test]
     fn actions_stay_within_the_range_and_reach_both_ends() {
         let space = Space::boxed(&[(-1.0, 3.0), (-2.0, 2.0)]);
-        let mut policy = PolicyNetwork::new(1, [1, 1], ActionRange::new(&space).unwrap(), 3);
+        let mut policy = PolicyNetwork::new(1, Hidden::relu([1, 1]), ActionRange::new(&space).unwrap(), 3);
         // h1 = h2 = max(s, 0); z = ±1000 h2
         let parameters = [1.0, 0.0, 1.0, 0.0, 1000.0, -1000.0, 0.0, 0.0];
         let mut actions = [f32::NAN; 6];

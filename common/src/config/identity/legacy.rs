@@ -6,8 +6,9 @@ use toml::{Table, Value};
 use super::sorted;
 use crate::algorithms::{Algorithm, Ddpg, Exploration, Reinforce, Tabular, Warmup, Weight};
 use crate::config::{Config, Mode};
+use shoal_policy::network::Activation;
 
-/// The text; `None` for an algorithm that there was not then.
+/// The text; `None` for an algorithm or a network that there was not then.
 pub(super) fn text(config: &Config) -> Option<String> {
     let Config { run, environment, .. } = config;
     let mode = match run.mode {
@@ -15,8 +16,8 @@ pub(super) fn text(config: &Config) -> Option<String> {
         Mode::Lockstep => "Lockstep",
     };
     let algorithm = match &config.algorithm {
-        Algorithm::Ddpg(settings) => ddpg(settings),
-        Algorithm::Reinforce(settings) => reinforce(settings),
+        Algorithm::Ddpg(settings) => ddpg(settings)?,
+        Algorithm::Reinforce(settings) => reinforce(settings)?,
         Algorithm::QLearning(settings) => format!("QLearning({})", tabular(settings)),
         Algorithm::Sarsa(settings) => format!("Sarsa({})", tabular(settings)),
         #[allow(unreachable_patterns, reason = "an algorithm that comes later has no such text")]
@@ -31,9 +32,10 @@ pub(super) fn text(config: &Config) -> Option<String> {
     ))
 }
 
-fn ddpg(settings: &Ddpg) -> String {
+fn ddpg(settings: &Ddpg) -> Option<String> {
     let Ddpg {
-        hidden: [h1, h2],
+        hidden,
+        activation,
         gamma,
         tau,
         actor_learning_rate,
@@ -41,38 +43,45 @@ fn ddpg(settings: &Ddpg) -> String {
         batch,
         exploration: Exploration { theta, sigma, warmup },
     } = settings;
+    let (&[h1, h2], Activation::Relu) = (&**hidden, activation) else {
+        return None;
+    };
     let warmup = match warmup {
         Warmup::Policy => "Policy",
         Warmup::Uniform => "Uniform",
     };
-    format!(
+    Some(format!(
         "Ddpg {{ hidden: [{h1}, {h2}], gamma: {gamma:?}, tau: {tau:?}, actor_learning_rate: {actor_learning_rate:?}, \
          critic_learning_rate: {critic_learning_rate:?}, batch: {batch} }} \
          Exploration {{ theta: {theta:?}, sigma: {sigma:?}, warmup: {warmup} }}"
-    )
+    ))
 }
 
-fn reinforce(settings: &Reinforce) -> String {
+fn reinforce(settings: &Reinforce) -> Option<String> {
     let Reinforce {
-        hidden: [h1, h2],
+        hidden,
+        activation,
         gamma,
         learning_rate,
         weight,
         discount_steps,
         learn_at_limit,
-        baseline_hidden: [b1, b2],
+        baseline_hidden,
         baseline_learning_rate,
     } = settings;
+    let (&[h1, h2], &[b1, b2], Activation::Relu) = (&**hidden, &**baseline_hidden, activation) else {
+        return None;
+    };
     let weight = match weight {
         Weight::Return => "Return",
         Weight::Normalised => "Normalised",
         Weight::Baseline => "Baseline",
     };
-    format!(
+    Some(format!(
         "Reinforce(Reinforce {{ hidden: [{h1}, {h2}], gamma: {gamma:?}, learning_rate: {learning_rate:?}, \
          weight: {weight}, discount_steps: {discount_steps}, learn_at_limit: {learn_at_limit}, \
          baseline_hidden: [{b1}, {b2}], baseline_learning_rate: {baseline_learning_rate:?} }})"
-    )
+    ))
 }
 
 fn tabular(settings: &Tabular) -> String {

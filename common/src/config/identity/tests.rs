@@ -1,4 +1,5 @@
 use super::*;
+use shoal_policy::network::Activation;
 
 /// Runs that commit 2d50610 made, as `tests/data/2d50610` has them, and the fingerprint in the header of each one's replay.
 const OLD: [(&str, u64, &str); 4] = [
@@ -174,6 +175,42 @@ fn form_1_is_this_text() {
     assert!(texts[2].contains("\nlearned policy: network 4 8 8 2\n"), "{}", texts[2]);
 }
 
+#[test]
+fn form_1_says_any_list_of_layers_and_tanh() {
+    let network = |settings: &str| {
+        let text = OLD[0].2.replace("hidden = [8, 8]", settings);
+        let identity = numbered(&text).identity();
+        let lines = identity.lines().filter(|line| line.starts_with("learned "));
+        lines.map(str::to_owned).collect::<Vec<_>>()
+    };
+    assert_eq!(
+        network("hidden = [8]"),
+        ["learned actor: network 6 8 2", "learned critic: network 6 8 1 late 2"]
+    );
+    assert_eq!(
+        network("hidden = [8, 7, 6]\nactivation = \"tanh\""),
+        [
+            "learned actor: network 6 8 7 6 2 tanh",
+            "learned critic: network 6 8 7 6 1 late 2 tanh"
+        ]
+    );
+    assert_eq!(
+        network("hidden = [8, 8]"),
+        network("hidden = [8, 8]\nactivation = \"relu\"")
+    );
+}
+
+/// A configuration without a noted form can be written by hand. Its text is the numbered one, where the old one had no words.
+#[test]
+fn networks_that_there_were_not_have_no_unnumbered_text() {
+    for settings in ["hidden = [8]", "hidden = [8, 8]\nactivation = \"tanh\""] {
+        for old in [OLD[0].2, OLD[2].2] {
+            let config = config(&old.replace("hidden = [8, 8]", settings));
+            assert!(config.identity().starts_with("shoal run, identity 1\n"), "{settings}");
+        }
+    }
+}
+
 /// A change of a configuration that says the same, and one that says something else.
 #[test]
 fn form_1_changes_with_what_rows_and_weights_depend_on_and_with_nothing_else() {
@@ -209,7 +246,7 @@ fn form_1_changes_with_what_rows_and_weights_depend_on_and_with_nothing_else() {
         assert_ne!(changed, base, "{key}");
         assert_eq!(changed.identity(), base.identity(), "{key}");
     }
-    let other: [(&str, Change); 12] = [
+    let other: [(&str, Change); 14] = [
         ("environment.name", |c| c.environment.name.push('s')),
         ("a parameter's value", |c| {
             c.environment.parameters.insert("mass".into(), 2.0.into());
@@ -227,6 +264,8 @@ fn form_1_changes_with_what_rows_and_weights_depend_on_and_with_nothing_else() {
             c.algorithm = crate::algorithms::Algorithm::Sarsa(Default::default())
         }),
         ("ddpg.hidden", |c| ddpg(c).hidden[1] += 1),
+        ("a hidden layer more", |c| ddpg(c).hidden = [8, 8, 8].into()),
+        ("ddpg.activation", |c| ddpg(c).activation = Activation::Tanh),
         ("ddpg.gamma", |c| ddpg(c).gamma = 0.98),
         ("run.seed", |c| c.run.seed += 1),
         ("run.mode", |c| c.run.mode = Mode::Lockstep),

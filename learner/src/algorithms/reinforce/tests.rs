@@ -1,5 +1,5 @@
 use rand::RngExt;
-use shoal_common::network::Activations;
+use shoal_common::network::{Activation, Layers, Network};
 use shoal_common::space::Space;
 use shoal_common::stream::{Purpose, stream};
 
@@ -23,8 +23,8 @@ fn spec() -> EnvironmentSpec {
 
 fn settings(weight: Weight) -> config::Reinforce {
     config::Reinforce {
-        hidden: [7, 5],
-        baseline_hidden: [6, 4],
+        hidden: [7, 5].into(),
+        baseline_hidden: [6, 4].into(),
         weight,
         ..config::Reinforce::default()
     }
@@ -90,14 +90,8 @@ impl Episode {
 
 /// ln π(a|s), or V(s), computed by the network alone.
 fn output(layout: &NetworkLayout, parameters: &[f32], s: &[f32]) -> Vec<f64> {
-    let [mut h1, mut h2] = layout.hidden().map(|units| vec![0.0; units]);
     let mut out = vec![0.0; layout.outputs()];
-    let to = Activations {
-        h1: &mut h1,
-        h2: &mut h2,
-        output: &mut out,
-    };
-    layout.forward(parameters, s, &[], to);
+    Network::new(*layout, 1).forward(parameters, s, &mut out);
     out.into_iter().map(f64::from).collect()
 }
 
@@ -155,13 +149,26 @@ fn agrees_with_finite_differences(
 fn the_gradient_is_that_of_the_objective() {
     let (long, short) = (Episode::random(1, 12, false), Episode::random(2, 5, true));
     let steps = [long.steps(), short.steps()].concat();
-    for (weight, discount_steps) in [
+    let lists: [Layers; 4] = [
+        [7, 5].into(),
+        [9].into(),
+        [7, 6, 5].into(),
+        [6, 5, 7, 6, 5, 6, 7, 5].into(),
+    ];
+    for ((weight, discount_steps), (hidden, activation)) in [
         (Weight::Return, false),
         (Weight::Return, true),
         (Weight::Normalised, false),
-    ] {
+    ]
+    .into_iter()
+    .flat_map(|weight| {
+        let both = lists.map(|list| [(list, Activation::Relu), (list, Activation::Tanh)]);
+        both.concat().into_iter().map(move |hidden| (weight, hidden))
+    }) {
         let settings = config::Reinforce {
             discount_steps,
+            hidden,
+            activation,
             ..settings(weight)
         };
         let mut learner = learner(&settings);

@@ -38,7 +38,7 @@ fn close(found: &[f32], expected: &[f32]) {
 fn scores(config: &Config, policy: &PolicyFile, observations: &[f32], batch: usize) -> Vec<f32> {
     let mut scores: Scores = match &config.algorithm {
         shoal_common::config::Algorithm::Reinforce(reinforce) => {
-            softmax("reinforce", reinforce.hidden, &config.spec, batch).unwrap()
+            softmax("reinforce", reinforce.hidden_layers(), &config.spec, batch).unwrap()
         }
         _ => table("q-learning", &config.spec, batch).unwrap(),
     };

@@ -1,0 +1,129 @@
+//! Runs whose networks have other hidden layers than two: they train, go on, are judged and leave the program.
+
+use rten::{Model, Value};
+use safetensors::SafeTensors;
+
+use crate::support::{QUICK, Workplace, complaint, json};
+
+#[test]
+fn networks_of_one_and_of_three_hidden_layers_train_go_on_are_judged_and_exported() {
+    let cases: [(&str, &str, &[usize]); 3] = [
+        ("[32]", "relu", &[32]),
+        ("[16,16,16]", "relu", &[16; 3]),
+        ("[12,14,16]", "tanh", &[12, 14, 16]),
+    ];
+    for (hidden, activation, units) in cases {
+        let place = Workplace::new();
+        let [hidden, activation_key] = [format!("ddpg.hidden={hidden}"), format!("ddpg.activation={activation}")];
+        let settings = ["--set", &hidden, "--set", &activation_key];
+        let train = [
+            "train",
+            "pendulum",
+            "--lockstep",
+            "--run",
+            "run",
+            "--steps",
+            "600",
+            "--json",
+        ];
+        let output = place.output(&[&train[..], &QUICK, &settings].concat());
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let before = json(&output)["weights_sha256"].clone();
+        let output = place.output(&["resume", "run", "--steps", "900", "--json"]);
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let after = json(&output);
+        assert_eq!(after["env_steps"], 900);
+        assert_ne!(after["weights_sha256"], before, "it has learned on");
+        // Not broken off, it ends with the same bits.
+        let whole = [
+            "train",
+            "pendulum",
+            "--lockstep",
+            "--run",
+            "whole",
+            "--steps",
+            "900",
+            "--json",
+        ];
+        let whole = place.output(&[&whole[..], &QUICK, &settings].concat());
+        assert_eq!(json(&whole)["weights_sha256"], after["weights_sha256"]);
+
+        let judged = place.output(&["eval", "run", "--policy", "last", "--episodes", "2", "--json"]);
+        assert!(judged.status.success(), "{}", String::from_utf8_lossy(&judged.stderr));
+
+        for format in ["onnx", "safetensors"] {
+            let output = place.output(&["export", "run", "--policy", "last", "--format", format]);
+            assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        }
+        let read = |name: &str| std::fs::read(place.path().join("run").join(name)).unwrap();
+        let bytes = read("last.safetensors");
+        let (tensors, about) = (
+            SafeTensors::deserialize(&bytes).unwrap(),
+            SafeTensors::read_metadata(&bytes).unwrap().1,
+        );
+        assert_eq!(about.metadata().as_ref().unwrap()["hidden_activation"], activation);
+        let sizes = [&[3], units, &[1]].concat();
+        assert_eq!(tensors.len(), 2 * (sizes.len() - 1));
+        for (layer, pair) in sizes.windows(2).enumerate() {
+            let weights = tensors.tensor(&format!("layers.{layer}.weight")).unwrap();
+            assert_eq!(weights.shape(), [pair[1], pair[0]]);
+        }
+
+        // What a runtime that is not ours says is what the tensors say.
+        let model = Model::load(read("last.onnx")).unwrap();
+        let [input, output] = ["observation", "action"].map(|name| model.node_id(name).unwrap());
+        let s = vec![0.6_f32, -0.8, 1.5];
+        let observation = Value::from_shape([1, 3], s.clone()).unwrap();
+        let mut said = model.run(vec![(input, observation.into())], &[output], None).unwrap();
+        let (_, action) = said.remove(0).into_shape_vec::<f32, 2>().unwrap();
+        let expected = 2.0 * by_tensors(&tensors, units.len(), activation, s).tanh();
+        assert!(
+            (action[0] - expected).abs() < 1e-5,
+            "{hidden}: {action:?} for {expected}"
+        );
+    }
+}
+
+/// The linear output of the network, by the tensors alone.
+fn by_tensors(tensors: &SafeTensors<'_>, last: usize, activation: &str, s: Vec<f32>) -> f32 {
+    let numbers = |name: String| -> Vec<f32> {
+        let tensor = tensors.tensor(&name).unwrap();
+        let bytes = tensor.data().as_chunks::<4>().0.iter();
+        bytes.map(|bytes| f32::from_le_bytes(*bytes)).collect()
+    };
+    let x = (0..=last).fold(s, |x, layer| {
+        let [weights, biases] = ["weight", "bias"].map(|what| numbers(format!("layers.{layer}.{what}")));
+        let rows = weights.chunks_exact(x.len()).zip(&biases);
+        let z = rows.map(|(row, bias)| row.iter().zip(&x).map(|(w, x)| w * x).sum::<f32>() + bias);
+        z.map(|z| match activation {
+            _ if layer == last => z,
+            "relu" => z.max(0.0),
+            _ => z.tanh(),
+        })
+        .collect()
+    });
+    x[0]
+}
+
+#[test]
+fn a_run_goes_on_with_the_networks_it_has_and_with_no_others() {
+    let place = Workplace::new();
+    place.train(&["pendulum", "--steps", "300", "--run", "run"]);
+    let path = place.path().join("run/config.toml");
+    let config = std::fs::read_to_string(&path).unwrap();
+    for (written, other) in [
+        ("hidden = [24, 16]", "hidden = [24, 16, 16]"),
+        ("hidden = [24, 16]", "hidden = [24]"),
+        ("activation = \"relu\"", "activation = \"tanh\""),
+    ] {
+        let changed = config.replace(written, other);
+        assert_ne!(changed, config, "{written}");
+        std::fs::write(&path, changed).unwrap();
+        let said = complaint(&place.output(&["resume", "run", "--steps", "400"]));
+        assert!(said.contains("another configuration"), "{other}: {said}");
+    }
+    // A configuration from before there was the key.
+    std::fs::write(&path, config.replace("activation = \"relu\"\n", "")).unwrap();
+    let output = place.output(&["resume", "run", "--steps", "400"]);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+}
