@@ -3,7 +3,7 @@
 use rand::RngExt;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use shoal_common::{
+use shoal_base::{
     space::{EnvironmentSpec, Space},
     stream::Stream,
 };

@@ -6,7 +6,17 @@ use std::path::{Path, PathBuf};
 use super::names;
 
 /// Whose sources are searched. `reproduce` and `bench` run presets.
-const SEARCHED: [&str; 6] = ["common/src", "actor/src", "learner/src", "run/src", "report/src", "src"];
+const SEARCHED: [&str; 9] = [
+    "common/base/src",
+    "common/channel/src",
+    "common/policy/src",
+    "common/src",
+    "actor/src",
+    "learner/src",
+    "run/src",
+    "report/src",
+    "src",
+];
 
 const MAY_NAME_THEM: [&str; 6] = [
     "run/src/analysis",

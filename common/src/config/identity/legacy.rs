@@ -42,6 +42,7 @@ fn ddpg(settings: &Ddpg) -> Option<String> {
         critic_learning_rate,
         batch,
         exploration: Exploration { theta, sigma, warmup },
+        ..
     } = settings;
     let (&[h1, h2], Activation::Relu) = (&**hidden, activation) else {
         return None;
@@ -68,6 +69,7 @@ fn reinforce(settings: &Reinforce) -> Option<String> {
         learn_at_limit,
         baseline_hidden,
         baseline_learning_rate,
+        ..
     } = settings;
     let (&[h1, h2], &[b1, b2], Activation::Relu) = (&**hidden, &**baseline_hidden, activation) else {
         return None;
@@ -85,7 +87,9 @@ fn reinforce(settings: &Reinforce) -> Option<String> {
 }
 
 fn tabular(settings: &Tabular) -> String {
-    let Tabular { gamma, alpha, epsilon } = settings;
+    let Tabular {
+        gamma, alpha, epsilon, ..
+    } = settings;
     format!("Tabular {{ gamma: {gamma:?}, alpha: {alpha:?}, epsilon: {epsilon:?} }}")
 }
 
