@@ -21,7 +21,7 @@ pub(crate) struct ReproduceArgs {
     /// Trainings at a time [default: half the cores, for each keeps about two busy].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     pub(crate) jobs: Option<u16>,
-    /// A first look in a few minutes: tiny networks, hardly any steps; nothing is judged.
+    /// A first look in a minute or two: tiny networks, hardly any steps; nothing is judged.
     #[arg(long)]
     pub(crate) quick: bool,
     /// Where runs, results and figures lie [default: runs/reproduction; with --quick runs/reproduction-quick].
