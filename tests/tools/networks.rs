@@ -23,18 +23,18 @@ fn networks_of_one_and_of_three_hidden_layers_train_go_on_are_judged_and_exporte
             "--run",
             "run",
             "--steps",
-            "600",
+            "1024",
             "--json",
         ];
         let output = place.output(&[&train[..], &QUICK, &settings].concat());
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
         let before = json(&output)["weights_sha256"].clone();
-        let output = place.output(&["resume", "run", "--steps", "900", "--json"]);
+        let output = place.output(&["resume", "run", "--steps", "2048", "--json"]);
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
         let after = json(&output);
-        assert_eq!(after["env_steps"], 900);
+        assert_eq!(after["env_steps"], 2048);
         assert_ne!(after["weights_sha256"], before, "it has learned on");
-        // Not broken off, it ends with the same bits.
+        // Both are whole rounds, so a run that was not broken off ends with the same bits.
         let whole = [
             "train",
             "pendulum",
@@ -42,7 +42,7 @@ fn networks_of_one_and_of_three_hidden_layers_train_go_on_are_judged_and_exporte
             "--run",
             "whole",
             "--steps",
-            "900",
+            "2048",
             "--json",
         ];
         let whole = place.output(&[&whole[..], &QUICK, &settings].concat());
