@@ -95,7 +95,10 @@ impl Process {
     pub(crate) fn kill(&mut self) {
         self.child.kill().unwrap();
         self.child.wait().unwrap();
-        Domain::clean_up(&self.run).unwrap();
+        // iceoryx2 cannot always do it at once.
+        eventually(&format!("the shared memory of {} is cleaned up", self.role), || {
+            Domain::clean_up(&self.run).unwrap() == 0
+        });
     }
 
     /// Closes the child's standard input and waits until it has ended in good order.
