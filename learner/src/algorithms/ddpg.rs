@@ -75,11 +75,11 @@ impl Learned {
     }
 }
 
-/// Samples, or units of a hidden layer, that are worth being cut in two: of each hidden layer but the last, or of the only one. faer adds up
-/// the terms of a transposed product in another order where a dimension is 1, or the whole product small, and nobody shall see
-/// in the bits how many threads there were.
+/// Samples, or units of a hidden layer, that are worth being cut in two; asked of each hidden layer but the last, or of the
+/// only one. faer adds up the terms of a transposed product in another order where a dimension is 1, or the whole product
+/// small, and nobody shall see in the bits how many threads there were.
 const LEAST_CUT: usize = 4;
-/// As [`LEAST_CUT`]: samples times units, of each hidden layer but the first, or of the only one.
+/// As [`LEAST_CUT`]: samples times units of a hidden layer; asked of each but the first, or of the only one.
 const LEAST_WORK: usize = 8_192;
 
 /// The learner of DDPG: both networks, their targets, both optimisers.

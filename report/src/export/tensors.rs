@@ -5,8 +5,8 @@ use safetensors::tensor::TensorView;
 
 use super::{Body, Dense, Portable};
 
-/// `layers.<i>.weight` (outputs × inputs, row after row) and `layers.<i>.bias` for every layer from 0 on, the output layer last; of a table, `action_values`
-/// (states × actions). Metadata says the rest.
+/// `layers.<i>.weight` (outputs × inputs, row after row) and `layers.<i>.bias` for each layer from 0 on, the output layer
+/// last; of a table, `action_values` (states × actions). Metadata says the rest.
 pub(super) fn file(policy: &Portable) -> anyhow::Result<Vec<u8>> {
     let tensors = match &policy.body {
         Body::Actions { network, .. } | Body::Probabilities { network } => of_layers(&network.layers),
