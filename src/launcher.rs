@@ -2,12 +2,12 @@
 
 mod cleaner;
 mod crew;
-mod desk;
 mod incarnations;
 mod log;
 mod member;
 mod process;
 mod progress;
+mod requests;
 mod stall;
 
 use std::os::fd::AsFd;
@@ -324,12 +324,12 @@ impl<'a> Launcher<'a> {
         } = self;
         control.attend(run.key()?, run.path(), |question| -> anyhow::Result<Option<Answer>> {
             match question {
-                Question::Status => Ok(Some(match desk::status(config, run, crew, progress, rest) {
+                Question::Status => Ok(Some(match requests::status(config, run, crew, progress, rest) {
                     Ok(status) => Answer::Status(status),
                     Err(error) => Answer::Refused(error.to_string()),
                 })),
                 Question::Scale { .. } if *ends => Ok(Some(Answer::Refused("the run is ending".into()))),
-                Question::Scale { actors } => desk::scale(config, run, crew, actors).map(Some),
+                Question::Scale { actors } => requests::scale(config, run, crew, actors).map(Some),
                 Question::Stop => {
                     to_end.get_or_insert_with(Instant::now);
                     Ok(None)
@@ -361,7 +361,7 @@ impl<'a> Launcher<'a> {
         self.end(actors, ACTORS_END);
         self.end(|_| true, OTHERS_END);
         self.read_reports()?;
-        self.crew.say_farewell()
+        self.crew.check_saved()
     }
 
     fn end(&mut self, which: impl Fn(Role) -> bool + Copy, patience: Duration) {

@@ -14,7 +14,7 @@ use shoal_common::run_dir::RunDir;
 use shoal_common::stop::Stop;
 use shoal_env_server::vector::VectorEnvironment;
 use shoal_learner::process;
-use shoal_run::external_environment::{self, Post};
+use shoal_run::external_environment::{self, LaunchSpec};
 use shoal_run::status::judged;
 use tracing_subscriber::filter::LevelFilter;
 
@@ -43,7 +43,7 @@ pub(crate) fn run(role: Role, args: &RoleArgs) -> anyhow::Result<ExitCode> {
         incarnation: args.incarnation,
     };
     if role == Role::EnvServer
-        && let Some(program) = server_post(&config, &run, identity).command(&config.environment)?
+        && let Some(program) = launch_spec(&config, &run, identity).command(&config.environment)?
     {
         return external_environment::serve_by(&program);
     }
@@ -67,7 +67,7 @@ fn log_level() -> LevelFilter {
 
 fn work(domain: &Domain, config: &Config, run: &RunDir, identity: Identity, stop: &Stop) -> anyhow::Result<()> {
     match identity.role {
-        Role::EnvServer => serve(domain, config, &server_post(config, run, identity), identity, stop),
+        Role::EnvServer => serve(domain, config, &launch_spec(config, run, identity), identity, stop),
         Role::Actor => {
             let settings = explorer::Settings::new(config, run, identity);
             Ok(explorer::explore(domain, &settings, stop)?)
@@ -89,14 +89,14 @@ fn work(domain: &Domain, config: &Config, run: &RunDir, identity: Identity, stop
 }
 
 /// What an environment server has to know.
-fn server_post<'a>(config: &'a Config, run: &RunDir, identity: Identity) -> Post<'a> {
+fn launch_spec<'a>(config: &'a Config, run: &RunDir, identity: Identity) -> LaunchSpec<'a> {
     let Identity { index, incarnation, .. } = identity;
     let (client, environments) = if index == config.evaluation_server() {
         (Place(Role::Evaluator, 0), config.evaluation_envs())
     } else {
         (Place(Role::Actor, index), config.actors.envs)
     };
-    Post {
+    LaunchSpec {
         iceoryx2: run.iceoryx2_config(),
         run_id: &config.run.id,
         index,
@@ -113,23 +113,29 @@ fn server_post<'a>(config: &'a Config, run: &RunDir, identity: Identity) -> Post
     }
 }
 
-fn serve(domain: &Domain, config: &Config, post: &Post<'_>, identity: Identity, stop: &Stop) -> anyhow::Result<()> {
+fn serve(
+    domain: &Domain,
+    config: &Config,
+    launch: &LaunchSpec<'_>,
+    identity: Identity,
+    stop: &Stop,
+) -> anyhow::Result<()> {
     let environment = &config.environment;
     let mut environments = VectorEnvironment::new(
         &environment.name,
         &environment.parameters,
-        post.environments,
-        post.seed,
-        post.index.into(),
-        post.stream,
+        launch.environments,
+        launch.seed,
+        launch.index.into(),
+        launch.stream,
     )?;
     let spec = environments.spec().clone();
-    let port = EnvironmentPort::open(domain, post.index, spec, environments.count(), post.client)?;
+    let port = EnvironmentPort::open(domain, launch.index, spec, environments.count(), launch.client)?;
     let pulse = Pulse::new(domain, identity)?;
     Ok(shoal_env_server::server::serve(
         &mut environments,
         &port,
-        post.seed,
+        launch.seed,
         pulse,
         stop,
     )?)

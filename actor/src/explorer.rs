@@ -87,7 +87,7 @@ pub fn explore(domain: &Domain, settings: &Settings, stop: &Stop) -> Result<(), 
         Err(exit) => return exit.into_result(),
     };
     match explorer.run() {
-        Exit::Stopped => explorer.say_farewell(),
+        Exit::Stopped => explorer.hand_over(),
         Exit::Failed(error) => Err(error),
     }
 }
@@ -238,7 +238,7 @@ impl<'a> Explorer<'a> {
             self.pulse.count(self.settings.envs as u64);
             self.pulse.beat(Activity::Working);
             if self.chunk_is_complete() {
-                if !self.take_stand()? {
+                if !self.append_snapshot()? {
                     return Ok(());
                 }
                 self.await_room().map_err(Exit::widen)?;
@@ -347,7 +347,7 @@ impl<'a> Explorer<'a> {
 
     /// Says behind the chunk's rows where the actor stands after them, where that is asked for; whether the environment
     /// server is still there to say its part.
-    fn take_stand(&mut self) -> Result<bool, Exit<ActorError>> {
+    fn append_snapshot(&mut self) -> Result<bool, Exit<ActorError>> {
         if self.settings.chunk.standing_words == 0 {
             return Ok(true);
         }
@@ -411,7 +411,7 @@ impl<'a> Explorer<'a> {
 
     /// Sends what was collected and waits until it is committed: for as long as that takes where only this actor retires,
     /// for a moment where the run ends. In lockstep a round is whole or not at all.
-    fn say_farewell(&mut self) -> Result<(), ActorError> {
+    fn hand_over(&mut self) -> Result<(), ActorError> {
         if self.settings.mode == Mode::Free
             && !self.chunk.is_empty()
             && self.await_commits(u64::from(self.settings.window) - 1)?

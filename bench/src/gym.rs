@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use anyhow::Context;
 use serde::{Deserialize, Serialize};
 use shoal_common::config::Environment;
-use shoal_run::external_environment::{Conversation, default_command};
+use shoal_run::external_environment::{ExternalEnvironment, default_command};
 
 use super::measurement::{Figures, Patience};
 use super::step::quantile_of;
@@ -73,7 +73,7 @@ fn times(
     length: Duration,
     patience: &Patience,
 ) -> anyhow::Result<Vec<u32>> {
-    let mut conversation = Conversation::begin(environment, environments, 1)?;
+    let mut conversation = ExternalEnvironment::begin(environment, environments, 1)?;
     conversation.begin_evaluation(0)?;
     let actions = vec![0.5; environments as usize * conversation.spec().action.width()];
     let begun = Instant::now();

@@ -8,7 +8,7 @@ use rustix::process::{Pid, Signal, kill_process};
 use serde::Serialize;
 use shoal_common::report::Role;
 
-use self::training::{Began, Came, Training};
+use self::training::{Recovery, Startup, Training};
 use super::measurement::{Figures, Patience};
 use super::memory::Memory;
 use super::target::{Line, Target};
@@ -91,7 +91,7 @@ fn recoveries_and_memory(
     training: &mut Training,
     begun: Instant,
     patience: &Patience,
-) -> anyhow::Result<(Vec<Came>, Vec<RoleMemory>)> {
+) -> anyhow::Result<(Vec<Recovery>, Vec<RoleMemory>)> {
     let mut recoveries = Vec::new();
     let mut roles = Vec::new();
     while recoveries.is_empty() || (begun.elapsed() < patience.length && recoveries.len() < MOST) {
@@ -117,12 +117,12 @@ fn recoveries_and_memory(
 }
 
 impl RunFigures {
-    fn new(starts: &[Began], recoveries: &[Came], roles: Vec<RoleMemory>) -> Self {
-        let of_starts = |seconds: fn(&Began) -> Duration| Spread::of(starts.iter().map(seconds));
+    fn new(starts: &[Startup], recoveries: &[Recovery], roles: Vec<RoleMemory>) -> Self {
+        let of_starts = |seconds: fn(&Startup) -> Duration| Spread::of(starts.iter().map(seconds));
         Self {
             starts: starts.len(),
             ready_seconds: of_starts(|began| began.ready),
-            warm_up_seconds: of_starts(Began::warm_up),
+            warm_up_seconds: of_starts(Startup::warm_up),
             warm_up_rows: starts.first().map_or(0, |began| began.warm_up_rows),
             first_update_seconds: of_starts(|began| began.update.saturating_sub(began.warm)),
             start_seconds: of_starts(|began| began.update - began.warm_up()),

@@ -91,7 +91,7 @@ pub(super) fn train(
         }
     }
     command.args(length.argument()).arg("--quiet");
-    conduct(&mut command, interrupted)
+    run_child(&mut command, interrupted)
 }
 
 /// Whether a run has come to this length, and ended in order there: then it leaves its last policy.
@@ -107,7 +107,7 @@ fn has_ended(run: &Path, length: Length, progress: Progress) -> anyhow::Result<b
     })
 }
 
-fn conduct(command: &mut Command, interrupted: Interrupted<'_>) -> anyhow::Result<Trained> {
+fn run_child(command: &mut Command, interrupted: Interrupted<'_>) -> anyhow::Result<Trained> {
     let mut training = Peer::start(command, "training".into()).context("cannot start a training")?;
     let mut told = false;
     let status = loop {
@@ -139,7 +139,7 @@ mod tests {
     use super::*;
 
     fn shell(script: &str, signal: Option<i32>) -> anyhow::Result<Trained> {
-        conduct(Command::new("sh").args(["-c", script]), &|| signal)
+        run_child(Command::new("sh").args(["-c", script]), &|| signal)
     }
 
     #[test]

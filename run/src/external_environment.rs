@@ -38,7 +38,7 @@ pub fn default_command(name: &str) -> Option<Vec<String>> {
 }
 
 /// Which server of which run a program is to be.
-pub struct Post<'a> {
+pub struct LaunchSpec<'a> {
     /// The file that says where the run lies in shared memory.
     pub iceoryx2: PathBuf,
     /// The run's id.
@@ -57,7 +57,7 @@ pub struct Post<'a> {
     pub stream: u64,
 }
 
-impl Post<'_> {
+impl LaunchSpec<'_> {
     /// What starts the program; `None` where the environment is one of our own.
     pub fn command(&self, environment: &Environment) -> anyhow::Result<Option<Command>> {
         let Some((program, arguments)) = environment.server.split_first() else {
@@ -185,27 +185,27 @@ fn cannot_start(command: &Command) -> String {
 }
 
 /// A program that serves environments to this process, until this is dropped.
-pub struct Conversation {
+pub struct ExternalEnvironment {
     client: EnvironmentClient,
     bell: Bell,
     spec: EnvironmentSpec,
     program: Peer,
     // The last to go, in this order.
     _services: Services,
-    _corner: Corner,
+    _domain: TidyDomain,
 }
 
 /// A corner of shared memory that is left tidy.
-struct Corner(Option<Domain>);
+struct TidyDomain(Option<Domain>);
 
-impl Drop for Corner {
+impl Drop for TidyDomain {
     fn drop(&mut self) {
         // What cannot be removed now is removed by the next who comes.
         let _ = self.0.take().map(Domain::leave);
     }
 }
 
-impl Conversation {
+impl ExternalEnvironment {
     /// Starts the environment's server, with so many environments, and asks what it serves. Its evaluation episodes start
     /// as `seed` says.
     ///
@@ -215,7 +215,7 @@ impl Conversation {
         Domain::remove_abandoned()?;
         let run_id = format!("{:08x}", rand::random::<u32>());
         let domain = Domain::join(&run_id, 1)?;
-        let post = Post {
+        let launch = LaunchSpec {
             // Where everybody is killed it goes with the rest.
             iceoryx2: domain.directory()?.join("iceoryx2.toml"),
             run_id: &run_id,
@@ -226,14 +226,14 @@ impl Conversation {
             seed,
             stream: 0,
         };
-        match opened(&domain, &post, environment) {
+        match opened(&domain, &launch, environment) {
             Ok((services, client, bell, spec, program)) => Ok(Self {
                 client,
                 bell,
                 spec,
                 program,
                 _services: services,
-                _corner: Corner(Some(domain)),
+                _domain: TidyDomain(Some(domain)),
             }),
             Err(error) => {
                 domain.leave()?;
@@ -269,7 +269,7 @@ impl Conversation {
     }
 }
 
-impl Drop for Conversation {
+impl Drop for ExternalEnvironment {
     fn drop(&mut self) {
         self.program.dismiss();
     }
@@ -277,23 +277,23 @@ impl Drop for Conversation {
 
 type Opened = (Services, EnvironmentClient, Bell, EnvironmentSpec, Peer);
 
-fn opened(domain: &Domain, post: &Post<'_>, environment: &Environment) -> anyhow::Result<Opened> {
-    let Some(command) = post.command(environment)? else {
+fn opened(domain: &Domain, launch: &LaunchSpec<'_>, environment: &Environment) -> anyhow::Result<Opened> {
+    let Some(command) = launch.command(environment)? else {
         bail!("environment {} is not served by another program", environment.name);
     };
-    std::fs::write(&post.iceoryx2, domain.iox_config()?).context("cannot write a temporary file")?;
+    std::fs::write(&launch.iceoryx2, domain.iox_config()?).context("cannot write a temporary file")?;
     let mut services = Services::new(domain)?;
     services.create_common(domain)?;
-    services.create_environment(domain, post.index)?;
-    let bell = Bell::hang(domain, post.client)?;
+    services.create_environment(domain, launch.index)?;
+    let bell = Bell::hang(domain, launch.client)?;
     let mut program =
         Peer::start(&mut tied(&command)?, "environment server".into()).with_context(|| cannot_start(&command))?;
     let heard = Stop::default();
     let stop = stopped_when_it_ends(&program, heard.clone())?;
-    let described = describe(domain, post.index, &bell, stop.clone());
+    let described = describe(domain, launch.index, &bell, stop.clone());
     heard.request();
     let (spec, environments) = answered(described, &mut program).map_err(with_advice)?;
-    let opened = EnvironmentClient::open(domain, post.index, &spec, environments, stop);
+    let opened = EnvironmentClient::open(domain, launch.index, &spec, environments, stop);
     let client = answered(opened.map_err(Exit::from), &mut program)?;
     Ok((services, client, bell, spec, program))
 }

@@ -11,7 +11,7 @@ use shoal_common::space::{EnvironmentSpec, Space};
 use shoal_env_server::environment;
 use toml::{Table, Value};
 
-use crate::external_environment::{self, Conversation, GYMNASIUM};
+use crate::external_environment::{self, ExternalEnvironment, GYMNASIUM};
 use crate::preflight;
 
 const PRESETS: [(&str, &str); 7] = [
@@ -220,7 +220,7 @@ fn describe_environment(table: &mut Table) -> anyhow::Result<()> {
             server,
             parameters: section.clone(),
         };
-        let spec = Conversation::begin(&environment, 1, 0)?.spec().clone();
+        let spec = ExternalEnvironment::begin(&environment, 1, 0)?.spec().clone();
         (environment, spec)
     } else {
         let parameters = environment::resolve(&name, section)?;

@@ -10,7 +10,7 @@ use shoal_env_server::environment::Source;
 use shoal_env_server::environment::angle::followed;
 use shoal_env_server::vector::{Start, VectorEnvironment};
 
-use crate::external_environment::Conversation;
+use crate::external_environment::ExternalEnvironment;
 
 /// An episode of T steps.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -61,7 +61,7 @@ pub struct Rollout<'a> {
 enum Stage {
     Here(Box<VectorEnvironment>),
     /// By another program, whose evaluation episodes start as this seed says. Begun with the first episode.
-    Elsewhere(Option<(u64, Box<Conversation>)>),
+    Elsewhere(Option<(u64, Box<ExternalEnvironment>)>),
 }
 
 /// What a step gave.
@@ -151,7 +151,12 @@ impl Stage {
                     // One at a time.
                     *conversation = None;
                 }
-                let begin = || anyhow::Ok((seed, Box::new(Conversation::begin(&config.environment, 1, seed)?)));
+                let begin = || {
+                    anyhow::Ok((
+                        seed,
+                        Box::new(ExternalEnvironment::begin(&config.environment, 1, seed)?),
+                    ))
+                };
                 let (_, conversation) = match conversation {
                     Some(begun) => begun,
                     None => conversation.insert(begin()?),

@@ -8,8 +8,8 @@ use clap::Args;
 use shoal_common::run_dir::RunDir;
 use shoal_run::status;
 
-use super::training::Telling;
-use super::training::conduct;
+use super::training::OutputMode;
+use super::training::run_training;
 
 #[derive(Args, Clone, Debug)]
 pub(crate) struct ResumeArgs {
@@ -22,7 +22,7 @@ pub(crate) struct ResumeArgs {
     #[arg(long, value_name = "M")]
     pub(crate) episodes: Option<u64>,
     #[command(flatten)]
-    pub(crate) telling: Telling,
+    pub(crate) output: OutputMode,
 }
 
 /// Goes on with the run's own replay, counters and noise, to the steps it was to take or to others.
@@ -50,5 +50,5 @@ pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
         config.check()?;
         run.write_config(&config)?;
     }
-    conduct(config, &run, lock, &args.telling)
+    run_training(config, &run, lock, &args.output)
 }

@@ -9,8 +9,8 @@ use clap_complete::engine::ArgValueCompleter;
 use shoal_run::plan::{Plan, RunOverrides};
 
 use super::help_config;
-use super::training::Telling;
-use super::training::conduct;
+use super::training::OutputMode;
+use super::training::run_training;
 use crate::completion;
 
 #[derive(Args, Clone, Debug)]
@@ -26,7 +26,7 @@ pub(crate) struct TrainArgs {
     #[command(flatten)]
     pub(crate) overrides: RunArgs,
     #[command(flatten)]
-    pub(crate) telling: Telling,
+    pub(crate) output: OutputMode,
 }
 
 /// What of a run can be said on the command line.
@@ -91,5 +91,5 @@ pub(crate) fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
     }
     let what = args.what.as_deref().context("say what to train")?;
     let Plan { config, run, lock } = Plan::new(what, &args.overrides.overrides())?;
-    conduct(config, &run, lock, &args.telling)
+    run_training(config, &run, lock, &args.output)
 }

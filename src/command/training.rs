@@ -23,7 +23,7 @@ use crate::launcher::{self, Ending, Outcome};
 
 /// What a training run says.
 #[derive(Args, Clone, Debug, Default)]
-pub(crate) struct Telling {
+pub(crate) struct OutputMode {
     /// No live line and no table.
     #[arg(long)]
     pub(crate) quiet: bool,
@@ -52,8 +52,13 @@ struct Summary {
 
 /// Trains until the run's end or an earlier one, judges what was learned, draws it, and tells the person.
 /// The run is this process's until all of that is done.
-pub(crate) fn conduct(config: Config, run: &RunDir, _lock: RunLock, telling: &Telling) -> anyhow::Result<ExitCode> {
-    let outcome = launcher::run(config.clone(), run, telling.quiet)?;
+pub(crate) fn run_training(
+    config: Config,
+    run: &RunDir,
+    _lock: RunLock,
+    output: &OutputMode,
+) -> anyhow::Result<ExitCode> {
+    let outcome = launcher::run(config.clone(), run, output.quiet)?;
     let judged = match outcome.ending {
         Ending::Finished => judge(&config, run)?,
         Ending::Stopped | Ending::Interrupted(_) | Ending::Renewed => Vec::new(),
@@ -66,10 +71,10 @@ pub(crate) fn conduct(config: Config, run: &RunDir, _lock: RunLock, telling: &Te
         outcome::Outcome::new(outcome::State::Finished, env_steps, episodes).write(run)?;
     }
     let summary = Summary::new(&config, run, &outcome, judged.first().map(|(_, summary)| summary))?;
-    if !telling.quiet {
+    if !output.quiet {
         tell(&mut std::io::stderr().lock(), run, &outcome, &summary, &judged)?;
     }
-    if telling.json {
+    if output.json {
         writeln!(std::io::stdout().lock(), "{}", serde_json::to_string(&summary)?)?;
     }
     Ok(match outcome.ending {

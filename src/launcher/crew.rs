@@ -117,7 +117,7 @@ impl Crew {
     pub(super) fn start_all(&mut self, domain: &Domain) -> anyhow::Result<()> {
         self.serve(domain)?;
         (0..self.members.len()).try_for_each(|i| self.start(i))?;
-        self.recruit(domain)
+        self.start_missing(domain)
     }
 
     /// What has happened since this was asked last, in order.
@@ -151,7 +151,7 @@ impl Crew {
     }
 
     /// Makes and fills the places that are missing, each actor's with its environment server's.
-    fn recruit(&mut self, domain: &Domain) -> anyhow::Result<()> {
+    fn start_missing(&mut self, domain: &Domain) -> anyhow::Result<()> {
         self.serve(domain)?;
         for index in 0..self.actors {
             for role in [Role::EnvServer, Role::Actor] {
@@ -269,8 +269,8 @@ impl Crew {
                 return Ok(State::LearnerDone);
             }
         }
-        self.let_go();
-        self.recruit(domain)?;
+        self.retire_surplus();
+        self.start_missing(domain)?;
         Ok(state)
     }
 
@@ -371,7 +371,7 @@ impl Crew {
     }
 
     /// Lets actors retire that are too many, and when they are gone their environment servers.
-    fn let_go(&mut self) {
+    fn retire_surplus(&mut self) {
         let serves_nobody = |members: &[Member], member: &Member| {
             member.identity.role == Role::EnvServer
                 && !members.iter().any(|actor| actor.is(Role::Actor, member.identity.index))
@@ -475,7 +475,7 @@ impl Crew {
     ///
     /// # Errors
     /// When the learner did not save its state at its end.
-    pub(super) fn say_farewell(&self) -> anyhow::Result<()> {
+    pub(super) fn check_saved(&self) -> anyhow::Result<()> {
         self.log.note("launcher", EVERYBODY_ENDED);
         let Some(how) = &self.unsaved else { return Ok(()) };
         let lines = self.log.last_lines(&name(Identity {

@@ -9,7 +9,7 @@ use shoal_common::run_dir::RunDir;
 use shoal_run::numbers::thousands;
 
 use super::crew::Crew;
-use super::desk::waiting;
+use super::requests::waiting;
 
 /// Rates are taken over so long.
 const SPAN: Duration = Duration::from_secs(5);

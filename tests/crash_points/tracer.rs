@@ -164,7 +164,7 @@ impl Tracer {
                 }
             }
             Some(false) => self.go_on(process, None),
-            None => self.let_go(process, None),
+            None => self.continue_thread(process, None),
         }
     }
 
@@ -214,11 +214,11 @@ impl Tracer {
         let _ = match (is_target, self.found) {
             (true, _) => ptrace::syscall(thread, signal),
             (false, None) => ptrace::cont(thread, signal),
-            (false, Some(_)) => return self.let_go(thread, signal),
+            (false, Some(_)) => return self.continue_thread(thread, signal),
         };
     }
 
-    fn let_go(&mut self, thread: Pid, signal: Option<Signal>) {
+    fn continue_thread(&mut self, thread: Pid, signal: Option<Signal>) {
         self.threads.remove(&thread);
         let _ = ptrace::detach(thread, signal);
     }

@@ -28,7 +28,7 @@ pub(crate) struct Run {
 /// A stop that is requested if the test hangs.
 pub(crate) struct Watchdog {
     pub(crate) stop: Stop,
-    _bone: Sender<()>,
+    _ends: Sender<()>,
 }
 
 impl Run {
@@ -121,14 +121,14 @@ impl Drop for Run {
 impl Watchdog {
     pub(crate) fn new() -> Self {
         let stop = Stop::default();
-        let (bone, bones) = mpsc::channel();
+        let (ends, bones) = mpsc::channel();
         let hanging = stop.clone();
         std::thread::spawn(move || {
             if bones.recv_timeout(DEADLINE) == Err(mpsc::RecvTimeoutError::Timeout) {
                 hanging.request();
             }
         });
-        Self { stop, _bone: bone }
+        Self { stop, _ends: ends }
     }
 }
 

@@ -31,12 +31,12 @@ pub(super) struct Training {
     begun: Instant,
     /// Of the learner that was seen last.
     incarnation: u64,
-    seat: Option<Seat>,
+    seat: Option<Observer>,
     directory: TempDir,
 }
 
 /// What is needed to look on.
-struct Seat {
+struct Observer {
     remote: Remote,
     heartbeats: Reports<Heartbeat>,
     policies: PolicyReader,
@@ -44,7 +44,7 @@ struct Seat {
 }
 
 /// When a run had come how far, since its launcher was started.
-pub(super) struct Began {
+pub(super) struct Startup {
     pub(super) ready: Duration,
     first_row: Duration,
     pub(super) warm: Duration,
@@ -53,12 +53,12 @@ pub(super) struct Began {
 }
 
 /// When a learner that was killed was replaced, since then.
-pub(super) struct Came {
+pub(super) struct Recovery {
     pub(super) ready: Duration,
     pub(super) update: Duration,
 }
 
-impl Began {
+impl Startup {
     pub(super) fn warm_up(&self) -> Duration {
         self.warm - self.first_row
     }
@@ -94,7 +94,7 @@ impl Training {
         // Whoever is the last to leave removes the run from shared memory.
         let left = match self.seat {
             None => Ok(()),
-            Some(Seat {
+            Some(Observer {
                 heartbeats,
                 policies,
                 domain,
@@ -111,14 +111,14 @@ impl Training {
     }
 
     /// Looks on until the first policy that updates have changed.
-    pub(super) fn begin(&mut self, patience: &Patience) -> anyhow::Result<Began> {
+    pub(super) fn begin(&mut self, patience: &Patience) -> anyhow::Result<Startup> {
         let run = RunDir::planned(&self.directory.path().join("run"));
         let begun = self.begun;
         // Who joins before the launcher has would be taken for what another launcher left; and the services are there when the
         // first process is started, whose number is written down before.
         let counter = run.incarnations();
         self.wait(patience, "no process", |_| Ok(counter.exists().then_some(())))?;
-        let mut seat = Seat::take(&run)?;
+        let mut seat = Observer::take(&run)?;
         let actors = seat.remote.config.actors.count;
         let roles = 3 + 2 * actors as usize;
         let warm_up_rows = seat.remote.config.replay.warmup;
@@ -146,7 +146,7 @@ impl Training {
             note(&mut update, header.is_some_and(|header| header.updates > 0));
             *incarnation = header.map_or(0, |header| header.incarnation);
             let all = ready.zip(first_row).zip(warm).zip(update);
-            Ok(all.map(|(((ready, first_row), warm), update)| Began {
+            Ok(all.map(|(((ready, first_row), warm), update)| Startup {
                 ready,
                 first_row,
                 warm,
@@ -179,7 +179,7 @@ impl Training {
     }
 
     /// Looks on until the successor of a learner that was killed then has made updates.
-    pub(super) fn recover(&mut self, killed: Instant, patience: &Patience) -> anyhow::Result<Came> {
+    pub(super) fn recover(&mut self, killed: Instant, patience: &Patience) -> anyhow::Result<Recovery> {
         let mut seat = self.seat.take().context("nobody looks on")?;
         let (mut ready, mut first, before) = (None, None, self.incarnation);
         let came = self.wait(patience, "no update of the learner's successor", |incarnation| {
@@ -195,7 +195,7 @@ impl Training {
             let is_changed = header.updates > restored;
             Ok(ready.filter(|_| is_changed).map(|ready| {
                 *incarnation = header.incarnation;
-                Came {
+                Recovery {
                     ready,
                     update: killed.elapsed(),
                 }
@@ -205,7 +205,7 @@ impl Training {
         came
     }
 
-    fn seat(&self) -> anyhow::Result<&Seat> {
+    fn seat(&self) -> anyhow::Result<&Observer> {
         self.seat.as_ref().context("nobody looks on")
     }
 
@@ -231,7 +231,7 @@ impl Training {
     }
 }
 
-impl Seat {
+impl Observer {
     fn take(run: &RunDir) -> anyhow::Result<Self> {
         let remote = Remote::open(run.path())?;
         let domain = Domain::join(&remote.config.run.id, remote.config.actors.max)?;

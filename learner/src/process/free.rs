@@ -32,7 +32,7 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
         if learner.stop.requested() {
             return Err(Exit::Stopped);
         }
-        learner.call_the_roll()?;
+        learner.connect_new_actors()?;
         let updates = learner.updates();
         // A power loss may leave a replay of many rows without one that can be read: new ones have to come first.
         let drained = learner.intake.drain(&mut learner.replay, CHUNKS_AT_ONCE, |replay| {

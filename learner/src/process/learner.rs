@@ -189,7 +189,7 @@ impl<'a> Learner<'a> {
     }
 
     /// Listens to actors that have come since: a run is scaled while it goes on.
-    pub(crate) fn call_the_roll(&mut self) -> Result<(), LearnerError> {
+    pub(crate) fn connect_new_actors(&mut self) -> Result<(), LearnerError> {
         if self.called.elapsed() < ROLL_CALL {
             return Ok(());
         }

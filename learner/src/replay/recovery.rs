@@ -32,7 +32,7 @@ struct Candidate<'a> {
 impl Candidate<'_> {
     /// Greater is better. A power loss must not cost a row that was synced: they count first. Rows before `replaced` count
     /// for nothing.
-    fn merit(&self, replaced: u64, synced: u64, layout: &ReplayLayout) -> (u64, u64, bool, u64) {
+    fn rank(&self, replaced: u64, synced: u64, layout: &ReplayLayout) -> (u64, u64, bool, u64) {
         let (head, tail) = (self.record.head(), self.tail.max(replaced));
         let of_synced = head.min(synced).saturating_sub(tail);
         let of_all = head.saturating_sub(tail);
@@ -83,7 +83,7 @@ pub(super) fn recover(words: &Words, places: &Places, layout: &ReplayLayout, rin
             .filter_map(|(slot, record)| Some(candidate(slot, record.as_ref()?)));
         best = records
             .chain([best])
-            .max_by_key(|each| each.merit(replaced, synced, layout))
+            .max_by_key(|each| each.rank(replaced, synced, layout))
             .ok_or(NONE_LEFT)?;
     }
 
