@@ -1,14 +1,14 @@
 //! The launcher: starts the roles of a run, watches them, keeps the records, and ends all of them.
 
+mod child;
 mod cleaner;
-mod crew;
 mod incarnations;
 mod log;
-mod member;
 mod process;
 mod progress;
 mod requests;
 mod stall;
+mod supervisor;
 
 use std::os::fd::AsFd;
 use std::time::{Duration, Instant};
@@ -28,11 +28,11 @@ use shoal_run::signals::Signals;
 use shoal_run::{preflight, status};
 
 pub(crate) use self::cleaner::work as clean_up;
-use self::crew::Crew;
 use self::log::Log;
 pub(crate) use self::log::{EVERYBODY_ENDED, FAILED};
 use self::progress::Progress;
 use self::stall::Stalls;
+use self::supervisor::Supervisor;
 
 /// How often the launcher reads reports and looks round where nothing wakes it. It begins with the shortest tick, and a tick is
 /// longer than the one before where reports come slowly: the oldest of a full buffer are lost.
@@ -158,7 +158,7 @@ struct Launcher<'a> {
     to_end: Option<Instant>,
     /// The end has begun.
     ends: bool,
-    crew: Crew,
+    supervisor: Supervisor,
     log: Log,
     recorder: Recorder,
     progress: Progress,
@@ -190,7 +190,7 @@ impl<'a> Launcher<'a> {
         let rest = status::at_rest(&config, run)?;
         outcome::Outcome::new(State::Running, rest.env_steps, rest.episodes).write(run)?;
         // Makes the services that are opened below.
-        let crew = Crew::new(&config, run, domain, log.clone())?;
+        let supervisor = Supervisor::new(&config, run, domain, log.clone())?;
         Ok(Self {
             control: ControlPort::open(domain)?,
             rest,
@@ -202,7 +202,7 @@ impl<'a> Launcher<'a> {
             episode_reports: Reports::open(domain)?,
             evaluation_reports: Reports::open(domain)?,
             learner_reports: Reports::open(domain)?,
-            crew,
+            supervisor,
             stalls: Stalls::new(Duration::from_secs(config.run.stall_seconds)),
             log,
             recorder,
@@ -218,7 +218,7 @@ impl<'a> Launcher<'a> {
         let ending = self.watch();
         // Whatever happened, nobody is left behind.
         self.progress.say("ending");
-        let ended = self.end_crew();
+        let ended = self.end_everyone();
         self.progress.clear();
         self.control.dismiss(&match &ended {
             Ok(()) => Answer::Accepted,
@@ -261,21 +261,21 @@ impl<'a> Launcher<'a> {
     }
 
     fn watch(&mut self) -> anyhow::Result<Ending> {
-        self.crew.start_all(self.domain)?;
+        self.supervisor.start_all(self.domain)?;
         loop {
             if let Some(signal) = self.signals.received() {
                 return Ok(Ending::Interrupted(signal));
             }
             self.read_reports()?;
             self.attend()?;
-            match self.crew.look_after(self.domain)? {
-                crew::State::AtWork => {}
-                crew::State::LearnerDone => {
+            match self.supervisor.look_after(self.domain)? {
+                supervisor::State::AtWork => {}
+                supervisor::State::LearnerDone => {
                     self.await_last_evaluation()?;
                     return Ok(Ending::Finished);
                 }
-                crew::State::SharedMemoryOccupied if self.to_end.is_some() => {}
-                crew::State::SharedMemoryOccupied => {
+                supervisor::State::SharedMemoryOccupied if self.to_end.is_some() => {}
+                supervisor::State::SharedMemoryOccupied => {
                     let why =
                         "dead processes occupy places in shared memory: the run goes on in shared memory made anew";
                     self.log.note("launcher", why);
@@ -283,30 +283,30 @@ impl<'a> Launcher<'a> {
                     return Ok(Ending::Renewed);
                 }
             }
-            for stalled in self.crew.replace_stalled(&mut self.stalls) {
+            for stalled in self.supervisor.replace_stalled(&mut self.stalls) {
                 self.log.note("launcher", &stalled);
                 self.progress.note(&stalled);
             }
             // A learner that has just died shall come back and take in what was sent, before everybody ends.
-            let may_end = |asked: Instant| self.crew.has_learner() || asked.elapsed() >= LEARNER_BACK;
+            let may_end = |asked: Instant| self.supervisor.has_learner() || asked.elapsed() >= LEARNER_BACK;
             if self.to_end.is_some_and(may_end) {
                 return Ok(Ending::Stopped);
             }
-            self.progress.draw(&self.crew);
-            self.sleep(self.tick.min(self.crew.idle_for()));
+            self.progress.draw(&self.supervisor);
+            self.sleep(self.tick.min(self.supervisor.idle_for()));
         }
     }
 
     /// Sleeps until a process ends, a signal comes or somebody asks, but no longer than `most`.
     fn sleep(&mut self, most: Duration) {
-        let mut wakers: Vec<_> = self.crew.ends().collect();
+        let mut wakers: Vec<_> = self.supervisor.ends().collect();
         wakers.extend([self.signals.as_fd(), self.control.as_fd()]);
         if wait_for_any(&wakers, most) {
             self.tick = SHORTEST_TICK;
         }
         // What it has woken for is not to wake it again.
         self.signals.received();
-        self.crew.see_ends();
+        self.supervisor.see_ends();
     }
 
     /// Answers who asks from another terminal. Who asks for the end is answered when it is there.
@@ -315,7 +315,7 @@ impl<'a> Launcher<'a> {
             config,
             run,
             control,
-            crew,
+            supervisor,
             progress,
             rest,
             ends,
@@ -324,12 +324,12 @@ impl<'a> Launcher<'a> {
         } = self;
         control.attend(run.key()?, run.path(), |question| -> anyhow::Result<Option<Answer>> {
             match question {
-                Question::Status => Ok(Some(match requests::status(config, run, crew, progress, rest) {
+                Question::Status => Ok(Some(match requests::status(config, run, supervisor, progress, rest) {
                     Ok(status) => Answer::Status(status),
                     Err(error) => Answer::Refused(error.to_string()),
                 })),
                 Question::Scale { .. } if *ends => Ok(Some(Answer::Refused("the run is ending".into()))),
-                Question::Scale { actors } => requests::scale(config, run, crew, actors).map(Some),
+                Question::Scale { actors } => requests::scale(config, run, supervisor, actors).map(Some),
                 Question::Stop => {
                     to_end.get_or_insert_with(Instant::now);
                     Ok(None)
@@ -355,21 +355,21 @@ impl<'a> Launcher<'a> {
     }
 
     /// Ends everyone: the actors first, so that the learner still takes what they send.
-    fn end_crew(&mut self) -> anyhow::Result<()> {
+    fn end_everyone(&mut self) -> anyhow::Result<()> {
         self.ends = true;
         let actors = |role| role == Role::Actor;
         self.end(actors, ACTORS_END);
         self.end(|_| true, OTHERS_END);
         self.read_reports()?;
-        self.crew.check_saved()
+        self.supervisor.check_saved()
     }
 
     fn end(&mut self, which: impl Fn(Role) -> bool + Copy, patience: Duration) {
         let deadline = Instant::now() + patience;
-        self.crew.ask_to_end(which);
-        while !self.crew.have_ended(which) {
+        self.supervisor.ask_to_end(which);
+        while !self.supervisor.have_ended(which) {
             if Instant::now() >= deadline {
-                self.crew.kill(which);
+                self.supervisor.kill(which);
             }
             // No question keeps a run from ending.
             let _ = self.attend();
@@ -379,11 +379,11 @@ impl<'a> Launcher<'a> {
 
     fn read_reports(&mut self) -> anyhow::Result<()> {
         let wall = self.begun.elapsed();
-        for incident in self.crew.take_incidents() {
+        for incident in self.supervisor.take_incidents() {
             self.recorder.incident(&incident, wall)?;
         }
         while let Some(heartbeat) = self.heartbeats.receive()? {
-            self.crew.hear(&heartbeat);
+            self.supervisor.hear(&heartbeat);
         }
         let filled = [
             each(&self.episode_reports, |report| {

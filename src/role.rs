@@ -7,7 +7,7 @@ use std::process::ExitCode;
 use anyhow::Context;
 use shoal_actor::{evaluator, explorer};
 use shoal_common::channel::environment::EnvironmentPort;
-use shoal_common::channel::{Domain, Place, Pulse};
+use shoal_common::channel::{Domain, HeartbeatSender, Place};
 use shoal_common::config::{Config, Mode};
 use shoal_common::report::{Identity, Role};
 use shoal_common::run_dir::RunDir;
@@ -131,7 +131,7 @@ fn serve(
     )?;
     let spec = environments.spec().clone();
     let port = EnvironmentPort::open(domain, launch.index, spec, environments.count(), launch.client)?;
-    let pulse = Pulse::new(domain, identity)?;
+    let pulse = HeartbeatSender::new(domain, identity)?;
     Ok(shoal_env_server::server::serve(
         &mut environments,
         &port,

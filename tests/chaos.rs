@@ -134,7 +134,7 @@ fn inspect(run: &Path, config: &Config, rows: u64) {
         row: config.row_layout(),
         ring: config.replay.capacity,
         actors: config.actors.max as usize,
-        standing_words: 0,
+        actor_snapshot_words: 0,
         fingerprint: config.fingerprint(),
     };
     let replay = Replay::open(&run.join("replay.bin"), &layout).unwrap();

@@ -183,7 +183,7 @@ fn an_actor_killed_before_its_first_chunk_begins_again_as_if_it_had_never_been()
     let running = place.start("killed", &arguments);
     let commits = CommitReader::open(&running.run.join("replay.bin")).unwrap();
     for (actor, who) in ["actor-0", "actor-1"].into_iter().enumerate() {
-        // Then it begins its first chunk. The learner takes the second actor's greeting after the first one's chunk.
+        // Then it begins its first chunk. The learner takes the second actor's handshake after the first one's chunk.
         until("the learner knows of it", || commits.committed(actor).incarnation > 0);
         running.stop(who);
         assert_eq!(commits.actor(actor).rows, 0, "or this test shows nothing");

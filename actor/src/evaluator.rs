@@ -6,7 +6,7 @@ use std::rc::Rc;
 use shoal_common::channel::environment::{Begin, EnvironmentClient, Stepped};
 use shoal_common::channel::policy::{self, PolicyHeader, PolicyReader};
 use shoal_common::channel::reports::Reporter;
-use shoal_common::channel::{Bell, ChannelError, Domain, Place, Pulse, Ringer, wait_for};
+use shoal_common::channel::{ChannelError, Domain, HeartbeatSender, Listener, Notifier, Place, wait_for};
 use shoal_common::config::{Algorithm, Config, Evaluation};
 use shoal_common::evaluator_state::EvaluatorState;
 use shoal_common::exit::Exit;
@@ -91,15 +91,15 @@ pub fn evaluate(domain: &Domain, settings: &Settings, stop: &Stop) -> Result<(),
 struct Evaluator<'a> {
     settings: &'a Settings,
     stop: &'a Stop,
-    bell: Bell,
-    learner: Ringer,
+    bell: Listener,
+    learner: Notifier,
     client: EnvironmentClient,
     reader: PolicyReader,
     policy: Policy,
     reports: Reporter<EvaluationReport>,
     state: EvaluatorState,
     judgements: Reporter<JudgedReport>,
-    pulse: Pulse,
+    pulse: HeartbeatSender,
     actions: Vec<f32>,
     /// The period of the policy judged last.
     judged: Option<u64>,
@@ -111,8 +111,8 @@ impl<'a> Evaluator<'a> {
     fn new(domain: &Domain, settings: &'a Settings, stop: &'a Stop) -> Result<Self, Exit<ActorError>> {
         let policy = settings.algorithm.policy(&settings.spec, settings.envs)?;
         let layout = policy.layout();
-        let bell = Bell::hang(domain, Place(Role::Evaluator, settings.identity.index))?;
-        let mut pulse = Pulse::new(domain, settings.identity)?;
+        let bell = Listener::bind(domain, Place(Role::Evaluator, settings.identity.index))?;
+        let mut pulse = HeartbeatSender::new(domain, settings.identity)?;
         let client = connect(domain, &bell, settings.server, &settings.spec, settings.envs, stop)?;
         let reader = PolicyReader::open(domain, layout.fingerprint(), layout.parameters())?;
         let best = if settings.run.best_policy().exists() {
@@ -133,7 +133,7 @@ impl<'a> Evaluator<'a> {
         Ok(Self {
             settings,
             stop,
-            learner: Ringer::new(domain, Place(Role::Learner, 0))?,
+            learner: Notifier::new(domain, Place(Role::Learner, 0))?,
             client,
             reader,
             reports,
@@ -189,7 +189,7 @@ impl<'a> Evaluator<'a> {
             .map_err(ActorError::State)?;
         self.reports.send(evaluation);
         self.judgements.send(JudgedReport { period });
-        self.learner.ring();
+        self.learner.notify();
         Ok(())
     }
 

@@ -19,7 +19,7 @@ use shoal_common::channel::environment::{Begin, EnvironmentClient, Observed, Sna
 use shoal_common::channel::policy::{Policy, PolicyReader};
 use shoal_common::channel::reports::Reporter;
 use shoal_common::channel::transitions::{Chunk, ChunkSender};
-use shoal_common::channel::{Bell, ChannelError, Domain, Place, Pulse, Ringer, wait_for};
+use shoal_common::channel::{ChannelError, Domain, HeartbeatSender, Listener, Notifier, Place, wait_for};
 use shoal_common::commit::{CommitReader, OpenError};
 use shoal_common::config::{Algorithm, Config, Mode};
 use shoal_common::exit::Exit;
@@ -30,9 +30,9 @@ use shoal_common::stop::Stop;
 use shoal_common::stream::{Purpose, stream};
 use shoal_common::transition::{ChunkLayout, Transition};
 
+use crate::actor_snapshot::ActorSnapshot;
 use crate::error::ActorError;
 use crate::exploration::Exploration;
-use crate::standing::Standing;
 
 /// How long an actor waits for its last chunk to be committed when the whole run ends.
 const FAREWELL: Duration = Duration::from_secs(1);
@@ -95,8 +95,8 @@ pub fn explore(domain: &Domain, settings: &Settings, stop: &Stop) -> Result<(), 
 struct Explorer<'a> {
     settings: &'a Settings,
     stop: &'a Stop,
-    bell: Bell,
-    learner: Ringer,
+    bell: Listener,
+    learner: Notifier,
     client: EnvironmentClient,
     policy: PolicyReader,
     exploration: Exploration,
@@ -106,7 +106,7 @@ struct Explorer<'a> {
     /// Version of the policy that its last row was collected with; of the one before it, while it is empty.
     policy_version: u64,
     commits: CommitReader,
-    pulse: Pulse,
+    pulse: HeartbeatSender,
     episodes: Reporter<EpisodeReport>,
     returns: Vec<f64>,
     lengths: Vec<u32>,
@@ -114,7 +114,7 @@ struct Explorer<'a> {
     /// Steps of every environment since the actor's stream began.
     step: u64,
     /// Where it stood after the last chunk, where it can say that.
-    standing: Option<Standing>,
+    standing: Option<ActorSnapshot>,
     /// Since when it knows that the run ends.
     hurried: Option<Instant>,
     /// Episodes whose ends are in the chunk under way.
@@ -126,17 +126,17 @@ impl<'a> Explorer<'a> {
         let Identity { index, incarnation, .. } = settings.identity;
         let row = settings.chunk.row;
         let layout = settings.algorithm.policy_layout(&settings.spec)?;
-        let bell = Bell::hang(domain, Place(Role::Actor, index))?;
-        let mut pulse = Pulse::new(domain, settings.identity)?;
+        let bell = Listener::bind(domain, Place(Role::Actor, index))?;
+        let mut pulse = HeartbeatSender::new(domain, settings.identity)?;
         let client = connect(domain, &bell, index, &settings.spec, settings.envs, stop)?;
         let policy = PolicyReader::open(domain, layout.fingerprint(), layout.parameters())?;
         pulse.beat(Activity::WaitingForPeer);
 
         let commits = wait_for_replay(settings, &bell, stop, &mut pulse)?;
-        let greeting = ChunkSender::open(domain, index, incarnation, settings.chunk, settings.window)?;
-        let learner = Ringer::new(domain, Place(Role::Learner, 0))?;
-        learner.ring();
-        let sender = greeting
+        let handshake = ChunkSender::open(domain, index, incarnation, settings.chunk, settings.window)?;
+        let learner = Notifier::new(domain, Place(Role::Learner, 0))?;
+        learner.notify();
+        let sender = handshake
             .wait(&commits, &bell, stop, || pulse.beat(Activity::WaitingForPeer))
             .map_err(Exit::widen)?;
         // In lockstep nothing may depend on how often an actor was started: it goes on where the last chunk left it.
@@ -152,7 +152,7 @@ impl<'a> Explorer<'a> {
         );
         let standing = if settings.mode == Mode::Lockstep && sender.sent() > 0 {
             let words = commits.standing(index as usize);
-            Standing::read(&words, &settings.chunk, settings.envs, exploration.state().len())
+            ActorSnapshot::read(&words, &settings.chunk, settings.envs, exploration.state().len())
         } else {
             None
         };
@@ -348,7 +348,7 @@ impl<'a> Explorer<'a> {
     /// Says behind the chunk's rows where the actor stands after them, where that is asked for; whether the environment
     /// server is still there to say its part.
     fn append_snapshot(&mut self) -> Result<bool, Exit<ActorError>> {
-        if self.settings.chunk.standing_words == 0 {
+        if self.settings.chunk.actor_snapshot_words == 0 {
             return Ok(true);
         }
         let idle = || self.pulse.beat(Activity::WaitingForServer);
@@ -356,7 +356,7 @@ impl<'a> Explorer<'a> {
         let Snapshot::Taken(snapshot) = snapshot else {
             return Ok(false);
         };
-        let standing = Standing {
+        let standing = ActorSnapshot {
             snapshot,
             step: self.step,
             noise: self.exploration.state().into(),
@@ -404,7 +404,7 @@ impl<'a> Explorer<'a> {
     fn send(&mut self) -> Result<(), ChannelError> {
         let chunk = std::mem::replace(&mut self.chunk, self.sender.begin()?);
         self.sender.send(chunk, self.policy_version)?;
-        self.learner.ring();
+        self.learner.notify();
         self.ended.drain(..).for_each(|episode| self.episodes.send(episode));
         Ok(())
     }
@@ -444,7 +444,7 @@ impl<'a> Explorer<'a> {
 /// Opens the conversation with environment server `index` and makes sure that it serves what the run is about.
 pub(crate) fn connect(
     domain: &Domain,
-    bell: &Bell,
+    bell: &Listener,
     index: u32,
     spec: &EnvironmentSpec,
     envs: usize,
@@ -466,9 +466,9 @@ pub(crate) fn connect(
 
 fn wait_for_replay(
     settings: &Settings,
-    bell: &Bell,
+    bell: &Listener,
     stop: &Stop,
-    pulse: &mut Pulse,
+    pulse: &mut HeartbeatSender,
 ) -> Result<CommitReader, Exit<ActorError>> {
     loop {
         match CommitReader::open(&settings.replay) {

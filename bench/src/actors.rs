@@ -7,11 +7,11 @@ use anyhow::{Context, bail};
 use serde::Serialize;
 
 use super::costs::{self, Costs};
-use super::crew::Crew;
 use super::flow::{Flow, LOOK};
 use super::measurement::{Figures, Patience};
 use super::model::{Bottleneck, Stages};
 use super::one_core::{self, OneCore};
+use super::processes::Processes;
 use super::rows::ENVIRONMENTS;
 use super::scene::{Scene, counted_settings};
 use super::window::Windows;
@@ -183,10 +183,10 @@ fn count(actors: u32, updates: bool, length: Duration, patience: &Patience) -> a
     let scene = Scene::of(actors, ENVIRONMENTS as u32, &counted_settings(actors, updates))?;
     scene.with_crew(
         |_| None,
-        |domain, crew| {
-            let mut flow = Flow::begin(&scene, domain, crew, patience)?;
-            flow.sleep(length.mul_f64(WARM_UP), crew, patience)?;
-            watch(&mut flow, length.mul_f64(1.0 - WARM_UP), crew, patience)
+        |domain, processes| {
+            let mut flow = Flow::begin(&scene, domain, processes, patience)?;
+            flow.sleep(length.mul_f64(WARM_UP), processes, patience)?;
+            watch(&mut flow, length.mul_f64(1.0 - WARM_UP), processes, patience)
         },
     )
 }
@@ -194,7 +194,7 @@ fn count(actors: u32, updates: bool, length: Duration, patience: &Patience) -> a
 fn watch(
     flow: &mut Flow<'_>,
     length: Duration,
-    crew: &mut Crew,
+    processes: &mut Processes,
     patience: &Patience,
 ) -> anyhow::Result<(Windows, f64)> {
     let mut windows = Windows::default();
@@ -214,7 +214,7 @@ fn watch(
         windows.add((rows - opened.1) as f64 / (now - opened.0).as_secs_f64());
         opened = (now, rows);
         patience.check()?;
-        crew.check()?;
+        processes.check()?;
         // Two policies are the least that a rate can be taken from.
         if now - begun >= length && (!flow.expects_updates() || published.len() > 1) {
             break;

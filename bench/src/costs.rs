@@ -7,7 +7,7 @@ use serde::Serialize;
 use shoal_actor::exploration::Exploration;
 use shoal_common::channel::environment::{Begin, EnvironmentClient, ResponseLayout, Stepped};
 use shoal_common::channel::transitions::ChunkSender;
-use shoal_common::channel::{Bell, Domain, Place, Ringer};
+use shoal_common::channel::{Domain, Listener, Notifier, Place};
 use shoal_common::commit::CommitReader;
 use shoal_common::config::Config;
 use shoal_common::network::{ActionRange, PolicyNetwork};
@@ -168,7 +168,7 @@ fn round_trip(
     length: Duration,
     patience: &Patience,
 ) -> anyhow::Result<f64> {
-    let bell = Bell::hang(domain, Place(Role::Actor, 0))?;
+    let bell = Listener::bind(domain, Place(Role::Actor, 0))?;
     let client = EnvironmentClient::open(domain, 0, &config.spec, ENVIRONMENTS, patience.stop.clone())?;
     client.describe(&bell, || ()).map_err(interrupted)?;
     client.reset(&bell, Begin::Next, || ()).map_err(interrupted)?;
@@ -212,13 +212,13 @@ fn chunks(
     for step in rows.chunks_exact_mut(ENVIRONMENTS * row.width()) {
         source.fill(step)?;
     }
-    let bell = Bell::hang(domain, Place(Role::Actor, 0))?;
-    let learner = Ringer::new(domain, Place(Role::Learner, 0))?;
+    let bell = Listener::bind(domain, Place(Role::Actor, 0))?;
+    let learner = Notifier::new(domain, Place(Role::Learner, 0))?;
     let mut intake = Intake::open(domain, 1, window, config.chunk_layout(), u64::MAX)?;
-    let greeting = ChunkSender::open(domain, 0, 1, config.chunk_layout(), window)?;
+    let handshake = ChunkSender::open(domain, 0, 1, config.chunk_layout(), window)?;
     intake.drain(replay, window, |_| false)?;
     let commits = CommitReader::open(&scene.run.replay_file())?;
-    let mut sender = greeting
+    let mut sender = handshake
         .wait(&commits, &bell, &patience.stop, || {})
         .map_err(interrupted)?;
 
@@ -233,7 +233,7 @@ fn chunks(
             rows.chunks_exact(row.width())
                 .for_each(|one| chunk.push(&row.read(one)));
             sender.send(chunk, 0)?;
-            learner.ring();
+            learner.notify();
         }
         let between = Instant::now();
         let head = replay.head();

@@ -9,8 +9,8 @@ use shoal_common::commit::{CommitReader, OpenError};
 use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
 
-use super::crew::Crew;
 use super::measurement::Patience;
+use super::processes::Processes;
 use super::scene::Scene;
 
 /// How often it is looked whether something has come.
@@ -32,19 +32,19 @@ impl<'a> Flow<'a> {
     pub(super) fn begin(
         scene: &'a Scene,
         domain: &Domain,
-        crew: &mut Crew,
+        processes: &mut Processes,
         patience: &Patience,
     ) -> anyhow::Result<Self> {
         let policies = policy_reader(&scene.config, domain)?;
         let begun = Instant::now();
         let mut commits = None;
         loop {
-            crew.check()?;
+            processes.check()?;
             patience.check()?;
             if commits.is_none() {
                 commits = commits_of(&scene.run)?;
             }
-            // The first chunk is the greeting, and takes no number.
+            // The first chunk is the handshake, and takes no number.
             let has_sent = |commits: &CommitReader, actor: u32| commits.committed(actor as usize).sequence > 0;
             let all = 0..scene.config.actors.count;
             match commits.take() {
@@ -75,11 +75,11 @@ impl<'a> Flow<'a> {
     }
 
     /// Sleeps, unless somebody asks for the end or a role has ended.
-    pub(super) fn sleep(&self, length: Duration, crew: &mut Crew, patience: &Patience) -> anyhow::Result<()> {
+    pub(super) fn sleep(&self, length: Duration, processes: &mut Processes, patience: &Patience) -> anyhow::Result<()> {
         let begun = Instant::now();
         loop {
             patience.check()?;
-            crew.check()?;
+            processes.check()?;
             let left = length.saturating_sub(begun.elapsed());
             if left.is_zero() {
                 return Ok(());

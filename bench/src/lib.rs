@@ -3,7 +3,6 @@
 mod actors;
 mod cores;
 mod costs;
-mod crew;
 mod flow;
 mod gym;
 mod learner;
@@ -12,6 +11,7 @@ mod memory;
 mod model;
 mod one_core;
 mod policy;
+mod processes;
 mod product;
 mod rows;
 mod scene;

@@ -9,9 +9,9 @@ use shoal_common::report::Role;
 
 use super::cores::Cores;
 use super::costs::Inference;
-use super::crew::Crew;
 use super::flow::Flow;
 use super::measurement::Patience;
+use super::processes::Processes;
 use super::rows::ENVIRONMENTS;
 use super::scene::{Scene, counted_settings};
 use super::window::{self, Windows};
@@ -45,17 +45,17 @@ pub(super) fn measure(length: Duration, patience: &Patience) -> anyhow::Result<O
             _ => cores.pair,
         })
     };
-    scene.with_crew(chosen, |domain, crew| {
-        let mut flow = Flow::begin(&scene, domain, crew, patience)?;
+    scene.with_crew(chosen, |domain, processes| {
+        let mut flow = Flow::begin(&scene, domain, processes, patience)?;
         let turns = window::count(length, 1.0, TURN.mul_f64(1.5));
         let turn = TURN.min(length.div_f64(1.5));
-        take_turns(&mut flow, crew, &cores, turns, turn, &mut inference, patience)
+        take_turns(&mut flow, processes, &cores, turns, turn, &mut inference, patience)
     })
 }
 
 fn take_turns(
     flow: &mut Flow<'_>,
-    crew: &mut Crew,
+    processes: &mut Processes,
     cores: &Cores,
     turns: usize,
     turn: Duration,
@@ -68,9 +68,9 @@ fn take_turns(
         // The pair has just been woken.
         std::thread::sleep(turn / 10);
         let (begun, before) = (Instant::now(), flow.rows());
-        flow.sleep(turn, crew, patience)?;
+        flow.sleep(turn, processes, patience)?;
         let rows = (flow.rows() - before) as f64 / begun.elapsed().as_secs_f64();
-        let rate = crew.with_actors_paused(|| -> anyhow::Result<f64> {
+        let rate = processes.with_actors_paused(|| -> anyhow::Result<f64> {
             sched_setaffinity(None, &cores.pair)?;
             inference.step();
             Ok(window::rate(turn / 2, || inference.step()))

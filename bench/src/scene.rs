@@ -13,7 +13,7 @@ use shoal_run::preflight;
 use shoal_run::process::Peer;
 use tempfile::TempDir;
 
-use super::crew::Crew;
+use super::processes::Processes;
 
 /// A run that exists until this is dropped.
 #[derive(Debug)]
@@ -59,7 +59,7 @@ impl Scene {
             row: self.config.row_layout(),
             ring: self.config.replay.capacity,
             actors: self.config.actors.max as usize,
-            standing_words: 0,
+            actor_snapshot_words: 0,
             fingerprint: self.config.fingerprint(),
         }
     }
@@ -91,13 +91,13 @@ impl Scene {
     pub(super) fn with_crew<T>(
         &self,
         chosen: impl Fn(Role) -> Option<CpuSet>,
-        act: impl FnOnce(&Domain, &mut Crew) -> anyhow::Result<T>,
+        act: impl FnOnce(&Domain, &mut Processes) -> anyhow::Result<T>,
     ) -> anyhow::Result<T> {
         self.in_shared_memory(|domain| {
             preflight::claim(&self.config, &self.run, domain)?;
-            let mut crew = Crew::start(&self.run, self.config.actors.count, chosen)?;
-            let acted = act(domain, &mut crew);
-            let ended = crew.end();
+            let mut processes = Processes::start(&self.run, self.config.actors.count, chosen)?;
+            let acted = act(domain, &mut processes);
+            let ended = processes.end();
             let acted = acted?;
             ended?;
             Ok(acted)

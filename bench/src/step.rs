@@ -6,7 +6,7 @@ use anyhow::bail;
 use rustix::thread::sched_setaffinity;
 use serde::Serialize;
 use shoal_common::channel::environment::{Begin, EnvironmentClient, Stepped};
-use shoal_common::channel::{Bell, ChannelError, Domain, Place};
+use shoal_common::channel::{ChannelError, Domain, Listener, Place};
 use shoal_common::config::Config;
 use shoal_common::exit::Exit;
 use shoal_common::report::Role;
@@ -98,7 +98,7 @@ fn round_trips(
     patience: &Patience,
 ) -> anyhow::Result<Vec<u32>> {
     let environments = config.actors.envs as usize;
-    let bell = Bell::hang(domain, Place(Role::Actor, 0))?;
+    let bell = Listener::bind(domain, Place(Role::Actor, 0))?;
     let client = EnvironmentClient::open(domain, 0, &config.spec, environments, patience.stop.clone())?;
     let mut ask = |request: &dyn Fn() -> Result<(), Exit<ChannelError>>| match request() {
         Ok(()) => Ok(()),

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use serde::Serialize;
 use shoal_common::channel::transitions::ChunkSender;
-use shoal_common::channel::{Bell, Domain, Place, Ringer, wait_for};
+use shoal_common::channel::{Domain, Listener, Notifier, Place, wait_for};
 use shoal_common::commit::{CommitReader, OpenError};
 use shoal_common::config::Config;
 use shoal_common::exit::Exit;
@@ -88,11 +88,11 @@ fn move_rows(
     let mut chunks = vec![vec![0.0; ENVIRONMENTS * row.width()]; CHUNKS];
     chunks.iter_mut().try_for_each(|chunk| rows.fill(chunk))?;
 
-    let bell = Bell::hang(domain, Place(Role::Actor, 0))?;
-    let ringer = Ringer::new(domain, Place(Role::Learner, 0))?;
+    let bell = Listener::bind(domain, Place(Role::Actor, 0))?;
+    let ringer = Notifier::new(domain, Place(Role::Learner, 0))?;
     let commits = wait_for_replay(run, &bell, learner, patience)?;
-    let greeting = ChunkSender::open(domain, 0, 1, config.chunk_layout(), config.actors.window)?;
-    let mut sender = greeting
+    let handshake = ChunkSender::open(domain, 0, 1, config.chunk_layout(), config.actors.window)?;
+    let mut sender = handshake
         .wait(&commits, &bell, &patience.stop, || {
             // A learner that has ended commits nothing.
             if learner.check().is_err() {
@@ -129,7 +129,7 @@ fn move_rows(
                 chunk.push(&row.read(numbers));
             }
             sender.send(chunk, 0)?;
-            ringer.ring();
+            ringer.notify();
         }
         let elapsed = begun.elapsed();
         if elapsed >= length {
@@ -148,7 +148,12 @@ fn move_rows(
     }
 }
 
-fn wait_for_replay(run: &RunDir, bell: &Bell, learner: &mut Peer, patience: &Patience) -> anyhow::Result<CommitReader> {
+fn wait_for_replay(
+    run: &RunDir,
+    bell: &Listener,
+    learner: &mut Peer,
+    patience: &Patience,
+) -> anyhow::Result<CommitReader> {
     loop {
         match CommitReader::open(&run.replay_file()) {
             Ok(reader) => return Ok(reader),

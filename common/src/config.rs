@@ -149,13 +149,13 @@ impl Config {
         ChunkLayout {
             row: self.row_layout(),
             rows: self.chunk_rows(),
-            standing_words: self.standing_words(),
+            actor_snapshot_words: self.actor_snapshot_words(),
         }
     }
 
     /// Words that say where an actor stands between two chunks: in lockstep, where the environments can say their state, a
     /// process that is killed is replaced by one that goes on with the same bits.
-    pub fn standing_words(&self) -> usize {
+    pub fn actor_snapshot_words(&self) -> usize {
         let envs = self.actors.envs as usize;
         match (self.run.mode, self.spec.snapshot_words(envs)) {
             (Mode::Free, _) | (_, 0) => 0,

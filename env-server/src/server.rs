@@ -3,7 +3,7 @@
 use shoal_base::report::Activity;
 use shoal_base::stop::Stop;
 use shoal_channel::environment::{Ask, EnvironmentPort};
-use shoal_channel::{ChannelError, Pulse};
+use shoal_channel::{ChannelError, HeartbeatSender};
 
 use crate::vector::{Start, VectorEnvironment};
 
@@ -15,7 +15,7 @@ pub fn serve(
     environments: &mut VectorEnvironment,
     port: &EnvironmentPort,
     seed: u64,
-    mut pulse: Pulse,
+    mut pulse: HeartbeatSender,
     stop: &Stop,
 ) -> Result<(), ChannelError> {
     let mut started = false;

@@ -12,7 +12,7 @@ use super::folder::Folder;
 use super::order::{Ending, Job, Name};
 use super::progress::Progress;
 use super::settings::Settings;
-use super::training::{Standing, Trained, train};
+use super::training::{RunState, Trained, train};
 
 /// How often the live line is drawn.
 const ROUND: Duration = Duration::from_secs(1);
@@ -122,7 +122,7 @@ impl Batch<'_> {
                 continue;
             }
             let length = stage.length(self.effort);
-            let (done, all) = length.done(Standing::of(&run)?.progress());
+            let (done, all) = length.done(RunState::of(&run)?.progress());
             if matches!(length, Length::Steps(_)) && done > all {
                 bail!(
                     "{} is beyond {length}, and its result there was not kept: remove the run to begin it again",

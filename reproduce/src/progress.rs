@@ -13,7 +13,7 @@ use shoal_run::recorder::recorded;
 use super::experiment::{self, Effort, Length};
 use super::folder::Folder;
 use super::order::{Job, Name};
-use super::training::Standing;
+use super::training::RunState;
 
 /// The live line, and what is to be known for it.
 pub(super) struct Progress<'a> {
@@ -59,7 +59,7 @@ impl<'a> Progress<'a> {
             .into_iter()
             .filter_map(|job| {
                 // What cannot be read is said when its turn comes.
-                let standing = Standing::of(&folder.run(job.experiment, job.seed)).unwrap_or(Standing::Absent);
+                let standing = RunState::of(&folder.run(job.experiment, job.seed)).unwrap_or(RunState::Absent);
                 let length = job.experiment.length(effort)?;
                 let begin = length.done(standing.progress()).0;
                 Some((job.name(), Due { length, begin }))

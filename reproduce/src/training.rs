@@ -19,7 +19,7 @@ const ROUND: Duration = Duration::from_millis(100);
 
 /// How a run directory stands.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Standing {
+pub(super) enum RunState {
     Absent,
     Begun(Progress),
 }
@@ -32,7 +32,7 @@ pub(super) enum Trained {
     Interrupted,
 }
 
-impl Standing {
+impl RunState {
     pub(super) fn of(run: &Path) -> anyhow::Result<Self> {
         // Who was killed before anything was written leaves an empty directory.
         let _ = std::fs::remove_dir(run);
@@ -73,9 +73,9 @@ pub(super) fn train(
 ) -> anyhow::Result<Trained> {
     let mut command = Command::new("/proc/self/exe");
     command.arg0("shoal");
-    match Standing::of(run)? {
-        Standing::Begun(progress) if has_ended(run, length, progress)? => return Ok(Trained::Through),
-        Standing::Absent => {
+    match RunState::of(run)? {
+        RunState::Begun(progress) if has_ended(run, length, progress)? => return Ok(Trained::Through),
+        RunState::Absent => {
             command
                 .args(["train", experiment.preset, "--lockstep", "--run"])
                 .arg(run);
@@ -86,7 +86,7 @@ pub(super) fn train(
                 command.args(["--set", setting]);
             }
         }
-        Standing::Begun(_) => {
+        RunState::Begun(_) => {
             command.arg("resume").arg(run);
         }
     }
@@ -169,9 +169,9 @@ mod tests {
         let parent = tempfile::tempdir().unwrap();
         let run = parent.path().join("seed-1");
         std::fs::create_dir(&run).unwrap();
-        assert_eq!(Standing::of(&run).unwrap(), Standing::Absent);
+        assert_eq!(RunState::of(&run).unwrap(), RunState::Absent);
         std::fs::create_dir(&run).unwrap();
         std::fs::write(run.join("notes"), "").unwrap();
-        assert!(Standing::of(&run).is_err(), "what is not ours is left alone");
+        assert!(RunState::of(&run).is_err(), "what is not ours is left alone");
     }
 }

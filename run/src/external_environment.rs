@@ -16,7 +16,7 @@ use rustix::process::{
     set_parent_process_death_signal,
 };
 use shoal_common::channel::environment::{Begin, EnvironmentClient, Observed, Stepped, describe};
-use shoal_common::channel::{Bell, ChannelError, Domain, Place, Services};
+use shoal_common::channel::{ChannelError, Domain, Listener, Place, Services};
 use shoal_common::config::Environment;
 use shoal_common::exit::Exit;
 use shoal_common::report::Role;
@@ -187,7 +187,7 @@ fn cannot_start(command: &Command) -> String {
 /// A program that serves environments to this process, until this is dropped.
 pub struct ExternalEnvironment {
     client: EnvironmentClient,
-    bell: Bell,
+    bell: Listener,
     spec: EnvironmentSpec,
     program: Peer,
     // The last to go, in this order.
@@ -275,7 +275,7 @@ impl Drop for ExternalEnvironment {
     }
 }
 
-type Opened = (Services, EnvironmentClient, Bell, EnvironmentSpec, Peer);
+type Opened = (Services, EnvironmentClient, Listener, EnvironmentSpec, Peer);
 
 fn opened(domain: &Domain, launch: &LaunchSpec<'_>, environment: &Environment) -> anyhow::Result<Opened> {
     let Some(command) = launch.command(environment)? else {
@@ -285,7 +285,7 @@ fn opened(domain: &Domain, launch: &LaunchSpec<'_>, environment: &Environment) -
     let mut services = Services::new(domain)?;
     services.create_common(domain)?;
     services.create_environment(domain, launch.index)?;
-    let bell = Bell::hang(domain, launch.client)?;
+    let bell = Listener::bind(domain, launch.client)?;
     let mut program =
         Peer::start(&mut tied(&command)?, "environment server".into()).with_context(|| cannot_start(&command))?;
     let heard = Stop::default();

@@ -8,8 +8,8 @@ use shoal_common::report::{EvaluationReport, LearnerReport};
 use shoal_common::run_dir::RunDir;
 use shoal_run::numbers::thousands;
 
-use super::crew::Crew;
 use super::requests::waiting;
+use super::supervisor::Supervisor;
 
 /// Rates are taken over so long.
 const SPAN: Duration = Duration::from_secs(5);
@@ -94,18 +94,18 @@ impl Progress {
         self.bar.finish_and_clear();
     }
 
-    pub(super) fn draw(&mut self, crew: &Crew) {
+    pub(super) fn draw(&mut self, supervisor: &Supervisor) {
         if self.drawn.elapsed() < Duration::from_millis(250) || self.bar.is_hidden() {
             return;
         }
         self.drawn = Instant::now();
         let Some(learner) = self.learner else { return };
         self.bar.set_position(self.done(&learner));
-        self.bar.set_message(self.line(&learner, crew));
+        self.bar.set_message(self.line(&learner, supervisor));
     }
 
     /// How far it is; how good and how fast; who waits; and restarts if there were any: each on a line of 80 columns.
-    fn line(&self, learner: &LearnerReport, crew: &Crew) -> String {
+    fn line(&self, learner: &LearnerReport, supervisor: &Supervisor) -> String {
         let (done, all) = (self.done(learner), self.bar.length().unwrap_or(0));
         let unit = if self.counts_episodes { "episodes" } else { "steps" };
         let mut way = vec![format!("{}/{} {unit}", thousands(done), thousands(all))];
@@ -128,11 +128,11 @@ impl Progress {
         } else {
             0.0
         };
-        let waits = waiting(crew).map(|who| format!(", {who}")).unwrap_or_default();
+        let waits = waiting(supervisor).map(|who| format!(", {who}")).unwrap_or_default();
         let ratio = format!("ratio {ratio:.2} of {:.2}{waits}", self.updates_per_step);
         let mut lines = vec![way.join(" · "), pace.join(" · "), ratio];
-        if crew.restarts() > 0 {
-            lines.push(format!("{} restarts; shoal.log says why", crew.restarts()));
+        if supervisor.restarts() > 0 {
+            lines.push(format!("{} restarts; shoal.log says why", supervisor.restarts()));
         }
         lines.join("\n  ")
     }

@@ -7,20 +7,20 @@ use shoal_common::report::{Activity, Role};
 use shoal_common::run_dir::RunDir;
 use shoal_run::status;
 
-use super::crew::Crew;
 use super::progress::Progress;
+use super::supervisor::Supervisor;
 
 /// How the run gets on, which stood at `rest` when it began.
 pub(super) fn status(
     config: &Config,
     run: &RunDir,
-    crew: &Crew,
+    supervisor: &Supervisor,
     progress: &Progress,
     rest: &RunStatus,
 ) -> Result<RunStatus, OpenError> {
     let mut status = RunStatus {
         replay_rows: status::replay_rows(run)?,
-        actors: crew.actors(),
+        actors: supervisor.actors(),
         ..rest.clone()
     };
     if let Some(learner) = progress.learner() {
@@ -34,8 +34,8 @@ pub(super) fn status(
     if let Some(report) = progress.evaluated() {
         status.eval_return_mean = Some(report.return_mean);
     }
-    status.roles = crew.status(status.policy_version);
-    status.waiting = waiting(crew).map(|who| {
+    status.roles = supervisor.status(status.policy_version);
+    status.waiting = waiting(supervisor).map(|who| {
         let (ratio, agreed) = (status.ratio, status.updates_per_step);
         format!("{who}: ratio {ratio:.2} of {agreed:.2}")
     });
@@ -43,7 +43,12 @@ pub(super) fn status(
 }
 
 /// Goes on with so many actors, from now on and when the run is resumed.
-pub(super) fn scale(config: &mut Config, run: &RunDir, crew: &mut Crew, actors: u32) -> anyhow::Result<Answer> {
+pub(super) fn scale(
+    config: &mut Config,
+    run: &RunDir,
+    supervisor: &mut Supervisor,
+    actors: u32,
+) -> anyhow::Result<Answer> {
     if config.run.mode == Mode::Lockstep {
         let reason = "a lockstep run keeps the actors it began with: its numbers depend on them";
         return Ok(Answer::Refused(reason.into()));
@@ -60,13 +65,13 @@ pub(super) fn scale(config: &mut Config, run: &RunDir, crew: &mut Crew, actors: 
         return Ok(Answer::Refused(error.to_string()));
     }
     *config = scaled;
-    crew.scale(actors);
+    supervisor.scale(actors);
     Ok(Answer::Accepted)
 }
 
 /// Who waits for whom, in words, from what actors and learner said last.
-pub(super) fn waiting(crew: &Crew) -> Option<&'static str> {
-    match (crew.activity(Role::Actor), crew.activity(Role::Learner)) {
+pub(super) fn waiting(supervisor: &Supervisor) -> Option<&'static str> {
+    match (supervisor.activity(Role::Actor), supervisor.activity(Role::Learner)) {
         (Some(Activity::WaitingForRatio), _) => Some("actors wait"),
         (_, Some(Activity::WaitingForRatio)) => Some("learner waits"),
         (_, Some(Activity::WaitingForPeer)) => Some("learner waits for rows"),

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use shoal_common::report::{Activity, Role};
 
-use super::member::{Member, SILENT};
+use super::child::{Child, SILENT};
 
 /// A launcher that was away for so long was stopped, and the others perhaps too: nobody is accused then.
 const AWAY: Duration = Duration::from_secs(2);
@@ -32,53 +32,53 @@ impl Stalls {
     }
 
     /// Who is to be replaced, and why. Since this was asked last the launcher was `busy` for so long.
-    pub(super) fn find(&mut self, members: &mut [Member], busy: Duration) -> Vec<(usize, &'static str)> {
+    pub(super) fn find(&mut self, children: &mut [Child], busy: Duration) -> Vec<(usize, &'static str)> {
         let now = Instant::now();
         let since = now - std::mem::replace(&mut self.looked, now);
         if since.saturating_sub(busy) >= AWAY {
-            members.iter_mut().for_each(Member::excuse);
+            children.iter_mut().for_each(Child::excuse);
             return Vec::new();
         }
-        let mut found: Vec<_> = (0..members.len())
-            .filter_map(|i| Some((i, self.accuse(members, i)?)))
-            .filter(|(i, _)| !members[*i].is_stopped())
+        let mut found: Vec<_> = (0..children.len())
+            .filter_map(|i| Some((i, self.accuse(children, i)?)))
+            .filter(|(i, _)| !children[*i].is_stopped())
             .collect();
         if found.is_empty() {
-            found = self.deadlock(members);
+            found = self.deadlock(children);
         }
         for (i, _) in &found {
-            members[*i].stalls += 1;
-            members[*i].excuse();
+            children[*i].stalls += 1;
+            children[*i].excuse();
         }
         found
     }
 
-    /// What is wrong with one member, whatever the others but its environment server do.
-    fn accuse(&self, members: &[Member], i: usize) -> Option<&'static str> {
-        let member = &members[i];
-        if !member.is_present() {
+    /// What is wrong with one child, whatever the others but its environment server do.
+    fn accuse(&self, children: &[Child], i: usize) -> Option<&'static str> {
+        let child = &children[i];
+        if !child.is_present() {
             return None;
         }
-        if member.identity.role == Role::EnvServer {
+        if child.identity.role == Role::EnvServer {
             // Only where replacing its client has not helped.
-            let client = members
+            let client = children
                 .iter()
-                .find(|client| client.server() == Some(member.identity.index))?;
-            let both = client.stalls > 0 && self.waits_for_an_idle_server(members, client);
+                .find(|client| client.server() == Some(child.identity.index))?;
+            let both = client.stalls > 0 && self.waits_for_an_idle_server(children, client);
             return both.then_some("it does not hear its client, which waits for its answer");
         }
-        if self.waits_for_an_idle_server(members, member) && member.stalls == 0 {
+        if self.waits_for_an_idle_server(children, child) && child.stalls == 0 {
             return Some("it waits for an answer of its environment server, which has nothing to do");
         }
-        let silent = member.silent_for() >= WORK * self.patience;
-        let idle_server = member
+        let silent = child.silent_for() >= WORK * self.patience;
+        let idle_server = child
             .server()
-            .is_none_or(|index| find(members, Role::EnvServer, index).is_some_and(|server| self.is_idle(server)));
-        (silent && idle_server && member.sleeps()).then_some("nothing was heard of it, and it sleeps")
+            .is_none_or(|index| find(children, Role::EnvServer, index).is_some_and(|server| self.is_idle(server)));
+        (silent && idle_server && child.sleeps()).then_some("nothing was heard of it, and it sleeps")
     }
 
-    fn waits_for_an_idle_server(&self, members: &[Member], client: &Member) -> bool {
-        let server = client.server().and_then(|index| find(members, Role::EnvServer, index));
+    fn waits_for_an_idle_server(&self, children: &[Child], client: &Child) -> bool {
+        let server = client.server().and_then(|index| find(children, Role::EnvServer, index));
         let waits = match client.activity() {
             // It is ready once its server has said what it serves.
             None => client.is_present() && client.moved.elapsed() >= self.patience,
@@ -88,28 +88,28 @@ impl Stalls {
     }
 
     /// Whether it has waited, and not got on, for too long.
-    fn is_idle(&self, member: &Member) -> bool {
-        member.is_present() && member.waits() && member.moved.elapsed() >= self.patience
+    fn is_idle(&self, child: &Child) -> bool {
+        child.is_present() && child.waits() && child.moved.elapsed() >= self.patience
     }
 
     /// Everybody waits, and nobody works: the actors and the evaluator are replaced, or where that has not helped the learner.
-    fn deadlock(&self, members: &[Member]) -> Vec<(usize, &'static str)> {
-        if !members.iter().all(|member| self.is_idle(member)) {
+    fn deadlock(&self, children: &[Child]) -> Vec<(usize, &'static str)> {
+        if !children.iter().all(|child| self.is_idle(child)) {
             return Vec::new();
         }
-        let roles: &[Role] = if members.iter().any(|member| member.stalls > 0) {
+        let roles: &[Role] = if children.iter().any(|child| child.stalls > 0) {
             &[Role::Learner]
         } else {
             &[Role::Actor, Role::Evaluator]
         };
-        let chosen = |i: &usize| roles.contains(&members[*i].identity.role);
-        (0..members.len())
+        let chosen = |i: &usize| roles.contains(&children[*i].identity.role);
+        (0..children.len())
             .filter(chosen)
             .map(|i| (i, "every process of the run waits for another"))
             .collect()
     }
 }
 
-fn find(members: &[Member], role: Role, index: u32) -> Option<&Member> {
-    members.iter().find(|member| member.is(role, index))
+fn find(children: &[Child], role: Role, index: u32) -> Option<&Child> {
+    children.iter().find(|child| child.is(role, index))
 }

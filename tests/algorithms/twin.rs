@@ -126,7 +126,7 @@ pub(crate) fn reinforce(config: &Config) -> String {
         row: chunk.row,
         ring: config.replay.capacity,
         actors: 1,
-        standing_words: 0,
+        actor_snapshot_words: 0,
         fingerprint: 0,
     };
     let mut replay = Replay::create(&place.path().join("replay"), &layout).unwrap();

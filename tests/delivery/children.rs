@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use shoal_common::channel::environment::{Ask, EnvironmentPort};
 use shoal_common::channel::policy::{PolicyHeader, PolicyPublisher};
 use shoal_common::channel::transitions::ChunkSender;
-use shoal_common::channel::{Bell, Domain, Place, Pulse, Ringer, Services, wait_for};
+use shoal_common::channel::{Domain, HeartbeatSender, Listener, Notifier, Place, Services, wait_for};
 use shoal_common::commit::{CommitReader, OpenError};
 use shoal_common::report::{Identity, Role};
 use shoal_common::stop::Stop;
@@ -98,15 +98,15 @@ fn host(domain: &Domain) {
 /// Commands: `send N` chunks, saying `sending S` after each and `full S` when it first naps before a full window;
 /// `hold N`, which fills N rows of a chunk and says `holding`, to be killed with it; `finish`, until all are committed.
 fn actor(domain: &Domain, replay: &std::path::Path, index: u32, incarnation: u64) {
-    let bell = Bell::hang(domain, Place(Role::Actor, index)).unwrap();
-    let learner = Ringer::new(domain, Place(Role::Learner, 0)).unwrap();
+    let bell = Listener::bind(domain, Place(Role::Actor, index)).unwrap();
+    let learner = Notifier::new(domain, Place(Role::Learner, 0)).unwrap();
     let commits = loop {
         match CommitReader::open(replay) {
             Err(OpenError::NotYet { .. }) => drop(bell.wait(Duration::from_millis(5)).unwrap()),
             opened => break opened.unwrap(),
         }
     };
-    let greeting = ChunkSender::open(domain, index, incarnation, chunk_layout(), WINDOW).unwrap();
+    let handshake = ChunkSender::open(domain, index, incarnation, chunk_layout(), WINDOW).unwrap();
     say("ready");
     let mut slowest = Duration::ZERO;
     let stop = Stop::default();
@@ -119,7 +119,7 @@ fn actor(domain: &Domain, replay: &std::path::Path, index: u32, incarnation: u64
     };
     let Ok(first) = commands.recv() else { return };
     let waits = Cell::new(false);
-    let mut sender = greeting.wait(&commits, &bell, &stop, || full(&waits, 0)).unwrap();
+    let mut sender = handshake.wait(&commits, &bell, &stop, || full(&waits, 0)).unwrap();
     let before = sender.sent();
     for command in std::iter::once(first).chain(commands) {
         let (word, count) = words(&command);
@@ -156,7 +156,7 @@ fn actor(domain: &Domain, replay: &std::path::Path, index: u32, incarnation: u64
                 let begun = Instant::now();
                 sender.send(chunk, 0).unwrap();
                 slowest = slowest.max(begun.elapsed());
-                learner.ring();
+                learner.notify();
                 say(&format!("sending {}", sender.sent() - before));
             }
         }
@@ -167,7 +167,7 @@ fn actor(domain: &Domain, replay: &std::path::Path, index: u32, incarnation: u64
 /// Commands: `take N` more chunks, then says `took`; `crawl`, taking one chunk more each time it has slept a little;
 /// `run`. Takes nothing before its first command, except to stall once `after` chunks have passed a step.
 fn learner(domain: &Domain, path: &std::path::Path, actors: u32, stalls_at: Option<(&str, u64)>) {
-    let bell = Bell::hang(domain, Place(Role::Learner, 0)).unwrap();
+    let bell = Listener::bind(domain, Place(Role::Learner, 0)).unwrap();
     let mut replay = match Replay::open(path, &replay_layout(MAX_ACTORS)) {
         Err(ReplayError::Missing(_)) => Replay::create(path, &replay_layout(MAX_ACTORS)).unwrap(),
         opened => opened.unwrap(),
@@ -260,7 +260,7 @@ fn env_server(domain: &Domain) {
         index: 0,
         incarnation: 0,
     };
-    let pulse = Pulse::new(domain, identity).unwrap();
+    let pulse = HeartbeatSender::new(domain, identity).unwrap();
     let stop = Stop::when_stdin_closes().unwrap();
     say("ready");
     serve(&mut environments, &port, 1, pulse, &stop).unwrap();

@@ -21,7 +21,7 @@ pub(crate) fn chunk_layout() -> ChunkLayout {
     ChunkLayout {
         row: row_layout(),
         rows: ROWS,
-        standing_words: 0,
+        actor_snapshot_words: 0,
     }
 }
 
@@ -30,7 +30,7 @@ pub(crate) fn replay_layout(actors: u32) -> ReplayLayout {
         row: row_layout(),
         ring: RING,
         actors: actors as usize,
-        standing_words: 0,
+        actor_snapshot_words: 0,
         fingerprint: 1,
     }
 }

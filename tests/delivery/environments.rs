@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use rustix::process::Signal;
 use shoal_common::channel::environment::{Begin, EnvironmentClient, Observed, Snapshot, Stepped};
-use shoal_common::channel::{Bell, ChannelError, Domain, Place};
+use shoal_common::channel::{ChannelError, Domain, Listener, Place};
 use shoal_common::exit::Exit;
 use shoal_common::report::Role;
 
@@ -16,7 +16,7 @@ const ACTIONS: [f32; ENVS as usize] = [0.5; ENVS as usize];
 
 /// An actor's end of the conversation.
 struct Asker {
-    bell: Bell,
+    bell: Listener,
     client: EnvironmentClient,
     _watchdog: Watchdog,
 }
@@ -25,7 +25,7 @@ impl Asker {
     fn new(domain: &Domain) -> Self {
         let watchdog = Watchdog::new();
         let environments = pendulums();
-        let bell = Bell::hang(domain, Place(Role::Actor, 0)).unwrap();
+        let bell = Listener::bind(domain, Place(Role::Actor, 0)).unwrap();
         let client = EnvironmentClient::open(domain, 0, environments.spec(), ENVS as usize, watchdog.stop.clone());
         Self {
             bell,

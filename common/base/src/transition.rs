@@ -17,7 +17,7 @@ pub struct ChunkLayout {
     /// Rows.
     pub rows: usize,
     /// Words (`u64`) behind the rows, which say where the actor stands after the chunk; 0 where nobody asks.
-    pub standing_words: usize,
+    pub actor_snapshot_words: usize,
 }
 
 /// A transition, borrowed from its row.
@@ -95,7 +95,7 @@ impl ChunkLayout {
 
     /// Numbers in a chunk.
     pub fn len(&self) -> usize {
-        self.numbers_of_rows() + NUMBERS_OF_A_WORD * self.standing_words
+        self.numbers_of_rows() + NUMBERS_OF_A_WORD * self.actor_snapshot_words
     }
 
     /// Whether a chunk holds nothing.

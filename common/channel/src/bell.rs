@@ -6,8 +6,8 @@ use std::io;
 use std::os::fd::{AsFd, BorrowedFd};
 use std::time::{Duration, Instant};
 
-use iceoryx2::port::listener::{Listener, ListenerWaitError};
-use iceoryx2::port::notifier::Notifier;
+use iceoryx2::port::listener::{Listener as IoxListener, ListenerWaitError};
+use iceoryx2::port::notifier::Notifier as IoxNotifier;
 use iceoryx2::prelude::*;
 use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::event::PortFactory;
@@ -52,8 +52,8 @@ impl fmt::Display for Place {
 
 /// Hears rings.
 #[derive(Debug)]
-pub struct Bell {
-    listener: Listener<ipc::Service>,
+pub struct Listener {
+    listener: IoxListener<ipc::Service>,
     channel: String,
     polling: Polling,
 }
@@ -88,11 +88,11 @@ impl Polling {
 
 /// Rings the bell of another process.
 #[derive(Debug)]
-pub struct Ringer {
-    notifier: Notifier<ipc::Service>,
+pub struct Notifier {
+    notifier: IoxNotifier<ipc::Service>,
 }
 
-impl Bell {
+impl Listener {
     /// Bytes of shared memory that a bell reserves in a run of up to so many actors.
     pub fn reserved(max_actors: usize) -> u64 {
         // The second file holds what has rung: iceoryx2 has one of 2103 bytes for each listener.
@@ -103,7 +103,7 @@ impl Bell {
     ///
     /// # Errors
     /// When shared memory cannot be had.
-    pub fn hang(domain: &Domain, place: Place) -> Result<Self, ChannelError> {
+    pub fn bind(domain: &Domain, place: Place) -> Result<Self, ChannelError> {
         Self::on(domain, place.to_string())
     }
 
@@ -160,13 +160,13 @@ impl Bell {
     }
 }
 
-impl AsFd for Bell {
+impl AsFd for Listener {
     fn as_fd(&self) -> BorrowedFd<'_> {
         descriptor::of(&self.listener)
     }
 }
 
-impl Ringer {
+impl Notifier {
     /// Holds the cord of the bell at `place`, whether it hangs there yet or not.
     ///
     /// # Errors
@@ -190,7 +190,7 @@ impl Ringer {
     }
 
     /// Rings. A ring that finds nobody is no error: the hearer may be restarting, and looks for itself then.
-    pub fn ring(&self) {
+    pub fn notify(&self) {
         if let Err(cause) = self.notifier.notify() {
             tracing::debug!(?cause, "a ring was not heard");
         }
@@ -203,7 +203,7 @@ impl Ringer {
 /// # Errors
 /// [`Exit::Stopped`] once `stop` is requested, and whatever `poll` or `look_after` fail with.
 pub fn wait_for<T>(
-    bell: &Bell,
+    bell: &Listener,
     stop: &Stop,
     mut poll: impl FnMut() -> Result<Option<T>, ChannelError>,
     mut look_after: impl FnMut() -> Result<(), ChannelError>,

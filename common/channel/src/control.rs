@@ -15,7 +15,7 @@ use iceoryx2::service::port_factory::request_response::PortFactory;
 
 pub use self::message::{Answer, Question, RoleState, RoleStatus, RunKey, RunStatus};
 use self::message::{Asked, VERSION, decode, encode};
-use super::bell::{Bell, Ringer};
+use super::bell::{Listener, Notifier};
 use super::domain::Domain;
 use super::error::{Cause, ChannelError, ChannelErrorKind};
 use super::memory;
@@ -48,7 +48,7 @@ const LOOK: Duration = Duration::from_millis(100);
 #[derive(Debug)]
 pub struct ControlPort {
     server: Server<ipc::Service, [u8], ControlHeader, [u8], ControlHeader>,
-    bell: Bell,
+    bell: Listener,
     /// Who will be answered later.
     waiting: Vec<ControlRequest>,
 }
@@ -101,7 +101,7 @@ impl ControlPort {
         })?;
         Ok(Self {
             server,
-            bell: Bell::of_launcher(domain)?,
+            bell: Listener::of_launcher(domain)?,
             waiting: Vec::new(),
         })
     }
@@ -198,8 +198,8 @@ pub fn ask(
         request.send().map_err(cannot_ask)
     };
     let question = encode(&Asked { run, question }).map_err(cannot_ask)?;
-    let launcher = Ringer::to_launcher(domain);
-    let ring = || launcher.iter().for_each(Ringer::ring);
+    let launcher = Notifier::to_launcher(domain);
+    let ring = || launcher.iter().for_each(Notifier::notify);
     let mut pending = ask(&question)?;
     ring();
     let mut looked = Instant::now();

@@ -18,10 +18,10 @@ mod service;
 mod services;
 pub mod transitions;
 
-pub use bell::{Bell, Place, Ringer, wait_for};
+pub use bell::{Listener, Notifier, Place, wait_for};
 pub use cleanup::Sweeper;
 pub use domain::{Domain, DomainError};
 pub use error::{ChannelError, ChannelErrorKind, PeerError};
 pub use memory::free_shared_memory;
-pub use pulse::Pulse;
+pub use pulse::HeartbeatSender;
 pub use services::Services;

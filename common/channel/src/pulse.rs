@@ -12,13 +12,13 @@ const INTERVAL: Duration = Duration::from_millis(500);
 
 /// Tells the launcher that this role lives, how far it is, and what it waits for. The first beat says that it is ready.
 #[derive(Debug)]
-pub struct Pulse {
+pub struct HeartbeatSender {
     reporter: Reporter<Heartbeat>,
     heartbeat: Heartbeat,
     last: Option<Instant>,
 }
 
-impl Pulse {
+impl HeartbeatSender {
     /// The pulse of a role that is not ready yet.
     ///
     /// # Errors

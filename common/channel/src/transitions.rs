@@ -5,7 +5,7 @@
 //! So `send` always finds room, and what a dead learner had not committed reaches the next one.
 //!
 //! What a dead actor had sent still arrives, and before anything of its next start, if the learner was connected to it.
-//! Nobody can ask for that, so an actor first sends an empty chunk, its [`Greeting`], and no row before that one is
+//! Nobody can ask for that, so an actor first sends an empty chunk, its [`Handshake`], and no row before that one is
 //! committed. By then it is certain what of its predecessor is in the replay, and its sequence goes on after that.
 
 use iceoryx2::port::publisher::Publisher;
@@ -22,7 +22,7 @@ use shoal_base::packing::{numbers_of, words_of};
 use shoal_base::stop::Stop;
 use shoal_base::transition::{ChunkLayout, Transition};
 
-use super::bell::{Bell, wait_for};
+use super::bell::{Listener, wait_for};
 use super::domain::Domain;
 use super::error::{ChannelError, PeerError};
 use super::memory;
@@ -44,7 +44,7 @@ const NODES: usize = 8;
 pub struct ChunkHeader {
     /// The actor's start that collected the rows.
     pub incarnation: u64,
-    /// Counts the chunks of this actor, from 1 and over all its starts; 0 for a greeting.
+    /// Counts the chunks of this actor, from 1 and over all its starts; 0 for a handshake.
     pub sequence: u64,
     /// Version of the policy that the last row was collected with.
     pub policy_version: u64,
@@ -68,7 +68,7 @@ pub struct ChunkSender {
 
 /// An actor's end that has said that it is there, and may send no row before that is committed.
 #[derive(Debug)]
-pub struct Greeting(ChunkSender);
+pub struct Handshake(ChunkSender);
 
 /// A chunk being filled, in the memory it will be sent in.
 #[derive(Debug)]
@@ -93,15 +93,15 @@ pub struct ReceivedChunk {
     layout: ChunkLayout,
 }
 
-impl Greeting {
-    /// Waits until the greeting is committed; `idle` is called at each pause.
+impl Handshake {
+    /// Waits until the handshake is committed; `idle` is called at each pause.
     ///
     /// # Errors
     /// When interrupted.
     pub fn wait(
         self,
         commits: &CommitReader,
-        bell: &Bell,
+        bell: &Listener,
         stop: &Stop,
         mut idle: impl FnMut(),
     ) -> Result<ChunkSender, Exit<ChannelError>> {
@@ -135,7 +135,7 @@ impl ChunkSender {
         incarnation: u64,
         layout: ChunkLayout,
         window: u32,
-    ) -> Result<Greeting, ChannelError> {
+    ) -> Result<Handshake, ChannelError> {
         let channel = name(actor);
         let (service, publisher) = claim(|| {
             let service = service(domain, &channel, window, Entry::Open)?;
@@ -157,7 +157,7 @@ impl ChunkSender {
             sent: 0,
         };
         sender.deliver(sender.begin()?, 0)?;
-        Ok(Greeting(sender))
+        Ok(Handshake(sender))
     }
 
     /// Sequence number of the chunk sent last; 0 before the first.
@@ -319,7 +319,7 @@ impl ReceivedChunk {
         self.sample.user_header()
     }
 
-    /// Where the chunk stands in its actor's sequence, of which `committed` is the newest. A greeting takes no place of its
+    /// Where the chunk stands in its actor's sequence, of which `committed` is the newest. A handshake takes no place of its
     /// own: it says who goes on after it.
     pub fn mark(&self, committed: ChunkMark) -> ChunkMark {
         let ChunkHeader {
@@ -344,10 +344,10 @@ impl ReceivedChunk {
         &self.sample.payload()[..self.header().rows as usize * self.layout.row.width()]
     }
 
-    /// Where the actor stands after it; `None` for a greeting, and where nobody asks.
+    /// Where the actor stands after it; `None` for a handshake, and where nobody asks.
     pub fn standing(&self) -> Option<Vec<u64>> {
         let rows = self.layout.numbers_of_rows();
-        let asked = self.layout.standing_words > 0 && !self.is_greeting();
+        let asked = self.layout.actor_snapshot_words > 0 && !self.is_greeting();
         asked.then(|| words_of(&self.sample.payload()[rows..]))
     }
 }

@@ -19,7 +19,7 @@ fn layout() -> ReplayLayout {
         row: RowLayout::new(1, 1),
         ring: 10,
         actors: ACTORS,
-        standing_words: 0,
+        actor_snapshot_words: 0,
         fingerprint: 5,
     }
 }
@@ -150,7 +150,7 @@ proptest! {
             row: RowLayout::new(observation as u32 as usize, action as u32 as usize),
             ring,
             actors: actors as usize,
-            standing_words: 0,
+            actor_snapshot_words: 0,
             fingerprint: 5,
         };
         // Nothing is in it: the space is not used.
@@ -190,7 +190,7 @@ fn a_record_with_more_rows_of_an_actor_than_rows_is_damaged() {
 fn a_file_for_more_actors_than_there_can_be_is_refused_and_not_read() {
     let many = ReplayLayout {
         actors: u32::MAX as usize,
-        standing_words: 0,
+        actor_snapshot_words: 0,
         ..layout()
     };
     let bytes: Vec<u8> = many.identity().iter().flat_map(|word| word.to_le_bytes()).collect();

@@ -91,7 +91,7 @@ fn usable(config: &Config) {
         row,
         ring,
         actors: config.actors.max as usize,
-        standing_words: 0,
+        actor_snapshot_words: 0,
         fingerprint: config.fingerprint(),
     };
     assert!(layout.places().is_some());

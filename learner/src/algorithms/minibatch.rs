@@ -98,7 +98,7 @@ mod tests {
             row: RowLayout::new(2, 1),
             ring: 5,
             actors: 1,
-            standing_words: 0,
+            actor_snapshot_words: 0,
             fingerprint: 0,
         };
         let directory = tempfile::tempdir().unwrap();

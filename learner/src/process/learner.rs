@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use shoal_common::channel::policy::{PolicyHeader, PolicyPublisher};
 use shoal_common::channel::reports::{Reporter, Reports};
-use shoal_common::channel::{Bell, Domain, Place, Pulse, Ringer};
+use shoal_common::channel::{Domain, HeartbeatSender, Listener, Notifier, Place};
 use shoal_common::config::Mode;
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::report::{Activity, Heartbeat, LearnerReport, Role};
@@ -36,17 +36,17 @@ pub(crate) struct Learner<'a> {
     pub(crate) domain: &'a Domain,
     pub(crate) settings: &'a Settings,
     pub(crate) stop: &'a Stop,
-    pub(crate) bell: Bell,
+    pub(crate) bell: Listener,
     pub(crate) replay: Replay,
     pub(crate) intake: Intake,
-    pub(crate) pulse: Pulse,
+    pub(crate) pulse: HeartbeatSender,
     /// Rows that updates have been allowed by. In a free run, the replay's head; in lockstep, the rows of whole rounds.
     pub(crate) rows: u64,
     /// Episodes that end within them.
     episodes: u64,
     algorithm: Box<dyn Algorithm>,
     pub(crate) publisher: PolicyPublisher,
-    evaluator: Ringer,
+    evaluator: Notifier,
     policy_version: u64,
     checkpoints: Checkpoints,
     sync: Option<JoinHandle<io::Result<SyncedRows>>>,
@@ -64,7 +64,7 @@ impl<'a> Learner<'a> {
         if config.learner.threads > 1 {
             algorithm.set_threads(Threads::two()?);
         }
-        let bell = Bell::hang(domain, Place(Role::Learner, 0))?;
+        let bell = Listener::bind(domain, Place(Role::Learner, 0))?;
         let (layout, file) = (replay_layout(config), run.replay_file());
         let replay = if file.exists() {
             Replay::open(&file, &layout)?
@@ -98,10 +98,10 @@ impl<'a> Learner<'a> {
             }
         };
 
-        let mut pulse = Pulse::new(domain, settings.identity)?;
+        let mut pulse = HeartbeatSender::new(domain, settings.identity)?;
         let learner = Self {
             publisher: PolicyPublisher::open(domain, algorithm.policy().len())?,
-            evaluator: Ringer::new(domain, Place(Role::Evaluator, 0))?,
+            evaluator: Notifier::new(domain, Place(Role::Evaluator, 0))?,
             intake: Intake::open(
                 domain,
                 config.actors.count,
@@ -220,7 +220,7 @@ impl<'a> Learner<'a> {
     /// Wakes everyone who may be waiting for a policy.
     pub(crate) fn announce(&self) {
         self.intake.ring_all();
-        self.evaluator.ring();
+        self.evaluator.notify();
     }
 
     /// Renews connections and lets the launcher know what the learner waits for.

@@ -118,7 +118,7 @@ pub(super) fn replay_layout(config: &Config) -> ReplayLayout {
         row: chunk.row,
         ring: ring_rows(config),
         actors: config.actors.max as usize,
-        standing_words: chunk.standing_words,
+        actor_snapshot_words: chunk.actor_snapshot_words,
         fingerprint: config.fingerprint(),
     }
 }

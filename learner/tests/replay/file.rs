@@ -82,7 +82,7 @@ fn a_file_that_is_not_the_one_meant_is_refused_by_name_and_left_alone() {
         &image,
         &ReplayLayout {
             actors: 4,
-            standing_words: 0,
+            actor_snapshot_words: 0,
             ..right.clone()
         },
         "it has room for 3 actors, this run's 4",

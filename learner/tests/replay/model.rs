@@ -17,7 +17,7 @@ pub(crate) fn layout(ring: u64) -> ReplayLayout {
         row: RowLayout::new(1, 1),
         ring,
         actors: ACTORS,
-        standing_words: 0,
+        actor_snapshot_words: 0,
         fingerprint: 0xF00D,
     }
 }

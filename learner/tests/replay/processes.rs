@@ -20,7 +20,7 @@ fn layout() -> ReplayLayout {
         row: RowLayout::new(1, 1),
         ring: 4096,
         actors: ACTORS,
-        standing_words: 0,
+        actor_snapshot_words: 0,
         fingerprint: 1,
     }
 }

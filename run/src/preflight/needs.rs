@@ -1,6 +1,6 @@
 //! What a run needs of the machine, from its configuration alone: upper bounds over everything it may be scaled to.
 
-use shoal_common::channel::{Bell, control, environment, policy, reports, transitions};
+use shoal_common::channel::{Listener, control, environment, policy, reports, transitions};
 use shoal_common::config::Config;
 use shoal_common::report::{EpisodeReport, EvaluationReport, Heartbeat, JudgedReport, LearnerReport};
 use shoal_common::run_dir::RunDir;
@@ -37,7 +37,7 @@ pub(super) fn shared_memory(config: &Config) -> u64 {
         + reports::reserved::<JudgedReport>(max, 1)
         + reports::reserved::<LearnerReport>(max, 1)
         // One for each role, and the launcher's.
-        + (roles as u64 + 1) * Bell::reserved(max)
+        + (roles as u64 + 1) * Listener::reserved(max)
 }
 
 /// Bytes of disk that the run's directory may come to need beyond what is in it.

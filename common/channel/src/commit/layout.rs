@@ -50,7 +50,7 @@ pub struct ReplayLayout {
     /// Actors there may ever be; their indices are `0 .. actors`.
     pub actors: usize,
     /// Words that say where an actor stood after its last chunk; 0 where nobody asks.
-    pub standing_words: usize,
+    pub actor_snapshot_words: usize,
     /// Identifies the configuration the rows were collected under; the caller's to choose.
     pub fingerprint: u64,
 }
@@ -95,7 +95,10 @@ impl ReplayLayout {
     /// Where everything lies, or `None` if the ring or the actors are none, the actors too many, or the file would be
     /// larger than a file can be.
     pub fn places(&self) -> Option<Places> {
-        if self.ring == 0 || !(1..=MOST_ACTORS).contains(&self.actors) || self.standing_words > MOST_STANDING_WORDS {
+        if self.ring == 0
+            || !(1..=MOST_ACTORS).contains(&self.actors)
+            || self.actor_snapshot_words > MOST_STANDING_WORDS
+        {
             return None;
         }
         let ring = usize::try_from(self.ring).ok()?;
@@ -129,7 +132,7 @@ impl ReplayLayout {
 
     /// Words of a commit record; `None` if there are more than can be counted.
     fn record_words(&self) -> Option<usize> {
-        let stride = self.standing_words.checked_add(ACTOR_WORDS)?;
+        let stride = self.actor_snapshot_words.checked_add(ACTOR_WORDS)?;
         self.actors.checked_mul(stride)?.checked_add(RECORD_WORDS)
     }
 
@@ -143,7 +146,7 @@ impl ReplayLayout {
             self.row.width() as u64,
             self.ring,
             self.actors as u64,
-            self.standing_words as u64,
+            self.actor_snapshot_words as u64,
             self.fingerprint,
         ];
         words.push(crc32fast::hash(bytemuck::cast_slice(&words)).into());
@@ -169,7 +172,7 @@ impl ReplayLayout {
             row: RowLayout::new(size(fields[2])?, size(fields[3])?),
             ring: fields[5],
             actors: size(fields[6])?,
-            standing_words: size(fields[7])?,
+            actor_snapshot_words: size(fields[7])?,
             fingerprint: fields[8],
         };
         if fields[4] != layout.row.width() as u64 {
@@ -203,8 +206,8 @@ impl ReplayLayout {
         .or_else(|| {
             differs(
                 "where an actor stands takes",
-                self.standing_words,
-                found.standing_words,
+                self.actor_snapshot_words,
+                found.actor_snapshot_words,
                 "words",
             )
         })

@@ -126,7 +126,7 @@ impl CommitReader {
     /// As indexing a slice does: `actor` must be less than `layout().actors`.
     pub fn standing(&self, actor: usize) -> Vec<u64> {
         self.snapshot().map_or_else(
-            || vec![0; self.layout.standing_words],
+            || vec![0; self.layout.actor_snapshot_words],
             |record| record.standing(actor).to_vec(),
         )
     }

@@ -65,7 +65,7 @@ const LIMIT: u64 = 1 << 60;
 impl Record {
     /// The record of an empty replay of this layout, which is one that has `places`.
     pub fn empty(layout: &ReplayLayout) -> Self {
-        let stride = ACTOR_WORDS + layout.standing_words;
+        let stride = ACTOR_WORDS + layout.actor_snapshot_words;
         Self {
             words: vec![0; ACTORS + stride * layout.actors],
             stride,
@@ -185,7 +185,7 @@ pub(super) fn load_head(words: &Words, offset: usize) -> u64 {
 
 /// What is committed of an actor, by the record in the slot at `offset`.
 pub(super) fn load_actor(words: &Words, offset: usize, layout: &ReplayLayout, actor: usize) -> ActorCommit {
-    let stride = ACTOR_WORDS + layout.standing_words;
+    let stride = ACTOR_WORDS + layout.actor_snapshot_words;
     actor_from(|i| words.load(offset + (1 + ACTORS + stride * actor + i) * WORD))
 }
 

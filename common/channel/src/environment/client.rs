@@ -16,7 +16,7 @@ use shoal_base::stop::Stop;
 
 use super::message::{Ask, Block, RequestHeader, ResponseHeader, ResponseLayout, Verdict};
 use super::service::{EnvironmentService, name, question_length, service};
-use crate::bell::{Bell, Place, Ringer, wait_for};
+use crate::bell::{Listener, Notifier, Place, wait_for};
 use crate::domain::Domain;
 use crate::error::{ChannelError, PeerError};
 use crate::service::{CLAIM_PATIENCE, Entry, claim};
@@ -66,7 +66,7 @@ pub struct EnvironmentClient {
     episodes: Cell<Option<UniqueServerId>>,
     client: Client<ipc::Service, [f32], RequestHeader, [f32], ResponseHeader>,
     channel: String,
-    ringer: Ringer,
+    ringer: Notifier,
     layout: ResponseLayout,
     snapshot_words: usize,
     stop: Stop,
@@ -121,7 +121,7 @@ impl Observed {
 pub fn describe(
     domain: &Domain,
     index: u32,
-    bell: &Bell,
+    bell: &Listener,
     stop: Stop,
 ) -> Result<(EnvironmentSpec, usize), Exit<ChannelError>> {
     let unknown = Space::boxed(&[]);
@@ -159,7 +159,7 @@ impl EnvironmentClient {
                 .map_err(|cause| ChannelError::new(&channel, "ask", cause))?;
             Ok((service, client))
         })?;
-        let ringer = Ringer::new(domain, Place(Role::EnvServer, index))?;
+        let ringer = Notifier::new(domain, Place(Role::EnvServer, index))?;
         Ok(Self {
             service,
             episodes: Cell::new(None),
@@ -176,7 +176,11 @@ impl EnvironmentClient {
     ///
     /// # Errors
     /// When interrupted.
-    pub fn describe(&self, bell: &Bell, idle: impl FnMut()) -> Result<(EnvironmentSpec, usize), Exit<ChannelError>> {
+    pub fn describe(
+        &self,
+        bell: &Listener,
+        idle: impl FnMut(),
+    ) -> Result<(EnvironmentSpec, usize), Exit<ChannelError>> {
         let response = self.insist(bell, Ask::Describe, 0, &[], idle)?;
         let (header, payload) = (response.user_header(), response.payload());
         let described = header.described(payload);
@@ -187,7 +191,7 @@ impl EnvironmentClient {
     ///
     /// # Errors
     /// When interrupted.
-    pub fn reset(&self, bell: &Bell, begin: Begin, idle: impl FnMut()) -> Result<Observed, Exit<ChannelError>> {
+    pub fn reset(&self, bell: &Listener, begin: Begin, idle: impl FnMut()) -> Result<Observed, Exit<ChannelError>> {
         let (ask, episode) = match begin {
             Begin::Next => (Ask::Reset, 0),
             Begin::Training(episode) => (Ask::ResetToTraining, episode),
@@ -200,7 +204,7 @@ impl EnvironmentClient {
     ///
     /// # Errors
     /// When interrupted, or the server refuses the actions or has forgotten its episodes.
-    pub fn step(&self, bell: &Bell, actions: &[f32], idle: impl FnMut()) -> Result<Stepped, Exit<ChannelError>> {
+    pub fn step(&self, bell: &Listener, actions: &[f32], idle: impl FnMut()) -> Result<Stepped, Exit<ChannelError>> {
         match self.ask_within_episodes(bell, Ask::Step, actions, idle)? {
             Some(response) => Ok(Stepped::Taken(self.observed(response)?)),
             None => Ok(Stepped::Lost),
@@ -211,7 +215,7 @@ impl EnvironmentClient {
     ///
     /// # Errors
     /// When interrupted, or the server refuses: its environments cannot say their state, or run evaluation episodes.
-    pub fn snapshot(&self, bell: &Bell, idle: impl FnMut()) -> Result<Snapshot, Exit<ChannelError>> {
+    pub fn snapshot(&self, bell: &Listener, idle: impl FnMut()) -> Result<Snapshot, Exit<ChannelError>> {
         let Some(response) = self.ask_within_episodes(bell, Ask::Snapshot, &[], idle)? else {
             return Ok(Snapshot::Lost);
         };
@@ -227,7 +231,7 @@ impl EnvironmentClient {
     ///
     /// # Errors
     /// When interrupted, or the server refuses the words; it stays as it was then.
-    pub fn restore(&self, bell: &Bell, words: &[u64], idle: impl FnMut()) -> Result<Observed, Exit<ChannelError>> {
+    pub fn restore(&self, bell: &Listener, words: &[u64], idle: impl FnMut()) -> Result<Observed, Exit<ChannelError>> {
         if words.len() != self.snapshot_words {
             let cause = PeerError::SnapshotLength {
                 found: words.len(),
@@ -272,7 +276,7 @@ impl EnvironmentClient {
     /// Asks once: for requests about the episodes under way. `None` when the server that ran them is no more.
     fn ask_within_episodes(
         &self,
-        bell: &Bell,
+        bell: &Listener,
         ask: Ask,
         payload: &[f32],
         idle: impl FnMut(),
@@ -296,7 +300,7 @@ impl EnvironmentClient {
     /// Asks until some server answers: for requests that may be asked twice.
     fn insist(
         &self,
-        bell: &Bell,
+        bell: &Listener,
         ask: Ask,
         episode: u64,
         payload: &[f32],
@@ -329,12 +333,17 @@ impl EnvironmentClient {
             .write_from_slice(payload)
             .send()
             .map_err(|cause| ChannelError::new(&self.channel, "ask", cause))?;
-        self.ringer.ring();
+        self.ringer.notify();
         Ok(Sent { pending, server })
     }
 
     /// Waits for the answer; `None` when the server that was asked is no more, or was not reached.
-    fn answer(&self, bell: &Bell, sent: &Sent, mut idle: impl FnMut()) -> Result<Option<Answer>, Exit<ChannelError>> {
+    fn answer(
+        &self,
+        bell: &Listener,
+        sent: &Sent,
+        mut idle: impl FnMut(),
+    ) -> Result<Option<Answer>, Exit<ChannelError>> {
         let lost = Cell::new(false);
         let answer = wait_for(
             bell,

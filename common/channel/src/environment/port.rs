@@ -11,7 +11,7 @@ use shoal_base::stop::Stop;
 
 use super::message::{Ask, RequestHeader, ResponseHeader, ResponseLayout, StepBlocks, Verdict};
 use super::service::{LOANED_RESPONSES, answer_length, name, service};
-use crate::bell::{Bell, Place, Ringer, wait_for};
+use crate::bell::{Listener, Notifier, Place, wait_for};
 use crate::domain::Domain;
 use crate::error::ChannelError;
 use crate::service::{Entry, claim};
@@ -21,8 +21,8 @@ use crate::service::{Entry, claim};
 pub struct EnvironmentPort {
     server: Server<ipc::Service, [f32], RequestHeader, [f32], ResponseHeader>,
     channel: String,
-    bell: Bell,
-    ringer: Ringer,
+    bell: Listener,
+    ringer: Notifier,
     layout: ResponseLayout,
     spec: EnvironmentSpec,
 }
@@ -57,8 +57,8 @@ impl EnvironmentPort {
                 .create()
                 .map_err(|cause| ChannelError::new(&channel, "answer", cause))
         })?;
-        let bell = Bell::hang(domain, Place(Role::EnvServer, index))?;
-        let ringer = Ringer::new(domain, client)?;
+        let bell = Listener::bind(domain, Place(Role::EnvServer, index))?;
+        let ringer = Notifier::new(domain, client)?;
         Ok(Self {
             server,
             channel,
@@ -212,7 +212,7 @@ impl Request<'_> {
         response
             .send()
             .map_err(|cause| ChannelError::new(channel, "answer", cause))?;
-        self.port.ringer.ring();
+        self.port.ringer.notify();
         Ok(())
     }
 }

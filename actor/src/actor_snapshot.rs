@@ -4,7 +4,7 @@ use shoal_common::transition::ChunkLayout;
 
 /// The actor's part of it, and its environment server's.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Standing {
+pub(crate) struct ActorSnapshot {
     /// The environments, as their server says it.
     pub(crate) snapshot: Vec<u64>,
     /// Steps of every environment since the actor's stream began.
@@ -17,7 +17,7 @@ pub(crate) struct Standing {
     pub(crate) lengths: Vec<u32>,
 }
 
-impl Standing {
+impl ActorSnapshot {
     /// As it travels behind a chunk's rows.
     pub(crate) fn words(&self) -> Vec<u64> {
         let own = self.noise.iter().chain(&self.returns).map(|number| number.to_bits());
@@ -35,7 +35,7 @@ impl Standing {
     /// Reads the words of an actor with `envs` environments, whose noise has so many numbers; `None` where they are not so
     /// many as `layout` says.
     pub(crate) fn read(words: &[u64], layout: &ChunkLayout, envs: usize, noise: usize) -> Option<Self> {
-        let snapshot = layout.standing_words.checked_sub(1 + noise + 2 * envs)?;
+        let snapshot = layout.actor_snapshot_words.checked_sub(1 + noise + 2 * envs)?;
         let (snapshot, rest) = words.split_at_checked(snapshot)?;
         let (step, rest) = rest.split_first()?;
         let (noise, rest) = rest.split_at_checked(noise)?;
@@ -63,9 +63,9 @@ mod tests {
         let layout = ChunkLayout {
             row: RowLayout::new(3, 2),
             rows: 4,
-            standing_words: 10 + 1 + 2 * (2 + 2),
+            actor_snapshot_words: 10 + 1 + 2 * (2 + 2),
         };
-        let standing = Standing {
+        let standing = ActorSnapshot {
             snapshot: (0..10).collect(),
             step: 77,
             noise: vec![0.5, -0.0, f64::MIN_POSITIVE, 3.0],
@@ -73,13 +73,13 @@ mod tests {
             lengths: vec![199, 0],
         };
         let words = standing.words();
-        assert_eq!(Standing::read(&words, &layout, 2, 4), Some(standing));
-        assert_eq!(Standing::read(&words[1..], &layout, 2, 4), None);
-        assert_eq!(Standing::read(&[], &layout, 2, 4), None);
+        assert_eq!(ActorSnapshot::read(&words, &layout, 2, 4), Some(standing));
+        assert_eq!(ActorSnapshot::read(&words[1..], &layout, 2, 4), None);
+        assert_eq!(ActorSnapshot::read(&[], &layout, 2, 4), None);
         let free = ChunkLayout {
-            standing_words: 0,
+            actor_snapshot_words: 0,
             ..layout
         };
-        assert_eq!(Standing::read(&words, &free, 2, 4), None);
+        assert_eq!(ActorSnapshot::read(&words, &free, 2, 4), None);
     }
 }

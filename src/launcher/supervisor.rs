@@ -15,10 +15,10 @@ use shoal_common::report::{Activity, Heartbeat, Identity, Role};
 use shoal_common::run_dir::RunDir;
 use shoal_run::recorder::{Incident, What};
 
+use super::child::{Child, Consequence};
 use super::cleaner;
 use super::incarnations::{last_committed, read_counter};
 use super::log::{EVERYBODY_ENDED, Log};
-use super::member::{Consequence, Member};
 use super::process::{Process, name};
 use super::stall::Stalls;
 
@@ -32,7 +32,7 @@ const SOON: Duration = Duration::from_millis(200);
 /// More processes than are started without any of them sending a chunk.
 const NEVER_SENT: u64 = 100_000;
 
-/// How the crew is.
+/// How the processes of the run are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum State {
     AtWork,
@@ -43,8 +43,8 @@ pub(super) enum State {
 
 /// All processes of a run.
 #[derive(Debug)]
-pub(super) struct Crew {
-    members: Vec<Member>,
+pub(super) struct Supervisor {
+    children: Vec<Child>,
     services: Services,
     /// Actors whose services there are.
     served: u32,
@@ -57,7 +57,7 @@ pub(super) struct Crew {
     actors: u32,
     max_actors: u32,
     log: Log,
-    /// What has happened since the last [`Crew::take_incidents`].
+    /// What has happened since the last [`Supervisor::take_incidents`].
     incidents: Vec<Incident>,
     run: PathBuf,
     /// Where the number of processes ever started is kept: incarnations are never used twice, not by a resumed run either.
@@ -70,7 +70,7 @@ pub(super) struct Crew {
     unsaved: Option<String>,
 }
 
-impl Crew {
+impl Supervisor {
     pub(super) fn new(config: &Config, run: &RunDir, domain: &Domain, log: Log) -> anyhow::Result<Self> {
         let counter = run.incarnations();
         let mut started = read_counter(&counter)?;
@@ -87,13 +87,13 @@ impl Crew {
         services.create_common(domain)?;
         services.create_environment(domain, config.evaluation_server())?;
         let server = config.evaluation_server();
-        let members = vec![
-            Member::new(Role::Learner, 0),
-            Member::new(Role::EnvServer, server),
-            Member::new(Role::Evaluator, 0).with_server(server),
+        let children = vec![
+            Child::new(Role::Learner, 0),
+            Child::new(Role::EnvServer, server),
+            Child::new(Role::Evaluator, 0).with_server(server),
         ];
         Ok(Self {
-            members,
+            children,
             services,
             served: 0,
             window: config.actors.window,
@@ -116,7 +116,7 @@ impl Crew {
     /// Starts everyone.
     pub(super) fn start_all(&mut self, domain: &Domain) -> anyhow::Result<()> {
         self.serve(domain)?;
-        (0..self.members.len()).try_for_each(|i| self.start(i))?;
+        (0..self.children.len()).try_for_each(|i| self.start(i))?;
         self.start_missing(domain)
     }
 
@@ -155,9 +155,9 @@ impl Crew {
         self.serve(domain)?;
         for index in 0..self.actors {
             for role in [Role::EnvServer, Role::Actor] {
-                if !self.members.iter().any(|member| member.is(role, index)) {
-                    self.members.push(Member::new(role, index));
-                    self.start(self.members.len() - 1)?;
+                if !self.children.iter().any(|child| child.is(role, index)) {
+                    self.children.push(Child::new(role, index));
+                    self.start(self.children.len() - 1)?;
                 }
             }
         }
@@ -169,93 +169,93 @@ impl Crew {
         let text = self.started.to_string();
         write_atomically(&self.counter, |file| std::io::Write::write_all(file, text.as_bytes()))
             .with_context(|| format!("cannot write {}", self.counter.display()))?;
-        let member = &mut self.members[i];
-        member.identity.incarnation = self.started;
-        let process = Process::start(member.identity, &self.run, &self.log)?;
+        let child = &mut self.children[i];
+        child.identity.incarnation = self.started;
+        let process = Process::start(child.identity, &self.run, &self.log)?;
         self.log
-            .note(&name(member.identity), &format!("started as process {}", process.pid()));
-        member.begin(process);
+            .note(&name(child.identity), &format!("started as process {}", process.pid()));
+        child.begin(process);
         Ok(())
     }
 
     /// Takes note of a sign of life.
     pub(super) fn hear(&mut self, heartbeat: &Heartbeat) {
-        let member = self.members.iter_mut().find(|member| {
+        let child = self.children.iter_mut().find(|child| {
             let Identity {
                 role,
                 index,
                 incarnation,
-            } = member.identity;
+            } = child.identity;
             (heartbeat.role(), heartbeat.index, heartbeat.incarnation) == (Some(role), index, incarnation)
         });
-        let Some(member) = member else { return };
-        if let Some(after) = member.hear(heartbeat) {
+        let Some(child) = child else { return };
+        if let Some(after) = child.hear(heartbeat) {
             self.log
-                .note(&name(member.identity), &format!("ready after {} ms", after.as_millis()));
+                .note(&name(child.identity), &format!("ready after {} ms", after.as_millis()));
         }
-        if !self.all_ready && self.members.iter().all(Member::is_ready) {
+        if !self.all_ready && self.children.iter().all(Child::is_ready) {
             self.all_ready = true;
             self.log.note("launcher", "every role is ready");
         }
     }
 
-    /// What the members of a role are doing: what the first one says that was heard of.
+    /// What the children of a role are doing: what the first one says that was heard of.
     pub(super) fn activity(&self, role: Role) -> Option<Activity> {
-        let mut of_role = self.members.iter().filter(|member| member.identity.role == role);
-        of_role.find_map(Member::activity)
+        let mut of_role = self.children.iter().filter(|child| child.identity.role == role);
+        of_role.find_map(Child::activity)
     }
 
     /// Whether there is a learner, past its start.
     pub(super) fn has_learner(&self) -> bool {
         let mut learners = self
-            .members
+            .children
             .iter()
-            .filter(|member| member.identity.role == Role::Learner);
+            .filter(|child| child.identity.role == Role::Learner);
         learners.any(|learner| learner.process.is_some() && learner.is_ready())
     }
 
     /// How often processes were started again.
     pub(super) fn restarts(&self) -> u32 {
-        self.members.iter().map(|member| member.restarts).sum()
+        self.children.iter().map(|child| child.restarts).sum()
     }
 
     /// How everyone gets on, where the learner's newest policy is `newest`.
     pub(super) fn status(&self, newest: u64) -> Vec<RoleStatus> {
-        let mut members: Vec<_> = self.members.iter().collect();
-        members.sort_by_key(|member| (std::cmp::Reverse(member.identity.role), member.identity.index));
-        members.into_iter().map(|member| member.status(newest)).collect()
+        let mut children: Vec<_> = self.children.iter().collect();
+        children.sort_by_key(|child| (std::cmp::Reverse(child.identity.role), child.identity.index));
+        children.into_iter().map(|child| child.status(newest)).collect()
     }
 
     /// What wakes the launcher when a process ends.
     pub(super) fn ends(&self) -> impl Iterator<Item = BorrowedFd<'_>> {
-        self.members
+        self.children
             .iter()
-            .filter_map(|member| member.process.as_ref().and_then(Process::end))
+            .filter_map(|child| child.process.as_ref().and_then(Process::end))
     }
 
-    /// How long nothing is to be done for the members unless a process ends.
+    /// How long nothing is to be done for the children unless a process ends.
     pub(super) fn idle_for(&self) -> Duration {
         let since_clean = self.cleaned.elapsed();
         let cleaning = self.occupied.map_or(CLEANING, |_| SOON).saturating_sub(since_clean);
-        let missing = |member: &&Member| member.process.is_none() && self.is_wanted(member);
+        let missing = |child: &&Child| child.process.is_none() && self.is_wanted(child);
         let now = Instant::now();
-        let restarts = self.members.iter().filter(missing);
+        let restarts = self.children.iter().filter(missing);
         restarts
-            .map(|member| member.restart_at.saturating_duration_since(now))
+            .map(|child| child.restart_at.saturating_duration_since(now))
             .fold(cleaning, Duration::min)
     }
 
     /// Sees whose processes have ended. What those said before is heard before [`look_after`](Self::look_after) acts on it.
     pub(super) fn see_ends(&mut self) {
-        for member in self.members.iter_mut().filter(|member| member.ended.is_none()) {
-            member.ended = member.process.as_mut().and_then(Process::exit_status);
+        for child in self.children.iter_mut().filter(|child| child.ended.is_none()) {
+            child.ended = child.process.as_mut().and_then(Process::exit_status);
         }
     }
 
     /// Acts on the ends that were seen, and starts processes again when their time has come.
     pub(super) fn look_after(&mut self, domain: &Domain) -> anyhow::Result<State> {
         let mut state = State::AtWork;
-        if self.members.iter().any(|member| member.ended.is_some()) {
+        if self.children.iter().any(|child| child.ended.is_some()) {
             // Their places in shared memory are free for their successors.
             state = self.clean(domain)?;
         } else if self.cleaned.elapsed() >= self.occupied.map_or(CLEANING, |_| SOON) {
@@ -264,7 +264,7 @@ impl Crew {
                 state = self.clean(domain)?;
             }
         }
-        for i in 0..self.members.len() {
+        for i in 0..self.children.len() {
             if self.look_after_one(i)? == State::LearnerDone {
                 return Ok(State::LearnerDone);
             }
@@ -275,15 +275,15 @@ impl Crew {
     }
 
     fn look_after_one(&mut self, i: usize) -> anyhow::Result<State> {
-        if let Some(status) = self.members[i].ended.take()
+        if let Some(status) = self.children[i].ended.take()
             && self.act_on_end(i, status)? == State::LearnerDone
         {
             return Ok(State::LearnerDone);
         }
-        let is_wanted = self.is_wanted(&self.members[i]);
-        let member = &mut self.members[i];
-        if member.process.is_none() && is_wanted && Instant::now() >= member.restart_at {
-            member.restarts += 1;
+        let is_wanted = self.is_wanted(&self.children[i]);
+        let child = &mut self.children[i];
+        if child.process.is_none() && is_wanted && Instant::now() >= child.restart_at {
+            child.restarts += 1;
             self.start(i)?;
             self.note_incident(i, What::StartedAgain, String::new());
         }
@@ -291,22 +291,22 @@ impl Crew {
     }
 
     fn act_on_end(&mut self, i: usize, status: ExitStatus) -> anyhow::Result<State> {
-        let member = &mut self.members[i];
-        let name = name(member.identity);
-        if member.identity.role == Role::Learner && status.success() {
-            member.process = None;
+        let child = &mut self.children[i];
+        let name = name(child.identity);
+        if child.identity.role == Role::Learner && status.success() {
+            child.process = None;
             self.learner_done = true;
             self.log.note(&name, "done");
             return Ok(State::LearnerDone);
         }
-        if member.retires {
-            member.process = None;
-            member.restart_at = Instant::now();
+        if child.retires {
+            child.process = None;
+            child.restart_at = Instant::now();
             self.log.note(&name, &format!("retired: {}", ending(status)));
             self.note_incident(i, What::Retired, String::new());
             return Ok(State::AtWork);
         }
-        let consequence = member.has_ended(status);
+        let consequence = child.has_ended(status);
         let what = if status.signal().is_some() {
             What::Killed
         } else {
@@ -315,7 +315,7 @@ impl Crew {
         self.note_incident(i, what, ending(status));
         match consequence {
             Consequence::Restart(pause) => {
-                self.members[i].restart_at = Instant::now() + pause;
+                self.children[i].restart_at = Instant::now() + pause;
                 self.log
                     .note(&name, &format!("{}; starting it again in {pause:?}", ending(status)));
                 Ok(State::AtWork)
@@ -329,15 +329,15 @@ impl Crew {
 
     /// Ends processes that should be working and do not, so that they are replaced; what is to be said of each.
     pub(super) fn replace_stalled(&mut self, stalls: &mut Stalls) -> Vec<String> {
-        let stalled = stalls.find(&mut self.members, std::mem::take(&mut self.busy));
+        let stalled = stalls.find(&mut self.children, std::mem::take(&mut self.busy));
         let mut said = Vec::new();
         for (i, why) in stalled {
-            let member = &mut self.members[i];
+            let child = &mut self.children[i];
             said.push(format!(
                 "{} makes no progress: {why}; it is replaced",
-                name(member.identity)
+                name(child.identity)
             ));
-            if let Some(process) = &mut member.process {
+            if let Some(process) = &mut child.process {
                 process.kill();
             }
             self.note_incident(i, What::Stalled, why.into());
@@ -347,7 +347,7 @@ impl Crew {
 
     fn note_incident(&mut self, i: usize, what: What, detail: String) {
         self.incidents
-            .push(Incident::of(self.members[i].identity, what, detail));
+            .push(Incident::of(self.children[i].identity, what, detail));
     }
 
     /// Frees what dead processes have in shared memory.
@@ -372,36 +372,36 @@ impl Crew {
 
     /// Lets actors retire that are too many, and when they are gone their environment servers.
     fn retire_surplus(&mut self) {
-        let serves_nobody = |members: &[Member], member: &Member| {
-            member.identity.role == Role::EnvServer
-                && !members.iter().any(|actor| actor.is(Role::Actor, member.identity.index))
+        let serves_nobody = |children: &[Child], child: &Child| {
+            child.identity.role == Role::EnvServer
+                && !children.iter().any(|actor| actor.is(Role::Actor, child.identity.index))
         };
-        let mut members = std::mem::take(&mut self.members);
-        members.retain(|member| {
-            let stays = member.process.is_some() || self.is_wanted(member);
+        let mut children = std::mem::take(&mut self.children);
+        children.retain(|child| {
+            let stays = child.process.is_some() || self.is_wanted(child);
             if !stays {
-                self.log.note(&name(member.identity), "not needed any more");
+                self.log.note(&name(child.identity), "not needed any more");
             }
             stays
         });
-        self.members = members;
-        for i in 0..self.members.len() {
-            if self.is_wanted(&self.members[i]) || self.members[i].retires {
+        self.children = children;
+        for i in 0..self.children.len() {
+            if self.is_wanted(&self.children[i]) || self.children[i].retires {
                 continue;
             }
             let may_end =
-                self.members[i].identity.role == Role::Actor || serves_nobody(&self.members, &self.members[i]);
-            let member = &mut self.members[i];
-            if let Some(process) = member.process.as_mut().filter(|_| may_end) {
-                member.retires = true;
+                self.children[i].identity.role == Role::Actor || serves_nobody(&self.children, &self.children[i]);
+            let child = &mut self.children[i];
+            if let Some(process) = child.process.as_mut().filter(|_| may_end) {
+                child.retires = true;
                 process.ask_to_retire();
             }
         }
     }
 
     /// Whether it is not an actor, or an actor's environment server, of which there are enough.
-    fn is_wanted(&self, member: &Member) -> bool {
-        let Identity { role, index, .. } = member.identity;
+    fn is_wanted(&self, child: &Child) -> bool {
+        let Identity { role, index, .. } = child.identity;
         // The evaluator's server comes after those of all actors there may be.
         !matches!(role, Role::Actor | Role::EnvServer) || !(self.actors..self.max_actors).contains(&index)
     }
@@ -424,13 +424,13 @@ impl Crew {
 
     /// Asks the processes of some roles to end.
     pub(super) fn ask_to_end(&mut self, which: impl Fn(Role) -> bool) {
-        for member in self.members.iter_mut().filter(|member| which(member.identity.role)) {
-            match &mut member.process {
+        for child in self.children.iter_mut().filter(|child| which(child.identity.role)) {
+            match &mut child.process {
                 Some(process) => {
-                    member.ends = true;
+                    child.ends = true;
                     process.ask_to_end();
                 }
-                None if member.identity.role == Role::Learner && !self.learner_done => {
+                None if child.identity.role == Role::Learner && !self.learner_done => {
                     self.unsaved = Some("it had died and was not back yet".into());
                 }
                 None => {}
@@ -441,12 +441,12 @@ impl Crew {
     /// Whether the processes of some roles have ended.
     pub(super) fn have_ended(&mut self, which: impl Fn(Role) -> bool) -> bool {
         let mut all = true;
-        for member in self.members.iter_mut().filter(|member| which(member.identity.role)) {
-            let Some(process) = &mut member.process else { continue };
+        for child in self.children.iter_mut().filter(|child| which(child.identity.role)) {
+            let Some(process) = &mut child.process else { continue };
             match process.exit_status() {
                 Some(status) => {
-                    member.process = None;
-                    if member.identity.role == Role::Learner && !status.success() {
+                    child.process = None;
+                    if child.identity.role == Role::Learner && !status.success() {
                         self.unsaved = Some(ending(status));
                     }
                 }
@@ -458,13 +458,13 @@ impl Crew {
 
     /// Kills the processes of some roles that did not end when they were asked to.
     pub(super) fn kill(&mut self, which: impl Fn(Role) -> bool) {
-        for member in self.members.iter_mut().filter(|member| which(member.identity.role)) {
-            if member.process.take().is_some() {
-                let name = name(member.identity);
+        for child in self.children.iter_mut().filter(|child| which(child.identity.role)) {
+            if child.process.take().is_some() {
+                let name = name(child.identity);
                 self.log.note(&name, "did not end when asked to, and was killed");
                 let detail = "did not end when asked to".into();
-                self.incidents.push(Incident::of(member.identity, What::Killed, detail));
-                if member.identity.role == Role::Learner {
+                self.incidents.push(Incident::of(child.identity, What::Killed, detail));
+                if child.identity.role == Role::Learner {
                     self.unsaved = Some("it did not end when asked to, and was killed".into());
                 }
             }

@@ -1,4 +1,4 @@
-//! One place in the crew: who has it, how it gets on, and what its end means.
+//! A child of the supervisor: which process has its role, how it gets on, and what its end means.
 
 use std::os::unix::process::ExitStatusExt;
 use std::process::ExitStatus;
@@ -34,7 +34,7 @@ const SPAN: Duration = Duration::from_millis(400);
 
 /// A role of the run, the process that has it now, and what became of those before.
 #[derive(Debug)]
-pub(super) struct Member {
+pub(super) struct Child {
     pub(super) identity: Identity,
     pub(super) process: Option<Process>,
     /// How the process ended, where that has been seen and not been acted upon.
@@ -73,7 +73,7 @@ pub(super) enum Consequence {
     GiveUp(u32),
 }
 
-impl Member {
+impl Child {
     /// A place that nobody has yet.
     pub(super) fn new(role: Role, index: u32) -> Self {
         let now = Instant::now();
@@ -314,26 +314,26 @@ mod tests {
 
     /// A place whose time is told, and not waited for.
     struct Place {
-        member: Member,
+        child: Child,
         now: Instant,
     }
 
     impl Place {
         fn new(role: Role) -> Self {
             Self {
-                member: Member::new(role, 0),
+                child: Child::new(role, 0),
                 now: Instant::now(),
             }
         }
 
         /// A process lives for so long, is ready after so long, says this last, and then ends.
         fn lives(&mut self, lived: Duration, ready: Option<Duration>, last: Heartbeat, end: ExitStatus) -> Consequence {
-            self.member.begin_at(self.now);
+            self.child.begin_at(self.now);
             if let Some(ready) = ready {
-                self.member.hear_at(&last, self.now + ready);
+                self.child.hear_at(&last, self.now + ready);
             }
             self.now += lived;
-            let consequence = self.member.has_ended_at(end, self.now);
+            let consequence = self.child.has_ended_at(end, self.now);
             if let Consequence::Restart(pause) = consequence {
                 self.now += pause;
             }
@@ -341,7 +341,7 @@ mod tests {
         }
 
         fn says(&self, activity: Activity, steps: u64) -> Heartbeat {
-            let mut heartbeat = Heartbeat::new(self.member.identity);
+            let mut heartbeat = Heartbeat::new(self.child.identity);
             heartbeat.set_activity(activity);
             heartbeat.steps = steps;
             heartbeat

@@ -8,13 +8,13 @@ use shoal_run::process::Peer;
 
 /// Who is there.
 #[derive(Debug)]
-pub(super) struct Crew(Vec<(Role, Peer)>);
+pub(super) struct Processes(Vec<(Role, Peer)>);
 
-impl Crew {
+impl Processes {
     /// Starts a learner and so many actors, each with its environment server; `chosen` says on which cores a role shall run.
     pub(super) fn start(run: &RunDir, actors: u32, chosen: impl Fn(Role) -> Option<CpuSet>) -> anyhow::Result<Self> {
         let pairs = (0..actors).flat_map(|index| [(Role::EnvServer, index), (Role::Actor, index)]);
-        let mut crew = Self(Vec::new());
+        let mut processes = Self(Vec::new());
         for (incarnation, (role, index)) in (1..).zip([(Role::Learner, 0)].into_iter().chain(pairs)) {
             let identity = Identity {
                 role,
@@ -25,9 +25,9 @@ impl Crew {
             if let Some(cores) = chosen(role) {
                 peer.pin(&cores)?;
             }
-            crew.0.push((role, peer));
+            processes.0.push((role, peer));
         }
-        Ok(crew)
+        Ok(processes)
     }
 
     /// An error if anyone has ended, with what it said last.
