@@ -57,7 +57,7 @@ fn actors_that_die_while_the_learner_is_stopped_lose_nothing_they_sent() {
     let mut actor = run.start("actor 0 1");
     sends(&mut actor, 3);
     finishes(&mut actor);
-    learner.signal(Signal::STOP);
+    learner.stop();
     sends(&mut actor, FULL);
     actor.kill();
     // It lives and dies without the learner ever knowing of it.

@@ -187,7 +187,7 @@ fn a_server_that_is_stopped_for_a_while_answers_when_it_goes_on() {
     let asker = Asker::new(&domain);
     asker.reset();
     asker.steps(3);
-    server.signal(Signal::STOP);
+    server.stop();
     let (waits, waiting) = channel();
     let waker = std::thread::spawn(move || {
         waits_several_times(waiting);
