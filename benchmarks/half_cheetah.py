@@ -7,8 +7,8 @@ Both train at the same time, each on one core and with one thread. The settings 
 its HalfCheetah (`hyperparams/ddpg.yml`, tuned for PyBullet's), Stable-Baselines3's own defaults where it says nothing. Two
 things are not alike: in Shoal's critic the action enters at the second layer, and its output layers begin with small weights.
 
-Both are judged every 10,000 steps by 10 episodes without exploration. Shoal's time is all of it, from the start of the program,
-evaluations included, which share its core; Stable-Baselines3's is that of `learn` without its evaluations. What was judged goes
+Both are evaluated every 10,000 steps by 10 episodes without exploration. Shoal's time is all of it, from the start of the program,
+evaluations included, which share its core; Stable-Baselines3's is that of `learn` without its evaluations. What was evaluated goes
 to `docs/half-cheetah.csv` and the figure to `docs/half-cheetah.svg`; `--draw` makes the figure of what is there.
 """
 
@@ -56,8 +56,8 @@ def begin_shoal(program, run, seed, core):
     return subprocess.Popen(["taskset", "-c", str(core), *command])
 
 
-def judged_by_shoal(run, seconds):
-    """What was judged within so many seconds of the program's start."""
+def evaluated_by_shoal(run, seconds):
+    """What was evaluated within so many seconds of the program's start."""
     with (run / "evaluations.csv").open() as file:
         for row in csv.DictReader(file):
             if float(row["wall_seconds"]) <= seconds:
@@ -65,7 +65,7 @@ def judged_by_shoal(run, seconds):
 
 
 def stable_baselines3(seed, core, seconds):
-    """What was judged within so many seconds of training."""
+    """What was evaluated within so many seconds of training."""
     os.sched_setaffinity(0, {core})
     import gymnasium
     import numpy as np
@@ -77,30 +77,30 @@ def stable_baselines3(seed, core, seconds):
     torch.set_num_threads(1)
     environments = gymnasium.make_vec(ENVIRONMENT, num_envs=EPISODES, vectorization_mode="sync")
 
-    class Judge(BaseCallback):
+    class Evaluate(BaseCallback):
         def _on_training_start(self):
             self.begun = time.monotonic()
-            self.judging = 0.0
-            self.judged = []
-            self._judge()
+            self.evaluating = 0.0
+            self.evaluated = []
+            self._evaluate()
 
         def _on_step(self):
             if self.num_timesteps % EVERY == 0:
-                self._judge()
-            return time.monotonic() - self.begun - self.judging < seconds
+                self._evaluate()
+            return time.monotonic() - self.begun - self.evaluating < seconds
 
-        def _judge(self):
+        def _evaluate(self):
             before = time.monotonic()
             returns = returns_of(self.model, environments)
-            at = before - self.begun - self.judging
+            at = before - self.begun - self.evaluating
             row = ["Stable-Baselines3", f"{at:.3f}", self.num_timesteps, returns.mean(), returns.std()]
-            self.judged.append(row)
+            self.evaluated.append(row)
             print(*row, file=sys.stderr, flush=True)
-            self.judging += time.monotonic() - before
+            self.evaluating += time.monotonic() - before
 
     environment = gymnasium.make(ENVIRONMENT)
     width = environment.action_space.shape[0]
-    judge = Judge()
+    evaluate = Evaluate()
     DDPG(
         "MlpPolicy",
         environment,
@@ -116,8 +116,8 @@ def stable_baselines3(seed, core, seconds):
         policy_kwargs={"net_arch": [400, 300]},
         seed=seed,
         device="cpu",
-    ).learn(100_000_000, callback=judge)
-    return judge.judged
+    ).learn(100_000_000, callback=evaluate)
+    return evaluate.evaluated
 
 
 def train(program, seed, minutes):
@@ -129,15 +129,15 @@ def train(program, seed, minutes):
         begun = time.monotonic()
         process = begin_shoal(program, run, seed, cores[0])
         try:
-            judged = stable_baselines3(seed, cores[1], 60 * minutes)
+            evaluated = stable_baselines3(seed, cores[1], 60 * minutes)
             time.sleep(max(0.0, begun + 60 * minutes - time.monotonic()))
-            judged += judged_by_shoal(run, 60 * minutes)
+            evaluated += evaluated_by_shoal(run, 60 * minutes)
         finally:
             process.send_signal(signal.SIGINT)
             process.wait()
     with (DOCS / "half-cheetah.csv").open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerows([COLUMNS, *judged])
+        writer.writerows([COLUMNS, *evaluated])
 
 
 def draw():

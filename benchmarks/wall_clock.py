@@ -3,9 +3,9 @@
     pip install stable-baselines3==2.9.2 gymnasium==1.4.0
     python benchmarks/wall_clock.py --shoal target/release/shoal --seeds 5
 
-The seeds take turns: Shoal, then Stable-Baselines3, each alone on the machine. Both are judged every 1,000 steps by
-episodes without exploration, begun as Gymnasium does; the time counts to the first mean of at least -160. Stable-Baselines3 is judged by 1,000
-episodes. Shoal is judged by 100, for it pays for them; how lucky their starts are tells the run's best policy, which plays 1,000 others
+The seeds take turns: Shoal, then Stable-Baselines3, each alone on the machine. Both are evaluated every 1,000 steps by
+episodes without exploration, begun as Gymnasium does; the time counts to the first mean of at least -160. Stable-Baselines3 is evaluated by 1,000
+episodes. Shoal is evaluated by 100, for it pays for them; how lucky their starts are tells the run's best policy, which plays 1,000 others
 at the end, and that is taken off. Shoal's time is all of it, from the start of
 the program, its evaluations included; Stable-Baselines3's is that of `learn` without its evaluations, after its
 imports. Networks, rates, noise and replay are those of the thesis for both (section 4.3.1), torch's own settings are left as
@@ -39,7 +39,7 @@ def shoal(program, seed):
         command = [program, "train", "pendulum", "--quiet", "--run", run, "--seed", str(seed), "--steps", str(STEPS)]
         command += [word for it in settings for word in ("--set", it)]
         subprocess.run(command, check=True)
-        luck = judged(program, run, "--episodes", "100") - judged(program, run, "--episodes", str(STARTS), "--seed", "10000")
+        luck = evaluated(program, run, "--episodes", "100") - evaluated(program, run, "--episodes", str(STARTS), "--seed", "10000")
         with (run / "evaluations.csv").open() as file:
             for row in csv.DictReader(file):
                 if float(row["return_mean"]) - luck >= THRESHOLD:
@@ -47,7 +47,7 @@ def shoal(program, seed):
     return None
 
 
-def judged(program, run, *which):
+def evaluated(program, run, *which):
     """The mean return of a run's best policy."""
     output = subprocess.run([program, "eval", run, "--json", *which], check=True, capture_output=True, text=True).stdout
     return json.loads(output.splitlines()[-1])["return_mean"]
@@ -96,9 +96,9 @@ def stable_baselines3(seed):
                 for group in optimizer.param_groups:
                     group["lr"] = rate
 
-    class Judge(BaseCallback):
+    class Evaluate(BaseCallback):
         good = None
-        judging = 0.0
+        evaluating = 0.0
 
         def _on_training_start(self):
             self.begun = time.monotonic()
@@ -107,10 +107,10 @@ def stable_baselines3(seed):
             if self.num_timesteps % EVERY:
                 return True
             before = time.monotonic()
-            if returns_of(self.model, judged).mean() >= THRESHOLD:
-                self.good = before - self.begun - self.judging, self.num_timesteps
+            if returns_of(self.model, evaluated).mean() >= THRESHOLD:
+                self.good = before - self.begun - self.evaluating, self.num_timesteps
                 return False
-            self.judging += time.monotonic() - before
+            self.evaluating += time.monotonic() - before
             return True
 
     model = Thesis(
@@ -128,10 +128,10 @@ def stable_baselines3(seed):
         seed=seed,
         device="cpu",
     )
-    judged = gymnasium.make_vec("Pendulum-v1", num_envs=STARTS, vectorization_mode="sync")
-    judge = Judge()
-    model.learn(STEPS, callback=judge)
-    return judge.good
+    evaluated = gymnasium.make_vec("Pendulum-v1", num_envs=STARTS, vectorization_mode="sync")
+    evaluate = Evaluate()
+    model.learn(STEPS, callback=evaluate)
+    return evaluate.good
 
 
 def returns_of(model, environments):

@@ -41,7 +41,7 @@ pub(crate) enum Command {
     Scale(ScaleArgs),
     /// End a run in order, so that it can be resumed.
     Stop(StopArgs),
-    /// Judge a run's policy on episodes with fixed starts.
+    /// Evaluate a run's policy on episodes with fixed starts.
     Eval(EvalArgs),
     /// Draw a run's figures.
     Plot(PlotArgs),

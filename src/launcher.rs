@@ -21,7 +21,7 @@ use shoal_common::config::Config;
 use shoal_common::report::{EpisodeReport, EvaluationReport, Heartbeat, LearnerReport, Role};
 use shoal_common::run_dir::RunDir;
 use shoal_common::stop::GRACE;
-use shoal_run::outcome::{self, State};
+use shoal_run::outcome::{RunOutcome, RunState};
 use shoal_run::process::wait_for_any;
 use shoal_run::recorder::Recorder;
 use shoal_run::signals::Signals;
@@ -74,7 +74,7 @@ pub(crate) enum Ending {
 
 /// What is known of a run when it ends.
 #[derive(Clone, Debug)]
-pub(crate) struct Outcome {
+pub(crate) struct TrainingOutcome {
     pub(crate) ending: Ending,
     pub(crate) wall: Duration,
     /// How the run stood when it began, and how it stands now.
@@ -83,7 +83,7 @@ pub(crate) struct Outcome {
 }
 
 /// Runs all roles until the learner is through, a signal comes, or somebody asks for the end.
-pub(crate) fn run(mut config: Config, run: &RunDir, quiet: bool) -> anyhow::Result<Outcome> {
+pub(crate) fn run(mut config: Config, run: &RunDir, quiet: bool) -> anyhow::Result<TrainingOutcome> {
     let signals = Signals::register()?;
     let (mut renewals, mut before, mut wall) = (Vec::new(), None, Duration::ZERO);
     loop {
@@ -92,7 +92,7 @@ pub(crate) fn run(mut config: Config, run: &RunDir, quiet: bool) -> anyhow::Resu
         let before = before.get_or_insert(outcome.before.clone());
         if outcome.ending != Ending::Renewed {
             let before = before.clone();
-            return Ok(Outcome {
+            return Ok(TrainingOutcome {
                 before,
                 wall,
                 ..outcome
@@ -108,7 +108,7 @@ pub(crate) fn run(mut config: Config, run: &RunDir, quiet: bool) -> anyhow::Resu
     }
 }
 
-fn run_once(config: Config, run: &RunDir, signals: &Signals, quiet: bool) -> anyhow::Result<Outcome> {
+fn run_once(config: Config, run: &RunDir, signals: &Signals, quiet: bool) -> anyhow::Result<TrainingOutcome> {
     Domain::wait_for_the_last(&config.run.id, PREDECESSORS_END).map_err(|error| explain(error, run))?;
     Domain::remove_abandoned()?;
     let domain = Domain::join(&config.run.id, config.actors.max)?;
@@ -188,7 +188,7 @@ impl<'a> Launcher<'a> {
         }
         let recorder = Recorder::open(run, config.replay.warmup)?;
         let rest = status::at_rest(&config, run)?;
-        outcome::Outcome::new(State::Running, rest.env_steps, rest.episodes).write(run)?;
+        RunOutcome::new(RunState::Running, rest.env_steps, rest.episodes).write(run)?;
         // Makes the services that are opened below.
         let supervisor = Supervisor::new(&config, run, domain, log.clone())?;
         Ok(Self {
@@ -214,7 +214,7 @@ impl<'a> Launcher<'a> {
         })
     }
 
-    fn run(mut self) -> anyhow::Result<Outcome> {
+    fn run(mut self) -> anyhow::Result<TrainingOutcome> {
         let ending = self.watch();
         // Whatever happened, nobody is left behind.
         self.progress.say("ending");
@@ -231,7 +231,7 @@ impl<'a> Launcher<'a> {
             self.log.note("launcher", &format!("{FAILED}{why}"));
             // The error itself is what is to be told.
             let _ = self
-                .outcome(State::Failed)
+                .outcome(RunState::Failed)
                 .map(|outcome| outcome.because(why).write(self.run));
         }
         let ending = ending?;
@@ -240,14 +240,14 @@ impl<'a> Launcher<'a> {
         self.recorder.flush()?;
         // What the learner saved: its last report may have come too late to be heard.
         let after = status::at_rest(&self.config, self.run)?;
-        let stopped = outcome::Outcome::new(State::Stopped, after.env_steps, after.episodes);
+        let stopped = RunOutcome::new(RunState::Stopped, after.env_steps, after.episodes);
         match ending {
             Ending::Stopped => stopped.because("somebody asked for it").write(self.run)?,
             Ending::Interrupted(signal) => stopped.because(format!("signal {signal}")).write(self.run)?,
-            // A finished run is still to be judged.
+            // A finished run is still to be evaluated.
             Ending::Finished | Ending::Renewed => {}
         }
-        Ok(Outcome {
+        Ok(TrainingOutcome {
             ending,
             wall: self.begun.elapsed(),
             after,
@@ -255,9 +255,9 @@ impl<'a> Launcher<'a> {
         })
     }
 
-    fn outcome(&self, state: State) -> anyhow::Result<outcome::Outcome> {
+    fn outcome(&self, state: RunState) -> anyhow::Result<RunOutcome> {
         let rest = status::at_rest(&self.config, self.run)?;
-        Ok(outcome::Outcome::new(state, rest.env_steps, rest.episodes))
+        Ok(RunOutcome::new(state, rest.env_steps, rest.episodes))
     }
 
     fn watch(&mut self) -> anyhow::Result<Ending> {
@@ -269,13 +269,13 @@ impl<'a> Launcher<'a> {
             self.read_reports()?;
             self.attend()?;
             match self.supervisor.look_after(self.domain)? {
-                supervisor::State::AtWork => {}
-                supervisor::State::LearnerDone => {
+                supervisor::Situation::AtWork => {}
+                supervisor::Situation::LearnerDone => {
                     self.await_last_evaluation()?;
                     return Ok(Ending::Finished);
                 }
-                supervisor::State::SharedMemoryOccupied if self.to_end.is_some() => {}
-                supervisor::State::SharedMemoryOccupied => {
+                supervisor::Situation::SharedMemoryOccupied if self.to_end.is_some() => {}
+                supervisor::Situation::SharedMemoryOccupied => {
                     let why =
                         "dead processes occupy places in shared memory: the run goes on in shared memory made anew";
                     self.log.note("launcher", why);

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 use shoal_common::channel::control::RunStatus;
 use shoal_common::run_dir::RunDir;
-use shoal_run::outcome::{self, Outcome};
+use shoal_run::outcome::{RunOutcome, RunState};
 use shoal_run::recorder::read_evaluations;
 use shoal_run::remote::Remote;
 use shoal_run::status::at_rest;
@@ -21,7 +21,7 @@ const END_OF_LOG: u64 = 1 << 16;
 /// How a run stands.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
-pub(crate) enum State {
+pub(crate) enum ListedState {
     /// A launcher works on it.
     Running,
     /// A launcher works on it and does not answer.
@@ -40,7 +40,7 @@ pub(crate) enum State {
     Damaged,
 }
 
-impl State {
+impl ListedState {
     /// As it is written in `--json`.
     pub(crate) fn name(self) -> &'static str {
         match self {
@@ -61,7 +61,7 @@ impl State {
 pub(crate) struct Listed {
     pub(crate) name: String,
     pub(crate) path: PathBuf,
-    pub(crate) state: State,
+    pub(crate) state: ListedState,
     /// Why it is damaged or silent.
     pub(crate) reason: Option<String>,
     pub(crate) environment: String,
@@ -81,7 +81,7 @@ impl Listed {
         let mut listed = Self {
             name: name.unwrap_or_default(),
             path: path.into(),
-            state: State::Damaged,
+            state: ListedState::Damaged,
             reason: None,
             environment: String::new(),
             algorithm: String::new(),
@@ -109,16 +109,20 @@ impl Listed {
         self.best_return = returns.reduce(f64::max);
         match remote.status() {
             Ok(Some(status)) => {
-                self.state = State::Running;
+                self.state = ListedState::Running;
                 self.reached(&status);
             }
             Ok(None) => {
                 let status = at_rest(&run.config()?, run)?;
-                self.state = if status.finished { State::Finished } else { ended(run)? };
+                self.state = if status.finished {
+                    ListedState::Finished
+                } else {
+                    ended(run)?
+                };
                 self.reached(&status);
             }
             Err(error) => {
-                self.state = State::Silent;
+                self.state = ListedState::Silent;
                 return Err(error);
             }
         }
@@ -155,20 +159,20 @@ fn by_number(a: &str, b: &str) -> Ordering {
 }
 
 /// How a run ended that has not reached its end.
-fn ended(run: &RunDir) -> anyhow::Result<State> {
-    Ok(match Outcome::read(run)?.map(|outcome| outcome.state) {
+fn ended(run: &RunDir) -> anyhow::Result<ListedState> {
+    Ok(match RunOutcome::read(run)?.map(|outcome| outcome.state) {
         None => ended_by_its_log(run)?,
-        Some(outcome::State::Stopped) => State::Stopped,
-        Some(outcome::State::Failed) => State::Failed,
+        Some(RunState::Stopped) => ListedState::Stopped,
+        Some(RunState::Failed) => ListedState::Failed,
         // Finished, and given more steps since, by a launcher that was killed before it said that it runs.
-        Some(outcome::State::Running | outcome::State::Finished) => State::Killed,
+        Some(RunState::Running | RunState::Finished) => ListedState::Killed,
     })
 }
 
 /// The same of a run of a build that wrote no outcome: what its launcher logged last.
-fn ended_by_its_log(run: &RunDir) -> io::Result<State> {
+fn ended_by_its_log(run: &RunDir) -> io::Result<ListedState> {
     let mut file = match File::open(run.log()) {
-        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(State::New),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(ListedState::New),
         file => file?,
     };
     let length = file.seek(SeekFrom::End(0))?;
@@ -178,13 +182,13 @@ fn ended_by_its_log(run: &RunDir) -> io::Result<State> {
     Ok(last_words(&String::from_utf8_lossy(&end)))
 }
 
-fn last_words(log: &str) -> State {
+fn last_words(log: &str) -> ListedState {
     // Whatever a role says comes before its launcher says that all have ended.
     let last = log.lines().next_back().unwrap_or_default();
     match last.strip_prefix("launcher") {
-        Some(words) if words.contains(EVERYBODY_ENDED) => State::Stopped,
-        Some(words) if words.contains(FAILED) => State::Failed,
-        _ => State::Killed,
+        Some(words) if words.contains(EVERYBODY_ENDED) => ListedState::Stopped,
+        Some(words) if words.contains(FAILED) => ListedState::Failed,
+        _ => ListedState::Killed,
     }
 }
 
@@ -213,16 +217,16 @@ mod tests {
     fn the_last_line_of_the_log_tells_how_a_run_ended() {
         let start = "launcher       1.0 every role is ready\n";
         let end = format!("{start}launcher       2.0 {EVERYBODY_ENDED}\n");
-        assert_eq!(last_words(start), State::Killed);
-        assert_eq!(last_words(&end), State::Stopped);
+        assert_eq!(last_words(start), ListedState::Killed);
+        assert_eq!(last_words(&end), ListedState::Stopped);
         assert_eq!(
             last_words(&format!("{end}launcher       2.1 {FAILED}disk full\n")),
-            State::Failed
+            ListedState::Failed
         );
         assert_eq!(
             last_words(&format!("{end}learner-0      3.0 started as process 7\n")),
-            State::Killed
+            ListedState::Killed
         );
-        assert_eq!(last_words(""), State::Killed);
+        assert_eq!(last_words(""), ListedState::Killed);
     }
 }

@@ -7,7 +7,7 @@ use std::process::ExitCode;
 use anyhow::Context;
 use shoal_actor::{evaluator, explorer};
 use shoal_common::channel::environment::EnvironmentPort;
-use shoal_common::channel::{Domain, HeartbeatSender, Place};
+use shoal_common::channel::{Domain, EventName, HeartbeatSender};
 use shoal_common::config::{Config, Mode};
 use shoal_common::report::{Identity, Role};
 use shoal_common::run_dir::RunDir;
@@ -15,7 +15,7 @@ use shoal_common::stop::Stop;
 use shoal_env_server::vector::VectorEnvironment;
 use shoal_learner::process;
 use shoal_run::external_environment::{self, LaunchSpec};
-use shoal_run::status::judged;
+use shoal_run::status::evaluated_period;
 use tracing_subscriber::filter::LevelFilter;
 
 use crate::cli::RoleArgs;
@@ -69,19 +69,19 @@ fn work(domain: &Domain, config: &Config, run: &RunDir, identity: Identity, stop
     match identity.role {
         Role::EnvServer => serve(domain, config, &launch_spec(config, run, identity), identity, stop),
         Role::Actor => {
-            let settings = explorer::Settings::new(config, run, identity);
+            let settings = explorer::ExplorerSettings::new(config, run, identity);
             Ok(explorer::explore(domain, &settings, stop)?)
         }
         Role::Evaluator => {
-            let settings = evaluator::Settings::new(config, run, identity, judged(config, run)?);
+            let settings = evaluator::EvaluatorSettings::new(config, run, identity, evaluated_period(config, run)?);
             Ok(evaluator::evaluate(domain, &settings, stop)?)
         }
         Role::Learner => {
-            let settings = process::Settings {
+            let settings = process::LearnerSettings {
                 identity,
                 config: config.clone(),
                 run: run.clone(),
-                judged: judged(config, run)?,
+                evaluated_period: evaluated_period(config, run)?,
             };
             Ok(process::learn(domain, &settings, stop)?)
         }
@@ -92,9 +92,9 @@ fn work(domain: &Domain, config: &Config, run: &RunDir, identity: Identity, stop
 fn launch_spec<'a>(config: &'a Config, run: &RunDir, identity: Identity) -> LaunchSpec<'a> {
     let Identity { index, incarnation, .. } = identity;
     let (client, environments) = if index == config.evaluation_server() {
-        (Place(Role::Evaluator, 0), config.evaluation_envs())
+        (EventName(Role::Evaluator, 0), config.evaluation_envs())
     } else {
-        (Place(Role::Actor, index), config.actors.envs)
+        (EventName(Role::Actor, index), config.actors.envs)
     };
     LaunchSpec {
         iceoryx2: run.iceoryx2_config(),
@@ -131,12 +131,12 @@ fn serve(
     )?;
     let spec = environments.spec().clone();
     let port = EnvironmentPort::open(domain, launch.index, spec, environments.count(), launch.client)?;
-    let pulse = HeartbeatSender::new(domain, identity)?;
+    let heartbeat = HeartbeatSender::new(domain, identity)?;
     Ok(shoal_env_server::server::serve(
         &mut environments,
         &port,
         launch.seed,
-        pulse,
+        heartbeat,
         stop,
     )?)
 }

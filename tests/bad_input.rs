@@ -186,13 +186,13 @@ fn json_is_the_only_line_on_standard_output() {
     let place = Workplace::new();
     let result = place.train(&["point-mass-r3", "--steps", "400", "--run", "run"]);
     assert_eq!(result["env_steps"], 400);
-    let judged = support::json(&place.output(&["eval", "run", "--policy", "last", "--episodes", "4", "--json"]));
-    assert_eq!(judged["episodes"], 4);
-    assert!(judged["final_distance_mean"].is_f64(), "{judged}");
-    let reached = judged["reached_fraction"].as_f64().unwrap();
-    assert_eq!((reached * 4.0).fract(), 0.0, "so many of four episodes: {judged}");
+    let evaluated = support::json(&place.output(&["eval", "run", "--policy", "last", "--episodes", "4", "--json"]));
+    assert_eq!(evaluated["episodes"], 4);
+    assert!(evaluated["final_distance_mean"].is_f64(), "{evaluated}");
+    let reached = evaluated["reached_fraction"].as_f64().unwrap();
+    assert_eq!((reached * 4.0).fract(), 0.0, "so many of four episodes: {evaluated}");
     let again = support::json(&place.output(&["eval", "run", "--policy", "last", "--episodes", "4", "--json"]));
-    assert_eq!(again, judged, "always the same starts");
+    assert_eq!(again, evaluated, "always the same starts");
 }
 
 #[test]

@@ -143,8 +143,8 @@ fn an_evaluator_killed_while_a_new_learner_does_its_rounds_again_holds_nobody_up
     ];
     let whole = end_of(place.start_as("whole", &arguments));
     let running = place.start_as("killed", &arguments);
-    // Versions of the policies that were judged.
-    let judged = || {
+    // Versions of the policies that were evaluated.
+    let evaluated = || {
         let evaluations = csv::Reader::from_path(running.run.join("evaluations.csv"));
         let versions = evaluations
             .unwrap()
@@ -152,14 +152,14 @@ fn an_evaluator_killed_while_a_new_learner_does_its_rounds_again_holds_nobody_up
             .map(|row| row.unwrap()[3].parse().unwrap());
         versions.collect::<Vec<u64>>()
     };
-    until("the policies of two periods are judged", || judged().len() == 2);
-    let before = judged()[1];
+    until("the policies of two periods are evaluated", || evaluated().len() == 2);
+    let before = evaluated()[1];
     until("the evaluator is at the next one", || {
         place.role("killed", "evaluator-0")["policy_version"].as_u64() > Some(before)
     });
     // It goes on with it when the new learner has begun with its rounds.
     running.stop("evaluator-0");
-    assert_eq!(judged().len(), 2, "or this test shows nothing");
+    assert_eq!(evaluated().len(), 2, "or this test shows nothing");
     running.kill("learner-0");
     until("there is a new learner", || running.pids("learner-0").len() == 2);
     until("it is at work", || {
@@ -167,7 +167,7 @@ fn an_evaluator_killed_while_a_new_learner_does_its_rounds_again_holds_nobody_up
     });
     running.stop("learner-0");
     running.go_on("evaluator-0");
-    until("the policy is judged", || judged().len() == 3);
+    until("the policy is evaluated", || evaluated().len() == 3);
     running.kill("evaluator-0");
     until("there is a new evaluator", || running.pids("evaluator-0").len() == 2);
     running.go_on("learner-0");

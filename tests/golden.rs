@@ -101,13 +101,13 @@ fn check_text(text: &str) -> Result<(), Failure> {
     let file: Value = serde_json::from_str(text).map_err(|e| e.to_string())?;
     match file.get("env").and_then(Value::as_str) {
         Some("pendulum") => {
-            let pendulum = Pendulum::new(pendulum::Parameters::default()).map_err(|e| e.to_string())?;
+            let pendulum = Pendulum::new(pendulum::PendulumParameters::default()).map_err(|e| e.to_string())?;
             rollout(&Rollout::read(&file)?, pendulum, |pendulum| {
                 Some(pendulum.state().to_vec())
             })
         }
         Some("cart_pole") => {
-            let cart_pole = CartPole::new(cart_pole::Parameters::default()).map_err(|e| e.to_string())?;
+            let cart_pole = CartPole::new(cart_pole::CartPoleParameters::default()).map_err(|e| e.to_string())?;
             rollout(&Rollout::read(&file)?, cart_pole, |_| None)
         }
         Some("frozen_lake") => frozen_lake(&file),
@@ -237,7 +237,7 @@ fn frozen_lake(file: &Value) -> Result<(), Failure> {
     Ok(())
 }
 
-fn same_outcome(ours: &frozen_lake::Outcome, recorded: &Value) -> bool {
+fn same_outcome(ours: &frozen_lake::LakeTransition, recorded: &Value) -> bool {
     recorded["p"].as_f64().is_some_and(|p| (p - ours.p).abs() <= 1e-9)
         && recorded["next"].as_u64() == Some(ours.next as u64)
         && recorded["reward"].as_f64() == Some(ours.reward)
@@ -276,13 +276,13 @@ fn ddpg_update(file: &Value) -> Result<(), Failure> {
             expected.len()
         ));
     }
-    let settings = config::Ddpg {
+    let settings = config::DdpgConfig {
         tau: read(file, "tau", serde_json::from_value)?,
         actor_learning_rate: read(file, "actor_lr", serde_json::from_value)?,
         critic_learning_rate: read(file, "critic_lr", serde_json::from_value)?,
         hidden: read(file, "hidden", serde_json::from_value)?,
         batch: batches[0].size(),
-        ..config::Ddpg::default()
+        ..config::DdpgConfig::default()
     };
     let mut ddpg = Ddpg::new(&spec, &settings, 0).map_err(|e| e.to_string())?;
     let initial = networks(&file["initial"], &ddpg)?;

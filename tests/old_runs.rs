@@ -141,7 +141,7 @@ fn is_listed_as(place: &Workplace, state: &str) {
 /// cannot be served here is left out.
 fn is_read(place: &Workplace, playable: bool) {
     if playable {
-        is_judged_as_before(place);
+        is_evaluated_as_before(place);
     }
 
     let figures = printed(place, &["plot", "run", "--out", "figures"]);
@@ -173,22 +173,22 @@ fn is_read(place: &Workplace, playable: bool) {
 }
 
 /// The best policy does what the run's evaluator wrote down. Another processor may round otherwise.
-fn is_judged_as_before(place: &Workplace) {
+fn is_evaluated_as_before(place: &Workplace) {
     let mut records = csv::Reader::from_path(place.path().join("run/evaluations.csv")).unwrap();
     let columns = records.headers().unwrap().clone();
     let column = |name| columns.iter().position(|column| column == name).unwrap();
     let [best, episodes, mean] = ["best", "episodes", "return_mean"].map(column);
-    let judged = records
+    let evaluated = records
         .records()
         .map(Result::unwrap)
         .filter(|row| &row[best] == "1")
         .last();
-    let judged = judged.unwrap();
+    let evaluated = evaluated.unwrap();
 
-    let judge = ["eval", "run", "--json", "--episodes", &judged[episodes]];
-    let now: Value = serde_json::from_str(&printed(place, &judge)).unwrap();
+    let evaluate = ["eval", "run", "--json", "--episodes", &evaluated[episodes]];
+    let now: Value = serde_json::from_str(&printed(place, &evaluate)).unwrap();
     let now = now["return_mean"].as_f64().unwrap();
-    let then: f64 = judged[mean].parse().unwrap();
+    let then: f64 = evaluated[mean].parse().unwrap();
     assert!((now - then).abs() <= 1e-3 * then.abs().max(1.0), "{now} and {then}");
 }
 

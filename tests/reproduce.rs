@@ -267,13 +267,13 @@ fn every_experiment_of_the_thesis_can_be_glanced_at() {
             "{figure}"
         );
     }
-    // Every policy that was judged on the lake is there, and the table at the end.
-    let judged = place.path().join("kept/frozen-lake/seed-1/policies");
-    let judged = std::fs::read_dir(judged).unwrap().count();
+    // Every policy that was evaluated on the lake is there, and the table at the end.
+    let evaluated = place.path().join("kept/frozen-lake/seed-1/policies");
+    let evaluated = std::fs::read_dir(evaluated).unwrap().count();
     let result = &lines(&place.path().join("kept/frozen-lake.jsonl.gz"))[1];
     let result: serde_json::Value = serde_json::from_str(result).unwrap();
-    assert!(judged > 1, "{judged}");
-    assert_eq!(result["tests"]["judged"].as_array().unwrap().len(), judged);
+    assert!(evaluated > 1, "{evaluated}");
+    assert_eq!(result["tests"]["judged"].as_array().unwrap().len(), evaluated);
     assert_eq!(result["tests"]["q"].as_array().unwrap().len(), 64);
     // Each experiment has one file, with all its stages.
     let stages = ["", "-longer"].map(|stage| (1, stage.to_string()));

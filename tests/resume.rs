@@ -96,19 +96,19 @@ fn when_everything_is_killed_at_once_no_committed_row_is_lost() {
 }
 
 #[test]
-fn a_policy_of_a_period_that_was_judged_is_not_judged_again() {
+fn a_policy_of_a_period_that_was_evaluated_is_not_evaluated_again() {
     let place = Workplace::new();
     let running = place.start("run", &[&ENDLESS[..], &["--set", "evaluation.every=50000000"]].concat());
     let evaluations = running.run.join("evaluations.csv");
-    let judged = || std::fs::read_to_string(&evaluations).unwrap().lines().count() - 1;
-    until("the first policy is judged", || judged() == 1);
+    let evaluated = || std::fs::read_to_string(&evaluations).unwrap().lines().count() - 1;
+    until("the first policy is evaluated", || evaluated() == 1);
     running.kill("evaluator-0");
     until("it is replaced", || running.pids("evaluator-0").len() == 2);
     running.learns_on();
     assert!(place.output(&["stop", "run"]).status.success());
     running.wait();
     goes_on(&place, 2000);
-    assert_eq!(judged(), 1);
+    assert_eq!(evaluated(), 1);
 }
 
 #[test]

@@ -230,11 +230,11 @@ fn a_directory_that_cannot_be_written_is_said() {
 
     place.train(&["pendulum", "--steps", "300", "--run", "run"]);
     let closed = "mount --bind run run; mount -o remount,bind,ro run;";
-    let judged = in_namespace(
+    let evaluated = in_namespace(
         &place,
         &format!("{closed} exec $SHOAL eval run --policy last --episodes 2 --json"),
     );
-    assert_eq!(json(&judged)["episodes"], 2, "to read is enough");
+    assert_eq!(json(&evaluated)["episodes"], 2, "to read is enough");
     let said = complaint(&in_namespace(&place, &format!("{closed} exec $SHOAL plot run")));
     assert!(
         said.contains(".svg") && said.contains("Read-only file system"),

@@ -6,13 +6,13 @@ use std::rc::Rc;
 use shoal_common::channel::environment::{Begin, EnvironmentClient, Stepped};
 use shoal_common::channel::policy::{self, PolicyHeader, PolicyReader};
 use shoal_common::channel::reports::Reporter;
-use shoal_common::channel::{ChannelError, Domain, HeartbeatSender, Listener, Notifier, Place, wait_for};
-use shoal_common::config::{Algorithm, Config, Evaluation};
+use shoal_common::channel::{ChannelError, Domain, EventName, HeartbeatSender, Listener, Notifier, wait_for};
+use shoal_common::config::{Algorithm, Config, EvaluationConfig};
 use shoal_common::evaluator_state::EvaluatorState;
 use shoal_common::exit::Exit;
 use shoal_common::policy::Policy;
 use shoal_common::policy_file::PolicyFile;
-use shoal_common::report::{Activity, EvaluationReport, Identity, JudgedReport, Role};
+use shoal_common::report::{Activity, EvaluatedReport, EvaluationReport, Identity, Role};
 use shoal_common::run_dir::RunDir;
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::stop::Stop;
@@ -22,7 +22,7 @@ use crate::explorer::connect;
 
 /// What an evaluator is told.
 #[derive(Clone, Debug)]
-pub struct Settings {
+pub struct EvaluatorSettings {
     /// Which process this is.
     pub identity: Identity,
     /// What the environment server is expected to serve.
@@ -32,18 +32,18 @@ pub struct Settings {
     /// Environments it steps at once.
     pub envs: usize,
     /// How often, and how long.
-    pub evaluation: Evaluation,
+    pub evaluation: EvaluationConfig,
     /// What is learned, and with it what kind of policy.
     pub algorithm: Algorithm,
     /// The run's directory, where the best policy is kept, and all of them if that is wanted.
     pub run: RunDir,
-    /// The period of the policy that an evaluator before this one judged last.
-    pub judged: Option<u64>,
+    /// The period of the policy that an evaluator before this one evaluated last.
+    pub evaluated_period: Option<u64>,
 }
 
-impl Settings {
-    /// What the evaluator of this run is told; `judged` is the period of the policy that one before it judged last.
-    pub fn new(config: &Config, run: &RunDir, identity: Identity, judged: Option<u64>) -> Self {
+impl EvaluatorSettings {
+    /// What the evaluator of this run is told; `evaluated_period` is the period of the policy that one before it evaluated last.
+    pub fn new(config: &Config, run: &RunDir, identity: Identity, evaluated_period: Option<u64>) -> Self {
         Self {
             identity,
             spec: config.spec.clone(),
@@ -52,7 +52,7 @@ impl Settings {
             evaluation: config.evaluation.clone(),
             algorithm: config.algorithm.clone(),
             run: run.clone(),
-            judged,
+            evaluated_period,
         }
     }
 }
@@ -72,48 +72,48 @@ pub fn mean_and_std(returns: &[f64]) -> (f64, f64) {
     )
 }
 
-/// Judges policies until `stop`.
+/// Evaluates policies until `stop`.
 ///
 /// # Errors
 /// When a channel does not work, the environment is not the expected one, or the best policy cannot be written.
-pub fn evaluate(domain: &Domain, settings: &Settings, stop: &Stop) -> Result<(), ActorError> {
+pub fn evaluate(domain: &Domain, settings: &EvaluatorSettings, stop: &Stop) -> Result<(), ActorError> {
     let mut evaluator = match Evaluator::new(domain, settings, stop) {
         Ok(evaluator) => evaluator,
         Err(exit) => return exit.into_result(),
     };
     loop {
-        if let Err(exit) = evaluator.judge_next() {
+        if let Err(exit) = evaluator.evaluate_next() {
             return exit.into_result();
         }
     }
 }
 
 struct Evaluator<'a> {
-    settings: &'a Settings,
+    settings: &'a EvaluatorSettings,
     stop: &'a Stop,
-    bell: Listener,
+    listener: Listener,
     learner: Notifier,
     client: EnvironmentClient,
     reader: PolicyReader,
     policy: Policy,
     reports: Reporter<EvaluationReport>,
     state: EvaluatorState,
-    judgements: Reporter<JudgedReport>,
-    pulse: HeartbeatSender,
+    evaluated_reports: Reporter<EvaluatedReport>,
+    heartbeat: HeartbeatSender,
     actions: Vec<f32>,
-    /// The period of the policy judged last.
-    judged: Option<u64>,
+    /// The period of the policy evaluated last.
+    evaluated_period: Option<u64>,
     /// Mean return and version of the best policy.
     best: Option<(f64, u64)>,
 }
 
 impl<'a> Evaluator<'a> {
-    fn new(domain: &Domain, settings: &'a Settings, stop: &'a Stop) -> Result<Self, Exit<ActorError>> {
+    fn new(domain: &Domain, settings: &'a EvaluatorSettings, stop: &'a Stop) -> Result<Self, Exit<ActorError>> {
         let policy = settings.algorithm.policy(&settings.spec, settings.envs)?;
         let layout = policy.layout();
-        let bell = Listener::bind(domain, Place(Role::Evaluator, settings.identity.index))?;
-        let mut pulse = HeartbeatSender::new(domain, settings.identity)?;
-        let client = connect(domain, &bell, settings.server, &settings.spec, settings.envs, stop)?;
+        let listener = Listener::bind(domain, EventName(Role::Evaluator, settings.identity.index))?;
+        let mut heartbeat = HeartbeatSender::new(domain, settings.identity)?;
+        let client = connect(domain, &listener, settings.server, &settings.spec, settings.envs, stop)?;
         let reader = PolicyReader::open(domain, layout.fingerprint(), layout.parameters())?;
         let best = if settings.run.best_policy().exists() {
             let best = PolicyFile::read(&settings.run.best_policy(), &layout)?;
@@ -121,34 +121,34 @@ impl<'a> Evaluator<'a> {
         } else {
             None
         };
-        pulse.beat(Activity::WaitingForPeer);
+        heartbeat.beat(Activity::WaitingForPeer);
         let state = EvaluatorState::read(&settings.run.evaluator_state())?;
         let reports = Reporter::open(domain)?;
         // The launcher leaves out what it has written down.
         state.evaluations().for_each(|evaluation| reports.send(*evaluation));
-        let judgements = Reporter::open(domain)?;
-        if let Some(period) = settings.judged {
-            judgements.send(JudgedReport { period });
+        let evaluated_reports = Reporter::open(domain)?;
+        if let Some(period) = settings.evaluated_period {
+            evaluated_reports.send(EvaluatedReport { period });
         }
         Ok(Self {
             settings,
             stop,
-            learner: Notifier::new(domain, Place(Role::Learner, 0))?,
+            learner: Notifier::new(domain, EventName(Role::Learner, 0))?,
             client,
             reader,
             reports,
-            judgements,
+            evaluated_reports,
             state,
-            pulse,
+            heartbeat,
             actions: vec![0.0; settings.envs * settings.spec.action.width()],
             policy,
-            bell,
-            judged: settings.judged,
+            listener,
+            evaluated_period: settings.evaluated_period,
             best,
         })
     }
 
-    fn judge_next(&mut self) -> Result<(), Exit<ActorError>> {
+    fn evaluate_next(&mut self) -> Result<(), Exit<ActorError>> {
         let published = self.await_due_policy().map_err(Exit::widen)?;
         let header = published.header();
         let mut returns = Vec::new();
@@ -169,11 +169,11 @@ impl<'a> Evaluator<'a> {
             self.best = Some((return_mean, header.version));
         }
         if self.settings.evaluation.keep_policies {
-            let path = self.settings.run.judged_policy(header.env_steps);
+            let path = self.settings.run.evaluated_policy(header.env_steps);
             self.keep(&published, return_mean, return_std, &path)?;
         }
         let period = self.settings.evaluation.period(header.env_steps);
-        self.judged = Some(period);
+        self.evaluated_period = Some(period);
         let evaluation = EvaluationReport {
             policy_version: header.version,
             env_steps: header.env_steps,
@@ -188,37 +188,38 @@ impl<'a> Evaluator<'a> {
             .add(evaluation, &self.settings.run.evaluator_state())
             .map_err(ActorError::State)?;
         self.reports.send(evaluation);
-        self.judgements.send(JudgedReport { period });
+        self.evaluated_reports.send(EvaluatedReport { period });
         self.learner.notify();
         Ok(())
     }
 
-    /// Waits for a policy of a period that was not judged yet.
+    /// Waits for a policy of a period that was not evaluated yet.
     fn await_due_policy(&mut self) -> Result<Rc<policy::Policy>, Exit<ChannelError>> {
         let Self {
             reader,
-            judged,
+            evaluated_period,
             settings,
-            bell,
+            listener,
             stop,
-            pulse,
+            heartbeat,
             reports,
-            judgements,
+            evaluated_reports,
             ..
         } = self;
-        let due = |header: &PolicyHeader| judged.is_none_or(|j| settings.evaluation.period(header.env_steps) > j);
+        let due =
+            |header: &PolicyHeader| evaluated_period.is_none_or(|j| settings.evaluation.period(header.env_steps) > j);
         let published = wait_for(
-            bell,
+            listener,
             stop,
             || Ok(reader.latest()?.filter(|policy| due(policy.header()))),
             || {
-                pulse.beat(Activity::WaitingForPeer);
+                heartbeat.beat(Activity::WaitingForPeer);
                 reports.look_after();
-                judgements.look_after();
+                evaluated_reports.look_after();
                 Ok(())
             },
         )?;
-        self.pulse.set_policy_version(published.header().version);
+        self.heartbeat.set_policy_version(published.header().version);
         Ok(published)
     }
 
@@ -227,21 +228,21 @@ impl<'a> Evaluator<'a> {
     fn run_episodes(&mut self, parameters: &[f32], first: u64) -> Result<Option<Vec<f64>>, Exit<ActorError>> {
         let Self {
             client,
-            bell,
+            listener,
             policy,
-            pulse,
+            heartbeat,
             actions,
             ..
         } = self;
-        let begun = client.reset(bell, Begin::Evaluation(first), || {
-            pulse.beat(Activity::WaitingForServer);
+        let begun = client.reset(listener, Begin::Evaluation(first), || {
+            heartbeat.beat(Activity::WaitingForServer);
         });
         let mut current = begun.map_err(Exit::widen)?;
         let mut returns = vec![0.0; self.settings.envs];
         let mut under_way = vec![true; self.settings.envs];
         while under_way.contains(&true) {
             policy.act(parameters, current.observations(), actions);
-            let stepped = client.step(bell, actions, || pulse.beat(Activity::WaitingForServer));
+            let stepped = client.step(listener, actions, || heartbeat.beat(Activity::WaitingForServer));
             match stepped.map_err(Exit::widen)? {
                 Stepped::Taken(next) => current = next,
                 Stepped::Lost => return Ok(None),
@@ -252,8 +253,8 @@ impl<'a> Evaluator<'a> {
                     *under_way = !(current.terminated(e) || current.truncated(e));
                 }
             }
-            pulse.count(self.settings.envs as u64);
-            pulse.beat(Activity::Working);
+            heartbeat.count(self.settings.envs as u64);
+            heartbeat.beat(Activity::Working);
             if self.stop.requested() {
                 return Err(Exit::Stopped);
             }

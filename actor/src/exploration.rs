@@ -124,7 +124,7 @@ fn drawn(logits: &[f32], u: f64) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use shoal_common::config::{Algorithm, Ddpg, Reinforce, Tabular};
+    use shoal_common::config::{Algorithm, DdpgConfig, ReinforceConfig, TabularConfig};
     use shoal_common::space::{EnvironmentSpec, Space};
     use shoal_common::stream::{Purpose, stream};
 
@@ -135,9 +135,9 @@ mod tests {
             time_limit: 100,
             state_width: 1,
         };
-        let tabular = Tabular {
+        let tabular = TabularConfig {
             epsilon,
-            ..Tabular::default()
+            ..TabularConfig::default()
         };
         let stream = stream(7, Purpose::Exploration, 0, 0);
         Exploration::new(Algorithm::QLearning(tabular).behaviour(&spec, 1).unwrap(), 1, stream)
@@ -177,9 +177,9 @@ mod tests {
             state_width: 1,
         };
         let stream = stream(7, Purpose::Exploration, 0, 0);
-        let algorithm = Algorithm::Reinforce(Reinforce {
+        let algorithm = Algorithm::Reinforce(ReinforceConfig {
             hidden: [1, 1].into(),
-            ..Reinforce::default()
+            ..ReinforceConfig::default()
         });
         let mut policy = Exploration::new(algorithm.behaviour(&spec, 1).unwrap(), 1, stream);
         // The logits are 0 and ln 3, whatever is observed: probabilities 1/4 and 3/4.
@@ -198,13 +198,13 @@ mod tests {
             state_width: 1,
         };
         let new = |warmup| {
-            let noise = shoal_common::config::Exploration {
+            let noise = shoal_common::config::ExplorationConfig {
                 warmup,
                 ..Default::default()
             };
-            let algorithm = Algorithm::Ddpg(Ddpg {
+            let algorithm = Algorithm::Ddpg(DdpgConfig {
                 exploration: noise,
-                ..Ddpg::default()
+                ..DdpgConfig::default()
             });
             let behaviour = algorithm.behaviour(&spec, 1).unwrap();
             Exploration::new(behaviour, 1, stream(7, Purpose::Exploration, 0, 0))

@@ -19,7 +19,7 @@ use shoal_common::channel::environment::{Begin, EnvironmentClient, Observed, Sna
 use shoal_common::channel::policy::{Policy, PolicyReader};
 use shoal_common::channel::reports::Reporter;
 use shoal_common::channel::transitions::{Chunk, ChunkSender};
-use shoal_common::channel::{ChannelError, Domain, HeartbeatSender, Listener, Notifier, Place, wait_for};
+use shoal_common::channel::{ChannelError, Domain, EventName, HeartbeatSender, Listener, Notifier, wait_for};
 use shoal_common::commit::{CommitReader, OpenError};
 use shoal_common::config::{Algorithm, Config, Mode};
 use shoal_common::exit::Exit;
@@ -39,7 +39,7 @@ const FAREWELL: Duration = Duration::from_secs(1);
 
 /// What an actor is told.
 #[derive(Clone, Debug)]
-pub struct Settings {
+pub struct ExplorerSettings {
     /// Which process this is.
     pub identity: Identity,
     /// The run's seed.
@@ -60,7 +60,7 @@ pub struct Settings {
     pub replay: PathBuf,
 }
 
-impl Settings {
+impl ExplorerSettings {
     /// What an actor of this run is told.
     pub fn new(config: &Config, run: &RunDir, identity: Identity) -> Self {
         Self {
@@ -81,7 +81,7 @@ impl Settings {
 ///
 /// # Errors
 /// When a channel does not work, or the environment is not the expected one.
-pub fn explore(domain: &Domain, settings: &Settings, stop: &Stop) -> Result<(), ActorError> {
+pub fn explore(domain: &Domain, settings: &ExplorerSettings, stop: &Stop) -> Result<(), ActorError> {
     let mut explorer = match Explorer::new(domain, settings, stop) {
         Ok(explorer) => explorer,
         Err(exit) => return exit.into_result(),
@@ -93,9 +93,9 @@ pub fn explore(domain: &Domain, settings: &Settings, stop: &Stop) -> Result<(), 
 }
 
 struct Explorer<'a> {
-    settings: &'a Settings,
+    settings: &'a ExplorerSettings,
     stop: &'a Stop,
-    bell: Listener,
+    listener: Listener,
     learner: Notifier,
     client: EnvironmentClient,
     policy: PolicyReader,
@@ -106,7 +106,7 @@ struct Explorer<'a> {
     /// Version of the policy that its last row was collected with; of the one before it, while it is empty.
     policy_version: u64,
     commits: CommitReader,
-    pulse: HeartbeatSender,
+    heartbeat: HeartbeatSender,
     episodes: Reporter<EpisodeReport>,
     returns: Vec<f64>,
     lengths: Vec<u32>,
@@ -122,22 +122,22 @@ struct Explorer<'a> {
 }
 
 impl<'a> Explorer<'a> {
-    fn new(domain: &Domain, settings: &'a Settings, stop: &'a Stop) -> Result<Self, Exit<ActorError>> {
+    fn new(domain: &Domain, settings: &'a ExplorerSettings, stop: &'a Stop) -> Result<Self, Exit<ActorError>> {
         let Identity { index, incarnation, .. } = settings.identity;
         let row = settings.chunk.row;
         let layout = settings.algorithm.policy_layout(&settings.spec)?;
-        let bell = Listener::bind(domain, Place(Role::Actor, index))?;
-        let mut pulse = HeartbeatSender::new(domain, settings.identity)?;
-        let client = connect(domain, &bell, index, &settings.spec, settings.envs, stop)?;
+        let listener = Listener::bind(domain, EventName(Role::Actor, index))?;
+        let mut heartbeat = HeartbeatSender::new(domain, settings.identity)?;
+        let client = connect(domain, &listener, index, &settings.spec, settings.envs, stop)?;
         let policy = PolicyReader::open(domain, layout.fingerprint(), layout.parameters())?;
-        pulse.beat(Activity::WaitingForPeer);
+        heartbeat.beat(Activity::WaitingForPeer);
 
-        let commits = wait_for_replay(settings, &bell, stop, &mut pulse)?;
+        let commits = wait_for_replay(settings, &listener, stop, &mut heartbeat)?;
         let handshake = ChunkSender::open(domain, index, incarnation, settings.chunk, settings.window)?;
-        let learner = Notifier::new(domain, Place(Role::Learner, 0))?;
+        let learner = Notifier::new(domain, EventName(Role::Learner, 0))?;
         learner.notify();
         let sender = handshake
-            .wait(&commits, &bell, stop, || pulse.beat(Activity::WaitingForPeer))
+            .wait(&commits, &listener, stop, || heartbeat.beat(Activity::WaitingForPeer))
             .map_err(Exit::widen)?;
         // In lockstep nothing may depend on how often an actor was started: it goes on where the last chunk left it.
         let incarnation = match settings.mode {
@@ -171,12 +171,12 @@ impl<'a> Explorer<'a> {
             policy_version: 0,
             sender,
             commits,
-            pulse,
+            heartbeat,
             episodes: Reporter::open(domain)?,
             returns: vec![0.0; settings.envs],
             lengths: vec![0; settings.envs],
             actions: vec![0.0; settings.envs * row.action_width()],
-            bell,
+            listener,
         })
     }
 
@@ -202,8 +202,8 @@ impl<'a> Explorer<'a> {
             self.exploration.restore(&standing.noise);
             self.returns.clone_from(&standing.returns);
             self.lengths.clone_from(&standing.lengths);
-            let idle = || self.pulse.beat(Activity::WaitingForServer);
-            let restored = self.client.restore(&self.bell, &standing.snapshot, idle);
+            let idle = || self.heartbeat.beat(Activity::WaitingForServer);
+            let restored = self.client.restore(&self.listener, &standing.snapshot, idle);
             return restored.map_err(Exit::widen);
         }
         (0..self.settings.envs).for_each(|environment| self.begin_episode(environment));
@@ -215,18 +215,18 @@ impl<'a> Explorer<'a> {
     }
 
     fn reset(&mut self, begin: Begin) -> Result<Observed, Exit<ActorError>> {
-        let idle = || self.pulse.beat(Activity::WaitingForServer);
-        self.client.reset(&self.bell, begin, idle).map_err(Exit::widen)
+        let idle = || self.heartbeat.beat(Activity::WaitingForServer);
+        self.client.reset(&self.listener, begin, idle).map_err(Exit::widen)
     }
 
     fn run_until_the_server_is_lost(&mut self) -> Result<(), Exit<ActorError>> {
         let mut current = self.begin()?;
         loop {
             let policy = self.await_policy().map_err(Exit::widen)?;
-            self.pulse.begin_work();
+            self.heartbeat.begin_work();
             self.act(&policy, &current);
-            let idle = || self.pulse.beat(Activity::WaitingForServer);
-            let stepped = self.client.step(&self.bell, &self.actions, idle);
+            let idle = || self.heartbeat.beat(Activity::WaitingForServer);
+            let stepped = self.client.step(&self.listener, &self.actions, idle);
             match stepped.map_err(Exit::widen)? {
                 Stepped::Taken(next) => {
                     self.remember(&current, &next, policy.header().version);
@@ -235,8 +235,8 @@ impl<'a> Explorer<'a> {
                 Stepped::Lost => return Ok(()),
             }
             self.step += 1;
-            self.pulse.count(self.settings.envs as u64);
-            self.pulse.beat(Activity::Working);
+            self.heartbeat.count(self.settings.envs as u64);
+            self.heartbeat.beat(Activity::Working);
             if self.chunk_is_complete() {
                 if !self.append_snapshot()? {
                     return Ok(());
@@ -266,8 +266,8 @@ impl<'a> Explorer<'a> {
         let Self {
             policy,
             sender,
-            pulse,
-            bell,
+            heartbeat,
+            listener,
             stop,
             ..
         } = self;
@@ -277,17 +277,17 @@ impl<'a> Explorer<'a> {
         let newest = match newest(policy)? {
             Some(newest) => newest,
             None => wait_for(
-                bell,
+                listener,
                 stop,
                 || newest(policy),
                 || {
-                    pulse.beat(Activity::WaitingForPeer);
+                    heartbeat.beat(Activity::WaitingForPeer);
                     // A new learner may need the last chunks before it can publish anything.
                     sender.look_after()
                 },
             )?,
         };
-        self.pulse.set_policy_version(newest.header().version);
+        self.heartbeat.set_policy_version(newest.header().version);
         Ok(newest)
     }
 
@@ -351,8 +351,8 @@ impl<'a> Explorer<'a> {
         if self.settings.chunk.actor_snapshot_words == 0 {
             return Ok(true);
         }
-        let idle = || self.pulse.beat(Activity::WaitingForServer);
-        let snapshot = self.client.snapshot(&self.bell, idle).map_err(Exit::widen)?;
+        let idle = || self.heartbeat.beat(Activity::WaitingForServer);
+        let snapshot = self.client.snapshot(&self.listener, idle).map_err(Exit::widen)?;
         let Snapshot::Taken(snapshot) = snapshot else {
             return Ok(false);
         };
@@ -374,9 +374,9 @@ impl<'a> Explorer<'a> {
             sender,
             commits,
             settings,
-            bell,
+            listener,
             stop,
-            pulse,
+            heartbeat,
             ..
         } = self;
         let room = || {
@@ -387,16 +387,16 @@ impl<'a> Explorer<'a> {
             return Ok(());
         }
         wait_for(
-            bell,
+            listener,
             stop,
             || Ok(room()),
             || {
-                pulse.beat(Activity::WaitingForRatio);
+                heartbeat.beat(Activity::WaitingForRatio);
                 sender.look_after()
             },
         )?;
         // A learner that is at work rings before a nap is over, and the launcher is to know of this wait too.
-        pulse.beat(Activity::WaitingForRatio);
+        heartbeat.beat(Activity::WaitingForRatio);
         Ok(())
     }
 
@@ -419,7 +419,7 @@ impl<'a> Explorer<'a> {
             self.send()?;
         }
         self.await_commits(0)?;
-        self.pulse.beat_now(Activity::Done);
+        self.heartbeat.beat_now(Activity::Done);
         Ok(())
     }
 
@@ -433,9 +433,9 @@ impl<'a> Explorer<'a> {
                     return Ok(false);
                 }
             }
-            self.pulse.beat(Activity::WaitingForRatio);
+            self.heartbeat.beat(Activity::WaitingForRatio);
             self.sender.look_after()?;
-            self.bell.wait(Duration::from_millis(10))?;
+            self.listener.wait(Duration::from_millis(10))?;
         }
         Ok(true)
     }
@@ -444,14 +444,14 @@ impl<'a> Explorer<'a> {
 /// Opens the conversation with environment server `index` and makes sure that it serves what the run is about.
 pub(crate) fn connect(
     domain: &Domain,
-    bell: &Listener,
+    listener: &Listener,
     index: u32,
     spec: &EnvironmentSpec,
     envs: usize,
     stop: &Stop,
 ) -> Result<EnvironmentClient, Exit<ActorError>> {
     let client = EnvironmentClient::open(domain, index, spec, envs, stop.clone())?;
-    let (served, served_envs) = client.describe(bell, || ()).map_err(Exit::widen)?;
+    let (served, served_envs) = client.describe(listener, || ()).map_err(Exit::widen)?;
     if served != *spec || served_envs != envs {
         let served = format!("{served_envs} times {served:?}");
         let configured = format!("{envs} times {spec:?}");
@@ -465,18 +465,18 @@ pub(crate) fn connect(
 }
 
 fn wait_for_replay(
-    settings: &Settings,
-    bell: &Listener,
+    settings: &ExplorerSettings,
+    listener: &Listener,
     stop: &Stop,
-    pulse: &mut HeartbeatSender,
+    heartbeat: &mut HeartbeatSender,
 ) -> Result<CommitReader, Exit<ActorError>> {
     loop {
         match CommitReader::open(&settings.replay) {
             Ok(reader) => return Ok(reader),
             Err(OpenError::NotYet { .. }) if stop.requested() => return Err(Exit::Stopped),
             Err(OpenError::NotYet { .. }) => {
-                bell.wait(Duration::from_millis(20))?;
-                pulse.beat(Activity::WaitingForPeer);
+                listener.wait(Duration::from_millis(20))?;
+                heartbeat.beat(Activity::WaitingForPeer);
             }
             Err(error) => return Err(error.into()),
         }

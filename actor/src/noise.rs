@@ -2,7 +2,7 @@
 
 use rand::RngExt;
 use rand_distr::StandardNormal;
-use shoal_common::config::{Exploration, Warmup};
+use shoal_common::config::{ExplorationConfig, Warmup};
 use shoal_common::network::ActionRange;
 use shoal_common::stream::Stream;
 
@@ -10,7 +10,7 @@ use shoal_common::stream::Stream;
 /// done again gets the same ones.
 #[derive(Clone, Debug)]
 pub struct OrnsteinUhlenbeck {
-    settings: Exploration,
+    settings: ExplorationConfig,
     /// The process's state, environment after environment.
     x: Vec<f64>,
     width: usize,
@@ -19,7 +19,7 @@ pub struct OrnsteinUhlenbeck {
 
 impl OrnsteinUhlenbeck {
     /// Noise at rest for `environments` environments with actions of `width` numbers.
-    pub fn new(settings: &Exploration, environments: usize, width: usize, stream: Stream) -> Self {
+    pub fn new(settings: &ExplorationConfig, environments: usize, width: usize, stream: Stream) -> Self {
         Self {
             settings: settings.clone(),
             x: vec![0.0; environments * width],
@@ -62,7 +62,7 @@ impl OrnsteinUhlenbeck {
     /// Advances every process by step number `step`: x ← x − θ x + σ N(0, 1).
     pub fn advance(&mut self, step: u64) {
         self.go_to(step);
-        let Exploration { theta, sigma, .. } = self.settings;
+        let ExplorationConfig { theta, sigma, .. } = self.settings;
         for x in &mut self.x {
             let normal: f64 = self.stream.sample(StandardNormal);
             *x += -theta * *x + sigma * normal;
@@ -94,7 +94,7 @@ mod tests {
 
     fn noise(environments: usize) -> OrnsteinUhlenbeck {
         OrnsteinUhlenbeck::new(
-            &Exploration::default(),
+            &ExplorationConfig::default(),
             environments,
             1,
             stream(7, Purpose::Exploration, 0, 0),

@@ -7,7 +7,7 @@ use serde::Serialize;
 use shoal_actor::exploration::Exploration;
 use shoal_common::channel::environment::{Begin, EnvironmentClient, ResponseLayout, Stepped};
 use shoal_common::channel::transitions::ChunkSender;
-use shoal_common::channel::{Domain, Listener, Notifier, Place};
+use shoal_common::channel::{Domain, EventName, Listener, Notifier};
 use shoal_common::commit::CommitReader;
 use shoal_common::config::Config;
 use shoal_common::network::{ActionRange, PolicyNetwork};
@@ -168,10 +168,10 @@ fn round_trip(
     length: Duration,
     patience: &Patience,
 ) -> anyhow::Result<f64> {
-    let bell = Listener::bind(domain, Place(Role::Actor, 0))?;
+    let listener = Listener::bind(domain, EventName(Role::Actor, 0))?;
     let client = EnvironmentClient::open(domain, 0, &config.spec, ENVIRONMENTS, patience.stop.clone())?;
-    client.describe(&bell, || ()).map_err(interrupted)?;
-    client.reset(&bell, Begin::Next, || ()).map_err(interrupted)?;
+    client.describe(&listener, || ()).map_err(interrupted)?;
+    client.reset(&listener, Begin::Next, || ()).map_err(interrupted)?;
     let actions = vec![0.5; ENVIRONMENTS * config.spec.action.width()];
     let part = length / (WINDOWS + 1);
     let mut windows = Windows::default();
@@ -182,7 +182,7 @@ fn round_trip(
         while asked == 0.0 || begun.elapsed() < part {
             inference.step();
             let before = Instant::now();
-            if let Stepped::Lost = client.step(&bell, &actions, || ()).map_err(interrupted)? {
+            if let Stepped::Lost = client.step(&listener, &actions, || ()).map_err(interrupted)? {
                 bail!("the environment server gave up its episodes");
             }
             taken += before.elapsed();
@@ -212,14 +212,14 @@ fn chunks(
     for step in rows.chunks_exact_mut(ENVIRONMENTS * row.width()) {
         source.fill(step)?;
     }
-    let bell = Listener::bind(domain, Place(Role::Actor, 0))?;
-    let learner = Notifier::new(domain, Place(Role::Learner, 0))?;
+    let listener = Listener::bind(domain, EventName(Role::Actor, 0))?;
+    let learner = Notifier::new(domain, EventName(Role::Learner, 0))?;
     let mut intake = Intake::open(domain, 1, window, config.chunk_layout(), u64::MAX)?;
     let handshake = ChunkSender::open(domain, 0, 1, config.chunk_layout(), window)?;
     intake.drain(replay, window, |_| false)?;
     let commits = CommitReader::open(&scene.run.replay_file())?;
     let mut sender = handshake
-        .wait(&commits, &bell, &patience.stop, || {})
+        .wait(&commits, &listener, &patience.stop, || {})
         .map_err(interrupted)?;
 
     let (mut writing, mut taking_in) = (Windows::default(), Windows::default());

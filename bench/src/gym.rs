@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use serde::{Deserialize, Serialize};
-use shoal_common::config::Environment;
+use shoal_common::config::EnvironmentConfig;
 use shoal_run::external_environment::{ExternalEnvironment, default_command};
 
 use super::measurement::{Figures, Patience};
@@ -46,7 +46,7 @@ struct Gymnasium {
 }
 
 pub(super) fn measure(patience: &Patience) -> anyhow::Result<GymFigures> {
-    let environment = Environment {
+    let environment = EnvironmentConfig {
         name: NAME.into(),
         server: default_command(NAME).context("no server for Gymnasium's environments")?,
         parameters: toml::Table::new(),
@@ -68,7 +68,7 @@ pub(super) fn measure(patience: &Patience) -> anyhow::Result<GymFigures> {
 
 /// Times of steps of so many environments, in ns; at least one.
 fn times(
-    environment: &Environment,
+    environment: &EnvironmentConfig,
     environments: u32,
     length: Duration,
     patience: &Patience,
@@ -89,7 +89,7 @@ fn times(
     Ok(times)
 }
 
-fn gymnasium(environment: &Environment, length: Duration) -> anyhow::Result<Gymnasium> {
+fn gymnasium(environment: &EnvironmentConfig, length: Duration) -> anyhow::Result<Gymnasium> {
     let python = environment.server.first().context("no Python")?;
     let output = Command::new(python)
         .args(["-m", "shoal_gym.peers", "--name", NAME])

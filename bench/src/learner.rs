@@ -134,7 +134,7 @@ fn filled(config: &Config, mut replay: Replay, patience: &Patience) -> anyhow::R
 
 /// New networks that learn from minibatches of this size.
 fn method(config: &Config, batch: usize) -> anyhow::Result<ReplayedDdpg> {
-    let settings = config::Ddpg {
+    let settings = config::DdpgConfig {
         batch,
         ..ddpg(config)?.clone()
     };

@@ -4,7 +4,7 @@ use anyhow::Context;
 use rustix::thread::CpuSet;
 use shoal_common::channel::{Domain, Services};
 use shoal_common::commit::ReplayLayout;
-use shoal_common::config::{Config, Ddpg};
+use shoal_common::config::{Config, DdpgConfig};
 use shoal_common::report::Role;
 use shoal_common::run_dir::RunDir;
 use shoal_run::plan::Plan;
@@ -24,7 +24,7 @@ pub(super) struct Scene {
 }
 
 /// DDPG's numbers: the only learner that is measured.
-pub(super) fn ddpg(config: &Config) -> anyhow::Result<&Ddpg> {
+pub(super) fn ddpg(config: &Config) -> anyhow::Result<&DdpgConfig> {
     config.algorithm.ddpg().context("only DDPG is measured")
 }
 

@@ -6,7 +6,7 @@ use anyhow::bail;
 use rustix::thread::sched_setaffinity;
 use serde::Serialize;
 use shoal_common::channel::environment::{Begin, EnvironmentClient, Stepped};
-use shoal_common::channel::{ChannelError, Domain, Listener, Place};
+use shoal_common::channel::{ChannelError, Domain, EventName, Listener};
 use shoal_common::config::Config;
 use shoal_common::exit::Exit;
 use shoal_common::report::Role;
@@ -98,15 +98,15 @@ fn round_trips(
     patience: &Patience,
 ) -> anyhow::Result<Vec<u32>> {
     let environments = config.actors.envs as usize;
-    let bell = Listener::bind(domain, Place(Role::Actor, 0))?;
+    let listener = Listener::bind(domain, EventName(Role::Actor, 0))?;
     let client = EnvironmentClient::open(domain, 0, &config.spec, environments, patience.stop.clone())?;
     let mut ask = |request: &dyn Fn() -> Result<(), Exit<ChannelError>>| match request() {
         Ok(()) => Ok(()),
         Err(Exit::Stopped) => patience.check(),
         Err(Exit::Failed(error)) => server.check().and(Err(error.into())),
     };
-    ask(&|| client.describe(&bell, || ()).map(|_| ()))?;
-    ask(&|| client.reset(&bell, Begin::Next, || ()).map(|_| ()))?;
+    ask(&|| client.describe(&listener, || ()).map(|_| ()))?;
+    ask(&|| client.reset(&listener, Begin::Next, || ()).map(|_| ()))?;
 
     let actions = vec![0.5; environments * config.spec.action.width()];
     let mut times = Vec::new();
@@ -114,7 +114,7 @@ fn round_trips(
     let (begun, mut looked) = (Instant::now(), Instant::now());
     loop {
         let before = Instant::now();
-        match client.step(&bell, &actions, || ()) {
+        match client.step(&listener, &actions, || ()) {
             Ok(Stepped::Taken(_)) => {}
             Ok(Stepped::Lost) => {
                 server.check()?;

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use serde::Serialize;
 use shoal_common::channel::transitions::ChunkSender;
-use shoal_common::channel::{Domain, Listener, Notifier, Place, wait_for};
+use shoal_common::channel::{Domain, EventName, Listener, Notifier, wait_for};
 use shoal_common::commit::{CommitReader, OpenError};
 use shoal_common::config::Config;
 use shoal_common::exit::Exit;
@@ -88,12 +88,12 @@ fn move_rows(
     let mut chunks = vec![vec![0.0; ENVIRONMENTS * row.width()]; CHUNKS];
     chunks.iter_mut().try_for_each(|chunk| rows.fill(chunk))?;
 
-    let bell = Listener::bind(domain, Place(Role::Actor, 0))?;
-    let ringer = Notifier::new(domain, Place(Role::Learner, 0))?;
-    let commits = wait_for_replay(run, &bell, learner, patience)?;
+    let listener = Listener::bind(domain, EventName(Role::Actor, 0))?;
+    let notifier = Notifier::new(domain, EventName(Role::Learner, 0))?;
+    let commits = wait_for_replay(run, &listener, learner, patience)?;
     let handshake = ChunkSender::open(domain, 0, 1, config.chunk_layout(), config.actors.window)?;
     let mut sender = handshake
-        .wait(&commits, &bell, &patience.stop, || {
+        .wait(&commits, &listener, &patience.stop, || {
             // A learner that has ended commits nothing.
             if learner.check().is_err() {
                 patience.stop.request();
@@ -109,7 +109,7 @@ fn move_rows(
         for numbers in &chunks {
             let room = || sender.in_flight(commits.committed(0)) < u64::from(config.actors.window);
             let waited = wait_for(
-                &bell,
+                &listener,
                 &patience.stop,
                 || Ok(room().then_some(())),
                 || {
@@ -129,7 +129,7 @@ fn move_rows(
                 chunk.push(&row.read(numbers));
             }
             sender.send(chunk, 0)?;
-            ringer.notify();
+            notifier.notify();
         }
         let elapsed = begun.elapsed();
         if elapsed >= length {
@@ -150,7 +150,7 @@ fn move_rows(
 
 fn wait_for_replay(
     run: &RunDir,
-    bell: &Listener,
+    listener: &Listener,
     learner: &mut Peer,
     patience: &Patience,
 ) -> anyhow::Result<CommitReader> {
@@ -160,7 +160,7 @@ fn wait_for_replay(
             Err(OpenError::NotYet { .. }) => {
                 learner.check()?;
                 patience.check()?;
-                bell.wait(Duration::from_millis(5))?;
+                listener.wait(Duration::from_millis(5))?;
             }
             Err(error) => return Err(error.into()),
         }

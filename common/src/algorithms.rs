@@ -10,14 +10,14 @@ mod tabular;
 
 pub use algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Shape};
 pub use behaviour::Behaviour;
-pub use ddpg::Ddpg;
-pub use exploration::{Exploration, Warmup};
-pub use reinforce::{Reinforce, Weight};
+pub use ddpg::DdpgConfig;
+pub use exploration::{ExplorationConfig, Warmup};
+pub use reinforce::{ReinforceConfig, Weight};
 use serde::Serialize;
 use shoal_base::section::{self, OutOfRange, Section, describe};
 use shoal_base::space::EnvironmentSpec;
 use shoal_policy::{Policy, PolicyError, PolicyLayout};
-pub use tabular::Tabular;
+pub use tabular::TabularConfig;
 
 macro_rules! registry {
     ($($(#[$attribute:meta])* $variant:ident($settings:ty) is $spec:expr;)*) => {
@@ -70,19 +70,19 @@ macro_rules! registry {
 // The registry: a line for each algorithm. The variant's name is that of the section (`QLearning`: `[q-learning]`).
 registry! {
     /// `[ddpg]` and `[exploration]`.
-    Ddpg(Ddpg) is ddpg::SPEC;
+    Ddpg(DdpgConfig) is ddpg::SPEC;
     /// `[reinforce]`.
-    Reinforce(Reinforce) is reinforce::SPEC;
+    Reinforce(ReinforceConfig) is reinforce::SPEC;
     /// `[q-learning]`.
-    QLearning(Tabular) is tabular::Q_LEARNING;
+    QLearning(TabularConfig) is tabular::Q_LEARNING;
     /// `[sarsa]`.
-    Sarsa(Tabular) is tabular::SARSA;
+    Sarsa(TabularConfig) is tabular::SARSA;
 }
 
 impl Default for Algorithm {
     /// What is learned with where no algorithm has a section.
     fn default() -> Self {
-        Self::Ddpg(Ddpg::default())
+        Self::Ddpg(DdpgConfig::default())
     }
 }
 
@@ -98,7 +98,7 @@ impl Algorithm {
     }
 
     /// DDPG's settings, where it is that.
-    pub fn ddpg(&self) -> Option<&Ddpg> {
+    pub fn ddpg(&self) -> Option<&DdpgConfig> {
         match self {
             Self::Ddpg(ddpg) => Some(ddpg),
             _ => None,

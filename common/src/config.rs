@@ -16,43 +16,43 @@ mod sections;
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
-pub use actors::Actors;
-pub use checkpoint::Checkpoint;
-pub use environment::Environment;
-pub use evaluation::Evaluation;
+pub use actors::ActorsConfig;
+pub use checkpoint::CheckpointConfig;
+pub use environment::EnvironmentConfig;
+pub use evaluation::EvaluationConfig;
 pub use identity_format::IdentityFormat;
-pub use learner::Learner;
-pub use replay::Replay;
-pub use run::{Mode, Run};
+pub use learner::LearnerConfig;
+pub use replay::ReplayConfig;
+pub use run::{Mode, RunConfig};
 pub use shoal_base::section::OutOfRange;
 use shoal_base::space::EnvironmentSpec;
 use shoal_base::transition::{ChunkLayout, RowLayout};
 use shoal_policy::PolicyError;
 
 use crate::algorithms::Experience;
-pub use crate::algorithms::{Algorithm, Ddpg, Exploration, Reinforce, Tabular, Warmup, Weight};
+pub use crate::algorithms::{Algorithm, DdpgConfig, ExplorationConfig, ReinforceConfig, TabularConfig, Warmup, Weight};
 
 /// Everything a run was started with.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Config {
     /// Identity and length of the run.
-    pub run: Run,
+    pub run: RunConfig,
     /// What is controlled.
-    pub environment: Environment,
+    pub environment: EnvironmentConfig,
     /// What the environment says of itself.
     pub spec: EnvironmentSpec,
     /// Who explores, and in how large portions.
-    pub actors: Actors,
+    pub actors: ActorsConfig,
     /// What is learned, and how.
     pub algorithm: Algorithm,
     /// With what it is computed.
-    pub learner: Learner,
+    pub learner: LearnerConfig,
     /// What is remembered, and how often it is used.
-    pub replay: Replay,
-    /// How often the policy is judged.
-    pub evaluation: Evaluation,
+    pub replay: ReplayConfig,
+    /// How often the policy is evaluated.
+    pub evaluation: EvaluationConfig,
     /// How often the learner's state is saved.
-    pub checkpoint: Checkpoint,
+    pub checkpoint: CheckpointConfig,
 }
 
 /// Why a configuration cannot be used.

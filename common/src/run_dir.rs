@@ -215,13 +215,13 @@ impl RunDir {
         self.checkpoints().join("evaluator.state")
     }
 
-    /// `policies`: every policy that was judged, where those are kept.
+    /// `policies`: every policy that was evaluated, where those are kept.
     pub fn policies(&self) -> PathBuf {
         self.path.join("policies")
     }
 
     /// `policies/<steps>.policy`: the one that was learned from so many environment steps.
-    pub fn judged_policy(&self, env_steps: u64) -> PathBuf {
+    pub fn evaluated_policy(&self, env_steps: u64) -> PathBuf {
         self.policies().join(format!("{env_steps:012}.policy"))
     }
 

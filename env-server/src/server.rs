@@ -15,13 +15,13 @@ pub fn serve(
     environments: &mut VectorEnvironment,
     port: &EnvironmentPort,
     seed: u64,
-    mut pulse: HeartbeatSender,
+    mut heartbeat: HeartbeatSender,
     stop: &Stop,
 ) -> Result<(), ChannelError> {
     let mut started = false;
-    pulse.beat(Activity::WaitingForPeer);
+    heartbeat.beat(Activity::WaitingForPeer);
     loop {
-        let request = match port.next(stop, || pulse.beat(Activity::WaitingForPeer)) {
+        let request = match port.next(stop, || heartbeat.beat(Activity::WaitingForPeer)) {
             Ok(request) => request,
             Err(exit) => return exit.into_result(),
         };
@@ -35,18 +35,18 @@ pub fn serve(
                     _ => Start::Next,
                 };
                 started = true;
-                pulse.begin_work();
+                heartbeat.begin_work();
                 request
                     .answer(|_, blocks| environments.reset(start, blocks.observations))?
                     .err()
             }
             Some(Ask::Step) if started => {
-                pulse.begin_work();
+                heartbeat.begin_work();
                 let refused = request
                     .answer(|actions, blocks| environments.step(actions, blocks))?
                     .err();
-                pulse.count(environments.count() as u64);
-                pulse.beat(Activity::Working);
+                heartbeat.count(environments.count() as u64);
+                heartbeat.beat(Activity::Working);
                 refused
             }
             Some(Ask::Snapshot) if started => request.answer_snapshot(|words| environments.snapshot(words))?.err(),

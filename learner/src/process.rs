@@ -6,9 +6,9 @@
 //! ```
 
 pub mod checkpoint;
+mod evaluation_wait;
 mod free;
 pub mod intake;
-mod judging;
 mod learner;
 mod lockstep;
 pub mod ratio;
@@ -20,13 +20,13 @@ use shoal_common::exit::Exit;
 use shoal_common::stop::Stop;
 
 use self::learner::Learner;
-pub use self::settings::{LearnerError, Settings, SizeError, disk_bytes};
+pub use self::settings::{LearnerError, LearnerSettings, SizeError, disk_bytes};
 
 /// Learns until the run's steps are taken and learned from, or until `stop`; either way the state is saved.
 ///
 /// # Errors
 /// When a channel, the replay or a checkpoint cannot be used, or learning diverges.
-pub fn learn(domain: &Domain, settings: &Settings, stop: &Stop) -> Result<(), LearnerError> {
+pub fn learn(domain: &Domain, settings: &LearnerSettings, stop: &Stop) -> Result<(), LearnerError> {
     let mut learner = Learner::new(domain, settings, stop)?;
     let ended = match settings.config.run.mode {
         Mode::Free => free::run(&mut learner),

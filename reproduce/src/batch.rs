@@ -9,9 +9,9 @@ use shoal_run::signals::Signals;
 
 use super::experiment::{Effort, Length};
 use super::folder::Folder;
-use super::order::{Ending, Job, Name};
+use super::order::{BatchEnding, Job, Name};
 use super::progress::Progress;
-use super::settings::Settings;
+use super::settings::RunSettings;
 use super::training::{RunState, Trained, train};
 
 /// How often the live line is drawn.
@@ -22,7 +22,7 @@ pub(super) struct Batch<'a> {
     pub(super) folder: &'a Folder,
     pub(super) effort: Effort,
     pub(super) jobs: &'a [Job],
-    pub(super) settings: &'a BTreeMap<&'static str, Settings>,
+    pub(super) settings: &'a BTreeMap<&'static str, RunSettings>,
 }
 
 /// What a worker tells.
@@ -42,7 +42,7 @@ impl Batch<'_> {
         &self,
         at_once: usize,
         write: impl Fn(&BTreeMap<Name, String>) -> anyhow::Result<()>,
-    ) -> anyhow::Result<Ending> {
+    ) -> anyhow::Result<BatchEnding> {
         let signals = Signals::register()?;
         let due: VecDeque<Job> = self.jobs.iter().copied().filter(|job| self.is_due(job)).collect();
         let mut progress = Progress::new(self.folder, self.effort, self.jobs.len(), &due)?;
@@ -82,9 +82,9 @@ impl Batch<'_> {
         progress.clear();
         write(&failures)?;
         Ok(match (signals.received(), failures.len()) {
-            (None, 0) => Ending::Complete,
-            (None, failed) => Ending::Failed(failed),
-            (Some(signal), _) => Ending::Interrupted(signal),
+            (None, 0) => BatchEnding::Complete,
+            (None, failed) => BatchEnding::Failed(failed),
+            (Some(signal), _) => BatchEnding::Interrupted(signal),
         })
     }
 

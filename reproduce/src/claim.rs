@@ -4,7 +4,7 @@ use std::fmt::{self, Display};
 
 use super::experiment::Effort;
 
-/// A claim, judged seed by seed.
+/// A claim, checked seed by seed.
 #[derive(Clone, Debug)]
 pub(super) struct Claim {
     /// In the thesis's words, or close to them.
@@ -14,7 +14,7 @@ pub(super) struct Claim {
     /// What was measured.
     pub(super) ours: String,
     pub(super) scope: Scope,
-    /// For each seed that could be judged, or once for all of them, whether it holds.
+    /// For each seed that could be checked, or once for all of them, whether it holds.
     pub(super) held: Vec<bool>,
 }
 
@@ -30,8 +30,8 @@ pub(super) enum Scope {
 /// Whether a claim holds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Verdict {
-    /// A quick look judges nothing, and neither do results that are not there.
-    NotJudged,
+    /// A quick look checks nothing, and neither do results that are not there.
+    NotChecked,
     /// For more than half of the seeds.
     Holds {
         of: usize,
@@ -50,8 +50,8 @@ impl Claim {
     pub(super) fn verdict(&self, effort: Effort) -> Verdict {
         let (of, held) = (self.held.len(), self.held.iter().filter(|held| **held).count());
         match effort {
-            Effort::Quick => Verdict::NotJudged,
-            Effort::Full if of == 0 => Verdict::NotJudged,
+            Effort::Quick => Verdict::NotChecked,
+            Effort::Full if of == 0 => Verdict::NotChecked,
             Effort::Full if self.scope == Scope::Together && held == of => Verdict::HoldsTogether,
             Effort::Full if self.scope == Scope::Together => Verdict::FailsTogether,
             Effort::Full if 2 * held > of => Verdict::Holds { of, held },
@@ -63,7 +63,7 @@ impl Claim {
 impl Display for Verdict {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::NotJudged => write!(f, "not judged"),
+            Self::NotChecked => write!(f, "not checked"),
             Self::HoldsTogether => write!(f, "**holds**"),
             Self::FailsTogether => write!(f, "**does not hold**"),
             Self::Holds { of: 1, .. } => write!(f, "**holds** for the only seed"),
@@ -130,15 +130,15 @@ mod tests {
         let verdict = |held: &[bool]| claim(held).verdict(Effort::Full);
         assert_eq!(verdict(&[true, true, false]), Verdict::Holds { of: 3, held: 2 });
         assert_eq!(verdict(&[true, false]), Verdict::Fails { of: 2, held: 1 });
-        assert_eq!(verdict(&[]), Verdict::NotJudged);
+        assert_eq!(verdict(&[]), Verdict::NotChecked);
         let together = |held| Claim {
             scope: Scope::Together,
             ..claim(&[held])
         };
         assert_eq!(together(true).verdict(Effort::Full).to_string(), "**holds**");
         assert_eq!(together(false).verdict(Effort::Full), Verdict::FailsTogether);
-        assert_eq!(together(true).verdict(Effort::Quick), Verdict::NotJudged);
-        assert_eq!(claim(&[true]).verdict(Effort::Quick), Verdict::NotJudged);
+        assert_eq!(together(true).verdict(Effort::Quick), Verdict::NotChecked);
+        assert_eq!(claim(&[true]).verdict(Effort::Quick), Verdict::NotChecked);
         assert_eq!(verdict(&[true; 5]).to_string(), "**holds** for all 5 seeds");
         assert_eq!(verdict(&[false]).to_string(), "**does not hold** for the only seed");
         assert_eq!(

@@ -8,13 +8,13 @@ use shoal_common::config::Config;
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::run_dir::RunDir;
 use shoal_run::evaluation::{WhichPolicy, evaluate};
-use shoal_run::recorder::{Episode, read_episodes, read_evaluations};
+use shoal_run::recorder::{EpisodeRecord, read_episodes, read_evaluations};
 
 use super::album::{Album, Section};
 use super::experiment::{Experiment, Length, Stage};
 use super::folder::Folder;
 use super::result::{Evaluation, Header, Policy, SeedResult};
-use super::settings::Settings;
+use super::settings::RunSettings;
 
 /// Experiments of one kind. Adding one takes this trait and a line in [`super::FAMILIES`].
 pub(super) trait Family {
@@ -27,7 +27,7 @@ pub(super) trait Family {
     /// Tries the policies of a run that has just reached the end of `stage`.
     fn test(policies: &Policies, stage: &Stage) -> anyhow::Result<Self::Tests>;
 
-    /// Judges the thesis's claims and draws its figures again, from results alone.
+    /// Checks the thesis's claims and draws its figures again, from results alone.
     fn sections(results: &Results<Self::Tests>, album: &Album) -> anyhow::Result<Vec<Section>>;
 }
 
@@ -46,7 +46,7 @@ impl Policies {
     /// The training's episodes in their order, of a run with one actor, one environment, and at most one episode in a chunk:
     /// then a policy is behind one of them at most. A chunk that was sent and not learned from when a run was interrupted is
     /// collected again, and its episode recorded again; and one that began when the run was over is none of it.
-    pub(super) fn episodes(&self) -> anyhow::Result<Vec<Episode>> {
+    pub(super) fn episodes(&self) -> anyhow::Result<Vec<EpisodeRecord>> {
         let mut episodes = read_episodes(&self.run.episodes())?;
         episodes.dedup_by_key(|episode| episode.policy_version);
         episodes.truncate(self.config.run.episodes.unwrap_or(u64::MAX) as usize);
@@ -82,7 +82,7 @@ impl<T> Results<T> {
 pub(super) struct Entry {
     pub(super) experiments: &'static [Experiment],
     /// Makes and keeps the result of a run that has reached the end of a stage.
-    pub(super) keep: fn(&Folder, &'static Experiment, &Stage, u64, Length, &Settings) -> anyhow::Result<()>,
+    pub(super) keep: fn(&Folder, &'static Experiment, &Stage, u64, Length, &RunSettings) -> anyhow::Result<()>,
     /// What the report says, from the results in the folder.
     pub(super) sections: fn(&Folder, &Album) -> anyhow::Result<Vec<Section>>,
 }
@@ -103,12 +103,12 @@ fn keep<F: Family>(
     stage: &Stage,
     seed: u64,
     length: Length,
-    settings: &Settings,
+    settings: &RunSettings,
 ) -> anyhow::Result<()> {
     let run = RunDir::open(&folder.run(experiment, seed))?;
     let config = run.config()?;
     // Said by the run itself; it was checked to be what was expected.
-    Settings::of_run(run.path(), seed)?.check(&run.path().display().to_string(), settings)?;
+    RunSettings::of_run(run.path(), seed)?.check(&run.path().display().to_string(), settings)?;
     let policies = Policies {
         best: WhichPolicy::Best.read(&run, &config)?,
         last: WhichPolicy::Last.read(&run, &config)?,
@@ -116,7 +116,7 @@ fn keep<F: Family>(
         run,
     };
     let run = &policies.run;
-    let judge = |policy: &PolicyFile| -> anyhow::Result<Policy> {
+    let evaluate = |policy: &PolicyFile| -> anyhow::Result<Policy> {
         let config = &policies.config;
         let episodes = config.evaluation.final_episodes;
         Ok(Policy {
@@ -134,10 +134,10 @@ fn keep<F: Family>(
         .collect();
     evaluations.sort_by_key(|evaluation| evaluation.steps);
     let result = SeedResult {
-        header: Header::new(experiment, seed, length, &Settings::of(&policies.config)?),
+        header: Header::new(experiment, seed, length, &RunSettings::of(&policies.config)?),
         evaluations,
-        best: judge(&policies.best)?,
-        last: judge(&policies.last)?,
+        best: evaluate(&policies.best)?,
+        last: evaluate(&policies.last)?,
         tests: F::test(&policies, stage)?,
     };
     folder.add(experiment, stage, &result)

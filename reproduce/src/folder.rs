@@ -15,7 +15,7 @@ use shoal_common::file_lock;
 use super::experiment::{Effort, Experiment, Stage};
 use super::result::{self, Header, SeedResult};
 use super::results_file::{ResultsFile, numbered};
-use super::settings::Settings;
+use super::settings::RunSettings;
 
 /// A folder that is this process's.
 #[derive(Debug)]
@@ -100,7 +100,7 @@ impl Folder {
     }
 
     /// Refuses a folder with results or runs of this experiment that were made otherwise than they would be now.
-    pub(super) fn check(&self, experiment: &Experiment, effort: Effort, settings: &Settings) -> anyhow::Result<()> {
+    pub(super) fn check(&self, experiment: &Experiment, effort: Effort, settings: &RunSettings) -> anyhow::Result<()> {
         for stage in experiment.stages {
             for (seed, line) in self.results()[experiment.name].of(stage) {
                 let length = stage.length(effort);
@@ -110,7 +110,7 @@ impl Folder {
         for seed in numbered(&self.path.join(experiment.name), "")? {
             let run = self.run(experiment, seed);
             if run.join("config.toml").is_file() {
-                Settings::of_run(&run, seed)?.check(&run.display().to_string(), settings)?;
+                RunSettings::of_run(&run, seed)?.check(&run.display().to_string(), settings)?;
             }
         }
         Ok(())

@@ -98,13 +98,14 @@ const fn often(experiment: Experiment) -> Experiment {
 pub(super) struct Tests {
     /// The table at the end, state after state.
     q: Vec<f32>,
-    /// Each policy that was judged, in order.
-    judged: Vec<Judged>,
+    /// Each policy that was evaluated, in order.
+    #[serde(rename = "judged")]
+    evaluated: Vec<EvaluatedPolicy>,
 }
 
 /// A policy on the way.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-struct Judged {
+struct EvaluatedPolicy {
     /// Training episodes before it.
     episodes: u64,
     /// What the lake's table says of it.
@@ -112,20 +113,23 @@ struct Judged {
 }
 
 impl Tests {
-    /// The value at each multiple of [`GRID`] episodes: of the last policy judged before.
-    fn on_grid(&self, of: impl Fn(&Judged) -> f64) -> Vec<(f64, f64)> {
+    /// The value at each multiple of [`GRID`] episodes: of the last policy evaluated before.
+    fn on_grid(&self, of: impl Fn(&EvaluatedPolicy) -> f64) -> Vec<(f64, f64)> {
         (1..=EPISODES / GRID)
             .filter_map(|i| {
                 let episodes = i * GRID;
-                let judged = self.judged.iter().rfind(|judged| judged.episodes <= episodes)?;
-                Some((episodes as f64, of(judged)))
+                let evaluated = self
+                    .evaluated
+                    .iter()
+                    .rfind(|evaluated| evaluated.episodes <= episodes)?;
+                Some((episodes as f64, of(evaluated)))
             })
             .collect()
     }
 
     /// The mean, over the grid's points from one episode to another, of how likely the goal is reached.
     fn reached(&self, from: u64, to: u64) -> f64 {
-        let points = self.on_grid(|judged| judged.exact.reached).into_iter();
+        let points = self.on_grid(|evaluated| evaluated.exact.reached).into_iter();
         let within = points.filter(|(episodes, _)| (from as f64..=to as f64).contains(episodes));
         let values: Vec<f64> = within.map(|(_, value)| value).collect();
         values.iter().sum::<f64>() / values.len().max(1) as f64
@@ -154,16 +158,16 @@ impl Family for FrozenLake {
             .collect();
         let mut evaluations = read_evaluations(&run.evaluations())?;
         evaluations.sort_by_key(|evaluation| evaluation.env_steps);
-        let judged = evaluations.iter().map(|evaluation| {
-            let path = run.judged_policy(evaluation.env_steps);
-            let policy = PolicyFile::read(&path, &layout).context("a policy that was judged")?;
-            Ok(Judged {
+        let evaluated = evaluations.iter().map(|evaluation| {
+            let path = run.evaluated_policy(evaluation.env_steps);
+            let policy = PolicyFile::read(&path, &layout).context("a policy that was evaluated")?;
+            Ok(EvaluatedPolicy {
                 episodes: ends.partition_point(|end| *end <= evaluation.env_steps) as u64,
                 exact: Walk::of(&greedy(&policy.parameters)).rounded(),
             })
         });
         Ok(Tests {
-            judged: judged.collect::<anyhow::Result<_>>()?,
+            evaluated: evaluated.collect::<anyhow::Result<_>>()?,
             q: last.parameters.clone(),
         })
     }
@@ -206,7 +210,7 @@ impl Family for FrozenLake {
                  broken by the first index, and with probability ε any of the four actions is taken, the greedy one \
                  included. (Other readings were tried in a prototype, which no command here repeats: with random ties ε = 0.1 comes further, to 0.64 of \
                  the goal instead of 0.28; where exploration excludes the greedy action, ε = 0.7 loses its early lead.) The \
-                 policies on the way are judged exactly, by the lake's table: how likely the goal is reached within {LIMIT} \
+                 policies on the way are evaluated exactly, by the lake's table: how likely the goal is reached within {LIMIT} \
                  steps, and how many steps it takes, {LIMIT} where it is not reached. The five evaluation episodes of the \
                  thesis are run and kept as well, but five throws say little. The best policy reaches the goal with probability \
                  {:.3}.",
@@ -229,7 +233,7 @@ fn of_sweep(
     number: &str,
     best: Walk,
 ) -> anyhow::Result<Vec<Figure>> {
-    let settings = |of: fn(&Judged) -> f64| -> Vec<Setting> {
+    let settings = |of: fn(&EvaluatedPolicy) -> f64| -> Vec<Setting> {
         let curves = sweep.iter().map(|(label, seeds)| {
             let runs: Vec<_> = seeds.iter().map(|seed| seed.tests.on_grid(of)).collect();
             Setting {
@@ -260,12 +264,12 @@ fn of_sweep(
         album.add(
             &format!("frozen-lake-{file}-reward"),
             format!("Reward history for several {what}: mean over the seeds (figure 4.2{number})"),
-            |path| figure::lines(&rewards, &settings(|judged| judged.exact.reached), path),
+            |path| figure::lines(&rewards, &settings(|evaluated| evaluated.exact.reached), path),
         )?,
         album.add(
             &format!("frozen-lake-{file}-steps"),
             format!("Steps needed to reach the goal for several {what}: mean over the seeds (figure 4.3{number})"),
-            |path| figure::lines(&steps, &settings(|judged| judged.exact.steps), path),
+            |path| figure::lines(&steps, &settings(|evaluated| evaluated.exact.steps), path),
         )?,
     ])
 }

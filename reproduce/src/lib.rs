@@ -30,8 +30,8 @@ use self::experiment::Experiment;
 use self::family::{Entry, entry};
 use self::folder::Folder;
 use self::order::Job;
-pub use self::order::{Ending, Order};
-use self::settings::Settings;
+pub use self::order::{BatchEnding, Order};
+use self::settings::RunSettings;
 
 /// Every family, in the report's order.
 const FAMILIES: [Entry; 4] = [
@@ -49,7 +49,7 @@ pub fn names() -> impl Iterator<Item = &'static str> {
 }
 
 /// Runs what is due, keeps each result, and writes the report from all results of the folder.
-pub fn run(order: &Order) -> anyhow::Result<Ending> {
+pub fn run(order: &Order) -> anyhow::Result<BatchEnding> {
     let folder = Folder::open(&order.folder, experiments().map(|(_, experiment)| experiment))?;
     let settings = expected(order.effort)?;
     let wanted = experiments()
@@ -90,8 +90,8 @@ fn experiments() -> impl Iterator<Item = (&'static Entry, &'static Experiment)> 
 }
 
 /// With which settings each experiment is run by this program.
-fn expected(effort: Effort) -> anyhow::Result<BTreeMap<&'static str, Settings>> {
+fn expected(effort: Effort) -> anyhow::Result<BTreeMap<&'static str, RunSettings>> {
     experiments()
-        .map(|(_, experiment)| Ok((experiment.name, Settings::expected(experiment, effort)?)))
+        .map(|(_, experiment)| Ok((experiment.name, RunSettings::expected(experiment, effort)?)))
         .collect()
 }

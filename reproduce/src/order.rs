@@ -26,7 +26,7 @@ pub struct Order {
 
 /// How it went.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Ending {
+pub enum BatchEnding {
     /// Every result that was asked for is there.
     Complete,
     /// So many seeds have failed.

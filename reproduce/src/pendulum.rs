@@ -96,7 +96,7 @@ fn claims(seeds: &[SeedResult<Tests>]) -> Vec<Claim> {
         });
         format!("{best}{unit} (last policy {last}{unit})")
     };
-    let judge = |thesis, criterion, ours, holds: fn(&Measures) -> bool| Claim {
+    let check = |thesis, criterion, ours, holds: fn(&Measures) -> bool| Claim {
         thesis,
         criterion,
         ours,
@@ -120,13 +120,13 @@ fn claims(seeds: &[SeedResult<Tests>]) -> Vec<Claim> {
                 .map(|seed| around_150(seed.best.evaluation.return_mean) && around_150(seed.late_mean()))
                 .collect(),
         },
-        judge(
+        check(
             "The pendulum swings back and forth a few times to gain momentum",
             "it turns back at least once before it is up",
             format!("turns: {}", measured(|it| it.reversals.into(), 0, "")),
             |it| it.reversals >= 1,
         ),
-        judge(
+        check(
             "The angle and angular velocity converge to zero",
             "at rest the angle stays below 0.1 rad, the angular velocity below 0.1 rad/s",
             format!(
@@ -136,7 +136,7 @@ fn claims(seeds: &[SeedResult<Tests>]) -> Vec<Claim> {
             ),
             |it| it.angle_at_rest < 0.1 && it.velocity_at_rest < 0.1,
         ),
-        judge(
+        check(
             "The applied torque converges to a small value",
             "at rest the torque is below 0.2 N m in the mean of its size (its range is ±2)",
             format!(

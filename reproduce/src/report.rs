@@ -134,7 +134,7 @@ fn compose(sections: &[(Section, Vec<String>, String)], effort: Effort, figures:
     let quick = if effort == Effort::Quick { " --quick" } else { "" };
     if effort == Effort::Quick {
         text += "> **A quick look.** A few seeds, tiny networks, hardly any steps: this shows that everything works, and \
-            judges nothing.\n\n";
+            checks nothing.\n\n";
     }
     let _ = writeln!(
         text,
@@ -142,7 +142,7 @@ fn compose(sections: &[(Section, Vec<String>, String)], effort: Effort, figures:
         seed gives the same bits on the same kind of machine. The numbers are of each run's best policy by evaluation \
         unless something else is said: the median over the seeds, with the least and the greatest in brackets. A claim \
         about single runs holds when its criterion does for more than half of the seeds; one about the seeds together is \
-        judged once.",
+        checked once.",
         env!("CARGO_PKG_VERSION")
     );
     if effort == Effort::Full {
@@ -154,11 +154,11 @@ fn compose(sections: &[(Section, Vec<String>, String)], effort: Effort, figures:
         let count = |which: fn(&Verdict) -> bool| verdicts.iter().filter(|verdict| which(verdict)).count();
         let _ = writeln!(
             text,
-            "\nOf {} claims {} hold, {} do not, {} are not judged.",
+            "\nOf {} claims {} hold, {} do not, {} are not checked.",
             verdicts.len(),
             count(|verdict| matches!(verdict, Verdict::Holds { .. } | Verdict::HoldsTogether)),
             count(|verdict| matches!(verdict, Verdict::Fails { .. } | Verdict::FailsTogether)),
-            count(|verdict| *verdict == Verdict::NotJudged)
+            count(|verdict| *verdict == Verdict::NotChecked)
         );
     }
     for (section, seeds, notes) in sections {
@@ -255,7 +255,7 @@ mod tests {
         };
         let full = of(&[true], Effort::Full, false);
         for part in [
-            "Of 1 claims 1 hold, 0 do not, 0 are not judged.",
+            "Of 1 claims 1 hold, 0 do not, 0 are not checked.",
             "| it swings up | 0.01 | it is up | **holds** for the only seed |",
             "missing: 2",
             "It leans a little.",
@@ -264,7 +264,7 @@ mod tests {
             assert!(full.contains(part), "{part}: {full}");
         }
         let quick = of(&[true], Effort::Quick, true);
-        assert!(quick.contains("quick look") && quick.contains("| not judged |") && !quick.contains("**holds**"));
+        assert!(quick.contains("quick look") && quick.contains("| not checked |") && !quick.contains("**holds**"));
         assert!(quick.contains("*Figure 4.9* ([PNG](figures/swing.png))"), "{quick}");
         assert!(of(&[false], Effort::Full, false).contains("**does not hold**"));
     }

@@ -1,4 +1,4 @@
-//! What is kept of a seed: little, but enough to judge claims and to draw figures long after the run is gone.
+//! What is kept of a seed: little, but enough to check claims and to draw figures long after the run is gone.
 
 use anyhow::{Context, bail};
 use serde::de::DeserializeOwned;
@@ -7,7 +7,7 @@ use shoal_run::evaluation::EvaluationSummary;
 
 use super::experiment::{Experiment, Length};
 use super::results_file::Line;
-use super::settings::Settings;
+use super::settings::RunSettings;
 
 /// The form of a result; raise it with every change of what a key means.
 const SCHEMA: u32 = 1;
@@ -22,7 +22,7 @@ pub(super) struct Header {
     length: Length,
     /// The version of this program that made it.
     pub(super) shoal: String,
-    settings: Settings,
+    settings: RunSettings,
 }
 
 /// A seed's result; `T` is what its family tests beyond the evaluations.
@@ -77,7 +77,7 @@ impl<T> SeedResult<T> {
 }
 
 impl Header {
-    pub(super) fn new(experiment: &Experiment, seed: u64, length: Length, settings: &Settings) -> Self {
+    pub(super) fn new(experiment: &Experiment, seed: u64, length: Length, settings: &RunSettings) -> Self {
         Self {
             schema: SCHEMA,
             experiment: experiment.name.into(),
@@ -112,7 +112,7 @@ impl Header {
         experiment: &Experiment,
         seed: u64,
         length: Length,
-        settings: &Settings,
+        settings: &RunSettings,
     ) -> anyhow::Result<()> {
         let (found, wanted) = (
             (self.experiment.as_str(), self.seed, self.length),
@@ -183,7 +183,7 @@ pub(super) mod tests {
                 experiment,
                 seed,
                 length,
-                &Settings::from_pairs(&[("ddpg.tau", "0.001")]),
+                &RunSettings::from_pairs(&[("ddpg.tau", "0.001")]),
             ),
             evaluations: (0..=20).map(evaluation).collect(),
             best: policy(return_mean),
@@ -207,7 +207,7 @@ pub(super) mod tests {
         assert_eq!(read::<Vec<f64>>(&line).unwrap(), made);
         let header = Header::read(&line).unwrap();
         assert_eq!(header, made.header);
-        let settings = |tau| Settings::from_pairs(&[("ddpg.tau", tau), ("ddpg.new", "1")]);
+        let settings = |tau| RunSettings::from_pairs(&[("ddpg.tau", tau), ("ddpg.new", "1")]);
         header
             .check(&line.place, experiment(), 3, Length::Steps(120_000), &settings("0.001"))
             .unwrap();

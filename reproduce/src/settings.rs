@@ -16,9 +16,9 @@ use super::experiment::{Effort, Experiment, Length};
 
 /// Keys with their sections, and values as TOML.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub(super) struct Settings(BTreeMap<String, String>);
+pub(super) struct RunSettings(BTreeMap<String, String>);
 
-impl Settings {
+impl RunSettings {
     /// Those of a run.
     pub(super) fn of(config: &Config) -> anyhow::Result<Self> {
         let mut settings = BTreeMap::new();
@@ -109,14 +109,14 @@ mod tests {
     #[test]
     fn settings_leave_out_name_seed_and_length() {
         let experiment = &super::super::pendulum::EXPERIMENTS[0];
-        let [full, quick] = [Effort::Full, Effort::Quick].map(|e| Settings::expected(experiment, e).unwrap());
+        let [full, quick] = [Effort::Full, Effort::Quick].map(|e| RunSettings::expected(experiment, e).unwrap());
         assert_eq!(full.0["ddpg.hidden"], "[400, 300]");
         assert_eq!(full.0["run.mode"], "\"lockstep\"");
         assert!(
             !full.0.keys().any(|key| key == "run.seed" || key.starts_with("spec")),
             "{full:?}"
         );
-        assert_eq!(Settings::expected(experiment, Effort::Full).unwrap(), full);
+        assert_eq!(RunSettings::expected(experiment, Effort::Full).unwrap(), full);
         let refused = quick.check("seed-1.json", &full).unwrap_err().to_string();
         assert!(
             refused.contains("seed-1.json") && refused.contains("which is now") && !refused.contains('\n'),

@@ -16,8 +16,8 @@ use rustix::process::{
     set_parent_process_death_signal,
 };
 use shoal_common::channel::environment::{Begin, EnvironmentClient, Observed, Stepped, describe};
-use shoal_common::channel::{ChannelError, Domain, Listener, Place, Services};
-use shoal_common::config::Environment;
+use shoal_common::channel::{ChannelError, Domain, EventName, Listener, Services};
+use shoal_common::config::EnvironmentConfig;
 use shoal_common::exit::Exit;
 use shoal_common::report::Role;
 use shoal_common::space::EnvironmentSpec;
@@ -48,7 +48,7 @@ pub struct LaunchSpec<'a> {
     /// How often this server was started, this time included.
     pub incarnation: u64,
     /// Who asks it.
-    pub client: Place,
+    pub client: EventName,
     /// How many environments it steps at once.
     pub environments: u32,
     /// The root of its random streams.
@@ -59,7 +59,7 @@ pub struct LaunchSpec<'a> {
 
 impl LaunchSpec<'_> {
     /// What starts the program; `None` where the environment is one of our own.
-    pub fn command(&self, environment: &Environment) -> anyhow::Result<Option<Command>> {
+    pub fn command(&self, environment: &EnvironmentConfig) -> anyhow::Result<Option<Command>> {
         let Some((program, arguments)) = environment.server.split_first() else {
             return Ok(None);
         };
@@ -187,7 +187,7 @@ fn cannot_start(command: &Command) -> String {
 /// A program that serves environments to this process, until this is dropped.
 pub struct ExternalEnvironment {
     client: EnvironmentClient,
-    bell: Listener,
+    listener: Listener,
     spec: EnvironmentSpec,
     program: Peer,
     // The last to go, in this order.
@@ -211,7 +211,7 @@ impl ExternalEnvironment {
     ///
     /// # Errors
     /// When it cannot be started, ends, or does not answer; with what it said last.
-    pub fn begin(environment: &Environment, environments: u32, seed: u64) -> anyhow::Result<Self> {
+    pub fn begin(environment: &EnvironmentConfig, environments: u32, seed: u64) -> anyhow::Result<Self> {
         Domain::remove_abandoned()?;
         let run_id = format!("{:08x}", rand::random::<u32>());
         let domain = Domain::join(&run_id, 1)?;
@@ -221,15 +221,15 @@ impl ExternalEnvironment {
             run_id: &run_id,
             index: 0,
             incarnation: 1,
-            client: Place(Role::Evaluator, 0),
+            client: EventName(Role::Evaluator, 0),
             environments,
             seed,
             stream: 0,
         };
         match opened(&domain, &launch, environment) {
-            Ok((services, client, bell, spec, program)) => Ok(Self {
+            Ok((services, client, listener, spec, program)) => Ok(Self {
                 client,
-                bell,
+                listener,
                 spec,
                 program,
                 _services: services,
@@ -252,7 +252,7 @@ impl ExternalEnvironment {
     /// # Errors
     /// When the program has ended or refuses.
     pub fn begin_evaluation(&mut self, number: u64) -> anyhow::Result<Observed> {
-        let begun = self.client.reset(&self.bell, Begin::Evaluation(number), || ());
+        let begun = self.client.reset(&self.listener, Begin::Evaluation(number), || ());
         answered(begun, &mut self.program)
     }
 
@@ -261,7 +261,7 @@ impl ExternalEnvironment {
     /// # Errors
     /// When the program has ended or refuses.
     pub fn step(&mut self, actions: &[f32]) -> anyhow::Result<Observed> {
-        let stepped = self.client.step(&self.bell, actions, || ());
+        let stepped = self.client.step(&self.listener, actions, || ());
         match answered(stepped, &mut self.program)? {
             Stepped::Taken(observed) => Ok(observed),
             Stepped::Lost => bail!("the environment server gave up its episodes"),
@@ -277,7 +277,7 @@ impl Drop for ExternalEnvironment {
 
 type Opened = (Services, EnvironmentClient, Listener, EnvironmentSpec, Peer);
 
-fn opened(domain: &Domain, launch: &LaunchSpec<'_>, environment: &Environment) -> anyhow::Result<Opened> {
+fn opened(domain: &Domain, launch: &LaunchSpec<'_>, environment: &EnvironmentConfig) -> anyhow::Result<Opened> {
     let Some(command) = launch.command(environment)? else {
         bail!("environment {} is not served by another program", environment.name);
     };
@@ -285,17 +285,17 @@ fn opened(domain: &Domain, launch: &LaunchSpec<'_>, environment: &Environment) -
     let mut services = Services::new(domain)?;
     services.create_common(domain)?;
     services.create_environment(domain, launch.index)?;
-    let bell = Listener::bind(domain, launch.client)?;
+    let listener = Listener::bind(domain, launch.client)?;
     let mut program =
         Peer::start(&mut tied(&command)?, "environment server".into()).with_context(|| cannot_start(&command))?;
     let heard = Stop::default();
     let stop = stopped_when_it_ends(&program, heard.clone())?;
-    let described = describe(domain, launch.index, &bell, stop.clone());
+    let described = describe(domain, launch.index, &listener, stop.clone());
     heard.request();
     let (spec, environments) = answered(described, &mut program).map_err(with_advice)?;
     let opened = EnvironmentClient::open(domain, launch.index, &spec, environments, stop);
     let client = answered(opened.map_err(Exit::from), &mut program)?;
-    Ok((services, client, bell, spec, program))
+    Ok((services, client, listener, spec, program))
 }
 
 /// Says what to do where Gymnasium's server is not installed.

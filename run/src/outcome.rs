@@ -12,10 +12,10 @@ const FORMAT: u32 = 1;
 
 /// How a run ended.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Outcome {
+pub struct RunOutcome {
     format: u32,
     /// What became of it.
-    pub state: State,
+    pub state: RunState,
     /// Why, where it did not finish.
     pub reason: Option<String>,
     /// Environment steps that were learned from.
@@ -27,7 +27,7 @@ pub struct Outcome {
 /// What became of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum State {
+pub enum RunState {
     /// A launcher works on it, or was killed over it.
     Running,
     /// All that was asked for is done: steps, updates, evaluations.
@@ -38,9 +38,9 @@ pub enum State {
     Failed,
 }
 
-impl Outcome {
+impl RunOutcome {
     /// An outcome without a reason.
-    pub fn new(state: State, steps: u64, episodes: u64) -> Self {
+    pub fn new(state: RunState, steps: u64, episodes: u64) -> Self {
         Self {
             format: FORMAT,
             state,

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 use shoal_common::algorithms::Experience;
-use shoal_common::config::{Actors, Algorithm, Config, Environment, IdentityFormat};
+use shoal_common::config::{ActorsConfig, Algorithm, Config, EnvironmentConfig, IdentityFormat};
 use shoal_common::run_dir::{RunDir, RunLock};
 use shoal_common::space::{EnvironmentSpec, Space};
 use shoal_env_server::environment;
@@ -174,7 +174,7 @@ fn resolve(mut table: Table, overrides: &RunOverrides, origin: &str) -> anyhow::
         .get("actors")
         .and_then(|actors| actors.get("count"))
         .and_then(Value::as_integer)
-        && count > i64::from(Actors::default().max)
+        && count > i64::from(ActorsConfig::default().max)
         && table.get("actors").is_some_and(|actors| actors.get("max").is_none())
     {
         put(&mut table, &["actors", "max"], count.into())?;
@@ -189,7 +189,7 @@ fn resolve(mut table: Table, overrides: &RunOverrides, origin: &str) -> anyhow::
     put(&mut table, &["run", "identity_format"], format.into())?;
     describe_environment(&mut table)?;
     let mut config = Config::from_table(table, origin)?;
-    // Also a short run ends with its policy judged.
+    // Also a short run ends with its policy evaluated.
     config.evaluation.every = config.evaluation.every.min(config.run.steps);
     Ok(config)
 }
@@ -215,7 +215,7 @@ fn describe_environment(table: &mut Table) -> anyhow::Result<()> {
         None => external_environment::default_command(&name),
     };
     let (environment, spec) = if let Some(server) = server {
-        let environment = Environment {
+        let environment = EnvironmentConfig {
             name,
             server,
             parameters: section.clone(),
@@ -225,7 +225,7 @@ fn describe_environment(table: &mut Table) -> anyhow::Result<()> {
     } else {
         let parameters = environment::resolve(&name, section)?;
         let spec = environment::make(&name, &parameters)?.spec();
-        let environment = Environment {
+        let environment = EnvironmentConfig {
             name,
             server: vec![],
             parameters,

@@ -21,7 +21,7 @@ const UNWRITTEN: Duration = Duration::from_millis(500);
 
 /// A row of `episodes.csv`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct Episode {
+pub struct EpisodeRecord {
     /// Seconds the run had taken, over all its launchers.
     pub wall_seconds: f64,
     /// Environment steps over all actors by then.
@@ -41,7 +41,7 @@ pub struct Episode {
 
 /// A row of `evaluations.csv`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct Evaluation {
+pub struct EvaluationRecord {
     /// Seconds the run had taken, over all its launchers.
     pub wall_seconds: f64,
     /// Environment steps the policy was learned from.
@@ -62,7 +62,7 @@ pub struct Evaluation {
 
 /// A row of `learner.csv`. Empty where there is nothing to tell: no update since the row before, or none before it.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct Learner {
+pub struct LearnerRecord {
     /// Seconds the run had taken, over all its launchers.
     pub wall_seconds: f64,
     /// Rows committed to the replay.
@@ -110,15 +110,15 @@ pub struct Recorder {
 impl Recorder {
     /// Opens the records of `run`, whose learner begins after `warmup` environment steps.
     pub fn open(run: &RunDir, warmup: u64) -> Result<Self, RecordError> {
-        let episodes = Table::open::<Episode>(&run.episodes())?;
-        let evaluations = Table::open::<Evaluation>(&run.evaluations())?;
-        let learner = Table::open::<Learner>(&run.learner_log())?;
+        let episodes = Table::open::<EpisodeRecord>(&run.episodes())?;
+        let evaluations = Table::open::<EvaluationRecord>(&run.evaluations())?;
+        let learner = Table::open::<LearnerRecord>(&run.learner_log())?;
         let incidents = Table::open::<IncidentRow>(&run.incidents())?;
         let evaluated = read_evaluations(&run.evaluations())?
             .iter()
             .map(|row| row.env_steps)
             .max();
-        let last = table::last::<Learner>(&run.learner_log())?;
+        let last = table::last::<LearnerRecord>(&run.learner_log())?;
         let (earlier, env_steps) = last.as_ref().map_or((0.0, 0), |row| (row.wall_seconds, row.env_steps));
         let events = EventFile::create(&run.tensorboard()).map_err(|cause| RecordError::Write {
             path: run.tensorboard(),
@@ -148,7 +148,7 @@ impl Recorder {
 
     /// An exploration episode has ended, `wall` after this launcher's start.
     pub fn episode(&mut self, report: &EpisodeReport, wall: Duration) -> Result<(), RecordError> {
-        self.episodes.write(&Episode {
+        self.episodes.write(&EpisodeRecord {
             wall_seconds: self.seconds(wall),
             env_steps: report.env_steps,
             actor: report.actor,
@@ -175,13 +175,13 @@ impl Recorder {
         self.evaluated
     }
 
-    /// A policy has been judged. An evaluator that was started again reports what those before it did: that is left out.
+    /// A policy has been evaluated. An evaluator that was started again reports what those before it did: that is left out.
     pub fn evaluation(&mut self, report: &EvaluationReport, wall: Duration) -> Result<(), RecordError> {
         if self.evaluated >= Some(report.env_steps) {
             return Ok(());
         }
         self.evaluated = Some(report.env_steps);
-        self.evaluations.write(&Evaluation {
+        self.evaluations.write(&EvaluationRecord {
             wall_seconds: self.seconds(wall),
             env_steps: report.env_steps,
             updates: report.updates,
@@ -210,7 +210,7 @@ impl Recorder {
             (seconds > 0.0).then_some(done as f64 / seconds)
         };
         let explored = report.env_steps.saturating_sub(self.warmup);
-        let row = Learner {
+        let row = LearnerRecord {
             wall_seconds: self.seconds(wall),
             env_steps: report.env_steps,
             episodes: report.episodes,
@@ -283,17 +283,17 @@ impl Recorder {
 }
 
 /// The rows of an `evaluations.csv`, none where there is no such file.
-pub fn read_evaluations(path: &Path) -> Result<Vec<Evaluation>, RecordError> {
+pub fn read_evaluations(path: &Path) -> Result<Vec<EvaluationRecord>, RecordError> {
     table::rows(path)
 }
 
 /// The rows of an `episodes.csv`, none where there is no such file.
-pub fn read_episodes(path: &Path) -> Result<Vec<Episode>, RecordError> {
+pub fn read_episodes(path: &Path) -> Result<Vec<EpisodeRecord>, RecordError> {
     table::rows(path)
 }
 
 /// The rows of a `learner.csv`, none where there is no such file.
-pub fn read_learner(path: &Path) -> Result<Vec<Learner>, RecordError> {
+pub fn read_learner(path: &Path) -> Result<Vec<LearnerRecord>, RecordError> {
     table::rows(path)
 }
 
@@ -304,7 +304,7 @@ pub fn read_incidents(path: &Path) -> Result<Option<Vec<IncidentRow>>, RecordErr
 
 /// Environment steps and episodes of a run by its records; none before the first row.
 pub fn recorded(run: &RunDir) -> Result<Option<(u64, u64)>, RecordError> {
-    Ok(table::last::<Learner>(&run.learner_log())?.map(|row| (row.env_steps, row.episodes)))
+    Ok(table::last::<LearnerRecord>(&run.learner_log())?.map(|row| (row.env_steps, row.episodes)))
 }
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! Whole episodes of a policy without exploration: what `eval` judges and `plot` draws. Our own environments are stepped
+//! Whole episodes of a policy without exploration: what `eval` evaluates and `plot` draws. Our own environments are stepped
 //! in this process, others by their servers.
 
 use anyhow::{Context, bail, ensure};
@@ -65,7 +65,7 @@ enum Stage {
 }
 
 /// What a step gave.
-struct Step {
+struct RolloutStep {
     s_next: Vec<f32>,
     reward: f64,
     terminated: bool,
@@ -171,7 +171,7 @@ impl Stage {
         }
     }
 
-    fn step(&mut self, action: &[f32]) -> anyhow::Result<Step> {
+    fn step(&mut self, action: &[f32]) -> anyhow::Result<RolloutStep> {
         match self {
             Self::Here(environment) => {
                 let width = environment.spec().observation.width();
@@ -186,7 +186,7 @@ impl Stage {
                     truncated: &mut truncated,
                 };
                 environment.step(action, blocks)?;
-                Ok(Step {
+                Ok(RolloutStep {
                     s_next,
                     reward: reward[0].into(),
                     terminated: terminated[0] != 0.0,
@@ -196,7 +196,7 @@ impl Stage {
             Self::Elsewhere(conversation) => {
                 let (_, conversation) = conversation.as_mut().context("a step before an episode")?;
                 let observed = conversation.step(action)?;
-                Ok(Step {
+                Ok(RolloutStep {
                     s_next: observed.next_observation(0).to_vec(),
                     reward: observed.reward(0).into(),
                     terminated: observed.terminated(0),

@@ -8,7 +8,7 @@ use shoal_common::run_dir::RunDir;
 use shoal_learner::process::checkpoint::Checkpoints;
 use shoal_learner::process::ratio::Ratio;
 
-use crate::outcome::{Outcome, State};
+use crate::outcome::{RunOutcome, RunState};
 use crate::recorder::read_evaluations;
 
 /// How a run stands that nobody works on: what a learner would go on from.
@@ -43,8 +43,8 @@ fn is_finished(config: &Config, run: &RunDir, status: &RunStatus) -> anyhow::Res
     if !config.run.has_all_steps(status.env_steps, status.episodes) {
         return Ok(false);
     }
-    if let Some(outcome) = Outcome::read(run)? {
-        return Ok(outcome.state == State::Finished);
+    if let Some(outcome) = RunOutcome::read(run)? {
+        return Ok(outcome.state == RunState::Finished);
     }
     // The run is of a build that did not write it down.
     Ok(status.updates >= Ratio::from(&config.replay).allowed(status.env_steps))
@@ -59,12 +59,12 @@ pub fn replay_rows(run: &RunDir) -> Result<u64, OpenError> {
     }
 }
 
-/// The period of the policy that was judged last: as the evaluator left it, and where a build did not have it do so, by the run's
+/// The period of the policy that was evaluated last: as the evaluator left it, and where a build did not have it do so, by the run's
 /// records.
 ///
 /// # Errors
 /// When they cannot be read.
-pub fn judged(config: &Config, run: &RunDir) -> anyhow::Result<Option<u64>> {
+pub fn evaluated_period(config: &Config, run: &RunDir) -> anyhow::Result<Option<u64>> {
     let state = EvaluatorState::read(&run.evaluator_state())?;
     let recorded = read_evaluations(&run.evaluations())?;
     let steps = state.last().map(|last| last.env_steps);

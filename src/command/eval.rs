@@ -16,7 +16,7 @@ use shoal_run::evaluation::{EvaluationSummary, WhichPolicy, evaluate};
 pub(crate) struct EvalArgs {
     /// Run directory.
     pub(crate) run: PathBuf,
-    /// Which policy to judge.
+    /// Which policy to evaluate.
     #[arg(long, value_enum, default_value_t)]
     pub(crate) policy: WhichPolicy,
     /// Episodes, from starts that are the same always.
@@ -30,7 +30,7 @@ pub(crate) struct EvalArgs {
     pub(crate) json: bool,
 }
 
-/// Judges a policy and tells the person, or a script, how it did.
+/// Evaluates a policy and tells the person, or a script, how it did.
 pub(crate) fn run(args: &EvalArgs) -> anyhow::Result<()> {
     let run = RunDir::open(&args.run)?;
     let config = run.config()?;

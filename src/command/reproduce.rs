@@ -6,7 +6,7 @@ use std::process::ExitCode;
 
 use clap::Args;
 use clap::builder::PossibleValuesParser;
-use shoal_reproduce::{Effort, Ending, Order};
+use shoal_reproduce::{BatchEnding, Effort, Order};
 use shoal_run::signals::exit_code;
 
 /// What is interrupted goes on when the same is typed again; what is there is not run again.
@@ -21,7 +21,7 @@ pub(crate) struct ReproduceArgs {
     /// Trainings at a time [default: half the cores, for each keeps about two busy].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     pub(crate) jobs: Option<u16>,
-    /// A first look in a minute or two: tiny networks, hardly any steps; nothing is judged.
+    /// A first look in a minute or two: tiny networks, hardly any steps; nothing is checked.
     #[arg(long)]
     pub(crate) quick: bool,
     /// Where runs, results and figures lie [default: runs/reproduction; with --quick runs/reproduction-quick].
@@ -72,15 +72,15 @@ pub(crate) fn run(args: &ReproduceArgs) -> anyhow::Result<ExitCode> {
     writeln!(std::io::stdout().lock(), "{}", order.report.display())?;
     let mut stderr = std::io::stderr().lock();
     Ok(match ending {
-        Ending::Complete => ExitCode::SUCCESS,
-        Ending::Failed(seeds) => {
+        BatchEnding::Complete => ExitCode::SUCCESS,
+        BatchEnding::Failed(seeds) => {
             writeln!(
                 stderr,
                 "error: {seeds} of the seeds failed; type the same again to go on with them"
             )?;
             ExitCode::FAILURE
         }
-        Ending::Interrupted(signal) => {
+        BatchEnding::Interrupted(signal) => {
             writeln!(
                 stderr,
                 "interrupted; every training is saved: type the same again to go on"

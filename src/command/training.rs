@@ -16,10 +16,10 @@ use shoal_learner::process::checkpoint::Checkpoints;
 use shoal_report::plots;
 use shoal_run::evaluation::{EvaluationSummary, WhichPolicy, evaluate};
 use shoal_run::numbers::thousands;
-use shoal_run::outcome;
+use shoal_run::outcome::{RunOutcome, RunState};
 use shoal_run::signals::exit_code;
 
-use crate::launcher::{self, Ending, Outcome};
+use crate::launcher::{self, Ending, TrainingOutcome};
 
 /// What a training run says.
 #[derive(Args, Clone, Debug, Default)]
@@ -43,14 +43,14 @@ struct Summary {
     /// Since this launcher began.
     updates_per_second: f64,
     env_steps_per_second: f64,
-    /// Of the best policy, as `shoal eval` judges it; none where the run was interrupted.
+    /// Of the best policy, as `shoal eval` evaluates it; none where the run was interrupted.
     eval_return_mean: Option<f64>,
     eval_return_std: Option<f64>,
     eval_episodes: Option<u32>,
     weights_sha256: Option<String>,
 }
 
-/// Trains until the run's end or an earlier one, judges what was learned, draws it, and tells the person.
+/// Trains until the run's end or an earlier one, evaluates what was learned, draws it, and tells the person.
 /// The run is this process's until all of that is done.
 pub(crate) fn run_training(
     config: Config,
@@ -59,8 +59,8 @@ pub(crate) fn run_training(
     output: &OutputMode,
 ) -> anyhow::Result<ExitCode> {
     let outcome = launcher::run(config.clone(), run, output.quiet)?;
-    let judged = match outcome.ending {
-        Ending::Finished => judge(&config, run)?,
+    let evaluated = match outcome.ending {
+        Ending::Finished => final_evaluation(&config, run)?,
         Ending::Stopped | Ending::Interrupted(_) | Ending::Renewed => Vec::new(),
     };
     plots::draw(run, &config, run.path())?;
@@ -68,11 +68,11 @@ pub(crate) fn run_training(
         let RunStatus {
             env_steps, episodes, ..
         } = outcome.after;
-        outcome::Outcome::new(outcome::State::Finished, env_steps, episodes).write(run)?;
+        RunOutcome::new(RunState::Finished, env_steps, episodes).write(run)?;
     }
-    let summary = Summary::new(&config, run, &outcome, judged.first().map(|(_, summary)| summary))?;
+    let summary = Summary::new(&config, run, &outcome, evaluated.first().map(|(_, summary)| summary))?;
     if !output.quiet {
-        tell(&mut std::io::stderr().lock(), run, &outcome, &summary, &judged)?;
+        tell(&mut std::io::stderr().lock(), run, &outcome, &summary, &evaluated)?;
     }
     if output.json {
         writeln!(std::io::stdout().lock(), "{}", serde_json::to_string(&summary)?)?;
@@ -85,29 +85,29 @@ pub(crate) fn run_training(
 }
 
 /// The final evaluation: the policy with the best evaluation first, then the last one.
-fn judge(config: &Config, run: &RunDir) -> anyhow::Result<Vec<(&'static str, EvaluationSummary)>> {
-    let mut judged = Vec::new();
+fn final_evaluation(config: &Config, run: &RunDir) -> anyhow::Result<Vec<(&'static str, EvaluationSummary)>> {
+    let mut evaluated = Vec::new();
     for (name, path, which) in [
         ("best policy", run.best_policy(), WhichPolicy::Best),
         ("last policy", run.last_policy(), WhichPolicy::Last),
     ] {
         if path.exists() {
             let parameters = which.read(run, config)?.parameters;
-            judged.push((
+            evaluated.push((
                 name,
                 evaluate(config, &parameters, config.evaluation.final_episodes, config.run.seed)?,
             ));
         }
     }
-    Ok(judged)
+    Ok(evaluated)
 }
 
 impl Summary {
     fn new(
         config: &Config,
         run: &RunDir,
-        outcome: &Outcome,
-        judged: Option<&EvaluationSummary>,
+        outcome: &TrainingOutcome,
+        evaluated: Option<&EvaluationSummary>,
     ) -> anyhow::Result<Self> {
         let wall_seconds = outcome.wall.as_secs_f64();
         let RunStatus {
@@ -127,9 +127,9 @@ impl Summary {
             wall_seconds,
             updates_per_second: done as f64 / wall_seconds,
             env_steps_per_second: taken as f64 / wall_seconds,
-            eval_return_mean: judged.map(|judged| judged.return_mean),
-            eval_return_std: judged.map(|judged| judged.return_std),
-            eval_episodes: judged.map(|judged| judged.episodes),
+            eval_return_mean: evaluated.map(|evaluated| evaluated.return_mean),
+            eval_return_std: evaluated.map(|evaluated| evaluated.return_std),
+            eval_episodes: evaluated.map(|evaluated| evaluated.episodes),
             weights_sha256: weights_sha256(config, run)?,
         })
     }
@@ -148,9 +148,9 @@ fn weights_sha256(config: &Config, run: &RunDir) -> anyhow::Result<Option<String
 fn tell(
     to: &mut impl Write,
     run: &RunDir,
-    outcome: &Outcome,
+    outcome: &TrainingOutcome,
     summary: &Summary,
-    judged: &[(&str, EvaluationSummary)],
+    evaluated: &[(&str, EvaluationSummary)],
 ) -> std::io::Result<()> {
     let mut table = Table::new();
     table.load_style(UTF8_BORDERS_ONLY);
@@ -165,12 +165,12 @@ fn tell(
             summary.updates_per_second, summary.env_steps_per_second
         ),
     ]);
-    for (name, judged) in judged {
+    for (name, evaluated) in evaluated {
         let mut text = format!(
             "return {:.2} ± {:.2} over {} episodes",
-            judged.return_mean, judged.return_std, judged.episodes
+            evaluated.return_mean, evaluated.return_std, evaluated.episodes
         );
-        if let (Some(distance), Some(reached)) = (judged.final_distance_mean, judged.reached_fraction) {
+        if let (Some(distance), Some(reached)) = (evaluated.final_distance_mean, evaluated.reached_fraction) {
             text += &format!(
                 "; ends {distance:.3} m from the goal, reaches it in {:.0} %",
                 100.0 * reached
@@ -188,5 +188,5 @@ fn tell(
         to,
         "  learning-curve.svg, evaluations.csv, episodes.csv, learner.csv, tensorboard/, checkpoints/, shoal.log"
     )?;
-    writeln!(to, "  figures: shoal plot {here}    judge again: shoal eval {here}")
+    writeln!(to, "  figures: shoal plot {here}    evaluate again: shoal eval {here}")
 }

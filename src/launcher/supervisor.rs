@@ -34,7 +34,7 @@ const NEVER_SENT: u64 = 100_000;
 
 /// How the processes of the run are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum State {
+pub(super) enum Situation {
     AtWork,
     LearnerDone,
     /// Dead processes have places in shared memory that cannot be freed.
@@ -253,8 +253,8 @@ impl Supervisor {
     }
 
     /// Acts on the ends that were seen, and starts processes again when their time has come.
-    pub(super) fn look_after(&mut self, domain: &Domain) -> anyhow::Result<State> {
-        let mut state = State::AtWork;
+    pub(super) fn look_after(&mut self, domain: &Domain) -> anyhow::Result<Situation> {
+        let mut state = Situation::AtWork;
         if self.children.iter().any(|child| child.ended.is_some()) {
             // Their places in shared memory are free for their successors.
             state = self.clean(domain)?;
@@ -265,8 +265,8 @@ impl Supervisor {
             }
         }
         for i in 0..self.children.len() {
-            if self.look_after_one(i)? == State::LearnerDone {
-                return Ok(State::LearnerDone);
+            if self.look_after_one(i)? == Situation::LearnerDone {
+                return Ok(Situation::LearnerDone);
             }
         }
         self.retire_surplus();
@@ -274,11 +274,11 @@ impl Supervisor {
         Ok(state)
     }
 
-    fn look_after_one(&mut self, i: usize) -> anyhow::Result<State> {
+    fn look_after_one(&mut self, i: usize) -> anyhow::Result<Situation> {
         if let Some(status) = self.children[i].ended.take()
-            && self.act_on_end(i, status)? == State::LearnerDone
+            && self.act_on_end(i, status)? == Situation::LearnerDone
         {
-            return Ok(State::LearnerDone);
+            return Ok(Situation::LearnerDone);
         }
         let is_wanted = self.is_wanted(&self.children[i]);
         let child = &mut self.children[i];
@@ -287,24 +287,24 @@ impl Supervisor {
             self.start(i)?;
             self.note_incident(i, What::StartedAgain, String::new());
         }
-        Ok(State::AtWork)
+        Ok(Situation::AtWork)
     }
 
-    fn act_on_end(&mut self, i: usize, status: ExitStatus) -> anyhow::Result<State> {
+    fn act_on_end(&mut self, i: usize, status: ExitStatus) -> anyhow::Result<Situation> {
         let child = &mut self.children[i];
         let name = name(child.identity);
         if child.identity.role == Role::Learner && status.success() {
             child.process = None;
             self.learner_done = true;
             self.log.note(&name, "done");
-            return Ok(State::LearnerDone);
+            return Ok(Situation::LearnerDone);
         }
         if child.retires {
             child.process = None;
             child.restart_at = Instant::now();
             self.log.note(&name, &format!("retired: {}", ending(status)));
             self.note_incident(i, What::Retired, String::new());
-            return Ok(State::AtWork);
+            return Ok(Situation::AtWork);
         }
         let consequence = child.has_ended(status);
         let what = if status.signal().is_some() {
@@ -318,7 +318,7 @@ impl Supervisor {
                 self.children[i].restart_at = Instant::now() + pause;
                 self.log
                     .note(&name, &format!("{}; starting it again in {pause:?}", ending(status)));
-                Ok(State::AtWork)
+                Ok(Situation::AtWork)
             }
             Consequence::GiveUp(starts) => {
                 self.note_incident(i, What::GivenUp, String::new());
@@ -351,7 +351,7 @@ impl Supervisor {
     }
 
     /// Frees what dead processes have in shared memory.
-    fn clean(&mut self, domain: &Domain) -> anyhow::Result<State> {
+    fn clean(&mut self, domain: &Domain) -> anyhow::Result<Situation> {
         let begun = Instant::now();
         let cleaned = cleaner::clean_up(domain, &self.services);
         self.cleaned = Instant::now();
@@ -361,13 +361,13 @@ impl Supervisor {
         }
         if self.services.occupied_by_the_dead() == 0 {
             self.occupied = None;
-            return Ok(State::AtWork);
+            return Ok(Situation::AtWork);
         }
         let since = *self.occupied.get_or_insert(begun);
         if cleaned.is_ok() && since.elapsed() >= HOPELESS {
-            return Ok(State::SharedMemoryOccupied);
+            return Ok(Situation::SharedMemoryOccupied);
         }
-        Ok(State::AtWork)
+        Ok(Situation::AtWork)
     }
 
     /// Lets actors retire that are too many, and when they are gone their environment servers.
@@ -406,7 +406,7 @@ impl Supervisor {
         !matches!(role, Role::Actor | Role::EnvServer) || !(self.actors..self.max_actors).contains(&index)
     }
 
-    fn give_up(&self, name: &str, starts: u32, status: ExitStatus) -> anyhow::Result<State> {
+    fn give_up(&self, name: &str, starts: u32, status: ExitStatus) -> anyhow::Result<Situation> {
         let mut lines = self.log.last_lines(name);
         lines.dedup();
         let said = match lines.split_last() {

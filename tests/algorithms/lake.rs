@@ -1,13 +1,13 @@
 //! What a policy is worth on the lake, by its transition table.
 
-use shoal_env_server::environment::frozen_lake::{Outcome, STATES, transitions};
+use shoal_env_server::environment::frozen_lake::{LakeTransition, STATES, transitions};
 
 /// How likely a policy is to reach the goal from the start within so many steps.
 pub(crate) fn reaches_the_goal(policy: &[usize], steps: usize) -> f64 {
     let mut reached = [0.0; STATES];
     for _ in 0..steps {
         let one_more = |state| {
-            let then = |o: Outcome| o.p * if o.terminated { o.reward } else { reached[o.next] };
+            let then = |o: LakeTransition| o.p * if o.terminated { o.reward } else { reached[o.next] };
             transitions(state, policy[state]).map(then).sum()
         };
         reached = std::array::from_fn(one_more);

@@ -17,7 +17,7 @@ use shoal_common::policy_file::PolicyFile;
 use shoal_env_server::environment::frozen_lake::{ACTIONS, STATES};
 use support::{Running, Workplace, comes_further, complaint, end_of, json, parse, until};
 
-/// Few episodes to judge by, and those not often.
+/// Few episodes to evaluate by, and those not often.
 const QUICK: [&str; 6] = [
     "--set",
     "evaluation.every=4000",
@@ -198,10 +198,10 @@ fn whoever_is_killed_it_ends_the_same(arguments: &[&str]) {
     comes_further(&running, 1000);
     running.kill_everybody();
     drop(running);
-    let (again, judged) = end_of(place.resume("killed", &[]));
+    let (again, evaluated) = end_of(place.resume("killed", &[]));
     assert_eq!(again, weights);
     // One may have died with the launcher before it was written down.
-    assert!(judged.iter().all(|line| evaluations.contains(line)), "{judged:?}");
+    assert!(evaluated.iter().all(|line| evaluations.contains(line)), "{evaluated:?}");
 }
 
 #[test]

@@ -128,7 +128,7 @@ fn some(user: User, modes: &[Mode], victims: &[Victim], [first, dangerous, other
     }
     .run();
     eprint!("{}", table.text());
-    table.judge();
+    table.evaluate();
 }
 
 const EVALUATOR: Victim = Victim::Role("evaluator", 0);
@@ -245,7 +245,7 @@ fn every_crash_point() {
         table.join(sweep.run());
     }
     eprint!("{}", table.text());
-    table.judge();
+    table.evaluate();
 }
 
 /// Which roles are killed.

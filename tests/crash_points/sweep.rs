@@ -172,7 +172,7 @@ impl Sweep<'_> {
 
 impl Table {
     /// Fails with everything that went wrong.
-    pub(crate) fn judge(&self) {
+    pub(crate) fn evaluate(&self) {
         let failures = self.failures.join("\n\n");
         assert!(
             self.failures.is_empty(),

@@ -9,14 +9,14 @@ use std::time::{Duration, Instant};
 use shoal_common::channel::environment::{Ask, EnvironmentPort};
 use shoal_common::channel::policy::{PolicyHeader, PolicyPublisher};
 use shoal_common::channel::transitions::ChunkSender;
-use shoal_common::channel::{Domain, HeartbeatSender, Listener, Notifier, Place, Services, wait_for};
+use shoal_common::channel::{Domain, EventName, HeartbeatSender, Listener, Notifier, Services, wait_for};
 use shoal_common::commit::{CommitReader, OpenError};
 use shoal_common::report::{Identity, Role};
 use shoal_common::stop::Stop;
 use shoal_env_server::server::serve;
 use shoal_env_server::vector::VectorEnvironment;
 use shoal_learner::process::intake::Intake;
-use shoal_learner::replay::{Replay, ReplayError, Step};
+use shoal_learner::replay::{Replay, ReplayError, WriteStep};
 
 use crate::chunks::{ROWS, WINDOW, chunk_layout, fill, replay_layout};
 use crate::process::MARK;
@@ -98,11 +98,11 @@ fn host(domain: &Domain) {
 /// Commands: `send N` chunks, saying `sending S` after each and `full S` when it first naps before a full window;
 /// `hold N`, which fills N rows of a chunk and says `holding`, to be killed with it; `finish`, until all are committed.
 fn actor(domain: &Domain, replay: &std::path::Path, index: u32, incarnation: u64) {
-    let bell = Listener::bind(domain, Place(Role::Actor, index)).unwrap();
-    let learner = Notifier::new(domain, Place(Role::Learner, 0)).unwrap();
+    let listener = Listener::bind(domain, EventName(Role::Actor, index)).unwrap();
+    let learner = Notifier::new(domain, EventName(Role::Learner, 0)).unwrap();
     let commits = loop {
         match CommitReader::open(replay) {
-            Err(OpenError::NotYet { .. }) => drop(bell.wait(Duration::from_millis(5)).unwrap()),
+            Err(OpenError::NotYet { .. }) => drop(listener.wait(Duration::from_millis(5)).unwrap()),
             opened => break opened.unwrap(),
         }
     };
@@ -119,7 +119,7 @@ fn actor(domain: &Domain, replay: &std::path::Path, index: u32, incarnation: u64
     };
     let Ok(first) = commands.recv() else { return };
     let waits = Cell::new(false);
-    let mut sender = handshake.wait(&commits, &bell, &stop, || full(&waits, 0)).unwrap();
+    let mut sender = handshake.wait(&commits, &listener, &stop, || full(&waits, 0)).unwrap();
     let before = sender.sent();
     for command in std::iter::once(first).chain(commands) {
         let (word, count) = words(&command);
@@ -141,7 +141,7 @@ fn actor(domain: &Domain, replay: &std::path::Path, index: u32, incarnation: u64
             let waits = Cell::new(false);
             let committed = || commits.committed(index as usize);
             wait_for(
-                &bell,
+                &listener,
                 &stop,
                 || Ok((sender.in_flight(committed()) <= most_in_flight).then_some(())),
                 || {
@@ -167,7 +167,7 @@ fn actor(domain: &Domain, replay: &std::path::Path, index: u32, incarnation: u64
 /// Commands: `take N` more chunks, then says `took`; `crawl`, taking one chunk more each time it has slept a little;
 /// `run`. Takes nothing before its first command, except to stall once `after` chunks have passed a step.
 fn learner(domain: &Domain, path: &std::path::Path, actors: u32, stalls_at: Option<(&str, u64)>) {
-    let bell = Listener::bind(domain, Place(Role::Learner, 0)).unwrap();
+    let listener = Listener::bind(domain, EventName(Role::Learner, 0)).unwrap();
     let mut replay = match Replay::open(path, &replay_layout(MAX_ACTORS)) {
         Err(ReplayError::Missing(_)) => Replay::create(path, &replay_layout(MAX_ACTORS)).unwrap(),
         opened => opened.unwrap(),
@@ -175,7 +175,7 @@ fn learner(domain: &Domain, path: &std::path::Path, actors: u32, stalls_at: Opti
     if let Some((name, after)) = stalls_at {
         let name = name.to_owned();
         let mut passed = 0;
-        replay.on_step(move |step: Step| {
+        replay.on_step(move |step: WriteStep| {
             if format!("{step:?}") == name {
                 passed += 1;
                 if passed > after {
@@ -209,7 +209,7 @@ fn learner(domain: &Domain, path: &std::path::Path, actors: u32, stalls_at: Opti
             say("took");
         }
         if !drained && !crawls {
-            bell.wait(NAP).unwrap();
+            listener.wait(NAP).unwrap();
         }
     }
 }
@@ -247,7 +247,7 @@ fn port(domain: &Domain, environments: &VectorEnvironment) -> EnvironmentPort {
         0,
         environments.spec().clone(),
         ENVS as usize,
-        Place(Role::Actor, 0),
+        EventName(Role::Actor, 0),
     )
     .unwrap()
 }
@@ -260,10 +260,10 @@ fn env_server(domain: &Domain) {
         index: 0,
         incarnation: 0,
     };
-    let pulse = HeartbeatSender::new(domain, identity).unwrap();
+    let heartbeat = HeartbeatSender::new(domain, identity).unwrap();
     let stop = Stop::when_stdin_closes().unwrap();
     say("ready");
-    serve(&mut environments, &port, 1, pulse, &stop).unwrap();
+    serve(&mut environments, &port, 1, heartbeat, &stop).unwrap();
 }
 
 /// Says `asked` at the first step or snapshot.

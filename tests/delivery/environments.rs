@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use rustix::process::Signal;
 use shoal_common::channel::environment::{Begin, EnvironmentClient, Observed, Snapshot, Stepped};
-use shoal_common::channel::{ChannelError, Domain, Listener, Place};
+use shoal_common::channel::{ChannelError, Domain, EventName, Listener};
 use shoal_common::exit::Exit;
 use shoal_common::report::Role;
 
@@ -16,7 +16,7 @@ const ACTIONS: [f32; ENVS as usize] = [0.5; ENVS as usize];
 
 /// An actor's end of the conversation.
 struct Asker {
-    bell: Listener,
+    listener: Listener,
     client: EnvironmentClient,
     _watchdog: Watchdog,
 }
@@ -25,10 +25,10 @@ impl Asker {
     fn new(domain: &Domain) -> Self {
         let watchdog = Watchdog::new();
         let environments = pendulums();
-        let bell = Listener::bind(domain, Place(Role::Actor, 0)).unwrap();
+        let listener = Listener::bind(domain, EventName(Role::Actor, 0)).unwrap();
         let client = EnvironmentClient::open(domain, 0, environments.spec(), ENVS as usize, watchdog.stop.clone());
         Self {
-            bell,
+            listener,
             client: client.unwrap(),
             _watchdog: watchdog,
         }
@@ -40,7 +40,7 @@ impl Asker {
 
     /// `idle` is called again and again while it waits.
     fn reset_while(&self, idle: impl FnMut()) -> Observed {
-        self.client.reset(&self.bell, Begin::Next, idle).expect("no hang")
+        self.client.reset(&self.listener, Begin::Next, idle).expect("no hang")
     }
 
     fn step(&self) -> Stepped {
@@ -48,11 +48,11 @@ impl Asker {
     }
 
     fn step_while(&self, idle: impl FnMut()) -> Stepped {
-        self.client.step(&self.bell, &ACTIONS, idle).expect("no hang")
+        self.client.step(&self.listener, &ACTIONS, idle).expect("no hang")
     }
 
     fn snapshot(&self) -> Snapshot {
-        self.client.snapshot(&self.bell, || ()).expect("no hang")
+        self.client.snapshot(&self.listener, || ()).expect("no hang")
     }
 
     fn taken(&self) -> Vec<u64> {
@@ -67,7 +67,7 @@ impl Asker {
     }
 
     fn restore_while(&self, words: &[u64], idle: impl FnMut()) -> Result<Observed, Exit<ChannelError>> {
-        self.client.restore(&self.bell, words, idle)
+        self.client.restore(&self.listener, words, idle)
     }
 
     /// All that comes of so many steps, as bits.
@@ -283,7 +283,7 @@ fn a_training_episode_is_begun_by_its_number_whatever_came_before() {
     let _server = run.start("env-server");
     let asker = Asker::new(&domain);
     let begin = |begin| {
-        let observed = asker.client.reset(&asker.bell, begin, || ()).expect("no hang");
+        let observed = asker.client.reset(&asker.listener, begin, || ()).expect("no hang");
         observed.observations().to_vec()
     };
     let [first, second] = [begin(Begin::Next), begin(Begin::Next)];

@@ -102,8 +102,8 @@ fn gymnasiums_pendulum_is_trained_while_its_servers_are_killed() {
     assert_eq!(spec.action, Space::boxed(&[(-2.0, 2.0)]));
     assert_eq!((spec.time_limit, spec.state_width), (200, 0));
 
-    let judged = || place.output(&["eval", "run", "--episodes", "3", "--json"]);
-    let (first, second) = (judged(), judged());
+    let evaluated = || place.output(&["eval", "run", "--episodes", "3", "--json"]);
+    let (first, second) = (evaluated(), evaluated());
     assert!(first.status.success(), "{}", String::from_utf8_lossy(&first.stderr));
     assert_eq!(first.stdout, second.stdout, "evaluation episodes start alike");
     let output = place.output(&["report", "run", "--out", "page.html"]);

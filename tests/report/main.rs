@@ -28,13 +28,13 @@ fn main() -> ExitCode {
 /// A short run of each environment; the pendulum's is repeated with another seed, and made again with a kill on its way.
 fn runs() -> (Workplace, Vec<&'static str>) {
     let place = Workplace::new();
-    let judge = ["--set", "evaluation.every=200", "--steps", "800"];
-    place.train(&[&["pendulum", "--run", "swing", "--lockstep"], &judge[..]].concat());
-    place.train(&[&["point-mass-r3", "--run", "drive", "--lockstep"], &judge[..]].concat());
+    let evaluate = ["--set", "evaluation.every=200", "--steps", "800"];
+    place.train(&[&["pendulum", "--run", "swing", "--lockstep"], &evaluate[..]].concat());
+    place.train(&[&["point-mass-r3", "--run", "drive", "--lockstep"], &evaluate[..]].concat());
     place.train(
         &[
             &["pendulum", "--run", "swing-2", "--lockstep", "--seed", "2"],
-            &judge[..],
+            &evaluate[..],
         ]
         .concat(),
     );
@@ -71,7 +71,9 @@ fn killed_on_the_way(place: &Workplace, name: &str) {
     until("the kill is on record", || {
         incidents(&running).contains("actor,0,started-again")
     });
-    until("it was judged", || running.run.join("checkpoints/best.policy").exists());
+    until("it was evaluated", || {
+        running.run.join("checkpoints/best.policy").exists()
+    });
     assert!(place.output(&["stop", name]).status.success());
     running.wait();
 }
@@ -260,7 +262,7 @@ fn a_run_under_way_and_one_that_has_hardly_begun_are_reported() -> Completion {
     let output = place.output(&["report", "run"]);
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let page = std::fs::read_to_string(run.join("report.html")).unwrap();
-    assert!(page.contains("\"incidents\":null") && page.contains("No policy has been judged yet."));
+    assert!(page.contains("\"incidents\":null") && page.contains("No policy has been evaluated yet."));
     if let Some(missing) = CHROMIUM.missing() {
         return Completion::ignored_with(format!("the report was written and not looked at: {missing}"));
     }

@@ -15,7 +15,7 @@ const PATIENCE: Duration = Duration::from_secs(120);
 /// And after so long a command that may be a whole training.
 const LONG_PATIENCE: Duration = Duration::from_secs(600);
 
-/// Settings with which a run is quick: small networks, little warm-up, few episodes to judge by.
+/// Settings with which a run is quick: small networks, little warm-up, few episodes to evaluate by.
 pub(crate) const QUICK: [&str; 10] = [
     "--set",
     "ddpg.hidden=[24, 16]",
@@ -323,7 +323,7 @@ pub(crate) fn committed(run: &Path, actor: usize) -> u64 {
     commits.actor(actor).rows
 }
 
-/// The weights a run ends with, and what its policies were judged to be on the way.
+/// The weights a run ends with, and what its policies were evaluated to be on the way.
 pub(crate) fn end_of(running: Running) -> (serde_json::Value, Vec<String>) {
     let run = running.run.clone();
     let (code, printed, leftovers) = running.wait();

@@ -1,13 +1,13 @@
 //! What is best on the lake, by its transition table.
 
-use shoal_env_server::environment::frozen_lake::{ACTIONS, Outcome, STATES, transitions};
+use shoal_env_server::environment::frozen_lake::{ACTIONS, LakeTransition, STATES, transitions};
 
 /// Bellman's optimality equation, iterated until nothing changes by 1e-12.
 pub(crate) fn optimal_values(gamma: f64) -> [[f64; ACTIONS]; STATES] {
     let mut q = [[0.0; ACTIONS]; STATES];
     loop {
         let v = q.map(|values| values.into_iter().fold(f64::NEG_INFINITY, f64::max));
-        let backup = |o: Outcome| o.p * (o.reward + if o.terminated { 0.0 } else { gamma * v[o.next] });
+        let backup = |o: LakeTransition| o.p * (o.reward + if o.terminated { 0.0 } else { gamma * v[o.next] });
         let mut change: f64 = 0.0;
         for (state, values) in q.iter_mut().enumerate() {
             for (action, value) in values.iter_mut().enumerate() {

@@ -1,4 +1,4 @@
-//! Runs whose networks have other hidden layers than two: they train, go on, are judged and leave the program.
+//! Runs whose networks have other hidden layers than two: they train, go on, are evaluated and leave the program.
 
 use rten::{Model, Value};
 use safetensors::SafeTensors;
@@ -6,7 +6,7 @@ use safetensors::SafeTensors;
 use crate::support::{QUICK, Workplace, complaint, json};
 
 #[test]
-fn networks_of_one_and_of_three_hidden_layers_train_go_on_are_judged_and_exported() {
+fn networks_of_one_and_of_three_hidden_layers_train_go_on_are_evaluated_and_exported() {
     let cases: [(&str, &str, &[usize]); 3] = [
         ("[32]", "relu", &[32]),
         ("[16,16,16]", "relu", &[16; 3]),
@@ -48,8 +48,12 @@ fn networks_of_one_and_of_three_hidden_layers_train_go_on_are_judged_and_exporte
         let whole = place.output(&[&whole[..], &QUICK, &settings].concat());
         assert_eq!(json(&whole)["weights_sha256"], after["weights_sha256"]);
 
-        let judged = place.output(&["eval", "run", "--policy", "last", "--episodes", "2", "--json"]);
-        assert!(judged.status.success(), "{}", String::from_utf8_lossy(&judged.stderr));
+        let evaluated = place.output(&["eval", "run", "--policy", "last", "--episodes", "2", "--json"]);
+        assert!(
+            evaluated.status.success(),
+            "{}",
+            String::from_utf8_lossy(&evaluated.stderr)
+        );
 
         for format in ["onnx", "safetensors"] {
             let output = place.output(&["export", "run", "--policy", "last", "--format", format]);

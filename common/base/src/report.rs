@@ -11,7 +11,7 @@ pub enum Role {
     EnvServer,
     /// Explores.
     Actor,
-    /// Judges the policy.
+    /// Evaluates the policy.
     Evaluator,
     /// Learns.
     Learner,
@@ -154,7 +154,7 @@ pub struct EpisodeReport {
     pub env_steps: u64,
 }
 
-/// A policy has been judged.
+/// A policy has been evaluated.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, ZeroCopySend)]
 #[repr(C)]
 pub struct EvaluationReport {
@@ -174,11 +174,11 @@ pub struct EvaluationReport {
     pub best: u32,
 }
 
-/// How far the judging is: sent when an evaluator begins and after each policy it has judged.
+/// How far the evaluating is: sent when an evaluator begins and after each policy it has evaluated.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ZeroCopySend)]
 #[repr(C)]
-pub struct JudgedReport {
-    /// The period of the policy judged last.
+pub struct EvaluatedReport {
+    /// The period of the policy evaluated last.
     pub period: u64,
 }
 

@@ -15,9 +15,9 @@ use iceoryx2::service::port_factory::request_response::PortFactory;
 
 pub use self::message::{Answer, Question, RoleState, RoleStatus, RunKey, RunStatus};
 use self::message::{Asked, VERSION, decode, encode};
-use super::bell::{Listener, Notifier};
 use super::domain::Domain;
 use super::error::{Cause, ChannelError, ChannelErrorKind};
+use super::event::{Listener, Notifier};
 use super::memory;
 use super::service::{Entry, Held, claim, service_name};
 
@@ -48,7 +48,7 @@ const LOOK: Duration = Duration::from_millis(100);
 #[derive(Debug)]
 pub struct ControlPort {
     server: Server<ipc::Service, [u8], ControlHeader, [u8], ControlHeader>,
-    bell: Listener,
+    listener: Listener,
     /// Who will be answered later.
     waiting: Vec<ControlRequest>,
 }
@@ -82,7 +82,7 @@ pub enum ControlError {
 /// Readable when somebody has asked.
 impl AsFd for ControlPort {
     fn as_fd(&self) -> BorrowedFd<'_> {
-        self.bell.as_fd()
+        self.listener.as_fd()
     }
 }
 
@@ -101,7 +101,7 @@ impl ControlPort {
         })?;
         Ok(Self {
             server,
-            bell: Listener::of_launcher(domain)?,
+            listener: Listener::of_launcher(domain)?,
             waiting: Vec::new(),
         })
     }
@@ -118,7 +118,7 @@ impl ControlPort {
         mut answer: impl FnMut(Question) -> Result<Option<Answer>, E>,
     ) -> Result<(), E> {
         // Before the questions are looked for: who asks later rings again.
-        self.bell.rang()?;
+        self.listener.notified()?;
         loop {
             let received = self
                 .server
@@ -311,7 +311,7 @@ mod tests {
             let mut asked = 0;
             while asked == 0 {
                 let woken = poll(&mut [PollFd::new(&port, PollFlags::IN)], Some(&a_minute)).unwrap();
-                assert_eq!(woken, 1, "nobody rang");
+                assert_eq!(woken, 1, "nobody notified");
                 port.attend::<ChannelError>(run, Path::new("run"), |question| {
                     assert_eq!(question, Question::Stop);
                     asked += 1;

@@ -9,7 +9,7 @@ use iceoryx2::prelude::*;
 use iceoryx2::service::header::publish_subscribe::Header;
 use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
-use shoal_base::report::{EpisodeReport, EvaluationReport, Heartbeat, JudgedReport, LearnerReport};
+use shoal_base::report::{EpisodeReport, EvaluatedReport, EvaluationReport, Heartbeat, LearnerReport};
 
 use super::domain::Domain;
 use super::error::ChannelError;
@@ -55,7 +55,7 @@ impl Report for EvaluationReport {
     const HISTORY: usize = 2;
 }
 
-impl Report for JudgedReport {
+impl Report for EvaluatedReport {
     const CHANNEL: &'static str = "reports/judged";
     const BUFFER: usize = 8;
     // A learner in lockstep that was restarted waits for it.

@@ -7,15 +7,15 @@ use std::os::unix::fs::OpenOptionsExt;
 
 use iceoryx2::identifiers::UniqueNodeId;
 use iceoryx2::prelude::CallbackProgression;
-use shoal_base::report::{EpisodeReport, EvaluationReport, Heartbeat, JudgedReport, LearnerReport, Role};
+use shoal_base::report::{EpisodeReport, EvaluatedReport, EvaluationReport, Heartbeat, LearnerReport, Role};
 
-use super::bell::Place;
 use super::cleanup::{Sweeper, lives};
 use super::domain::{Domain, DomainError, io_error};
 use super::error::ChannelError;
+use super::event::EventName;
 use super::files::prefix;
 use super::service::Held;
-use super::{bell, control, environment, policy, reports, transitions};
+use super::{control, environment, event, policy, reports, transitions};
 
 /// The services of a run that this process has made. They are gone when this is dropped and nobody else has them open.
 #[derive(Debug)]
@@ -42,16 +42,16 @@ impl Services {
     /// When a service is there already, or shared memory cannot be had.
     pub fn create_common(&mut self, domain: &Domain) -> Result<(), ChannelError> {
         self.held.extend([
-            bell::create_of_launcher(domain)?,
+            event::create_of_launcher(domain)?,
             control::create(domain)?,
             policy::create(domain)?,
             reports::create::<Heartbeat>(domain)?,
             reports::create::<EpisodeReport>(domain)?,
             reports::create::<EvaluationReport>(domain)?,
-            reports::create::<JudgedReport>(domain)?,
+            reports::create::<EvaluatedReport>(domain)?,
             reports::create::<LearnerReport>(domain)?,
-            bell::create(domain, Place(Role::Learner, 0))?,
-            bell::create(domain, Place(Role::Evaluator, 0))?,
+            event::create(domain, EventName(Role::Learner, 0))?,
+            event::create(domain, EventName(Role::Evaluator, 0))?,
         ]);
         Ok(())
     }
@@ -63,7 +63,7 @@ impl Services {
     pub fn create_environment(&mut self, domain: &Domain, index: u32) -> Result<(), ChannelError> {
         self.held.extend([
             environment::create(domain, index)?,
-            bell::create(domain, Place(Role::EnvServer, index))?,
+            event::create(domain, EventName(Role::EnvServer, index))?,
         ]);
         Ok(())
     }
@@ -76,7 +76,7 @@ impl Services {
         self.create_environment(domain, index)?;
         self.held.extend([
             transitions::create(domain, index, window)?,
-            bell::create(domain, Place(Role::Actor, index))?,
+            event::create(domain, EventName(Role::Actor, index))?,
         ]);
         Ok(())
     }
@@ -85,8 +85,8 @@ impl Services {
     ///
     /// # Errors
     /// As [`create_common`](Self::create_common).
-    pub fn create_bell(&mut self, domain: &Domain, place: Place) -> Result<(), ChannelError> {
-        self.held.push(bell::create(domain, place)?);
+    pub fn create_event(&mut self, domain: &Domain, name: EventName) -> Result<(), ChannelError> {
+        self.held.push(event::create(domain, name)?);
         Ok(())
     }
 

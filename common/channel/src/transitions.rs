@@ -22,9 +22,9 @@ use shoal_base::packing::{numbers_of, words_of};
 use shoal_base::stop::Stop;
 use shoal_base::transition::{ChunkLayout, Transition};
 
-use super::bell::{Listener, wait_for};
 use super::domain::Domain;
 use super::error::{ChannelError, PeerError};
+use super::event::{Listener, wait_for};
 use super::memory;
 use super::service::{Entry, Held, claim, service_name};
 use crate::commit::{ChunkMark, CommitReader};
@@ -101,13 +101,13 @@ impl Handshake {
     pub fn wait(
         self,
         commits: &CommitReader,
-        bell: &Listener,
+        listener: &Listener,
         stop: &Stop,
         mut idle: impl FnMut(),
     ) -> Result<ChunkSender, Exit<ChannelError>> {
         let Self(mut sender) = self;
         let newest = wait_for(
-            bell,
+            listener,
             stop,
             || {
                 let newest = commits.committed(sender.actor as usize);

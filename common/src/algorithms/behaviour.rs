@@ -3,14 +3,14 @@
 use shoal_policy::network::PolicyNetwork;
 use shoal_policy::{Policy, Scores};
 
-use super::exploration::Exploration;
+use super::exploration::ExplorationConfig;
 
 /// A policy with the exploration around it. Which kind of policy goes with which exploration is said by the variants, so that
 /// no other pair can be made.
 #[derive(Clone, Debug)]
 pub enum Behaviour {
     /// The policy says the action, and actors add noise to it.
-    Noise(PolicyNetwork, Exploration),
+    Noise(PolicyNetwork, ExplorationConfig),
     /// An action drawn with the probabilities that the policy says.
     Sample(Scores),
     /// The action with the highest score, but with this probability any of all.

@@ -8,7 +8,7 @@ use shoal_policy::network::{Activation, Hidden, Layers, NetworkLayout};
 
 use super::algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Shape};
 use super::behaviour::Behaviour;
-use super::exploration::Exploration;
+use super::exploration::ExplorationConfig;
 
 /// DDPG.
 pub(super) const SPEC: AlgorithmSpec = AlgorithmSpec {
@@ -19,7 +19,7 @@ pub(super) const SPEC: AlgorithmSpec = AlgorithmSpec {
 
 section! {
     /// Algorithm 4 with the numbers of section 4.3.1.
-    pub struct Ddpg {
+    pub struct DdpgConfig {
         /// Units of each hidden layer, of actor and critic alike: a list of 1 to 8 layers. The critic takes the action in at the
         /// second one, or at the only one.
         hidden: Layers = Layers::from([400, 300]), bounds: from(1, 8_192), unit: "units", source: "section 4.3.1";
@@ -38,11 +38,11 @@ section! {
         /// The noise of its actors: a section of its own, `[exploration]`.
         #[serde(skip)]
         #[schemars(skip)]
-        exploration: Exploration = Exploration::default();
+        exploration: ExplorationConfig = ExplorationConfig::default();
     }
 }
 
-impl Ddpg {
+impl DdpgConfig {
     /// The hidden layers of actor and critic.
     pub fn hidden_layers(&self) -> Hidden {
         Hidden {
@@ -52,7 +52,7 @@ impl Ddpg {
     }
 }
 
-impl AlgorithmSettings for Ddpg {
+impl AlgorithmSettings for DdpgConfig {
     fn check(&self, section: &str) -> Result<(), OutOfRange> {
         self.exploration.check_bounds("exploration")?;
         self.check_bounds(section)

@@ -7,7 +7,7 @@ use shoal_base::section::from;
 
 section! {
     /// Ornstein-Uhlenbeck noise: x ← x − θ x + σ N(0, 1) at each step, added to the action in units of half its range.
-    pub struct Exploration {
+    pub struct ExplorationConfig {
         /// θ, the pull towards zero.
         theta: f64 = 0.15, bounds: from(0.0, 1.0), unit: "1 / step", source: "section 4.3.1";
         /// σ, the size of each step's impulse.

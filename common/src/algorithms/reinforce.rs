@@ -20,7 +20,7 @@ pub(super) const SPEC: AlgorithmSpec = AlgorithmSpec {
 
 section! {
     /// Algorithm 3 with the numbers of section 4.2.1, and its variants of section 4.2.2.
-    pub struct Reinforce {
+    pub struct ReinforceConfig {
         /// Units of each of the policy's hidden layers: a list of 1 to 8 layers.
         hidden: Layers = Layers::from([10, 2]), bounds: from(1, 8_192), unit: "units", source: "section 4.2.1";
         /// What the units of the hidden layers do, of policy and baseline alike.
@@ -54,7 +54,7 @@ pub enum Weight {
     Baseline,
 }
 
-impl Reinforce {
+impl ReinforceConfig {
     /// The policy's hidden layers.
     pub fn hidden_layers(&self) -> Hidden {
         Hidden {
@@ -72,7 +72,7 @@ impl Reinforce {
     }
 }
 
-impl AlgorithmSettings for Reinforce {
+impl AlgorithmSettings for ReinforceConfig {
     fn check(&self, section: &str) -> Result<(), OutOfRange> {
         self.check_bounds(section)
     }

@@ -24,7 +24,7 @@ pub(super) const SARSA: AlgorithmSpec = AlgorithmSpec {
 
 section! {
     /// Algorithms 1 and 2 with the numbers of section 4.1.
-    pub struct Tabular {
+    pub struct TabularConfig {
         /// γ, the discount of one step.
         gamma: f64 = 0.999, bounds: from(0.0, 1.0), unit: "–", source: "section 4.1";
         /// α, the step size.
@@ -34,7 +34,7 @@ section! {
     }
 }
 
-impl AlgorithmSettings for Tabular {
+impl AlgorithmSettings for TabularConfig {
     fn check(&self, section: &str) -> Result<(), OutOfRange> {
         self.check_bounds(section)
     }

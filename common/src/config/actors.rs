@@ -6,7 +6,7 @@ use shoal_base::section::{OutOfRange, from};
 section! {
     /// Who explores, and in how large portions.
     #[derive(Eq)]
-    pub struct Actors {
+    pub struct ActorsConfig {
         /// Actor processes, each with an environment server of its own; at most `actors.max`.
         count: u32 = 2, unit: "processes", source: "ours";
         /// Environments an actor steps at once.
@@ -20,7 +20,7 @@ section! {
     }
 }
 
-impl Actors {
+impl ActorsConfig {
     /// Whether every number makes sense.
     ///
     /// # Errors

@@ -5,7 +5,7 @@ use shoal_base::section::from;
 
 section! {
     /// How often the learner's state is saved.
-    pub struct Checkpoint {
+    pub struct CheckpointConfig {
         /// Seconds between checkpoints of a free run.
         every_seconds: f64 = 5.0, bounds: from(0.0, 86_400.0), unit: "s", source: "ours";
         /// Updates between checkpoints of a lockstep run.

@@ -11,7 +11,7 @@ const WIDEST: usize = 4_096;
 
 /// What is controlled: an environment's name, and the parameters that this environment understands.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-pub struct Environment {
+pub struct EnvironmentConfig {
     /// One of the environments' names, or what another program makes an environment from, as `gym:Pendulum-v1`.
     #[schemars(extend("unit" = "–", "source" = "chapters 4 and 5"))]
     pub name: String,

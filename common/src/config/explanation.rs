@@ -3,30 +3,34 @@
 use shoal_base::section::describe;
 pub use shoal_base::section::{Key, Section, keys};
 
-use super::actors::Actors;
-use super::checkpoint::Checkpoint;
-use super::environment::Environment;
-use super::evaluation::Evaluation;
-use super::learner::Learner;
-use super::replay::Replay;
-use super::run::Run;
-use crate::algorithms::{Algorithm, Exploration};
+use super::actors::ActorsConfig;
+use super::checkpoint::CheckpointConfig;
+use super::environment::EnvironmentConfig;
+use super::evaluation::EvaluationConfig;
+use super::learner::LearnerConfig;
+use super::replay::ReplayConfig;
+use super::run::RunConfig;
+use crate::algorithms::{Algorithm, ExplorationConfig};
 
 /// Every section that somebody may write, those of all algorithms included, but without an environment's own parameters.
 pub fn sections() -> Vec<Section> {
     let environment = Section {
         name: "environment",
-        keys: keys::<Environment>(),
+        keys: keys::<EnvironmentConfig>(),
         defaults: toml::Table::new(),
     };
-    let mut all = vec![describe::<Run>("run"), environment, describe::<Actors>("actors")];
+    let mut all = vec![
+        describe::<RunConfig>("run"),
+        environment,
+        describe::<ActorsConfig>("actors"),
+    ];
     all.extend(Algorithm::sections());
     all.extend([
-        describe::<Exploration>("exploration"),
-        describe::<Learner>("learner"),
-        describe::<Replay>("replay"),
-        describe::<Evaluation>("evaluation"),
-        describe::<Checkpoint>("checkpoint"),
+        describe::<ExplorationConfig>("exploration"),
+        describe::<LearnerConfig>("learner"),
+        describe::<ReplayConfig>("replay"),
+        describe::<EvaluationConfig>("evaluation"),
+        describe::<CheckpointConfig>("checkpoint"),
     ]);
     all
 }
@@ -34,11 +38,11 @@ pub fn sections() -> Vec<Section> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::{Ddpg, Reinforce};
+    use crate::config::{DdpgConfig, ReinforceConfig};
 
     #[test]
     fn a_key_is_explained_by_its_declaration() {
-        let ddpg = keys::<Ddpg>();
+        let ddpg = keys::<DdpgConfig>();
         let tau = ddpg.iter().find(|key| key.name == "tau").unwrap();
         assert_eq!(
             tau.meaning,
@@ -48,13 +52,13 @@ mod tests {
             (tau.unit.as_str(), tau.source.as_str(), tau.bounds.as_str()),
             ("–", "equation 3.31, section 4.3.1", "above 0 and at most 1")
         );
-        let weight = keys::<Reinforce>()
+        let weight = keys::<ReinforceConfig>()
             .into_iter()
             .find(|key| key.name == "weight")
             .unwrap();
         assert_eq!(weight.choices, ["return", "normalised", "baseline"]);
         assert_eq!(weight.bounds, "");
-        let mode = keys::<Run>().into_iter().find(|key| key.name == "mode").unwrap();
+        let mode = keys::<RunConfig>().into_iter().find(|key| key.name == "mode").unwrap();
         assert_eq!(mode.choices, ["free", "lockstep"]);
         assert!(
             ddpg.iter().all(|key| key.name != "exploration"),

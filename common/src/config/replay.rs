@@ -10,7 +10,7 @@ const MOST: u64 = 1_000_000_000;
 
 section! {
     /// What is remembered, and how often it is used.
-    pub struct Replay {
+    pub struct ReplayConfig {
         /// The newest so many transitions are sampled from.
         capacity: u64 = 1_000_000, bounds: from(1, MOST), unit: "transitions", source: "section 4.3.1";
         /// Transitions collected before the first update.
@@ -22,7 +22,7 @@ section! {
     }
 }
 
-impl Replay {
+impl ReplayConfig {
     /// Whether every number makes sense, for this algorithm.
     ///
     /// # Errors

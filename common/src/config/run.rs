@@ -9,7 +9,7 @@ use super::identity_format::IdentityFormat;
 
 section! {
     /// Identity and length of the run.
-    pub struct Run {
+    pub struct RunConfig {
         /// Names the run's services and shared memory; chosen when the run directory is made.
         id: String = String::new(), unit: "–", source: "ours";
         /// The root of every random stream.
@@ -42,7 +42,7 @@ pub enum Mode {
     Lockstep,
 }
 
-impl Run {
+impl RunConfig {
     /// Whether so many environment steps, or episodes, are all that were asked for. Updates may be left.
     pub fn has_all_steps(&self, env_steps: u64, episodes: u64) -> bool {
         env_steps >= self.steps || self.episodes.is_some_and(|limit| episodes >= limit)

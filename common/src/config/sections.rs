@@ -5,26 +5,27 @@ use shoal_base::space::EnvironmentSpec;
 use toml::{Table, Value};
 
 use super::{
-    Actors, Algorithm, Checkpoint, Config, Environment, Evaluation, Exploration, Learner, Replay, Run, explanation,
+    ActorsConfig, Algorithm, CheckpointConfig, Config, EnvironmentConfig, EvaluationConfig, ExplorationConfig,
+    LearnerConfig, ReplayConfig, RunConfig, explanation,
 };
 
 /// What is read.
 #[derive(Deserialize)]
 struct Sections {
-    run: Run,
-    environment: Environment,
+    run: RunConfig,
+    environment: EnvironmentConfig,
     spec: EnvironmentSpec,
     #[serde(default)]
-    actors: Actors,
-    exploration: Option<Exploration>,
+    actors: ActorsConfig,
+    exploration: Option<ExplorationConfig>,
     #[serde(default)]
-    learner: Learner,
+    learner: LearnerConfig,
     #[serde(default)]
-    replay: Replay,
+    replay: ReplayConfig,
     #[serde(default)]
-    evaluation: Evaluation,
+    evaluation: EvaluationConfig,
     #[serde(default)]
-    checkpoint: Checkpoint,
+    checkpoint: CheckpointConfig,
     /// Those of algorithms, and what is no section.
     #[serde(flatten)]
     others: Table,
@@ -33,19 +34,19 @@ struct Sections {
 /// What is written.
 #[derive(Serialize)]
 struct Written<'a> {
-    run: &'a Run,
-    environment: &'a Environment,
+    run: &'a RunConfig,
+    environment: &'a EnvironmentConfig,
     spec: &'a EnvironmentSpec,
-    actors: &'a Actors,
+    actors: &'a ActorsConfig,
     #[serde(skip_serializing_if = "Option::is_none")]
-    exploration: Option<&'a Exploration>,
+    exploration: Option<&'a ExplorationConfig>,
     /// A section with the algorithm's name.
     #[serde(flatten)]
     algorithm: &'a Algorithm,
-    learner: &'a Learner,
-    replay: &'a Replay,
-    evaluation: &'a Evaluation,
-    checkpoint: &'a Checkpoint,
+    learner: &'a LearnerConfig,
+    replay: &'a ReplayConfig,
+    evaluation: &'a EvaluationConfig,
+    checkpoint: &'a CheckpointConfig,
 }
 
 impl<'de> Deserialize<'de> for Config {

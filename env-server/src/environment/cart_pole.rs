@@ -33,13 +33,13 @@ const THETA_LIMIT: f64 = 12.0 / 180.0 * std::f64::consts::PI;
 /// What can be set.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
-pub struct Parameters {
+pub struct CartPoleParameters {
     /// Steps after which an episode is truncated.
     #[schemars(extend("unit" = "steps", "source" = "section 4.2.1"))]
     pub time_limit: u32,
 }
 
-impl Default for Parameters {
+impl Default for CartPoleParameters {
     fn default() -> Self {
         Self { time_limit: 200 }
     }
@@ -49,14 +49,14 @@ impl Default for Parameters {
 /// terminates when the pole has fallen or the cart has left the track.
 #[derive(Clone, Debug)]
 pub struct CartPole {
-    parameters: Parameters,
+    parameters: CartPoleParameters,
     /// (x, ẋ, θ, θ̇) in m, m/s, rad, rad/s.
     state: [f64; 4],
 }
 
 impl CartPole {
     /// Upright, centred and at rest.
-    pub fn new(parameters: Parameters) -> Result<Self, OutOfRange> {
+    pub fn new(parameters: CartPoleParameters) -> Result<Self, OutOfRange> {
         check_time_limit(parameters.time_limit)?;
         Ok(Self {
             parameters,
@@ -151,7 +151,7 @@ mod tests {
     use shoal_base::stream::{Purpose, stream};
 
     fn at(state: [f64; 4]) -> CartPole {
-        let mut cart_pole = CartPole::new(Parameters::default()).unwrap();
+        let mut cart_pole = CartPole::new(CartPoleParameters::default()).unwrap();
         cart_pole.reset_to(&state).unwrap();
         cart_pole
     }

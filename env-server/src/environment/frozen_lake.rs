@@ -25,13 +25,13 @@ pub const ACTIONS: usize = 4;
 /// What can be set.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
-pub struct Parameters {
+pub struct FrozenLakeParameters {
     /// Steps after which an episode is truncated.
     #[schemars(extend("unit" = "steps", "source" = "section 4.1"))]
     pub time_limit: u32,
 }
 
-impl Default for Parameters {
+impl Default for FrozenLakeParameters {
     fn default() -> Self {
         Self { time_limit: 100 }
     }
@@ -39,7 +39,7 @@ impl Default for Parameters {
 
 /// One way a step may turn out.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Outcome {
+pub struct LakeTransition {
     /// How likely it is.
     pub p: f64,
     /// The state after the step.
@@ -54,7 +54,7 @@ pub struct Outcome {
 /// (equation 4.1). A hole or the goal is never left: one outcome, without reward.
 ///
 /// Panics unless `state < STATES` and `action < ACTIONS`.
-pub fn transitions(state: usize, action: usize) -> impl Iterator<Item = Outcome> {
+pub fn transitions(state: usize, action: usize) -> impl Iterator<Item = LakeTransition> {
     assert!(action < ACTIONS, "action {action} of {ACTIONS}");
     let ways = if is_terminal(state) { 1 } else { 3 };
     (0..ways).map(move |slip| outcome(state, slipped(action, slip), 1.0 / f64::from(ways)))
@@ -66,9 +66,9 @@ fn slipped(action: usize, slip: u32) -> usize {
 }
 
 /// What comes of moving in `direction`, which happens with probability `p`.
-fn outcome(state: usize, direction: usize, p: f64) -> Outcome {
+fn outcome(state: usize, direction: usize, p: f64) -> LakeTransition {
     if is_terminal(state) {
-        return Outcome {
+        return LakeTransition {
             p,
             next: state,
             reward: 0.0,
@@ -76,7 +76,7 @@ fn outcome(state: usize, direction: usize, p: f64) -> Outcome {
         };
     }
     let next = neighbour(state, direction);
-    Outcome {
+    LakeTransition {
         p,
         next,
         reward: f64::from(u8::from(MAP[next] == b'G')),
@@ -103,13 +103,13 @@ fn neighbour(state: usize, direction: usize) -> usize {
 /// A walk over ice. Observation and action are indices; reward 1 at the goal, where it terminates, as in a hole.
 #[derive(Clone, Debug)]
 pub struct FrozenLake {
-    parameters: Parameters,
+    parameters: FrozenLakeParameters,
     state: usize,
 }
 
 impl FrozenLake {
     /// At the start.
-    pub fn new(parameters: Parameters) -> Result<Self, OutOfRange> {
+    pub fn new(parameters: FrozenLakeParameters) -> Result<Self, OutOfRange> {
         check_time_limit(parameters.time_limit)?;
         Ok(Self { parameters, state: 0 })
     }
@@ -148,7 +148,7 @@ impl Environment for FrozenLake {
 
     fn step(&mut self, action: &[f64], rng: &mut Stream) -> Step {
         let action = (action[0] as usize).min(ACTIONS - 1);
-        let Outcome {
+        let LakeTransition {
             next,
             reward,
             terminated,
@@ -184,7 +184,7 @@ mod tests {
     #[test]
     fn the_table_has_equation_4_1() {
         let third = 1.0 / 3.0;
-        let outcome = |next, terminated| Outcome {
+        let outcome = |next, terminated| LakeTransition {
             p: third,
             next,
             reward: 0.0,
@@ -201,7 +201,7 @@ mod tests {
 
     #[test]
     fn steps_follow_the_table() {
-        let mut lake = FrozenLake::new(Parameters::default()).unwrap();
+        let mut lake = FrozenLake::new(FrozenLakeParameters::default()).unwrap();
         let mut rng = stream(3, Purpose::Environment, 0, 0);
         let mut visits = [0; STATES];
         for _ in 0..3000 {
@@ -220,7 +220,7 @@ mod tests {
 
     #[test]
     fn only_fields_of_the_lake_are_states() {
-        let mut lake = FrozenLake::new(Parameters::default()).unwrap();
+        let mut lake = FrozenLake::new(FrozenLakeParameters::default()).unwrap();
         for state in [&[16.0][..], &[-1.0], &[0.5], &[f64::NAN], &[], &[1.0, 2.0]] {
             assert!(lake.reset_to(state).is_err(), "{state:?}");
         }

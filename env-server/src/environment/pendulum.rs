@@ -32,7 +32,7 @@ const MAX_TORQUE: f64 = 2.0;
 /// What can be set.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
-pub struct Parameters {
+pub struct PendulumParameters {
     /// Episodes start with |θ̇| up to this, in rad/s. The thesis's 2 by default; Gymnasium's own is 1.
     #[schemars(extend("unit" = "rad/s", "source" = "section 4.3"))]
     pub start_speed: f64,
@@ -41,7 +41,7 @@ pub struct Parameters {
     pub time_limit: u32,
 }
 
-impl Default for Parameters {
+impl Default for PendulumParameters {
     fn default() -> Self {
         Self {
             start_speed: 2.0,
@@ -53,7 +53,7 @@ impl Default for Parameters {
 /// A rod on a joint, swung by a torque τ; θ = 0 is upright. Observation (cos θ, sin θ, θ̇), action (τ), never terminates.
 #[derive(Clone, Debug)]
 pub struct Pendulum {
-    parameters: Parameters,
+    parameters: PendulumParameters,
     /// θ in rad, not wrapped, as in Gymnasium.
     theta: f64,
     /// θ̇ in rad/s.
@@ -62,7 +62,7 @@ pub struct Pendulum {
 
 impl Pendulum {
     /// Upright and at rest.
-    pub fn new(parameters: Parameters) -> Result<Self, OutOfRange> {
+    pub fn new(parameters: PendulumParameters) -> Result<Self, OutOfRange> {
         check("start_speed", parameters.start_speed, 0.0..=MAX_SPEED)?;
         check_time_limit(parameters.time_limit)?;
         Ok(Self {
@@ -153,7 +153,7 @@ mod tests {
     use shoal_base::stream::{Purpose, stream};
 
     fn at(theta: f64, theta_dot: f64) -> Pendulum {
-        let mut pendulum = Pendulum::new(Parameters::default()).unwrap();
+        let mut pendulum = Pendulum::new(PendulumParameters::default()).unwrap();
         pendulum.reset_to(&[theta, theta_dot]).unwrap();
         pendulum
     }
@@ -187,9 +187,9 @@ mod tests {
 
     #[test]
     fn starts_fill_their_range_and_no_more() {
-        let parameters = Parameters {
+        let parameters = PendulumParameters {
             start_speed: 0.5,
-            ..Parameters::default()
+            ..PendulumParameters::default()
         };
         let mut pendulum = Pendulum::new(parameters).unwrap();
         let mut rng = rng();

@@ -5,7 +5,7 @@ mod reward;
 
 use std::f64::consts::PI;
 
-pub use parameters::Parameters;
+pub use parameters::PointMassParameters;
 use rand::RngExt;
 pub use reward::{Motion, Reward};
 use shoal_base::{
@@ -30,7 +30,7 @@ pub const REACHED: f64 = 0.05;
 /// equation (5.8) with θ in rad and F_u in N, never terminates. Episodes start at rest.
 #[derive(Clone, Debug)]
 pub struct PointMass {
-    parameters: Parameters,
+    parameters: PointMassParameters,
     x: Axis,
     y: Axis,
     /// The action before, (θ, F_u); none on an episode's first step.
@@ -79,7 +79,7 @@ impl Axis {
 
 impl PointMass {
     /// At rest at the goal.
-    pub fn new(parameters: Parameters) -> Result<Self, OutOfRange> {
+    pub fn new(parameters: PointMassParameters) -> Result<Self, OutOfRange> {
         parameters.check()?;
         Ok(Self {
             parameters,
@@ -174,7 +174,7 @@ impl Environment for PointMass {
 
     fn step(&mut self, action: &[f64], _: &mut Stream) -> Step {
         let (theta, force) = (action[0].clamp(-PI, PI), action[1].clamp(0.0, MAX_FORCE));
-        let Parameters {
+        let PointMassParameters {
             mass: m,
             friction: mu,
             gravity: g,

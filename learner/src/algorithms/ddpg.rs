@@ -108,7 +108,7 @@ impl Ddpg {
     ///
     /// # Errors
     /// When the environment's actions are not real numbers in finite ranges.
-    pub fn new(spec: &EnvironmentSpec, settings: &config::Ddpg, seed: u64) -> Result<Self, PolicyError> {
+    pub fn new(spec: &EnvironmentSpec, settings: &config::DdpgConfig, seed: u64) -> Result<Self, PolicyError> {
         let range = ActionRange::new(&spec.action)?;
         let (observation, action, batch) = (spec.observation.width(), range.width(), settings.batch);
         let mu = NetworkLayout::policy(observation, settings.hidden_layers(), action);

@@ -72,7 +72,7 @@ impl Learned {
 /// The learner of REINFORCE.
 #[derive(Clone, Debug)]
 pub struct Reinforce {
-    settings: config::Reinforce,
+    settings: config::ReinforceConfig,
     policy: Learned,
     baseline: Option<Learned>,
     /// Rows learned from.
@@ -97,7 +97,7 @@ impl Reinforce {
     /// # Errors
     /// When it has real-valued actions or counted observations.
     pub fn new(
-        settings: &config::Reinforce,
+        settings: &config::ReinforceConfig,
         spec: &EnvironmentSpec,
         seed: u64,
         room: Room,
@@ -221,7 +221,7 @@ fn ln_sum_exp(logits: &[f32]) -> f32 {
     greatest + logits.iter().map(|logit| (logit - greatest).exp()).sum::<f32>().ln()
 }
 
-impl Method for &config::Reinforce {
+impl Method for &config::ReinforceConfig {
     fn start(&self, spec: &EnvironmentSpec, seed: u64, room: Room) -> Result<Box<dyn Algorithm>, PolicyError> {
         Ok(Box::new(Reinforce::new(self, spec, seed, room)?))
     }

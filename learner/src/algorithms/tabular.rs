@@ -20,11 +20,11 @@ pub enum Lead {
 
 /// Q-learning with these settings.
 #[derive(Debug)]
-pub struct QLearning<'a>(pub &'a config::Tabular);
+pub struct QLearning<'a>(pub &'a config::TabularConfig);
 
 /// SARSA with these settings.
 #[derive(Debug)]
-pub struct Sarsa<'a>(pub &'a config::Tabular);
+pub struct Sarsa<'a>(pub &'a config::TabularConfig);
 
 impl Method for QLearning<'_> {
     fn start(&self, spec: &EnvironmentSpec, _: u64, room: Room) -> Result<Box<dyn Algorithm>, PolicyError> {
@@ -55,7 +55,7 @@ impl Method for Sarsa<'_> {
 }
 
 /// The table, and a pending step for each environment.
-fn state_numbers(settings: &config::Tabular, spec: &EnvironmentSpec, room: Room) -> usize {
+fn state_numbers(settings: &config::TabularConfig, spec: &EnvironmentSpec, room: Room) -> usize {
     let tables = settings.learned(spec).into_iter();
     tables.map(|(_, shape)| shape.parameters()).sum::<usize>() + slots(room) * PENDING
 }
@@ -104,7 +104,7 @@ impl Tabular {
     /// When states or actions cannot be counted.
     pub fn new(
         lead: Lead,
-        settings: &config::Tabular,
+        settings: &config::TabularConfig,
         spec: &EnvironmentSpec,
         room: Room,
     ) -> Result<Self, PolicyError> {

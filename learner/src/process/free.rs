@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use shoal_common::exit::Exit;
 use shoal_common::report::Activity;
 
-use super::judging::Judging;
+use super::evaluation_wait::EvaluationWait;
 use super::learner::Learner;
 use super::ratio::Ratio;
 use super::settings::LearnerError;
@@ -49,7 +49,7 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
         } else if learner.has_all_rows() {
             learner.publish()?;
             learner.announce();
-            return Judging::new(learner)?.wait(learner, Some(LAST_EVALUATION));
+            return EvaluationWait::new(learner)?.wait(learner, Some(LAST_EVALUATION));
         } else {
             let activity = if learner.rows < ratio.warmup {
                 Activity::WaitingForPeer
@@ -57,7 +57,7 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
                 Activity::WaitingForRatio
             };
             if !drained {
-                learner.bell.wait(NAP)?;
+                learner.listener.wait(NAP)?;
             }
             learner.look_after(activity)?;
         }

@@ -1,7 +1,7 @@
 //! Takes the actors' chunks into the replay, each exactly once.
 
 use shoal_common::channel::transitions::{ChunkReceiver, ReceivedChunk};
-use shoal_common::channel::{ChannelError, Domain, Notifier, Place};
+use shoal_common::channel::{ChannelError, Domain, EventName, Notifier};
 use shoal_common::report::Role;
 use shoal_common::transition::ChunkLayout;
 
@@ -39,7 +39,7 @@ pub struct Intake {
 #[derive(Debug)]
 struct Source {
     receiver: ChunkReceiver,
-    bell: Notifier,
+    listener: Notifier,
 }
 
 impl Intake {
@@ -74,7 +74,7 @@ impl Intake {
         for actor in self.sources.len() as u32..actors {
             self.sources.push(Source {
                 receiver: ChunkReceiver::open(domain, actor, self.chunk, self.window)?,
-                bell: Notifier::new(domain, Place(Role::Actor, actor))?,
+                listener: Notifier::new(domain, EventName(Role::Actor, actor))?,
             });
         }
         Ok(())
@@ -124,13 +124,13 @@ impl Intake {
         let room = (self.limit - replay.head()).min(chunk.header().rows.into()) as usize * self.chunk.row.width();
         let appended = append(replay, actor, &chunk, room)?;
         drop(chunk);
-        source.bell.notify();
+        source.listener.notify();
         Ok(Some(appended))
     }
 
     /// Rings every actor's bell: there is a policy to go on with.
     pub fn ring_all(&self) {
-        self.sources.iter().for_each(|source| source.bell.notify());
+        self.sources.iter().for_each(|source| source.listener.notify());
     }
 }
 

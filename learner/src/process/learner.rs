@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use shoal_common::channel::policy::{PolicyHeader, PolicyPublisher};
 use shoal_common::channel::reports::{Reporter, Reports};
-use shoal_common::channel::{Domain, HeartbeatSender, Listener, Notifier, Place};
+use shoal_common::channel::{Domain, EventName, HeartbeatSender, Listener, Notifier};
 use shoal_common::config::Mode;
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::report::{Activity, Heartbeat, LearnerReport, Role};
@@ -14,7 +14,7 @@ use shoal_common::stop::Stop;
 
 use super::checkpoint::{Checkpoints, Counters};
 use super::intake::Intake;
-use super::settings::{LearnerError, Settings, replay_layout};
+use super::settings::{LearnerError, LearnerSettings, replay_layout};
 use crate::algorithms::algorithm::{Algorithm, SavedState};
 use crate::algorithms::registry;
 use crate::networks::threads::Threads;
@@ -34,12 +34,12 @@ const LAST_CHUNKS: Duration = Duration::from_secs(2);
 /// A learner at work.
 pub(crate) struct Learner<'a> {
     pub(crate) domain: &'a Domain,
-    pub(crate) settings: &'a Settings,
+    pub(crate) settings: &'a LearnerSettings,
     pub(crate) stop: &'a Stop,
-    pub(crate) bell: Listener,
+    pub(crate) listener: Listener,
     pub(crate) replay: Replay,
     pub(crate) intake: Intake,
-    pub(crate) pulse: HeartbeatSender,
+    pub(crate) heartbeat: HeartbeatSender,
     /// Rows that updates have been allowed by. In a free run, the replay's head; in lockstep, the rows of whole rounds.
     pub(crate) rows: u64,
     /// Episodes that end within them.
@@ -58,13 +58,13 @@ pub(crate) struct Learner<'a> {
 }
 
 impl<'a> Learner<'a> {
-    pub(crate) fn new(domain: &'a Domain, settings: &'a Settings, stop: &'a Stop) -> Result<Self, LearnerError> {
+    pub(crate) fn new(domain: &'a Domain, settings: &'a LearnerSettings, stop: &'a Stop) -> Result<Self, LearnerError> {
         let (config, run) = (&settings.config, &settings.run);
         let mut algorithm = registry::new(config)?;
         if config.learner.threads > 1 {
             algorithm.set_threads(Threads::two()?);
         }
-        let bell = Listener::bind(domain, Place(Role::Learner, 0))?;
+        let listener = Listener::bind(domain, EventName(Role::Learner, 0))?;
         let (layout, file) = (replay_layout(config), run.replay_file());
         let replay = if file.exists() {
             Replay::open(&file, &layout)?
@@ -98,10 +98,10 @@ impl<'a> Learner<'a> {
             }
         };
 
-        let mut pulse = HeartbeatSender::new(domain, settings.identity)?;
+        let mut heartbeat = HeartbeatSender::new(domain, settings.identity)?;
         let learner = Self {
             publisher: PolicyPublisher::open(domain, algorithm.policy().len())?,
-            evaluator: Notifier::new(domain, Place(Role::Evaluator, 0))?,
+            evaluator: Notifier::new(domain, EventName(Role::Evaluator, 0))?,
             intake: Intake::open(
                 domain,
                 config.actors.count,
@@ -121,11 +121,11 @@ impl<'a> Learner<'a> {
             domain,
             settings,
             stop,
-            bell,
+            listener,
             replay,
-            pulse: {
-                pulse.beat(Activity::WaitingForPeer);
-                pulse
+            heartbeat: {
+                heartbeat.beat(Activity::WaitingForPeer);
+                heartbeat
             },
             algorithm,
             checkpoints,
@@ -142,7 +142,7 @@ impl<'a> Learner<'a> {
     /// Learns what is due next, on the replay as it was at `self.rows` rows.
     pub(crate) fn update(&mut self) -> Result<(), LearnerError> {
         let before = self.updates();
-        self.pulse.begin_work();
+        self.heartbeat.begin_work();
         let losses = self.algorithm.update(&self.replay, self.rows);
         if !(losses.critic_loss.is_finite() && losses.actor_loss.is_finite()) {
             return Err(LearnerError::Diverged {
@@ -153,7 +153,7 @@ impl<'a> Learner<'a> {
         self.report.actor_loss += f64::from(losses.actor_loss);
         self.report.q_mean += f64::from(losses.q_mean);
         self.report.averaged += 1;
-        self.pulse.count(self.updates() - before);
+        self.heartbeat.count(self.updates() - before);
         Ok(())
     }
 
@@ -210,7 +210,7 @@ impl<'a> Learner<'a> {
             if self.intake.drain(&mut self.replay, u32::MAX, |_| false)? {
                 quiet = Instant::now();
             } else {
-                self.bell.wait(Duration::from_millis(10))?;
+                self.listener.wait(Duration::from_millis(10))?;
             }
         }
         self.count_rows(self.replay.head());
@@ -232,8 +232,8 @@ impl<'a> Learner<'a> {
 
     /// Reports, if it is time to.
     pub(crate) fn tell(&mut self, activity: Activity) {
-        self.pulse.set_policy_version(self.policy_version);
-        self.pulse.beat(activity);
+        self.heartbeat.set_policy_version(self.policy_version);
+        self.heartbeat.beat(activity);
         if self.reported.elapsed() >= REPORT_INTERVAL {
             self.send_report();
         }
@@ -306,7 +306,7 @@ impl<'a> Learner<'a> {
         }
         .write(&self.settings.run.last_policy())?;
         self.send_report();
-        self.pulse.beat_now(Activity::Done);
+        self.heartbeat.beat_now(Activity::Done);
         Ok(())
     }
 }

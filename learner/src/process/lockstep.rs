@@ -9,14 +9,14 @@ use shoal_common::channel::wait_for;
 use shoal_common::exit::Exit;
 use shoal_common::report::Activity;
 
+use super::evaluation_wait::EvaluationWait;
 use super::intake::IntakeError;
-use super::judging::Judging;
 use super::learner::Learner;
 use super::ratio::Ratio;
 use super::settings::LearnerError;
 
 pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
-    let mut judging = Judging::new(learner)?;
+    let mut evaluation_wait = EvaluationWait::new(learner)?;
     let config = &learner.settings.config;
     let (interval, ratio) = (config.checkpoint.every_updates, Ratio::from(&config.replay));
     let needed = learner.rows.saturating_sub(config.replay.capacity);
@@ -28,7 +28,7 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
         learner.save()?;
     }
     learner.announce();
-    judging.wait(learner, None)?;
+    evaluation_wait.wait(learner, None)?;
     while !learner.has_all_rows() {
         let (before, updates) = (learner.rows, learner.updates());
         let mut rows = before;
@@ -43,7 +43,7 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
         }
         learner.publish()?;
         learner.announce();
-        judging.wait(learner, None)?;
+        evaluation_wait.wait(learner, None)?;
         if learner.updates() / interval > updates / interval {
             learner.save()?;
         }
@@ -61,24 +61,24 @@ fn await_chunk(learner: &mut Learner<'_>, actor: usize, first: u64) -> Result<u6
             return Ok(end);
         }
         let Learner {
-            bell,
+            listener,
             stop,
             intake,
             replay,
             publisher,
-            pulse,
+            heartbeat,
             ..
         } = learner;
         // The inner result is what is wrong with the chunk, the outer one what is wrong with waiting for it.
         let taken = wait_for(
-            bell,
+            listener,
             stop,
             || match intake.take_from(actor, replay) {
                 Err(IntakeError::Channel(error)) => Err(error),
                 other => Ok(other.transpose()),
             },
             || {
-                pulse.beat(Activity::WaitingForPeer);
+                heartbeat.beat(Activity::WaitingForPeer);
                 publisher.look_after()
             },
         );

@@ -13,8 +13,8 @@ pub struct Ratio {
     pub tolerance: u64,
 }
 
-impl From<&config::Replay> for Ratio {
-    fn from(replay: &config::Replay) -> Self {
+impl From<&config::ReplayConfig> for Ratio {
+    fn from(replay: &config::ReplayConfig) -> Self {
         Self {
             warmup: replay.warmup,
             updates_per_step: replay.updates_per_step,

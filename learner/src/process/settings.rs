@@ -18,15 +18,15 @@ use crate::replay::{ReplayError, ReplayLayout};
 
 /// What a learner is told.
 #[derive(Clone, Debug)]
-pub struct Settings {
+pub struct LearnerSettings {
     /// Which process this is.
     pub identity: Identity,
     /// The run's configuration.
     pub config: Config,
     /// The run's directory, where the replay, the checkpoints and the last policy are.
     pub run: RunDir,
-    /// The period of the policy that was judged last.
-    pub judged: Option<u64>,
+    /// The period of the policy that was evaluated last.
+    pub evaluated_period: Option<u64>,
 }
 
 /// Why a learner cannot go on.

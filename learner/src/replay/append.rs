@@ -5,7 +5,7 @@ use std::sync::atomic::{Ordering, compiler_fence, fence};
 use shoal_common::commit::ChunkMark;
 
 use super::error::ChunkError;
-use super::step::{Step, observe};
+use super::step::{WriteStep, observe};
 use super::store::Replay;
 
 /// What became of a chunk.
@@ -104,7 +104,7 @@ impl<'a> Reserved<'a> {
         words.store(places.reach, head + rows);
         record.set_tail(record.tail().max((head + rows).saturating_sub(layout.ring)));
         compiler_fence(Ordering::SeqCst);
-        observe(hook, Step::ReachSet);
+        observe(hook, WriteStep::ReachSet);
         ring.put(head, numbers, |step| observe(hook, step));
         // The rows stand in the file before a record can name them: for the file's sake, no reader looks at rows.
         fence(Ordering::Release);

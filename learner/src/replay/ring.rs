@@ -8,7 +8,7 @@ use memmap2::{MmapMut, MmapOptions};
 use shoal_common::commit::{Places, ReplayLayout};
 
 use super::check;
-use super::step::Step;
+use super::step::WriteStep;
 
 /// The places of the ring. Row `index` stands in place `index` mod `ring`.
 pub(super) struct Ring {
@@ -57,14 +57,14 @@ impl Ring {
     }
 
     /// Writes rows `first ..`, at most a ring of them, and then their checks.
-    pub(super) fn put(&mut self, first: u64, numbers: &[f32], mut step: impl FnMut(Step)) {
+    pub(super) fn put(&mut self, first: u64, numbers: &[f32], mut step: impl FnMut(WriteStep)) {
         let (start, places, width) = (self.place(first), self.ring as usize, self.width);
         let (checks, rows) = self.parts();
         let (before, after) = numbers.split_at(numbers.len().min((places - start) * width));
         rows[start * width..][..before.len()].copy_from_slice(before);
-        step(Step::RowsBeforeWrap);
+        step(WriteStep::RowsBeforeWrap);
         rows[..after.len()].copy_from_slice(after);
-        step(Step::Rows);
+        step(WriteStep::Rows);
         let (before, after) = (before.chunks_exact(width), after.chunks_exact(width));
         let wrapped = first + before.len() as u64;
         for ((check, row), index) in checks[start..].iter_mut().zip(before).zip(first..) {
@@ -73,7 +73,7 @@ impl Ring {
         for ((check, row), index) in checks.iter_mut().zip(after).zip(wrapped..) {
             *check = check::of_row(index, row);
         }
-        step(Step::Checks);
+        step(WriteStep::Checks);
     }
 
     fn check(&self, index: u64) -> u32 {

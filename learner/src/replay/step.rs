@@ -2,7 +2,7 @@
 
 /// What the writer has just done to the file; for tests that stop it there.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub enum Step {
+pub enum WriteStep {
     /// The header says up to which row the ring is being written.
     ReachSet,
     /// The chunk's rows up to the ring's end are copied.
@@ -25,13 +25,13 @@ pub enum Step {
     SyncRecorded,
 }
 
-pub(super) type Hook = Box<dyn FnMut(Step) + Send>;
+pub(super) type Hook = Box<dyn FnMut(WriteStep) + Send>;
 
-pub(super) fn step_of_record(step: usize) -> Step {
-    [Step::SealBroken, Step::RecordWritten, Step::Sealed][step]
+pub(super) fn step_of_record(step: usize) -> WriteStep {
+    [WriteStep::SealBroken, WriteStep::RecordWritten, WriteStep::Sealed][step]
 }
 
-pub(super) fn observe(hook: &mut Option<Hook>, step: Step) {
+pub(super) fn observe(hook: &mut Option<Hook>, step: WriteStep) {
     if let Some(hook) = hook {
         hook(step);
     }

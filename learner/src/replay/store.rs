@@ -9,7 +9,7 @@ use shoal_common::commit::{ActorCommit, Places, Record, ReplayLayout, WritableWo
 
 use super::error::ReplayError;
 use super::ring::Ring;
-use super::step::{Hook, Step, observe, step_of_record};
+use super::step::{Hook, WriteStep, observe, step_of_record};
 use super::{file, recovery};
 
 /// The replay of a run. Holding one is the right to write the file: a second one is refused while it lives.
@@ -136,7 +136,7 @@ impl Replay {
     }
 
     /// Calls `hook` after each step of every later write. A seam for crash tests.
-    pub fn on_step(&mut self, hook: impl FnMut(Step) + Send + 'static) {
+    pub fn on_step(&mut self, hook: impl FnMut(WriteStep) + Send + 'static) {
         self.hook = Some(Box::new(hook));
     }
 
@@ -154,7 +154,7 @@ impl Replay {
         // A kill cannot come between two instructions in another order than the compiler gave them: keep it from
         // moving the next chunk's rows, plain stores, up over this one.
         compiler_fence(Ordering::SeqCst);
-        observe(hook, Step::Published);
+        observe(hook, WriteStep::Published);
     }
 }
 

@@ -10,7 +10,7 @@ use std::io;
 use shoal_common::commit::{Record, SYNCED};
 
 use super::error::ReplayError;
-use super::step::{Step, observe, step_of_record};
+use super::step::{WriteStep, observe, step_of_record};
 use super::store::Replay;
 
 /// The replay as it was at some moment, to be brought to the disk by any thread.
@@ -54,14 +54,14 @@ impl Replay {
             return;
         }
         let hook = &mut self.hook;
-        observe(hook, Step::RowsSynced);
+        observe(hook, WriteStep::RowsSynced);
         let slot = self.places.slots[self.next_synced];
         synced
             .record
             .store(&mut self.words, slot, |step| observe(hook, step_of_record(step)));
         self.synced_generation = synced.record.generation();
         self.next_synced = if self.next_synced == SYNCED { SYNCED + 1 } else { SYNCED };
-        observe(hook, Step::SyncRecorded);
+        observe(hook, WriteStep::SyncRecorded);
     }
 
     /// Brings all that is committed to the disk and waits: after this, a power loss leaves at least these rows (but for

@@ -6,12 +6,12 @@ use std::sync::{Arc, Mutex};
 
 use proptest::prelude::*;
 use shoal_common::commit::{CommitReader, OpenError};
-use shoal_learner::replay::{Appended, Replay, Step};
+use shoal_learner::replay::{Appended, Replay, WriteStep};
 
 use crate::model::{ACTORS, Directory, Model, WIDTH, chunk, filled, layout, mark, places, reopen};
 
 /// The file as it stood after each step.
-type Images = Vec<(Step, Vec<u8>)>;
+type Images = Vec<(WriteStep, Vec<u8>)>;
 
 proptest! {
     #![proptest_config(ProptestConfig { cases: 24, failure_persistence: None, ..ProptestConfig::default() })]
@@ -43,8 +43,8 @@ proptest! {
 
             let mut committed = false;
             for (step, mut image) in images.lock().unwrap().drain(..) {
-                committed |= step == Step::Sealed;
-                if step == Step::ReachSet {
+                committed |= step == WriteStep::Sealed;
+                if step == WriteStep::ReachSet {
                     // Killed within the copy: any part of the places about to be written may be anything.
                     for index in before.head()..after.head() {
                         let place = places(ring).rows.start + (index % ring) as usize * 4 * WIDTH;
@@ -258,7 +258,7 @@ fn a_record_under_construction_has_no_seal() {
         let broken = word(&image, other) == 0;
         assert_eq!(
             broken,
-            matches!(step, Step::SealBroken | Step::RecordWritten),
+            matches!(step, WriteStep::SealBroken | WriteStep::RecordWritten),
             "after {step:?}"
         );
     }

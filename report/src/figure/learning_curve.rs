@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use plotters::style::text_anchor::HPos;
-use shoal_run::recorder::Evaluation;
+use shoal_run::recorder::EvaluationRecord;
 
 use super::canvas::{BLUE, px, save, text};
 use super::panel::{Axis, Look, Panel, Series, range_of};
@@ -11,8 +11,8 @@ use super::panel::{Axis, Look, Panel, Series, range_of};
 const SIZE: (u32, u32) = (860, 470);
 
 /// Draws the evaluations as they were, thin, and their moving average, thick.
-pub fn learning_curve(evaluations: &[Evaluation], path: &Path) -> anyhow::Result<()> {
-    let mut evaluations: Vec<&Evaluation> = evaluations.iter().collect();
+pub fn learning_curve(evaluations: &[EvaluationRecord], path: &Path) -> anyhow::Result<()> {
+    let mut evaluations: Vec<&EvaluationRecord> = evaluations.iter().collect();
     evaluations.sort_by_key(|evaluation| evaluation.env_steps);
     let last = evaluations
         .last()
@@ -114,17 +114,17 @@ mod tests {
 
     use super::*;
 
-    fn evaluations(count: u64) -> Vec<Evaluation> {
+    fn evaluations(count: u64) -> Vec<EvaluationRecord> {
         (0..count)
             .map(|i| {
                 let t = i as f64 / count as f64;
                 let noise = ((i * 7919 % 1009) as f64 / 1009.0 - 0.5) * 250.0;
                 let return_mean = -150.0 - 1300.0 * (1.0 - 1.0 / (1.0 + (-(t - 0.25) * 25.0).exp())) + noise;
-                Evaluation {
+                EvaluationRecord {
                     env_steps: i * 2_000,
                     return_mean,
                     episodes: 10,
-                    ..Evaluation::default()
+                    ..EvaluationRecord::default()
                 }
             })
             .collect()
@@ -179,7 +179,7 @@ mod tests {
             let directory = tempfile::tempdir().unwrap();
             let evaluations: Vec<_> = numbers
                 .into_iter()
-                .map(|(env_steps, return_mean)| Evaluation { env_steps, return_mean, ..Evaluation::default() })
+                .map(|(env_steps, return_mean)| EvaluationRecord { env_steps, return_mean, ..EvaluationRecord::default() })
                 .collect();
             learning_curve(&evaluations, &directory.path().join("curve.svg")).unwrap();
         }

@@ -1,7 +1,7 @@
 //! Runs beside each other: those of one environment in one picture, repetitions with their median and spread.
 
 use serde::Serialize;
-use shoal_run::recorder::Evaluation;
+use shoal_run::recorder::EvaluationRecord;
 
 use super::numbers::short;
 use super::run::Run;
@@ -76,8 +76,11 @@ pub(super) fn compare(runs: &[Run]) -> Vec<Comparison> {
             .collect();
         for (set, label) in comparison.sets.iter_mut().zip(labels) {
             set.label = label;
-            let curves = |x: fn(&Evaluation) -> f64| -> Vec<Vec<(f64, f64)>> {
-                set.runs.iter().map(|i| curve(&runs[*i].judged, x)).collect()
+            let curves = |x: fn(&EvaluationRecord) -> f64| -> Vec<Vec<(f64, f64)>> {
+                set.runs
+                    .iter()
+                    .map(|i| curve(&runs[*i].evaluation_records, x))
+                    .collect()
             };
             set.by_steps = spread(&curves(|row| row.env_steps as f64));
             set.by_time = spread(&curves(|row| row.wall_seconds));
@@ -107,7 +110,7 @@ fn label(sets: &[Set], i: usize, runs: &[Run]) -> String {
 }
 
 /// (x, mean return) by increasing x.
-fn curve(rows: &[Evaluation], x: fn(&Evaluation) -> f64) -> Vec<(f64, f64)> {
+fn curve(rows: &[EvaluationRecord], x: fn(&EvaluationRecord) -> f64) -> Vec<(f64, f64)> {
     let points = rows.iter().map(|row| (x(row), row.return_mean));
     let mut curve: Vec<_> = points.filter(|(x, y)| x.is_finite() && y.is_finite()).collect();
     curve.sort_by(|a, b| a.0.total_cmp(&b.0));
@@ -186,7 +189,7 @@ mod tests {
             (10.0, 55.0, 100.0)
         );
         assert_eq!(super::spread(std::slice::from_ref(&long)), None);
-        assert_eq!(super::spread(&[long, vec![]]), None, "a run that was never judged");
+        assert_eq!(super::spread(&[long, vec![]]), None, "a run that was never evaluated");
         assert_eq!(super::spread(&[late, vec![(300.0, 1.0), (400.0, 1.0)]]), None);
     }
 

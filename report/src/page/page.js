@@ -33,7 +33,7 @@ function table(label, rows) {
 }
 
 function glance() {
-  const judged = (of) => (of ? `${text(of.mean)} ± ${text(of.std)} (${plural(of.episodes, "episode")}, step ${whole(of.env_steps)})` : "not judged yet");
+  const evaluated = (of) => (of ? `${text(of.mean)} ± ${text(of.std)} (${plural(of.episodes, "episode")}, step ${whole(of.env_steps)})` : "not evaluated yet");
   const states = { training: "being trained", finished: "finished", unfinished: "not finished" };
   const planned = (run) => `${whole(run.env_steps)} of ${whole(run.planned_steps)}`;
   const episodes = (run) => (run.planned_episodes === null ? whole(run.episodes) : `${whole(run.episodes)} of ${whole(run.planned_episodes)}`);
@@ -47,8 +47,8 @@ function glance() {
     ["episodes", episodes],
     ["updates", (run) => whole(run.updates)],
     ["time", (run) => duration(run.wall_seconds)],
-    ["best return", (run) => judged(run.best)],
-    ["last return", (run) => judged(run.last)],
+    ["best return", (run) => evaluated(run.best)],
+    ["last return", (run) => evaluated(run.last)],
     ["processes", incidents],
   ];
   section(

@@ -59,7 +59,7 @@ impl Played {
         let which = match (run.best_policy().exists(), run.last_policy().exists()) {
             (true, _) => WhichPolicy::Best,
             (false, true) => WhichPolicy::Last,
-            (false, false) => return why_not("No policy has been judged yet.".into()),
+            (false, false) => return why_not("No policy has been evaluated yet.".into()),
         };
         Self::try_of(run, config, which, episodes)
             .unwrap_or_else(|error| why_not(format!("This cannot be played: {error:#}.")))

@@ -3,9 +3,10 @@
 use serde::Serialize;
 use shoal_common::config::{Config, Mode};
 use shoal_common::run_dir::RunDir;
-use shoal_run::outcome::{self, Outcome};
+use shoal_run::outcome::{RunOutcome, RunState};
 use shoal_run::recorder::{
-    Episode, Evaluation, IncidentRow, Learner, read_episodes, read_evaluations, read_incidents, read_learner,
+    EpisodeRecord, EvaluationRecord, IncidentRow, LearnerRecord, read_episodes, read_evaluations, read_incidents,
+    read_learner,
 };
 
 use super::Room;
@@ -25,7 +26,7 @@ pub(super) struct Run {
     pub(super) algorithm: &'static str,
     seed: u64,
     mode: Mode,
-    state: State,
+    state: PageState,
     pub(super) settings: Vec<Setting>,
     env_steps: u64,
     planned_steps: u64,
@@ -34,8 +35,8 @@ pub(super) struct Run {
     updates: u64,
     wall_seconds: f64,
     updates_per_step: f64,
-    best: Option<Judged>,
-    last: Option<Judged>,
+    best: Option<EvaluatedPolicy>,
+    last: Option<EvaluatedPolicy>,
     evaluations: Curve,
     exploration: Curve,
     learner: Rates,
@@ -43,12 +44,12 @@ pub(super) struct Run {
     pub(super) played: Played,
     /// All of them, for medians.
     #[serde(skip)]
-    pub(super) judged: Vec<Evaluation>,
+    pub(super) evaluation_records: Vec<EvaluationRecord>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
-enum State {
+enum PageState {
     Training,
     Finished,
     Unfinished,
@@ -56,7 +57,7 @@ enum State {
 
 /// An evaluation.
 #[derive(Clone, Copy, Debug, Serialize)]
-struct Judged {
+struct EvaluatedPolicy {
     env_steps: u64,
     mean: f64,
     std: f64,
@@ -107,12 +108,12 @@ impl Run {
         let config = configuration(run)?;
         // Asked first: what a run that ends meanwhile writes last is read below.
         let goes_on = run.goes_on()?;
-        let judged = read_evaluations(&run.evaluations())?;
+        let evaluation_records = read_evaluations(&run.evaluations())?;
         let learner = read_learner(&run.learner_log())?;
         let explored = read_episodes(&run.episodes())?;
         let now = learner.last().cloned().unwrap_or_default();
         let all_steps = config.run.has_all_steps(now.env_steps, now.episodes);
-        let outcome = Outcome::read(run)?.is_none_or(|outcome| outcome.state == outcome::State::Finished);
+        let outcome = RunOutcome::read(run)?.is_none_or(|outcome| outcome.state == RunState::Finished);
         let through = all_steps && outcome;
         Ok(Self {
             name,
@@ -121,9 +122,9 @@ impl Run {
             seed: config.run.seed,
             mode: config.run.mode,
             state: match (goes_on, through) {
-                (true, _) => State::Training,
-                (false, true) => State::Finished,
-                (false, false) => State::Unfinished,
+                (true, _) => PageState::Training,
+                (false, true) => PageState::Finished,
+                (false, false) => PageState::Unfinished,
             },
             settings: settings::of(&config)?,
             env_steps: now.env_steps,
@@ -134,20 +135,24 @@ impl Run {
             updates: now.updates,
             wall_seconds: short(now.wall_seconds),
             updates_per_step: config.replay.updates_per_step,
-            best: judged.iter().rev().find(|row| row.best == 1).map(Judged::of),
-            last: judged.last().map(Judged::of),
-            evaluations: Curve::of_evaluations(&judged, room.points),
+            best: evaluation_records
+                .iter()
+                .rev()
+                .find(|row| row.best == 1)
+                .map(EvaluatedPolicy::of),
+            last: evaluation_records.last().map(EvaluatedPolicy::of),
+            evaluations: Curve::of_evaluations(&evaluation_records, room.points),
             exploration: Curve::of_episodes(&explored, room.points),
             learner: Rates::of(learner, room.points),
             incidents: read_incidents(&run.incidents())?.map(Incidents::of),
             played: Played::of(run, &config, room.episodes),
-            judged,
+            evaluation_records,
         })
     }
 }
 
-impl Judged {
-    fn of(row: &Evaluation) -> Self {
+impl EvaluatedPolicy {
+    fn of(row: &EvaluationRecord) -> Self {
         Self {
             env_steps: row.env_steps,
             mean: short(row.return_mean),
@@ -158,9 +163,9 @@ impl Judged {
 }
 
 impl Curve {
-    fn of_evaluations(rows: &[Evaluation], points: usize) -> Self {
+    fn of_evaluations(rows: &[EvaluationRecord], points: usize) -> Self {
         let means: Vec<f64> = rows.iter().map(|row| row.return_mean).collect();
-        let shown: Vec<&Evaluation> = telling(&means, points).into_iter().map(|i| &rows[i]).collect();
+        let shown: Vec<&EvaluationRecord> = telling(&means, points).into_iter().map(|i| &rows[i]).collect();
         Self {
             steps: shown.iter().map(|row| row.env_steps).collect(),
             time: shown.iter().map(|row| short(row.wall_seconds)).collect(),
@@ -171,9 +176,9 @@ impl Curve {
     }
 
     /// Means over episodes that ended one after the other.
-    fn of_episodes(rows: &[Episode], points: usize) -> Self {
-        let shown: Vec<&[Episode]> = parts(rows.len(), points).map(|part| &rows[part]).collect();
-        let last = |part: &&[Episode]| part.last().cloned().unwrap_or_default();
+    fn of_episodes(rows: &[EpisodeRecord], points: usize) -> Self {
+        let shown: Vec<&[EpisodeRecord]> = parts(rows.len(), points).map(|part| &rows[part]).collect();
+        let last = |part: &&[EpisodeRecord]| part.last().cloned().unwrap_or_default();
         Self {
             steps: shown.iter().map(|part| last(part).env_steps).collect(),
             time: shown.iter().map(|part| short(last(part).wall_seconds)).collect(),
@@ -188,15 +193,15 @@ impl Curve {
 }
 
 impl Rates {
-    fn of(mut rows: Vec<Learner>, points: usize) -> Self {
-        let hasty = |pair: &[Learner]| pair[1].wall_seconds - pair[0].wall_seconds < SPAN;
+    fn of(mut rows: Vec<LearnerRecord>, points: usize) -> Self {
+        let hasty = |pair: &[LearnerRecord]| pair[1].wall_seconds - pair[0].wall_seconds < SPAN;
         let hasty: Vec<usize> = (1..rows.len()).filter(|i| hasty(&rows[i - 1..=*i])).collect();
         for i in hasty {
             (rows[i].env_steps_per_second, rows[i].updates_per_second) = (None, None);
         }
-        let shown: Vec<&[Learner]> = parts(rows.len(), points).map(|part| &rows[part]).collect();
-        let last = |part: &&[Learner]| part.last().cloned().unwrap_or_default();
-        let column = |of: fn(&Learner) -> Option<f64>| -> Vec<f64> {
+        let shown: Vec<&[LearnerRecord]> = parts(rows.len(), points).map(|part| &rows[part]).collect();
+        let last = |part: &&[LearnerRecord]| part.last().cloned().unwrap_or_default();
+        let column = |of: fn(&LearnerRecord) -> Option<f64>| -> Vec<f64> {
             shown.iter().map(|part| mean(part.iter().filter_map(of))).collect()
         };
         Self {

@@ -91,7 +91,7 @@ fn what_cannot_be_played_is_said_in_a_sentence_and_the_rest_is_shown() {
     let reasons = report.not_played();
     assert_eq!(reasons.len(), 3);
     for ((reason, runs), (name, part)) in reasons.iter().zip([
-        ("begun", "No policy has been judged yet."),
+        ("begun", "No policy has been evaluated yet."),
         ("damaged", "best.policy"),
         ("served", "cannot start the environment server no-such-program"),
     ]) {

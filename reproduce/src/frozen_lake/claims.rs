@@ -210,13 +210,13 @@ fn on_policy(good: &[SeedResult<Tests>], sarsa: &[SeedResult<Tests>], q_star: &V
 #[cfg(test)]
 mod tests {
     use super::super::super::result::tests::result;
-    use super::super::{EXPERIMENTS, Judged};
+    use super::super::{EXPERIMENTS, EvaluatedPolicy};
     use super::*;
     use shoal_run::analysis::lake;
 
     /// A seed that has learned so much of the goal by this episode, and ends with these action-values.
     fn seed(number: u64, rises: &[(u64, f64)], q: &Values) -> SeedResult<Tests> {
-        let judged = rises.iter().map(|(episodes, reached)| Judged {
+        let evaluated = rises.iter().map(|(episodes, reached)| EvaluatedPolicy {
             episodes: *episodes,
             exact: Walk {
                 reached: *reached,
@@ -225,7 +225,7 @@ mod tests {
         });
         let tests = Tests {
             q: q.iter().flatten().map(|q| *q as f32).collect(),
-            judged: judged.collect(),
+            evaluated: evaluated.collect(),
         };
         result(&EXPERIMENTS[0], number, 0.7, tests)
     }

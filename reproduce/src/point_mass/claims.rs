@@ -278,7 +278,7 @@ pub(super) fn of_longer(before: &[Seed], after: &[Seed]) -> Vec<Claim> {
     let value = |before: &Seed, after: &Seed, number: Number| {
         (near_mean(before, number), mean(near(&after.tests.last), number))
     };
-    let judge = |thesis, criterion, what: &str, number: Number, decimals, holds: fn(f64, f64) -> bool| Claim {
+    let check = |thesis, criterion, what: &str, number: Number, decimals, holds: fn(f64, f64) -> bool| Claim {
         thesis,
         criterion,
         ours: format!(
@@ -293,7 +293,7 @@ pub(super) fn of_longer(before: &[Seed], after: &[Seed]) -> Vec<Claim> {
             .collect(),
     };
     vec![
-        judge(
+        check(
             "With additional training the agent has learned to reduce the position error",
             "the last policy of the additional training ends nearer to the goal than the best one of the first training",
             "distance at the end in m",
@@ -301,7 +301,7 @@ pub(super) fn of_longer(before: &[Seed], after: &[Seed]) -> Vec<Claim> {
             3,
             |before, after| after < before,
         ),
-        judge(
+        check(
             "… but it no longer understands how to reduce the derivative of the input",
             "the last policy of the additional training turns more than the best one of the first training",
             "turning in rad",

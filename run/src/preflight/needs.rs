@@ -2,7 +2,7 @@
 
 use shoal_common::channel::{Listener, control, environment, policy, reports, transitions};
 use shoal_common::config::Config;
-use shoal_common::report::{EpisodeReport, EvaluationReport, Heartbeat, JudgedReport, LearnerReport};
+use shoal_common::report::{EpisodeReport, EvaluatedReport, EvaluationReport, Heartbeat, LearnerReport};
 use shoal_common::run_dir::RunDir;
 use shoal_learner::process::{self, SizeError};
 
@@ -34,7 +34,7 @@ pub(super) fn shared_memory(config: &Config) -> u64 {
         + reports::reserved::<Heartbeat>(max, roles)
         + reports::reserved::<EpisodeReport>(max, max)
         + reports::reserved::<EvaluationReport>(max, 1)
-        + reports::reserved::<JudgedReport>(max, 1)
+        + reports::reserved::<EvaluatedReport>(max, 1)
         + reports::reserved::<LearnerReport>(max, 1)
         // One for each role, and the launcher's.
         + (roles as u64 + 1) * Listener::reserved(max)

@@ -172,7 +172,7 @@ fn a_restarted_learner_has_no_rate_rather_than_a_wrong_one() {
     let mut recorder = Recorder::open(&run, 0).unwrap();
     recorder.learner(&learner(2_000, 500, 1), seconds(1.0)).unwrap();
     recorder.learner(&learner(2_500, 400, 1), seconds(2.0)).unwrap();
-    let rows: Vec<Learner> = table::rows(&run.learner_log()).unwrap();
+    let rows: Vec<LearnerRecord> = table::rows(&run.learner_log()).unwrap();
     assert_eq!(
         (rows[1].updates_per_second, rows[1].env_steps_per_second),
         (None, Some(500.0))
@@ -208,7 +208,7 @@ fn a_foreign_file_and_a_full_disk_are_errors_in_one_line() {
     let full = std::fs::OpenOptions::new().write(true).open("/dev/full").unwrap();
     let mut full = Table::onto(Path::new("/dev/full"), full, 0);
     let error = full
-        .write(&Evaluation::default())
+        .write(&EvaluationRecord::default())
         .and_then(|()| full.flush())
         .unwrap_err();
     assert!(
@@ -252,7 +252,7 @@ proptest! {
             prop_assert!(!error.to_string().contains('\n'), "{}", error);
         }
         prop_assert_eq!(&std::fs::read(run.evaluations()).unwrap(), &bytes);
-        let opened = Table::open::<Evaluation>(&run.evaluations());
+        let opened = Table::open::<EvaluationRecord>(&run.evaluations());
         let after = std::fs::read(run.evaluations()).unwrap();
         match opened {
             Ok(_) => {

@@ -16,9 +16,9 @@ use shoal_base::stop::Stop;
 
 use super::message::{Ask, Block, RequestHeader, ResponseHeader, ResponseLayout, Verdict};
 use super::service::{EnvironmentService, name, question_length, service};
-use crate::bell::{Listener, Notifier, Place, wait_for};
 use crate::domain::Domain;
 use crate::error::{ChannelError, PeerError};
+use crate::event::{EventName, Listener, Notifier, wait_for};
 use crate::service::{CLAIM_PATIENCE, Entry, claim};
 
 /// Which episodes a reset begins.
@@ -66,7 +66,7 @@ pub struct EnvironmentClient {
     episodes: Cell<Option<UniqueServerId>>,
     client: Client<ipc::Service, [f32], RequestHeader, [f32], ResponseHeader>,
     channel: String,
-    ringer: Notifier,
+    notifier: Notifier,
     layout: ResponseLayout,
     snapshot_words: usize,
     stop: Stop,
@@ -121,7 +121,7 @@ impl Observed {
 pub fn describe(
     domain: &Domain,
     index: u32,
-    bell: &Listener,
+    listener: &Listener,
     stop: Stop,
 ) -> Result<(EnvironmentSpec, usize), Exit<ChannelError>> {
     let unknown = Space::boxed(&[]);
@@ -131,7 +131,7 @@ pub fn describe(
         time_limit: 0,
         state_width: 0,
     };
-    EnvironmentClient::open(domain, index, &spec, 0, stop)?.describe(bell, || ())
+    EnvironmentClient::open(domain, index, &spec, 0, stop)?.describe(listener, || ())
 }
 
 impl EnvironmentClient {
@@ -159,13 +159,13 @@ impl EnvironmentClient {
                 .map_err(|cause| ChannelError::new(&channel, "ask", cause))?;
             Ok((service, client))
         })?;
-        let ringer = Notifier::new(domain, Place(Role::EnvServer, index))?;
+        let notifier = Notifier::new(domain, EventName(Role::EnvServer, index))?;
         Ok(Self {
             service,
             episodes: Cell::new(None),
             client,
             channel,
-            ringer,
+            notifier,
             layout: ResponseLayout::new(environments, spec.observation.width()),
             snapshot_words,
             stop,
@@ -178,10 +178,10 @@ impl EnvironmentClient {
     /// When interrupted.
     pub fn describe(
         &self,
-        bell: &Listener,
+        listener: &Listener,
         idle: impl FnMut(),
     ) -> Result<(EnvironmentSpec, usize), Exit<ChannelError>> {
-        let response = self.insist(bell, Ask::Describe, 0, &[], idle)?;
+        let response = self.insist(listener, Ask::Describe, 0, &[], idle)?;
         let (header, payload) = (response.user_header(), response.payload());
         let described = header.described(payload);
         described.ok_or_else(|| ChannelError::new(&self.channel, "describe", PeerError::ShortAnswer).into())
@@ -191,21 +191,26 @@ impl EnvironmentClient {
     ///
     /// # Errors
     /// When interrupted.
-    pub fn reset(&self, bell: &Listener, begin: Begin, idle: impl FnMut()) -> Result<Observed, Exit<ChannelError>> {
+    pub fn reset(&self, listener: &Listener, begin: Begin, idle: impl FnMut()) -> Result<Observed, Exit<ChannelError>> {
         let (ask, episode) = match begin {
             Begin::Next => (Ask::Reset, 0),
             Begin::Training(episode) => (Ask::ResetToTraining, episode),
             Begin::Evaluation(first) => (Ask::ResetToEvaluation, first),
         };
-        self.begun(self.insist(bell, ask, episode, &[], idle)?)
+        self.begun(self.insist(listener, ask, episode, &[], idle)?)
     }
 
     /// Every environment takes a step with its action.
     ///
     /// # Errors
     /// When interrupted, or the server refuses the actions or has forgotten its episodes.
-    pub fn step(&self, bell: &Listener, actions: &[f32], idle: impl FnMut()) -> Result<Stepped, Exit<ChannelError>> {
-        match self.ask_within_episodes(bell, Ask::Step, actions, idle)? {
+    pub fn step(
+        &self,
+        listener: &Listener,
+        actions: &[f32],
+        idle: impl FnMut(),
+    ) -> Result<Stepped, Exit<ChannelError>> {
+        match self.ask_within_episodes(listener, Ask::Step, actions, idle)? {
             Some(response) => Ok(Stepped::Taken(self.observed(response)?)),
             None => Ok(Stepped::Lost),
         }
@@ -215,8 +220,8 @@ impl EnvironmentClient {
     ///
     /// # Errors
     /// When interrupted, or the server refuses: its environments cannot say their state, or run evaluation episodes.
-    pub fn snapshot(&self, bell: &Listener, idle: impl FnMut()) -> Result<Snapshot, Exit<ChannelError>> {
-        let Some(response) = self.ask_within_episodes(bell, Ask::Snapshot, &[], idle)? else {
+    pub fn snapshot(&self, listener: &Listener, idle: impl FnMut()) -> Result<Snapshot, Exit<ChannelError>> {
+        let Some(response) = self.ask_within_episodes(listener, Ask::Snapshot, &[], idle)? else {
             return Ok(Snapshot::Lost);
         };
         let words = words_of(self.answered(&response)?);
@@ -231,7 +236,12 @@ impl EnvironmentClient {
     ///
     /// # Errors
     /// When interrupted, or the server refuses the words; it stays as it was then.
-    pub fn restore(&self, bell: &Listener, words: &[u64], idle: impl FnMut()) -> Result<Observed, Exit<ChannelError>> {
+    pub fn restore(
+        &self,
+        listener: &Listener,
+        words: &[u64],
+        idle: impl FnMut(),
+    ) -> Result<Observed, Exit<ChannelError>> {
         if words.len() != self.snapshot_words {
             let cause = PeerError::SnapshotLength {
                 found: words.len(),
@@ -239,7 +249,7 @@ impl EnvironmentClient {
             };
             return Err(ChannelError::new(&self.channel, "restore", cause).into());
         }
-        self.begun(self.insist(bell, Ask::Restore, 0, numbers_of(words), idle)?)
+        self.begun(self.insist(listener, Ask::Restore, 0, numbers_of(words), idle)?)
     }
 
     /// The first observations of new episodes, which the server that sent them runs from now on.
@@ -276,7 +286,7 @@ impl EnvironmentClient {
     /// Asks once: for requests about the episodes under way. `None` when the server that ran them is no more.
     fn ask_within_episodes(
         &self,
-        bell: &Listener,
+        listener: &Listener,
         ask: Ask,
         payload: &[f32],
         idle: impl FnMut(),
@@ -285,7 +295,7 @@ impl EnvironmentClient {
             return Ok(None);
         }
         let sent = self.send(ask, 0, payload)?;
-        let Some(response) = self.answer(bell, &sent, idle)? else {
+        let Some(response) = self.answer(listener, &sent, idle)? else {
             return Ok(None);
         };
         if response.user_header().verdict != Verdict::NotStarted as u32 {
@@ -300,7 +310,7 @@ impl EnvironmentClient {
     /// Asks until some server answers: for requests that may be asked twice.
     fn insist(
         &self,
-        bell: &Listener,
+        listener: &Listener,
         ask: Ask,
         episode: u64,
         payload: &[f32],
@@ -309,7 +319,7 @@ impl EnvironmentClient {
         let mut unreachable = None;
         loop {
             let sent = self.send(ask, episode, payload)?;
-            if let Some(response) = self.answer(bell, &sent, &mut idle)? {
+            if let Some(response) = self.answer(listener, &sent, &mut idle)? {
                 return Ok(response);
             }
             if sent.server.is_none() || sent.is_delivered() {
@@ -333,20 +343,20 @@ impl EnvironmentClient {
             .write_from_slice(payload)
             .send()
             .map_err(|cause| ChannelError::new(&self.channel, "ask", cause))?;
-        self.ringer.notify();
+        self.notifier.notify();
         Ok(Sent { pending, server })
     }
 
     /// Waits for the answer; `None` when the server that was asked is no more, or was not reached.
     fn answer(
         &self,
-        bell: &Listener,
+        listener: &Listener,
         sent: &Sent,
         mut idle: impl FnMut(),
     ) -> Result<Option<Answer>, Exit<ChannelError>> {
         let lost = Cell::new(false);
         let answer = wait_for(
-            bell,
+            listener,
             &self.stop,
             || match sent.pending.receive() {
                 Ok(Some(response)) => Ok(Some(Some(response))),

@@ -11,9 +11,9 @@ use shoal_base::stop::Stop;
 
 use super::message::{Ask, RequestHeader, ResponseHeader, ResponseLayout, StepBlocks, Verdict};
 use super::service::{LOANED_RESPONSES, answer_length, name, service};
-use crate::bell::{Listener, Notifier, Place, wait_for};
 use crate::domain::Domain;
 use crate::error::ChannelError;
+use crate::event::{EventName, Listener, Notifier, wait_for};
 use crate::service::{Entry, claim};
 
 /// The server's end.
@@ -21,8 +21,8 @@ use crate::service::{Entry, claim};
 pub struct EnvironmentPort {
     server: Server<ipc::Service, [f32], RequestHeader, [f32], ResponseHeader>,
     channel: String,
-    bell: Listener,
-    ringer: Notifier,
+    listener: Listener,
+    notifier: Notifier,
     layout: ResponseLayout,
     spec: EnvironmentSpec,
 }
@@ -44,7 +44,7 @@ impl EnvironmentPort {
         index: u32,
         spec: EnvironmentSpec,
         environments: usize,
-        client: Place,
+        client: EventName,
     ) -> Result<Self, ChannelError> {
         let channel = name(index);
         let layout = ResponseLayout::new(environments, spec.observation.width());
@@ -57,13 +57,13 @@ impl EnvironmentPort {
                 .create()
                 .map_err(|cause| ChannelError::new(&channel, "answer", cause))
         })?;
-        let bell = Listener::bind(domain, Place(Role::EnvServer, index))?;
-        let ringer = Notifier::new(domain, client)?;
+        let listener = Listener::bind(domain, EventName(Role::EnvServer, index))?;
+        let notifier = Notifier::new(domain, client)?;
         Ok(Self {
             server,
             channel,
-            bell,
-            ringer,
+            listener,
+            notifier,
             layout,
             spec,
         })
@@ -76,7 +76,7 @@ impl EnvironmentPort {
     pub fn next(&self, stop: &Stop, mut idle: impl FnMut()) -> Result<Request<'_>, Exit<ChannelError>> {
         loop {
             let request = wait_for(
-                &self.bell,
+                &self.listener,
                 stop,
                 || {
                     self.server
@@ -212,7 +212,7 @@ impl Request<'_> {
         response
             .send()
             .map_err(|cause| ChannelError::new(channel, "answer", cause))?;
-        self.port.ringer.notify();
+        self.port.notifier.notify();
         Ok(())
     }
 }

@@ -4,7 +4,7 @@
 use toml::{Table, Value};
 
 use super::sorted;
-use crate::algorithms::{Algorithm, Ddpg, Exploration, Reinforce, Tabular, Warmup, Weight};
+use crate::algorithms::{Algorithm, DdpgConfig, ExplorationConfig, ReinforceConfig, TabularConfig, Warmup, Weight};
 use crate::config::{Config, Mode};
 use shoal_policy::network::Activation;
 
@@ -32,8 +32,8 @@ pub(super) fn text(config: &Config) -> Option<String> {
     ))
 }
 
-fn ddpg(settings: &Ddpg) -> Option<String> {
-    let Ddpg {
+fn ddpg(settings: &DdpgConfig) -> Option<String> {
+    let DdpgConfig {
         hidden,
         activation,
         gamma,
@@ -41,7 +41,7 @@ fn ddpg(settings: &Ddpg) -> Option<String> {
         actor_learning_rate,
         critic_learning_rate,
         batch,
-        exploration: Exploration { theta, sigma, warmup },
+        exploration: ExplorationConfig { theta, sigma, warmup },
         ..
     } = settings;
     let (&[h1, h2], Activation::Relu) = (&**hidden, activation) else {
@@ -52,14 +52,14 @@ fn ddpg(settings: &Ddpg) -> Option<String> {
         Warmup::Uniform => "Uniform",
     };
     Some(format!(
-        "Ddpg {{ hidden: [{h1}, {h2}], gamma: {gamma:?}, tau: {tau:?}, actor_learning_rate: {actor_learning_rate:?}, \
+        "DdpgConfig {{ hidden: [{h1}, {h2}], gamma: {gamma:?}, tau: {tau:?}, actor_learning_rate: {actor_learning_rate:?}, \
          critic_learning_rate: {critic_learning_rate:?}, batch: {batch} }} \
-         Exploration {{ theta: {theta:?}, sigma: {sigma:?}, warmup: {warmup} }}"
+         ExplorationConfig {{ theta: {theta:?}, sigma: {sigma:?}, warmup: {warmup} }}"
     ))
 }
 
-fn reinforce(settings: &Reinforce) -> Option<String> {
-    let Reinforce {
+fn reinforce(settings: &ReinforceConfig) -> Option<String> {
+    let ReinforceConfig {
         hidden,
         activation,
         gamma,
@@ -80,14 +80,14 @@ fn reinforce(settings: &Reinforce) -> Option<String> {
         Weight::Baseline => "Baseline",
     };
     Some(format!(
-        "Reinforce(Reinforce {{ hidden: [{h1}, {h2}], gamma: {gamma:?}, learning_rate: {learning_rate:?}, \
+        "ReinforceConfig(ReinforceConfig {{ hidden: [{h1}, {h2}], gamma: {gamma:?}, learning_rate: {learning_rate:?}, \
          weight: {weight}, discount_steps: {discount_steps}, learn_at_limit: {learn_at_limit}, \
          baseline_hidden: [{b1}, {b2}], baseline_learning_rate: {baseline_learning_rate:?} }})"
     ))
 }
 
-fn tabular(settings: &Tabular) -> String {
-    let Tabular {
+fn tabular(settings: &TabularConfig) -> String {
+    let TabularConfig {
         gamma, alpha, epsilon, ..
     } = settings;
     format!("Tabular {{ gamma: {gamma:?}, alpha: {alpha:?}, epsilon: {epsilon:?} }}")

@@ -216,7 +216,7 @@ fn networks_that_there_were_not_have_no_unnumbered_text() {
 fn form_1_changes_with_what_rows_and_weights_depend_on_and_with_nothing_else() {
     let base = numbered(OLD[0].2);
     type Change = fn(&mut Config);
-    fn ddpg(config: &mut Config) -> &mut crate::algorithms::Ddpg {
+    fn ddpg(config: &mut Config) -> &mut crate::algorithms::DdpgConfig {
         let crate::algorithms::Algorithm::Ddpg(ddpg) = &mut config.algorithm else {
             panic!("the base is ddpg's");
         };

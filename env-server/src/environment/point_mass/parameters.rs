@@ -11,8 +11,8 @@ use super::{
 /// What can be set. In TOML, `reward` is `"r1"`, `"r2"` or `"r3"` and the reward's parameters stand beside it; those of
 /// another reward are refused.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(try_from = "Flat", into = "Flat")]
-pub struct Parameters {
+#[serde(try_from = "PointMassTable", into = "PointMassTable")]
+pub struct PointMassParameters {
     /// m in kg.
     pub mass: f64,
     /// Friction coefficient μ of equation (5.6).
@@ -29,7 +29,7 @@ pub struct Parameters {
     pub reward: Reward,
 }
 
-impl Parameters {
+impl PointMassParameters {
     /// Refuses what is out of range.
     pub(super) fn check(&self) -> Result<(), OutOfRange> {
         check("mass", self.mass, 1e-3..=1e3)?;
@@ -92,7 +92,7 @@ enum Name {
 /// The TOML form.
 #[derive(Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
-struct Flat {
+struct PointMassTable {
     /// m, the vehicle's mass.
     #[schemars(extend("unit" = "kg", "source" = "ours (docs/POINT_MASS.md)"))]
     mass: f64,
@@ -134,7 +134,7 @@ struct Flat {
     c_force: Option<f64>,
 }
 
-impl Default for Flat {
+impl Default for PointMassTable {
     /// The thesis prints neither m, μ nor F_s; these fit its figures.
     fn default() -> Self {
         Self {
@@ -155,10 +155,10 @@ impl Default for Flat {
     }
 }
 
-impl TryFrom<Flat> for Parameters {
+impl TryFrom<PointMassTable> for PointMassParameters {
     type Error = String;
 
-    fn try_from(mut flat: Flat) -> Result<Self, String> {
+    fn try_from(mut flat: PointMassTable) -> Result<Self, String> {
         let taken = |given: &mut Option<f64>, default| given.take().unwrap_or(default);
         let (name, reward) = match flat.reward {
             Name::R1 => (
@@ -200,7 +200,7 @@ impl TryFrom<Flat> for Parameters {
                 "`{key}` is no parameter of reward {name}: remove it, or set reward to {owner}"
             ));
         }
-        let Flat {
+        let PointMassTable {
             mass,
             friction,
             stiction_ratio,
@@ -221,9 +221,9 @@ impl TryFrom<Flat> for Parameters {
     }
 }
 
-impl From<Parameters> for Flat {
-    fn from(parameters: Parameters) -> Self {
-        let Parameters {
+impl From<PointMassParameters> for PointMassTable {
+    fn from(parameters: PointMassParameters) -> Self {
+        let PointMassParameters {
             mass,
             friction,
             stiction_ratio,
@@ -283,7 +283,7 @@ mod tests {
     use super::super::super::{make, resolve};
     use super::*;
 
-    fn parameters(text: &str) -> Parameters {
+    fn parameters(text: &str) -> PointMassParameters {
         toml::from_str(text).unwrap()
     }
 

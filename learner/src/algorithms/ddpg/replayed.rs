@@ -29,7 +29,12 @@ impl ReplayedDdpg {
     ///
     /// # Errors
     /// When DDPG cannot control an environment like `spec`.
-    pub fn new(spec: &EnvironmentSpec, settings: &config::Ddpg, seed: u64, capacity: u64) -> Result<Self, PolicyError> {
+    pub fn new(
+        spec: &EnvironmentSpec,
+        settings: &config::DdpgConfig,
+        seed: u64,
+        capacity: u64,
+    ) -> Result<Self, PolicyError> {
         let row = RowLayout::new(spec.observation.width(), spec.action.width());
         Ok(Self {
             ddpg: Ddpg::new(spec, settings, seed)?,
@@ -41,7 +46,7 @@ impl ReplayedDdpg {
     }
 }
 
-impl Method for &config::Ddpg {
+impl Method for &config::DdpgConfig {
     fn start(&self, spec: &EnvironmentSpec, seed: u64, room: Room) -> Result<Box<dyn Algorithm>, PolicyError> {
         Ok(Box::new(ReplayedDdpg::new(spec, self, seed, room.capacity)?))
     }

@@ -17,14 +17,14 @@ fn spec() -> EnvironmentSpec {
     }
 }
 
-fn settings() -> config::Ddpg {
-    config::Ddpg {
+fn settings() -> config::DdpgConfig {
+    config::DdpgConfig {
         tau: 0.01,
         actor_learning_rate: 1e-3,
         critic_learning_rate: 1e-2,
         hidden: [9, 7].into(),
         batch: BATCH,
-        ..config::Ddpg::default()
+        ..config::DdpgConfig::default()
     }
 }
 
@@ -46,7 +46,7 @@ fn learner(seed: u64) -> Ddpg {
 
 /// Output layers as large as the others, so that every gradient is well above rounding.
 fn learner_of(hidden: Hidden, seed: u64) -> Ddpg {
-    let settings = config::Ddpg {
+    let settings = config::DdpgConfig {
         hidden: hidden.layers,
         activation: hidden.activation,
         ..settings()
@@ -263,7 +263,7 @@ fn two_threads_compute_the_same_bits_as_one() {
         (Hidden::relu([3, 300, 300]), 64),
         (Hidden::tanh([64, 128, 129, 130, 131, 132, 133, 134]), 65),
     ] {
-        let settings = config::Ddpg {
+        let settings = config::DdpgConfig {
             hidden: hidden.layers,
             activation: hidden.activation,
             batch: size,

@@ -21,17 +21,17 @@ fn spec() -> EnvironmentSpec {
     }
 }
 
-fn settings(weight: Weight) -> config::Reinforce {
-    config::Reinforce {
+fn settings(weight: Weight) -> config::ReinforceConfig {
+    config::ReinforceConfig {
         hidden: [7, 5].into(),
         baseline_hidden: [6, 4].into(),
         weight,
-        ..config::Reinforce::default()
+        ..config::ReinforceConfig::default()
     }
 }
 
 /// Output layers as large as the others, so that every gradient is well above rounding.
-fn learner(settings: &config::Reinforce) -> Reinforce {
+fn learner(settings: &config::ReinforceConfig) -> Reinforce {
     let mut learner = Reinforce::new(settings, &spec(), 1, ROOM).unwrap();
     let mut numbers = stream(1, Purpose::Sampling, 0, 0);
     for network in std::iter::once(&mut learner.policy).chain(&mut learner.baseline) {
@@ -165,7 +165,7 @@ fn the_gradient_is_that_of_the_objective() {
         let both = lists.map(|list| [(list, Activation::Relu), (list, Activation::Tanh)]);
         both.concat().into_iter().map(move |hidden| (weight, hidden))
     }) {
-        let settings = config::Reinforce {
+        let settings = config::ReinforceConfig {
             discount_steps,
             hidden,
             activation,
@@ -221,7 +221,7 @@ fn the_baseline_is_taken_off_the_return_and_follows_it() {
 #[test]
 fn only_whole_episodes_are_learned_from_and_at_the_limit_only_where_that_is_wanted() {
     let (cut, over) = (Episode::random(1, 12, false), Episode::random(2, 5, true));
-    let mut skips = learner(&config::Reinforce {
+    let mut skips = learner(&config::ReinforceConfig {
         learn_at_limit: false,
         ..settings(Weight::Return)
     });

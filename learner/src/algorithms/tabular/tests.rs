@@ -19,9 +19,9 @@ fn lake(states: u32, actions: u32) -> EnvironmentSpec {
 }
 
 fn table(lead: Lead, alpha: f64) -> Tabular {
-    let settings = config::Tabular {
+    let settings = config::TabularConfig {
         alpha,
-        ..config::Tabular::default()
+        ..config::TabularConfig::default()
     };
     Tabular::new(lead, &settings, &lake(3, 2), ROOM).unwrap()
 }
@@ -110,7 +110,7 @@ fn real_numbers_are_no_states() {
         observation: Space::boxed(&[(-1.0, 1.0)]),
         ..lake(1, 2)
     };
-    let refused = Tabular::new(Lead::Taken, &config::Tabular::default(), &pendulum, ROOM);
+    let refused = Tabular::new(Lead::Taken, &config::TabularConfig::default(), &pendulum, ROOM);
     assert!(
         refused
             .unwrap_err()

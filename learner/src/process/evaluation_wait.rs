@@ -5,27 +5,27 @@ use std::time::{Duration, Instant};
 use shoal_common::channel::reports::Reports;
 use shoal_common::channel::{ChannelError, wait_for};
 use shoal_common::exit::Exit;
-use shoal_common::report::{Activity, JudgedReport};
+use shoal_common::report::{Activity, EvaluatedReport};
 
 use super::learner::Learner;
 use super::settings::LearnerError;
 
 /// What is known of the evaluator's work.
-pub(crate) struct Judging {
-    reports: Reports<JudgedReport>,
-    /// The period of the policy judged last.
-    judged: Option<u64>,
+pub(crate) struct EvaluationWait {
+    reports: Reports<EvaluatedReport>,
+    /// The period of the policy evaluated last.
+    evaluated_period: Option<u64>,
 }
 
-impl Judging {
+impl EvaluationWait {
     pub(crate) fn new(learner: &Learner<'_>) -> Result<Self, LearnerError> {
         Ok(Self {
             reports: Reports::open(learner.domain)?,
-            judged: learner.settings.judged,
+            evaluated_period: learner.settings.evaluated_period,
         })
     }
 
-    /// Waits until a policy of this period is judged, the one just published if none was before, but no longer than
+    /// Waits until a policy of this period is evaluated, the one just published if none was before, but no longer than
     /// `patience`. An evaluator that dies over it has a successor, which is given the same policy.
     pub(crate) fn wait(
         &mut self,
@@ -34,28 +34,28 @@ impl Judging {
     ) -> Result<(), Exit<LearnerError>> {
         let due = Some(learner.settings.config.evaluation.period(learner.rows));
         let Learner {
-            bell,
+            listener,
             stop,
             publisher,
-            pulse,
+            heartbeat,
             ..
         } = learner;
-        if self.judged >= due {
+        if self.evaluated_period >= due {
             return Ok(());
         }
         let begun = Instant::now();
         let waited = wait_for(
-            bell,
+            listener,
             stop,
             || -> Result<Option<()>, ChannelError> {
                 while let Some(report) = self.reports.receive()? {
-                    self.judged = self.judged.max(Some(report.period));
+                    self.evaluated_period = self.evaluated_period.max(Some(report.period));
                 }
                 let waited = patience.is_some_and(|patience| begun.elapsed() >= patience);
-                Ok((self.judged >= due || waited).then_some(()))
+                Ok((self.evaluated_period >= due || waited).then_some(()))
             },
             || {
-                pulse.beat(Activity::WaitingForPeer);
+                heartbeat.beat(Activity::WaitingForPeer);
                 publisher.look_after()
             },
         );

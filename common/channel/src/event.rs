@@ -39,12 +39,12 @@ const NAP: Duration = Duration::from_millis(50);
 
 /// Where a bell hangs: a role of the run, and which one of that role.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Place(pub Role, pub u32);
+pub struct EventName(pub Role, pub u32);
 
 /// The channel of the launcher's own bell, which is no role.
 const LAUNCHER: &str = "bell/launcher";
 
-impl fmt::Display for Place {
+impl fmt::Display for EventName {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "bell/{}/{}", self.0.name(), self.1)
     }
@@ -103,8 +103,8 @@ impl Listener {
     ///
     /// # Errors
     /// When shared memory cannot be had.
-    pub fn bind(domain: &Domain, place: Place) -> Result<Self, ChannelError> {
-        Self::on(domain, place.to_string())
+    pub fn bind(domain: &Domain, name: EventName) -> Result<Self, ChannelError> {
+        Self::on(domain, name.to_string())
     }
 
     /// Hangs the launcher's bell.
@@ -143,14 +143,14 @@ impl Listener {
             Ok(_) | Err(Errno::INTR) => {}
             Err(errno) => return Err(self.failed(io::Error::from(errno))),
         }
-        self.rang()
+        self.notified()
     }
 
     /// Whether there was a ring since this was asked last. It does not block.
-    pub(super) fn rang(&self) -> Result<bool, ChannelError> {
-        let mut rang = false;
-        match self.listener.try_wait(|_| rang = true) {
-            Ok(_) | Err(ListenerWaitError::InterruptSignal) => Ok(rang),
+    pub(super) fn notified(&self) -> Result<bool, ChannelError> {
+        let mut notified = false;
+        match self.listener.try_wait(|_| notified = true) {
+            Ok(_) | Err(ListenerWaitError::InterruptSignal) => Ok(notified),
             Err(cause) => Err(self.failed(cause)),
         }
     }
@@ -171,8 +171,8 @@ impl Notifier {
     ///
     /// # Errors
     /// When shared memory cannot be had.
-    pub fn new(domain: &Domain, place: Place) -> Result<Self, ChannelError> {
-        let channel = place.to_string();
+    pub fn new(domain: &Domain, name: EventName) -> Result<Self, ChannelError> {
+        let channel = name.to_string();
         claim(|| Self::on(domain, &channel))
     }
 
@@ -203,18 +203,18 @@ impl Notifier {
 /// # Errors
 /// [`Exit::Stopped`] once `stop` is requested, and whatever `poll` or `look_after` fail with.
 pub fn wait_for<T>(
-    bell: &Listener,
+    listener: &Listener,
     stop: &Stop,
     mut poll: impl FnMut() -> Result<Option<T>, ChannelError>,
     mut look_after: impl FnMut() -> Result<(), ChannelError>,
 ) -> Result<T, Exit<ChannelError>> {
     // The clock is not read for an answer that comes while it polls.
     let mut looked_after = None;
-    let most = bell.polling.polls();
+    let most = listener.polling.polls();
     loop {
         for polls in 0..most {
             if let Some(found) = poll()? {
-                bell.polling.learn(looked_after.is_some(), polls);
+                listener.polling.learn(looked_after.is_some(), polls);
                 return Ok(found);
             }
             std::hint::spin_loop();
@@ -223,7 +223,7 @@ pub fn wait_for<T>(
             return Err(Exit::Stopped);
         }
         let since = looked_after.get_or_insert_with(Instant::now);
-        bell.wait(NAP)?;
+        listener.wait(NAP)?;
         // By the clock: rings that bring nothing must not keep it from its connections.
         if since.elapsed() >= NAP {
             *since = Instant::now();
@@ -233,8 +233,8 @@ pub fn wait_for<T>(
 }
 
 /// Makes the service of the bell at `place`.
-pub(super) fn create(domain: &Domain, place: Place) -> Result<Held, ChannelError> {
-    create_on(domain, &place.to_string())
+pub(super) fn create(domain: &Domain, name: EventName) -> Result<Held, ChannelError> {
+    create_on(domain, &name.to_string())
 }
 
 /// Makes the service of the launcher's bell.
