@@ -8,7 +8,7 @@ mod exploration;
 mod reinforce;
 mod tabular;
 
-pub use algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Shape};
+pub use algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Learned, Shape};
 pub use behaviour::Behaviour;
 pub use ddpg::DdpgConfig;
 pub use exploration::{ExplorationConfig, Warmup};
@@ -190,8 +190,8 @@ mod tests {
                 .iter()
                 .find_map(|spec| Some((spec, algorithm.policy_layout(spec).ok()?)));
             let (spec, layout) = fits.unwrap();
-            let first = algorithm.settings().learned(spec)[0].1;
-            assert_eq!(first.parameters(), layout.parameters(), "{}", algorithm.name());
+            let (_, policy) = algorithm.settings().learned(spec).policy;
+            assert_eq!(policy.parameters(), layout.parameters(), "{}", algorithm.name());
         }
     }
 }

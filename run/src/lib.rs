@@ -10,6 +10,7 @@ pub mod outcome;
 pub mod plan;
 pub mod preflight;
 pub mod process;
+pub mod rate;
 pub mod recorder;
 pub mod remote;
 pub mod rollout;

@@ -15,6 +15,7 @@ pub use table::RecordError;
 use table::Table;
 
 use self::tensorboard::EventFile;
+use crate::rate::{per_second, updates_per_step};
 
 /// What a `kill -9` of the launcher may cost.
 const UNWRITTEN: Duration = Duration::from_millis(500);
@@ -204,12 +205,8 @@ impl Recorder {
         let averaged = |mean: f64| (report.averaged > 0).then_some(mean);
         let rate = |count: fn(&LearnerReport) -> u64| {
             let (before, previous) = self.previous.as_ref()?;
-            let seconds = wall.checked_sub(*before)?.as_secs_f64();
-            // A restarted learner begins again at its checkpoint.
-            let done = count(report).checked_sub(count(previous))?;
-            (seconds > 0.0).then_some(done as f64 / seconds)
+            per_second((*before, count(previous)), (wall, count(report)))
         };
-        let explored = report.env_steps.saturating_sub(self.warmup);
         let row = LearnerRecord {
             wall_seconds: self.seconds(wall),
             env_steps: report.env_steps,
@@ -221,7 +218,7 @@ impl Recorder {
             q_mean: averaged(report.q_mean),
             updates_per_second: rate(|report| report.updates),
             env_steps_per_second: rate(|report| report.env_steps),
-            ratio: (explored > 0).then(|| report.updates as f64 / explored as f64),
+            ratio: updates_per_step(report.updates, report.env_steps, self.warmup),
         };
         self.env_steps = report.env_steps;
         self.previous = Some((wall, *report));

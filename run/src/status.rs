@@ -9,6 +9,7 @@ use shoal_learner::process::checkpoint::Checkpoints;
 use shoal_learner::process::ratio::Ratio;
 
 use crate::outcome::{RunOutcome, RunState};
+use crate::rate::updates_per_step;
 use crate::recorder::read_evaluations;
 
 /// How a run stands that nobody works on: what a learner would go on from.
@@ -32,7 +33,7 @@ pub fn at_rest(config: &Config, run: &RunDir) -> anyhow::Result<RunStatus> {
             .map(|last| last.return_mean),
         ..Default::default()
     };
-    status.ratio = ratio(&status, config.replay.warmup);
+    status.ratio = updates_per_step(status.updates, status.env_steps, config.replay.warmup).unwrap_or(0.0);
     status.finished = is_finished(config, run, &status)?;
     Ok(status)
 }
@@ -70,12 +71,4 @@ pub fn evaluated_period(config: &Config, run: &RunDir) -> anyhow::Result<Option<
     let steps = state.last().map(|last| last.env_steps);
     let steps = steps.into_iter().chain(recorded.iter().map(|row| row.env_steps)).max();
     Ok(steps.map(|steps| config.evaluation.period(steps)))
-}
-
-/// Updates for each environment step beyond the warm-up.
-pub fn ratio(status: &RunStatus, warmup: u64) -> f64 {
-    match status.env_steps.saturating_sub(warmup) {
-        0 => 0.0,
-        beyond => status.updates as f64 / beyond as f64,
-    }
 }

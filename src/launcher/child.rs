@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 
 use shoal_common::channel::control::{RoleState, RoleStatus};
 use shoal_common::report::{Activity, Heartbeat, Identity, Role};
+use shoal_run::rate::per_second;
 use signal_hook::consts::{SIGABRT, SIGBUS, SIGFPE, SIGILL, SIGSEGV};
 
 use super::process::Process;
@@ -159,8 +160,8 @@ impl Child {
         }
         let (then, steps) = self.span;
         if first || now - then >= SPAN {
-            let made = heartbeat.steps.saturating_sub(steps) as f64;
-            self.rate = if first { 0.0 } else { made / (now - then).as_secs_f64() };
+            let rate = per_second((Duration::ZERO, steps), (now - then, heartbeat.steps));
+            self.rate = if first { 0.0 } else { rate.unwrap_or(0.0) };
             self.span = (now, heartbeat.steps);
         }
         let took = first.then(|| now - self.begun)?;

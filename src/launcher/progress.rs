@@ -7,6 +7,7 @@ use shoal_common::config::Config;
 use shoal_common::report::{EvaluationReport, LearnerReport};
 use shoal_common::run_dir::RunDir;
 use shoal_run::numbers::thousands;
+use shoal_run::rate::{per_second, updates_per_step};
 
 use super::requests::waiting;
 use super::supervisor::Supervisor;
@@ -122,12 +123,7 @@ impl Progress {
             Some((rate, env_steps)) => pace.push(format!("{updates} updates, {rate:.0}/s · {env_steps:.0} steps/s")),
             None => pace.push(format!("{updates} updates")),
         }
-        let beyond = learner.env_steps.saturating_sub(self.warmup);
-        let ratio = if beyond > 0 {
-            learner.updates as f64 / beyond as f64
-        } else {
-            0.0
-        };
+        let ratio = updates_per_step(learner.updates, learner.env_steps, self.warmup).unwrap_or(0.0);
         let waits = waiting(supervisor).map(|who| format!(", {who}")).unwrap_or_default();
         let ratio = format!("ratio {ratio:.2} of {:.2}{waits}", self.updates_per_step);
         let mut lines = vec![way.join(" · "), pace.join(" · "), ratio];
@@ -159,7 +155,6 @@ impl Progress {
             return None;
         }
         let ((then, old), (now, new)) = (self.recent.front()?, self.recent.back()?);
-        let seconds = (*now - *then).as_secs_f64();
-        (seconds > 0.0).then(|| count(new).saturating_sub(count(old)) as f64 / seconds)
+        per_second((*then, count(old)), (*now, count(new)))
     }
 }

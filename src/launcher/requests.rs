@@ -5,6 +5,7 @@ use shoal_common::commit::OpenError;
 use shoal_common::config::{Config, Mode};
 use shoal_common::report::{Activity, Role};
 use shoal_common::run_dir::RunDir;
+use shoal_run::rate::updates_per_step;
 use shoal_run::status;
 
 use super::progress::Progress;
@@ -28,7 +29,8 @@ pub(super) fn status(
         status.episodes = learner.episodes;
         status.updates = learner.updates;
         status.policy_version = learner.policy_version;
-        status.ratio = status::ratio(&status, config.replay.warmup);
+        let ratio = updates_per_step(status.updates, status.env_steps, config.replay.warmup);
+        status.ratio = ratio.unwrap_or(0.0);
     }
     (status.updates_per_second, status.env_steps_per_second) = progress.rates().unwrap_or_default();
     if let Some(report) = progress.evaluated() {

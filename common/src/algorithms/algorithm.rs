@@ -49,19 +49,36 @@ pub trait AlgorithmSettings {
     /// When it cannot control that environment.
     fn behaviour(&self, name: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError>;
 
-    /// Numbers that the exploration of one environment in `spec` carries from step to step.
-    fn exploration_state_width(&self, _spec: &EnvironmentSpec) -> usize {
-        0
+    /// Numbers that the exploration of one environment in `spec` carries from step to step; 0 where each step's is drawn anew.
+    fn exploration_state_width(&self, spec: &EnvironmentSpec) -> usize;
+
+    /// Transitions that the replay must be able to hold at least: a minibatch, or 1.
+    fn least_capacity(&self) -> u64;
+
+    /// What it learns in an environment like `spec`.
+    fn learned(&self, spec: &EnvironmentSpec) -> Learned;
+}
+
+/// The networks or tables that an algorithm learns, each with a name and without target networks and what an optimiser
+/// remembers.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Learned {
+    /// The policy.
+    pub policy: (&'static str, Shape),
+    /// All else.
+    pub others: Vec<(&'static str, Shape)>,
+}
+
+impl Learned {
+    /// All of them, the policy first.
+    pub fn iter(&self) -> impl Iterator<Item = (&'static str, Shape)> {
+        std::iter::once(self.policy).chain(self.others.iter().copied())
     }
 
-    /// Transitions that the replay must be able to hold at least.
-    fn least_capacity(&self) -> u64 {
-        1
+    /// Numbers in all of them.
+    pub fn parameters(&self) -> usize {
+        self.iter().map(|(_, shape)| shape.parameters()).sum()
     }
-
-    /// What it learns in an environment like `spec`, by name: the shape of each network or table, without targets and what an
-    /// optimiser remembers.
-    fn learned(&self, spec: &EnvironmentSpec) -> Vec<(&'static str, Shape)>;
 }
 
 /// The shape of something that is learned.

@@ -6,7 +6,7 @@ use shoal_base::space::EnvironmentSpec;
 use shoal_policy::PolicyError;
 use shoal_policy::network::{Activation, Hidden, Layers, NetworkLayout};
 
-use super::algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Shape};
+use super::algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Learned, Shape};
 use super::behaviour::Behaviour;
 use super::exploration::ExplorationConfig;
 
@@ -75,10 +75,13 @@ impl AlgorithmSettings for DdpgConfig {
         self.batch as u64
     }
 
-    fn learned(&self, spec: &EnvironmentSpec) -> Vec<(&'static str, Shape)> {
+    fn learned(&self, spec: &EnvironmentSpec) -> Learned {
         let (observation, action) = (spec.observation.width(), spec.action.width());
         let actor = NetworkLayout::policy(observation, self.hidden_layers(), action);
         let critic = NetworkLayout::critic(observation, self.hidden_layers(), action);
-        vec![("actor", Shape::Network(actor)), ("critic", Shape::Network(critic))]
+        Learned {
+            policy: ("actor", Shape::Network(actor)),
+            others: vec![("critic", Shape::Network(critic))],
+        }
     }
 }

@@ -8,7 +8,7 @@ use shoal_base::space::EnvironmentSpec;
 use shoal_policy::PolicyError;
 use shoal_policy::network::{Activation, Hidden, Layers, NetworkLayout};
 
-use super::algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Shape};
+use super::algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Learned, Shape};
 use super::behaviour::Behaviour;
 
 /// REINFORCE.
@@ -90,13 +90,21 @@ impl AlgorithmSettings for ReinforceConfig {
         )?))
     }
 
-    fn learned(&self, spec: &EnvironmentSpec) -> Vec<(&'static str, Shape)> {
+    fn exploration_state_width(&self, _: &EnvironmentSpec) -> usize {
+        0
+    }
+
+    fn least_capacity(&self) -> u64 {
+        1
+    }
+
+    fn learned(&self, spec: &EnvironmentSpec) -> Learned {
         let observation = spec.observation.width();
         let network = |hidden, outputs| Shape::Network(NetworkLayout::policy(observation, hidden, outputs));
-        let mut learned = vec![("policy", network(self.hidden_layers(), spec.action.size()))];
-        if self.weight == Weight::Baseline {
-            learned.push(("baseline", network(self.baseline_hidden_layers(), 1)));
+        let baseline = (self.weight == Weight::Baseline).then(|| network(self.baseline_hidden_layers(), 1));
+        Learned {
+            policy: ("policy", network(self.hidden_layers(), spec.action.size())),
+            others: baseline.map(|network| ("baseline", network)).into_iter().collect(),
         }
-        learned
     }
 }

@@ -5,7 +5,7 @@ use shoal_base::section::{OutOfRange, from};
 use shoal_base::space::EnvironmentSpec;
 use shoal_policy::PolicyError;
 
-use super::algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Shape};
+use super::algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Learned, Shape};
 use super::behaviour::Behaviour;
 
 /// Q-learning.
@@ -48,8 +48,19 @@ impl AlgorithmSettings for TabularConfig {
         Ok(Behaviour::EpsilonGreedy(values, self.epsilon))
     }
 
-    fn learned(&self, spec: &EnvironmentSpec) -> Vec<(&'static str, Shape)> {
+    fn exploration_state_width(&self, _: &EnvironmentSpec) -> usize {
+        0
+    }
+
+    fn least_capacity(&self) -> u64 {
+        1
+    }
+
+    fn learned(&self, spec: &EnvironmentSpec) -> Learned {
         let (states, actions) = (spec.observation.size(), spec.action.size());
-        vec![("action-values", Shape::Table { states, actions })]
+        Learned {
+            policy: ("action-values", Shape::Table { states, actions }),
+            others: Vec::new(),
+        }
     }
 }

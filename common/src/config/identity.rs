@@ -58,7 +58,7 @@ fn text(config: &Config) -> String {
     line("action", &space(&spec.action));
     line("time limit", &spec.time_limit.to_string());
     line("algorithm", algorithm.name());
-    for (name, shape) in algorithm.settings().learned(spec) {
+    for (name, shape) in algorithm.settings().learned(spec).iter() {
         line(&format!("learned {name}"), &shape.to_string());
     }
     line("gamma", &algorithm.gamma().to_string());

@@ -232,8 +232,7 @@ impl Method for &config::ReinforceConfig {
 
     fn state_numbers(&self, spec: &EnvironmentSpec, _: Room) -> usize {
         // Each network and two moments; and the steps of Adam.
-        let networks = self.learned(spec).into_iter();
-        networks.map(|(_, shape)| 3 * shape.parameters()).sum::<usize>() + 1
+        3 * self.learned(spec).parameters() + 1
     }
 }
 

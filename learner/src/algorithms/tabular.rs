@@ -56,8 +56,7 @@ impl Method for Sarsa<'_> {
 
 /// The table, and a pending step for each environment.
 fn state_numbers(settings: &config::TabularConfig, spec: &EnvironmentSpec, room: Room) -> usize {
-    let tables = settings.learned(spec).into_iter();
-    tables.map(|(_, shape)| shape.parameters()).sum::<usize>() + slots(room) * PENDING
+    settings.learned(spec).parameters() + slots(room) * PENDING
 }
 
 /// Environments of all actors.

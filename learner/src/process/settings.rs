@@ -101,10 +101,9 @@ pub fn disk_bytes(config: &Config, run: &RunDir) -> Result<u64, SizeError> {
         let places = replay_layout(config).places().ok_or(SizeError::Replay { capacity })?;
         places.end as u64
     };
-    let policy = config.algorithm.settings().learned(&config.spec);
-    let policy = policy.first().map_or(0, |(_, shape)| shape.parameters());
+    let (_, policy) = config.algorithm.settings().learned(&config.spec).policy;
     // The latest, the one before it, and the next one while it is written; the best policy and the last likewise.
-    let numbers = 3 * (registry::state_numbers(config) + policy) as u64;
+    let numbers = 3 * (registry::state_numbers(config) + policy.parameters()) as u64;
     let sum = numbers
         .checked_mul(size_of::<f32>() as u64)
         .and_then(|bytes| bytes.checked_add(replay));

@@ -57,8 +57,7 @@ impl Method for &config::DdpgConfig {
 
     fn state_numbers(&self, spec: &EnvironmentSpec, _: Room) -> usize {
         // Each network, its target and two moments.
-        let networks = self.learned(spec).into_iter();
-        networks.map(|(_, shape)| 4 * shape.parameters()).sum()
+        4 * self.learned(spec).parameters()
     }
 }
 
