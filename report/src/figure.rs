@@ -20,4 +20,4 @@ pub use learning_curves::{learning_curves, quantile};
 pub use lines::{Frame, Setting, lines, lines_apart, pointwise};
 pub use pendulum::swing_up;
 pub use point_mass::{test_runs, trajectories};
-pub use raster::rasterise;
+pub use raster::{CAN_RASTERISE, rasterise};

@@ -4,8 +4,10 @@ use std::io::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
+use anyhow::bail;
 use clap::Args;
 use clap::builder::PossibleValuesParser;
+use shoal_report::figure::CAN_RASTERISE;
 use shoal_reproduce::{BatchEnding, Effort, Order};
 use shoal_run::signals::exit_code;
 
@@ -27,7 +29,7 @@ pub(crate) struct ReproduceArgs {
     /// Where runs, results and figures lie [default: runs/reproduction; with --quick runs/reproduction-quick].
     #[arg(long, value_name = "DIR")]
     pub(crate) out: Option<PathBuf>,
-    /// Draw every figure as PNG too, beside the SVG.
+    /// Draw every figure as PNG too, beside the SVG; needs a build with `--features png`.
     #[arg(long)]
     pub(crate) png: bool,
     /// Where to write the report [default: REPORT.md in that directory].
@@ -51,6 +53,9 @@ fn usual_jobs() -> usize {
 
 /// Runs what was asked for and says where the report is.
 pub(crate) fn run(args: &ReproduceArgs) -> anyhow::Result<ExitCode> {
+    if args.png && !CAN_RASTERISE {
+        bail!("--png: this program was built without it; build it again with: cargo build --release --features png");
+    }
     let (effort, usual) = if args.quick {
         (Effort::Quick, "runs/reproduction-quick")
     } else {

@@ -30,17 +30,43 @@ pub trait Report: Copy + Debug + ZeroCopySend + 'static {
     const BUFFER: usize;
     /// Reports that a reader who comes late is still given.
     const HISTORY: usize;
-    /// Readers there may be: the launcher, the learner, and room for one more to look on.
+    /// Readers there may be: the launcher, the learner, and one more to look on.
     const READERS: usize = 3;
+
+    /// Opens the sending end, as [`Reporter::open`] does.
+    #[doc(hidden)]
+    fn sender(domain: &Domain) -> Result<Box<dyn Sender<Self>>, ChannelError>;
+
+    /// Opens the reading end, as [`Reports::open`] does.
+    #[doc(hidden)]
+    fn receiver(domain: &Domain) -> Result<Box<dyn Receiver<Self>>, ChannelError>;
 }
 
-impl Report for Heartbeat {
+/// Declares a kind of report. Its ports are compiled here, and not once more in each crate that sends or reads it: a port
+/// brings half a megabyte of iceoryx2 with it.
+macro_rules! report {
+    ($report:ty: $($constants:tt)*) => {
+        impl Report for $report {
+            $($constants)*
+
+            fn sender(domain: &Domain) -> Result<Box<dyn Sender<Self>>, ChannelError> {
+                Ok(Box::new(publisher::<Self>(domain)?))
+            }
+
+            fn receiver(domain: &Domain) -> Result<Box<dyn Receiver<Self>>, ChannelError> {
+                Ok(Box::new(subscriber::<Self>(domain)?))
+            }
+        }
+    };
+}
+
+report! { Heartbeat:
     const CHANNEL: &'static str = "reports/heartbeats";
     const BUFFER: usize = 8;
     const HISTORY: usize = 1;
 }
 
-impl Report for EpisodeReport {
+report! { EpisodeReport:
     const CHANNEL: &'static str = "reports/episodes";
     // As many environments as an actor can have: a time limit ends all their episodes at the same step.
     const BUFFER: usize = 4096;
@@ -49,20 +75,20 @@ impl Report for EpisodeReport {
     const READERS: usize = 1;
 }
 
-impl Report for EvaluationReport {
+report! { EvaluationReport:
     const CHANNEL: &'static str = "reports/evaluations";
     const BUFFER: usize = 64;
     const HISTORY: usize = 2;
 }
 
-impl Report for EvaluatedReport {
+report! { EvaluatedReport:
     const CHANNEL: &'static str = "reports/judged";
     const BUFFER: usize = 8;
     // A learner in lockstep that was restarted waits for it.
     const HISTORY: usize = 1;
 }
 
-impl Report for LearnerReport {
+report! { LearnerReport:
     const CHANNEL: &'static str = "reports/learner";
     const BUFFER: usize = 64;
     const HISTORY: usize = 1;
@@ -70,15 +96,11 @@ impl Report for LearnerReport {
 
 /// The sending end of one kind of report.
 #[derive(Debug)]
-pub struct Reporter<R: Report> {
-    publisher: Publisher<ipc::Service, R, ()>,
-}
+pub struct Reporter<R: Report>(Box<dyn Sender<R>>);
 
 /// The reading end of one kind of report, from all its senders.
 #[derive(Debug)]
-pub struct Reports<R: Report> {
-    subscriber: Subscriber<ipc::Service, R, ()>,
-}
+pub struct Reports<R: Report>(Box<dyn Receiver<R>>);
 
 impl<R: Report> Reporter<R> {
     /// Opens the sending end.
@@ -86,28 +108,17 @@ impl<R: Report> Reporter<R> {
     /// # Errors
     /// When shared memory cannot be had.
     pub fn open(domain: &Domain) -> Result<Self, ChannelError> {
-        let publisher = claim(|| {
-            service::<R>(domain, Entry::Open)?
-                .publisher_builder()
-                .max_loaned_samples(LOANED)
-                .create()
-                .map_err(|cause| ChannelError::new(R::CHANNEL, "report", cause))
-        })?;
-        Ok(Self { publisher })
+        R::sender(domain).map(Self)
     }
 
     /// Sends a report. One that cannot be sent is lost: reports must not stop the work they report on.
     pub fn send(&self, report: R) {
-        if let Err(cause) = self.publisher.send_copy(report) {
-            tracing::debug!(?cause, channel = R::CHANNEL, "a report was lost");
-        }
+        self.0.send(report);
     }
 
     /// Hands the newest reports to readers that have come since. To be called while waiting.
     pub fn look_after(&self) {
-        if let Err(cause) = self.publisher.update_connections() {
-            tracing::debug!(?cause, channel = R::CHANNEL, "a reader was not connected");
-        }
+        self.0.look_after();
     }
 }
 
@@ -117,13 +128,7 @@ impl<R: Report> Reports<R> {
     /// # Errors
     /// When shared memory cannot be had.
     pub fn open(domain: &Domain) -> Result<Self, ChannelError> {
-        let subscriber = claim(|| {
-            service::<R>(domain, Entry::Open)?
-                .subscriber_builder()
-                .create()
-                .map_err(|cause| ChannelError::new(R::CHANNEL, "read", cause))
-        })?;
-        Ok(Self { subscriber })
+        R::receiver(domain).map(Self)
     }
 
     /// The next report, if there is one.
@@ -131,12 +136,63 @@ impl<R: Report> Reports<R> {
     /// # Errors
     /// When a sender's memory cannot be mapped.
     pub fn receive(&self) -> Result<Option<R>, ChannelError> {
+        self.0.next()
+    }
+}
+
+/// What a [`Reporter`] does, whatever port it has.
+#[doc(hidden)]
+pub trait Sender<R>: Debug {
+    fn send(&self, report: R);
+    fn look_after(&self);
+}
+
+/// What [`Reports`] do, whatever port they have.
+#[doc(hidden)]
+pub trait Receiver<R>: Debug {
+    fn next(&self) -> Result<Option<R>, ChannelError>;
+}
+
+impl<R: Report> Sender<R> for Publisher<ipc::Service, R, ()> {
+    fn send(&self, report: R) {
+        if let Err(cause) = self.send_copy(report) {
+            tracing::debug!(?cause, channel = R::CHANNEL, "a report was lost");
+        }
+    }
+
+    fn look_after(&self) {
+        if let Err(cause) = self.update_connections() {
+            tracing::debug!(?cause, channel = R::CHANNEL, "a reader was not connected");
+        }
+    }
+}
+
+impl<R: Report> Receiver<R> for Subscriber<ipc::Service, R, ()> {
+    fn next(&self) -> Result<Option<R>, ChannelError> {
         let received = self
-            .subscriber
             .receive()
             .map_err(|cause| ChannelError::new(R::CHANNEL, "read", cause))?;
         Ok(received.map(|sample| *sample.payload()))
     }
+}
+
+fn publisher<R: Report>(domain: &Domain) -> Result<Publisher<ipc::Service, R, ()>, ChannelError> {
+    claim(|| {
+        service::<R>(domain, Entry::Open)?
+            .publisher_builder()
+            .max_loaned_samples(LOANED)
+            .create()
+            .map_err(|cause| ChannelError::new(R::CHANNEL, "report", cause))
+    })
+}
+
+fn subscriber<R: Report>(domain: &Domain) -> Result<Subscriber<ipc::Service, R, ()>, ChannelError> {
+    claim(|| {
+        service::<R>(domain, Entry::Open)?
+            .subscriber_builder()
+            .create()
+            .map_err(|cause| ChannelError::new(R::CHANNEL, "read", cause))
+    })
 }
 
 /// Bytes of shared memory that reports of kind `R` reserve in a run of up to so many actors, with so many senders.

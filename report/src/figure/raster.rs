@@ -1,55 +1,81 @@
-//! An SVG picture as a PNG picture, with a font of our own, so that it looks the same on every machine.
+//! An SVG picture as a PNG picture, with a font of our own, so that it looks the same on every machine. The feature `png` builds
+//! it in.
 
-use std::io::Write;
 use std::path::Path;
-use std::sync::Arc;
 
-use anyhow::Context;
-use epaint_default_fonts::UBUNTU_LIGHT;
-use resvg::tiny_skia::{Pixmap, Transform};
-use resvg::usvg::fontdb::Database;
-use resvg::usvg::{Options, Tree};
-use shoal_common::durable::write_atomically;
-
-/// Pixels of the PNG for each pixel of the shown SVG.
-const SCALE: f32 = 1.5;
+/// Whether this build can draw PNG pictures.
+pub const CAN_RASTERISE: bool = cfg!(feature = "png");
 
 /// Writes the picture `svg` once more as `png`.
+///
+/// # Errors
+/// When a file cannot be read or written, `svg` is no picture, or this build cannot draw PNG pictures.
 pub fn rasterise(svg: &Path, png: &Path) -> anyhow::Result<()> {
-    let text = std::fs::read_to_string(svg).with_context(|| format!("cannot read {}", svg.display()))?;
-    let picture = draw(&text).with_context(|| format!("cannot rasterise {}", svg.display()))?;
-    let bytes = picture.encode_png()?;
-    write_atomically(png, |file| file.write_all(&bytes)).with_context(|| format!("cannot write {}", png.display()))
+    #[cfg(feature = "png")]
+    return raster::rasterise(svg, png);
+    #[cfg(not(feature = "png"))]
+    anyhow::bail!(
+        "cannot draw {} from {}: this program was built without the feature `png`",
+        png.display(),
+        svg.display()
+    );
 }
 
-fn draw(svg: &str) -> anyhow::Result<Pixmap> {
-    let tree = Tree::from_str(svg, &options())?;
-    let size = tree.size().to_int_size().scale_by(SCALE).context("it is empty")?;
-    let mut picture = Pixmap::new(size.width(), size.height()).context("it is empty")?;
-    resvg::render(&tree, Transform::from_scale(SCALE, SCALE), &mut picture.as_mut());
-    Ok(picture)
-}
+#[cfg(feature = "png")]
+mod raster {
+    use std::io::Write;
+    use std::path::Path;
+    use std::sync::Arc;
 
-/// The one font stands for every family.
-fn options() -> Options<'static> {
-    let mut fonts = Database::new();
-    fonts.load_font_data(UBUNTU_LIGHT.to_vec());
-    let family = fonts
-        .faces()
-        .next()
-        .and_then(|face| face.families.first())
-        .map(|(name, _)| name.clone());
-    let family = family.unwrap_or_default();
-    fonts.set_sans_serif_family(&family);
-    Options {
-        fontdb: Arc::new(fonts),
-        font_family: family,
-        ..Options::default()
+    use anyhow::Context;
+    use epaint_default_fonts::UBUNTU_LIGHT;
+    use resvg::tiny_skia::{Pixmap, Transform};
+    use resvg::usvg::fontdb::Database;
+    use resvg::usvg::{Options, Tree};
+    use shoal_common::durable::write_atomically;
+
+    /// Pixels of the PNG for each pixel of the shown SVG.
+    const SCALE: f32 = 1.5;
+
+    pub(super) fn rasterise(svg: &Path, png: &Path) -> anyhow::Result<()> {
+        let text = std::fs::read_to_string(svg).with_context(|| format!("cannot read {}", svg.display()))?;
+        let picture = draw(&text).with_context(|| format!("cannot rasterise {}", svg.display()))?;
+        let bytes = picture.encode_png()?;
+        write_atomically(png, |file| file.write_all(&bytes)).with_context(|| format!("cannot write {}", png.display()))
+    }
+
+    pub(super) fn draw(svg: &str) -> anyhow::Result<Pixmap> {
+        let tree = Tree::from_str(svg, &options())?;
+        let size = tree.size().to_int_size().scale_by(SCALE).context("it is empty")?;
+        let mut picture = Pixmap::new(size.width(), size.height()).context("it is empty")?;
+        resvg::render(&tree, Transform::from_scale(SCALE, SCALE), &mut picture.as_mut());
+        Ok(picture)
+    }
+
+    /// The one font stands for every family.
+    fn options() -> Options<'static> {
+        let mut fonts = Database::new();
+        fonts.load_font_data(UBUNTU_LIGHT.to_vec());
+        let family = fonts
+            .faces()
+            .next()
+            .and_then(|face| face.families.first())
+            .map(|(name, _)| name.clone());
+        let family = family.unwrap_or_default();
+        fonts.set_sans_serif_family(&family);
+        Options {
+            fontdb: Arc::new(fonts),
+            font_family: family,
+            ..Options::default()
+        }
     }
 }
 
-#[cfg(test)]
+#[cfg(all(test, feature = "png"))]
 mod tests {
+    use resvg::tiny_skia::Pixmap;
+
+    use super::raster::draw;
     use super::*;
 
     fn drawn(text: &str) -> Pixmap {

@@ -179,9 +179,9 @@ impl EnvironmentClient {
     pub fn describe(
         &self,
         listener: &Listener,
-        idle: impl FnMut(),
+        mut idle: impl FnMut(),
     ) -> Result<(EnvironmentSpec, usize), Exit<ChannelError>> {
-        let response = self.insist(listener, Ask::Describe, 0, &[], idle)?;
+        let response = self.insist(listener, Ask::Describe, 0, &[], &mut idle)?;
         let (header, payload) = (response.user_header(), response.payload());
         let described = header.described(payload);
         described.ok_or_else(|| ChannelError::new(&self.channel, "describe", PeerError::ShortAnswer).into())
@@ -191,13 +191,18 @@ impl EnvironmentClient {
     ///
     /// # Errors
     /// When interrupted.
-    pub fn reset(&self, listener: &Listener, begin: Begin, idle: impl FnMut()) -> Result<Observed, Exit<ChannelError>> {
+    pub fn reset(
+        &self,
+        listener: &Listener,
+        begin: Begin,
+        mut idle: impl FnMut(),
+    ) -> Result<Observed, Exit<ChannelError>> {
         let (ask, episode) = match begin {
             Begin::Next => (Ask::Reset, 0),
             Begin::Training(episode) => (Ask::ResetToTraining, episode),
             Begin::Evaluation(first) => (Ask::ResetToEvaluation, first),
         };
-        self.begun(self.insist(listener, ask, episode, &[], idle)?)
+        self.begun(self.insist(listener, ask, episode, &[], &mut idle)?)
     }
 
     /// Every environment takes a step with its action.
@@ -208,9 +213,9 @@ impl EnvironmentClient {
         &self,
         listener: &Listener,
         actions: &[f32],
-        idle: impl FnMut(),
+        mut idle: impl FnMut(),
     ) -> Result<Stepped, Exit<ChannelError>> {
-        match self.ask_within_episodes(listener, Ask::Step, actions, idle)? {
+        match self.ask_within_episodes(listener, Ask::Step, actions, &mut idle)? {
             Some(response) => Ok(Stepped::Taken(self.observed(response)?)),
             None => Ok(Stepped::Lost),
         }
@@ -220,8 +225,8 @@ impl EnvironmentClient {
     ///
     /// # Errors
     /// When interrupted, or the server refuses: its environments cannot say their state, or run evaluation episodes.
-    pub fn snapshot(&self, listener: &Listener, idle: impl FnMut()) -> Result<Snapshot, Exit<ChannelError>> {
-        let Some(response) = self.ask_within_episodes(listener, Ask::Snapshot, &[], idle)? else {
+    pub fn snapshot(&self, listener: &Listener, mut idle: impl FnMut()) -> Result<Snapshot, Exit<ChannelError>> {
+        let Some(response) = self.ask_within_episodes(listener, Ask::Snapshot, &[], &mut idle)? else {
             return Ok(Snapshot::Lost);
         };
         let words = words_of(self.answered(&response)?);
@@ -240,7 +245,7 @@ impl EnvironmentClient {
         &self,
         listener: &Listener,
         words: &[u64],
-        idle: impl FnMut(),
+        mut idle: impl FnMut(),
     ) -> Result<Observed, Exit<ChannelError>> {
         if words.len() != self.snapshot_words {
             let cause = PeerError::SnapshotLength {
@@ -249,7 +254,7 @@ impl EnvironmentClient {
             };
             return Err(ChannelError::new(&self.channel, "restore", cause).into());
         }
-        self.begun(self.insist(listener, Ask::Restore, 0, numbers_of(words), idle)?)
+        self.begun(self.insist(listener, Ask::Restore, 0, numbers_of(words), &mut idle)?)
     }
 
     /// The first observations of new episodes, which the server that sent them runs from now on.
@@ -289,7 +294,7 @@ impl EnvironmentClient {
         listener: &Listener,
         ask: Ask,
         payload: &[f32],
-        idle: impl FnMut(),
+        idle: &mut dyn FnMut(),
     ) -> Result<Option<Answer>, Exit<ChannelError>> {
         if self.server() != self.episodes.get() {
             return Ok(None);
@@ -314,12 +319,12 @@ impl EnvironmentClient {
         ask: Ask,
         episode: u64,
         payload: &[f32],
-        mut idle: impl FnMut(),
+        idle: &mut dyn FnMut(),
     ) -> Result<Answer, Exit<ChannelError>> {
         let mut unreachable = None;
         loop {
             let sent = self.send(ask, episode, payload)?;
-            if let Some(response) = self.answer(listener, &sent, &mut idle)? {
+            if let Some(response) = self.answer(listener, &sent, idle)? {
                 return Ok(response);
             }
             if sent.server.is_none() || sent.is_delivered() {
@@ -352,7 +357,7 @@ impl EnvironmentClient {
         &self,
         listener: &Listener,
         sent: &Sent,
-        mut idle: impl FnMut(),
+        idle: &mut dyn FnMut(),
     ) -> Result<Option<Answer>, Exit<ChannelError>> {
         let lost = Cell::new(false);
         let answer = wait_for(
