@@ -12,7 +12,7 @@ pub const CAN_RASTERISE: bool = cfg!(feature = "png");
 /// When a file cannot be read or written, `svg` is no picture, or this build cannot draw PNG pictures.
 pub fn rasterise(svg: &Path, png: &Path) -> anyhow::Result<()> {
     #[cfg(feature = "png")]
-    return raster::rasterise(svg, png);
+    return with_resvg::rasterise(svg, png);
     #[cfg(not(feature = "png"))]
     anyhow::bail!(
         "cannot draw {} from {}: this program was built without the feature `png`",
@@ -22,7 +22,7 @@ pub fn rasterise(svg: &Path, png: &Path) -> anyhow::Result<()> {
 }
 
 #[cfg(feature = "png")]
-mod raster {
+mod with_resvg {
     use std::io::Write;
     use std::path::Path;
     use std::sync::Arc;
@@ -75,7 +75,7 @@ mod raster {
 mod tests {
     use resvg::tiny_skia::Pixmap;
 
-    use super::raster::draw;
+    use super::with_resvg::draw;
     use super::*;
 
     fn drawn(text: &str) -> Pixmap {
