@@ -71,7 +71,8 @@ mod with_resvg {
     }
 }
 
-#[cfg(all(test, feature = "png"))]
+#[cfg(feature = "png")]
+#[cfg(test)]
 mod tests {
     use resvg::tiny_skia::Pixmap;
 
