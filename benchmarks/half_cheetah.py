@@ -1,15 +1,17 @@
-"""Whether Shoal learns from an environment that Gymnasium serves: HalfCheetah-v5 beside Stable-Baselines3's DDPG.
+"""Compares Shoal with Stable-Baselines3's DDPG on HalfCheetah-v5 of Gymnasium.
 
     pip install ./python stable-baselines3==2.9.2 'gymnasium[mujoco]==1.4.0' matplotlib
     python benchmarks/half_cheetah.py --shoal target/release/shoal --minutes 60
 
-Both train at the same time, each on one core and with one thread. The settings are those that RL Baselines3 Zoo has for DDPG on
-its HalfCheetah (`hyperparams/ddpg.yml`, tuned for PyBullet's), Stable-Baselines3's own defaults where it says nothing. Two
-things are not alike: in Shoal's critic the action enters at the second layer, and its output layers begin with small weights.
+Both train at the same time, each on one core with one thread. The settings are those of RL Baselines3 Zoo for DDPG on
+its HalfCheetah (`hyperparams/ddpg.yml`, tuned for PyBullet's), and otherwise Stable-Baselines3's defaults. There are
+two differences: in Shoal's critic the action enters at the second layer, and Shoal's output layers start with small
+weights.
 
-Both are evaluated every 10,000 steps by 10 episodes without exploration. Shoal's time is all of it, from the start of the program,
-evaluations included, which share its core; Stable-Baselines3's is that of `learn` without its evaluations. What was evaluated goes
-to `docs/half-cheetah.csv` and the figure to `docs/half-cheetah.svg`; `--draw` makes the figure of what is there.
+Both are evaluated every 10,000 steps with 10 episodes without exploration. Shoal's time counts from the start of the
+program and includes its evaluations, which share its core. Stable-Baselines3's time is that of `learn` without its
+evaluations. The evaluations are written to `docs/half-cheetah.csv` and the figure to `docs/half-cheetah.svg`. `--draw`
+only draws the figure from the existing evaluations.
 """
 
 import argparse
@@ -34,7 +36,7 @@ SETTINGS = {
     "ddpg.actor_learning_rate": 1e-3,
     "ddpg.critic_learning_rate": 1e-3,
     "ddpg.batch": 256,
-    # The pull towards zero takes all of the last step's noise away: what is left is Gaussian.
+    # With theta = 1 nothing of the last step's noise remains, so the noise is independent and Gaussian.
     "exploration.theta": 1.0,
     "exploration.sigma": 0.1,
     "exploration.warmup": "uniform",
@@ -50,14 +52,14 @@ COLUMNS = ["program", "seconds", "env_steps", "return_mean", "return_std"]
 
 
 def begin_shoal(program, run, seed, core):
-    command = [program, "train", f"gym:{ENVIRONMENT}", "--quiet", "--run", run, "--seed", str(seed), "--actors", "1", "--envs", "1"]
-    command += ["--steps", "100000000"]
+    command = [program, "train", f"gym:{ENVIRONMENT}", "--quiet", "--run", run, "--seed", str(seed)]
+    command += ["--actors", "1", "--envs", "1", "--steps", "100000000"]
     command += [word for key, value in SETTINGS.items() for word in ("--set", f"{key}={value}")]
     return subprocess.Popen(["taskset", "-c", str(core), *command])
 
 
 def evaluated_by_shoal(run, seconds):
-    """What was evaluated within so many seconds of the program's start."""
+    """Evaluations in the first `seconds` after the program's start."""
     with (run / "evaluations.csv").open() as file:
         for row in csv.DictReader(file):
             if float(row["wall_seconds"]) <= seconds:
@@ -65,7 +67,7 @@ def evaluated_by_shoal(run, seconds):
 
 
 def stable_baselines3(seed, core, seconds):
-    """What was evaluated within so many seconds of training."""
+    """Trains for `seconds` and returns the evaluations."""
     os.sched_setaffinity(0, {core})
     import gymnasium
     import numpy as np
@@ -123,7 +125,7 @@ def stable_baselines3(seed, core, seconds):
 def train(program, seed, minutes):
     cores = sorted(os.sched_getaffinity(0))
     if len(cores) < 2:
-        sys.exit("each of the two needs a core of its own")
+        sys.exit("needs two cores, one for each program")
     with tempfile.TemporaryDirectory() as directory:
         run = Path(directory) / "run"
         begun = time.monotonic()
@@ -169,10 +171,10 @@ def draw():
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--shoal", default="target/release/shoal", help="the program")
-    parser.add_argument("--minutes", type=float, default=60.0, help="of training")
+    parser.add_argument("--shoal", default="target/release/shoal", help="path of the program")
+    parser.add_argument("--minutes", type=float, default=60.0, help="length of the training")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--draw", action="store_true", help="train nothing")
+    parser.add_argument("--draw", action="store_true", help="only draw the figure")
     arguments = parser.parse_args()
     if not arguments.draw:
         train(arguments.shoal, arguments.seed, arguments.minutes)

@@ -1,14 +1,17 @@
-"""What others give on this machine: DDPG updates a second in JAX and PyTorch, and rows a second of Gymnasium's vectors.
+"""Rates of other software on this machine.
+
+Measures DDPG gradient steps per second in JAX and PyTorch, and environment steps per second of Gymnasium's vectors.
 
     pip install jax torch gymnasium==1.4.0
     OMP_NUM_THREADS=1 taskset -c 1 python benchmarks/peers.py learner
     python benchmarks/peers.py actors
 
-Compare with `shoal bench learner` and `shoal bench actors`, right before or after. Networks, batch and rates are those of the
-thesis's section 4.3.1. An update is what Shoal's is: sampling 64 rows of a million, critic, actor, both targets. JAX samples
-and makes 32 updates a call, the fastest way known. PyTorch flushes denormal numbers (it gets much slower without) and has
-Adam and target update fused over all parameters; compiled as it stands (`torch.compile`) it was slower. The actors' policy is
-PyTorch's, 64 environments a vector. The last line of standard output is one JSON object.
+Compare with `shoal bench learner` and `shoal bench actors`, run right before or after. Networks, batch size and
+learning rates are those of the thesis, section 4.3.1. An update does the same as in Shoal: it samples 64 rows of a
+million and updates critic, actor and both targets. JAX samples and makes 32 updates per call, the fastest variant
+found. PyTorch flushes denormal numbers, without which it gets much slower, and uses fused Adam and a fused target
+update. `torch.compile` of this code was slower. The actors' policy is in PyTorch, with 64 environments per vector. The
+last line of standard output is one JSON object.
 """
 
 import argparse
@@ -17,7 +20,7 @@ import os
 import statistics
 import time
 
-# Before JAX is imported: one thread, as Shoal's learner is measured.
+# One thread, as in the measurement of Shoal's learner. Must be set before JAX is imported.
 os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
 
 import numpy as np
@@ -30,7 +33,7 @@ ENVIRONMENTS = 64
 
 
 class Replay:
-    """Rows s, a, r, s' of random numbers."""
+    """A replay of random rows s, a, r, s'."""
 
     def __init__(self):
         self.random = np.random.default_rng(1)
@@ -41,7 +44,7 @@ class Replay:
 
 
 def rate(work, each):
-    """The median rate over windows, after one to warm up; `work` does `each` pieces."""
+    """The median rate over several windows, after a warm-up. Each call of `work` counts as `each` units."""
     rates = []
     for _ in range(WINDOWS + 1):
         done, begun = 0, time.perf_counter()
@@ -53,7 +56,7 @@ def rate(work, each):
 
 
 def initial(sizes, random):
-    """Weights and biases of the layers, inputs x outputs."""
+    """Initial weights (inputs x outputs) and biases of the layers."""
     bound = [1 / np.sqrt(inputs) for inputs, _ in sizes]
     draw = lambda shape, b: random.uniform(-b, b, shape).astype(np.float32)
     return [draw(shape, b) for size, b in zip(sizes, bound) for shape in (size, size[1:])]
@@ -151,7 +154,7 @@ def torch_updates(replay):
 
 
 def rows_of_gymnasium(mode):
-    """Environments and policy, nothing else: no noise, no rows written."""
+    """Environment steps per second of environments and policy only: no noise, no rows written."""
     import gymnasium
     import torch
 

@@ -1,15 +1,20 @@
-"""How long until Pendulum is swung up: Shoal's preset beside Stable-Baselines3's DDPG with the same numbers, on this machine.
+"""Time to learn Pendulum: Shoal's preset compared with Stable-Baselines3's DDPG with the same settings.
 
     pip install stable-baselines3==2.9.2 gymnasium==1.4.0
     python benchmarks/wall_clock.py --shoal target/release/shoal --seeds 5
 
-The seeds take turns: Shoal, then Stable-Baselines3, each alone on the machine. Both are evaluated every 1,000 steps by
-episodes without exploration, begun as Gymnasium does; the time counts to the first mean of at least -160. Stable-Baselines3 is evaluated by 1,000
-episodes. Shoal is evaluated by 100, for it pays for them; how lucky their starts are tells the run's best policy, which plays 1,000 others
-at the end, and that is taken off. Shoal's time is all of it, from the start of
-the program, its evaluations included; Stable-Baselines3's is that of `learn` without its evaluations, after its
-imports. Networks, rates, noise and replay are those of the thesis for both (section 4.3.1), torch's own settings are left as
-they are. The last line of standard output is one JSON object.
+For each seed, first Shoal and then Stable-Baselines3 runs, alone on the machine. Both are evaluated every 1,000 steps
+with episodes without exploration, whose starts are distributed as in Gymnasium. The time counts to the first mean
+return of at least -160.
+
+Stable-Baselines3 is evaluated with 1,000 episodes. Shoal is evaluated with only 100, because its evaluations count as
+time. To correct for lucky starts, its best policy is evaluated at the end with the same 100 episodes and with 1,000
+others, and the difference is subtracted from Shoal's evaluations.
+
+Shoal's time counts from the start of the program and includes its evaluations. Stable-Baselines3's time is that of
+`learn` without its evaluations and without its imports. Networks, learning rates, noise and replay are those of the
+thesis for both (section 4.3.1). PyTorch's settings are its defaults. The last line of standard output is one JSON
+object.
 """
 
 import argparse
@@ -24,22 +29,23 @@ from pathlib import Path
 
 THRESHOLD = -160.0
 STARTS = 1_000
-"""Whatever the policy, the mean over 100 starts is off by 9 (standard deviation), and as the starts of a seed are always the same it is
-always off by the same. Over a thousand it is 3."""
+"""The mean over 100 starts has a standard error of 9, over 1,000 starts of 3. A seed always has the same starts, so the
+error is the same in every evaluation."""
 EVERY = 1_000
 STEPS = 40_000
-"""After so many steps a seed has failed."""
+"""A seed that needs more steps has failed."""
 
 
 def shoal(program, seed):
-    """Seconds from the program's start to the first good evaluation, and the steps it was made after; None if there was none."""
+    """Seconds and steps from the program's start to the first good evaluation; None if there was none."""
     with tempfile.TemporaryDirectory() as directory:
         run = Path(directory) / "run"
         settings = ["environment.start_speed=1", f"evaluation.every={EVERY}", "evaluation.episodes=100"]
         command = [program, "train", "pendulum", "--quiet", "--run", run, "--seed", str(seed), "--steps", str(STEPS)]
         command += [word for it in settings for word in ("--set", it)]
         subprocess.run(command, check=True)
-        luck = evaluated(program, run, "--episodes", "100") - evaluated(program, run, "--episodes", str(STARTS), "--seed", "10000")
+        same_starts = evaluated(program, run, "--episodes", "100")
+        luck = same_starts - evaluated(program, run, "--episodes", str(STARTS), "--seed", "10000")
         with (run / "evaluations.csv").open() as file:
             for row in csv.DictReader(file):
                 if float(row["return_mean"]) - luck >= THRESHOLD:
@@ -54,7 +60,7 @@ def evaluated(program, run, *which):
 
 
 def stable_baselines3(seed):
-    """As shoal(): seconds of training alone."""
+    """The same as shoal() for Stable-Baselines3; counts seconds of training only."""
     import gymnasium
     import numpy as np
     import torch
@@ -89,7 +95,7 @@ def stable_baselines3(seed):
             return Critic(**self._update_features_extractor(self.critic_kwargs, features_extractor)).to(self.device)
 
     class Thesis(DDPG):
-        """Two learning rates, where the library has one."""
+        """DDPG with a learning rate for each network; the library has one for both."""
 
         def _update_learning_rate(self, optimizers):
             for optimizer, rate in ((self.actor.optimizer, 1e-4), (self.critic.optimizer, 1e-3)):
@@ -135,7 +141,10 @@ def stable_baselines3(seed):
 
 
 def returns_of(model, environments):
-    """Of one episode of each environment without exploration, from the same starts every time. All must end at the time limit."""
+    """Returns of one episode in each environment without exploration, with the same starts every time.
+
+    All episodes must end at the time limit.
+    """
     observations, _ = environments.reset(seed=10_000)
     total, over = 0.0, False
     while not over:
@@ -148,23 +157,28 @@ def returns_of(model, environments):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--shoal", default="target/release/shoal", help="the program")
+    parser.add_argument("--shoal", default="target/release/shoal", help="path of the program")
     parser.add_argument("--seeds", type=int, default=5)
     arguments = parser.parse_args()
     times = {"shoal": [], "stable_baselines3": []}
     for seed in range(1, arguments.seeds + 1):
-        for who, train in (("shoal", lambda: shoal(arguments.shoal, seed)), ("stable_baselines3", lambda: stable_baselines3(seed))):
+        trainings = {
+            "shoal": lambda: shoal(arguments.shoal, seed),
+            "stable_baselines3": lambda: stable_baselines3(seed),
+        }
+        for who, train in trainings.items():
             reached = train()
             times[who].append(reached)
-            told = f"{reached[0]:.1f} s, {reached[1]} steps" if reached else f"not within {STEPS} steps"
-            print(f"seed {seed}, {who}: {told}", file=sys.stderr, flush=True)
+            result = f"{reached[0]:.1f} s, {reached[1]} steps" if reached else f"not within {STEPS} steps"
+            print(f"seed {seed}, {who}: {result}", file=sys.stderr, flush=True)
     medians = {
-        # A seed that never got there is later than any other.
+        # A failed seed counts as later than any other.
         who: statistics.median(it[0] if it else float("inf") for it in reached)
         for who, reached in times.items()
     }
     ratio = medians["stable_baselines3"] / medians["shoal"]
-    print(json.dumps({"threshold": THRESHOLD, "seconds_and_steps": times, "median_seconds": medians, "times_as_fast": ratio}))
+    figures = {"threshold": THRESHOLD, "seconds_and_steps": times, "median_seconds": medians, "times_as_fast": ratio}
+    print(json.dumps(figures))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-//! The commands. What each can be told stands beside it in `command/`.
+//! The command line. The arguments of each command are in its file in `command/`.
 
 use std::ffi::OsString;
 use std::path::PathBuf;
@@ -31,33 +31,33 @@ pub(crate) struct Cli {
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum Command {
-    /// Train a policy: starts environment servers, actors, an evaluator and a learner, and ends when it has learned.
+    /// Train a policy with environment servers, actors, an evaluator and a learner.
     Train(TrainArgs),
-    /// Go on with a run that was stopped, or whose processes were killed.
+    /// Continue a run that was stopped or killed.
     Resume(ResumeArgs),
-    /// Show how a run gets on: every role, its rate and restarts, and who waits for whom.
+    /// Show the status of a run: its progress, every process with its rate and restarts, and who waits for whom.
     Status(StatusArgs),
-    /// Change the number of actors while training goes on.
+    /// Change the number of actors during training.
     Scale(ScaleArgs),
-    /// End a run in order, so that it can be resumed.
+    /// Save a run's state and end it; it can be resumed.
     Stop(StopArgs),
-    /// Evaluate a run's policy on episodes with fixed starts.
+    /// Evaluate a run's policy on episodes with fixed start states.
     Eval(EvalArgs),
     /// Draw a run's figures.
     Plot(PlotArgs),
-    /// Put what there is to see of one run, or of several side by side, into one file that can be sent to anybody.
+    /// Write an interactive report of one run, or of several side by side, into a single HTML file.
     Report(ReportArgs),
-    /// Write a run's policy as a file that other programs read.
+    /// Write a run's policy into a file for other programs.
     Export(ExportArgs),
-    /// List the runs in a directory: their state, how far they are, their best return.
+    /// List the runs in a directory with their state, progress and best return.
     List(ListArgs),
-    /// Run the thesis's experiments over several seeds, draw its figures, and report which of its claims hold.
+    /// Run the thesis's experiments with several seeds, draw its figures, and report which of its claims hold.
     Reproduce(ReproduceArgs),
     /// Measure a stage of the system on this machine.
     Bench(BenchArgs),
-    /// Watch a run on the whole terminal, and scale or stop it by a key.
+    /// Watch a run on the full terminal, and scale or stop it with a key.
     Top(TopArgs),
-    /// Print what has a shell complete the commands, presets and keys, to be read by its start-up file.
+    /// Print shell code that completes commands, presets and keys, for the shell's start-up file.
     Completions(CompletionsArgs),
     /// Write the manual pages.
     Man(ManArgs),
@@ -75,7 +75,7 @@ pub(crate) enum Command {
     Tied(TiedArgs),
 }
 
-/// How a program is started that is to end with the process that starts it.
+/// The arguments with which a program is started that is killed when its parent process dies.
 #[derive(Args, Clone, Debug)]
 pub(crate) struct TiedArgs {
     pub(crate) parent: u32,
@@ -83,13 +83,13 @@ pub(crate) struct TiedArgs {
     pub(crate) program: Vec<OsString>,
 }
 
-/// How the launcher has shared memory cleaned up.
+/// The arguments with which the launcher starts a clean-up of shared memory.
 #[derive(Args, Clone, Debug)]
 pub(crate) struct CleanUpArgs {
     pub(crate) run_id: String,
 }
 
-/// How the launcher starts a role; everything else is in the run directory.
+/// The arguments with which the launcher starts a role. Everything else is in the run directory.
 #[derive(Args, Clone, Debug)]
 pub(crate) struct RoleArgs {
     pub(crate) run: PathBuf,

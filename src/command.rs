@@ -1,4 +1,4 @@
-//! What `shoal` does once the command line is read, a command a file.
+//! The commands of `shoal`, one file each.
 
 pub(crate) mod bench;
 pub(crate) mod completions;

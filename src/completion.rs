@@ -1,4 +1,4 @@
-//! What a shell may complete: presets, configuration files, and the keys of the configuration with their values.
+//! Completions for a shell: presets, configuration files, and the keys of the configuration with their values.
 
 use std::ffi::OsStr;
 
@@ -11,15 +11,15 @@ use shoal_run::external_environment::GYMNASIUM;
 use shoal_run::plan::{FILLED_IN, preset_names};
 use toml::{Table, Value};
 
-/// The variable that a shell sets where it asks for completions. (`COMPLETE` alone may be somebody else's.)
+/// The variable that a shell sets when it asks for completions. (Other programs may use plain `COMPLETE`.)
 pub(crate) const VARIABLE: &str = "SHOAL_COMPLETE";
 
-/// Answers a shell that asks for completions, and ends the process; does nothing where none asks.
+/// If a shell asks for completions, answers and ends the process. Otherwise does nothing.
 pub(crate) fn answer(command: fn() -> Command) {
     CompleteEnv::with_factory(command).var(VARIABLE).complete();
 }
 
-/// Presets, the beginning of a Gymnasium environment, and configuration files.
+/// Presets, the prefix of Gymnasium environments, and configuration files.
 pub(crate) fn what_to_train(typed: &OsStr) -> Vec<CompletionCandidate> {
     let typed_text = typed.to_string_lossy();
     let names = preset_names()
@@ -31,7 +31,7 @@ pub(crate) fn what_to_train(typed: &OsStr) -> Vec<CompletionCandidate> {
     names.map(CompletionCandidate::new).chain(files).collect()
 }
 
-/// Keys of the configuration; behind the `=`, what the key may be, or its default.
+/// Keys of the configuration. After the `=`: the choices of the key, or its default.
 pub(crate) fn settings(typed: &OsStr) -> Vec<CompletionCandidate> {
     let typed = typed.to_string_lossy();
     let settings = all_settings();
@@ -50,7 +50,7 @@ pub(crate) fn settings(typed: &OsStr) -> Vec<CompletionCandidate> {
         .map(|value| format!("{typed_key}={value}"))
         .filter(|assignment| assignment.starts_with(typed.as_ref()))
         .collect();
-    // A parameter that several environments have.
+    // Several environments may share a parameter.
     assignments.sort();
     assignments.dedup();
     assignments.into_iter().map(CompletionCandidate::new).collect()
@@ -135,11 +135,11 @@ mod tests {
             values(settings(OsStr::new("environment.time"))),
             ["environment.time_limit="]
         );
-        assert!(values(settings(OsStr::new("run.i"))).is_empty(), "not for choosing");
+        assert!(values(settings(OsStr::new("run.i"))).is_empty(), "cannot be set");
     }
 
     #[test]
-    fn behind_the_equals_sign_stand_the_choices_or_the_default() {
+    fn choices_or_the_default_are_completed_after_the_equals_sign() {
         assert_eq!(values(settings(OsStr::new("ddpg.tau="))), ["ddpg.tau=0.001"]);
         assert_eq!(values(settings(OsStr::new("run.mode=l"))), ["run.mode=lockstep"]);
         assert_eq!(values(settings(OsStr::new("ddpg.hidden="))), ["ddpg.hidden=[400,300]"]);

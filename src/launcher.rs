@@ -109,10 +109,10 @@ pub(crate) fn run(mut config: Config, run: &RunDir, quiet: bool) -> anyhow::Resu
 }
 
 fn run_once(config: Config, run: &RunDir, signals: &Signals, quiet: bool) -> anyhow::Result<TrainingOutcome> {
-    Domain::wait_for_the_last(&config.run.id, PREDECESSORS_END).map_err(|error| explain(error, run))?;
+    Domain::wait_for_earlier_processes(&config.run.id, PREDECESSORS_END).map_err(|error| explain(error, run))?;
     Domain::remove_abandoned()?;
     let domain = Domain::join(&config.run.id, config.actors.max)?;
-    let outcome = preflight::claim(&config, run, &domain)
+    let outcome = preflight::reserve(&config, run, &domain)
         .and_then(|()| Launcher::new(config, run, &domain, signals, quiet))
         .and_then(Launcher::run);
     // Even where something failed: no role is left by now.
@@ -187,7 +187,7 @@ impl<'a> Launcher<'a> {
             std::fs::create_dir_all(run.policies()).context("cannot make the directory for policies")?;
         }
         let recorder = Recorder::open(run, config.replay.warmup)?;
-        let rest = status::at_rest(&config, run)?;
+        let rest = status::saved_status(&config, run)?;
         RunOutcome::new(RunState::Running, rest.env_steps, rest.episodes).write(run)?;
         // Makes the services that are opened below.
         let supervisor = Supervisor::new(&config, run, domain, log.clone())?;
@@ -220,7 +220,7 @@ impl<'a> Launcher<'a> {
         self.progress.say("ending");
         let ended = self.end_everyone();
         self.progress.clear();
-        self.control.dismiss(&match &ended {
+        self.control.answer_waiting(&match &ended {
             Ok(()) => Answer::Accepted,
             Err(error) => Answer::Refused(format!("{error:#}")),
         });
@@ -232,18 +232,18 @@ impl<'a> Launcher<'a> {
             // The error itself is what is to be told.
             let _ = self
                 .outcome(RunState::Failed)
-                .map(|outcome| outcome.because(why).write(self.run));
+                .map(|outcome| outcome.with_reason(why).write(self.run));
         }
         let ending = ending?;
         // Where shared memory is made anew, the learner goes on from its newest checkpoint.
         ended.or_else(|error| if ending == Ending::Renewed { Ok(()) } else { Err(error) })?;
         self.recorder.flush()?;
         // What the learner saved: its last report may have come too late to be heard.
-        let after = status::at_rest(&self.config, self.run)?;
+        let after = status::saved_status(&self.config, self.run)?;
         let stopped = RunOutcome::new(RunState::Stopped, after.env_steps, after.episodes);
         match ending {
-            Ending::Stopped => stopped.because("somebody asked for it").write(self.run)?,
-            Ending::Interrupted(signal) => stopped.because(format!("signal {signal}")).write(self.run)?,
+            Ending::Stopped => stopped.with_reason("somebody asked for it").write(self.run)?,
+            Ending::Interrupted(signal) => stopped.with_reason(format!("signal {signal}")).write(self.run)?,
             // A finished run is still to be evaluated.
             Ending::Finished | Ending::Renewed => {}
         }
@@ -256,7 +256,7 @@ impl<'a> Launcher<'a> {
     }
 
     fn outcome(&self, state: RunState) -> anyhow::Result<RunOutcome> {
-        let rest = status::at_rest(&self.config, self.run)?;
+        let rest = status::saved_status(&self.config, self.run)?;
         Ok(RunOutcome::new(state, rest.env_steps, rest.episodes))
     }
 
@@ -322,7 +322,7 @@ impl<'a> Launcher<'a> {
             to_end,
             ..
         } = self;
-        control.attend(run.key()?, run.path(), |question| -> anyhow::Result<Option<Answer>> {
+        control.answer_questions(run.key()?, run.path(), |question| -> anyhow::Result<Option<Answer>> {
             match question {
                 Question::Status => Ok(Some(match requests::status(config, run, supervisor, progress, rest) {
                     Ok(status) => Answer::Status(status),
@@ -340,7 +340,7 @@ impl<'a> Launcher<'a> {
 
     /// The evaluator may still be at the policy of the last period.
     fn await_last_evaluation(&mut self) -> anyhow::Result<()> {
-        let last = status::at_rest(&self.config, self.run)?.env_steps;
+        let last = status::saved_status(&self.config, self.run)?.env_steps;
         let patience = Instant::now();
         while patience.elapsed() < LAST_EVALUATION && self.signals.received().is_none() {
             self.read_reports()?;

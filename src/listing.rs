@@ -1,4 +1,4 @@
-//! The runs in a directory, each with its state as far as its files and its launcher tell.
+//! The runs in a directory, each with its state from its files and its launcher.
 
 use std::cmp::Ordering;
 use std::fs::File;
@@ -11,37 +11,37 @@ use shoal_common::run_dir::RunDir;
 use shoal_run::outcome::{RunOutcome, RunState};
 use shoal_run::recorder::read_evaluations;
 use shoal_run::remote::Remote;
-use shoal_run::status::at_rest;
+use shoal_run::status::saved_status;
 
-use crate::launcher::{EVERYBODY_ENDED, FAILED};
+use crate::launcher::{ALL_ENDED, FAILED};
 
-/// Bytes at the end of a log that its last launcher's last line lies in.
+/// Bytes read from the end of a log; they contain its last line.
 const END_OF_LOG: u64 = 1 << 16;
 
-/// How a run stands.
+/// The state of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub(crate) enum ListedState {
-    /// A launcher works on it.
+    /// Its launcher answers.
     Running,
-    /// A launcher works on it and does not answer.
+    /// It has a launcher, which does not answer.
     Silent,
-    /// All its steps are taken.
+    /// All steps, updates and evaluations are done.
     Finished,
-    /// Ended in order before that; `shoal resume` goes on.
+    /// It was ended earlier with its state saved; `shoal resume` continues it.
     Stopped,
-    /// Ended by an error, which `shoal.log` tells.
+    /// It ended with an error, which is in `shoal.log`.
     Failed,
-    /// Its launcher was killed; `shoal resume` goes on.
+    /// Its launcher was killed; `shoal resume` continues it.
     Killed,
-    /// Made, and never begun.
+    /// It was created but never started.
     New,
     /// Its files cannot be read.
     Damaged,
 }
 
 impl ListedState {
-    /// As it is written in `--json`.
+    /// The name in `--json`.
     pub(crate) fn name(self) -> &'static str {
         match self {
             Self::Running => "running",
@@ -62,7 +62,7 @@ pub(crate) struct Listed {
     pub(crate) name: String,
     pub(crate) path: PathBuf,
     pub(crate) state: ListedState,
-    /// Why it is damaged or silent.
+    /// Why the run is damaged or silent.
     pub(crate) reason: Option<String>,
     pub(crate) environment: String,
     pub(crate) algorithm: String,
@@ -75,7 +75,7 @@ pub(crate) struct Listed {
 }
 
 impl Listed {
-    /// The run in this directory. Whatever is wrong with it is its state, not an error: the others are to be seen too.
+    /// Reads the run in this directory. A failure becomes its state, so that the other runs are still listed.
     pub(crate) fn new(path: &Path) -> Self {
         let name = path.file_name().map(|name| name.to_string_lossy().into_owned());
         let mut listed = Self {
@@ -91,13 +91,13 @@ impl Listed {
             episodes_limit: None,
             best_return: None,
         };
-        if let Err(error) = listed.look() {
+        if let Err(error) = listed.read() {
             listed.reason = Some(format!("{error:#}"));
         }
         listed
     }
 
-    fn look(&mut self) -> anyhow::Result<()> {
+    fn read(&mut self) -> anyhow::Result<()> {
         let remote = Remote::open(&self.path)?;
         let Remote { run, config } = &remote;
         self.environment.clone_from(&config.environment.name);
@@ -110,16 +110,16 @@ impl Listed {
         match remote.status() {
             Ok(Some(status)) => {
                 self.state = ListedState::Running;
-                self.reached(&status);
+                self.set_progress(&status);
             }
             Ok(None) => {
-                let status = at_rest(&run.config()?, run)?;
+                let status = saved_status(&run.config()?, run)?;
                 self.state = if status.finished {
                     ListedState::Finished
                 } else {
-                    ended(run)?
+                    state_after_early_end(run)?
                 };
-                self.reached(&status);
+                self.set_progress(&status);
             }
             Err(error) => {
                 self.state = ListedState::Silent;
@@ -129,13 +129,13 @@ impl Listed {
         Ok(())
     }
 
-    fn reached(&mut self, status: &RunStatus) {
+    fn set_progress(&mut self, status: &RunStatus) {
         (self.env_steps, self.episodes) = (Some(status.env_steps), Some(status.episodes));
         (self.steps, self.episodes_limit) = (Some(status.steps), status.episodes_limit);
     }
 }
 
-/// The run directories in `directory`, by name, `pendulum-2` before `pendulum-10`.
+/// The run directories in `directory` by name, with `pendulum-2` before `pendulum-10`.
 pub(crate) fn runs_in(directory: &Path) -> io::Result<Vec<PathBuf>> {
     let mut runs = Vec::new();
     for entry in std::fs::read_dir(directory)? {
@@ -148,7 +148,7 @@ pub(crate) fn runs_in(directory: &Path) -> io::Result<Vec<PathBuf>> {
     Ok(runs)
 }
 
-/// Numbers at the end of a name are compared as numbers.
+/// Orders names; numbers at their end are compared as numbers.
 fn by_number(a: &str, b: &str) -> Ordering {
     let parts = |name: &str| {
         let word = name.trim_end_matches(|c: char| c.is_ascii_digit()).to_owned();
@@ -158,19 +158,19 @@ fn by_number(a: &str, b: &str) -> Ordering {
     parts(a).cmp(&parts(b)).then_with(|| a.cmp(b))
 }
 
-/// How a run ended that has not reached its end.
-fn ended(run: &RunDir) -> anyhow::Result<ListedState> {
+/// The state of a run that has ended without being finished.
+fn state_after_early_end(run: &RunDir) -> anyhow::Result<ListedState> {
     Ok(match RunOutcome::read(run)?.map(|outcome| outcome.state) {
-        None => ended_by_its_log(run)?,
+        None => state_from_log(run)?,
         Some(RunState::Stopped) => ListedState::Stopped,
         Some(RunState::Failed) => ListedState::Failed,
-        // Finished, and given more steps since, by a launcher that was killed before it said that it runs.
+        // `Finished` here: a launcher extended the finished run and was killed before it wrote `Running`.
         Some(RunState::Running | RunState::Finished) => ListedState::Killed,
     })
 }
 
-/// The same of a run of a build that wrote no outcome: what its launcher logged last.
-fn ended_by_its_log(run: &RunDir) -> io::Result<ListedState> {
+/// The same for a run of an earlier version, which wrote no outcome: by the last line of its log.
+fn state_from_log(run: &RunDir) -> io::Result<ListedState> {
     let mut file = match File::open(run.log()) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(ListedState::New),
         file => file?,
@@ -179,15 +179,15 @@ fn ended_by_its_log(run: &RunDir) -> io::Result<ListedState> {
     file.seek(SeekFrom::Start(length.saturating_sub(END_OF_LOG)))?;
     let mut end = Vec::new();
     file.read_to_end(&mut end)?;
-    Ok(last_words(&String::from_utf8_lossy(&end)))
+    Ok(state_from_last_line(&String::from_utf8_lossy(&end)))
 }
 
-fn last_words(log: &str) -> ListedState {
-    // Whatever a role says comes before its launcher says that all have ended.
+fn state_from_last_line(log: &str) -> ListedState {
+    // No role writes after its launcher has logged that every role has ended.
     let last = log.lines().next_back().unwrap_or_default();
     match last.strip_prefix("launcher") {
-        Some(words) if words.contains(EVERYBODY_ENDED) => ListedState::Stopped,
-        Some(words) if words.contains(FAILED) => ListedState::Failed,
+        Some(text) if text.contains(ALL_ENDED) => ListedState::Stopped,
+        Some(text) if text.contains(FAILED) => ListedState::Failed,
         _ => ListedState::Killed,
     }
 }
@@ -197,7 +197,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn runs_come_in_the_order_of_their_numbers() {
+    fn runs_are_ordered_by_name_and_number() {
         let parent = tempfile::tempdir().unwrap();
         for name in ["pendulum-10", "pendulum-2", "cart-pole-1", "notes"] {
             std::fs::create_dir(parent.path().join(name)).unwrap();
@@ -214,19 +214,19 @@ mod tests {
     }
 
     #[test]
-    fn the_last_line_of_the_log_tells_how_a_run_ended() {
+    fn the_state_follows_from_the_last_line_of_the_log() {
         let start = "launcher       1.0 every role is ready\n";
-        let end = format!("{start}launcher       2.0 {EVERYBODY_ENDED}\n");
-        assert_eq!(last_words(start), ListedState::Killed);
-        assert_eq!(last_words(&end), ListedState::Stopped);
+        let end = format!("{start}launcher       2.0 {ALL_ENDED}\n");
+        assert_eq!(state_from_last_line(start), ListedState::Killed);
+        assert_eq!(state_from_last_line(&end), ListedState::Stopped);
         assert_eq!(
-            last_words(&format!("{end}launcher       2.1 {FAILED}disk full\n")),
+            state_from_last_line(&format!("{end}launcher       2.1 {FAILED}disk full\n")),
             ListedState::Failed
         );
         assert_eq!(
-            last_words(&format!("{end}learner-0      3.0 started as process 7\n")),
+            state_from_last_line(&format!("{end}learner-0      3.0 started as process 7\n")),
             ListedState::Killed
         );
-        assert_eq!(last_words(""), ListedState::Killed);
+        assert_eq!(state_from_last_line(""), ListedState::Killed);
     }
 }

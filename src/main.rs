@@ -1,4 +1,4 @@
-//! Shoal: the only binary. Each command is a file of `command/`.
+//! Shoal, the only binary. Each command is a file in `command/`.
 
 mod cli;
 mod command;
@@ -20,17 +20,17 @@ use crate::cli::{Cli, Command};
 
 fn main() -> ExitCode {
     completion::answer(Cli::command);
-    // Whatever this program makes is for its user alone.
+    // Everything this program creates is accessible to its user alone.
     rustix::process::umask(rustix::fs::Mode::RWXG | rustix::fs::Mode::RWXO);
-    // What goes wrong in shared memory is returned as an error and said once, by us.
+    // iceoryx2 also returns its errors, and they are reported once, below.
     set_log_level(LogLevel::Fatal);
-    // A file-size limit shall be an error of the write that meets it, not the end of the process.
-    let watched = signal_hook::flag::register(signal_hook::consts::SIGXFSZ, Arc::default());
-    let result = watched
+    // A file-size limit must be an error of the write that exceeds it, not the end of the process.
+    let registered = signal_hook::flag::register(signal_hook::consts::SIGXFSZ, Arc::default());
+    let result = registered
         .map_err(anyhow::Error::from)
         .and_then(|_| run(&Cli::parse().command));
     result.unwrap_or_else(|error| {
-        // Where nobody reads any more, there is nobody to tell.
+        // After a broken pipe nobody reads the message.
         if !is_broken_pipe(&error) {
             let _ = writeln!(std::io::stderr(), "error: {}", in_one_line(&error));
         }
@@ -59,12 +59,12 @@ fn run(command: &Command) -> anyhow::Result<ExitCode> {
         Command::Actor(args) => role::run(Role::Actor, args),
         Command::Evaluator(args) => role::run(Role::Evaluator, args),
         Command::Learner(args) => role::run(Role::Learner, args),
-        Command::Tied(args) => shoal_run::external_environment::become_tied(args.parent, &args.program),
+        Command::Tied(args) => shoal_run::external_environment::exec_tied(args.parent, &args.program),
         Command::CleanUp(args) => launcher::clean_up(&args.run_id),
     }
 }
 
-/// The error and its causes, but for those that it names itself.
+/// The error with its causes, except those whose text it already contains.
 fn in_one_line(error: &anyhow::Error) -> String {
     let mut line = error.to_string();
     for cause in error.chain().skip(1).map(ToString::to_string) {

@@ -1,4 +1,4 @@
-//! One role of a run, in a process of its own: the run directory says everything, this hands each role its part of it.
+//! One role of a run, in its own process. Reads the run directory and passes each role its settings.
 
 use std::ffi::CString;
 use std::io::Write;
@@ -20,9 +20,9 @@ use tracing_subscriber::filter::LevelFilter;
 
 use crate::cli::RoleArgs;
 
-/// Runs a role until it is through, or its standard input closes.
+/// Runs a role until it is done or its standard input closes.
 pub(crate) fn run(role: Role, args: &RoleArgs) -> anyhow::Result<ExitCode> {
-    // What is logged goes to the launcher, which may be gone already: then it is lost, and no reason to fail.
+    // The log goes to the launcher through standard error. If the launcher is gone, losing it is not an error.
     tracing_subscriber::fmt()
         .with_writer(std::io::stderr)
         .with_max_level(log_level())
@@ -31,7 +31,7 @@ pub(crate) fn run(role: Role, args: &RoleArgs) -> anyhow::Result<ExitCode> {
         .log_internal_errors(false)
         .init();
 
-    // For `ps` and `top`, which would show how it was started; 15 bytes are kept.
+    // For `ps` and `top`, which would otherwise show `exe`. The kernel keeps 15 bytes.
     if let Ok(name) = CString::new(format!("shoal-{}-{}", role.name(), args.index)) {
         let _ = rustix::thread::set_name(&name);
     }
@@ -45,7 +45,7 @@ pub(crate) fn run(role: Role, args: &RoleArgs) -> anyhow::Result<ExitCode> {
     if role == Role::EnvServer
         && let Some(program) = launch_spec(&config, &run, identity).command(&config.environment)?
     {
-        return external_environment::serve_by(&program);
+        return external_environment::serve_with(&program);
     }
     let stop = Stop::when_stdin_closes().context("cannot watch standard input")?;
     let domain = Domain::join(&config.run.id, config.actors.max)?;
@@ -53,13 +53,13 @@ pub(crate) fn run(role: Role, args: &RoleArgs) -> anyhow::Result<ExitCode> {
     let left = domain.leave();
     ended?;
     if let Err(error) = left {
-        // Whoever leaves later removes what is left.
+        // A process that leaves later removes the rest.
         let _ = writeln!(std::io::stderr(), "{error}");
     }
     Ok(ExitCode::SUCCESS)
 }
 
-/// `info`, or what the environment variable `SHOAL_LOG` says: `debug` tells of every chunk that is sent.
+/// The level in the environment variable `SHOAL_LOG`, by default `info`; `debug` logs every chunk that is sent.
 fn log_level() -> LevelFilter {
     let level = std::env::var("SHOAL_LOG").ok().and_then(|level| level.parse().ok());
     level.unwrap_or(LevelFilter::INFO)
@@ -88,7 +88,7 @@ fn work(domain: &Domain, config: &Config, run: &RunDir, identity: Identity, stop
     }
 }
 
-/// What an environment server has to know.
+/// The arguments of an environment server.
 fn launch_spec<'a>(config: &'a Config, run: &RunDir, identity: Identity) -> LaunchSpec<'a> {
     let Identity { index, incarnation, .. } = identity;
     let (client, environments) = if index == config.evaluation_server() {
@@ -104,7 +104,7 @@ fn launch_spec<'a>(config: &'a Config, run: &RunDir, identity: Identity) -> Laun
         client,
         environments,
         seed: config.run.seed,
-        // In lockstep nothing may depend on how often a process was started.
+        // A lockstep run must not depend on how often processes were started.
         stream: if config.run.mode == Mode::Lockstep {
             0
         } else {

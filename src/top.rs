@@ -1,89 +1,89 @@
-//! What `shoal top` knows and shows of a run. The terminal itself, and its keys, are `command/top.rs`'s.
+//! The state and the view of `shoal top`. `command/top.rs` handles the terminal and its keys.
 
 mod link;
 mod view;
 
 use std::collections::VecDeque;
 
-pub(crate) use link::{Link, News, Order};
+pub(crate) use link::{Link, Request, RunEvent};
 use shoal_common::channel::control::RunStatus;
 pub(crate) use view::draw;
 
-/// Looks that the throughput is kept of.
+/// Number of polls whose throughput is kept.
 const KEPT: usize = 240;
 
-/// Looks that a notice stays for.
-const NOTICED: u8 = 4;
+/// Number of polls for which a notice is shown.
+const NOTICE_POLLS: u8 = 4;
 
-/// Whether the run lives.
+/// The state of the run's launcher.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) enum Life {
-    /// Nothing is known yet.
+pub(crate) enum LauncherState {
+    /// Not known yet.
     Unknown,
-    /// Its launcher answers.
+    /// It answers.
     Running,
-    /// There is a launcher, and it does not answer: why.
+    /// It exists but does not answer, for this reason.
     Silent(String),
-    /// There is no launcher any more.
+    /// It has ended.
     Ended,
 }
 
-/// What lies over the picture.
+/// A box shown over the screen.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Over {
-    /// Nothing.
+pub(crate) enum Overlay {
+    /// No box.
     Nothing,
-    /// What the keys do.
+    /// The list of keys.
     Help,
-    /// Whether the run is to be stopped.
+    /// The question whether to stop the run.
     Stop,
 }
 
 /// Everything that is drawn.
 #[derive(Clone, Debug)]
 pub(crate) struct Screen {
-    /// The run's directory, as it was typed.
+    /// The run's directory, as given by the user.
     pub(crate) run: String,
     /// Environment, method and mode.
     pub(crate) task: String,
-    pub(crate) life: Life,
+    pub(crate) launcher: LauncherState,
     pub(crate) status: RunStatus,
     /// Environment steps and mean return of every evaluation.
     pub(crate) evaluations: Vec<(f64, f64)>,
-    /// Updates a second, one for each look; the newest last.
+    /// Updates per second at each poll, the newest last.
     pub(crate) throughput: VecDeque<u64>,
-    pub(crate) over: Over,
-    /// What came of the last key, for a few looks.
+    pub(crate) overlay: Overlay,
+    /// The result of the last key, shown for a few polls.
     pub(crate) notice: Option<String>,
-    looks_since: u8,
-    /// The actors that were asked for and are not confirmed yet.
+    polls_since: u8,
+    /// The number of actors that was requested and is not confirmed yet.
     pub(crate) wanted: Option<u32>,
-    /// Whether colours are welcome.
+    /// Whether to use colours.
     pub(crate) colours: bool,
 }
 
 impl Screen {
-    /// Before anything is heard.
+    /// The screen before the first event.
     pub(crate) fn new(run: String, task: String, colours: bool) -> Self {
         Self {
             run,
             task,
-            life: Life::Unknown,
+            launcher: LauncherState::Unknown,
             status: RunStatus::default(),
             evaluations: Vec::new(),
             throughput: VecDeque::new(),
-            over: Over::Nothing,
+            overlay: Overlay::Nothing,
             notice: None,
-            looks_since: 0,
+            polls_since: 0,
             wanted: None,
             colours,
         }
     }
 
-    /// Takes in what was heard of the run.
-    pub(crate) fn hear(&mut self, news: News) {
-        match news {
-            News::Running(status, evaluations) => {
+    /// Applies an event.
+    pub(crate) fn handle(&mut self, event: RunEvent) {
+        match event {
+            RunEvent::Running(status, evaluations) => {
                 if self.throughput.len() == KEPT {
                     self.throughput.pop_front();
                 }
@@ -91,59 +91,61 @@ impl Screen {
                 if self.wanted == Some(status.actors) {
                     self.wanted = None;
                 }
-                self.looks_since = self.looks_since.saturating_add(1);
-                if self.looks_since > NOTICED {
+                self.polls_since = self.polls_since.saturating_add(1);
+                if self.polls_since > NOTICE_POLLS {
                     self.notice = None;
                 }
-                self.life = Life::Running;
+                self.launcher = LauncherState::Running;
                 (self.status, self.evaluations) = (*status, evaluations);
             }
-            News::Ended(status, evaluations) => {
-                self.life = Life::Ended;
+            RunEvent::Ended(status, evaluations) => {
+                self.launcher = LauncherState::Ended;
                 (self.status, self.evaluations) = (*status, evaluations);
-                self.over = Over::Nothing;
+                self.overlay = Overlay::Nothing;
                 self.notice = None;
             }
-            News::Silent(why) => self.life = Life::Silent(why),
-            News::Answered(words) => {
+            RunEvent::Silent(why) => self.launcher = LauncherState::Silent(why),
+            RunEvent::Answered(text) => {
                 self.wanted = None;
-                self.say(words);
+                self.set_notice(text);
             }
         }
     }
 
-    /// Takes in a key; gives what is to be asked of the run, if anything.
-    pub(crate) fn press(&mut self, key: char) -> Option<Order> {
-        let over = std::mem::replace(&mut self.over, Over::Nothing);
-        match (over, key) {
-            (Over::Stop, 'y') => {
-                self.say("stopping: the learner saves its state".into());
-                return Some(Order::Stop);
+    /// Handles a key; returns the request to send, if any.
+    pub(crate) fn press(&mut self, key: char) -> Option<Request> {
+        let overlay = std::mem::replace(&mut self.overlay, Overlay::Nothing);
+        match (overlay, key) {
+            (Overlay::Stop, 'y') => {
+                self.set_notice("stopping: the learner saves its state".into());
+                return Some(Request::Stop);
             }
-            (Over::Stop | Over::Help, _) => {}
-            (Over::Nothing, '?') => self.over = Over::Help,
-            // A launcher that is silent may hear it all the same, or be busy for a moment only.
-            (Over::Nothing, 's' | '+' | '=' | '-') if matches!(self.life, Life::Unknown | Life::Ended) => {
-                self.say("nothing runs that could be scaled or stopped".into());
+            (Overlay::Stop | Overlay::Help, _) => {}
+            (Overlay::Nothing, '?') => self.overlay = Overlay::Help,
+            // A silent launcher can still be asked: it may only be busy for a moment.
+            (Overlay::Nothing, 's' | '+' | '=' | '-')
+                if matches!(self.launcher, LauncherState::Unknown | LauncherState::Ended) =>
+            {
+                self.set_notice("the run is not running: it cannot be scaled or stopped".into());
             }
-            (Over::Nothing, 's') => self.over = Over::Stop,
-            (Over::Nothing, '+' | '=') => return Some(self.scale(1)),
-            (Over::Nothing, '-') => return Some(self.scale(-1)),
-            (Over::Nothing, _) => {}
+            (Overlay::Nothing, 's') => self.overlay = Overlay::Stop,
+            (Overlay::Nothing, '+' | '=') => return Some(self.scale(1)),
+            (Overlay::Nothing, '-') => return Some(self.scale(-1)),
+            (Overlay::Nothing, _) => {}
         }
         None
     }
 
-    fn say(&mut self, words: String) {
-        (self.notice, self.looks_since) = (Some(words), 0);
+    fn set_notice(&mut self, text: String) {
+        (self.notice, self.polls_since) = (Some(text), 0);
     }
 
-    fn scale(&mut self, by: i32) -> Order {
+    fn scale(&mut self, by: i32) -> Request {
         let now = self.wanted.unwrap_or(self.status.actors);
         let wanted = now.saturating_add_signed(by);
         self.wanted = Some(wanted);
-        self.say(format!("asking for {wanted} actors"));
-        Order::Scale(wanted)
+        self.set_notice(format!("requesting {wanted} actors"));
+        Request::Scale(wanted)
     }
 }
 
@@ -157,46 +159,50 @@ mod tests {
             actors,
             ..RunStatus::default()
         };
-        screen.hear(News::Running(Box::new(status), Vec::new()));
+        screen.handle(RunEvent::Running(Box::new(status), Vec::new()));
         screen
     }
 
     #[test]
-    fn two_presses_ask_for_two_actors_more() {
+    fn two_key_presses_request_two_more_actors() {
         let mut screen = running(2);
-        assert_eq!(screen.press('+'), Some(Order::Scale(3)));
-        assert_eq!(screen.press('+'), Some(Order::Scale(4)));
-        assert_eq!(screen.press('-'), Some(Order::Scale(3)));
-        screen.hear(News::Answered("no room".into()));
-        assert_eq!(screen.press('-'), Some(Order::Scale(1)), "a refusal counts for nothing");
+        assert_eq!(screen.press('+'), Some(Request::Scale(3)));
+        assert_eq!(screen.press('+'), Some(Request::Scale(4)));
+        assert_eq!(screen.press('-'), Some(Request::Scale(3)));
+        screen.handle(RunEvent::Answered("refused".into()));
+        assert_eq!(
+            screen.press('-'),
+            Some(Request::Scale(1)),
+            "a refused request does not count"
+        );
     }
 
     #[test]
-    fn a_run_is_stopped_only_after_a_yes() {
+    fn a_run_is_stopped_only_after_confirmation() {
         let mut screen = running(1);
-        assert_eq!((screen.press('s'), screen.over), (None, Over::Stop));
-        assert_eq!((screen.press('n'), screen.over), (None, Over::Nothing));
+        assert_eq!((screen.press('s'), screen.overlay), (None, Overlay::Stop));
+        assert_eq!((screen.press('n'), screen.overlay), (None, Overlay::Nothing));
         assert_eq!(screen.press('y'), None);
         screen.press('s');
-        assert_eq!(screen.press('y'), Some(Order::Stop));
+        assert_eq!(screen.press('y'), Some(Request::Stop));
     }
 
     #[test]
-    fn a_run_whose_launcher_is_silent_can_still_be_asked() {
+    fn a_silent_launcher_can_still_be_asked() {
         let mut screen = running(1);
-        screen.hear(News::Silent("no answer".into()));
-        assert_eq!(screen.press('+'), Some(Order::Scale(2)));
+        screen.handle(RunEvent::Silent("no answer".into()));
+        assert_eq!(screen.press('+'), Some(Request::Scale(2)));
         screen.press('s');
-        assert_eq!(screen.press('y'), Some(Order::Stop));
+        assert_eq!(screen.press('y'), Some(Request::Stop));
     }
 
     #[test]
-    fn what_has_ended_is_neither_scaled_nor_stopped() {
+    fn an_ended_run_is_neither_scaled_nor_stopped() {
         let mut screen = running(1);
-        screen.hear(News::Ended(Box::default(), Vec::new()));
+        screen.handle(RunEvent::Ended(Box::default(), Vec::new()));
         for key in ['+', '-', 's'] {
             assert_eq!(screen.press(key), None);
-            assert_eq!(screen.over, Over::Nothing);
+            assert_eq!(screen.overlay, Overlay::Nothing);
         }
     }
 }

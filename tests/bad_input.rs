@@ -1,13 +1,13 @@
-//! Bad input gets one clear line that says what, where and what to do, a non-zero exit code, and loses nothing.
+//! Bad input gets one line that states what is wrong, where, and what to do, and a non-zero exit code. Nothing is lost.
 
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
 
 mod support;
 
-use support::{QUICK, Workplace, complaint, until};
+use support::{QUICK, Workplace, error_line, until};
 
 #[test]
-fn what_cannot_be_trained_is_refused_before_anything_is_made() {
+fn invalid_training_arguments_are_refused_before_anything_is_created() {
     let place = Workplace::new();
     std::fs::write(place.path().join("broken.toml"), "[run\n").unwrap();
     std::fs::write(
@@ -77,7 +77,7 @@ fn what_cannot_be_trained_is_refused_before_anything_is_made() {
         ),
         (
             &["pendulum", "--set", "run.identity_format=0"],
-            "run.identity_format is not for choosing",
+            "run.identity_format cannot be set",
         ),
         (&["pendulum", "--set", "environment.start_sped=1"], "start_sped"),
         (&["point-mass-r1", "--set", "environment.friction=-1"], "friction"),
@@ -121,31 +121,31 @@ fn what_cannot_be_trained_is_refused_before_anything_is_made() {
         (&["cart-pole", "--episodes", "0"], "run.episodes = 0: must be from 1"),
         (&["pendulum", "--steps", "0"], "run.steps = 0"),
     ] {
-        let said = complaint(&place.output(&[&["train"], arguments].concat()));
+        let message = error_line(&place.output(&[&["train"], arguments].concat()));
         assert!(
-            said.starts_with("error: ") && said.contains(part),
-            "{arguments:?}: {said}"
+            message.starts_with("error: ") && message.contains(part),
+            "{arguments:?}: {message}"
         );
     }
-    assert!(!place.path().join("runs").exists(), "nothing was made");
+    assert!(!place.path().join("runs").exists(), "nothing was created");
 }
 
 #[test]
-fn a_run_directory_that_exists_is_left_as_it_is() {
+fn an_existing_directory_is_refused_and_left_unchanged() {
     let place = Workplace::new();
     std::fs::create_dir(place.path().join("mine")).unwrap();
     std::fs::write(place.path().join("mine/thesis.txt"), "four months of work").unwrap();
-    let said = complaint(&place.output(&["train", "pendulum", "--run", "mine"]));
-    assert!(said.contains("mine exists already"), "{said}");
+    let message = error_line(&place.output(&["train", "pendulum", "--run", "mine"]));
+    assert!(message.contains("mine exists already"), "{message}");
     assert_eq!(std::fs::read_dir(place.path().join("mine")).unwrap().count(), 1);
 }
 
 #[test]
-fn what_is_no_run_is_refused() {
+fn a_path_that_is_not_a_run_directory_is_refused() {
     let place = Workplace::new();
     for command in ["eval", "plot"] {
-        let said = complaint(&place.output(&[command, "nowhere"]));
-        assert!(said.contains("nowhere is not a run directory"), "{said}");
+        let message = error_line(&place.output(&[command, "nowhere"]));
+        assert!(message.contains("nowhere is not a run directory"), "{message}");
     }
 }
 
@@ -158,27 +158,27 @@ fn a_damaged_policy_is_refused_and_kept() {
     let middle = bytes.len() / 2;
     bytes[middle] ^= 1;
     std::fs::write(&policy, &bytes).unwrap();
-    let said = complaint(&place.output(&["eval", "run", "--policy", "last"]));
-    assert!(said.contains("last.policy"), "{said}");
+    let message = error_line(&place.output(&["eval", "run", "--policy", "last"]));
+    assert!(message.contains("last.policy"), "{message}");
     assert_eq!(std::fs::read(&policy).unwrap(), bytes);
 }
 
 #[test]
-fn a_disk_that_is_too_small_for_the_replay_is_said_and_ends_the_run() {
+fn a_disk_too_small_for_the_replay_is_reported_and_ends_the_run() {
     let place = Workplace::new();
-    // A file-size limit of a few megabytes stands for the full disk: the replay wants forty.
+    // A file size limit of a few megabytes simulates a full disk: the replay needs forty.
     let script = format!(
         "ulimit -f 8000; exec {} train pendulum --run run --json",
         env!("CARGO_BIN_EXE_shoal")
     );
     let mut shell = std::process::Command::new("sh");
     let output = support::output_of(shell.args(["-c", &script]).current_dir(place.path()));
-    let said = complaint(&output);
-    assert!(said.contains("learner-0") && said.contains("replay.bin"), "{said}");
+    let message = error_line(&output);
     assert!(
-        !place.path().join("run/replay.bin").exists(),
-        "no half-made file is left"
+        message.contains("learner-0") && message.contains("replay.bin"),
+        "{message}"
     );
+    assert!(!place.path().join("run/replay.bin").exists(), "no partial file is left");
 }
 
 #[test]
@@ -190,13 +190,17 @@ fn json_is_the_only_line_on_standard_output() {
     assert_eq!(evaluated["episodes"], 4);
     assert!(evaluated["final_distance_mean"].is_f64(), "{evaluated}");
     let reached = evaluated["reached_fraction"].as_f64().unwrap();
-    assert_eq!((reached * 4.0).fract(), 0.0, "so many of four episodes: {evaluated}");
+    assert_eq!(
+        (reached * 4.0).fract(),
+        0.0,
+        "a whole number of the four episodes: {evaluated}"
+    );
     let again = support::json(&place.output(&["eval", "run", "--policy", "last", "--episodes", "4", "--json"]));
-    assert_eq!(again, evaluated, "always the same starts");
+    assert_eq!(again, evaluated, "every evaluation uses the same starts");
 }
 
 #[test]
-fn two_runs_side_by_side_do_not_touch_each_other() {
+fn two_runs_at_the_same_time_do_not_affect_each_other() {
     let place = Workplace::new();
     let other = Workplace::new();
     let running = place.start("run", &["--steps", "100000000"]);
@@ -204,7 +208,7 @@ fn two_runs_side_by_side_do_not_touch_each_other() {
     let before = starts();
     let output = other.output(&[&["train", "pendulum", "--steps", "300", "--lockstep"], &QUICK[..]].concat());
     assert!(output.status.success());
-    until("the first run goes on", || {
+    until("the first run has saved a checkpoint", || {
         running.run.join("checkpoints/latest.ckpt").exists()
     });
     assert_eq!(starts(), before, "no process of the first run was replaced");

@@ -1,6 +1,6 @@
-//! `shoal bench`: every stage answers, and what it says hangs together. No time is asserted.
+//! Every stage of `shoal bench` prints figures that are consistent with each other. No test asserts a duration.
 
-#![allow(clippy::unwrap_used, reason = "a failure anywhere in here is a failed test")]
+#![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
 
 mod support;
 
@@ -21,14 +21,14 @@ fn bench(stage: &str, temporary: &Path, seconds: &str) -> Command {
     command
 }
 
-/// Runs a stage for a moment: the JSON object that is the one line of its standard output.
+/// Runs a stage briefly and returns the JSON object that it prints as its only line.
 fn figures(stage: &str) -> Value {
     let temporary = TempDir::new().unwrap();
     let Output { status, stdout, stderr } = output_of(&mut bench(stage, temporary.path(), "0.3"));
     let (stdout, stderr) = (String::from_utf8(stdout).unwrap(), String::from_utf8(stderr).unwrap());
     assert!(status.success(), "{stage}: {status}: {stderr}");
     assert_eq!(stdout.lines().count(), 1, "{stdout}");
-    assert!(stderr.contains('│'), "a table for people: {stderr}");
+    assert!(stderr.contains('│'), "a table for the user: {stderr}");
     assert_eq!(entries(temporary.path()), 0, "{stage} leaves nothing behind");
     serde_json::from_str(&stdout).unwrap()
 }
@@ -47,7 +47,7 @@ fn number(figures: &Value, field: &str) -> f64 {
 }
 
 #[test]
-fn the_learner_is_held_against_the_matrix_products() {
+fn the_learner_is_compared_with_bare_matrix_products() {
     let figures = figures("learner");
     for (figures, batch, megaflop) in [(&figures, 64.0, 140.0), (&figures["large_batch"], 256.0, 560.0)] {
         let [rate, flop, limit, share] = [
@@ -68,7 +68,7 @@ fn the_learner_is_held_against_the_matrix_products() {
 }
 
 #[test]
-fn rows_reach_the_replay_and_come_out_again() {
+fn rows_are_written_to_the_replay_and_sampled_from_it() {
     let figures = figures("transitions");
     number(&figures, "rows_per_second");
     number(&figures, "sampled_rows_per_second");
@@ -78,7 +78,7 @@ fn rows_reach_the_replay_and_come_out_again() {
 }
 
 #[test]
-fn a_step_has_its_median_and_its_tail() {
+fn step_times_have_a_median_and_a_tail() {
     let figures = figures("step");
     let [least, median, p90, p99] = ["least_us", "median_us", "p90_us", "p99_us"].map(|field| number(&figures, field));
     assert!(least <= median && median <= p90 && p90 <= p99, "{figures}");
@@ -90,7 +90,7 @@ fn a_step_has_its_median_and_its_tail() {
 }
 
 #[test]
-fn the_policy_acts_alone_and_in_batches() {
+fn the_policy_acts_on_one_observation_and_on_batches() {
     let figures = figures("policy");
     for (batch, actions, time) in [
         (1.0, "actions_per_second_batch_1", "microseconds_per_call_batch_1"),
@@ -110,9 +110,9 @@ fn the_policy_acts_alone_and_in_batches() {
     assert!((share - gflops / limit).abs() < 1e-9 * share, "{figures}");
 }
 
-/// Every stage alone is tested above: here they are together, and each line's verdict is that of its number.
+/// The tests above cover the stages one by one. Here all of them run, and each line's verdict follows from its number.
 #[test]
-fn all_stages_make_one_table() {
+fn all_stages_together_give_one_table() {
     let figures = figures("all");
     for stage in ["learner", "transitions", "step", "policy", "actors", "run"] {
         assert!(figures[stage].is_object(), "{stage} in {figures}");
@@ -138,7 +138,7 @@ fn all_stages_make_one_table() {
 }
 
 #[test]
-fn actors_are_counted_and_expected() {
+fn rates_of_several_actors_are_measured_and_predicted() {
     let figures = figures("actors");
     let cores = number(&figures, "cores");
     assert_eq!(number(&figures, "environments_per_actor"), 64.0);
@@ -177,8 +177,8 @@ fn actors_are_counted_and_expected() {
         number(&figures["costs"], &format!("{stage}_us"));
     }
     let scaling = figures["scaling"].as_array().unwrap();
-    let asked: Vec<f64> = scaling.iter().map(|one| number(one, "actors")).collect();
-    assert_eq!(asked, [1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0]);
+    let predicted: Vec<f64> = scaling.iter().map(|one| number(one, "actors")).collect();
+    assert_eq!(predicted, [1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0]);
     for pair in scaling.windows(2) {
         let [few, many] = [0, 1].map(|i| number(&pair[i], "rows_per_second"));
         assert!(few < many, "more actors, more rows: {figures}");
@@ -196,7 +196,7 @@ fn actors_are_counted_and_expected() {
 }
 
 #[test]
-fn a_run_has_its_start_its_recoveries_and_its_memory() {
+fn the_run_stage_measures_starts_recoveries_and_memory() {
     let figures = figures("run");
     assert!(number(&figures, "starts") >= 1.0 && number(&figures, "kills") >= 1.0);
     assert_eq!(number(&figures, "warm_up_rows"), 1000.0);
@@ -227,7 +227,7 @@ fn a_run_has_its_start_its_recoveries_and_its_memory() {
 }
 
 #[test]
-fn a_list_of_counts_that_is_none_is_refused_in_one_line() {
+fn an_invalid_list_of_counts_is_refused_in_one_line() {
     let temporary = TempDir::new().unwrap();
     for (stage, counts) in [
         ("actors", ""),
@@ -244,14 +244,17 @@ fn a_list_of_counts_that_is_none_is_refused_in_one_line() {
             !output.status.success() && output.stdout.is_empty(),
             "{stage} {counts:?}"
         );
-        let said = String::from_utf8(output.stderr).unwrap();
-        assert!(said.contains("--actors") && said.lines().count() == 1, "{said}");
+        let message = String::from_utf8(output.stderr).unwrap();
+        assert!(
+            message.contains("--actors") && message.lines().count() == 1,
+            "{message}"
+        );
         assert_eq!(entries(temporary.path()), 0);
     }
 }
 
 #[test]
-fn interrupted_it_leaves_nothing_behind() {
+fn an_interrupted_stage_leaves_nothing_behind() {
     for stage in ["transitions", "step", "actors", "run"] {
         let temporary = TempDir::new().unwrap();
         let mut child = bench(stage, temporary.path(), "60")
@@ -271,24 +274,24 @@ fn interrupted_it_leaves_nothing_behind() {
         kill_process(Pid::from_child(&child), Signal::INT).unwrap();
         let status = eventually(stage, || child.try_wait().unwrap());
         assert_eq!(status.code(), Some(1), "{stage}");
-        let mut said = String::new();
-        std::io::Read::read_to_string(&mut child.stderr.take().unwrap(), &mut said).unwrap();
-        assert_eq!(said, "error: interrupted\n", "{stage}");
+        let mut message = String::new();
+        std::io::Read::read_to_string(&mut child.stderr.take().unwrap(), &mut message).unwrap();
+        assert_eq!(message, "error: interrupted\n", "{stage}");
         assert_eq!(entries(temporary.path()), 0, "{stage}");
         assert_eq!(shared_files(&shared), 0, "{stage}");
     }
 }
 
 #[test]
-fn a_time_that_is_none_is_refused_in_one_line() {
+fn an_invalid_duration_is_refused_in_one_line() {
     let temporary = TempDir::new().unwrap();
     for seconds in ["soon", "0", "-1", "nan"] {
         let output = output_of(&mut bench("policy", temporary.path(), seconds));
         assert!(!output.status.success() && output.stdout.is_empty());
-        let said = String::from_utf8(output.stderr).unwrap();
+        let message = String::from_utf8(output.stderr).unwrap();
         assert!(
-            said.contains("SHOAL_BENCH_SECONDS") && said.lines().count() == 1,
-            "{said}"
+            message.contains("SHOAL_BENCH_SECONDS") && message.lines().count() == 1,
+            "{message}"
         );
     }
 }
@@ -300,7 +303,7 @@ fn shared_files(prefix: &str) -> usize {
         .count()
 }
 
-/// Looks until there is something. Nothing takes this long unless it hangs.
+/// Polls until `look` returns something. Only a stage that hangs reaches the deadline.
 fn eventually<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
     let deadline = Instant::now() + Duration::from_secs(120);
     loop {

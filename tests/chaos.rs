@@ -1,5 +1,5 @@
-//! A person with a fixed seed kills a random process every second or so and scales the actors up and down; in the end
-//! everything that was sent is in the replay, once, and the run can go on and learn what it was to learn.
+//! Kills a random process every second or so, and scales the actors up and down, with a fixed seed. At the end the
+//! replay holds everything that was sent exactly once, and the run can continue and learn its task.
 
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
 
@@ -26,15 +26,15 @@ struct Kill {
     at: f64,
 }
 
-/// What the chaos came to.
+/// The results of one chaos run.
 struct Figures {
     kills: usize,
-    /// Seconds from a kill to the successor's being ready, ascending.
+    /// Seconds from each kill until the successor was ready, ascending.
     recoveries: Vec<f64>,
     rows: u64,
     rows_lost: u64,
     scalings: usize,
-    /// The longest time without a report of the learner, which comes twice a second, in seconds.
+    /// The longest time between two reports of the learner, in seconds. It reports twice a second.
     silence: f64,
 }
 
@@ -42,11 +42,11 @@ fn now() -> f64 {
     SystemTime::UNIX_EPOCH.elapsed().unwrap().as_secs_f64()
 }
 
-/// Kills and scales for so long.
-fn rage(place: &Workplace, running: &Running, rng: &mut Stream, length: Duration) -> (Vec<Kill>, usize) {
+/// Kills and scales for `length`. Returns the kills and the number of scalings.
+fn kill_and_scale(place: &Workplace, running: &Running, rng: &mut Stream, length: Duration) -> (Vec<Kill>, usize) {
     let (begun, mut kills, mut scalings) = (Instant::now(), Vec::new(), 0);
     while begun.elapsed() < length {
-        // From one kill to the next: at any moment of whatever goes on.
+        // A random pause, so that a kill may come at any moment.
         std::thread::sleep(Duration::from_millis(rng.random_range(300..1500)));
         if rng.random_bool(0.2) {
             let actors = rng.random_range(1..=MAX_ACTORS).to_string();
@@ -60,7 +60,7 @@ fn rage(place: &Workplace, running: &Running, rng: &mut Stream, length: Duration
         let victim = &roles[rng.random_range(0..roles.len())];
         let who = format!("{}-{}", victim["role"].as_str().unwrap(), victim["index"]);
         let Some(pid) = victim["pid"].as_i64() else { continue };
-        // It may have ended, or been replaced, since it was asked for.
+        // The process may have ended or been replaced since the status was read.
         if running.pids(&who).last().is_some_and(|last| i64::from(*last) == pid)
             && kill_process(Pid::from_raw(pid as i32).unwrap(), Signal::KILL).is_ok()
         {
@@ -70,33 +70,35 @@ fn rage(place: &Workplace, running: &Running, rng: &mut Stream, length: Duration
     (kills, scalings)
 }
 
-/// The launcher's lines about a process, with their times.
+/// The launcher's log lines about a role, with their times.
 fn notes(log: &str, who: &str) -> Vec<(f64, String)> {
     let of = |line: &str| {
         let (name, rest) = line.split_once(' ')?;
-        let (time, said) = rest.trim_start().split_once(' ')?;
-        Some((time.parse().ok()?, said.to_owned())).filter(|_| name == who)
+        let (time, message) = rest.trim_start().split_once(' ')?;
+        Some((time.parse().ok()?, message.to_owned())).filter(|_| name == who)
     };
     log.lines().filter_map(of).collect()
 }
 
-/// When the process after `kill` was ready, if there was to be one: who was retiring, or was no longer needed before its
-/// successor had started, has none.
+/// When the successor of the killed process was ready. `None` if there was none, because the process was retiring or no
+/// longer needed.
 fn ready_again(log: &str, kill: &Kill) -> Option<f64> {
     let notes = notes(log, &kill.who);
     let started = format!("started as process {}", kill.pid);
-    let killed = notes.iter().position(|(_, said)| *said == started)?;
+    let killed = notes.iter().position(|(_, message)| *message == started)?;
     let ended = notes
         .iter()
         .skip(killed)
-        .position(|(_, said)| said.contains("killed by signal 9"))?;
+        .position(|(_, message)| message.contains("killed by signal 9"))?;
     let after = &notes[killed + ended..];
-    let ready = after.iter().position(|(_, said)| said.starts_with("ready after"))?;
-    let was_needed = !after[..ready].iter().any(|(_, said)| said.contains("not needed"));
+    let ready = after
+        .iter()
+        .position(|(_, message)| message.starts_with("ready after"))?;
+    let was_needed = !after[..ready].iter().any(|(_, message)| message.contains("not needed"));
     was_needed.then_some(after[ready].0)
 }
 
-/// Whether no learner was ready at some moment of the half second around `time`.
+/// Whether no learner was ready at some moment within half a second of `time`.
 fn learner_was_away(log: &str, kills: &[Kill], time: f64) -> bool {
     kills.iter().filter(|kill| kill.who == "learner-0").any(|kill| {
         let back = ready_again(log, kill).unwrap_or(f64::INFINITY);
@@ -104,8 +106,9 @@ fn learner_was_away(log: &str, kills: &[Kill], time: f64) -> bool {
     })
 }
 
-/// Everything that was sent is in the replay, but for what may be lost.
-fn account(run: &Path, config: &Config, kills: &[Kill]) -> (u64, u64) {
+/// Checks that everything that was sent is in the replay, except what may be lost. Returns the rows in the replay and
+/// the rows lost.
+fn check_sent_rows(run: &Path, config: &Config, kills: &[Kill]) -> (u64, u64) {
     let log = std::fs::read_to_string(run.join("shoal.log")).unwrap();
     let chunk = config.chunk_rows() as u64;
     let (mut rows, mut lost) = (0, 0);
@@ -113,12 +116,12 @@ fn account(run: &Path, config: &Config, kills: &[Kill]) -> (u64, u64) {
         let (sent, committed) = (sent(run, actor), committed(run, actor as usize));
         let own = kills.iter().filter(|kill| kill.who == format!("actor-{actor}"));
         let (alone, with_learner): (Vec<_>, Vec<_>) = own.partition(|kill| !learner_was_away(&log, kills, kill.at));
-        // An actor may be killed after it has sent a chunk and before it has said so.
-        let unsaid = chunk * (alone.len() + with_learner.len()) as u64;
+        // An actor may be killed after it has sent a chunk and before it has logged that.
+        let unlogged = chunk * (alone.len() + with_learner.len()) as u64;
         let windows = chunk * u64::from(config.actors.window) * with_learner.len() as u64;
         assert!(
-            (sent.saturating_sub(windows)..=sent + unsaid).contains(&committed),
-            "actor {actor} sent {sent} rows and {committed} are in the replay; it was killed {} times with a learner and {} without",
+            (sent.saturating_sub(windows)..=sent + unlogged).contains(&committed),
+            "actor {actor} sent {sent} rows, {committed} are in the replay; killed {} times with a learner, {} without",
             alone.len(),
             with_learner.len()
         );
@@ -128,8 +131,8 @@ fn account(run: &Path, config: &Config, kills: &[Kill]) -> (u64, u64) {
     (rows, lost)
 }
 
-/// Every row of the replay is there once, whole, and none is taken for a terminal one: the pendulum has no end.
-fn inspect(run: &Path, config: &Config, rows: u64) {
+/// Checks that every row of the replay is whole and unique. None may be terminal: the pendulum never terminates.
+fn check_stored_rows(run: &Path, config: &Config, rows: u64) {
     let layout = ReplayLayout {
         row: config.row_layout(),
         ring: config.replay.capacity,
@@ -145,7 +148,7 @@ fn inspect(run: &Path, config: &Config, rows: u64) {
         let row = replay.row(index);
         let transition = layout.row.read(row);
         assert_eq!(transition.discount, config.algorithm.gamma() as f32);
-        // Spinning at full speed under full torque, a pendulum may come by exactly where it was.
+        // A pendulum that spins at full speed under full torque may return to exactly the same state.
         if transition.a[0].abs() < 2.0 {
             let bits: Vec<u32> = row.iter().map(|x| x.to_bits()).collect();
             assert!(seen.insert(bits), "row {index} is there twice");
@@ -154,8 +157,8 @@ fn inspect(run: &Path, config: &Config, rows: u64) {
     assert!(seen.len() > 1000);
 }
 
-/// A learner is never ahead of the ratio, and takes nothing while the actors are ahead by more than is agreed. Returns the
-/// longest time without a report.
+/// Checks that the learner is never ahead of the ratio, and takes nothing in while the actors are ahead by more than
+/// the tolerance. Returns the longest time between two reports, in seconds.
 fn ratio_is_kept(run: &Path, config: &Config) -> f64 {
     #[derive(serde::Deserialize)]
     struct Row {
@@ -171,17 +174,17 @@ fn ratio_is_kept(run: &Path, config: &Config) -> f64 {
     assert!(rows.len() > 10);
     let beyond = |row: &Row| row.env_steps.saturating_sub(config.replay.warmup);
     let mut seen = 0;
-    // The last one tells of what was taken in when the run was stopped.
+    // The last report includes what was taken in when the run was stopped.
     for two in rows[..rows.len() - 1].windows(2) {
         assert!(two[1].updates <= beyond(&two[1]), "ahead of the ratio");
-        // A learner reports twice a second and begins half a second after its start; a new one has updates to do again.
-        let the_same = two[1].wall_seconds - two[0].wall_seconds < 0.58;
-        let took = the_same && two[1].env_steps > two[0].env_steps;
-        seen += usize::from(took);
-        let agreed = config.replay.tolerance + config.chunk_rows() as u64;
+        // A learner reports every half second. A longer gap means a new one, which has gradient steps to repeat.
+        let same_learner = two[1].wall_seconds - two[0].wall_seconds < 0.58;
+        let took_in = same_learner && two[1].env_steps > two[0].env_steps;
+        seen += usize::from(took_in);
+        let tolerance = config.replay.tolerance + config.chunk_rows() as u64;
         assert!(
-            !took || beyond(&two[1]) <= two[1].updates + agreed,
-            "{} rows were taken with {} updates done",
+            !took_in || beyond(&two[1]) <= two[1].updates + tolerance,
+            "{} steps were taken in with {} updates done",
             two[1].env_steps,
             two[1].updates
         );
@@ -191,30 +194,31 @@ fn ratio_is_kept(run: &Path, config: &Config) -> f64 {
     silences.fold(0.0, f64::max)
 }
 
-/// Chaos for so long over a run started with `arguments`; the run's end, when it has gone on to `steps`.
+/// Kills and scales for `length` in a run started with `arguments`, stops it, and resumes it to at least `steps`.
+/// Returns the figures and the result of the resumed run.
 fn chaos(seed: u64, length: Duration, arguments: &[&str], steps: u64) -> (Figures, Value) {
-    let place = Workplace::where_chunks_are_counted();
+    let place = Workplace::logging_chunks();
     let begin = ["train", "pendulum", "--run", "run", "--steps", "100000000"];
     let running = place.launch("run", &[&begin[..], arguments].concat());
     let run = running.run.clone();
     let mut rng = Stream::seed_from_u64(seed);
-    let (kills, scalings) = rage(&place, &running, &mut rng, length);
+    let (kills, scalings) = kill_and_scale(&place, &running, &mut rng, length);
 
     let stopped = place.output(&["stop", "run"]);
     assert!(stopped.status.success(), "{}", String::from_utf8_lossy(&stopped.stderr));
     let (code, _, leftovers) = running.wait();
     let log = std::fs::read_to_string(run.join("shoal.log")).unwrap();
-    assert_eq!(code, Some(0), "{}\n{log}", place.said());
+    assert_eq!(code, Some(0), "{}\n{log}", place.stderr());
     assert!(leftovers.processes().is_empty(), "{:?}", leftovers.processes());
     assert!(leftovers.files().is_empty(), "{:?}", leftovers.files());
     let config = Config::load(&run.join("config.toml")).unwrap();
-    let (rows, rows_lost) = account(&run, &config, &kills);
-    inspect(&run, &config, rows);
+    let (rows, rows_lost) = check_sent_rows(&run, &config, &kills);
+    check_stored_rows(&run, &config, rows);
     let silence = ratio_is_kept(&run, &config);
 
     let steps = steps.max(rows + 1000).to_string();
     let (code, printed, leftovers) = place.resume("run", &["--steps", &steps]).wait();
-    assert_eq!(code, Some(0), "{}", place.said());
+    assert_eq!(code, Some(0), "{}", place.stderr());
     assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
     let mut recoveries: Vec<_> = kills
         .iter()
@@ -243,7 +247,8 @@ impl std::fmt::Display for Figures {
         };
         write!(
             f,
-            "{} kills, {} scalings, {n} recoveries (seconds: median {:.3}, p99 {:.3}, longest {:.3}), {} rows, {} of them lost; longest silence of the learner {:.3} s",
+            "{} kills, {} scalings, {n} recoveries (seconds: median {:.3}, p99 {:.3}, longest {:.3}), {} rows, \
+             {} of them lost; longest silence of the learner {:.3} s",
             self.kills,
             self.scalings,
             at(0.5),
@@ -257,7 +262,7 @@ impl std::fmt::Display for Figures {
 }
 
 #[test]
-fn whatever_is_killed_every_row_that_was_sent_is_in_the_replay_once() {
+fn every_sent_row_is_in_the_replay_once_after_random_kills() {
     let arguments = [&support::QUICK[..], &["--set", "replay.capacity=200000"]].concat();
     let (figures, result) = chaos(20, Duration::from_secs(20), &arguments, 0);
     eprintln!("{figures}");
@@ -267,7 +272,7 @@ fn whatever_is_killed_every_row_that_was_sent_is_in_the_replay_once() {
 
 #[test]
 #[ignore = "takes minutes"]
-fn a_minute_of_chaos_and_the_pendulum_still_swings_up() {
+fn the_pendulum_still_swings_up_after_a_minute_of_random_kills() {
     let (figures, result) = chaos(60, Duration::from_secs(60), &[], 30_000);
     eprintln!("{figures}; the best policy: {}", result["eval_return_mean"]);
     assert!(figures.kills >= 20 && figures.scalings >= 3);

@@ -1,4 +1,4 @@
-//! A run seen and led from another terminal: status, scale, stop, resume.
+//! Commands that observe and control a run from another terminal: status, scale, stop, resume.
 
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
 
@@ -12,7 +12,7 @@ use support::{Workplace, json, parse, until};
 
 const ENDLESS: [&str; 2] = ["--steps", "100000000"];
 
-fn said(output: &Output) -> String {
+fn stderr(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
@@ -22,10 +22,10 @@ fn roles<'a>(status: &'a Value, name: &str) -> Vec<&'a Value> {
 }
 
 #[test]
-fn status_shows_every_role_while_a_run_goes_on_and_says_so_when_nothing_runs() {
+fn status_shows_every_role_of_a_run_and_reports_when_nothing_runs() {
     let place = Workplace::new();
     let running = place.start("run", &[&ENDLESS[..], &["--actors", "2"]].concat());
-    running.learns_on();
+    running.wait_for_learning();
     let status = place.status("run");
     assert_eq!(status["running"], true);
     for (role, count) in [("learner", 1), ("evaluator", 1), ("actor", 2), ("env-server", 3)] {
@@ -62,19 +62,19 @@ fn status_shows_every_role_while_a_run_goes_on_and_says_so_when_nothing_runs() {
     running.wait();
     let output = place.output(&["status", "run", "--json"]);
     assert_eq!(output.status.code(), Some(3));
-    let rest = json(&output);
+    let after = json(&output);
     assert_eq!(
-        (&rest["running"], &rest["roles"]),
+        (&after["running"], &after["roles"]),
         (&false.into(), &Value::Array(vec![]))
     );
-    assert!(rest["updates"].as_u64() > status["updates"].as_u64());
+    assert!(after["updates"].as_u64() > status["updates"].as_u64());
     let output = place.output(&["status", "run"]);
     assert_eq!(output.status.code(), Some(3));
     assert!(String::from_utf8_lossy(&output.stdout).contains("shoal resume run"));
 }
 
 #[test]
-fn a_watching_terminal_sees_the_run_to_its_end() {
+fn status_watch_follows_a_run_to_its_end() {
     let place = Workplace::new();
     let running = place.start("run", &ENDLESS);
     let mut watch = place
@@ -83,64 +83,68 @@ fn a_watching_terminal_sees_the_run_to_its_end() {
         .spawn()
         .unwrap();
     let printed = std::io::BufReader::new(watch.stdout.take().unwrap()).lines();
-    let (sender, heard) = std::sync::mpsc::channel();
+    let (sender, received) = std::sync::mpsc::channel();
     std::thread::spawn(move || printed.map_while(Result::ok).try_for_each(|line| sender.send(line)));
     let mut lines: Vec<Value> = Vec::new();
-    let mut listen = || {
-        let new = heard.try_iter().map(|line| serde_json::from_str(&line).unwrap());
+    let mut receive = || {
+        let new = received.try_iter().map(|line| serde_json::from_str(&line).unwrap());
         lines.extend(new);
         lines.len()
     };
-    until("the terminal has seen the run twice", || listen() >= 2);
+    until("two lines are printed", || receive() >= 2);
     assert!(place.output(&["stop", "run"]).status.success());
     running.wait();
-    until("the terminal notices", || watch.try_wait().unwrap().is_some());
+    until("the watching command ends", || watch.try_wait().unwrap().is_some());
     assert!(watch.wait().unwrap().success());
-    lines.extend(heard.iter().map(|line| serde_json::from_str::<Value>(&line).unwrap()));
+    lines.extend(
+        received
+            .iter()
+            .map(|line| serde_json::from_str::<Value>(&line).unwrap()),
+    );
     let (last, before) = lines.split_last().unwrap();
     assert!(before.iter().all(|line| line["running"] == true), "{lines:?}");
     assert_eq!(last["running"], false);
 }
 
 #[test]
-fn actors_come_and_go_while_training_goes_on_and_none_of_their_rows_is_lost() {
-    let place = Workplace::where_chunks_are_counted();
+fn scaling_actors_during_training_loses_no_rows() {
+    let place = Workplace::logging_chunks();
     let running = place.start("run", &[&ENDLESS[..], &["--actors", "1"]].concat());
     for actors in [4, 2, 3, 1] {
         let output = place.output(&["scale", "run", "--actors", &actors.to_string()]);
-        assert!(output.status.success(), "{}", said(&output));
+        assert!(output.status.success(), "{}", stderr(&output));
         let status = place.status("run");
         assert_eq!(status["actors"], actors);
         assert_eq!(roles(&status, "actor").len(), actors, "{status}");
         until("the retired actors' environment servers have ended", || {
             roles(&place.status("run"), "env-server").len() == actors + 1
         });
-        running.learns_on();
+        running.wait_for_learning();
     }
     for (actors, part) in [("0", "room for 1 to 16"), ("17", "room for 1 to 16")] {
         let output = place.output(&["scale", "run", "--actors", actors]);
         assert!(
-            !output.status.success() && said(&output).contains(part),
+            !output.status.success() && stderr(&output).contains(part),
             "{}",
-            said(&output)
+            stderr(&output)
         );
     }
     assert_eq!(place.status("run")["actors"], 1);
     let run = running.run.clone();
     let stopped = place.output(&["stop", "run"]);
-    assert!(stopped.status.success(), "{}", said(&stopped));
+    assert!(stopped.status.success(), "{}", stderr(&stopped));
     let (code, _, leftovers) = running.wait();
     assert_eq!(code, Some(0));
     assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
-    support::all_that_was_sent_is_there(&run, 4);
+    support::assert_all_rows_committed(&run, 4);
 }
 
 #[test]
-fn what_was_sent_is_taken_in_at_the_end_however_far_the_learner_is_behind() {
-    let place = Workplace::where_chunks_are_counted();
-    let slowly = ["--set", "replay.warmup=64", "--set", "actors.chunk_steps=64"];
-    let running = place.start_as("run", &[&ENDLESS[..], &slowly].concat());
-    // Two windows of 512 rows: more than a second's work.
+fn a_stop_stores_everything_sent_even_if_the_learner_is_far_behind() {
+    let place = Workplace::logging_chunks();
+    let slow = ["--set", "replay.warmup=64", "--set", "actors.chunk_steps=64"];
+    let running = place.start_as("run", &[&ENDLESS[..], &slow].concat());
+    // Two windows of 512 rows, which the learner needs more than a second for.
     until("the actors wait", || {
         let sent = support::sent(&running.run, 0);
         sent >= support::committed(&running.run, 0) + 512 && support::sent(&running.run, 1) > 0
@@ -148,46 +152,50 @@ fn what_was_sent_is_taken_in_at_the_end_however_far_the_learner_is_behind() {
     let run = running.run.clone();
     assert!(place.output(&["stop", "run"]).status.success());
     running.wait();
-    support::all_that_was_sent_is_there(&run, 2);
+    support::assert_all_rows_committed(&run, 2);
 }
 
 #[test]
-fn an_end_without_the_learners_state_saved_is_no_success() {
+fn a_run_that_ends_without_saving_the_learners_state_fails() {
     let place = Workplace::new();
     let running = place.start("run", &ENDLESS);
-    running.learns_on();
-    running.stop("learner-0");
+    running.wait_for_learning();
+    running.stop_role("learner-0");
     let stopped = place.output(&["stop", "run"]);
     assert_eq!(stopped.status.code(), Some(1));
     assert!(
-        said(&stopped).contains("did not save its last state"),
+        stderr(&stopped).contains("did not save its last state"),
         "{}",
-        said(&stopped)
+        stderr(&stopped)
     );
     let (code, _, leftovers) = running.wait();
     assert_eq!(code, Some(1));
-    assert!(place.said().contains("did not save its last state"), "{}", place.said());
+    assert!(
+        place.stderr().contains("did not save its last state"),
+        "{}",
+        place.stderr()
+    );
     assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
 }
 
 #[test]
-fn a_learner_that_has_just_died_comes_back_before_the_run_ends() {
-    let place = Workplace::where_chunks_are_counted();
+fn a_learner_killed_just_before_a_stop_is_replaced_before_the_run_ends() {
+    let place = Workplace::logging_chunks();
     let running = place.start("run", &ENDLESS);
-    running.learns_on();
+    running.wait_for_learning();
     running.kill("learner-0");
     let stopped = place.output(&["stop", "run"]);
-    assert!(stopped.status.success(), "{}", said(&stopped));
+    assert!(stopped.status.success(), "{}", stderr(&stopped));
     let run = running.run.clone();
     running.wait();
-    support::all_that_was_sent_is_there(&run, 2);
+    support::assert_all_rows_committed(&run, 2);
 }
 
 #[test]
-fn a_stopped_run_goes_on_where_it_was() {
+fn a_stopped_run_resumes_where_it_stopped() {
     let place = Workplace::new();
     let running = place.start("run", &ENDLESS);
-    running.learns_on();
+    running.wait_for_learning();
     assert!(place.output(&["scale", "run", "--actors", "3"]).status.success());
     let run = running.run.clone();
     let stopped = place.output(&["stop", "run"]);
@@ -204,7 +212,7 @@ fn a_stopped_run_goes_on_where_it_was() {
         assert!(run.join(file).exists(), "{file}");
     }
     let stop_again = place.output(&["stop", "run"]);
-    assert!(!stop_again.status.success() && said(&stop_again).contains("nothing runs"));
+    assert!(!stop_again.status.success() && stderr(&stop_again).contains("nothing runs"));
 
     let steps = before["env_steps"].as_u64().unwrap() + 20_000;
     let running = place.resume("run", &["--steps", &steps.to_string()]);
@@ -215,9 +223,9 @@ fn a_stopped_run_goes_on_where_it_was() {
     );
     let busy = place.output(&["resume", "run"]);
     assert!(
-        !busy.status.success() && said(&busy).contains("is going on"),
+        !busy.status.success() && stderr(&busy).contains("is going on"),
         "{}",
-        said(&busy)
+        stderr(&busy)
     );
     let pids = running.pids("learner-0").len();
     let (code, printed, _) = running.wait();
@@ -227,7 +235,7 @@ fn a_stopped_run_goes_on_where_it_was() {
     assert_eq!(
         after["updates"],
         steps - 64,
-        "the updates of both parts, and none twice"
+        "the updates of both parts, each counted once"
     );
     assert!(after["episodes"].as_u64() > before["episodes"].as_u64());
 
@@ -241,35 +249,35 @@ fn a_stopped_run_goes_on_where_it_was() {
         let output = place.output(arguments);
         assert_eq!(output.status.code(), Some(1));
         assert!(
-            said(&output).contains(part) && said(&output).lines().count() == 1,
+            stderr(&output).contains(part) && stderr(&output).lines().count() == 1,
             "{}",
-            said(&output)
+            stderr(&output)
         );
     }
 }
 
 #[test]
-fn a_lockstep_run_keeps_its_actors() {
+fn a_lockstep_run_cannot_be_scaled() {
     let place = Workplace::new();
     let running = place.start("run", &[&ENDLESS[..], &["--lockstep"]].concat());
     let output = place.output(&["scale", "run", "--actors", "3"]);
     assert!(
-        !output.status.success() && said(&output).contains("lockstep"),
+        !output.status.success() && stderr(&output).contains("lockstep"),
         "{}",
-        said(&output)
+        stderr(&output)
     );
     assert_eq!(place.status("run")["actors"], 2);
     drop(running);
 }
 
 #[test]
-fn a_launcher_that_does_not_answer_is_said_to_be_silent() {
+fn a_launcher_that_does_not_answer_is_reported() {
     let place = Workplace::new();
     let running = place.start("run", &ENDLESS);
     running.signal(rustix::process::Signal::STOP);
     let output = place.output(&["status", "run"]);
     running.signal(rustix::process::Signal::CONT);
     assert_eq!(output.status.code(), Some(1));
-    assert!(said(&output).contains("does not answer"), "{}", said(&output));
-    running.learns_on();
+    assert!(stderr(&output).contains("does not answer"), "{}", stderr(&output));
+    running.wait_for_learning();
 }

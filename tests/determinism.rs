@@ -1,5 +1,5 @@
-//! Lockstep: the same seed gives the same bits, whatever the timing and whatever is killed; and with one actor and one
-//! environment they are the bits of Algorithm 4 in a single process.
+//! Lockstep runs with the same seed give the same bits, with any timing and any kills. With one actor and one
+//! environment they give the bits of Algorithm 4 in a single process.
 
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
 
@@ -17,10 +17,10 @@ use shoal_env_server::vector::{Start, VectorEnvironment};
 use shoal_learner::algorithms::ddpg::Ddpg;
 use shoal_learner::algorithms::minibatch::Minibatch;
 use shoal_learner::algorithms::sampling::Sampler;
-use support::{QUICK, Workplace, comes_further, end_of, json, until};
+use support::{QUICK, Workplace, final_result, json, until, wait_for_rows};
 
 #[test]
-fn the_same_seed_and_actors_give_the_same_bits_and_another_seed_others() {
+fn the_same_seed_gives_the_same_bits_and_another_seed_gives_others() {
     let place = Workplace::new();
     let run = |seed| {
         let result = place.train(&[
@@ -46,7 +46,7 @@ fn the_same_seed_and_actors_give_the_same_bits_and_another_seed_others() {
 }
 
 #[test]
-fn two_threads_of_a_learner_leave_the_bits_of_one() {
+fn a_learner_gives_the_same_bits_with_one_thread_and_with_two() {
     let place = Workplace::new();
     let [one, two] = ["1", "2"].map(|threads| {
         let setting = format!("learner.threads={threads}");
@@ -55,12 +55,12 @@ fn two_threads_of_a_learner_leave_the_bits_of_one() {
             &[
                 "--lockstep",
                 "--steps",
-                // Long enough to be looked at.
+                // Long enough to look at its threads.
                 "10000",
                 "--set",
                 &setting,
                 "--set",
-                // Enough to be shared.
+                // Large enough to be split between two threads.
                 "ddpg.hidden=[40,128]",
                 "--set",
                 "evaluation.final_episodes=1",
@@ -70,8 +70,8 @@ fn two_threads_of_a_learner_leave_the_bits_of_one() {
         let mut names =
             tasks.map(|task| std::fs::read_to_string(task.unwrap().path().join("comm")).unwrap_or_default());
         let has_second = names.any(|name| name.trim() == "learner-2");
-        assert_eq!(has_second, threads == "2", "its threads");
-        end_of(running)
+        assert_eq!(has_second, threads == "2", "whether it has a second thread");
+        final_result(running)
     });
     assert_eq!(one, two);
 }
@@ -93,9 +93,9 @@ const SHARED: [&str; 13] = [
 ];
 
 #[test]
-fn whoever_is_killed_in_lockstep_the_run_ends_with_the_bits_of_a_whole_one() {
+fn a_lockstep_run_with_killed_roles_ends_with_the_bits_of_an_undisturbed_one() {
     let place = Workplace::new();
-    let whole = end_of(place.start("whole", &SHARED));
+    let undisturbed = final_result(place.start("undisturbed", &SHARED));
     let running = place.start("killed", &SHARED);
     for who in [
         "actor-1",
@@ -109,16 +109,16 @@ fn whoever_is_killed_in_lockstep_the_run_ends_with_the_bits_of_a_whole_one() {
         "actor-1",
         "learner-0",
     ] {
-        comes_further(&running, 2000);
+        wait_for_rows(&running, 2000);
         let starts = running.pids(who).len();
         running.kill(who);
         until("it is replaced", || running.pids(who).len() > starts);
     }
-    assert_eq!(end_of(running), whole);
+    assert_eq!(final_result(running), undisturbed);
 }
 
 #[test]
-fn an_evaluator_killed_while_a_new_learner_does_its_rounds_again_holds_nobody_up() {
+fn an_evaluator_killed_while_a_new_learner_repeats_rounds_does_not_block_the_run() {
     let place = Workplace::new();
     let arguments = [
         "--lockstep",
@@ -127,7 +127,7 @@ fn an_evaluator_killed_while_a_new_learner_does_its_rounds_again_holds_nobody_up
         "--set",
         "evaluation.every=1500",
         "--set",
-        // From the beginning again, each time, and slowly.
+        // No checkpoint, so that a new learner starts from the beginning; and slow gradient steps.
         "checkpoint.every_updates=100000",
         "--set",
         "ddpg.batch=1024",
@@ -136,12 +136,12 @@ fn an_evaluator_killed_while_a_new_learner_does_its_rounds_again_holds_nobody_up
         "--set",
         "replay.warmup=64",
         "--set",
-        // Long enough to be seen at it.
+        // Long enough to be interrupted.
         "evaluation.episodes=10000",
         "--set",
         "evaluation.final_episodes=3",
     ];
-    let whole = end_of(place.start_as("whole", &arguments));
+    let undisturbed = final_result(place.start_as("undisturbed", &arguments));
     let running = place.start_as("killed", &arguments);
     // Versions of the policies that were evaluated.
     let evaluated = || {
@@ -154,71 +154,74 @@ fn an_evaluator_killed_while_a_new_learner_does_its_rounds_again_holds_nobody_up
     };
     until("the policies of two periods are evaluated", || evaluated().len() == 2);
     let before = evaluated()[1];
-    until("the evaluator is at the next one", || {
+    until("the evaluator is evaluating the next one", || {
         place.role("killed", "evaluator-0")["policy_version"].as_u64() > Some(before)
     });
-    // It goes on with it when the new learner has begun with its rounds.
-    running.stop("evaluator-0");
-    assert_eq!(evaluated().len(), 2, "or this test shows nothing");
+    // It continues when the new learner has begun to repeat the rounds.
+    running.stop_role("evaluator-0");
+    assert_eq!(evaluated().len(), 2, "the third evaluation must not have ended yet");
     running.kill("learner-0");
     until("there is a new learner", || running.pids("learner-0").len() == 2);
-    until("it is at work", || {
+    until("it is working", || {
         place.role("killed", "learner-0")["state"] == "working"
     });
-    running.stop("learner-0");
-    running.go_on("evaluator-0");
+    running.stop_role("learner-0");
+    running.continue_role("evaluator-0");
     until("the policy is evaluated", || evaluated().len() == 3);
     running.kill("evaluator-0");
     until("there is a new evaluator", || running.pids("evaluator-0").len() == 2);
-    running.go_on("learner-0");
-    assert_eq!(end_of(running), whole);
+    running.continue_role("learner-0");
+    assert_eq!(final_result(running), undisturbed);
 }
 
 #[test]
-fn an_actor_killed_before_its_first_chunk_begins_again_as_if_it_had_never_been() {
+fn an_actor_killed_before_its_first_chunk_restarts_from_the_beginning() {
     let place = Workplace::new();
-    // The longest chunks there are, so that the kills come before the first one is sent.
+    // The longest chunks possible, so that the kills come before the first one is sent.
     let arguments = [&SHARED[..], &["--set", "actors.chunk_steps=4096"]].concat();
-    let whole = end_of(place.start("whole", &arguments));
+    let undisturbed = final_result(place.start("undisturbed", &arguments));
     let running = place.start("killed", &arguments);
     let commits = CommitReader::open(&running.run.join("replay.bin")).unwrap();
     for (actor, who) in ["actor-0", "actor-1"].into_iter().enumerate() {
-        // Then it begins its first chunk. The learner takes the second actor's handshake after the first one's chunk.
-        until("the learner knows of it", || commits.committed(actor).incarnation > 0);
-        running.stop(who);
-        assert_eq!(commits.actor(actor).rows, 0, "or this test shows nothing");
+        // After its handshake an actor begins its first chunk. The learner accepts the second actor's handshake after
+        // the first actor's chunk.
+        until("the learner has accepted its handshake", || {
+            commits.committed(actor).incarnation > 0
+        });
+        running.stop_role(who);
+        assert_eq!(commits.actor(actor).rows, 0, "its first chunk must not be there yet");
         let starts = running.pids(who).len();
         running.kill(who);
         until("it is replaced", || running.pids(who).len() > starts);
     }
-    assert_eq!(end_of(running), whole);
+    assert_eq!(final_result(running), undisturbed);
 }
 
 #[test]
-fn a_lockstep_run_broken_off_again_and_again_is_resumed_to_the_bits_of_a_whole_one() {
+fn a_lockstep_run_interrupted_several_times_ends_with_the_bits_of_an_undisturbed_one() {
     let place = Workplace::new();
-    let (weights, evaluations) = end_of(place.start("whole", &SHARED));
+    let (weights, evaluations) = final_result(place.start("undisturbed", &SHARED));
     let mut running = place.start("stopped", &SHARED);
     for _ in 0..3 {
-        comes_further(&running, 5000);
+        wait_for_rows(&running, 5000);
         assert!(place.output(&["stop", "stopped"]).status.success());
         running.wait();
         running = place.resume("stopped", &[]);
     }
-    assert_eq!(end_of(running), (weights.clone(), evaluations.clone()));
+    assert_eq!(final_result(running), (weights.clone(), evaluations.clone()));
 
     let mut running = place.start("killed", &SHARED);
     for _ in 0..3 {
-        comes_further(&running, 5000);
-        running.kill_everybody();
+        wait_for_rows(&running, 5000);
+        running.kill_all();
         drop(running);
         running = place.resume("killed", &[]);
     }
-    assert_eq!(end_of(running), (weights, evaluations));
+    assert_eq!(final_result(running), (weights, evaluations));
 }
 
 #[test]
-fn one_actor_in_lockstep_is_algorithm_4_in_a_single_process() {
+fn one_lockstep_actor_gives_the_bits_of_algorithm_4_in_a_single_process() {
     for (preset, warmup) in [
         ("pendulum", "policy"),
         ("point-mass-r2", "policy"),
@@ -252,7 +255,7 @@ fn one_actor_in_lockstep_is_algorithm_4_in_a_single_process() {
 }
 
 #[test]
-fn three_tanh_layers_have_the_bits_of_a_single_process_with_one_thread_and_with_two() {
+fn three_tanh_layers_give_the_bits_of_a_single_process_with_one_thread_and_with_two() {
     let place = Workplace::new();
     for threads in ["1", "2"] {
         let learner_threads = format!("learner.threads={threads}");
@@ -271,7 +274,7 @@ fn three_tanh_layers_have_the_bits_of_a_single_process_with_one_thread_and_with_
             ],
             &["--steps", "900", "--seed", "11"][..],
             &QUICK,
-            // Enough to be shared.
+            // Large enough to be split between two threads.
             &["--set", "ddpg.hidden=[40, 128, 130]", "--set", "ddpg.activation=tanh"],
             &["--set", "actors.chunk_steps=1", "--set", &learner_threads],
         ];
@@ -282,12 +285,12 @@ fn three_tanh_layers_have_the_bits_of_a_single_process_with_one_thread_and_with_
     }
 }
 
-/// Algorithm 4, plainly. Returns the SHA-256 of all the weights it ends with.
+/// Algorithm 4 as a plain single-process program. Returns the SHA-256 of its final weights.
 fn twin(config: &Config) -> String {
     let seed = config.run.seed;
     let row = config.row_layout();
     let Algorithm::Ddpg(ddpg) = &config.algorithm else {
-        panic!("the twin is DDPG's")
+        panic!("this twin is for DDPG")
     };
     let exploration = &ddpg.exploration;
     let mut learner = Ddpg::new(&config.spec, ddpg, seed).unwrap();
@@ -319,7 +322,7 @@ fn twin(config: &Config) -> String {
         } else {
             mu.forward(learner.policy(), &s, &mut a);
             noise.advance(t);
-            noise.disturb(&mut a, mu.range());
+            noise.add_to(&mut a, mu.range());
         }
 
         environment.step(&a, layout.split_mut(&mut response)).unwrap();
@@ -343,7 +346,7 @@ fn twin(config: &Config) -> String {
         }
         s.copy_from_slice(step.observations);
 
-        // One update for each step beyond the warm-up.
+        // One gradient step for each environment step beyond the warm-up.
         if replay.len() as u64 > config.replay.warmup {
             let rows = replay.len() as u64;
             sampler.indices(

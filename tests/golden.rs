@@ -1,5 +1,5 @@
-//! Replays data recorded from Gymnasium and PyTorch: every file of `tests/golden`, or of the directory that
-//! `SHOAL_GOLDEN_DIR` names.
+//! Compares the program with data recorded from Gymnasium and PyTorch: every file in `tests/golden`, or in the
+//! directory that `SHOAL_GOLDEN_DIR` names.
 
 #[path = "support/value_iteration.rs"]
 mod value_iteration;
@@ -25,10 +25,10 @@ use shoal_learner::algorithms::{
     minibatch::Minibatch,
 };
 
-/// Greatest difference of a number from the recorded one.
+/// The largest difference allowed from a recorded number.
 const TOLERANCE: f64 = 1e-5;
 
-/// Why a file does not agree.
+/// Why a file disagrees.
 type Failure = String;
 
 #[test]
@@ -76,10 +76,10 @@ fn golden_files_of_unknown_kind_or_wrong_content_fail() {
     assert!(rollout("0.0, 0.0", "1.0, 0.0, 0.0").is_err(), "more rewards than steps");
 }
 
-/// One line for each file that does not agree, or one for a directory without files.
+/// Returns one line for each file that disagrees, or one line if the directory holds no files.
 fn check_directory(directory: &Path) -> Vec<Failure> {
     let entries = std::fs::read_dir(directory).into_iter().flatten().flatten();
-    // Beside the data lie its generators.
+    // The scripts that generate the data are in the same directory.
     let is_generator = |path: &PathBuf| path.extension().is_some_and(|extension| extension == "py");
     let files: Vec<PathBuf> = entries
         .map(|entry| entry.path())
@@ -96,7 +96,7 @@ fn check_directory(directory: &Path) -> Vec<Failure> {
     files.into_iter().filter_map(check).collect()
 }
 
-/// Tells the kind of a file by its content and checks it.
+/// Determines the kind of a file from its content and checks it.
 fn check_text(text: &str) -> Result<(), Failure> {
     let file: Value = serde_json::from_str(text).map_err(|e| e.to_string())?;
     match file.get("env").and_then(Value::as_str) {
@@ -112,11 +112,11 @@ fn check_text(text: &str) -> Result<(), Failure> {
         }
         Some("frozen_lake") => frozen_lake(&file),
         None if file.get("hidden").is_some() && file.get("batches").is_some() => ddpg_update(&file),
-        kind => Err(format!("a file of unknown kind: env is {kind:?}")),
+        kind => Err(format!("unknown kind of file: env is {kind:?}")),
     }
 }
 
-/// The element `key` of a file, by one of the readers below.
+/// Reads the element `key` of a file with one of the readers below.
 fn read<T>(file: &Value, key: &str, reader: fn(Value) -> serde_json::Result<T>) -> Result<T, Failure> {
     reader(file[key].clone()).map_err(|e| format!("{key}: {e}"))
 }
@@ -170,7 +170,7 @@ fn rollout<E: Environment>(
         states.as_ref().map_or(steps, Vec::len),
     ];
     if steps == 0 || lengths != [steps; 4] {
-        return Err(format!("{steps} actions, but other lists of lengths {lengths:?}"));
+        return Err(format!("{steps} actions, but the other lists have lengths {lengths:?}"));
     }
     let spec = environment.spec();
     let mut rng = stream(0, Purpose::Environment, 0, 0);
@@ -178,7 +178,7 @@ fn rollout<E: Environment>(
     environment.reset_to(initial_state).map_err(|e| e.to_string())?;
     for (i, action) in actions.iter().enumerate() {
         if action.len() != spec.action.width() {
-            return Err(format!("step {i}: {} numbers of action", action.len()));
+            return Err(format!("step {i}: an action of {} numbers", action.len()));
         }
         let step = environment.step(action, &mut rng);
         environment.observe(&mut observation);
@@ -198,7 +198,7 @@ fn rollout<E: Environment>(
     Ok(())
 }
 
-/// Agreement of all numbers within `TOLERANCE`; a NaN agrees with nothing.
+/// Checks that all numbers agree within `TOLERANCE`. A NaN agrees with nothing.
 fn close(ours: &[f64], recorded: &[f64]) -> Result<(), Failure> {
     let agree = ours.len() == recorded.len() && ours.iter().zip(recorded).all(|(a, b)| (a - b).abs() <= TOLERANCE);
     if agree {
@@ -208,13 +208,13 @@ fn close(ours: &[f64], recorded: &[f64]) -> Result<(), Failure> {
     }
 }
 
-/// Gymnasium's transition table, `transitions[state][action]`, and the optimal action values at γ = 0.999.
+/// Compares Gymnasium's transition table, `transitions[state][action]`, and the optimal action values at γ = 0.999.
 fn frozen_lake(file: &Value) -> Result<(), Failure> {
     type Table = Vec<Vec<Vec<Value>>>;
     let recorded = read(file, "transitions", serde_json::from_value::<Table>)?;
     let shape: Vec<_> = recorded.iter().map(Vec::len).collect();
     if shape != [frozen_lake::ACTIONS; frozen_lake::STATES] {
-        return Err(format!("transitions of {shape:?} actions"));
+        return Err(format!("transitions for {shape:?} actions"));
     }
     for (state, actions) in recorded.iter().enumerate() {
         for (action, recorded) in actions.iter().enumerate() {
@@ -229,7 +229,7 @@ fn frozen_lake(file: &Value) -> Result<(), Failure> {
     let recorded = read(file, "q_star_gamma_0_999", ROWS)?;
     let q_star = value_iteration::optimal_values(0.999);
     if recorded.len() != q_star.len() {
-        return Err(format!("action values of {} states", recorded.len()));
+        return Err(format!("action values for {} states", recorded.len()));
     }
     for (state, (ours, recorded)) in q_star.iter().zip(&recorded).enumerate() {
         close(ours, recorded).map_err(|e| format!("action values of state {state}: {e}"))?;
@@ -244,7 +244,8 @@ fn same_outcome(ours: &frozen_lake::LakeTransition, recorded: &Value) -> bool {
         && recorded["terminated"].as_bool() == Some(ours.terminated)
 }
 
-/// Four DDPG updates by PyTorch's autograd and Adam: `initial` networks, `batches`, and the `expected` networks after each.
+/// Repeats DDPG gradient steps of PyTorch's autograd and Adam: from the `initial` networks, one step for each of
+/// `batches`. After each step the losses and networks must be those in `expected`.
 fn ddpg_update(file: &Value) -> Result<(), Failure> {
     if file["adam"] != serde_json::json!({"beta1": 0.9, "beta2": 0.999, "eps": 1e-8}) {
         return Err(format!("Adam's constants are not the learner's: {}", file["adam"]));
@@ -306,7 +307,7 @@ fn ddpg_update(file: &Value) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Actor, critic, target actor and target critic as the learner lays them out.
+/// Actor, critic, target actor and target critic, with their parameters in the learner's order.
 fn networks(recorded: &Value, ddpg: &Ddpg) -> Result<[Vec<f32>; 4], Failure> {
     let (mu, q) = (ddpg.policy_layout(), ddpg.critic_layout());
     let network = |name: &str, layout| flat(&recorded[name], layout).map_err(|e| format!("{name}: {e}"));
@@ -318,7 +319,7 @@ fn networks(recorded: &Value, ddpg: &Ddpg) -> Result<[Vec<f32>; 4], Failure> {
     ])
 }
 
-/// A recorded network's parameters in the learner's order. Its weights are lists of rows, one an output.
+/// A recorded network's parameters in the learner's order. The recorded weights are lists of rows, one row per output.
 fn flat(network: &Value, layout: &NetworkLayout) -> Result<Vec<f32>, Failure> {
     let mut parameters = Vec::with_capacity(layout.parameters());
     for ((inputs, outputs), [w, b]) in layout.layer_sizes().zip([["w1", "b1"], ["w2", "b2"], ["w3", "b3"]]) {
@@ -345,7 +346,7 @@ fn minibatch(batch: &Value, layout: RowLayout, gamma: f32) -> Result<Minibatch, 
     let (observation, action) = (layout.observation_width(), layout.action_width());
     if !(fits(&s, observation) && fits(&a, action) && fits(&s_next, observation)) || terminated.len() != r.len() {
         return Err(format!(
-            "a batch is not {} transitions of {observation} and {action} numbers",
+            "a batch does not hold {} transitions of {observation} observed and {action} action numbers",
             r.len()
         ));
     }

@@ -1,9 +1,9 @@
-//! Runs that earlier versions left behind are read, and gone on with. `tests/data/README.md` says what they are.
+//! Reads and resumes runs of earlier versions. `tests/data/README.md` describes them.
 //!
-//! An unpacked run has the id it was made with, so two copies of it must not go on at once: each archive has one test.
+//! An unpacked run keeps its id, so two copies of it must not run at the same time: each archive has one test.
 
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
-#![allow(clippy::print_stderr, reason = "a test says what it reads")]
+#![allow(clippy::print_stderr, reason = "a test prints what it reads")]
 
 #[path = "support/suite.rs"]
 mod suite;
@@ -22,65 +22,65 @@ use support::{Leftovers, Workplace, json};
 
 fn main() -> ExitCode {
     suite::run(vec![
-        test!(a_free_run_that_is_finished_is_read_and_given_more_steps),
-        test!(a_free_run_that_was_stopped_is_read_and_goes_on_to_its_end),
-        test!(a_lockstep_run_that_is_finished_is_read_and_given_more_steps),
-        test!(a_lockstep_run_that_was_stopped_is_read_and_goes_on_to_its_end),
-        test!(a_gymnasium_run_that_is_finished_is_read_and_given_more_steps),
-        test!(a_gymnasium_run_that_was_stopped_is_read_and_goes_on_to_its_end),
+        test!(a_finished_free_run_is_read_and_extended),
+        test!(a_stopped_free_run_is_read_and_resumed_to_its_end),
+        test!(a_finished_lockstep_run_is_read_and_extended),
+        test!(a_stopped_lockstep_run_is_read_and_resumed_to_its_end),
+        test!(a_finished_gymnasium_run_is_read_and_extended),
+        test!(a_stopped_gymnasium_run_is_read_and_resumed_to_its_end),
     ])
 }
 
-/// The versions whose runs are kept, as their directories in `tests/data/` are named.
+/// The versions whose runs are kept, by the names of their directories in `tests/data/`.
 const VERSIONS: [&str; 1] = ["2d50610"];
 
-/// How the kept run ended.
+/// How an archived run ended.
 #[derive(Clone, Copy, PartialEq)]
 enum Ended {
     Finished,
     Stopped,
 }
 
-fn a_free_run_that_is_finished_is_read_and_given_more_steps() {
-    every_version_of("free-finished", Ended::Finished);
+fn a_finished_free_run_is_read_and_extended() {
+    check_versions("free-finished", Ended::Finished);
 }
 
-fn a_free_run_that_was_stopped_is_read_and_goes_on_to_its_end() {
-    every_version_of("free-stopped", Ended::Stopped);
+fn a_stopped_free_run_is_read_and_resumed_to_its_end() {
+    check_versions("free-stopped", Ended::Stopped);
 }
 
-fn a_lockstep_run_that_is_finished_is_read_and_given_more_steps() {
-    every_version_of("lockstep-finished", Ended::Finished);
+fn a_finished_lockstep_run_is_read_and_extended() {
+    check_versions("lockstep-finished", Ended::Finished);
 }
 
-fn a_lockstep_run_that_was_stopped_is_read_and_goes_on_to_its_end() {
-    every_version_of("lockstep-stopped", Ended::Stopped);
+fn a_stopped_lockstep_run_is_read_and_resumed_to_its_end() {
+    check_versions("lockstep-stopped", Ended::Stopped);
 }
 
-fn a_gymnasium_run_that_is_finished_is_read_and_given_more_steps() -> Completion {
-    every_version_of_gymnasiums("gym-finished", Ended::Finished)
+fn a_finished_gymnasium_run_is_read_and_extended() -> Completion {
+    check_versions_with_gymnasium("gym-finished", Ended::Finished)
 }
 
-fn a_gymnasium_run_that_was_stopped_is_read_and_goes_on_to_its_end() -> Completion {
-    every_version_of_gymnasiums("gym-stopped", Ended::Stopped)
+fn a_stopped_gymnasium_run_is_read_and_resumed_to_its_end() -> Completion {
+    check_versions_with_gymnasium("gym-stopped", Ended::Stopped)
 }
 
-/// A run whose environments Python serves is only read where there are none.
-fn every_version_of_gymnasiums(name: &str, ended: Ended) -> Completion {
+/// Python serves the environments of these runs. Without it they are only read.
+fn check_versions_with_gymnasium(name: &str, ended: Ended) -> Completion {
     let missing = PYTHON.missing();
-    is_good(name, ended, missing.is_none());
+    check(name, ended, missing.is_none());
     match missing {
         None => Completion::Completed,
-        Some(missing) => Completion::ignored_with(format!("read, and neither played nor gone on with: {missing}")),
+        Some(missing) => Completion::ignored_with(format!("read, but neither played nor resumed: {missing}")),
     }
 }
 
-fn every_version_of(name: &str, ended: Ended) {
-    is_good(name, ended, true);
+fn check_versions(name: &str, ended: Ended) {
+    check(name, ended, true);
 }
 
-/// What is not playable is only read.
-fn is_good(name: &str, ended: Ended, playable: bool) {
+/// Reads the run of every version. If its environment is available (`playable`), also resumes it and reads it again.
+fn check(name: &str, ended: Ended, playable: bool) {
     for version in VERSIONS {
         eprintln!("{version}/{name}");
         let place = unpacked(version, name);
@@ -88,11 +88,11 @@ fn is_good(name: &str, ended: Ended, playable: bool) {
             Ended::Finished => "finished",
             Ended::Stopped => "stopped",
         };
-        is_the_run_that_its_replay_is_of(&place);
+        has_the_fingerprint_of_its_replay(&place);
         is_listed_as(&place, state);
         is_read(&place, playable);
         if playable {
-            goes_on(&place, ended);
+            is_resumed(&place, ended);
             // Now its records have rows of both versions.
             is_listed_as(&place, "finished");
             is_read(&place, playable);
@@ -100,7 +100,7 @@ fn is_good(name: &str, ended: Ended, playable: bool) {
     }
 }
 
-/// A place in which the archive's run lies as `run`.
+/// A workplace with the archive's run unpacked as `run`.
 fn unpacked(version: &str, name: &str) -> Workplace {
     let place = Workplace::new();
     let archive = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("tests/data/{version}/{name}.tar.gz"));
@@ -114,8 +114,8 @@ fn unpacked(version: &str, name: &str) -> Workplace {
     place
 }
 
-/// The configuration has the fingerprint that stands in the header of the replay (`ARCHITECTURE.md`, "The replay file").
-fn is_the_run_that_its_replay_is_of(place: &Workplace) {
+/// The configuration has the fingerprint in the replay's header (`docs/REPLAY_FORMAT.md`).
+fn has_the_fingerprint_of_its_replay(place: &Workplace) {
     const FINGERPRINT: usize = 8;
     let header = std::fs::read(place.path().join("run/replay.bin")).unwrap();
     let word = header[FINGERPRINT * 8..][..8].try_into().unwrap();
@@ -123,22 +123,22 @@ fn is_the_run_that_its_replay_is_of(place: &Workplace) {
     assert_eq!(config.fingerprint(), u64::from_le_bytes(word), "{}", config.identity());
 }
 
-/// What a command that must succeed printed.
+/// Standard output of a command, which must succeed.
 fn printed(place: &Workplace, arguments: &[&str]) -> String {
     let output = place.output(arguments);
-    let said = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success(), "{arguments:?}: {said}");
+    let message = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{arguments:?}: {message}");
     String::from_utf8(output.stdout).unwrap()
 }
 
-/// `shoal list` says that the run is in this state.
+/// `shoal list` reports the run in this state.
 fn is_listed_as(place: &Workplace, state: &str) {
     let listed: Value = serde_json::from_str(&printed(place, &["list", ".", "--json"])).unwrap();
     assert_eq!(listed["runs"][0]["state"], state, "{listed}");
 }
 
-/// The run's policies, records and settings are read by all commands that do. What plays episodes of an environment that
-/// cannot be served here is left out.
+/// Every command that reads a run's policies, records or settings succeeds. Episodes are played only if the environment
+/// is available.
 fn is_read(place: &Workplace, playable: bool) {
     if playable {
         is_evaluated_as_before(place);
@@ -148,7 +148,7 @@ fn is_read(place: &Workplace, playable: bool) {
     assert!(figures.contains("learning-curve.svg"), "{figures}");
     for figure in figures.lines() {
         let figure = std::fs::read_to_string(place.path().join(figure)).unwrap();
-        assert!(figure.contains("<polyline"), "something is drawn");
+        assert!(figure.contains("<polyline"), "the figure has a curve");
     }
 
     printed(place, &["report", "run", "--out", "page.html"]);
@@ -172,7 +172,7 @@ fn is_read(place: &Workplace, playable: bool) {
     }
 }
 
-/// The best policy does what the run's evaluator wrote down. Another processor may round otherwise.
+/// The best policy has the return that the run's evaluator recorded. Another processor may round differently.
 fn is_evaluated_as_before(place: &Workplace) {
     let mut records = csv::Reader::from_path(place.path().join("run/evaluations.csv")).unwrap();
     let columns = records.headers().unwrap().clone();
@@ -192,8 +192,8 @@ fn is_evaluated_as_before(place: &Workplace) {
     assert!((now - then).abs() <= 1e-3 * then.abs().max(1.0), "{now} and {then}");
 }
 
-/// Goes on to the end the run was to have, or to a later one, with all that was learned and collected before.
-fn goes_on(place: &Workplace, ended: Ended) {
+/// Resumes a stopped run to its planned end, or a finished one to a later end. It keeps what it learned and collected.
+fn is_resumed(place: &Workplace, ended: Ended) {
     let before = support::json(&place.output(&["status", "run", "--json"]));
     let number = |field: &str| before[field].as_u64().unwrap();
     let rows = number("replay_rows");
@@ -210,19 +210,19 @@ fn goes_on(place: &Workplace, ended: Ended) {
     let output = place.output(&resume);
     let run = place.path().join("run");
     let log = std::fs::read_to_string(run.join("shoal.log")).unwrap();
-    let said = String::from_utf8_lossy(&output.stderr);
-    assert_eq!(output.status.code(), Some(0), "{said}\n{log}");
+    let message = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(0), "{message}\n{log}");
     let result = json(&output);
     assert_eq!(result["env_steps"], steps);
     assert!(result["eval_return_mean"].is_f64(), "{result}");
     let updates = number("updates");
     assert!(result["updates"].as_u64().unwrap() > updates, "{result}");
-    let going_on = format!("going on after {updates} updates and ");
-    let going_on = log
+    let resumed = format!("continuing after {updates} updates and ");
+    let resumed = log
         .lines()
-        .find(|line| line.contains(&going_on))
+        .find(|line| line.contains(&resumed))
         .unwrap_or_else(|| panic!("{log}"));
-    assert!(going_on.ends_with(&format!("of {rows} rows")), "{going_on}");
+    assert!(resumed.ends_with(&format!("of {rows} rows")), "{resumed}");
     assert!(!log.contains("is damaged"), "{log}");
     let left = Leftovers::of(&run);
     assert!(left.processes().is_empty() && left.files().is_empty());

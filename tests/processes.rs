@@ -1,4 +1,4 @@
-//! Processes of a run: they start, are ready, and end, whatever ends them, and leave nothing behind.
+//! The processes of a run start, become ready and end. However they end, they leave nothing behind.
 
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
 
@@ -12,7 +12,7 @@ use support::{Workplace, parse, until};
 const ENDLESS: [&str; 2] = ["--steps", "100000000"];
 
 #[test]
-fn a_run_ends_by_itself_with_what_it_promised() {
+fn a_run_ends_by_itself_with_all_its_results() {
     let place = Workplace::new();
     let (code, printed, leftovers) = place.start("run", &["--steps", "1500", "--actors", "2"]).wait();
     assert_eq!(code, Some(0));
@@ -43,12 +43,12 @@ fn a_run_ends_by_itself_with_what_it_promised() {
     ] {
         assert!(place.path().join("run").join(file).exists(), "{file}");
     }
-    assert!(leftovers.processes().is_empty(), "every role was waited for");
+    assert!(leftovers.processes().is_empty(), "no process is left");
     assert!(leftovers.files().is_empty(), "{:?}", leftovers.files());
 }
 
 #[test]
-fn ctrl_c_and_sigterm_end_a_run_with_its_state_saved() {
+fn ctrl_c_and_sigterm_end_a_run_and_save_its_state() {
     for (signal, code) in [(Signal::INT, 130), (Signal::TERM, 143)] {
         let place = Workplace::new();
         let running = place.start("run", &ENDLESS);
@@ -66,34 +66,34 @@ fn ctrl_c_and_sigterm_end_a_run_with_its_state_saved() {
 }
 
 #[test]
-fn when_the_launcher_is_killed_the_roles_save_and_end_and_nothing_is_left() {
+fn when_the_launcher_is_killed_the_roles_save_their_state_end_and_leave_nothing_behind() {
     let place = Workplace::new();
     let running = place.start("run", &ENDLESS);
     until("something is learned", || running.learned("updates") > 0);
     let leftovers = running.leftovers();
     running.signal(Signal::KILL);
-    leftovers.vanish();
+    leftovers.wait_until_gone();
     assert!(running.run.join("checkpoints/latest.ckpt").exists());
     assert!(
         running.run.join("checkpoints/last.policy").exists(),
-        "the learner ended in order"
+        "the learner ended cleanly"
     );
 }
 
 #[test]
-fn what_a_run_left_whose_processes_were_all_killed_goes_with_the_next_start() {
+fn the_next_start_removes_what_a_killed_run_left_in_shared_memory() {
     let place = Workplace::new();
     let running = place.start("killed", &ENDLESS);
     let leftovers = running.leftovers();
-    // Asked while it lives: once it is killed, the start of any run removes it, be it another test's.
-    assert!(!leftovers.files().is_empty(), "or this test shows nothing");
-    running.kill_everybody();
+    // Checked while the run lives: once it is killed, the start of any run, even another test's, removes its files.
+    assert!(!leftovers.files().is_empty(), "the run has files in shared memory");
+    running.kill_all();
     place.start("next", &["--steps", "100"]).wait();
     assert!(leftovers.files().is_empty(), "{:?}", leftovers.files());
 }
 
 #[test]
-fn a_role_that_is_killed_is_replaced_and_the_run_goes_on_to_its_end() {
+fn a_killed_role_is_replaced_and_the_run_continues_to_its_end() {
     for who in ["actor-0", "env-server-0", "env-server-16", "evaluator-0", "learner-0"] {
         let place = Workplace::new();
         let running = place.start("run", &["--steps", "30000"]);
@@ -110,7 +110,7 @@ fn a_role_that_is_killed_is_replaced_and_the_run_goes_on_to_its_end() {
 }
 
 #[test]
-fn a_role_that_cannot_work_is_given_up_and_its_last_words_are_passed_on() {
+fn a_role_that_keeps_failing_is_given_up_and_its_error_is_reported() {
     let place = Workplace::new();
     let running = place.start("run", &["--steps", "3000000"]);
     until("something is learned", || running.learned("updates") > 0);
@@ -118,7 +118,7 @@ fn a_role_that_cannot_work_is_given_up_and_its_last_words_are_passed_on() {
         running.run.join("checkpoints/latest.ckpt").exists()
     });
     // Stopped, so that it cannot save again in between.
-    running.stop("learner-0");
+    running.stop_role("learner-0");
     for name in ["latest.ckpt", "previous.ckpt"] {
         let file = running.run.join("checkpoints").join(name);
         if file.exists() {
@@ -128,16 +128,16 @@ fn a_role_that_cannot_work_is_given_up_and_its_last_words_are_passed_on() {
     running.kill("learner-0");
     let (code, _, leftovers) = running.wait();
     assert_eq!(code, Some(1));
-    let said = std::fs::read_to_string(place.path().join("stderr")).unwrap();
-    let last = said.lines().last().unwrap();
+    let message = std::fs::read_to_string(place.path().join("stderr")).unwrap();
+    let last = message.lines().last().unwrap();
     assert!(
         last.contains("learner-0 failed") && last.contains("times and is given up") && last.contains("latest.ckpt"),
-        "{said}"
+        "{message}"
     );
     assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
 }
 
-/// Files with which iceoryx2 knows that a process is in the run: its directory, and what tells whether it lives.
+/// iceoryx2's files for a process of the run: the directory of its node, and the files that show whether it is alive.
 fn node_of(pid: i32) -> Vec<PathBuf> {
     let open = std::fs::read_dir(format!("/proc/{pid}/fd")).unwrap().flatten();
     let mut open = open.filter_map(|file| std::fs::read_link(file.path()).ok());
@@ -154,14 +154,14 @@ fn node_of(pid: i32) -> Vec<PathBuf> {
 }
 
 #[test]
-fn a_run_whose_shared_memory_cannot_be_cleaned_up_goes_on_in_other_shared_memory() {
+fn a_run_whose_shared_memory_cannot_be_cleaned_up_continues_in_new_shared_memory() {
     let place = Workplace::new();
     let running = place.start("run", &["--steps", "100000000"]);
-    running.learns_on();
+    running.wait_for_learning();
     let actor = *running.pids("actor-0").last().unwrap();
     let node = node_of(actor);
     assert!(node.len() > 1, "{node:?}");
-    // The launcher is to find the actor dead, and nothing to clean up by.
+    // The launcher must find the actor dead, and the files that it needs for the cleanup gone.
     running.signal(Signal::STOP);
     running.kill("actor-0");
     until("the actor is dead", || {
@@ -177,11 +177,13 @@ fn a_run_whose_shared_memory_cannot_be_cleaned_up_goes_on_in_other_shared_memory
         removed.unwrap();
     }
     running.signal(Signal::CONT);
-    until("it is said", || running.log().contains("shared memory made anew"));
-    running.learns_on();
-    running.learns_on();
+    until("new shared memory is reported", || {
+        running.log().contains("shared memory made anew")
+    });
+    running.wait_for_learning();
+    running.wait_for_learning();
     assert!(place.output(&["stop", "run"]).status.success());
     let (code, _, leftovers) = running.wait();
-    assert_eq!(code, Some(0), "{}", place.said());
+    assert_eq!(code, Some(0), "{}", place.stderr());
     assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
 }

@@ -1,4 +1,5 @@
-//! `shoal reproduce`: what is interrupted goes on, what is there is not run again, and what is not ours is refused.
+//! `shoal reproduce` resumes what was interrupted, does not repeat what is finished, and refuses files that are not its
+//! own.
 
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
 
@@ -13,12 +14,12 @@ use flate2::Compression;
 use flate2::read::GzDecoder;
 use flate2::write::GzEncoder;
 use rustix::process::{Pid, Signal, kill_process};
-use support::{Leftovers, Workplace, complaint, until};
+use support::{Leftovers, Workplace, error_line, until};
 
-/// The command under way; ended when dropped.
-struct Reproducing(Child);
+/// A running `shoal reproduce`; ended when dropped.
+struct Reproduction(Child);
 
-impl Reproducing {
+impl Reproduction {
     fn start(place: &Workplace, arguments: &[&str]) -> Self {
         let stderr = std::fs::File::create(place.path().join("stderr")).unwrap();
         let mut command = place.shoal(arguments);
@@ -35,9 +36,9 @@ impl Reproducing {
     }
 }
 
-impl Drop for Reproducing {
+impl Drop for Reproduction {
     fn drop(&mut self) {
-        // In order, so that its training ends too.
+        // By SIGTERM, so that its training ends too.
         if self.0.try_wait().unwrap().is_none() {
             self.signal(Signal::TERM);
             let _ = self.0.wait();
@@ -51,7 +52,7 @@ fn log(run: &Path) -> String {
     std::fs::read_to_string(run.join("shoal.log")).unwrap_or_default()
 }
 
-/// How often a run was started.
+/// How many times a run was started.
 fn starts(run: &Path) -> usize {
     log(run).matches("every role is ready").count()
 }
@@ -60,7 +61,7 @@ fn runs(place: &Workplace) -> [PathBuf; 2] {
     ["seed-1", "seed-2"].map(|seed| place.path().join("kept/pendulum").join(seed))
 }
 
-/// The lines of an experiment's results: its head, then a result in each.
+/// The lines of an experiment's results file: a header, then one result per line.
 fn lines(results: &Path) -> Vec<String> {
     lines_of(&std::fs::read(results).unwrap())
 }
@@ -71,8 +72,8 @@ fn lines_of(bytes: &[u8]) -> Vec<String> {
     text.lines().map(Into::into).collect()
 }
 
-/// The seeds and stages whose results are there.
-fn kept(results: &Path) -> Vec<(u64, String)> {
+/// The seeds and stages whose results are in the file.
+fn seeds_and_stages(results: &Path) -> Vec<(u64, String)> {
     let of = |line: &String| {
         let result: serde_json::Value = serde_json::from_str(line).unwrap();
         (
@@ -83,10 +84,10 @@ fn kept(results: &Path) -> Vec<(u64, String)> {
     lines(results)[1..].iter().map(of).collect()
 }
 
-/// Puts every result of the first stage into a file of its own, as earlier versions did, and removes the one file.
-fn as_before(results: &Path, directory: &Path) {
+/// Puts every result of the first stage into a file of its own, as earlier versions did, and removes the results file.
+fn convert_to_old_format(results: &Path, directory: &Path) {
     std::fs::create_dir_all(directory).unwrap();
-    for ((seed, _), line) in kept(results).iter().zip(&lines(results)[1..]) {
+    for ((seed, _), line) in seeds_and_stages(results).iter().zip(&lines(results)[1..]) {
         let old = line.replacen("\"stage\":\"\",", "", 1) + "\n";
         std::fs::write(directory.join(format!("seed-{seed}.json")), old).unwrap();
     }
@@ -94,29 +95,29 @@ fn as_before(results: &Path, directory: &Path) {
 }
 
 #[test]
-fn what_is_interrupted_goes_on_and_nothing_is_run_twice() {
+fn an_interrupted_reproduction_continues_and_repeats_no_training() {
     let place = Workplace::new();
     let [first, second] = runs(&place);
     let results = place.path().join("kept/pendulum.jsonl.gz");
     let seeds = |seeds: &[u64]| seeds.iter().map(|seed| (*seed, String::new())).collect::<Vec<_>>();
 
-    let reproducing = Reproducing::start(&place, &PENDULUM);
+    let reproduction = Reproduction::start(&place, &PENDULUM);
     until("the second seed trains", || starts(&second) == 1);
-    let meanwhile = complaint(&place.output(&PENDULUM));
+    let meanwhile = error_line(&place.output(&PENDULUM));
     assert!(meanwhile.contains("another `shoal reproduce`"), "{meanwhile}");
-    reproducing.signal(Signal::INT);
-    assert_eq!(reproducing.wait().code(), Some(130), "{}", place.said());
-    assert_eq!(kept(&results), seeds(&[1]));
-    Leftovers::of(&second).vanish();
+    reproduction.signal(Signal::INT);
+    assert_eq!(reproduction.wait().code(), Some(130), "{}", place.stderr());
+    assert_eq!(seeds_and_stages(&results), seeds(&[1]));
+    Leftovers::of(&second).wait_until_gone();
     let report = || std::fs::read_to_string(place.path().join("kept/REPORT.md")).unwrap();
     assert!(report().contains("seeds 1; missing: 2"), "{}", report());
 
     assert!(
-        Reproducing::start(&place, &PENDULUM).wait().success(),
+        Reproduction::start(&place, &PENDULUM).wait().success(),
         "{}",
-        place.said()
+        place.stderr()
     );
-    assert_eq!((starts(&first), starts(&second)), (1, 2), "{}", place.said());
+    assert_eq!((starts(&first), starts(&second)), (1, 2), "{}", place.stderr());
     assert!(
         report().contains("seeds 1, 2\n") && report().contains("quick look"),
         "{}",
@@ -129,29 +130,32 @@ fn what_is_interrupted_goes_on_and_nothing_is_run_twice() {
                 .unwrap()
                 .starts_with(b"<svg")
         );
-        assert!(!figure(&format!("{name}.png")).exists(), "nobody asked for it");
+        assert!(
+            !figure(&format!("{name}.png")).exists(),
+            "PNG figures were not requested"
+        );
     }
 
-    // Results alone are enough for the report, wherever it goes.
-    assert_eq!(kept(&results), seeds(&[1, 2]));
+    // The results alone are enough for the report, in any directory.
+    assert_eq!(seeds_and_stages(&results), seeds(&[1, 2]));
     let bytes = std::fs::read(&results).unwrap();
     for run in [&first, &second] {
         std::fs::remove_dir_all(run).unwrap();
     }
-    let elsewhere = [&PENDULUM[..], &["--report", "told/REPORT.md", "--png"]].concat();
+    let elsewhere = [&PENDULUM[..], &["--report", "elsewhere/REPORT.md", "--png"]].concat();
     assert!(
-        Reproducing::start(&place, &elsewhere).wait().success(),
+        Reproduction::start(&place, &elsewhere).wait().success(),
         "{}",
-        place.said()
+        place.stderr()
     );
-    assert!(!first.exists() && !second.exists(), "nothing was due");
-    let told = std::fs::read_to_string(place.path().join("told/REPORT.md")).unwrap();
+    assert!(!first.exists() && !second.exists(), "nothing was trained");
+    let other_report = std::fs::read_to_string(place.path().join("elsewhere/REPORT.md")).unwrap();
     for link in [
         "![The swing-up",
         "](../kept/figures/pendulum-swing-up.svg)",
         "([PNG](../kept/figures/pendulum-swing-up.png))",
     ] {
-        assert!(told.contains(link), "{link}: {told}");
+        assert!(other_report.contains(link), "{link}: {other_report}");
     }
     assert!(
         std::fs::read(figure("pendulum-swing-up.png"))
@@ -160,16 +164,16 @@ fn what_is_interrupted_goes_on_and_nothing_is_run_twice() {
     );
 
     // In lockstep a seed's result is the same, interrupted or not.
-    let mut without = GzEncoder::new(File::create(&results).unwrap(), Compression::fast());
+    let mut shortened = GzEncoder::new(File::create(&results).unwrap(), Compression::fast());
     for line in &lines_of(&bytes)[..2] {
-        writeln!(without, "{line}").unwrap();
+        writeln!(shortened, "{line}").unwrap();
     }
-    without.finish().unwrap();
-    assert_eq!(kept(&results), seeds(&[1]));
+    shortened.finish().unwrap();
+    assert_eq!(seeds_and_stages(&results), seeds(&[1]));
     assert!(
-        Reproducing::start(&place, &PENDULUM).wait().success(),
+        Reproduction::start(&place, &PENDULUM).wait().success(),
         "{}",
-        place.said()
+        place.stderr()
     );
     assert!(!first.exists() && starts(&second) == 1);
     assert_eq!(lines(&results), lines_of(&bytes));
@@ -178,26 +182,30 @@ fn what_is_interrupted_goes_on_and_nothing_is_run_twice() {
         "the same results are the same bytes"
     );
 
-    // What earlier versions kept counts, and is taken over.
-    as_before(&results, first.parent().unwrap());
+    // Results of earlier versions count, and are moved into the new file.
+    convert_to_old_format(&results, first.parent().unwrap());
     assert!(
-        Reproducing::start(&place, &PENDULUM).wait().success(),
+        Reproduction::start(&place, &PENDULUM).wait().success(),
         "{}",
-        place.said()
+        place.stderr()
     );
-    assert!(!first.exists() && starts(&second) == 1, "nothing was due");
+    assert!(!first.exists() && starts(&second) == 1, "nothing was trained");
     assert_eq!(lines(&results), lines_of(&bytes));
     assert!(!place.path().join("kept/pendulum/seed-1.json").exists() && report().contains("seeds 1, 2\n"));
 }
 
 #[test]
-fn a_seed_that_fails_is_missing_and_the_others_go_on() {
+fn a_failed_seed_is_reported_missing_and_the_others_continue() {
     let place = Workplace::new();
     let [first, second] = runs(&place);
     std::fs::create_dir_all(&first).unwrap();
     std::fs::write(first.join("notes.txt"), "mine").unwrap();
-    assert_eq!(Reproducing::start(&place, &PENDULUM).wait().code(), Some(1));
-    assert!(place.said().contains("pendulum seed 1: failed: "), "{}", place.said());
+    assert_eq!(Reproduction::start(&place, &PENDULUM).wait().code(), Some(1));
+    assert!(
+        place.stderr().contains("pendulum seed 1: failed: "),
+        "{}",
+        place.stderr()
+    );
     let report = std::fs::read_to_string(place.path().join("kept/REPORT.md")).unwrap();
     assert!(
         report.contains("seeds 2; missing: 1; seed 1 failed: pendulum/seed-1 is not"),
@@ -206,18 +214,18 @@ fn a_seed_that_fails_is_missing_and_the_others_go_on() {
     assert_eq!(std::fs::read_to_string(first.join("notes.txt")).unwrap(), "mine");
     assert_eq!(starts(&second), 1);
 
-    // What was made otherwise is neither used nor overwritten, in whichever form it is.
+    // Results made with other settings are neither used nor overwritten, in either format.
     let results = place.path().join("kept/pendulum.jsonl.gz");
     let bytes = std::fs::read(&results).unwrap();
     let full = ["reproduce", "pendulum", "--out", "kept"];
-    let refused = complaint(&place.output(&full));
+    let refused = error_line(&place.output(&full));
     assert!(
         refused.contains("pendulum.jsonl.gz (seed 2)") && refused.contains("--out"),
         "{refused}"
     );
     assert_eq!(std::fs::read(&results).unwrap(), bytes);
-    as_before(&results, first.parent().unwrap());
-    let refused = complaint(&place.output(&full));
+    convert_to_old_format(&results, first.parent().unwrap());
+    let refused = error_line(&place.output(&full));
     assert!(
         refused.contains("pendulum/seed-2.json") && refused.contains("--out"),
         "{refused}"
@@ -226,7 +234,7 @@ fn a_seed_that_fails_is_missing_and_the_others_go_on() {
 }
 
 #[test]
-fn every_experiment_of_the_thesis_can_be_glanced_at() {
+fn every_experiment_of_the_thesis_runs_with_quick() {
     let place = Workplace::new();
     let all = [
         "reproduce",
@@ -239,7 +247,7 @@ fn every_experiment_of_the_thesis_can_be_glanced_at() {
         "--out",
         "kept",
     ];
-    assert!(Reproducing::start(&place, &all).wait().success(), "{}", place.said());
+    assert!(Reproduction::start(&place, &all).wait().success(), "{}", place.stderr());
     let report = std::fs::read_to_string(place.path().join("kept/REPORT.md")).unwrap();
     assert!(!report.contains("missing"), "{report}");
     for (figure, of_the_thesis) in [
@@ -267,7 +275,7 @@ fn every_experiment_of_the_thesis_can_be_glanced_at() {
             "{figure}"
         );
     }
-    // Every policy that was evaluated on the lake is there, and the table at the end.
+    // The result for the lake holds every evaluated policy and the final table.
     let evaluated = place.path().join("kept/frozen-lake/seed-1/policies");
     let evaluated = std::fs::read_dir(evaluated).unwrap().count();
     let result = &lines(&place.path().join("kept/frozen-lake.jsonl.gz"))[1];
@@ -277,5 +285,8 @@ fn every_experiment_of_the_thesis_can_be_glanced_at() {
     assert_eq!(result["tests"]["q"].as_array().unwrap().len(), 64);
     // Each experiment has one file, with all its stages.
     let stages = ["", "-longer"].map(|stage| (1, stage.to_string()));
-    assert_eq!(kept(&place.path().join("kept/point-mass-r2.jsonl.gz")), stages);
+    assert_eq!(
+        seeds_and_stages(&place.path().join("kept/point-mass-r2.jsonl.gz")),
+        stages
+    );
 }

@@ -1,4 +1,4 @@
-//! Runs that were broken off go on: after the launcher was killed, after everything was, and after what a disk may do.
+//! Interrupted runs can be resumed: after the launcher or every process was killed, and after files were damaged.
 
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
 
@@ -11,16 +11,17 @@ use std::time::{Duration, Instant};
 use rustix::process::Signal;
 use shoal_common::commit::CommitReader;
 use shoal_common::config::Config;
-use support::{Running, Workplace, complaint, parse, until};
+use support::{Running, Workplace, error_line, parse, until};
 
-/// Rows of the quick runs' ring.
+/// Rows in the ring of a quick run's replay.
 const RING: u64 = 2000;
 
 const ENDLESS: [&str; 2] = ["--steps", "100000000"];
 
-fn has_saved(running: &Running) {
+/// Waits until the run has two checkpoints and a best policy.
+fn wait_for_checkpoints(running: &Running) {
     let there = |name: &str| running.run.join("checkpoints").join(name).exists();
-    // A learner killed while it saves leaves the previous one alone.
+    // A learner killed while it saves may leave only the previous checkpoint.
     until("there are two checkpoints", || {
         there("previous.ckpt") && there("latest.ckpt")
     });
@@ -31,21 +32,21 @@ fn rows(run: &Path) -> u64 {
     CommitReader::open(&run.join("replay.bin")).unwrap().rows()
 }
 
-/// A run that has learned something, whose processes are all killed.
+/// Starts a run, lets it learn, and kills all its processes. Returns its directory.
 fn killed(place: &Workplace, arguments: &[&str]) -> std::path::PathBuf {
     let quickly = ["--set", "checkpoint.every_seconds=0.5"];
     let running = place.start("run", &[&ENDLESS[..], &quickly, arguments].concat());
-    running.learns_on();
-    has_saved(&running);
-    running.kill_everybody();
+    running.wait_for_learning();
+    wait_for_checkpoints(&running);
+    running.kill_all();
     running.run.clone()
 }
 
-/// Goes on for so many steps more, to the end.
-fn goes_on(place: &Workplace, more: u64) -> serde_json::Value {
+/// Resumes the run for `more` steps, to its end. Returns its result.
+fn resume_to_the_end(place: &Workplace, more: u64) -> serde_json::Value {
     let steps = rows(&place.path().join("run")) + more;
     let (code, printed, leftovers) = place.resume("run", &["--steps", &steps.to_string()]).wait();
-    assert_eq!(code, Some(0), "{}", place.said());
+    assert_eq!(code, Some(0), "{}", place.stderr());
     assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
     let result = parse(&printed);
     assert_eq!(result["env_steps"], steps);
@@ -54,15 +55,15 @@ fn goes_on(place: &Workplace, more: u64) -> serde_json::Value {
 }
 
 #[test]
-fn when_the_launcher_is_killed_the_run_can_be_resumed_at_once() {
-    let place = Workplace::where_chunks_are_counted();
+fn a_run_whose_launcher_was_killed_can_be_resumed_at_once() {
+    let place = Workplace::logging_chunks();
     let running = place.start("run", &ENDLESS);
-    running.learns_on();
+    running.wait_for_learning();
     let (run, before) = (running.run.clone(), rows(&running.run));
     running.signal(Signal::KILL);
     // The old roles may still be saving what they have.
     let resumed = place.resume("run", &[]);
-    resumed.learns_on();
+    resumed.wait_for_learning();
     assert!(rows(&run) > before);
     assert!(place.output(&["stop", "run"]).status.success());
     let (code, _, leftovers) = resumed.wait();
@@ -70,7 +71,7 @@ fn when_the_launcher_is_killed_the_run_can_be_resumed_at_once() {
     assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
     for actor in 0..2 {
         let (sent, committed) = (support::sent(&run, actor), support::committed(&run, actor as usize));
-        // Between two launchers nobody writes down what an actor says of its last chunks: some tenth of a second's.
+        // Between two launchers an actor's last chunks, those of a few tenths of a second, are not logged.
         assert!(
             (sent..sent + 2000).contains(&committed),
             "actor {actor} sent {sent}, {committed} are there"
@@ -79,7 +80,7 @@ fn when_the_launcher_is_killed_the_run_can_be_resumed_at_once() {
 }
 
 #[test]
-fn when_everything_is_killed_at_once_no_committed_row_is_lost() {
+fn no_committed_row_is_lost_when_all_processes_are_killed_at_once() {
     let place = Workplace::new();
     let run = killed(&place, &[]);
     let before = rows(&run);
@@ -87,7 +88,7 @@ fn when_everything_is_killed_at_once_no_committed_row_is_lost() {
     let status = place.output(&["status", "run", "--json"]);
     assert_eq!(status.status.code(), Some(3));
     assert_eq!(support::json(&status)["replay_rows"], before);
-    goes_on(&place, 2000);
+    resume_to_the_end(&place, 2000);
     let log = std::fs::read_to_string(run.join("shoal.log")).unwrap();
     assert!(
         log.contains(&format!("of {before} rows")),
@@ -96,7 +97,7 @@ fn when_everything_is_killed_at_once_no_committed_row_is_lost() {
 }
 
 #[test]
-fn a_policy_of_a_period_that_was_evaluated_is_not_evaluated_again() {
+fn a_period_that_was_evaluated_is_not_evaluated_again() {
     let place = Workplace::new();
     let running = place.start("run", &[&ENDLESS[..], &["--set", "evaluation.every=50000000"]].concat());
     let evaluations = running.run.join("evaluations.csv");
@@ -104,46 +105,44 @@ fn a_policy_of_a_period_that_was_evaluated_is_not_evaluated_again() {
     until("the first policy is evaluated", || evaluated() == 1);
     running.kill("evaluator-0");
     until("it is replaced", || running.pids("evaluator-0").len() == 2);
-    running.learns_on();
+    running.wait_for_learning();
     assert!(place.output(&["stop", "run"]).status.success());
     running.wait();
-    goes_on(&place, 2000);
+    resume_to_the_end(&place, 2000);
     assert_eq!(evaluated(), 1);
 }
 
 #[test]
-fn a_role_that_is_stopped_for_a_while_goes_on_and_nothing_is_there_twice() {
-    stopped_for(Duration::from_secs(4));
+fn a_role_paused_for_a_while_continues_and_nothing_is_stored_twice() {
+    pause_each_role(Duration::from_secs(4));
 }
 
 #[test]
 #[ignore = "takes minutes"]
-fn a_role_that_is_stopped_for_half_a_minute_goes_on_and_nothing_is_there_twice() {
-    stopped_for(Duration::from_secs(30));
+fn a_role_paused_for_half_a_minute_continues_and_nothing_is_stored_twice() {
+    pause_each_role(Duration::from_secs(30));
 }
 
-/// Stops each role in turn, then the launcher, then everybody.
-fn stopped_for(length: Duration) {
-    let place = Workplace::where_chunks_are_counted();
+/// Pauses each role in turn with SIGSTOP, then the launcher.
+fn pause_each_role(length: Duration) {
+    let place = Workplace::logging_chunks();
     let running = place.start("run", &[&ENDLESS[..], &["--set", "replay.capacity=200000"]].concat());
     let run = running.run.clone();
-    running.learns_on();
+    running.wait_for_learning();
     for who in ["actor-0", "env-server-0", "evaluator-0", "env-server-16", "learner-0"] {
-        running.stop(who);
+        running.stop_role(who);
         let begun = Instant::now();
-        until("it is said to be silent", || {
-            place.role("run", who)["state"] == "silent"
-        });
-        // How long it is stopped is the test.
+        until("it is reported silent", || place.role("run", who)["state"] == "silent");
+        // The length of the pause is what is tested.
         std::thread::sleep(length.saturating_sub(begun.elapsed()));
-        running.go_on(who);
-        running.learns_on();
+        running.continue_role(who);
+        running.wait_for_learning();
     }
     running.signal(Signal::STOP);
-    // So is this.
+    // The same for the launcher.
     std::thread::sleep(length);
     running.signal(Signal::CONT);
-    running.learns_on();
+    running.wait_for_learning();
     assert_eq!(place.status("run")["running"], true);
 
     assert!(place.output(&["stop", "run"]).status.success());
@@ -151,8 +150,8 @@ fn stopped_for(length: Duration) {
     let (code, _, leftovers) = running.wait();
     assert_eq!(code, Some(0));
     assert!(leftovers.files().is_empty());
-    assert!(!log.contains("starting it again"), "{log}");
-    support::all_that_was_sent_is_there(&run, 2);
+    assert!(!log.contains("restarting it"), "{log}");
+    support::assert_all_rows_committed(&run, 2);
 }
 
 #[test]
@@ -162,8 +161,8 @@ fn a_damaged_checkpoint_is_reported_and_the_one_before_it_used() {
         "run",
         &[&ENDLESS[..], &["--set", "checkpoint.every_seconds=0.5"]].concat(),
     );
-    has_saved(&running);
-    // Stopped and not killed: both are there for certain.
+    wait_for_checkpoints(&running);
+    // Stopped, not killed, so that both checkpoints certainly exist.
     assert!(place.output(&["stop", "run"]).status.success());
     let run = running.run.clone();
     assert_eq!(running.wait().0, Some(0));
@@ -172,10 +171,10 @@ fn a_damaged_checkpoint_is_reported_and_the_one_before_it_used() {
     let middle = bytes.len() / 2;
     bytes[middle] ^= 1;
     std::fs::write(&latest, &bytes).unwrap();
-    goes_on(&place, 500);
+    resume_to_the_end(&place, 500);
     let log = std::fs::read_to_string(run.join("shoal.log")).unwrap();
     assert!(
-        log.contains("latest.ckpt: is damaged") && log.contains("going on from"),
+        log.contains("latest.ckpt: is damaged") && log.contains("continuing from"),
         "{log}"
     );
     assert_eq!(
@@ -186,37 +185,37 @@ fn a_damaged_checkpoint_is_reported_and_the_one_before_it_used() {
 }
 
 #[test]
-fn a_lost_counter_of_incarnations_keeps_nobody_from_going_on() {
+fn a_run_with_a_lost_incarnation_counter_can_be_resumed() {
     for counter in [None, Some("3")] {
         let place = Workplace::new();
         let run = killed(&place, &[]);
-        // Now the replay knows of greater ones than those of a first start.
-        goes_on(&place, 500);
+        // Now the replay holds higher incarnations than those of a first start.
+        resume_to_the_end(&place, 500);
         let file = run.join("incarnations");
         match counter {
             None => std::fs::remove_file(&file).unwrap(),
             Some(number) => std::fs::write(&file, number).unwrap(),
         }
-        goes_on(&place, 500);
+        resume_to_the_end(&place, 500);
     }
 }
 
 #[test]
-fn a_copy_of_a_run_that_goes_on_is_told_from_it() {
+fn resuming_a_copy_of_a_running_run_is_refused() {
     let place = Workplace::new();
     let running = place.start("run", &ENDLESS);
-    running.learns_on();
+    running.wait_for_learning();
     place.copy("run", "copy");
-    let said = complaint(&place.output(&["resume", "copy"]));
+    let message = error_line(&place.output(&["resume", "copy"]));
     assert!(
-        said.contains("is a copy of") && said.contains(running.run.to_str().unwrap()),
-        "{said}"
+        message.contains("is a copy of") && message.contains(running.run.to_str().unwrap()),
+        "{message}"
     );
-    running.learns_on();
+    running.wait_for_learning();
 }
 
 #[test]
-fn what_is_not_this_runs_is_refused_in_one_line_and_left_as_it_is() {
+fn files_that_do_not_belong_to_the_run_are_refused_and_left_unchanged() {
     let place = Workplace::new();
     let run = killed(&place, &[]);
     let config = std::fs::read_to_string(run.join("config.toml")).unwrap();
@@ -224,8 +223,8 @@ fn what_is_not_this_runs_is_refused_in_one_line_and_left_as_it_is() {
 
     // Another configuration.
     std::fs::write(run.join("config.toml"), config.replace("gamma = 0.99", "gamma = 0.9")).unwrap();
-    let said = complaint(&place.output(&["resume", "run"]));
-    assert!(said.contains("another configuration"), "{said}");
+    let message = error_line(&place.output(&["resume", "run"]));
+    assert!(message.contains("another configuration"), "{message}");
     std::fs::write(run.join("config.toml"), &config).unwrap();
 
     // A replay of another version: the second word of the file.
@@ -234,8 +233,11 @@ fn what_is_not_this_runs_is_refused_in_one_line_and_left_as_it_is() {
         .open(run.join("replay.bin"))
         .unwrap();
     file.write_all_at(&99_u64.to_le_bytes(), 8).unwrap();
-    let said = complaint(&place.output(&["resume", "run"]));
-    assert!(said.contains("replay.bin") && said.contains("version is 99"), "{said}");
+    let message = error_line(&place.output(&["resume", "run"]));
+    assert!(
+        message.contains("replay.bin") && message.contains("version is 99"),
+        "{message}"
+    );
     file.write_all_at(&replay[8..16], 8).unwrap();
 
     // Another layout.
@@ -244,19 +246,19 @@ fn what_is_not_this_runs_is_refused_in_one_line_and_left_as_it_is() {
         config.replace("capacity = 2000", "capacity = 3000"),
     )
     .unwrap();
-    let (code, said) = resume_fails(&place);
+    let (code, message) = try_to_resume(&place);
     assert!(
-        code == Some(1) && said.contains("its ring has 2000 rows, this run's 3000"),
-        "{said}"
+        code == Some(1) && message.contains("its ring has 2000 rows, this run's 3000"),
+        "{message}"
     );
     std::fs::write(run.join("config.toml"), &config).unwrap();
 
     assert_eq!(std::fs::read(run.join("replay.bin")).unwrap(), replay);
-    goes_on(&place, 500);
+    resume_to_the_end(&place, 500);
 }
 
-/// A resumption whose learner is given up; what was said.
-fn resume_fails(place: &Workplace) -> (Option<i32>, String) {
+/// Tries to resume the run. Returns the exit code and standard error.
+fn try_to_resume(place: &Workplace) -> (Option<i32>, String) {
     let output = place.output(&["resume", "run"]);
     (
         output.status.code(),
@@ -265,8 +267,8 @@ fn resume_fails(place: &Workplace) -> (Option<i32>, String) {
 }
 
 #[test]
-fn after_a_power_loss_the_replay_falls_back_to_what_it_can_prove() {
-    // The newest rows never reached the disk, or none of those that the ring holds.
+fn after_a_power_loss_the_replay_falls_back_to_the_rows_that_reached_the_disk() {
+    // Either the newest 20 rows or all rows in the ring never reached the disk.
     for lost in [20, RING] {
         let place = Workplace::new();
         let run = killed(&place, &[]);
@@ -282,7 +284,7 @@ fn after_a_power_loss_the_replay_falls_back_to_what_it_can_prove() {
                 .unwrap();
         }
         drop(file);
-        goes_on(&place, 3000);
+        resume_to_the_end(&place, 3000);
         let log = std::fs::read_to_string(run.join("shoal.log")).unwrap();
         let whole = format!("of {before} rows");
         let fell_back = log.contains("did not reach the disk") && !log.contains(&whole);
@@ -291,25 +293,27 @@ fn after_a_power_loss_the_replay_falls_back_to_what_it_can_prove() {
 }
 
 #[test]
-fn a_role_that_cannot_start_is_given_up_with_its_last_words_and_the_run_can_be_resumed() {
+fn a_role_that_cannot_start_is_given_up_with_its_error_and_the_run_can_be_resumed() {
     let place = Workplace::new();
     let run = killed(&place, &[]);
-    // What the evaluator cannot read.
+    // A policy file that the evaluator cannot read.
     let best = run.join("checkpoints/best.policy");
     let bytes = std::fs::read(&best).unwrap();
     std::fs::write(&best, b"not a policy at all").unwrap();
-    let (code, said) = resume_fails(&place);
+    let (code, message) = try_to_resume(&place);
     assert_eq!(code, Some(1));
     assert!(
-        said.contains("evaluator-0 failed") && said.contains("times and is given up") && said.contains("best.policy"),
-        "{said}"
+        message.contains("evaluator-0 failed")
+            && message.contains("times and is given up")
+            && message.contains("best.policy"),
+        "{message}"
     );
-    assert!(said.contains("shoal resume"), "{said}");
+    assert!(message.contains("shoal resume"), "{message}");
     std::fs::write(&best, bytes).unwrap();
-    goes_on(&place, 500);
+    resume_to_the_end(&place, 500);
 }
 
-/// Networks and batches with which updates come long after their rows.
+/// Networks and batches so large that gradient steps come long after their environment steps.
 const SLOW_UPDATES: [&str; 14] = [
     "--steps",
     "3000",
@@ -328,31 +332,31 @@ const SLOW_UPDATES: [&str; 14] = [
 ];
 
 #[test]
-fn a_run_that_was_broken_off_after_its_last_row_is_finished_when_it_is_resumed() {
+fn a_run_interrupted_after_its_last_environment_step_is_finished_when_it_is_resumed() {
     for stopped in [true, false] {
         let place = Workplace::new();
         let running = place.start_as("run", &SLOW_UPDATES);
-        until("all rows are there", || support::rows_of(&running) == 3000);
+        until("all steps are taken", || support::committed_rows(&running) == 3000);
         if stopped {
             assert!(place.output(&["stop", "run"]).status.success());
             assert_eq!(running.wait().0, Some(0));
         } else {
-            running.kill_everybody();
+            running.kill_all();
         }
-        let rest = || {
+        let status_at_rest = || {
             let output = place.output(&["status", "run", "--json"]);
             assert_eq!(output.status.code(), Some(3));
             support::json(&output)
         };
-        let before = rest();
+        let before = status_at_rest();
         assert!(
             before["updates"].as_u64().unwrap() < 2936,
-            "it was broken off too late: {before}"
+            "it was interrupted too late: {before}"
         );
         assert_eq!(before["finished"], false);
 
         let (code, printed, leftovers) = place.resume("run", &[]).wait();
-        assert_eq!(code, Some(0), "{}", place.said());
+        assert_eq!(code, Some(0), "{}", place.stderr());
         assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
         let result = parse(&printed);
         assert_eq!((&result["env_steps"], &result["updates"]), (&3000.into(), &2936.into()));
@@ -360,30 +364,30 @@ fn a_run_that_was_broken_off_after_its_last_row_is_finished_when_it_is_resumed()
         let evaluations = std::fs::read_to_string(place.path().join("run/evaluations.csv")).unwrap();
         assert!(evaluations.lines().last().unwrap().contains(",3000,"), "{evaluations}");
 
-        assert_eq!(rest()["finished"], true);
-        let said = complaint(&place.output(&["resume", "run"]));
-        assert!(said.contains("3000 of 3000 steps already"), "{said}");
+        assert_eq!(status_at_rest()["finished"], true);
+        let message = error_line(&place.output(&["resume", "run"]));
+        assert!(message.contains("3000 of 3000 steps already"), "{message}");
     }
 }
 
 #[test]
-fn a_copy_that_waits_for_the_original_is_no_way_to_stop_the_original() {
+fn stopping_a_waiting_copy_does_not_stop_the_original() {
     let place = Workplace::new();
     let running = place.start("run", &ENDLESS);
-    running.learns_on();
+    running.wait_for_learning();
     place.copy("run", "copy");
     let mut waiting = place.shoal(&["resume", "copy"]).spawn().unwrap();
-    let mut said = String::new();
+    let mut message = String::new();
     until("the copy's launcher waits", || {
-        said = complaint(&place.output(&["stop", "copy"]));
-        !said.contains("nothing runs")
+        message = error_line(&place.output(&["stop", "copy"]));
+        !message.contains("nothing runs")
     });
     assert!(
-        said.contains("is a copy of") && said.contains(running.run.to_str().unwrap()),
-        "{said}"
+        message.contains("is a copy of") && message.contains(running.run.to_str().unwrap()),
+        "{message}"
     );
     assert!(!place.output(&["scale", "copy", "--actors", "3"]).status.success());
     until("the copy's launcher gives up", || waiting.try_wait().unwrap().is_some());
-    running.learns_on();
+    running.wait_for_learning();
     assert_eq!(place.status("run")["actors"], 2);
 }

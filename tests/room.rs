@@ -1,8 +1,9 @@
-//! Whether there is room is asked before anything starts, and what is made is for its owner alone. Small file systems are
-//! mounted in a namespace of their own; where the machine allows none, those tests are ignored.
+//! A run checks memory, disk space and limits before anything starts. Everything it creates is private to its owner.
+//! Tests that need small file systems mount them in a namespace of their own; if the machine allows none, they are
+//! ignored.
 
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
-#![allow(clippy::print_stderr, reason = "a test says what it measured")]
+#![allow(clippy::print_stderr, reason = "a test prints what it measured")]
 
 #[path = "support/suite.rs"]
 mod suite;
@@ -17,7 +18,7 @@ use std::sync::OnceLock;
 
 use rustix::process::{Pid, Signal, kill_process};
 use suite::{Need, ROOT, test};
-use support::{Leftovers, QUICK, Running, Workplace, complaint, json, until};
+use support::{Leftovers, QUICK, Running, Workplace, error_line, json, until};
 
 const SHOAL: &str = env!("CARGO_BIN_EXE_shoal");
 const ENDLESS: [&str; 2] = ["--steps", "100000000"];
@@ -25,31 +26,31 @@ const PAGE: u64 = 4096;
 
 fn main() -> ExitCode {
     suite::run(vec![
-        test!(what_a_run_reserves_is_at_most_what_was_computed_and_at_least_half_of_it),
+        test!(a_run_reserves_at_most_the_computed_memory_and_at_least_half_of_it),
         test!(
-            the_default_run_fits_into_a_container_and_one_of_64_actors_is_refused_there,
+            the_default_run_fits_into_a_container_and_one_with_64_actors_is_refused,
             NAMESPACE
         ),
-        test!(what_another_run_was_promised_is_not_free, NAMESPACE),
-        test!(a_full_disk_is_said_before_anything_is_made, NAMESPACE),
+        test!(memory_promised_to_another_run_is_not_free, NAMESPACE),
+        test!(a_full_disk_is_reported_before_anything_is_created, NAMESPACE),
         test!(a_disk_that_fills_up_ends_the_run_with_one_line, NAMESPACE),
-        test!(a_directory_that_cannot_be_written_is_said, NAMESPACE),
-        test!(a_limit_of_open_files_is_raised_where_it_can_be_and_said_where_not),
-        test!(everything_a_run_makes_is_for_its_owner_alone),
-        test!(two_users_do_not_touch_each_other, ROOT),
-        test!(another_users_files_with_a_runs_name_change_nothing, ROOT),
+        test!(a_read_only_directory_is_reported, NAMESPACE),
+        test!(the_limit_of_open_files_is_raised_or_an_error_is_reported),
+        test!(everything_a_run_creates_is_private_to_its_owner),
+        test!(runs_of_two_users_do_not_affect_each_other, ROOT),
+        test!(another_users_files_with_the_name_of_a_run_change_nothing, ROOT),
     ])
 }
 
-/// The right to mount file systems that nobody else sees.
+/// Permission to mount file systems in a private namespace.
 static NAMESPACE: Need = Need::new(
     "this machine allows no mount namespace",
-    || way_to_mount().is_some(),
+    || unshare_options().is_some(),
     None,
 );
 
-/// The options of `unshare` with which this machine allows to mount; looked for once.
-fn way_to_mount() -> Option<&'static [&'static str]> {
+/// The options of `unshare` with which this machine allows mounting, if any do; tried once.
+fn unshare_options() -> Option<&'static [&'static str]> {
     const WAYS: [&[&str]; 2] = [&["--mount"], &["--user", "--map-root-user", "--mount"]];
     static WAY: OnceLock<Option<&[&str]>> = OnceLock::new();
     let allowed = |way: &&[&str]| {
@@ -60,13 +61,13 @@ fn way_to_mount() -> Option<&'static [&'static str]> {
     *WAY.get_or_init(|| WAYS.into_iter().find(allowed))
 }
 
-/// Runs a shell script that may mount what it likes, with `$SHOAL` the program and `$QUICK` the quick settings: for tests
-/// that need a [`NAMESPACE`].
+/// Runs a shell script in a mount namespace. `$SHOAL` is the program, `$QUICK` the quick settings. Only for tests that
+/// need a [`NAMESPACE`].
 fn in_namespace(place: &Workplace, script: &str) -> Output {
     let quick: Vec<String> = QUICK.iter().map(|argument| argument.replace(' ', "")).collect();
     let mut command = Command::new("unshare");
     command
-        .args(way_to_mount().unwrap())
+        .args(unshare_options().unwrap())
         .args(["sh", "-ec", script])
         .env("SHOAL", SHOAL)
         .env("QUICK", quick.join(" "))
@@ -75,7 +76,7 @@ fn in_namespace(place: &Workplace, script: &str) -> Output {
     support::output_of(&mut command)
 }
 
-/// A shared memory of 64 MB, and a user's directory that belongs to it: with the one outside, the next start would find
+/// Mounts 64 MB of shared memory and a private `/tmp/shoal-<uid>`. With the outer directory, the next start would find
 /// killed runs whose files it cannot see.
 const CONTAINER: &str = "mount -t tmpfs -o size=64m tmpfs /dev/shm
     mkdir -p /tmp/shoal-$(id -u); mount -t tmpfs -o mode=700 tmpfs /tmp/shoal-$(id -u)
@@ -86,7 +87,7 @@ fn files_of(running: &Running) -> Vec<PathBuf> {
     files.map(|name| Path::new("/dev/shm").join(name)).collect()
 }
 
-/// What is in a directory, and in those below it.
+/// A directory and everything in it, at any depth.
 fn everything_in(directory: &Path) -> Vec<PathBuf> {
     let mut found = vec![directory.to_owned()];
     let mut next = 0;
@@ -101,11 +102,11 @@ fn everything_in(directory: &Path) -> Vec<PathBuf> {
 }
 
 fn is_private(path: &Path) -> bool {
-    // What has gone in between is nobody's.
+    // A file may wait_until_gone in between.
     fs::symlink_metadata(path).is_ok_and(|metadata| metadata.mode() & 0o077 == 0) || !path.exists()
 }
 
-fn what_a_run_reserves_is_at_most_what_was_computed_and_at_least_half_of_it() {
+fn a_run_reserves_at_most_the_computed_memory_and_at_least_half_of_it() {
     for arguments in [
         &["--actors", "1", "--set", "actors.max=1"][..],
         &["--actors", "12", "--set", "actors.max=12"],
@@ -138,8 +139,8 @@ fn what_a_run_reserves_is_at_most_what_was_computed_and_at_least_half_of_it() {
     ] {
         let place = Workplace::new();
         let running = place.start_as("run", &[&QUICK[..], &ENDLESS, arguments].concat());
-        // A role opens its last channels after it has said that it is ready.
-        until("everybody is at work", || running.learned("updates") > 0);
+        // A role opens its last channels after it has reported that it is ready.
+        until("something is learned", || running.learned("updates") > 0);
         let files = files_of(&running);
         let promised = |path: &PathBuf| path.to_str()?.split_once("_promise_")?.1.parse().ok();
         let computed: u64 = files.iter().find_map(promised).unwrap();
@@ -154,7 +155,7 @@ fn what_a_run_reserves_is_at_most_what_was_computed_and_at_least_half_of_it() {
     }
 }
 
-fn the_default_run_fits_into_a_container_and_one_of_64_actors_is_refused_there() {
+fn the_default_run_fits_into_a_container_and_one_with_64_actors_is_refused() {
     let place = Workplace::new();
     let output = in_namespace(
         &place,
@@ -167,15 +168,15 @@ fn the_default_run_fits_into_a_container_and_one_of_64_actors_is_refused_there()
         &place,
         &format!("{CONTAINER} exec $SHOAL train pendulum --steps 1300 --run large --json --actors 64"),
     );
-    let said = complaint(&refused);
+    let message = error_line(&refused);
     assert!(
-        said.contains("MiB of /dev/shm for up to 64 actors, and 64.0 MiB are free: lay it out for at most "),
-        "{said}"
+        message.contains("MiB of /dev/shm for up to 64 actors, and 64.0 MiB are free: allow at most "),
+        "{message}"
     );
-    assert!(!place.path().join("large").exists(), "nothing was made");
+    assert!(!place.path().join("large").exists(), "nothing was created");
 }
 
-fn what_another_run_was_promised_is_not_free() {
+fn memory_promised_to_another_run_is_not_free() {
     let place = Workplace::new();
     let script = "$SHOAL train pendulum --steps 100000000 --run first --quiet & first=$!
         timeout 60 sh -c 'until ls /dev/shm | grep -q promise; do sleep 0.05; done'
@@ -183,12 +184,12 @@ fn what_another_run_was_promised_is_not_free() {
         kill $first; wait $first || true
         exit $code";
     let output = in_namespace(&place, &[CONTAINER, script].concat());
-    let said = complaint(&output);
-    assert!(said.contains("of /dev/shm"), "{said}");
-    assert!(!place.path().join("second").exists(), "nothing was made");
+    let message = error_line(&output);
+    assert!(message.contains("of /dev/shm"), "{message}");
+    assert!(!place.path().join("second").exists(), "nothing was created");
 }
 
-fn a_full_disk_is_said_before_anything_is_made() {
+fn a_full_disk_is_reported_before_anything_is_created() {
     let place = Workplace::new();
     fs::create_dir(place.path().join("small")).unwrap();
     let script = "mount -t tmpfs -o size=8m tmpfs small
@@ -196,10 +197,10 @@ fn a_full_disk_is_said_before_anything_is_made() {
         ls small
         exit $code";
     let output = in_namespace(&place, script);
-    let said = complaint(&output);
+    let message = error_line(&output);
     assert!(
-        said.contains("of disk and") && said.contains("small has 8.0 MiB"),
-        "{said}"
+        message.contains("of disk and") && message.contains("small has 8.0 MiB"),
+        "{message}"
     );
 }
 
@@ -213,19 +214,19 @@ fn a_disk_that_fills_up_ends_the_run_with_one_line() {
         timeout 60 tail --pid=$run -f /dev/null
         wait $run";
     let output = in_namespace(&place, script);
-    let said = complaint(&output);
-    assert!(said.contains("No space left on device"), "{said}");
+    let message = error_line(&output);
+    assert!(message.contains("No space left on device"), "{message}");
 }
 
-fn a_directory_that_cannot_be_written_is_said() {
+fn a_read_only_directory_is_reported() {
     let place = Workplace::new();
     fs::create_dir(place.path().join("closed")).unwrap();
     let script = "mount -t tmpfs -o ro tmpfs closed; exec $SHOAL train pendulum --run closed/run --json";
     let output = in_namespace(&place, script);
-    let said = complaint(&output);
+    let message = error_line(&output);
     assert!(
-        said.contains("closed/run") && said.contains("Read-only file system"),
-        "{said}"
+        message.contains("closed/run") && message.contains("Read-only file system"),
+        "{message}"
     );
 
     place.train(&["pendulum", "--steps", "300", "--run", "run"]);
@@ -234,15 +235,15 @@ fn a_directory_that_cannot_be_written_is_said() {
         &place,
         &format!("{closed} exec $SHOAL eval run --policy last --episodes 2 --json"),
     );
-    assert_eq!(json(&evaluated)["episodes"], 2, "to read is enough");
-    let said = complaint(&in_namespace(&place, &format!("{closed} exec $SHOAL plot run")));
+    assert_eq!(json(&evaluated)["episodes"], 2, "reading is enough");
+    let message = error_line(&in_namespace(&place, &format!("{closed} exec $SHOAL plot run")));
     assert!(
-        said.contains(".svg") && said.contains("Read-only file system"),
-        "{said}"
+        message.contains(".svg") && message.contains("Read-only file system"),
+        "{message}"
     );
 }
 
-fn a_limit_of_open_files_is_raised_where_it_can_be_and_said_where_not() {
+fn the_limit_of_open_files_is_raised_or_an_error_is_reported() {
     let place = Workplace::new();
     let limited = |limit: &str, run: &str| {
         let script = format!("ulimit {limit}; exec {SHOAL} train pendulum --steps 300 --run {run} --json \"$@\"");
@@ -253,24 +254,24 @@ fn a_limit_of_open_files_is_raised_where_it_can_be_and_said_where_not() {
             .current_dir(place.path());
         support::output_of(&mut command)
     };
-    let said = complaint(&limited("-n 64", "run"));
+    let message = error_line(&limited("-n 64", "run"));
     assert!(
-        said.contains("open files") && said.contains("the limit is 64"),
-        "{said}"
+        message.contains("open files") && message.contains("the limit is 64"),
+        "{message}"
     );
-    assert!(!place.path().join("run").exists(), "nothing was made");
+    assert!(!place.path().join("run").exists(), "nothing was created");
     let output = limited("-Sn 32", "run");
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
 }
 
-fn everything_a_run_makes_is_for_its_owner_alone() {
+fn everything_a_run_creates_is_private_to_its_owner() {
     let place = Workplace::new();
     let running = place.start("run", &ENDLESS);
     until("there is a checkpoint", || {
         running.run.join("checkpoints/latest.ckpt").exists()
     });
     let user = rustix::process::getuid().as_raw();
-    // What is below it is closed with it.
+    // It closes everything below it.
     let root = PathBuf::from(format!("/tmp/shoal-{user}"));
     let files = files_of(&running);
     assert!(files.len() > 50, "{files:?}");
@@ -287,11 +288,11 @@ fn everything_a_run_makes_is_for_its_owner_alone() {
     assert_eq!(open(figures), none);
 }
 
-fn two_users_do_not_touch_each_other() {
+fn runs_of_two_users_do_not_affect_each_other() {
     const NOBODY: u32 = 65534;
     let (place, other) = (Workplace::new(), Workplace::new());
     let running = place.start("run", &ENDLESS);
-    until("everybody is at work", || running.learned("updates") > 0);
+    until("something is learned", || running.learned("updates") > 0);
     let state = || {
         let mut files: Vec<_> = files_of(&running)
             .into_iter()
@@ -302,7 +303,7 @@ fn two_users_do_not_touch_each_other() {
     };
     let before = state();
 
-    // The program's own directory may be closed to others.
+    // The other user may have no access to the program's own directory.
     let program = other.path().join("shoal");
     fs::copy(SHOAL, &program).unwrap();
     chown(other.path(), Some(NOBODY), Some(NOBODY)).unwrap();
@@ -327,25 +328,25 @@ fn two_users_do_not_touch_each_other() {
     assert_eq!(state(), before, "the first run was not touched");
 }
 
-/// Files and a process that are gone when the test is, however it ends.
-struct Gone(Vec<PathBuf>, std::process::Child);
+/// Removes files and kills a process when dropped.
+struct Cleanup(Vec<PathBuf>, std::process::Child);
 
-impl Drop for Gone {
+impl Drop for Cleanup {
     fn drop(&mut self) {
         for path in &self.0 {
             let _ = fs::remove_file(path);
         }
-        // Its roles end with it.
+        // The roles end with the launcher.
         let _ = self.1.kill();
         let _ = self.1.wait();
     }
 }
 
-fn another_users_files_with_a_runs_name_change_nothing() {
+fn another_users_files_with_the_name_of_a_run_change_nothing() {
     const OWNER: u32 = 65534;
     const OTHER: u32 = 20_002;
     let place = Workplace::new();
-    // The program's own directory may be closed to others.
+    // The other user may have no access to the program's own directory.
     fs::copy(SHOAL, place.path().join("shoal")).unwrap();
     chown(place.path(), Some(OWNER), Some(OWNER)).unwrap();
     let owner = |arguments: &[&str]| {
@@ -358,17 +359,17 @@ fn another_users_files_with_a_runs_name_change_nothing() {
         command
     };
     let quick = ["train", "pendulum", "--run", "run", "--steps", "100000000", "--quiet"];
-    let mut gone = Gone(Vec::new(), owner(&[&quick[..], &QUICK[..]].concat()).spawn().unwrap());
+    let mut cleanup = Cleanup(Vec::new(), owner(&[&quick[..], &QUICK[..]].concat()).spawn().unwrap());
     let run = place.path().join("run");
     let log = || fs::read_to_string(run.join("shoal.log")).unwrap_or_default();
-    until("it is at work", || log().contains("every role is ready"));
+    until("every role is ready", || log().contains("every role is ready"));
     let id = Leftovers::of(&run).run_id().to_owned();
 
     for name in ["x", "y.global_mgmt", "promise_1", "0_0.connection"] {
         let path = PathBuf::from(format!("/dev/shm/shoal_{id}_{name}"));
         fs::write(&path, "").unwrap();
         chown(&path, Some(OTHER), Some(OTHER)).unwrap();
-        gone.0.push(path);
+        cleanup.0.push(path);
     }
     let works = |arguments: &[&str]| {
         let output = support::output_of(&mut owner(arguments));
@@ -377,11 +378,11 @@ fn another_users_files_with_a_runs_name_change_nothing() {
     works(&["status", "run"]);
     let started = || log().matches("started as process").count();
     let before = started();
-    let actor = Leftovers::of(&run).processes();
-    kill_process(Pid::from_raw(*actor.last().unwrap()).unwrap(), Signal::KILL).unwrap();
+    let processes = Leftovers::of(&run).processes();
+    kill_process(Pid::from_raw(*processes.last().unwrap()).unwrap(), Signal::KILL).unwrap();
     until("a killed process is replaced", || started() > before);
     works(&["stop", "run"]);
-    assert!(gone.1.wait().unwrap().success());
+    assert!(cleanup.1.wait().unwrap().success());
     works(&["resume", "run", "--steps", &(rows(&run) + 300).to_string(), "--quiet"]);
     works(
         &[
@@ -390,7 +391,7 @@ fn another_users_files_with_a_runs_name_change_nothing() {
         ]
         .concat(),
     );
-    for path in gone.0.drain(..) {
+    for path in cleanup.0.drain(..) {
         fs::remove_file(path).unwrap();
     }
     assert!(Leftovers::of(&run).files().is_empty());

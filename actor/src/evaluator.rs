@@ -20,7 +20,7 @@ use shoal_common::stop::Stop;
 use crate::error::ActorError;
 use crate::explorer::connect;
 
-/// What an evaluator is told.
+/// The settings of an evaluator.
 #[derive(Clone, Debug)]
 pub struct EvaluatorSettings {
     /// Which process this is.
@@ -29,20 +29,21 @@ pub struct EvaluatorSettings {
     pub spec: EnvironmentSpec,
     /// The environment server's index.
     pub server: u32,
-    /// Environments it steps at once.
+    /// The number of environments that it steps at once.
     pub envs: usize,
-    /// How often, and how long.
+    /// How often to evaluate, and for how many episodes.
     pub evaluation: EvaluationConfig,
-    /// What is learned, and with it what kind of policy.
+    /// The algorithm, which determines the kind of policy.
     pub algorithm: Algorithm,
-    /// The run's directory, where the best policy is kept, and all of them if that is wanted.
+    /// The run directory, where the best policy is written, and all evaluated ones if configured.
     pub run: RunDir,
-    /// The period of the policy that an evaluator before this one evaluated last.
+    /// The period of the policy that a previous evaluator evaluated last.
     pub evaluated_period: Option<u64>,
 }
 
 impl EvaluatorSettings {
-    /// What the evaluator of this run is told; `evaluated_period` is the period of the policy that one before it evaluated last.
+    /// The settings of this run's evaluator. `evaluated_period` is the period of the policy that a previous one
+    /// evaluated last.
     pub fn new(config: &Config, run: &RunDir, identity: Identity, evaluated_period: Option<u64>) -> Self {
         Self {
             identity,
@@ -57,7 +58,7 @@ impl EvaluatorSettings {
     }
 }
 
-/// Mean and standard deviation (of the sample; 0 for fewer than two) of returns.
+/// Mean and sample standard deviation of returns; the latter is 0 for fewer than two.
 pub fn mean_and_std(returns: &[f64]) -> (f64, f64) {
     let n = returns.len() as f64;
     let mean = returns.iter().sum::<f64>() / n;
@@ -75,7 +76,8 @@ pub fn mean_and_std(returns: &[f64]) -> (f64, f64) {
 /// Evaluates policies until `stop`.
 ///
 /// # Errors
-/// When a channel does not work, the environment is not the expected one, or the best policy cannot be written.
+/// When a channel fails, the environment is not the expected one, or the evaluator's state or a policy cannot be read
+/// or written.
 pub fn evaluate(domain: &Domain, settings: &EvaluatorSettings, stop: &Stop) -> Result<(), ActorError> {
     let mut evaluator = match Evaluator::new(domain, settings, stop) {
         Ok(evaluator) => evaluator,
@@ -124,7 +126,7 @@ impl<'a> Evaluator<'a> {
         heartbeat.beat(Activity::WaitingForPeer);
         let state = EvaluatorState::read(&settings.run.evaluator_state())?;
         let reports = Reporter::open(domain)?;
-        // The launcher leaves out what it has written down.
+        // The launcher skips evaluations that it has already recorded.
         state.evaluations().for_each(|evaluation| reports.send(*evaluation));
         let evaluated_reports = Reporter::open(domain)?;
         if let Some(period) = settings.evaluated_period {
@@ -153,24 +155,24 @@ impl<'a> Evaluator<'a> {
         let header = published.header();
         let mut returns = Vec::new();
         while (returns.len() as u32) < self.settings.evaluation.episodes {
-            // A server that dies takes its episodes with it; they are run again.
-            if let Some(some) = self.run_episodes(published.parameters(), returns.len() as u64)? {
-                returns.extend(some);
+            // If the server dies, its episodes are run again.
+            if let Some(more) = self.run_episodes(published.parameters(), returns.len() as u64)? {
+                returns.extend(more);
             }
         }
         returns.truncate(self.settings.evaluation.episodes as usize);
         let (return_mean, return_std) = mean_and_std(&returns);
-        // An evaluator may have died when it had kept this policy and not said so.
+        // A previous evaluator may have died after it wrote this policy and before it reported that.
         let best = self
             .best
             .is_none_or(|(mean, version)| return_mean > mean || version == header.version);
         if best {
-            self.keep(&published, return_mean, return_std, &self.settings.run.best_policy())?;
+            self.write_policy(&published, return_mean, return_std, &self.settings.run.best_policy())?;
             self.best = Some((return_mean, header.version));
         }
         if self.settings.evaluation.keep_policies {
             let path = self.settings.run.evaluated_policy(header.env_steps);
-            self.keep(&published, return_mean, return_std, &path)?;
+            self.write_policy(&published, return_mean, return_std, &path)?;
         }
         let period = self.settings.evaluation.period(header.env_steps);
         self.evaluated_period = Some(period);
@@ -183,7 +185,7 @@ impl<'a> Evaluator<'a> {
             episodes: self.settings.evaluation.episodes,
             best: best.into(),
         };
-        // First: a successor reports it where this process dies over it.
+        // Before the report: if this process dies in between, its successor sends the report.
         self.state
             .add(evaluation, &self.settings.run.evaluator_state())
             .map_err(ActorError::State)?;
@@ -193,7 +195,7 @@ impl<'a> Evaluator<'a> {
         Ok(())
     }
 
-    /// Waits for a policy of a period that was not evaluated yet.
+    /// Waits for a policy of a period that has not been evaluated.
     fn await_due_policy(&mut self) -> Result<Rc<policy::Policy>, Exit<ChannelError>> {
         let Self {
             reader,
@@ -214,8 +216,8 @@ impl<'a> Evaluator<'a> {
             || Ok(reader.latest()?.filter(|policy| due(policy.header()))),
             || {
                 heartbeat.beat(Activity::WaitingForPeer);
-                reports.look_after();
-                evaluated_reports.look_after();
+                reports.refresh_connections();
+                evaluated_reports.refresh_connections();
                 Ok(())
             },
         )?;
@@ -223,8 +225,8 @@ impl<'a> Evaluator<'a> {
         Ok(published)
     }
 
-    /// Returns of the episodes from `first` on under these parameters, one in each environment; `None` when the server was
-    /// lost over them.
+    /// Runs one evaluation episode in each environment with these parameters, from number `first` on. Returns their
+    /// returns, or `None` if the server was lost.
     fn run_episodes(&mut self, parameters: &[f32], first: u64) -> Result<Option<Vec<f64>>, Exit<ActorError>> {
         let Self {
             client,
@@ -239,18 +241,18 @@ impl<'a> Evaluator<'a> {
         });
         let mut current = begun.map_err(Exit::widen)?;
         let mut returns = vec![0.0; self.settings.envs];
-        let mut under_way = vec![true; self.settings.envs];
-        while under_way.contains(&true) {
+        let mut running = vec![true; self.settings.envs];
+        while running.contains(&true) {
             policy.act(parameters, current.observations(), actions);
             let stepped = client.step(listener, actions, || heartbeat.beat(Activity::WaitingForServer));
             match stepped.map_err(Exit::widen)? {
                 Stepped::Taken(next) => current = next,
                 Stepped::Lost => return Ok(None),
             }
-            for (e, (under_way, total)) in under_way.iter_mut().zip(&mut returns).enumerate() {
-                if *under_way {
+            for (e, (running, total)) in running.iter_mut().zip(&mut returns).enumerate() {
+                if *running {
                     *total += f64::from(current.reward(e));
-                    *under_way = !(current.terminated(e) || current.truncated(e));
+                    *running = !(current.terminated(e) || current.truncated(e));
                 }
             }
             heartbeat.count(self.settings.envs as u64);
@@ -262,7 +264,7 @@ impl<'a> Evaluator<'a> {
         Ok(Some(returns))
     }
 
-    fn keep(
+    fn write_policy(
         &self,
         published: &policy::Policy,
         return_mean: f64,

@@ -1,4 +1,4 @@
-//! How actors try what their policy would not do: a way for each kind of exploration.
+//! How actors explore: a variant for each kind of exploration.
 
 use rand::RngExt;
 use shoal_common::algorithms::{Behaviour, Warmup};
@@ -8,21 +8,21 @@ use shoal_common::stream::Stream;
 
 use crate::noise::OrnsteinUhlenbeck;
 
-/// A policy and its exploration, for all environments of an actor. A step's random numbers are reached by the step's own
-/// number, so that a step done again gets the same ones.
+/// A policy and its exploration, for all environments of an actor. A step's random numbers depend only on its number,
+/// so that a repeated step gets the same ones.
 #[derive(Clone, Debug)]
 pub enum Exploration {
     /// DDPG: the policy's action and noise (line 8 of Algorithm 4).
     Noise(PolicyNetwork, OrnsteinUhlenbeck),
     /// REINFORCE: an action drawn from π(·|s), the softmax of the scores (line 3 of Algorithm 3).
     Sample(Scores, Stream),
-    /// Q-learning and SARSA: the action with the highest value, the first of equals, but with probability ε any of all
-    /// (section 3.3.2).
+    /// Q-learning and SARSA: with probability ε a uniformly random action, otherwise the action with the highest value,
+    /// the first among equals (section 3.3.2).
     EpsilonGreedy(Scores, Stream, f64),
 }
 
 impl Exploration {
-    /// How to act in `environments` environments: with as many as the behaviour's policy has room for.
+    /// The exploration for `environments` environments, as many as the policy of `behaviour` was made for.
     pub fn new(behaviour: Behaviour, environments: usize, stream: Stream) -> Self {
         match behaviour {
             Behaviour::Noise(network, noise) => {
@@ -34,7 +34,7 @@ impl Exploration {
         }
     }
 
-    /// What the policy's parameters are.
+    /// The layout of the policy's parameters.
     pub fn layout(&self) -> PolicyLayout {
         match self {
             Self::Noise(network, _) => PolicyLayout::Deterministic(*network.layout()),
@@ -42,7 +42,7 @@ impl Exploration {
         }
     }
 
-    /// Chooses the actions of step number `step` as `act` does, but with a policy that no update has made.
+    /// Chooses the actions of step number `step` before the policy's first update.
     pub fn warm_up(&mut self, parameters: &[f32], observations: &[f32], step: u64, actions: &mut [f32]) {
         match self {
             Self::Noise(network, noise) if noise.warmup() == Warmup::Uniform => {
@@ -58,19 +58,19 @@ impl Exploration {
             Self::Noise(network, noise) => {
                 network.forward(parameters, observations, actions);
                 noise.advance(step);
-                noise.disturb(actions, network.range());
+                noise.add_to(actions, network.range());
             }
             Self::Sample(logits, stream) => {
-                go_to(stream, step);
+                seek(stream, step);
                 for (action, logits) in actions.iter_mut().zip(logits.of(parameters, observations)) {
-                    *action = drawn(logits, stream.random()) as f32;
+                    *action = draw(logits, stream.random()) as f32;
                 }
             }
             Self::EpsilonGreedy(values, stream, epsilon) => {
-                go_to(stream, step);
+                seek(stream, step);
                 let count = values.actions();
                 for (action, values) in actions.iter_mut().zip(values.of(parameters, observations)) {
-                    // Both are drawn, whatever comes of the first: the numbers of the next environment stay in their place.
+                    // Both are always drawn, so that the next environment's numbers do not depend on the first.
                     let (explore, which): (f64, f64) = (stream.random(), stream.random());
                     let any = (which * count as f64) as usize;
                     *action = if explore < *epsilon { any } else { highest(values) } as f32;
@@ -86,7 +86,7 @@ impl Exploration {
         }
     }
 
-    /// What the next step depends on besides its number, environment after environment.
+    /// The state that the next step depends on besides its number, one environment after another.
     pub(crate) fn state(&self) -> &[f64] {
         match self {
             Self::Noise(_, noise) => noise.state(),
@@ -94,7 +94,7 @@ impl Exploration {
         }
     }
 
-    /// Goes on from this state; another length than `state` has is none of this exploration.
+    /// Continues from this state, which must have the length of `state`.
     pub(crate) fn restore(&mut self, state: &[f64]) {
         if let Self::Noise(_, noise) = self {
             noise.restore(state);
@@ -102,13 +102,13 @@ impl Exploration {
     }
 }
 
-fn go_to(stream: &mut Stream, step: u64) {
+fn seek(stream: &mut Stream, step: u64) {
     stream.set_stream(step);
     stream.set_word_pos(0);
 }
 
-/// The action that `u`, uniform in [0, 1), draws from the softmax of these logits.
-fn drawn(logits: &[f32], u: f64) -> usize {
+/// Draws an action from the softmax of these logits by `u`, which is uniform in [0, 1).
+fn draw(logits: &[f32], u: f64) -> usize {
     let greatest = f64::from(logits[highest(logits)]);
     let weight = |logit: &f32| (f64::from(*logit) - greatest).exp();
     let mut left = u * logits.iter().map(weight).sum::<f64>();
@@ -155,21 +155,21 @@ mod tests {
     }
 
     #[test]
-    fn epsilon_is_shared_by_all_actions_and_the_rest_by_the_best() {
+    fn epsilon_is_shared_by_all_actions_and_the_best_one_has_the_rest() {
         let values = [0.0, 3.0, 3.0, 1.0, 0.0, 0.0, 0.0, 2.0];
         assert_eq!(
             counts(&mut lake(0.0), &values, &[0.0]),
             [0, 4_000, 0, 0],
-            "the first of equals"
+            "the first among equals"
         );
         let exploring = counts(&mut lake(0.4), &values, &[1.0]);
-        // 400 each, standard deviation 19, and for the best 2,800.
+        // 400 are expected of each, with a standard deviation of 19, and 2,800 of the best one.
         assert!(exploring[..3].iter().all(|n| n.abs_diff(400) < 100), "{exploring:?}");
         assert!(exploring[3].abs_diff(2_800) < 150, "{exploring:?}");
     }
 
     #[test]
-    fn actions_are_drawn_from_the_softmax_and_again_the_same_by_step() {
+    fn actions_are_drawn_from_the_softmax_and_depend_only_on_the_step() {
         let spec = EnvironmentSpec {
             observation: Space::boxed(&[(-1.0, 1.0)]),
             action: Space::Discrete { n: 2 },
@@ -190,7 +190,7 @@ mod tests {
     }
 
     #[test]
-    fn until_something_is_learned_actions_may_be_uniform_over_their_range_and_again_the_same_by_step() {
+    fn warm_up_actions_may_be_uniform_over_their_range_and_depend_only_on_the_step() {
         let spec = EnvironmentSpec {
             observation: Space::boxed(&[(-1.0, 1.0)]),
             action: Space::boxed(&[(-2.0, 2.0), (0.0, 8.0)]),
@@ -225,26 +225,26 @@ mod tests {
             let quarter_of = |action: &[f32; 2]| ((action[element] - low) / (high - low) * 4.0) as usize;
             for quarter in 0..4 {
                 let count = warm.iter().filter(|action| quarter_of(action) == quarter).count();
-                // 250, standard deviation 14.
+                // 250 are expected, with a standard deviation of 14.
                 assert!(
                     count.abs_diff(250) < 70,
                     "element {element}, quarter {quarter}: {count}"
                 );
             }
         }
-        let mut as_ever = new(Warmup::Policy);
-        let noisy = choose(&mut as_ever, warm_up, 0);
+        let mut with_policy = new(Warmup::Policy);
+        let noisy = choose(&mut with_policy, warm_up, 0);
         assert_eq!(
             choose(&mut uniform, act, 0),
             noisy,
-            "the noise begins at rest behind a uniform warm-up"
+            "the noise begins at rest after a uniform warm-up"
         );
         assert_eq!(choose(&mut new(Warmup::Policy), act, 0), noisy);
     }
 
     #[test]
-    fn the_last_action_takes_what_rounding_leaves() {
-        assert_eq!(drawn(&[0.0, 0.0], 1.0), 1);
-        assert_eq!(drawn(&[f32::NEG_INFINITY, 1e30], 0.0), 1);
+    fn the_last_action_takes_the_remainder_of_rounding() {
+        assert_eq!(draw(&[0.0, 0.0], 1.0), 1);
+        assert_eq!(draw(&[f32::NEG_INFINITY, 1e30], 0.0), 1);
     }
 }

@@ -1,4 +1,4 @@
-//! The exploring actor: acts with the newest policy and noise, and writes what happens into chunks for the learner.
+//! The exploring actor: acts with the newest policy and noise, and writes transitions into chunks for the learner.
 //!
 //! ```text
 //! loop {
@@ -6,7 +6,7 @@
 //!     actions = explore(policy, observations)      // as the algorithm does: noise, sampling, or ε-greedy
 //!     next    = environments.step(actions)
 //!     chunk.push(s, a, r, discount, s', last)
-//!     when the chunk is full, or its episode over: wait for room in the window, send it
+//!     when the chunk is full, or its episode over: wait for space in the window, send it
 //! }
 //! ```
 
@@ -35,33 +35,33 @@ use crate::error::ActorError;
 use crate::exploration::Exploration;
 
 /// How long an actor waits for its last chunk to be committed when the whole run ends.
-const FAREWELL: Duration = Duration::from_secs(1);
+const LAST_COMMIT_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// What an actor is told.
+/// The settings of an actor.
 #[derive(Clone, Debug)]
 pub struct ExplorerSettings {
     /// Which process this is.
     pub identity: Identity,
     /// The run's seed.
     pub seed: u64,
-    /// Whether to wait for every policy in turn.
+    /// Free or lockstep. In lockstep, the actor waits for the policy of each round.
     pub mode: Mode,
-    /// What the environment server is expected to serve, and how many of it.
+    /// What the environment server is expected to serve.
     pub spec: EnvironmentSpec,
     /// Environments stepped at once.
     pub envs: usize,
-    /// What a chunk has room for.
+    /// The layout of a chunk.
     pub chunk: ChunkLayout,
-    /// Chunks that may be sent and not committed.
+    /// How many chunks may be sent and not yet committed.
     pub window: u32,
-    /// What is learned, and with it how to explore.
+    /// The algorithm, which determines the exploration.
     pub algorithm: Algorithm,
-    /// The replay, whose commit record tells what has arrived.
+    /// The replay file; its commit record shows which chunks have arrived.
     pub replay: PathBuf,
 }
 
 impl ExplorerSettings {
-    /// What an actor of this run is told.
+    /// The settings of an actor of this run.
     pub fn new(config: &Config, run: &RunDir, identity: Identity) -> Self {
         Self {
             identity,
@@ -80,7 +80,7 @@ impl ExplorerSettings {
 /// Explores until `stop`.
 ///
 /// # Errors
-/// When a channel does not work, or the environment is not the expected one.
+/// When a channel fails, or the environment is not the expected one.
 pub fn explore(domain: &Domain, settings: &ExplorerSettings, stop: &Stop) -> Result<(), ActorError> {
     let mut explorer = match Explorer::new(domain, settings, stop) {
         Ok(explorer) => explorer,
@@ -101,9 +101,9 @@ struct Explorer<'a> {
     policy: PolicyReader,
     exploration: Exploration,
     sender: ChunkSender,
-    /// The chunk under way.
+    /// The chunk that is being filled.
     chunk: Chunk,
-    /// Version of the policy that its last row was collected with; of the one before it, while it is empty.
+    /// Version of the policy that its last row was collected with. While it is empty, that of the previous chunk.
     policy_version: u64,
     commits: CommitReader,
     heartbeat: HeartbeatSender,
@@ -111,13 +111,13 @@ struct Explorer<'a> {
     returns: Vec<f64>,
     lengths: Vec<u32>,
     actions: Vec<f32>,
-    /// Steps of every environment since the actor's stream began.
+    /// Steps of each environment since the actor's random stream began.
     step: u64,
-    /// Where it stood after the last chunk, where it can say that.
-    standing: Option<ActorSnapshot>,
-    /// Since when it knows that the run ends.
-    hurried: Option<Instant>,
-    /// Episodes whose ends are in the chunk under way.
+    /// The actor's snapshot after the last chunk, if it takes snapshots.
+    snapshot: Option<ActorSnapshot>,
+    /// When it first noticed that the whole run is ending.
+    ending_since: Option<Instant>,
+    /// Episodes that ended in the chunk that is being filled.
     ended: Vec<EpisodeReport>,
 }
 
@@ -139,7 +139,7 @@ impl<'a> Explorer<'a> {
         let sender = handshake
             .wait(&commits, &listener, stop, || heartbeat.beat(Activity::WaitingForPeer))
             .map_err(Exit::widen)?;
-        // In lockstep nothing may depend on how often an actor was started: it goes on where the last chunk left it.
+        // In lockstep the bits must not depend on how often an actor was started: it continues after its last chunk.
         let incarnation = match settings.mode {
             Mode::Lockstep => 0,
             Mode::Free => incarnation,
@@ -150,8 +150,8 @@ impl<'a> Explorer<'a> {
             settings.envs,
             stream,
         );
-        let standing = if settings.mode == Mode::Lockstep && sender.sent() > 0 {
-            let words = commits.standing(index as usize);
+        let snapshot = if settings.mode == Mode::Lockstep && sender.sent() > 0 {
+            let words = commits.actor_snapshot(index as usize);
             ActorSnapshot::read(&words, &settings.chunk, settings.envs, exploration.state().len())
         } else {
             None
@@ -164,8 +164,8 @@ impl<'a> Explorer<'a> {
             policy,
             exploration,
             step: 0,
-            standing,
-            hurried: None,
+            snapshot,
+            ending_since: None,
             ended: Vec::new(),
             chunk: sender.begin()?,
             policy_version: 0,
@@ -182,14 +182,15 @@ impl<'a> Explorer<'a> {
 
     fn run(&mut self) -> Exit<ActorError> {
         loop {
-            if let Err(exit) = self.run_until_the_server_is_lost() {
+            if let Err(exit) = self.run_until_server_lost() {
                 return exit;
             }
             tracing::warn!("the environment server was restarted");
         }
     }
 
-    /// Begins new episodes, and gives up those under way; in lockstep goes on with those after the last chunk.
+    /// Drops the current episodes and begins new ones. In lockstep, continues those of the last chunk's snapshot, if
+    /// there is one.
     fn begin(&mut self) -> Result<Observed, Exit<ActorError>> {
         if self.settings.mode == Mode::Free {
             (0..self.settings.envs).for_each(|environment| self.begin_episode(environment));
@@ -197,17 +198,17 @@ impl<'a> Explorer<'a> {
         }
         self.chunk.clear();
         self.ended.clear();
-        if let Some(standing) = &self.standing {
-            self.step = standing.step;
-            self.exploration.restore(&standing.noise);
-            self.returns.clone_from(&standing.returns);
-            self.lengths.clone_from(&standing.lengths);
+        if let Some(snapshot) = &self.snapshot {
+            self.step = snapshot.step;
+            self.exploration.restore(&snapshot.noise);
+            self.returns.clone_from(&snapshot.returns);
+            self.lengths.clone_from(&snapshot.lengths);
             let idle = || self.heartbeat.beat(Activity::WaitingForServer);
-            let restored = self.client.restore(&self.listener, &standing.snapshot, idle);
+            let restored = self.client.restore(&self.listener, &snapshot.environments, idle);
             return restored.map_err(Exit::widen);
         }
         (0..self.settings.envs).for_each(|environment| self.begin_episode(environment));
-        // Without a word of where it stood there is only the beginning that is the same for everyone.
+        // Without a snapshot, only the first episodes of the run can be repeated with the same bits.
         let sent = self.sender.sent();
         self.step = sent * (self.settings.chunk.rows / self.settings.envs) as u64;
         let begin = if sent == 0 { Begin::Training(0) } else { Begin::Next };
@@ -219,7 +220,7 @@ impl<'a> Explorer<'a> {
         self.client.reset(&self.listener, begin, idle).map_err(Exit::widen)
     }
 
-    fn run_until_the_server_is_lost(&mut self) -> Result<(), Exit<ActorError>> {
+    fn run_until_server_lost(&mut self) -> Result<(), Exit<ActorError>> {
         let mut current = self.begin()?;
         loop {
             let policy = self.await_policy().map_err(Exit::widen)?;
@@ -229,7 +230,7 @@ impl<'a> Explorer<'a> {
             let stepped = self.client.step(&self.listener, &self.actions, idle);
             match stepped.map_err(Exit::widen)? {
                 Stepped::Taken(next) => {
-                    self.remember(&current, &next, policy.header().version);
+                    self.store(&current, &next, policy.header().version);
                     current = next;
                 }
                 Stepped::Lost => return Ok(()),
@@ -241,7 +242,7 @@ impl<'a> Explorer<'a> {
                 if !self.append_snapshot()? {
                     return Ok(());
                 }
-                self.await_room().map_err(Exit::widen)?;
+                self.await_capacity().map_err(Exit::widen)?;
                 self.send()?;
             }
             if self.stop.requested() {
@@ -250,14 +251,14 @@ impl<'a> Explorer<'a> {
         }
     }
 
-    /// Whether the chunk is full, or holds the one episode that it is for.
+    /// Whether the chunk is full or, if a chunk is one episode, the episode is over.
     fn chunk_is_complete(&self) -> bool {
         let episode_is_over =
             self.settings.algorithm.spec().experience == Experience::Episodes && !self.ended.is_empty();
         self.chunk.is_full() || episode_is_over
     }
 
-    /// The policy to act with: the newest, or in lockstep the one after the last round.
+    /// Waits for the policy to act with: the newest, or in lockstep the one after the last round.
     fn await_policy(&mut self) -> Result<Rc<Policy>, Exit<ChannelError>> {
         let wanted = match self.settings.mode {
             Mode::Free => 0,
@@ -282,8 +283,8 @@ impl<'a> Explorer<'a> {
                 || newest(policy),
                 || {
                     heartbeat.beat(Activity::WaitingForPeer);
-                    // A new learner may need the last chunks before it can publish anything.
-                    sender.look_after()
+                    // A restarted learner may need the last chunks before it can publish a policy.
+                    sender.refresh_connections()
                 },
             )?,
         };
@@ -306,8 +307,8 @@ impl<'a> Explorer<'a> {
         );
     }
 
-    /// Line 10 of Algorithm 4, for every environment.
-    fn remember(&mut self, current: &Observed, next: &Observed, version: u64) {
+    /// Adds the transition of every environment to the chunk (line 10 of Algorithm 4).
+    fn store(&mut self, current: &Observed, next: &Observed, version: u64) {
         let width = self.settings.chunk.row.action_width();
         let gamma = self.settings.algorithm.gamma() as f32;
         self.policy_version = version;
@@ -345,31 +346,30 @@ impl<'a> Explorer<'a> {
         self.lengths[environment] = 0;
     }
 
-    /// Says behind the chunk's rows where the actor stands after them, where that is asked for; whether the environment
-    /// server is still there to say its part.
+    /// Adds the actor's snapshot to the chunk, if the layout has one. Returns false if the environment server was lost.
     fn append_snapshot(&mut self) -> Result<bool, Exit<ActorError>> {
         if self.settings.chunk.actor_snapshot_words == 0 {
             return Ok(true);
         }
         let idle = || self.heartbeat.beat(Activity::WaitingForServer);
-        let snapshot = self.client.snapshot(&self.listener, idle).map_err(Exit::widen)?;
-        let Snapshot::Taken(snapshot) = snapshot else {
+        let environments = self.client.snapshot(&self.listener, idle).map_err(Exit::widen)?;
+        let Snapshot::Taken(environments) = environments else {
             return Ok(false);
         };
-        let standing = ActorSnapshot {
-            snapshot,
+        let snapshot = ActorSnapshot {
+            environments,
             step: self.step,
             noise: self.exploration.state().into(),
             returns: self.returns.clone(),
             lengths: self.lengths.clone(),
         };
-        self.chunk.set_standing(&standing.words());
-        self.standing = Some(standing);
+        self.chunk.set_actor_snapshot(&snapshot.words());
+        self.snapshot = Some(snapshot);
         Ok(true)
     }
 
     /// Waits until another chunk may be sent.
-    fn await_room(&mut self) -> Result<(), Exit<ChannelError>> {
+    fn await_capacity(&mut self) -> Result<(), Exit<ChannelError>> {
         let Self {
             sender,
             commits,
@@ -379,28 +379,28 @@ impl<'a> Explorer<'a> {
             heartbeat,
             ..
         } = self;
-        let room = || {
+        let has_capacity = || {
             let committed = commits.committed(settings.identity.index as usize);
             (sender.in_flight(committed) < u64::from(settings.window)).then_some(())
         };
-        if room().is_some() {
+        if has_capacity().is_some() {
             return Ok(());
         }
         wait_for(
             listener,
             stop,
-            || Ok(room()),
+            || Ok(has_capacity()),
             || {
                 heartbeat.beat(Activity::WaitingForRatio);
-                sender.look_after()
+                sender.refresh_connections()
             },
         )?;
-        // A learner that is at work rings before a nap is over, and the launcher is to know of this wait too.
+        // A busy learner may notify before the first heartbeat of this wait; the launcher must see even a short wait.
         heartbeat.beat(Activity::WaitingForRatio);
         Ok(())
     }
 
-    /// Sends the chunk under way, and begins the next one.
+    /// Sends the chunk and begins the next one.
     fn send(&mut self) -> Result<(), ChannelError> {
         let chunk = std::mem::replace(&mut self.chunk, self.sender.begin()?);
         self.sender.send(chunk, self.policy_version)?;
@@ -409,8 +409,9 @@ impl<'a> Explorer<'a> {
         Ok(())
     }
 
-    /// Sends what was collected and waits until it is committed: for as long as that takes where only this actor retires,
-    /// for a moment where the run ends. In lockstep a round is whole or not at all.
+    /// Sends the rows collected so far and waits until they are committed: without a limit if only this actor ends, for
+    /// a short time if the whole run ends. In lockstep incomplete chunks are dropped, because a round is complete or
+    /// does not count.
     fn hand_over(&mut self) -> Result<(), ActorError> {
         if self.settings.mode == Mode::Free
             && !self.chunk.is_empty()
@@ -423,25 +424,25 @@ impl<'a> Explorer<'a> {
         Ok(())
     }
 
-    /// Waits until no more than `most` chunks are uncommitted; whether that came about.
+    /// Waits until at most `most` chunks are uncommitted. Returns false if it gave up because the whole run is ending.
     fn await_commits(&mut self, most: u64) -> Result<bool, ChannelError> {
         let index = self.settings.identity.index as usize;
         while self.sender.in_flight(self.commits.committed(index)) > most {
             if self.stop.at_once() {
-                let hurried = self.hurried.get_or_insert_with(Instant::now);
-                if !self.sender.is_heard() || hurried.elapsed() >= FAREWELL {
+                let ending_since = self.ending_since.get_or_insert_with(Instant::now);
+                if !self.sender.has_receiver() || ending_since.elapsed() >= LAST_COMMIT_TIMEOUT {
                     return Ok(false);
                 }
             }
             self.heartbeat.beat(Activity::WaitingForRatio);
-            self.sender.look_after()?;
+            self.sender.refresh_connections()?;
             self.listener.wait(Duration::from_millis(10))?;
         }
         Ok(true)
     }
 }
 
-/// Opens the conversation with environment server `index` and makes sure that it serves what the run is about.
+/// Connects to environment server `index` and checks that its environments are those of the run's configuration.
 pub(crate) fn connect(
     domain: &Domain,
     listener: &Listener,

@@ -1,5 +1,5 @@
-//! Exploration: the policy, its noise and the writing of transitions; the same conversation without noise is the
-//! evaluator's.
+//! The actor, which explores with the policy and its noise and writes transitions, and the evaluator, which acts
+//! without noise.
 
 mod actor_snapshot;
 pub mod error;

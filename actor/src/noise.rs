@@ -6,12 +6,12 @@ use shoal_common::config::{ExplorationConfig, Warmup};
 use shoal_common::network::ActionRange;
 use shoal_common::stream::Stream;
 
-/// The noise of one actor's environments. Each step's normal numbers are reached by the step's own number, so that a step
-/// done again gets the same ones.
+/// The noise of one actor's environments. A step's normal numbers depend only on its number, so that a repeated step
+/// gets the same ones.
 #[derive(Clone, Debug)]
 pub struct OrnsteinUhlenbeck {
     settings: ExplorationConfig,
-    /// The process's state, environment after environment.
+    /// The states of the processes, one environment after another.
     x: Vec<f64>,
     width: usize,
     stream: Stream,
@@ -28,30 +28,30 @@ impl OrnsteinUhlenbeck {
         }
     }
 
-    /// Puts the noise of one environment to rest, as at the start of an episode (line 5 of Algorithm 4).
+    /// Sets the noise of one environment to zero, as at the start of an episode (line 5 of Algorithm 4).
     pub fn reset(&mut self, environment: usize) {
         self.x[environment * self.width..][..self.width].fill(0.0);
     }
 
-    /// The processes' states, environment after environment.
+    /// The states of the processes, one environment after another.
     pub(crate) fn state(&self) -> &[f64] {
         &self.x
     }
 
-    /// Goes on from these states; others than so many are none of this noise.
+    /// Continues from these states. Panics if their number is not that of `state`.
     pub(crate) fn restore(&mut self, state: &[f64]) {
         self.x.copy_from_slice(state);
     }
 
-    /// How to act while nothing has been learned.
+    /// How to act before the policy's first update.
     pub fn warmup(&self) -> Warmup {
         self.settings.warmup
     }
 
-    /// Draws every element of the actions uniformly from its range, with the numbers of step `step`. The processes stay as
-    /// they are.
+    /// Draws every element of the actions uniformly from its range, with the random numbers of step `step`. The noise
+    /// does not change.
     pub fn draw_uniformly(&mut self, step: u64, actions: &mut [f32], range: &ActionRange) {
-        self.go_to(step);
+        self.seek(step);
         for action in actions.chunks_exact_mut(range.width()) {
             for (i, a) in action.iter_mut().enumerate() {
                 *a = range.action(i, self.stream.random_range(-1.0..=1.0));
@@ -61,7 +61,7 @@ impl OrnsteinUhlenbeck {
 
     /// Advances every process by step number `step`: x ← x − θ x + σ N(0, 1).
     pub fn advance(&mut self, step: u64) {
-        self.go_to(step);
+        self.seek(step);
         let ExplorationConfig { theta, sigma, .. } = self.settings;
         for x in &mut self.x {
             let normal: f64 = self.stream.sample(StandardNormal);
@@ -69,14 +69,14 @@ impl OrnsteinUhlenbeck {
         }
     }
 
-    fn go_to(&mut self, step: u64) {
+    fn seek(&mut self, step: u64) {
         self.stream.set_stream(step);
         self.stream.set_word_pos(0);
     }
 
     /// Adds the noise to the actions, in units of half the range of each action element, and clips the sum to the range
     /// (equation 3.32).
-    pub fn disturb(&self, actions: &mut [f32], range: &ActionRange) {
+    pub fn add_to(&self, actions: &mut [f32], range: &ActionRange) {
         let width = range.width();
         for (action, x) in actions.chunks_exact_mut(width).zip(self.x.chunks_exact(width)) {
             for (i, a) in action.iter_mut().enumerate() {
@@ -102,7 +102,7 @@ mod tests {
     }
 
     #[test]
-    fn a_step_done_again_gets_the_same_numbers() {
+    fn a_repeated_step_gets_the_same_numbers() {
         let (mut straight, mut again) = (noise(3), noise(3));
         (0..10).for_each(|step| straight.advance(step));
         (0..5).for_each(|step| again.advance(step));
@@ -114,7 +114,7 @@ mod tests {
     }
 
     #[test]
-    fn it_has_the_stationary_spread_of_the_process_and_its_correlation() {
+    fn the_noise_has_the_variance_and_the_correlation_of_the_process() {
         let mut noise = noise(2000);
         (0..100).for_each(|step| noise.advance(step));
         let variance = noise.x.iter().map(|x| x * x).sum::<f64>() / 2000.0;
@@ -131,12 +131,12 @@ mod tests {
     }
 
     #[test]
-    fn the_sum_is_scaled_and_clipped_and_an_episode_starts_at_rest() {
+    fn the_noise_is_scaled_and_clipped_and_an_episode_starts_without_it() {
         let mut noise = noise(2);
         noise.x = vec![0.5, -3.0];
         let mut actions = [1.0, 0.5];
         let torque = ActionRange::new(&Space::boxed(&[(-2.0, 2.0)])).unwrap();
-        noise.disturb(&mut actions, &torque);
+        noise.add_to(&mut actions, &torque);
         assert_eq!(actions, [2.0, -2.0]);
         noise.reset(1);
         assert_eq!(noise.x, [0.5, 0.0]);

@@ -1,9 +1,9 @@
-//! Which cores processes are bound to.
+//! The cores that processes are bound to.
 
 use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
 
-/// The core for a pair, and the one for everything else: the same where there is only one. This process may run on all of
-/// its cores again when this is dropped.
+/// One core for an actor and its server, and one for everything else; the same core if the machine has only one.
+/// Dropping this lets the current process run on all of its cores again.
 pub(super) struct Cores {
     pub(super) pair: CpuSet,
     pub(super) others: CpuSet,

@@ -1,4 +1,4 @@
-//! What each stage of an actor's and a learner's work costs, measured one by one.
+//! The time that each stage of an actor's and a learner's work takes, measured separately.
 
 use std::time::{Duration, Instant};
 
@@ -20,34 +20,34 @@ use shoal_learner::process::intake::Intake;
 use shoal_learner::replay::Replay;
 use shoal_run::process::Peer;
 
-use super::measurement::{Patience, interrupted};
+use super::measurement::{Budget, interrupted};
 use super::rows::{ENVIRONMENTS, Rows};
-use super::scene::{Scene, ddpg};
+use super::temporary_run::{TemporaryRun, ddpg};
 use super::window::{self, Windows};
 
-/// Windows of each stage, of which the median counts.
+/// Windows per stage; the result is their median.
 const WINDOWS: u32 = 5;
 
-/// What stages cost, in microseconds; a step is one of all 64 environments.
+/// Times of the stages in microseconds. A step is one of all 64 environments.
 #[derive(Clone, Copy, Debug, Serialize)]
 pub(super) struct Costs {
-    /// The policy alone.
+    /// The policy's forward pass.
     pub(super) inference_us: f64,
-    /// The policy and its noise.
+    /// The forward pass and exploration noise.
     pub(super) acting_us: f64,
-    /// The environments alone, in the process that measures.
+    /// The environments' step, in this process.
     pub(super) environment_step_us: f64,
-    /// To the environment server's process and back, the environments' step included, where a forward pass comes before
-    /// each, as an actor has it.
+    /// The same step through the environment server's process, with a forward pass before each request, as in an actor.
     pub(super) round_trip_us: f64,
-    /// A chunk's rows, and sending it.
+    /// Writing a chunk's rows and sending it.
     pub(super) writing_chunk_us: f64,
-    /// A chunk, from the channel into the committed replay.
+    /// Moving a chunk from the channel into the committed replay.
     pub(super) intake_of_chunk_us: f64,
+    /// One gradient step of critic and actor.
     pub(super) update_us: f64,
 }
 
-/// The policy's forward pass of one step, as an actor has it.
+/// The policy's forward pass for one step of all environments, as in an actor.
 pub(super) struct Inference {
     policy: PolicyNetwork,
     parameters: Vec<f32>,
@@ -77,14 +77,14 @@ impl Inference {
     }
 }
 
-/// Measures every stage; together they take about `length`.
-pub(super) fn measure(length: Duration, patience: &Patience) -> anyhow::Result<Costs> {
-    let scene = Scene::of(1, ENVIRONMENTS as u32, &[])?;
-    let config = &scene.config;
+/// Measures every stage, in about `length` altogether.
+pub(super) fn measure(length: Duration, budget: &Budget) -> anyhow::Result<Costs> {
+    let temporary = TemporaryRun::of(1, ENVIRONMENTS as u32, &[])?;
+    let config = &temporary.config;
     let each = length / 6;
 
     let mut inference = Inference::new(config)?;
-    let inference_us = microseconds(each, patience, || inference.step())?;
+    let inference_us = microseconds(each, budget, || inference.step())?;
 
     let stream = stream(config.run.seed, Purpose::Exploration, 0, 0);
     let mut exploration = Exploration::new(
@@ -93,7 +93,7 @@ pub(super) fn measure(length: Duration, patience: &Patience) -> anyhow::Result<C
         stream,
     );
     let mut step = 0;
-    let acting_us = microseconds(each, patience, || {
+    let acting_us = microseconds(each, budget, || {
         let Inference {
             parameters,
             observations,
@@ -105,17 +105,17 @@ pub(super) fn measure(length: Duration, patience: &Patience) -> anyhow::Result<C
         std::hint::black_box(actions);
     })?;
 
-    let environment_step_us = environment_step(config, each, patience)?;
-    let round_trip_us = scene.with_peer(Role::EnvServer, |domain, server| {
-        round_trip(config, domain, server, &mut inference, each, patience)
+    let environment_step_us = environment_step(config, each, budget)?;
+    let round_trip_us = temporary.with_peer(Role::EnvServer, |domain, server| {
+        round_trip(config, domain, server, &mut inference, each, budget)
     })?;
-    let mut replay = Replay::create(&scene.run.replay_file(), &scene.replay_layout())?;
+    let mut replay = Replay::create(&temporary.run.replay_file(), &temporary.replay_layout())?;
     let (writing_chunk_us, intake_of_chunk_us) =
-        scene.in_shared_memory(|domain| chunks(&scene, domain, &mut replay, each, patience))?;
+        temporary.in_shared_memory(|domain| chunks(&temporary, domain, &mut replay, each, budget))?;
 
     let mut method = registry::new(config)?;
     let head = replay.head();
-    let update_us = microseconds(each, patience, || {
+    let update_us = microseconds(each, budget, || {
         std::hint::black_box(method.update(&replay, head));
     })?;
     Ok(Costs {
@@ -129,19 +129,19 @@ pub(super) fn measure(length: Duration, patience: &Patience) -> anyhow::Result<C
     })
 }
 
-/// Median of windows; the first part of the time warms up.
-fn microseconds(length: Duration, patience: &Patience, mut work: impl FnMut()) -> anyhow::Result<f64> {
+/// The median time of `work` over several windows, after a warm-up.
+fn microseconds(length: Duration, budget: &Budget, mut work: impl FnMut()) -> anyhow::Result<f64> {
     let part = length / (WINDOWS + 1);
     window::rate(part, &mut work);
     let mut windows = Windows::default();
     for _ in 0..WINDOWS {
-        patience.check()?;
+        budget.check()?;
         windows.add(1e6 / window::rate(part, &mut work));
     }
     Ok(windows.median())
 }
 
-fn environment_step(config: &Config, length: Duration, patience: &Patience) -> anyhow::Result<f64> {
+fn environment_step(config: &Config, length: Duration, budget: &Budget) -> anyhow::Result<f64> {
     let (name, parameters) = (&config.environment.name, &config.environment.parameters);
     let mut environments = VectorEnvironment::new(name, parameters, config.actors.envs, config.run.seed, 0, 0)?;
     let layout = ResponseLayout::new(ENVIRONMENTS, config.spec.observation.width());
@@ -149,7 +149,7 @@ fn environment_step(config: &Config, length: Duration, patience: &Patience) -> a
     environments.reset(Start::Next, layout.split_mut(&mut response).observations)?;
     let actions = vec![0.5; ENVIRONMENTS * config.spec.action.width()];
     let mut refused = Ok(());
-    let taken = microseconds(length, patience, || {
+    let taken = microseconds(length, budget, || {
         if let Err(error) = environments.step(&actions, layout.split_mut(&mut response)) {
             refused = Err(error);
         }
@@ -159,36 +159,37 @@ fn environment_step(config: &Config, length: Duration, patience: &Patience) -> a
     Ok(taken)
 }
 
-/// The mean over all, as it adds up in an actor's time; after a forward pass each, over which the server falls asleep.
+/// The mean time of a request within each window, and the median of these. A forward pass precedes each request, so the
+/// server falls asleep in between, as in a run.
 fn round_trip(
     config: &Config,
     domain: &Domain,
     server: &mut Peer,
     inference: &mut Inference,
     length: Duration,
-    patience: &Patience,
+    budget: &Budget,
 ) -> anyhow::Result<f64> {
     let listener = Listener::bind(domain, EventName(Role::Actor, 0))?;
-    let client = EnvironmentClient::open(domain, 0, &config.spec, ENVIRONMENTS, patience.stop.clone())?;
+    let client = EnvironmentClient::open(domain, 0, &config.spec, ENVIRONMENTS, budget.stop.clone())?;
     client.describe(&listener, || ()).map_err(interrupted)?;
     client.reset(&listener, Begin::Next, || ()).map_err(interrupted)?;
     let actions = vec![0.5; ENVIRONMENTS * config.spec.action.width()];
     let part = length / (WINDOWS + 1);
     let mut windows = Windows::default();
     for window in 0..=WINDOWS {
-        patience.check()?;
+        budget.check()?;
         server.check()?;
         let (begun, mut asked, mut taken) = (Instant::now(), 0.0, Duration::ZERO);
         while asked == 0.0 || begun.elapsed() < part {
             inference.step();
             let before = Instant::now();
             if let Stepped::Lost = client.step(&listener, &actions, || ()).map_err(interrupted)? {
-                bail!("the environment server gave up its episodes");
+                bail!("the environment server lost its episodes");
             }
             taken += before.elapsed();
             asked += 1.0;
         }
-        // The first one warms up.
+        // The first window is the warm-up.
         if window > 0 {
             windows.add(taken.as_secs_f64() * 1e6 / asked);
         }
@@ -196,16 +197,16 @@ fn round_trip(
     Ok(windows.median())
 }
 
-/// What a chunk costs its actor, and the learner: both in this process, which sends a window of chunks and then takes them
-/// in, as the learner does.
+/// The times to send a chunk and to receive it. This process does both: it sends a window of chunks, then receives them
+/// as the learner does.
 fn chunks(
-    scene: &Scene,
+    temporary: &TemporaryRun,
     domain: &Domain,
     replay: &mut Replay,
     length: Duration,
-    patience: &Patience,
+    budget: &Budget,
 ) -> anyhow::Result<(f64, f64)> {
-    let config = &scene.config;
+    let config = &temporary.config;
     let (row, window) = (config.row_layout(), config.actors.window);
     let mut rows = vec![0.0; config.chunk_rows() * row.width()];
     let mut source = Rows::new(config)?;
@@ -217,16 +218,16 @@ fn chunks(
     let mut intake = Intake::open(domain, 1, window, config.chunk_layout(), u64::MAX)?;
     let handshake = ChunkSender::open(domain, 0, 1, config.chunk_layout(), window)?;
     intake.drain(replay, window, |_| false)?;
-    let commits = CommitReader::open(&scene.run.replay_file())?;
+    let commits = CommitReader::open(&temporary.run.replay_file())?;
     let mut sender = handshake
-        .wait(&commits, &listener, &patience.stop, || {})
+        .wait(&commits, &listener, &budget.stop, || {})
         .map_err(interrupted)?;
 
     let (mut writing, mut taking_in) = (Windows::default(), Windows::default());
     let begun = Instant::now();
-    // Until every page of the replay was touched once, they would be what is measured.
+    // The first pass over the replay measures page faults, so it does not count.
     while replay.head() < config.replay.capacity || writing.is_empty() || begun.elapsed() < length {
-        patience.check()?;
+        budget.check()?;
         let before = Instant::now();
         for _ in 0..window {
             let mut chunk = sender.begin()?;
@@ -238,11 +239,11 @@ fn chunks(
         let between = Instant::now();
         let head = replay.head();
         intake.drain(replay, window, |_| false)?;
-        // The learner counts the episodes that have ended.
+        // The learner also counts the episodes that ended.
         std::hint::black_box((head..replay.head()).filter(|i| row.read(replay.row(*i)).last).count());
         let after = Instant::now();
         if replay.head() != head + u64::from(window) * config.chunk_rows() as u64 {
-            bail!("chunks were sent and not taken in");
+            bail!("some of the chunks sent were not received");
         }
         if replay.head() > config.replay.capacity {
             writing.add((between - before).as_secs_f64() * 1e6 / f64::from(window));

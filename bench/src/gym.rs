@@ -1,4 +1,4 @@
-//! How fast an environment of Gymnasium is stepped through its server in Python, beside Gymnasium's own vectors of the same
+//! Steps per second of a Gymnasium environment through its Python server, compared with Gymnasium's own vector
 //! environments.
 
 use std::process::{Command, Stdio};
@@ -9,25 +9,25 @@ use serde::{Deserialize, Serialize};
 use shoal_common::config::EnvironmentConfig;
 use shoal_run::external_environment::{ExternalEnvironment, default_command};
 
-use super::measurement::{Figures, Patience};
+use super::measurement::{Budget, Figures};
 use super::step::quantile_of;
 
 const NAME: &str = "gym:Pendulum-v1";
 
-/// Environments of a vector.
+/// Environments in a vector.
 const ENVIRONMENTS: u32 = 16;
 
-/// What part of the time goes to round trips, to our vector, and to each of Gymnasium's.
+/// Share of the time for each measurement: round trips, our vector, and each of Gymnasium's two.
 const SHARE: f64 = 0.25;
 
-/// Part of a measurement's time that goes before, to warm up.
+/// Share of a measurement's time that is spent on warming up.
 const WARM_UP: f64 = 0.1;
 
 /// The fields of `bench gym --json`.
 #[derive(Serialize)]
 pub(super) struct GymFigures {
     environment: &'static str,
-    /// One environment: from this process to the server's and back, the step itself included.
+    /// Round trip to a server with one environment, its step included.
     round_trip_median_us: f64,
     round_trip_p99_us: f64,
     environments: u32,
@@ -39,21 +39,21 @@ pub(super) struct GymFigures {
 /// What `shoal_gym.peers` prints.
 #[derive(Serialize, Deserialize)]
 struct Gymnasium {
-    /// In the process that asks.
+    /// All environments in the calling process.
     sync_vector_steps_per_second: f64,
-    /// A process for each environment.
+    /// One process per environment.
     async_vector_steps_per_second: f64,
 }
 
-pub(super) fn measure(patience: &Patience) -> anyhow::Result<GymFigures> {
+pub(super) fn measure(budget: &Budget) -> anyhow::Result<GymFigures> {
     let environment = EnvironmentConfig {
         name: NAME.into(),
-        server: default_command(NAME).context("no server for Gymnasium's environments")?,
+        server: default_command(NAME).context("found no server for Gymnasium's environments")?,
         parameters: toml::Table::new(),
     };
-    let length = patience.length.mul_f64(SHARE);
-    let mut alone = times(&environment, 1, length, patience)?;
-    let together = times(&environment, ENVIRONMENTS, length, patience)?;
+    let length = budget.length.mul_f64(SHARE);
+    let mut alone = times(&environment, 1, length, budget)?;
+    let together = times(&environment, ENVIRONMENTS, length, budget)?;
     let nanoseconds: f64 = together.iter().map(|ns| f64::from(*ns)).sum();
     alone.sort_unstable();
     Ok(GymFigures {
@@ -66,12 +66,12 @@ pub(super) fn measure(patience: &Patience) -> anyhow::Result<GymFigures> {
     })
 }
 
-/// Times of steps of so many environments, in ns; at least one.
+/// Times of steps of a vector of `environments`, in ns; at least one.
 fn times(
     environment: &EnvironmentConfig,
     environments: u32,
     length: Duration,
-    patience: &Patience,
+    budget: &Budget,
 ) -> anyhow::Result<Vec<u32>> {
     let mut conversation = ExternalEnvironment::begin(environment, environments, 1)?;
     conversation.begin_evaluation(0)?;
@@ -79,7 +79,7 @@ fn times(
     let begun = Instant::now();
     let mut times = Vec::new();
     while times.is_empty() || begun.elapsed() < length {
-        patience.check()?;
+        budget.check()?;
         let before = Instant::now();
         conversation.step(&actions)?;
         if begun.elapsed() >= length.mul_f64(WARM_UP) {
@@ -99,7 +99,10 @@ fn gymnasium(environment: &EnvironmentConfig, length: Duration) -> anyhow::Resul
         .stderr(Stdio::inherit())
         .output()
         .with_context(|| format!("cannot start {python}"))?;
-    anyhow::ensure!(output.status.success(), "Gymnasium's own vectors could not be measured");
+    anyhow::ensure!(
+        output.status.success(),
+        "could not measure Gymnasium's own vector environments"
+    );
     serde_json::from_slice(&output.stdout).context("shoal_gym.peers printed no figures")
 }
 

@@ -1,4 +1,4 @@
-//! How many updates a second the learner makes, and how much of the machine's matrix products that is.
+//! Gradient steps per second of the learner, compared with the machine's rate of matrix products.
 
 use std::time::Duration;
 
@@ -14,26 +14,26 @@ use shoal_learner::networks::product::products_of_update;
 use shoal_learner::networks::threads::Threads;
 use shoal_learner::replay::Replay;
 
-use super::measurement::{Figures, Patience};
+use super::measurement::{Budget, Figures};
 use super::product::Multiplication;
 use super::rows::{ENVIRONMENTS, Rows};
-use super::scene::{Scene, ddpg};
 use super::target::{Line, Target};
+use super::temporary_run::{TemporaryRun, ddpg};
 use super::window::{self, Windows};
 
 const WINDOW: Duration = Duration::from_millis(100);
 
-/// In one round of windows: updates, the fastest product and all products, at both sizes of a minibatch, and updates by
-/// two threads. Each gets as much of the time.
+/// Share of the time for each of seven measurements: for both minibatch sizes the gradient steps, the fastest product
+/// and all products; and gradient steps on two threads.
 const SHARE: f64 = 1.0 / 7.0;
 
-/// A minibatch that is not the configured one: large enough for Adam to weigh little.
+/// The second minibatch size, large enough that Adam takes little of the time.
 const LARGE_BATCH: usize = 256;
 
-/// Attempts at each shape by each kernel, of which the best counts when the kernels and shapes are compared.
+/// Attempts per shape and kernel; the best one counts when kernels and shapes are compared.
 const ATTEMPTS: usize = 10;
 
-/// Part of the time that goes before: until Adam's moments and the caches are as they stay.
+/// Share of the time for warming up, until Adam's moments and the caches have settled.
 const WARM_UP: f64 = 0.05;
 
 /// The fields of `bench learner --json`.
@@ -46,19 +46,19 @@ pub(super) struct LearnerFigures {
     replay_rows: u64,
 }
 
-/// One thread, with minibatches of one size.
+/// The results for one minibatch size, on one thread. An update is one gradient step of critic and actor.
 #[derive(Serialize)]
 struct Figure {
     batch: usize,
     updates_per_second: f64,
-    /// Of the matrix products alone.
+    /// Counts the matrix products only.
     flop_per_update: u64,
-    /// The fastest of the update's own products, by the fastest kernel.
+    /// Rate of the update's fastest product with the fastest kernel.
     limit_gflops: f64,
     share_of_limit: f64,
     limit_product: String,
     limit_kernel: &'static str,
-    /// All products of an update one after the other, each by its fastest kernel, small ones and all.
+    /// Rate of all products of an update in their order, each with its fastest kernel.
     products_gflops: f64,
     share_of_products: f64,
     #[serde(skip)]
@@ -69,22 +69,22 @@ struct Figure {
     products: Windows,
 }
 
-/// The configured minibatch, its updates shared by two threads.
+/// The configured minibatch size, on two threads.
 #[derive(Serialize)]
 struct TwoThreads {
     updates_per_second: f64,
-    /// Against one thread.
+    /// Relative to one thread.
     speedup: f64,
     #[serde(skip)]
     updates: Windows,
 }
 
-pub(super) fn measure(patience: &Patience) -> anyhow::Result<LearnerFigures> {
-    let scene = Scene::new(&[])?;
-    let replay = Replay::create(&scene.run.replay_file(), &scene.replay_layout())?;
-    // Mapped as ever, and gone from the directory whatever becomes of this process.
-    let config = scene.remove_directory()?;
-    let replay = filled(&config, replay, patience)?;
+pub(super) fn measure(budget: &Budget) -> anyhow::Result<LearnerFigures> {
+    let temporary = TemporaryRun::new(&[])?;
+    let replay = Replay::create(&temporary.run.replay_file(), &temporary.replay_layout())?;
+    // The mapping outlives the file, so nothing is left behind even if this process is killed.
+    let config = temporary.remove_directory()?;
+    let replay = filled(&config, replay, budget)?;
 
     let batch = ddpg(&config)?.batch;
     let mut configured = Case::new(&config, batch)?;
@@ -93,10 +93,10 @@ pub(super) fn measure(patience: &Patience) -> anyhow::Result<LearnerFigures> {
     shared.set_threads(Threads::two()?);
     let mut updates_of_two = Windows::default();
     for method in [&mut configured.method, &mut large.method, &mut shared] {
-        window::rate(patience.length.mul_f64(WARM_UP), || update(method, &replay));
+        window::rate(budget.length.mul_f64(WARM_UP), || update(method, &replay));
     }
-    for _ in 0..window::count(patience.length, SHARE, WINDOW) {
-        patience.check()?;
+    for _ in 0..window::count(budget.length, SHARE, WINDOW) {
+        budget.check()?;
         configured.measure(&replay);
         updates_of_two.add(window::rate(WINDOW, || update(&mut shared, &replay)));
         large.measure(&replay);
@@ -115,13 +115,13 @@ pub(super) fn measure(patience: &Patience) -> anyhow::Result<LearnerFigures> {
     })
 }
 
-/// A replay that is filled to its capacity.
-fn filled(config: &Config, mut replay: Replay, patience: &Patience) -> anyhow::Result<Replay> {
+/// Fills the replay to its capacity.
+fn filled(config: &Config, mut replay: Replay, budget: &Budget) -> anyhow::Result<Replay> {
     let row = config.row_layout();
     let mut rows = Rows::new(config)?;
     let mut chunk = vec![0.0; ENVIRONMENTS * row.width()];
     for sequence in 1..=config.replay.capacity / ENVIRONMENTS as u64 {
-        patience.check()?;
+        budget.check()?;
         rows.fill(&mut chunk)?;
         let mark = ChunkMark {
             incarnation: 0,
@@ -132,7 +132,7 @@ fn filled(config: &Config, mut replay: Replay, patience: &Patience) -> anyhow::R
     Ok(replay)
 }
 
-/// New networks that learn from minibatches of this size.
+/// A new learner with minibatches of `batch` rows.
 fn method(config: &Config, batch: usize) -> anyhow::Result<ReplayedDdpg> {
     let settings = config::DdpgConfig {
         batch,
@@ -146,12 +146,12 @@ fn method(config: &Config, batch: usize) -> anyhow::Result<ReplayedDdpg> {
     )?)
 }
 
-/// An update as in the learner's loop.
+/// One gradient step, as in the learner's loop.
 fn update(method: &mut ReplayedDdpg, replay: &Replay) {
     std::hint::black_box(method.update(replay, replay.head()));
 }
 
-/// One size of a minibatch under measurement.
+/// The measurement of one minibatch size.
 struct Case {
     method: ReplayedDdpg,
     batch: usize,
@@ -177,7 +177,7 @@ impl Case {
         })
     }
 
-    /// A window of each.
+    /// Adds one window to each measurement.
     fn measure(&mut self, replay: &Replay) {
         let flop = self.method.ddpg.flop_per_update() as f64;
         self.updates
@@ -207,7 +207,7 @@ impl Case {
     }
 }
 
-/// An update's products in their order; a shape that comes again uses the same numbers.
+/// An update's products in their order. A repeated shape uses the same matrices again.
 struct List {
     distinct: Vec<Multiplication>,
     order: Vec<usize>,
@@ -221,7 +221,7 @@ impl List {
     }
 }
 
-/// All products of an update, each with its best kernel, and the fastest of them once more.
+/// All products of an update, each with its best kernel, and a copy of the fastest one.
 fn multiplications(config: &Config, ddpg: &Ddpg, batch: usize) -> (List, Multiplication) {
     let mut random = stream(config.run.seed, Purpose::Exploration, 1, 0);
     let (mut distinct, mut order): (Vec<Multiplication>, Vec<usize>) = Default::default();
@@ -232,7 +232,7 @@ fn multiplications(config: &Config, ddpg: &Ddpg, batch: usize) -> (List, Multipl
             distinct.push(Multiplication::new(product, &mut random));
         }
     }
-    // In turn, so that a disturbance does not meet all attempts at one shape.
+    // In turn, so that a disturbance does not affect all attempts at one shape.
     for _ in 0..ATTEMPTS {
         distinct.iter_mut().for_each(Multiplication::try_kernels);
     }

@@ -3,7 +3,6 @@
 mod actors;
 mod cores;
 mod costs;
-mod flow;
 mod gym;
 mod learner;
 mod measurement;
@@ -13,59 +12,62 @@ mod one_core;
 mod policy;
 mod processes;
 mod product;
+mod progress;
 mod rows;
-mod scene;
 mod spin;
 mod step;
 mod table;
 mod target;
+mod temporary_run;
 mod transitions;
 mod whole_run;
 mod window;
 
 use anyhow::bail;
 
-use self::measurement::{Patience, tell};
+use self::measurement::{Budget, print};
 
-/// A stage of the system.
+/// A stage to measure.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum Stage {
-    /// Whole DDPG updates a second, sampling included.
+    /// DDPG gradient steps per second, sampling included.
     Learner,
-    /// Rows a second from an actor process into the committed replay of a learner process.
+    /// Transitions per second from an actor process into the replay of a learner process.
     Transitions,
-    /// Round trip between an actor process and an environment server process.
+    /// Round-trip time between an actor process and an environment server process.
     Step,
-    /// Actions a second.
+    /// Actions per second that the policy network computes.
     Policy,
-    /// Rows a second of several actors, environments and learner included, and what is to be expected of more.
+    /// Environment steps per second of several actors, environments and learner included, and a prediction for more
+    /// actors.
     Actors,
-    /// A training: how long it takes to its first update and after a crash, and how much memory its processes have.
+    /// A training run: time to its first gradient steps, time to recover from a crash, and memory of each process.
     Run,
-    /// Every stage but `gym`, and one table of what they gave, the machine's limits, and what they should give.
+    /// Every stage except `gym`, and one table of the results, the machine's limits and the targets.
     All,
-    /// Steps of a Gymnasium environment through its server in Python, beside Gymnasium's own vectors.
+    /// Steps per second of a Gymnasium environment served from Python, compared with Gymnasium's own vector
+    /// environments.
     Gym,
 }
 
-/// Measures a stage and tells the person, or a script, how fast it is. `actors` lists how many actors [`Stage::Actors`] is to
-/// measure.
+/// Measures a stage and prints the result, as a table or with `json` also as one JSON object. `actors` lists the
+/// numbers of actors that [`Stage::Actors`] measures.
 ///
 /// # Errors
-/// When a process does not do what is measured, or somebody asks for the end.
+/// If a measured process fails, or the user interrupts.
 pub fn run(stage: Stage, actors: Option<&str>, json: bool) -> anyhow::Result<()> {
-    let patience = Patience::new()?;
+    let budget = Budget::new()?;
     if actors.is_some() && stage != Stage::Actors {
-        bail!("--actors is for `shoal bench actors` alone");
+        bail!("--actors is only for `shoal bench actors`");
     }
     match stage {
-        Stage::Learner => learner::measure(&patience).and_then(|it| tell(&it, json)),
-        Stage::Transitions => transitions::measure(&patience).and_then(|it| tell(&it, json)),
-        Stage::Step => step::measure(&patience).and_then(|it| tell(&it, json)),
-        Stage::Policy => policy::measure(&patience).and_then(|it| tell(&it, json)),
-        Stage::Actors => actors::measure(actors, &patience).and_then(|it| tell(&it, json)),
-        Stage::Run => whole_run::measure(&patience).and_then(|it| tell(&it, json)),
-        Stage::All => table::measure_all(json, &patience),
-        Stage::Gym => gym::measure(&patience).and_then(|it| tell(&it, json)),
+        Stage::Learner => learner::measure(&budget).and_then(|it| print(&it, json)),
+        Stage::Transitions => transitions::measure(&budget).and_then(|it| print(&it, json)),
+        Stage::Step => step::measure(&budget).and_then(|it| print(&it, json)),
+        Stage::Policy => policy::measure(&budget).and_then(|it| print(&it, json)),
+        Stage::Actors => actors::measure(actors, &budget).and_then(|it| print(&it, json)),
+        Stage::Run => whole_run::measure(&budget).and_then(|it| print(&it, json)),
+        Stage::All => table::measure_all(json, &budget),
+        Stage::Gym => gym::measure(&budget).and_then(|it| print(&it, json)),
     }
 }

@@ -1,4 +1,4 @@
-//! What every measurement has: how long it takes, when it is given up, and how it is told.
+//! What all measurements share: length, interruption and output.
 
 use std::io::Write;
 use std::time::Duration;
@@ -14,32 +14,34 @@ use shoal_run::signals::Signals;
 
 use super::target::Line;
 
-/// Shortens or lengthens the measurement itself, in seconds: tests care for the form of the answer, not for the numbers.
+/// Environment variable for the length of a measurement in seconds. Tests set it low: they check the form of the
+/// output.
 const SECONDS: &str = "SHOAL_BENCH_SECONDS";
 const DEFAULT_SECONDS: f64 = 6.0;
 
-/// What is said where somebody asked for the end.
+/// The error message after the user interrupted.
 pub(super) const INTERRUPTED: &str = "interrupted";
 
-/// What a stage's measurement gave: its fields are those of `--json`.
+/// The result of a stage. Its serialized fields are those of `--json`.
 pub(super) trait Figures: Serialize {
-    /// The same for people: what, and how much.
+    /// The result for the user: pairs of a name and a value.
     fn lines(&self) -> Vec<(&'static str, String)>;
 
-    /// The most important of them, each beside its limit and its target; none of a stage that `all` leaves out.
+    /// The most important figures with limits and targets, for the table of `bench all`; empty if `all` omits the
+    /// stage.
     fn table(&self) -> Vec<Line> {
         Vec::new()
     }
 }
 
-/// How long to measure, and when to give up.
+/// How long to measure, and whether the user has interrupted.
 #[derive(Clone, Debug)]
-pub(super) struct Patience {
+pub(super) struct Budget {
     pub(super) length: Duration,
     pub(super) stop: Stop,
 }
 
-/// A wait that ended early: somebody has asked for the end, or a channel does not work.
+/// The error of a wait that ended early: the user interrupted, or a channel failed.
 pub(super) fn interrupted(exit: Exit<ChannelError>) -> anyhow::Error {
     match exit {
         Exit::Stopped => anyhow::anyhow!(INTERRUPTED),
@@ -47,7 +49,7 @@ pub(super) fn interrupted(exit: Exit<ChannelError>) -> anyhow::Error {
     }
 }
 
-impl Patience {
+impl Budget {
     pub(super) fn new() -> anyhow::Result<Self> {
         let seconds = match std::env::var(SECONDS) {
             Ok(text) => text.parse().ok().filter(|seconds| (0.01..=600.0).contains(seconds)),
@@ -70,7 +72,7 @@ impl Patience {
         })
     }
 
-    /// An error once somebody has asked for the end: what was measured is cleared away on the way out.
+    /// Returns an error once the user has interrupted. Callers clean up on the way out.
     pub(super) fn check(&self) -> anyhow::Result<()> {
         if self.stop.requested() {
             bail!(INTERRUPTED);
@@ -79,7 +81,7 @@ impl Patience {
     }
 }
 
-pub(super) fn tell(figures: &impl Figures, json: bool) -> anyhow::Result<()> {
+pub(super) fn print(figures: &impl Figures, json: bool) -> anyhow::Result<()> {
     let mut table = Table::new();
     table.load_style(UTF8_BORDERS_ONLY);
     for (what, how_much) in figures.lines() {

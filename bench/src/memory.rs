@@ -1,26 +1,26 @@
-//! What a process has in memory, by `/proc/<pid>/smaps`.
+//! Resident memory of a process, from `/proc/<pid>/smaps`.
 
 use std::path::Path;
 
 use anyhow::Context;
 use serde::Serialize;
 
-/// Resident bytes of a process. Rows of the replay are nobody's: they are a file's, and counted apart.
+/// Resident bytes of a process. The replay file is counted separately.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub(super) struct Memory {
-    /// In nobody else's memory, whatever they belong to.
+    /// Pages that no other process maps, of any kind.
     pub(super) private_bytes: u64,
-    /// The same, and of what is shared the part that falls to this process (Pss).
+    /// Private pages and this process's share of shared ones (Pss).
     pub(super) proportional_bytes: u64,
-    /// Of files of shared memory, private or not.
+    /// Pages of files in shared memory, private or not.
     pub(super) shared_memory_bytes: u64,
-    /// Of other files, above all this program, private or not.
+    /// Pages of other files, mostly of this program, private or not.
     pub(super) file_bytes: u64,
-    /// Of the replay, which is in none of the numbers above.
+    /// Pages of the replay file; none of the numbers above includes them.
     pub(super) replay_bytes: u64,
 }
 
-/// Of what a mapping is.
+/// The kind of a mapping.
 #[derive(Clone, Copy)]
 enum Kind {
     Anonymous,
@@ -30,7 +30,7 @@ enum Kind {
 }
 
 impl Memory {
-    /// What process `pid` has, whose run has its replay at `replay`.
+    /// The memory of process `pid` of a run with its replay at `replay`.
     pub(super) fn of(pid: u32, replay: &Path) -> anyhow::Result<Self> {
         let path = format!("/proc/{pid}/smaps");
         let text = std::fs::read_to_string(&path).with_context(|| format!("cannot read {path}"))?;
@@ -44,7 +44,7 @@ impl Memory {
             let mut words = line.split_ascii_whitespace();
             let Some(first) = words.next() else { continue };
             let Some(field) = first.strip_suffix(':') else {
-                // addresses, rights, offset, device, inode, and what it is
+                // Addresses, rights, offset, device, inode and name.
                 let name = words.skip(4).collect::<Vec<_>>().join(" ");
                 kind = match name.as_str() {
                     name if name == replay => Kind::Replay,
@@ -101,7 +101,7 @@ Private_Dirty:         8 kB
 ";
 
     #[test]
-    fn the_replay_is_counted_apart() {
+    fn the_replay_is_counted_separately() {
         let memory = Memory::parse(SMAPS, "/tmp/my run/replay");
         let expected = Memory {
             private_bytes: 1024 * (4 + 21 + 80 + 8),

@@ -1,22 +1,24 @@
-//! What rates are to be expected of a run, from what each of its stages costs: a closed queueing network.
+//! A closed queueing network that predicts the rates of a run from the costs of its stages.
 //!
-//! Of every actor a window of chunks is under way. A chunk is collected by its actor, one at a time, and then waits its turn
-//! at the learner, which takes in the chunks of all. Both take an exponentially distributed time with the mean that was
-//! measured: real ones vary less, so waits are smaller than predicted. Such a network has a product form. With `k` chunks of
-//! each actor at the learner and K of them in all, its state has the weight K!/(k₁! … kₙ!) · (service/think)^K: so the
-//! solution is exact. With a window of one chunk it is the machine-repairman model that mean value analysis solves.
+//! Each actor has a window of chunks in circulation. The actor fills one chunk at a time; a full chunk then queues at
+//! the learner, which receives the chunks of all actors. Both times are assumed to be exponentially distributed with
+//! the measured means. Real times vary less, so real waits are shorter than predicted.
+//!
+//! The network has an exact product-form solution: the state with kᵢ chunks of actor i at the learner, K of them in
+//! all, has the weight K!/(k₁! … kₙ!) · (service/think)^K. With a window of one chunk it is the machine-repairman
+//! model, which mean value analysis solves.
 
 use serde::Serialize;
 
-/// Actors that fill chunks, and one learner that takes them in.
+/// Actors that fill chunks, and one learner that receives them.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Network {
     pub(super) actors: u32,
-    /// Chunks of each actor that are under way.
+    /// Chunks in circulation per actor.
     pub(super) window: u32,
-    /// Mean time of an actor over a chunk, in seconds.
+    /// Mean time of an actor to fill a chunk, in seconds.
     pub(super) think: f64,
-    /// Mean time of the learner over a chunk, in seconds.
+    /// Mean time of the learner to receive a chunk, in seconds.
     pub(super) service: f64,
 }
 
@@ -30,7 +32,8 @@ impl Network {
                 Some(f64::from(k) * ratio - *factorial)
             })
             .collect();
-        // Logarithm of the sum over all states with K chunks at the learner, but for the factor K!; actor after actor.
+        // For each K, the logarithm of the sum over all states with K chunks at the learner, without the factor K!.
+        // One convolution per actor.
         let mut states = vec![0.0];
         for _ in 0..self.actors {
             states = (0..states.len() + choices.len() - 1)
@@ -52,38 +55,38 @@ impl Network {
     }
 }
 
-/// Logarithm of the sum of what these are logarithms of.
+/// The logarithm of a sum, from the logarithms of its terms.
 fn log_sum(logarithms: impl Iterator<Item = f64> + Clone) -> f64 {
     let greatest = logarithms.clone().fold(f64::NEG_INFINITY, f64::max);
     greatest + logarithms.map(|it| (it - greatest).exp()).sum::<f64>().ln()
 }
 
-/// What the stages cost, in seconds.
+/// Times of the stages, in seconds.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Stages {
-    /// An actor with its environment server over a chunk, where each has a core.
+    /// An actor with its environment server fills a chunk, each on a core of its own.
     pub(super) think: f64,
-    /// The same where they share one.
+    /// The same on one shared core.
     pub(super) think_on_one_core: f64,
-    /// The learner over taking in a chunk.
+    /// The learner receives a chunk.
     pub(super) intake: f64,
-    /// The learner over an update.
+    /// The learner makes a gradient step.
     pub(super) update: f64,
     pub(super) window: u32,
 }
 
-/// What is expected of a run.
+/// The predicted rates of a run.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Expected {
     pub(super) chunks_per_second: f64,
     pub(super) updates_per_second: f64,
 }
 
-/// What keeps a run from becoming faster with more actors.
+/// The resource that keeps a run from becoming faster with more actors.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub(super) struct Bottleneck {
     pub(super) resource: &'static str,
-    /// So many actors saturate it.
+    /// The number of actors that saturates it.
     pub(super) actors: f64,
 }
 
@@ -92,30 +95,30 @@ pub(super) const INTAKE: &str = "the learner's intake";
 pub(super) const UPDATES: &str = "the learner's updates, over which the actors' windows fill";
 
 impl Stages {
-    /// A run in which every process has a core of its own; the learner takes everything in and makes updates in the rest of
-    /// its time, or none.
-    pub(super) fn alone(&self, actors: u32, updates: bool) -> Expected {
+    /// A run in which every process has a core of its own. The learner receives everything; with `updates` it makes
+    /// gradient steps in the rest of its time.
+    pub(super) fn with_own_cores(&self, actors: u32, updates: bool) -> Expected {
         self.with_shares(actors, updates, self.think, 1.0)
     }
 
-    /// A run on so many cores. A waiting pair's halves take turns, so a pair counts as one process that can run, and the
-    /// learner as another; those that can run share the cores alike.
-    pub(super) fn on(&self, cores: u32, actors: u32, updates: bool) -> Expected {
+    /// A run on `cores` cores. An actor and its server take turns, so such a pair counts as one runnable process and
+    /// the learner as another. Runnable processes share the cores equally.
+    pub(super) fn on_cores(&self, cores: u32, actors: u32, updates: bool) -> Expected {
         let (cores, n) = (f64::from(cores), f64::from(actors));
         let think = if 2.0 * n + 1.0 <= cores {
             self.think
         } else {
-            // The system puts a pair on one core where cores are scarce. That is not always the slower way: an idle core has
-            // to be woken for each request.
+            // With too few cores the system puts a pair on one core. This can even be faster, because an idle core
+            // would have to be woken for each request.
             self.think_on_one_core
         };
         if updates {
-            // A learner that makes updates can always run.
+            // A learner that makes gradient steps is always runnable.
             let learner = (cores / (n + 1.0)).min(1.0);
             let pair = ((cores - learner) / n).min(1.0);
             return self.with_shares(actors, true, think / pair, learner);
         }
-        // One that only takes in runs when there is something: all the work has to fit into the cores.
+        // A learner that only receives is idle at times. The total work must fit the cores.
         let most = cores / (think + self.intake);
         let Expected { chunks_per_second, .. } = self.with_shares(actors, false, think, 1.0);
         Expected {
@@ -124,10 +127,11 @@ impl Stages {
         }
     }
 
-    /// Where a pair takes `think` over a chunk and the learner has such a share of a core.
+    /// The rates if a pair takes `think` per chunk and the learner has the given share of a core.
     fn with_shares(&self, actors: u32, updates: bool, think: f64, share: f64) -> Expected {
-        // Between two updates the learner takes at most a window of each actor: under load each chunk carries its part of an
-        // update. Without load it does not matter, for the actor goes on while the chunk waits.
+        // Between two gradient steps the learner receives at most a window from each actor, so under load each chunk
+        // carries its part of a gradient step. Without load the actor continues while the chunk waits, so it costs
+        // nothing.
         let carried = if updates {
             self.update / f64::from(self.window * actors)
         } else {
@@ -147,8 +151,8 @@ impl Stages {
         }
     }
 
-    /// What more actors meet first where every process has a core of its own.
-    pub(super) fn first_bottleneck_alone(&self, updates: bool) -> Bottleneck {
+    /// The first bottleneck for more actors when every process has a core of its own.
+    pub(super) fn first_bottleneck_with_own_cores(&self, updates: bool) -> Bottleneck {
         let window = f64::from(self.window);
         if updates {
             // n/think = n · window / (update + n · window · intake).
@@ -164,11 +168,11 @@ impl Stages {
         }
     }
 
-    /// What more actors meet first on so many cores, the learner making no updates.
-    pub(super) fn first_bottleneck_on(&self, cores: u32) -> Bottleneck {
+    /// The first bottleneck for more actors on `cores` cores, with a learner that makes no gradient steps.
+    pub(super) fn first_bottleneck_on_cores(&self, cores: u32) -> Bottleneck {
         let think = self.think_on_one_core;
         let actors = f64::from(cores) * think / (think + self.intake);
-        let intake = self.first_bottleneck_alone(false);
+        let intake = self.first_bottleneck_with_own_cores(false);
         if actors < intake.actors {
             Bottleneck {
                 resource: CORES,
@@ -226,7 +230,7 @@ mod tests {
     }
 
     #[test]
-    fn a_window_of_one_is_what_mean_value_analysis_says() {
+    fn with_a_window_of_one_mean_value_analysis_gives_the_same() {
         for actors in [1, 2, 3, 7, 64, 256] {
             for service in [1e-4, 0.03, 1.0, 20.0] {
                 let found = network(actors, 1, 1.0, service).throughput();
@@ -236,7 +240,7 @@ mod tests {
     }
 
     #[test]
-    fn it_stays_within_its_bounds_and_grows() {
+    fn throughput_grows_with_actors_and_stays_within_its_bounds() {
         for window in [1, 8, 64] {
             let mut before = 0.0;
             for actors in 1..=64 {
@@ -259,41 +263,44 @@ mod tests {
     };
 
     #[test]
-    fn updates_get_the_time_that_the_intake_leaves() {
-        let few = STAGES.alone(1, true);
+    fn gradient_steps_get_the_time_that_the_intake_leaves() {
+        let few = STAGES.with_own_cores(1, true);
         close(
             few.updates_per_second,
             (1.0 - few.chunks_per_second * STAGES.intake) / STAGES.update,
         );
         assert!((450.0..510.0).contains(&few.chunks_per_second), "{few:?}");
-        let many = STAGES.alone(256, true);
+        let many = STAGES.with_own_cores(256, true);
         assert!(many.chunks_per_second < 2e4 && many.updates_per_second < 0.1 * few.updates_per_second);
-        assert_eq!(STAGES.alone(1, false).updates_per_second, 0.0);
+        assert_eq!(STAGES.with_own_cores(1, false).updates_per_second, 0.0);
     }
 
     #[test]
-    fn cores_bound_what_all_do_together() {
+    fn cores_bound_the_total_work() {
         let two = 2.0 / (STAGES.think + STAGES.intake);
-        close(STAGES.on(2, 8, false).chunks_per_second, two);
-        assert!(STAGES.on(2, 1, false).chunks_per_second <= 1.0 / STAGES.think);
-        let plenty = STAGES.on(1_000, 8, true);
-        close(plenty.chunks_per_second, STAGES.alone(8, true).chunks_per_second);
-        // Nine that can run share two cores alike.
-        let crowded = STAGES.on(2, 8, true);
+        close(STAGES.on_cores(2, 8, false).chunks_per_second, two);
+        assert!(STAGES.on_cores(2, 1, false).chunks_per_second <= 1.0 / STAGES.think);
+        let plenty = STAGES.on_cores(1_000, 8, true);
+        close(
+            plenty.chunks_per_second,
+            STAGES.with_own_cores(8, true).chunks_per_second,
+        );
+        // Nine runnable processes share two cores equally.
+        let crowded = STAGES.on_cores(2, 8, true);
         assert!(crowded.updates_per_second < 2.0 / 9.0 / STAGES.update, "{crowded:?}");
     }
 
     #[test]
-    fn the_first_bottleneck_is_where_its_bounds_cross() {
-        let intake = STAGES.first_bottleneck_alone(false);
+    fn the_first_bottleneck_is_where_the_bounds_cross() {
+        let intake = STAGES.first_bottleneck_with_own_cores(false);
         assert_eq!(intake.resource, INTAKE);
         close(intake.actors, 41.0);
-        close(STAGES.first_bottleneck_alone(true).actors, 35.0);
-        let cores = STAGES.first_bottleneck_on(2);
+        close(STAGES.first_bottleneck_with_own_cores(true).actors, 35.0);
+        let cores = STAGES.first_bottleneck_on_cores(2);
         assert_eq!(cores.resource, CORES);
         close(cores.actors, 2.0 * 2e-3 / 2.05e-3);
-        assert_eq!(STAGES.first_bottleneck_on(1_000), intake);
+        assert_eq!(STAGES.first_bottleneck_on_cores(1_000), intake);
         let slow = Stages { update: 1.0, ..STAGES };
-        assert_eq!(slow.first_bottleneck_alone(true).resource, UPDATES);
+        assert_eq!(slow.first_bottleneck_with_own_cores(true).resource, UPDATES);
     }
 }

@@ -1,5 +1,6 @@
-//! How much of a core an actor leaves to its policy: an actor and its environment server share one core, and what they give
-//! is held against the policy alone on the same core. Both take turns, so that what else the machine does strikes both.
+//! The share of a core that an actor leaves to its policy. An actor and its environment server share one core, and
+//! their rate is compared with that of the policy alone on this core. The two measurements alternate, so that a
+//! disturbance affects both.
 
 use std::time::{Duration, Instant};
 
@@ -9,24 +10,24 @@ use shoal_common::report::Role;
 
 use super::cores::Cores;
 use super::costs::Inference;
-use super::flow::Flow;
-use super::measurement::Patience;
+use super::measurement::Budget;
 use super::processes::Processes;
+use super::progress::Progress;
 use super::rows::ENVIRONMENTS;
-use super::scene::{Scene, counted_settings};
+use super::temporary_run::{TemporaryRun, settings_for_counting};
 use super::window::{self, Windows};
 
-/// A turn of the actor and its server; a turn of the policy alone takes half of it.
+/// Length of a turn of the actor and its server. A turn of the policy alone takes half as long.
 const TURN: Duration = Duration::from_millis(200);
 
-/// What the share should be.
+/// Target of the share.
 pub(super) const TARGET: f64 = 0.8;
 
 #[derive(Clone, Copy, Debug, Serialize)]
 pub(super) struct OneCore {
     pub(super) pair_rows_per_second: f64,
     pub(super) inference_rows_per_second: f64,
-    /// Median over turns of the first over the second.
+    /// Median over turns of the first rate divided by the second.
     pub(super) share: f64,
     pub(super) share_least: f64,
     pub(super) share_greatest: f64,
@@ -35,41 +36,41 @@ pub(super) struct OneCore {
 }
 
 /// Measures for about `length`.
-pub(super) fn measure(length: Duration, patience: &Patience) -> anyhow::Result<OneCore> {
-    let scene = Scene::of(1, ENVIRONMENTS as u32, &counted_settings(1, false))?;
-    let mut inference = Inference::new(&scene.config)?;
+pub(super) fn measure(length: Duration, budget: &Budget) -> anyhow::Result<OneCore> {
+    let temporary = TemporaryRun::of(1, ENVIRONMENTS as u32, &settings_for_counting(1, false))?;
+    let mut inference = Inference::new(&temporary.config)?;
     let cores = Cores::choose()?;
-    let chosen = |role| {
+    let cores_for = |role| {
         Some(match role {
             Role::Learner => cores.others,
             _ => cores.pair,
         })
     };
-    scene.with_crew(chosen, |domain, processes| {
-        let mut flow = Flow::begin(&scene, domain, processes, patience)?;
+    temporary.with_processes(cores_for, |domain, processes| {
+        let mut progress = Progress::begin(&temporary, domain, processes, budget)?;
         let turns = window::count(length, 1.0, TURN.mul_f64(1.5));
         let turn = TURN.min(length.div_f64(1.5));
-        take_turns(&mut flow, processes, &cores, turns, turn, &mut inference, patience)
+        take_turns(&mut progress, processes, &cores, turns, turn, &mut inference, budget)
     })
 }
 
 fn take_turns(
-    flow: &mut Flow<'_>,
+    progress: &mut Progress<'_>,
     processes: &mut Processes,
     cores: &Cores,
     turns: usize,
     turn: Duration,
     inference: &mut Inference,
-    patience: &Patience,
+    budget: &Budget,
 ) -> anyhow::Result<OneCore> {
     let (mut pair, mut alone, mut shares) = (Windows::default(), Windows::default(), Windows::default());
     for _ in 0..turns {
         sched_setaffinity(None, &cores.others)?;
-        // The pair has just been woken.
+        // The actor and its server have just been resumed.
         std::thread::sleep(turn / 10);
-        let (begun, before) = (Instant::now(), flow.rows());
-        flow.sleep(turn, processes, patience)?;
-        let rows = (flow.rows() - before) as f64 / begun.elapsed().as_secs_f64();
+        let (begun, before) = (Instant::now(), progress.rows());
+        progress.sleep(turn, processes, budget)?;
+        let rows = (progress.rows() - before) as f64 / begun.elapsed().as_secs_f64();
         let rate = processes.with_actors_paused(|| -> anyhow::Result<f64> {
             sched_setaffinity(None, &cores.pair)?;
             inference.step();

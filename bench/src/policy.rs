@@ -1,4 +1,4 @@
-//! How many actions a second the policy gives, as an actor asks it, and how much of the machine that is.
+//! Actions per second of the policy's forward pass, as actors use it, compared with the machine's limits.
 
 use std::time::Duration;
 
@@ -9,22 +9,22 @@ use shoal_common::stream::{Purpose, stream};
 use shoal_learner::networks::initialise::initialise;
 use shoal_learner::networks::product::{Product, Transposed};
 
-use super::measurement::{Figures, Patience};
+use super::measurement::{Budget, Figures};
 use super::product::Multiplication;
 use super::rows::{ENVIRONMENTS, Rows};
-use super::scene::{Scene, ddpg};
 use super::target::{Line, Target};
+use super::temporary_run::{TemporaryRun, ddpg};
 use super::window::{self, Windows};
 
 const WINDOW: Duration = Duration::from_millis(50);
 
-/// Four measurements take turns: both batches, and the limit of each.
+/// Share of the time for each of four measurements: two batch sizes and the limit of each.
 const SHARE: f64 = 0.25;
 
-/// Part of the time that goes before, to warm up.
+/// Share of the time that is spent on warming up.
 const WARM_UP: f64 = 0.05;
 
-/// Attempts of each kernel at the product that is the limit.
+/// Attempts per kernel at the product that serves as the limit.
 const ATTEMPTS: usize = 10;
 
 /// The fields of `bench policy --json`.
@@ -34,11 +34,11 @@ pub(super) struct PolicyFigures {
     actions_per_second_batch_64: f64,
     microseconds_per_call_batch_1: f64,
     microseconds_per_call_batch_64: f64,
-    /// What it takes to read every parameter once, where they lie after a call.
+    /// Time to read every parameter once, from where a call leaves them in the caches.
     reading_microseconds: f64,
     share_of_reading: f64,
     flop_batch_64: u64,
-    /// The second layer's product, by the fastest kernel.
+    /// Rate of the second layer's product with the fastest kernel.
     limit_gflops: f64,
     share_of_limit: f64,
     parameters: usize,
@@ -47,9 +47,9 @@ pub(super) struct PolicyFigures {
     calls: [Windows; 2],
 }
 
-pub(super) fn measure(patience: &Patience) -> anyhow::Result<PolicyFigures> {
-    let scene = Scene::new(&[])?;
-    let config = scene.remove_directory()?;
+pub(super) fn measure(budget: &Budget) -> anyhow::Result<PolicyFigures> {
+    let temporary = TemporaryRun::new(&[])?;
+    let config = temporary.remove_directory()?;
     let range = ActionRange::new(&config.spec.action)?;
     let width = config.spec.observation.width();
     let mut actions = vec![0.0; ENVIRONMENTS * range.width()];
@@ -69,12 +69,12 @@ pub(super) fn measure(patience: &Patience) -> anyhow::Result<PolicyFigures> {
     };
     let batches = [1, ENVIRONMENTS];
     for batch in batches {
-        calls_of(batch, patience.length.mul_f64(WARM_UP));
+        calls_of(batch, budget.length.mul_f64(WARM_UP));
     }
     let mut calls: [Windows; 2] = Default::default();
     let (mut readings, mut limit) = (Windows::default(), Windows::default());
-    for _ in 0..window::count(patience.length, SHARE, WINDOW) {
-        patience.check()?;
+    for _ in 0..window::count(budget.length, SHARE, WINDOW) {
+        budget.check()?;
         for (windows, batch) in calls.iter_mut().zip(batches) {
             windows.add(calls_of(batch, WINDOW));
         }
@@ -100,7 +100,7 @@ pub(super) fn measure(patience: &Patience) -> anyhow::Result<PolicyFigures> {
     })
 }
 
-/// The product of the second layer for a batch of 64, by the kernel that does it best: nearly all there is to compute.
+/// The second layer's product for a batch of 64, with its fastest kernel. It is nearly the whole computation.
 fn widest_product(layout: &NetworkLayout, seed: u64) -> Multiplication {
     let (k, m) = layout.layer_size(1);
     let product = Product {
@@ -114,7 +114,7 @@ fn widest_product(layout: &NetworkLayout, seed: u64) -> Multiplication {
     product
 }
 
-/// Reads every number once, and does as little as can be with it.
+/// Reads every number once and does as little as possible with it.
 fn read(numbers: &[f32]) {
     let sums = Arch::new().dispatch(|| {
         let mut sums = [0.0_f32; 64];

@@ -1,8 +1,8 @@
-//! The limit that the learner is held against: single-precision matrix products of an update's own shapes, by the best of
-//! the kernels tried.
+//! The limit that the learner is compared with: single-precision matrix products of the shapes in a gradient step, with
+//! the faster of two kernels.
 //!
-//! Both kernels read transposed factors through strides, as an update does: nothing is transposed beforehand. The factors
-//! are warm: each product is repeated on the same numbers.
+//! Both kernels read transposed factors through strides, as a gradient step does; nothing is transposed beforehand. The
+//! factors are warm in the caches, because each product is repeated on the same numbers.
 
 use std::time::Duration;
 
@@ -17,15 +17,15 @@ use shoal_learner::networks::product::{Product, Transposed};
 
 use super::window;
 
-/// Shorter than a time slice: of several attempts, one is not disturbed.
+/// Length of an attempt. It is shorter than a time slice, so that most attempts are undisturbed.
 const ATTEMPT: Duration = Duration::from_millis(2);
 
-/// Who multiplies.
+/// An implementation of matrix products.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Kernel {
     /// faer's `matmul`.
     Faer,
-    /// nalgebra's `gemm`, which is `matrixmultiply::sgemm` where no dimension is tiny.
+    /// nalgebra's `gemm`, which is `matrixmultiply::sgemm` unless a dimension is tiny.
     Nalgebra,
 }
 
@@ -40,12 +40,12 @@ impl Kernel {
     }
 }
 
-/// A product with numbers to multiply, and the kernel that does it best.
+/// A product with its matrices, and its fastest kernel.
 #[derive(Debug)]
 pub(super) struct Multiplication {
     pub(super) product: Product,
     pub(super) kernel: Kernel,
-    /// The best rate that a kernel was seen to have, in GFLOP/s.
+    /// The best rate seen, in GFLOP/s.
     pub(super) best: f64,
     a: Aligned,
     b: Aligned,
@@ -53,7 +53,7 @@ pub(super) struct Multiplication {
 }
 
 impl Multiplication {
-    /// Random factors, by faer at first.
+    /// Random factors; the kernel is faer until others are tried.
     pub(super) fn new(product: Product, random: &mut Stream) -> Self {
         let Product { m, k, n, .. } = product;
         let mut numbers =
@@ -68,7 +68,7 @@ impl Multiplication {
         }
     }
 
-    /// Tries every kernel for a moment, and keeps to the one that was ever the fastest.
+    /// Tries every kernel briefly and keeps the fastest so far.
     pub(super) fn try_kernels(&mut self) {
         let mut chosen = self.kernel;
         for kernel in Kernel::ALL {
@@ -109,7 +109,7 @@ impl Multiplication {
         std::hint::black_box(&mut self.c);
     }
 
-    /// For people: the shape, and which factor is read transposed.
+    /// Text for the user: the shape, and which factor is read transposed.
     pub(super) fn shape(&self) -> String {
         let Product { m, k, n, transposed } = self.product;
         let which = match transposed {

@@ -1,4 +1,4 @@
-//! Real rows to move and to learn from: Pendulums under random actions.
+//! Real transitions to move and to learn from: Pendulums under random actions.
 
 use rand::RngExt;
 use shoal_common::channel::environment::{ResponseLayout, StepBlocks};
@@ -8,10 +8,10 @@ use shoal_common::stream::{Purpose, Stream, stream};
 use shoal_common::transition::{RowLayout, Transition};
 use shoal_env_server::vector::{Start, VectorEnvironment};
 
-/// Environments stepped at once: rows come in portions of so many.
+/// Environments that are stepped together, and so the number of rows that each step yields.
 pub(super) const ENVIRONMENTS: usize = 64;
 
-/// A source of rows.
+/// A source of transitions.
 pub(super) struct Rows {
     environments: VectorEnvironment,
     layout: ResponseLayout,
@@ -49,12 +49,12 @@ impl Rows {
         })
     }
 
-    /// Observations that the environments show now, one after the other.
+    /// The current observations of the environments, one after the other.
     pub(super) fn observations(&self) -> &[f32] {
         &self.observations
     }
 
-    /// One step of every environment, as `ENVIRONMENTS` rows in `out`.
+    /// Steps every environment once and writes the `ENVIRONMENTS` rows to `out`.
     pub(super) fn fill(&mut self, out: &mut [f32]) -> anyhow::Result<()> {
         for action in self.actions.chunks_exact_mut(self.bounds.len()) {
             for (number, (low, high)) in action.iter_mut().zip(&self.bounds) {

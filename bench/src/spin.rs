@@ -1,9 +1,9 @@
-//! The limit of a round trip: two threads that do nothing but wait for each other's word in memory.
+//! The limit of a round trip: two threads that spin on a word in memory, waiting for each other.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-/// A word on cache lines of its own (two: they are fetched in pairs).
+/// A word on two cache lines of its own, because lines are fetched in pairs.
 #[repr(align(128))]
 struct Word(AtomicU64);
 

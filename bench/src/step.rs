@@ -1,4 +1,4 @@
-//! How long an environment's step takes from an actor's process and back, through an environment server's.
+//! The time of an environment step, from an actor's process to an environment server's and back.
 
 use std::time::{Duration, Instant};
 
@@ -13,22 +13,22 @@ use shoal_common::report::Role;
 use shoal_run::process::Peer;
 
 use super::cores::Cores;
-use super::measurement::{Figures, Patience};
-use super::scene::Scene;
+use super::measurement::{Budget, Figures};
 use super::spin;
 use super::target::{Line, Target};
+use super::temporary_run::TemporaryRun;
 
-/// How often the other process is looked after.
-const LOOK: Duration = Duration::from_millis(50);
+/// Time between two checks for an interruption.
+const CHECK_INTERVAL: Duration = Duration::from_millis(50);
 
-/// Part of the time that goes before, to warm up.
+/// Share of the time that is spent on warming up.
 const WARM_UP: f64 = 0.1;
 
-/// Part of the time that goes to round trips between two cores, and within one.
+/// Shares of the time: round trips between two cores, and within one.
 const SHARES: [f64; 2] = [0.6, 0.3];
 
-/// Part of the time that goes to the bare spin, half of it before the round trips and half after them: which cores a
-/// virtual machine is given, and how far apart they are, may change in between.
+/// Share of the time for the limit, half before the round trips and half after them: a virtual machine may be moved to
+/// other cores in between.
 const SPIN: f64 = 0.1;
 
 /// The fields of `bench step --json`.
@@ -38,7 +38,7 @@ pub(super) struct StepFigures {
     p99_us: f64,
     least_us: f64,
     p90_us: f64,
-    /// Median of two threads that wait for each other's word in memory.
+    /// Median of the limit: two threads that spin on a word in memory.
     spin_median_us: f64,
     round_trips: usize,
     environments: u32,
@@ -47,15 +47,15 @@ pub(super) struct StepFigures {
     one_core_p99_us: f64,
 }
 
-pub(super) fn measure(patience: &Patience) -> anyhow::Result<StepFigures> {
-    let scene = Scene::new(&[])?;
-    let mut spins = spin::times(patience.length.mul_f64(SPIN / 2.0));
-    let [apart, together] = SHARES.map(|share| patience.length.mul_f64(share));
-    let mut times = scene.with_peer(Role::EnvServer, |domain, server| {
-        round_trips(&scene.config, domain, server, apart, patience)
+pub(super) fn measure(budget: &Budget) -> anyhow::Result<StepFigures> {
+    let temporary = TemporaryRun::new(&[])?;
+    let mut spins = spin::times(budget.length.mul_f64(SPIN / 2.0));
+    let [apart, together] = SHARES.map(|share| budget.length.mul_f64(share));
+    let mut times = temporary.with_peer(Role::EnvServer, |domain, server| {
+        round_trips(&temporary.config, domain, server, apart, budget)
     })?;
-    let mut on_one_core = on_one_core(together, patience)?;
-    spins.extend(spin::times(patience.length.mul_f64(SPIN / 2.0)));
+    let mut on_one_core = on_one_core(together, budget)?;
+    spins.extend(spin::times(budget.length.mul_f64(SPIN / 2.0)));
     spins.sort_unstable();
     times.sort_unstable();
     on_one_core.sort_unstable();
@@ -67,24 +67,24 @@ pub(super) fn measure(patience: &Patience) -> anyhow::Result<StepFigures> {
         p90_us: microseconds(0.9),
         spin_median_us: quantile_of(&spins, 0.5),
         round_trips: times.len(),
-        environments: scene.config.actors.envs,
+        environments: temporary.config.actors.envs,
         one_core_median_us: quantile_of(&on_one_core, 0.5),
         one_core_p99_us: quantile_of(&on_one_core, 0.99),
     })
 }
 
 /// Times of round trips while this process and the server share a core.
-fn on_one_core(length: Duration, patience: &Patience) -> anyhow::Result<Vec<u32>> {
-    let scene = Scene::new(&[])?;
+fn on_one_core(length: Duration, budget: &Budget) -> anyhow::Result<Vec<u32>> {
+    let temporary = TemporaryRun::new(&[])?;
     let cores = Cores::choose()?;
-    scene.with_peer(Role::EnvServer, |domain, server| {
+    temporary.with_peer(Role::EnvServer, |domain, server| {
         server.pin(&cores.pair)?;
         sched_setaffinity(None, &cores.pair)?;
-        round_trips(&scene.config, domain, server, length, patience)
+        round_trips(&temporary.config, domain, server, length, budget)
     })
 }
 
-/// In µs; `sorted` are ns, and at least one.
+/// A quantile in µs of sorted times in ns. Panics if there are none.
 pub(super) fn quantile_of(sorted: &[u32], quantile: f64) -> f64 {
     f64::from(sorted[((sorted.len() - 1) as f64 * quantile) as usize]) / 1e3
 }
@@ -95,14 +95,14 @@ fn round_trips(
     domain: &Domain,
     server: &mut Peer,
     length: Duration,
-    patience: &Patience,
+    budget: &Budget,
 ) -> anyhow::Result<Vec<u32>> {
     let environments = config.actors.envs as usize;
     let listener = Listener::bind(domain, EventName(Role::Actor, 0))?;
-    let client = EnvironmentClient::open(domain, 0, &config.spec, environments, patience.stop.clone())?;
+    let client = EnvironmentClient::open(domain, 0, &config.spec, environments, budget.stop.clone())?;
     let mut ask = |request: &dyn Fn() -> Result<(), Exit<ChannelError>>| match request() {
         Ok(()) => Ok(()),
-        Err(Exit::Stopped) => patience.check(),
+        Err(Exit::Stopped) => budget.check(),
         Err(Exit::Failed(error)) => server.check().and(Err(error.into())),
     };
     ask(&|| client.describe(&listener, || ()).map(|_| ()))?;
@@ -118,7 +118,7 @@ fn round_trips(
             Ok(Stepped::Taken(_)) => {}
             Ok(Stepped::Lost) => {
                 server.check()?;
-                bail!("the environment server gave up its episodes");
+                bail!("the environment server lost its episodes");
             }
             Err(Exit::Stopped) => bail!(super::measurement::INTERRUPTED),
             Err(Exit::Failed(error)) => return Err(error.into()),
@@ -127,9 +127,9 @@ fn round_trips(
         if before.duration_since(begun) >= warm_up {
             times.push((after - before).as_nanos().try_into().unwrap_or(u32::MAX));
         }
-        if after - looked >= LOOK {
+        if after - looked >= CHECK_INTERVAL {
             looked = after;
-            patience.check()?;
+            budget.check()?;
         }
         if !times.is_empty() && after - begun >= length {
             return Ok(times);

@@ -1,4 +1,4 @@
-//! `shoal bench all`: every stage after the other, and one table of them.
+//! `shoal bench all`: every stage in turn, and one table of the results.
 
 use std::io::Write;
 
@@ -6,11 +6,11 @@ use comfy_table::Table;
 use comfy_table::presets::UTF8_BORDERS_ONLY;
 use serde_json::{Map, Value};
 
-use super::measurement::{Figures, Patience};
+use super::measurement::{Budget, Figures};
 use super::target::Line;
 use super::{actors, learner, policy, step, transitions, whole_run};
 
-/// What the stages gave, by name, and the lines of the table.
+/// The results of the stages by name, and the lines of the table.
 struct All {
     stages: Map<String, Value>,
     lines: Vec<Line>,
@@ -24,18 +24,18 @@ impl All {
     }
 }
 
-/// Measures every stage but those that need other programs, each as long as alone, and prints them.
-pub(super) fn measure_all(json: bool, patience: &Patience) -> anyhow::Result<()> {
+/// Measures every stage that needs no other program, each for the full length, and prints the results.
+pub(super) fn measure_all(json: bool, budget: &Budget) -> anyhow::Result<()> {
     let mut all = All {
         stages: Map::new(),
         lines: Vec::new(),
     };
-    all.add("learner", &learner::measure(patience)?)?;
-    all.add("transitions", &transitions::measure(patience)?)?;
-    all.add("step", &step::measure(patience)?)?;
-    all.add("policy", &policy::measure(patience)?)?;
-    all.add("actors", &actors::measure(None, patience)?)?;
-    all.add("run", &whole_run::measure(patience)?)?;
+    all.add("learner", &learner::measure(budget)?)?;
+    all.add("transitions", &transitions::measure(budget)?)?;
+    all.add("step", &step::measure(budget)?)?;
+    all.add("policy", &policy::measure(budget)?)?;
+    all.add("actors", &actors::measure(None, budget)?)?;
+    all.add("run", &whole_run::measure(budget)?)?;
     let All { mut stages, lines } = all;
 
     let mut table = Table::new();

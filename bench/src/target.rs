@@ -1,24 +1,24 @@
-//! What a figure is set beside: the machine's limit, and what it should be.
+//! What a figure is compared with: the machine's limit and a target.
 
 use serde::Serialize;
 
-/// A row of the table.
+/// A line of the table of `bench all`.
 #[derive(Debug, Serialize)]
 pub(super) struct Line {
     pub(super) stage: &'static str,
     pub(super) ours: String,
-    /// What the machine gives, measured in the same run; empty where there is no such figure.
+    /// The machine's limit, measured in the same run; empty if there is none.
     pub(super) limit: String,
-    /// Ours over the limit.
+    /// Our figure divided by the limit.
     pub(super) share: Option<f64>,
     pub(super) target: Target,
 }
 
-/// What a figure should be.
+/// The target of a figure.
 #[derive(Debug, Serialize)]
 pub(super) struct Target {
     text: &'static str,
-    /// Whether it is; nothing where it is more a direction than a number.
+    /// Whether the target is met; `None` if this measurement does not check it.
     met: Option<bool>,
 }
 

@@ -1,5 +1,5 @@
-//! How fast rows get from an actor's process into the committed replay of a learner's process, and from there into
-//! minibatches. The learner is the role as a run has it, told to make no updates; this process is the actor.
+//! The rate of rows from an actor's process into the committed replay of a learner's process, and from there into
+//! minibatches. The learner is the ordinary role, configured to make no gradient steps. This process is the actor.
 
 use std::time::{Duration, Instant};
 
@@ -16,20 +16,19 @@ use shoal_learner::algorithms::sampling::Sampler;
 use shoal_learner::replay::Replay;
 use shoal_run::process::Peer;
 
-use super::measurement::{Figures, Patience};
+use super::measurement::{Budget, Figures};
 use super::rows::{ENVIRONMENTS, Rows};
-use super::scene::{Scene, ddpg};
 use super::target::{Line, Target};
+use super::temporary_run::{TemporaryRun, ddpg};
 use super::window::{self, Windows};
 
 const WINDOW: Duration = Duration::from_millis(100);
 const SAMPLING_WINDOW: Duration = Duration::from_millis(20);
 
-/// What part of the time goes to warming up (the replay's pages are touched for the first time), to moving rows, and to
-/// sampling them.
+/// Shares of the time: warming up (the first access to the replay's pages), moving rows, and sampling them.
 const SHARES: [f64; 3] = [0.15, 0.65, 0.2];
 
-/// Chunks with different rows that are sent in turn.
+/// Number of different chunks that are sent in turn.
 const CHUNKS: usize = 64;
 
 /// The fields of `bench transitions --json`.
@@ -37,7 +36,7 @@ const CHUNKS: usize = 64;
 pub(super) struct TransitionFigures {
     rows_per_second: f64,
     chunk_rows: usize,
-    /// Drawn at random from the replay and copied into minibatches, by one thread, with nobody writing.
+    /// Rows drawn at random from the replay and copied into minibatches, by one thread, while no process writes.
     sampled_rows_per_second: f64,
     row_bytes: usize,
     window_chunks: u32,
@@ -49,39 +48,39 @@ pub(super) struct TransitionFigures {
     sampled: Windows,
 }
 
-pub(super) fn measure(patience: &Patience) -> anyhow::Result<TransitionFigures> {
-    let scene = Scene::new(&[
+pub(super) fn measure(budget: &Budget) -> anyhow::Result<TransitionFigures> {
+    let temporary = TemporaryRun::new(&[
         "actors.chunk_steps=64",
         "replay.updates_per_step=0",
         "run.steps=1_000_000_000_000",
-        // A checkpoint has the disk brought up to date: another stage's work.
+        // Writing a checkpoint to disk would disturb the measurement.
         "checkpoint.every_seconds=86_400",
     ])?;
-    let moved = scene.with_peer(Role::Learner, |domain, learner| {
-        move_rows(&scene.config, &scene.run, domain, learner, patience)
+    let moved = temporary.with_peer(Role::Learner, |domain, learner| {
+        move_rows(&temporary.config, &temporary.run, domain, learner, budget)
     })?;
-    let replay = Replay::open(&scene.run.replay_file(), &scene.replay_layout())?;
-    let sampled = sample(&replay, &scene.config, patience)?;
+    let replay = Replay::open(&temporary.run.replay_file(), &temporary.replay_layout())?;
+    let sampled = sample(&replay, &temporary.config, budget)?;
     Ok(TransitionFigures {
         rows_per_second: moved.median(),
-        chunk_rows: scene.config.chunk_rows(),
+        chunk_rows: temporary.config.chunk_rows(),
         sampled_rows_per_second: sampled.median(),
-        row_bytes: size_of::<f32>() * scene.config.row_layout().width(),
-        window_chunks: scene.config.actors.window,
+        row_bytes: size_of::<f32>() * temporary.config.row_layout().width(),
+        window_chunks: temporary.config.actors.window,
         replay_rows: replay.rows().end - replay.rows().start,
-        batch: ddpg(&scene.config)?.batch,
+        batch: ddpg(&temporary.config)?.batch,
         moved,
         sampled,
     })
 }
 
-/// Sends chunks as fast as the window allows; rows committed a second.
+/// Sends chunks as fast as the window allows and returns the rates of committed rows.
 fn move_rows(
     config: &Config,
     run: &RunDir,
     domain: &Domain,
     learner: &mut Peer,
-    patience: &Patience,
+    budget: &Budget,
 ) -> anyhow::Result<Windows> {
     let row = config.row_layout();
     let mut rows = Rows::new(config)?;
@@ -90,34 +89,34 @@ fn move_rows(
 
     let listener = Listener::bind(domain, EventName(Role::Actor, 0))?;
     let notifier = Notifier::new(domain, EventName(Role::Learner, 0))?;
-    let commits = wait_for_replay(run, &listener, learner, patience)?;
+    let commits = wait_for_replay(run, &listener, learner, budget)?;
     let handshake = ChunkSender::open(domain, 0, 1, config.chunk_layout(), config.actors.window)?;
     let mut sender = handshake
-        .wait(&commits, &listener, &patience.stop, || {
-            // A learner that has ended commits nothing.
+        .wait(&commits, &listener, &budget.stop, || {
+            // Once the learner has ended, nothing is committed any more.
             if learner.check().is_err() {
-                patience.stop.request();
+                budget.stop.request();
             }
         })
         .map_err(super::measurement::interrupted)?;
 
     let [warm_up, moving, _] = SHARES;
     let mut windows = Windows::default();
-    let mut left = window::count(patience.length, moving, WINDOW);
-    let (mut begun, mut length, mut committed) = (Instant::now(), patience.length.mul_f64(warm_up), None);
+    let mut left = window::count(budget.length, moving, WINDOW);
+    let (mut begun, mut length, mut committed) = (Instant::now(), budget.length.mul_f64(warm_up), None);
     loop {
         for numbers in &chunks {
-            let room = || sender.in_flight(commits.committed(0)) < u64::from(config.actors.window);
+            let may_send = || sender.in_flight(commits.committed(0)) < u64::from(config.actors.window);
             let waited = wait_for(
                 &listener,
-                &patience.stop,
-                || Ok(room().then_some(())),
+                &budget.stop,
+                || Ok(may_send().then_some(())),
                 || {
-                    // A learner that has ended commits nothing more.
+                    // Once the learner has ended, nothing is committed any more.
                     if learner.check().is_err() {
-                        patience.stop.request();
+                        budget.stop.request();
                     }
-                    sender.look_after()
+                    sender.refresh_connections()
                 },
             );
             if let Err(Exit::Stopped) = waited {
@@ -134,7 +133,7 @@ fn move_rows(
         let elapsed = begun.elapsed();
         if elapsed >= length {
             let now = commits.rows();
-            // The first window warmed up.
+            // The first window is the warm-up.
             if let Some(before) = committed.replace(now) {
                 windows.add((now - before) as f64 / elapsed.as_secs_f64());
                 left -= 1;
@@ -142,7 +141,7 @@ fn move_rows(
                     return Ok(windows);
                 }
             }
-            patience.check()?;
+            budget.check()?;
             (begun, length) = (Instant::now(), WINDOW);
         }
     }
@@ -152,14 +151,14 @@ fn wait_for_replay(
     run: &RunDir,
     listener: &Listener,
     learner: &mut Peer,
-    patience: &Patience,
+    budget: &Budget,
 ) -> anyhow::Result<CommitReader> {
     loop {
         match CommitReader::open(&run.replay_file()) {
             Ok(reader) => return Ok(reader),
             Err(OpenError::NotYet { .. }) => {
                 learner.check()?;
-                patience.check()?;
+                budget.check()?;
                 listener.wait(Duration::from_millis(5))?;
             }
             Err(error) => return Err(error.into()),
@@ -167,8 +166,8 @@ fn wait_for_replay(
     }
 }
 
-/// Rows a second into minibatches, drawn as the learner draws them.
-fn sample(replay: &Replay, config: &Config, patience: &Patience) -> anyhow::Result<Windows> {
+/// The rates of rows drawn into minibatches, as the learner does it.
+fn sample(replay: &Replay, config: &Config, budget: &Budget) -> anyhow::Result<Windows> {
     let sampler = Sampler::new(config.run.seed);
     let size = ddpg(config)?.batch;
     let mut batch = Minibatch::new(config.row_layout(), size);
@@ -181,11 +180,11 @@ fn sample(replay: &Replay, config: &Config, patience: &Patience) -> anyhow::Resu
         batch.gather(replay, &indices);
         std::hint::black_box(&mut batch);
     };
-    // The mapping is new: its pages come in first.
-    window::rate(patience.length.mul_f64(SHARES[2] / 4.0), &mut gather);
+    // Warms up: the first access to each page of the new mapping is a page fault.
+    window::rate(budget.length.mul_f64(SHARES[2] / 4.0), &mut gather);
     let mut windows = Windows::default();
-    for _ in 0..window::count(patience.length, SHARES[2], SAMPLING_WINDOW) {
-        patience.check()?;
+    for _ in 0..window::count(budget.length, SHARES[2], SAMPLING_WINDOW) {
+        budget.check()?;
         windows.add(window::rate(SAMPLING_WINDOW, &mut gather) * size as f64);
     }
     Ok(windows)

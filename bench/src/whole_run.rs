@@ -1,5 +1,5 @@
-//! A training as somebody starts it, launcher and all: how long it takes to its first update, how long a learner that was
-//! killed takes to be replaced, and how much memory its processes have.
+//! A complete training run with its launcher: the time to its first gradient steps, the time to replace a killed
+//! learner, and the memory of its processes.
 
 use std::time::{Duration, Instant};
 
@@ -9,20 +9,20 @@ use serde::Serialize;
 use shoal_common::report::Role;
 
 use self::training::{Recovery, Startup, Training};
-use super::measurement::{Figures, Patience};
+use super::measurement::{Budget, Figures};
 use super::memory::Memory;
 use super::target::{Line, Target};
 use super::window::Windows;
 
 mod training;
 
-/// Part of the time in which runs are started; in the rest the learner of the last one is killed.
-const STARTING: f64 = 0.4;
+/// Share of the time for starting runs. In the rest, the learner of the last run is killed repeatedly.
+const STARTUP_SHARE: f64 = 0.4;
 
-/// More would say no more.
-const MOST: usize = 20;
+/// Limit on the number of starts and on the number of kills.
+const MAX_REPEATS: usize = 20;
 
-/// What a start and a recovery should take, in seconds, and a process have, in bytes.
+/// Targets: the time of a start and of a recovery in seconds, and the private memory of a process in bytes.
 const TARGET_SECONDS: f64 = 0.5;
 const TARGET_BYTES: u64 = 64_000_000;
 
@@ -37,14 +37,14 @@ pub(super) struct RunFigures {
     /// From the first row committed to the last row of the warm-up.
     warm_up_seconds: Spread,
     warm_up_rows: u64,
-    /// From the last row of the warm-up to the first policy that updates have changed.
+    /// From the last row of the warm-up to the first policy that gradient steps have changed.
     first_update_seconds: Spread,
-    /// From the launcher's start to that policy, less the warm-up.
+    /// From the launcher's start to that policy, minus the warm-up.
     start_seconds: Spread,
     kills: usize,
     /// From the learner's `kill -9` to its successor's first heartbeat.
     successor_ready_seconds: Spread,
-    /// From the learner's `kill -9` to its successor's first policy that updates have changed.
+    /// From the learner's `kill -9` to its successor's first policy that gradient steps have changed.
     recovery_seconds: Spread,
     target_seconds: f64,
     roles: Vec<RoleMemory>,
@@ -65,16 +65,16 @@ struct RoleMemory {
     memory: Memory,
 }
 
-pub(super) fn measure(patience: &Patience) -> anyhow::Result<RunFigures> {
+pub(super) fn measure(budget: &Budget) -> anyhow::Result<RunFigures> {
     let begun = Instant::now();
     let mut starts = Vec::new();
     loop {
         let mut training = Training::start()?;
-        let measured = training.begin(patience).and_then(|began| {
+        let measured = training.begin(budget).and_then(|began| {
             starts.push(began);
-            let is_last = begun.elapsed() >= patience.length.mul_f64(STARTING) || starts.len() >= MOST;
+            let is_last = begun.elapsed() >= budget.length.mul_f64(STARTUP_SHARE) || starts.len() >= MAX_REPEATS;
             is_last
-                .then(|| recoveries_and_memory(&mut training, begun, patience))
+                .then(|| recoveries_and_memory(&mut training, begun, budget))
                 .transpose()
         });
         let ended = training.end();
@@ -86,16 +86,16 @@ pub(super) fn measure(patience: &Patience) -> anyhow::Result<RunFigures> {
     }
 }
 
-/// Kills the learner until the time is over, at least once; and looks at everyone's memory before that.
+/// Measures the memory of each process, then kills the learner until the time is over, at least once.
 fn recoveries_and_memory(
     training: &mut Training,
     begun: Instant,
-    patience: &Patience,
+    budget: &Budget,
 ) -> anyhow::Result<(Vec<Recovery>, Vec<RoleMemory>)> {
     let mut recoveries = Vec::new();
     let mut roles = Vec::new();
-    while recoveries.is_empty() || (begun.elapsed() < patience.length && recoveries.len() < MOST) {
-        training.settle(patience)?;
+    while recoveries.is_empty() || (begun.elapsed() < budget.length && recoveries.len() < MAX_REPEATS) {
+        training.settle(budget)?;
         let members = training.members()?;
         if recoveries.is_empty() {
             for (role, index, pid) in &members {
@@ -111,7 +111,7 @@ fn recoveries_and_memory(
         let pid = pid.context("the run has no learner to kill")?;
         let killed = Instant::now();
         kill_process(pid, Signal::KILL).context("cannot kill the learner")?;
-        recoveries.push(training.recover(killed, patience)?);
+        recoveries.push(training.recover(killed, budget)?);
     }
     Ok((recoveries, roles))
 }
@@ -137,7 +137,7 @@ impl RunFigures {
 }
 
 impl Spread {
-    /// Panics where there is nothing.
+    /// Panics if there are no times.
     fn of(times: impl Iterator<Item = Duration>) -> Self {
         let mut windows = Windows::default();
         times.for_each(|time| windows.add(time.as_secs_f64()));
@@ -196,15 +196,15 @@ impl Figures for RunFigures {
             (
                 "start to first update",
                 format!(
-                    "{} without the warm-up, target {TARGET_SECONDS}; {} starts",
+                    "{} without the warm-up, target {TARGET_SECONDS} s; {} starts",
                     self.start_seconds.show(),
                     self.starts
                 ),
             ),
             (
-                "of it",
+                "  in detail",
                 format!(
-                    "every role ready after {}\nwarm-up of {} rows {}\nfrom there to the first update {}",
+                    "every role ready after {}\nwarm-up of {} rows: {}\nfrom there to the first update {}",
                     self.ready_seconds.show(),
                     self.warm_up_rows,
                     self.warm_up_seconds.show(),
@@ -214,7 +214,7 @@ impl Figures for RunFigures {
             (
                 "killed learner to next update",
                 format!(
-                    "{}, target {TARGET_SECONDS}; {} kills\nits successor ready after {}",
+                    "{}, target {TARGET_SECONDS} s; {} kills\nits successor ready after {}",
                     self.recovery_seconds.show(),
                     self.kills,
                     self.successor_ready_seconds.show()
@@ -223,7 +223,7 @@ impl Figures for RunFigures {
             (
                 "memory of each process",
                 format!(
-                    "{}\ntarget {:.0} MB private, the replay's rows apart",
+                    "{}\ntarget {:.0} MB private, not counting the replay",
                     roles.collect::<Vec<_>>().join("\n"),
                     TARGET_BYTES as f64 / MEGABYTE
                 ),

@@ -1,10 +1,10 @@
-//! Measuring in short windows, so that a disturbance spoils some of them and not the result.
+//! Measurement in short windows, so that a disturbance affects some of them but not their median.
 
 use std::time::{Duration, Instant};
 
-/// Repeats `work` for about `length`; how often a second it was done.
+/// Repeats `work` for about `length` and returns the number of calls per second.
 pub(super) fn rate(length: Duration, mut work: impl FnMut()) -> f64 {
-    // The clock takes 30 ns to read: it is looked at every 20 µs or so, or after each piece of work that takes longer.
+    // Reading the clock takes some 30 ns, so it is read about every 20 µs, or after every call that takes longer.
     let begun = Instant::now();
     work();
     let stride = (2e-5 / begun.elapsed().as_secs_f64().max(1e-9)).clamp(1.0, 1_000.0) as u32;
@@ -20,7 +20,7 @@ pub(super) fn rate(length: Duration, mut work: impl FnMut()) -> f64 {
     }
 }
 
-/// What windows gave: the median stands for all, and the ends show how quiet the machine was.
+/// The sorted results of windows. The median is the result; the extremes show how quiet the machine was.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Windows(Vec<f64>);
 
@@ -34,7 +34,7 @@ impl Windows {
         self.0.is_empty()
     }
 
-    /// Panics where there was no window.
+    /// Panics if there is no window.
     pub(super) fn median(&self) -> f64 {
         self.0[self.0.len() / 2]
     }
@@ -47,14 +47,14 @@ impl Windows {
         self.0[self.0.len() - 1]
     }
 
-    /// For people: the median, and the ends in brackets, in `unit`s of so many.
+    /// Text for the user: the median, and the extremes in brackets, each divided by `unit`.
     pub(super) fn show(&self, unit: f64, decimals: usize) -> String {
         let [median, least, greatest] = [self.median(), self.least(), self.greatest()].map(|rate| rate / unit);
         format!("{median:.decimals$} ({least:.decimals$} to {greatest:.decimals$})")
     }
 }
 
-/// How many windows of `window` fit into the `share` of the time that a measurement has; at least one.
+/// How many windows of length `window` fit into the `share` of `whole`; at least one.
 pub(super) fn count(whole: Duration, share: f64, window: Duration) -> usize {
     (whole.as_secs_f64() * share / window.as_secs_f64()).round().max(1.0) as usize
 }
@@ -64,7 +64,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_rate_counts_all_the_work() {
+    fn a_rate_counts_every_call() {
         let mut calls = 0.0;
         let begun = Instant::now();
         let rate = rate(Duration::from_millis(20), || calls += 1.0);
@@ -72,7 +72,7 @@ mod tests {
     }
 
     #[test]
-    fn the_median_stands_in_the_middle() {
+    fn the_median_is_the_middle_of_the_sorted_rates() {
         let mut windows = Windows::default();
         [5.0, 1.0, 4.0, 2.0, 3.0].into_iter().for_each(|rate| windows.add(rate));
         assert_eq!((windows.least(), windows.median(), windows.greatest()), (1.0, 3.0, 5.0));

@@ -1,5 +1,5 @@
-//! The algorithms: the registry, and for each a file with its section of the configuration, its policy and its exploration.
-//! How each learns is the learner's.
+//! The algorithms: the registry, and for each algorithm a file with its section of the configuration, its policy and its
+//! exploration. How each learns is part of the crate `learner`.
 
 mod algorithm;
 mod behaviour;
@@ -29,19 +29,19 @@ macro_rules! registry {
         }
 
         impl Algorithm {
-            /// Each algorithm with the settings it has where nothing else is said.
+            /// Each algorithm with its default settings.
             pub fn all() -> Vec<Self> {
                 vec![$(Self::$variant(<$settings>::default())),*]
             }
 
-            /// What it is, whatever its numbers are.
+            /// The algorithm's fixed properties.
             pub fn spec(&self) -> AlgorithmSpec {
                 match self {
                     $(Self::$variant(_) => $spec),*
                 }
             }
 
-            /// Its settings, to whoever need not know which algorithm it is.
+            /// Its settings, without the type of the algorithm.
             pub fn settings(&self) -> &dyn AlgorithmSettings {
                 match self {
                     $(Self::$variant(settings) => settings),*
@@ -53,10 +53,10 @@ macro_rules! registry {
                 vec![$(describe::<$settings>($spec.name)),*]
             }
 
-            /// The algorithm of that name with the settings that its section has; `None` where there is none of that name.
+            /// Reads the section of the algorithm `name`; `None` if there is no algorithm of that name.
             ///
             /// # Errors
-            /// When a key is unknown or of the wrong type: the key, its value, and what is wrong.
+            /// When a key is unknown or of the wrong type. The error names the key and its value.
             pub fn read(name: &str, section: toml::Value) -> Option<Result<Self, toml::de::Error>> {
                 $(if name == $spec.name {
                     return Some(section::read(name, section).map(Self::$variant));
@@ -67,7 +67,7 @@ macro_rules! registry {
     };
 }
 
-// The registry: a line for each algorithm. The variant's name is that of the section (`QLearning`: `[q-learning]`).
+// The registry: a line for each algorithm. The variant in kebab case is the section's name (`QLearning`: `[q-learning]`).
 registry! {
     /// `[ddpg]` and `[exploration]`.
     Ddpg(DdpgConfig) is ddpg::SPEC;
@@ -80,7 +80,7 @@ registry! {
 }
 
 impl Default for Algorithm {
-    /// What is learned with where no algorithm has a section.
+    /// The algorithm of a configuration that has no algorithm's section.
     fn default() -> Self {
         Self::Ddpg(DdpgConfig::default())
     }
@@ -97,7 +97,7 @@ impl Algorithm {
         self.settings().gamma()
     }
 
-    /// DDPG's settings, where it is that.
+    /// The settings of DDPG, if this is DDPG.
     pub fn ddpg(&self) -> Option<&DdpgConfig> {
         match self {
             Self::Ddpg(ddpg) => Some(ddpg),
@@ -105,10 +105,10 @@ impl Algorithm {
         }
     }
 
-    /// Whether every number of its sections makes sense.
+    /// Checks every number of its sections.
     ///
     /// # Errors
-    /// For the first one that does not.
+    /// For the first invalid number.
     pub fn check(&self) -> Result<(), OutOfRange> {
         self.settings().check(self.name())
     }
@@ -116,12 +116,12 @@ impl Algorithm {
     /// How its actors act in `batch` environments like `spec`.
     ///
     /// # Errors
-    /// When it cannot control them.
+    /// When it cannot control such environments.
     pub fn behaviour(&self, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError> {
         self.settings().behaviour(self.name(), spec, batch)
     }
 
-    /// The policy that it learns in an environment like `spec`, for at most `batch` observations a call.
+    /// Its policy in an environment like `spec`, for at most `batch` observations a call.
     ///
     /// # Errors
     /// When it cannot control that environment.
@@ -129,7 +129,7 @@ impl Algorithm {
         Ok(self.behaviour(spec, batch)?.into_policy())
     }
 
-    /// What the parameters of that policy are.
+    /// The layout of that policy's parameters.
     ///
     /// # Errors
     /// When it cannot control that environment.
@@ -153,7 +153,7 @@ mod tests {
     }
 
     #[test]
-    fn each_algorithm_takes_the_spaces_it_can_control() {
+    fn each_algorithm_accepts_the_spaces_that_it_can_control() {
         let real = || Space::boxed(&[(-1.0, 1.0); 4]);
         let counted = || Space::Discrete { n: 3 };
         let takes = |observation: fn() -> Space, action: fn() -> Space| -> Vec<bool> {
@@ -178,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn the_policy_is_among_what_is_learned() {
+    fn the_learned_policy_has_as_many_parameters_as_the_policy_layout() {
         let (real, counted) = (|| Space::boxed(&[(-1.0, 1.0); 4]), || Space::Discrete { n: 3 });
         let specs = [
             spec(real(), real()),

@@ -1,5 +1,5 @@
-//! The run's configuration, as it stands in `config.toml` once everything is decided. A section is a
-//! file here, or in `algorithms/`, and each of its keys is declared there once.
+//! The run's resolved configuration, which is stored in `config.toml`. Each section has a file here or in `algorithms/`,
+//! which declares each of its keys once.
 
 mod actors;
 mod checkpoint;
@@ -32,22 +32,22 @@ use shoal_policy::PolicyError;
 use crate::algorithms::Experience;
 pub use crate::algorithms::{Algorithm, DdpgConfig, ExplorationConfig, ReinforceConfig, TabularConfig, Warmup, Weight};
 
-/// Everything a run was started with.
+/// The complete configuration of a run.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Config {
     /// Identity and length of the run.
     pub run: RunConfig,
-    /// What is controlled.
+    /// The environment.
     pub environment: EnvironmentConfig,
-    /// What the environment says of itself.
+    /// The environment's spaces and time limit, as its server describes them.
     pub spec: EnvironmentSpec,
-    /// Who explores, and in how large portions.
+    /// The actors, and the size of their chunks.
     pub actors: ActorsConfig,
-    /// What is learned, and how.
+    /// The algorithm and its settings.
     pub algorithm: Algorithm,
-    /// With what it is computed.
+    /// The learner's threads.
     pub learner: LearnerConfig,
-    /// What is remembered, and how often it is used.
+    /// The replay, and the ratio of updates to environment steps.
     pub replay: ReplayConfig,
     /// How often the policy is evaluated.
     pub evaluation: EvaluationConfig,
@@ -74,7 +74,7 @@ pub enum ConfigError {
         /// What is wrong with it, on one line.
         message: String,
     },
-    /// A value is outside what makes sense.
+    /// A value is out of range.
     #[error(transparent)]
     OutOfRange(#[from] OutOfRange),
     /// The algorithm does not fit the environment.
@@ -103,7 +103,7 @@ impl Config {
         Self::from_table(table, path.display())
     }
 
-    /// A configuration from its sections; `origin` is named when something is wrong with them.
+    /// Reads a configuration from its sections. `origin` is named in errors.
     ///
     /// # Errors
     /// When a key is unknown, of the wrong type, or out of range.
@@ -129,7 +129,7 @@ impl Config {
         (self.actors.chunk_steps * self.actors.envs) as usize
     }
 
-    /// Index of the evaluator's environment server; those of the actors have the actors' indices.
+    /// Index of the evaluator's environment server. The servers of actors have the actors' indices.
     pub fn evaluation_server(&self) -> u32 {
         self.actors.max
     }
@@ -139,12 +139,12 @@ impl Config {
         self.evaluation.episodes.min(64)
     }
 
-    /// How a transition's row is laid out.
+    /// The layout of a transition's row.
     pub fn row_layout(&self) -> RowLayout {
         RowLayout::new(self.spec.observation.width(), self.spec.action.width())
     }
 
-    /// What a chunk of transitions has room for.
+    /// The layout of a chunk of transitions.
     pub fn chunk_layout(&self) -> ChunkLayout {
         ChunkLayout {
             row: self.row_layout(),
@@ -153,13 +153,13 @@ impl Config {
         }
     }
 
-    /// Words that say where an actor stands between two chunks: in lockstep, where the environments can say their state, a
-    /// process that is killed is replaced by one that goes on with the same bits.
+    /// Words of an actor's snapshot between two chunks; 0 if there are no snapshots. Snapshots exist in lockstep runs whose
+    /// environments can save their state: the replacement of a killed process then continues with the same bits.
     pub fn actor_snapshot_words(&self) -> usize {
         let envs = self.actors.envs as usize;
         match (self.run.mode, self.spec.snapshot_words(envs)) {
             (Mode::Free, _) | (_, 0) => 0,
-            // The actor's own step, and of each environment the exploration's state and the return and length of its episode.
+            // The actor's step, and for each environment the state of its exploration and its episode's return and length.
             (Mode::Lockstep, snapshot) => {
                 let exploration = self.algorithm.settings().exploration_state_width(&self.spec);
                 snapshot + 1 + envs * (exploration + 2)
@@ -167,10 +167,10 @@ impl Config {
         }
     }
 
-    /// Whether every value makes sense, by itself and beside the others.
+    /// Checks every value, by itself and together with the others.
     ///
     /// # Errors
-    /// For the first that does not.
+    /// For the first invalid value.
     pub fn check(&self) -> Result<(), ConfigError> {
         self.run.check()?;
         environment::check_spec(&self.spec)?;
@@ -190,7 +190,7 @@ impl Config {
         Ok(self.checkpoint.check_bounds("checkpoint")?)
     }
 
-    /// What the algorithm asks of the way its transitions are collected.
+    /// Checks the algorithm's requirements on the collection of transitions.
     fn check_collection(&self) -> Result<(), OutOfRange> {
         let spec = self.algorithm.spec();
         let only = |key: &str, value: String, only: &str, why: &str| OutOfRange {
@@ -199,7 +199,7 @@ impl Config {
             expected: format!("{only}: {} {why}", spec.name),
         };
         if !spec.off_policy && self.run.mode == Mode::Free {
-            let why = "learns from what the newest policy does and from nothing older";
+            let why = "learns only from transitions of the newest policy";
             return Err(only("run.mode", "free".into(), "lockstep", why));
         }
         if spec.experience == Experience::Episodes {
@@ -232,32 +232,36 @@ mod tests {
         Config::from_table(text.parse().unwrap(), "test")
     }
 
-    const LEAST: &str = "[run]\nid = \"1a\"\n[spec]\ntime_limit = 200\nobservation.discrete.n = 16\naction.box = { low = [-2.0], high = [2.0] }\n\
+    const MINIMAL: &str = "[run]\nid = \"1a\"\n[spec]\ntime_limit = 200\nobservation.discrete.n = 16\naction.box = { low = [-2.0], high = [2.0] }\n\
         [environment]\nname = \"pendulum\"\n";
 
     #[test]
-    fn a_resolved_configuration_reads_back() {
-        let config = parse(&format!("{LEAST}start_speed = 1.0\n")).unwrap();
+    fn a_resolved_configuration_is_read_back_as_written() {
+        let config = parse(&format!("{MINIMAL}start_speed = 1.0\n")).unwrap();
         assert_eq!(parse(&config.to_toml().unwrap()).unwrap(), config);
-        assert_eq!(config.spec.state_width, 0, "where it is not written");
+        assert_eq!(config.spec.state_width, 0, "the value of a file without it");
     }
 
     #[test]
     fn unknown_keys_and_values_out_of_range_are_named() {
-        let unknown = parse(&format!("{LEAST}[ddpg]\ngama = 0.9\n")).unwrap_err().to_string();
+        let unknown = parse(&format!("{MINIMAL}[ddpg]\ngama = 0.9\n"))
+            .unwrap_err()
+            .to_string();
         assert!(
             unknown.contains("gama") && unknown.contains("gamma") && !unknown.contains('\n'),
             "{unknown}"
         );
-        let range = parse(&format!("{LEAST}[ddpg]\ngamma = 1.5\n")).unwrap_err().to_string();
+        let range = parse(&format!("{MINIMAL}[ddpg]\ngamma = 1.5\n"))
+            .unwrap_err()
+            .to_string();
         assert_eq!(range, "ddpg.gamma = 1.5: must be from 0 to 1");
-        let nan = parse(&format!("{LEAST}[ddpg]\ntau = nan\n")).unwrap_err().to_string();
+        let nan = parse(&format!("{MINIMAL}[ddpg]\ntau = nan\n")).unwrap_err().to_string();
         assert!(nan.contains("ddpg.tau = NaN"), "{nan}");
     }
 
     #[test]
-    fn the_fingerprint_follows_what_the_rows_depend_on() {
-        let base = parse(LEAST).unwrap();
+    fn the_fingerprint_depends_on_the_environment_but_not_on_the_length_of_the_run() {
+        let base = parse(MINIMAL).unwrap();
         let mut other = base.clone();
         other.run.steps += 1;
         assert_eq!(base.fingerprint(), other.fingerprint());

@@ -1,11 +1,11 @@
-//! What an evaluator leaves to its successor: the newest evaluations, so that no policy is evaluated twice, and none is missing in
-//! the records when the launcher was killed before it wrote one down.
+//! What an evaluator leaves to its successor: the newest evaluations. So no policy is evaluated twice, and no evaluation is
+//! missing in the records if the launcher is killed before it records it.
 
 use std::collections::VecDeque;
 use std::io::{self, Write};
 use std::path::Path;
 
-use shoal_base::durable::{Kind, SealError, read_sealed, seal, write_at_once};
+use shoal_base::durable::{Kind, SealError, read_sealed, seal, write_atomically_unsynced};
 use shoal_base::report::EvaluationReport;
 use shoal_channel::reports::Report;
 
@@ -15,7 +15,7 @@ const KIND: Kind = Kind {
     name: "an evaluator's state",
 };
 
-/// The newest evaluations of a run, at least as many as may be on their way to the launcher.
+/// The newest evaluations of a run: at least those that the launcher may not have received yet.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct EvaluatorState {
     evaluations: VecDeque<EvaluationReport>,
@@ -30,7 +30,7 @@ pub struct EvaluatorStateError {
 }
 
 impl EvaluatorState {
-    /// Reads the state at `path`; an empty one where there is none, or where a power loss has damaged it.
+    /// Reads the state at `path`. The state is empty if there is no file, or if a power loss has damaged it.
     ///
     /// # Errors
     /// When it cannot be read, or is of another version.
@@ -43,7 +43,7 @@ impl EvaluatorState {
             Ok(bytes) => bytes,
             Err(SealError::Io(cause)) if cause.kind() == io::ErrorKind::NotFound => return Ok(Self::default()),
             Err(SealError::Checksum) => {
-                tracing::warn!("{} is damaged: it is begun anew", path.display());
+                tracing::warn!("{} is damaged: starting with an empty one", path.display());
                 return Ok(Self::default());
             }
             Err(cause) => return Err(failed(cause)),
@@ -74,7 +74,7 @@ impl EvaluatorState {
         }
         let bytes =
             bincode::serde::encode_to_vec(&self.evaluations, bincode::config::standard()).map_err(io::Error::other)?;
-        write_at_once(path, |file| seal(KIND, file, |body| body.write_all(&bytes)))
+        write_atomically_unsynced(path, |file| seal(KIND, file, |body| body.write_all(&bytes)))
     }
 }
 
@@ -95,7 +95,7 @@ mod tests {
     }
 
     #[test]
-    fn the_newest_evaluations_read_back_bit_for_bit() {
+    fn the_newest_evaluations_are_read_back_bit_for_bit() {
         let parent = tempfile::tempdir().unwrap();
         let path = parent.path().join("evaluator.state");
         let mut state = EvaluatorState::read(&path).unwrap();
@@ -110,7 +110,7 @@ mod tests {
     }
 
     #[test]
-    fn a_damaged_state_is_begun_anew_and_another_file_refused() {
+    fn a_damaged_state_is_replaced_and_another_kind_of_file_is_refused() {
         let parent = tempfile::tempdir().unwrap();
         let path = parent.path().join("evaluator.state");
         EvaluatorState::default().add(evaluation(1), &path).unwrap();

@@ -1,12 +1,12 @@
-//! What crosses a process boundary of Shoal, or is shared by every role.
+//! Everything that crosses a process boundary of Shoal, or is shared by all roles.
 //!
 //! Its layers are packages, each of which imports those above it in this list:
 //!
-//! | package | what is in it |
+//! | package | contents |
 //! | --- | --- |
-//! | `shoal-base` | spaces, rows, reports, random streams, files that are whole or not there |
+//! | `shoal-base` | spaces, transitions, reports, random streams, files that are either complete or absent |
 //! | `shoal-channel` | the typed channels, and the replay's commit record |
-//! | `shoal-policy` | networks, and how everyone acts by a policy (imports `shoal-base` alone) |
+//! | `shoal-policy` | networks, and policies as actors and evaluator use them (imports `shoal-base` alone) |
 //! | `shoal-common` | the algorithms' settings, the configuration, the run directory |
 
 pub mod algorithms;

@@ -1,4 +1,4 @@
-//! The run directory: where everything a run leaves behind lies.
+//! The run directory, which contains all files of a run.
 
 use std::fs::{DirBuilder, File};
 use std::io::{self, ErrorKind, Write};
@@ -24,11 +24,11 @@ pub enum RunDirError {
     /// A run directory is never overwritten.
     #[error("{0} exists already; choose another directory with --run, or remove it")]
     Exists(PathBuf),
-    /// There is no run at this place.
+    /// There is no run in this directory.
     #[error("{0} is not a run directory: it has no config.toml")]
     NotARun(PathBuf),
-    /// Another launcher works in it.
-    #[error("the run in {0} is going on: a launcher holds its lock; end that one first")]
+    /// Another launcher is running the run.
+    #[error("the run in {0} is already running: a launcher holds its lock; end that one first")]
     Busy(PathBuf),
     /// The system refused.
     #[error("cannot {action} {path}: {cause}")]
@@ -42,41 +42,41 @@ pub enum RunDirError {
     },
 }
 
-/// Held by the launcher for as long as the run goes on; released by the system when the launcher dies.
+/// The lock of a run. The launcher holds it while the run is running; the system releases it when the launcher dies.
 #[derive(Debug)]
 pub struct RunLock {
     _file: File,
 }
 
 impl RunDir {
-    /// Makes a new, empty run directory, readable by its owner alone.
+    /// Creates a new, empty run directory, accessible to its owner alone.
     ///
     /// # Errors
-    /// When something is at `path` already, or it cannot be made.
+    /// When `path` exists already, or cannot be created.
     pub fn create(path: &Path) -> Result<Self, RunDirError> {
         let io = |action, path: &Path| {
             let path = path.to_owned();
             move |cause| RunDirError::Io { action, path, cause }
         };
         if let Some(parent) = path.parent() {
-            std::fs::create_dir_all(parent).map_err(io("make the directory", parent))?;
+            std::fs::create_dir_all(parent).map_err(io("create the directory", parent))?;
         }
         DirBuilder::new()
             .mode(0o700)
             .create(path)
             .map_err(|cause| match cause.kind() {
                 ErrorKind::AlreadyExists => RunDirError::Exists(path.to_owned()),
-                _ => io("make the run directory", path)(cause),
+                _ => io("create the run directory", path)(cause),
             })?;
-        // Roles are started with this path and may have another working directory.
+        // The path is absolute, because roles may have another working directory.
         let path = std::fs::canonicalize(path).map_err(io("resolve", path))?;
         Ok(Self { path })
     }
 
-    /// Makes the first free one of `<parent>/<name>-1`, `<parent>/<name>-2`, …
+    /// Creates the first of `<parent>/<name>-1`, `<parent>/<name>-2`, … that does not exist yet.
     ///
     /// # Errors
-    /// When the directory cannot be made.
+    /// When the directory cannot be created.
     pub fn create_next(parent: &Path, name: &str) -> Result<Self, RunDirError> {
         let mut n = 1_u64;
         loop {
@@ -87,12 +87,12 @@ impl RunDir {
         }
     }
 
-    /// The run directory that is to be at `path`: nothing is made, and nothing looked at.
+    /// A run directory that does not exist yet. The file system is neither read nor changed.
     pub fn planned(path: &Path) -> Self {
         Self { path: path.into() }
     }
 
-    /// An existing run directory.
+    /// Opens an existing run directory.
     ///
     /// # Errors
     /// When there is no run in it.
@@ -119,20 +119,20 @@ impl RunDir {
             cause,
         };
         let file = File::open(&self.path).map_err(io)?;
-        // Somebody who only looks whether the run goes on holds the lock for a moment.
+        // A process that only checks whether the run is running holds the lock for a moment.
         match file_lock::lock(&file, Duration::from_millis(200)).map_err(io)? {
             true => Ok(RunLock { _file: file }),
             false => Err(RunDirError::Busy(self.path.clone())),
         }
     }
 
-    /// Whether a launcher works in it.
+    /// Whether a launcher is running the run.
     ///
     /// # Errors
-    /// When the system refuses to tell.
-    pub fn goes_on(&self) -> Result<bool, RunDirError> {
+    /// When the state of the lock cannot be determined.
+    pub fn is_running(&self) -> Result<bool, RunDirError> {
         let io = |cause| RunDirError::Io {
-            action: "look at the lock of",
+            action: "check the lock of",
             path: self.path.clone(),
             cause,
         };
@@ -140,10 +140,10 @@ impl RunDir {
         file_lock::is_locked(&file).map_err(io)
     }
 
-    /// What tells it from its copies.
+    /// The key that distinguishes the directory from its copies.
     ///
     /// # Errors
-    /// When the system refuses to tell.
+    /// When the directory cannot be inspected.
     pub fn key(&self) -> Result<RunKey, RunDirError> {
         let metadata = std::fs::metadata(&self.path).map_err(|cause| RunDirError::Io {
             action: "inspect",
@@ -159,12 +159,12 @@ impl RunDir {
     /// The resolved configuration.
     ///
     /// # Errors
-    /// When it is missing or damaged.
+    /// When it is missing or invalid.
     pub fn config(&self) -> Result<Config, ConfigError> {
         Config::load(&self.config_file())
     }
 
-    /// Writes the configuration, whole or not at all. For the launcher alone.
+    /// Writes the configuration atomically. Only the launcher calls this.
     ///
     /// # Errors
     /// When it cannot be written.
@@ -215,17 +215,17 @@ impl RunDir {
         self.checkpoints().join("evaluator.state")
     }
 
-    /// `policies`: every policy that was evaluated, where those are kept.
+    /// `policies/`: every evaluated policy, if `evaluation.keep_policies` is set.
     pub fn policies(&self) -> PathBuf {
         self.path.join("policies")
     }
 
-    /// `policies/<steps>.policy`: the one that was learned from so many environment steps.
+    /// `policies/<steps>.policy`: the policy that was learned from this many environment steps.
     pub fn evaluated_policy(&self, env_steps: u64) -> PathBuf {
         self.policies().join(format!("{env_steps:012}.policy"))
     }
 
-    /// `checkpoints/last.policy`: the policy the learner ended with.
+    /// `checkpoints/last.policy`: the learner's last policy.
     pub fn last_policy(&self) -> PathBuf {
         self.checkpoints().join("last.policy")
     }
@@ -245,17 +245,17 @@ impl RunDir {
         self.path.join("learner.csv")
     }
 
-    /// `incidents.csv`: what became of processes on the way.
+    /// `incidents.csv`: starts, ends and failures of processes.
     pub fn incidents(&self) -> PathBuf {
         self.path.join("incidents.csv")
     }
 
-    /// `tensorboard/`: the same as event files.
+    /// `tensorboard/`: the same records as TensorBoard event files.
     pub fn tensorboard(&self) -> PathBuf {
         self.path.join("tensorboard")
     }
 
-    /// `incarnations`: how many processes were ever started for the run, written down before each of them is.
+    /// `incarnations`: the number of processes started for the run so far, written before each start.
     pub fn incarnations(&self) -> PathBuf {
         self.path.join("incarnations")
     }
@@ -265,17 +265,17 @@ impl RunDir {
         self.path.join("outcome.json")
     }
 
-    /// `shoal.log`: what every process had to say.
+    /// `shoal.log`: the log of all processes.
     pub fn log(&self) -> PathBuf {
         self.path.join("shoal.log")
     }
 
-    /// `config/iceoryx2.toml`: where the run lies in shared memory, for programs that are not this one.
+    /// `config/iceoryx2.toml`: the configuration with which other iceoryx2 programs find the run in shared memory.
     pub fn iceoryx2_config(&self) -> PathBuf {
         self.path.join("config/iceoryx2.toml")
     }
 
-    /// `learning-curve.svg`: evaluation returns over time.
+    /// `learning-curve.svg`: mean evaluation returns over environment steps.
     pub fn learning_curve(&self) -> PathBuf {
         self.path.join("learning-curve.svg")
     }
@@ -286,7 +286,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_run_directory_is_never_overwritten_and_has_one_launcher() {
+    fn a_run_directory_is_never_overwritten_and_has_only_one_launcher() {
         let parent = tempfile::tempdir().unwrap();
         let first = RunDir::create_next(parent.path(), "pendulum").unwrap();
         let second = RunDir::create_next(parent.path(), "pendulum").unwrap();

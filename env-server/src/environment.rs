@@ -1,4 +1,4 @@
-//! The environments that there are.
+//! The environments, and how they are made by name.
 
 pub mod angle;
 pub mod cart_pole;
@@ -16,61 +16,62 @@ use serde::{Serialize, de::DeserializeOwned};
 use shoal_base::section::{self, Key};
 pub use signal::{Goal, Picture, Signal, Source};
 
-/// Every environment: its name, and how it is made from its parameters. A new one is its file, its `mod` line above and
-/// its line here.
-const ENVIRONMENTS: &[(&str, Maker)] = &[
-    ("pendulum", |parameters| made(parameters, pendulum::Pendulum::new)),
-    ("point-mass", |parameters| made(parameters, point_mass::PointMass::new)),
-    ("cart-pole", |parameters| made(parameters, cart_pole::CartPole::new)),
+/// Every environment: its name, and how it is made from its parameters. A new one needs its file, a `mod` line above
+/// and a line here.
+const ENVIRONMENTS: &[(&str, Builder)] = &[
+    ("pendulum", |parameters| build(parameters, pendulum::Pendulum::new)),
+    ("point-mass", |parameters| build(parameters, point_mass::PointMass::new)),
+    ("cart-pole", |parameters| build(parameters, cart_pole::CartPole::new)),
     ("frozen-lake", |parameters| {
-        made(parameters, frozen_lake::FrozenLake::new)
+        build(parameters, frozen_lake::FrozenLake::new)
     }),
 ];
 
-/// The names that `make` and `resolve` know.
+/// The names that `make` and `resolve` accept.
 pub fn names() -> impl Iterator<Item = &'static str> {
     ENVIRONMENTS.iter().map(|(name, _)| *name)
 }
 
-/// The environment of this name. Parameters that are not given have their defaults.
+/// Makes the environment of this name. Parameters that are not given have their defaults.
 pub fn make(name: &str, parameters: &toml::Table) -> Result<Box<dyn Environment>, EnvironmentError> {
     find(name, parameters).map(|made| made.environment)
 }
 
-/// All parameters of the environment of this name, defaults filled in: what `make` makes the same environment from.
+/// All parameters of the environment of this name, with defaults filled in. `make` makes the same environment from
+/// them.
 pub fn resolve(name: &str, parameters: &toml::Table) -> Result<toml::Table, EnvironmentError> {
     find(name, parameters).map(|made| made.parameters)
 }
 
-/// What there is to know of each parameter of the environment of this name.
+/// Describes each parameter of the environment of this name.
 pub fn explain(name: &str) -> Result<Vec<Key>, EnvironmentError> {
     find(name, &toml::Table::new()).map(|made| (made.explain)())
 }
 
-struct Made {
+struct Built {
     environment: Box<dyn Environment>,
     parameters: toml::Table,
     explain: fn() -> Vec<Key>,
 }
 
-type Maker = fn(&toml::Table) -> Result<Made, String>;
+type Builder = fn(&toml::Table) -> Result<Built, String>;
 
-fn find(name: &str, parameters: &toml::Table) -> Result<Made, EnvironmentError> {
-    let Some((environment, maker)) = ENVIRONMENTS.iter().find(|(known, _)| *known == name) else {
+fn find(name: &str, parameters: &toml::Table) -> Result<Built, EnvironmentError> {
+    let Some((environment, builder)) = ENVIRONMENTS.iter().find(|(known, _)| *known == name) else {
         let (name, known) = (name.to_owned(), names().collect::<Vec<_>>().join(", "));
         return Err(EnvironmentError::UnknownName { name, known });
     };
-    maker(parameters).map_err(|reason| EnvironmentError::Parameters { environment, reason })
+    builder(parameters).map_err(|reason| EnvironmentError::Parameters { environment, reason })
 }
 
-fn made<P: Serialize + DeserializeOwned + JsonSchema, E: Environment + 'static>(
+fn build<P: Serialize + DeserializeOwned + JsonSchema, E: Environment + 'static>(
     parameters: &toml::Table,
     new: impl FnOnce(P) -> Result<E, OutOfRange>,
-) -> Result<Made, String> {
-    let read: P = parameters.clone().try_into().map_err(|e| error::for_people(&e))?;
+) -> Result<Built, String> {
+    let read: P = parameters.clone().try_into().map_err(|e| error::one_line(&e))?;
     let parameters = toml::Table::try_from(&read).map_err(|e| e.to_string())?;
     let environment = Box::new(new(read).map_err(|e| e.to_string())?);
-    Ok(Made {
+    Ok(Built {
         environment,
         parameters,
         explain: section::keys::<P>,
@@ -97,7 +98,7 @@ mod tests {
     }
 
     #[test]
-    fn every_environment_observes_what_its_spec_says() {
+    fn every_environment_observes_within_its_spec() {
         for name in names() {
             let mut environment = make(name, &toml::Table::new()).unwrap();
             let spec = environment.spec();
@@ -124,12 +125,12 @@ mod tests {
     }
 
     #[test]
-    fn every_signal_has_a_key_of_its_own_and_a_number_it_comes_from() {
+    fn every_signal_has_a_unique_key_and_a_valid_source() {
         for name in names() {
             let environment = make(name, &toml::Table::new()).unwrap();
             let spec = environment.spec();
             let signals = environment.signals();
-            let (seen, done) = (spec.observation.width(), spec.action.width());
+            let (observation, action) = (spec.observation.width(), spec.action.width());
             for (i, Signal { key, label, source, .. }) in signals.iter().enumerate() {
                 assert!(!key.is_empty() && !label.is_empty(), "{name}");
                 assert!(
@@ -139,14 +140,14 @@ mod tests {
                 );
                 assert!(
                     !["reward", "return"].contains(&key.as_str()),
-                    "{name}: {key} is a signal that every environment has"
+                    "{name}: {key} is reserved"
                 );
                 assert!(signals[..i].iter().all(|other| other.key != *key), "{name}: {key}");
                 assert!(
                     match *source {
-                        Source::Observation(i) => i < seen,
-                        Source::Action(i) => i < done,
-                        Source::Angle { cos, sin } => cos < seen && sin < seen,
+                        Source::Observation(i) => i < observation,
+                        Source::Action(i) => i < action,
+                        Source::Angle { cos, sin } => cos < observation && sin < observation,
                     },
                     "{name}: {key}"
                 );
@@ -154,9 +155,9 @@ mod tests {
             for key in environment.picture().keys() {
                 let signal = signals.iter().find(|signal| signal.key == *key);
                 assert!(signal.is_some(), "{name}: its picture needs a signal `{key}`");
-                let scale = environment.picture().scales().contains(key);
+                let needs_range = environment.picture().scales().contains(key);
                 assert!(
-                    !scale || signal.unwrap().range(&spec).is_some(),
+                    !needs_range || signal.unwrap().range(&spec).is_some(),
                     "{name}: its picture needs a range of `{key}`"
                 );
             }
@@ -180,7 +181,7 @@ mod tests {
     }
 
     #[test]
-    fn an_unknown_name_is_told_the_known_ones() {
+    fn an_unknown_name_is_answered_with_the_known_ones() {
         let message = refusal("pendulums", "");
         let known = names().collect::<Vec<_>>().join(", ");
         assert_eq!(

@@ -1,4 +1,4 @@
-//! The environments, and the server that steps a vector of them. Knows nothing of learning.
+//! The environments, and the server that steps a vector of them. It does not depend on how anything is learned.
 
 pub mod environment;
 pub mod server;

@@ -7,10 +7,10 @@ use shoal_channel::{ChannelError, HeartbeatSender};
 
 use crate::vector::{Start, VectorEnvironment};
 
-/// Answers requests until `stop`; evaluation episodes start as `seed` says.
+/// Answers requests until `stop`. `seed` determines the evaluation episodes.
 ///
 /// # Errors
-/// When the channel does not work. A request that makes no sense is refused and logged, not an error.
+/// When the channel fails. An invalid request is refused and logged; it is not an error.
 pub fn serve(
     environments: &mut VectorEnvironment,
     port: &EnvironmentPort,

@@ -1,4 +1,4 @@
-//! A vector of environments stepped in lockstep, with time limit, autoreset, counted random streams and
+//! A vector of environments that are stepped together, with time limits, automatic resets, numbered random streams and
 //! snapshots.
 
 mod snapshot;
@@ -9,22 +9,22 @@ use shoal_channel::environment::StepBlocks;
 
 use crate::environment::{Environment, EnvironmentError, RequestError, make};
 
-/// Bits of a stream's number that count episodes; the ones above number the environment.
+/// The low bits of a stream's number are the episode, the bits above them the environment.
 const EPISODE_BITS: u32 = 40;
 
 /// `count` environments of one kind, each in its own episode.
 ///
-/// All random numbers of training episode k of environment e come from stream (e, k) of
-/// `stream(seed, Environment, server, incarnation)`, those of evaluation episode k from `stream(seed, Evaluation, k, 0)`:
-/// an episode is reached by its counters, whatever was run before.
+/// All random numbers of training episode k of environment e come from stream (e, k) of `stream(seed, Environment,
+/// server, incarnation)`, those of evaluation episode k from `stream(seed, Evaluation, k, 0)`: these numbers alone
+/// determine an episode, not what was run before it.
 pub struct VectorEnvironment {
     spec: EnvironmentSpec,
     training: Stream,
     evaluation_seed: Option<u64>,
     running: Vec<Running>,
     action: Vec<f64>,
-    /// Takes restored states first, so that a refused one changes nothing.
-    trial: Box<dyn Environment>,
+    /// Tries states before they are restored, so that a refused one changes nothing.
+    scratch: Box<dyn Environment>,
 }
 
 struct Running {
@@ -38,25 +38,25 @@ struct Running {
 /// Where the environments start.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Start<'a> {
-    /// Each in its next training episode. The first is 0; later resets and autoresets count on.
+    /// Each in its next training episode. Episodes are counted from 0, across resets and automatic resets.
     Next,
-    /// Environment e in training episode `episodes[e]`, below 2⁴⁰; it counts on from there.
+    /// Environment e in training episode `episodes[e]`, below 2⁴⁰; its later episodes are counted from there.
     Episodes(&'a [u64]),
-    /// Environment e in evaluation episode `first` + e. At its end it goes on with the episode E later (E environments),
-    /// so that the E together run every episode from `first` on once.
+    /// Environment e in evaluation episode `first` + e. Of E environments, each continues with the episode E later, so
+    /// that together they run every episode from `first` on exactly once.
     Evaluation {
         /// Seed of the evaluation, not necessarily the run's.
         seed: u64,
         /// Number of the first episode.
         first: u64,
     },
-    /// Environment e in the physical state `states[e]` of E states in a row; at its end it goes on with training episodes.
+    /// Environment e in state e of E concatenated physical states. Training episodes follow.
     States(&'a [f64]),
 }
 
 impl VectorEnvironment {
-    /// `count` (below 2²⁴) environments that `make` makes of `name` and `parameters`, for the server of this index and
-    /// incarnation. `reset` comes before the first `step`.
+    /// Makes `count` (below 2²⁴) environments from `name` and `parameters`, for the server of this index and
+    /// incarnation. `reset` must be called before the first `step`.
     pub fn new(
         name: &str,
         parameters: &toml::Table,
@@ -65,8 +65,8 @@ impl VectorEnvironment {
         server: u64,
         incarnation: u64,
     ) -> Result<Self, EnvironmentError> {
-        let trial = make(name, parameters)?;
-        let spec = trial.spec();
+        let scratch = make(name, parameters)?;
+        let spec = scratch.spec();
         let training = stream(seed, Purpose::Environment, server, incarnation);
         let running = |_| {
             let environment = make(name, parameters)?;
@@ -84,7 +84,7 @@ impl VectorEnvironment {
             evaluation_seed: None,
             spec,
             training,
-            trial,
+            scratch,
         })
     }
 
@@ -93,15 +93,15 @@ impl VectorEnvironment {
         &self.spec
     }
 
-    /// How many environments there are: E.
+    /// The number of environments, E.
     pub fn count(&self) -> usize {
         self.running.len()
     }
 
     /// Starts an episode in every environment and writes the E first observations.
     ///
-    /// After an error over counts nothing has changed. After a refused state the episodes are undefined until the next
-    /// successful reset. Panics unless `observations` has E × observation width numbers.
+    /// A wrong count changes nothing. After a refused state the episodes are undefined until the next successful reset.
+    /// Panics unless `observations` has E × observation width numbers.
     pub fn reset(&mut self, start: Start<'_>, observations: &mut [f32]) -> Result<(), RequestError> {
         let count = self.running.len();
         assert_eq!(
@@ -132,7 +132,7 @@ impl VectorEnvironment {
         };
         let width = self.spec.observation.width();
         for (e, observation) in observations.chunks_exact_mut(width).enumerate() {
-            self.begin(e);
+            self.begin_episode(e);
             if let Start::States(states) = start {
                 let width = states.len() / count;
                 self.running[e].environment.reset_to(&states[e * width..][..width])?;
@@ -142,11 +142,12 @@ impl VectorEnvironment {
         Ok(())
     }
 
-    /// Takes one action in every environment (E actions in a row), and starts the next episode where one has ended.
+    /// Steps each environment with its action (E actions, concatenated), and starts the next episode where one has
+    /// ended.
     ///
-    /// An action that is NaN, infinite, or no index of a discrete action is refused before anything has changed: it means
-    /// that a policy diverges, which clipping would hide. A finite one outside its box is clipped by the environment.
-    /// Panics unless the slices of `out` have the lengths that `StepBlocks` gives them.
+    /// An action that is NaN, infinite or not an index of a discrete action is refused and changes nothing: clipping
+    /// would hide that a policy diverges. The environment clips a finite action outside its box. Panics unless the
+    /// slices of `out` have the lengths that `StepBlocks` gives them.
     pub fn step(&mut self, actions: &[f32], out: StepBlocks<'_>) -> Result<(), RequestError> {
         self.check(actions)?;
         let width = self.spec.observation.width();
@@ -182,7 +183,7 @@ impl VectorEnvironment {
             running.environment.observe(next_observation);
             let observation = &mut observations[e * width..][..width];
             if step.terminated || out_of_time {
-                self.begin(e);
+                self.begin_episode(e);
                 self.running[e].environment.observe(observation);
             } else {
                 observation.copy_from_slice(next_observation);
@@ -192,7 +193,7 @@ impl VectorEnvironment {
     }
 
     /// Starts the next episode of environment `e`.
-    fn begin(&mut self, e: usize) {
+    fn begin_episode(&mut self, e: usize) {
         let stride = self.running.len() as u64;
         let running = &mut self.running[e];
         match self.evaluation_seed {

@@ -1,4 +1,4 @@
-//! Parameters that nobody should have written: an environment that works, or one line.
+//! Arbitrary parameters give an environment that works, or an error of one line.
 
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
 
@@ -7,7 +7,7 @@ use shoal_base::stream::{Purpose, stream};
 use shoal_env_server::environment::{make, names, resolve};
 use toml::{Table, Value};
 
-fn anything() -> impl Strategy<Value = Value> {
+fn any_value() -> impl Strategy<Value = Value> {
     let leaf = prop_oneof![
         any::<i64>().prop_map(Value::Integer),
         (-2..3_i64).prop_map(Value::Integer),
@@ -28,7 +28,7 @@ fn anything() -> impl Strategy<Value = Value> {
     })
 }
 
-/// Every parameter of every environment, and one of none.
+/// A parameter of any environment, or an unknown one.
 fn key() -> impl Strategy<Value = String> {
     let known = names().flat_map(|name| resolve(name, &Table::new()).unwrap().into_iter().map(|(key, _)| key));
     let known: Vec<String> = known
@@ -41,9 +41,9 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 3000, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
-    fn any_parameters_make_an_environment_that_works_or_are_refused_in_one_line(
+    fn any_parameters_make_a_working_environment_or_are_refused_in_one_line(
         name in prop::sample::select(names().collect::<Vec<_>>()),
-        given in prop::collection::btree_map(key(), anything(), 0..4),
+        given in prop::collection::btree_map(key(), any_value(), 0..4),
         actions in prop::collection::vec(any::<f64>(), 20),
     ) {
         let given: Table = given.into_iter().collect();

@@ -1,4 +1,4 @@
-//! The learning methods: what one is ([`algorithm`]), which there are ([`registry`]), and each of them in a file.
+//! The learning methods: their interface ([`algorithm`]), their list ([`registry`]), and a file for each of them.
 
 pub mod algorithm;
 pub mod ddpg;

@@ -1,5 +1,5 @@
-//! The learner: what it computes with ([`networks`]), what it learns from ([`replay`]), how it learns ([`algorithms`]), and
-//! the process that does so ([`process`]). Each imports from those before it and from none after it.
+//! The learner: its networks ([`networks`]), the replay ([`replay`]), the learning methods ([`algorithms`]) and the
+//! process that runs them ([`process`]). Each of these modules imports only from those named before it.
 
 pub mod algorithms;
 pub mod networks;

@@ -1,4 +1,4 @@
-//! What a network's update is computed with: first weights, passes forward and backward, products, Adam, and threads.
+//! The parts of a gradient step: initial weights, forward and backward passes, products, Adam, and threads.
 
 pub mod adam;
 pub mod aligned;

@@ -22,7 +22,8 @@ use shoal_common::stop::Stop;
 use self::learner::Learner;
 pub use self::settings::{LearnerError, LearnerSettings, SizeError, disk_bytes};
 
-/// Learns until the run's steps are taken and learned from, or until `stop`; either way the state is saved.
+/// Learns until all of the run's environment steps are collected and learned from, or until `stop`. Saves its state in
+/// both cases.
 ///
 /// # Errors
 /// When a channel, the replay or a checkpoint cannot be used, or learning diverges.
@@ -36,7 +37,7 @@ pub fn learn(domain: &Domain, settings: &LearnerSettings, stop: &Stop) -> Result
         Ok(()) => learner.finish(),
         Err(Exit::Stopped) => {
             if settings.config.run.mode == Mode::Free {
-                learner.take_the_last()?;
+                learner.take_last_chunks()?;
             }
             learner.finish()
         }

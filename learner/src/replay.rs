@@ -1,9 +1,9 @@
-//! The replay: a ring of rows in a mapped file, written by the learner alone and sampled in place.
+//! The replay: a ring of rows in a mapped file. Only the learner writes it, and it samples rows in place.
 //!
 //! Rows are numbered in the order they are committed, from 0, for the life of the file. A chunk becomes part of the
 //! replay in three steps that cannot be taken out of order: [`Replay::begin`], [`Reserved::fill`], [`Filled::commit`].
-//! A process killed between any two instructions leaves the last committed state. `ARCHITECTURE.md`, "The replay
-//! file", has the layout, the invariants and what survives a power loss.
+//! A process that is killed between any two instructions leaves the last committed state. `docs/REPLAY_FORMAT.md` has
+//! the layout, the invariants and what survives a power loss.
 
 mod append;
 mod check;

@@ -1,4 +1,4 @@
-//! A policy as other programs read it: what there is to tell of it, whatever the form of the file.
+//! Export of policies for other programs, independent of the file format.
 
 mod onnx;
 mod tensors;
@@ -12,22 +12,22 @@ use shoal_common::policy_file::PolicyFile;
 use shoal_common::space::Space;
 use shoal_run::rollout::policy_layout;
 
-/// A policy without anything of ours that it would need to run.
+/// A policy in a form that needs no part of Shoal to run.
 #[derive(Clone, Debug)]
 pub struct Portable {
     body: Body,
-    /// What it is and where it comes from, by name; a list is written as JSON.
-    about: BTreeMap<String, String>,
+    /// Describes the policy and its origin; the file contains it as key-value pairs. Lists are written as JSON.
+    metadata: BTreeMap<String, String>,
 }
 
-/// What an observation goes through.
+/// The computation from an observation to the outputs.
 #[derive(Clone, Debug)]
 enum Body {
     /// DDPG's μ: the network, tanh, and the scaling to the range of the actions.
     Actions { network: Network, range: ActionRange },
     /// REINFORCE's π: the network, and softmax.
     Probabilities { network: Network },
-    /// Action-values Q(s, a), state after state.
+    /// Action-values Q(s, a), state by state.
     Table {
         states: usize,
         actions: usize,
@@ -35,24 +35,24 @@ enum Body {
     },
 }
 
-/// Layers one after the other, with the activation between them.
+/// A sequence of layers, with the activation between them.
 #[derive(Clone, Debug)]
 struct Network {
     activation: Activation,
     layers: Vec<Dense>,
 }
 
-/// A layer as PyTorch's `Linear` keeps it: y = W x + b.
+/// A layer in the form of PyTorch's `Linear`: y = W x + b.
 #[derive(Clone, Debug)]
 struct Dense {
     inputs: usize,
-    /// W, outputs × inputs, row after row.
+    /// W, outputs × inputs, in row-major order.
     weights: Vec<f32>,
     biases: Vec<f32>,
 }
 
 impl Portable {
-    /// The policy in `file`, which is that of a run of `config`; `which` is its name in the run.
+    /// The policy in `file`, from a run with configuration `config`. `which` is its name in the run: "best" or "last".
     pub fn new(config: &Config, file: &PolicyFile, which: &str) -> anyhow::Result<Self> {
         let body = match policy_layout(config)? {
             PolicyLayout::Deterministic(network) => Body::Actions {
@@ -68,8 +68,8 @@ impl Portable {
                 values: file.parameters.clone(),
             },
         };
-        let about = about(config, file, which, &body)?;
-        Ok(Self { body, about })
+        let metadata = metadata(config, file, which, &body)?;
+        Ok(Self { body, metadata })
     }
 
     /// The bytes of an ONNX model.
@@ -88,9 +88,9 @@ impl Network {
         let layers = layout.layers(parameters).zip(layout.layer_sizes());
         let dense = layers.map(|(layer, (inputs, outputs))| Dense {
             inputs,
-            // Ours are column after column.
+            // `NetworkLayout` stores weights in column-major order.
             weights: (0..outputs * inputs)
-                .map(|at| layer.weights[(at % inputs) * outputs + at / inputs])
+                .map(|i| layer.weights[(i % inputs) * outputs + i / inputs])
                 .collect(),
             biases: layer.biases.to_vec(),
         });
@@ -101,42 +101,42 @@ impl Network {
     }
 }
 
-fn about(config: &Config, file: &PolicyFile, which: &str, body: &Body) -> anyhow::Result<BTreeMap<String, String>> {
-    let mut about = BTreeMap::from([
+fn metadata(config: &Config, file: &PolicyFile, which: &str, body: &Body) -> anyhow::Result<BTreeMap<String, String>> {
+    let mut metadata = BTreeMap::from([
         ("environment".to_owned(), config.environment.name.clone()),
         ("algorithm".to_owned(), config.algorithm.name().to_owned()),
         ("policy".to_owned(), which.to_owned()),
         ("policy_version".to_owned(), file.version.to_string()),
         ("environment_steps".to_owned(), file.env_steps.to_string()),
     ]);
-    let mut tell = |name: &str, what: String| {
-        about.insert(name.to_owned(), what);
+    let mut insert = |key: &str, value: String| {
+        metadata.insert(key.to_owned(), value);
     };
     if file.episodes > 0 {
-        tell("evaluation_return", file.return_mean.to_string());
+        insert("evaluation_return", file.return_mean.to_string());
     }
     if let Body::Actions { network, .. } | Body::Probabilities { network } = body {
         let activation = match network.activation {
             Activation::Relu => "relu",
             Activation::Tanh => "tanh",
         };
-        tell("hidden_activation", activation.into());
+        insert("hidden_activation", activation.into());
     }
     match body {
         Body::Actions { .. } => {
-            tell(
+            insert(
                 "output_activation",
                 "tanh, then scaled to action_low .. action_high".into(),
             );
             if let Space::Box { low, high } = &config.spec.action {
-                tell("action_low", serde_json::to_string(low)?);
-                tell("action_high", serde_json::to_string(high)?);
+                insert("action_low", serde_json::to_string(low)?);
+                insert("action_high", serde_json::to_string(high)?);
             }
         }
-        Body::Probabilities { .. } => tell("output_activation", "softmax".into()),
-        Body::Table { .. } => tell("contents", "action values, a row for each state".into()),
+        Body::Probabilities { .. } => insert("output_activation", "softmax".into()),
+        Body::Table { .. } => insert("contents", "action values, a row for each state".into()),
     }
-    Ok(about)
+    Ok(metadata)
 }
 
 #[cfg(test)]
@@ -146,7 +146,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn weights_stand_row_after_row() {
+    fn weights_are_exported_in_row_major_order() {
         let layout = NetworkLayout::policy(3, Hidden::relu([2, 1]), 1);
         let parameters: Vec<f32> = (0..layout.parameters()).map(|i| i as f32).collect();
         let first = &Network::new(&layout, &parameters).layers[0];
@@ -157,13 +157,13 @@ mod tests {
 
 #[cfg(test)]
 mod tests_support {
-    //! Runs of every method, with policies that are no special case.
+    //! Configurations of every algorithm, with policies that are no special case.
 
     use shoal_env_server::environment::make;
 
     use super::*;
 
-    /// A configuration for each kind of policy, and a policy of it.
+    /// Configurations for each kind of policy, each with a policy for it.
     pub(super) fn policies() -> Vec<(Config, PolicyFile)> {
         let tasks = [
             "[environment]\nname = \"pendulum\"\n[ddpg]\nhidden = [40, 30]\n",
@@ -204,7 +204,7 @@ mod tests_support {
         (config, policy)
     }
 
-    /// So many observations of the environment, one after the other.
+    /// `count` observations of the environment, concatenated.
     pub(super) fn some_observations(config: &Config, count: usize) -> Vec<f32> {
         match config.spec.observation {
             Space::Discrete { n } => (0..count).map(|i| (i * 5 % n as usize) as f32).collect(),

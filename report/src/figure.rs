@@ -1,4 +1,4 @@
-//! The pictures of a run, as SVG files, and the same as PNG files.
+//! The figures of a run as SVG files, which can be converted to PNG.
 
 mod canvas;
 mod comparison;
@@ -12,12 +12,12 @@ mod pendulum;
 mod point_mass;
 mod raster;
 
-pub use comparison::{Agent, actions_beside, paths_beside};
+pub use comparison::{Agent, compare_actions, compare_paths};
 pub use episode::episode;
 pub use lake::lake;
 pub use learning_curve::learning_curve;
 pub use learning_curves::{learning_curves, quantile};
-pub use lines::{Frame, Setting, lines, lines_apart, pointwise};
+pub use lines::{Frame, Setting, lines, lines_by_setting, pointwise};
 pub use pendulum::swing_up;
 pub use point_mass::{test_runs, trajectories};
 pub use raster::{CAN_RASTERISE, rasterise};

@@ -1,4 +1,4 @@
-//! What there is to see and to take along of runs: figures, the page that can be sent, and policies for other programs.
+//! Output made from runs: figures, the self-contained HTML report, and policies exported for other programs.
 
 pub mod export;
 pub mod figure;

@@ -1,4 +1,5 @@
-//! A report that one can send: the numbers of one run or several, and a page that shows them without any network.
+//! The HTML report: the numbers of one or more runs, and the page that shows them. It is one file and loads nothing
+//! else.
 
 mod comparison;
 mod numbers;
@@ -15,12 +16,12 @@ use shoal_common::run_dir::RunDir;
 use self::comparison::Comparison;
 use self::run::Run;
 
-/// What a report begins with, and no other file.
+/// The first bytes of every report. They distinguish a report from other files.
 pub const MARK: &str = "<!doctype html>\n<!-- made by shoal report -->\n";
 
 const PAGE: &str = include_str!("page/page.html");
 const STYLE: &str = include_str!("page/page.css");
-/// In the order in which they need each other.
+/// In dependency order: a script uses only those before it.
 const SCRIPTS: [&str; 7] = [
     include_str!("page/dom.js"),
     include_str!("page/axis.js"),
@@ -31,12 +32,12 @@ const SCRIPTS: [&str; 7] = [
     include_str!("page/page.js"),
 ];
 
-/// Points of a curve of a single run; several share them, so that the page stays small.
+/// Points in a curve of a single run. Several runs share a total, so that the page stays small.
 const POINTS: usize = 800;
 const POINTS_TOGETHER: usize = 4_000;
 const FEWEST_POINTS: usize = 60;
 
-/// Episodes played of a single run; several share them.
+/// Playable episodes of a single run. Several runs share a total.
 const EPISODES: usize = 6;
 const EPISODES_TOGETHER: usize = 24;
 
@@ -50,15 +51,15 @@ pub struct Report {
     comparisons: Vec<Comparison>,
 }
 
-/// How much of each run there is room for.
+/// How much of one run the page may contain.
 #[derive(Clone, Copy, Debug)]
-struct Room {
+struct Limits {
     points: usize,
     episodes: usize,
 }
 
-impl Room {
-    /// For the run of this number among so many.
+impl Limits {
+    /// For run `number`, counted from 0, of `runs` in the report.
     fn of(number: usize, runs: usize) -> Self {
         Self {
             points: (POINTS_TOGETHER / runs).clamp(FEWEST_POINTS, POINTS),
@@ -70,13 +71,14 @@ impl Room {
     }
 }
 
-/// Reads what the runs, at least one, left behind so far. A run may be under way, or have hardly begun.
+/// Reads what the runs have recorded so far. There must be at least one. A run may still be training, or have just
+/// started.
 pub fn gather(runs: &[RunDir]) -> anyhow::Result<Report> {
     let names = run::names(runs);
     let mut gathered = Vec::new();
     for (number, (run, name)) in runs.iter().zip(names).enumerate() {
-        let room = Room::of(number, runs.len());
-        gathered.push(Run::read(run, name, room)?);
+        let limits = Limits::of(number, runs.len());
+        gathered.push(Run::read(run, name, limits)?);
     }
     let since = SystemTime::UNIX_EPOCH.elapsed();
     Ok(Report {
@@ -88,7 +90,7 @@ pub fn gather(runs: &[RunDir]) -> anyhow::Result<Report> {
 }
 
 impl Report {
-    /// Why no episode is played, and of which runs.
+    /// The reasons why runs have no playable episodes, each with the names of the runs concerned.
     pub fn not_played(&self) -> Vec<(&str, Vec<&str>)> {
         let mut reasons: Vec<(&str, Vec<&str>)> = Vec::new();
         for run in &self.runs {
@@ -103,9 +105,9 @@ impl Report {
         reasons
     }
 
-    /// The page, complete in itself.
+    /// The self-contained page.
     pub fn page(&self) -> anyhow::Result<String> {
-        // Nothing in the data may look like markup, whatever a run is called.
+        // Nothing in the data may look like markup, not even a run's name.
         let data = serde_json::to_string(self)?.replace('<', "\\u003c");
         let names: Vec<&str> = self.runs.iter().map(|run| run.name.as_str()).collect();
         let title = match names[..] {
@@ -122,7 +124,7 @@ impl Report {
     }
 }
 
-/// The template with its `{{name}}`s replaced, once: what is put in is not looked at again.
+/// Replaces every `{{name}}` of the template. Inserted text is not searched for names.
 fn filled(template: &str, parts: &[(&str, String)]) -> String {
     let mut page = String::from(MARK);
     let mut rest = template;

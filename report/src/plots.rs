@@ -1,4 +1,4 @@
-//! The figures of one run: what `shoal plot` draws, and every training at its end.
+//! The figures of one run. `shoal plot` draws them, and every training draws them at its end.
 
 mod thesis;
 
@@ -13,7 +13,7 @@ use shoal_run::rollout::Rollout;
 
 use crate::figure;
 
-/// Draws the evaluations of a run so far, and what its best policy does if there is one yet; gives the files.
+/// Draws the learning curve of a run so far and, if it has a best policy, that policy's behaviour. Returns the files.
 pub fn draw(run: &RunDir, config: &Config, out: &Path) -> anyhow::Result<Vec<PathBuf>> {
     let mut pictures = vec![out.join("learning-curve.svg")];
     figure::learning_curve(&read_evaluations(&run.evaluations())?, &pictures[0])?;
@@ -23,8 +23,9 @@ pub fn draw(run: &RunDir, config: &Config, out: &Path) -> anyhow::Result<Vec<Pat
     Ok(pictures)
 }
 
-/// Draws what the best policy does, and gives the files: the thesis's figures, or the signals of the first evaluation episode
-/// of the run's seed. Nothing where another program serves the environment: it would have to be started for this alone.
+/// Draws the behaviour of the best policy and returns the files: the thesis's figures, or the signals of the first
+/// evaluation episode of the run's seed. Draws nothing if another program serves the environment, because that program
+/// would have to be started only for this.
 fn behaviour(run: &RunDir, config: &Config, out: &Path) -> anyhow::Result<Vec<PathBuf>> {
     if !config.environment.server.is_empty() {
         return Ok(Vec::new());
@@ -84,7 +85,7 @@ mod tests {
     }
 
     #[test]
-    fn every_environment_has_its_pictures() {
+    fn every_environment_has_figures_of_its_behaviour() {
         let pendulum = files_of(small("name = \"pendulum\""));
         assert_eq!(pendulum, ["learning-curve.svg", "swing-up.svg"]);
         let point_mass = files_of(small("name = \"point-mass\"\nreward = \"r2\""));
@@ -104,7 +105,7 @@ mod tests {
     }
 
     #[test]
-    fn an_environment_of_another_program_has_its_learning_curve() {
+    fn an_environment_served_by_another_program_has_only_a_learning_curve() {
         let (mut config, parameters) = small("name = \"pendulum\"");
         config.environment.server = vec!["no-such-program".into()];
         assert_eq!(files_of((config, parameters)), ["learning-curve.svg"]);

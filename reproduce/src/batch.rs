@@ -1,4 +1,4 @@
-//! Which seeds are due, so many of them at a time, until all are through or a signal comes.
+//! Runs the seeds that have no result yet, several at a time, until all have finished or a signal arrives.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Mutex, PoisonError, mpsc};
@@ -9,15 +9,15 @@ use shoal_run::signals::Signals;
 
 use super::experiment::{Effort, Length};
 use super::folder::Folder;
-use super::order::{BatchEnding, Job, Name};
 use super::progress::Progress;
+use super::request::{BatchEnding, Job, Name};
 use super::settings::RunSettings;
-use super::training::{RunState, Trained, train};
+use super::training::{Ending, RunState, train};
 
-/// How often the live line is drawn.
-const ROUND: Duration = Duration::from_secs(1);
+/// Interval at which the live line is drawn.
+const DRAW_INTERVAL: Duration = Duration::from_secs(1);
 
-/// Seeds to bring through, in a folder.
+/// The seeds to run, and where.
 pub(super) struct Batch<'a> {
     pub(super) folder: &'a Folder,
     pub(super) effort: Effort,
@@ -25,22 +25,22 @@ pub(super) struct Batch<'a> {
     pub(super) settings: &'a BTreeMap<&'static str, RunSettings>,
 }
 
-/// What a worker tells.
+/// A message from a worker.
 enum Event {
-    Begun(Job),
-    /// A result is there.
-    Kept(Job, Length),
-    /// All of a job's results are there.
-    Through(Job),
+    Started(Job),
+    /// A result has been stored.
+    Stored(Job, Length),
+    /// All results of a job have been stored.
+    Finished(Job),
     Failed(Job, anyhow::Error),
 }
 
 impl Batch<'_> {
-    /// Brings all seeds through, `at_once` of them side by side. `write` is called whenever there is something new to
-    /// report, and at the end.
+    /// Runs all seeds, `parallel` of them at a time. `write` writes the report; it is called after each new result and
+    /// at the end.
     pub(super) fn run(
         &self,
-        at_once: usize,
+        parallel: usize,
         write: impl Fn(&BTreeMap<Name, String>) -> anyhow::Result<()>,
     ) -> anyhow::Result<BatchEnding> {
         let signals = Signals::register()?;
@@ -49,29 +49,29 @@ impl Batch<'_> {
         let queue = Mutex::new(due);
         let mut failures = BTreeMap::new();
         std::thread::scope(|scope| {
-            let (events, heard) = mpsc::channel();
-            for _ in 0..at_once {
+            let (events, receiver) = mpsc::channel();
+            for _ in 0..parallel {
                 let (events, queue, signals) = (events.clone(), &queue, &signals);
                 scope.spawn(move || self.work(queue, signals, &events));
             }
             drop(events);
             loop {
-                match heard.recv_timeout(ROUND) {
-                    Ok(Event::Begun(job)) => progress.begun(job),
-                    Ok(Event::Through(job)) => progress.through(&job),
-                    Ok(Event::Kept(job, length)) => {
-                        progress.kept(&job, length);
-                        // What cannot be written now is tried again at the end, and said then.
+                match receiver.recv_timeout(DRAW_INTERVAL) {
+                    Ok(Event::Started(job)) => progress.started(job),
+                    Ok(Event::Finished(job)) => progress.finished(&job),
+                    Ok(Event::Stored(job, length)) => {
+                        progress.stored(&job, length);
+                        // Writing is tried again at the end. An error is reported then.
                         if self.effort == Effort::Full {
                             let _ = write(&failures);
                         }
                     }
                     Ok(Event::Failed(job, error)) => {
-                        // The report may be read anywhere: it names places within the folder.
-                        let here = format!("{}/", self.folder.path().display());
-                        let said = format!("{error:#}").replace(&here, "");
-                        progress.failed(&job, &said);
-                        failures.insert(job.name(), said);
+                        // Paths in the report are relative to the folder, because the report may be read elsewhere.
+                        let prefix = format!("{}/", self.folder.path().display());
+                        let message = format!("{error:#}").replace(&prefix, "");
+                        progress.failed(&job, &message);
+                        failures.insert(job.name(), message);
                     }
                     Err(mpsc::RecvTimeoutError::Timeout) => {}
                     Err(mpsc::RecvTimeoutError::Disconnected) => break,
@@ -93,24 +93,24 @@ impl Batch<'_> {
         stages.any(|stage| !self.folder.has(job.experiment, stage, job.seed))
     }
 
-    /// Takes one job after the other until there is none, or a signal has come.
+    /// Runs one job after another until none is left or a signal has arrived.
     fn work(&self, queue: &Mutex<VecDeque<Job>>, signals: &Signals, events: &mpsc::Sender<Event>) {
         let next = || {
             let mut queue = queue.lock().unwrap_or_else(PoisonError::into_inner);
             queue.pop_front().filter(|_| signals.received().is_none())
         };
         while let Some(job) = next() {
-            // Nobody listens only where the report could not be written; then the seed is brought through all the same.
-            let _ = events.send(Event::Begun(job));
-            match self.bring_through(job, signals, events) {
-                Ok(Trained::Through) => _ = events.send(Event::Through(job)),
-                Ok(Trained::Interrupted) => return,
+            // A closed channel is no reason to stop: the results are still stored.
+            let _ = events.send(Event::Started(job));
+            match self.run_stages(job, signals, events) {
+                Ok(Ending::Finished) => _ = events.send(Event::Finished(job)),
+                Ok(Ending::Interrupted) => return,
                 Err(error) => _ = events.send(Event::Failed(job, error)),
             }
         }
     }
 
-    fn bring_through(&self, job: Job, signals: &Signals, events: &mpsc::Sender<Event>) -> anyhow::Result<Trained> {
+    fn run_stages(&self, job: Job, signals: &Signals, events: &mpsc::Sender<Event>) -> anyhow::Result<Ending> {
         let Job {
             family,
             experiment,
@@ -122,17 +122,18 @@ impl Batch<'_> {
                 continue;
             }
             let length = stage.length(self.effort);
-            let (done, all) = length.done(RunState::of(&run)?.progress());
-            if matches!(length, Length::Steps(_)) && done > all {
+            let (done, total) = length.progress(RunState::of(&run)?.progress());
+            if matches!(length, Length::Steps(_)) && done > total {
                 bail!(
-                    "{} is beyond {length}, and its result there was not kept: remove the run to begin it again",
+                    "{} has trained beyond {length} without a stored result: remove the run directory to start the \
+                     run again",
                     run.display()
                 );
             }
-            if train(experiment, self.effort, seed, length, &run, &|| signals.received())? == Trained::Interrupted {
-                return Ok(Trained::Interrupted);
+            if train(experiment, self.effort, seed, length, &run, &|| signals.received())? == Ending::Interrupted {
+                return Ok(Ending::Interrupted);
             }
-            (family.keep)(
+            (family.store_result)(
                 self.folder,
                 experiment,
                 stage,
@@ -140,8 +141,8 @@ impl Batch<'_> {
                 length,
                 &self.settings[experiment.name],
             )?;
-            let _ = events.send(Event::Kept(job, length));
+            let _ = events.send(Event::Stored(job, length));
         }
-        Ok(Trained::Through)
+        Ok(Ending::Finished)
     }
 }

@@ -1,4 +1,4 @@
-//! The pole on a cart of section 4.2: REINFORCE in the thesis's three variants, and with a baseline.
+//! CartPole (section 4.2): REINFORCE in the thesis's three variants, and with a baseline.
 
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
@@ -6,23 +6,23 @@ use shoal_common::policy::Policy;
 use shoal_common::stream::{Purpose, stream};
 use shoal_report::figure::{self, Frame, Setting};
 
-use super::album::{Album, Section};
 use super::claim::{Claim, Scope, median, percent, spread};
 use super::experiment::{Experiment, Length, Stage};
 use super::family::{Family, Policies, Results};
 use super::result::SeedResult;
+use super::section::{FigureWriter, Section};
 
-/// Episodes that the moving average of figure 4.6 is over.
+/// Number of episodes in the moving average of figure 4.6.
 const SPAN: usize = 100;
 
-/// The moving average from which the task counts as solved.
+/// The task is solved when the moving average reaches this return.
 const SOLVED: f64 = 195.0;
 
-/// Below this the performance has dropped, once the task was solved.
+/// After the task was solved, a moving average below this return is a drop in performance.
 const DROPPED: f64 = 150.0;
 
-/// A point of the curve is kept every so many episodes.
-const KEPT: usize = 10;
+/// Number of episodes between stored points of the curve.
+const CURVE_INTERVAL: usize = 10;
 
 const EPISODES: u64 = 5_000;
 
@@ -48,7 +48,7 @@ pub(super) const EXPERIMENTS: [Experiment; 4] = [
 const fn experiment(name: &'static str, settings: &'static [&'static str]) -> Experiment {
     Experiment {
         name,
-        asked_as: "cart-pole",
+        cli_name: "cart-pole",
         preset: "cart-pole",
         settings,
         quick: &["evaluation.every=500", "evaluation.final_episodes=10"],
@@ -61,18 +61,18 @@ const fn experiment(name: &'static str, settings: &'static [&'static str]) -> Ex
     }
 }
 
-/// The training's history.
+/// The history of the training.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Tests {
-    /// Episode and mean return of the last [`SPAN`] ones, every [`KEPT`] episodes.
+    /// (episode, mean return of the last [`SPAN`] episodes), every [`CURVE_INTERVAL`] episodes.
     average: Vec<(u64, f64)>,
-    /// The first episode at which the average over [`SPAN`] episodes was [`SOLVED`].
+    /// The first episode at which the average over [`SPAN`] episodes was at least [`SOLVED`].
     solved: Option<u64>,
-    /// Times the average then fell below [`DROPPED`], having been above 190 again in between.
+    /// How often the average fell below [`DROPPED`] after that. Between two drops it must have been above 190.
     drops: u32,
-    /// The share of the episodes after the first solving at which the average was below [`DROPPED`].
+    /// The share of the episodes from `solved` on at which the average was below [`DROPPED`].
     below: Option<f64>,
-    /// The policy says the same whatever it sees: all its ReLU units are dead.
+    /// Whether the last policy's scores are the same for all states, because all its ReLU units are dead.
     dead: bool,
 }
 
@@ -84,11 +84,11 @@ impl Tests {
                 last.iter().sum::<f64>() / last.len() as f64
             })
             .collect();
-        let whole = (SPAN - 1).min(averages.len());
-        let solved = averages[whole..]
+        let first_complete = (SPAN - 1).min(averages.len());
+        let solved = averages[first_complete..]
             .iter()
             .position(|it| *it >= SOLVED)
-            .map(|at| at + whole);
+            .map(|at| at + first_complete);
         let after = solved.map_or(&[][..], |at| &averages[at..]);
         let (mut drops, mut high) = (0, true);
         for average in after {
@@ -99,9 +99,15 @@ impl Tests {
             }
         }
         let low = after.iter().filter(|it| **it < DROPPED).count();
-        let kept = averages.iter().enumerate().skip(KEPT - 1).step_by(KEPT);
+        let curve = averages
+            .iter()
+            .enumerate()
+            .skip(CURVE_INTERVAL - 1)
+            .step_by(CURVE_INTERVAL);
         Self {
-            average: kept.map(|(i, it)| (i as u64 + 1, (10.0 * it).round() / 10.0)).collect(),
+            average: curve
+                .map(|(i, it)| (i as u64 + 1, (10.0 * it).round() / 10.0))
+                .collect(),
             solved: solved.map(|at| at as u64 + 1),
             drops,
             below: solved.map(|_| low as f64 / after.len() as f64),
@@ -116,7 +122,7 @@ impl Tests {
             .collect()
     }
 
-    /// Mean of the average after episode 1,000.
+    /// Mean of the moving average after episode 1,000.
     fn late(&self) -> f64 {
         let late = self
             .average
@@ -141,7 +147,7 @@ impl Family for CartPole {
         Ok(Tests::of(&returns, is_dead(policies)?))
     }
 
-    fn sections(results: &Results<Tests>, album: &Album) -> anyhow::Result<Vec<Section>> {
+    fn sections(results: &Results<Tests>, writer: &FigureWriter) -> anyhow::Result<Vec<Section>> {
         let variants = VARIANTS.map(|(name, label)| (label, results.of(name, "")));
         let settings: Vec<Setting> = variants
             .iter()
@@ -161,15 +167,16 @@ impl Family for CartPole {
             level: Some(("solved: 195", SOLVED)),
         };
         let figures = vec![
-            album.add(
+            writer.add(
                 "cart-pole-variants",
-                "Reward history, moving average over 100 episodes: median over the seeds (figure 4.6, and the baseline)",
+                "Reward history, moving average over 100 episodes: median over the seeds (figure 4.6, and the \
+                 baseline)",
                 |path| figure::lines(&frame, &settings, path),
             )?,
-            album.add(
+            writer.add(
                 "cart-pole-seeds",
-                "The same, every seed: a single run, as the thesis shows it, may be any of these (figure 4.6)",
-                |path| figure::lines_apart(&frame, &settings, path),
+                "The same for every seed; the thesis shows a single run, which may be like any of these (figure 4.6)",
+                |path| figure::lines_by_setting(&frame, &settings, path),
             )?,
         ];
         Ok(vec![Section {
@@ -182,27 +189,37 @@ impl Family for CartPole {
     }
 }
 
-const REMARK: &str = "The environment is Gymnasium's: the pole falls at ±12° or ±2.4 (the thesis's text gives the limits of the \
-    observation, ±24° and ±4.8). An episode is collected with the policy that its update starts from. The reading of \
-    Algorithm 3: without γᵗ, the mean over the episode's steps, one step of Adam an episode, weights as TensorFlow draws \
-    them (Glorot, biases zero); normalising is (G − mean) / (standard deviation + 1e-8) over one episode, so that equal \
-    returns weigh nothing; the baseline has two hidden layers of 32 units and Adam's rate 0.01. A prototype decided between \
-    the readings, 40 runs each, which no command here repeats: with the sum instead of the mean, plain returns solve the task in three of four runs, \
-    against the thesis; with γᵗ normalised returns cross 195 at episode 1,900 to 2,800, if at all; with a step of Adam at \
-    every time step nothing is learned. Only this reading gives plain returns that fail and normalised ones that cross near \
-    800. Two units in the second hidden layer are few: where both are dead from some episode on, the policy says the same \
-    whatever it sees and nothing is learned any more. Those seeds are counted as they came.";
+/// Markdown before the table of claims.
+const REMARK: &str = "\
+The environment is Gymnasium's: an episode ends when the pole is beyond ±12° or the cart beyond ±2.4. The thesis's text
+gives the bounds of the observation instead, ±24° and ±4.8. An episode is collected with the policy that its update
+starts from. Algorithm 3 was read as follows:
 
-/// Whether the last policy's scores are the same for all of many states within reach.
+- There is no factor γᵗ, the loss is the mean over the episode's steps, and there is one step of Adam per episode.
+- Weights are initialised as in TensorFlow: Glorot, biases zero.
+- Normalised returns are (G − mean) / (standard deviation + 1e-8) over one episode, so equal returns have no effect.
+- The baseline has two hidden layers of 32 units, and Adam's learning rate is 0.01.
+
+A prototype decided between the readings, with 40 runs each; no command here repeats it. Only this reading gives plain
+returns that fail and normalised returns that cross 195 near episode 800. The others contradict the thesis:
+
+- With the sum instead of the mean, plain returns solve the task in three of four runs.
+- With γᵗ, normalised returns cross 195 at episode 1,900 to 2,800, if at all.
+- With a step of Adam at every time step, nothing is learned.
+
+The second hidden layer has only two units. If both are dead from some episode on, the policy no longer depends on the
+observation, and nothing more is learned. Such seeds are counted like the others.";
+
+/// Whether the last policy has the same scores for many random states within the bounds of an episode.
 fn is_dead(policies: &Policies) -> anyhow::Result<bool> {
     const STATES: usize = 200;
     let Policy::Scored(mut scores) = policies.config.algorithm.policy(&policies.config.spec, STATES)? else {
         return Ok(false);
     };
     let mut numbers = stream(policies.config.run.seed, Purpose::Sampling, 0, 0);
-    let reach: [f32; 4] = [2.4, 2.0, 0.2, 2.0];
+    let bounds: [f32; 4] = [2.4, 2.0, 0.2, 2.0];
     let states: Vec<f32> = (0..STATES)
-        .flat_map(|_| reach.map(|most| numbers.random_range(-most..most)))
+        .flat_map(|_| bounds.map(|bound| numbers.random_range(-bound..bound)))
         .collect();
     let mut each = scores.of(&policies.last.parameters, &states);
     let first: Option<Vec<f32>> = each.next().map(Into::into);
@@ -213,7 +230,7 @@ type Seeds<'a> = &'a [SeedResult<Tests>];
 
 fn claims([plain, normalised, skipping, baseline]: [Seeds<'_>; 4]) -> Vec<Claim> {
     let solved = |seeds: Seeds<'_>| seeds.iter().filter_map(|seed| seed.tests.solved).count();
-    // A seed that never solves it has its crossing beyond all others.
+    // The median first crossing of 195. A seed that never solves the task counts as infinitely late.
     let crossing = |seeds: Seeds<'_>| -> Option<f64> {
         let mut at: Vec<f64> = seeds
             .iter()
@@ -222,7 +239,7 @@ fn claims([plain, normalised, skipping, baseline]: [Seeds<'_>; 4]) -> Vec<Claim>
         at.sort_by(f64::total_cmp);
         (!at.is_empty()).then(|| median(&at))
     };
-    let say = |at: Option<f64>| match at {
+    let episode = |at: Option<f64>| match at {
         Some(at) if at.is_finite() => format!("{at:.0}"),
         _ => "never".into(),
     };
@@ -254,7 +271,7 @@ fn claims([plain, normalised, skipping, baseline]: [Seeds<'_>; 4]) -> Vec<Claim>
             thesis: "Without normalisation the task is not even close to solved after 5,000 episodes",
             criterion: "the mean of 100 episodes never reaches 195",
             ours: format!(
-                "{} of {} seeds reach it; mean after episode 1,000: {}; dead at the end: {}",
+                "{} of {} seeds reach it; mean return after episode 1,000: {}; dead networks at the end: {}",
                 solved(plain),
                 plain.len(),
                 late(plain),
@@ -265,10 +282,10 @@ fn claims([plain, normalised, skipping, baseline]: [Seeds<'_>; 4]) -> Vec<Claim>
         },
         together(
             "With normalisation the moving average crosses 195 at about episode 800",
-            "the median over the seeds of the first crossing lies between 400 and 1,200",
+            "the median first crossing over the seeds lies between episodes 400 and 1,200",
             format!(
-                "median {}; {} of {} seeds cross; dead at the end: {}",
-                say(crossing(normalised)),
+                "median first crossing: {}; {} of {} seeds cross; dead networks at the end: {}",
+                episode(crossing(normalised)),
                 solved(normalised),
                 normalised.len(),
                 dead(normalised)
@@ -277,23 +294,24 @@ fn claims([plain, normalised, skipping, baseline]: [Seeds<'_>; 4]) -> Vec<Claim>
         ),
         Claim {
             thesis: "Performance drops when training continues beyond this point",
-            criterion: "having crossed 195, the average falls below 150 at least once",
-            ours: format!("{:.1} times in the mean over the seeds that cross", drops(normalised)),
+            criterion: "after crossing 195, the average falls below 150 at least once",
+            ours: format!("{:.1} times, in the mean over the seeds that cross", drops(normalised)),
             scope: Scope::EachSeed,
             held: solvers().map(|seed| seed.tests.drops > 0).collect(),
         },
         together(
             "Not updating where the step limit ended the episode stabilises the training",
-            "after the crossing the average is below 150 for a smaller share of the episodes, in the mean over the seeds that cross",
+            "after the crossing, a smaller share of the episodes has an average below 150, in the mean over the seeds \
+             that cross",
             format!(
-                "{} instead of {}; drops {:.1} instead of {:.1}; {} of {} seeds cross, median {}",
+                "share below 150: {} instead of {}; drops: {:.1} instead of {:.1}; {} of {} seeds cross, median {}",
                 share(below(skipping)),
                 share(below(normalised)),
                 drops(skipping),
                 drops(normalised),
                 solved(skipping),
                 skipping.len(),
-                say(crossing(skipping))
+                episode(crossing(skipping))
             ),
             below(skipping)
                 .zip(below(normalised))
@@ -303,10 +321,11 @@ fn claims([plain, normalised, skipping, baseline]: [Seeds<'_>; 4]) -> Vec<Claim>
             "A baseline would reduce the variance, and could decrease the convergence time",
             "the median first crossing is earlier than with plain returns",
             format!(
-                "median {} instead of {} (normalised: {}); {} of {} seeds cross; below 150 for {} of the time after it",
-                say(crossing(baseline)),
-                say(crossing(plain)),
-                say(crossing(normalised)),
+                "median {} instead of {} (normalised: {}); {} of {} seeds cross; share below 150 after the crossing: \
+                 {}",
+                episode(crossing(baseline)),
+                episode(crossing(plain)),
+                episode(crossing(normalised)),
                 solved(baseline),
                 baseline.len(),
                 share(below(baseline))
@@ -327,13 +346,13 @@ mod tests {
         result(&EXPERIMENTS[0], number, 100.0, Tests::of(returns, false))
     }
 
-    /// So many episodes of each return.
+    /// Returns of consecutive episodes: for each (count, value), `count` times `value`.
     fn history(parts: &[(usize, f64)]) -> Vec<f64> {
         parts.iter().flat_map(|(count, value)| vec![*value; *count]).collect()
     }
 
     #[test]
-    fn a_history_tells_when_it_was_solved_and_how_often_it_fell() {
+    fn solving_and_drops_are_found_in_a_history() {
         let returns = history(&[
             (500, 20.0),
             (400, 200.0),
@@ -343,7 +362,7 @@ mod tests {
             (450, 200.0),
         ]);
         let tests = Tests::of(&returns, false);
-        // 97 of 100 episodes at 200 and 3 at 20 are the first to have a mean of 194.6 or more.
+        // The first mean of at least 195 has 98 episodes of 200 and 2 of 20.
         assert_eq!(tests.solved, Some(598));
         assert_eq!(tests.drops, 2);
         assert!((0.2..0.5).contains(&tests.below.unwrap()), "{:?}", tests.below);
@@ -353,12 +372,12 @@ mod tests {
         assert_eq!(
             Tests::of(&history(&[(50, 200.0)]), false).solved,
             None,
-            "fewer than 100 episodes are no mean of 100"
+            "fewer than 100 episodes do not count"
         );
     }
 
     #[test]
-    fn what_the_thesis_saw_holds_and_its_opposite_does_not() {
+    fn claims_hold_for_results_like_the_thesis_and_fail_for_the_opposite() {
         let fails = history(&[(5_000, 20.0)]);
         let shaky = history(&[(750, 20.0), (1_000, 200.0), (1_000, 50.0), (2_250, 200.0)]);
         let steady = history(&[(700, 20.0), (4_300, 200.0)]);

@@ -1,38 +1,38 @@
-//! What the thesis claims, and whether it holds here.
+//! Claims of the thesis, and whether they hold here.
 
 use std::fmt::{self, Display};
 
 use super::experiment::Effort;
 
-/// A claim, checked seed by seed.
+/// A claim of the thesis, checked against results.
 #[derive(Clone, Debug)]
 pub(super) struct Claim {
     /// In the thesis's words, or close to them.
     pub(super) thesis: &'static str,
-    /// When it counts as holding for a seed.
+    /// The condition under which the claim holds.
     pub(super) criterion: &'static str,
     /// What was measured.
     pub(super) ours: String,
     pub(super) scope: Scope,
-    /// For each seed that could be checked, or once for all of them, whether it holds.
+    /// Whether the claim holds: one value for each seed that could be checked, or one for all seeds together.
     pub(super) held: Vec<bool>,
 }
 
-/// What a claim is about.
+/// What a claim is checked on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Scope {
-    /// Every seed by itself; it holds when it does for more than half of them.
+    /// Each seed separately. The claim holds if it holds for more than half of them.
     EachSeed,
-    /// The seeds together, by a mean, a median or a count.
+    /// All seeds together, by a mean, a median or a count.
     Together,
 }
 
 /// Whether a claim holds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Verdict {
-    /// A quick look checks nothing, and neither do results that are not there.
+    /// It was a quick look, or results are missing.
     NotChecked,
-    /// For more than half of the seeds.
+    /// It holds for more than half of the seeds.
     Holds {
         of: usize,
         held: usize,
@@ -41,7 +41,7 @@ pub(super) enum Verdict {
         of: usize,
         held: usize,
     },
-    /// For the seeds together.
+    /// It holds for the seeds together.
     HoldsTogether,
     FailsTogether,
 }
@@ -70,19 +70,19 @@ impl Display for Verdict {
             Self::Fails { of: 1, .. } => write!(f, "**does not hold** for the only seed"),
             Self::Holds { of, held } if of == held => write!(f, "**holds** for all {of} seeds"),
             Self::Holds { of, held } => write!(f, "**holds** for {held} of {of} seeds"),
-            Self::Fails { of, held } => write!(f, "**does not hold**: for {held} of {of} seeds"),
+            Self::Fails { of, held } => write!(f, "**does not hold**; true for {held} of {of} seeds"),
         }
     }
 }
 
-/// Numbers of several seeds as "median [least, greatest]"; of one seed just that one.
+/// Formats the values of several seeds as "median [minimum, maximum]", and a single value alone.
 pub(super) fn spread(values: impl IntoIterator<Item = f64>, decimals: usize) -> String {
     let mut values: Vec<f64> = values.into_iter().collect();
     values.sort_by(f64::total_cmp);
-    let (Some(least), Some(greatest)) = (values.first(), values.last()) else {
+    let (Some(minimum), Some(maximum)) = (values.first(), values.last()) else {
         return "—".into();
     };
-    let say = |value: f64| {
+    let format = |value: f64| {
         let text = format!("{value:.decimals$}");
         match text.strip_prefix('-') {
             Some(zero) if zero.chars().all(|c| matches!(c, '0' | '.')) => zero.to_owned(),
@@ -91,12 +91,17 @@ pub(super) fn spread(values: impl IntoIterator<Item = f64>, decimals: usize) -> 
         }
     };
     if values.len() == 1 {
-        return say(*least);
+        return format(*minimum);
     }
-    format!("{} [{}, {}]", say(median(&values)), say(*least), say(*greatest))
+    format!(
+        "{} [{}, {}]",
+        format(median(&values)),
+        format(*minimum),
+        format(*maximum)
+    )
 }
 
-/// Of sorted values, at least one.
+/// The median of sorted values. There must be at least one.
 pub(super) fn median(sorted: &[f64]) -> f64 {
     let middle = sorted.len() / 2;
     if sorted.len() % 2 == 1 {
@@ -106,7 +111,7 @@ pub(super) fn median(sorted: &[f64]) -> f64 {
     }
 }
 
-/// A share as "97 %".
+/// Formats a share, such as 0.97, as "97 %".
 pub(super) fn percent(share: f64) -> String {
     format!("{:.0} %", 100.0 * share)
 }
@@ -126,7 +131,7 @@ mod tests {
     }
 
     #[test]
-    fn more_than_half_of_the_seeds_decide() {
+    fn a_claim_holds_if_it_holds_for_more_than_half_of_the_seeds() {
         let verdict = |held: &[bool]| claim(held).verdict(Effort::Full);
         assert_eq!(verdict(&[true, true, false]), Verdict::Holds { of: 3, held: 2 });
         assert_eq!(verdict(&[true, false]), Verdict::Fails { of: 2, held: 1 });
@@ -143,12 +148,12 @@ mod tests {
         assert_eq!(verdict(&[false]).to_string(), "**does not hold** for the only seed");
         assert_eq!(
             verdict(&[false, false, true]).to_string(),
-            "**does not hold**: for 1 of 3 seeds"
+            "**does not hold**; true for 1 of 3 seeds"
         );
     }
 
     #[test]
-    fn a_spread_is_median_least_and_greatest() {
+    fn a_spread_is_median_minimum_and_maximum() {
         assert_eq!(
             spread([-150.0, -140.04, -160.0], 1),
             "\u{2212}150.0 [\u{2212}160.0, \u{2212}140.0]"

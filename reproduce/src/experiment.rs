@@ -1,16 +1,16 @@
-//! What is run: an experiment is a preset with settings, in one or more stages.
+//! An experiment is a preset with settings, run in one or more stages.
 
 use std::fmt::{self, Display};
 
 use serde::{Deserialize, Serialize};
 use shoal_run::numbers::thousands;
 
-/// How much is done.
+/// How much of each experiment is run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Effort {
-    /// What the thesis did.
+    /// As much as in the thesis.
     Full,
-    /// Just enough to see that everything works.
+    /// Just enough to show that everything works.
     Quick,
 }
 
@@ -19,32 +19,32 @@ pub enum Effort {
 pub(super) struct Experiment {
     /// Its name in the folder.
     pub(super) name: &'static str,
-    /// What it is asked for by on the command line: several that differ in a setting have one name there.
-    pub(super) asked_as: &'static str,
+    /// Its name on the command line. Experiments that differ only in a setting share one.
+    pub(super) cli_name: &'static str,
     /// The preset to train.
     pub(super) preset: &'static str,
-    /// SECTION.KEY=VALUE, beyond the preset.
+    /// Settings in addition to the preset, as SECTION.KEY=VALUE.
     pub(super) settings: &'static [&'static str],
-    /// The same, in addition, for a quick look.
+    /// Further settings for a quick look.
     pub(super) quick: &'static [&'static str],
-    /// How many seeds it has by itself.
+    /// Default number of seeds.
     pub(super) seeds: u32,
-    /// One after the other on the same run, each with more steps than the one before.
+    /// Points of the same run at which results are stored, in ascending order of length.
     pub(super) stages: &'static [Stage],
 }
 
-/// A point at which a run is looked at.
+/// A point of a run at which its result is stored.
 #[derive(Debug)]
 pub(super) struct Stage {
-    /// What the result's name ends in; empty for an experiment's first stage.
+    /// Distinguishes the results of an experiment's stages; empty for the first stage.
     pub(super) suffix: &'static str,
-    /// Since the run's beginning.
+    /// Counted from the start of the run.
     pub(super) length: Length,
-    /// The same for a quick look.
+    /// The length in a quick look.
     pub(super) quick_length: Length,
 }
 
-/// How long a run is.
+/// The length of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub(super) enum Length {
@@ -54,7 +54,7 @@ pub(super) enum Length {
     Episodes(u64),
 }
 
-/// How far a run is.
+/// The progress of a run.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct Progress {
     pub(super) steps: u64,
@@ -62,16 +62,16 @@ pub(super) struct Progress {
 }
 
 impl Length {
-    /// How much of it is done, and how much there is, in its own unit.
-    pub(super) fn done(self, progress: Progress) -> (u64, u64) {
+    /// How much of this length a run has done, and the length itself, both in its unit.
+    pub(super) fn progress(self, progress: Progress) -> (u64, u64) {
         match self {
             Self::Steps(steps) => (progress.steps, steps),
             Self::Episodes(episodes) => (progress.episodes, episodes),
         }
     }
 
-    /// As `train` and `resume` take it.
-    pub(super) fn argument(self) -> [String; 2] {
+    /// The arguments of `train` and `resume`.
+    pub(super) fn arguments(self) -> [String; 2] {
         match self {
             Self::Steps(steps) => ["--steps".into(), steps.to_string()],
             Self::Episodes(episodes) => ["--episodes".into(), episodes.to_string()],
@@ -89,7 +89,7 @@ impl Display for Length {
 }
 
 impl Experiment {
-    /// The settings of all its runs.
+    /// The settings of its runs, in addition to the preset.
     pub(super) fn settings(&self, effort: Effort) -> impl Iterator<Item = &'static str> {
         let quick: &[&str] = match effort {
             Effort::Full => &[],
@@ -98,7 +98,7 @@ impl Experiment {
         self.settings.iter().chain(quick).copied()
     }
 
-    /// Seeds, where nobody says how many.
+    /// The number of seeds if the user gives none.
     pub(super) fn seeds(&self, effort: Effort) -> u32 {
         match effort {
             Effort::Full => self.seeds,
@@ -106,7 +106,7 @@ impl Experiment {
         }
     }
 
-    /// How long a run is that is through.
+    /// The length of a finished run: that of its last stage.
     pub(super) fn length(&self, effort: Effort) -> Option<Length> {
         self.stages.last().map(|stage| stage.length(effort))
     }

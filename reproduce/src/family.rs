@@ -1,4 +1,4 @@
-//! Experiments that belong together: what is kept of a run, and what the report says of it.
+//! Families of related experiments: what is stored of a run, and what the report contains.
 
 use std::collections::BTreeMap;
 
@@ -10,42 +10,42 @@ use shoal_common::run_dir::RunDir;
 use shoal_run::evaluation::{WhichPolicy, evaluate};
 use shoal_run::recorder::{EpisodeRecord, read_episodes, read_evaluations};
 
-use super::album::{Album, Section};
 use super::experiment::{Experiment, Length, Stage};
 use super::folder::Folder;
 use super::result::{Evaluation, Header, Policy, SeedResult};
+use super::section::{FigureWriter, Section};
 use super::settings::RunSettings;
 
-/// Experiments of one kind. Adding one takes this trait and a line in [`super::FAMILIES`].
+/// A family of related experiments. A new family implements this trait and has a line in [`super::FAMILIES`].
 pub(super) trait Family {
-    /// What is kept of a run beside its evaluations: all that figures and claims need.
+    /// What is stored of a run besides its evaluations: everything that figures and claims need.
     type Tests: Serialize + DeserializeOwned;
 
-    /// What is run.
+    /// The experiments of this family.
     const EXPERIMENTS: &'static [Experiment];
 
-    /// Tries the policies of a run that has just reached the end of `stage`.
+    /// Measures a run that has just reached the end of `stage`.
     fn test(policies: &Policies, stage: &Stage) -> anyhow::Result<Self::Tests>;
 
-    /// Checks the thesis's claims and draws its figures again, from results alone.
-    fn sections(results: &Results<Self::Tests>, album: &Album) -> anyhow::Result<Vec<Section>>;
+    /// Checks the thesis's claims and draws its figures, from stored results alone.
+    fn sections(results: &Results<Self::Tests>, writer: &FigureWriter) -> anyhow::Result<Vec<Section>>;
 }
 
-/// What a run has learned.
+/// The policies of a run.
 pub(super) struct Policies {
     pub(super) config: Config,
-    /// With the best evaluation.
+    /// The policy with the best evaluation.
     pub(super) best: PolicyFile,
-    /// As the learner left it.
+    /// The policy at the end of the training.
     pub(super) last: PolicyFile,
-    /// Where its records are.
     pub(super) run: RunDir,
 }
 
 impl Policies {
-    /// The training's episodes in their order, of a run with one actor, one environment, and at most one episode in a chunk:
-    /// then a policy is behind one of them at most. A chunk that was sent and not learned from when a run was interrupted is
-    /// collected again, and its episode recorded again; and one that began when the run was over is none of it.
+    /// The training's episodes in order. This requires a run with one actor, one environment and at most one episode
+    /// per chunk, so that every episode has its own policy version. If a run is interrupted before the learner uses a
+    /// chunk, its episode is collected and recorded again; such duplicates are removed, and so are episodes beyond the
+    /// run's end.
     pub(super) fn episodes(&self) -> anyhow::Result<Vec<EpisodeRecord>> {
         let mut episodes = read_episodes(&self.run.episodes())?;
         episodes.dedup_by_key(|episode| episode.policy_version);
@@ -54,13 +54,13 @@ impl Policies {
     }
 }
 
-/// The results of a family that lie in a folder.
+/// All stored results of a family.
 pub(super) struct Results<T> {
     by_name: BTreeMap<(&'static str, &'static str), Vec<SeedResult<T>>>,
 }
 
 impl<T> Results<T> {
-    /// Those of an experiment's stage, in the order of their seeds.
+    /// The results of a stage of an experiment, ordered by seed.
     pub(super) fn of(&self, experiment: &'static str, suffix: &'static str) -> &[SeedResult<T>] {
         self.by_name.get(&(experiment, suffix)).map_or(&[], Vec::as_slice)
     }
@@ -77,27 +77,27 @@ impl<T> Results<T> {
     }
 }
 
-/// A family without its type, for lists.
+/// A [`Family`] without its type, so that a list can contain different families.
 #[derive(Debug)]
 pub(super) struct Entry {
     pub(super) experiments: &'static [Experiment],
-    /// Makes and keeps the result of a run that has reached the end of a stage.
-    pub(super) keep: fn(&Folder, &'static Experiment, &Stage, u64, Length, &RunSettings) -> anyhow::Result<()>,
-    /// What the report says, from the results in the folder.
-    pub(super) sections: fn(&Folder, &Album) -> anyhow::Result<Vec<Section>>,
+    /// Makes and stores the result of a run that has reached the end of a stage.
+    pub(super) store_result: fn(&Folder, &'static Experiment, &Stage, u64, Length, &RunSettings) -> anyhow::Result<()>,
+    /// Makes the report's sections from the results in the folder.
+    pub(super) sections: fn(&Folder, &FigureWriter) -> anyhow::Result<Vec<Section>>,
 }
 
-/// The entry of a family in a list.
+/// The [`Entry`] of a family.
 pub(super) const fn entry<F: Family>() -> Entry {
     Entry {
         experiments: F::EXPERIMENTS,
-        keep: keep::<F>,
+        store_result: store_result::<F>,
         sections: sections::<F>,
     }
 }
 
-/// Makes the result of a run that has reached the end of `stage`, and keeps it in the folder.
-fn keep<F: Family>(
+/// Makes the result of a run that has reached the end of `stage`, and stores it in the folder.
+fn store_result<F: Family>(
     folder: &Folder,
     experiment: &'static Experiment,
     stage: &Stage,
@@ -107,7 +107,7 @@ fn keep<F: Family>(
 ) -> anyhow::Result<()> {
     let run = RunDir::open(&folder.run(experiment, seed))?;
     let config = run.config()?;
-    // Said by the run itself; it was checked to be what was expected.
+    // The result's header states the settings of the run itself, so they must be the expected ones.
     RunSettings::of_run(run.path(), seed)?.check(&run.path().display().to_string(), settings)?;
     let policies = Policies {
         best: WhichPolicy::Best.read(&run, &config)?,
@@ -124,8 +124,8 @@ fn keep<F: Family>(
             evaluation: evaluate(config, &policy.parameters, episodes, config.run.seed)?,
         })
     };
-    let rows = read_evaluations(&run.evaluations())?.into_iter();
-    let mut evaluations: Vec<Evaluation> = rows
+    let mut evaluations: Vec<Evaluation> = read_evaluations(&run.evaluations())?
+        .into_iter()
         .map(|row| Evaluation {
             steps: row.env_steps,
             mean: row.return_mean,
@@ -143,12 +143,12 @@ fn keep<F: Family>(
     folder.add(experiment, stage, &result)
 }
 
-fn sections<F: Family>(folder: &Folder, album: &Album) -> anyhow::Result<Vec<Section>> {
+fn sections<F: Family>(folder: &Folder, writer: &FigureWriter) -> anyhow::Result<Vec<Section>> {
     let mut by_name = BTreeMap::new();
     for experiment in F::EXPERIMENTS {
         for stage in experiment.stages {
             by_name.insert((experiment.name, stage.suffix), folder.read(experiment, stage)?);
         }
     }
-    F::sections(&Results { by_name }, album)
+    F::sections(&Results { by_name }, writer)
 }

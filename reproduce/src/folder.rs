@@ -1,5 +1,5 @@
-//! The folder of a reproduction: results by experiment, and run directories by experiment and seed. One command works in it
-//! at a time.
+//! The folder of a reproduction: results by experiment, and run directories by experiment and seed. Only one command
+//! can use it at a time.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -17,29 +17,29 @@ use super::result::{self, Header, SeedResult};
 use super::results_file::{ResultsFile, numbered};
 use super::settings::RunSettings;
 
-/// A folder that is this process's.
+/// A folder that this process has locked.
 #[derive(Debug)]
 pub(super) struct Folder {
     path: PathBuf,
-    /// Of every experiment that the folder was opened for. Seeds side by side add to one file.
+    /// By name of the experiment. Seeds that run at the same time add results to the same file.
     results: Mutex<BTreeMap<&'static str, ResultsFile>>,
-    /// Holds the lock until it is dropped; the system releases it when this process dies.
+    /// Holds the lock until it is dropped. The system releases it if this process dies.
     _lock: File,
 }
 
 impl Folder {
-    /// Makes the folder if it is not there, claims it, and reads the results of these experiments.
+    /// Creates the folder if necessary, locks it, and reads the results of these experiments.
     pub(super) fn open(
         path: &Path,
         experiments: impl IntoIterator<Item = &'static Experiment>,
     ) -> anyhow::Result<Self> {
         let here = path.display();
-        std::fs::create_dir_all(path).with_context(|| format!("cannot make {here}"))?;
-        // Children have another working directory if they like.
+        std::fs::create_dir_all(path).with_context(|| format!("cannot create {here}"))?;
+        // The path must not depend on a working directory.
         let path = std::fs::canonicalize(path).with_context(|| format!("cannot resolve {here}"))?;
         let lock = File::open(&path).with_context(|| format!("cannot open {here}"))?;
         if !file_lock::lock(&lock, Duration::ZERO).with_context(|| format!("cannot lock {here}"))? {
-            bail!("another `shoal reproduce` works in {here}: wait for it, or choose another directory with --out");
+            bail!("another `shoal reproduce` is using {here}: wait for it, or choose another directory with --out");
         }
         let results = experiments
             .into_iter()
@@ -61,18 +61,18 @@ impl Folder {
         self.path.join(experiment.name).join(format!("seed-{seed}"))
     }
 
-    /// Whether the result of a seed at the end of a stage is there.
+    /// Whether there is a result for this seed and stage.
     pub(super) fn has(&self, experiment: &Experiment, stage: &Stage, seed: u64) -> bool {
         self.results()[experiment.name].has(stage, seed)
     }
 
-    /// The seeds whose results are there, in order.
+    /// The seeds that have a result for this stage, in ascending order.
     pub(super) fn seeds(&self, experiment: &Experiment, stage: &Stage) -> Vec<u64> {
         let results = self.results();
         results[experiment.name].of(stage).map(|(seed, _)| seed).collect()
     }
 
-    /// The results of a stage, in the order of seeds.
+    /// The results of a stage, ordered by seed.
     pub(super) fn read<T: DeserializeOwned>(
         &self,
         experiment: &Experiment,
@@ -85,7 +85,7 @@ impl Folder {
             .collect()
     }
 
-    /// Keeps a result. When this returns, it is on the disk.
+    /// Stores a result. It is on the disk when this returns.
     pub(super) fn add<T: Serialize>(
         &self,
         experiment: &Experiment,
@@ -99,7 +99,7 @@ impl Folder {
             .add(&text, stage)
     }
 
-    /// Refuses a folder with results or runs of this experiment that were made otherwise than they would be now.
+    /// Returns an error if the folder has results or runs of this experiment that were made with other settings.
     pub(super) fn check(&self, experiment: &Experiment, effort: Effort, settings: &RunSettings) -> anyhow::Result<()> {
         for stage in experiment.stages {
             for (seed, line) in self.results()[experiment.name].of(stage) {
@@ -116,9 +116,9 @@ impl Folder {
         Ok(())
     }
 
-    /// Moves what earlier versions kept in a file for each result into the one file of its experiment.
-    pub(super) fn take_over(&self) -> anyhow::Result<()> {
-        self.results().values_mut().try_for_each(ResultsFile::take_over)
+    /// Moves results from the format of earlier versions, one file per result, into the file of their experiment.
+    pub(super) fn move_old_results(&self) -> anyhow::Result<()> {
+        self.results().values_mut().try_for_each(ResultsFile::move_old_results)
     }
 
     fn results(&self) -> MutexGuard<'_, BTreeMap<&'static str, ResultsFile>> {
@@ -133,7 +133,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_folder_has_one_command_at_a_time() {
+    fn only_one_command_can_use_a_folder() {
         let parent = tempfile::tempdir().unwrap();
         let path = parent.path().join("results");
         let folder = Folder::open(&path, []).unwrap();
@@ -144,7 +144,7 @@ mod tests {
     }
 
     #[test]
-    fn seeds_side_by_side_are_all_kept() {
+    fn results_that_are_added_at_the_same_time_are_all_stored() {
         let directory = tempfile::tempdir().unwrap();
         let experiment = &EXPERIMENTS[1];
         let folder = Folder::open(directory.path(), [experiment]).unwrap();

@@ -1,4 +1,4 @@
-//! The slippery lake of section 4.1: Q-learning over two sweeps, and SARSA beside it.
+//! FrozenLake (section 4.1): Q-learning with several exploration rates and learning rates, and SARSA for comparison.
 
 mod claims;
 
@@ -11,18 +11,18 @@ use shoal_run::analysis::lake::{LIMIT, Walk, greedy, optimal};
 use shoal_run::recorder::read_evaluations;
 use shoal_run::rollout::policy_layout;
 
-use super::album::{Album, Figure, Section};
 use super::experiment::{Experiment, Length, Stage};
 use super::family::{Family, Policies, Results};
 use super::result::{SeedResult, representative};
+use super::section::{Figure, FigureWriter, Section};
 
-/// γ of every experiment here.
+/// γ of every experiment of this family.
 const GAMMA: f64 = 0.999;
 
-/// Episodes of a training.
+/// Number of episodes of a training.
 const EPISODES: u64 = 10_000;
 
-/// Curves are drawn at every so many episodes.
+/// Number of episodes between points of a curve.
 const GRID: u64 = 100;
 
 const GOOD: &str = "frozen-lake";
@@ -40,13 +40,13 @@ const ALPHA: [(&str, &str); 4] = [
 const SARSA: &str = "frozen-lake-sarsa";
 
 pub(super) const EXPERIMENTS: [Experiment; 7] = [
-    often(experiment(GOOD, "frozen-lake", &["evaluation.keep_policies=true"])),
-    often(experiment(
+    with_30_seeds(experiment(GOOD, "frozen-lake", &["evaluation.keep_policies=true"])),
+    with_30_seeds(experiment(
         EPSILON[0].0,
         "frozen-lake",
         &["evaluation.keep_policies=true", "q-learning.epsilon=0.1"],
     )),
-    often(experiment(
+    with_30_seeds(experiment(
         EPSILON[2].0,
         "frozen-lake",
         &["evaluation.keep_policies=true", "q-learning.epsilon=0.7"],
@@ -72,7 +72,7 @@ pub(super) const EXPERIMENTS: [Experiment; 7] = [
 const fn experiment(name: &'static str, preset: &'static str, settings: &'static [&'static str]) -> Experiment {
     Experiment {
         name,
-        asked_as: "frozen-lake",
+        cli_name: "frozen-lake",
         preset,
         settings,
         quick: &["evaluation.every=200", "evaluation.final_episodes=10"],
@@ -85,35 +85,35 @@ const fn experiment(name: &'static str, preset: &'static str, settings: &'static
     }
 }
 
-/// Three times the thesis's ten repeats: which of two rates is ahead is not to be told from ten.
-const fn often(experiment: Experiment) -> Experiment {
+/// Sets three times the thesis's ten repetitions: ten do not show which of two exploration rates is better.
+const fn with_30_seeds(experiment: Experiment) -> Experiment {
     Experiment {
         seeds: 30,
         ..experiment
     }
 }
 
-/// What was learned, and what it was worth on the way.
+/// The table that was learned, and the policies during training.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Tests {
-    /// The table at the end, state after state.
+    /// The action-values at the end, state by state.
     q: Vec<f32>,
-    /// Each policy that was evaluated, in order.
+    /// Every evaluated policy, in order.
     #[serde(rename = "judged")]
     evaluated: Vec<EvaluatedPolicy>,
 }
 
-/// A policy on the way.
+/// A policy that was evaluated during training.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 struct EvaluatedPolicy {
-    /// Training episodes before it.
+    /// Number of training episodes before it.
     episodes: u64,
-    /// What the lake's table says of it.
+    /// Its exact performance, by the lake's transition table.
     exact: Walk,
 }
 
 impl Tests {
-    /// The value at each multiple of [`GRID`] episodes: of the last policy evaluated before.
+    /// (episodes, value) at each multiple of [`GRID`] episodes, for the last policy evaluated up to then.
     fn on_grid(&self, of: impl Fn(&EvaluatedPolicy) -> f64) -> Vec<(f64, f64)> {
         (1..=EPISODES / GRID)
             .filter_map(|i| {
@@ -127,7 +127,7 @@ impl Tests {
             .collect()
     }
 
-    /// The mean, over the grid's points from one episode to another, of how likely the goal is reached.
+    /// The probability of reaching the goal, as mean over the points of the curve between these two episodes.
     fn reached(&self, from: u64, to: u64) -> f64 {
         let points = self.on_grid(|evaluated| evaluated.exact.reached).into_iter();
         let within = points.filter(|(episodes, _)| (from as f64..=to as f64).contains(episodes));
@@ -147,7 +147,7 @@ impl Family for FrozenLake {
         let Policies { config, run, last, .. } = policies;
         let layout = policy_layout(config)?;
         let mut steps = 0;
-        // There is one actor with one environment: an episode ends where its steps and those before add up to.
+        // With one actor and one environment, an episode ends at the sum of all steps up to its own.
         let ends: Vec<u64> = policies
             .episodes()?
             .iter()
@@ -160,7 +160,7 @@ impl Family for FrozenLake {
         evaluations.sort_by_key(|evaluation| evaluation.env_steps);
         let evaluated = evaluations.iter().map(|evaluation| {
             let path = run.evaluated_policy(evaluation.env_steps);
-            let policy = PolicyFile::read(&path, &layout).context("a policy that was evaluated")?;
+            let policy = PolicyFile::read(&path, &layout).context("cannot read a policy that was evaluated")?;
             Ok(EvaluatedPolicy {
                 episodes: ends.partition_point(|end| *end <= evaluation.env_steps) as u64,
                 exact: Walk::of(&greedy(&policy.parameters)).rounded(),
@@ -172,7 +172,7 @@ impl Family for FrozenLake {
         })
     }
 
-    fn sections(results: &Results<Tests>, album: &Album) -> anyhow::Result<Vec<Section>> {
+    fn sections(results: &Results<Tests>, writer: &FigureWriter) -> anyhow::Result<Vec<Section>> {
         let good = results.of(GOOD, "");
         let q_star = optimal(GAMMA);
         let best: Vec<f32> = q_star.iter().flatten().map(|q| *q as f32).collect();
@@ -184,10 +184,10 @@ impl Family for FrozenLake {
             ("epsilon", &epsilon[..], "exploration rates, α = 0.03", "a"),
             ("alpha", &alpha[..], "learning rates, ε = 0.4", "b"),
         ] {
-            figures.extend(of_sweep(album, file, sweep, what, number, walk)?);
+            figures.extend(of_sweep(writer, file, sweep, what, number, walk)?);
         }
         if let Some(middle) = representative(good) {
-            figures.push(album.add(
+            figures.push(writer.add(
                 "frozen-lake-policy",
                 format!(
                     "The greedy policy and its action-values after 10,000 episodes, seed {} (figure 4.4)",
@@ -196,37 +196,46 @@ impl Family for FrozenLake {
                 |path| draw_table(&middle.tests.q, path),
             )?);
         }
-        figures.push(album.add(
+        figures.push(writer.add(
             "frozen-lake-value-iteration",
-            "The best policy and its action-values, by value iteration on the lake's table",
+            "The optimal policy and its action-values, by value iteration",
             |path| draw_table(&best, path),
         )?);
         Ok(vec![Section {
             title: "FrozenLake with Q-learning (section 4.1)",
             from: EXPERIMENTS.iter().map(|experiment| (experiment.name, "")).collect(),
-            remark: format!(
-                "Every step is a round of the whole system: one actor, chunks of one row, one update, then the next action; \
-                 that is Algorithm 2 to the letter (and Algorithm 1 for `{SARSA}`: a' is chosen before the update). Ties are \
-                 broken by the first index, and with probability ε any of the four actions is taken, the greedy one \
-                 included. (Other readings were tried in a prototype, which no command here repeats: with random ties ε = 0.1 comes further, to 0.64 of \
-                 the goal instead of 0.28; where exploration excludes the greedy action, ε = 0.7 loses its early lead.) The \
-                 policies on the way are evaluated exactly, by the lake's table: how likely the goal is reached within {LIMIT} \
-                 steps, and how many steps it takes, {LIMIT} where it is not reached. The five evaluation episodes of the \
-                 thesis are run and kept as well, but five throws say little. The best policy reaches the goal with probability \
-                 {:.3}.",
-                walk.reached
-            ),
+            remark: remark(walk.reached),
             claims: claims::all(&epsilon, &alpha, results.of(SARSA, ""), &q_star, walk),
             figures,
         }])
     }
 }
 
-/// A setting's name, and its results.
+/// Markdown before the table of claims; `optimal` is the optimal policy's probability of reaching the goal.
+fn remark(optimal: f64) -> String {
+    format!(
+        "\
+The run is in lockstep with one actor, and a chunk has one transition: after each environment step there is one update,
+then the next action. That is exactly Algorithm 2, and Algorithm 1 for `{SARSA}`, where a' is chosen before the update.
+
+- Of equal action-values the first is taken. With probability ε one of the four actions is taken at random, which may be
+  the greedy one.
+- A prototype tried other readings; no command here repeats it. With random choices among equal values, ε = 0.1 reaches
+  the goal with probability 0.64 instead of 0.28. If exploration excludes the greedy action, ε = 0.7 loses its early
+  lead.
+- Policies during training are evaluated exactly, with the lake's transition table: the probability of reaching the goal
+  within {LIMIT} steps, and the mean number of steps, which is {LIMIT} if the goal is not reached.
+- The thesis's five evaluation episodes are run and stored as well, but five random episodes say little.
+
+The optimal policy reaches the goal with probability {optimal:.3}."
+    )
+}
+
+/// A setting's label, with its results.
 type Sweep<'a> = (&'static str, &'a [SeedResult<Tests>]);
 
 fn of_sweep(
-    album: &Album,
+    writer: &FigureWriter,
     file: &str,
     sweep: &[Sweep<'_>],
     what: &str,
@@ -261,12 +270,12 @@ fn of_sweep(
         best.steps,
     );
     Ok(vec![
-        album.add(
+        writer.add(
             &format!("frozen-lake-{file}-reward"),
             format!("Reward history for several {what}: mean over the seeds (figure 4.2{number})"),
             |path| figure::lines(&rewards, &settings(|evaluated| evaluated.exact.reached), path),
         )?,
-        album.add(
+        writer.add(
             &format!("frozen-lake-{file}-steps"),
             format!("Steps needed to reach the goal for several {what}: mean over the seeds (figure 4.3{number})"),
             |path| figure::lines(&steps, &settings(|evaluated| evaluated.exact.steps), path),

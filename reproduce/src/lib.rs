@@ -1,8 +1,7 @@
-//! The thesis's experiments, run through the system itself over several seeds; what is kept of each, and the report.
+//! Runs the thesis's experiments over several seeds with Shoal itself, stores their results, and writes the report.
 //!
-//! A new experiment is a file with a [`family::Family`] and a line in [`FAMILIES`].
+//! A new experiment needs a file with a [`family::Family`], and a line in [`FAMILIES`].
 
-mod album;
 mod batch;
 mod cart_pole;
 mod claim;
@@ -10,13 +9,14 @@ mod experiment;
 mod family;
 mod folder;
 mod frozen_lake;
-mod order;
 mod pendulum;
 mod point_mass;
 mod progress;
 mod report;
+mod request;
 mod result;
 mod results_file;
+mod section;
 mod settings;
 mod training;
 
@@ -29,8 +29,8 @@ pub use self::experiment::Effort;
 use self::experiment::Experiment;
 use self::family::{Entry, entry};
 use self::folder::Folder;
-use self::order::Job;
-pub use self::order::{BatchEnding, Order};
+use self::request::Job;
+pub use self::request::{BatchEnding, Request};
 use self::settings::RunSettings;
 
 /// Every family, in the report's order.
@@ -41,22 +41,23 @@ const FAMILIES: [Entry; 4] = [
     entry::<point_mass::PointMass>(),
 ];
 
-/// The experiments that can be asked for.
+/// The names of the experiments on the command line.
 pub fn names() -> impl Iterator<Item = &'static str> {
-    let mut names: Vec<_> = experiments().map(|(_, experiment)| experiment.asked_as).collect();
+    let mut names: Vec<_> = experiments().map(|(_, experiment)| experiment.cli_name).collect();
     names.dedup();
     names.into_iter()
 }
 
-/// Runs what is due, keeps each result, and writes the report from all results of the folder.
-pub fn run(order: &Order) -> anyhow::Result<BatchEnding> {
-    let folder = Folder::open(&order.folder, experiments().map(|(_, experiment)| experiment))?;
-    let settings = expected(order.effort)?;
-    let wanted = experiments()
-        .filter(|(_, it)| order.experiments.is_empty() || order.experiments.iter().any(|name| name == it.asked_as));
-    let jobs: Vec<Job> = wanted
+/// Runs the requested seeds that have no result yet, stores each result, and writes the report from all results in the
+/// folder.
+pub fn run(request: &Request) -> anyhow::Result<BatchEnding> {
+    let folder = Folder::open(&request.folder, experiments().map(|(_, experiment)| experiment))?;
+    let settings = expected(request.effort)?;
+    let requested = experiments()
+        .filter(|(_, it)| request.experiments.is_empty() || request.experiments.iter().any(|name| name == it.cli_name));
+    let jobs: Vec<Job> = requested
         .flat_map(|(family, experiment)| {
-            let seeds = order.seeds.unwrap_or(experiment.seeds(order.effort));
+            let seeds = request.seeds.unwrap_or(experiment.seeds(request.effort));
             (1..=u64::from(seeds)).map(move |seed| Job {
                 family,
                 experiment,
@@ -64,22 +65,22 @@ pub fn run(order: &Order) -> anyhow::Result<BatchEnding> {
             })
         })
         .collect();
-    // What does not belong here is refused before anything starts.
+    // Results and runs with other settings are refused before anything starts.
     for (_, experiment) in experiments() {
-        folder.check(experiment, order.effort, &settings[experiment.name])?;
+        folder.check(experiment, request.effort, &settings[experiment.name])?;
     }
-    folder.take_over()?;
+    folder.move_old_results()?;
     let write = |failures: &BTreeMap<_, _>| {
-        report::write(&FAMILIES, &folder, order, &jobs, failures)
-            .with_context(|| format!("cannot write the report {}", order.report.display()))
+        report::write(&FAMILIES, &folder, request, &jobs, failures)
+            .with_context(|| format!("cannot write the report {}", request.report.display()))
     };
     let batch = Batch {
         folder: &folder,
-        effort: order.effort,
+        effort: request.effort,
         jobs: &jobs,
         settings: &settings,
     };
-    batch.run(order.jobs, write)
+    batch.run(request.jobs, write)
 }
 
 fn experiments() -> impl Iterator<Item = (&'static Entry, &'static Experiment)> {
@@ -89,7 +90,7 @@ fn experiments() -> impl Iterator<Item = (&'static Entry, &'static Experiment)> 
         .flat_map(|entry| entry.experiments.iter().map(move |experiment| (entry, experiment)))
 }
 
-/// With which settings each experiment is run by this program.
+/// The settings with which this version runs each experiment.
 fn expected(effort: Effort) -> anyhow::Result<BTreeMap<&'static str, RunSettings>> {
     experiments()
         .map(|(_, experiment)| Ok((experiment.name, RunSettings::expected(experiment, effort)?)))

@@ -1,20 +1,20 @@
-//! The pendulum of section 4.3.2.
+//! The pendulum (section 4.3.2).
 
 use serde::{Deserialize, Serialize};
 use shoal_report::figure;
 use shoal_run::analysis::pendulum::{Measures, SwingUp};
 use shoal_run::rollout::Rollout;
 
-use super::album::{Album, Section};
 use super::claim::{Claim, Scope, spread};
 use super::experiment::{Experiment, Length, Stage};
 use super::family::{Family, Policies, Results};
 use super::result::{SeedResult, representative};
+use super::section::{FigureWriter, Section};
 
 /// 600 episodes of 200 steps.
 pub(super) const EXPERIMENTS: [Experiment; 1] = [Experiment {
     name: "pendulum",
-    asked_as: "pendulum",
+    cli_name: "pendulum",
     preset: "pendulum",
     settings: &[],
     quick: &[
@@ -32,7 +32,12 @@ pub(super) const EXPERIMENTS: [Experiment; 1] = [Experiment {
     }],
 }];
 
-/// The swing-up from rest at the bottom.
+/// Markdown before the table of claims.
+const REMARK: &str = "\
+\"At rest\" means the last 50 of the 200 steps of the test run. Angles are distances from upright. Figures of a single
+run show the seed with the median final evaluation.";
+
+/// The swing-up from rest at the bottom, with the best and the last policy.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Tests {
     swing_up: SwingUp,
@@ -57,16 +62,16 @@ impl Family for Pendulum {
         })
     }
 
-    fn sections(results: &Results<Tests>, album: &Album) -> anyhow::Result<Vec<Section>> {
+    fn sections(results: &Results<Tests>, writer: &FigureWriter) -> anyhow::Result<Vec<Section>> {
         let seeds = results.of("pendulum", "");
         let curves: Vec<_> = seeds.iter().map(SeedResult::curve).collect();
-        let mut figures = vec![album.add(
+        let mut figures = vec![writer.add(
             "pendulum-learning-curve",
             "Mean return of the evaluations during training, every seed (figure 4.8)",
             |path| figure::learning_curves("Pendulum", &curves, None, path),
         )?];
         if let Some(middle) = representative(seeds) {
-            figures.push(album.add(
+            figures.push(writer.add(
                 "pendulum-swing-up",
                 format!(
                     "The swing-up from rest at θ = π, seed {} (figure 4.9)",
@@ -78,9 +83,7 @@ impl Family for Pendulum {
         Ok(vec![Section {
             title: "Pendulum (section 4.3.2)",
             from: vec![("pendulum", "")],
-            remark: "\"At rest\" is the last 50 of the 200 steps of the test run. Angles are distances from upright. \
-                     Figures of a single run show the seed whose final evaluation is the median."
-                .into(),
+            remark: REMARK.into(),
             claims: claims(seeds),
             figures,
         }])
@@ -106,8 +109,8 @@ fn claims(seeds: &[SeedResult<Tests>]) -> Vec<Claim> {
     vec![
         Claim {
             thesis: "The agent improves until converging to a mean reward of approximately −150",
-            criterion: "both the final evaluation (100 fixed episodes) and the mean of the last fifth of the evaluations \
-                        during training lie between −190 and −110",
+            criterion: "both the final evaluation (100 fixed episodes) and the mean of the last fifth of the \
+                        evaluations during training lie between −190 and −110",
             ours: format!(
                 "final evaluation {} (last policy {}); last fifth of the evaluations {}",
                 spread(seeds.iter().map(|seed| seed.best.evaluation.return_mean), 1),
@@ -122,7 +125,7 @@ fn claims(seeds: &[SeedResult<Tests>]) -> Vec<Claim> {
         },
         check(
             "The pendulum swings back and forth a few times to gain momentum",
-            "it turns back at least once before it is up",
+            "it turns back at least once before it is upright",
             format!("turns: {}", measured(|it| it.reversals.into(), 0, "")),
             |it| it.reversals >= 1,
         ),
@@ -130,7 +133,7 @@ fn claims(seeds: &[SeedResult<Tests>]) -> Vec<Claim> {
             "The angle and angular velocity converge to zero",
             "at rest the angle stays below 0.1 rad, the angular velocity below 0.1 rad/s",
             format!(
-                "greatest angle at rest {}; greatest velocity {}",
+                "largest angle at rest {}; largest velocity at rest {}",
                 measured(|it| it.angle_at_rest, 3, " rad"),
                 measured(|it| it.velocity_at_rest, 3, " rad/s")
             ),
@@ -138,9 +141,9 @@ fn claims(seeds: &[SeedResult<Tests>]) -> Vec<Claim> {
         ),
         check(
             "The applied torque converges to a small value",
-            "at rest the torque is below 0.2 N m in the mean of its size (its range is ±2)",
+            "at rest the mean absolute torque is below 0.2 N m (its range is ±2)",
             format!(
-                "torque at rest {}; its change from step to step {}",
+                "mean absolute torque at rest {}; mean change per step {}",
                 measured(|it| it.torque_at_rest, 3, " N m"),
                 measured(|it| it.chatter_at_rest, 3, " N m")
             ),
@@ -166,7 +169,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_thesis_saw_holds_and_its_opposite_does_not() {
+    fn claims_hold_for_results_like_the_thesis_and_fail_for_the_opposite() {
         let good = seed(1, -150.0, swing(0.01, 0.05));
         let bad = seed(2, -900.0, swing(0.5, 1.0));
         let held: Vec<_> = claims(&[good, bad]).into_iter().map(|claim| claim.held).collect();
@@ -175,17 +178,17 @@ mod tests {
     }
 
     #[test]
-    fn results_make_a_section_with_figures() {
+    fn a_section_has_the_figures_of_the_existing_results() {
         let directory = tempfile::tempdir().unwrap();
-        let album = Album::in_directory(directory.path().into(), true).unwrap();
+        let writer = FigureWriter::in_directory(directory.path().into(), true).unwrap();
         let mut results = Results::new();
-        assert_eq!(Pendulum::sections(&results, &album).unwrap()[0].figures.len(), 1);
+        assert_eq!(Pendulum::sections(&results, &writer).unwrap()[0].figures.len(), 1);
         results.put(
             "pendulum",
             "",
             vec![seed(1, -150.0, swing(0.0, 0.1)), seed(2, -160.0, swing(0.0, 0.1))],
         );
-        assert_eq!(Pendulum::sections(&results, &album).unwrap()[0].figures.len(), 2);
+        assert_eq!(Pendulum::sections(&results, &writer).unwrap()[0].figures.len(), 2);
         for file in ["pendulum-learning-curve", "pendulum-swing-up"] {
             for ending in ["svg", "png"] {
                 assert!(directory.path().join(format!("{file}.{ending}")).exists());

@@ -1,4 +1,4 @@
-//! The vehicle of chapter 5 with its three rewards, and the training of r2 that goes on for too long (appendix A).
+//! The vehicle of chapter 5 with its three rewards, and the additional training with r2 (appendix A).
 
 mod claims;
 mod figures;
@@ -7,11 +7,11 @@ use serde::{Deserialize, Serialize};
 use shoal_run::analysis::point_mass::{Drive, FAR_STARTS, Measures, NEAR_STARTS};
 use shoal_run::rollout::Rollout;
 
-use super::album::{Album, Section};
 use super::experiment::{Experiment, Length, Stage};
 use super::family::{Family, Policies, Results};
+use super::section::{FigureWriter, Section};
 
-/// The run of r2 after its additional training.
+/// The suffix of the stage after the additional training with r2.
 const LONGER: &str = "-longer";
 
 const QUICK: &[&str] = &[
@@ -35,7 +35,7 @@ pub(super) const EXPERIMENTS: [Experiment; 3] = [
 const fn experiment(name: &'static str, stages: &'static [Stage]) -> Experiment {
     Experiment {
         name,
-        asked_as: name,
+        cli_name: name,
         preset: name,
         settings: &[],
         quick: QUICK,
@@ -52,14 +52,24 @@ const fn stage(suffix: &'static str, steps: u64, quick_steps: u64) -> Stage {
     }
 }
 
-/// Drives from the starts of section 5.3 and then those of appendix A.2.
+/// Markdown before the claims about r1; it applies to the other rewards too.
+const REMARK: &str = "\
+Unless stated otherwise, numbers of test runs are means over the four starts of section 5.3. \"At rest\" means the last
+50 of a run's 200 steps. Turning is the sum of all changes of θ, each taken the short way round.";
+
+/// Markdown before the claims about the additional training.
+const REMARK_ON_ADDITIONAL_TRAINING: &str = "\
+These are the same runs, resumed. The agent of appendix A.1 is the one at the end of the additional training. Here it is
+the last policy, not the best one by evaluation.";
+
+/// Test runs from the start positions of section 5.3, followed by those of appendix A.2.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Tests {
     best: Vec<Measures>,
     last: Vec<Measures>,
-    /// Of the best policy.
+    /// Test runs of the best policy.
     drives: Vec<Drive>,
-    /// Of the last policy from the starts of section 5.3, where the thesis shows that one (appendix A.1).
+    /// Test runs of the last policy from the starts of section 5.3, if the thesis shows that policy (appendix A.1).
     last_drives: Vec<Drive>,
 }
 
@@ -84,7 +94,7 @@ impl Family for PointMass {
         })
     }
 
-    fn sections(results: &Results<Tests>, album: &Album) -> anyhow::Result<Vec<Section>> {
+    fn sections(results: &Results<Tests>, writer: &FigureWriter) -> anyhow::Result<Vec<Section>> {
         let [r1, r2, r3] = ["point-mass-r1", "point-mass-r2", "point-mass-r3"].map(|name| results.of(name, ""));
         let longer = results.of("point-mass-r2", LONGER);
         let section = |title, from: &[(&'static str, &'static str)], remark: &str, claims, figures| Section {
@@ -98,39 +108,37 @@ impl Family for PointMass {
             section(
                 "Point mass with reward r1 (section 5.3.1)",
                 &[("point-mass-r1", "")],
-                "Numbers of test runs are means over the four starts of section 5.3 unless others are named. \"At rest\" is \
-                 the last 50 of a run's 200 steps. Turning is the sum of all changes of θ, taken the short way round.",
+                REMARK,
                 claims::of_r1(r1),
-                figures::of_reward(album, &figures::R1, r1)?,
+                figures::of_reward(writer, &figures::R1, r1)?,
             ),
             section(
                 "Point mass with reward r2 (section 5.3.2)",
                 &[("point-mass-r2", "")],
                 "",
                 claims::of_r2(r1, r2),
-                figures::of_reward(album, &figures::R2, r2)?,
+                figures::of_reward(writer, &figures::R2, r2)?,
             ),
             section(
                 "Point mass with reward r3 (section 5.3.3, appendix A.2)",
                 &[("point-mass-r3", "")],
                 "",
                 claims::of_r3(r1, r2, r3),
-                figures::of_r3(album, r3)?,
+                figures::of_r3(writer, r3)?,
             ),
             section(
-                "The three agents beside each other (section 5.4)",
+                "Comparison of the three agents (section 5.4)",
                 &[("point-mass-r1", ""), ("point-mass-r2", ""), ("point-mass-r3", "")],
-                "Seeds are compared by their number; a seed that one of the rewards lacks is left out.",
+                "Runs with the same seed are compared. A seed that has no result for one of the rewards is left out.",
                 claims::of_comparison(r1, r2, r3),
-                figures::of_comparison(album, [r1, r2, r3])?,
+                figures::of_comparison(writer, [r1, r2, r3])?,
             ),
             section(
                 "Reward r2 with additional training (section 5.3.2, appendix A.1)",
                 &[("point-mass-r2", ""), ("point-mass-r2", LONGER)],
-                "The same runs, resumed. The agent of appendix A.1 is the one at the end of the additional training: here \
-                 the last policy, not the best by evaluation.",
+                REMARK_ON_ADDITIONAL_TRAINING,
                 claims::of_longer(r2, longer),
-                figures::of_longer(album, longer)?,
+                figures::of_longer(writer, longer)?,
             ),
         ])
     }
@@ -143,7 +151,7 @@ mod tests {
     use super::*;
     use shoal_run::testing::drive;
 
-    /// A seed whose drives come to rest so, and turn and push so.
+    /// A seed whose test runs are made by [`drive`] with these arguments.
     pub(super) fn seed(number: u64, rest: f64, shake: f64, force: f64, held: f64) -> SeedResult<Tests> {
         let starts = [&NEAR_STARTS[..], &FAR_STARTS[..]].concat();
         let drives: Vec<_> = starts
@@ -161,12 +169,12 @@ mod tests {
     }
 
     #[test]
-    fn results_make_sections_with_all_figures() {
+    fn sections_have_the_figures_of_the_existing_results() {
         let directory = tempfile::tempdir().unwrap();
-        let album = Album::in_directory(directory.path().into(), false).unwrap();
+        let writer = FigureWriter::in_directory(directory.path().into(), false).unwrap();
         let mut results = Results::new();
         let figures = |results: &Results<Tests>| -> Vec<usize> {
-            let sections = PointMass::sections(results, &album).unwrap();
+            let sections = PointMass::sections(results, &writer).unwrap();
             sections.iter().map(|section| section.figures.len()).collect()
         };
         assert_eq!(figures(&results), [0, 0, 0, 0, 0]);
@@ -184,7 +192,7 @@ mod tests {
     }
 
     #[test]
-    fn a_result_stays_small() {
+    fn a_result_is_small() {
         let text = serde_json::to_string(&seed(1, 0.0123, 0.1234, 1.234, 0.1234).tests).unwrap();
         assert!(text.len() < 130_000, "{}", text.len());
     }

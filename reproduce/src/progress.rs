@@ -1,4 +1,4 @@
-//! How far the whole batch is: one live line on a terminal, and a line for whatever happens.
+//! Shows the progress of a batch: one live line on a terminal, and one line for each event.
 
 use std::collections::BTreeMap;
 use std::io::{IsTerminal, Write};
@@ -12,38 +12,39 @@ use shoal_run::recorder::recorded;
 
 use super::experiment::{self, Effort, Length};
 use super::folder::Folder;
-use super::order::{Job, Name};
+use super::request::{Job, Name};
 use super::training::RunState;
 
-/// The live line, and what is to be known for it.
+/// The live line and its data.
 pub(super) struct Progress<'a> {
     folder: &'a Folder,
     bar: ProgressBar,
     live: bool,
-    all: usize,
-    /// Every job that was due.
+    /// Number of all jobs, including those that had finished before the batch began.
+    total: usize,
+    /// Every job that had not finished when the batch began.
     due: BTreeMap<Name, Due>,
     running: BTreeMap<Name, PathBuf>,
-    over: Vec<Name>,
-    begun: Instant,
+    ended: Vec<Name>,
+    started_at: Instant,
 }
 
-/// A job that was due. An episode is taken for as much work as a step: where there are both, one is as quick as the other
-/// is slow.
+/// A job that had not finished when the batch began. For the estimate of the remaining time, an episode counts as much
+/// as an environment step.
 struct Due {
     length: Length,
-    /// Steps or episodes when the batch began.
+    /// Environment steps or episodes when the batch began.
     begin: u64,
 }
 
 impl Due {
     fn done(&self, run: &Path) -> Option<u64> {
         let (steps, episodes) = recorded(&RunDir::planned(run)).ok()??;
-        Some(self.length.done(experiment::Progress { steps, episodes }).0)
+        Some(self.length.progress(experiment::Progress { steps, episodes }).0)
     }
 
-    fn all(&self) -> u64 {
-        self.length.done(experiment::Progress::default()).1
+    fn total(&self) -> u64 {
+        self.length.progress(experiment::Progress::default()).1
     }
 }
 
@@ -51,17 +52,17 @@ impl<'a> Progress<'a> {
     pub(super) fn new<'j>(
         folder: &'a Folder,
         effort: Effort,
-        all: usize,
+        total: usize,
         due: impl IntoIterator<Item = &'j Job>,
     ) -> anyhow::Result<Self> {
         let live = std::io::stderr().is_terminal();
         let due: BTreeMap<Name, Due> = due
             .into_iter()
             .filter_map(|job| {
-                // What cannot be read is said when its turn comes.
-                let standing = RunState::of(&folder.run(job.experiment, job.seed)).unwrap_or(RunState::Absent);
+                // If the run cannot be read, the error is reported when the job starts.
+                let state = RunState::of(&folder.run(job.experiment, job.seed)).unwrap_or(RunState::Absent);
                 let length = job.experiment.length(effort)?;
-                let begin = length.done(standing.progress()).0;
+                let begin = length.progress(state.progress()).0;
                 Some((job.name(), Due { length, begin }))
             })
             .collect();
@@ -70,43 +71,43 @@ impl<'a> Progress<'a> {
         } else {
             ProgressDrawTarget::hidden()
         };
-        let bar = ProgressBar::with_draw_target(Some(all as u64), target);
+        let bar = ProgressBar::with_draw_target(Some(total as u64), target);
         bar.set_style(ProgressStyle::with_template("{bar:16.cyan/dim} {msg}")?.progress_chars("━━─"));
         let progress = Self {
             folder,
             bar,
             live,
-            all,
+            total,
             due,
             running: BTreeMap::new(),
-            over: Vec::new(),
-            begun: Instant::now(),
+            ended: Vec::new(),
+            started_at: Instant::now(),
         };
         if !progress.due.is_empty() {
-            progress.say(&format!("{} of {all} seeds are due", progress.due.len()));
+            progress.print(&format!("{} of {total} seeds to run", progress.due.len()));
         }
         Ok(progress)
     }
 
-    pub(super) fn begun(&mut self, job: Job) {
+    pub(super) fn started(&mut self, job: Job) {
         self.running
             .insert(job.name(), self.folder.run(job.experiment, job.seed));
         if !self.live {
-            self.say(&format!("{}: begins", title(&job)));
+            self.print(&format!("{}: started", title(&job)));
         }
     }
 
-    pub(super) fn kept(&self, job: &Job, length: Length) {
-        self.say(&format!("{}: result at {length}", title(job)));
+    pub(super) fn stored(&self, job: &Job, length: Length) {
+        self.print(&format!("{}: result at {length} stored", title(job)));
     }
 
-    pub(super) fn through(&mut self, job: &Job) {
+    pub(super) fn finished(&mut self, job: &Job) {
         self.running.remove(&job.name());
-        self.over.push(job.name());
+        self.ended.push(job.name());
         let left = self
-            .left()
+            .time_left()
             .map(|left| format!(", about {left:#} left", left = HumanDuration(left)));
-        self.say(&format!(
+        self.print(&format!(
             "{}: done, {}{}",
             title(job),
             self.count(),
@@ -114,10 +115,10 @@ impl<'a> Progress<'a> {
         ));
     }
 
-    pub(super) fn failed(&mut self, job: &Job, said: &str) {
+    pub(super) fn failed(&mut self, job: &Job, message: &str) {
         self.running.remove(&job.name());
-        self.over.push(job.name());
-        self.say(&format!("{}: failed: {said}", title(job)));
+        self.ended.push(job.name());
+        self.print(&format!("{}: failed: {message}", title(job)));
     }
 
     /// Draws the live line.
@@ -132,11 +133,10 @@ impl<'a> Progress<'a> {
                 parts.push(format!("{name} {seed}: {done} of {}", due.length));
             }
         }
-        if let Some(left) = self.left() {
+        if let Some(left) = self.time_left() {
             parts.push(format!("{:#} left", HumanDuration(left)));
         }
-        self.bar
-            .set_position((self.all - self.due.len() + self.over.len()) as u64);
+        self.bar.set_position(self.completed() as u64);
         self.bar.set_message(parts.join(" · "));
     }
 
@@ -144,30 +144,34 @@ impl<'a> Progress<'a> {
         self.bar.finish_and_clear();
     }
 
-    fn count(&self) -> String {
-        format!("{} of {} seeds", self.all - self.due.len() + self.over.len(), self.all)
+    fn completed(&self) -> usize {
+        self.total - self.due.len() + self.ended.len()
     }
 
-    /// From what remains, at the rate of this batch so far.
-    fn left(&self) -> Option<Duration> {
-        let (mut taken, mut remaining) = (0, 0);
+    fn count(&self) -> String {
+        format!("{} of {} seeds", self.completed(), self.total)
+    }
+
+    /// The time that the remaining work takes at the rate of this batch so far.
+    fn time_left(&self) -> Option<Duration> {
+        let (mut done, mut remaining) = (0, 0);
         for (name, due) in &self.due {
-            let (begin, end) = (due.begin, due.all());
+            let (begin, end) = (due.begin, due.total());
             let now = match self.running.get(name) {
-                _ if self.over.contains(name) => end,
+                _ if self.ended.contains(name) => end,
                 Some(run) => due.done(run).unwrap_or(begin).max(begin).min(end),
                 None => begin,
             };
-            taken += now.saturating_sub(begin);
+            done += now.saturating_sub(begin);
             remaining += end.saturating_sub(now);
         }
-        let seconds = self.begun.elapsed().as_secs_f64() * remaining as f64 / taken as f64;
-        (taken > 0 && remaining > 0).then(|| Duration::from_secs(seconds as u64))
+        let seconds = self.started_at.elapsed().as_secs_f64() * remaining as f64 / done as f64;
+        (done > 0 && remaining > 0).then(|| Duration::from_secs(seconds as u64))
     }
 
-    fn say(&self, line: &str) {
+    fn print(&self, line: &str) {
         self.bar.suspend(|| {
-            // Where nobody reads, there is nobody to tell.
+            // A closed stderr is no reason to fail.
             let _ = writeln!(std::io::stderr(), "{line}");
         });
     }

@@ -1,4 +1,4 @@
-//! `REPORT.md`: the claims with their verdicts, and the figures.
+//! The report, `REPORT.md`: claims with their verdicts, and figures.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -8,23 +8,23 @@ use std::path::{Component, Path, PathBuf};
 use anyhow::Context;
 use shoal_common::durable::write_atomically;
 
-use super::album::{Album, Figure, Section};
 use super::claim::{Claim, Verdict};
 use super::experiment::{Effort, Experiment, Stage};
 use super::family::Entry;
 use super::folder::Folder;
-use super::order::{Job, Name, Order};
+use super::request::{Job, Name, Request};
+use super::section::{Figure, FigureWriter, Section};
 
 /// Writes the report from all results of the folder, and draws its figures.
 pub(super) fn write(
     families: &[Entry],
     folder: &Folder,
-    order: &Order,
+    request: &Request,
     jobs: &[Job],
     failures: &BTreeMap<Name, String>,
 ) -> anyhow::Result<()> {
     let figures = folder.path().join("figures");
-    let album = Album::in_directory(figures.clone(), order.png)?;
+    let writer = FigureWriter::in_directory(figures.clone(), request.png)?;
     let mut sections = Vec::new();
     for family in families {
         let stages = Stages {
@@ -32,27 +32,27 @@ pub(super) fn write(
             folder,
             jobs,
             failures,
-            effort: order.effort,
+            effort: request.effort,
         };
-        if !stages.are_of_interest() {
+        if !stages.are_in_report() {
             continue;
         }
-        for section in (family.sections)(folder, &album)? {
+        for section in (family.sections)(folder, &writer)? {
             if let Some(seeds) = stages.seeds_of(&section) {
                 let notes = notes(folder, &section.from)?;
                 sections.push((section, seeds, notes));
             }
         }
     }
-    let parent = parent_of(&order.report);
-    std::fs::create_dir_all(parent).with_context(|| format!("cannot make {}", parent.display()))?;
+    let parent = parent_of(&request.report);
+    std::fs::create_dir_all(parent).with_context(|| format!("cannot create {}", parent.display()))?;
     let parent = std::fs::canonicalize(parent).with_context(|| format!("cannot resolve {}", parent.display()))?;
-    let text = compose(&sections, order.effort, &relative(&figures, &parent));
-    write_atomically(&order.report, |file| file.write_all(text.as_bytes()))?;
+    let text = compose(&sections, request.effort, &relative(&figures, &parent));
+    write_atomically(&request.report, |file| file.write_all(text.as_bytes()))?;
     Ok(())
 }
 
-/// The stages of a family, and what is known of their seeds.
+/// The stages of a family, with their results and failures.
 struct Stages<'a> {
     family: &'a Entry,
     folder: &'a Folder,
@@ -61,14 +61,14 @@ struct Stages<'a> {
     effort: Effort,
 }
 
-/// What somebody has written on a section, in `notes` of the folder, in a file named after all that the section is about:
-/// `point-mass-r2.md`, `point-mass-r2+point-mass-r2-longer.md`.
+/// The user's notes on a section. Their file is in the folder's directory `notes` and is named after all results that
+/// the section uses: `point-mass-r2.md`, `point-mass-r2+point-mass-r2-longer.md`.
 fn notes(folder: &Folder, from: &[(&str, &str)]) -> anyhow::Result<String> {
-    let about: Vec<String> = from
+    let names: Vec<String> = from
         .iter()
         .map(|(experiment, suffix)| format!("{experiment}{suffix}"))
         .collect();
-    let path = folder.path().join("notes").join(format!("{}.md", about.join("+")));
+    let path = folder.path().join("notes").join(format!("{}.md", names.join("+")));
     match std::fs::read_to_string(&path) {
         Ok(text) => Ok(text),
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(String::new()),
@@ -77,15 +77,16 @@ fn notes(folder: &Folder, from: &[(&str, &str)]) -> anyhow::Result<String> {
 }
 
 impl Stages<'_> {
-    /// Whether anything of the family was asked for or is there.
-    fn are_of_interest(&self) -> bool {
+    /// Whether results of the family were requested or exist.
+    fn are_in_report(&self) -> bool {
         let mut experiments = self.family.experiments.iter();
         experiments.any(|experiment| experiment.stages.iter().any(|stage| self.line(experiment, stage).1))
     }
 
-    /// Which seeds a section is made from, and which are missing; none where nobody asked for it and nothing is there.
+    /// The seeds that a section uses and those that are missing, a line for each stage. `None` if none were requested
+    /// and none exist.
     fn seeds_of(&self, section: &Section) -> Option<Vec<String>> {
-        let (mut lines, mut of_interest) = (Vec::new(), false);
+        let (mut lines, mut in_report) = (Vec::new(), false);
         for (name, suffix) in &section.from {
             let experiment = self
                 .family
@@ -94,55 +95,67 @@ impl Stages<'_> {
                 .find(|experiment| experiment.name == *name);
             let found = experiment.and_then(|it| Some((it, it.stages.iter().find(|stage| stage.suffix == *suffix)?)));
             if let Some((experiment, stage)) = found {
-                let (line, interesting) = self.line(experiment, stage);
+                let (line, line_in_report) = self.line(experiment, stage);
                 lines.push(line);
-                of_interest |= interesting;
+                in_report |= line_in_report;
             }
         }
-        of_interest.then_some(lines)
+        in_report.then_some(lines)
     }
 
+    /// The line of a stage, and whether any of its seeds were requested or exist.
     fn line(&self, experiment: &Experiment, stage: &Stage) -> (String, bool) {
-        let there = self.folder.seeds(experiment, stage);
-        let asked = self.jobs.iter().filter(|job| job.experiment.name == experiment.name);
-        let missing: Vec<u64> = asked.map(|job| job.seed).filter(|seed| !there.contains(seed)).collect();
-        let say = |seeds: &[u64]| seeds.iter().map(u64::to_string).collect::<Vec<_>>().join(", ");
+        let found = self.folder.seeds(experiment, stage);
+        let requested = self.jobs.iter().filter(|job| job.experiment.name == experiment.name);
+        let missing: Vec<u64> = requested
+            .map(|job| job.seed)
+            .filter(|seed| !found.contains(seed))
+            .collect();
+        let list = |seeds: &[u64]| seeds.iter().map(u64::to_string).collect::<Vec<_>>().join(", ");
         let mut line = format!(
             "`{}`, {}: {}",
             experiment.name,
             stage.length(self.effort),
-            if there.is_empty() {
-                "no seed yet".into()
+            if found.is_empty() {
+                "no results yet".into()
             } else {
-                format!("seeds {}", say(&there))
+                format!("seeds {}", list(&found))
             }
         );
         if !missing.is_empty() {
-            line += &format!("; missing: {}", say(&missing));
+            line += &format!("; missing: {}", list(&missing));
         }
         for seed in &missing {
-            if let Some(said) = self.failures.get(&(experiment.name, *seed)) {
-                line += &format!("; seed {seed} failed: {said}");
+            if let Some(message) = self.failures.get(&(experiment.name, *seed)) {
+                line += &format!("; seed {seed} failed: {message}");
             }
         }
-        (line, !there.is_empty() || !missing.is_empty())
+        (line, !found.is_empty() || !missing.is_empty())
     }
 }
 
+/// The start of the report of a quick look.
+const QUICK_LOOK: &str = "\
+> This is a quick look with few seeds, tiny networks and few environment steps. It shows that everything works; it
+> checks no claim.
+
+";
+
 fn compose(sections: &[(Section, Vec<String>, String)], effort: Effort, figures: &Path) -> String {
-    let mut text = String::from("# The thesis's experiments, done again\n\n");
+    let mut text = String::from("# Reproduction of the thesis's experiments\n\n");
     let quick = if effort == Effort::Quick { " --quick" } else { "" };
     if effort == Effort::Quick {
-        text += "> **A quick look.** A few seeds, tiny networks, hardly any steps: this shows that everything works, and \
-            checks nothing.\n\n";
+        text += QUICK_LOOK;
     }
     let _ = writeln!(
         text,
-        "Made by `shoal reproduce{quick}`, version {}. Each seed is a run of the whole system in lockstep, so that the same \
-        seed gives the same bits on the same kind of machine. The numbers are of each run's best policy by evaluation \
-        unless something else is said: the median over the seeds, with the least and the greatest in brackets. A claim \
-        about single runs holds when its criterion does for more than half of the seeds; one about the seeds together is \
-        checked once.",
+        "\
+Made by `shoal reproduce{quick}`, version {}. Each seed is a run of the whole system in lockstep, so the same seed gives
+the same bits on the same kind of machine. Unless stated otherwise, numbers are those of each run's best policy by
+evaluation, as median over the seeds [minimum, maximum].
+
+A claim about single runs holds if more than half of the seeds meet its criterion. A claim about all seeds together is
+checked once.",
         env!("CARGO_PKG_VERSION")
     );
     if effort == Effort::Full {
@@ -154,7 +167,7 @@ fn compose(sections: &[(Section, Vec<String>, String)], effort: Effort, figures:
         let count = |which: fn(&Verdict) -> bool| verdicts.iter().filter(|verdict| which(verdict)).count();
         let _ = writeln!(
             text,
-            "\nOf {} claims {} hold, {} do not, {} are not checked.",
+            "\nOf {} claims, {} hold, {} do not, and {} were not checked.",
             verdicts.len(),
             count(|verdict| matches!(verdict, Verdict::Holds { .. } | Verdict::HoldsTogether)),
             count(|verdict| matches!(verdict, Verdict::Fails { .. } | Verdict::FailsTogether)),
@@ -170,7 +183,7 @@ fn compose(sections: &[(Section, Vec<String>, String)], effort: Effort, figures:
             let _ = write!(text, "\n{}\n", section.remark);
         }
         if !section.claims.is_empty() {
-            text += "\n| the thesis | ours | holds for a seed when | verdict |\n| --- | --- | --- | --- |\n";
+            text += "\n| claim of the thesis | our result | criterion | verdict |\n| --- | --- | --- | --- |\n";
         }
         for claim in &section.claims {
             let Claim {
@@ -185,14 +198,14 @@ fn compose(sections: &[(Section, Vec<String>, String)], effort: Effort, figures:
             let _ = write!(text, "\n{}\n", notes.trim_end());
         }
         for Figure { file, caption, png } in &section.figures {
-            let place = figures.join(file);
-            let place = place.display();
+            let path = figures.join(file);
+            let path = path.display();
             let link = if *png {
-                format!(" ([PNG]({place}.png))")
+                format!(" ([PNG]({path}.png))")
             } else {
                 String::new()
             };
-            let _ = write!(text, "\n![{caption}]({place}.svg)\n\n*{caption}*{link}\n");
+            let _ = write!(text, "\n![{caption}]({path}.svg)\n\n*{caption}*{link}\n");
         }
     }
     text
@@ -204,7 +217,7 @@ fn parent_of(path: &Path) -> &Path {
         .unwrap_or(Path::new("."))
 }
 
-/// The way to `path` from the directory `from`; both are whole and without detours.
+/// The relative path from the directory `from` to `path`. Both are absolute, without `..` and symbolic links.
 fn relative(path: &Path, from: &Path) -> PathBuf {
     let common = path
         .components()
@@ -223,14 +236,14 @@ mod tests {
 
     #[test]
     fn links_are_relative_to_the_report() {
-        let way = |path, from| relative(Path::new(path), Path::new(from)).display().to_string();
-        assert_eq!(way("/a/b/figures", "/a/b"), "figures");
-        assert_eq!(way("/a/runs/x/figures", "/a/docs"), "../runs/x/figures");
-        assert_eq!(way("/x", "/a/docs"), "../../x");
+        let link = |path, from| relative(Path::new(path), Path::new(from)).display().to_string();
+        assert_eq!(link("/a/b/figures", "/a/b"), "figures");
+        assert_eq!(link("/a/runs/x/figures", "/a/docs"), "../runs/x/figures");
+        assert_eq!(link("/x", "/a/docs"), "../../x");
     }
 
     #[test]
-    fn a_report_says_what_holds_and_what_is_missing() {
+    fn a_report_contains_verdicts_notes_figures_and_missing_seeds() {
         let section = |held: &[bool], png| Section {
             title: "Pendulum",
             from: vec![("pendulum", "")],
@@ -255,7 +268,7 @@ mod tests {
         };
         let full = of(&[true], Effort::Full, false);
         for part in [
-            "Of 1 claims 1 hold, 0 do not, 0 are not checked.",
+            "Of 1 claims, 1 hold, 0 do not, and 0 were not checked.",
             "| it swings up | 0.01 | it is up | **holds** for the only seed |",
             "missing: 2",
             "It leans a little.",
@@ -270,7 +283,7 @@ mod tests {
     }
 
     #[test]
-    fn notes_stand_in_the_one_section_that_is_about_the_same() {
+    fn notes_appear_in_the_section_with_the_same_results() {
         let directory = tempfile::tempdir().unwrap();
         let folder = Folder::open(directory.path(), []).unwrap();
         std::fs::create_dir(directory.path().join("notes")).unwrap();
@@ -284,13 +297,13 @@ mod tests {
     }
 
     #[test]
-    fn a_figure_is_rasterised_once_and_only_where_that_is_wanted() {
+    fn a_png_is_made_on_request_and_again_only_after_a_change() {
         let directory = tempfile::tempdir().unwrap();
         let path = |ending| directory.path().join(format!("a.{ending}"));
         let draw = |png: bool, value: f64| {
-            let album = Album::in_directory(directory.path().into(), png).unwrap();
+            let writer = FigureWriter::in_directory(directory.path().into(), png).unwrap();
             let curve = vec![vec![(1_000, value), (2_000, 1.0)]];
-            let figure = album.add("a", "A", |path| figure::learning_curves("A", &curve, None, path));
+            let figure = writer.add("a", "A", |path| figure::learning_curves("A", &curve, None, path));
             assert_eq!(figure.unwrap().png, png);
             assert!(path("svg").exists());
             std::fs::read(path("png")).ok()
@@ -302,7 +315,7 @@ mod tests {
         assert_eq!(draw(true, 1.0).unwrap(), b"mine", "nothing has changed");
         assert_eq!(draw(false, 1.0).unwrap(), b"mine", "nothing has changed");
         assert_ne!(draw(true, 2.0).unwrap(), b"mine");
-        assert_eq!(draw(false, 3.0), None, "none that shows something else");
+        assert_eq!(draw(false, 3.0), None, "an outdated PNG is removed");
         assert_eq!(first, draw(true, 1.0));
     }
 }

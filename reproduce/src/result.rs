@@ -1,4 +1,5 @@
-//! What is kept of a seed: little, but enough to check claims and to draw figures long after the run is gone.
+//! The stored result of a seed. It is small, but enough to check claims and draw figures after the run has been
+//! deleted.
 
 use anyhow::{Context, bail};
 use serde::de::DeserializeOwned;
@@ -9,28 +10,28 @@ use super::experiment::{Experiment, Length};
 use super::results_file::Line;
 use super::settings::RunSettings;
 
-/// The form of a result; raise it with every change of what a key means.
+/// The version of a result's format. Increase it whenever the meaning of a key changes.
 const SCHEMA: u32 = 1;
 
-/// How a result came about.
+/// The run that a result belongs to.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Header {
     schema: u32,
     experiment: String,
     pub(super) seed: u64,
-    /// Since the run's beginning.
+    /// Counted from the start of the run.
     length: Length,
-    /// The version of this program that made it.
+    /// The version of Shoal that made the result.
     pub(super) shoal: String,
     settings: RunSettings,
 }
 
-/// A seed's result; `T` is what its family tests beyond the evaluations.
+/// A seed's result. `T` is what its family measures besides the evaluations.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct SeedResult<T> {
     #[serde(flatten)]
     pub(super) header: Header,
-    /// Of the whole run, in order.
+    /// All evaluations of the run, in order.
     pub(super) evaluations: Vec<Evaluation>,
     /// The policy with the best evaluation.
     pub(super) best: Policy,
@@ -47,10 +48,10 @@ pub(super) struct Evaluation {
     pub(super) std: f64,
 }
 
-/// A policy, and how it did in the final evaluation.
+/// A policy with its final evaluation.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Policy {
-    /// Environment steps it was learned from.
+    /// Environment steps at which it was learned.
     pub(super) steps: u64,
     pub(super) evaluation: EvaluationSummary,
 }
@@ -61,13 +62,14 @@ impl<T> SeedResult<T> {
         self.evaluations.iter().map(|it| (it.steps, it.mean)).collect()
     }
 
-    /// Mean of the last fifth of the evaluations, of one at least.
+    /// Mean of the last fifth of the evaluations, at least one.
     pub(super) fn late_mean(&self) -> f64 {
         let late = &self.evaluations[self.evaluations.len() * 4 / 5..];
         late.iter().map(|it| it.mean).sum::<f64>() / late.len() as f64
     }
 
-    /// The first evaluation's steps at which nine tenths of the way from the first to the best evaluation are made.
+    /// The environment steps of the first evaluation that has covered nine tenths of the way from the first
+    /// evaluation's mean return to the best one.
     pub(super) fn learned_by(&self) -> Option<u64> {
         let first = self.evaluations.first()?.mean;
         let best = self.evaluations.iter().map(|it| it.mean).fold(first, f64::max);
@@ -88,9 +90,9 @@ impl Header {
         }
     }
 
-    /// Reads how a result came about.
+    /// Reads the header of a result.
     pub(super) fn read(line: &Line) -> anyhow::Result<Self> {
-        /// What a result of any version has.
+        /// The key that results of every version have.
         #[derive(Deserialize)]
         struct Versioned {
             schema: u32,
@@ -98,14 +100,15 @@ impl Header {
         let Versioned { schema } = parse(line)?;
         if schema != SCHEMA {
             bail!(
-                "{} has schema {schema}, this program writes {SCHEMA}: move it away, or choose another directory with --out",
+                "{} has schema {schema}, this program writes {SCHEMA}: move it away, or choose another directory with \
+                 --out",
                 line.place
             );
         }
         parse(line)
     }
 
-    /// Refuses a result at `place` that is not the one that would be made now under its name.
+    /// Returns an error if the result at `place` is not of this experiment, seed, length and settings.
     pub(super) fn check(
         &self,
         place: &str,
@@ -114,16 +117,16 @@ impl Header {
         length: Length,
         settings: &RunSettings,
     ) -> anyhow::Result<()> {
-        let (found, wanted) = (
+        let (found, expected) = (
             (self.experiment.as_str(), self.seed, self.length),
             (experiment.name, seed, length),
         );
-        if found != wanted {
-            let say = |(name, seed, length): (&str, u64, Length)| format!("{name}, seed {seed}, {length}");
+        if found != expected {
+            let describe = |(name, seed, length): (&str, u64, Length)| format!("{name}, seed {seed}, {length}");
             bail!(
                 "{place} is the result of {}, not of {}: move it away, or choose another directory with --out",
-                say(found),
-                say(wanted)
+                describe(found),
+                describe(expected)
             );
         }
         self.settings.check(place, settings)
@@ -138,13 +141,14 @@ pub(super) fn read<T: DeserializeOwned>(line: &Line) -> anyhow::Result<SeedResul
 fn parse<T: DeserializeOwned>(line: &Line) -> anyhow::Result<T> {
     serde_json::from_str(&line.text).with_context(|| {
         format!(
-            "{} is no result of this program: move it away to have it made again",
+            "{} is not a result of this program: move it away, and the result will be made again",
             line.place
         )
     })
 }
 
-/// The result whose best policy did as the middle one of all: it stands for them in figures of a single run.
+/// The result whose best policy has the median final evaluation (the lower of the middle two). Figures of a single run
+/// show it.
 pub(super) fn representative<T>(results: &[SeedResult<T>]) -> Option<&SeedResult<T>> {
     let mut sorted: Vec<&SeedResult<T>> = results.iter().collect();
     sorted.sort_by(|a, b| {
@@ -159,7 +163,7 @@ pub(super) mod tests {
     use super::super::experiment::Progress;
     use super::*;
 
-    /// A result of this seed whose best policy has this return, and its last a slightly worse one.
+    /// A result of this seed. The best policy has this return, and the last policy a slightly lower one.
     pub(crate) fn result<T>(experiment: &Experiment, seed: u64, return_mean: f64, tests: T) -> SeedResult<T> {
         let policy = |return_mean| Policy {
             steps: 1_000,
@@ -172,7 +176,7 @@ pub(super) mod tests {
             },
         };
         let length = experiment.stages[0].length;
-        let steps = length.done(Progress::default()).1;
+        let steps = length.progress(Progress::default()).1;
         let evaluation = |i: u64| Evaluation {
             steps: i * steps / 20,
             mean: return_mean * i.min(10) as f64 / 10.0,
@@ -201,7 +205,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn a_result_reads_back() {
+    fn a_written_result_can_be_read() {
         let made = result(experiment(), 3, -150.25, vec![0.1, 3.25, -2e-5]);
         let line = line(&serde_json::to_string(&made).unwrap());
         assert_eq!(read::<Vec<f64>>(&line).unwrap(), made);
@@ -229,11 +233,11 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn another_schema_and_no_result_at_all_are_refused() {
+    fn another_schema_and_other_text_are_refused() {
         for (text, part) in [
             ("{\"schema\": 99}", "schema 99"),
-            ("{\"schema\"", "no result"),
-            ("[]", "no result"),
+            ("{\"schema\"", "not a result"),
+            ("[]", "not a result"),
         ] {
             let error = format!("{:#}", Header::read(&line(text)).unwrap_err());
             assert!(
@@ -244,14 +248,14 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn a_curve_says_how_it_ends_and_when_it_rose() {
+    fn late_mean_and_learning_time_follow_from_the_curve() {
         let result = result(experiment(), 1, 100.0, ());
         assert_eq!(result.late_mean(), 100.0);
         assert_eq!(result.learned_by(), Some(9 * 120_000 / 20));
     }
 
     #[test]
-    fn the_middle_seed_stands_for_all() {
+    fn the_median_seed_represents_all() {
         let results: Vec<_> = [(1, -200.0), (2, -100.0), (3, -150.0)]
             .map(|(seed, value)| result(experiment(), seed, value, ()))
             .into();

@@ -1,8 +1,8 @@
 //! The results of an experiment: one file, `<experiment>.jsonl.gz`. Its first line is the [`Head`]; every other line is
-//! the result of a seed at the end of a stage, in the order of seeds and stages.
+//! the result of one seed and stage, ordered by seed and stage.
 //!
-//! Before there was such a file, each result had one of its own, `<experiment>/seed-N<stage>.json`. Those are still read,
-//! and [`ResultsFile::take_over`] moves them.
+//! Earlier versions stored each result in its own file, `<experiment>/seed-N<stage>.json`. Such files are still read,
+//! and [`ResultsFile::move_old_results`] moves them into the new file.
 
 use std::collections::BTreeMap;
 use std::collections::btree_map;
@@ -19,17 +19,17 @@ use shoal_common::durable::write_atomically;
 
 use super::experiment::{Experiment, Stage};
 
-/// The form of the file; raise it with every change. 1 was a file for each result.
+/// The version of the file format. Increase it with every change. Format 1 had a file for each result.
 const FORMAT: u32 = 2;
 
-/// The first line.
+/// The first line of the file.
 #[derive(Debug, Serialize, Deserialize)]
 struct Head {
     format: u32,
     experiment: String,
 }
 
-/// Which of an experiment's results it is.
+/// Identifies a result of an experiment.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Deserialize)]
 struct Key {
     seed: u64,
@@ -37,14 +37,14 @@ struct Key {
     stage: String,
 }
 
-/// A result as it is kept.
+/// A result as it is stored.
 #[derive(Debug)]
 pub(super) struct Line {
-    /// JSON on one line. It is never written anew from numbers, so that every digit stays.
+    /// JSON on one line. It is copied and never formatted again, so that every digit is kept.
     pub(super) text: String,
-    /// Where it lies, for messages.
+    /// Where it is stored, for messages.
     pub(super) place: String,
-    /// The file of its own that it still has.
+    /// Its own file in the old format, if it still has one.
     old: Option<PathBuf>,
 }
 
@@ -63,14 +63,14 @@ impl Line {
 #[derive(Debug)]
 pub(super) struct ResultsFile {
     path: PathBuf,
-    /// Where runs lie, and where each result lay in a file of its own.
+    /// The directory of the runs and of results in the old format.
     directory: PathBuf,
     head: Head,
     lines: BTreeMap<Key, Line>,
 }
 
 impl ResultsFile {
-    /// Reads what there is of the experiment in a folder, in either form; there may be nothing.
+    /// Reads the experiment's results in a folder, in either format. There may be none.
     pub(super) fn read(folder: &Path, experiment: &Experiment) -> anyhow::Result<Self> {
         let mut results = Self {
             path: folder.join(format!("{}.jsonl.gz", experiment.name)),
@@ -89,7 +89,7 @@ impl ResultsFile {
         for stage in experiment.stages {
             let ending = format!("{}.json", stage.suffix);
             for seed in numbered(&results.directory, &ending)? {
-                results.find_old(seed, &ending, stage)?;
+                results.read_old(seed, &ending, stage)?;
             }
         }
         Ok(results)
@@ -97,14 +97,14 @@ impl ResultsFile {
 
     fn unpack(&mut self, file: File) -> anyhow::Result<()> {
         let here = self.path.display().to_string();
-        let hint = "restore it, or move it away to have its results made again";
-        let damaged = || format!("{here} is damaged, or no results of this program: {hint}");
+        let hint = "restore it, or move it away, and its results will be made again";
+        let damaged = || format!("{here} is damaged or not a results file of this program: {hint}");
         let mut text = String::new();
         MultiGzDecoder::new(file)
             .read_to_string(&mut text)
             .with_context(damaged)?;
         let mut lines = text.lines();
-        /// What the first line has in every format.
+        /// The key that the first line has in every format.
         #[derive(Deserialize)]
         struct Versioned {
             format: u32,
@@ -116,7 +116,7 @@ impl ResultsFile {
         }
         let head: Head = serde_json::from_str(head).with_context(damaged)?;
         if head.experiment != self.head.experiment {
-            bail!("{here} has the results of {}: {hint}", head.experiment);
+            bail!("{here} contains the results of {}: {hint}", head.experiment);
         }
         for text in lines {
             let key: Key = serde_json::from_str(text).with_context(damaged)?;
@@ -127,22 +127,23 @@ impl ResultsFile {
                 old: None,
             };
             if self.lines.insert(key, line).is_some() {
-                bail!("{place} is there twice: {hint}");
+                bail!("{place} occurs twice: {hint}");
             }
         }
         Ok(())
     }
 
-    /// Reads a result that has a file of its own.
-    fn find_old(&mut self, seed: u64, ending: &str, stage: &Stage) -> anyhow::Result<()> {
+    /// Reads a result in the old format.
+    fn read_old(&mut self, seed: u64, ending: &str, stage: &Stage) -> anyhow::Result<()> {
         let path = self.directory.join(format!("seed-{seed}{ending}"));
         let here = path.display();
         let text = std::fs::read_to_string(&path).with_context(|| format!("cannot read {here}"))?;
-        let (key, text) = line(&text, stage)
-            .with_context(|| format!("{here} is no result of this program: move it away to have it made again"))?;
+        let (key, text) = line(&text, stage).with_context(|| {
+            format!("{here} is not a result of this program: move it away, and the result will be made again")
+        })?;
         if key.seed != seed {
             bail!(
-                "{here} is the result of seed {}: give it its name again, or move it away",
+                "{here} is the result of seed {}: rename it back, or move it away",
                 key.seed
             );
         }
@@ -154,17 +155,17 @@ impl ResultsFile {
                     old: Some(path),
                 });
             }
-            // Somebody was killed after it was written there and before it was removed here.
-            btree_map::Entry::Occupied(mut kept) if kept.get().text == text => kept.get_mut().old = Some(path),
-            btree_map::Entry::Occupied(kept) => {
-                bail!("{here} and {} differ: move one of them away", kept.get().place)
+            // A command was killed after it had written the new file and before it removed this one.
+            btree_map::Entry::Occupied(mut stored) if stored.get().text == text => stored.get_mut().old = Some(path),
+            btree_map::Entry::Occupied(stored) => {
+                bail!("{here} and {} differ: move one of them away", stored.get().place)
             }
         }
         Ok(())
     }
 
-    /// Moves what still has files of its own into the one file. What is removed is on the disk there before.
-    pub(super) fn take_over(&mut self) -> anyhow::Result<()> {
+    /// Moves results in the old format into the new file. Old files are removed only when the new one is on the disk.
+    pub(super) fn move_old_results(&mut self) -> anyhow::Result<()> {
         let old: Vec<PathBuf> = self.lines.values_mut().filter_map(|line| line.old.take()).collect();
         if old.is_empty() {
             return Ok(());
@@ -173,7 +174,7 @@ impl ResultsFile {
         for path in &old {
             std::fs::remove_file(path).with_context(|| format!("cannot remove {}", path.display()))?;
         }
-        // It stays where runs lie in it.
+        // The directory remains if it contains runs.
         let _ = std::fs::remove_dir(&self.directory);
         for (key, line) in &mut self.lines {
             line.place = place(&self.path, key);
@@ -181,7 +182,7 @@ impl ResultsFile {
         Ok(())
     }
 
-    /// Adds a result, an object as JSON on one line, and writes the file.
+    /// Adds a result, which is a JSON object, and writes the file.
     pub(super) fn add(&mut self, result: &str, stage: &Stage) -> anyhow::Result<()> {
         let (key, text) = line(result, stage)?;
         let place = place(&self.path, &key);
@@ -193,12 +194,12 @@ impl ResultsFile {
         written
     }
 
-    /// Whether there is a result of this seed.
+    /// Whether there is a result for this seed and stage.
     pub(super) fn has(&self, stage: &Stage, seed: u64) -> bool {
-        self.of(stage).any(|(there, _)| there == seed)
+        self.of(stage).any(|(found, _)| found == seed)
     }
 
-    /// Seeds and results of a stage, in the order of seeds.
+    /// Seeds and results of a stage, ordered by seed.
     pub(super) fn of(&self, stage: &Stage) -> impl Iterator<Item = (u64, &Line)> {
         self.lines
             .iter()
@@ -206,11 +207,11 @@ impl ResultsFile {
             .map(|(key, line)| (key.seed, line))
     }
 
-    /// Writes the file: whole or not at all. Its bytes depend on the results alone.
+    /// Writes the file, completely or not at all. Its bytes depend only on the results.
     fn write(&self) -> anyhow::Result<()> {
         let head = serde_json::to_string(&self.head)?;
         write_atomically(&self.path, |file| -> io::Result<()> {
-            // Without a name and a time.
+            // The gzip header has no file name and no time.
             let mut gzip = GzEncoder::new(file, Compression::best());
             writeln!(gzip, "{head}")?;
             for line in self.lines.values() {
@@ -223,23 +224,24 @@ impl ResultsFile {
     }
 }
 
-/// Where a result lies in the file at `path`.
+/// Describes a result in the file at `path`, for messages.
 fn place(path: &Path, key: &Key) -> String {
     format!("{} (seed {}{})", path.display(), key.seed, key.stage)
 }
 
-/// The line of a result, an object as JSON, at the end of this stage: the same, digit for digit, with the stage before
-/// its other keys.
+/// The line of a result of this stage: the JSON object `result`, unchanged digit by digit, with the stage inserted as
+/// its first key.
 fn line(result: &str, stage: &Stage) -> anyhow::Result<(Key, String)> {
-    // JSON has line breaks only between its parts.
+    // JSON has no line breaks inside strings or numbers.
     let result: String = result.lines().map(str::trim).collect();
-    let rest = result.strip_prefix('{').context("it is no JSON object")?;
+    let rest = result.strip_prefix('{').context("it is not a JSON object")?;
     let suffix = serde_json::to_string(stage.suffix)?;
     let line = format!("{{\"stage\":{suffix},{rest}");
     Ok((serde_json::from_str(&line)?, line))
 }
 
-/// The numbers N of what is called `seed-N<ending>` in a directory, in order; none where there is no directory.
+/// The numbers N of all entries `seed-N<ending>` in a directory, in ascending order; none if the directory does not
+/// exist.
 pub(super) fn numbered(directory: &Path, ending: &str) -> anyhow::Result<Vec<u64>> {
     if !directory.exists() {
         return Ok(Vec::new());
@@ -251,7 +253,7 @@ pub(super) fn numbered(directory: &Path, ending: &str) -> anyhow::Result<Vec<u64
         let number = name
             .to_str()
             .and_then(|name| name.strip_prefix("seed-")?.strip_suffix(ending));
-        // A name with another spelling of a number is not ours.
+        // Other spellings of a number, such as 02, are ignored.
         let number = number.and_then(|text| text.parse().ok().filter(|number: &u64| number.to_string() == text));
         numbers.extend(number);
     }
@@ -270,12 +272,12 @@ mod tests {
     use super::super::result::{self, Header, SeedResult};
     use super::*;
 
-    /// The experiment with two stages.
-    const TWICE: &Experiment = &EXPERIMENTS[1];
+    /// An experiment with two stages.
+    const TWO_STAGES: &Experiment = &EXPERIMENTS[1];
 
-    /// A result of [`TWICE`] as it was kept in a file of its own.
+    /// A result of [`TWO_STAGES`] in the old format.
     fn text(seed: u64, of: f64) -> String {
-        serde_json::to_string(&result(TWICE, seed, of, ())).unwrap()
+        serde_json::to_string(&result(TWO_STAGES, seed, of, ())).unwrap()
     }
 
     fn unpacked(path: &Path) -> String {
@@ -293,24 +295,27 @@ mod tests {
     }
 
     fn refused(folder: &Path) -> String {
-        let error = format!("{:#}", ResultsFile::read(folder, TWICE).unwrap_err());
+        let error = format!("{:#}", ResultsFile::read(folder, TWO_STAGES).unwrap_err());
         assert!(error.contains("point-mass-r2") && !error.contains('\n'), "{error}");
         error
     }
 
     #[test]
-    fn results_are_lines_in_the_order_of_seeds_and_stages() {
+    fn results_are_lines_ordered_by_seed_and_stage() {
         let folder = tempfile::tempdir().unwrap();
-        let [first, second] = TWICE.stages else {
+        let [first, second] = TWO_STAGES.stages else {
             panic!("two stages")
         };
-        let mut results = ResultsFile::read(folder.path(), TWICE).unwrap();
+        let mut results = ResultsFile::read(folder.path(), TWO_STAGES).unwrap();
         for (stage, seed) in [(first, 10), (second, 2), (first, 2)] {
             results.add(&text(seed, 0.1 + 0.2), stage).unwrap();
         }
         let path = folder.path().join("point-mass-r2.jsonl.gz");
-        let there = unpacked(&path);
-        let lines: Vec<Value> = there.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+        let written = unpacked(&path);
+        let lines: Vec<Value> = written
+            .lines()
+            .map(|line| serde_json::from_str(line).unwrap())
+            .collect();
         assert_eq!(
             (&lines[0]["format"], &lines[0]["experiment"]),
             (&2.into(), &"point-mass-r2".into())
@@ -320,14 +325,14 @@ mod tests {
             .map(|line| (line["seed"].as_u64().unwrap(), line["stage"].as_str().unwrap()))
             .collect();
         assert_eq!(keys, [(2, ""), (2, "-longer"), (10, "")]);
-        assert!(there.contains("0.30000000000000004"), "every digit");
-        // Neither a name nor a time: flags, and seconds since 1970.
+        assert!(written.contains("0.30000000000000004"), "every digit is kept");
+        // The flags (no file name) and the time of the gzip header.
         let bytes = std::fs::read(&path).unwrap();
         assert_eq!(bytes[3..8], [0; 5]);
 
-        // However it came about.
+        // The order in which results are added does not matter.
         let other = tempfile::tempdir().unwrap();
-        let mut again = ResultsFile::read(other.path(), TWICE).unwrap();
+        let mut again = ResultsFile::read(other.path(), TWO_STAGES).unwrap();
         for (stage, seed) in [(first, 2), (first, 10), (second, 2)] {
             again.add(&text(seed, 0.1 + 0.2), stage).unwrap();
         }
@@ -335,20 +340,20 @@ mod tests {
             std::fs::read(other.path().join("point-mass-r2.jsonl.gz")).unwrap(),
             bytes
         );
-        let read = ResultsFile::read(folder.path(), TWICE).unwrap();
+        let read = ResultsFile::read(folder.path(), TWO_STAGES).unwrap();
         let seeds = |stage| read.of(stage).map(|(seed, _)| seed).collect::<Vec<_>>();
         assert_eq!((seeds(first), seeds(second)), (vec![2, 10], vec![2]));
         assert!(read.has(second, 2) && !read.has(second, 10));
     }
 
     #[test]
-    fn what_cannot_be_written_is_not_there() {
+    fn a_result_that_cannot_be_written_is_not_added() {
         let folder = tempfile::tempdir().unwrap();
-        let stage = &TWICE.stages[0];
-        let mut results = ResultsFile::read(folder.path(), TWICE).unwrap();
+        let stage = &TWO_STAGES.stages[0];
+        let mut results = ResultsFile::read(folder.path(), TWO_STAGES).unwrap();
         results.add(&text(1, 1.0), stage).unwrap();
         let kept = std::fs::read(folder.path().join("point-mass-r2.jsonl.gz")).unwrap();
-        // Where it is written before it gets its name.
+        // This directory has the name of the temporary file.
         std::fs::create_dir(folder.path().join("point-mass-r2.jsonl.gz.new")).unwrap();
         let error = results.add(&text(2, 1.0), stage).unwrap_err().to_string();
         assert!(
@@ -363,12 +368,12 @@ mod tests {
     }
 
     #[test]
-    fn a_file_for_each_result_is_taken_over_and_removed() {
+    fn results_in_the_old_format_are_moved() {
         let folder = tempfile::tempdir().unwrap();
-        let [first, second] = TWICE.stages else {
+        let [first, second] = TWO_STAGES.stages else {
             panic!("two stages")
         };
-        ResultsFile::read(folder.path(), TWICE)
+        ResultsFile::read(folder.path(), TWO_STAGES)
             .unwrap()
             .add(&text(3, 3.0), first)
             .unwrap();
@@ -378,19 +383,19 @@ mod tests {
         old("seed-12.json", &format!("{}\n", text(12, 0.1 + 0.2)));
         old("seed-1.json", &text(1, 1.0).replace(",\"", ",\n  \""));
         old("seed-1-longer.json", &text(1, 2.0));
-        // As a command that was killed in between leaves it.
+        // A command that was killed between writing and removing leaves this.
         old("seed-3.json", &text(3, 3.0));
         old("seed-4.json.new", "half");
         old("notes.txt", "mine");
 
-        let mut results = ResultsFile::read(folder.path(), TWICE).unwrap();
+        let mut results = ResultsFile::read(folder.path(), TWO_STAGES).unwrap();
         let keys: Vec<_> = results.of(first).map(|(seed, _)| seed).collect();
         assert_eq!(keys, [1, 3, 12]);
         assert!(
             results.has(second, 1) && directory.join("seed-1.json").exists(),
             "nothing is moved yet"
         );
-        results.take_over().unwrap();
+        results.move_old_results().unwrap();
         let mut left: Vec<_> = std::fs::read_dir(&directory)
             .unwrap()
             .map(|entry| entry.unwrap().file_name().into_string().unwrap())
@@ -407,39 +412,42 @@ mod tests {
                 .all(|(_, line)| line.place.contains("point-mass-r2.jsonl.gz (seed "))
         );
 
-        // Two that differ: nobody chooses.
+        // Two results of the same seed that differ are an error.
         old("seed-12.json", &text(12, 5.0));
         assert!(refused(folder.path()).contains("differ"));
         old("seed-12.json", &text(13, 5.0));
         assert!(refused(folder.path()).contains("the result of seed 13"));
         old("seed-12.json", "{\"schema\"");
-        assert!(refused(folder.path()).contains("no result of this program"));
+        assert!(refused(folder.path()).contains("not a result of this program"));
         assert_eq!(unpacked(&folder.path().join("point-mass-r2.jsonl.gz")), all);
     }
 
     #[test]
-    fn a_result_of_the_program_before_the_one_file_reads() {
+    fn a_result_of_an_earlier_version_can_be_read() {
         let folder = tempfile::tempdir().unwrap();
         let old = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/data/123d5ad/pendulum/seed-1.json");
         let directory = folder.path().join("pendulum");
         std::fs::create_dir(&directory).unwrap();
         std::fs::copy(&old, directory.join("seed-1.json")).unwrap();
         let pendulum = &Pendulum::EXPERIMENTS[0];
-        ResultsFile::read(folder.path(), pendulum).unwrap().take_over().unwrap();
-        assert!(!directory.exists(), "it was left empty");
+        ResultsFile::read(folder.path(), pendulum)
+            .unwrap()
+            .move_old_results()
+            .unwrap();
+        assert!(!directory.exists(), "the empty directory was removed");
 
         let results = ResultsFile::read(folder.path(), pendulum).unwrap();
         let lines: Vec<_> = results.of(&pendulum.stages[0]).collect();
         let [(1, line)] = lines[..] else { panic!("{lines:?}") };
-        let kept = std::fs::read_to_string(&old).unwrap();
-        assert_eq!(line.text.replacen("\"stage\":\"\",", "", 1), kept.trim_end());
+        let old_text = std::fs::read_to_string(&old).unwrap();
+        assert_eq!(line.text.replacen("\"stage\":\"\",", "", 1), old_text.trim_end());
         Header::read(line).unwrap();
         let read: SeedResult<<Pendulum as Family>::Tests> = result::read(line).unwrap();
         assert_eq!(read.evaluations.last().unwrap().steps, 4_000);
     }
 
     #[test]
-    fn what_lies_beside_the_file_is_found_by_its_name() {
+    fn old_results_and_runs_are_found_by_their_names() {
         let directory = tempfile::tempdir().unwrap();
         for name in [
             "seed-12.json",
@@ -460,15 +468,15 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_such_file_is_refused() {
+    fn damaged_and_foreign_files_are_refused() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("point-mass-r2.jsonl.gz");
-        ResultsFile::read(folder.path(), TWICE)
+        ResultsFile::read(folder.path(), TWO_STAGES)
             .unwrap()
-            .add(&text(1, 1.0), &TWICE.stages[0])
+            .add(&text(1, 1.0), &TWO_STAGES.stages[0])
             .unwrap();
         let (whole, lines) = (std::fs::read(&path).unwrap(), unpacked(&path));
-        let damaged = "damaged, or no results";
+        let damaged = "damaged or not a results file";
         for bytes in [
             &b"no gzip"[..],
             &whole[..whole.len() - 3],
@@ -486,13 +494,13 @@ mod tests {
                 &lines.replacen("point-mass-r2", "point-mass-r1", 1),
                 "the results of point-mass-r1",
             ),
-            (&format!("{lines}{result}\n"), "(seed 1) is there twice"),
+            (&format!("{lines}{result}\n"), "(seed 1) occurs twice"),
             (&format!("{lines}{{\"seed\":2}}\n"), damaged),
         ] {
             pack(&path, text);
             assert!(refused(folder.path()).contains(part), "{part}");
         }
         pack(&path, &lines);
-        ResultsFile::read(folder.path(), TWICE).unwrap();
+        ResultsFile::read(folder.path(), TWO_STAGES).unwrap();
     }
 }

@@ -1,5 +1,5 @@
-//! With which settings a run was made: its configuration but for its name, its seed and its length, and for what no result
-//! depends on.
+//! The settings of a run that determine its result: its configuration without name, seed and length, and without keys
+//! on which no result depends.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -14,12 +14,12 @@ use toml::Value;
 
 use super::experiment::{Effort, Experiment, Length};
 
-/// Keys with their sections, and values as TOML.
+/// Values as TOML, by SECTION.KEY.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct RunSettings(BTreeMap<String, String>);
 
 impl RunSettings {
-    /// Those of a run.
+    /// The settings of a run with this configuration.
     pub(super) fn of(config: &Config) -> anyhow::Result<Self> {
         let mut settings = BTreeMap::new();
         flatten("", toml::Value::try_from(config)?, &mut settings);
@@ -30,7 +30,7 @@ impl RunSettings {
         Ok(Self(settings))
     }
 
-    /// Those of the run in a directory, which must be of this seed.
+    /// The settings of the run in a directory, which must have this seed.
     pub(super) fn of_run(run: &Path, seed: u64) -> anyhow::Result<Self> {
         let config = RunDir::open(run)?.config()?;
         if config.run.seed != seed {
@@ -43,7 +43,7 @@ impl RunSettings {
         Self::of(&config)
     }
 
-    /// Those that a run of `experiment` would have.
+    /// The settings that a run of `experiment` has in this version.
     pub(super) fn expected(experiment: &Experiment, effort: Effort) -> anyhow::Result<Self> {
         let length = experiment.stages.first().map(|stage| stage.length(effort));
         let overrides = RunOverrides {
@@ -60,13 +60,14 @@ impl RunSettings {
         Self::of(&config)
     }
 
-    /// Refuses what was made with other settings; `made` says where it lies. A key that only one of them knows is of another version of this program
-    /// and says nothing.
+    /// Returns an error if these settings differ from `expected`. `made` names the run or result in the message. Keys
+    /// that only one side has belong to another version of this program and are ignored.
     pub(super) fn check(&self, made: &str, expected: &Self) -> anyhow::Result<()> {
         for (key, found) in &self.0 {
             if let Some(wanted) = expected.0.get(key).filter(|wanted| *wanted != found) {
                 bail!(
-                    "{made} was made with {key} = {found}, which is now {wanted}: move it away, or choose another directory with --out"
+                    "{made} was made with {key} = {found}, which is now {wanted}: move it away, or choose another \
+                     directory with --out"
                 );
             }
         }
@@ -107,7 +108,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn settings_leave_out_name_seed_and_length() {
+    fn settings_exclude_name_seed_and_length() {
         let experiment = &super::super::pendulum::EXPERIMENTS[0];
         let [full, quick] = [Effort::Full, Effort::Quick].map(|e| RunSettings::expected(experiment, e).unwrap());
         assert_eq!(full.0["ddpg.hidden"], "[400, 300]");

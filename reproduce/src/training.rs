@@ -1,4 +1,4 @@
-//! One training: this program, started again as `train` or `resume`.
+//! One training: starts this program as `shoal train` or `shoal resume`.
 
 use std::os::unix::process::CommandExt;
 use std::path::Path;
@@ -14,55 +14,55 @@ use shoal_run::status;
 
 use super::experiment::{Effort, Experiment, Length, Progress};
 
-/// How often it is looked whether a signal has come.
-const ROUND: Duration = Duration::from_millis(100);
+/// Interval at which a received signal is checked.
+const SIGNAL_INTERVAL: Duration = Duration::from_millis(100);
 
-/// How a run directory stands.
+/// The state of a run directory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum RunState {
     Absent,
-    Begun(Progress),
+    Started(Progress),
 }
 
 /// How a training ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Trained {
-    Through,
-    /// A signal came; its state is saved.
+pub(super) enum Ending {
+    Finished,
+    /// By a signal; its state is saved.
     Interrupted,
 }
 
 impl RunState {
     pub(super) fn of(run: &Path) -> anyhow::Result<Self> {
-        // Who was killed before anything was written leaves an empty directory.
+        // A training that was killed before it wrote anything leaves an empty directory. Only such a directory is
+        // removed.
         let _ = std::fs::remove_dir(run);
         if !run.exists() {
             return Ok(Self::Absent);
         }
         let directory = RunDir::open(run)?;
-        if directory.goes_on()? {
+        if directory.is_running()? {
             return Err(RunDirError::Busy(run.into()).into());
         }
-        let rest = status::at_rest(&directory.config()?, &directory)?;
-        Ok(Self::Begun(Progress {
+        let rest = status::saved_status(&directory.config()?, &directory)?;
+        Ok(Self::Started(Progress {
             steps: rest.env_steps,
             episodes: rest.episodes,
         }))
     }
 
-    /// How far it is.
     pub(super) fn progress(self) -> Progress {
         match self {
             Self::Absent => Progress::default(),
-            Self::Begun(progress) => progress,
+            Self::Started(progress) => progress,
         }
     }
 }
 
-/// The signal that is to end everything in order, if one has come.
+/// Returns the signal to terminate, if one has been received.
 pub(super) type Interrupted<'a> = &'a dyn Fn() -> Option<i32>;
 
-/// Brings the run to this length, from wherever it stands, or ends it in order before.
+/// Trains the run up to this length, or until a signal interrupts it. A started run is resumed.
 pub(super) fn train(
     experiment: &Experiment,
     effort: Effort,
@@ -70,31 +70,31 @@ pub(super) fn train(
     length: Length,
     run: &Path,
     interrupted: Interrupted<'_>,
-) -> anyhow::Result<Trained> {
+) -> anyhow::Result<Ending> {
     let mut command = Command::new("/proc/self/exe");
     command.arg0("shoal");
     match RunState::of(run)? {
-        RunState::Begun(progress) if has_ended(run, length, progress)? => return Ok(Trained::Through),
+        RunState::Started(progress) if has_ended(run, length, progress)? => return Ok(Ending::Finished),
         RunState::Absent => {
             command
                 .args(["train", experiment.preset, "--lockstep", "--run"])
                 .arg(run);
             command.args(["--seed", &seed.to_string()]);
-            // A run keeps to one core: the others have runs of their own.
+            // One learner thread, because other runs use the other cores.
             let settings = experiment.settings(effort);
             for setting in settings.chain(["learner.threads=1"]) {
                 command.args(["--set", setting]);
             }
         }
-        RunState::Begun(_) => {
+        RunState::Started(_) => {
             command.arg("resume").arg(run);
         }
     }
-    command.args(length.argument()).arg("--quiet");
+    command.args(length.arguments()).arg("--quiet");
     run_child(&mut command, interrupted)
 }
 
-/// Whether a run has come to this length, and ended in order there: then it leaves its last policy.
+/// Whether a run has reached this length and ended normally there, which leaves its last policy.
 fn has_ended(run: &Path, length: Length, progress: Progress) -> anyhow::Result<bool> {
     let run = RunDir::open(run)?;
     if !run.last_policy().exists() {
@@ -107,44 +107,44 @@ fn has_ended(run: &Path, length: Length, progress: Progress) -> anyhow::Result<b
     })
 }
 
-fn run_child(command: &mut Command, interrupted: Interrupted<'_>) -> anyhow::Result<Trained> {
+fn run_child(command: &mut Command, interrupted: Interrupted<'_>) -> anyhow::Result<Ending> {
     let mut training = Peer::start(command, "training".into()).context("cannot start a training")?;
-    let mut told = false;
+    let mut terminated = false;
     let status = loop {
-        if let Some(status) = training.wait(ROUND) {
+        if let Some(status) = training.wait(SIGNAL_INTERVAL) {
             break status;
         }
-        if interrupted().is_some() && !told {
-            told = true;
-            // Who does not hear it has ended.
+        if interrupted().is_some() && !terminated {
+            terminated = true;
+            // This fails only if the training has ended.
             let _ = training.signal(Signal::TERM);
         }
     };
     if interrupted().is_some() {
-        return Ok(Trained::Interrupted);
+        return Ok(Ending::Interrupted);
     }
     if !status.success() {
         bail!(
             "{}",
             training
-                .last_words()
+                .last_error_line()
                 .unwrap_or_else(|| format!("a training ended with {status}"))
         );
     }
-    Ok(Trained::Through)
+    Ok(Ending::Finished)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn shell(script: &str, signal: Option<i32>) -> anyhow::Result<Trained> {
+    fn shell(script: &str, signal: Option<i32>) -> anyhow::Result<Ending> {
         run_child(Command::new("sh").args(["-c", script]), &|| signal)
     }
 
     #[test]
-    fn a_training_that_fails_is_told_by_its_last_line() {
-        assert_eq!(shell("exit 0", None).unwrap(), Trained::Through);
+    fn the_error_of_a_failed_training_is_its_last_line() {
+        assert_eq!(shell("exit 0", None).unwrap(), Ending::Finished);
         let error = shell(
             "echo 'warning: hot' >&2; echo 'error: no room' >&2; echo >&2; exit 1",
             None,
@@ -155,23 +155,23 @@ mod tests {
     }
 
     #[test]
-    fn a_signal_ends_the_training_in_order() {
-        let begun = std::time::Instant::now();
+    fn a_signal_terminates_the_training() {
+        let start = std::time::Instant::now();
         assert_eq!(
             shell("sleep 60 & trap 'kill $!; exit 143' TERM; wait", Some(15)).unwrap(),
-            Trained::Interrupted
+            Ending::Interrupted
         );
-        assert!(begun.elapsed() < Duration::from_secs(30));
+        assert!(start.elapsed() < Duration::from_secs(30));
     }
 
     #[test]
-    fn an_empty_directory_is_no_run() {
+    fn an_empty_directory_is_not_a_run() {
         let parent = tempfile::tempdir().unwrap();
         let run = parent.path().join("seed-1");
         std::fs::create_dir(&run).unwrap();
         assert_eq!(RunState::of(&run).unwrap(), RunState::Absent);
         std::fs::create_dir(&run).unwrap();
         std::fs::write(run.join("notes"), "").unwrap();
-        assert!(RunState::of(&run).is_err(), "what is not ours is left alone");
+        assert!(RunState::of(&run).is_err(), "a directory with other files is an error");
     }
 }

@@ -1,26 +1,27 @@
-//! What the environment of a run says of its numbers.
+//! The meaning of an environment's numbers.
 
 use shoal_common::config::Config;
 use shoal_env_server::environment::{Goal, Picture, Signal, make};
 
-/// What an environment says of itself, besides its spaces.
+/// What is known of an environment besides its spaces.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Description {
-    /// What its numbers mean.
+    /// The meaning of its observations and actions.
     pub signals: Vec<Signal>,
-    /// Δt of a step in s, where it has a time.
+    /// Δt of a step in s, if the environment models time.
     pub time_step: Option<f64>,
-    /// What success is, where it says so.
+    /// What success means, if the environment defines it.
     pub goal: Option<Goal>,
-    /// What can be drawn of it.
+    /// How an episode is drawn.
     pub picture: Picture,
 }
 
 impl Description {
-    /// Of the run's environment. Where another program serves it, its numbers are known by their place alone.
+    /// Describes the run's environment. Of one that another program serves, only the positions of its numbers are
+    /// known.
     ///
     /// # Errors
-    /// When the environment cannot be made from the configuration.
+    /// When the environment cannot be created from the configuration.
     pub fn of(config: &Config) -> anyhow::Result<Self> {
         if !config.environment.server.is_empty() {
             return Ok(Self {
@@ -46,7 +47,7 @@ mod tests {
     use crate::testing::small;
 
     #[test]
-    fn another_programs_environment_is_described_by_number_whatever_it_is_called() {
+    fn an_external_environment_is_described_by_position_even_under_a_builtin_name() {
         let (mut config, _) = small("name = \"point-mass\"\nreward = \"r1\"");
         let ours = Description::of(&config).unwrap();
         assert!(ours.goal.is_some() && ours.picture == Picture::Plane && ours.signals[0].key == "x");

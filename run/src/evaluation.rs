@@ -1,4 +1,4 @@
-//! How good a run's policies are.
+//! Evaluation of a run's policies.
 
 use serde::{Deserialize, Serialize};
 use shoal_actor::evaluator::mean_and_std;
@@ -13,15 +13,15 @@ use crate::rollout::{Rollout, policy_layout};
 /// One of a run's policies.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
 pub enum WhichPolicy {
-    /// With the best evaluation so far.
+    /// The policy with the best evaluation so far.
     #[default]
     Best,
-    /// As the learner left it.
+    /// The learner's last policy.
     Last,
 }
 
 impl WhichPolicy {
-    /// Reads this policy of a run; it must be for the run's network.
+    /// Reads this policy of a run. It must fit the run's network.
     pub fn read(self, run: &RunDir, config: &Config) -> anyhow::Result<PolicyFile> {
         let path = match self {
             Self::Best => run.best_policy(),
@@ -31,24 +31,24 @@ impl WhichPolicy {
     }
 }
 
-/// How a policy did; the fields of `eval --json`.
+/// The result of an evaluation; the fields of `eval --json`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct EvaluationSummary {
     /// Mean of the episodes' returns.
     pub return_mean: f64,
-    /// Standard deviation of the sample (n − 1). 0 for a single episode.
+    /// Standard deviation of the episodes' returns (n − 1); 0 for a single episode.
     pub return_std: f64,
-    /// How many episodes.
+    /// Number of episodes.
     pub episodes: u32,
-    /// Where the environment has a goal: the mean distance to it at the end, in the distance's unit.
+    /// If the environment has a goal: the mean distance to it at the end, in the distance's unit.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub final_distance_mean: Option<f64>,
-    /// Where the environment has a goal: the share of episodes that reach it.
+    /// If the environment has a goal: the fraction of episodes that end at it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub reached_fraction: Option<f64>,
 }
 
-/// Runs the evaluation episodes 0 … `episodes` − 1 of `seed`, the same start states every time.
+/// Runs the evaluation episodes 0 … `episodes` − 1 of `seed`. They start in the same states every time.
 pub fn evaluate(config: &Config, parameters: &[f32], episodes: u32, seed: u64) -> anyhow::Result<EvaluationSummary> {
     let mut rollout = Rollout::new(config, parameters)?;
     let goal = Description::of(config)?.goal;
@@ -92,19 +92,19 @@ mod tests {
     }
 
     #[test]
-    fn a_vehicle_that_never_moves_ends_where_it_started() {
+    fn a_vehicle_without_force_ends_where_it_started() {
         let (config, mut parameters) = small("name = \"point-mass\"\nreward = \"r1\"");
-        // The last bias is the force's: tanh(−20) is the least force, 0.
+        // The last bias is that of the force: tanh(−20) gives the least force, 0.
         *parameters.last_mut().unwrap() = -20.0;
         let summary = evaluate(&config, &parameters, 50, 3).unwrap();
-        // The mean distance of a square's points from its centre is 0.765 half sides.
+        // The mean distance of a square's points from its centre is 0.765 times half its side.
         let distance = summary.final_distance_mean.unwrap();
         assert!((2.4..3.7).contains(&distance), "{distance}");
         assert_eq!(summary.reached_fraction, Some(0.0));
     }
 
     #[test]
-    fn a_policy_of_another_network_is_refused_in_one_line() {
+    fn a_policy_of_another_network_is_a_one_line_error() {
         let parent = tempfile::tempdir().unwrap();
         let run = RunDir::create(&parent.path().join("run")).unwrap();
         let (mut config, parameters) = small("name = \"pendulum\"");

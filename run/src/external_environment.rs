@@ -1,5 +1,5 @@
-//! Environment servers that are other programs (`docs/PROTOCOL.md`): how one is started, and a conversation with one
-//! outside of any run, to learn what it serves or to try a policy in it.
+//! Environment servers that are other programs (`docs/PROTOCOL.md`): starting one, and using one outside a run to learn
+//! its spaces or to evaluate a policy.
 
 use std::ffi::OsString;
 use std::os::fd::AsFd;
@@ -25,40 +25,40 @@ use shoal_common::stop::{GRACE, Stop};
 
 use crate::process::{Peer, wait_for_any};
 
-/// Environments whose name begins with this are Gymnasium's.
+/// The prefix of the names of Gymnasium environments.
 pub const GYMNASIUM: &str = "gym:";
 
-/// How long a program may take until it says what it serves: a simulator's libraries have to be loaded.
+/// How long a server may take to describe its environments. A simulator may load large libraries.
 const PATIENCE: Duration = Duration::from_secs(120);
 
-/// The command that serves environments of this name where the configuration names none.
+/// The default command that serves environments of this name; `None` for built-in environments.
 pub fn default_command(name: &str) -> Option<Vec<String>> {
     let gymnasium = || ["python3", "-m", "shoal_gym"].map(Into::into).into();
     name.starts_with(GYMNASIUM).then(gymnasium)
 }
 
-/// Which server of which run a program is to be.
+/// The arguments of an environment server.
 pub struct LaunchSpec<'a> {
-    /// The file that says where the run lies in shared memory.
+    /// The iceoryx2 configuration file of the run's shared memory.
     pub iceoryx2: PathBuf,
     /// The run's id.
     pub run_id: &'a str,
-    /// Which server of the run it is.
+    /// The index of the server in the run.
     pub index: u32,
-    /// How often this server was started, this time included.
+    /// The number of this process among all that the run has started.
     pub incarnation: u64,
-    /// Who asks it.
+    /// The process that sends it requests.
     pub client: EventName,
-    /// How many environments it steps at once.
+    /// Number of environments that it steps together.
     pub environments: u32,
     /// The root of its random streams.
     pub seed: u64,
-    /// Which random streams its training episodes come from, besides seed and index.
+    /// With seed and index, selects the random streams of its training episodes.
     pub stream: u64,
 }
 
 impl LaunchSpec<'_> {
-    /// What starts the program; `None` where the environment is one of our own.
+    /// The command that starts the server; `None` for a built-in environment.
     pub fn command(&self, environment: &EnvironmentConfig) -> anyhow::Result<Option<Command>> {
         let Some((program, arguments)) = environment.server.split_first() else {
             return Ok(None);
@@ -81,10 +81,10 @@ impl LaunchSpec<'_> {
     }
 }
 
-/// The hidden command that becomes a program which does not outlive the process that started it.
-pub const TIED: &str = "tied";
+/// The hidden command that replaces itself by another program, which is killed when its parent process dies.
+pub const TIED_COMMAND: &str = "tied";
 
-/// The command that starts `program` so: dead with this process, however that ends, and whatever the program is busy with.
+/// The command that starts `program` tied to this process: it is killed whenever this process dies.
 ///
 /// # Errors
 /// When there is no such program.
@@ -98,42 +98,44 @@ fn tied(program: &Command) -> anyhow::Result<Command> {
         bail!("{}: there is no such file", cannot_start(program));
     }
     let mut command = Command::new("/proc/self/exe");
-    command.arg0("shoal").args([TIED, &std::process::id().to_string()]);
+    command
+        .arg0("shoal")
+        .args([TIED_COMMAND, &std::process::id().to_string()]);
     command.arg(program.get_program()).args(program.get_args());
     Ok(command)
 }
 
-/// What that command does: dies with the process `parent`, and becomes the program.
+/// Carries out [`TIED_COMMAND`]: ties this process to `parent` and replaces it by the program. Returns only on errors.
 ///
 /// # Errors
 /// When the program cannot be started.
-pub fn become_tied(parent: u32, words: &[OsString]) -> anyhow::Result<ExitCode> {
-    let Some((program, arguments)) = words.split_first() else {
+pub fn exec_tied(parent: u32, command_line: &[OsString]) -> anyhow::Result<ExitCode> {
+    let Some((program, arguments)) = command_line.split_first() else {
         bail!("there is no program to start");
     };
-    set_parent_process_death_signal(Some(Signal::KILL)).context("cannot be tied to the process that starts it")?;
+    set_parent_process_death_signal(Some(Signal::KILL)).context("cannot tie the program to its parent process")?;
     if getppid().map(Pid::as_raw_pid) != Some(parent as i32) {
-        bail!("the process that starts it has ended");
+        bail!("the parent process has ended");
     }
     let mut command = Command::new(program);
     let cause = command.args(arguments).exec();
     Err(anyhow::Error::from(cause).context(cannot_start(&command)))
 }
 
-/// Plays the role by running the program, which has this process's standard input and error, and ends as it ends. A program
-/// that does not end when its standard input closes is ended, with all it has started, as a role of ours would be: not even
-/// one that is stuck outlives its run.
+/// Serves as the role by running the program, and ends as it ends. The program inherits this process's standard input
+/// and standard error. If it has not ended [`GRACE`] after its standard input closed, this kills the process group, so
+/// that a program that is stuck does not outlive its run.
 ///
 /// # Errors
-/// When it cannot be started or watched.
-pub fn serve_by(program: &Command) -> anyhow::Result<ExitCode> {
+/// When the program cannot be started or watched.
+pub fn serve_with(program: &Command) -> anyhow::Result<ExitCode> {
     let mut child = tied(program)?
         .stdout(Stdio::null())
         .spawn()
         .with_context(|| cannot_start(program))?;
     let process =
         pidfd_open(Pid::from_child(&child), PidfdFlags::empty()).context("cannot watch the environment server")?;
-    // Closing is told without being asked for; what comes in is for the program.
+    // No events: poll reports a closed stream anyway, and any input is for the program.
     let stdin = std::io::stdin();
     let mut until = [
         PollFd::new(&process, PollFlags::IN),
@@ -148,7 +150,7 @@ pub fn serve_by(program: &Command) -> anyhow::Result<ExitCode> {
     let deadline = Instant::now() + GRACE;
     loop {
         let left = deadline.saturating_duration_since(Instant::now());
-        let left = Timespec::try_from(left).context("cannot wait so long")?;
+        let left = Timespec::try_from(left).context("the time limit is too long")?;
         match poll(&mut [PollFd::new(&process, PollFlags::IN)], Some(&left)) {
             Ok(0) => return kill_this_group(),
             Ok(_) => return end_as(child.wait()?),
@@ -166,7 +168,7 @@ fn kill_this_group() -> anyhow::Result<ExitCode> {
     Ok(ExitCode::FAILURE)
 }
 
-/// Ends this process as another one has ended.
+/// Ends this process with the same signal or exit code as another.
 fn end_as(status: ExitStatus) -> anyhow::Result<ExitCode> {
     if let Some(signal) = status.signal().and_then(Signal::from_named_raw) {
         kill_process(getpid(), signal)?;
@@ -184,39 +186,39 @@ fn cannot_start(command: &Command) -> String {
     )
 }
 
-/// A program that serves environments to this process, until this is dropped.
+/// An environment server that serves this process. It is ended on drop.
 pub struct ExternalEnvironment {
     client: EnvironmentClient,
     listener: Listener,
     spec: EnvironmentSpec,
     program: Peer,
-    // The last to go, in this order.
+    // Dropped last, in this order.
     _services: Services,
-    _domain: TidyDomain,
+    _domain: LeaveOnDrop,
 }
 
-/// A corner of shared memory that is left tidy.
-struct TidyDomain(Option<Domain>);
+/// Leaves the domain on drop and thereby removes it from shared memory.
+struct LeaveOnDrop(Option<Domain>);
 
-impl Drop for TidyDomain {
+impl Drop for LeaveOnDrop {
     fn drop(&mut self) {
-        // What cannot be removed now is removed by the next who comes.
+        // A later process removes what cannot be removed now.
         let _ = self.0.take().map(Domain::leave);
     }
 }
 
 impl ExternalEnvironment {
-    /// Starts the environment's server, with so many environments, and asks what it serves. Its evaluation episodes start
-    /// as `seed` says.
+    /// Starts the environment's server with this number of environments and asks for their description. `seed`
+    /// determines the start states of its evaluation episodes.
     ///
     /// # Errors
-    /// When it cannot be started, ends, or does not answer; with what it said last.
+    /// When the server cannot be started, ends, or does not answer; with the last line it wrote.
     pub fn begin(environment: &EnvironmentConfig, environments: u32, seed: u64) -> anyhow::Result<Self> {
         Domain::remove_abandoned()?;
         let run_id = format!("{:08x}", rand::random::<u32>());
         let domain = Domain::join(&run_id, 1)?;
         let launch = LaunchSpec {
-            // Where everybody is killed it goes with the rest.
+            // In the domain's directory, so that it is cleaned up with it if all processes are killed.
             iceoryx2: domain.directory()?.join("iceoryx2.toml"),
             run_id: &run_id,
             index: 0,
@@ -226,14 +228,14 @@ impl ExternalEnvironment {
             seed,
             stream: 0,
         };
-        match opened(&domain, &launch, environment) {
+        match open(&domain, &launch, environment) {
             Ok((services, client, listener, spec, program)) => Ok(Self {
                 client,
                 listener,
                 spec,
                 program,
                 _services: services,
-                _domain: TidyDomain(Some(domain)),
+                _domain: LeaveOnDrop(Some(domain)),
             }),
             Err(error) => {
                 domain.leave()?;
@@ -242,7 +244,7 @@ impl ExternalEnvironment {
         }
     }
 
-    /// What the program says of its environments.
+    /// The server's description of its environments.
     pub fn spec(&self) -> &EnvironmentSpec {
         &self.spec
     }
@@ -250,34 +252,34 @@ impl ExternalEnvironment {
     /// Begins evaluation episode `number`.
     ///
     /// # Errors
-    /// When the program has ended or refuses.
+    /// When the server has ended or refuses.
     pub fn begin_evaluation(&mut self, number: u64) -> anyhow::Result<Observed> {
         let begun = self.client.reset(&self.listener, Begin::Evaluation(number), || ());
-        answered(begun, &mut self.program)
+        checked(begun, &mut self.program)
     }
 
-    /// Every environment takes a step with its action.
+    /// Steps every environment with its action.
     ///
     /// # Errors
-    /// When the program has ended or refuses.
+    /// When the server has ended or refuses.
     pub fn step(&mut self, actions: &[f32]) -> anyhow::Result<Observed> {
         let stepped = self.client.step(&self.listener, actions, || ());
-        match answered(stepped, &mut self.program)? {
+        match checked(stepped, &mut self.program)? {
             Stepped::Taken(observed) => Ok(observed),
-            Stepped::Lost => bail!("the environment server gave up its episodes"),
+            Stepped::Lost => bail!("the environment server has lost its episodes"),
         }
     }
 }
 
 impl Drop for ExternalEnvironment {
     fn drop(&mut self) {
-        self.program.dismiss();
+        self.program.shut_down();
     }
 }
 
 type Opened = (Services, EnvironmentClient, Listener, EnvironmentSpec, Peer);
 
-fn opened(domain: &Domain, launch: &LaunchSpec<'_>, environment: &EnvironmentConfig) -> anyhow::Result<Opened> {
+fn open(domain: &Domain, launch: &LaunchSpec<'_>, environment: &EnvironmentConfig) -> anyhow::Result<Opened> {
     let Some(command) = launch.command(environment)? else {
         bail!("environment {} is not served by another program", environment.name);
     };
@@ -288,26 +290,26 @@ fn opened(domain: &Domain, launch: &LaunchSpec<'_>, environment: &EnvironmentCon
     let listener = Listener::bind(domain, launch.client)?;
     let mut program =
         Peer::start(&mut tied(&command)?, "environment server".into()).with_context(|| cannot_start(&command))?;
-    let heard = Stop::default();
-    let stop = stopped_when_it_ends(&program, heard.clone())?;
+    let has_answered = Stop::default();
+    let stop = stop_when_it_ends(&program, has_answered.clone())?;
     let described = describe(domain, launch.index, &listener, stop.clone());
-    heard.request();
-    let (spec, environments) = answered(described, &mut program).map_err(with_advice)?;
+    has_answered.request();
+    let (spec, environments) = checked(described, &mut program).map_err(with_advice)?;
     let opened = EnvironmentClient::open(domain, launch.index, &spec, environments, stop);
-    let client = answered(opened.map_err(Exit::from), &mut program)?;
+    let client = checked(opened.map_err(Exit::from), &mut program)?;
     Ok((services, client, listener, spec, program))
 }
 
-/// Says what to do where Gymnasium's server is not installed.
+/// Adds what to do if the server for Gymnasium is not installed.
 fn with_advice(error: anyhow::Error) -> anyhow::Error {
     if error.to_string().contains("No module named shoal_gym") {
-        return anyhow::anyhow!("{error}; install it, as python/README.md says: pip install ./python");
+        return anyhow::anyhow!("{error}; install it as described in python/README.md: pip install ./python");
     }
     error
 }
 
-/// A stop that is requested once the program has ended, or was not `heard` of for too long.
-fn stopped_when_it_ends(program: &Peer, heard: Stop) -> anyhow::Result<Stop> {
+/// A stop that is requested when the program has ended, or after [`PATIENCE`] without `has_answered`.
+fn stop_when_it_ends(program: &Peer, has_answered: Stop) -> anyhow::Result<Stop> {
     let stop = Stop::default();
     let flag = stop.clone();
     let process = program.as_fd().try_clone_to_owned();
@@ -316,15 +318,16 @@ fn stopped_when_it_ends(program: &Peer, heard: Stop) -> anyhow::Result<Stop> {
         .name("watch".into())
         .spawn(move || {
             let ended = || wait_for_any(&[process.as_fd()], PATIENCE);
-            while !ended() && heard.requested() {}
+            while !ended() && has_answered.requested() {}
             flag.request();
         })
         .context("cannot watch the environment server")?;
     Ok(stop)
 }
 
-fn answered<T>(answer: Result<T, Exit<ChannelError>>, program: &mut Peer) -> anyhow::Result<T> {
-    answer.or_else(|exit| {
+/// The result, where the end of the program takes precedence as the error.
+fn checked<T>(result: Result<T, Exit<ChannelError>>, program: &mut Peer) -> anyhow::Result<T> {
+    result.or_else(|exit| {
         program.check()?;
         match exit {
             Exit::Stopped => bail!("the environment server did not answer within {PATIENCE:?}"),

@@ -1,5 +1,5 @@
-//! What a run is, without starting one: its plan and its directory, what it needs of the machine, its records, and what its
-//! policies do.
+//! Everything about a run except starting it: its configuration and directory, the resources it needs, its records, and
+//! the evaluation of its policies.
 
 pub mod analysis;
 pub mod description;

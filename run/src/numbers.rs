@@ -1,6 +1,6 @@
-//! Numbers as people read them.
+//! Numbers formatted for reading.
 
-/// With a comma after each three digits.
+/// The number with commas between thousands.
 pub fn thousands(number: u64) -> String {
     indicatif::HumanCount(number).to_string()
 }

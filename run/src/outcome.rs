@@ -1,4 +1,4 @@
-//! How a run ended: `outcome.json` in its directory, written by its launcher, whole or not at all.
+//! How a run ended: `outcome.json` in its directory, written atomically by its launcher.
 
 use std::io::{self, ErrorKind, Write};
 
@@ -7,16 +7,16 @@ use serde::{Deserialize, Serialize};
 use shoal_common::durable::write_atomically;
 use shoal_common::run_dir::RunDir;
 
-/// The number of the file's form.
+/// The number of the file's format.
 const FORMAT: u32 = 1;
 
 /// How a run ended.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RunOutcome {
     format: u32,
-    /// What became of it.
+    /// The run's state.
     pub state: RunState,
-    /// Why, where it did not finish.
+    /// Why it ended, if it did not finish.
     pub reason: Option<String>,
     /// Environment steps that were learned from.
     pub steps: u64,
@@ -24,17 +24,17 @@ pub struct RunOutcome {
     pub episodes: u64,
 }
 
-/// What became of a run.
+/// The state of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum RunState {
-    /// A launcher works on it, or was killed over it.
+    /// A launcher is at work on it, or was killed.
     Running,
-    /// All that was asked for is done: steps, updates, evaluations.
+    /// All steps, updates and evaluations are done.
     Finished,
-    /// It was asked to end, and can go on.
+    /// It ended on request, and can be resumed.
     Stopped,
-    /// It ended for an error.
+    /// It ended with an error.
     Failed,
 }
 
@@ -50,18 +50,18 @@ impl RunOutcome {
         }
     }
 
-    /// The same outcome for this reason.
-    pub fn because(self, reason: impl Into<String>) -> Self {
+    /// The same outcome with this reason.
+    pub fn with_reason(self, reason: impl Into<String>) -> Self {
         Self {
             reason: Some(reason.into()),
             ..self
         }
     }
 
-    /// What is written of the run; `None` where nothing is, as in runs of builds before this file.
+    /// Reads the outcome; `None` if there is none, as in runs of earlier versions.
     ///
     /// # Errors
-    /// When the file cannot be read, or is damaged or of another form.
+    /// When the file cannot be read, is damaged or has another format.
     pub fn read(run: &RunDir) -> anyhow::Result<Option<Self>> {
         let path = run.outcome();
         let text = match std::fs::read(&path) {
@@ -69,10 +69,10 @@ impl RunOutcome {
             text => text.with_context(|| format!("cannot read {}", path.display()))?,
         };
         let outcome: Self = serde_json::from_slice(&text)
-            .with_context(|| format!("{} is damaged; without it the run can be resumed", path.display()))?;
+            .with_context(|| format!("{} is damaged; remove it and the run can be resumed", path.display()))?;
         if outcome.format != FORMAT {
             anyhow::bail!(
-                "{} is of form {}, this program's is {FORMAT}",
+                "{} has format {}, and this program reads format {FORMAT}",
                 path.display(),
                 outcome.format
             );
@@ -80,7 +80,7 @@ impl RunOutcome {
         Ok(Some(outcome))
     }
 
-    /// Writes it, whole or not at all.
+    /// Writes the outcome atomically.
     ///
     /// # Errors
     /// When it cannot be written.

@@ -1,5 +1,5 @@
-//! From what was typed to a run that is decided: presets, files and overrides become one resolved configuration, and
-//! below this line nobody reads options any more.
+//! The configuration of a new run: presets, files and overrides become one resolved configuration. No later code reads
+//! command-line options.
 
 use std::path::{Path, PathBuf};
 
@@ -27,12 +27,12 @@ const PRESETS: [(&str, &str); 7] = [
     ("cart-pole", include_str!("../../presets/cart-pole.toml")),
 ];
 
-/// What a Gymnasium environment is trained with, by the kinds of its observations and actions.
+/// The defaults for a Gymnasium environment, by the kinds of its observations and actions.
 const FOR_CONTINUOUS_ACTIONS: &str = include_str!("../../presets/gym-continuous.toml");
 const FOR_DISCRETE_ACTIONS: &str = include_str!("../../presets/gym-discrete.toml");
 const FOR_A_TABLE: &str = include_str!("../../presets/gym-table.toml");
 
-/// The keys that the program fills in itself.
+/// The keys that the program sets itself.
 pub const FILLED_IN: [&str; 2] = ["run.id", "run.identity_format"];
 
 /// The presets' names.
@@ -40,15 +40,15 @@ pub fn preset_names() -> impl Iterator<Item = &'static str> {
     PRESETS.iter().map(|(name, _)| *name)
 }
 
-/// The configuration of a preset or a file, resolved, without options.
+/// The resolved configuration of a preset or a file, without overrides.
 pub fn resolved(what: &str) -> anyhow::Result<Config> {
     decide(what, &RunOverrides::default()).map(|(_, config)| config)
 }
 
-/// What of a preset or a file is decided otherwise for one run.
+/// Changes to a preset or a file for one run.
 #[derive(Clone, Debug, Default)]
 pub struct RunOverrides {
-    /// Run directory to make; `runs/<name>-<n>` where there is none.
+    /// Run directory to create; by default `runs/<name>-<n>`.
     pub run: Option<PathBuf>,
     /// `run.seed`.
     pub seed: Option<u64>,
@@ -60,25 +60,29 @@ pub struct RunOverrides {
     pub steps: Option<u64>,
     /// `run.episodes`.
     pub episodes: Option<u64>,
-    /// Whether `run.mode` is lockstep.
+    /// Whether to set `run.mode` to lockstep.
     pub lockstep: bool,
     /// Any key, as `SECTION.KEY=VALUE`.
     pub set: Vec<String>,
 }
 
-/// A run that can begin.
+/// A run that is ready to start.
 #[derive(Debug)]
 pub struct Plan {
-    /// Everything that was decided.
+    /// Its resolved configuration.
     pub config: Config,
-    /// The directory that was made for it.
+    /// Its directory.
     pub run: RunDir,
-    /// Held for as long as the run is this process's.
+    /// Held for as long as this process owns the run.
     pub lock: RunLock,
 }
 
 impl Plan {
-    /// Decides everything, and makes the run directory with its `config.toml` only when nothing is wrong.
+    /// Resolves and checks the configuration, then creates the run directory with its `config.toml`.
+    ///
+    /// # Errors
+    /// When the configuration is invalid, the machine lacks resources, or the directory cannot be created. No run
+    /// directory remains.
     pub fn new(what: &str, overrides: &RunOverrides) -> anyhow::Result<Self> {
         let (name, config) = decide(what, overrides)?;
         let place = overrides.run.clone().unwrap_or_else(|| Path::new("runs").join(&name));
@@ -89,7 +93,7 @@ impl Plan {
         };
         let lock = run.lock()?;
         if let Err(error) = run.write_config(&config) {
-            // An empty directory would be in the way of the next try.
+            // The directory would block the next attempt.
             let _ = std::fs::remove_dir_all(run.path());
             return Err(error.into());
         }
@@ -97,13 +101,13 @@ impl Plan {
     }
 }
 
-/// The configuration of a preset or a file with these overrides, and the name that a run of it gets. Nothing is made.
+/// The configuration of a preset or a file with these overrides, and the default name of its run. Creates nothing.
 pub fn decide(what: &str, overrides: &RunOverrides) -> anyhow::Result<(String, Config)> {
     let (name, table) = sections(what)?;
     Ok((name, resolve(table, overrides, what)?))
 }
 
-/// The sections of a preset or a file, and the name that a run of it gets.
+/// The sections of a preset or a file, and the default name of its run.
 fn sections(what: &str) -> anyhow::Result<(String, Table)> {
     if let Some((name, text)) = PRESETS.into_iter().find(|(name, _)| *name == what) {
         return Ok((name.into(), text.parse().with_context(|| format!("preset {name}"))?));
@@ -118,7 +122,7 @@ fn sections(what: &str) -> anyhow::Result<(String, Table)> {
     if path.extension().is_none_or(|extension| extension != "toml") {
         let known: Vec<&str> = preset_names().collect();
         bail!(
-            "there is no preset `{what}`: choose {}, a file that ends in .toml, or gym: and a Gymnasium environment",
+            "there is no preset `{what}`: choose {}, a file that ends in .toml, or gym: with a Gymnasium environment",
             known.join(", ")
         );
     }
@@ -165,11 +169,11 @@ fn resolve(mut table: Table, overrides: &RunOverrides, origin: &str) -> anyhow::
             .with_context(|| format!("--set {assignment}: must look like SECTION.KEY=VALUE"))?;
         let path: Vec<&str> = key.split('.').collect();
         if path[0] == "spec" || FILLED_IN.contains(&key) {
-            bail!("--set {assignment}: {key} is not for choosing: the program fills it in");
+            bail!("--set {assignment}: {key} cannot be set: the program sets it");
         }
         put(&mut table, &path, value_of(value)).with_context(|| format!("--set {assignment}"))?;
     }
-    // More actors than a run is usually laid out for: lay it out for them.
+    // For more actors than the default of `actors.max`, raise it.
     if let Some(count) = table
         .get("actors")
         .and_then(|actors| actors.get("count"))
@@ -179,7 +183,7 @@ fn resolve(mut table: Table, overrides: &RunOverrides, origin: &str) -> anyhow::
     {
         put(&mut table, &["actors", "max"], count.into())?;
     }
-    // The name in shared memory must not be that of another run, whatever the seed.
+    // Random and independent of the seed: the run's name in shared memory must be unique.
     put(
         &mut table,
         &["run", "id"],
@@ -189,20 +193,20 @@ fn resolve(mut table: Table, overrides: &RunOverrides, origin: &str) -> anyhow::
     put(&mut table, &["run", "identity_format"], format.into())?;
     describe_environment(&mut table)?;
     let mut config = Config::from_table(table, origin)?;
-    // Also a short run ends with its policy evaluated.
+    // A short run must end with an evaluation too.
     config.evaluation.every = config.evaluation.every.min(config.run.steps);
     Ok(config)
 }
 
-/// Fills in what the environment says of itself: of ours every parameter too, and for Gymnasium's a method that suits
-/// it, where no other is named.
+/// Fills in `[spec]` from the environment. Adds every parameter of a built-in environment, and for a Gymnasium
+/// environment the settings of a suitable method if the configuration names none.
 fn describe_environment(table: &mut Table) -> anyhow::Result<()> {
     let Some(Value::Table(section)) = table.get_mut("environment") else {
         bail!("the section [environment] is missing: it must have a name");
     };
     let Some(Value::String(name)) = section.remove("name") else {
         bail!(
-            "environment.name is missing: it must be one of {}, or begin with {GYMNASIUM}",
+            "environment.name is missing: it must be one of {}, or start with {GYMNASIUM}",
             environment::names().collect::<Vec<_>>().join(", ")
         );
     };
@@ -233,15 +237,16 @@ fn describe_environment(table: &mut Table) -> anyhow::Result<()> {
         (environment, spec)
     };
     if environment.name.starts_with(GYMNASIUM) {
-        suit(table, &spec)?;
+        add_method_defaults(table, &spec)?;
     }
     table.insert("environment".into(), Value::try_from(environment)?);
     table.insert("spec".into(), Value::try_from(spec)?);
     Ok(())
 }
 
-/// Puts a method's settings beside those that are there, by what the environment's spaces allow.
-fn suit(table: &mut Table, spec: &EnvironmentSpec) -> anyhow::Result<()> {
+/// Adds the default settings of a method that suits the environment's spaces. Keeps existing settings, and adds nothing
+/// if the table names another method.
+fn add_method_defaults(table: &mut Table, spec: &EnvironmentSpec) -> anyhow::Result<()> {
     let text = match (&spec.observation, &spec.action) {
         (_, Space::Box { .. }) => FOR_CONTINUOUS_ACTIONS,
         (Space::Box { .. }, Space::Discrete { .. }) => FOR_DISCRETE_ACTIONS,
@@ -257,7 +262,7 @@ fn suit(table: &mut Table, spec: &EnvironmentSpec) -> anyhow::Result<()> {
         .iter()
         .find(|algorithm| method.contains_key(algorithm.name()));
     if chosen.is_some_and(|algorithm| algorithm.spec().experience == Experience::Episodes) {
-        // A chunk is an episode.
+        // A chunk holds a whole episode.
         put(&mut method, &["actors", "chunk_steps"], spec.time_limit.into())?;
     }
     for (section, values) in method {
@@ -285,7 +290,7 @@ fn put(table: &mut Table, path: &[&str], value: Value) -> anyhow::Result<()> {
     }
 }
 
-/// A TOML value, or a string where it is none: `reward=r2` needs no quotes.
+/// The text as a TOML value, or as a string if it is not valid TOML: `reward=r2` needs no quotes.
 fn value_of(text: &str) -> Value {
     format!("value = {text}")
         .parse::<Table>()
@@ -319,15 +324,15 @@ mod tests {
             assert_eq!(config.spec.time_limit, limit, "{name}");
             assert!(
                 !config.environment.parameters.is_empty(),
-                "every parameter is filled in: {:?}",
+                "every parameter is set: {:?}",
                 config.environment
             );
         }
     }
 
-    /// A change here means that no run made before can go on, unless the form has a new number.
+    /// If this text changes, earlier runs cannot be resumed unless the identity format gets a new number.
     #[test]
-    fn the_identity_of_every_preset_is_the_text_that_was_released() {
+    fn the_identity_of_every_preset_is_unchanged_since_its_release() {
         let mut all = String::new();
         for (name, _) in PRESETS {
             let config = plan(name, &[]).unwrap();
@@ -344,7 +349,7 @@ mod tests {
     }
 
     #[test]
-    fn overrides_reach_the_configuration() {
+    fn overrides_change_the_configuration() {
         let overrides = RunOverrides {
             seed: Some(7),
             steps: Some(500),
@@ -378,14 +383,14 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_said_on_one_line() {
+    fn errors_in_the_configuration_are_one_line() {
         for (what, set, part) in [
             ("pendulums", "", "no preset `pendulums`"),
             ("missing.toml", "", "missing.toml"),
             ("pendulum", "ddpg.gama=1", "gama"),
             ("pendulum", "dpg.gamma=1", "dpg"),
             ("pendulum", "gamma=1", "SECTION.KEY=VALUE"),
-            ("pendulum", "spec.time_limit=50", "not for choosing"),
+            ("pendulum", "spec.time_limit=50", "cannot be set"),
             ("pendulum", "ddpg.gamma=2", "ddpg.gamma = 2: must be from 0 to 1"),
             ("pendulum", "ddpg.gamma=high", "high"),
             ("pendulum", "environment.start_sped=1", "start_sped"),

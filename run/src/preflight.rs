@@ -1,5 +1,5 @@
-//! Whether the machine has room for a run, before anything is started: shared memory, disk and open files. Later a lack of
-//! them is a SIGBUS, or the end of some role in the middle of its work.
+//! Checks that the machine has enough shared memory, disk space and open files for a run, before anything is started.
+//! A shortage found later is a SIGBUS, or ends a role in the middle of its work.
 
 mod needs;
 
@@ -11,11 +11,12 @@ use shoal_common::channel::{Domain, free_shared_memory};
 use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
 
-/// Whether there is room for the run in this directory, which need not be there yet; nothing is made. What this user's
-/// killed runs left in shared memory is removed, and this process may open as many files as the system lets it.
+/// Checks that the machine has the resources for this run. The run directory need not exist; nothing is created.
+/// Removes what this user's killed runs left in shared memory, and raises this process's limit on open files to its
+/// maximum.
 ///
 /// # Errors
-/// When there is no room: what is needed, what there is, and what to do.
+/// When a resource is short: what is needed, what is available, and what to do.
 pub fn check(config: &Config, run: &RunDir) -> anyhow::Result<()> {
     Domain::remove_abandoned()?;
     check_open_files(config)?;
@@ -23,19 +24,19 @@ pub fn check(config: &Config, run: &RunDir) -> anyhow::Result<()> {
     check_shared_memory(config)
 }
 
-/// The same for a run that has joined its corner of shared memory, where its needs are noted first: of two runs that are
-/// started at once, each sees the other's.
+/// Like [`check`], for a run that has joined its domain. Records the run's needs there first, so that two runs started
+/// at the same time see each other's.
 ///
 /// # Errors
 /// As for [`check`].
-pub fn claim(config: &Config, run: &RunDir, domain: &Domain) -> anyhow::Result<()> {
+pub fn reserve(config: &Config, run: &RunDir, domain: &Domain) -> anyhow::Result<()> {
     domain.promise(needs::shared_memory(config))?;
     check(config, run)
 }
 
 fn check_shared_memory(config: &Config) -> anyhow::Result<()> {
     let need = needs::shared_memory(config);
-    let free = free_shared_memory(&config.run.id).context("cannot ask how much of /dev/shm is free")?;
+    let free = free_shared_memory(&config.run.id).context("cannot find out how much of /dev/shm is free")?;
     let Some(free) = free.filter(|free| *free < need) else {
         return Ok(());
     };
@@ -45,11 +46,11 @@ fn check_shared_memory(config: &Config) -> anyhow::Result<()> {
         needs::shared_memory(&smaller) <= free
     });
     let advice = match fits {
-        Some(max) => format!("lay it out for at most {max} (--set actors.max={max})"),
+        Some(max) => format!("allow at most {max} actors (--set actors.max={max})"),
         None => "choose smaller networks (ddpg.hidden) or chunks (actors.chunk_steps)".into(),
     };
     bail!(
-        "the run needs {} of /dev/shm for up to {} actors, and {} are free: {advice}, end other runs, or make it larger \
+        "the run needs {} of /dev/shm for up to {} actors, and {} are free: {advice}, end other runs, or enlarge it \
          (mount -o remount,size=… /dev/shm, or docker run --shm-size=…)",
         mebibytes(need),
         config.actors.max,
@@ -60,14 +61,14 @@ fn check_shared_memory(config: &Config) -> anyhow::Result<()> {
 fn check_disk(config: &Config, run: &RunDir) -> anyhow::Result<()> {
     let place = existing(run.path());
     let need = needs::disk(config, run)?;
-    let status =
-        rustix::fs::statvfs(&place).with_context(|| format!("cannot ask how much room {} has", place.display()))?;
+    let status = rustix::fs::statvfs(&place)
+        .with_context(|| format!("cannot find out how much space {} has", place.display()))?;
     let free = status.f_bavail * status.f_frsize;
-    // A file system without blocks of its own does not say.
+    // A file system without blocks of its own reports 0.
     if status.f_blocks > 0 && free < need {
         bail!(
-            "the run needs {} of disk and {} has {}: choose another place with --run, free some space, or remember less \
-             (replay.capacity = {})",
+            "the run needs {} of disk and {} has {}: choose another directory with --run, free some space, or lower \
+             replay.capacity (= {})",
             mebibytes(need),
             place.display(),
             mebibytes(free),
@@ -77,7 +78,7 @@ fn check_disk(config: &Config, run: &RunDir) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Raises the limit as far as it goes; the roles inherit it.
+/// Raises the limit to its maximum; the roles inherit it.
 fn check_open_files(config: &Config) -> anyhow::Result<()> {
     let need = needs::open_files(config);
     let Rlimit { current, maximum } = getrlimit(Resource::Nofile);
@@ -86,7 +87,7 @@ fn check_open_files(config: &Config) -> anyhow::Result<()> {
             current: maximum,
             maximum,
         };
-        setrlimit(Resource::Nofile, raised).context("cannot raise the limit of open files")?;
+        setrlimit(Resource::Nofile, raised).context("cannot raise the limit on open files")?;
     }
     match maximum {
         Some(limit) if limit < need => bail!(
@@ -98,7 +99,7 @@ fn check_open_files(config: &Config) -> anyhow::Result<()> {
     }
 }
 
-/// The nearest directory above `path` that is there.
+/// `path` or its nearest ancestor that exists.
 fn existing(path: &Path) -> PathBuf {
     let found = path.ancestors().find(|path| path.exists());
     found
@@ -107,7 +108,7 @@ fn existing(path: &Path) -> PathBuf {
         .into()
 }
 
-/// With one decimal, as people and `df -h` count.
+/// In MiB, with one decimal.
 fn mebibytes(bytes: u64) -> String {
     format!("{:.1} MiB", bytes as f64 / f64::from(1 << 20))
 }

@@ -1,4 +1,5 @@
-//! Child processes: started in a group of their own, read, and ended with all that they started.
+//! Child processes: each is started in a process group of its own and ended together with everything it started; its
+//! output is read.
 
 mod child_group;
 mod child_output;
@@ -14,20 +15,20 @@ pub use self::child_group::ChildGroup;
 pub use self::child_output::{ChildOutput, harmless};
 pub use self::peer::Peer;
 
-/// Waits until something can be read from one of these, or a child whose [`ChildGroup`] is among them has ended, but no longer than
-/// `most`; whether one of them woke it. A signal to this process ends the wait sooner.
+/// Waits at most `most` until one of these is readable, or a child whose [`ChildGroup`] is among them has ended.
+/// Returns whether that happened. A signal to this process ends the wait early.
 pub fn wait_for_any(wakers: &[BorrowedFd<'_>], most: Duration) -> bool {
     let mut ready: Vec<_> = wakers
         .iter()
         .map(|waker| PollFd::from_borrowed_fd(*waker, PollFlags::IN))
         .collect();
-    // No wait is so long that it could not be said.
+    // Only an absurdly long wait cannot be represented; it becomes one without a limit.
     let most = Timespec::try_from(most).ok();
     match poll(&mut ready, most.as_ref()) {
         Ok(ready) => ready > 0,
         Err(Errno::INTR) => false,
         Err(_) => {
-            // The kernel has no memory for it at this moment: nobody shall spin.
+            // The kernel is short of memory: do not spin.
             std::thread::sleep(Duration::from_millis(10));
             false
         }

@@ -1,4 +1,4 @@
-//! The run's records: four tables, and the numbers of three of them for TensorBoard.
+//! The run's records: four tables, three of them also as TensorBoard scalars.
 
 mod incident;
 mod table;
@@ -7,7 +7,7 @@ mod tensorboard;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-pub use incident::{Incident, IncidentRow, What};
+pub use incident::{Incident, IncidentKind, IncidentRow};
 use serde::{Deserialize, Serialize};
 use shoal_common::report::{EpisodeReport, EvaluationReport, LearnerReport};
 use shoal_common::run_dir::RunDir;
@@ -17,78 +17,79 @@ use table::Table;
 use self::tensorboard::EventFile;
 use crate::rate::{per_second, updates_per_step};
 
-/// What a `kill -9` of the launcher may cost.
-const UNWRITTEN: Duration = Duration::from_millis(500);
+/// The longest time that rows stay unflushed. A `kill -9` of the launcher loses at most these.
+const MAX_UNFLUSHED: Duration = Duration::from_millis(500);
 
 /// A row of `episodes.csv`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct EpisodeRecord {
-    /// Seconds the run had taken, over all its launchers.
+    /// Running time of the run so far in seconds, over all its launchers.
     pub wall_seconds: f64,
-    /// Environment steps over all actors by then.
+    /// Environment steps of all actors so far.
     pub env_steps: u64,
     actor: u32,
     environment: u32,
-    /// Steps it took.
+    /// Steps of the episode.
     pub steps: u32,
-    /// 1 where the environment terminated, 0 where the time limit truncated.
+    /// 1 if the environment terminated the episode, 0 if the time limit truncated it.
     pub terminated: u32,
-    /// Sum of its rewards.
+    /// Sum of the episode's rewards.
     #[serde(rename = "return")]
     pub episode_return: f64,
-    /// Version of the policy at its end.
+    /// Version of the policy at the end of the episode.
     pub policy_version: u64,
 }
 
 /// A row of `evaluations.csv`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct EvaluationRecord {
-    /// Seconds the run had taken, over all its launchers.
+    /// Running time of the run so far in seconds, over all its launchers.
     pub wall_seconds: f64,
     /// Environment steps the policy was learned from.
     pub env_steps: u64,
-    /// Updates it was made by.
+    /// Updates the policy results from: gradient steps, or consumed rows for methods that use each row once.
     pub updates: u64,
-    /// Its version.
+    /// Version of the policy.
     pub policy_version: u64,
     /// Mean of the episodes' returns.
     pub return_mean: f64,
-    /// Their standard deviation (n − 1).
+    /// Standard deviation of the episodes' returns (n − 1).
     pub return_std: f64,
-    /// Episodes run.
+    /// Number of episodes.
     pub episodes: u32,
-    /// 1 where no earlier one was as good.
+    /// 1 if no earlier evaluation was as good.
     pub best: u32,
 }
 
-/// A row of `learner.csv`. Empty where there is nothing to tell: no update since the row before, or none before it.
+/// A row of `learner.csv`. A value is empty if it is undefined: a loss without an update since the previous row, or a
+/// rate without a previous row.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct LearnerRecord {
-    /// Seconds the run had taken, over all its launchers.
+    /// Running time of the run so far in seconds, over all its launchers.
     pub wall_seconds: f64,
-    /// Rows committed to the replay.
+    /// Environment steps committed to the replay.
     pub env_steps: u64,
-    /// Episodes over; older builds did not say.
+    /// Episodes ended; 0 in the records of earlier versions.
     #[serde(default)]
     pub episodes: u64,
-    /// Updates done.
+    /// Updates done: gradient steps, or consumed rows for methods that use each row once.
     pub updates: u64,
     policy_version: u64,
-    /// The last loss of what estimates values.
+    /// Mean loss of the value estimate since the previous row.
     pub critic_loss: Option<f64>,
-    /// The last loss of the policy.
+    /// Mean loss of the policy since the previous row.
     pub actor_loss: Option<f64>,
-    /// The last mean of the estimated values.
+    /// Mean of the estimated values since the previous row.
     pub q_mean: Option<f64>,
-    /// Since the row before.
+    /// Since the previous row.
     pub updates_per_second: Option<f64>,
-    /// Since the row before.
+    /// Since the previous row.
     pub env_steps_per_second: Option<f64>,
-    /// Updates for each environment step beyond the warm-up.
+    /// Updates per environment step after the warm-up.
     pub ratio: Option<f64>,
 }
 
-/// Writes the records of a run. A resumed run's are continued: one header, and seconds that count on.
+/// Writes the records of a run. Continues those of a resumed run: one header, and seconds that keep counting.
 #[derive(Debug)]
 pub struct Recorder {
     episodes: Table,
@@ -98,18 +99,18 @@ pub struct Recorder {
     events: EventFile,
     events_path: std::path::PathBuf,
     warmup: u64,
-    /// Seconds of the run's launchers before this one.
+    /// Running time of earlier launchers in seconds.
     earlier: f64,
     /// Environment steps by the newest report.
     env_steps: u64,
-    /// Environment steps of the newest policy whose evaluation is written down.
+    /// Environment steps of the newest policy whose evaluation is recorded.
     evaluated: Option<u64>,
     previous: Option<(Duration, LearnerReport)>,
     flushed: Instant,
 }
 
 impl Recorder {
-    /// Opens the records of `run`, whose learner begins after `warmup` environment steps.
+    /// Opens the records of `run`, whose learner starts after `warmup` environment steps.
     pub fn open(run: &RunDir, warmup: u64) -> Result<Self, RecordError> {
         let episodes = Table::open::<EpisodeRecord>(&run.episodes())?;
         let evaluations = Table::open::<EvaluationRecord>(&run.evaluations())?;
@@ -141,13 +142,13 @@ impl Recorder {
             flushed,
         };
         if last.is_some() {
-            let resumed = Incident::of_launcher(What::Resumed, String::new());
+            let resumed = Incident::of_launcher(IncidentKind::Resumed, String::new());
             recorder.incident(&resumed, Duration::ZERO)?;
         }
         Ok(recorder)
     }
 
-    /// An exploration episode has ended, `wall` after this launcher's start.
+    /// Records an exploration episode that ended `wall` after this launcher's start.
     pub fn episode(&mut self, report: &EpisodeReport, wall: Duration) -> Result<(), RecordError> {
         self.episodes.write(&EpisodeRecord {
             wall_seconds: self.seconds(wall),
@@ -164,19 +165,19 @@ impl Recorder {
             ("episode/steps", report.steps.into()),
         ];
         self.scalars(report.env_steps, &scalars)?;
-        if self.flushed.elapsed() >= UNWRITTEN {
+        if self.flushed.elapsed() >= MAX_UNFLUSHED {
             self.flush()
         } else {
             Ok(())
         }
     }
 
-    /// Environment steps of the newest policy whose evaluation is written down.
+    /// Environment steps of the newest policy whose evaluation is recorded.
     pub fn evaluated(&self) -> Option<u64> {
         self.evaluated
     }
 
-    /// A policy has been evaluated. An evaluator that was started again reports what those before it did: that is left out.
+    /// Records an evaluation. Skips those already recorded, which a restarted evaluator reports again.
     pub fn evaluation(&mut self, report: &EvaluationReport, wall: Duration) -> Result<(), RecordError> {
         if self.evaluated >= Some(report.env_steps) {
             return Ok(());
@@ -200,7 +201,7 @@ impl Recorder {
         self.flush()
     }
 
-    /// The learner has got on. Reports that come twice a second also bring the other records to the files.
+    /// Records the learner's progress and flushes all records. Reports come twice a second.
     pub fn learner(&mut self, report: &LearnerReport, wall: Duration) -> Result<(), RecordError> {
         let averaged = |mean: f64| (report.averaged > 0).then_some(mean);
         let rate = |count: fn(&LearnerReport) -> u64| {
@@ -238,7 +239,7 @@ impl Recorder {
         self.flush()
     }
 
-    /// Something became of a process. It is in the file when this returns.
+    /// Records an incident. It is in the file when this returns.
     pub fn incident(&mut self, incident: &Incident, wall: Duration) -> Result<(), RecordError> {
         self.incidents.write(&IncidentRow {
             wall_seconds: self.seconds(wall),
@@ -251,7 +252,7 @@ impl Recorder {
         self.incidents.flush()
     }
 
-    /// Hands everything to the system, which keeps it whatever becomes of this process.
+    /// Hands everything to the kernel; it then survives the death of this process.
     pub fn flush(&mut self) -> Result<(), RecordError> {
         self.flushed = Instant::now();
         for table in [&mut self.episodes, &mut self.evaluations, &mut self.learner] {
@@ -273,33 +274,33 @@ impl Recorder {
             })
     }
 
-    /// Whole milliseconds are enough.
+    /// Running time of the run so far in seconds, rounded to milliseconds.
     fn seconds(&self, wall: Duration) -> f64 {
         ((self.earlier + wall.as_secs_f64()) * 1e3).round() / 1e3
     }
 }
 
-/// The rows of an `evaluations.csv`, none where there is no such file.
+/// The rows of an `evaluations.csv`; empty if there is no such file.
 pub fn read_evaluations(path: &Path) -> Result<Vec<EvaluationRecord>, RecordError> {
     table::rows(path)
 }
 
-/// The rows of an `episodes.csv`, none where there is no such file.
+/// The rows of an `episodes.csv`; empty if there is no such file.
 pub fn read_episodes(path: &Path) -> Result<Vec<EpisodeRecord>, RecordError> {
     table::rows(path)
 }
 
-/// The rows of a `learner.csv`, none where there is no such file.
+/// The rows of a `learner.csv`; empty if there is no such file.
 pub fn read_learner(path: &Path) -> Result<Vec<LearnerRecord>, RecordError> {
     table::rows(path)
 }
 
-/// The rows of an `incidents.csv`; nothing where there is no such file: older builds kept none.
+/// The rows of an `incidents.csv`; `None` if there is no such file, as in runs of earlier versions.
 pub fn read_incidents(path: &Path) -> Result<Option<Vec<IncidentRow>>, RecordError> {
     path.exists().then(|| table::rows(path)).transpose()
 }
 
-/// Environment steps and episodes of a run by its records; none before the first row.
+/// Environment steps and episodes of a run, by the last row of its `learner.csv`; `None` before the first row.
 pub fn recorded(run: &RunDir) -> Result<Option<(u64, u64)>, RecordError> {
     Ok(table::last::<LearnerRecord>(&run.learner_log())?.map(|row| (row.env_steps, row.episodes)))
 }

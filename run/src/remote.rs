@@ -1,4 +1,4 @@
-//! A run that goes on, seen from another terminal.
+//! Access to a running run from another terminal.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -9,32 +9,32 @@ use shoal_common::channel::{Domain, Sweeper};
 use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
 
-/// How long a launcher may take to answer: one that starts does not at once.
+/// How long a launcher may take to answer. One that is starting does not answer at once.
 const PATIENCE: Duration = Duration::from_secs(5);
 
-/// How long a run may take to end: more than its roles are given.
-const TO_THE_END: Duration = Duration::from_secs(60);
+/// How long a run may take to end. Its roles are given less.
+const STOP_PATIENCE: Duration = Duration::from_secs(60);
 
-/// A run and the way to its launcher, if it has one.
+/// A run, and access to its launcher if it has one.
 #[derive(Debug)]
 pub struct Remote {
     /// The run's directory.
     pub run: RunDir,
-    /// What is in its `config.toml`.
+    /// The contents of its `config.toml`.
     pub config: Config,
 }
 
 impl Remote {
-    /// The run in this directory.
+    /// Opens the run in this directory.
     pub fn open(path: &Path) -> anyhow::Result<Self> {
         let run = RunDir::open(path)?;
         let config = run.config()?;
         Ok(Self { run, config })
     }
 
-    /// Asks the run's launcher; `None` where there is none, or none any more.
+    /// Asks the run's launcher; `None` if there is none, or it ends before it answers.
     fn ask(&self, question: Question, patience: Duration) -> anyhow::Result<Option<Answer>> {
-        if !self.run.goes_on()? {
+        if !self.run.is_running()? {
             return Ok(None);
         }
         let domain = Domain::visit(&self.config.run.id, self.config.actors.max)?;
@@ -47,11 +47,11 @@ impl Remote {
 
     fn ask_in(&self, domain: &Domain, question: Question, patience: Duration) -> anyhow::Result<Option<Answer>> {
         let _sweeper = Sweeper::start(domain)?;
-        let lives = || self.run.goes_on().unwrap_or(true);
+        let lives = || self.run.is_running().unwrap_or(true);
         match control::ask(domain, self.run.key()?, question, patience, lives) {
             Ok(Answer::AnotherRun(there)) => {
                 let here = self.run.path().display();
-                bail!("{here} is a copy of {there}, which is going on; what was started here waits for that one to end")
+                bail!("{here} is a copy of {there}, which is running; the launcher in {here} waits for it to end")
             }
             Ok(answer) => Ok(Some(answer)),
             Err(ControlError::Gone) => Ok(None),
@@ -59,53 +59,53 @@ impl Remote {
         }
     }
 
-    /// How the run gets on; `None` where it does not go on.
+    /// The run's status; `None` if it is not running.
     pub fn status(&self) -> anyhow::Result<Option<RunStatus>> {
         match self.ask(Question::Status, PATIENCE)? {
             None => Ok(None),
             Some(Answer::Status(status)) => Ok(Some(status)),
-            Some(other) => bail!("the launcher gave an answer that does not fit: {other:?}"),
+            Some(other) => bail!("the launcher gave an unexpected answer: {other:?}"),
         }
     }
 
-    /// Goes on with so many actors.
+    /// Changes the number of actors.
     pub fn scale(&self, actors: u32) -> anyhow::Result<()> {
         match self.ask(Question::Scale { actors }, PATIENCE)? {
-            None => bail!("{}", self.nothing_runs()),
-            Some(answer) => self.accepted(answer),
+            None => bail!("{}", self.not_running()),
+            Some(answer) => accepted(answer),
         }
     }
 
     /// Ends the run, and waits until it has ended.
     pub fn stop(&self) -> anyhow::Result<()> {
-        // A launcher that does not answer at all is not waited for so long.
+        // A launcher that does not answer at all is noticed sooner this way.
         if self.status()?.is_none() {
-            bail!("{}", self.nothing_runs());
+            bail!("{}", self.not_running());
         }
-        let answer = self.ask(Question::Stop, TO_THE_END)?;
+        let answer = self.ask(Question::Stop, STOP_PATIENCE)?;
         let asked = Instant::now();
-        while self.run.goes_on()? {
+        while self.run.is_running()? {
             if asked.elapsed() >= PATIENCE {
-                bail!("{} has said that it ends, and does not", self.run.path().display());
+                bail!("{} was told to stop but is still running", self.run.path().display());
             }
             std::thread::sleep(Duration::from_millis(10));
         }
-        // Without an answer it has ended for another reason, which its own terminal says.
-        answer.map_or(Ok(()), |answer| self.accepted(answer))
+        // Without an answer, the run has ended for another reason, which its own terminal reports.
+        answer.map_or(Ok(()), accepted)
     }
 
-    fn accepted(&self, answer: Answer) -> anyhow::Result<()> {
-        match answer {
-            Answer::Accepted => Ok(()),
-            Answer::Refused(reason) => bail!("{reason}"),
-            other @ (Answer::Status(_) | Answer::AnotherRun(_)) => {
-                bail!("the launcher gave an answer that does not fit: {other:?}")
-            }
-        }
-    }
-
-    fn nothing_runs(&self) -> String {
+    fn not_running(&self) -> String {
         let here = self.run.path().display();
-        format!("nothing runs in {here}; `shoal resume {here}` goes on with it")
+        format!("nothing runs in {here}; `shoal resume {here}` continues it")
+    }
+}
+
+fn accepted(answer: Answer) -> anyhow::Result<()> {
+    match answer {
+        Answer::Accepted => Ok(()),
+        Answer::Refused(reason) => bail!("{reason}"),
+        other @ (Answer::Status(_) | Answer::AnotherRun(_)) => {
+            bail!("the launcher gave an unexpected answer: {other:?}")
+        }
     }
 }

@@ -1,5 +1,5 @@
-//! Whole episodes of a policy without exploration: what `eval` evaluates and `plot` draws. Our own environments are stepped
-//! in this process, others by their servers.
+//! Whole episodes of a policy without exploration, for `eval`, `plot` and `report`. Built-in environments run in this
+//! process, others in their servers.
 
 use anyhow::{Context, bail, ensure};
 use shoal_common::channel::environment::StepBlocks;
@@ -7,7 +7,7 @@ use shoal_common::config::Config;
 use shoal_common::policy::{Policy, PolicyLayout};
 use shoal_common::space::EnvironmentSpec;
 use shoal_env_server::environment::Source;
-use shoal_env_server::environment::angle::followed;
+use shoal_env_server::environment::angle::unwrapped;
 use shoal_env_server::vector::{Start, VectorEnvironment};
 
 use crate::external_environment::ExternalEnvironment;
@@ -15,23 +15,24 @@ use crate::external_environment::ExternalEnvironment;
 /// An episode of T steps.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Trajectory {
-    /// T + 1 of them, the one after the last step included.
+    /// T + 1 observations, including the one after the last step.
     pub observations: Vec<Vec<f32>>,
-    /// T actions, in environment units.
+    /// T actions, in the environment's units.
     pub actions: Vec<Vec<f32>>,
     /// T rewards.
     pub rewards: Vec<f64>,
-    /// The last state is terminal; otherwise the time limit ended the episode.
+    /// Whether the last state is terminal. Otherwise the time limit ended the episode.
     pub terminated: bool,
 }
 
 impl Trajectory {
-    /// The sum of the rewards, undiscounted.
+    /// The undiscounted sum of the rewards.
     pub fn episode_return(&self) -> f64 {
         self.rewards.iter().sum()
     }
 
-    /// A signal's values: T + 1 of what is observed, T of an action. NaN where there is no such number.
+    /// A signal's values: T + 1 for a part of the observation, T for a part of the action. A number that does not exist
+    /// is NaN.
     pub fn values(&self, source: Source) -> Vec<f64> {
         let number = |row: &Vec<f32>, i: usize| row.get(i).map_or(f64::NAN, |number| f64::from(*number));
         match source {
@@ -43,28 +44,29 @@ impl Trajectory {
                     .iter()
                     .map(|row| number(row, sin).atan2(number(row, cos)));
                 let first = seen.clone().next().unwrap_or_default();
-                followed(seen, first)
+                unwrapped(seen, first)
             }
         }
     }
 }
 
-/// A policy, and an environment of the run to try it in.
+/// A policy and a single environment to run it in.
 pub struct Rollout<'a> {
     config: &'a Config,
-    stage: Stage,
+    host: Host,
     policy: Policy,
     parameters: &'a [f32],
 }
 
-/// Where one environment is stepped.
-enum Stage {
-    Here(Box<VectorEnvironment>),
-    /// By another program, whose evaluation episodes start as this seed says. Begun with the first episode.
-    Elsewhere(Option<(u64, Box<ExternalEnvironment>)>),
+/// Where the environment runs.
+enum Host {
+    /// In this process.
+    Builtin(Box<VectorEnvironment>),
+    /// In another program, which is started with the first episode. The number is the seed of its evaluation episodes.
+    External(Option<(u64, Box<ExternalEnvironment>)>),
 }
 
-/// What a step gave.
+/// The result of a step.
 struct RolloutStep {
     s_next: Vec<f32>,
     reward: f64,
@@ -73,7 +75,10 @@ struct RolloutStep {
 }
 
 impl<'a> Rollout<'a> {
-    /// The environment and network of `config`, with these parameters.
+    /// Combines the environment and the network of `config` with these parameters.
+    ///
+    /// # Errors
+    /// When the number of parameters is not that of the network, or the environment differs from the configuration.
     pub fn new(config: &'a Config, parameters: &'a [f32]) -> anyhow::Result<Self> {
         let policy = policy_of(config)?;
         let expected = policy.layout().parameters();
@@ -84,24 +89,24 @@ impl<'a> Rollout<'a> {
         );
         Ok(Self {
             config,
-            stage: Stage::of(config)?,
+            host: Host::new(config)?,
             policy,
             parameters,
         })
     }
 
-    /// Runs evaluation episode `number` of `seed`: it starts where every evaluation's episode of this number starts.
+    /// Runs evaluation episode `number` of `seed`. The two determine its start state.
     pub fn evaluation_episode(&mut self, seed: u64, number: u64) -> anyhow::Result<Trajectory> {
         self.episode(Start::Evaluation { seed, first: number })
     }
 
-    /// Runs an episode that starts in a physical state of the environment, which must be one of ours.
+    /// Runs an episode that starts in this physical state of the environment, which must be a built-in one.
     pub fn episode_from(&mut self, state: &[f64]) -> anyhow::Result<Trajectory> {
         self.episode(Start::States(state))
     }
 
     fn episode(&mut self, start: Start<'_>) -> anyhow::Result<Trajectory> {
-        let mut observation = self.stage.begin(self.config, start)?;
+        let mut observation = self.host.begin(self.config, start)?;
         let mut action = vec![0.0; self.config.spec.action.width()];
         let mut trajectory = Trajectory {
             observations: vec![observation.clone()],
@@ -109,7 +114,7 @@ impl<'a> Rollout<'a> {
         };
         loop {
             self.policy.act(self.parameters, &observation, &mut action);
-            let step = self.stage.step(&action)?;
+            let step = self.host.step(&action)?;
             observation.clone_from(&step.s_next);
             trajectory.observations.push(step.s_next);
             trajectory.actions.push(action.clone());
@@ -122,34 +127,34 @@ impl<'a> Rollout<'a> {
     }
 }
 
-impl Stage {
-    fn of(config: &Config) -> anyhow::Result<Self> {
+impl Host {
+    fn new(config: &Config) -> anyhow::Result<Self> {
         if !config.environment.server.is_empty() {
-            return Ok(Self::Elsewhere(None));
+            return Ok(Self::External(None));
         }
         let (name, parameters) = (&config.environment.name, &config.environment.parameters);
         let environment = VectorEnvironment::new(name, parameters, 1, config.run.seed, 0, 0)?;
-        // Here no state is saved, and runs of older builds do not know its width.
-        let said = EnvironmentSpec {
+        // No state is saved here, and the configurations of earlier versions lack its width.
+        let found = EnvironmentSpec {
             state_width: config.spec.state_width,
             ..environment.spec().clone()
         };
-        same_spec(config, &said)?;
-        Ok(Self::Here(Box::new(environment)))
+        check_spec(config, &found)?;
+        Ok(Self::Builtin(Box::new(environment)))
     }
 
-    /// Begins an episode; its first observation.
+    /// Begins an episode and returns its first observation.
     fn begin(&mut self, config: &Config, start: Start<'_>) -> anyhow::Result<Vec<f32>> {
         match (self, start) {
-            (Self::Here(environment), start) => {
+            (Self::Builtin(environment), start) => {
                 let mut observation = vec![0.0; config.spec.observation.width()];
                 environment.reset(start, &mut observation)?;
                 Ok(observation)
             }
-            (Self::Elsewhere(conversation), Start::Evaluation { seed, first }) => {
-                if conversation.as_ref().is_none_or(|(of, _)| *of != seed) {
-                    // One at a time.
-                    *conversation = None;
+            (Self::External(server), Start::Evaluation { seed, first }) => {
+                if server.as_ref().is_none_or(|(of, _)| *of != seed) {
+                    // The old server ends before the new one starts.
+                    *server = None;
                 }
                 let begin = || {
                     anyhow::Ok((
@@ -157,25 +162,22 @@ impl Stage {
                         Box::new(ExternalEnvironment::begin(&config.environment, 1, seed)?),
                     ))
                 };
-                let (_, conversation) = match conversation {
+                let (_, server) = match server {
                     Some(begun) => begun,
-                    None => conversation.insert(begin()?),
+                    None => server.insert(begin()?),
                 };
-                same_spec(config, conversation.spec())?;
-                Ok(conversation.begin_evaluation(first)?.observation(0).to_vec())
+                check_spec(config, server.spec())?;
+                Ok(server.begin_evaluation(first)?.observation(0).to_vec())
             }
-            (Self::Elsewhere(_), _) => bail!(
-                "episodes of {} cannot be begun in a state of one's choice",
-                config.environment.name
-            ),
+            (Self::External(_), _) => bail!("episodes of {} cannot start in a chosen state", config.environment.name),
         }
     }
 
     fn step(&mut self, action: &[f32]) -> anyhow::Result<RolloutStep> {
         match self {
-            Self::Here(environment) => {
+            Self::Builtin(environment) => {
                 let width = environment.spec().observation.width();
-                // What comes after an end is not looked at.
+                // The first observation of the next episode is not used.
                 let (mut observation, mut s_next) = (vec![0.0; width], vec![0.0; width]);
                 let (mut reward, mut terminated, mut truncated) = ([0.0], [0.0], [0.0]);
                 let blocks = StepBlocks {
@@ -193,9 +195,9 @@ impl Stage {
                     truncated: truncated[0] != 0.0,
                 })
             }
-            Self::Elsewhere(conversation) => {
-                let (_, conversation) = conversation.as_mut().context("a step before an episode")?;
-                let observed = conversation.step(action)?;
+            Self::External(server) => {
+                let (_, server) = server.as_mut().context("a step was taken before an episode began")?;
+                let observed = server.step(action)?;
                 Ok(RolloutStep {
                     s_next: observed.next_observation(0).to_vec(),
                     reward: observed.reward(0).into(),
@@ -207,16 +209,16 @@ impl Stage {
     }
 }
 
-fn same_spec(config: &Config, said: &EnvironmentSpec) -> anyhow::Result<()> {
+fn check_spec(config: &Config, found: &EnvironmentSpec) -> anyhow::Result<()> {
     let name = &config.environment.name;
     ensure!(
-        *said == config.spec,
-        "config.toml: [spec] is not what environment {name} says of itself"
+        *found == config.spec,
+        "config.toml: [spec] does not match the environment {name}"
     );
     Ok(())
 }
 
-/// What a policy file of this run must hold.
+/// The layout that a policy file of this run must have.
 pub fn policy_layout(config: &Config) -> anyhow::Result<PolicyLayout> {
     config
         .algorithm
@@ -249,12 +251,12 @@ mod tests {
         assert!(hanging.actions.iter().all(|action| action == &[0.0]));
         assert!(
             (hanging.episode_return() + 30.0 * std::f64::consts::PI.powi(2)).abs() < 1e-3,
-            "it stays at the bottom"
+            "it keeps hanging down"
         );
     }
 
     #[test]
-    fn an_evaluation_episode_depends_on_seed_and_number_alone() {
+    fn an_evaluation_episode_depends_only_on_seed_and_number() {
         let (config, parameters) = small("name = \"point-mass\"\nreward = \"r1\"");
         let mut rollout = Rollout::new(&config, &parameters).unwrap();
         let first = rollout.evaluation_episode(1, 0).unwrap();
@@ -275,7 +277,7 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_fit_is_refused_in_one_line() {
+    fn a_wrong_number_of_parameters_and_a_diverged_policy_are_errors() {
         let (config, parameters) = small("name = \"pendulum\"");
         let short = Rollout::new(&config, &parameters[1..]).err().unwrap();
         assert_eq!(short.to_string(), "the policy has 34 parameters, the run's network 35");

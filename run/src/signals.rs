@@ -12,28 +12,27 @@ use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 use crate::process::wait_for_any;
 
-/// SIGINT, SIGTERM and SIGHUP are received from now on. Once this is dropped they end the process again, as they do everywhere
-/// else.
+/// Receives SIGINT, SIGTERM and SIGHUP. Once this is dropped, they end the process again.
 #[derive(Debug)]
 pub struct Signals {
     last: Arc<AtomicUsize>,
     over: Arc<AtomicBool>,
-    /// Readable when a signal has come since it was asked for.
+    /// Readable if a signal has arrived since the last call of `received`.
     wake: UnixStream,
 }
 
 impl Signals {
-    /// Begins to receive them.
+    /// Starts to receive the signals.
     ///
     /// # Errors
-    /// When the system does not let this process.
+    /// When a handler cannot be registered.
     pub fn register() -> anyhow::Result<Self> {
         let registered = || -> io::Result<Self> {
             let (last, over) = (Arc::default(), Arc::new(AtomicBool::new(false)));
             let (wake, write) = UnixStream::pair()?;
             wake.set_nonblocking(true)?;
             for signal in [SIGINT, SIGTERM, SIGHUP] {
-                // In this order: who wakes up finds the number.
+                // In this order, so that a thread that is woken finds the number.
                 signal_hook::flag::register_conditional_default(signal, Arc::clone(&over))?;
                 signal_hook::flag::register_usize(signal, Arc::clone(&last), signal as usize)?;
                 signal_hook::low_level::pipe::register(signal, write.try_clone()?)?;
@@ -43,9 +42,9 @@ impl Signals {
         registered().context("cannot watch for signals")
     }
 
-    /// The last signal that has come.
+    /// The last signal that has arrived.
     pub fn received(&self) -> Option<i32> {
-        // It wakes once for each signal. Nothing is read where none has come.
+        // Empties the stream, so that each signal wakes only once.
         let _ = (&self.wake).read(&mut [0; 64]);
         match self.last.load(Ordering::Relaxed) {
             0 => None,
@@ -53,7 +52,7 @@ impl Signals {
         }
     }
 
-    /// Waits for a signal; the one that has come, if one has.
+    /// Waits at most `patience` for a signal; the last one that has arrived, if any.
     pub fn wait(&self, patience: Duration) -> Option<i32> {
         if self.last.load(Ordering::Relaxed) == 0 {
             wait_for_any(&[self.as_fd()], patience);
@@ -74,7 +73,7 @@ impl Drop for Signals {
     }
 }
 
-/// The exit code by which a shell tells that a signal ended a process.
+/// The exit code with which a shell reports that a signal ended a process.
 pub fn exit_code(signal: i32) -> std::process::ExitCode {
     std::process::ExitCode::from(128 + signal as u8)
 }
@@ -85,7 +84,7 @@ mod tests {
     use rustix::event::PollFlags;
 
     #[test]
-    fn a_signal_wakes_who_waits_and_is_remembered() {
+    fn a_signal_wakes_a_waiting_thread_and_is_remembered() {
         let signals = Signals::register().unwrap();
         assert_eq!(signals.received(), None);
         assert_eq!(signals.wait(Duration::from_millis(1)), None);
@@ -94,7 +93,7 @@ mod tests {
             assert_eq!(signals.wait(Duration::from_secs(60)), Some(SIGHUP));
         });
         assert_eq!(signals.received(), Some(SIGHUP));
-        // It has been read: who polls is not woken by it again.
+        // It has been received, so it does not wake a poll again.
         let mut ready = [rustix::event::PollFd::new(&signals, PollFlags::IN)];
         assert_eq!(rustix::event::poll(&mut ready, Some(&Default::default())), Ok(0));
     }

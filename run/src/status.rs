@@ -1,4 +1,4 @@
-//! How a run stands, as far as its directory tells.
+//! The status of a run that is not running, read from its directory.
 
 use shoal_common::channel::control::RunStatus;
 use shoal_common::commit::{CommitReader, OpenError};
@@ -12,8 +12,11 @@ use crate::outcome::{RunOutcome, RunState};
 use crate::rate::updates_per_step;
 use crate::recorder::read_evaluations;
 
-/// How a run stands that nobody works on: what a learner would go on from.
-pub fn at_rest(config: &Config, run: &RunDir) -> anyhow::Result<RunStatus> {
+/// The status that a learner would continue from, by the run's files.
+///
+/// # Errors
+/// When they cannot be read.
+pub fn saved_status(config: &Config, run: &RunDir) -> anyhow::Result<RunStatus> {
     let counters = Checkpoints::new(&run.checkpoints(), config.fingerprint())
         .load_newest()?
         .map(|loaded| loaded.checkpoint.counters)
@@ -38,8 +41,8 @@ pub fn at_rest(config: &Config, run: &RunDir) -> anyhow::Result<RunStatus> {
     Ok(status)
 }
 
-/// Whether a run that nobody works on has done all it was to do. A launcher that was killed, or stopped, after the last step
-/// has left updates or evaluations undone.
+/// Whether a run without a launcher has done everything. A launcher that was killed or stopped after the last step may
+/// have left updates or evaluations undone.
 fn is_finished(config: &Config, run: &RunDir, status: &RunStatus) -> anyhow::Result<bool> {
     if !config.run.has_all_steps(status.env_steps, status.episodes) {
         return Ok(false);
@@ -47,11 +50,11 @@ fn is_finished(config: &Config, run: &RunDir, status: &RunStatus) -> anyhow::Res
     if let Some(outcome) = RunOutcome::read(run)? {
         return Ok(outcome.state == RunState::Finished);
     }
-    // The run is of a build that did not write it down.
+    // Earlier versions wrote no outcome.
     Ok(status.updates >= Ratio::from(&config.replay).allowed(status.env_steps))
 }
 
-/// Rows committed to a run's replay; 0 before there is one.
+/// Rows committed to a run's replay; 0 if it has none yet.
 pub fn replay_rows(run: &RunDir) -> Result<u64, OpenError> {
     match CommitReader::open(&run.replay_file()) {
         Ok(reader) => Ok(reader.rows()),
@@ -60,11 +63,11 @@ pub fn replay_rows(run: &RunDir) -> Result<u64, OpenError> {
     }
 }
 
-/// The period of the policy that was evaluated last: as the evaluator left it, and where a build did not have it do so, by the run's
-/// records.
+/// The evaluation period of the policy that was evaluated last, by the evaluator's state and the run's records. Earlier
+/// versions saved no evaluator state.
 ///
 /// # Errors
-/// When they cannot be read.
+/// When these files cannot be read.
 pub fn evaluated_period(config: &Config, run: &RunDir) -> anyhow::Result<Option<u64>> {
     let state = EvaluatorState::read(&run.evaluator_state())?;
     let recorded = read_evaluations(&run.evaluations())?;

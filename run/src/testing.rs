@@ -1,4 +1,4 @@
-//! What the tests of several crates need.
+//! Helpers for the tests of several crates.
 
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
 
@@ -25,8 +25,8 @@ pub fn small(environment: &str) -> (Config, Vec<f32>) {
     (config, parameters)
 }
 
-/// A drive that comes to rest `rest` m from the goal, turning back and forth by `shake` rad a step, with this force on
-/// the way and `held` at rest.
+/// A drive that comes to rest `rest` m from the goal. It turns back and forth by `shake` rad each step. The force is
+/// `force` on the way and `held` at rest, in N.
 pub fn drive(start: [f64; 2], rest: f64, shake: f64, force: f64, held: f64) -> Drive {
     let left = |t: u32| rest / start[0].hypot(start[1]) + (1.0 - f64::from(t.min(80)) / 80.0);
     Drive {
@@ -39,7 +39,7 @@ pub fn drive(start: [f64; 2], rest: f64, shake: f64, force: f64, held: f64) -> D
     }
 }
 
-/// An episode that swings for 60 steps and then stands still, up to `rest`, held by `torque`.
+/// An episode that swings for 60 steps and then stands still at an angle of `rest` rad, held by ±`torque` N m.
 pub fn swing(rest: f64, torque: f64) -> SwingUp {
     let angle = |t: u32| {
         let left = 1.0 - f64::from(t.min(60)) / 60.0;

@@ -1,4 +1,4 @@
-//! `shoal bench`: how fast each stage is on this machine.
+//! `shoal bench`: measures the speed of each stage on this machine.
 
 use clap::Args;
 use shoal_bench::Stage;
@@ -8,7 +8,7 @@ pub(crate) struct BenchArgs {
     /// What to measure.
     #[arg(value_enum)]
     pub(crate) stage: Stage,
-    /// With `actors`: how many actors to measure, one after the other [default: 1,2,4, and doubled up to the cores].
+    /// With `actors`: the numbers of actors to measure [default: 1,2,4, … up to the number of cores].
     #[arg(long, value_name = "N,N,…", allow_hyphen_values = true)]
     pub(crate) actors: Option<String>,
     /// Print one JSON object on standard output.
@@ -16,7 +16,7 @@ pub(crate) struct BenchArgs {
     pub(crate) json: bool,
 }
 
-/// Measures a stage and tells the person, or a script, how fast it is.
+/// Measures a stage and prints the result as a table or as JSON.
 pub(crate) fn run(args: &BenchArgs) -> anyhow::Result<()> {
     shoal_bench::run(args.stage, args.actors.as_deref(), args.json)
 }

@@ -1,4 +1,4 @@
-//! `shoal completions`: what has a shell ask this program for completions.
+//! `shoal completions`: shell code that asks this program for completions.
 
 use std::io::Write;
 
@@ -16,7 +16,7 @@ pub(crate) struct CompletionsArgs {
     pub(crate) shell: Shell,
 }
 
-/// Prints the lines for the shell's start-up file. They call `shoal`, so they know of whatever it can do by then.
+/// Prints the lines for the shell's start-up file. They call `shoal`, so they need no change after an update of it.
 pub(crate) fn run(args: &CompletionsArgs) -> anyhow::Result<()> {
     let name = args.shell.to_string();
     let shells = Shells::builtins();

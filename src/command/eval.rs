@@ -1,4 +1,4 @@
-//! `shoal eval`: how good a run's policy is.
+//! `shoal eval`: evaluates a run's policy.
 
 use std::io::Write;
 use std::path::PathBuf;
@@ -19,10 +19,10 @@ pub(crate) struct EvalArgs {
     /// Which policy to evaluate.
     #[arg(long, value_enum, default_value_t)]
     pub(crate) policy: WhichPolicy,
-    /// Episodes, from starts that are the same always.
+    /// Number of episodes. Their start states are the same every time.
     #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..))]
     pub(crate) episodes: u32,
-    /// Other starts than those of the run's own seed.
+    /// Seed of the start states [default: the run's seed].
     #[arg(long)]
     pub(crate) seed: Option<u64>,
     /// Print one JSON object on standard output.
@@ -30,7 +30,7 @@ pub(crate) struct EvalArgs {
     pub(crate) json: bool,
 }
 
-/// Evaluates a policy and tells the person, or a script, how it did.
+/// Evaluates a policy and prints the result as a table or as JSON.
 pub(crate) fn run(args: &EvalArgs) -> anyhow::Result<()> {
     let run = RunDir::open(&args.run)?;
     let config = run.config()?;
@@ -75,7 +75,7 @@ fn table(summary: &EvaluationSummary, policy: &PolicyFile, seed: u64, goal: Opti
     if let Some(goal) = goal {
         let unit = goal.distance.unit;
         if let Some(distance) = summary.final_distance_mean {
-            row("distance at the end", format!("{distance:.4} {unit} in the mean"));
+            row("distance at the end", format!("{distance:.4} {unit} on average"));
         }
         if let Some(reached) = summary.reached_fraction {
             row(

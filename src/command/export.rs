@@ -1,4 +1,4 @@
-//! `shoal export`: a run's policy for programs that know nothing of this one.
+//! `shoal export`: writes a run's policy for other programs.
 
 use std::io::Write;
 use std::path::PathBuf;
@@ -15,27 +15,27 @@ use shoal_run::evaluation::WhichPolicy;
 pub(crate) struct ExportArgs {
     /// Run directory.
     pub(crate) run: PathBuf,
-    /// The form of the file.
+    /// Format of the file.
     #[arg(long, value_enum)]
     pub(crate) format: Format,
     /// Which policy to write.
     #[arg(long, value_enum, default_value_t)]
     pub(crate) policy: WhichPolicy,
-    /// The file [default: <policy>.<format> in the run directory].
+    /// The file to write [default: <policy>.<format> in the run directory].
     #[arg(long, value_name = "FILE")]
     pub(crate) out: Option<PathBuf>,
 }
 
-/// The form of the file.
+/// The format of the file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub(crate) enum Format {
-    /// A graph that any ONNX runtime computes, action scaling included.
+    /// A graph for any ONNX runtime, including the scaling of actions.
     Onnx,
-    /// The weights by PyTorch's names, with metadata.
+    /// The weights under PyTorch's names, with metadata.
     Safetensors,
 }
 
-/// Writes the policy, and says where it is.
+/// Writes the policy and prints the path of the file.
 pub(crate) fn run(args: &ExportArgs) -> anyhow::Result<()> {
     let run = RunDir::open(&args.run)?;
     let config = run.config()?;
@@ -51,7 +51,7 @@ pub(crate) fn run(args: &ExportArgs) -> anyhow::Result<()> {
     let file = format!("{which}.{}", name(args.format.to_possible_value()));
     let out = args.out.clone().unwrap_or_else(|| args.run.join(file));
     write_atomically(&out, |to| to.write_all(&bytes))
-        .with_context(|| format!("cannot write {}; choose another place with --out", out.display()))?;
+        .with_context(|| format!("cannot write {}; choose another file with --out", out.display()))?;
     writeln!(std::io::stdout(), "{}", out.display())?;
     Ok(())
 }

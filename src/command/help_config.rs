@@ -1,4 +1,4 @@
-//! `shoal train --help-config`: every key of the configuration, with its default, its unit and where that comes from.
+//! `shoal train --help-config`: every key of the configuration, with its default, its unit and its source.
 
 use std::fmt::Write as _;
 use std::io::Write as _;
@@ -9,21 +9,21 @@ use shoal_env_server::environment;
 use shoal_run::plan::{FILLED_IN, preset_names, resolved};
 use toml::{Table, Value};
 
-/// Explains the keys of one preset or file, or where none is named, all that there are.
+/// Explains the keys of one preset or file, or all keys if none is named.
 pub(crate) fn explain(what: Option<&str>) -> anyhow::Result<()> {
-    let text = what.map_or_else(everything, of)?;
+    let text = what.map_or_else(explain_all, explain_one)?;
     std::io::stdout().lock().write_all(text.as_bytes())?;
     Ok(())
 }
 
-/// A key with its section, and what is known of it.
+/// A key with its section and its default.
 struct Entry {
     section: String,
     key: Key,
     default: Option<Value>,
 }
 
-/// Every key that a configuration may have, section after section; an environment's parameters stand under its name.
+/// Every key of a configuration, by section. The parameters of an environment are listed under its name.
 fn entries() -> anyhow::Result<Vec<(String, Vec<Entry>)>> {
     let mut all = Vec::new();
     for section in sections() {
@@ -56,11 +56,11 @@ fn entries() -> anyhow::Result<Vec<(String, Vec<Entry>)>> {
 }
 
 const HEAD: &str = "\
-Keys of a configuration, as --set SECTION.KEY=VALUE or in a FILE.toml. In brackets: the unit (– where there is none),
-and the place in the thesis that the default comes from, or ours.
+The keys of a configuration, for --set SECTION.KEY=VALUE or a FILE.toml. In brackets: the unit (– if there is none), and
+the source of the default: a place in the thesis, or ours.
 ";
 
-fn everything() -> anyhow::Result<String> {
+fn explain_all() -> anyhow::Result<String> {
     let preset = |name| Ok((name, table(&resolved(name)?)?));
     let presets = preset_names()
         .map(preset)
@@ -69,7 +69,7 @@ fn everything() -> anyhow::Result<String> {
     for (title, entries) in entries()? {
         let _ = writeln!(text, "\n{title}");
         for entry in entries {
-            tell(&mut text, &entry.key, entry.default.as_ref());
+            write_key(&mut text, &entry.key, entry.default.as_ref());
             let of_environment = title.strip_prefix("[environment] of ");
             for (value, names) in differing(&presets, &entry, of_environment) {
                 let _ = writeln!(text, "      {value} in {}", names.join(", "));
@@ -79,12 +79,12 @@ fn everything() -> anyhow::Result<String> {
     Ok(text)
 }
 
-/// Whether the program fills the key in for each run.
+/// Whether the program sets the key itself for each run.
 fn is_filled_in(section: &str, key: &Key) -> bool {
     FILLED_IN.contains(&format!("{section}.{}", key.name).as_str())
 }
 
-/// What presets have instead of the default, with their names.
+/// The values that differ from the default, each with the presets that have it.
 fn differing<'a>(
     presets: &[(&'a str, Table)],
     entry: &Entry,
@@ -116,7 +116,7 @@ fn differing<'a>(
     differing
 }
 
-fn of(what: &str) -> anyhow::Result<String> {
+fn explain_one(what: &str) -> anyhow::Result<String> {
     let config = resolved(what)?;
     let table = table(&config)?;
     let mut text = format!("{HEAD}\n{what} is a configuration for {}.\n", config.algorithm.name());
@@ -124,7 +124,7 @@ fn of(what: &str) -> anyhow::Result<String> {
     for (title, entries) in entries()? {
         let chosen = entries.iter().filter_map(|entry| {
             let value = table.get(&entry.section)?.as_table()?.get(&entry.key.name)?;
-            // What the program fills in has no value to show.
+            // A key that the program sets has no value to show.
             Some((&entry.key, (!is_filled_in(&entry.section, &entry.key)).then_some(value)))
         });
         let chosen: Vec<_> = chosen.collect();
@@ -133,13 +133,13 @@ fn of(what: &str) -> anyhow::Result<String> {
         }
         let _ = writeln!(text, "\n{title}");
         for (key, value) in chosen {
-            tell(&mut text, key, value);
+            write_key(&mut text, key, value);
         }
     }
     Ok(text)
 }
 
-fn tell(text: &mut String, key: &Key, value: Option<&Value>) {
+fn write_key(text: &mut String, key: &Key, value: Option<&Value>) {
     let Key {
         name,
         meaning,
@@ -171,7 +171,7 @@ fn table(config: &Config) -> anyhow::Result<Table> {
 mod tests {
     use super::*;
 
-    /// A key that is new in a configuration and not explained ends up here.
+    /// Fails for a new key without an explanation.
     #[test]
     fn every_key_of_every_preset_is_explained() {
         let entries = entries().unwrap();
@@ -179,7 +179,7 @@ mod tests {
             let config = resolved(preset).unwrap();
             let environment = format!("[environment] of {}", config.environment.name);
             for (section, keys) in table(&config).unwrap() {
-                // What the environment says of itself is nobody's to set.
+                // The environment's description is not set by the user.
                 if section == "spec" {
                     continue;
                 }
@@ -194,7 +194,7 @@ mod tests {
                         .next();
                     let key = key.unwrap_or_else(|| panic!("{preset}: {section}.{name} is not explained"));
                     for part in [&key.meaning, &key.unit, &key.source] {
-                        assert!(!part.is_empty(), "{preset}: {section}.{name} lacks something: {key:?}");
+                        assert!(!part.is_empty(), "{preset}: {section}.{name} is incomplete: {key:?}");
                     }
                 }
             }
@@ -202,7 +202,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_explained_is_a_key_and_has_words() {
+    fn every_explanation_has_a_meaning_a_unit_and_a_source() {
         for (title, entries) in entries().unwrap() {
             assert!(!entries.is_empty(), "{title}");
             for Entry { key, .. } in entries {
@@ -213,11 +213,11 @@ mod tests {
     }
 
     #[test]
-    fn a_presets_own_numbers_are_named() {
-        let text = everything().unwrap();
+    fn values_of_presets_that_differ_from_the_default_are_shown() {
+        let text = explain_all().unwrap();
         assert!(text.contains("steps = 120000  [environment steps;"), "{text}");
         assert!(text.contains("800000 in point-mass-r1"), "{text}");
-        let lake = of("frozen-lake").unwrap();
+        let lake = explain_one("frozen-lake").unwrap();
         assert!(lake.contains("alpha = 0.03") && !lake.contains("tau"), "{lake}");
         assert!(lake.contains("warmup = 0 "), "{lake}");
     }

@@ -14,7 +14,7 @@ use crate::listing::{Listed, runs_in};
 
 #[derive(Args, Clone, Debug)]
 pub(crate) struct ListArgs {
-    /// Directory with runs in it.
+    /// Directory that contains the runs.
     #[arg(default_value = "runs")]
     pub(crate) directory: PathBuf,
     /// Print one JSON object on standard output.
@@ -22,19 +22,19 @@ pub(crate) struct ListArgs {
     pub(crate) json: bool,
 }
 
-/// What `--json` prints.
+/// The output of `--json`.
 #[derive(Serialize)]
 struct Printed<'a> {
     directory: &'a Path,
     runs: &'a [Listed],
 }
 
-/// Lists the runs that lie in the directory itself.
+/// Lists the runs directly in the directory.
 pub(crate) fn run(args: &ListArgs) -> anyhow::Result<()> {
     let directory = &args.directory;
     if !directory.is_dir() {
         bail!(
-            "there is no directory {}: name the one that holds the runs, or start a run with `shoal train`",
+            "there is no directory {}: name the one that contains the runs, or start a run with `shoal train`",
             directory.display()
         );
     }

@@ -10,12 +10,12 @@ use clap_mangen::Man;
 
 #[derive(Args, Clone, Debug)]
 pub(crate) struct ManArgs {
-    /// Where to put a page for each command [default: the first page, on standard output].
+    /// Directory for the pages of all commands [default: the main page goes to standard output].
     #[arg(long, value_name = "DIR")]
     pub(crate) out: Option<PathBuf>,
 }
 
-/// Writes a page for each command into a directory, or the first page to standard output.
+/// Writes a page for each command into a directory, or the main page to standard output.
 pub(crate) fn run(args: &ManArgs, command: Command) -> anyhow::Result<()> {
     match &args.out {
         Some(directory) => {

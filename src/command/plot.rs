@@ -1,4 +1,4 @@
-//! `shoal plot`: the pictures of a run.
+//! `shoal plot`: the figures of a run.
 
 use std::io::Write;
 use std::path::PathBuf;
@@ -12,20 +12,20 @@ use shoal_report::plots;
 pub(crate) struct PlotArgs {
     /// Run directory.
     pub(crate) run: PathBuf,
-    /// Where to put the figures [default: the run directory].
+    /// Directory for the figures [default: the run directory].
     #[arg(long, value_name = "DIR")]
     pub(crate) out: Option<PathBuf>,
 }
 
-/// Draws what there is to draw of a run, and says where it is.
+/// Draws all figures of a run and prints their paths.
 pub(crate) fn run(args: &PlotArgs) -> anyhow::Result<()> {
     let run = RunDir::open(&args.run)?;
     let config = run.config()?;
     let out = args.out.as_deref().unwrap_or(run.path());
-    std::fs::create_dir_all(out).with_context(|| format!("cannot make {}", out.display()))?;
+    std::fs::create_dir_all(out).with_context(|| format!("cannot create {}", out.display()))?;
     let mut stdout = std::io::stdout().lock();
-    for picture in plots::draw(&run, &config, out)? {
-        writeln!(stdout, "{}", picture.display())?;
+    for figure in plots::draw(&run, &config, out)? {
+        writeln!(stdout, "{}", figure.display())?;
     }
     Ok(())
 }

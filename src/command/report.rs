@@ -1,4 +1,4 @@
-//! `shoal report`: one file with everything there is to see of one run or several, to be looked at anywhere.
+//! `shoal report`: an interactive report of one or several runs in a single HTML file.
 
 use std::io::{ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
@@ -11,18 +11,18 @@ use shoal_report::page::{self, MARK};
 
 #[derive(Args, Clone, Debug)]
 pub(crate) struct ReportArgs {
-    /// Run directories; of one environment they are compared.
+    /// Run directories. Runs in the same environment are compared.
     #[arg(value_name = "RUN", required = true)]
     pub(crate) runs: Vec<PathBuf>,
-    /// The file to write [default: report.html in the run directory; of several runs, in the working directory].
+    /// The file to write [default: report.html in the run directory; for several runs, in the working directory].
     #[arg(long, value_name = "FILE")]
     pub(crate) out: Option<PathBuf>,
 }
 
-/// The report's name where none is given.
+/// The default name of the report.
 const NAME: &str = "report.html";
 
-/// Gathers what the runs left behind so far, writes the page, and says where it is.
+/// Collects the data of the runs, writes the page, and prints its path.
 pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<()> {
     let runs = open(&args.runs)?;
     let out = match (&args.out, &runs[..]) {
@@ -30,12 +30,12 @@ pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<()> {
         (None, [run]) => run.path().join(NAME),
         (None, _) => NAME.into(),
     };
-    refuse_what_is_no_report(&out)?;
+    check_replaceable(&out)?;
     let report = page::gather(&runs)?;
     for (reason, names) in report.not_played() {
         writeln!(
             std::io::stderr().lock(),
-            "{}: no episode is played: {reason}",
+            "{}: no episode is shown: {reason}",
             names.join(", ")
         )?;
     }
@@ -46,7 +46,7 @@ pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The runs, each of them once.
+/// Opens the runs. Each may be named only once.
 fn open(paths: &[PathBuf]) -> anyhow::Result<Vec<RunDir>> {
     let mut runs: Vec<RunDir> = Vec::new();
     for path in paths {
@@ -58,8 +58,8 @@ fn open(paths: &[PathBuf]) -> anyhow::Result<Vec<RunDir>> {
     Ok(runs)
 }
 
-/// Only a report is replaced by a report.
-fn refuse_what_is_no_report(out: &Path) -> anyhow::Result<()> {
+/// Checks that `out` does not exist or is a report: no other file is replaced.
+fn check_replaceable(out: &Path) -> anyhow::Result<()> {
     if out.is_dir() {
         bail!("{} is a directory: give --out the name of a file", out.display());
     }
@@ -70,7 +70,7 @@ fn refuse_what_is_no_report(out: &Path) -> anyhow::Result<()> {
     };
     ensure!(
         start == MARK.as_bytes(),
-        "{} is there and is no report: choose another file with --out, or remove it",
+        "{} exists and is not a report: choose another file with --out, or remove it",
         out.display()
     );
     Ok(())
@@ -82,7 +82,7 @@ mod tests {
     use shoal_run::testing::small;
 
     #[test]
-    fn a_report_replaces_a_report_and_nothing_else() {
+    fn a_report_replaces_only_a_report() {
         let parent = tempfile::tempdir().unwrap();
         let run_dir = RunDir::create(&parent.path().join("run")).unwrap();
         let (config, _) = small("name = \"pendulum\"");
@@ -102,7 +102,7 @@ mod tests {
             report(&config)
                 .unwrap_err()
                 .to_string()
-                .contains("is there and is no report")
+                .contains("exists and is not a report")
         );
         assert_eq!(std::fs::read(&config).unwrap(), before);
         assert!(
@@ -116,7 +116,7 @@ mod tests {
     }
 
     #[test]
-    fn a_run_is_named_once() {
+    fn a_run_named_twice_is_an_error() {
         let parent = tempfile::tempdir().unwrap();
         let run_dir = RunDir::create(&parent.path().join("run")).unwrap();
         std::fs::write(run_dir.config_file(), "").unwrap();

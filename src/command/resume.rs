@@ -1,4 +1,4 @@
-//! `shoal resume`: a run that was stopped, or whose processes were killed, goes on.
+//! `shoal resume`: continues a run that was stopped or killed.
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -15,34 +15,34 @@ use super::training::run_training;
 pub(crate) struct ResumeArgs {
     /// Run directory.
     pub(crate) run: PathBuf,
-    /// Environment steps over all actors, those already taken included [default: as before].
+    /// Environment steps of all actors together, including those already taken [default: as before].
     #[arg(long, value_name = "N")]
     pub(crate) steps: Option<u64>,
-    /// Episodes over all actors, those already over included [default: as before].
+    /// Episodes of all actors together, including those already finished [default: as before].
     #[arg(long, value_name = "M")]
     pub(crate) episodes: Option<u64>,
     #[command(flatten)]
     pub(crate) output: OutputMode,
 }
 
-/// Goes on with the run's own replay, counters and noise, to the steps it was to take or to others.
+/// Continues with the run's replay, counters and noise, until its old or new number of steps or episodes.
 pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
     let run = RunDir::open(&args.run)?;
     let mut config = run.config()?;
-    // Only who holds the lock may change the configuration.
+    // Only the holder of the lock may change the configuration.
     let lock = run.lock()?;
     let here = args.run.display();
-    let rest = status::at_rest(&config, &run).with_context(|| format!("cannot resume {here}"))?;
-    let (taken, over) = (rest.env_steps, rest.episodes);
+    let saved = status::saved_status(&config, &run).with_context(|| format!("cannot resume {here}"))?;
+    let (steps_taken, episodes_ended) = (saved.env_steps, saved.episodes);
     let steps = args.steps.unwrap_or(config.run.steps);
     let episodes = args.episodes.or(config.run.episodes);
-    // Where all steps are taken, updates or the last evaluation may be left.
-    if rest.finished || (steps, episodes) != (config.run.steps, config.run.episodes) {
-        if taken >= steps {
-            bail!("{here} has taken {taken} of {steps} steps already: give it more with --steps");
+    // A run with all its steps may still lack updates or the last evaluation.
+    if saved.finished || (steps, episodes) != (config.run.steps, config.run.episodes) {
+        if steps_taken >= steps {
+            bail!("{here} has taken {steps_taken} of {steps} steps already: give it more with --steps");
         }
-        if let Some(episodes) = episodes.filter(|episodes| over >= *episodes) {
-            bail!("{here} has finished {over} of {episodes} episodes already: give it more with --episodes");
+        if let Some(episodes) = episodes.filter(|episodes| episodes_ended >= *episodes) {
+            bail!("{here} has finished {episodes_ended} of {episodes} episodes already: give it more with --episodes");
         }
     }
     if (steps, episodes) != (config.run.steps, config.run.episodes) {

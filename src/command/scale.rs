@@ -1,4 +1,4 @@
-//! `shoal scale`: more actors, or fewer, while training goes on.
+//! `shoal scale`: more or fewer actors during training.
 
 use std::io::Write;
 use std::path::PathBuf;
@@ -14,15 +14,15 @@ use shoal_run::remote::Remote;
 pub(crate) struct ScaleArgs {
     /// Run directory.
     pub(crate) run: PathBuf,
-    /// Actor processes from now on.
+    /// New number of actor processes.
     #[arg(long, value_name = "N")]
     pub(crate) actors: u32,
 }
 
-/// Actors that retire hand over what they have first: the learner may take its time over it.
+/// How long the change may take. Retiring actors first hand over their transitions, which the learner may take slowly.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// Asks for so many actors, and waits until there are.
+/// Requests this number of actors, and waits until all of them are at work.
 pub(crate) fn run(args: &ScaleArgs) -> anyhow::Result<()> {
     let remote = Remote::open(&args.run)?;
     remote.scale(args.actors)?;
@@ -30,11 +30,13 @@ pub(crate) fn run(args: &ScaleArgs) -> anyhow::Result<()> {
     loop {
         match remote.status()? {
             None => bail!("{here} has ended meanwhile"),
-            Some(status) if status.actors != args.actors => bail!("somebody else scaled {here} to {}", status.actors),
+            Some(status) if status.actors != args.actors => {
+                bail!("another command scaled {here} to {} actors", status.actors)
+            }
             Some(status) if is_at_work(&status) => break,
             Some(_) if asked.elapsed() >= PATIENCE => {
                 bail!(
-                    "the actors of {here} are not {} yet; `shoal status {here}` shows them",
+                    "{here} does not have {} actors at work after {PATIENCE:?}; `shoal status {here}` shows them",
                     args.actors
                 )
             }
@@ -45,7 +47,7 @@ pub(crate) fn run(args: &ScaleArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Whether the actors are those wanted, all of them past their start.
+/// Whether the number of actors is right and all of them have started.
 fn is_at_work(status: &RunStatus) -> bool {
     let mut actors = status.roles.iter().filter(|role| role.role == Role::Actor.name());
     actors.clone().count() == status.actors as usize

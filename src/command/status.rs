@@ -1,4 +1,4 @@
-//! `shoal status`: how a run gets on.
+//! `shoal status`: the status of a run.
 
 use std::io::{IsTerminal, Write};
 use std::path::{Path, PathBuf};
@@ -13,7 +13,7 @@ use serde::Serialize;
 use shoal_common::channel::control::{RoleState, RunStatus};
 use shoal_run::numbers::thousands;
 use shoal_run::remote::Remote;
-use shoal_run::status::at_rest;
+use shoal_run::status::saved_status;
 
 #[derive(Args, Clone, Debug)]
 pub(crate) struct StatusArgs {
@@ -22,18 +22,18 @@ pub(crate) struct StatusArgs {
     /// Print one JSON object on standard output.
     #[arg(long)]
     pub(crate) json: bool,
-    /// Again every second, until the run ends.
+    /// Repeat every second until the run ends.
     #[arg(long)]
     pub(crate) watch: bool,
 }
 
-/// From one look to the next.
-const EVERY: Duration = Duration::from_secs(1);
+/// Time between two requests with `--watch`.
+const INTERVAL: Duration = Duration::from_secs(1);
 
-/// The exit code that says that nothing runs.
-const NOTHING_RUNS: u8 = 3;
+/// The exit code if the run is not running.
+const NOT_RUNNING: u8 = 3;
 
-/// What `--json` prints.
+/// The output of `--json`.
 #[derive(Serialize)]
 struct Printed<'a> {
     running: bool,
@@ -41,11 +41,11 @@ struct Printed<'a> {
     status: &'a RunStatus,
 }
 
-/// Shows how the run gets on, once or until it ends.
+/// Shows the run's status, once or until it ends.
 pub(crate) fn run(args: &StatusArgs) -> anyhow::Result<ExitCode> {
     let remote = Remote::open(&args.run)?;
     let Some(mut status) = remote.status()? else {
-        return rest(&args.run, args.json, &remote);
+        return show_saved(&args.run, args.json, &remote);
     };
     if !args.watch {
         show(args, &status, &mut std::io::stdout().lock())?;
@@ -58,21 +58,21 @@ pub(crate) fn run(args: &StatusArgs) -> anyhow::Result<ExitCode> {
         } else {
             screen.set_message(table(&status));
         }
-        std::thread::sleep(EVERY);
+        std::thread::sleep(INTERVAL);
         match remote.status()? {
             Some(newer) => status = newer,
             None => break,
         }
     }
     screen.finish_and_clear();
-    rest(&args.run, args.json, &remote)?;
+    show_saved(&args.run, args.json, &remote)?;
     Ok(ExitCode::SUCCESS)
 }
 
-/// Shows how a run stands that does not go on.
-pub(super) fn rest(run: &Path, json: bool, remote: &Remote) -> anyhow::Result<ExitCode> {
-    // It may have been scaled, or been given more steps, since it was looked at first.
-    let status = at_rest(&remote.run.config()?, &remote.run)?;
+/// Shows the status of a run that is not running, by its files.
+pub(super) fn show_saved(run: &Path, json: bool, remote: &Remote) -> anyhow::Result<ExitCode> {
+    // The configuration is read again: the run may have been scaled or extended since it was opened.
+    let status = saved_status(&remote.run.config()?, &remote.run)?;
     let mut stdout = std::io::stdout().lock();
     let here = run.display();
     if json {
@@ -84,13 +84,13 @@ pub(super) fn rest(run: &Path, json: bool, remote: &Remote) -> anyhow::Result<Ex
     } else if !status.finished {
         writeln!(
             stdout,
-            "nothing runs in {here}; {}; to go on: shoal resume {here}",
+            "nothing runs in {here}; {}; to continue: shoal resume {here}",
             progress(&status)
         )?;
     } else {
-        writeln!(stdout, "nothing runs in {here}; {}: it is done", progress(&status))?;
+        writeln!(stdout, "nothing runs in {here}; {}: finished", progress(&status))?;
     }
-    Ok(ExitCode::from(NOTHING_RUNS))
+    Ok(ExitCode::from(NOT_RUNNING))
 }
 
 fn show(args: &StatusArgs, status: &RunStatus, to: &mut impl Write) -> anyhow::Result<()> {
@@ -103,7 +103,7 @@ fn show(args: &StatusArgs, status: &RunStatus, to: &mut impl Write) -> anyhow::R
     Ok(())
 }
 
-/// A place on the terminal that is drawn anew each time.
+/// An area of the terminal that is redrawn each time.
 fn screen() -> ProgressBar {
     let screen = ProgressBar::with_draw_target(None, ProgressDrawTarget::stdout());
     if let Ok(style) = ProgressStyle::with_template("{msg}") {
@@ -112,7 +112,7 @@ fn screen() -> ProgressBar {
     screen
 }
 
-/// How far the run is, in words.
+/// The run's progress in words.
 pub(crate) fn progress(status: &RunStatus) -> String {
     let updates = thousands(status.updates);
     match status.episodes_limit {
@@ -139,7 +139,7 @@ fn table(status: &RunStatus) -> String {
         table.add_row([
             format!("{} {}", role.role, role.index),
             role.pid.map_or_else(String::new, |pid| pid.to_string()),
-            in_words(role.state).into(),
+            state_name(role.state).into(),
             role.restarts.to_string(),
             format!("{:.0}/s", role.rate),
             or_none(role.policy_version),
@@ -154,7 +154,7 @@ fn table(status: &RunStatus) -> String {
     let evaluated = status
         .eval_return_mean
         .map_or_else(String::new, |mean| format!(", eval {mean:.2}"));
-    let waiting = waits(status);
+    let waiting = waiting(status);
     format!(
         "{}, {} rows{evaluated}\n{:.0} updates/s, {:.0} steps/s, ratio {:.2} of {:.2}; {waiting}\n\n{table}",
         progress(status),
@@ -167,13 +167,13 @@ fn table(status: &RunStatus) -> String {
 }
 
 /// Who waits for whom, in words.
-pub(crate) fn waits(status: &RunStatus) -> &str {
+pub(crate) fn waiting(status: &RunStatus) -> &str {
     let waiting = status.waiting.as_deref();
     waiting.map_or("nobody waits", |waiting| waiting.split(':').next().unwrap_or(waiting))
 }
 
-/// What a role does, in words.
-pub(crate) fn in_words(state: RoleState) -> &'static str {
+/// The state of a role in words.
+pub(crate) fn state_name(state: RoleState) -> &'static str {
     match state {
         RoleState::Starting => "starting",
         RoleState::Working => "working",

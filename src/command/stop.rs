@@ -1,4 +1,4 @@
-//! `shoal stop`: ends a run in order.
+//! `shoal stop`: saves a run's state and ends it.
 
 use std::io::Write;
 use std::path::PathBuf;
@@ -12,12 +12,12 @@ pub(crate) struct StopArgs {
     pub(crate) run: PathBuf,
 }
 
-/// Asks the launcher for the end, and waits until it is there.
+/// Asks the launcher to end the run, and waits until it has ended.
 pub(crate) fn run(args: &StopArgs) -> anyhow::Result<()> {
     Remote::open(&args.run)?.stop()?;
     writeln!(
         std::io::stdout(),
-        "stopped; to go on: shoal resume {}",
+        "stopped; to continue: shoal resume {}",
         args.run.display()
     )?;
     Ok(())

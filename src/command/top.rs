@@ -1,4 +1,4 @@
-//! `shoal top`: a run on the whole terminal, until somebody leaves.
+//! `shoal top`: shows a run on the full terminal.
 
 use std::io::IsTerminal;
 use std::path::PathBuf;
@@ -18,7 +18,7 @@ use shoal_run::remote::Remote;
 use shoal_run::signals::{Signals, exit_code};
 use signal_hook::consts::SIGHUP;
 
-use super::status::rest;
+use super::status::show_saved;
 use crate::top::{Link, Screen, draw};
 
 #[derive(Args, Clone, Debug)]
@@ -27,32 +27,32 @@ pub(crate) struct TopArgs {
     pub(crate) run: PathBuf,
 }
 
-/// How long a key, a signal or news may lie unread.
-const LOOK: Duration = Duration::from_millis(200);
+/// The longest delay until a key, a signal or an event is handled.
+const TICK: Duration = Duration::from_millis(200);
 
-/// How long the picture's loop may take to end after a signal: a look, and what `Link::close` waits for.
-const TO_THE_END: Duration = Duration::from_secs(3);
+/// How long the main loop may take to end after a signal. A tick and the wait in `Link::close` take less.
+const END_PATIENCE: Duration = Duration::from_secs(3);
 
-/// Shows the run until `q` or a signal; the terminal is then as it was.
+/// Shows the run until `q` or a signal, and then restores the terminal.
 pub(crate) fn run(args: &TopArgs) -> anyhow::Result<ExitCode> {
     let remote = Remote::open(&args.run)?;
     if !(std::io::stdout().is_terminal() && std::io::stdin().is_terminal()) {
         bail!(
-            "shoal top draws on a terminal, and this is none; `shoal status {} --watch` writes lines",
+            "shoal top draws on a terminal, and this is not one; use `shoal status {} --watch`",
             args.run.display()
         );
     }
     if remote.status()?.is_none() {
-        return rest(&args.run, false, &remote);
+        return show_saved(&args.run, false, &remote);
     }
     let signal = watched_signals()?;
     let here = args.run.display().to_string();
     let mut screen = Screen::new(here, task(&remote.config), colours());
     let link = Link::new(remote)?;
-    let restored = Restored;
+    let restore = RestoreOnDrop;
     let mut terminal = ratatui::try_init().context("cannot draw on this terminal")?;
     let shown = show(&mut terminal, &mut screen, &link, &signal);
-    drop(restored);
+    drop(restore);
     link.close();
     shown?;
     match signal.load(Ordering::Relaxed) {
@@ -61,12 +61,12 @@ pub(crate) fn run(args: &TopArgs) -> anyhow::Result<ExitCode> {
     }
 }
 
-/// Gives the terminal back when dropped. (A panic does so before it says anything: `try_init` sees to that.)
-struct Restored;
+/// Restores the terminal on drop. (After a panic, the hook of `try_init` restores it before the message is printed.)
+struct RestoreOnDrop;
 
-impl Drop for Restored {
+impl Drop for RestoreOnDrop {
     fn drop(&mut self) {
-        // There may be no terminal any more.
+        // The terminal may be gone.
         let _ = ratatui::try_restore();
     }
 }
@@ -80,7 +80,7 @@ fn show(terminal: &mut DefaultTerminal, screen: &mut Screen, link: &Link, signal
                 .context("cannot draw on this terminal")?;
         }
         changed = false;
-        match awaited()? {
+        match wait_for_input()? {
             Input::Nothing => {}
             Input::Something => {
                 changed = true;
@@ -90,79 +90,81 @@ fn show(terminal: &mut DefaultTerminal, screen: &mut Screen, link: &Link, signal
             }
             Input::Gone => signal.store(SIGHUP as usize, Ordering::Relaxed),
         }
-        for news in link.heard()? {
+        for event in link.events()? {
             changed = true;
-            screen.hear(news);
+            screen.handle(event);
         }
     }
     Ok(())
 }
 
-/// What a wait for the keyboard came to.
+/// The result of a wait for the keyboard.
 enum Input {
     Nothing,
     Something,
-    /// There is no terminal any more.
+    /// The terminal is gone.
     Gone,
 }
 
-/// Waits a moment for a key. A terminal that has gone is told here, because who reads on never comes back from it.
-fn awaited() -> anyhow::Result<Input> {
+/// Waits a tick for a key. Detects here that the terminal is gone, because a read would never return then.
+fn wait_for_input() -> anyhow::Result<Input> {
     let stdin = std::io::stdin();
     let mut fds = [PollFd::new(&stdin, PollFlags::IN)];
-    let moment = Timespec::try_from(LOOK).context("cannot wait for the keyboard")?;
-    match poll(&mut fds, Some(&moment)) {
-        // A signal: the window may have another size.
+    let tick = Timespec::try_from(TICK).context("cannot wait for the keyboard")?;
+    match poll(&mut fds, Some(&tick)) {
+        // A signal: the size of the window may have changed.
         Err(Errno::INTR) => return Ok(Input::Something),
-        told => told.context("cannot wait for the keyboard")?,
+        polled => polled.context("cannot wait for the keyboard")?,
     };
-    let told = fds[0].revents();
-    Ok(if told.intersects(PollFlags::HUP | PollFlags::ERR | PollFlags::NVAL) {
-        Input::Gone
-    } else if told.contains(PollFlags::IN) {
-        Input::Something
-    } else {
-        Input::Nothing
-    })
+    let events = fds[0].revents();
+    Ok(
+        if events.intersects(PollFlags::HUP | PollFlags::ERR | PollFlags::NVAL) {
+            Input::Gone
+        } else if events.contains(PollFlags::IN) {
+            Input::Something
+        } else {
+            Input::Nothing
+        },
+    )
 }
 
-/// Takes in the keys that were pressed; whether one of them leaves.
+/// Handles the keys that were pressed; returns whether one of them quits.
 fn read_keys(screen: &mut Screen, link: &Link) -> anyhow::Result<bool> {
     while event::poll(Duration::ZERO).context("cannot read the keyboard")? {
         let Event::Key(key) = event::read().context("cannot read the keyboard")? else {
             continue;
         };
-        if leaves(&key) {
+        if is_quit_key(&key) {
             return Ok(true);
         }
-        // Any key closes what lies over the picture.
+        // Any key closes an open box, so other keys count as a space.
         let pressed = key.code.as_char().filter(|_| key.kind == KeyEventKind::Press);
-        if let Some(order) = screen.press(pressed.unwrap_or(' ')) {
-            link.order(order);
+        if let Some(request) = screen.press(pressed.unwrap_or(' ')) {
+            link.request(request);
         }
     }
     Ok(false)
 }
 
-/// Ctrl-C comes as a key here.
-fn leaves(key: &KeyEvent) -> bool {
+/// Whether the key is `q` or Ctrl-C, which arrives as a key here.
+fn is_quit_key(key: &KeyEvent) -> bool {
     let control = key.modifiers.contains(KeyModifiers::CONTROL);
     matches!(key.code, KeyCode::Char('q')) || (control && matches!(key.code, KeyCode::Char('c')))
 }
 
-/// The number of the signal that has come; 0 before one has. Should the picture's loop hang, the process ends all the same.
+/// The number of the signal that has arrived; 0 if none has. Ends the process if the main loop hangs after a signal.
 fn watched_signals() -> anyhow::Result<Arc<AtomicUsize>> {
     let signal = Arc::new(AtomicUsize::new(0));
     let signals = Signals::register()?;
     let received = Arc::clone(&signal);
     let watch = move || {
         let number = loop {
-            if let Some(number) = signals.wait(LOOK) {
+            if let Some(number) = signals.wait(TICK) {
                 break number;
             }
         };
         received.store(number as usize, Ordering::Relaxed);
-        std::thread::sleep(TO_THE_END);
+        std::thread::sleep(END_PATIENCE);
         let _ = ratatui::try_restore();
         std::process::exit(128 + number);
     };
@@ -171,7 +173,7 @@ fn watched_signals() -> anyhow::Result<Arc<AtomicUsize>> {
     Ok(signal)
 }
 
-/// Whether colours are welcome (no-color.org: any value of the variable but none says no).
+/// Whether to use colours: not if `NO_COLOR` is set and not empty (no-color.org).
 fn colours() -> bool {
     std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty())
 }

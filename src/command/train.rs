@@ -1,4 +1,4 @@
-//! `shoal train`: a new run, from its plan to its result.
+//! `shoal train`: a new run, from its configuration to its result.
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -16,11 +16,11 @@ use crate::completion;
 #[derive(Args, Clone, Debug)]
 pub(crate) struct TrainArgs {
     /// What to train: frozen-lake, frozen-lake-sarsa, cart-pole, pendulum, point-mass-r1, point-mass-r2, point-mass-r3,
-    /// gym: and a Gymnasium environment (gym:HalfCheetah-v5), or a configuration file (FILE.toml).
+    /// gym: with a Gymnasium environment (gym:HalfCheetah-v5), or a configuration file (FILE.toml).
     #[arg(value_name = "PRESET|gym:ID|FILE.toml", required_unless_present = "help_config")]
     #[arg(add = ArgValueCompleter::new(completion::what_to_train))]
     pub(crate) what: Option<String>,
-    /// Explain every key of the configuration, or those of the named preset or file, and train nothing.
+    /// Explain every key of the configuration, or those of the named preset or file, without training.
     #[arg(long)]
     pub(crate) help_config: bool,
     #[command(flatten)]
@@ -29,13 +29,13 @@ pub(crate) struct TrainArgs {
     pub(crate) output: OutputMode,
 }
 
-/// What of a run can be said on the command line.
+/// The settings of a run that have options of their own, and `--set`.
 #[derive(Args, Clone, Debug, Default)]
 pub(crate) struct RunArgs {
-    /// Run directory to make [default: runs/<preset>-<n>].
+    /// Run directory to create [default: runs/<preset>-<n>].
     #[arg(long, value_name = "DIR")]
     pub(crate) run: Option<PathBuf>,
-    /// Root of every random stream.
+    /// Seed of every random stream.
     #[arg(long)]
     pub(crate) seed: Option<u64>,
     /// Actor processes.
@@ -44,16 +44,16 @@ pub(crate) struct RunArgs {
     /// Environments of each actor.
     #[arg(long, value_name = "E")]
     pub(crate) envs: Option<u32>,
-    /// Environment steps over all actors.
+    /// Environment steps of all actors together.
     #[arg(long, value_name = "N")]
     pub(crate) steps: Option<u64>,
-    /// Episodes over all actors, where they come before the steps.
+    /// Episodes of all actors together; the run ends at this limit or at its steps, whichever comes first.
     #[arg(long, value_name = "M")]
     pub(crate) episodes: Option<u64>,
-    /// Take turns: the same seed and actor count give the same bits.
+    /// Lockstep: actors and learner take turns, and the same seed and number of actors give the same bits.
     #[arg(long)]
     pub(crate) lockstep: bool,
-    /// Override a key of the configuration, as in --set ddpg.tau=0.005. May be repeated.
+    /// Set a key of the configuration, as in --set ddpg.tau=0.005. May be repeated.
     #[arg(long, value_name = "SECTION.KEY=VALUE", add = ArgValueCompleter::new(completion::settings))]
     pub(crate) set: Vec<String>,
 }
@@ -83,13 +83,16 @@ impl RunArgs {
     }
 }
 
-/// Makes a run and trains it, or explains what can be set.
+/// Creates a run and trains it, or explains the configuration.
 pub(crate) fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
     if args.help_config {
         help_config::explain(args.what.as_deref())?;
         return Ok(ExitCode::SUCCESS);
     }
-    let what = args.what.as_deref().context("say what to train")?;
+    let what = args
+        .what
+        .as_deref()
+        .context("name a preset, a gym: environment or a configuration file to train")?;
     let Plan { config, run, lock } = Plan::new(what, &args.overrides.overrides())?;
     run_training(config, &run, lock, &args.output)
 }

@@ -1,4 +1,4 @@
-//! From a run that is decided to its result: what `train` and `resume` share.
+//! Trains a run and reports its result: shared by `train` and `resume`.
 
 use std::io::Write;
 use std::process::ExitCode;
@@ -21,18 +21,18 @@ use shoal_run::signals::exit_code;
 
 use crate::launcher::{self, Ending, TrainingOutcome};
 
-/// What a training run says.
+/// The output options of a training.
 #[derive(Args, Clone, Debug, Default)]
 pub(crate) struct OutputMode {
     /// No live line and no table.
     #[arg(long)]
     pub(crate) quiet: bool,
-    /// Print one JSON object on standard output at the end, and everything else on standard error.
+    /// Print one JSON object on standard output at the end. Everything else goes to standard error.
     #[arg(long)]
     pub(crate) json: bool,
 }
 
-/// What `--json` prints.
+/// The output of `--json`.
 #[derive(Serialize)]
 struct Summary {
     run: String,
@@ -40,18 +40,18 @@ struct Summary {
     updates: u64,
     episodes: u64,
     wall_seconds: f64,
-    /// Since this launcher began.
+    /// Mean rates since this launcher started.
     updates_per_second: f64,
     env_steps_per_second: f64,
-    /// Of the best policy, as `shoal eval` evaluates it; none where the run was interrupted.
+    /// The final evaluation of the best policy; `None` if the run was stopped or interrupted.
     eval_return_mean: Option<f64>,
     eval_return_std: Option<f64>,
     eval_episodes: Option<u32>,
     weights_sha256: Option<String>,
 }
 
-/// Trains until the run's end or an earlier one, evaluates what was learned, draws it, and tells the person.
-/// The run is this process's until all of that is done.
+/// Trains until the run is finished, stopped or interrupted. Then evaluates its policies, draws its figures, and prints
+/// the result. This process owns the run until all of that is done.
 pub(crate) fn run_training(
     config: Config,
     run: &RunDir,
@@ -72,14 +72,14 @@ pub(crate) fn run_training(
     }
     let summary = Summary::new(&config, run, &outcome, evaluated.first().map(|(_, summary)| summary))?;
     if !output.quiet {
-        tell(&mut std::io::stderr().lock(), run, &outcome, &summary, &evaluated)?;
+        write_summary(&mut std::io::stderr().lock(), run, &outcome, &summary, &evaluated)?;
     }
     if output.json {
         writeln!(std::io::stdout().lock(), "{}", serde_json::to_string(&summary)?)?;
     }
     Ok(match outcome.ending {
         Ending::Finished | Ending::Stopped | Ending::Renewed => ExitCode::SUCCESS,
-        // As a shell reports a process that the signal ended.
+        // As a shell reports a process that was ended by the signal.
         Ending::Interrupted(signal) => exit_code(signal),
     })
 }
@@ -116,7 +116,7 @@ impl Summary {
             episodes,
             ..
         } = outcome.after;
-        // A learner whose checkpoint was damaged has begun before where the run stood.
+        // Saturating: a learner whose newest checkpoint was damaged has fallen back to an older one.
         let done = updates.saturating_sub(outcome.before.updates);
         let taken = env_steps.saturating_sub(outcome.before.env_steps);
         Ok(Self {
@@ -135,7 +135,7 @@ impl Summary {
     }
 }
 
-/// SHA-256 of what was learned, in the newest checkpoint: of DDPG, actor, critic and both targets.
+/// SHA-256 of the learned weights in the newest checkpoint; for DDPG: actor, critic and both targets.
 fn weights_sha256(config: &Config, run: &RunDir) -> anyhow::Result<Option<String>> {
     let loaded = Checkpoints::new(&run.checkpoints(), config.fingerprint()).load_newest()?;
     Ok(loaded.map(|loaded| {
@@ -145,7 +145,7 @@ fn weights_sha256(config: &Config, run: &RunDir) -> anyhow::Result<Option<String
     }))
 }
 
-fn tell(
+fn write_summary(
     to: &mut impl Write,
     run: &RunDir,
     outcome: &TrainingOutcome,
@@ -172,7 +172,7 @@ fn tell(
         );
         if let (Some(distance), Some(reached)) = (evaluated.final_distance_mean, evaluated.reached_fraction) {
             text += &format!(
-                "; ends {distance:.3} m from the goal, reaches it in {:.0} %",
+                "; ends {distance:.3} m from the goal, at the goal in {:.0} %",
                 100.0 * reached
             );
         }
@@ -181,7 +181,7 @@ fn tell(
     writeln!(to, "{table}")?;
     let here = run.path().display();
     if outcome.ending != Ending::Finished {
-        writeln!(to, "The learner's state is saved; to go on: shoal resume {here}")?;
+        writeln!(to, "The learner's state is saved; to continue: shoal resume {here}")?;
     }
     writeln!(to, "{here}")?;
     writeln!(

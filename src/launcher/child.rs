@@ -1,4 +1,4 @@
-//! A child of the supervisor: which process has its role, how it gets on, and what its end means.
+//! A child of the supervisor: a role's current process, its progress, and the consequence of its end.
 
 use std::os::unix::process::ExitStatusExt;
 use std::process::ExitStatus;
@@ -11,71 +11,73 @@ use signal_hook::consts::{SIGABRT, SIGBUS, SIGFPE, SIGILL, SIGSEGV};
 
 use super::process::Process;
 
-/// A process that has worked for so long, or an environment server that has taken so many steps, is able to work. One that
-/// fails sooner, again and again, is not.
-const ABLE: Duration = Duration::from_secs(30);
-const ABLE_STEPS: u64 = 1000;
+/// A process that has lived this long, or an environment server that has taken this many steps, is able to work. A
+/// process that repeatedly fails earlier is not.
+const PROVEN: Duration = Duration::from_secs(30);
+const PROVEN_STEPS: u64 = 1000;
 
-/// Starts without progress after which a role is given up, if they span [`SPAN_OF_FAILURES`] and twice its longest start.
-const LIMIT: u32 = 5;
+/// Failed starts after which a role is given up, if they span [`SPAN_OF_FAILURES`] and twice its longest start.
+const MAX_FAILURES: u32 = 5;
 const SPAN_OF_FAILURES: Duration = Duration::from_secs(30);
 
-/// The pause before the first restart after a failure; each further one is twice as long, up to the longest.
+/// The pause before the restart after the first failure. It doubles with each further failure, up to the longest.
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
 const LONGEST_PAUSE: Duration = Duration::from_secs(4);
 
-/// How long a start may take at least, however fast earlier ones were.
-const START: Duration = Duration::from_secs(1);
+/// The time that a start may take, even if earlier ones were faster.
+const START_TIME: Duration = Duration::from_secs(1);
 
-/// A process that was not heard of for so long is stopped or stuck: it has a word to say twice a second.
+/// A process without a heartbeat for this long is stopped or stuck. Heartbeats are sent twice a second.
 pub(super) const SILENT: Duration = Duration::from_secs(3);
 
-/// Heartbeats closer together say nothing of the rate.
-const SPAN: Duration = Duration::from_millis(400);
+/// The least time between two heartbeats from which a rate is computed.
+const RATE_SPAN: Duration = Duration::from_millis(400);
 
-/// A role of the run, the process that has it now, and what became of those before.
+/// A role of the run, its current process, and the history of the earlier ones.
 #[derive(Debug)]
 pub(super) struct Child {
     pub(super) identity: Identity,
     pub(super) process: Option<Process>,
-    /// How the process ended, where that has been seen and not been acted upon.
+    /// The exit status of a process whose end has been observed but not handled.
     pub(super) ended: Option<ExitStatus>,
-    /// It was asked to hand over what it has, and is not to be replaced.
+    /// The process was asked to hand over its transitions and end; it is not replaced.
     pub(super) retires: bool,
-    /// It was asked to end with the whole run.
+    /// The process was asked to end with the run.
     pub(super) ends: bool,
     pub(super) restarts: u32,
     pub(super) restart_at: Instant,
     begun: Instant,
-    /// Starts without progress since the last one with progress, and when the first of them was.
+    /// Failed starts since the last process that was able to work, and the time of the first of them.
     failures: u32,
     failing_since: Option<Instant>,
-    /// The longest time that a start took until the process was ready, and the same with those that never were.
+    /// The longest time from a start until the process was ready.
     usual_start: Option<Duration>,
+    /// The longest life of a process that ended before it was ready.
     longest_start: Duration,
-    heard: Option<(Instant, Heartbeat)>,
-    /// When it was last seen to get on: to start, to take steps, to have another policy, or to do something else.
+    /// The last heartbeat of the current process, with its time of arrival.
+    last_heartbeat: Option<(Instant, Heartbeat)>,
+    /// When the process last made progress: started, took steps, got another policy, or changed its activity.
     pub(super) moved: Instant,
-    /// How often it was replaced because it made no progress, since it last did.
+    /// How often the process was replaced for lack of progress since it last took steps.
     pub(super) stalls: u32,
-    /// The environment server that it asks, if it asks one.
+    /// The environment server that it uses, if any.
     server: Option<u32>,
-    /// When its rate was taken, and its steps then.
+    /// The time and the steps at which its rate was last computed.
     span: (Instant, u64),
     rate: f64,
 }
 
-/// What the launcher does about the end of a process.
+/// The launcher's reaction to the end of a process.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Consequence {
-    /// Starts it again after a pause.
+    /// Start the role again after this pause.
     Restart(Duration),
-    /// It cannot work: after so many starts without progress.
+    /// Give the role up, after this many failures.
     GiveUp(u32),
 }
 
 impl Child {
-    /// A place that nobody has yet.
+    /// A role without a process.
     pub(super) fn new(role: Role, index: u32) -> Self {
         let now = Instant::now();
         Self {
@@ -95,7 +97,7 @@ impl Child {
             failing_since: None,
             usual_start: None,
             longest_start: Duration::ZERO,
-            heard: None,
+            last_heartbeat: None,
             moved: now,
             stalls: 0,
             server: (role == Role::Actor).then_some(index),
@@ -104,7 +106,7 @@ impl Child {
         }
     }
 
-    /// The same, of a role that asks environment server `index`.
+    /// The same, for a role that uses environment server `index`.
     pub(super) fn with_server(self, index: u32) -> Self {
         Self {
             server: Some(index),
@@ -112,7 +114,7 @@ impl Child {
         }
     }
 
-    /// The environment server that it asks, if it asks one.
+    /// The environment server that it uses, if any.
     pub(super) fn server(&self) -> Option<u32> {
         self.server
     }
@@ -121,7 +123,7 @@ impl Child {
         (self.identity.role, self.identity.index) == (role, index)
     }
 
-    /// Gives the place to a process.
+    /// Assigns the role to a new process.
     pub(super) fn begin(&mut self, process: Process) {
         self.process = Some(process);
         self.retires = false;
@@ -131,25 +133,25 @@ impl Child {
     fn begin_at(&mut self, now: Instant) {
         self.begun = now;
         self.moved = now;
-        self.heard = None;
+        self.last_heartbeat = None;
         self.rate = 0.0;
     }
 
     pub(super) fn is_ready(&self) -> bool {
-        self.heard.is_some()
+        self.last_heartbeat.is_some()
     }
 
     pub(super) fn activity(&self) -> Option<Activity> {
-        self.heard?.1.activity()
+        self.last_heartbeat?.1.activity()
     }
 
-    /// Takes note of a sign of life; how long it took to be ready, if this is the first.
-    pub(super) fn hear(&mut self, heartbeat: &Heartbeat) -> Option<Duration> {
-        self.hear_at(heartbeat, Instant::now())
+    /// Records a heartbeat. Returns how long the process took to be ready, if this is its first.
+    pub(super) fn record(&mut self, heartbeat: &Heartbeat) -> Option<Duration> {
+        self.record_at(heartbeat, Instant::now())
     }
 
-    fn hear_at(&mut self, heartbeat: &Heartbeat, now: Instant) -> Option<Duration> {
-        let before = self.heard.replace((now, *heartbeat)).map(|(_, before)| before);
+    fn record_at(&mut self, heartbeat: &Heartbeat, now: Instant) -> Option<Duration> {
+        let before = self.last_heartbeat.replace((now, *heartbeat)).map(|(_, before)| before);
         let first = before.is_none();
         let position = |heartbeat: &Heartbeat| (heartbeat.steps, heartbeat.policy_version, heartbeat.activity());
         if before.is_none_or(|before| position(&before) != position(heartbeat)) {
@@ -159,7 +161,7 @@ impl Child {
             self.stalls = 0;
         }
         let (then, steps) = self.span;
-        if first || now - then >= SPAN {
+        if first || now - then >= RATE_SPAN {
             let rate = per_second((Duration::ZERO, steps), (now - then, heartbeat.steps));
             self.rate = if first { 0.0 } else { rate.unwrap_or(0.0) };
             self.span = (now, heartbeat.steps);
@@ -169,21 +171,21 @@ impl Child {
         Some(took)
     }
 
-    /// Its process has ended, and nobody had asked it to.
+    /// Handles the end of its process, which was not asked to end.
     pub(super) fn has_ended(&mut self, status: ExitStatus) -> Consequence {
         self.has_ended_at(status, Instant::now())
     }
 
-    /// A process that was able to work will be again. One that was killed while it waited or after its first step, or in its
-    /// usual start-up time, is not to blame. One that ended otherwise would do it again.
+    /// After a process that was able to work, the role is restarted and its failures are forgotten. Being killed while it
+    /// waited, after its first step, or within the usual time of a start is not a failure either. Any other end is.
     fn has_ended_at(&mut self, status: ExitStatus, now: Instant) -> Consequence {
         (self.process, self.ended) = (None, None);
-        let by_its_own = [SIGABRT, SIGBUS, SIGFPE, SIGILL, SIGSEGV];
-        let was_killed = status.signal().is_some_and(|signal| !by_its_own.contains(&signal));
+        let crash_signals = [SIGABRT, SIGBUS, SIGFPE, SIGILL, SIGSEGV];
+        let was_killed = status.signal().is_some_and(|signal| !crash_signals.contains(&signal));
         let lived = now - self.begun;
-        let steps = self.heard.map_or(0, |(_, heartbeat)| heartbeat.steps);
-        let served = self.identity.role == Role::EnvServer && steps >= ABLE_STEPS;
-        if self.is_ready() && (lived >= ABLE || served) {
+        let steps = self.last_heartbeat.map_or(0, |(_, heartbeat)| heartbeat.steps);
+        let served = self.identity.role == Role::EnvServer && steps >= PROVEN_STEPS;
+        if self.is_ready() && (lived >= PROVEN || served) {
             (self.failures, self.failing_since) = (0, None);
             return Consequence::Restart(if was_killed { Duration::ZERO } else { FIRST_PAUSE });
         }
@@ -191,7 +193,7 @@ impl Child {
             Some(activity) => steps > 0 || activity != Activity::Working,
             None => {
                 self.longest_start = self.longest_start.max(lived);
-                lived <= START.max(self.usual_start.unwrap_or_default())
+                lived <= START_TIME.max(self.usual_start.unwrap_or_default())
             }
         };
         if was_killed && blameless {
@@ -200,49 +202,49 @@ impl Child {
         self.failures += 1;
         let since = *self.failing_since.get_or_insert(self.begun);
         let longest = self.longest_start.max(self.usual_start.unwrap_or_default());
-        if self.failures >= LIMIT && now - since >= SPAN_OF_FAILURES.max(2 * longest) {
+        if self.failures >= MAX_FAILURES && now - since >= SPAN_OF_FAILURES.max(2 * longest) {
             return Consequence::GiveUp(self.failures);
         }
         let doubled = FIRST_PAUSE * 2_u32.pow((self.failures - 1).min(10));
         Consequence::Restart(doubled.min(LONGEST_PAUSE))
     }
 
-    /// Whether it was heard of a moment ago and said then that it waits.
-    pub(super) fn waits(&self) -> bool {
-        let says_so = |activity| !matches!(activity, Activity::Working | Activity::Done);
-        self.is_heard() && self.activity().is_some_and(says_so)
+    /// Whether a recent heartbeat reports that it waits.
+    pub(super) fn is_waiting(&self) -> bool {
+        let waits = |activity| !matches!(activity, Activity::Working | Activity::Done);
+        self.is_responsive() && self.activity().is_some_and(waits)
     }
 
-    /// Whether it has a process that is to go on working.
-    pub(super) fn is_present(&self) -> bool {
+    /// Whether it has a process that is expected to keep working.
+    pub(super) fn is_active(&self) -> bool {
         self.process.is_some() && self.ended.is_none() && !self.retires && !self.ends
     }
 
-    /// Begins anew to count how long it makes no progress.
-    pub(super) fn excuse(&mut self) {
+    /// Restarts the clocks for progress and heartbeats.
+    pub(super) fn reset_clocks(&mut self) {
         self.moved = Instant::now();
-        if let Some((then, _)) = &mut self.heard {
+        if let Some((then, _)) = &mut self.last_heartbeat {
             *then = self.moved;
         }
     }
 
-    /// How long nothing was heard of it.
+    /// The time since its last heartbeat, or since its start.
     pub(super) fn silent_for(&self) -> Duration {
-        self.heard.map_or(self.moved, |(then, _)| then).elapsed()
+        self.last_heartbeat.map_or(self.moved, |(then, _)| then).elapsed()
     }
 
-    /// Whether its process is stopped.
+    /// Whether its process is stopped, as by SIGSTOP or a debugger.
     pub(super) fn is_stopped(&self) -> bool {
         self.states_in_kernel().iter().any(|state| matches!(state, 'T' | 't'))
     }
 
-    /// Whether no thread of its process computes or waits for a device.
-    pub(super) fn sleeps(&self) -> bool {
+    /// Whether all threads of its process sleep: none computes or waits for a device.
+    pub(super) fn is_asleep(&self) -> bool {
         let states = self.states_in_kernel();
         !states.is_empty() && states.iter().all(|state| *state == 'S')
     }
 
-    /// The state of each thread of its process, as `ps` has it.
+    /// The state of each thread of its process, as in `ps`.
     fn states_in_kernel(&self) -> Vec<char> {
         let Some(process) = &self.process else {
             return Vec::new();
@@ -250,22 +252,22 @@ impl Child {
         let threads = std::fs::read_dir(format!("/proc/{}/task", process.pid()));
         let state = |thread: std::fs::DirEntry| {
             let stat = std::fs::read_to_string(thread.path().join("stat")).ok()?;
-            // Behind the name, which is in brackets and may hold anything.
+            // After the name, which is in parentheses and may contain any character.
             stat.rsplit_once(") ")?.1.chars().next()
         };
         threads.into_iter().flatten().flatten().filter_map(state).collect()
     }
 
-    /// Whether it was heard of a moment ago.
-    pub(super) fn is_heard(&self) -> bool {
-        self.heard.is_some_and(|(then, _)| then.elapsed() < SILENT)
+    /// Whether a heartbeat arrived recently.
+    pub(super) fn is_responsive(&self) -> bool {
+        self.last_heartbeat.is_some_and(|(then, _)| then.elapsed() < SILENT)
     }
 
-    /// How it gets on, where the learner's newest policy is `newest`.
+    /// Its status. `newest` is the version of the learner's newest policy.
     pub(super) fn status(&self, newest: u64) -> RoleStatus {
         let Identity { role, index, .. } = self.identity;
         let policy_version = self
-            .heard
+            .last_heartbeat
             .filter(|_| role != Role::EnvServer)
             .map(|(_, heartbeat)| heartbeat.policy_version);
         let state = self.state();
@@ -282,7 +284,7 @@ impl Child {
     }
 
     fn state(&self) -> RoleState {
-        match (&self.process, self.heard) {
+        match (&self.process, self.last_heartbeat) {
             (None, _) => RoleState::Restarting,
             (_, Some((then, _))) if then.elapsed() >= SILENT => RoleState::Silent,
             _ if self.retires => RoleState::Retiring,
@@ -304,22 +306,23 @@ mod tests {
 
     const KILLED: i32 = 9;
 
-    /// An ended process as `wait` describes it: by a signal, or with an exit code.
+    /// The exit status after this signal.
     fn by_signal(signal: i32) -> ExitStatus {
         ExitStatus::from_raw(signal)
     }
 
+    /// The exit status with this exit code.
     fn with_code(code: i32) -> ExitStatus {
         ExitStatus::from_raw(code << 8)
     }
 
-    /// A place whose time is told, and not waited for.
-    struct Place {
+    /// A child with a simulated clock.
+    struct Simulation {
         child: Child,
         now: Instant,
     }
 
-    impl Place {
+    impl Simulation {
         fn new(role: Role) -> Self {
             Self {
                 child: Child::new(role, 0),
@@ -327,11 +330,11 @@ mod tests {
             }
         }
 
-        /// A process lives for so long, is ready after so long, says this last, and then ends.
-        fn lives(&mut self, lived: Duration, ready: Option<Duration>, last: Heartbeat, end: ExitStatus) -> Consequence {
+        /// A process lives for `lived` and then ends. It is ready after `ready`, with this last heartbeat.
+        fn live(&mut self, lived: Duration, ready: Option<Duration>, last: Heartbeat, end: ExitStatus) -> Consequence {
             self.child.begin_at(self.now);
             if let Some(ready) = ready {
-                self.child.hear_at(&last, self.now + ready);
+                self.child.record_at(&last, self.now + ready);
             }
             self.now += lived;
             let consequence = self.child.has_ended_at(end, self.now);
@@ -341,7 +344,7 @@ mod tests {
             consequence
         }
 
-        fn says(&self, activity: Activity, steps: u64) -> Heartbeat {
+        fn heartbeat(&self, activity: Activity, steps: u64) -> Heartbeat {
             let mut heartbeat = Heartbeat::new(self.child.identity);
             heartbeat.set_activity(activity);
             heartbeat.steps = steps;
@@ -352,41 +355,41 @@ mod tests {
     const READY: Duration = Duration::from_millis(20);
 
     #[test]
-    fn who_fails_again_and_again_is_given_up_after_half_a_minute_of_growing_pauses() {
-        let mut place = Place::new(Role::Actor);
-        let (begun, mut pauses) = (place.now, Vec::new());
-        let last = place.says(Activity::Working, 0);
-        while let Consequence::Restart(pause) = place.lives(READY, None, last, with_code(1)) {
+    fn a_role_that_always_fails_is_given_up_after_half_a_minute_of_growing_pauses() {
+        let mut child = Simulation::new(Role::Actor);
+        let (begun, mut pauses) = (child.now, Vec::new());
+        let last = child.heartbeat(Activity::Working, 0);
+        while let Consequence::Restart(pause) = child.live(READY, None, last, with_code(1)) {
             pauses.push(pause.as_millis());
         }
         assert_eq!(pauses[..7], [100, 200, 400, 800, 1600, 3200, 4000]);
-        let tried = place.now - begun;
+        let tried = child.now - begun;
         assert!((30..40).contains(&tried.as_secs()), "{tried:?}");
     }
 
     #[test]
-    fn who_takes_long_to_start_is_given_up_later() {
-        let mut place = Place::new(Role::EnvServer);
-        let begun = place.now;
-        let last = place.says(Activity::Working, 0);
+    fn a_role_with_long_starts_is_given_up_later() {
+        let mut child = Simulation::new(Role::EnvServer);
+        let begun = child.now;
+        let last = child.heartbeat(Activity::Working, 0);
         let mut starts = 1;
-        while place.lives(Duration::from_secs(60), None, last, with_code(1)) != Consequence::GiveUp(starts) {
+        while child.live(Duration::from_secs(60), None, last, with_code(1)) != Consequence::GiveUp(starts) {
             starts += 1;
         }
-        assert_eq!(starts, LIMIT);
-        assert!(place.now - begun >= Duration::from_secs(300));
+        assert_eq!(starts, MAX_FAILURES);
+        assert!(child.now - begun >= Duration::from_secs(300));
     }
 
     #[test]
-    fn being_killed_while_it_waits_or_starts_or_works_is_nobodys_fault() {
-        let mut place = Place::new(Role::Evaluator);
+    fn being_killed_while_starting_waiting_or_working_is_not_a_failure() {
+        let mut child = Simulation::new(Role::Evaluator);
         for _ in 0..1000 {
             let (idle, at_work) = (
-                place.says(Activity::WaitingForPeer, 0),
-                place.says(Activity::Working, 9),
+                child.heartbeat(Activity::WaitingForPeer, 0),
+                child.heartbeat(Activity::Working, 9),
             );
             for (ready, last) in [(None, idle), (Some(READY), idle), (Some(READY), at_work)] {
-                let consequence = place.lives(10 * READY, ready, last, by_signal(KILLED));
+                let consequence = child.live(10 * READY, ready, last, by_signal(KILLED));
                 let pause = if ready.is_some() { Duration::ZERO } else { FIRST_PAUSE };
                 assert_eq!(consequence, Consequence::Restart(pause));
             }
@@ -394,13 +397,13 @@ mod tests {
     }
 
     #[test]
-    fn a_start_that_is_killed_after_it_should_have_been_ready_counts() {
-        let mut place = Place::new(Role::EnvServer);
-        let idle = place.says(Activity::WaitingForPeer, 0);
-        place.lives(READY, Some(READY), idle, by_signal(KILLED));
-        let killed = |place: &mut Place, lived| place.lives(lived, None, idle, by_signal(KILLED));
-        assert_eq!(killed(&mut place, START), Consequence::Restart(FIRST_PAUSE));
-        let counted = (0..100).find_map(|_| match killed(&mut place, 2 * START) {
+    fn being_killed_after_the_usual_time_of_a_start_is_a_failure() {
+        let mut child = Simulation::new(Role::EnvServer);
+        let idle = child.heartbeat(Activity::WaitingForPeer, 0);
+        child.live(READY, Some(READY), idle, by_signal(KILLED));
+        let killed = |child: &mut Simulation, lived| child.live(lived, None, idle, by_signal(KILLED));
+        assert_eq!(killed(&mut child, START_TIME), Consequence::Restart(FIRST_PAUSE));
+        let counted = (0..100).find_map(|_| match killed(&mut child, 2 * START_TIME) {
             Consequence::GiveUp(starts) => Some(starts),
             Consequence::Restart(_) => None,
         });
@@ -408,12 +411,12 @@ mod tests {
     }
 
     #[test]
-    fn who_dies_over_its_first_step_is_given_up_whatever_the_signal() {
+    fn a_role_that_always_dies_in_its_first_step_is_given_up() {
         for end in [by_signal(KILLED), by_signal(SIGSEGV), with_code(1)] {
-            let mut place = Place::new(Role::EnvServer);
-            let over_a_step = place.says(Activity::Working, 0);
+            let mut child = Simulation::new(Role::EnvServer);
+            let in_first_step = child.heartbeat(Activity::Working, 0);
             let given_up = (0..100).any(|_| {
-                let consequence = place.lives(10 * READY, Some(READY), over_a_step, end);
+                let consequence = child.live(10 * READY, Some(READY), in_first_step, end);
                 matches!(consequence, Consequence::GiveUp(_))
             });
             assert!(given_up, "{end}");
@@ -421,27 +424,27 @@ mod tests {
     }
 
     #[test]
-    fn who_fails_after_a_few_steps_every_time_is_given_up() {
-        let mut place = Place::new(Role::EnvServer);
-        let at_work = place.says(Activity::Working, 3);
-        let mut ends = (0..100).map(|_| place.lives(10 * READY, Some(READY), at_work, with_code(1)));
+    fn a_role_that_always_fails_after_a_few_steps_is_given_up() {
+        let mut child = Simulation::new(Role::EnvServer);
+        let at_work = child.heartbeat(Activity::Working, 3);
+        let mut ends = (0..100).map(|_| child.live(10 * READY, Some(READY), at_work, with_code(1)));
         assert!(ends.any(|end| matches!(end, Consequence::GiveUp(_))));
     }
 
     #[test]
-    fn a_learner_that_fails_whenever_it_saves_is_given_up() {
-        let mut place = Place::new(Role::Learner);
-        let at_work = place.says(Activity::Working, 3000);
-        let mut ends = (0..100).map(|_| place.lives(Duration::from_secs(5), Some(READY), at_work, with_code(1)));
+    fn a_learner_that_always_fails_while_saving_is_given_up() {
+        let mut child = Simulation::new(Role::Learner);
+        let at_work = child.heartbeat(Activity::Working, 3000);
+        let mut ends = (0..100).map(|_| child.live(Duration::from_secs(5), Some(READY), at_work, with_code(1)));
         assert!(ends.any(|end| matches!(end, Consequence::GiveUp(_))));
     }
 
     #[test]
-    fn who_fails_now_and_then_is_forgiven() {
-        let mut place = Place::new(Role::EnvServer);
-        let at_work = place.says(Activity::Working, 3000);
+    fn an_environment_server_that_fails_after_many_steps_is_always_restarted() {
+        let mut child = Simulation::new(Role::EnvServer);
+        let at_work = child.heartbeat(Activity::Working, 3000);
         for _ in 0..1000 {
-            let consequence = place.lives(Duration::from_secs(1), Some(READY), at_work, with_code(1));
+            let consequence = child.live(Duration::from_secs(1), Some(READY), at_work, with_code(1));
             assert_eq!(consequence, Consequence::Restart(FIRST_PAUSE));
         }
     }

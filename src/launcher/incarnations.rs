@@ -1,12 +1,12 @@
-//! How many processes a run has started: incarnations are never used twice, not by a resumed run either.
+//! The number of processes that a run has started. An incarnation is never used twice, not even by a resumed run.
 
 use std::path::Path;
 
 use anyhow::Context;
-use shoal_common::commit::{CommitReader, LAST_INCARNATION, OpenError};
+use shoal_common::commit::{CommitReader, MAX_INCARNATION, OpenError};
 use shoal_common::run_dir::RunDir;
 
-/// The greatest incarnation of an actor that is in the run's replay.
+/// The greatest incarnation of an actor in the run's replay.
 pub(super) fn last_committed(run: &RunDir) -> anyhow::Result<u64> {
     let commits = match CommitReader::open(&run.replay_file()) {
         Err(OpenError::NotYet { .. }) => return Ok(0),
@@ -16,7 +16,7 @@ pub(super) fn last_committed(run: &RunDir) -> anyhow::Result<u64> {
     Ok(marks.max().unwrap_or(0))
 }
 
-/// The number in the file at `path`, 0 where there is none.
+/// The number in the file at `path`; 0 if there is no file.
 pub(super) fn read_counter(path: &Path) -> anyhow::Result<u64> {
     let text = match std::fs::read(path) {
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(0),
@@ -25,9 +25,9 @@ pub(super) fn read_counter(path: &Path) -> anyhow::Result<u64> {
     let number = std::str::from_utf8(&text)
         .ok()
         .and_then(|text| text.trim().parse().ok());
-    number.filter(|started| *started < LAST_INCARNATION).with_context(|| {
+    number.filter(|started| *started < MAX_INCARNATION).with_context(|| {
         format!(
-            "{} is damaged: write a number into it that is greater than every incarnation in the run's log",
+            "{} is damaged: remove it; counting then continues above the incarnations in the replay",
             path.display()
         )
     })
@@ -52,7 +52,7 @@ mod tests {
         #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::default() })]
 
         #[test]
-        fn a_counter_is_a_number_that_can_be_counted_on_or_refused(
+        fn any_counter_file_is_read_as_a_number_below_the_limit_or_refused(
             bytes in prop_oneof![
                 prop::collection::vec(any::<u8>(), 0..30),
                 "[ +-]?[0-9]{0,25}\n?".prop_map(String::into_bytes),
@@ -67,7 +67,7 @@ mod tests {
     }
 
     #[test]
-    fn a_counter_that_is_not_there_is_none() {
+    fn a_missing_counter_is_zero_and_an_invalid_one_is_refused() {
         assert_eq!(read_counter(Path::new("/nowhere/incarnations")).unwrap(), 0);
         assert_eq!(counted(b"17").unwrap(), 17);
         assert!(counted(b"18446744073709551615").is_err() && counted(b"").is_err());

@@ -1,4 +1,4 @@
-//! `shoal.log`: what every process of the run had to say, written by the launcher alone.
+//! `shoal.log`: the output of all processes of the run. Only the launcher writes it.
 
 use std::collections::{HashMap, VecDeque};
 use std::fs::{File, OpenOptions};
@@ -10,13 +10,13 @@ use std::time::SystemTime;
 
 use anyhow::Context;
 
-/// Lines of each process that are kept for the message when it is given up.
+/// Number of lines kept per process, for the message when it is given up.
 const KEPT: usize = 5;
 
-/// What the launcher writes when it ends in order.
-pub(crate) const EVERYBODY_ENDED: &str = "every role has ended";
+/// The launcher's line after all roles have ended.
+pub(crate) const ALL_ENDED: &str = "every role has ended";
 
-/// What a launcher's line begins with that ends for an error.
+/// The start of the launcher's last line if the run ended with an error.
 pub(crate) const FAILED: &str = "the run failed: ";
 
 /// The log of a run; clones write to the same file.
@@ -43,7 +43,7 @@ impl Log {
         }))))
     }
 
-    /// A line of the launcher's own, about `who`.
+    /// Writes a line of the launcher about `who`, with the time.
     pub(super) fn note(&self, who: &str, line: &str) {
         let seconds = SystemTime::UNIX_EPOCH
             .elapsed()
@@ -51,7 +51,7 @@ impl Log {
         self.write(who, &format!("{seconds:.3} {line}"));
     }
 
-    /// A line that `who` wrote, which brings its own time.
+    /// Writes a line of output of `who`, which has its own time.
     pub(super) fn line(&self, who: &str, line: &str) {
         self.write(who, line);
         let mut inner = self.lock();
@@ -72,7 +72,7 @@ impl Log {
     }
 
     fn write(&self, who: &str, line: &str) {
-        // A log that cannot be written must not end the run it is about.
+        // A log that cannot be written must not end the run.
         let _ = writeln!(self.lock().file, "{who:<14} {line}");
     }
 

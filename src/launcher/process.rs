@@ -1,4 +1,4 @@
-//! One role's process: started, listened to, ended.
+//! The process of a role: its start, its output and its end.
 
 use std::io::Write;
 use std::os::fd::{AsFd, BorrowedFd};
@@ -13,7 +13,7 @@ use shoal_run::process::ChildOutput;
 
 use super::log::Log;
 
-/// A running process of a role. It is told to end by closing its standard input; dropped, it is killed.
+/// The process of a role. Closing its standard input asks it to end. It is killed on drop.
 #[derive(Debug)]
 pub(super) struct Process {
     group: ChildGroup,
@@ -22,7 +22,7 @@ pub(super) struct Process {
 }
 
 impl Process {
-    /// Starts this program again as a role.
+    /// Starts this program as a role.
     pub(super) fn start(identity: Identity, run: &Path, log: &Log) -> anyhow::Result<Self> {
         let Identity {
             role,
@@ -36,7 +36,7 @@ impl Process {
             ChildGroup::start(&mut command).with_context(|| format!("cannot start {} {index}", role.name()))?;
         let (who, log) = (name(identity), log.clone());
         let read = stderr.map(|stderr| ChildOutput::read(&who.clone(), stderr, move |line| log.line(&who, line)));
-        let output = read.transpose().context("cannot listen to a role")?;
+        let output = read.transpose().context("cannot read the output of a role")?;
         Ok(Self { group, stdin, output })
     }
 
@@ -44,7 +44,7 @@ impl Process {
         self.group.pid().as_raw_pid() as u32
     }
 
-    /// How it ended, if it has. What it wrote is in the log then.
+    /// Its exit status, once it has ended. Its output is in the log by then.
     pub(super) fn exit_status(&mut self) -> Option<ExitStatus> {
         let status = self.group.exit_status()?;
         if let Some(output) = self.output.take() {
@@ -53,16 +53,16 @@ impl Process {
         Some(status)
     }
 
-    /// Asks it to hand over what it has, and then to end.
+    /// Asks it to hand over its transitions and then to end.
     pub(super) fn ask_to_retire(&mut self) {
         if let Some(stdin) = &mut self.stdin {
-            // Who does not hear it has ended.
+            // This fails only if the process has ended.
             let _ = stdin.write_all(b"retire\n");
         }
     }
 
-    /// Readable once it has ended; `None` where that was seen.
-    pub(super) fn end(&self) -> Option<BorrowedFd<'_>> {
+    /// A descriptor that becomes readable when the process ends; `None` once its end has been observed.
+    pub(super) fn exit_descriptor(&self) -> Option<BorrowedFd<'_>> {
         self.group.is_alive().then(|| self.group.as_fd())
     }
 
@@ -71,13 +71,13 @@ impl Process {
         self.stdin = None;
     }
 
-    /// Ends it without asking.
+    /// Kills it.
     pub(super) fn kill(&mut self) {
         self.group.kill();
     }
 }
 
-/// What a process is called in the log and in messages.
+/// The name of a process in the log and in messages.
 pub(super) fn name(identity: Identity) -> String {
     format!("{}-{}", identity.role.name(), identity.index)
 }

@@ -12,14 +12,14 @@ use shoal_run::rate::{per_second, updates_per_step};
 use super::requests::waiting;
 use super::supervisor::Supervisor;
 
-/// Rates are taken over so long.
+/// The time over which rates are averaged.
 const SPAN: Duration = Duration::from_secs(5);
 
-/// Shows on standard error how far a run is; nothing where that is no terminal.
+/// Shows the progress of a run on standard error, if that is a terminal.
 #[derive(Debug)]
 pub(super) struct Progress {
     bar: ProgressBar,
-    /// Whether the bar counts episodes; else steps.
+    /// Whether the bar counts episodes rather than steps.
     counts_episodes: bool,
     warmup: u64,
     updates_per_step: f64,
@@ -27,8 +27,8 @@ pub(super) struct Progress {
     /// Reports of the last [`SPAN`].
     recent: std::collections::VecDeque<(Duration, LearnerReport)>,
     evaluated: Option<EvaluationReport>,
-    /// When the learner's last report came.
-    heard: Instant,
+    /// When the learner's last report arrived.
+    reported: Instant,
     drawn: Instant,
 }
 
@@ -54,40 +54,40 @@ impl Progress {
             learner: None,
             recent: [].into(),
             evaluated: None,
-            heard: Instant::now(),
+            reported: Instant::now(),
             drawn: Instant::now(),
         }
     }
 
-    /// What the learner said last.
+    /// The learner's last report.
     pub(super) fn learner(&self) -> Option<&LearnerReport> {
         self.learner.as_ref()
     }
 
-    /// What the evaluator said last.
+    /// The evaluator's last report.
     pub(super) fn evaluated(&self) -> Option<&EvaluationReport> {
         self.evaluated.as_ref()
     }
 
-    pub(super) fn heard_learner(&mut self, report: &LearnerReport, wall: Duration) {
+    pub(super) fn add_learner_report(&mut self, report: &LearnerReport, wall: Duration) {
         self.learner = Some(*report);
-        self.heard = Instant::now();
+        self.reported = Instant::now();
         self.recent.push_back((wall, *report));
         while self.recent.front().is_some_and(|(then, _)| wall - *then > SPAN) {
             self.recent.pop_front();
         }
     }
 
-    pub(super) fn heard_evaluation(&mut self, report: &EvaluationReport) {
+    pub(super) fn set_evaluation(&mut self, report: &EvaluationReport) {
         self.evaluated = Some(*report);
     }
 
-    pub(super) fn say(&self, message: &'static str) {
+    pub(super) fn set_message(&self, message: &'static str) {
         self.bar.set_message(message);
     }
 
-    /// Says something beside the bar, where somebody looks on.
-    pub(super) fn note(&self, text: &str) {
+    /// Prints a line above the bar, if it is shown.
+    pub(super) fn print(&self, text: &str) {
         self.bar.println(text);
     }
 
@@ -105,14 +105,15 @@ impl Progress {
         self.bar.set_message(self.line(&learner, supervisor));
     }
 
-    /// How far it is; how good and how fast; who waits; and restarts if there were any: each on a line of 80 columns.
+    /// One line each for the progress, for the last evaluation and the rates, for the ratio and who waits, and for
+    /// restarts if there were any. Each fits into 80 columns.
     fn line(&self, learner: &LearnerReport, supervisor: &Supervisor) -> String {
         let (done, all) = (self.done(learner), self.bar.length().unwrap_or(0));
         let unit = if self.counts_episodes { "episodes" } else { "steps" };
-        let mut way = vec![format!("{}/{} {unit}", thousands(done), thousands(all))];
+        let mut distance = vec![format!("{}/{} {unit}", thousands(done), thousands(all))];
         if let Some(pace) = self.pace(|report| self.done(report)).filter(|pace| *pace > 0.0) {
             let left = all.saturating_sub(done) as f64 / pace;
-            way.push(format!("{} left", HumanDuration(Duration::from_secs_f64(left))));
+            distance.push(format!("{} left", HumanDuration(Duration::from_secs_f64(left))));
         }
         let mut pace = Vec::new();
         if let Some(evaluated) = &self.evaluated {
@@ -126,14 +127,14 @@ impl Progress {
         let ratio = updates_per_step(learner.updates, learner.env_steps, self.warmup).unwrap_or(0.0);
         let waits = waiting(supervisor).map(|who| format!(", {who}")).unwrap_or_default();
         let ratio = format!("ratio {ratio:.2} of {:.2}{waits}", self.updates_per_step);
-        let mut lines = vec![way.join(" · "), pace.join(" · "), ratio];
+        let mut lines = vec![distance.join(" · "), pace.join(" · "), ratio];
         if supervisor.restarts() > 0 {
-            lines.push(format!("{} restarts; shoal.log says why", supervisor.restarts()));
+            lines.push(format!("{} restarts; see shoal.log", supervisor.restarts()));
         }
         lines.join("\n  ")
     }
 
-    /// Steps or episodes, whichever the run is to end with.
+    /// Episodes so far, if the run has a limit of episodes; otherwise steps.
     fn done(&self, learner: &LearnerReport) -> u64 {
         if self.counts_episodes {
             learner.episodes
@@ -142,7 +143,7 @@ impl Progress {
         }
     }
 
-    /// Updates and environment steps a second; `None` while the learner is not heard of.
+    /// Updates and environment steps per second; `None` without recent reports from the learner.
     pub(super) fn rates(&self) -> Option<(f64, f64)> {
         Some((
             self.pace(|report| report.updates)?,
@@ -151,7 +152,7 @@ impl Progress {
     }
 
     fn pace(&self, count: impl Fn(&LearnerReport) -> u64) -> Option<f64> {
-        if self.heard.elapsed() > SPAN {
+        if self.reported.elapsed() > SPAN {
             return None;
         }
         let ((then, old), (now, new)) = (self.recent.front()?, self.recent.back()?);

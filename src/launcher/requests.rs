@@ -1,4 +1,4 @@
-//! What the launcher says and does when somebody asks from another terminal.
+//! The launcher's answers to requests from other terminals.
 
 use shoal_common::channel::control::{Answer, RunStatus};
 use shoal_common::commit::OpenError;
@@ -11,18 +11,18 @@ use shoal_run::status;
 use super::progress::Progress;
 use super::supervisor::Supervisor;
 
-/// How the run gets on, which stood at `rest` when it began.
+/// The run's status. `initial` is its status when the launcher started.
 pub(super) fn status(
     config: &Config,
     run: &RunDir,
     supervisor: &Supervisor,
     progress: &Progress,
-    rest: &RunStatus,
+    initial: &RunStatus,
 ) -> Result<RunStatus, OpenError> {
     let mut status = RunStatus {
         replay_rows: status::replay_rows(run)?,
         actors: supervisor.actors(),
-        ..rest.clone()
+        ..initial.clone()
     };
     if let Some(learner) = progress.learner() {
         status.env_steps = learner.env_steps;
@@ -44,7 +44,7 @@ pub(super) fn status(
     Ok(status)
 }
 
-/// Goes on with so many actors, from now on and when the run is resumed.
+/// Changes the number of actors, now and for when the run is resumed.
 pub(super) fn scale(
     config: &mut Config,
     run: &RunDir,
@@ -52,17 +52,17 @@ pub(super) fn scale(
     actors: u32,
 ) -> anyhow::Result<Answer> {
     if config.run.mode == Mode::Lockstep {
-        let reason = "a lockstep run keeps the actors it began with: its numbers depend on them";
+        let reason = "the number of actors of a lockstep run cannot change: its results depend on it";
         return Ok(Answer::Refused(reason.into()));
     }
     let max = config.actors.max;
     if !(1..=max).contains(&actors) {
-        let reason = format!("this run has room for 1 to {max} actors (actors.max, chosen when it began)");
+        let reason = format!("this run can have 1 to {max} actors (actors.max, fixed when it was created)");
         return Ok(Answer::Refused(reason));
     }
     let mut scaled = config.clone();
     scaled.actors.count = actors;
-    // First, so that a learner that is started now knows of all of them.
+    // Before the actors start, so that a learner that is started now reads the new number.
     if let Err(error) = run.write_config(&scaled) {
         return Ok(Answer::Refused(error.to_string()));
     }
@@ -71,7 +71,7 @@ pub(super) fn scale(
     Ok(Answer::Accepted)
 }
 
-/// Who waits for whom, in words, from what actors and learner said last.
+/// Who waits for whom, in words, by the last heartbeats of actors and learner.
 pub(super) fn waiting(supervisor: &Supervisor) -> Option<&'static str> {
     match (supervisor.activity(Role::Actor), supervisor.activity(Role::Learner)) {
         (Some(Activity::WaitingForRatio), _) => Some("actors wait"),

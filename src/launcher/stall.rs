@@ -1,7 +1,7 @@
-//! Who should be working and is not. A process that waits for something that cannot come any more is ended, and replaced as
-//! one that has died: no fault of shared memory, and none of ours, leaves a run standing still.
+//! Finds processes that should be working but make no progress. A process that waits for something that cannot happen
+//! is killed and replaced, so that no fault, in shared memory or in this program, stalls a run for good.
 //!
-//! What is slow is left alone: an environment server over a step, a stopped process, and whoever waits for one of these.
+//! Slow processes are left alone: an environment server in a step, a stopped process, and processes that wait for them.
 
 use std::time::{Duration, Instant};
 
@@ -9,13 +9,14 @@ use shoal_common::report::{Activity, Role};
 
 use super::child::{Child, SILENT};
 
-/// A launcher that was away for so long was stopped, and the others perhaps too: nobody is accused then.
-const AWAY: Duration = Duration::from_secs(2);
+/// If the launcher itself did not run for this long, it was stopped, and perhaps the others too. No process is replaced
+/// then.
+const PAUSED: Duration = Duration::from_secs(2);
 
-/// How many times as long a process that waits for nobody may say nothing: it may be at work.
+/// A process that may be at work is silent for too long only after this multiple of the patience.
 const WORK: u32 = 3;
 
-/// Looks for processes that do not get on.
+/// Looks for processes that make no progress.
 #[derive(Debug)]
 pub(super) struct Stalls {
     patience: Duration,
@@ -23,7 +24,7 @@ pub(super) struct Stalls {
 }
 
 impl Stalls {
-    /// Nobody may stand still for longer than `patience`.
+    /// `patience` is the longest time without progress.
     pub(super) fn new(patience: Duration) -> Self {
         Self {
             patience: patience.max(SILENT),
@@ -31,16 +32,17 @@ impl Stalls {
         }
     }
 
-    /// Who is to be replaced, and why. Since this was asked last the launcher was `busy` for so long.
+    /// The processes to replace, with the reasons. `busy` is the time that the launcher has spent on clean-ups since the
+    /// last call.
     pub(super) fn find(&mut self, children: &mut [Child], busy: Duration) -> Vec<(usize, &'static str)> {
         let now = Instant::now();
         let since = now - std::mem::replace(&mut self.looked, now);
-        if since.saturating_sub(busy) >= AWAY {
-            children.iter_mut().for_each(Child::excuse);
+        if since.saturating_sub(busy) >= PAUSED {
+            children.iter_mut().for_each(Child::reset_clocks);
             return Vec::new();
         }
         let mut found: Vec<_> = (0..children.len())
-            .filter_map(|i| Some((i, self.accuse(children, i)?)))
+            .filter_map(|i| Some((i, self.fault(children, i)?)))
             .filter(|(i, _)| !children[*i].is_stopped())
             .collect();
         if found.is_empty() {
@@ -48,51 +50,51 @@ impl Stalls {
         }
         for (i, _) in &found {
             children[*i].stalls += 1;
-            children[*i].excuse();
+            children[*i].reset_clocks();
         }
         found
     }
 
-    /// What is wrong with one child, whatever the others but its environment server do.
-    fn accuse(&self, children: &[Child], i: usize) -> Option<&'static str> {
+    /// Why one child must be replaced, by its own state and that of its environment server or client.
+    fn fault(&self, children: &[Child], i: usize) -> Option<&'static str> {
         let child = &children[i];
-        if !child.is_present() {
+        if !child.is_active() {
             return None;
         }
         if child.identity.role == Role::EnvServer {
-            // Only where replacing its client has not helped.
+            // Only if replacing its client has not helped.
             let client = children
                 .iter()
                 .find(|client| client.server() == Some(child.identity.index))?;
             let both = client.stalls > 0 && self.waits_for_an_idle_server(children, client);
-            return both.then_some("it does not hear its client, which waits for its answer");
+            return both.then_some("it does not receive the request that its client waits on");
         }
         if self.waits_for_an_idle_server(children, child) && child.stalls == 0 {
-            return Some("it waits for an answer of its environment server, which has nothing to do");
+            return Some("it waits for an answer from its environment server, which is idle");
         }
         let silent = child.silent_for() >= WORK * self.patience;
         let idle_server = child
             .server()
             .is_none_or(|index| find(children, Role::EnvServer, index).is_some_and(|server| self.is_idle(server)));
-        (silent && idle_server && child.sleeps()).then_some("nothing was heard of it, and it sleeps")
+        (silent && idle_server && child.is_asleep()).then_some("it sends no heartbeats and all its threads sleep")
     }
 
     fn waits_for_an_idle_server(&self, children: &[Child], client: &Child) -> bool {
         let server = client.server().and_then(|index| find(children, Role::EnvServer, index));
         let waits = match client.activity() {
-            // It is ready once its server has said what it serves.
-            None => client.is_present() && client.moved.elapsed() >= self.patience,
+            // It becomes ready when its server has described its environments.
+            None => client.is_active() && client.moved.elapsed() >= self.patience,
             Some(activity) => activity == Activity::WaitingForServer && self.is_idle(client),
         };
         waits && server.is_some_and(|server| self.is_idle(server))
     }
 
-    /// Whether it has waited, and not got on, for too long.
+    /// Whether it has waited without progress for too long.
     fn is_idle(&self, child: &Child) -> bool {
-        child.is_present() && child.waits() && child.moved.elapsed() >= self.patience
+        child.is_active() && child.is_waiting() && child.moved.elapsed() >= self.patience
     }
 
-    /// Everybody waits, and nobody works: the actors and the evaluator are replaced, or where that has not helped the learner.
+    /// If all processes wait: the actors and the evaluator, or, if replacing them has not helped, the learner.
     fn deadlock(&self, children: &[Child]) -> Vec<(usize, &'static str)> {
         if !children.iter().all(|child| self.is_idle(child)) {
             return Vec::new();

@@ -1,4 +1,4 @@
-//! All processes of a run: who is there, who is ready, who has to be started again, and who is given up.
+//! All processes of a run: starts them, tracks which are ready, restarts them, and gives up those that cannot work.
 
 use std::os::fd::BorrowedFd;
 use std::os::unix::process::ExitStatusExt;
@@ -13,31 +13,32 @@ use shoal_common::config::Config;
 use shoal_common::durable::write_atomically;
 use shoal_common::report::{Activity, Heartbeat, Identity, Role};
 use shoal_common::run_dir::RunDir;
-use shoal_run::recorder::{Incident, What};
+use shoal_run::recorder::{Incident, IncidentKind};
 
 use super::child::{Child, Consequence};
 use super::cleaner;
 use super::incarnations::{last_committed, read_counter};
-use super::log::{EVERYBODY_ENDED, Log};
+use super::log::{ALL_ENDED, Log};
 use super::process::{Process, name};
 use super::stall::Stalls;
 
-/// How often the dead are cleaned up after whose end the launcher does not see: terminals that asked something.
+/// How often to look for dead processes whose end the launcher does not observe, such as `shoal status`.
 const CLEANING: Duration = Duration::from_secs(2);
 
-/// How long clean-ups may leave places occupied, and how soon the next one follows. A process may be dead and not yet gone.
-const HOPELESS: Duration = Duration::from_secs(2);
-const SOON: Duration = Duration::from_millis(200);
+/// How long dead processes may keep occupying shared memory in spite of clean-ups, and how soon a clean-up is repeated. A
+/// killed process may take a moment to disappear.
+const OCCUPIED_PATIENCE: Duration = Duration::from_secs(2);
+const CLEANING_AGAIN: Duration = Duration::from_millis(200);
 
-/// More processes than are started without any of them sending a chunk.
-const NEVER_SENT: u64 = 100_000;
+/// More starts than ever happen without any of the processes sending a chunk.
+const STARTS_WITHOUT_CHUNK: u64 = 100_000;
 
-/// How the processes of the run are.
+/// The situation of the run's processes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Situation {
     AtWork,
     LearnerDone,
-    /// Dead processes have places in shared memory that cannot be freed.
+    /// Dead processes occupy shared memory that cannot be freed.
     SharedMemoryOccupied,
 }
 
@@ -46,27 +47,27 @@ pub(super) enum Situation {
 pub(super) struct Supervisor {
     children: Vec<Child>,
     services: Services,
-    /// Actors whose services there are.
-    served: u32,
+    /// Number of actors whose services have been created.
+    actors_with_services: u32,
     window: u32,
-    /// Since when clean-ups have left places occupied.
+    /// Since when dead processes have occupied shared memory in spite of clean-ups.
     occupied: Option<Instant>,
-    /// How long it has cleaned up since stalls were looked for last.
+    /// Time spent on clean-ups since the last search for stalls.
     busy: Duration,
-    /// Actors there are to be, and may ever be.
+    /// The wanted number of actors, and its maximum.
     actors: u32,
     max_actors: u32,
     log: Log,
-    /// What has happened since the last [`Supervisor::take_incidents`].
+    /// Incidents since the last [`Supervisor::take_incidents`].
     incidents: Vec<Incident>,
     run: PathBuf,
-    /// Where the number of processes ever started is kept: incarnations are never used twice, not by a resumed run either.
+    /// The file with the number of processes ever started. It lasts over resumes: incarnations are never used twice.
     counter: PathBuf,
     started: u64,
     all_ready: bool,
     cleaned: Instant,
     learner_done: bool,
-    /// How the learner ended, if it was not with its state saved.
+    /// How the learner ended, if it ended without saving its state.
     unsaved: Option<String>,
 }
 
@@ -76,11 +77,11 @@ impl Supervisor {
         let mut started = read_counter(&counter)?;
         let committed = last_committed(run)?;
         if started < committed {
-            // The counter was lost. A lower incarnation's chunks would be taken for old ones, and its noise was used.
-            started = committed.saturating_add(NEVER_SENT);
+            // The counter was lost. Chunks of a reused incarnation would be taken for old ones, and its noise would repeat.
+            started = committed.saturating_add(STARTS_WITHOUT_CHUNK);
             log.note(
                 "launcher",
-                &format!("{} is lost or wrong; counting on from {started}", counter.display()),
+                &format!("{} is missing or wrong; counting from {started}", counter.display()),
             );
         }
         let mut services = Services::new(domain)?;
@@ -95,7 +96,7 @@ impl Supervisor {
         Ok(Self {
             children,
             services,
-            served: 0,
+            actors_with_services: 0,
             window: config.actors.window,
             occupied: None,
             busy: Duration::ZERO,
@@ -113,46 +114,45 @@ impl Supervisor {
         })
     }
 
-    /// Starts everyone.
+    /// Starts all processes.
     pub(super) fn start_all(&mut self, domain: &Domain) -> anyhow::Result<()> {
-        self.serve(domain)?;
+        self.create_services(domain)?;
         (0..self.children.len()).try_for_each(|i| self.start(i))?;
         self.start_missing(domain)
     }
 
-    /// What has happened since this was asked last, in order.
+    /// The incidents since the last call, in order.
     pub(super) fn take_incidents(&mut self) -> Vec<Incident> {
         std::mem::take(&mut self.incidents)
     }
 
-    /// Goes on with so many actors, who are started when this looks after everyone next.
+    /// Changes the wanted number of actors. [`maintain`](Self::maintain) starts or retires them.
     pub(super) fn scale(&mut self, actors: u32) {
-        self.log.note(
-            "launcher",
-            &format!("actors: {actors} from now on, {} before", self.actors),
-        );
+        self.log
+            .note("launcher", &format!("scaled from {} to {actors} actors", self.actors));
         let detail = format!("{} to {actors} actors", self.actors);
-        self.incidents.push(Incident::of_launcher(What::Scaled, detail));
+        self.incidents.push(Incident::of_launcher(IncidentKind::Scaled, detail));
         self.actors = actors;
     }
 
-    /// Actors there are to be.
+    /// The wanted number of actors.
     pub(super) fn actors(&self) -> u32 {
         self.actors
     }
 
-    /// Makes the services of actors that have come.
-    fn serve(&mut self, domain: &Domain) -> anyhow::Result<()> {
-        while self.served < self.actors {
-            self.services.create_actor(domain, self.served, self.window)?;
-            self.served += 1;
+    /// Creates the services of all wanted actors.
+    fn create_services(&mut self, domain: &Domain) -> anyhow::Result<()> {
+        while self.actors_with_services < self.actors {
+            self.services
+                .create_actor(domain, self.actors_with_services, self.window)?;
+            self.actors_with_services += 1;
         }
         Ok(())
     }
 
-    /// Makes and fills the places that are missing, each actor's with its environment server's.
+    /// Adds and starts the wanted actors that do not exist, each with its environment server.
     fn start_missing(&mut self, domain: &Domain) -> anyhow::Result<()> {
-        self.serve(domain)?;
+        self.create_services(domain)?;
         for index in 0..self.actors {
             for role in [Role::EnvServer, Role::Actor] {
                 if !self.children.iter().any(|child| child.is(role, index)) {
@@ -178,8 +178,8 @@ impl Supervisor {
         Ok(())
     }
 
-    /// Takes note of a sign of life.
-    pub(super) fn hear(&mut self, heartbeat: &Heartbeat) {
+    /// Records a heartbeat.
+    pub(super) fn record(&mut self, heartbeat: &Heartbeat) {
         let child = self.children.iter_mut().find(|child| {
             let Identity {
                 role,
@@ -189,7 +189,7 @@ impl Supervisor {
             (heartbeat.role(), heartbeat.index, heartbeat.incarnation) == (Some(role), index, incarnation)
         });
         let Some(child) = child else { return };
-        if let Some(after) = child.hear(heartbeat) {
+        if let Some(after) = child.record(heartbeat) {
             self.log
                 .note(&name(child.identity), &format!("ready after {} ms", after.as_millis()));
         }
@@ -199,13 +199,13 @@ impl Supervisor {
         }
     }
 
-    /// What the children of a role are doing: what the first one says that was heard of.
+    /// The activity of a role: that of its first process with a heartbeat.
     pub(super) fn activity(&self, role: Role) -> Option<Activity> {
         let mut of_role = self.children.iter().filter(|child| child.identity.role == role);
         of_role.find_map(Child::activity)
     }
 
-    /// Whether there is a learner, past its start.
+    /// Whether there is a learner that is ready.
     pub(super) fn has_learner(&self) -> bool {
         let mut learners = self
             .children
@@ -214,29 +214,29 @@ impl Supervisor {
         learners.any(|learner| learner.process.is_some() && learner.is_ready())
     }
 
-    /// How often processes were started again.
+    /// Total number of restarts.
     pub(super) fn restarts(&self) -> u32 {
         self.children.iter().map(|child| child.restarts).sum()
     }
 
-    /// How everyone gets on, where the learner's newest policy is `newest`.
+    /// The status of all processes. `newest` is the version of the learner's newest policy.
     pub(super) fn status(&self, newest: u64) -> Vec<RoleStatus> {
         let mut children: Vec<_> = self.children.iter().collect();
         children.sort_by_key(|child| (std::cmp::Reverse(child.identity.role), child.identity.index));
         children.into_iter().map(|child| child.status(newest)).collect()
     }
 
-    /// What wakes the launcher when a process ends.
-    pub(super) fn ends(&self) -> impl Iterator<Item = BorrowedFd<'_>> {
+    /// Descriptors that wake the launcher when a process ends.
+    pub(super) fn exit_descriptors(&self) -> impl Iterator<Item = BorrowedFd<'_>> {
         self.children
             .iter()
-            .filter_map(|child| child.process.as_ref().and_then(Process::end))
+            .filter_map(|child| child.process.as_ref().and_then(Process::exit_descriptor))
     }
 
-    /// How long nothing is to be done for the children unless a process ends.
+    /// The time until the next restart or clean-up, unless a process ends earlier.
     pub(super) fn idle_for(&self) -> Duration {
         let since_clean = self.cleaned.elapsed();
-        let cleaning = self.occupied.map_or(CLEANING, |_| SOON).saturating_sub(since_clean);
+        let cleaning = self.occupied.map_or(CLEANING, |_| CLEANING_AGAIN).saturating_sub(since_clean);
         let missing = |child: &&Child| child.process.is_none() && self.is_wanted(child);
         let now = Instant::now();
         let restarts = self.children.iter().filter(missing);
@@ -245,27 +245,28 @@ impl Supervisor {
             .fold(cleaning, Duration::min)
     }
 
-    /// Sees whose processes have ended. What those said before is heard before [`look_after`](Self::look_after) acts on it.
-    pub(super) fn see_ends(&mut self) {
+    /// Collects the exit statuses of ended processes. Their last reports are read before [`maintain`](Self::maintain)
+    /// handles the ends.
+    pub(super) fn collect_exits(&mut self) {
         for child in self.children.iter_mut().filter(|child| child.ended.is_none()) {
             child.ended = child.process.as_mut().and_then(Process::exit_status);
         }
     }
 
-    /// Acts on the ends that were seen, and starts processes again when their time has come.
-    pub(super) fn look_after(&mut self, domain: &Domain) -> anyhow::Result<Situation> {
+    /// Handles collected ends, restarts processes that are due, and starts or retires actors.
+    pub(super) fn maintain(&mut self, domain: &Domain) -> anyhow::Result<Situation> {
         let mut state = Situation::AtWork;
         if self.children.iter().any(|child| child.ended.is_some()) {
-            // Their places in shared memory are free for their successors.
+            // Frees their shared memory for their successors.
             state = self.clean(domain)?;
-        } else if self.cleaned.elapsed() >= self.occupied.map_or(CLEANING, |_| SOON) {
+        } else if self.cleaned.elapsed() >= self.occupied.map_or(CLEANING, |_| CLEANING_AGAIN) {
             self.cleaned = Instant::now();
-            if domain.has_dead_nodes() || self.services.occupied_by_the_dead() > 0 {
+            if domain.has_dead_nodes() || self.services.ports_of_dead_processes() > 0 {
                 state = self.clean(domain)?;
             }
         }
         for i in 0..self.children.len() {
-            if self.look_after_one(i)? == Situation::LearnerDone {
+            if self.maintain_one(i)? == Situation::LearnerDone {
                 return Ok(Situation::LearnerDone);
             }
         }
@@ -274,9 +275,9 @@ impl Supervisor {
         Ok(state)
     }
 
-    fn look_after_one(&mut self, i: usize) -> anyhow::Result<Situation> {
+    fn maintain_one(&mut self, i: usize) -> anyhow::Result<Situation> {
         if let Some(status) = self.children[i].ended.take()
-            && self.act_on_end(i, status)? == Situation::LearnerDone
+            && self.handle_end(i, status)? == Situation::LearnerDone
         {
             return Ok(Situation::LearnerDone);
         }
@@ -285,12 +286,12 @@ impl Supervisor {
         if child.process.is_none() && is_wanted && Instant::now() >= child.restart_at {
             child.restarts += 1;
             self.start(i)?;
-            self.note_incident(i, What::StartedAgain, String::new());
+            self.note_incident(i, IncidentKind::StartedAgain, String::new());
         }
         Ok(Situation::AtWork)
     }
 
-    fn act_on_end(&mut self, i: usize, status: ExitStatus) -> anyhow::Result<Situation> {
+    fn handle_end(&mut self, i: usize, status: ExitStatus) -> anyhow::Result<Situation> {
         let child = &mut self.children[i];
         let name = name(child.identity);
         if child.identity.role == Role::Learner && status.success() {
@@ -303,54 +304,54 @@ impl Supervisor {
             child.process = None;
             child.restart_at = Instant::now();
             self.log.note(&name, &format!("retired: {}", ending(status)));
-            self.note_incident(i, What::Retired, String::new());
+            self.note_incident(i, IncidentKind::Retired, String::new());
             return Ok(Situation::AtWork);
         }
         let consequence = child.has_ended(status);
         let what = if status.signal().is_some() {
-            What::Killed
+            IncidentKind::Killed
         } else {
-            What::Failed
+            IncidentKind::Failed
         };
         self.note_incident(i, what, ending(status));
         match consequence {
             Consequence::Restart(pause) => {
                 self.children[i].restart_at = Instant::now() + pause;
                 self.log
-                    .note(&name, &format!("{}; starting it again in {pause:?}", ending(status)));
+                    .note(&name, &format!("{}; restarting it in {pause:?}", ending(status)));
                 Ok(Situation::AtWork)
             }
             Consequence::GiveUp(starts) => {
-                self.note_incident(i, What::GivenUp, String::new());
+                self.note_incident(i, IncidentKind::GivenUp, String::new());
                 self.give_up(&name, starts, status)
             }
         }
     }
 
-    /// Ends processes that should be working and do not, so that they are replaced; what is to be said of each.
+    /// Kills stalled processes, so that they are replaced. Returns a message for each.
     pub(super) fn replace_stalled(&mut self, stalls: &mut Stalls) -> Vec<String> {
         let stalled = stalls.find(&mut self.children, std::mem::take(&mut self.busy));
-        let mut said = Vec::new();
+        let mut messages = Vec::new();
         for (i, why) in stalled {
             let child = &mut self.children[i];
-            said.push(format!(
+            messages.push(format!(
                 "{} makes no progress: {why}; it is replaced",
                 name(child.identity)
             ));
             if let Some(process) = &mut child.process {
                 process.kill();
             }
-            self.note_incident(i, What::Stalled, why.into());
+            self.note_incident(i, IncidentKind::Stalled, why.into());
         }
-        said
+        messages
     }
 
-    fn note_incident(&mut self, i: usize, what: What, detail: String) {
+    fn note_incident(&mut self, i: usize, what: IncidentKind, detail: String) {
         self.incidents
             .push(Incident::of(self.children[i].identity, what, detail));
     }
 
-    /// Frees what dead processes have in shared memory.
+    /// Frees shared memory that dead processes occupy.
     fn clean(&mut self, domain: &Domain) -> anyhow::Result<Situation> {
         let begun = Instant::now();
         let cleaned = cleaner::clean_up(domain, &self.services);
@@ -359,20 +360,20 @@ impl Supervisor {
         if let Err(error) = &cleaned {
             self.log.note("launcher", &format!("{error:#}"));
         }
-        if self.services.occupied_by_the_dead() == 0 {
+        if self.services.ports_of_dead_processes() == 0 {
             self.occupied = None;
             return Ok(Situation::AtWork);
         }
         let since = *self.occupied.get_or_insert(begun);
-        if cleaned.is_ok() && since.elapsed() >= HOPELESS {
+        if cleaned.is_ok() && since.elapsed() >= OCCUPIED_PATIENCE {
             return Ok(Situation::SharedMemoryOccupied);
         }
         Ok(Situation::AtWork)
     }
 
-    /// Lets actors retire that are too many, and when they are gone their environment servers.
+    /// Retires surplus actors and then their environment servers.
     fn retire_surplus(&mut self) {
-        let serves_nobody = |children: &[Child], child: &Child| {
+        let has_no_client = |children: &[Child], child: &Child| {
             child.identity.role == Role::EnvServer
                 && !children.iter().any(|actor| actor.is(Role::Actor, child.identity.index))
         };
@@ -380,7 +381,7 @@ impl Supervisor {
         children.retain(|child| {
             let stays = child.process.is_some() || self.is_wanted(child);
             if !stays {
-                self.log.note(&name(child.identity), "not needed any more");
+                self.log.note(&name(child.identity), "no longer needed");
             }
             stays
         });
@@ -390,7 +391,7 @@ impl Supervisor {
                 continue;
             }
             let may_end =
-                self.children[i].identity.role == Role::Actor || serves_nobody(&self.children, &self.children[i]);
+                self.children[i].identity.role == Role::Actor || has_no_client(&self.children, &self.children[i]);
             let child = &mut self.children[i];
             if let Some(process) = child.process.as_mut().filter(|_| may_end) {
                 child.retires = true;
@@ -399,24 +400,24 @@ impl Supervisor {
         }
     }
 
-    /// Whether it is not an actor, or an actor's environment server, of which there are enough.
+    /// Whether the child is not a surplus actor or the environment server of one.
     fn is_wanted(&self, child: &Child) -> bool {
         let Identity { role, index, .. } = child.identity;
-        // The evaluator's server comes after those of all actors there may be.
+        // The index of the evaluator's server is the maximum number of actors.
         !matches!(role, Role::Actor | Role::EnvServer) || !(self.actors..self.max_actors).contains(&index)
     }
 
     fn give_up(&self, name: &str, starts: u32, status: ExitStatus) -> anyhow::Result<Situation> {
         let mut lines = self.log.last_lines(name);
         lines.dedup();
-        let said = match lines.split_last() {
-            None if status.signal().is_some() => "it said nothing: something kills it; does memory run out?".into(),
-            None => "it said nothing".into(),
+        let output = match lines.split_last() {
+            None if status.signal().is_some() => "it wrote no message before it was killed; is memory short?".into(),
+            None => "it wrote no message".into(),
             Some((last, [])) => last.strip_prefix("error: ").unwrap_or(last).to_owned(),
-            Some(_) => format!("it said last\n  {}", lines.join("\n  ")),
+            Some(_) => format!("its last messages:\n  {}", lines.join("\n  ")),
         };
         bail!(
-            "{name} failed {starts} times and is given up ({}); when its reason is gone, `shoal resume {}` goes on; {said}",
+            "{name} failed {starts} times and is given up ({}); fix the cause, then `shoal resume {}` continues; {output}",
             ending(status),
             self.run.display()
         );
@@ -431,14 +432,14 @@ impl Supervisor {
                     process.ask_to_end();
                 }
                 None if child.identity.role == Role::Learner && !self.learner_done => {
-                    self.unsaved = Some("it had died and was not back yet".into());
+                    self.unsaved = Some("it had died and was not restarted yet".into());
                 }
                 None => {}
             }
         }
     }
 
-    /// Whether the processes of some roles have ended.
+    /// Whether all processes of some roles have ended.
     pub(super) fn have_ended(&mut self, which: impl Fn(Role) -> bool) -> bool {
         let mut all = true;
         for child in self.children.iter_mut().filter(|child| which(child.identity.role)) {
@@ -463,7 +464,8 @@ impl Supervisor {
                 let name = name(child.identity);
                 self.log.note(&name, "did not end when asked to, and was killed");
                 let detail = "did not end when asked to".into();
-                self.incidents.push(Incident::of(child.identity, What::Killed, detail));
+                self.incidents
+                    .push(Incident::of(child.identity, IncidentKind::Killed, detail));
                 if child.identity.role == Role::Learner {
                     self.unsaved = Some("it did not end when asked to, and was killed".into());
                 }
@@ -471,21 +473,22 @@ impl Supervisor {
         }
     }
 
-    /// Says that every role has ended.
+    /// Logs that every role has ended.
     ///
     /// # Errors
-    /// When the learner did not save its state at its end.
+    /// When the learner did not save its state before it ended.
     pub(super) fn check_saved(&self) -> anyhow::Result<()> {
-        self.log.note("launcher", EVERYBODY_ENDED);
+        self.log.note("launcher", ALL_ENDED);
         let Some(how) = &self.unsaved else { return Ok(()) };
         let lines = self.log.last_lines(&name(Identity {
             role: Role::Learner,
             index: 0,
             incarnation: 0,
         }));
-        let said = lines.last().map_or_else(String::new, |line| format!(": {line}"));
+        let message = lines.last().map_or_else(String::new, |line| format!(": {line}"));
         bail!(
-            "the learner did not save its last state ({how}){said}; `shoal resume {}` goes on from the newest checkpoint",
+            "the learner did not save its last state ({how}){message}; `shoal resume {}` continues from the newest \
+             checkpoint",
             self.run.display()
         );
     }

@@ -1,4 +1,4 @@
-//! The way to the run's launcher, on a thread of its own: an answer that takes its time keeps no key waiting.
+//! The connection to the run's launcher, on its own thread, so that a slow answer does not delay the keys.
 
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::thread::{self, JoinHandle};
@@ -8,103 +8,103 @@ use anyhow::Context;
 use shoal_common::channel::control::RunStatus;
 use shoal_run::recorder::read_evaluations;
 use shoal_run::remote::Remote;
-use shoal_run::status::at_rest;
+use shoal_run::status::saved_status;
 
-/// From one look to the next.
-const EVERY: Duration = Duration::from_secs(1);
+/// Time between two polls.
+const INTERVAL: Duration = Duration::from_secs(1);
 
-/// How long a look that is under way may take to end when nobody wants to know any more.
-const FAREWELL: Duration = Duration::from_secs(1);
+/// How long to wait for a poll in progress at the end.
+const END_PATIENCE: Duration = Duration::from_secs(1);
 
-/// What can be asked of the run.
+/// A request to the run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Order {
-    /// Go on with so many actors.
+pub(crate) enum Request {
+    /// Change the number of actors.
     Scale(u32),
-    /// End in order.
+    /// Save the state and end.
     Stop,
 }
 
-/// What is heard of the run. The numbers are the environment steps and mean returns of its evaluations.
+/// An event of the run. The pairs of numbers are the environment steps and mean returns of its evaluations.
 #[derive(Clone, Debug)]
-pub(crate) enum News {
+pub(crate) enum RunEvent {
     Running(Box<RunStatus>, Vec<(f64, f64)>),
     Ended(Box<RunStatus>, Vec<(f64, f64)>),
-    /// The launcher did not answer, and why.
+    /// The launcher did not answer, for this reason.
     Silent(String),
-    /// What came of an order.
+    /// The result of a request.
     Answered(String),
 }
 
-/// The thread that looks after the run about once a second.
+/// The thread that polls the run about once a second.
 #[derive(Debug)]
 pub(crate) struct Link {
-    orders: Option<Sender<Order>>,
-    news: Receiver<News>,
+    requests: Option<Sender<Request>>,
+    events: Receiver<RunEvent>,
     thread: JoinHandle<()>,
 }
 
 impl Link {
-    /// Begins to look.
+    /// Starts to poll.
     ///
     /// # Errors
-    /// When there can be no thread.
+    /// When the thread cannot be started.
     pub(crate) fn new(remote: Remote) -> anyhow::Result<Self> {
-        let (orders, to_do) = channel();
-        let (told, news) = channel();
+        let (requests, incoming) = channel();
+        let (outgoing, events) = channel();
         let thread = thread::Builder::new()
-            .name("look".into())
-            .spawn(move || look_on(&remote, &to_do, &told))
+            .name("poll".into())
+            .spawn(move || poll_until_closed(&remote, &incoming, &outgoing))
             .context("cannot start a thread")?;
         Ok(Self {
-            orders: Some(orders),
-            news,
+            requests: Some(requests),
+            events,
             thread,
         })
     }
 
-    /// Has something asked of the run; what comes of it is news.
-    pub(crate) fn order(&self, order: Order) {
-        // Without the thread the next look at the news says so.
-        let _ = self.orders.as_ref().map(|orders| orders.send(order));
+    /// Sends a request to the run. Its result arrives as an event.
+    pub(crate) fn request(&self, request: Request) {
+        // If the thread has ended, the next call of `events` reports it.
+        let _ = self.requests.as_ref().map(|requests| requests.send(request));
     }
 
-    /// What was heard since the last call.
+    /// The events since the last call.
     ///
     /// # Errors
     /// When the thread has ended.
-    pub(crate) fn heard(&self) -> anyhow::Result<Vec<News>> {
-        let news = self.news.try_iter().collect();
+    pub(crate) fn events(&self) -> anyhow::Result<Vec<RunEvent>> {
+        let events = self.events.try_iter().collect();
         anyhow::ensure!(
             !self.thread.is_finished(),
-            "whoever looked after the run has failed; start again"
+            "the thread that watches the run has failed; start again"
         );
-        Ok(news)
+        Ok(events)
     }
 
-    /// Ends the thread, unless it waits for an answer for too long: the run's launcher cleans up after it then.
+    /// Ends the thread. Gives up on one that still waits for an answer; the run's launcher then cleans up after it.
     pub(crate) fn close(mut self) {
-        self.orders = None;
+        self.requests = None;
         let asked = Instant::now();
-        while !self.thread.is_finished() && asked.elapsed() < FAREWELL {
+        while !self.thread.is_finished() && asked.elapsed() < END_PATIENCE {
             thread::sleep(Duration::from_millis(5));
         }
     }
 }
 
-fn look_on(remote: &Remote, orders: &Receiver<Order>, told: &Sender<News>) {
+fn poll_until_closed(remote: &Remote, requests: &Receiver<Request>, events: &Sender<RunEvent>) {
     let mut ended = false;
     loop {
-        let news = look(remote, ended);
-        ended = matches!(news, Some(News::Ended(..))) || (ended && news.is_none());
-        if news.is_some_and(|news| told.send(news).is_err()) {
+        let event = poll(remote, ended);
+        ended = matches!(event, Some(RunEvent::Ended(..))) || (ended && event.is_none());
+        if event.is_some_and(|event| events.send(event).is_err()) {
             return;
         }
-        match orders.recv_timeout(EVERY) {
+        match requests.recv_timeout(INTERVAL) {
             Err(RecvTimeoutError::Disconnected) => return,
             Err(RecvTimeoutError::Timeout) => {}
-            Ok(order) => {
-                if told.send(News::Answered(carry_out(remote, order))).is_err() {
+            Ok(request) => {
+                if events.send(RunEvent::Answered(carry_out(remote, request))).is_err() {
                     return;
                 }
             }
@@ -112,19 +112,19 @@ fn look_on(remote: &Remote, orders: &Receiver<Order>, told: &Sender<News>) {
     }
 }
 
-/// How the run gets on; `None` where it is known to have ended and has not been resumed.
-fn look(remote: &Remote, ended: bool) -> Option<News> {
-    let heard = || -> anyhow::Result<Option<News>> {
+/// The state of the run; `None` if it was already known to have `ended` and has not been resumed.
+fn poll(remote: &Remote, ended: bool) -> Option<RunEvent> {
+    let polled = || -> anyhow::Result<Option<RunEvent>> {
         if let Some(status) = remote.status()? {
-            return Ok(Some(News::Running(Box::new(status), evaluations(remote)?)));
+            return Ok(Some(RunEvent::Running(Box::new(status), evaluations(remote)?)));
         }
         if ended {
             return Ok(None);
         }
-        let status = at_rest(&remote.run.config()?, &remote.run)?;
-        Ok(Some(News::Ended(Box::new(status), evaluations(remote)?)))
+        let status = saved_status(&remote.run.config()?, &remote.run)?;
+        Ok(Some(RunEvent::Ended(Box::new(status), evaluations(remote)?)))
     };
-    heard().unwrap_or_else(|error| Some(News::Silent(format!("{error:#}"))))
+    polled().unwrap_or_else(|error| Some(RunEvent::Silent(format!("{error:#}"))))
 }
 
 fn evaluations(remote: &Remote) -> anyhow::Result<Vec<(f64, f64)>> {
@@ -133,10 +133,10 @@ fn evaluations(remote: &Remote) -> anyhow::Result<Vec<(f64, f64)>> {
     Ok(points.collect())
 }
 
-fn carry_out(remote: &Remote, order: Order) -> String {
-    let (done, words) = match order {
-        Order::Scale(actors) => (remote.scale(actors), format!("{actors} actors from now on")),
-        Order::Stop => (remote.stop(), "stopped in order".into()),
+fn carry_out(remote: &Remote, request: Request) -> String {
+    let (result, success) = match request {
+        Request::Scale(actors) => (remote.scale(actors), format!("scaled to {actors} actors")),
+        Request::Stop => (remote.stop(), "stopped; the state is saved".into()),
     };
-    done.map_or_else(|error| format!("{error:#}"), |()| words)
+    result.map_or_else(|error| format!("{error:#}"), |()| success)
 }

@@ -1,5 +1,5 @@
-//! The picture: what is known of the run, laid out for the terminal there is. Where there is little room, the curves go
-//! first, then the columns of the roles that are least needed.
+//! The layout of the screen for the size of the terminal. On a small terminal the curves are left out first, then the
+//! least important columns of the roles.
 
 use ratatui::Frame;
 use ratatui::layout::{Alignment, Constraint, Layout, Rect};
@@ -12,18 +12,18 @@ use ratatui::widgets::{
 use shoal_common::channel::control::{RoleState, RoleStatus};
 use shoal_run::numbers::thousands;
 
-use super::{Life, Over, Screen};
-use crate::command::status::{in_words, progress, waits};
+use super::{LauncherState, Overlay, Screen};
+use crate::command::status::{progress, state_name, waiting};
 
-/// Rows above the roles, and the row of keys below everything.
+/// Number of rows above the roles, and of rows with keys at the bottom.
 const HEAD: u16 = 4;
 const FOOT: u16 = 1;
 
-/// The least room in which curves can be read.
+/// The least height and width in which the curves are readable.
 const CURVES: u16 = 8;
 const CURVES_WIDTH: u16 = 60;
 
-/// The least width at which every column of the roles fits.
+/// The least width in which all columns of the roles fit.
 const ALL_COLUMNS: u16 = 74;
 
 /// Draws the whole screen.
@@ -52,10 +52,10 @@ pub(crate) fn draw(frame: &mut Frame<'_>, screen: &Screen) {
         draw_throughput(frame, screen, right);
     }
     draw_foot(frame, screen, foot);
-    match screen.over {
-        Over::Nothing => {}
-        Over::Help => over(frame, "keys", HELP),
-        Over::Stop => over(
+    match screen.overlay {
+        Overlay::Nothing => {}
+        Overlay::Help => draw_box(frame, "keys", HELP),
+        Overlay::Stop => draw_box(
             frame,
             "stop",
             &["Stop the run? Its state is saved.", "y  yes      any other key  no"],
@@ -66,7 +66,7 @@ pub(crate) fn draw(frame: &mut Frame<'_>, screen: &Screen) {
 const HELP: &[&str] = &[
     "+  one actor more     -  one less",
     "s  stop the run (asks first)",
-    "q  leave; the run goes on",
+    "q  quit; the run continues",
     "any key closes this",
 ];
 
@@ -79,14 +79,14 @@ fn colour(screen: &Screen, colour: Color) -> Style {
 }
 
 fn draw_head(frame: &mut Frame<'_>, screen: &Screen, area: Rect) {
-    let [title, way, pace, ratio] = Layout::vertical([Constraint::Length(1); 4]).areas(area);
+    let [title, bar, rates, ratio] = Layout::vertical([Constraint::Length(1); 4]).areas(area);
     let status = &screen.status;
-    let (state, style) = match &screen.life {
-        Life::Unknown => ("looking".to_owned(), Style::new()),
-        Life::Running => ("running".to_owned(), colour(screen, Color::Green)),
-        Life::Silent(_) => ("no answer".to_owned(), colour(screen, Color::Red)),
-        Life::Ended if status.finished => ("has ended: done".to_owned(), colour(screen, Color::Cyan)),
-        Life::Ended => ("has ended".to_owned(), colour(screen, Color::Yellow)),
+    let (state, style) = match &screen.launcher {
+        LauncherState::Unknown => ("connecting".to_owned(), Style::new()),
+        LauncherState::Running => ("running".to_owned(), colour(screen, Color::Green)),
+        LauncherState::Silent(_) => ("no answer".to_owned(), colour(screen, Color::Red)),
+        LauncherState::Ended if status.finished => ("has ended: finished".to_owned(), colour(screen, Color::Cyan)),
+        LauncherState::Ended => ("has ended".to_owned(), colour(screen, Color::Yellow)),
     };
     let line = Line::from(vec![
         Span::styled(screen.run.clone(), Modifier::BOLD),
@@ -96,7 +96,7 @@ fn draw_head(frame: &mut Frame<'_>, screen: &Screen, area: Rect) {
         Span::raw(screen.task.clone()),
     ]);
     frame.render_widget(line, title);
-    if screen.life == Life::Unknown {
+    if screen.launcher == LauncherState::Unknown {
         return;
     }
     let (done, all) = match status.episodes_limit {
@@ -111,25 +111,25 @@ fn draw_head(frame: &mut Frame<'_>, screen: &Screen, area: Rect) {
         } else {
             Style::new().add_modifier(Modifier::REVERSED)
         });
-    // Without colours a bar behind words is their reverse, and words at its edge are hard to read: words alone then.
+    // Without colours the bar would reverse the text, which is hard to read at the bar's end: text alone instead.
     if screen.colours {
-        frame.render_widget(gauge, way);
+        frame.render_widget(gauge, bar);
     } else {
         let percent = 100.0 * done as f64 / all.max(1) as f64;
-        frame.render_widget(Line::raw(format!("{} ({percent:.0} %)", progress(status))), way);
+        frame.render_widget(Line::raw(format!("{} ({percent:.0} %)", progress(status))), bar);
     }
     let best = screen.evaluations.iter().map(|(_, mean)| *mean).reduce(f64::max);
-    let mut words = format!(
+    let mut text = format!(
         "{:.0} updates/s, {:.0} steps/s",
         status.updates_per_second, status.env_steps_per_second
     );
     if let Some((mean, best)) = status.eval_return_mean.zip(best) {
-        words += &format!(", eval {mean:.2}, best {best:.2}");
+        text += &format!(", eval {mean:.2}, best {best:.2}");
     }
-    frame.render_widget(Line::raw(words), pace);
+    frame.render_widget(Line::raw(text), rates);
     let line = Line::from(vec![
         Span::raw(format!("ratio {:.2} of {:.2}; ", status.ratio, status.updates_per_step)),
-        Span::styled(waits(status).to_owned(), colour(screen, Color::Yellow)),
+        Span::styled(waiting(status).to_owned(), colour(screen, Color::Yellow)),
     ]);
     frame.render_widget(line, ratio);
 }
@@ -146,15 +146,19 @@ fn draw_roles(frame: &mut Frame<'_>, screen: &Screen, area: Rect) {
     };
     roles.sort_by_key(|role| (rank(role).unwrap_or(usize::MAX), role.index));
     let wide = area.width >= ALL_COLUMNS;
-    let room = area.height as usize - 1;
-    let hidden = if roles.len() > room { roles.len() + 1 - room } else { 0 };
+    let lines = area.height as usize - 1;
+    let hidden = if roles.len() > lines {
+        roles.len() + 1 - lines
+    } else {
+        0
+    };
     let shown = roles.len() - hidden;
     let or_none = |number: Option<u64>| number.map_or_else(String::new, thousands);
     let right = |text: String| Cell::from(Line::raw(text).alignment(Alignment::Right));
     let mut rows: Vec<Row<'_>> = roles[..shown]
         .iter()
         .map(|role| {
-            let state = Cell::from(in_words(role.state)).style(style_of(screen, role.state));
+            let state = Cell::from(state_name(role.state)).style(style_of(screen, role.state));
             let mut cells = vec![Cell::from(format!("{} {}", role.role, role.index))];
             if wide {
                 cells.push(right(role.pid.map_or_else(String::new, |pid| pid.to_string())));
@@ -255,17 +259,17 @@ fn draw_throughput(frame: &mut Frame<'_>, screen: &Screen, area: Rect) {
 }
 
 fn draw_foot(frame: &mut Frame<'_>, screen: &Screen, area: Rect) {
-    let line = match (&screen.notice, &screen.life) {
-        (_, Life::Silent(why)) => Line::raw(why.clone()),
+    let line = match (&screen.notice, &screen.launcher) {
+        (_, LauncherState::Silent(why)) => Line::raw(why.clone()),
         (Some(notice), _) => Line::raw(notice.clone()),
-        (None, Life::Ended) => Line::raw(format!("the run has ended; q leaves; shoal resume {}", screen.run)),
+        (None, LauncherState::Ended) => Line::raw(format!("the run has ended; q quits; shoal resume {}", screen.run)),
         (None, _) => Line::raw("+/- actors  s stop  ? help  q quit"),
     };
     frame.render_widget(line.style(Modifier::REVERSED), area);
 }
 
-/// A box in the middle.
-fn over(frame: &mut Frame<'_>, title: &str, lines: &[&str]) {
+/// Draws a box in the middle of the screen.
+fn draw_box(frame: &mut Frame<'_>, title: &str, lines: &[&str]) {
     let wide = lines.iter().map(|line| line.chars().count()).max().unwrap_or(0) as u16;
     let area = frame
         .area()

@@ -1,8 +1,8 @@
-//! What a policy is worth on the lake, by its transition table.
+//! Evaluates a policy on the lake by its transition table.
 
 use shoal_env_server::environment::frozen_lake::{LakeTransition, STATES, transitions};
 
-/// How likely a policy is to reach the goal from the start within so many steps.
+/// The probability that a policy reaches the goal from the start within `steps` steps.
 pub(crate) fn reaches_the_goal(policy: &[usize], steps: usize) -> f64 {
     let mut reached = [0.0; STATES];
     for _ in 0..steps {

@@ -1,5 +1,5 @@
-//! What learns beside DDPG, in real processes: Q-learning finds the lake's values, each method has the bits of its algorithm
-//! in a single process, and keeps them whoever is killed; a run ends after so many episodes.
+//! The algorithms other than DDPG, in real processes. Q-learning finds the lake's values. Each method gives the bits of
+//! its algorithm in a single process, even if roles are killed. A run ends after a given number of episodes.
 
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
 
@@ -15,9 +15,9 @@ use shoal_common::config::Config;
 use shoal_common::policy::{PolicyLayout, highest};
 use shoal_common::policy_file::PolicyFile;
 use shoal_env_server::environment::frozen_lake::{ACTIONS, STATES};
-use support::{Running, Workplace, comes_further, complaint, end_of, json, parse, until};
+use support::{Running, Workplace, error_line, final_result, json, parse, until, wait_for_rows};
 
-/// Few episodes to evaluate by, and those not often.
+/// Rare evaluations of few episodes.
 const QUICK: [&str; 6] = [
     "--set",
     "evaluation.every=4000",
@@ -38,7 +38,7 @@ fn start(place: &Workplace, name: &str, arguments: &[&str]) -> Running {
     place.launch(name, &[&["train"], arguments, &QUICK, &["--run", name]].concat())
 }
 
-/// The table that a run ended with.
+/// The final table of the run.
 fn table(place: &Workplace) -> Vec<f32> {
     let layout = PolicyLayout::Table {
         states: STATES,
@@ -90,18 +90,18 @@ fn q_learning_finds_the_values_of_the_lake_and_a_policy_that_reaches_the_goal() 
 }
 
 #[test]
-fn a_step_at_a_time_q_learning_is_algorithm_2_in_a_single_process() {
-    is_its_algorithm("frozen-lake", "q-learning");
+fn q_learning_gives_the_bits_of_algorithm_2_in_a_single_process() {
+    gives_the_bits_of_its_twin("frozen-lake", "q-learning");
 }
 
 #[test]
-fn a_step_at_a_time_sarsa_is_algorithm_1_in_a_single_process() {
-    is_its_algorithm("frozen-lake-sarsa", "sarsa");
+fn sarsa_gives_the_bits_of_algorithm_1_in_a_single_process() {
+    gives_the_bits_of_its_twin("frozen-lake-sarsa", "sarsa");
 }
 
-fn is_its_algorithm(preset: &str, section: &str) {
+fn gives_the_bits_of_its_twin(preset: &str, section: &str) {
     let place = Workplace::new();
-    // Within 30 steps some episodes are cut off, and some of so much exploration reach the goal.
+    // With a limit of 30 steps and so much exploration, some episodes are truncated and some reach the goal.
     let [epsilon, alpha] = ["epsilon=0.9", "alpha=0.3"].map(|setting| format!("{section}.{setting}"));
     let limit = "environment.time_limit=30";
     let result = train(
@@ -124,13 +124,13 @@ fn is_its_algorithm(preset: &str, section: &str) {
     let (weights, truncated, learned) = twin::tabular(&config);
     assert!(
         truncated > 0 && learned > 8,
-        "or this shows less: {truncated}, {learned}"
+        "{truncated} episodes truncated, {learned} values learned: too few for this test"
     );
     assert_eq!(result["weights_sha256"], weights);
 }
 
 #[test]
-fn an_episode_at_a_time_reinforce_is_algorithm_3_in_a_single_process() {
+fn reinforce_gives_the_bits_of_algorithm_3_in_a_single_process() {
     for weight in ["normalised", "baseline"] {
         let place = Workplace::new();
         let weight = format!("reinforce.weight={weight}");
@@ -176,73 +176,73 @@ const SARSA: [&str; 17] = [
 ];
 
 #[test]
-fn whoever_is_killed_reinforce_ends_with_the_bits_of_a_whole_run() {
-    whoever_is_killed_it_ends_the_same(&CART_POLE);
+fn reinforce_with_killed_roles_ends_with_the_bits_of_an_undisturbed_run() {
+    kills_do_not_change_the_bits(&CART_POLE);
 }
 
 #[test]
-fn whoever_is_killed_sarsa_ends_with_the_bits_of_a_whole_run() {
-    whoever_is_killed_it_ends_the_same(&SARSA);
+fn sarsa_with_killed_roles_ends_with_the_bits_of_an_undisturbed_run() {
+    kills_do_not_change_the_bits(&SARSA);
 }
 
-fn whoever_is_killed_it_ends_the_same(arguments: &[&str]) {
+fn kills_do_not_change_the_bits(arguments: &[&str]) {
     let place = Workplace::new();
-    let (weights, evaluations) = end_of(start(&place, "whole", arguments));
+    let (weights, evaluations) = final_result(start(&place, "undisturbed", arguments));
     let running = start(&place, "killed", arguments);
     for who in ["actor-1", "learner-0", "env-server-0", "actor-0", "learner-0"] {
-        comes_further(&running, 1000);
+        wait_for_rows(&running, 1000);
         let starts = running.pids(who).len();
         running.kill(who);
         until("it is replaced", || running.pids(who).len() > starts);
     }
-    comes_further(&running, 1000);
-    running.kill_everybody();
+    wait_for_rows(&running, 1000);
+    running.kill_all();
     drop(running);
-    let (again, evaluated) = end_of(place.resume("killed", &[]));
+    let (again, evaluated) = final_result(place.resume("killed", &[]));
     assert_eq!(again, weights);
-    // One may have died with the launcher before it was written down.
+    // One may have been lost with the launcher before it was recorded.
     assert!(evaluated.iter().all(|line| evaluations.contains(line)), "{evaluated:?}");
 }
 
 #[test]
-fn a_run_of_so_many_episodes_has_them_and_goes_on_where_it_was_broken_off() {
+fn a_run_limited_by_episodes_plays_that_many_and_resumes_where_it_stopped() {
     for preset in ["frozen-lake", "cart-pole"] {
         let place = Workplace::new();
-        let whole = train(&place, &[preset, "--episodes", "900"]);
-        assert_eq!(whole["episodes"], 900);
-        // An actor may have done the first of the next round before it heard of the end.
+        let undisturbed = train(&place, &[preset, "--episodes", "900"]);
+        assert_eq!(undisturbed["episodes"], 900);
+        // An actor may finish the first episode of the next round before it learns of the end.
         assert!((900..=901).contains(&recorded(&place, "run")), "{preset}");
 
-        let running = start(&place, "broken-off", &[preset, "--episodes", "900"]);
-        comes_further(&running, 500);
+        let running = start(&place, "stopped", &[preset, "--episodes", "900"]);
+        wait_for_rows(&running, 500);
         running.signal(Signal::INT);
         let (code, printed, leftovers) = running.wait();
         assert_eq!(code, Some(130));
         assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
         assert!(
             parse(&printed)["episodes"].as_u64().unwrap() < 900,
-            "or nothing was broken off"
+            "it was stopped too late"
         );
-        let result = json(&place.output(&["resume", "broken-off", "--json"]));
+        let result = json(&place.output(&["resume", "stopped", "--json"]));
         for key in ["weights_sha256", "episodes", "env_steps"] {
-            assert_eq!(result[key], whole[key], "{preset}: {key}");
+            assert_eq!(result[key], undisturbed[key], "{preset}: {key}");
         }
 
-        let said = complaint(&place.output(&["resume", "broken-off"]));
+        let message = error_line(&place.output(&["resume", "stopped"]));
         assert!(
-            said.contains("finished 900 of 900 episodes") && said.contains("--episodes"),
-            "{said}"
+            message.contains("finished 900 of 900 episodes") && message.contains("--episodes"),
+            "{message}"
         );
         let more = ["--episodes", "950", "--json"];
         let [result, longer] =
-            ["broken-off", "run"].map(|run| json(&place.output(&[&["resume", run], &more[..]].concat())));
+            ["stopped", "run"].map(|run| json(&place.output(&[&["resume", run], &more[..]].concat())));
         assert_eq!((&result["episodes"], &longer["episodes"]), (&950.into(), &950.into()));
         assert_eq!(result["weights_sha256"], longer["weights_sha256"]);
     }
 }
 
 #[test]
-fn q_learning_needs_no_turns() {
+fn q_learning_also_learns_in_a_free_run() {
     let place = Workplace::new();
     let arguments = [
         "frozen-lake",
@@ -255,7 +255,7 @@ fn q_learning_needs_no_turns() {
     ];
     let result = train(&place, &arguments);
     let episodes = result["episodes"].as_u64().unwrap();
-    // Both actors go on until they hear of the end, and what they sent is learned from by nobody.
+    // Both actors continue until they learn of the end. The learner ignores what they send in the meantime.
     assert!((300..400).contains(&episodes), "{result}");
     assert_eq!(result["updates"], result["env_steps"]);
     assert!(recorded(&place, "run") >= episodes);

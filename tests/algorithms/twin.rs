@@ -1,4 +1,4 @@
-//! Algorithms 1, 2 and 3, plainly: one process, one environment, and the same random streams.
+//! Algorithms 1, 2 and 3 as plain single-process programs, with one environment and the same random streams.
 
 use shoal_actor::exploration::Exploration;
 use shoal_common::channel::environment::ResponseLayout;
@@ -11,18 +11,18 @@ use shoal_learner::algorithms::registry;
 use shoal_learner::networks::digest::sha256;
 use shoal_learner::replay::{ChunkMark, Replay, ReplayLayout};
 
-/// An environment, and how one acts in it.
+/// An environment, and the exploration that chooses actions in it.
 struct World {
     environment: VectorEnvironment,
     exploration: Exploration,
     response: Vec<f32>,
     /// Actions chosen so far.
     t: u64,
-    /// Where it stands; behind the end of an episode, where the next one begins.
+    /// The current state; after the end of an episode, the first state of the next one.
     s: Vec<f32>,
 }
 
-/// What came of an action.
+/// The result of an action.
 struct Step {
     s: Vec<f32>,
     a: f32,
@@ -73,11 +73,11 @@ impl World {
     }
 }
 
-/// SARSA or Q-learning. The SHA-256 of the table it ends with, how many episodes the time limit cut off, and how many values
-/// are not 0 any more.
+/// SARSA or Q-learning. Returns the SHA-256 of the final table, the number of truncated episodes, and the number of
+/// values that are no longer 0.
 pub(crate) fn tabular(config: &Config) -> (String, u64, usize) {
     let (Algorithm::QLearning(settings) | Algorithm::Sarsa(settings)) = &config.algorithm else {
-        panic!("no table is learned")
+        panic!("this twin is for tabular methods")
     };
     let (alpha, gamma) = (settings.alpha as f32, settings.gamma as f32);
     let mut q = [0.0_f32; STATES * ACTIONS];
@@ -96,7 +96,7 @@ pub(crate) fn tabular(config: &Config) -> (String, u64, usize) {
             } else if step.terminated {
                 Some(step.r)
             } else if step.truncated {
-                // No a' is chosen.
+                // There is no a' to learn from.
                 None
             } else {
                 a = world.choose(&q);
@@ -117,7 +117,7 @@ pub(crate) fn tabular(config: &Config) -> (String, u64, usize) {
     (sha256(&[&q]), truncated, q.iter().filter(|q| **q != 0.0).count())
 }
 
-/// REINFORCE: an episode with the policy as it is, then an update. The SHA-256 of all the weights it ends with.
+/// REINFORCE: plays an episode with the current policy, then updates it. Returns the SHA-256 of the final weights.
 pub(crate) fn reinforce(config: &Config) -> String {
     let place = tempfile::tempdir().unwrap();
     let chunk = config.chunk_layout();

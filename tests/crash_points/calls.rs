@@ -1,32 +1,32 @@
-//! The system calls before which a process may be killed, and how they are recognised.
+//! The system calls before which a process may be killed.
 
 use nix::libc;
 use nix::sys::ptrace;
 use nix::unistd::Pid;
 
-/// A kind of system call that changes what other processes see, or waits for them.
+/// A kind of system call that has an effect on other processes or waits for them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub(crate) enum Call {
-    /// A file is opened, in shared memory too.
+    /// Opens a file, possibly in shared memory.
     Open,
-    /// The same, and made if it is not there.
+    /// Opens a file, and creates it if it does not exist.
     Create,
-    /// A file gets its size.
+    /// Sets the size of a file.
     Ftruncate,
-    /// A file gets its rights.
+    /// Sets the permissions of a file.
     Fchmod,
-    /// A file is mapped to be shared.
+    /// Maps a file as shared memory.
     Mmap,
     Write,
     Rename,
     Unlink,
     Mkdir,
     Fsync,
-    /// A lock is taken or given up, of `fcntl` or `flock`.
+    /// Acquires or releases a lock of `fcntl` or `flock`.
     Lock,
-    /// A socket gets its name in the file system.
+    /// Binds a socket to a name in the file system.
     Bind,
-    /// A bell is rung.
+    /// Sends a notification of an event.
     Send,
 }
 
@@ -65,7 +65,7 @@ impl Call {
         }
     }
 
-    /// Whether a call with this number and these arguments is of the kind.
+    /// Whether a call with this number and these arguments is of this kind.
     fn is(self, number: i64, arguments: &[u64; 6]) -> bool {
         let flags = |index: usize| arguments[index] as i32;
         match self {
@@ -100,7 +100,7 @@ fn opens(number: i64, arguments: &[u64; 6]) -> Option<i32> {
     }
 }
 
-/// Calls that newer architectures have no more.
+/// Calls that newer architectures lack.
 #[cfg(target_arch = "x86_64")]
 mod old {
     use nix::libc;
@@ -129,7 +129,7 @@ pub(crate) struct Entry {
 }
 
 impl Entry {
-    /// The call at whose entry this thread stands; `None` where it stands elsewhere.
+    /// The call that this thread is about to enter; `None` if it stopped elsewhere.
     pub(crate) fn of(thread: Pid) -> Option<Self> {
         let stop = ptrace::syscall_info(thread).ok()?;
         if stop.op != libc::PTRACE_SYSCALL_INFO_ENTRY {
@@ -143,14 +143,14 @@ impl Entry {
         })
     }
 
-    /// Every kind that it is of.
+    /// All kinds of this call.
     pub(crate) fn kinds(&self) -> impl Iterator<Item = Call> + '_ {
         Call::ALL
             .into_iter()
             .filter(|call| call.is(self.number, &self.arguments))
     }
 
-    /// What it is about, for a person: the path, or what the descriptor stands for.
+    /// Text for the user: the path, or the file of the descriptor.
     pub(crate) fn subject(&self) -> String {
         let [first, second, ..] = self.arguments;
         let at_path = [
@@ -178,7 +178,7 @@ impl Entry {
         subject.unwrap_or_else(|| "?".into())
     }
 
-    /// The text at an address of the process.
+    /// The zero-terminated text at an address of the process.
     fn text(&self, address: u64) -> Option<String> {
         let mut bytes = Vec::new();
         while bytes.len() < 512 && !bytes.contains(&0) {
@@ -203,8 +203,8 @@ fn numbers(registers: &libc::user_regs_struct) -> (i64, [u64; 6]) {
     (r[8] as i64, [r[0], r[1], r[2], r[3], r[4], r[5]])
 }
 
-/// Nothing is traced on other processors: `tracer::is_allowed` says so.
+/// Never called on other processors, because `tracer::is_allowed` returns false there.
 #[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
 fn numbers(_registers: &libc::user_regs_struct) -> (i64, [u64; 6]) {
-    unreachable!("nothing is traced here")
+    unreachable!("this architecture is not traced")
 }

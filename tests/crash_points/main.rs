@@ -1,8 +1,8 @@
-//! Any process may be killed at any instruction, and the others go on. What a process says to others it says in system
-//! calls, so each of these tests kills one process just before a certain call, of libc's or the program's own, and looks at
-//! what becomes of the run. Others kill faster than a process can begin its work.
+//! Any process may be killed at any instruction, and the others continue. Other processes see most effects of a process
+//! through its system calls, so these tests kill a process just before a chosen system call and check the run. Further
+//! tests kill processes faster than they can start.
 //!
-//! The tests of every day try a selection; the others are asked for, and say what came of each kind of kill:
+//! The ordinary tests try a selection of calls. The ignored tests try more, and print the results of each kind of kill:
 //!
 //! ```text
 //! cargo test --release --test crash_points -- --ignored --nocapture every_crash_point
@@ -10,92 +10,92 @@
 //! cargo test --release --test crash_points -- --ignored --nocapture a_million_steps
 //! ```
 //!
-//! `SHOAL_CRASH_JOBS` says how many runs are under way at a time (2). `SHOAL_CRASH_ROLES` (`learner-0,launcher,status`),
-//! `SHOAL_CRASH_CALLS` (`ftruncate,fchmod`), `SHOAL_CRASH_MODES` (`free,lockstep`), `SHOAL_CRASH_USERS` (`own,nobody`) and
-//! `SHOAL_CRASH_UPTO` (200) restrict the first; `SHOAL_CRASH_SECONDS` (60) says after how long a run hangs;
-//! `SHOAL_CRASH_BURSTS` (10) and `SHOAL_CRASH_SEED` (1) belong to the second, `SHOAL_CRASH_STEPS` to the third.
+//! | variable | default or example | meaning |
+//! | --- | --- | --- |
+//! | `SHOAL_CRASH_JOBS` | 2 | runs at the same time; with 1, runs cannot disturb each other |
+//! | `SHOAL_CRASH_SECONDS` | 60 | a run that takes longer hangs |
+//! | `SHOAL_CRASH_ROLES` | `learner-0,launcher,status` | `every_crash_point`: processes to kill |
+//! | `SHOAL_CRASH_CALLS` | `ftruncate,fchmod` | `every_crash_point`: system calls |
+//! | `SHOAL_CRASH_MODES` | `free,lockstep` | `every_crash_point`: modes |
+//! | `SHOAL_CRASH_USERS` | `own,nobody` | `every_crash_point`: users |
+//! | `SHOAL_CRASH_UPTO` | 200 | `every_crash_point`: calls of each kind |
+//! | `SHOAL_CRASH_BURSTS` | 10 | `hostile`: bursts of kills |
+//! | `SHOAL_CRASH_SEED` | 1 | `hostile` and `a_million_steps`: random seed |
+//! | `SHOAL_CRASH_STEPS` | 1000000 | `a_million_steps`: environment steps |
 //!
-//! With `SHOAL_CRASH_JOBS=1` no run has a neighbour, and each failure is its own.
-//!
-//! Processes are traced (`ptrace`); where the machine does not allow it, these tests are ignored.
+//! The tests trace processes (`ptrace`) and are ignored on a machine that does not allow it.
 
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
 #![allow(
     clippy::print_stderr,
-    reason = "a test says what came of its kills, and a long one how it gets on"
+    reason = "tests print the results of their kills, and long tests their progress"
 )]
 
 mod calls;
-mod place;
 mod schedules;
 #[path = "../support/suite.rs"]
 mod suite;
 mod sweep;
 mod tracer;
 mod trial;
+mod workplace;
 
 use std::process::{Command, ExitCode};
 use std::time::Duration;
 
 use calls::Call;
-use place::User;
 use schedules::Schedule;
 use suite::{Need, PYTHON, ROOT, test};
 use sweep::{Sweep, Table, in_parallel, list, number};
 use tracer::{Target, follow};
 use trial::{Mode, Victim};
+use workplace::User;
 
-/// The right to trace one's children.
-static TRACING: Need = Need::new("this machine allows no tracing", tracer::is_allowed, None);
+/// Permission to trace child processes.
+static TRACING: Need = Need::new("this machine does not allow tracing", tracer::is_allowed, None);
 
 fn main() -> ExitCode {
     suite::run(vec![
-        test!(who_is_killed_before_a_call_has_not_made_it, TRACING),
+        test!(a_process_killed_before_a_call_has_not_made_it, TRACING),
+        test!(a_role_killed_before_a_call_is_replaced_and_the_run_completes, TRACING),
+        test!(an_evaluator_killed_before_a_call_is_replaced, TRACING),
+        test!(a_lockstep_run_with_a_kill_ends_with_the_same_bits, TRACING),
         test!(
-            a_role_killed_before_a_call_of_its_start_is_replaced_and_the_run_ends_as_it_was_to,
+            after_a_kill_of_the_launcher_its_roles_end_and_the_run_can_be_resumed,
             TRACING
         ),
-        test!(an_evaluator_killed_before_a_call_of_its_start_is_replaced, TRACING),
-        test!(in_lockstep_the_run_ends_with_the_same_bits_too, TRACING),
-        test!(
-            when_the_launcher_is_killed_before_a_call_its_roles_end_and_the_run_goes_on_when_it_is_resumed,
-            TRACING
-        ),
-        test!(
-            a_command_killed_before_a_call_does_not_disturb_the_run_that_it_asks,
-            TRACING
-        ),
-        test!(a_clean_up_that_is_killed_before_a_call_is_done_again, TRACING),
+        test!(a_command_killed_before_a_call_does_not_disturb_its_run, TRACING),
+        test!(a_clean_up_killed_before_a_call_is_repeated, TRACING),
         test!(a_python_server_killed_before_a_call_is_replaced, TRACING, PYTHON),
-        test!(an_ordinary_users_run_goes_on_where_roots_does, TRACING, ROOT),
-        // Hours: kills before every call.
+        test!(an_ordinary_users_run_survives_the_same_kills, TRACING, ROOT),
+        // Takes hours: kills before every call.
         test!(every_crash_point, TRACING).with_ignored_flag(true),
-        test!(who_is_killed_faster_than_it_can_begin_is_at_work_again_soon_after),
-        // Ten minutes and more: hostile schedules of kills.
+        test!(roles_killed_faster_than_they_can_start_recover_soon_after),
+        // Takes ten minutes or more.
         test!(hostile_schedules_of_kills_never_stop_a_run).with_ignored_flag(true),
-        // Up to an hour each: a kill every 100 ms, all the way.
-        test!(a_million_steps_are_taken_under_a_kill_every_tenth_of_a_second).with_ignored_flag(true),
+        // Takes up to an hour for each mode.
+        test!(a_million_steps_with_a_kill_every_tenth_of_a_second).with_ignored_flag(true),
     ])
 }
 
-/// A selection for one run gives up after so many failures: each may take a minute.
-const FEW: usize = 3;
+/// A selection of kills stops after this many failures, because each may take a minute.
+const MAX_FAILURES: usize = 3;
 
-/// Calls between which a file is there and not yet what it is to be.
+/// Calls between which a file exists and is incomplete.
 const DANGEROUS: [Call; 3] = [Call::Create, Call::Ftruncate, Call::Fchmod];
 
-/// Before how many calls of a kind somebody is killed.
+/// The number of calls of each kind before which a process is killed.
 #[derive(Clone, Copy)]
-struct Choice {
-    /// The first ones of a dangerous kind.
+struct Selection {
+    /// The first calls of a dangerous kind.
     first: u32,
-    /// More of a dangerous kind, spread over all there are.
+    /// Further calls of a dangerous kind, spread evenly.
     dangerous: u32,
-    /// Of every other kind, spread likewise.
+    /// Calls of every other kind, spread evenly.
     others: u32,
 }
 
-impl Choice {
+impl Selection {
     fn numbers(self, call: Call, count: u32) -> Vec<u32> {
         let (first, spread) = if DANGEROUS.contains(&call) {
             (self.first.min(count), self.dangerous)
@@ -112,9 +112,9 @@ impl Choice {
     }
 }
 
-/// Kills before a selection of calls.
-fn some(user: User, modes: &[Mode], victims: &[Victim], [first, dangerous, others]: [u32; 3]) {
-    let choice = Choice {
+/// Kills each of `victims` before a selection of its calls, and checks the runs.
+fn kill_before_some_calls(user: User, modes: &[Mode], victims: &[Victim], [first, dangerous, others]: [u32; 3]) {
+    let selection = Selection {
         first,
         dangerous,
         others,
@@ -123,17 +123,17 @@ fn some(user: User, modes: &[Mode], victims: &[Victim], [first, dangerous, other
         user,
         modes,
         victims: victims.to_vec(),
-        points: &|_, call, count| choice.numbers(call, count),
-        patience: FEW,
+        points: &|_, call, count| selection.numbers(call, count),
+        max_failures: MAX_FAILURES,
     }
     .run();
     eprint!("{}", table.text());
-    table.evaluate();
+    table.assert_no_failures();
 }
 
 const EVALUATOR: Victim = Victim::Role("evaluator", 0);
 
-/// Everybody else who belongs to a run.
+/// The other roles of a run; `env-server` 4 is the evaluator's.
 const ROLES: [Victim; 4] = [
     Victim::Role("learner", 0),
     Victim::Role("actor", 0),
@@ -141,14 +141,14 @@ const ROLES: [Victim; 4] = [
     Victim::Role("env-server", 4),
 ];
 
-fn who_is_killed_before_a_call_has_not_made_it() {
+fn a_process_killed_before_a_call_has_not_made_it() {
     let directory = tempfile::tempdir().unwrap();
     let words = ["sh", "-c", ": > first; : > second; : > third"].map(String::from);
     let made = |number| {
-        let settle = |command: &mut Command| {
+        let prepare = |command: &mut Command| {
             command.current_dir(directory.path());
         };
-        let followed = follow(&words, settle, Target::Command, Some((Call::Create, number)));
+        let followed = follow(&words, prepare, Target::Command, Some((Call::Create, number)));
         let mut names: Vec<_> = std::fs::read_dir(directory.path())
             .unwrap()
             .map(|entry| entry.unwrap().file_name().into_string().unwrap())
@@ -167,63 +167,63 @@ fn who_is_killed_before_a_call_has_not_made_it() {
     assert_eq!(names, ["first", "second", "third"]);
 }
 
-fn a_role_killed_before_a_call_of_its_start_is_replaced_and_the_run_ends_as_it_was_to() {
-    some(User::Own, &[Mode::Free], &ROLES, [2, 3, 1]);
+fn a_role_killed_before_a_call_is_replaced_and_the_run_completes() {
+    kill_before_some_calls(User::Own, &[Mode::Free], &ROLES, [2, 3, 1]);
 }
 
-fn an_evaluator_killed_before_a_call_of_its_start_is_replaced() {
-    // A free run may wait some seconds for its last evaluation.
-    some(User::Own, &[Mode::Free], &[EVALUATOR], [1, 1, 0]);
+fn an_evaluator_killed_before_a_call_is_replaced() {
+    // Few kills, because a free run may wait some seconds for its last evaluation.
+    kill_before_some_calls(User::Own, &[Mode::Free], &[EVALUATOR], [1, 1, 0]);
 }
 
-fn in_lockstep_the_run_ends_with_the_same_bits_too() {
-    let everybody = [&ROLES[..], &[EVALUATOR]].concat();
-    some(User::Own, &[Mode::Lockstep], &everybody, [1, 1, 1]);
+fn a_lockstep_run_with_a_kill_ends_with_the_same_bits() {
+    let all_roles = [&ROLES[..], &[EVALUATOR]].concat();
+    kill_before_some_calls(User::Own, &[Mode::Lockstep], &all_roles, [1, 1, 1]);
 }
 
-fn when_the_launcher_is_killed_before_a_call_its_roles_end_and_the_run_goes_on_when_it_is_resumed() {
-    some(User::Own, &Mode::BOTH, &[Victim::Launcher], [1, 1, 1]);
+fn after_a_kill_of_the_launcher_its_roles_end_and_the_run_can_be_resumed() {
+    kill_before_some_calls(User::Own, &Mode::BOTH, &[Victim::Launcher], [1, 1, 1]);
 }
 
-fn a_command_killed_before_a_call_does_not_disturb_the_run_that_it_asks() {
-    let askers = ["status", "scale", "stop"].map(Victim::Asker);
-    some(User::Own, &[Mode::Free], &askers, [1, 1, 0]);
+fn a_command_killed_before_a_call_does_not_disturb_its_run() {
+    let commands = ["status", "scale", "stop"].map(Victim::Command);
+    kill_before_some_calls(User::Own, &[Mode::Free], &commands, [1, 1, 0]);
 }
 
-fn a_clean_up_that_is_killed_before_a_call_is_done_again() {
-    some(User::Own, &Mode::BOTH, &[Victim::CleanUp], [1, 2, 1]);
+fn a_clean_up_killed_before_a_call_is_repeated() {
+    kill_before_some_calls(User::Own, &Mode::BOTH, &[Victim::CleanUp], [1, 2, 1]);
 }
 
 fn a_python_server_killed_before_a_call_is_replaced() {
-    some(User::Own, &[Mode::Free], &[Victim::Python(0)], [1, 1, 1]);
+    kill_before_some_calls(User::Own, &[Mode::Free], &[Victim::Python(0)], [1, 1, 1]);
 }
 
-fn an_ordinary_users_run_goes_on_where_roots_does() {
-    some(User::Nobody, &[Mode::Free], &ROLES, [1, 2, 0]);
+fn an_ordinary_users_run_survives_the_same_kills() {
+    kill_before_some_calls(User::Nobody, &[Mode::Free], &ROLES, [1, 2, 0]);
 }
 
 fn every_crash_point() {
     let upto: u32 = number("SHOAL_CRASH_UPTO").unwrap_or(200);
-    let chosen = |variable: &str, name: &str| list(variable).is_none_or(|names| names.iter().any(|it| it == name));
+    let is_chosen = |variable: &str, name: &str| list(variable).is_none_or(|names| names.iter().any(|it| it == name));
     let named = list("SHOAL_CRASH_CALLS");
     let mut victims: Vec<_> = Victim::ALL.into();
-    victims.retain(|victim| chosen("SHOAL_CRASH_ROLES", &victim.to_string()));
-    assert!(!victims.is_empty(), "SHOAL_CRASH_ROLES names nobody");
+    victims.retain(|victim| is_chosen("SHOAL_CRASH_ROLES", &victim.to_string()));
+    assert!(!victims.is_empty(), "SHOAL_CRASH_ROLES names no known process");
     let has_python = victims.iter().any(|victim| matches!(victim, Victim::Python(_)));
     if let Some(missing) = PYTHON.missing().filter(|_| has_python) {
         eprintln!("left out: {missing}");
         victims.retain(|victim| !matches!(victim, Victim::Python(_)));
     }
     let mut modes: Vec<_> = Mode::BOTH.into();
-    modes.retain(|mode| chosen("SHOAL_CRASH_MODES", mode.name()));
-    // What is created is opened.
-    let is_meant = |call: Call| match &named {
+    modes.retain(|mode| is_chosen("SHOAL_CRASH_MODES", mode.name()));
+    // `open` covers `create`.
+    let is_selected = |call: Call| match &named {
         None => call != Call::Create,
         Some(names) => names.iter().any(|name| name == call.name()),
     };
     let mut table = Table::default();
     for (user, name) in [(User::Own, "own"), (User::Nobody, "nobody")] {
-        if !chosen("SHOAL_CRASH_USERS", name) {
+        if !is_chosen("SHOAL_CRASH_USERS", name) {
             continue;
         }
         if let Some(missing) = ROOT.missing().filter(|_| user == User::Nobody) {
@@ -235,20 +235,20 @@ fn every_crash_point() {
             modes: &modes,
             victims: victims.clone(),
             points: &|victim, call, count| match victim {
-                // Python opens too many files of its own; those it makes are looked at.
+                // Python opens too many files of its own, so only calls that create files are tried.
                 Victim::Python(_) if named.is_none() && call == Call::Create => (1..=count.min(upto)).collect(),
-                _ if is_meant(call) => (1..=count.min(upto)).collect(),
+                _ if is_selected(call) => (1..=count.min(upto)).collect(),
                 _ => Vec::new(),
             },
-            patience: usize::MAX,
+            max_failures: usize::MAX,
         };
         table.join(sweep.run());
     }
     eprint!("{}", table.text());
-    table.evaluate();
+    table.assert_no_failures();
 }
 
-/// Which roles are killed.
+/// Sets of roles to kill; the empty set stands for all roles.
 const SETS: [&[&str]; 5] = [
     &["env-server"],
     &["env-server", "actor"],
@@ -273,19 +273,19 @@ fn schedules(sets: &[&'static [&'static str]], actors: &[u32], bursts: u32, seed
     let mut failures = Vec::new();
     for (schedule, result) in results {
         match result {
-            Ok(kills) => eprintln!("{schedule}: {kills} kills, always went on"),
+            Ok(kills) => eprintln!("{schedule}: {kills} kills, the run always recovered"),
             Err(what) => failures.push(what),
         }
     }
     assert!(
         failures.is_empty(),
-        "{} schedules:\n{}",
+        "{} schedules failed:\n{}",
         failures.len(),
         failures.join("\n\n")
     );
 }
 
-fn who_is_killed_faster_than_it_can_begin_is_at_work_again_soon_after() {
+fn roles_killed_faster_than_they_can_start_recover_soon_after() {
     schedules(&[&["env-server"], &[]], &[1], 3, 1);
 }
 
@@ -294,7 +294,7 @@ fn hostile_schedules_of_kills_never_stop_a_run() {
     schedules(&SETS, &[1, 2], bursts, number("SHOAL_CRASH_SEED").unwrap_or(1));
 }
 
-fn a_million_steps_are_taken_under_a_kill_every_tenth_of_a_second() {
+fn a_million_steps_with_a_kill_every_tenth_of_a_second() {
     let steps = number("SHOAL_CRASH_STEPS").unwrap_or(1_000_000);
     let limit = Duration::from_secs(3600);
     let often = Some(Duration::from_millis(100));

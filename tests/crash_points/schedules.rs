@@ -1,4 +1,4 @@
-//! Kills that come faster than a process can begin its work, and what has to follow.
+//! Kills in quick succession, faster than a process can start, and the recovery that must follow.
 
 use std::time::{Duration, Instant};
 
@@ -6,31 +6,31 @@ use rand::{RngExt, SeedableRng};
 use shoal_common::commit::CommitReader;
 use shoal_common::stream::Stream;
 
-use crate::place::{Place, Program, User, kill};
 use crate::sweep::Permit;
 use crate::trial::{Mode, SMALL, explain, until, weights};
+use crate::workplace::{Program, User, Workplace, kill};
 
-/// The roles that a schedule kills, and the run it does that in.
+/// The roles to kill, and the run in which they are killed.
 #[derive(Clone, Copy)]
 pub(crate) struct Schedule {
-    /// None of them: every role.
+    /// Empty for every role.
     pub(crate) roles: &'static [&'static str],
     pub(crate) mode: Mode,
     pub(crate) actors: u32,
     pub(crate) seed: u64,
 }
 
-/// From one kill to the next, in milliseconds.
+/// Pauses between kills, in milliseconds.
 const PAUSES: std::ops::Range<u64> = 30..200;
 
-/// How long it is killed, before it is left alone.
+/// Length of a burst of kills.
 const BURST: Duration = Duration::from_secs(3);
 
-/// Within so long after a burst new steps are in the replay.
-const RECOVERY: Duration = Duration::from_secs(15);
+/// Longest wait for new steps in the replay after a burst.
+const RECOVERY_TIMEOUT: Duration = Duration::from_secs(15);
 
-/// A run may take so long to begin, and to end.
-const PATIENCE: Duration = Duration::from_secs(60);
+/// Longest wait for the start and for the end of a run.
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 impl std::fmt::Display for Schedule {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
@@ -47,18 +47,18 @@ impl std::fmt::Display for Schedule {
 }
 
 impl Schedule {
-    /// Kills in so many bursts; how many kills that were.
+    /// Runs with `bursts` bursts of kills and checks the recovery after each. Returns the number of kills.
     pub(crate) fn bursts(&self, bursts: u32) -> Result<u32, String> {
         let _permit = Permit::take();
         let program = Program::of(User::Own);
-        let place = Place::new(&program);
+        let place = Workplace::new(&program);
         let mut kills = 0;
         let done = self.bursts_in(&place, bursts, &mut kills);
         done.map_err(|what| explain(&place, format!("{self}: after {kills} kills {what}")))?;
         Ok(kills)
     }
 
-    fn bursts_in(&self, place: &Place<'_>, bursts: u32, kills: &mut u32) -> Result<(), String> {
+    fn bursts_in(&self, place: &Workplace<'_>, bursts: u32, kills: &mut u32) -> Result<(), String> {
         let mut launcher = self.start(
             place,
             100_000_000,
@@ -70,34 +70,34 @@ impl Schedule {
                 .unwrap()
                 .map(|status| format!("the launcher ended: {status}"))
         };
-        until(PATIENCE, "steps are made", || rows(place) > 0 || ended().is_some())?;
+        until(TIMEOUT, "steps are committed", || rows(place) > 0 || ended().is_some())?;
         let mut rng = Stream::seed_from_u64(self.seed);
         for _ in 0..bursts {
             let begun = Instant::now();
             while begun.elapsed() < BURST {
-                // The pauses are the schedule.
                 std::thread::sleep(Duration::from_millis(rng.random_range(PAUSES)));
                 *kills += u32::from(self.kill_one(place, &mut rng));
             }
             let before = rows(place);
-            until(RECOVERY, "new steps are made", || {
+            until(RECOVERY_TIMEOUT, "new steps are committed", || {
                 rows(place) > before || ended().is_some()
             })?;
             if let Some(how) = ended() {
                 return Err(how);
             }
         }
-        match place.run("stop", &["stop", "run"], PATIENCE)? {
+        match place.run("stop", &["stop", "run"], TIMEOUT)? {
             0 => {}
             code => return Err(format!("stop ended with {code}")),
         }
-        match place.wait(launcher, "train", PATIENCE)? {
-            0 => is_tidy(place),
+        match place.wait(launcher, "train", TIMEOUT)? {
+            0 => check_leftovers(place),
             code => Err(format!("the run ended with {code}")),
         }
     }
 
-    /// A run of so many steps to its end, with a kill every so often; how many, how long it took, and the weights.
+    /// A run of `steps` environment steps to its end, with a kill after every interval `every`. Returns the number of
+    /// kills, the duration and the hash of the weights.
     pub(crate) fn to_the_end(
         self,
         steps: u64,
@@ -106,7 +106,7 @@ impl Schedule {
     ) -> Result<(u32, Duration, String), String> {
         let _permit = Permit::take();
         let program = Program::of(User::Own);
-        let place = Place::new(&program);
+        let place = Workplace::new(&program);
         let mut kills = 0;
         let begun = Instant::now();
         let mut done = || {
@@ -121,14 +121,13 @@ impl Schedule {
                 && begun.elapsed() < limit
                 && launcher.try_wait().unwrap().is_none()
             {
-                // The pauses are the schedule.
                 std::thread::sleep(every);
                 kills += u32::from(self.kill_one(&place, &mut rng));
             }
             let taken = |place| format!("with {} of {steps} steps taken", rows(place));
             let code = place.wait(launcher, "train", limit.saturating_sub(begun.elapsed()));
             match code.map_err(|what| format!("{what}, {}", taken(&place)))? {
-                0 => is_tidy(&place)?,
+                0 => check_leftovers(&place)?,
                 code => return Err(format!("the run ended with {code}, {}", taken(&place))),
             }
             weights(&place, "run")
@@ -139,42 +138,42 @@ impl Schedule {
         }
     }
 
-    fn start(&self, place: &Place<'_>, steps: u64, settings: &[&str]) -> std::process::Child {
+    fn start(&self, place: &Workplace<'_>, steps: u64, settings: &[&str]) -> std::process::Child {
         let (seed, actors, steps) = (self.seed.to_string(), self.actors.to_string(), steps.to_string());
         let plain = [
             "train", "pendulum", "--run", "run", "--quiet", "--json", "--seed", &seed,
         ];
         let size = ["--actors", &actors, "--steps", &steps];
         let mut words = [&plain[..], &size, &SMALL].concat();
-        words.extend(settings.iter().flat_map(|setting| ["--set", setting]));
+        words.extend(settings.iter().flat_map(|prepare| ["--set", prepare]));
         words.extend((self.mode == Mode::Lockstep).then_some("--lockstep"));
         place.start("train", &words)
     }
 
-    /// Kills one process of the roles; whether there was one.
-    fn kill_one(&self, place: &Place<'_>, rng: &mut Stream) -> bool {
-        let is_meant = |words: &String| {
+    /// Kills a random process of the roles. Returns whether there was one.
+    fn kill_one(&self, place: &Workplace<'_>, rng: &mut Stream) -> bool {
+        let is_selected = |words: &String| {
             let role = words.split(' ').nth(1).unwrap_or_default();
             ["learner", "actor", "env-server", "evaluator"].contains(&role)
                 && (self.roles.is_empty() || self.roles.contains(&role))
         };
-        let mut there = place.processes();
-        there.retain(|(_, words)| is_meant(words));
-        there.sort_unstable();
-        !there.is_empty() && kill(there[rng.random_range(0..there.len())].0)
+        let mut processes = place.processes();
+        processes.retain(|(_, words)| is_selected(words));
+        processes.sort_unstable();
+        !processes.is_empty() && kill(processes[rng.random_range(0..processes.len())].0)
     }
 }
 
-/// Rows in the replay of the place's run.
-fn rows(place: &Place<'_>) -> u64 {
+/// Committed rows of the run.
+fn rows(place: &Workplace<'_>) -> u64 {
     CommitReader::open(&place.path("run/replay.bin")).map_or(0, |commits| commits.rows())
 }
 
-/// Nothing of the run is left.
-fn is_tidy(place: &Place<'_>) -> Result<(), String> {
-    place.is_left_within(Duration::from_secs(5))?;
-    match place.traces("run") {
-        traces if traces.is_empty() => Ok(()),
-        traces => Err(format!("{} files are left: {traces:?}", traces.len())),
+/// Checks that no process and no file of the run is left.
+fn check_leftovers(place: &Workplace<'_>) -> Result<(), String> {
+    place.wait_until_empty(Duration::from_secs(5))?;
+    match place.leftovers("run") {
+        leftovers if leftovers.is_empty() => Ok(()),
+        leftovers => Err(format!("{} files are left: {leftovers:?}", leftovers.len())),
     }
 }

@@ -1,14 +1,14 @@
-//! Many kills, some at a time, and a table of what came of them.
+//! Many kills, several at a time, and a table of their results.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::sync::{Condvar, Mutex};
 
 use crate::calls::Call;
-use crate::place::{Program, User};
-use crate::trial::{Calm, Mode, Scene, Verdict, Victim};
+use crate::trial::{Baseline, Case, Mode, Outcome, Victim};
+use crate::workplace::{Program, User};
 
-/// Runs at a time, of all tests of this process together.
+/// Limit on the number of runs at the same time, of all tests of this process together.
 pub(crate) fn jobs() -> usize {
     number("SHOAL_CRASH_JOBS").unwrap_or(2).max(1)
 }
@@ -16,11 +16,11 @@ pub(crate) fn jobs() -> usize {
 pub(crate) fn number<N: std::str::FromStr>(variable: &str) -> Option<N> {
     let text = std::env::var(variable).ok()?;
     let parsed = text.parse().ok();
-    assert!(parsed.is_some(), "{variable}={text} is no number");
+    assert!(parsed.is_some(), "{variable}={text} is not a number");
     parsed
 }
 
-/// The words of a list in an environment variable.
+/// The entries of a comma-separated list in an environment variable.
 pub(crate) fn list(variable: &str) -> Option<Vec<String>> {
     let text = std::env::var(variable).ok()?;
     Some(text.split(',').map(|word| word.trim().to_owned()).collect())
@@ -28,7 +28,7 @@ pub(crate) fn list(variable: &str) -> Option<Vec<String>> {
 
 static RUNNING: (Mutex<usize>, Condvar) = (Mutex::new(0), Condvar::new());
 
-/// The right to have a run under way.
+/// Permission to have a run running.
 pub(crate) struct Permit;
 
 impl Permit {
@@ -49,18 +49,18 @@ impl Drop for Permit {
     }
 }
 
-/// Victims, calls and numbers to try.
+/// Kills to try: processes, modes, calls and the numbers of the calls.
 pub(crate) struct Sweep<'a> {
     pub(crate) user: User,
     pub(crate) modes: &'a [Mode],
     pub(crate) victims: Vec<Victim>,
-    /// Before which of a victim's calls of a kind it is killed, where it begins so many.
+    /// Maps a victim, a kind of call and the number of such calls in an undisturbed run to the calls to kill before.
     pub(crate) points: &'a (dyn Fn(Victim, Call, u32) -> Vec<u32> + Sync),
-    /// It ends after so many failures.
-    pub(crate) patience: usize,
+    /// The sweep stops after this many failures.
+    pub(crate) max_failures: usize,
 }
 
-/// What came of the kills before one kind of call.
+/// Results of the kills before one kind of call.
 #[derive(Clone, Copy, Default)]
 struct Row {
     tried: u32,
@@ -68,7 +68,7 @@ struct Row {
     failed: u32,
 }
 
-/// What came of all.
+/// Results of all kills.
 #[derive(Default)]
 pub(crate) struct Table {
     rows: BTreeMap<(String, Call), Row>,
@@ -77,50 +77,50 @@ pub(crate) struct Table {
 }
 
 struct Point<'a> {
-    scene: Scene<'a>,
-    calm: &'a Calm,
+    case: Case<'a>,
+    baseline: &'a Baseline,
     call: Call,
     number: u32,
 }
 
 impl Sweep<'_> {
-    /// Does it all.
+    /// Runs everything.
     pub(crate) fn run(&self) -> Table {
         let program = Program::of(self.user);
         let mut table = Table::default();
-        let scenes = self.victims.iter().flat_map(|victim| {
-            self.modes.iter().map(|mode| Scene {
+        let cases = self.victims.iter().flat_map(|victim| {
+            self.modes.iter().map(|mode| Case {
                 program: &program,
                 victim: *victim,
                 mode: *mode,
             })
         });
-        // A lockstep run is asked nothing that changes it.
-        let scenes = scenes.filter(|scene| (scene.victim, scene.mode) != (Victim::Asker("scale"), Mode::Lockstep));
-        let calms = in_parallel(scenes.collect(), |scene: Scene<'_>| {
+        // A lockstep run cannot be scaled.
+        let cases = cases.filter(|case| (case.victim, case.mode) != (Victim::Command("scale"), Mode::Lockstep));
+        let baselines = in_parallel(cases.collect(), |case: Case<'_>| {
             let _permit = Permit::take();
-            (scene, scene.calm())
+            (case, case.baseline())
         });
         let mut known = Vec::new();
-        for (scene, calm) in calms {
-            match calm {
+        for (case, baseline) in baselines {
+            match baseline {
                 Err(errno) => table
                     .failures
-                    .push(format!("{}, cannot be traced: {errno}", self.name(scene))),
+                    .push(format!("{}, cannot be traced: {errno}", self.name(case))),
                 Ok(Err(what)) => table
                     .failures
-                    .push(format!("{}, nobody killed: {what}", self.name(scene))),
-                Ok(Ok(calm)) => known.push((scene, calm)),
+                    .push(format!("{}, without a kill: {what}", self.name(case))),
+                Ok(Ok(baseline)) => known.push((case, baseline)),
             }
         }
         let mut points = Vec::new();
-        for (scene, calm) in &known {
-            for call in scene.victim.calls() {
-                let count = calm.counts.get(&call).copied().unwrap_or(0);
-                let numbers = (self.points)(scene.victim, call, count).into_iter();
+        for (case, baseline) in &known {
+            for call in case.victim.calls() {
+                let count = baseline.counts.get(&call).copied().unwrap_or(0);
+                let numbers = (self.points)(case.victim, call, count).into_iter();
                 points.extend(numbers.map(|number| Point {
-                    scene: *scene,
-                    calm,
+                    case: *case,
+                    baseline,
                     call,
                     number,
                 }));
@@ -133,50 +133,50 @@ impl Sweep<'_> {
 
     fn attempt(&self, point: &Point<'_>, table: &Mutex<Table>) {
         let _permit = Permit::take();
-        if table.lock().unwrap().failures.len() >= self.patience {
+        if table.lock().unwrap().failures.len() >= self.max_failures {
             return;
         }
         let Point {
-            scene,
-            calm,
+            case,
+            baseline,
             call,
             number,
         } = *point;
-        let verdict = scene.kill_before(call, number, calm);
+        let outcome = case.kill_before(call, number, baseline);
         let mut table = table.lock().unwrap();
-        let row = table.rows.entry((self.name(scene), call)).or_default();
+        let row = table.rows.entry((self.name(case), call)).or_default();
         row.tried += 1;
-        row.hit += u32::from(!matches!(verdict, Verdict::NotReached));
-        row.failed += u32::from(matches!(verdict, Verdict::Failed(_)));
-        table.hit += u32::from(!matches!(verdict, Verdict::NotReached));
-        if let Verdict::Failed(what) = verdict {
+        row.hit += u32::from(!matches!(outcome, Outcome::NotReached));
+        row.failed += u32::from(matches!(outcome, Outcome::Failed(_)));
+        table.hit += u32::from(!matches!(outcome, Outcome::NotReached));
+        if let Outcome::Failed(what) = outcome {
             let text = format!(
                 "{} killed before its {} number {number}: {what}",
-                self.name(scene),
+                self.name(case),
                 call.name()
             );
-            // The whole of it comes at the end.
+            // The complete text is printed at the end.
             eprintln!("{}", text.lines().next().unwrap_or_default());
             table.failures.push(text);
         }
     }
 
-    fn name(&self, scene: Scene<'_>) -> String {
+    fn name(&self, case: Case<'_>) -> String {
         let user = match self.user {
             User::Own => "",
             User::Nobody => ", nobody",
         };
-        format!("{} ({}{user})", scene.victim, scene.mode.name())
+        format!("{} ({}{user})", case.victim, case.mode.name())
     }
 }
 
 impl Table {
-    /// Fails with everything that went wrong.
-    pub(crate) fn evaluate(&self) {
+    /// Panics with all failures if there are any.
+    pub(crate) fn assert_no_failures(&self) {
         let failures = self.failures.join("\n\n");
         assert!(
             self.failures.is_empty(),
-            "{} of {} kills:\n{failures}",
+            "{} of {} kills failed:\n{failures}",
             self.failures.len(),
             self.hit
         );
@@ -207,7 +207,7 @@ impl Table {
     }
 }
 
-/// Does something with each of these, some at a time; the results in the same order.
+/// Calls `work` with each item, several at a time. The results have the order of the items.
 pub(crate) fn in_parallel<T: Send, R: Send>(items: Vec<T>, work: impl Fn(T) -> R + Sync) -> Vec<R> {
     let mut results: Vec<Option<R>> = items.iter().map(|_| None).collect();
     let left = Mutex::new(items.into_iter().zip(results.iter_mut()));

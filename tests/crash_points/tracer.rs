@@ -1,7 +1,7 @@
-//! Follows a command and what it starts until the process that is to die, and kills that one just before a system call.
+//! Traces a command and its descendants until the target process appears, and kills that one just before a system call.
 //!
-//! Everybody else is let go as soon as it is known who it is, and runs at full speed. Tracing is a thread's: what is
-//! traced dies with the thread, so nothing stays behind stopped.
+//! Other processes are detached as soon as they are recognised and then run at full speed. Traced processes die with
+//! the tracing thread, so none is left stopped.
 
 use std::collections::BTreeMap;
 use std::io::Write;
@@ -16,61 +16,64 @@ use nix::unistd::Pid;
 
 use crate::calls::{Call, Entry};
 
-/// Which process is to die.
+/// The process to kill.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Target {
     /// The command itself.
     Command,
     /// The first process of a role.
     Role(&'static str, u32),
-    /// The first process of an environment server that is another program, from where it is that program.
+    /// The first process of an environment server that is another program, from the moment it executes that program.
     Program(u32),
 }
 
-/// Before which of its calls it is to die; the first is number 1.
-pub(crate) type Aim = (Call, u32);
+/// The call before which to kill the target: its kind, and its number among those of this kind, from 1.
+pub(crate) type CrashPoint = (Call, u32);
 
-/// What became of a followed command.
+/// The result of a traced command.
 #[derive(Debug, Default)]
 pub(crate) struct Followed {
-    /// Its exit code, or the signal that ended it, negative.
+    /// Its exit code, or the negated signal that ended it.
     pub(crate) code: i32,
-    /// What the call was about before which the target was killed; `None` where it never made that call.
+    /// The path or file of the call before which the target was killed; `None` if it never made that call.
     pub(crate) hit: Option<String>,
-    /// How many calls of each kind the target began.
+    /// Calls of each kind that the target began.
     pub(crate) counts: BTreeMap<Call, u32>,
 }
 
-/// Whether this machine, and this kind of processor, allows to trace a child.
+/// Whether this machine allows tracing a child, and its processor is supported.
 pub(crate) fn is_allowed() -> bool {
     let nothing = ["true".to_owned()];
     cfg!(any(target_arch = "x86_64", target_arch = "aarch64"))
         && follow(&nothing, |_| (), Target::Command, None).is_ok()
 }
 
-/// Starts the program with these arguments as `setting` says, and waits until it has ended; whoever calls this sees to it
-/// that it ends. `Err` where the machine allows no tracing.
+/// Starts `program`, a command line, after `prepare` has configured the command, and waits until it has ended. The
+/// caller must ensure that it ends. Returns an error if the machine does not allow tracing.
 pub(crate) fn follow(
     program: &[String],
-    setting: impl FnOnce(&mut Command),
+    prepare: impl FnOnce(&mut Command),
     target: Target,
-    aim: Option<Aim>,
+    crash_point: Option<CrashPoint>,
 ) -> nix::Result<Followed> {
-    // The shell waits for a word, and so can be seized before the program begins.
+    // The shell waits for a line, so that it can be seized before the program starts.
     let mut command = Command::new("sh");
     command
         .args(["-c", "read -r word && exec \"$@\" </dev/null", "sh"])
         .args(program);
-    setting(&mut command);
+    prepare(&mut command);
     command.stdin(Stdio::piped());
-    // The threads of a process have children of their own, and these are waited for here.
+    // In a separate thread, which waits for all of its children and for no others.
     let following = std::thread::Builder::new().name("tracer".into());
     let following = following.spawn(move || {
-        #[expect(clippy::zombie_processes, reason = "all children of this thread are waited for")]
+        #[expect(
+            clippy::zombie_processes,
+            reason = "the tracer waits for all children of this thread"
+        )]
         let mut child = command.spawn().unwrap();
         let root = Pid::from_raw(child.id() as i32);
-        let seized = ptrace::seize(root, everything());
-        let mut tracer = Tracer::new(root, target, aim);
+        let seized = ptrace::seize(root, descendants());
+        let mut tracer = Tracer::new(root, target, crash_point);
         match seized {
             Ok(()) => child.stdin.take().unwrap().write_all(b"go\n").unwrap(),
             Err(_) => drop(child.stdin.take()),
@@ -81,13 +84,13 @@ pub(crate) fn follow(
     following.unwrap().join().unwrap()
 }
 
-/// How a process is traced that may start the target.
-fn everything() -> Options {
+/// Options for a process that may start the target.
+fn descendants() -> Options {
     let starts = Options::PTRACE_O_TRACEFORK | Options::PTRACE_O_TRACEVFORK | Options::PTRACE_O_TRACECLONE;
     starts | Options::PTRACE_O_TRACEEXEC | Options::PTRACE_O_EXITKILL
 }
 
-/// How the target is traced: its threads too, and nothing that it starts.
+/// Options for the target: includes its threads, but not its children.
 fn threads_and_calls() -> Options {
     Options::PTRACE_O_TRACECLONE | Options::PTRACE_O_TRACESYSGOOD | Options::PTRACE_O_EXITKILL
 }
@@ -95,46 +98,46 @@ fn threads_and_calls() -> Options {
 struct Tracer {
     root: Pid,
     target: Target,
-    aim: Option<Aim>,
-    /// The target's process, once it is there.
+    crash_point: Option<CrashPoint>,
+    /// The target's process, once it exists.
     found: Option<Pid>,
-    /// Every thread that is traced, and whether it is the target's.
+    /// All traced threads, and whether each belongs to the target.
     threads: BTreeMap<Pid, bool>,
     followed: Followed,
 }
 
 impl Tracer {
-    fn new(root: Pid, target: Target, aim: Option<Aim>) -> Self {
+    fn new(root: Pid, target: Target, crash_point: Option<CrashPoint>) -> Self {
         Self {
             root,
             target,
-            aim,
+            crash_point,
             found: None,
             threads: [(root, false)].into(),
             followed: Followed::default(),
         }
     }
 
-    /// Until no child of this thread is left, traced or not.
+    /// Handles events until no child of this thread is left, traced or not.
     fn follow(&mut self) {
         loop {
             match waitpid(None, Some(WaitPidFlag::__WALL | WaitPidFlag::__WNOTHREAD)) {
-                Ok(status) => self.look_at(status),
+                Ok(status) => self.handle(status),
                 Err(Errno::ECHILD) => return,
-                // Interrupted, or ended by a signal that has no name.
+                // The wait was interrupted, or the child was ended by a signal unknown to nix.
                 Err(_) => {}
             }
         }
     }
 
-    fn look_at(&mut self, status: WaitStatus) {
+    fn handle(&mut self, status: WaitStatus) {
         match status {
             WaitStatus::Exited(process, code) => self.ended(process, code),
             WaitStatus::Signaled(process, signal, _) => self.ended(process, -(signal as i32)),
             WaitStatus::PtraceSyscall(thread) => self.enters(thread),
-            WaitStatus::PtraceEvent(process, _, libc::PTRACE_EVENT_EXEC) => self.begins(process),
-            WaitStatus::PtraceEvent(thread, ..) => self.go_on(thread, None),
-            WaitStatus::Stopped(thread, signal) => self.go_on(thread, Some(signal)),
+            WaitStatus::PtraceEvent(process, _, libc::PTRACE_EVENT_EXEC) => self.executes(process),
+            WaitStatus::PtraceEvent(thread, ..) => self.resume(thread, None),
+            WaitStatus::Stopped(thread, signal) => self.resume(thread, Some(signal)),
             WaitStatus::Continued(_) | WaitStatus::StillAlive => {}
         }
     }
@@ -146,29 +149,29 @@ impl Tracer {
         }
     }
 
-    /// A process has become another program.
-    fn begins(&mut self, process: Pid) {
+    /// Handles the event that a process executes another program.
+    fn executes(&mut self, process: Pid) {
         let words = std::fs::read(format!("/proc/{process}/cmdline")).unwrap_or_default();
         let words = String::from_utf8_lossy(&words).into_owned();
         let words: Vec<&str> = words.split('\0').collect();
         match self.is_target(process, &words) {
-            _ if self.found.is_some() => self.go_on(process, None),
+            _ if self.found.is_some() => self.resume(process, None),
             Some(true) => {
                 self.found = Some(process);
                 self.threads.insert(process, true);
                 let _ = ptrace::setoptions(process, threads_and_calls());
-                self.go_on(process, None);
+                self.resume(process, None);
                 for (other, _) in self.threads.iter().filter(|(_, is_target)| !**is_target) {
-                    // They stop, and are let go.
+                    // They stop, and are then detached.
                     let _ = ptrace::interrupt(*other);
                 }
             }
-            Some(false) => self.go_on(process, None),
-            None => self.continue_thread(process, None),
+            Some(false) => self.resume(process, None),
+            None => self.detach(process, None),
         }
     }
 
-    /// Whether this is the target; `None` where it neither is nor can start it or become it.
+    /// Whether this is the target; `None` if it neither is the target nor can become or start it.
     fn is_target(&self, process: Pid, words: &[&str]) -> Option<bool> {
         let role = |name: &str, index: u32| words.get(1) == Some(&name) && words.get(3) == Some(&&*index.to_string());
         match self.target {
@@ -176,7 +179,7 @@ impl Tracer {
             _ if process == self.root => Some(false),
             Target::Role(name, index) => role(name, index).then_some(true),
             Target::Program(index) if role("env-server", index) => {
-                // What follows is the program itself.
+                // This process will execute the program.
                 Some(false)
             }
             Target::Program(index) => {
@@ -188,37 +191,37 @@ impl Tracer {
         }
     }
 
-    /// The target enters or leaves a system call.
+    /// Handles the event that the target enters or leaves a system call.
     fn enters(&mut self, thread: Pid) {
         let Some(entry) = Entry::of(thread) else {
-            return self.go_on(thread, None);
+            return self.resume(thread, None);
         };
         for call in entry.kinds() {
             let count = self.followed.counts.entry(call).or_default();
             *count += 1;
-            if self.aim == Some((call, *count)) && self.followed.hit.is_none() {
+            if self.crash_point == Some((call, *count)) && self.followed.hit.is_none() {
                 self.followed.hit = Some(entry.subject());
-                // A thread that is killed here does not make the call.
+                // A thread that is killed at this point does not make the call.
                 let _ = kill(self.found.unwrap_or(thread), Signal::SIGKILL);
                 return;
             }
         }
-        self.go_on(thread, None);
+        self.resume(thread, None);
     }
 
-    fn go_on(&mut self, thread: Pid, signal: Option<Signal>) {
+    fn resume(&mut self, thread: Pid, signal: Option<Signal>) {
         let known = self.threads.get(&thread).copied();
         let is_target = known.unwrap_or_else(|| self.found.is_some() && process_of(thread) == self.found);
         self.threads.insert(thread, is_target);
-        // Whoever was killed meanwhile cannot go on, and says so next.
+        // This fails for a process that was killed in the meantime; its end is reported next.
         let _ = match (is_target, self.found) {
             (true, _) => ptrace::syscall(thread, signal),
             (false, None) => ptrace::cont(thread, signal),
-            (false, Some(_)) => return self.continue_thread(thread, signal),
+            (false, Some(_)) => return self.detach(thread, signal),
         };
     }
 
-    fn continue_thread(&mut self, thread: Pid, signal: Option<Signal>) {
+    fn detach(&mut self, thread: Pid, signal: Option<Signal>) {
         self.threads.remove(&thread);
         let _ = ptrace::detach(thread, signal);
     }

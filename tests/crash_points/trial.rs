@@ -1,4 +1,4 @@
-//! One kill before one system call of one process, and what has to follow.
+//! One kill of one process before one system call, and the checks of the run afterwards.
 
 use std::fmt;
 use std::process::Command;
@@ -12,23 +12,23 @@ use shoal_learner::networks::digest;
 use shoal_learner::process::checkpoint::Checkpoints;
 
 use crate::calls::Call;
-use crate::place::{Place, Program, Watchdog};
 use crate::sweep::number;
 use crate::tracer::{Followed, Target, follow};
+use crate::workplace::{Program, Watchdog, Workplace};
 
-/// A run takes less than a second; after so long it hangs.
+/// A run that takes longer hangs; an ordinary one takes less than a second.
 fn limit() -> Duration {
     Duration::from_secs(number("SHOAL_CRASH_SECONDS").unwrap_or(60))
 }
 
-/// So long the roles of a launcher that was killed may take to end.
-const ENDING: Duration = Duration::from_secs(30);
+/// Longest wait for the roles to end after their launcher was killed.
+const ENDING_TIMEOUT: Duration = Duration::from_secs(30);
 
-/// Steps of a run in which a role is killed, and of one that is asked something.
+/// Steps of a run in which a role is killed, and of a run beside which a command is killed.
 const STEPS: u64 = 1500;
-const STEPS_WHILE_ASKED: u64 = 20_000;
+const STEPS_WITH_COMMAND: u64 = 20_000;
 
-/// The run's size: what is learned does not matter, only that it is learned to the end.
+/// Settings for a small run.
 pub(crate) const SMALL: [&str; 14] = [
     "--set",
     "ddpg.hidden=[8,8]",
@@ -63,21 +63,21 @@ impl Mode {
     }
 }
 
-/// Who is killed.
+/// The process to kill.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Victim {
     Role(&'static str, u32),
-    /// An environment server that is a program of Gymnasium's.
+    /// An environment server in Python.
     Python(u32),
     Launcher,
-    /// A command that is given while the run goes on.
-    Asker(&'static str),
-    /// The process that cleans up in shared memory after a killed actor. It is started here while the launcher is stopped,
-    /// which does it again then.
+    /// A command that is executed while the run is running.
+    Command(&'static str),
+    /// The process that cleans up shared memory after a killed actor. The test starts it while the launcher is stopped;
+    /// the launcher repeats the clean-up afterwards.
     CleanUp,
 }
 
-/// The environment server of the evaluator comes after those of all actors that there may be.
+/// Index of the evaluator's environment server: it follows those of all possible actors (`actors.max`).
 const EVALUATION: u32 = 4;
 
 impl Victim {
@@ -88,15 +88,15 @@ impl Victim {
         Self::Role("evaluator", 0),
         Self::Role("env-server", EVALUATION),
         Self::Launcher,
-        Self::Asker("status"),
-        Self::Asker("scale"),
-        Self::Asker("stop"),
+        Self::Command("status"),
+        Self::Command("scale"),
+        Self::Command("stop"),
         Self::CleanUp,
         Self::Python(0),
         Self::Python(EVALUATION),
     ];
 
-    /// Which calls are tried where none are named. Python opens hundreds of files of its own before it serves anything.
+    /// The calls to try. `open` is left out for Python, which opens hundreds of files of its own.
     pub(crate) fn calls(self) -> impl Iterator<Item = Call> {
         let all = Call::ALL.into_iter();
         all.filter(move |call| !matches!((self, call), (Self::Python(_), Call::Open)))
@@ -106,11 +106,11 @@ impl Victim {
         match self {
             Self::Role(name, index) => Target::Role(name, index),
             Self::Python(index) => Target::Program(index),
-            Self::Launcher | Self::Asker(_) | Self::CleanUp => Target::Command,
+            Self::Launcher | Self::Command(_) | Self::CleanUp => Target::Command,
         }
     }
 
-    /// What is trained.
+    /// The environment to train in.
     fn environment(self) -> &'static str {
         match self {
             Self::Python(_) => "gym:Pendulum-v1",
@@ -120,12 +120,12 @@ impl Victim {
 
     fn steps(self) -> u64 {
         match self {
-            Self::Asker(_) | Self::CleanUp => STEPS_WHILE_ASKED,
+            Self::Command(_) | Self::CleanUp => STEPS_WITH_COMMAND,
             _ => STEPS,
         }
     }
 
-    /// Whether a lockstep run ends with the same bits though this one was killed.
+    /// Whether a lockstep run ends with the same bits after this process was killed.
     fn keeps_bits(self) -> bool {
         !matches!(self, Self::Python(_))
     }
@@ -137,102 +137,103 @@ impl fmt::Display for Victim {
             Self::Role(name, index) => write!(f, "{name}-{index}"),
             Self::Python(index) => write!(f, "python-{index}"),
             Self::Launcher => write!(f, "launcher"),
-            Self::Asker(command) => write!(f, "{command}"),
+            Self::Command(command) => write!(f, "{command}"),
             Self::CleanUp => write!(f, "clean-up"),
         }
     }
 }
 
-/// A victim, and the run in which it is killed.
+/// A process to kill, and the run in which it is killed.
 #[derive(Clone, Copy)]
-pub(crate) struct Scene<'a> {
+pub(crate) struct Case<'a> {
     pub(crate) program: &'a Program,
     pub(crate) victim: Victim,
     pub(crate) mode: Mode,
 }
 
-/// What came of a kill.
-pub(crate) enum Verdict {
-    /// The victim never made that call.
+/// The result of a kill.
+pub(crate) enum Outcome {
+    /// The process never made that call.
     NotReached,
     Survived,
-    /// What went wrong.
     Failed(String),
 }
 
-/// A run that nobody is killed in.
-pub(crate) struct Calm {
-    /// How many calls of each kind the victim begins.
+/// The result of a run without a kill.
+pub(crate) struct Baseline {
+    /// Calls of each kind that the victim makes.
     pub(crate) counts: std::collections::BTreeMap<Call, u32>,
     weights: String,
 }
 
-impl Scene<'_> {
-    /// Runs it without a kill; the second `Err` is that the machine allows no tracing.
-    pub(crate) fn calm(&self) -> nix::Result<Result<Calm, String>> {
-        let place = Place::new(self.program);
+impl Case<'_> {
+    /// Runs without a kill. The outer error means that the machine does not allow tracing.
+    pub(crate) fn baseline(&self) -> nix::Result<Result<Baseline, String>> {
+        let place = Workplace::new(self.program);
         let traced = self.traced(&place, None);
         let explained = |what| explain(&place, what);
         Ok(match traced? {
             Err(what) => Err(explained(what)),
-            Ok(followed) => self
-                .all_is_well(&place, &followed, None)
-                .map_err(explained)
-                .and_then(|()| {
-                    Ok(Calm {
-                        counts: followed.counts,
-                        weights: weights(&place, "run").map_err(explained)?,
-                    })
-                }),
+            Ok(followed) => self.check(&place, &followed, None).map_err(explained).and_then(|()| {
+                Ok(Baseline {
+                    counts: followed.counts,
+                    weights: weights(&place, "run").map_err(explained)?,
+                })
+            }),
         })
     }
 
-    /// Kills the victim before the call.
-    pub(crate) fn kill_before(&self, call: Call, number: u32, calm: &Calm) -> Verdict {
-        let place = Place::new(self.program);
+    /// Kills the victim before a call, and checks the run.
+    pub(crate) fn kill_before(&self, call: Call, number: u32, baseline: &Baseline) -> Outcome {
+        let place = Workplace::new(self.program);
         let followed = match self.traced(&place, Some((call, number))) {
             Ok(Ok(followed)) => followed,
-            Ok(Err(what)) => return Verdict::Failed(explain(&place, what)),
-            Err(errno) => return Verdict::Failed(format!("cannot be traced: {errno}")),
+            Ok(Err(what)) => return Outcome::Failed(explain(&place, what)),
+            Err(errno) => return Outcome::Failed(format!("cannot be traced: {errno}")),
         };
-        match self.all_is_well(&place, &followed, Some(calm)) {
-            Err(what) => Verdict::Failed(explain(&place, format!("({}) {what}", about(&followed)))),
-            Ok(()) if followed.hit.is_none() => Verdict::NotReached,
-            Ok(()) => Verdict::Survived,
+        match self.check(&place, &followed, Some(baseline)) {
+            Err(what) => Outcome::Failed(explain(&place, format!("({}) {what}", description(&followed)))),
+            Ok(()) if followed.hit.is_none() => Outcome::NotReached,
+            Ok(()) => Outcome::Survived,
         }
     }
 
-    /// The run's first command to its end, and the victim's too where that is another one.
-    fn traced(&self, place: &Place<'_>, aim: Option<(Call, u32)>) -> nix::Result<Result<Followed, String>> {
+    /// Runs the training to its end, and the victim's command too if that is another one. Traces the victim's command.
+    fn traced(&self, place: &Workplace<'_>, crash_point: Option<(Call, u32)>) -> nix::Result<Result<Followed, String>> {
         let train = self.train("run");
         let train: Vec<&str> = train.iter().map(String::as_str).collect();
         let traced = |name: &str, arguments: &[&str]| {
             std::thread::scope(|scope| {
                 let watchdog = Watchdog::new(scope, place, limit());
-                let settle = |command: &mut Command| place.settle(command, name);
-                let followed = follow(&place.words(arguments), settle, self.victim.target(), aim);
+                let prepare = |command: &mut Command| place.prepare(command, name);
+                let followed = follow(
+                    &place.command_line(arguments),
+                    prepare,
+                    self.victim.target(),
+                    crash_point,
+                );
                 let found = watchdog.found();
                 followed.map(|followed| match found {
                     None => Ok(followed),
-                    Some(found) => Err(format!("({}) {name} {found}", about(&followed))),
+                    Some(found) => Err(format!("({}) {name} {found}", description(&followed))),
                 })
             })
         };
         let command = match self.victim {
-            Victim::Asker(command) => command,
+            Victim::Command(command) => command,
             Victim::CleanUp => "clean-up",
             _ => return traced("train", &train),
         };
         let mut run = place.start("train", &train);
         let launcher = Pid::from_child(&run);
-        let asked = || {
+        let run_command = || {
             if let Err(what) = until(limit(), "every role is ready", || {
                 place.read("run/shoal.log").contains("every role is ready")
             }) {
                 return Ok(Err(what));
             }
             let followed = if self.victim == Victim::CleanUp {
-                let id = match after_an_actor(place, launcher) {
+                let id = match kill_actor(place, launcher) {
                     Ok(id) => id,
                     Err(what) => return Ok(Err(what)),
                 };
@@ -240,11 +241,11 @@ impl Scene<'_> {
                 let _ = kill_process(launcher, Signal::CONT);
                 followed
             } else {
-                traced(command, &asked(command))
+                traced(command, &arguments_of(command))
             };
-            followed.map(|followed| followed.and_then(|followed| answered(place, command, followed)))
+            followed.map(|followed| followed.and_then(|followed| check_answer(place, command, followed)))
         };
-        match asked() {
+        match run_command() {
             Ok(Ok(followed)) => Ok(place
                 .wait(run, "train", limit())
                 .map(|code| Followed { code, ..followed })),
@@ -271,42 +272,43 @@ impl Scene<'_> {
         words
     }
 
-    /// What has to hold once the traced run has ended.
-    fn all_is_well(&self, place: &Place<'_>, followed: &Followed, calm: Option<&Calm>) -> Result<(), String> {
+    /// Checks the run after the traced command has ended.
+    fn check(&self, place: &Workplace<'_>, followed: &Followed, baseline: Option<&Baseline>) -> Result<(), String> {
         let mut run = "run";
         if self.victim == Victim::Launcher && followed.hit.is_some() {
-            run = self.go_on_without_launcher(place)?;
+            run = self.recover_from_killed_launcher(place)?;
         } else if followed.code != 0 {
             return Err(format!("the run ended with {}", followed.code));
         }
-        if self.victim == Victim::Asker("stop") && steps(place, "train") < Some(self.victim.steps()) {
+        if self.victim == Victim::Command("stop") && steps(place, "train") < Some(self.victim.steps()) {
             match place.run("resume", &["resume", "run", "--quiet", "--json"], limit())? {
                 0 => {}
-                code => return Err(format!("resumed, the run ended with {code}")),
+                code => return Err(format!("the resumed run ended with {code}")),
             }
         }
-        place.is_left_within(Duration::from_secs(5))?;
+        place.wait_until_empty(Duration::from_secs(5))?;
         for run in ["run", run] {
-            let traces = place.traces(run);
-            if !traces.is_empty() {
+            let leftovers = place.leftovers(run);
+            if !leftovers.is_empty() {
                 return Err(format!(
                     "{} files are left: {:?}",
-                    traces.len(),
-                    &traces[..traces.len().min(3)]
+                    leftovers.len(),
+                    &leftovers[..leftovers.len().min(3)]
                 ));
             }
         }
-        if let Some(calm) = calm.filter(|_| self.mode == Mode::Lockstep && self.victim.keeps_bits())
-            && weights(place, run)? != calm.weights
+        if let Some(baseline) = baseline.filter(|_| self.mode == Mode::Lockstep && self.victim.keeps_bits())
+            && weights(place, run)? != baseline.weights
         {
             return Err("the run ended with other bits".into());
         }
         Ok(())
     }
 
-    /// The launcher was killed: its roles end, and the run can go on, or another can begin. In which directory.
-    fn go_on_without_launcher(&self, place: &Place<'_>) -> Result<&'static str, String> {
-        place.is_left_within(ENDING)?;
+    /// After a kill of the launcher: checks that its roles end and that the run can be resumed, or else another run
+    /// started. Returns the directory of the run that ended successfully.
+    fn recover_from_killed_launcher(&self, place: &Workplace<'_>) -> Result<&'static str, String> {
+        place.wait_until_empty(ENDING_TIMEOUT)?;
         let again = self.train("again");
         let again: Vec<&str> = again.iter().map(String::as_str).collect();
         let another = || match place.run("again", &again, limit())? {
@@ -318,49 +320,49 @@ impl Scene<'_> {
         }
         match place.run("resume", &["resume", "run", "--quiet", "--json"], limit())? {
             0 => Ok("run"),
-            // It had done everything, and what it left goes with the next start.
+            // The run had completed. The next start removes its leftovers.
             1 if place.read("resume.err").contains("steps already") => another().map(|_| "run"),
-            code => Err(format!("resumed, the run ended with {code}")),
+            code => Err(format!("the resumed run ended with {code}")),
         }
     }
 }
 
-/// What the call was about before which the victim was killed.
-fn about(followed: &Followed) -> &str {
-    followed.hit.as_deref().unwrap_or("nobody was killed")
+/// The path or file of the call before which the victim was killed.
+fn description(followed: &Followed) -> &str {
+    followed.hit.as_deref().unwrap_or("no process was killed")
 }
 
-/// Stops the launcher and kills the actor, so that there is something to clean up; the run's name in shared memory.
-fn after_an_actor(place: &Place<'_>, launcher: Pid) -> Result<String, String> {
+/// Stops the launcher and kills the actor, so that there is something to clean up. Returns the run's id.
+fn kill_actor(place: &Workplace<'_>, launcher: Pid) -> Result<String, String> {
     let actors = || {
         let processes = place.processes().into_iter();
         let mut actors = processes.filter(|(_, words)| words.starts_with("shoal actor "));
         actors.next().and_then(|(pid, _)| Pid::from_raw(pid))
     };
     let config = Config::load(&place.path("run/config.toml")).map_err(|error| error.to_string())?;
-    let failed = |errno| format!("no signal can be sent: {errno}");
+    let failed = |errno| format!("cannot send a signal: {errno}");
     let actor = actors().ok_or("there is no actor")?;
     kill_process(launcher, Signal::STOP).map_err(failed)?;
     kill_process(actor, Signal::KILL).map_err(failed)?;
-    until(limit(), "the actor is dead", || actors().is_none())?;
+    until(limit(), "the actor has ended", || actors().is_none())?;
     Ok(config.run.id)
 }
 
-fn asked(command: &'static str) -> Vec<&'static str> {
+fn arguments_of(command: &'static str) -> Vec<&'static str> {
     match command {
         "scale" => vec!["scale", "run", "--actors", "2"],
         other => vec![other, "run"],
     }
 }
 
-/// A command was answered, or killed, and the next one is answered.
-fn answered(place: &Place<'_>, command: &str, followed: Followed) -> Result<Followed, String> {
+/// Checks that a command got an answer or was killed, and that a `status` afterwards gets one.
+fn check_answer(place: &Workplace<'_>, command: &str, followed: Followed) -> Result<Followed, String> {
     let fits = match followed.code {
-        // What runs no more is 3.
+        // The exit code for a run that is not running is 3.
         0 | 3 | -9 => true,
-        // iceoryx2 cannot always clean up after somebody at once. The launcher has it tried again, and the run must go on.
+        // iceoryx2 does not always succeed at the first attempt. The launcher tries again.
         1 if command == "clean-up" => true,
-        // A traced command is slow.
+        // A traced command is slow, so the run may end before it.
         1 => place.read(&format!("{command}.err")).contains("has ended meanwhile"),
         _ => false,
     };
@@ -369,20 +371,20 @@ fn answered(place: &Place<'_>, command: &str, followed: Followed) -> Result<Foll
     }
     match place.run("status", &["status", "run", "--json"], limit())? {
         0 | 3 => Ok(followed),
-        code => Err(format!("afterwards status ended with {code}")),
+        code => Err(format!("status ended with {code} afterwards")),
     }
 }
 
-/// How many steps a run's command says it has taken.
-fn steps(place: &Place<'_>, name: &str) -> Option<u64> {
+/// The environment steps that a run's command has reported.
+fn steps(place: &Workplace<'_>, name: &str) -> Option<u64> {
     let printed = place.read(&format!("{name}.out"));
     let printed: serde_json::Value = serde_json::from_str(printed.lines().last()?).ok()?;
     printed["env_steps"].as_u64()
 }
 
-/// `weights_sha256` of what a run has saved last.
-pub(crate) fn weights(place: &Place<'_>, run: &str) -> Result<String, String> {
-    let failed = |error: &dyn fmt::Display| format!("what was learned cannot be read: {error}");
+/// `weights_sha256` of a run's newest checkpoint.
+pub(crate) fn weights(place: &Workplace<'_>, run: &str) -> Result<String, String> {
+    let failed = |error: &dyn fmt::Display| format!("cannot read the checkpoint: {error}");
     let config = Config::load(&place.path(run).join("config.toml")).map_err(|error| failed(&error))?;
     let run = RunDir::open(&place.path(run)).map_err(|error| failed(&error))?;
     let loaded = Checkpoints::new(&run.checkpoints(), config.fingerprint()).load_newest();
@@ -394,8 +396,8 @@ pub(crate) fn weights(place: &Place<'_>, run: &str) -> Result<String, String> {
     Ok(digest::sha256(&weights))
 }
 
-/// What went wrong, and what was said last.
-pub(crate) fn explain(place: &Place<'_>, what: String) -> String {
+/// A failure, with the last lines of output and log.
+pub(crate) fn explain(place: &Workplace<'_>, what: String) -> String {
     let mut text = what;
     for (name, lines) in [
         ("train.err", 4),
@@ -407,21 +409,21 @@ pub(crate) fn explain(place: &Place<'_>, what: String) -> String {
         ("again.err", 4),
         ("run/shoal.log", 12),
     ] {
-        let said = place.read(name);
-        let said: Vec<&str> = said.lines().collect();
-        for line in &said[said.len().saturating_sub(lines)..] {
+        let output = place.read(name);
+        let output: Vec<&str> = output.lines().collect();
+        for line in &output[output.len().saturating_sub(lines)..] {
             text += &format!("\n      {name}: {line}");
         }
     }
     text
 }
 
-/// Waits until something holds.
+/// Polls until `holds` returns true.
 pub(crate) fn until(limit: Duration, what: &str, mut holds: impl FnMut() -> bool) -> Result<(), String> {
     let begun = Instant::now();
     while !holds() {
         if begun.elapsed() >= limit {
-            return Err(format!("waited {limit:?} in vain until {what}"));
+            return Err(format!("waited {limit:?} without success until {what}"));
         }
         std::thread::sleep(Duration::from_millis(5));
     }

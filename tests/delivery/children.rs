@@ -1,4 +1,5 @@
-//! What the child processes do. Each opens its channels, says `ready`, and obeys its standard input until that closes.
+//! The child processes. Each opens its channels, prints `ready`, and executes commands from its standard input until
+//! that closes.
 
 use std::cell::Cell;
 use std::io::{BufRead, Write};
@@ -26,15 +27,15 @@ pub(crate) const RUN: &str = "SHOAL_TEST_RUN";
 pub(crate) const DIRECTORY: &str = "SHOAL_TEST_DIRECTORY";
 
 pub(crate) const MAX_ACTORS: u32 = 4;
-/// Environments of a server.
+/// Environments per server.
 pub(crate) const ENVS: u32 = 2;
 pub(crate) const PARAMETERS: usize = 5_000;
 pub(crate) const FINGERPRINT: u64 = 77;
 
-const NAP: Duration = Duration::from_millis(50);
+const POLL: Duration = Duration::from_millis(50);
 
 pub(crate) fn main() {
-    // Somebody may run the ignored tests by hand.
+    // Without the variable, a user runs the ignored tests by hand.
     let Ok(role) = std::env::var(ROLE) else { return };
     iceoryx2::prelude::set_log_level(iceoryx2::prelude::LogLevel::Fatal);
     let domain = Domain::join(&std::env::var(RUN).unwrap(), MAX_ACTORS).unwrap();
@@ -49,21 +50,21 @@ pub(crate) fn main() {
         }
         ["policy-publisher", incarnation] => policy_publisher(&domain, number(incarnation)),
         ["env-server"] => env_server(&domain),
-        ["env-server", "that-never-answers"] => env_server_that_never_answers(&domain),
+        ["env-server", "mute"] => mute_env_server(&domain),
         _ => panic!("no such role: {role}"),
     }
     domain.leave().unwrap();
 }
 
-fn say(line: &str) {
+fn reply(line: &str) {
     let mut stdout = std::io::stdout().lock();
-    // The harness has begun a line of its own.
+    // The test harness has begun a line.
     write!(stdout, "\n{MARK}{line}\n")
         .and_then(|()| stdout.flush())
         .unwrap();
 }
 
-/// Lines of the standard input; closed with it.
+/// The lines of standard input. The channel closes with it.
 fn commands() -> Receiver<String> {
     let (sender, commands) = mpsc::channel();
     std::thread::spawn(move || {
@@ -78,25 +79,30 @@ fn words(command: &str) -> (&str, u64) {
     (word, number.parse().unwrap())
 }
 
-/// Says something and does nothing more until it is killed.
+/// Prints a line and then sleeps until the process is killed.
 fn stall(line: &str) -> ! {
-    say(line);
+    reply(line);
     loop {
         std::thread::park();
     }
 }
 
-/// Holds the services of everybody else, as the launcher does.
+/// Creates and holds the services of the run, as the launcher does.
 fn host(domain: &Domain) {
     let mut services = Services::new(domain).unwrap();
     services.create_common(domain).unwrap();
     (0..MAX_ACTORS).for_each(|index| services.create_actor(domain, index, WINDOW).unwrap());
-    say("ready");
+    reply("ready");
     commands().iter().for_each(drop);
 }
 
-/// Commands: `send N` chunks, saying `sending S` after each and `full S` when it first naps before a full window;
-/// `hold N`, which fills N rows of a chunk and says `holding`, to be killed with it; `finish`, until all are committed.
+/// Commands, where S is the number of chunks sent so far:
+///
+/// - `send N`: sends N chunks; prints `sending S` after each, and `full S` when it starts to wait for a full window.
+/// - `hold N`: fills N rows of a borrowed chunk, prints `holding` and sleeps until it is killed.
+/// - `finish`: waits until all chunks are committed.
+///
+/// After `send` and `finish` it prints `done S M`, with the longest time of a `send` in µs.
 fn actor(domain: &Domain, replay: &std::path::Path, index: u32, incarnation: u64) {
     let listener = Listener::bind(domain, EventName(Role::Actor, index)).unwrap();
     let learner = Notifier::new(domain, EventName(Role::Learner, 0)).unwrap();
@@ -107,14 +113,14 @@ fn actor(domain: &Domain, replay: &std::path::Path, index: u32, incarnation: u64
         }
     };
     let handshake = ChunkSender::open(domain, index, incarnation, chunk_layout(), WINDOW).unwrap();
-    say("ready");
+    reply("ready");
     let mut slowest = Duration::ZERO;
     let stop = Stop::default();
     let commands = commands();
-    // What it says counts from its own start.
+    // The numbers it prints count from its own start.
     let full = |waits: &Cell<bool>, sent: u64| {
         if !waits.replace(true) {
-            say(&format!("full {sent}"));
+            reply(&format!("full {sent}"));
         }
     };
     let Ok(first) = commands.recv() else { return };
@@ -146,7 +152,7 @@ fn actor(domain: &Domain, replay: &std::path::Path, index: u32, incarnation: u64
                 || Ok((sender.in_flight(committed()) <= most_in_flight).then_some(())),
                 || {
                     full(&waits, sender.sent() - before);
-                    sender.look_after()
+                    sender.refresh_connections()
                 },
             )
             .unwrap();
@@ -157,15 +163,21 @@ fn actor(domain: &Domain, replay: &std::path::Path, index: u32, incarnation: u64
                 sender.send(chunk, 0).unwrap();
                 slowest = slowest.max(begun.elapsed());
                 learner.notify();
-                say(&format!("sending {}", sender.sent() - before));
+                reply(&format!("sending {}", sender.sent() - before));
             }
         }
-        say(&format!("done {} {}", sender.sent() - before, slowest.as_micros()));
+        reply(&format!("done {} {}", sender.sent() - before, slowest.as_micros()));
     }
 }
 
-/// Commands: `take N` more chunks, then says `took`; `crawl`, taking one chunk more each time it has slept a little;
-/// `run`. Takes nothing before its first command, except to stall once `after` chunks have passed a step.
+/// Commands:
+///
+/// - `take N`: receives N more chunks, then prints `took`.
+/// - `crawl`: receives one chunk per millisecond.
+/// - `run`: receives everything.
+///
+/// It receives nothing before its first command. With `stalls_at` it receives from the start, and prints `stalled` and
+/// sleeps when more than the given number of chunks have passed this step of a write.
 fn learner(domain: &Domain, path: &std::path::Path, actors: u32, stalls_at: Option<(&str, u64)>) {
     let listener = Listener::bind(domain, EventName(Role::Learner, 0)).unwrap();
     let mut replay = match Replay::open(path, &replay_layout(MAX_ACTORS)) {
@@ -185,7 +197,7 @@ fn learner(domain: &Domain, path: &std::path::Path, actors: u32, stalls_at: Opti
         });
     }
     let mut intake = Intake::open(domain, actors, WINDOW, chunk_layout(), u64::MAX).unwrap();
-    say("ready");
+    reply("ready");
     let commands = commands();
     let mut quota = if stalls_at.is_some() { u64::MAX } else { replay.head() };
     let (mut busy, mut crawls) = (false, false);
@@ -199,28 +211,28 @@ fn learner(domain: &Domain, path: &std::path::Path, actors: u32, stalls_at: Opti
             Err(TryRecvError::Empty) => {}
         }
         if crawls {
-            // Its being slow is what it is for.
+            // Makes this learner slow on purpose.
             std::thread::sleep(Duration::from_millis(1));
             quota += ROWS as u64;
         }
         let drained = intake.drain(&mut replay, 8, |replay| replay.head() >= quota).unwrap();
         if busy && replay.head() >= quota {
             busy = false;
-            say("took");
+            reply("took");
         }
         if !drained && !crawls {
-            listener.wait(NAP).unwrap();
+            listener.wait(POLL).unwrap();
         }
     }
 }
 
-/// Commands: `publish V`, whose parameters are all V; then says `published`.
+/// Command: `publish V` publishes a policy whose parameters are all V, then prints `published`.
 fn policy_publisher(domain: &Domain, incarnation: u64) {
     let publisher = PolicyPublisher::open(domain, PARAMETERS).unwrap();
-    say("ready");
+    reply("ready");
     let commands = commands();
     loop {
-        match commands.recv_timeout(NAP).as_deref().map(words) {
+        match commands.recv_timeout(POLL).as_deref().map(words) {
             Ok((_, version)) => {
                 let header = PolicyHeader {
                     incarnation,
@@ -229,9 +241,9 @@ fn policy_publisher(domain: &Domain, incarnation: u64) {
                     ..Default::default()
                 };
                 publisher.publish(&[version as f32; PARAMETERS], header).unwrap();
-                say("published");
+                reply("published");
             }
-            Err(mpsc::RecvTimeoutError::Timeout) => publisher.look_after().unwrap(),
+            Err(mpsc::RecvTimeoutError::Timeout) => publisher.refresh_connections().unwrap(),
             Err(mpsc::RecvTimeoutError::Disconnected) => return,
         }
     }
@@ -262,15 +274,15 @@ fn env_server(domain: &Domain) {
     };
     let heartbeat = HeartbeatSender::new(domain, identity).unwrap();
     let stop = Stop::when_stdin_closes().unwrap();
-    say("ready");
+    reply("ready");
     serve(&mut environments, &port, 1, heartbeat, &stop).unwrap();
 }
 
-/// Says `asked` at the first step or snapshot.
-fn env_server_that_never_answers(domain: &Domain) {
+/// A server that prints `asked` at the first request for a step or snapshot, and never answers it.
+fn mute_env_server(domain: &Domain) {
     let mut environments = pendulums();
     let port = port(domain, &environments);
-    say("ready");
+    reply("ready");
     let stop = Stop::when_stdin_closes().unwrap();
     while let Ok(request) = port.next(&stop, || ()) {
         if matches!(request.ask(), Some(Ask::Step | Ask::Snapshot)) {

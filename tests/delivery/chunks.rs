@@ -1,4 +1,4 @@
-//! The chunks that test actors send: every row says which chunk it belongs to and where it stands in it.
+//! The chunks that test actors send. Every row contains the id of its chunk and its position in it.
 
 use std::path::Path;
 
@@ -52,11 +52,11 @@ pub(crate) fn fill(chunk: &mut Chunk, (actor, incarnation, sequence): Id, rows: 
     }
 }
 
-/// The chunks of a replay that nobody writes any more, in the order they were committed.
+/// The chunks of a replay in the order of their commits. No process may be writing it.
 pub(crate) fn committed(path: &Path, actors: u32) -> Vec<Id> {
     let replay = Replay::open(path, &replay_layout(actors)).unwrap();
     assert_eq!(replay.warnings(), [] as [String; 0]);
-    assert_eq!(replay.rows().start, 0, "the ring has room for the whole test");
+    assert_eq!(replay.rows().start, 0, "the ring is large enough for the whole test");
     let rows: Vec<_> = replay
         .rows()
         .map(|index| row_layout().read(replay.row(index)))
@@ -76,7 +76,7 @@ pub(crate) fn committed(path: &Path, actors: u32) -> Vec<Id> {
     rows.chunks_exact(ROWS).map(id).collect()
 }
 
-/// Chunks 1 to `last` of an actor's incarnation.
-pub(crate) fn all(actor: u32, incarnation: u64, last: u64) -> Vec<Id> {
+/// The ids of chunks 1 to `last` of an actor's incarnation.
+pub(crate) fn chunk_ids(actor: u32, incarnation: u64, last: u64) -> Vec<Id> {
     (1..=last).map(|sequence| (actor, incarnation, sequence)).collect()
 }

@@ -1,4 +1,4 @@
-//! Environment servers that die or pause between question and answer.
+//! Environment servers that die or are stopped between a request and its answer.
 
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::time::Duration;
@@ -10,18 +10,18 @@ use shoal_common::exit::Exit;
 use shoal_common::report::Role;
 
 use crate::children::{ENVS, pendulums};
-use crate::run::{DEADLINE, Run, Watchdog};
+use crate::run::{Run, TIMEOUT, Watchdog};
 
 const ACTIONS: [f32; ENVS as usize] = [0.5; ENVS as usize];
 
-/// An actor's end of the conversation.
-struct Asker {
+/// A client of an environment server, as an actor has it.
+struct TestClient {
     listener: Listener,
-    client: EnvironmentClient,
+    inner: EnvironmentClient,
     _watchdog: Watchdog,
 }
 
-impl Asker {
+impl TestClient {
     fn new(domain: &Domain) -> Self {
         let watchdog = Watchdog::new();
         let environments = pendulums();
@@ -29,7 +29,7 @@ impl Asker {
         let client = EnvironmentClient::open(domain, 0, environments.spec(), ENVS as usize, watchdog.stop.clone());
         Self {
             listener,
-            client: client.unwrap(),
+            inner: client.unwrap(),
             _watchdog: watchdog,
         }
     }
@@ -38,9 +38,9 @@ impl Asker {
         self.reset_while(|| ())
     }
 
-    /// `idle` is called again and again while it waits.
+    /// `idle` is called repeatedly during the wait.
     fn reset_while(&self, idle: impl FnMut()) -> Observed {
-        self.client.reset(&self.listener, Begin::Next, idle).expect("no hang")
+        self.inner.reset(&self.listener, Begin::Next, idle).expect("no hang")
     }
 
     fn step(&self) -> Stepped {
@@ -48,17 +48,17 @@ impl Asker {
     }
 
     fn step_while(&self, idle: impl FnMut()) -> Stepped {
-        self.client.step(&self.listener, &ACTIONS, idle).expect("no hang")
+        self.inner.step(&self.listener, &ACTIONS, idle).expect("no hang")
     }
 
     fn snapshot(&self) -> Snapshot {
-        self.client.snapshot(&self.listener, || ()).expect("no hang")
+        self.inner.snapshot(&self.listener, || ()).expect("no hang")
     }
 
-    fn taken(&self) -> Vec<u64> {
+    fn take_snapshot(&self) -> Vec<u64> {
         match self.snapshot() {
             Snapshot::Taken(words) => words,
-            Snapshot::Lost => panic!("the server lives and was reset"),
+            Snapshot::Lost => panic!("the server is running and was reset"),
         }
     }
 
@@ -67,15 +67,15 @@ impl Asker {
     }
 
     fn restore_while(&self, words: &[u64], idle: impl FnMut()) -> Result<Observed, Exit<ChannelError>> {
-        self.client.restore(&self.listener, words, idle)
+        self.inner.restore(&self.listener, words, idle)
     }
 
-    /// All that comes of so many steps, as bits.
+    /// The results of the next `steps` steps, as bits.
     fn future(&self, steps: u32) -> Vec<u32> {
         let mut seen = Vec::new();
         for _ in 0..steps {
             let Stepped::Taken(observed) = self.step() else {
-                panic!("the server lives and was reset")
+                panic!("the server is running and was reset")
             };
             for e in 0..ENVS as usize {
                 seen.extend(observed.observation(e).iter().map(|x| x.to_bits()));
@@ -90,206 +90,209 @@ impl Asker {
     fn steps(&self, count: u32) {
         for _ in 0..count {
             let Stepped::Taken(observed) = self.step() else {
-                panic!("the server lives and was reset")
+                panic!("the server is running and was reset")
             };
             assert!((0..ENVS as usize).all(|e| !observed.terminated(e) && observed.reward(e) < 0.0));
         }
     }
 }
 
-/// What a client does while it waits.
-fn tells(waits: &Sender<()>) -> impl FnMut() {
+/// An `idle` function that signals each of its calls.
+fn notify(waits: &Sender<()>) -> impl FnMut() {
     move || {
-        // It may wait longer than anybody listens.
+        // The receiver may be gone.
         let _ = waits.send(());
     }
 }
 
-/// Returns when a client has napped over its question several times.
-fn waits_several_times(waiting: Receiver<()>) {
+/// Returns once a client has polled several times for its answer.
+fn expect_several_polls(waiting: Receiver<()>) {
     for _ in 0..5 {
-        waiting.recv_timeout(DEADLINE).expect("the client waits");
+        waiting.recv_timeout(TIMEOUT).expect("the client waits");
     }
 }
 
 #[test]
-fn a_step_whose_server_is_killed_before_it_answers_is_lost_and_the_next_server_goes_on() {
+fn a_step_is_lost_if_its_server_is_killed_and_the_next_server_takes_over() {
     let run = Run::new();
     let domain = run.join();
-    let mut doomed = run.start("env-server that-never-answers");
-    let asker = Asker::new(&domain);
-    let seen = asker.reset();
+    let mut mute = run.start("env-server mute");
+    let client = TestClient::new(&domain);
+    let seen = client.reset();
     let before = seen.observations().to_vec();
     std::thread::scope(|scope| {
         let killer = scope.spawn(|| {
-            doomed.says("asked");
-            doomed.kill();
+            mute.expect_line("asked");
+            mute.kill();
             run.start("env-server")
         });
-        assert!(matches!(asker.step(), Stepped::Lost));
+        assert!(matches!(client.step(), Stepped::Lost));
         let _server = killer.join().unwrap();
-        assert_eq!(seen.observations(), before, "what the dead server said stays readable");
-        assert!(matches!(asker.step(), Stepped::Lost), "the new server knows no episode");
-        asker.reset();
-        asker.steps(10);
+        assert_eq!(seen.observations(), before, "the dead server's answer stays readable");
+        assert!(matches!(client.step(), Stepped::Lost), "the new server has no episode");
+        client.reset();
+        client.steps(10);
     });
 }
 
 #[test]
-fn a_step_asked_while_no_server_lives_is_lost_and_a_reset_waits_for_one() {
+fn without_a_server_a_step_is_lost_and_a_reset_waits_for_one() {
     let run = Run::new();
     let domain = run.join();
     let mut server = run.start("env-server");
-    let asker = Asker::new(&domain);
-    asker.reset();
-    asker.steps(10);
+    let client = TestClient::new(&domain);
+    client.reset();
+    client.steps(10);
     server.kill();
-    assert!(matches!(asker.step(), Stepped::Lost));
+    assert!(matches!(client.step(), Stepped::Lost));
     std::thread::scope(|scope| {
         let (waits, waiting) = channel();
         let starter = scope.spawn(|| {
-            waits_several_times(waiting);
+            expect_several_polls(waiting);
             run.start("env-server")
         });
-        asker.reset_while(tells(&waits));
+        client.reset_while(notify(&waits));
         let _server = starter.join().unwrap();
-        asker.steps(10);
+        client.steps(10);
     });
 }
 
 #[test]
-fn servers_killed_at_any_moment_never_hold_the_client_up() {
+fn servers_killed_at_any_moment_never_block_the_client() {
     let run = Run::new();
     let domain = run.join();
-    let asker = Asker::new(&domain);
+    let client = TestClient::new(&domain);
     let mut server = run.start("env-server");
     for kill in 0..6 {
-        asker.reset();
+        client.reset();
         let killer = std::thread::spawn(move || {
-            // Each time at another moment of a step.
+            // Each time at a different moment of a step.
             std::thread::sleep(Duration::from_micros(kill * 1_777));
             server.kill();
         });
-        while matches!(asker.step(), Stepped::Taken(_)) {}
+        while matches!(client.step(), Stepped::Taken(_)) {}
         killer.join().unwrap();
         server = run.launch("env-server");
     }
-    asker.reset();
-    asker.steps(3);
-    server.ends();
+    client.reset();
+    client.steps(3);
+    server.end();
 }
 
 #[test]
-fn a_server_that_is_stopped_for_a_while_answers_when_it_goes_on() {
+fn a_stopped_server_answers_when_it_continues() {
     let run = Run::new();
     let domain = run.join();
     let server = run.start("env-server");
-    let asker = Asker::new(&domain);
-    asker.reset();
-    asker.steps(3);
+    let client = TestClient::new(&domain);
+    client.reset();
+    client.steps(3);
     server.stop();
     let (waits, waiting) = channel();
     let waker = std::thread::spawn(move || {
-        waits_several_times(waiting);
+        expect_several_polls(waiting);
         server.signal(Signal::CONT);
         server
     });
-    assert!(matches!(asker.step_while(tells(&waits)), Stepped::Taken(_)));
+    assert!(matches!(client.step_while(notify(&waits)), Stepped::Taken(_)));
     let server = waker.join().unwrap();
-    asker.steps(3);
-    server.ends();
+    client.steps(3);
+    server.end();
 }
 
-/// Steps beyond the ends of two episodes.
+/// Enough steps to pass the ends of two episodes.
 const FUTURE: u32 = 450;
 
 #[test]
-fn a_new_server_goes_on_where_a_killed_one_was_bit_for_bit() {
+fn a_new_server_continues_a_killed_ones_episodes_bit_for_bit() {
     let run = Run::new();
     let domain = run.join();
     let mut server = run.start("env-server");
-    let asker = Asker::new(&domain);
-    assert_eq!(asker.snapshot(), Snapshot::Lost, "no episode is under way");
-    asker.reset();
-    asker.steps(237);
-    let words = asker.taken();
-    let whole = asker.future(FUTURE);
+    let client = TestClient::new(&domain);
+    assert_eq!(client.snapshot(), Snapshot::Lost, "no episode has begun");
+    client.reset();
+    client.steps(237);
+    let words = client.take_snapshot();
+    let whole = client.future(FUTURE);
     server.kill();
-    assert_eq!(asker.snapshot(), Snapshot::Lost);
+    assert_eq!(client.snapshot(), Snapshot::Lost);
     let _server = run.start("env-server");
-    assert_eq!(asker.snapshot(), Snapshot::Lost, "the new server knows no episode");
-    assert!(matches!(asker.step(), Stepped::Lost));
-    let observed = asker.restore(&words).unwrap().observations().to_vec();
-    assert_eq!(asker.taken(), words);
-    assert_eq!(asker.future(FUTURE), whole);
-    let again = asker.restore(&words).unwrap();
-    assert_eq!(again.observations(), observed, "the same server can go back too");
-    assert_eq!(asker.future(FUTURE), whole);
+    assert_eq!(client.snapshot(), Snapshot::Lost, "the new server has no episode");
+    assert!(matches!(client.step(), Stepped::Lost));
+    let observed = client.restore(&words).unwrap().observations().to_vec();
+    assert_eq!(client.take_snapshot(), words);
+    assert_eq!(client.future(FUTURE), whole);
+    let again = client.restore(&words).unwrap();
+    assert_eq!(again.observations(), observed, "the same server can be restored too");
+    assert_eq!(client.future(FUTURE), whole);
 }
 
 #[test]
-fn a_snapshot_whose_server_is_killed_before_it_answers_is_lost_and_a_restore_waits_for_the_next() {
+fn a_snapshot_is_lost_if_its_server_is_killed_and_a_restore_waits_for_the_next() {
     let run = Run::new();
     let domain = run.join();
-    let asker = Asker::new(&domain);
+    let client = TestClient::new(&domain);
     let mut server = run.start("env-server");
-    asker.reset();
-    asker.steps(10);
-    let words = asker.taken();
-    let whole = asker.future(10);
+    client.reset();
+    client.steps(10);
+    let words = client.take_snapshot();
+    let whole = client.future(10);
     server.kill();
-    let mut doomed = run.start("env-server that-never-answers");
-    asker.reset();
+    let mut mute = run.start("env-server mute");
+    client.reset();
     std::thread::scope(|scope| {
         let killer = scope.spawn(|| {
-            doomed.says("asked");
-            doomed.kill();
+            mute.expect_line("asked");
+            mute.kill();
         });
-        assert_eq!(asker.snapshot(), Snapshot::Lost);
+        assert_eq!(client.snapshot(), Snapshot::Lost);
         killer.join().unwrap();
         let (waits, waiting) = channel();
         let starter = scope.spawn(|| {
-            waits_several_times(waiting);
+            expect_several_polls(waiting);
             run.start("env-server")
         });
-        asker.restore_while(&words, tells(&waits)).unwrap();
+        client.restore_while(&words, notify(&waits)).unwrap();
         let _server = starter.join().unwrap();
-        assert_eq!(asker.future(10), whole);
+        assert_eq!(client.future(10), whole);
     });
 }
 
 #[test]
-fn words_that_are_no_snapshot_are_refused_and_the_server_goes_on() {
+fn an_invalid_snapshot_is_refused_and_the_server_continues() {
     let run = Run::new();
     let domain = run.join();
     let _server = run.start("env-server");
-    let asker = Asker::new(&domain);
+    let client = TestClient::new(&domain);
     let garbage = [u64::MAX; ENVS as usize * 5];
-    let refusal = |words: &[u64]| asker.restore(words).unwrap_err().to_string();
+    let refusal = |words: &[u64]| client.restore(words).unwrap_err().to_string();
     assert!(refusal(&garbage).contains("refused"));
-    assert!(matches!(asker.step(), Stepped::Lost), "what is refused starts nothing");
-    asker.reset();
-    let words = asker.taken();
+    assert!(
+        matches!(client.step(), Stepped::Lost),
+        "a refused snapshot starts no episode"
+    );
+    client.reset();
+    let words = client.take_snapshot();
     assert!(refusal(&garbage).contains("refused"));
-    assert!(refusal(&garbage[1..]).contains("9 words for a snapshot of 10"));
-    assert_eq!(asker.taken(), words);
-    asker.steps(3);
+    assert!(refusal(&garbage[1..]).contains("the snapshot has 9 words instead of 10"));
+    assert_eq!(client.take_snapshot(), words);
+    client.steps(3);
 }
 
 #[test]
-fn a_training_episode_is_begun_by_its_number_whatever_came_before() {
+fn a_training_episode_depends_only_on_its_number() {
     let run = Run::new();
     let domain = run.join();
     let _server = run.start("env-server");
-    let asker = Asker::new(&domain);
+    let client = TestClient::new(&domain);
     let begin = |begin| {
-        let observed = asker.client.reset(&asker.listener, begin, || ()).expect("no hang");
+        let observed = client.inner.reset(&client.listener, begin, || ()).expect("no hang");
         observed.observations().to_vec()
     };
     let [first, second] = [begin(Begin::Next), begin(Begin::Next)];
     assert_ne!(first, second);
-    asker.steps(10);
+    client.steps(10);
     assert_eq!(begin(Begin::Training(0)), first);
-    assert_eq!(begin(Begin::Next), second, "it counts on from there");
+    assert_eq!(begin(Begin::Next), second, "the count continues from there");
     assert_eq!(begin(Begin::Training(1)), second);
 }

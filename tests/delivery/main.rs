@@ -1,5 +1,6 @@
-//! Delivery between real processes, any of which may be killed: chunks, policies, steps of environments, and what a run
-//! leaves in shared memory. The promises are those of `ARCHITECTURE.md`; the children are this binary again.
+//! Delivery between real processes, any of which may be killed: chunks, policies, environment steps, and the leftovers
+//! of a run in shared memory. The promises are those of "Delivery of chunks" in `docs/DESIGN.md`. The child processes
+//! run this test binary.
 
 #![allow(
     clippy::unwrap_used,
@@ -11,10 +12,10 @@ mod actors;
 mod children;
 mod chunks;
 mod environments;
+mod leftovers;
 mod policies;
 mod process;
 mod run;
-mod traces;
 mod transitions;
 
 #[test]

@@ -1,4 +1,4 @@
-//! The policy outlives its learner, reaches those who come late, and is followed by the next learner's.
+//! A policy outlives its learner, reaches late readers, and is replaced by the next learner's.
 
 use shoal_common::channel::Domain;
 use shoal_common::channel::policy::{Policy, PolicyReader};
@@ -11,9 +11,9 @@ fn reader(domain: &Domain) -> PolicyReader {
     PolicyReader::open(domain, FINGERPRINT, PARAMETERS).unwrap()
 }
 
-fn publishes(learner: &mut Process, version: u64) {
-    learner.told(&format!("publish {version}"));
-    learner.says("published");
+fn publish(learner: &mut Process, version: u64) {
+    learner.tell(&format!("publish {version}"));
+    learner.expect_line("published");
 }
 
 fn is(policy: &Policy, incarnation: u64, version: u64) -> bool {
@@ -27,7 +27,7 @@ fn is(policy: &Policy, incarnation: u64, version: u64) -> bool {
     (header.incarnation, header.version) == (incarnation, version)
 }
 
-fn reads(reader: &mut PolicyReader, incarnation: u64, version: u64) {
+fn expect_policy(reader: &mut PolicyReader, incarnation: u64, version: u64) {
     eventually(&format!("version {version} of learner {incarnation} arrives"), || {
         reader
             .latest()
@@ -37,19 +37,19 @@ fn reads(reader: &mut PolicyReader, incarnation: u64, version: u64) {
 }
 
 #[test]
-fn a_policy_stays_as_it_is_when_its_learner_is_killed_and_the_next_learners_follows() {
+fn a_policy_survives_its_learner_until_the_next_learner_publishes() {
     let run = Run::new();
     let domain = run.join();
     let mut early = reader(&domain);
     assert!(early.latest().unwrap().is_none());
     let mut learner = run.start("policy-publisher 0");
     for version in 1..=7 {
-        publishes(&mut learner, version);
+        publish(&mut learner, version);
     }
-    reads(&mut early, 0, 7);
-    // Comes after the publication, and is given it without another one.
+    expect_policy(&mut early, 0, 7);
+    // This reader opens after the publication and still receives the policy.
     let mut late = reader(&domain);
-    reads(&mut late, 0, 7);
+    expect_policy(&mut late, 0, 7);
     learner.kill();
     for reader in [&mut early, &mut late] {
         assert!(is(&reader.latest().unwrap().unwrap(), 0, 7));
@@ -59,34 +59,34 @@ fn a_policy_stays_as_it_is_when_its_learner_is_killed_and_the_next_learners_foll
     let mut learner = run.start("policy-publisher 1");
     assert!(is(&held, 0, 7));
     drop(held);
-    // A learner goes on from its checkpoint: its version may be an older one.
-    publishes(&mut learner, 5);
+    // A learner continues from its checkpoint, so its version may be older.
+    publish(&mut learner, 5);
     for reader in [&mut early, &mut late] {
-        reads(reader, 1, 5);
+        expect_policy(reader, 1, 5);
     }
-    learner.ends();
+    learner.end();
     assert!(is(&early.latest().unwrap().unwrap(), 1, 5));
 }
 
 #[test]
-fn a_policy_published_between_a_readers_looks_is_found_though_its_learner_died() {
+fn a_reader_finds_a_policy_whose_learner_died_in_the_meantime() {
     let run = Run::new();
     let domain = run.join();
     let mut learner = run.start("policy-publisher 0");
     let mut reader = reader(&domain);
-    publishes(&mut learner, 1);
-    reads(&mut reader, 0, 1);
-    publishes(&mut learner, 2);
+    publish(&mut learner, 1);
+    expect_policy(&mut reader, 0, 1);
+    publish(&mut learner, 2);
     learner.kill();
-    reads(&mut reader, 0, 2);
+    expect_policy(&mut reader, 0, 2);
     for incarnation in 1..=4 {
         let mut learner = run.start(&format!("policy-publisher {incarnation}"));
-        publishes(&mut learner, 2 + incarnation);
+        publish(&mut learner, 2 + incarnation);
         learner.kill();
     }
-    // Those that died unread are older than the last one, and never read after it.
+    // The unread policies are older than the last one and must not be read after it.
     let mut learner = run.start("policy-publisher 5");
-    publishes(&mut learner, 9);
-    reads(&mut reader, 5, 9);
+    publish(&mut learner, 9);
+    expect_policy(&mut reader, 5, 9);
     assert!(is(&reader.latest().unwrap().unwrap(), 5, 9));
 }

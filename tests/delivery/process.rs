@@ -1,4 +1,4 @@
-//! A child process, and the lines spoken with it: commands on its standard input, what it says on its standard output.
+//! A child process that takes commands on its standard input and prints replies on its standard output.
 
 use std::io::{BufRead, BufReader, Write};
 use std::path::Path;
@@ -10,12 +10,12 @@ use rustix::process::{Pid, Signal, kill_process};
 use shoal_common::channel::Domain;
 
 use crate::children::{DIRECTORY, ROLE, RUN};
-use crate::run::{DEADLINE, eventually};
+use crate::run::{TIMEOUT, eventually};
 
-/// Begins a line that a child says, among those of its test harness.
+/// First character of a child's replies, which distinguishes them from the lines of its test harness.
 pub(crate) const MARK: char = '@';
 
-/// Gone, at the latest, when this is.
+/// A child process. Dropping it kills the process.
 pub(crate) struct Process {
     child: Child,
     stdin: Option<ChildStdin>,
@@ -37,11 +37,11 @@ impl Process {
         let (sender, lines) = mpsc::channel();
         let stdout = BufReader::new(child.stdout.take().unwrap());
         std::thread::spawn(move || {
-            let said = stdout
+            let replies = stdout
                 .lines()
                 .map_while(Result::ok)
                 .filter_map(|line| Some(line.strip_prefix(MARK)?.to_owned()));
-            said.for_each(|line| drop(sender.send(line)));
+            replies.for_each(|line| drop(sender.send(line)));
         });
         Self {
             stdin: child.stdin.take(),
@@ -52,22 +52,22 @@ impl Process {
         }
     }
 
-    /// Gives a command.
-    pub(crate) fn told(&mut self, command: &str) {
+    /// Sends a command.
+    pub(crate) fn tell(&mut self, command: &str) {
         writeln!(self.stdin.as_mut().unwrap(), "{command}").unwrap();
     }
 
-    /// Waits until the child says a line that begins with these words; the numbers after them.
-    pub(crate) fn says(&self, words: &str) -> Vec<u64> {
-        let deadline = Instant::now() + DEADLINE;
+    /// Waits for a line that begins with `words`. Returns the numbers after them.
+    pub(crate) fn expect_line(&self, words: &str) -> Vec<u64> {
+        let deadline = Instant::now() + TIMEOUT;
         loop {
             let line = match self
                 .lines
                 .recv_timeout(deadline.saturating_duration_since(Instant::now()))
             {
                 Ok(line) => line,
-                Err(RecvTimeoutError::Timeout) => panic!("{} hangs: it does not say `{words}`", self.role),
-                Err(RecvTimeoutError::Disconnected) => panic!("{} ended and did not say `{words}`", self.role),
+                Err(RecvTimeoutError::Timeout) => panic!("{} hangs: it does not print `{words}`", self.role),
+                Err(RecvTimeoutError::Disconnected) => panic!("{} ended without printing `{words}`", self.role),
             };
             if let Some(numbers) = line.strip_prefix(words) {
                 return numbers
@@ -78,8 +78,8 @@ impl Process {
         }
     }
 
-    /// Everything said and not yet heard that begins with these words, until the child closes its output.
-    pub(crate) fn last_words(&self, words: &str) -> Option<u64> {
+    /// The number in the last remaining line that begins with `words`. Reads until the child closes its output.
+    pub(crate) fn last_number(&self, words: &str) -> Option<u64> {
         let numbers = self
             .lines
             .iter()
@@ -91,7 +91,7 @@ impl Process {
         kill_process(Pid::from_child(&self.child), signal).unwrap();
     }
 
-    /// Stops it, and waits until none of its threads runs: a signal takes its time.
+    /// Stops the process, and waits until none of its threads runs, because a signal takes effect later.
     pub(crate) fn stop(&self) {
         self.signal(Signal::STOP);
         let threads = format!("/proc/{}/task", self.child.id());
@@ -103,18 +103,18 @@ impl Process {
         });
     }
 
-    /// `kill -9`, waits until it is gone, and cleans up after it, as the launcher does.
+    /// Kills the process with `kill -9`, waits until it is gone, and cleans up after it as the launcher does.
     pub(crate) fn kill(&mut self) {
         self.child.kill().unwrap();
         self.child.wait().unwrap();
-        // iceoryx2 cannot always do it at once.
+        // iceoryx2 does not always succeed at the first attempt.
         eventually(&format!("the shared memory of {} is cleaned up", self.role), || {
             Domain::clean_up(&self.run).unwrap() == 0
         });
     }
 
-    /// Closes the child's standard input and waits until it has ended in good order.
-    pub(crate) fn ends(mut self) {
+    /// Closes the child's standard input and waits until it has ended successfully.
+    pub(crate) fn end(mut self) {
         self.stdin = None;
         let mut status: Option<ExitStatus> = None;
         eventually(&format!("{} ends", self.role), || {

@@ -1,4 +1,4 @@
-//! A run of a test: its name in shared memory, its directory, its processes.
+//! A test's run: its name in shared memory, its directory and its processes.
 
 use std::path::PathBuf;
 use std::sync::Mutex;
@@ -14,10 +14,10 @@ use tempfile::TempDir;
 use crate::children::MAX_ACTORS;
 use crate::process::Process;
 
-/// How long anything may take. Nothing takes this long unless it hangs.
-pub(crate) const DEADLINE: Duration = Duration::from_secs(30);
+/// Longest wait for any event.
+pub(crate) const TIMEOUT: Duration = Duration::from_secs(30);
 
-/// Owns everything that the run leaves, and makes sure at its end that nothing is left.
+/// A run. Dropping it asserts that nothing is left in shared memory.
 pub(crate) struct Run {
     id: String,
     directory: TempDir,
@@ -25,7 +25,7 @@ pub(crate) struct Run {
     host: Mutex<Option<Process>>,
 }
 
-/// A stop that is requested if the test hangs.
+/// A stop flag that is set if the test hangs.
 pub(crate) struct Watchdog {
     pub(crate) stop: Stop,
     _ends: Sender<()>,
@@ -45,22 +45,22 @@ impl Run {
         run
     }
 
-    /// Ends in order what holds the run's services.
+    /// Ends the process that holds the run's services.
     pub(crate) fn end_host(&self) {
-        self.host.lock().unwrap().take().unwrap().ends();
+        self.host.lock().unwrap().take().unwrap().end();
     }
 
-    /// Kills it.
+    /// Kills the process that holds the run's services.
     pub(crate) fn kill_host(&self) {
         *self.host.lock().unwrap() = None;
     }
 
-    /// Makes this process one of the run's.
+    /// Makes this process a member of the run.
     pub(crate) fn join(&self) -> Domain {
         Domain::join(&self.id, MAX_ACTORS).unwrap()
     }
 
-    /// Starts a process; `role` is what `children::main` understands.
+    /// Starts a process with a `role` of `children::main`.
     pub(crate) fn launch(&self, role: &str) -> Process {
         Process::launch(role, &self.id, self.directory.path())
     }
@@ -68,7 +68,7 @@ impl Run {
     /// Starts a process and waits until its channels are open.
     pub(crate) fn start(&self, role: &str) -> Process {
         let process = self.launch(role);
-        process.says("ready");
+        process.expect_line("ready");
         process
     }
 
@@ -76,10 +76,10 @@ impl Run {
         self.directory.path().join("replay.rows")
     }
 
-    /// The replay's commit record, once a learner has made the replay.
+    /// The replay's commit record. Waits until a learner has created the replay.
     pub(crate) fn commits(&self) -> CommitReader {
         let mut reader = None;
-        eventually("a learner makes the replay", || {
+        eventually("a learner creates the replay", || {
             reader = match CommitReader::open(&self.replay()) {
                 Err(OpenError::NotYet { .. }) => None,
                 opened => Some(opened.unwrap()),
@@ -90,16 +90,16 @@ impl Run {
     }
 
     /// Every file of the run outside its directory.
-    pub(crate) fn traces(&self) -> Vec<PathBuf> {
+    pub(crate) fn leftovers(&self) -> Vec<PathBuf> {
         let prefix = format!("shoal_{}_", self.id);
         let listing = std::fs::read_dir("/dev/shm").unwrap().flatten();
-        let mut traces: Vec<_> = listing
+        let mut leftovers: Vec<_> = listing
             .filter(|entry| entry.file_name().to_string_lossy().starts_with(&prefix))
             .map(|entry| entry.path())
             .collect();
         let user = rustix::process::getuid().as_raw();
-        traces.extend(Some(PathBuf::from(format!("/tmp/shoal-{user}/{}", self.id))).filter(|root| root.exists()));
-        traces
+        leftovers.extend(Some(PathBuf::from(format!("/tmp/shoal-{user}/{}", self.id))).filter(|root| root.exists()));
+        leftovers
     }
 }
 
@@ -107,13 +107,13 @@ impl Drop for Run {
     fn drop(&mut self) {
         let host = self.host.get_mut().ok().and_then(Option::take);
         match host {
-            Some(host) if !std::thread::panicking() => host.ends(),
+            Some(host) if !std::thread::panicking() => host.end(),
             _ => {}
         }
         let left = self.join().leave();
         if !std::thread::panicking() {
             left.unwrap();
-            assert_eq!(self.traces(), [] as [PathBuf; 0], "left by run {}", self.id);
+            assert_eq!(self.leftovers(), [] as [PathBuf; 0], "left by run {}", self.id);
         }
     }
 }
@@ -121,10 +121,10 @@ impl Drop for Run {
 impl Watchdog {
     pub(crate) fn new() -> Self {
         let stop = Stop::default();
-        let (ends, bones) = mpsc::channel();
+        let (ends, ended) = mpsc::channel();
         let hanging = stop.clone();
         std::thread::spawn(move || {
-            if bones.recv_timeout(DEADLINE) == Err(mpsc::RecvTimeoutError::Timeout) {
+            if ended.recv_timeout(TIMEOUT) == Err(mpsc::RecvTimeoutError::Timeout) {
                 hanging.request();
             }
         });
@@ -132,11 +132,11 @@ impl Watchdog {
     }
 }
 
-/// Waits until `holds`.
+/// Polls until `holds` returns true.
 pub(crate) fn eventually(what: &str, mut holds: impl FnMut() -> bool) {
     let start = Instant::now();
     while !holds() {
-        assert!(start.elapsed() < DEADLINE, "waited in vain: {what}");
+        assert!(start.elapsed() < TIMEOUT, "waited {TIMEOUT:?} without success: {what}");
         std::thread::sleep(Duration::from_millis(1));
     }
 }

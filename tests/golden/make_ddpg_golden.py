@@ -3,12 +3,12 @@
     pip install torch==2.15.0 numpy==2.4.6
     python tests/golden/make_ddpg_golden.py DIRECTORY
 
-DIRECTORY gets ddpg_update_3x1.json and ddpg_update_6x2.json. Networks and minibatches are the same, bit for bit, wherever
-numpy draws the same numbers; what autograd and Adam make of them may differ between machines in the last bits.
+Writes ddpg_update_3x1.json and ddpg_update_6x2.json into DIRECTORY. Networks and minibatches are the same, bit for bit,
+wherever numpy draws the same numbers. The results of autograd and Adam may differ between machines in the last bits.
 
-An update is that of the thesis's Algorithm 4, steps 11 to 16: first the critic, then the actor through the critic just
-updated, then both targets. Actions are in the environment's units everywhere. The numbers are of float64; the files also
-say by how much float32 differs at most.
+An update is steps 11 to 16 of the thesis's Algorithm 4: first the critic, then the actor through the updated critic,
+then both targets. Actions are in the environment's units everywhere. The numbers are float64. Each file also states the
+largest difference that float32 makes.
 """
 
 import json
@@ -23,10 +23,10 @@ GAMMA = 0.99
 TAU = 0.001
 ACTOR_LEARNING_RATE = 1e-4
 CRITIC_LEARNING_RATE = 1e-3
-# PyTorch's own, which the test must be told.
+# PyTorch's defaults. The test checks that the learner uses the same.
 ADAM = {"beta1": 0.9, "beta2": 0.999, "eps": 1e-8}
 
-# Of a file's name: seed, widths of observations and actions, hidden units of both layers, rows of a minibatch.
+# By the end of the file's name: seed, widths of observations and actions, hidden units of both layers, minibatch size.
 CASES = {
     "3x1": (1, 3, 1, 20, 12, 8),
     "6x2": (2, 6, 2, 16, 14, 16),
@@ -52,7 +52,7 @@ class Case:
         def near(parameters):
             return {name: numbers + rng.normal(0, 0.01, numbers.shape) for name, numbers in parameters.items()}
 
-        # The order of all that is drawn matters.
+        # The order of the random draws matters.
         actor = network(layer(hidden1, observation), layer(hidden2, hidden1), layer(action, hidden2, 0.3))
         critic = network(layer(hidden1, observation), layer(hidden2, hidden1 + action), layer(1, hidden2, 0.3))
         # The targets differ from the trained networks, as in the middle of a run.
@@ -124,7 +124,7 @@ class Case:
         return results
 
     def document(self):
-        """What the file says."""
+        """The content of the file."""
         observation, action, hidden1, hidden2 = self.sizes
         in64, in32 = self.updates(torch.float64), self.updates(torch.float32)
         gaps = (
@@ -154,7 +154,7 @@ class Case:
 
 
 def plain(value):
-    """What JSON can write."""
+    """Converts arrays to lists, which JSON can represent."""
     if isinstance(value, dict):
         return {key: plain(part) for key, part in value.items()}
     if isinstance(value, list):

@@ -3,8 +3,8 @@
     pip install gymnasium==1.4.0 numpy==2.4.6
     python tests/golden/make_env_golden.py DIRECTORY
 
-DIRECTORY gets pendulum_{0,1,2}.json, cart_pole_{0,1,2}.json and frozen_lake.json. With these versions they are, byte for
-byte, the files beside this script.
+Writes pendulum_{0,1,2}.json, cart_pole_{0,1,2}.json and frozen_lake.json into DIRECTORY. These versions reproduce the
+files beside this script byte for byte.
 """
 
 import json
@@ -17,7 +17,7 @@ import numpy as np
 SEED = 7
 STEPS = 200
 ROLLOUTS = 3
-# Of the value iteration on the lake: the thesis's.
+# The discount of the value iteration on the lake, as in the thesis.
 DISCOUNT = 0.999
 
 
@@ -54,7 +54,7 @@ def pendulum(rng):
 
 
 def cart_pole(rng, balanced):
-    """A rollout up to its end. Random actions end it early; a simple controller balances the pole for long."""
+    """A rollout up to its end. Random actions end it early; a simple controller balances the pole for a long time."""
     environment = gymnasium.make("CartPole-v1").unwrapped
     environment.reset(seed=SEED)
     initial = rng.uniform(-0.05, 0.05, 4)
@@ -123,7 +123,7 @@ def main():
     def write(name, data):
         (directory / name).write_text(json.dumps(data) + "\n")
 
-    # One stream for all of them: their order matters.
+    # All rollouts draw from one stream, so their order matters.
     rng = np.random.default_rng(SEED)
     for rollout in range(ROLLOUTS):
         write(f"pendulum_{rollout}.json", pendulum(rng))

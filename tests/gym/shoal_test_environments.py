@@ -1,4 +1,4 @@
-"""Environments that end, fail and cannot be served, for the tests."""
+"""Environments for the tests, some of which fail or cannot be served."""
 
 import os
 import subprocess
@@ -9,7 +9,10 @@ import numpy as np
 
 
 class Ends(gym.Env):
-    """Ends by itself after ``after`` steps, if the time limit of 5 does not end it before; says what it was seeded with."""
+    """Terminates after ``after`` steps, unless the time limit of 5 comes first.
+
+    Its rewards and observations depend on its seed.
+    """
 
     observation_space = gym.spaces.Box(-np.inf, np.inf, (2, 2))
     action_space = gym.spaces.Box(np.array([-2, 0], np.float32), np.array([2, 1], np.float32))
@@ -32,7 +35,7 @@ class Ends(gym.Env):
 
 
 class Fails(Ends):
-    """Goes wrong in its fourth step."""
+    """Fails in its fourth step."""
 
     def __init__(self, how):
         super().__init__(after=0)
@@ -47,7 +50,7 @@ class Fails(Ends):
 
 
 class Parent(Ends):
-    """Has started a process that lives for long and keeps standard error open."""
+    """Starts a long-lived process that keeps standard error open."""
 
     def __init__(self, alone=False):
         super().__init__(after=0)
@@ -55,7 +58,7 @@ class Parent(Ends):
 
 
 class Talks(Ends):
-    """Writes to standard error without an end, or what a terminal takes for commands."""
+    """Writes endlessly to standard error, or writes terminal control sequences."""
 
     def __init__(self, how):
         super().__init__(after=0)
@@ -70,9 +73,9 @@ class Talks(Ends):
 
 
 class Sleeps(Ends):
-    """Does not come back from a step, once there is a file of the name ``sleep``, or from being made.
+    """Hangs in a step once a file ``sleep`` exists, or with ``from_the_start`` in its constructor.
 
-    The file ``asleep`` says that it sleeps in a step.
+    It creates the file ``asleep`` when it hangs in a step.
     """
 
     def __init__(self, from_the_start=False):
@@ -92,7 +95,10 @@ class Odd(Ends):
 
 
 class Offset(gym.Env):
-    """Counts from 5 observations and from -1 actions; from 5 to 8 lead actions 0, 1, 0, each for a reward, and others end."""
+    """Observations start at 5 and actions at -1.
+
+    Actions 0, 1, 0 lead from 5 to 8, each with a reward of 1. Any other action terminates the episode.
+    """
 
     observation_space = gym.spaces.Discrete(4, start=5)
     action_space = gym.spaces.Discrete(3, start=-1)
@@ -104,9 +110,9 @@ class Offset(gym.Env):
 
     def step(self, action):
         assert self.action_space.contains(action), action
-        leads_on = action == (1 if self.state == 6 else 0)
-        self.state += leads_on
-        return self.state, float(leads_on), bool(not leads_on or self.state == 8), False, {}
+        is_right = action == (1 if self.state == 6 else 0)
+        self.state += is_right
+        return self.state, float(is_right), bool(not is_right or self.state == 8), False, {}
 
 
 gym.register("Ends-v0", entry_point=Ends, max_episode_steps=5)
@@ -120,17 +126,17 @@ gym.register("Offset-v0", entry_point=Offset, max_episode_steps=5)
 
 
 def deaf_server():
-    """An environment server that goes on living and stops hearing, once there is a file of the name ``deaf``."""
+    """An environment server that keeps running but ignores requests while a file ``deaf`` exists."""
     from shoal_gym import port
 
-    hear = port.Port.next_request
+    original = port.Port.next_request
 
     def next_request(self):
         while os.path.exists("deaf"):
             self._look_out()
             self.beat(port.Activity.WAITING_FOR_PEER)
             time.sleep(0.05)
-        return hear(self)
+        return original(self)
 
     port.Port.next_request = next_request
     from shoal_gym.__main__ import main

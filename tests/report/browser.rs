@@ -1,5 +1,5 @@
-//! A page in headless Chromium, driven over the pipe that Chromium itself offers: messages of its DevTools protocol as
-//! JSON, each ended by a zero byte. No crate is needed for that, and no port is opened.
+//! A page in headless Chromium, controlled by `--remote-debugging-pipe`: JSON messages of the DevTools protocol, each
+//! ended by a zero byte. This needs no further crate and opens no port.
 
 use std::io::{BufRead, BufReader, Write};
 use std::os::unix::process::CommandExt;
@@ -13,14 +13,14 @@ use serde_json::{Value, json};
 
 use crate::suite::Need;
 
-/// After so long without a word Chromium is stuck.
-const PATIENCE: Duration = Duration::from_secs(120);
+/// Longest wait for a message of Chromium.
+const TIMEOUT: Duration = Duration::from_secs(120);
 
 const NAMES: [&str; 4] = ["chromium", "chromium-browser", "google-chrome", "chrome"];
 
 /// A Chromium in the search path.
 pub(crate) static CHROMIUM: Need = Need::new(
-    "there is no Chromium here",
+    "found no Chromium",
     || program().is_some(),
     Some("SHOAL_REQUIRE_BROWSER"),
 );
@@ -44,7 +44,7 @@ fn program() -> Option<&'static str> {
 }
 
 impl Browser {
-    /// Starts [`CHROMIUM`], which must be there.
+    /// Starts Chromium. Panics if [`CHROMIUM`] is missing.
     pub(crate) fn start() -> Self {
         let name = program().unwrap();
         let profile = tempfile::tempdir().unwrap();
@@ -100,7 +100,7 @@ impl Browser {
         browser
     }
 
-    /// Loads a file, in a window so wide.
+    /// Loads a file in a window of the given width.
     pub(crate) fn open(&mut self, page: &Path, width: u32, dark: bool) {
         let size = json!({ "width": width, "height": 800, "deviceScaleFactor": 1, "mobile": false });
         self.call("Emulation.setDeviceMetricsOverride", size);
@@ -114,15 +114,15 @@ impl Browser {
         }
     }
 
-    /// The value of an expression in the page, awaited.
+    /// Evaluates a JavaScript expression in the page and awaits its value.
     pub(crate) fn value(&mut self, expression: &str) -> Value {
-        let question = json!({ "expression": expression, "returnByValue": true, "awaitPromise": true });
-        let answer = self.call("Runtime.evaluate", question);
+        let request = json!({ "expression": expression, "returnByValue": true, "awaitPromise": true });
+        let answer = self.call("Runtime.evaluate", request);
         assert_eq!(answer["exceptionDetails"], Value::Null, "{expression}");
         answer["result"]["value"].clone()
     }
 
-    /// Presses a key where the focus is.
+    /// Presses a key in the focused element.
     pub(crate) fn key(&mut self, key: &str) {
         let code = match key {
             " " => 32,
@@ -143,7 +143,7 @@ impl Browser {
         );
     }
 
-    /// Clicks into an element, at this share of its width.
+    /// Clicks into an element, at the fraction `share` of its width.
     pub(crate) fn click(&mut self, selector: &str, share: f64) {
         let place = self.value(&format!(
             "(() => {{ const e = document.querySelector({selector:?}); e.scrollIntoView({{ block: 'center', behavior: 'instant' }}); \
@@ -156,19 +156,19 @@ impl Browser {
         }
     }
 
-    /// What the page has complained of since it was opened: exceptions, errors and warnings.
-    pub(crate) fn complaints(&mut self) -> Vec<String> {
-        // What was said before this answer has come before it.
+    /// Exceptions, errors and warnings of the page since it was opened.
+    pub(crate) fn problems(&mut self) -> Vec<String> {
+        // Events precede this answer, so all of them are received.
         self.value("0");
-        let said = ["Runtime.exceptionThrown", "Runtime.consoleAPICalled", "Log.entryAdded"];
+        let kinds = ["Runtime.exceptionThrown", "Runtime.consoleAPICalled", "Log.entryAdded"];
         let events = self.events.iter();
         events
-            .filter(|event| said.iter().any(|kind| event["method"] == *kind))
+            .filter(|event| kinds.iter().any(|kind| event["method"] == *kind))
             .map(|event| event["params"].to_string())
             .collect()
     }
 
-    /// What it has asked for since, itself included.
+    /// URLs that the page has requested since it was opened, including its own.
     pub(crate) fn requests(&self) -> Vec<String> {
         let sent = self.events_called("Network.requestWillBeSent");
         let url = |event: &Value| event["params"]["request"]["url"].as_str().unwrap().to_owned();
@@ -197,15 +197,13 @@ impl Browser {
     }
 
     fn receive(&self) -> Value {
-        self.from
-            .recv_timeout(PATIENCE)
-            .expect("Chromium has ended, or says nothing any more")
+        self.from.recv_timeout(TIMEOUT).expect("Chromium has ended or hangs")
     }
 }
 
 impl Drop for Browser {
     fn drop(&mut self) {
-        // All of its processes: they are of one group.
+        // Its process group contains all of its processes.
         let _ = kill_process_group(Pid::from_child(&self.child), Signal::KILL);
         let _ = self.child.wait();
     }

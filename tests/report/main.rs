@@ -1,4 +1,4 @@
-//! The report of real runs: one file that is complete in itself, looked at in a real browser.
+//! The report of real runs: a self-contained file, tested in a real browser.
 
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that panics has failed")]
 
@@ -15,17 +15,17 @@ use browser::{Browser, CHROMIUM};
 use libtest_mimic::Completion;
 use serde_json::Value;
 use suite::test;
-use support::{Running, Workplace, complaint, until};
+use support::{Running, Workplace, error_line, until};
 
 fn main() -> ExitCode {
     suite::run(vec![
-        test!(a_report_is_looked_at_in_a_browser, CHROMIUM),
-        test!(a_run_under_way_and_one_that_has_hardly_begun_are_reported),
-        test!(what_cannot_be_reported_is_refused_in_one_line),
+        test!(a_report_works_in_a_browser, CHROMIUM),
+        test!(a_running_run_and_one_with_few_records_can_be_reported),
+        test!(an_impossible_report_is_refused_in_one_line),
     ])
 }
 
-/// A short run of each environment; the pendulum's is repeated with another seed, and made again with a kill on its way.
+/// Short runs of each environment, and of the pendulum also one with another seed and one with a kill.
 fn runs() -> (Workplace, Vec<&'static str>) {
     let place = Workplace::new();
     let evaluate = ["--set", "evaluation.every=200", "--steps", "800"];
@@ -49,12 +49,12 @@ fn runs() -> (Workplace, Vec<&'static str>) {
         );
         assert!(trained.status.success(), "{}", String::from_utf8_lossy(&trained.stderr));
     }
-    killed_on_the_way(&place, "again");
+    train_with_a_kill(&place, "again");
     (place, vec!["swing", "swing-2", "drive", "balance", "lake", "again"])
 }
 
-/// A pendulum's run whose actor was killed, and which was stopped.
-fn killed_on_the_way(place: &Workplace, name: &str) {
+/// A run of the pendulum in which an actor is killed, and which is then stopped.
+fn train_with_a_kill(place: &Workplace, name: &str) {
     let running = place.start(
         name,
         &[
@@ -66,12 +66,12 @@ fn killed_on_the_way(place: &Workplace, name: &str) {
             "evaluation.every=200",
         ],
     );
-    running.learns_on();
+    running.wait_for_learning();
     running.kill("actor-0");
-    until("the kill is on record", || {
+    until("the kill is recorded", || {
         incidents(&running).contains("actor,0,started-again")
     });
-    until("it was evaluated", || {
+    until("a policy was evaluated", || {
         running.run.join("checkpoints/best.policy").exists()
     });
     assert!(place.output(&["stop", name]).status.success());
@@ -82,7 +82,7 @@ fn incidents(running: &Running) -> String {
     std::fs::read_to_string(running.run.join("incidents.csv")).unwrap_or_default()
 }
 
-/// Writes the report of these runs and gives its place.
+/// Writes a report of these runs and returns its path.
 fn report(place: &Workplace, runs: &[&str]) -> PathBuf {
     let output = place.output(&[&["report"], runs, &["--out", "page.html"]].concat());
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
@@ -90,7 +90,7 @@ fn report(place: &Workplace, runs: &[&str]) -> PathBuf {
     std::fs::canonicalize(place.path().join("page.html")).unwrap()
 }
 
-/// Where the moving part of the player's picture is.
+/// The position of the moving part of the player's picture.
 fn moving_part(browser: &mut Browser) -> Vec<Value> {
     let place = "(() => { const b = document.querySelector('[data-part=moves]').getBoundingClientRect(); \
                  return [Math.round(b.left * 10), Math.round((b.top + scrollY) * 10)]; })()";
@@ -102,26 +102,26 @@ fn frame(browser: &mut Browser) -> u64 {
     frame.as_str().unwrap().parse().unwrap()
 }
 
-fn plays(browser: &mut Browser) -> bool {
+fn is_playing(browser: &mut Browser) -> bool {
     browser.value("document.querySelector('.play').dataset.playing") == "true"
 }
 
-fn a_report_is_looked_at_in_a_browser() {
+fn a_report_works_in_a_browser() {
     let mut browser = Browser::start();
     let (place, runs) = runs();
     let page = report(&place, &runs);
     browser.open(&page, 1200, false);
-    assert_eq!(browser.complaints(), [""; 0]);
+    assert_eq!(browser.problems(), [""; 0]);
     assert_eq!(
         browser.requests(),
         [format!("file://{}", page.display())],
-        "nothing but itself"
+        "requests only itself"
     );
 
     let names = browser.value("document.querySelector('.legend').innerText");
     assert!(names.as_str().unwrap().contains("median of 2 runs of ddpg"), "{names}");
 
-    // Every diagram has a curve, and the kill is on the time line.
+    // Every chart has a curve, and the time line shows the kill.
     let charts = browser.value("[...document.querySelectorAll('figure.chart .plot:not(.timeline)')].map((plot) => [...plot.querySelectorAll('.line')].some((line) => line.getAttribute('d').includes('L')) || plot.querySelector('circle') !== null)");
     let charts = charts.as_array().unwrap();
     assert!(
@@ -140,20 +140,20 @@ fn a_report_is_looked_at_in_a_browser() {
         browser.value(&format!(
             "(() => {{ const choice = document.querySelector('.player select'); choice.value = {i}; choice.dispatchEvent(new Event('change')); }})()"
         ));
-        it_is_played(&mut browser, run);
+        check_player(&mut browser, run);
     }
-    a_curve_is_read_and_zoomed(&mut browser);
-    assert_eq!(browser.complaints(), [""; 0]);
-    it_fits_a_phone_and_the_dark(&mut browser, &page);
+    check_readout_and_zoom(&mut browser);
+    assert_eq!(browser.problems(), [""; 0]);
+    check_narrow_and_dark(&mut browser, &page);
 }
 
-/// By the slider, by the keyboard, and by itself.
-fn it_is_played(browser: &mut Browser, run: &str) {
+/// Plays an episode with the slider, with the keyboard and automatically.
+fn check_player(browser: &mut Browser, run: &str) {
     let start = moving_part(browser);
     browser.click(".player input[type=range]", 0.5);
     let middle = frame(browser);
     assert!(middle > 0, "{run}: the slider was moved");
-    // What comes back to the same place half-way has at least been elsewhere: the lake's walker does.
+    // Several positions, because the lake's walker is back at its start half-way.
     let mut places = vec![start, moving_part(browser)];
     browser.value("document.querySelector('.player').focus()");
     browser.key("Home");
@@ -175,11 +175,11 @@ fn it_is_played(browser: &mut Browser, run: &str) {
     browser.key("Home");
     browser.key(" ");
     until("space plays", || frame(browser) > 0);
-    // The others may be over by now; this one takes ten seconds.
+    // The other episodes may be over by now; this one takes ten seconds.
     if run == "swing" {
-        assert!(plays(browser));
+        assert!(is_playing(browser));
         browser.key(" ");
-        assert!(!plays(browser), "space pauses");
+        assert!(!is_playing(browser), "space pauses");
         let paused = frame(browser);
         browser.value("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))");
         assert_eq!(frame(browser), paused);
@@ -191,14 +191,14 @@ fn last_frame(browser: &mut Browser) -> u64 {
     last.as_str().unwrap().parse().unwrap()
 }
 
-fn a_curve_is_read_and_zoomed(browser: &mut Browser) {
+fn check_readout_and_zoom(browser: &mut Browser) {
     browser.value("document.querySelector('.plot').focus()");
     browser.key("ArrowRight");
     browser.key("ArrowRight");
-    let said = browser.value("document.querySelector('.plot .readout').innerText");
+    let readout = browser.value("document.querySelector('.plot .readout').innerText");
     assert!(
-        said.as_str().unwrap().contains("step ") && said.as_str().unwrap().contains("swing: "),
-        "{said}"
+        readout.as_str().unwrap().contains("step ") && readout.as_str().unwrap().contains("swing: "),
+        "{readout}"
     );
     let curve = "document.querySelector('.plot .line').getAttribute('d')";
     let whole = browser.value(curve);
@@ -206,21 +206,21 @@ fn a_curve_is_read_and_zoomed(browser: &mut Browser) {
     let nearer = browser.value(curve);
     assert_ne!(nearer, whole, "zoomed in");
     browser.click(".chart .tools button:nth-child(3)", 0.5);
-    assert_eq!(browser.value(curve), whole, "all of it again");
+    assert_eq!(browser.value(curve), whole, "the whole curve again");
 }
 
-fn it_fits_a_phone_and_the_dark(browser: &mut Browser, page: &std::path::Path) {
+fn check_narrow_and_dark(browser: &mut Browser, page: &std::path::Path) {
     browser.open(page, 390, true);
-    assert_eq!(browser.complaints(), [""; 0]);
+    assert_eq!(browser.problems(), [""; 0]);
     assert_eq!(
         browser.value("document.documentElement.scrollWidth"),
         390,
-        "nothing sticks out"
+        "no horizontal scrolling"
     );
     let small = browser.value(
         "[...document.querySelectorAll('button, select, input[type=range], nav a, summary')].filter((part) => part.offsetParent && part.getBoundingClientRect().height < 43).map((part) => part.outerHTML)",
     );
-    assert_eq!(small, serde_json::json!([]), "a finger hits everything");
+    assert_eq!(small, serde_json::json!([]), "controls are large enough for a finger");
     let [paper, ink] = ["backgroundColor", "color"].map(|name| {
         let colour = browser.value(&format!("getComputedStyle(document.body).{name}"));
         let parts = colour
@@ -235,20 +235,20 @@ fn it_fits_a_phone_and_the_dark(browser: &mut Browser, page: &std::path::Path) {
     browser.value("document.querySelector('.play').focus()");
     browser.key("Tab");
     let outline = browser.value("getComputedStyle(document.activeElement).outlineStyle");
-    assert_eq!(outline, "solid", "where the focus is can be seen");
+    assert_eq!(outline, "solid", "the focus is visible");
 }
 
-fn a_run_under_way_and_one_that_has_hardly_begun_are_reported() -> Completion {
+fn a_running_run_and_one_with_few_records_can_be_reported() -> Completion {
     let place = Workplace::new();
     let running = place.start("run", &["--steps", "1000000000"]);
-    running.learns_on();
+    running.wait_for_learning();
     let page = std::fs::read_to_string(report(&place, &["run"])).unwrap();
     assert!(page.contains("\"state\":\"training\""));
     assert!(place.output(&["stop", "run"]).status.success());
     let run = running.run.clone();
     running.wait();
 
-    // As an older build left it, and with nothing on record.
+    // A run without records, as an older version may have left it.
     for file in [
         "incidents.csv",
         "evaluations.csv",
@@ -264,15 +264,15 @@ fn a_run_under_way_and_one_that_has_hardly_begun_are_reported() -> Completion {
     let page = std::fs::read_to_string(run.join("report.html")).unwrap();
     assert!(page.contains("\"incidents\":null") && page.contains("No policy has been evaluated yet."));
     if let Some(missing) = CHROMIUM.missing() {
-        return Completion::ignored_with(format!("the report was written and not looked at: {missing}"));
+        return Completion::ignored_with(format!("the report was written but not opened: {missing}"));
     }
     let mut browser = Browser::start();
     browser.open(&run.join("report.html"), 800, false);
-    assert_eq!(browser.complaints(), [""; 0]);
+    assert_eq!(browser.problems(), [""; 0]);
     Completion::Completed
 }
 
-fn what_cannot_be_reported_is_refused_in_one_line() {
+fn an_impossible_report_is_refused_in_one_line() {
     let place = Workplace::new();
     std::fs::create_dir(place.path().join("empty")).unwrap();
     place.train(&["pendulum", "--run", "run", "--steps", "200", "--lockstep"]);
@@ -286,7 +286,7 @@ fn what_cannot_be_reported_is_refused_in_one_line() {
         (&["run", "run/../run"], "is named twice"),
         (
             &["run", "--out", "letter.html"],
-            "letter.html is there and is no report",
+            "letter.html exists and is not a report",
         ),
         (
             &["run", "--out", "empty"],
@@ -297,15 +297,18 @@ fn what_cannot_be_reported_is_refused_in_one_line() {
             "cannot write no/where.html; choose another place with --out",
         ),
     ] {
-        let said = complaint(&place.output(&[&["report"], arguments].concat()));
+        let message = error_line(&place.output(&[&["report"], arguments].concat()));
         assert!(
-            said.starts_with("error: ") && said.contains(part),
-            "{arguments:?}: {said}"
+            message.starts_with("error: ") && message.contains(part),
+            "{arguments:?}: {message}"
         );
     }
     let kept = std::fs::read_to_string(place.path().join("letter.html")).unwrap();
     assert!(kept.ends_with("Dear reader"));
     std::fs::write(place.path().join("run/learner.csv"), "a,b\n1,2\n").unwrap();
-    let said = complaint(&place.output(&["report", "run"]));
-    assert!(said.contains("learner.csv is not a record of this program"), "{said}");
+    let message = error_line(&place.output(&["report", "run"]));
+    assert!(
+        message.contains("learner.csv is not a record of this program"),
+        "{message}"
+    );
 }

@@ -3,16 +3,16 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-/// A package, with what its library and program need to be built.
+/// A package and the dependencies of its library and program.
 pub(crate) struct Package {
     pub(crate) name: String,
-    /// Names of packages; those for tests alone are left out.
+    /// Names of the packages, without dev-dependencies.
     pub(crate) dependencies: BTreeSet<String>,
-    /// `lib.rs` and `main.rs`, as far as they are there.
+    /// Those of `src/lib.rs` and `src/main.rs` that exist.
     pub(crate) roots: Vec<PathBuf>,
 }
 
-/// Every package of the workspace whose `Cargo.toml` lies here.
+/// Every package of the workspace whose `Cargo.toml` is in `root`.
 pub(crate) fn workspace(root: &Path) -> Vec<Package> {
     let manifest = read(root);
     let members = manifest["workspace"]["members"].as_array().unwrap();

@@ -1,21 +1,21 @@
-//! What the sources must keep to: no large import circles, and which crate may import which.
+//! Rules for the sources: no large import cycles, and which crate may import which.
 //!
-//! An import is a `use` or a path in the code. What a module only hands on (`pub use`) is followed to the file that declares
-//! it. A parent's `mod` declaration alone is no import. Tests inside the crates are left out.
+//! An import is a `use` or a path in the code. A re-export (`pub use`) is followed to the file that declares the item.
+//! A parent's `mod` declaration alone is not an import. Unit tests are left out.
 
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
 
-mod circles;
 mod crates;
+mod cycles;
 mod scan;
 
 use std::path::Path;
 
-use circles::{circles, fault, text};
 use crates::{Package, workspace};
+use cycles::{cycles, fault, text};
 use scan::Sources;
 
-/// Which of our crates each one may import. Nothing imports `shoal`, so it stands in no list.
+/// The crates of the workspace that each crate may import. No crate imports `shoal`.
 const MAY_IMPORT: [(&str, &[&str]); 12] = [
     ("shoal-base", &[]),
     ("shoal-channel", &["shoal-base"]),
@@ -63,21 +63,21 @@ fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }
 
-/// Circles of a workspace that are not allowed.
-fn wrong_circles(root: &Path, packages: &[Package]) -> Vec<String> {
+/// The forbidden import cycles of a workspace.
+fn wrong_cycles(root: &Path, packages: &[Package]) -> Vec<String> {
     let mut wrong = Vec::new();
     for file in packages.iter().flat_map(|package| &package.roots) {
         let imports = Sources::read(root, file).imports();
-        for circle in circles(&imports) {
-            if let Some(fault) = fault(&circle) {
-                wrong.push(format!("a circle ({fault}):\n{}", text(&circle, &imports)));
+        for cycle in cycles(&imports) {
+            if let Some(fault) = fault(&cycle) {
+                wrong.push(format!("a cycle ({fault}):\n{}", text(&cycle, &imports)));
             }
         }
     }
     wrong
 }
 
-/// Imports of our crates, in manifests and sources, that the table does not allow.
+/// The imports between crates, in manifests and sources, that the table does not allow.
 fn wrong_crates(root: &Path, packages: &[Package], may_import: &[(&str, &[&str])]) -> Vec<String> {
     let mut wrong = Vec::new();
     for package in packages {
@@ -99,7 +99,7 @@ fn wrong_crates(root: &Path, packages: &[Package], may_import: &[(&str, &[&str])
             let mut sources = Sources::read(root, file);
             sources.imports();
             for other in &forbidden {
-                // A crate's library may be used by its own program, and has the package's name.
+                // A package's own library is not among the forbidden ones, although its program imports it by name.
                 for file in sources.foreign.get(&other.replace('-', "_")).into_iter().flatten() {
                     wrong.push(format!("{} imports {other}", file.display()));
                 }
@@ -110,11 +110,11 @@ fn wrong_crates(root: &Path, packages: &[Package], may_import: &[(&str, &[&str])
 }
 
 #[test]
-fn there_is_no_import_circle_but_small_ones_in_one_folder() {
-    let wrong = wrong_circles(root(), &workspace(root()));
+fn import_cycles_are_small_and_within_one_folder() {
+    let wrong = wrong_cycles(root(), &workspace(root()));
     assert!(
         wrong.is_empty(),
-        "of the import circles {} are wrong:\n{}",
+        "{} import cycles are not allowed:\n{}",
         wrong.len(),
         wrong.join("\n")
     );
@@ -184,8 +184,8 @@ fn suites_with_a_harness_of_their_own_have_no_standard_tests() {
     }
 }
 
-/// A workspace of these files.
-fn invented(files: &[(&str, &str)]) -> (tempfile::TempDir, Vec<Package>) {
+/// A temporary workspace with these files.
+fn workspace_of(files: &[(&str, &str)]) -> (tempfile::TempDir, Vec<Package>) {
     let place = tempfile::tempdir().unwrap();
     for (name, text) in files {
         let path = place.path().join(name);
@@ -199,7 +199,7 @@ fn invented(files: &[(&str, &str)]) -> (tempfile::TempDir, Vec<Package>) {
 const MANIFEST: (&str, &str) = ("Cargo.toml", "[package]\nname = \"one\"\n[workspace]\nmembers = []\n");
 
 #[test]
-fn a_circle_is_found_through_nested_uses_inline_paths_and_what_is_handed_on() {
+fn a_cycle_is_found_through_nested_uses_inline_paths_and_re_exports() {
     let files = [
         MANIFEST,
         ("src/lib.rs", "mod a; mod b; mod c; mod d; pub use d::deep::Deep;"),
@@ -211,7 +211,7 @@ fn a_circle_is_found_through_nested_uses_inline_paths_and_what_is_handed_on() {
             "src/b.rs",
             "pub struct Bee; fn f<'a>(x: &'a str) { super::c::go('\\'', \"{\"); }",
         ),
-        // Not lib.rs hands `Deep` on, but `deep.rs` declares it.
+        // lib.rs re-exports `Deep`, which deep.rs declares.
         (
             "src/c.rs",
             "/* { /* */ */ pub(crate) fn go() -> crate::Deep { todo!() }",
@@ -222,11 +222,11 @@ fn a_circle_is_found_through_nested_uses_inline_paths_and_what_is_handed_on() {
             "pub struct Deep; use super::super::a as first; const X: &str = r#\"\"}\"#;",
         ),
     ];
-    let (place, packages) = invented(&files);
-    let wrong = wrong_circles(place.path(), &packages);
+    let (place, packages) = workspace_of(&files);
+    let wrong = wrong_cycles(place.path(), &packages);
     assert_eq!(
         wrong,
-        ["a circle (4 files, and 3 are the most):\n    \
+        ["a cycle (4 files, at most 3 are allowed):\n    \
           src/a.rs imports from src/b.rs\n    \
           src/b.rs imports from src/c.rs\n    \
           src/c.rs imports from src/d/deep.rs\n    \
@@ -235,7 +235,7 @@ fn a_circle_is_found_through_nested_uses_inline_paths_and_what_is_handed_on() {
 }
 
 #[test]
-fn a_small_circle_is_allowed_in_one_folder_only_and_tests_make_none() {
+fn a_small_cycle_is_allowed_only_in_one_folder_and_unit_tests_do_not_count() {
     let inside = [
         MANIFEST,
         ("src/main.rs", "mod a; mod other; fn main() { a::start() }"),
@@ -249,13 +249,13 @@ fn a_small_circle_is_allowed_in_one_folder_only_and_tests_make_none() {
             "#[cfg(test)] mod tests { use crate::a::Ay; } #[cfg(test)] use crate::{a, a::Ay};",
         ),
     ];
-    let (place, packages) = invented(&inside);
-    assert_eq!(wrong_circles(place.path(), &packages), [""; 0]);
+    let (place, packages) = workspace_of(&inside);
+    assert_eq!(wrong_cycles(place.path(), &packages), [""; 0]);
 
     let mut outside = inside;
     outside[4].1 = "use crate::a::Bee;";
-    let (place, packages) = invented(&outside);
-    let wrong = wrong_circles(place.path(), &packages);
+    let (place, packages) = workspace_of(&outside);
+    let wrong = wrong_cycles(place.path(), &packages);
     assert!(
         wrong.len() == 1 && wrong[0].contains("it is not inside one folder"),
         "{wrong:?}"
@@ -263,7 +263,7 @@ fn a_small_circle_is_allowed_in_one_folder_only_and_tests_make_none() {
 }
 
 #[test]
-fn an_import_of_a_crate_is_found_in_the_manifest_and_in_the_sources() {
+fn forbidden_imports_are_found_in_manifests_and_sources() {
     let files = [
         (
             "Cargo.toml",
@@ -281,7 +281,7 @@ fn an_import_of_a_crate_is_found_in_the_manifest_and_in_the_sources() {
         ),
         ("high/src/lib.rs", "#[cfg(test)] mod tests { use low::f; }"),
     ];
-    let (place, packages) = invented(&files);
+    let (place, packages) = workspace_of(&files);
     let table: [(&str, &[&str]); 2] = [("top", &["high", "low"]), ("low", &[])];
     let mut wrong = wrong_crates(place.path(), &packages, &table);
     wrong.sort_unstable();

@@ -1,5 +1,5 @@
-//! Reads Rust sources as far as imports need it: modules, `use` trees, and paths that begin with a module. Code for tests
-//! (`#[cfg(test)]`) is left out.
+//! Parses the parts of Rust sources that matter for imports: modules, `use` trees, and paths that begin with a module.
+//! Test code (`#[cfg(test)]`) is left out.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -7,14 +7,15 @@ use std::path::{Path, PathBuf};
 /// A word, or one character of punctuation.
 type Token = String;
 
-/// The names that a module gets from elsewhere, by the name they have in it.
+/// The names that a module imports: from its local name to the path of the item.
 type Names = BTreeMap<String, Vec<String>>;
 
 /// One crate, read from its root file.
 #[derive(Default)]
 pub(crate) struct Sources {
     modules: BTreeMap<Vec<String>, Module>,
-    /// The first segment of every path that no module of the crate begins: names of crates, types, functions.
+    /// First segments of paths that do not begin with a module of the crate (crates, types, functions), with the files
+    /// that use them.
     pub(crate) foreign: BTreeMap<String, BTreeSet<PathBuf>>,
 }
 
@@ -23,7 +24,7 @@ pub(crate) struct Sources {
 struct Module {
     file: PathBuf,
     imported: Names,
-    /// Paths as they are written, from the module they are written in.
+    /// Paths as written in this module.
     paths: BTreeSet<Vec<String>>,
 }
 
@@ -39,7 +40,7 @@ impl Sources {
         sources
     }
 
-    /// Reads a module's file; those of its own modules lie in `directory`.
+    /// Reads a module's file. The files of its submodules are in `directory`.
     fn read_file(&mut self, base: &Path, file: &Path, directory: &Path, module: Vec<String>) {
         let text = std::fs::read_to_string(file).unwrap_or_else(|error| panic!("{}: {error}", file.display()));
         let tokens = tokens(&text);
@@ -54,7 +55,7 @@ impl Sources {
         }
     }
 
-    /// Reads what stands in one module, up to its end; modules that have files of their own are added to `children`.
+    /// Reads the items of one module. Submodules in files of their own are added to `children`.
     fn read_items(&mut self, tokens: &[Token], file: &Path, module: Vec<String>, children: &mut Vec<Vec<String>>) {
         let known = self.modules.entry(module.clone()).or_default();
         known.file = file.to_owned();
@@ -77,7 +78,7 @@ impl Sources {
                     let end = closing(tokens, at + 2);
                     assert!(
                         !tokens[at + 3..end].windows(3).any(|it| it[0] == "mod" && it[2] == ";"),
-                        "{}: a file below an inline module: this test does not follow it",
+                        "{}: this test does not support a module file below an inline module",
                         file.display()
                     );
                     self.read_items(&tokens[at + 3..end], file, child, children);
@@ -98,7 +99,7 @@ impl Sources {
         }
     }
 
-    /// Who imports from whom.
+    /// Which file imports from which. Also fills [`Self::foreign`].
     pub(crate) fn imports(&mut self) -> Imports {
         let mut imports = Imports::new();
         let mut foreign: BTreeMap<String, BTreeSet<PathBuf>> = BTreeMap::new();
@@ -116,10 +117,10 @@ impl Sources {
         imports
     }
 
-    /// The file that declares what a path in a module means; what a module has from elsewhere is followed to there. `None`
-    /// for what is not of this crate.
+    /// The file that declares the item of a path in a module; imported names are followed to their origin. `None` for
+    /// items of other crates.
     fn file_of(&self, module: &[String], path: &[String], depth: u32) -> Option<&PathBuf> {
-        // Names may be imported in a circle, which the compiler refuses.
+        // Limits the recursion for cyclic `use` declarations, which the compiler refuses anyway.
         if depth > 16 {
             return None;
         }
@@ -151,7 +152,7 @@ impl Sources {
                 (here, rest) = (child, others);
                 continue;
             }
-            // Something that this module only hands on.
+            // A re-export of this module.
             if let Some(origin) = self.modules[&here].imported.get(first) {
                 let origin = [&origin[..], others].concat();
                 let is_of_this_crate = self.file_of(&here, &origin, depth + 1);
@@ -177,7 +178,7 @@ fn after_item(tokens: &[Token], mut at: usize) -> usize {
     while tokens[at] == "#" {
         at = closing(tokens, at + 1) + 1;
     }
-    // Behind a visibility, which may be `pub(crate)`.
+    // Skips the visibility, which may be `pub(crate)`.
     if tokens[at] == "pub" {
         at += 1;
         if tokens[at] == "(" {
@@ -194,7 +195,7 @@ fn after_item(tokens: &[Token], mut at: usize) -> usize {
     at
 }
 
-/// Where what is opened here is closed.
+/// The index of the bracket that closes the one at `opening`.
 fn closing(tokens: &[Token], opening: usize) -> usize {
     let mut depth = 0;
     for (at, token) in tokens.iter().enumerate().skip(opening) {
@@ -210,8 +211,8 @@ fn closing(tokens: &[Token], opening: usize) -> usize {
     panic!("a bracket is not closed")
 }
 
-/// Every name that a `use` brings in, with the path it is brought in from. A glob brings in no name that is known here, so
-/// it counts as the module itself.
+/// Reports every name that a `use` imports, with its path. The names of a glob are unknown here, so it counts as an
+/// import of the module itself.
 fn use_tree(tokens: &[Token], before: &[String], found: &mut impl FnMut(String, Vec<String>)) {
     let mut path = before.to_vec();
     let mut at = 0;
@@ -247,7 +248,7 @@ fn use_tree(tokens: &[Token], before: &[String], found: &mut impl FnMut(String, 
     found(path.last().unwrap().clone(), path);
 }
 
-/// The words and punctuation of a text without its comments, strings, characters and lifetimes.
+/// The words and punctuation of a source text, without comments, strings, characters and lifetimes.
 fn tokens(text: &str) -> Vec<Token> {
     let text: Vec<char> = text.chars().collect();
     let is_word = |at: usize| text.get(at).is_some_and(|c| c.is_alphanumeric() || *c == '_');
@@ -316,7 +317,7 @@ fn tokens(text: &str) -> Vec<Token> {
     tokens
 }
 
-/// Where the raw string that begins here has ended.
+/// The end of the raw string that begins at `start`; `None` if none begins there.
 fn raw_string(text: &[char], start: usize) -> Option<usize> {
     let mut at = start;
     if text[at] == 'b' {

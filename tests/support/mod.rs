@@ -1,6 +1,6 @@
-//! Runs the real program as a person would, in a directory of its own, and knows what it must leave behind.
+//! Runs the real program as a user would, in a directory of its own, and checks what it leaves behind.
 
-#![allow(dead_code, reason = "every test file uses its own part of this")]
+#![allow(dead_code, reason = "every suite uses a different part of this file")]
 
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
@@ -9,13 +9,13 @@ use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process, test_kill_process};
 
-/// After so long a test has failed, however slow the machine.
-const PATIENCE: Duration = Duration::from_secs(120);
+/// A wait that takes longer has failed, even on a slow machine.
+const TIMEOUT: Duration = Duration::from_secs(120);
 
-/// And after so long a command that may be a whole training.
-const LONG_PATIENCE: Duration = Duration::from_secs(600);
+/// The same for a command that may be a whole training run.
+const COMMAND_TIMEOUT: Duration = Duration::from_secs(600);
 
-/// Settings with which a run is quick: small networks, little warm-up, few episodes to evaluate by.
+/// Settings for a quick run: small networks, a short warm-up, few evaluation episodes.
 pub(crate) const QUICK: [&str; 10] = [
     "--set",
     "ddpg.hidden=[24, 16]",
@@ -32,11 +32,11 @@ pub(crate) const QUICK: [&str; 10] = [
 /// A directory to run the program in.
 pub(crate) struct Workplace {
     directory: tempfile::TempDir,
-    /// What the log of its runs is to tell of (`SHOAL_LOG`).
+    /// Log level of its runs (`SHOAL_LOG`).
     log: &'static str,
 }
 
-/// A run under way; killed with all its roles when dropped.
+/// A running run. Dropping it kills the launcher and all roles.
 pub(crate) struct Running {
     child: Child,
     pub(crate) run: PathBuf,
@@ -50,8 +50,8 @@ impl Workplace {
         }
     }
 
-    /// A place whose runs' logs tell of every chunk that is sent.
-    pub(crate) fn where_chunks_are_counted() -> Self {
+    /// A directory whose runs log every chunk that is sent.
+    pub(crate) fn logging_chunks() -> Self {
         Self {
             log: "debug",
             ..Self::new()
@@ -95,7 +95,7 @@ impl Workplace {
         self.launch(name, &[&["train", "pendulum", "--run", name], arguments].concat())
     }
 
-    /// Goes on with the run in `name` and waits until every role is ready.
+    /// Resumes the run in `name` and waits until every role is ready.
     pub(crate) fn resume(&self, name: &str, arguments: &[&str]) -> Running {
         self.launch(name, &[&["resume", name], arguments].concat())
     }
@@ -111,7 +111,7 @@ impl Workplace {
             .stdout(Stdio::piped())
             .stderr(std::fs::File::create(self.path().join("stderr")).unwrap())
             .env("SHOAL_LOG", self.log)
-            // A signal to the test runner's group is not for the run.
+            // So that signals to the test runner's group do not reach the run.
             .process_group(0)
             .spawn()
             .unwrap();
@@ -121,16 +121,16 @@ impl Workplace {
         };
         until("every role is ready", || {
             let ended = running.child.try_wait().unwrap();
-            // A short run may be over before it was seen at work.
+            // A short run may have ended before it was seen running.
             let is_ready = ready() > before || ended.is_some_and(|status| status.success());
-            assert!(ended.is_none() || is_ready, "{}", self.said());
+            assert!(ended.is_none() || is_ready, "{}", self.stderr());
             is_ready
         });
         running
     }
 
-    /// What the launcher started last wrote to standard error.
-    pub(crate) fn said(&self) -> String {
+    /// Standard error of the launcher that was started last.
+    pub(crate) fn stderr(&self) -> String {
         std::fs::read_to_string(self.path().join("stderr")).unwrap_or_default()
     }
 
@@ -139,17 +139,17 @@ impl Workplace {
         json(&self.output(&["status", name, "--json"]))
     }
 
-    /// What it prints of a role, like `actor-0`, of a run that goes on.
+    /// The entry of a role, like `actor-0`, in the status of a running run.
     pub(crate) fn role(&self, name: &str, who: &str) -> serde_json::Value {
         let status = self.status(name);
         let roles = status["roles"].as_array().unwrap();
-        let is_meant =
+        let has_name =
             |role: &&serde_json::Value| format!("{}-{}", role["role"].as_str().unwrap(), role["index"]) == who;
-        let found = roles.iter().find(is_meant);
+        let found = roles.iter().find(has_name);
         found.unwrap_or_else(|| panic!("no {who}: {status}")).clone()
     }
 
-    /// Copies the run directory `from` as it stands, under way or not.
+    /// Copies the run directory `from` in its current state, whether the run is running or not.
     pub(crate) fn copy(&self, from: &str, to: &str) {
         let mut command = Command::new("cp");
         let copied = command.args(["-r", from, to]).current_dir(self.path()).status();
@@ -162,10 +162,10 @@ impl Running {
         std::fs::read_to_string(self.run.join("shoal.log")).unwrap_or_default()
     }
 
-    /// Waits until the learner has reported more updates than by now.
-    pub(crate) fn learns_on(&self) {
+    /// Waits until the learner has reported more updates than at the time of the call.
+    pub(crate) fn wait_for_learning(&self) {
         let before = self.learned("updates");
-        until("something more is learned", || self.learned("updates") > before);
+        until("the learner has made more updates", || self.learned("updates") > before);
     }
 
     /// The highest number that the learner has reported in a column of `learner.csv`; 0 before the first report.
@@ -177,7 +177,7 @@ impl Running {
         rows.records().flatten().filter_map(number).max().unwrap_or(0)
     }
 
-    /// Process numbers of a role in the order of their starts, like `actor-0`.
+    /// Process ids of a role, like `actor-0`, in the order of its starts.
     pub(crate) fn pids(&self, who: &str) -> Vec<i32> {
         pids(&self.log())
             .into_iter()
@@ -192,12 +192,12 @@ impl Running {
     }
 
     /// Stops the running process of a role with SIGSTOP.
-    pub(crate) fn stop(&self, who: &str) {
+    pub(crate) fn stop_role(&self, who: &str) {
         self.signal_role(who, Signal::STOP);
     }
 
-    /// Lets a stopped process go on.
-    pub(crate) fn go_on(&self, who: &str) {
+    /// Continues the stopped process of a role with SIGCONT.
+    pub(crate) fn continue_role(&self, who: &str) {
         self.signal_role(who, Signal::CONT);
     }
 
@@ -206,21 +206,21 @@ impl Running {
         kill_process(Pid::from_raw(pid).unwrap(), signal).unwrap();
     }
 
-    /// Kills all processes of the run at once, and waits until they are gone. They are stopped first, so that none
-    /// notices the end of another.
-    pub(crate) fn kill_everybody(&self) {
-        let everybody = self.leftovers().processes();
+    /// Kills all processes of the run at once and waits until they are gone. They are stopped first, so that none can
+    /// react to the end of another.
+    pub(crate) fn kill_all(&self) {
+        let processes = self.leftovers().processes();
         for signal in [Signal::STOP, Signal::KILL] {
             self.signal(signal);
-            for pid in &everybody {
-                // One may have ended in between.
+            for pid in &processes {
+                // It may have ended in between.
                 let _ = kill_process(Pid::from_raw(*pid).unwrap(), signal);
             }
         }
-        until("everybody is dead", || self.leftovers().processes().is_empty());
+        until("every process has ended", || self.leftovers().processes().is_empty());
     }
 
-    /// The launcher's process number.
+    /// The launcher's process id.
     pub(crate) fn launcher(&self) -> u32 {
         self.child.id()
     }
@@ -230,7 +230,7 @@ impl Running {
         kill_process(Pid::from_child(&self.child), signal).unwrap();
     }
 
-    /// Waits until the launcher has ended; its exit code, and what it printed.
+    /// Waits until the launcher has ended. Returns its exit code, its standard output and the run's leftovers.
     pub(crate) fn wait(mut self) -> (Option<i32>, String, Leftovers) {
         until("the launcher has ended", || self.child.try_wait().unwrap().is_some());
         let code = self.child.wait().unwrap().code();
@@ -239,7 +239,7 @@ impl Running {
         (code, printed, Leftovers::of(&self.run))
     }
 
-    /// What this run must not leave behind.
+    /// Processes and shared memory of this run.
     pub(crate) fn leftovers(&self) -> Leftovers {
         Leftovers::of(&self.run)
     }
@@ -274,7 +274,7 @@ impl Leftovers {
         }
     }
 
-    /// Processes of the run that are still there.
+    /// Processes of the run that still exist.
     pub(crate) fn processes(&self) -> Vec<i32> {
         self.pids.iter().copied().filter(|pid| is_ours(*pid)).collect()
     }
@@ -293,8 +293,8 @@ impl Leftovers {
         &self.run_id
     }
 
-    /// Waits until nothing is left.
-    pub(crate) fn vanish(&self) {
+    /// Waits until no process and no file in shared memory is left.
+    pub(crate) fn wait_until_gone(&self) {
         assert!(!self.pids.is_empty());
         until("no process of the run is left", || self.processes().is_empty());
         until("no file of the run is left in shared memory", || {
@@ -303,7 +303,7 @@ impl Leftovers {
     }
 }
 
-/// Rows that an actor has sent in all its starts, by the log of a run in a [`Workplace`] where they are counted.
+/// Rows that an actor has sent in all its incarnations, according to the log of a run in [`Workplace::logging_chunks`].
 pub(crate) fn sent(run: &Path, actor: u32) -> u64 {
     let log = std::fs::read_to_string(run.join("shoal.log")).unwrap();
     let number = |line: &str, name: &str| -> u64 {
@@ -317,14 +317,14 @@ pub(crate) fn sent(run: &Path, actor: u32) -> u64 {
     chunks.map(|line| number(line, "rows")).sum()
 }
 
-/// Rows of an actor that are in the replay.
+/// Rows of an actor in the replay.
 pub(crate) fn committed(run: &Path, actor: usize) -> u64 {
     let commits = shoal_common::commit::CommitReader::open(&run.join("replay.bin")).unwrap();
     commits.actor(actor).rows
 }
 
-/// The weights a run ends with, and what its policies were evaluated to be on the way.
-pub(crate) fn end_of(running: Running) -> (serde_json::Value, Vec<String>) {
+/// Waits until a run has ended successfully. Returns its final weights and its evaluations without their times.
+pub(crate) fn final_result(running: Running) -> (serde_json::Value, Vec<String>) {
     let run = running.run.clone();
     let (code, printed, leftovers) = running.wait();
     assert_eq!(
@@ -342,38 +342,38 @@ pub(crate) fn end_of(running: Running) -> (serde_json::Value, Vec<String>) {
     )
 }
 
-/// Waits until so many rows more are in the replay.
-pub(crate) fn comes_further(running: &Running, by: u64) {
-    let wanted = rows_of(running) + by;
-    until("it has come further", || rows_of(running) >= wanted);
+/// Waits until the replay has `by` more rows than at the time of the call.
+pub(crate) fn wait_for_rows(running: &Running, by: u64) {
+    let wanted = committed_rows(running) + by;
+    until("more rows are committed", || committed_rows(running) >= wanted);
 }
 
-/// Rows in the replay; 0 before there is one.
-pub(crate) fn rows_of(running: &Running) -> u64 {
+/// Committed rows of a run; 0 before its replay exists.
+pub(crate) fn committed_rows(running: &Running) -> u64 {
     shoal_common::commit::CommitReader::open(&running.run.join("replay.bin")).map_or(0, |commits| commits.rows())
 }
 
-/// The one line that a failed command said.
-pub(crate) fn complaint(output: &Output) -> String {
-    let said = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert!(!output.status.success(), "{said}");
+/// The error message of a failed command, which must be its only output and one line.
+pub(crate) fn error_line(output: &Output) -> String {
+    let message = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(!output.status.success(), "{message}");
     assert!(output.stdout.is_empty());
-    assert_eq!(said.lines().count(), 1, "one line: {said}");
-    said
+    assert_eq!(message.lines().count(), 1, "one line: {message}");
+    message
 }
 
-/// Each of so many actors has sent rows, and all of them are in the replay.
-pub(crate) fn all_that_was_sent_is_there(run: &Path, actors: u32) {
+/// Asserts that each of the first `actors` actors has sent rows and that all of them are in the replay.
+pub(crate) fn assert_all_rows_committed(run: &Path, actors: u32) {
     for actor in 0..actors {
         let (sent, committed) = (sent(run, actor), committed(run, actor as usize));
         assert!(
             sent > 0 && sent == committed,
-            "actor {actor} sent {sent} rows, {committed} are there"
+            "actor {actor} sent {sent} rows, {committed} are committed"
         );
     }
 }
 
-/// The last line of what was printed, as JSON.
+/// The only line of a command's standard output, as JSON.
 pub(crate) fn json(output: &Output) -> serde_json::Value {
     parse(&String::from_utf8_lossy(&output.stdout))
 }
@@ -388,13 +388,13 @@ pub(crate) fn parse(printed: &str) -> serde_json::Value {
     serde_json::from_str(printed).unwrap()
 }
 
-/// Runs a command to its end; one that hangs is killed, and the test has failed.
+/// Runs a command to its end. A command that hangs is killed, and the test fails.
 pub(crate) fn output_of(command: &mut Command) -> Output {
     let child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     let pid = Pid::from_child(&child);
     let (sender, ended) = std::sync::mpsc::channel();
     std::thread::spawn(move || sender.send(child.wait_with_output()));
-    match ended.recv_timeout(LONG_PATIENCE) {
+    match ended.recv_timeout(COMMAND_TIMEOUT) {
         Ok(output) => output.unwrap(),
         Err(_) => {
             kill_process(pid, Signal::KILL).unwrap();
@@ -403,11 +403,14 @@ pub(crate) fn output_of(command: &mut Command) -> Output {
     }
 }
 
-/// Waits until something holds.
+/// Polls until `holds` returns true.
 pub(crate) fn until(what: &str, mut holds: impl FnMut() -> bool) {
     let begun = Instant::now();
     while !holds() {
-        assert!(begun.elapsed() < PATIENCE, "waited in vain until {what}");
+        assert!(
+            begun.elapsed() < TIMEOUT,
+            "waited {TIMEOUT:?} without success until {what}"
+        );
         std::thread::sleep(Duration::from_millis(10));
     }
 }
@@ -420,7 +423,7 @@ fn pids(log: &str) -> Vec<(String, i32)> {
     log.lines().filter_map(started).collect()
 }
 
-/// Whether the process exists and is a role of ours: its number may have been given to somebody else.
+/// Whether the process exists and is a role of Shoal. Its id may have been reused by another program.
 fn is_ours(pid: i32) -> bool {
     let alive = test_kill_process(Pid::from_raw(pid).unwrap()).is_ok();
     let command = std::fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();

@@ -1,16 +1,18 @@
-//! Suites some of whose tests need what not every machine has. The standard harness cannot say `ignored` once it runs; this
-//! one can, with the reason. Such a suite has `harness = false` in `Cargo.toml`, and its `main` lists its tests; one that is
-//! not listed is dead code, of which the compiler warns. A filter, `--list`, `--ignored`, `--exact`, `--skip` and
-//! `--test-threads` work as usual. Output is not captured, and there is at most one filter.
+//! A harness for suites in which some tests need something that a machine may lack, such as Python or root. The
+//! standard harness cannot ignore a test at run time; this one can, and prints the reason.
+//!
+//! Such a suite has `harness = false` in `Cargo.toml`, and its `main` lists its tests. A test that is not listed is
+//! dead code, and the compiler warns. A filter, `--list`, `--ignored`, `--exact`, `--skip` and `--test-threads` work as
+//! usual. Output is not captured, and at most one filter is possible.
 
-#![allow(dead_code, reason = "every suite uses its own part of this")]
+#![allow(dead_code, reason = "every suite uses a different part of this file")]
 
 use std::process::{Command, ExitCode};
 use std::sync::OnceLock;
 
 use libtest_mimic::{Arguments, Completion, Trial};
 
-/// Something that not every machine has.
+/// Something that a test needs and that a machine may lack.
 pub(crate) struct Need {
     missing: &'static str,
     look: fn() -> bool,
@@ -18,7 +20,7 @@ pub(crate) struct Need {
     found: OnceLock<bool>,
 }
 
-/// What a test can end with, where it does not fail.
+/// The result of a test that does not fail.
 pub(crate) trait Done {
     fn done(self) -> Completion;
 }
@@ -30,15 +32,16 @@ pub(crate) static PYTHON: Need = Need::new(
     Some("SHOAL_REQUIRE_PYTHON"),
 );
 
-/// The right to be two users.
+/// The right to run as two users.
 pub(crate) static ROOT: Need = Need::new(
-    "only root can be two users",
+    "only root can run as two users",
     || rustix::process::getuid().is_root(),
     None,
 );
 
 impl Need {
-    /// `missing` is what is said where `look` finds nothing. Where the variable `required_by` is set that is a failure.
+    /// `look` returns whether the machine has it; `missing` is the reason printed otherwise. If the environment
+    /// variable `required_by` is set, a missing one is a failure.
     pub(crate) const fn new(missing: &'static str, look: fn() -> bool, required_by: Option<&'static str>) -> Self {
         Self {
             missing,
@@ -48,10 +51,10 @@ impl Need {
         }
     }
 
-    /// What is missing on this machine; `None` where nothing is. It is looked for once.
+    /// The reason if this machine lacks it, otherwise `None`. The machine is examined once.
     ///
     /// # Panics
-    /// Where it is missing and required.
+    /// If it is missing and required.
     pub(crate) fn missing(&self) -> Option<&'static str> {
         if *self.found.get_or_init(self.look) {
             return None;
@@ -79,7 +82,7 @@ impl Done for Completion {
     }
 }
 
-/// A test by its function, and what it needs.
+/// A test from its function and its needs.
 macro_rules! test {
     ($test:ident $(, $need:expr)*) => {
         $crate::suite::trial(stringify!($test), vec![$(&$need),*], $test)
@@ -87,7 +90,7 @@ macro_rules! test {
 }
 pub(crate) use test;
 
-/// A test that is ignored where something that it needs is missing.
+/// A test that is ignored if one of its needs is missing.
 pub(crate) fn trial<D: Done + 'static>(name: &str, needs: Vec<&'static Need>, test: fn() -> D) -> Trial {
     Trial::ignorable_test(name, move || {
         Ok(match needs.iter().find_map(|need| need.missing()) {
@@ -97,10 +100,10 @@ pub(crate) fn trial<D: Done + 'static>(name: &str, needs: Vec<&'static Need>, te
     })
 }
 
-/// Runs the tests that the command line asks for.
+/// Runs the tests that the command line selects.
 pub(crate) fn run(tests: Vec<Trial>) -> ExitCode {
     let mut arguments = Arguments::from_args();
-    // As the standard harness does.
+    // The standard harness reads this variable too.
     let threads = std::env::var("RUST_TEST_THREADS").ok();
     let threads = threads.map(|threads| threads.parse().unwrap());
     arguments.test_threads = arguments.test_threads.or(threads);

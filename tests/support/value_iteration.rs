@@ -1,8 +1,8 @@
-//! What is best on the lake, by its transition table.
+//! Optimal values of the frozen lake, computed from its transition table.
 
 use shoal_env_server::environment::frozen_lake::{ACTIONS, LakeTransition, STATES, transitions};
 
-/// Bellman's optimality equation, iterated until nothing changes by 1e-12.
+/// Iterates Bellman's optimality equation until no value changes by 1e-12.
 pub(crate) fn optimal_values(gamma: f64) -> [[f64; ACTIONS]; STATES] {
     let mut q = [[0.0; ACTIONS]; STATES];
     loop {

@@ -1,11 +1,11 @@
-//! A run's policy as a file for other programs.
+//! Export of a policy for other programs.
 
 use rten::{Model, Value};
 
-use crate::support::{Workplace, complaint};
+use crate::support::{Workplace, error_line};
 
 #[test]
-fn a_trained_policy_is_written_in_both_forms_and_computes_elsewhere() {
+fn a_policy_is_exported_in_both_formats_and_runs_in_other_software() {
     let place = Workplace::new();
     place.train(&["pendulum", "--steps", "400", "--run", "run"]);
     let printed = |arguments: &[&str]| {
@@ -39,22 +39,25 @@ fn a_trained_policy_is_written_in_both_forms_and_computes_elsewhere() {
 }
 
 #[test]
-fn what_cannot_be_exported_is_said_on_one_line() {
+fn an_impossible_export_is_refused_in_one_line() {
     let place = Workplace::new();
-    let said = complaint(&place.output(&["export", "nowhere", "--format", "onnx"]));
-    assert!(said.contains("nowhere is not a run directory"), "{said}");
+    let message = error_line(&place.output(&["export", "nowhere", "--format", "onnx"]));
+    assert!(message.contains("nowhere is not a run directory"), "{message}");
     place.train(&["pendulum", "--steps", "300", "--run", "run"]);
-    let said = complaint(&place.output(&["export", "run", "--format", "onnx", "--out", "missing/policy.onnx"]));
-    assert!(said.contains("missing/policy.onnx") && said.contains("--out"), "{said}");
-    std::fs::remove_file(place.path().join("run/checkpoints/best.policy")).unwrap();
-    let said = complaint(&place.output(&["export", "run", "--format", "safetensors"]));
+    let message = error_line(&place.output(&["export", "run", "--format", "onnx", "--out", "missing/policy.onnx"]));
     assert!(
-        said.contains("best.policy") && said.contains("no policy here"),
-        "{said}"
+        message.contains("missing/policy.onnx") && message.contains("--out"),
+        "{message}"
+    );
+    std::fs::remove_file(place.path().join("run/checkpoints/best.policy")).unwrap();
+    let message = error_line(&place.output(&["export", "run", "--format", "safetensors"]));
+    assert!(
+        message.contains("best.policy") && message.contains("no policy here"),
+        "{message}"
     );
     assert_eq!(
         place.output(&["export", "run"]).status.code(),
         Some(2),
-        "a form must be named"
+        "--format is required"
     );
 }

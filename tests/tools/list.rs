@@ -1,8 +1,8 @@
-//! The runs in a directory.
+//! The list of runs in a directory.
 
 use serde_json::Value;
 
-use crate::support::{QUICK, Workplace, complaint, json, output_of};
+use crate::support::{QUICK, Workplace, error_line, json, output_of};
 
 fn listed<'a>(list: &'a Value, name: &str) -> &'a Value {
     let mut runs = list["runs"].as_array().unwrap().iter();
@@ -13,8 +13,8 @@ fn listed<'a>(list: &'a Value, name: &str) -> &'a Value {
 #[test]
 fn every_run_is_listed_with_its_state() {
     let place = Workplace::new();
-    let said = complaint(&place.output(&["list"]));
-    assert!(said.contains("there is no directory runs"), "{said}");
+    let message = error_line(&place.output(&["list"]));
+    assert!(message.contains("there is no directory runs"), "{message}");
     std::fs::create_dir(place.path().join("runs")).unwrap();
     let empty = place.output(&["list"]);
     assert_eq!(String::from_utf8_lossy(&empty.stdout), "no runs in runs\n");
@@ -23,17 +23,17 @@ fn every_run_is_listed_with_its_state() {
     place.train(&[&["pendulum", "--run", "runs/finished"][..], &length].concat());
     let endless = ["--steps", "100000000"];
     let killed = place.start("runs/killed", &endless);
-    killed.learns_on();
-    killed.kill_everybody();
+    killed.wait_for_learning();
+    killed.kill_all();
     let stopped = place.start("runs/stopped", &endless);
-    stopped.learns_on();
+    stopped.wait_for_learning();
     assert!(place.output(&["stop", "runs/stopped"]).status.success());
     stopped.wait();
     std::fs::create_dir(place.path().join("runs/damaged")).unwrap();
     std::fs::write(place.path().join("runs/damaged/config.toml"), "[run\n").unwrap();
     std::fs::create_dir(place.path().join("runs/notes")).unwrap();
     let running = place.start("runs/running", &endless);
-    running.learns_on();
+    running.wait_for_learning();
 
     let list = json(&place.output(&["list", "--json"]));
     assert_eq!(list["runs"].as_array().unwrap().len(), 5, "{list}");
@@ -69,9 +69,9 @@ fn every_run_is_listed_with_its_state() {
 }
 
 #[test]
-fn a_run_that_failed_is_told_from_one_that_was_killed() {
+fn a_failed_run_is_listed_as_failed() {
     let place = Workplace::new();
-    // Without room for its replay.
+    // The limit on file sizes is too small for the replay.
     let script = format!(
         "ulimit -f 8000; exec {} train pendulum --run runs/run {}",
         env!("CARGO_BIN_EXE_shoal"),

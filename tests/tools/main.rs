@@ -1,4 +1,4 @@
-//! What surrounds training: the policy exported, runs listed, the shell's completions, the manual, and the terminal.
+//! Tools around training: export of policies, list of runs, completions, manual, and output on a terminal.
 
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
 

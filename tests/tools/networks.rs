@@ -1,12 +1,12 @@
-//! Runs whose networks have other hidden layers than two: they train, go on, are evaluated and leave the program.
+//! Runs with other than two hidden layers: training, resuming, evaluation and export.
 
 use rten::{Model, Value};
 use safetensors::SafeTensors;
 
-use crate::support::{QUICK, Workplace, complaint, json};
+use crate::support::{QUICK, Workplace, error_line, json};
 
 #[test]
-fn networks_of_one_and_of_three_hidden_layers_train_go_on_are_evaluated_and_exported() {
+fn networks_of_one_and_three_hidden_layers_can_be_trained_resumed_evaluated_and_exported() {
     let cases: [(&str, &str, &[usize]); 3] = [
         ("[32]", "relu", &[32]),
         ("[16,16,16]", "relu", &[16; 3]),
@@ -33,8 +33,8 @@ fn networks_of_one_and_of_three_hidden_layers_train_go_on_are_evaluated_and_expo
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
         let after = json(&output);
         assert_eq!(after["env_steps"], 2048);
-        assert_ne!(after["weights_sha256"], before, "it has learned on");
-        // Both are whole rounds, so a run that was not broken off ends with the same bits.
+        assert_ne!(after["weights_sha256"], before, "learning has continued");
+        // Both lengths are whole rounds, so an uninterrupted run ends with the same bits.
         let whole = [
             "train",
             "pendulum",
@@ -73,14 +73,14 @@ fn networks_of_one_and_of_three_hidden_layers_train_go_on_are_evaluated_and_expo
             assert_eq!(weights.shape(), [pair[1], pair[0]]);
         }
 
-        // What a runtime that is not ours says is what the tensors say.
+        // An independent ONNX runtime computes the same as the tensors.
         let model = Model::load(read("last.onnx")).unwrap();
         let [input, output] = ["observation", "action"].map(|name| model.node_id(name).unwrap());
         let s = vec![0.6_f32, -0.8, 1.5];
         let observation = Value::from_shape([1, 3], s.clone()).unwrap();
-        let mut said = model.run(vec![(input, observation.into())], &[output], None).unwrap();
-        let (_, action) = said.remove(0).into_shape_vec::<f32, 2>().unwrap();
-        let expected = 2.0 * by_tensors(&tensors, units.len(), activation, s).tanh();
+        let mut outputs = model.run(vec![(input, observation.into())], &[output], None).unwrap();
+        let (_, action) = outputs.remove(0).into_shape_vec::<f32, 2>().unwrap();
+        let expected = 2.0 * output_of_tensors(&tensors, units.len(), activation, s).tanh();
         assert!(
             (action[0] - expected).abs() < 1e-5,
             "{hidden}: {action:?} for {expected}"
@@ -88,8 +88,8 @@ fn networks_of_one_and_of_three_hidden_layers_train_go_on_are_evaluated_and_expo
     }
 }
 
-/// The linear output of the network, by the tensors alone.
-fn by_tensors(tensors: &SafeTensors<'_>, last: usize, activation: &str, s: Vec<f32>) -> f32 {
+/// The network's output before its output activation, computed from the tensors.
+fn output_of_tensors(tensors: &SafeTensors<'_>, last: usize, activation: &str, s: Vec<f32>) -> f32 {
     let numbers = |name: String| -> Vec<f32> {
         let tensor = tensors.tensor(&name).unwrap();
         let bytes = tensor.data().as_chunks::<4>().0.iter();
@@ -110,7 +110,7 @@ fn by_tensors(tensors: &SafeTensors<'_>, last: usize, activation: &str, s: Vec<f
 }
 
 #[test]
-fn a_run_goes_on_with_the_networks_it_has_and_with_no_others() {
+fn a_run_can_be_resumed_only_with_its_own_networks() {
     let place = Workplace::new();
     place.train(&["pendulum", "--steps", "300", "--run", "run"]);
     let path = place.path().join("run/config.toml");
@@ -123,10 +123,10 @@ fn a_run_goes_on_with_the_networks_it_has_and_with_no_others() {
         let changed = config.replace(written, other);
         assert_ne!(changed, config, "{written}");
         std::fs::write(&path, changed).unwrap();
-        let said = complaint(&place.output(&["resume", "run", "--steps", "400"]));
-        assert!(said.contains("another configuration"), "{other}: {said}");
+        let message = error_line(&place.output(&["resume", "run", "--steps", "400"]));
+        assert!(message.contains("another configuration"), "{other}: {message}");
     }
-    // A configuration from before there was the key.
+    // A configuration of a version without this key.
     std::fs::write(&path, config.replace("activation = \"relu\"\n", "")).unwrap();
     let output = place.output(&["resume", "run", "--steps", "400"]);
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));

@@ -2,10 +2,10 @@
 
 use std::process::Command;
 
-use crate::support::{Workplace, complaint, output_of};
+use crate::support::{Workplace, error_line, output_of};
 
-/// What bash would offer for the last of these words, by the function that `shoal completions bash` defines.
-fn offered(place: &Workplace, words: &[&str]) -> String {
+/// The completions that bash offers for the last of these words.
+fn completions(place: &Workplace, words: &[&str]) -> String {
     let binary = std::path::Path::new(env!("CARGO_BIN_EXE_shoal"));
     let words: Vec<String> = words.iter().map(|word| format!("'{word}'")).collect();
     let script = format!(
@@ -34,17 +34,17 @@ fn bash_completes_commands_presets_files_and_keys() {
     let place = Workplace::new();
     std::fs::write(place.path().join("mine.toml"), "").unwrap();
     std::fs::write(place.path().join("mine.txt"), "").unwrap();
-    assert_eq!(offered(&place, &["shoal", "expo"]).trim(), "export");
-    assert_eq!(offered(&place, &["shoal", "train", "pend"]).trim(), "pendulum");
-    assert_eq!(offered(&place, &["shoal", "train", "mi"]).trim(), "mine.toml");
-    let keys = offered(&place, &["shoal", "train", "pendulum", "--set", "ddpg.t"]);
+    assert_eq!(completions(&place, &["shoal", "expo"]).trim(), "export");
+    assert_eq!(completions(&place, &["shoal", "train", "pend"]).trim(), "pendulum");
+    assert_eq!(completions(&place, &["shoal", "train", "mi"]).trim(), "mine.toml");
+    let keys = completions(&place, &["shoal", "train", "pendulum", "--set", "ddpg.t"]);
     assert_eq!(keys.trim(), "ddpg.tau=");
-    let forms = offered(&place, &["shoal", "export", "run", "--format", ""]);
+    let forms = completions(&place, &["shoal", "export", "run", "--format", ""]);
     assert!(forms.contains("onnx") && forms.contains("safetensors"), "{forms}");
 }
 
 #[test]
-fn every_shell_is_told_how_to_ask() {
+fn completions_exist_for_every_shell() {
     let place = Workplace::new();
     for shell in ["bash", "zsh", "fish", "elvish", "powershell"] {
         let output = place.output(&["completions", shell]);
@@ -78,14 +78,14 @@ fn the_manual_has_a_page_for_every_command() {
     }
     assert!(
         !place.path().join("man/man1/shoal-learner.1").exists(),
-        "a role is nobody's to type"
+        "users do not start roles"
     );
     std::fs::write(place.path().join("file"), "").unwrap();
-    assert!(complaint(&place.output(&["man", "--out", "file"])).contains("cannot write the manual to file"));
+    assert!(error_line(&place.output(&["man", "--out", "file"])).contains("cannot write the manual to file"));
 }
 
 #[test]
-fn the_configuration_is_explained_without_training_anything() {
+fn help_config_explains_the_configuration_without_training() {
     let place = Workplace::new();
     let explained = |arguments: &[&str]| {
         let output = place.output(&[&["train"], arguments, &["--help-config"]].concat());
@@ -112,11 +112,11 @@ fn the_configuration_is_explained_without_training_anything() {
         !pendulum.contains("[sarsa]") && !pendulum.contains("friction"),
         "{pendulum}"
     );
-    assert!(complaint(&place.output(&["train", "pendulums", "--help-config"])).contains("no preset `pendulums`"));
+    assert!(error_line(&place.output(&["train", "pendulums", "--help-config"])).contains("no preset `pendulums`"));
     assert_eq!(
         place.output(&["train"]).status.code(),
         Some(2),
-        "what to train must be said"
+        "a preset or file is required"
     );
     assert!(!place.path().join("runs").exists());
 }

@@ -1,4 +1,4 @@
-//! A terminal for a program that wants one: a pseudo-terminal, and a reader that knows what it shows.
+//! A pseudo-terminal with a program, and tests of the program's output on it.
 
 use std::fs::{File, OpenOptions};
 use std::io::{Read, Write};
@@ -14,11 +14,11 @@ use rustix::termios::{LocalModes, Winsize, tcgetattr, tcsetwinsize};
 
 use crate::support::{QUICK, Workplace, until};
 
-/// A terminal with a program on it, which is killed when this is dropped.
+/// A terminal with a program. Dropping it kills the program.
 pub(crate) struct Terminal {
     child: Child,
     master: File,
-    /// Kept open, so that the terminal's settings can be asked for when the program has ended.
+    /// Kept open, so that the terminal's settings can be read after the program has ended.
     slave: File,
     before: LocalModes,
     seen: Arc<Mutex<Seen>>,
@@ -30,7 +30,7 @@ struct Seen {
 }
 
 impl Terminal {
-    /// Starts the program with these arguments on a terminal of its own of 80 × 24.
+    /// Starts the program with these arguments on a new terminal of 80 × 24.
     pub(crate) fn start(place: &Workplace, arguments: &[&str], no_colour: bool) -> Self {
         let (master, slave) = open();
         let seen = Arc::new(Mutex::new(Seen {
@@ -72,17 +72,17 @@ impl Terminal {
         self.master.write_all(keys.as_bytes()).unwrap();
     }
 
-    /// What stands on the terminal now.
+    /// The current contents of the terminal.
     pub(crate) fn text(&self) -> String {
         self.seen.lock().unwrap().screen.screen().contents()
     }
 
-    /// Waits until this stands on the terminal.
+    /// Waits until the terminal shows `text`.
     pub(crate) fn shows(&self, text: &str) {
         until(&format!("the terminal shows {text:?}"), || self.text().contains(text));
     }
 
-    /// Everything that was written to it.
+    /// Everything that was written to the terminal so far.
     pub(crate) fn written(&self) -> String {
         String::from_utf8_lossy(&self.seen.lock().unwrap().bytes).into_owned()
     }
@@ -91,24 +91,24 @@ impl Terminal {
         kill_process(Pid::from_child(&self.child), signal).unwrap();
     }
 
-    pub(crate) fn is_at_work(&mut self) -> bool {
+    pub(crate) fn is_running(&mut self) -> bool {
         self.child.try_wait().unwrap().is_none()
     }
 
-    /// Waits for the program's end; its exit code. The terminal must be as it was.
+    /// Waits for the program's end, checks that the terminal's settings are restored, and returns the exit code.
     pub(crate) fn end(&mut self) -> Option<i32> {
-        until("the program on the terminal has ended", || !self.is_at_work());
+        until("the program on the terminal has ended", || !self.is_running());
         let now = tcgetattr(&self.slave).unwrap().local_modes;
         assert_eq!(now, self.before, "lines are edited and echoed as before");
         let seen = Arc::clone(&self.seen);
-        until("the picture is gone", || {
+        until("the alternate screen is closed", || {
             !seen.lock().unwrap().screen.screen().alternate_screen()
         });
         self.child.wait().unwrap().code()
     }
 }
 
-/// A terminal of 80 × 24, by its two ends.
+/// Opens a terminal of 80 × 24 and returns its two ends.
 fn open() -> (File, File) {
     let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).unwrap();
     grantpt(&master).unwrap();
@@ -126,9 +126,9 @@ fn open() -> (File, File) {
     (master, slave)
 }
 
-/// The program with these arguments, on a terminal.
+/// The command that runs the program with these arguments on a terminal.
 fn on(slave: &File, place: &Workplace, arguments: &[&str]) -> Command {
-    // A session of its own, so that the terminal is its and not the tester's.
+    // A new session, so that this terminal is the controlling one.
     let mut command = Command::new("setsid");
     command
         .args(["--ctty", env!("CARGO_BIN_EXE_shoal")])
@@ -160,7 +160,7 @@ impl Drop for Terminal {
 
 const SHORT: [&str; 4] = ["train", "pendulum", "--steps", "600"];
 
-/// Whether something sets a colour: of the letters or behind them.
+/// Whether an escape sequence sets a colour, of the text or its background.
 fn has_colour(written: &str) -> bool {
     let sequences = written.split("\x1b[").skip(1);
     let settings = sequences.filter_map(|rest| rest.split_once('m').map(|(numbers, _)| numbers));
@@ -172,7 +172,7 @@ fn has_colour(written: &str) -> bool {
 }
 
 #[test]
-fn the_live_line_has_colours_on_a_terminal_unless_none_are_wanted() {
+fn the_live_line_has_colours_unless_no_color_is_set() {
     let place = Workplace::new();
     let written = |no_colour| {
         let mut terminal = Terminal::start(&place, &[&SHORT[..], &QUICK[..]].concat(), no_colour);
@@ -180,14 +180,14 @@ fn the_live_line_has_colours_on_a_terminal_unless_none_are_wanted() {
         terminal.shows("figures: shoal plot");
         terminal.written()
     };
-    let usual = written(false);
-    assert!(usual.contains("updates") && has_colour(&usual), "{usual}");
+    let coloured = written(false);
+    assert!(coloured.contains("updates") && has_colour(&coloured), "{coloured}");
     let plain = written(true);
     assert!(plain.contains("updates") && !has_colour(&plain), "{plain}");
 }
 
 #[test]
-fn help_and_errors_have_no_colours_either() {
+fn no_color_also_applies_to_help_and_errors() {
     let place = Workplace::new();
     for arguments in [
         &["--help"][..],
@@ -197,7 +197,7 @@ fn help_and_errors_have_no_colours_either() {
     ] {
         let mut terminal = Terminal::start(&place, arguments, true);
         terminal.end();
-        until("something is said", || !terminal.text().trim().is_empty());
+        until("something is printed", || !terminal.text().trim().is_empty());
         assert!(!has_colour(&terminal.written()), "{}", terminal.written());
     }
 }
@@ -206,16 +206,16 @@ fn help_and_errors_have_no_colours_either() {
 fn without_a_terminal_there_is_no_live_line() {
     let place = Workplace::new();
     let output = place.output(&[&SHORT[..], &QUICK[..]].concat());
-    let said = String::from_utf8(output.stderr).unwrap();
+    let message = String::from_utf8(output.stderr).unwrap();
     assert!(
-        output.status.success() && said.contains("figures: shoal plot"),
-        "{said}"
+        output.status.success() && message.contains("figures: shoal plot"),
+        "{message}"
     );
-    assert!(!said.contains(['\x1b', '\r']), "{said}");
+    assert!(!message.contains(['\x1b', '\r']), "{message}");
 }
 
 #[test]
-fn when_the_terminal_goes_away_nobody_goes_on_drawing() {
+fn top_ends_when_its_terminal_goes_away() {
     let place = Workplace::new();
     let running = place.start("run", &["--steps", "100000000", "--actors", "1"]);
     let (mut master, slave) = open();
@@ -227,6 +227,6 @@ fn when_the_terminal_goes_away_nobody_goes_on_drawing() {
         seen.extend(&bytes[..count]);
     }
     drop(master);
-    until("it has ended", || top.try_wait().unwrap().is_some());
-    running.learns_on();
+    until("top has ended", || top.try_wait().unwrap().is_some());
+    running.wait_for_learning();
 }

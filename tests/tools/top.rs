@@ -1,14 +1,14 @@
-//! `shoal top` on a terminal, with a real run.
+//! `shoal top` on a terminal, with real runs.
 
 use rustix::process::Signal;
 
-use crate::support::{Workplace, complaint, until};
+use crate::support::{Workplace, error_line, until};
 use crate::terminal::Terminal;
 
 const ENDLESS: [&str; 4] = ["--steps", "100000000", "--actors", "1"];
 
 #[test]
-fn a_run_is_watched_scaled_and_stopped_by_keys() {
+fn top_shows_scales_and_stops_a_run() {
     let place = Workplace::new();
     let running = place.start("run", &ENDLESS);
     let mut terminal = Terminal::start(&place, &["top", "run"], false);
@@ -43,14 +43,14 @@ fn a_run_is_watched_scaled_and_stopped_by_keys() {
     let (code, _, leftovers) = running.wait();
     assert_eq!(code, Some(0));
     terminal.shows("has ended");
-    assert!(terminal.is_at_work(), "it stays until somebody leaves");
+    assert!(terminal.is_running(), "it stays open until the user quits");
     terminal.press("q");
     assert_eq!(terminal.end(), Some(0));
-    leftovers.vanish();
+    leftovers.wait_until_gone();
 }
 
 #[test]
-fn whoever_ends_it_gets_the_terminal_back_and_the_run_goes_on() {
+fn ending_top_restores_the_terminal_and_leaves_the_run_running() {
     let place = Workplace::new();
     let running = place.start("run", &ENDLESS);
     for (signal, code) in [(Signal::TERM, 143), (Signal::INT, 130), (Signal::HUP, 129)] {
@@ -63,18 +63,18 @@ fn whoever_ends_it_gets_the_terminal_back_and_the_run_goes_on() {
     terminal.shows("learner 0");
     terminal.press("\x03");
     assert_eq!(terminal.end(), Some(0));
-    running.learns_on();
+    running.wait_for_learning();
 }
 
 #[test]
-fn without_a_terminal_or_a_run_one_line_says_so() {
+fn without_a_terminal_or_a_run_top_is_refused_in_one_line() {
     let place = Workplace::new();
-    assert!(complaint(&place.output(&["top", "nowhere"])).contains("nowhere is not a run directory"));
+    assert!(error_line(&place.output(&["top", "nowhere"])).contains("nowhere is not a run directory"));
     place.train(&["pendulum", "--steps", "300", "--run", "run"]);
-    let said = complaint(&place.output(&["top", "run"]));
+    let message = error_line(&place.output(&["top", "run"]));
     assert!(
-        said.contains("draws on a terminal") && said.contains("shoal status run --watch"),
-        "{said}"
+        message.contains("draws on a terminal") && message.contains("shoal status run --watch"),
+        "{message}"
     );
     let mut terminal = Terminal::start(&place, &["top", "run"], true);
     assert_eq!(terminal.end(), Some(3));

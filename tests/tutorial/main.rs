@@ -1,8 +1,11 @@
-//! `docs/TUTORIAL.md` does what it says: every command of it is run, and its environment is compiled and stepped.
+//! `docs/TUTORIAL.md` is correct: its commands are run, and its environment is compiled and stepped.
 
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
 
-#[allow(unreachable_pub, reason = "it is public where the tutorial puts it")]
+#[allow(
+    unreachable_pub,
+    reason = "it is public in the crate for which the tutorial writes it"
+)]
 mod rail;
 #[path = "../support/mod.rs"]
 mod support;
@@ -16,7 +19,7 @@ use support::{Leftovers, Workplace};
 
 const TUTORIAL: &str = include_str!("../../docs/TUTORIAL.md");
 
-/// The contents of the fenced blocks in a language, in their order.
+/// The contents of the fenced blocks of a language, in order.
 fn blocks(language: &str) -> Vec<&'static str> {
     let fence = format!("```{language}\n");
     let after = TUTORIAL.split(fence.as_str()).skip(1);
@@ -24,13 +27,13 @@ fn blocks(language: &str) -> Vec<&'static str> {
 }
 
 #[test]
-fn every_command_does_what_the_tutorial_says() {
+fn the_tutorials_commands_work() {
     let place = Workplace::new();
     let binaries = std::path::Path::new(env!("CARGO_BIN_EXE_shoal")).parent().unwrap();
     let path = format!("{}:{}", binaries.display(), std::env::var("PATH").unwrap_or_default());
     let blocks = blocks("sh");
     assert!(blocks.len() >= 6, "the tutorial's commands are found");
-    // What a failure leaves running in the background ends in order.
+    // After a failure, background jobs are ended in order.
     let script = format!("trap 'kill $(jobs -p) 2>/dev/null || true' EXIT\n{}", blocks.concat());
     let output = Command::new("timeout")
         .args(["500", "bash", "-e", "-o", "pipefail", "-c", &script])
@@ -39,31 +42,31 @@ fn every_command_does_what_the_tutorial_says() {
         .stdin(std::process::Stdio::null())
         .output()
         .unwrap();
-    let [printed, said] = [&output.stdout, &output.stderr].map(|text| String::from_utf8_lossy(text).into_owned());
-    assert!(output.status.success(), "{printed}\n{said}");
+    let [printed, errors] = [&output.stdout, &output.stderr].map(|text| String::from_utf8_lossy(text).into_owned());
+    assert!(output.status.success(), "{printed}\n{errors}");
     for part in [
         "runs/first/swing-up.svg",
         "first.onnx",
         "actors: 4",
         "stopped; to go on",
     ] {
-        assert!(printed.contains(part), "{part}: {printed}\n{said}");
+        assert!(printed.contains(part), "{part}: {printed}\n{errors}");
     }
     for file in ["runs/first/learning-curve.svg", "first.onnx", "first.safetensors"] {
         assert!(place.path().join(file).exists(), "{file}");
     }
     let log = std::fs::read_to_string(place.path().join("runs/second/shoal.log")).unwrap();
     assert!(log.contains("killed by signal 9"), "a learner was killed: {log}");
-    Leftovers::of(&place.path().join("runs/second")).vanish();
+    Leftovers::of(&place.path().join("runs/second")).wait_until_gone();
 }
 
 #[test]
-fn the_tutorials_environment_is_the_one_that_is_compiled() {
+fn the_tutorials_environment_is_the_compiled_one() {
     assert_eq!(blocks("rust"), [include_str!("rail.rs")]);
 }
 
 #[test]
-fn the_tutorials_environment_keeps_what_an_environment_promises() {
+fn the_tutorials_environment_implements_the_trait_correctly() {
     let mut rail = rail::Rail::new(rail::Parameters::default()).unwrap();
     let spec = rail.spec();
     let mut rng = stream(1, Purpose::Environment, 0, 0);

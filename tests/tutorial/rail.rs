@@ -16,7 +16,7 @@ const DT: f64 = 0.05;
 const X: f64 = 2.0;
 const V: f64 = 2.0;
 
-/// What can be set.
+/// The environment's parameters.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Parameters {
@@ -31,7 +31,8 @@ impl Default for Parameters {
     }
 }
 
-/// A cart of 1 kg. Observation (x, v), action (force in N, at most 1 either way), reward −x² − 0.1 v² each step; never terminates.
+/// A cart of 1 kg. Observation (x, v), action (force in N, from −1 to 1), reward −x² − 0.1 v² in each step. Never
+/// terminates.
 #[derive(Clone, Debug)]
 pub struct Rail {
     parameters: Parameters,

@@ -1,4 +1,4 @@
-//! The same for people.
+//! The results of `bench actors` as text for the user.
 
 use super::super::one_core::{OneCore, TARGET};
 use super::super::target::{Line, Target};
@@ -15,12 +15,13 @@ impl Figures for ActorFigures {
             ("rows a second, no updates", lines(counts.iter().map(collecting))),
             ("rows and updates a second", lines(counts.iter().map(learning))),
             ("cores", self.cores()),
-            ("an actor and its server on one core", self.share()),
+            ("one actor and its server on one core", self.share()),
             (
-                "what stages cost",
+                "cost of each stage",
                 format!(
-                    "64 observations {:.0} µs, with noise {:.0}; a step of 64 environments {:.1} µs, from the other process \
-                     {:.1};\na chunk of {} rows {:.1} µs to write, {:.1} to take in; an update {:.0} µs",
+                    "policy for 64 observations {:.0} µs, with noise {:.0};\n\
+                     a step of 64 environments {:.1} µs, through the server process {:.1};\n\
+                     a chunk of {} rows {:.1} µs to write, {:.1} to receive; an update {:.0} µs",
                     costs.inference_us,
                     costs.acting_us,
                     costs.environment_step_us,
@@ -36,7 +37,7 @@ impl Figures for ActorFigures {
                 lines(scaling.iter().map(expected)),
             ),
             (
-                "what saturates first",
+                "first bottleneck",
                 format!(
                     "here {}; with a core for each process {}, with updates {}",
                     saturated(&self.first_bottleneck_on_these_cores),
@@ -87,9 +88,9 @@ impl ActorFigures {
     fn cores(&self) -> String {
         let crowded = self.counts.iter().find(|count| count.more_processes_than_cores);
         match crowded {
-            None => format!("{}: one for every process", self.cores),
+            None => format!("{}: one for each process", self.cores),
             Some(Count { actors, processes, .. }) => format!(
-                "{}: from {} on ({processes} processes) they share cores, and efficiency is the machine's",
+                "{}: from {} on ({processes} processes), processes share cores and efficiency depends on the machine",
                 self.cores,
                 of_actors(*actors)
             ),
@@ -101,10 +102,11 @@ impl ActorFigures {
         let learner = if it.learner_apart {
             ""
         } else {
-            "; the learner shared the core"
+            "; the learner ran on the same core"
         };
         format!(
-            "{:.2} ({:.2} to {:.2}) of the policy alone, target {TARGET}: {:.0} of {:.0} thousand rows a second{learner}",
+            "{:.2} ({:.2} to {:.2}) of the policy alone, target {TARGET}: \
+             {:.0} of {:.0} thousand rows a second{learner}",
             it.share,
             it.share_least,
             it.share_greatest,
@@ -151,7 +153,7 @@ fn expected(scaling: &Scaling) -> String {
 }
 
 fn saturated(bottleneck: &Bottleneck) -> String {
-    format!("{}, by {:.1} actors", bottleneck.resource, bottleneck.actors)
+    format!("{}, at {:.1} actors", bottleneck.resource, bottleneck.actors)
 }
 
 fn of_actors(actors: u32) -> String {

@@ -1,4 +1,4 @@
-//! A training that is a child of this process, and when what happens in it. It is looked at every millisecond.
+//! A training run as a child process, and the times of its events. It is polled every millisecond.
 
 use std::collections::HashSet;
 use std::os::unix::process::CommandExt;
@@ -16,26 +16,26 @@ use shoal_run::process::Peer;
 use shoal_run::remote::Remote;
 use tempfile::TempDir;
 
-use super::super::flow::{LOOK, commits_of, newest, policy_reader};
-use super::super::measurement::Patience;
+use super::super::measurement::Budget;
+use super::super::progress::{POLL_INTERVAL, newest, open_commits, policy_reader};
 
-/// How long a learner is at work before it is killed: the launcher has heard of it by then.
-const SETTLED: Duration = Duration::from_millis(700);
+/// How long a learner runs before it is killed, so that the launcher has received its heartbeat.
+const SETTLING_TIME: Duration = Duration::from_millis(700);
 
-/// How long anything may take. What takes longer hangs.
-const PATIENCE: Duration = Duration::from_secs(60);
+/// Longest wait for any event. A run that takes longer hangs.
+const TIMEOUT: Duration = Duration::from_secs(60);
 
-/// A training that goes on.
+/// A running training process.
 pub(super) struct Training {
     launcher: Peer,
     begun: Instant,
-    /// Of the learner that was seen last.
+    /// Incarnation of the newest learner seen.
     incarnation: u64,
-    seat: Option<Observer>,
+    observer: Option<Observer>,
     directory: TempDir,
 }
 
-/// What is needed to look on.
+/// Access to the run's configuration, status, heartbeats and policies.
 struct Observer {
     remote: Remote,
     heartbeats: Reports<Heartbeat>,
@@ -43,7 +43,7 @@ struct Observer {
     domain: Domain,
 }
 
-/// When a run had come how far, since its launcher was started.
+/// Times of a run's first events, from the start of its launcher.
 pub(super) struct Startup {
     pub(super) ready: Duration,
     first_row: Duration,
@@ -52,7 +52,7 @@ pub(super) struct Startup {
     pub(super) warm_up_rows: u64,
 }
 
-/// When a learner that was killed was replaced, since then.
+/// Times of a recovery, from the kill of the learner.
 pub(super) struct Recovery {
     pub(super) ready: Duration,
     pub(super) update: Duration,
@@ -65,7 +65,7 @@ impl Startup {
 }
 
 impl Training {
-    /// Starts the preset `pendulum` as it is, but for its length.
+    /// Starts the preset `pendulum` with its settings, but a much larger number of steps.
     pub(super) fn start() -> anyhow::Result<Self> {
         let directory = tempfile::Builder::new()
             .prefix("shoal-bench-")
@@ -83,16 +83,16 @@ impl Training {
             launcher,
             begun,
             incarnation: 0,
-            seat: None,
+            observer: None,
             directory,
         })
     }
 
-    /// Ends the training in order, and removes what it left.
+    /// Ends the training in order and removes its files.
     pub(super) fn end(self) -> anyhow::Result<()> {
-        let ended = self.launcher.interrupt(PATIENCE);
-        // Whoever is the last to leave removes the run from shared memory.
-        let left = match self.seat {
+        let ended = self.launcher.interrupt(TIMEOUT);
+        // The last process to leave removes the run from shared memory.
+        let left = match self.observer {
             None => Ok(()),
             Some(Observer {
                 heartbeats,
@@ -110,37 +110,37 @@ impl Training {
         removed.context("cannot remove a temporary directory")
     }
 
-    /// Looks on until the first policy that updates have changed.
-    pub(super) fn begin(&mut self, patience: &Patience) -> anyhow::Result<Startup> {
+    /// Observes the run until the first policy that gradient steps have changed.
+    pub(super) fn begin(&mut self, budget: &Budget) -> anyhow::Result<Startup> {
         let run = RunDir::planned(&self.directory.path().join("run"));
         let begun = self.begun;
-        // Who joins before the launcher has would be taken for what another launcher left; and the services are there when the
-        // first process is started, whose number is written down before.
+        // Joining before the launcher would look like the remains of an earlier run. The launcher writes this file
+        // before it starts the first process, and has created the services by then.
         let counter = run.incarnations();
-        self.wait(patience, "no process", |_| Ok(counter.exists().then_some(())))?;
-        let mut seat = Observer::take(&run)?;
-        let actors = seat.remote.config.actors.count;
+        self.wait(budget, "no process", |_| Ok(counter.exists().then_some(())))?;
+        let mut observer = Observer::open(&run)?;
+        let actors = observer.remote.config.actors.count;
         let roles = 3 + 2 * actors as usize;
-        let warm_up_rows = seat.remote.config.replay.warmup;
+        let warm_up_rows = observer.remote.config.replay.warmup;
 
-        let (mut heard, mut commits) = (HashSet::new(), None);
+        let (mut seen, mut commits) = (HashSet::new(), None);
         let (mut ready, mut first_row, mut warm, mut update) = (None, None, None, None);
-        let began = self.wait(patience, "no update", |incarnation| {
-            while let Some(heartbeat) = seat.heartbeats.receive()? {
-                heard.insert((heartbeat.role(), heartbeat.index));
+        let began = self.wait(budget, "no update", |incarnation| {
+            while let Some(heartbeat) = observer.heartbeats.receive()? {
+                seen.insert((heartbeat.role(), heartbeat.index));
             }
             if commits.is_none() {
-                commits = commits_of(&run)?;
+                commits = open_commits(&run)?;
             }
             let rows = commits.as_ref().map_or(0, |commits| commits.rows());
-            let header = newest(&mut seat.policies)?;
+            let header = newest(&mut observer.policies)?;
             let now = begun.elapsed();
-            let note = |event: &mut Option<Duration>, has_come: bool| {
-                if has_come {
+            let note = |event: &mut Option<Duration>, has_occurred: bool| {
+                if has_occurred {
                     event.get_or_insert(now);
                 }
             };
-            note(&mut ready, heard.len() == roles);
+            note(&mut ready, seen.len() == roles);
             note(&mut first_row, rows > 0);
             note(&mut warm, rows >= warm_up_rows);
             note(&mut update, header.is_some_and(|header| header.updates > 0));
@@ -154,43 +154,45 @@ impl Training {
                 warm_up_rows,
             }))
         });
-        self.seat = Some(seat);
+        self.observer = Some(observer);
         began
     }
 
-    /// Waits until the run is at work for a while.
-    pub(super) fn settle(&mut self, patience: &Patience) -> anyhow::Result<()> {
+    /// Lets the run work for a while.
+    pub(super) fn settle(&mut self, budget: &Budget) -> anyhow::Result<()> {
         let begun = Instant::now();
-        self.wait(patience, "no rest", |_| Ok((begun.elapsed() >= SETTLED).then_some(())))
+        self.wait(budget, "no steady state", |_| {
+            Ok((begun.elapsed() >= SETTLING_TIME).then_some(()))
+        })
     }
 
-    /// Role, index and number of every process.
+    /// Role, index and process id of every process.
     pub(super) fn members(&self) -> anyhow::Result<Vec<(String, u32, u32)>> {
-        let status = self.seat()?.remote.status()?.context("the training has ended")?;
+        let status = self.observer()?.remote.status()?.context("the training has ended")?;
         let members = status.roles.into_iter();
         Ok(members
             .filter_map(|role| Some((role.role, role.index, role.pid?)))
             .collect())
     }
 
-    /// The file that the replay is.
+    /// The path of the replay file.
     pub(super) fn replay(&self) -> anyhow::Result<PathBuf> {
-        Ok(self.seat()?.remote.run.replay_file())
+        Ok(self.observer()?.remote.run.replay_file())
     }
 
-    /// Looks on until the successor of a learner that was killed then has made updates.
-    pub(super) fn recover(&mut self, killed: Instant, patience: &Patience) -> anyhow::Result<Recovery> {
-        let mut seat = self.seat.take().context("nobody looks on")?;
+    /// Observes the run until the successor of the learner killed at `killed` has made gradient steps.
+    pub(super) fn recover(&mut self, killed: Instant, budget: &Budget) -> anyhow::Result<Recovery> {
+        let mut observer = self.observer.take().context("the training is not being observed")?;
         let (mut ready, mut first, before) = (None, None, self.incarnation);
-        let came = self.wait(patience, "no update of the learner's successor", |incarnation| {
-            while let Some(heartbeat) = seat.heartbeats.receive()? {
+        let came = self.wait(budget, "no update of the learner's successor", |incarnation| {
+            while let Some(heartbeat) = observer.heartbeats.receive()? {
                 if heartbeat.role() == Some(Role::Learner) && heartbeat.incarnation > before {
                     ready.get_or_insert(killed.elapsed());
                 }
             }
-            let header = newest(&mut seat.policies)?.filter(|header| header.incarnation > before);
+            let header = newest(&mut observer.policies)?.filter(|header| header.incarnation > before);
             let Some(header) = header else { return Ok(None) };
-            // Its first policy is that of the checkpoint.
+            // The successor's first policy is that of the checkpoint.
             let restored = *first.get_or_insert(header.updates);
             let is_changed = header.updates > restored;
             Ok(ready.filter(|_| is_changed).map(|ready| {
@@ -201,18 +203,19 @@ impl Training {
                 }
             }))
         });
-        self.seat = Some(seat);
+        self.observer = Some(observer);
         came
     }
 
-    fn seat(&self) -> anyhow::Result<&Observer> {
-        self.seat.as_ref().context("nobody looks on")
+    fn observer(&self) -> anyhow::Result<&Observer> {
+        self.observer.as_ref().context("the training is not being observed")
     }
 
-    /// Looks until there is something; an error when that takes too long, or the training ends, or somebody asks for the end.
+    /// Polls until `look` returns something. Returns an error if that takes too long, the training ends, or the user
+    /// interrupts.
     fn wait<T>(
         &mut self,
-        patience: &Patience,
+        budget: &Budget,
         missing: &str,
         mut look: impl FnMut(&mut u64) -> anyhow::Result<Option<T>>,
     ) -> anyhow::Result<T> {
@@ -221,18 +224,18 @@ impl Training {
             if let Some(found) = look(&mut self.incarnation)? {
                 return Ok(found);
             }
-            patience.check()?;
+            budget.check()?;
             self.launcher.check()?;
-            if begun.elapsed() >= PATIENCE {
-                bail!("the training showed {missing} for {} s", PATIENCE.as_secs());
+            if begun.elapsed() >= TIMEOUT {
+                bail!("the training showed {missing} for {} s", TIMEOUT.as_secs());
             }
-            std::thread::sleep(LOOK);
+            std::thread::sleep(POLL_INTERVAL);
         }
     }
 }
 
 impl Observer {
-    fn take(run: &RunDir) -> anyhow::Result<Self> {
+    fn open(run: &RunDir) -> anyhow::Result<Self> {
         let remote = Remote::open(run.path())?;
         let domain = Domain::join(&remote.config.run.id, remote.config.actors.max)?;
         Ok(Self {

@@ -1,12 +1,12 @@
-//! Files that are either whole or not there: written under another name, synced, then renamed; and the envelope that
-//! shows when one was damaged afterwards.
+//! Files that are either complete or absent: they are written under a temporary name, synced and renamed. A sealed file
+//! also has an envelope with a checksum, which reveals later damage.
 
 use std::fs::{self, File, OpenOptions, Permissions};
 use std::io::{self, BufWriter, Read, Write};
 use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
-/// A file that is complete and on the disk, still under its temporary name. Dropped unpublished, it is removed.
+/// A file that is complete and on the disk, still under its temporary name. Dropping it without publishing removes it.
 #[derive(Debug)]
 #[must_use = "the file appears only when it is published"]
 pub struct Prepared {
@@ -16,8 +16,8 @@ pub struct Prepared {
 }
 
 impl Prepared {
-    /// Writes and syncs what `write` gives, for `path`, readable by the owner alone. What a process killed here before
-    /// has left under the temporary name (`path` with `.new` appended) is overwritten.
+    /// Writes and syncs a file for `path`, readable by the owner alone. The temporary name is `path` with `.new` appended;
+    /// a file that a killed process left there is overwritten.
     pub fn write<E: From<io::Error>>(
         path: &Path,
         write: impl FnOnce(&mut BufWriter<File>) -> Result<(), E>,
@@ -52,7 +52,7 @@ impl Prepared {
         Ok((prepared, file))
     }
 
-    /// Gives the file its name, replacing in one step what had it.
+    /// Renames the file to its final name, which atomically replaces a file of that name.
     pub fn publish(mut self) -> io::Result<()> {
         self.rename()?;
         sync_directory_of(&self.path)
@@ -68,13 +68,13 @@ impl Prepared {
 impl Drop for Prepared {
     fn drop(&mut self) {
         if !self.published {
-            // Nothing to do about a failure here: the next write uses the same temporary name.
+            // A failure does no harm: the next write uses the same temporary name.
             let _ = fs::remove_file(&self.temporary);
         }
     }
 }
 
-/// Writes a file so that at any moment `path` is what it was before or all of what `write` gives, after a power loss too.
+/// Writes a file atomically: at any moment `path` is either the old file or the complete new one, also after a power loss.
 pub fn write_atomically<E: From<io::Error>>(
     path: &Path,
     write: impl FnOnce(&mut BufWriter<File>) -> Result<(), E>,
@@ -82,9 +82,9 @@ pub fn write_atomically<E: From<io::Error>>(
     Ok(Prepared::write(path, write)?.publish()?)
 }
 
-/// Writes a file so that at any moment `path` is what it was before or all of what `write` gives, whichever process dies. It does
-/// not wait for the disk: a power loss may leave the file damaged.
-pub fn write_at_once<E: From<io::Error>>(
+/// Like [`write_atomically`], but without waiting for the disk: the file is whole after any process dies, but a power loss
+/// may damage it.
+pub fn write_atomically_unsynced<E: From<io::Error>>(
     path: &Path,
     write: impl FnOnce(&mut BufWriter<File>) -> Result<(), E>,
 ) -> Result<(), E> {
@@ -92,7 +92,7 @@ pub fn write_at_once<E: From<io::Error>>(
     Ok(prepared.rename()?)
 }
 
-/// Makes the names in the directory of `path` survive a power loss.
+/// Syncs the directory of `path`, so that the names in it survive a power loss.
 pub fn sync_directory_of(path: &Path) -> io::Result<()> {
     let directory = path
         .parent()
@@ -101,12 +101,12 @@ pub fn sync_directory_of(path: &Path) -> io::Result<()> {
     File::open(directory)?.sync_all()
 }
 
-/// What a sealed file of some kind begins with.
+/// A kind of sealed file: the prefix of such files, and the kind's name.
 #[derive(Clone, Copy, Debug)]
 pub struct Kind {
-    /// Tells the kind of file.
+    /// Identifies the kind of file.
     pub magic: [u8; 8],
-    /// Its format; raise it with every change.
+    /// The number of its format; increase it with every change.
     pub version: u32,
     /// The kind in words, for messages: "a checkpoint".
     pub name: &'static str,
@@ -152,7 +152,7 @@ pub fn seal<W: Write>(kind: Kind, writer: W, body: impl FnOnce(&mut Sealing<W>) 
     writer.write_all(&hasher.finalize().to_le_bytes())
 }
 
-/// Reads the file `seal` wrote at `path` and gives its body, which the checksum vouches for.
+/// Reads a file that [`seal`] wrote at `path`, checks its checksum and returns its body.
 pub fn read_sealed(kind: Kind, path: &Path) -> Result<Vec<u8>, SealError> {
     let mut bytes = Vec::new();
     File::open(path)?.read_to_end(&mut bytes)?;
@@ -162,7 +162,8 @@ pub fn read_sealed(kind: Kind, path: &Path) -> Result<Vec<u8>, SealError> {
     if *magic != kind.magic {
         return Err(SealError::Kind(kind.name));
     }
-    // The envelope is the same in every version, so that a damaged version is not taken for another one.
+    // The checksum comes before the version: the envelope is the same in every version, so a damaged version number is
+    // reported as damage.
     let version = u32::from_le_bytes([*a, *b, *c, *d]);
     match bytes.split_last_chunk::<SEAL>() {
         Some((rest, seal)) if rest.len() >= PREFIX && crc32fast::hash(rest).to_le_bytes() == *seal => {}
@@ -179,7 +180,7 @@ pub fn read_sealed(kind: Kind, path: &Path) -> Result<Vec<u8>, SealError> {
     Ok(bytes)
 }
 
-/// The body of a sealed file while it is written.
+/// The writer for the body of a sealed file.
 #[derive(Debug)]
 pub struct Sealing<W> {
     writer: W,

@@ -1,22 +1,22 @@
-//! How a role's loop comes to its end before it is through.
+//! How a role's loop ends before its work is done.
 
 use std::error::Error;
 use std::fmt;
 
-/// Why a role's loop ends early: it was asked to, or it failed with an `E`.
+/// Why a role's loop ends early: it was asked to stop, or it failed with an `E`.
 ///
-/// It is no [`Error`] itself, so that `?` makes one of every error that an `E` can be made of. Between exits with different
-/// errors, [`map_err`](Result::map_err) with [`Exit::widen`] does the same.
+/// It does not implement [`Error`], so that `?` can convert every error that converts into `E`. To convert between exits
+/// with different errors, use [`map_err`](Result::map_err) with [`Exit::widen`].
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Exit<E> {
-    /// The role was asked to end, which is no failure.
+    /// The role was asked to end, which is not a failure.
     Stopped,
-    /// It cannot go on.
+    /// The role cannot continue.
     Failed(E),
 }
 
 impl<E> Exit<E> {
-    /// The same exit of a loop that can fail in more ways.
+    /// Converts the error into a wider error type.
     pub fn widen<F: From<E>>(self) -> Exit<F> {
         match self {
             Self::Stopped => Exit::Stopped,
@@ -24,7 +24,7 @@ impl<E> Exit<E> {
         }
     }
 
-    /// The loop's result: being asked to end is no failure.
+    /// The loop's result; a requested end counts as success.
     ///
     /// # Errors
     /// When the loop failed.
@@ -75,7 +75,7 @@ mod tests {
         }
     }
 
-    /// A wait that is interrupted where there is nothing to read.
+    /// A wait that is stopped when the text is empty.
     fn wait(text: &str) -> Result<u8, Exit<ParseIntError>> {
         if text.is_empty() {
             return Err(Exit::Stopped);
@@ -90,7 +90,7 @@ mod tests {
     }
 
     #[test]
-    fn an_exit_keeps_its_reason_on_the_way_up() {
+    fn an_exit_keeps_its_reason_when_it_is_converted() {
         assert_eq!(role("1", "0.5"), Ok(1.5));
         assert_eq!(role("", "0.5"), Err(Exit::Stopped));
         let (whole, float) = ("x".parse::<u8>().unwrap_err(), "y".parse::<f64>().unwrap_err());

@@ -1,17 +1,17 @@
-//! Locks on open files. They are advisory, and gone with the processes that have the file open.
+//! Advisory locks on open files. The system releases them when the processes that have the file open end.
 
 use std::fs::{File, TryLockError};
 use std::io;
 use std::thread;
 use std::time::{Duration, Instant};
 
-/// How often a lock that another process holds is asked for again.
+/// Pause between two attempts to take a lock that another process holds.
 const PAUSE: Duration = Duration::from_millis(1);
 
-/// Locks the file for this process alone, and waits for that no longer than `patience`; whether it is locked now.
+/// Locks the file exclusively, waiting at most `patience`. Returns whether it is locked now.
 ///
 /// # Errors
-/// When the system refuses for another reason than that somebody holds a lock.
+/// When the system refuses for another reason than a lock of another process.
 pub fn lock(file: &File, patience: Duration) -> io::Result<bool> {
     let deadline = Instant::now() + patience;
     loop {
@@ -24,10 +24,10 @@ pub fn lock(file: &File, patience: Duration) -> io::Result<bool> {
     }
 }
 
-/// Whether somebody has locked the file for himself alone. Asking holds a lock for a moment that lets others ask.
+/// Whether a process holds an exclusive lock on the file. The check itself takes a shared lock for a moment.
 ///
 /// # Errors
-/// When the system refuses to tell.
+/// When the lock's state cannot be determined.
 pub fn is_locked(file: &File) -> io::Result<bool> {
     match file.try_lock_shared() {
         Ok(()) => Ok(false),
@@ -41,7 +41,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_lock_keeps_others_out_until_its_file_is_closed() {
+    fn a_lock_excludes_others_until_its_file_is_closed() {
         let directory = tempfile::tempdir().unwrap();
         let open = || File::open(directory.path()).unwrap();
         let first = open();

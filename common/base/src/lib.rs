@@ -1,4 +1,5 @@
-//! What every process of Shoal speaks of: spaces, rows, reports, random streams, files that are whole or not there.
+//! The vocabulary of all processes of Shoal: spaces, transitions, reports, random streams, and files that are either
+//! complete or absent.
 
 pub mod durable;
 pub mod exit;

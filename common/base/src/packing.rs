@@ -1,16 +1,16 @@
-//! Words of 64 bits among numbers of 32: how a `u64` travels in a payload of `f32`.
+//! Packing of `u64` words into a payload of `f32` numbers.
 
-/// Numbers that carry the bits of a word.
-pub const NUMBERS_OF_A_WORD: usize = 2;
+/// `f32` numbers that hold the bits of one word.
+pub const NUMBERS_PER_WORD: usize = 2;
 
-/// Words as they travel.
+/// The words as numbers.
 pub fn numbers_of(words: &[u64]) -> &[f32] {
     bytemuck::cast_slice(words)
 }
 
-/// The words whose bits came, wherever in memory they lie.
+/// The words in these numbers, whatever the alignment of the slice.
 pub fn words_of(numbers: &[f32]) -> Vec<u64> {
-    let (words, _) = numbers.as_chunks::<NUMBERS_OF_A_WORD>();
+    let (words, _) = numbers.as_chunks::<NUMBERS_PER_WORD>();
     words.iter().map(|numbers| bytemuck::cast(*numbers)).collect()
 }
 
@@ -19,11 +19,15 @@ mod tests {
     use super::*;
 
     #[test]
-    fn words_come_as_they_went() {
+    fn words_survive_packing_bit_for_bit() {
         let words = [0, u64::MAX, 0x7FA0_0001_FFA0_0001, f64::NAN.to_bits(), 1];
         assert_eq!(words_of(numbers_of(&words)), words);
         let mut shifted = vec![0.0];
         shifted.extend(numbers_of(&words));
-        assert_eq!(words_of(&shifted[1..]), words, "f32 is aligned more loosely");
+        assert_eq!(
+            words_of(&shifted[1..]),
+            words,
+            "an odd offset, which is not aligned for u64"
+        );
     }
 }

@@ -1,9 +1,9 @@
-//! What the roles tell the launcher while they work: small plain structs, one kind a channel.
+//! What the roles report to the launcher while they work: small plain structs, a channel for each kind.
 
 use iceoryx2::prelude::ZeroCopySend;
 use serde::{Deserialize, Serialize};
 
-/// A process of a run.
+/// What a process of a run is for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 #[repr(u32)]
 pub enum Role {
@@ -28,7 +28,7 @@ impl Role {
         }
     }
 
-    /// Reads the number a role travels as.
+    /// The role with this number in a message.
     fn from_code(code: u32) -> Option<Self> {
         [Self::EnvServer, Self::Actor, Self::Evaluator, Self::Learner]
             .into_iter()
@@ -37,7 +37,7 @@ impl Role {
 }
 
 impl Activity {
-    /// Reads the number an activity travels as.
+    /// The activity with this number in a message.
     fn from_code(code: u32) -> Option<Self> {
         let all = [
             Self::Working,
@@ -50,14 +50,14 @@ impl Activity {
     }
 }
 
-/// A process of a run: which role, which one of it, and which start of that one.
+/// Identifies a process of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Identity {
-    /// What it is for.
+    /// Its role.
     pub role: Role,
-    /// Which one of that role.
+    /// Its index among the processes of that role.
     pub index: u32,
-    /// Grows with every process that the run starts, whatever its role.
+    /// Grows with every process that the run starts, across all roles.
     pub incarnation: u64,
 }
 
@@ -72,27 +72,27 @@ pub enum Activity {
     WaitingForPeer,
     /// An actor whose window is full, or a learner ahead of the ratio.
     WaitingForRatio,
-    /// Through with everything.
+    /// Finished with all its work.
     Done,
     /// Waiting for its environment server's answer.
     WaitingForServer,
 }
 
-/// A role lives: sent when it is ready, whenever its activity changes for long, and about twice a second.
+/// A sign of life of a role: sent when it is ready, when a lasting activity begins, and about twice a second.
 ///
-/// Role and activity travel as numbers, because a sender in another language may know more of them than we do.
+/// Role and activity are sent as numbers, because a sender in another language may know more of them than this build.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ZeroCopySend)]
 #[type_name("ShoalHeartbeat")]
 #[repr(C)]
 pub struct Heartbeat {
     role: u32,
-    /// Which one of that role.
+    /// Its index among the processes of that role.
     pub index: u32,
     activity: u32,
     reserved: u32,
-    /// Which start of it.
+    /// Its incarnation.
     pub incarnation: u64,
-    /// Environment steps it has made, or updates of a learner, since it started.
+    /// Environment steps since it started; for a learner gradient steps, or rows where each is used once.
     pub steps: u64,
     /// Version of the policy it uses or publishes.
     pub policy_version: u64,
@@ -118,17 +118,17 @@ impl Heartbeat {
         }
     }
 
-    /// Who; `None` for a role this build does not know.
+    /// The role; `None` if this build does not know it.
     pub fn role(&self) -> Option<Role> {
         Role::from_code(self.role)
     }
 
-    /// What it does; `None` for an activity this build does not know.
+    /// What the role is doing; `None` for an activity that this build does not know.
     pub fn activity(&self) -> Option<Activity> {
         Activity::from_code(self.activity)
     }
 
-    /// Says what the role does now.
+    /// Sets what the role is doing.
     pub fn set_activity(&mut self, activity: Activity) {
         self.activity = activity as u32;
     }
@@ -140,17 +140,17 @@ impl Heartbeat {
 pub struct EpisodeReport {
     /// The actor that ran it.
     pub actor: u32,
-    /// Which of the actor's environments.
+    /// Index of the environment within the actor.
     pub environment: u32,
     /// Steps it took.
     pub steps: u32,
-    /// 1 where the environment terminated, 0 where the time limit truncated.
+    /// 1 if the environment terminated, 0 if the time limit truncated the episode.
     pub terminated: u32,
     /// Sum of its rewards, undiscounted.
     pub episode_return: f64,
     /// Version of the policy at its end.
     pub policy_version: u64,
-    /// Rows in the replay when it ended.
+    /// Environment steps in the replay when it ended.
     pub env_steps: u64,
 }
 
@@ -160,9 +160,9 @@ pub struct EpisodeReport {
 pub struct EvaluationReport {
     /// The policy's version.
     pub policy_version: u64,
-    /// Environment steps the policy was learned from.
+    /// Environment steps that the policy was learned from.
     pub env_steps: u64,
-    /// Updates the policy was made by.
+    /// Gradient steps that made the policy; rows where each is used once.
     pub updates: u64,
     /// Mean of the episodes' returns.
     pub return_mean: f64,
@@ -170,19 +170,19 @@ pub struct EvaluationReport {
     pub return_std: f64,
     /// Episodes run.
     pub episodes: u32,
-    /// 1 where no earlier evaluation of the run was as good.
+    /// 1 if no earlier evaluation of the run was as good.
     pub best: u32,
 }
 
-/// How far the evaluating is: sent when an evaluator begins and after each policy it has evaluated.
+/// The progress of the evaluator: sent when it starts and after each policy that it has evaluated.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ZeroCopySend)]
 #[repr(C)]
 pub struct EvaluatedReport {
-    /// The period of the policy evaluated last.
+    /// The period of the last evaluated policy.
     pub period: u64,
 }
 
-/// How the learner gets on: sent about twice a second.
+/// The progress of the learner: sent about twice a second.
 #[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
 #[repr(C)]
 pub struct LearnerReport {
@@ -190,17 +190,17 @@ pub struct LearnerReport {
     pub env_steps: u64,
     /// Episodes that end within them.
     pub episodes: u64,
-    /// Updates done.
+    /// Gradient steps made so far; rows where each is used once.
     pub updates: u64,
     /// Version of the policy published last.
     pub policy_version: u64,
-    /// Mean squared error of what estimates values, averaged over the updates since the last report (line 13 of Algorithm
-    /// 4; of the baseline; of the table).
+    /// Mean squared error of the value estimates (the critic, line 13 of Algorithm 4; the baseline; or the table), averaged
+    /// over the updates since the last report.
     pub critic_loss: f64,
-    /// What the policy's steps make smaller, averaged likewise: −mean Q(s, μ(s)); of REINFORCE, its objective's negative.
+    /// The loss of the policy, averaged likewise: −mean Q(s, μ(s)), or for REINFORCE the negative of its objective.
     pub actor_loss: f64,
-    /// Mean Q(s, a), or of REINFORCE the mean return, averaged likewise.
+    /// Mean Q(s, a), or for REINFORCE the mean return, averaged likewise.
     pub q_mean: f64,
-    /// Updates averaged over; the three means are 0 where it is 0.
+    /// Number of updates in the averages; if it is 0, the three means are 0.
     pub averaged: u64,
 }

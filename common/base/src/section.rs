@@ -1,5 +1,5 @@
-//! A section of the configuration, each key declared once: its name and type, its default, its bounds, its unit, where the
-//! default comes from, and what it means. Reading, validation, `--help-config` and completions all go by that declaration.
+//! Sections of the configuration. Each key is declared once: its name, type, default, bounds, unit and meaning, and the
+//! source of the default. Reading, validation, `--help-config` and completions all follow from that declaration.
 
 mod bounds;
 mod explanation;
@@ -10,12 +10,12 @@ pub use explanation::{Key, Section, describe, keys};
 use serde::de::{DeserializeOwned, Error};
 use toml::{Table, Value};
 
-/// Reads the section `name`, whose type is `T`; no key of it has to be there.
+/// Reads the section `name`, whose type is `T`. Every key is optional.
 ///
 /// # Errors
-/// When a key is unknown or of the wrong type. The error begins with the key and its value where it is that of one key.
+/// When a key is unknown or of the wrong type. If a single key is at fault, the error begins with that key and its value.
 pub fn read<T: DeserializeOwned>(name: &str, section: Value) -> Result<T, toml::de::Error> {
-    // An error does not say of which key it is; so each is read alone, and what is wrong is found again.
+    // serde's error does not name the key, so each key is read alone to find the faulty one.
     let alone = |(key, value): (&String, &Value)| {
         let only = Table::from_iter([(key.clone(), value.clone())]);
         let error = T::deserialize(only).err()?;
@@ -34,9 +34,8 @@ pub fn read<T: DeserializeOwned>(name: &str, section: Value) -> Result<T, toml::
 /// gamma: f64 = 0.99, bounds: from(0.0, 1.0), unit: "–", source: "section 4.3.1";
 /// ```
 ///
-/// `bounds` is left out where there is nothing to be compared (a word, `true` or `false`) or where the bounds are another
-/// key's value; then the section's `check` or `Config::check` compares. The struct gets a default, serde's
-/// and schemars' traits, and `check_bounds`.
+/// Leave out `bounds` for values that are not numbers, and where a bound is the value of another key; the section's `check`
+/// or `Config::check` then compares. The struct gets `Default`, the traits of serde and schemars, and `check_bounds`.
 #[macro_export]
 macro_rules! section {
     (
@@ -69,10 +68,11 @@ macro_rules! section {
         }
 
         impl $name {
-            /// Whether every number is within the bounds that are declared for it.
+            /// Checks that every number is within its declared bounds. `section` is the section's name in the
+            /// configuration.
             ///
             /// # Errors
-            /// For the first one that is not; `section` is the section's name in the configuration.
+            /// For the first number that is not.
             pub fn check_bounds(&self, section: &str) -> Result<(), $crate::section::OutOfRange> {
                 $($($crate::section::Bounded::check(&self.$field, section, stringify!($field), &$bounds)?;)?)*
                 Ok(())

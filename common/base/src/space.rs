@@ -1,8 +1,8 @@
-//! What an observation or an action may be.
+//! Spaces of observations and actions.
 
 use serde::{Deserialize, Serialize};
 
-/// The set an observation or an action comes from. Every element travels as `width()` numbers of `f32`.
+/// The set of possible observations or actions. An element is stored as `width()` numbers of `f32`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase", deny_unknown_fields)]
 pub enum Space {
@@ -13,9 +13,9 @@ pub enum Space {
         /// Greatest value of each element.
         high: Vec<f32>,
     },
-    /// One of the indices `0 .. n`, carried as one `f32`.
+    /// One of the indices `0 .. n`, stored as one `f32`.
     Discrete {
-        /// How many indices there are.
+        /// Number of indices.
         n: u32,
     },
 }
@@ -29,7 +29,7 @@ impl Space {
         }
     }
 
-    /// Numbers an element of the space takes in a row, a request or a response.
+    /// Numbers that an element takes in a row, a request or a response.
     pub fn width(&self) -> usize {
         match self {
             Self::Box { low, .. } => low.len(),
@@ -37,7 +37,7 @@ impl Space {
         }
     }
 
-    /// How many indices there are, or how many numbers an element has: the outputs of a network that has one for each.
+    /// Number of indices, or numbers in an element: the width of a network's output layer with one output for each.
     pub fn size(&self) -> usize {
         match self {
             Self::Box { low, .. } => low.len(),
@@ -46,23 +46,23 @@ impl Space {
     }
 }
 
-/// What an agent has to know of an environment before its first step.
+/// What an agent must know about an environment before its first step.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct EnvironmentSpec {
-    /// What the agent sees.
+    /// The space of observations.
     pub observation: Space,
-    /// What the agent does.
+    /// The space of actions.
     pub action: Space,
     /// Steps after which an episode is truncated.
     pub time_limit: u32,
-    /// Numbers (`f64`) in the environment's state, as it can be said and restored; 0 where the environment cannot say it.
+    /// Numbers (`f64`) in the environment's saved state; 0 if the environment cannot save its state.
     #[serde(default)]
     pub state_width: usize,
 }
 
 impl EnvironmentSpec {
-    /// Words in the snapshot of so many environments: for each the number of its episode, the steps taken in it, the
-    /// position in its random stream, and the state. 0 where the environment cannot say its state: there are no snapshots.
+    /// Words in a snapshot of this many environments. For each environment: the number of its episode, the steps taken in
+    /// it, the position in its random stream, and the state. 0 if the environment cannot save its state.
     pub fn snapshot_words(&self, environments: usize) -> usize {
         const COUNTERS: usize = 3;
         match self.state_width {
@@ -77,7 +77,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_environment_that_cannot_say_its_state_has_no_snapshots() {
+    fn an_environment_that_cannot_save_its_state_has_no_snapshots() {
         let lake = |state_width| EnvironmentSpec {
             observation: Space::Discrete { n: 16 },
             action: Space::Discrete { n: 4 },

@@ -1,7 +1,9 @@
-//! How a role learns that it shall end. Its standard input closes when the launcher wants it or is no more: one sign for
-//! both, and the system gives it even when the launcher is killed. A role that is still there some time after that, stuck in
-//! a call that does not return, is ended by the thread that watches. A line on standard input before that lets it retire:
-//! the run goes on, and it may take the time to hand over all it has.
+//! How a role learns that it must end.
+//!
+//! A role's standard input closes when the launcher asks it to end, and also when the launcher dies, because the system
+//! closes the pipe. If the role is still there some time later, stuck in a call that does not return, the thread that
+//! watches standard input kills it. A line on standard input asks the role to retire: the run continues without it, and it
+//! may take the time to hand over everything it has.
 
 use std::io::{ErrorKind, Read};
 use std::sync::Arc;
@@ -10,22 +12,22 @@ use std::time::Duration;
 
 use rustix::process::{Signal, getpgrp, getpid, kill_process, kill_process_group};
 
-/// How long a role may take to end after its standard input has closed. The launcher gives it no longer either.
+/// How long a role may take to end after its standard input has closed. The launcher kills it after the same time.
 pub const GRACE: Duration = Duration::from_secs(15);
 
 const RETIRE: u8 = 1;
 const END: u8 = 2;
 
-/// The wish to end; every loop of a role looks at it.
+/// The request to end, which every loop of a role checks.
 #[derive(Clone, Debug, Default)]
 pub struct Stop(Arc<AtomicU8>);
 
 impl Stop {
-    /// A stop that is requested once this process's standard input says or ends something. [`GRACE`] after its end the
-    /// process is killed, if it is still there, and with it those of its process group, if it leads one.
+    /// A stop that is requested when this process's standard input receives a line or closes. [`GRACE`] after it closed,
+    /// the process is killed if it still runs, together with its process group if it leads one.
     ///
     /// # Errors
-    /// When the watching thread cannot be started.
+    /// When the thread that watches standard input cannot be started.
     pub fn when_stdin_closes() -> std::io::Result<Self> {
         let stop = Self::default();
         let flag = stop.clone();
@@ -47,29 +49,29 @@ impl Stop {
         Ok(stop)
     }
 
-    /// Asks for the end.
+    /// Requests the end.
     pub fn request(&self) {
         self.raise(END);
     }
 
-    /// Whether the end was asked for, at leisure or not.
+    /// Whether the role was asked to end, with the run or alone.
     pub fn requested(&self) -> bool {
         self.0.load(Ordering::Relaxed) > 0
     }
 
-    /// Whether the run is ending too, so that nobody may wait for long.
+    /// Whether the whole run is ending, so that the role must not wait for long.
     pub fn at_once(&self) -> bool {
         self.0.load(Ordering::Relaxed) >= END
     }
 
-    fn raise(&self, wish: u8) {
-        self.0.fetch_max(wish, Ordering::Relaxed);
+    fn raise(&self, request: u8) {
+        self.0.fetch_max(request, Ordering::Relaxed);
     }
 }
 
-/// Ends this process, and with it those of its process group where it leads one.
+/// Kills this process, together with its process group if it leads one.
 fn kill_this_group() {
-    // Neither fails: the process is there, and its own.
+    // This cannot fail: the process exists and belongs to the same user.
     let _ = if getpgrp() == getpid() {
         kill_process_group(getpgrp(), Signal::KILL)
     } else {

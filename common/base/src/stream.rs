@@ -1,10 +1,10 @@
-//! Random streams. Every random number of a run comes from one of them, and a stream is named by what it is for, so that
-//! no two roles, indices or incarnations ever share numbers and a counter leads back to any point of it.
+//! Random streams. Every random number of a run comes from one of them. A stream is named by its purpose, index and
+//! incarnation, so no two processes share numbers, and a counter leads back to any point of it.
 
 use rand::SeedableRng;
 pub use rand_chacha::ChaCha8Rng as Stream;
 
-/// What a stream's numbers decide. The discriminants are part of a run's identity: never reuse one.
+/// What a stream is used for. The discriminants determine the numbers of existing runs: never change or reuse one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u64)]
 pub enum Purpose {
@@ -12,9 +12,9 @@ pub enum Purpose {
     Environment = 1,
     /// Exploration noise of an actor.
     Exploration = 2,
-    /// Which rows a minibatch takes.
+    /// Rows of a minibatch.
     Sampling = 3,
-    /// The networks' first weights.
+    /// Initial weights of the networks.
     Initialisation = 4,
     /// Start states of evaluation episodes.
     Evaluation = 5,
@@ -22,8 +22,8 @@ pub enum Purpose {
 
 /// The stream of `purpose` for the process `index` in its `incarnation`, under the run's `seed`.
 ///
-/// The four words are the generator's key itself; `set_stream` and `set_word_pos` of the result make it a counter-based
-/// generator (ChaCha with 8 rounds: portable, the same on every machine and in every version).
+/// The four words are the generator's key. With `set_stream` and `set_word_pos` the result is a counter-based generator
+/// (ChaCha with 8 rounds), which gives the same numbers on every machine and in every version.
 pub fn stream(seed: u64, purpose: Purpose, index: u64, incarnation: u64) -> Stream {
     let mut key = [0; 32];
     for (bytes, word) in key.chunks_exact_mut(8).zip([seed, purpose as u64, index, incarnation]) {

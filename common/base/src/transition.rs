@@ -1,44 +1,44 @@
-//! A transition as it stands in a chunk and in the replay: `s, a, r, discount, s', last`, all `f32`.
+//! The row of a transition in a chunk and in the replay: `s, a, r, discount, s', last`, all `f32`.
 
-use crate::packing::NUMBERS_OF_A_WORD;
+use crate::packing::NUMBERS_PER_WORD;
 
-/// Where each field of a transition's row lies. The one statement of the layout; everyone else asks it.
+/// The layout of a transition's row. No other code knows where a field lies.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct RowLayout {
     observation: usize,
     action: usize,
 }
 
-/// What a chunk has room for.
+/// The layout of a chunk.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ChunkLayout {
     /// The fields of a row.
     pub row: RowLayout,
-    /// Rows.
+    /// Rows in a full chunk.
     pub rows: usize,
-    /// Words (`u64`) behind the rows, which say where the actor stands after the chunk; 0 where nobody asks.
+    /// Words (`u64`) of the actor's snapshot after the chunk, which follows the rows; 0 if chunks carry no snapshot.
     pub actor_snapshot_words: usize,
 }
 
-/// A transition, borrowed from its row.
+/// A transition that borrows its vectors.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Transition<'a> {
-    /// Observation `s` the action was chosen on.
+    /// Observation `s` that the action was chosen for.
     pub s: &'a [f32],
     /// Action `a`, in environment units, as executed.
     pub a: &'a [f32],
     /// Reward `r`.
     pub r: f32,
-    /// What the value of `s'` counts for: γⁿ, or 0 where the environment terminated. Truncation does not change it.
+    /// Discount of the value of `s'`: γ, or 0 if the environment terminated. Truncation does not change it.
     pub discount: f32,
     /// Observation `s'` after the step.
     pub s_next: &'a [f32],
-    /// The episode ended with this step, terminated or truncated.
+    /// Whether the episode ended with this step, terminated or truncated.
     pub last: bool,
 }
 
 impl RowLayout {
-    /// Rows for observations and actions of these widths.
+    /// The layout for observations and actions of these widths.
     pub fn new(observation: usize, action: usize) -> Self {
         Self { observation, action }
     }
@@ -88,14 +88,14 @@ impl RowLayout {
 }
 
 impl ChunkLayout {
-    /// Numbers that the rows take.
+    /// Numbers in the rows.
     pub fn numbers_of_rows(&self) -> usize {
         self.rows * self.row.width()
     }
 
     /// Numbers in a chunk.
     pub fn len(&self) -> usize {
-        self.numbers_of_rows() + NUMBERS_OF_A_WORD * self.actor_snapshot_words
+        self.numbers_of_rows() + NUMBERS_PER_WORD * self.actor_snapshot_words
     }
 
     /// Whether a chunk holds nothing.
@@ -109,7 +109,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_row_reads_back_as_written() {
+    fn a_row_is_read_back_as_written() {
         let layout = RowLayout::new(3, 2);
         let written = Transition {
             s: &[1.0, 2.0, 3.0],

@@ -1,9 +1,11 @@
-//! What killed processes leave in shared memory, and how it is removed.
+//! Removal of what killed processes leave in shared memory.
 //!
-//! iceoryx2 0.10 makes a file in steps (create, size, fill, open to readers), and opens one that stops half-way again and
-//! again: for a second, or as root for ever where it has no size yet. So files whose maker is dead are removed here as soon as
-//! they are seen. And it leaves a port in its service for good where the file that tells of the port is gone first; so that
-//! file is put back before iceoryx2 cleans up.
+//! iceoryx2 0.10 creates a file in steps: create, set the size, fill, make readable. If a process dies in between, others
+//! retry to open its half-made file for a second, or forever if they run as root and the file has no size yet. So half-made
+//! files of dead processes are removed here as soon as they are seen.
+//!
+//! iceoryx2 also never frees a port whose port tag is removed before the port. So missing tags are restored before iceoryx2
+//! cleans up ([`Services::restore_port_tags`](super::Services::restore_port_tags)).
 
 use std::collections::HashSet;
 use std::fs::Metadata;
@@ -23,20 +25,19 @@ use super::error::ChannelError;
 use super::files::{SHARED_MEMORY, files_of};
 use super::memory::is_promise;
 
-/// How often the sweeper looks. Whoever opens a half-made file is held up for so long at most.
-const SWEEP: Duration = Duration::from_millis(250);
+/// Interval between two sweeps: the longest time that a half-made file of a dead process delays other processes.
+const SWEEP_INTERVAL: Duration = Duration::from_millis(250);
 
-/// A file that is younger may be in the making, even where the system does not tell who has it open: that takes some
-/// microseconds.
-const YOUNG: Duration = Duration::from_millis(50);
+/// A younger file may still be in creation, which takes some microseconds, even if no process is seen to have it open.
+const MIN_AGE: Duration = Duration::from_millis(50);
 
-/// How long a clean-up waits for half-made files that may have living makers.
-const MAKERS: Duration = Duration::from_millis(200);
+/// How long a clean-up waits for half-made files whose makers may be alive.
+const MAKER_PATIENCE: Duration = Duration::from_millis(200);
 
-/// How long iceoryx2 may wait for another process that cleans up after the same dead one.
+/// How long iceoryx2 may wait for another process that cleans up after the same dead process.
 const OTHER_CLEANER: Duration = Duration::from_millis(100);
 
-/// A thread that removes what killed processes have half made, until this is dropped.
+/// A thread that removes half-made files of killed processes until this is dropped.
 #[derive(Debug)]
 pub struct Sweeper {
     stop: Option<Sender<()>>,
@@ -44,7 +45,8 @@ pub struct Sweeper {
 }
 
 impl Sweeper {
-    /// Starts to sweep the files of a run: for its launcher, and for who asks a launcher that may be killed over the answer.
+    /// Starts to remove half-made files of a run. It is used by the run's launcher, and by a process that asks a launcher,
+    /// because the launcher may be killed while it answers.
     ///
     /// # Errors
     /// When the thread cannot be started.
@@ -52,16 +54,16 @@ impl Sweeper {
         let (stop, stopped) = mpsc::channel();
         let run_id = domain.run_id().to_owned();
         let sweep = move || {
-            while stopped.recv_timeout(SWEEP) == Err(RecvTimeoutError::Timeout) {
+            while stopped.recv_timeout(SWEEP_INTERVAL) == Err(RecvTimeoutError::Timeout) {
                 if let Err(error) = remove_unfinished(&run_id) {
-                    tracing::warn!("cannot look for files that killed processes have left: {error}");
+                    tracing::warn!("cannot remove half-made files of killed processes: {error}");
                 }
             }
         };
         let thread = std::thread::Builder::new()
             .name("sweeper".into())
             .spawn(sweep)
-            .map_err(|cause| ChannelError::new("all", "be watched", cause))?;
+            .map_err(|cause| ChannelError::new("all", "start the sweeper thread", cause))?;
         Ok(Self {
             stop: Some(stop),
             thread: Some(thread),
@@ -72,27 +74,27 @@ impl Sweeper {
 impl Drop for Sweeper {
     fn drop(&mut self) {
         self.stop = None;
-        // It has nothing to tell.
+        // The thread returns nothing.
         let _ = self.thread.take().map(JoinHandle::join);
     }
 }
 
-/// Removes files that a process was making when it was killed; whether no half-made file is left.
+/// Removes half-made files of killed processes. Returns whether no half-made file is left.
 pub(super) fn remove_unfinished(run_id: &str) -> io::Result<bool> {
     let mut unfinished = files_of(run_id)?;
     unfinished.retain(|(path, metadata)| is_unfinished(path, metadata));
     if unfinished.is_empty() {
         return Ok(true);
     }
-    // A maker has its file open from the first moment to the last. Whoever merely tries to open it has it so for moments:
-    // such a file is removed the next time.
+    // The maker keeps its file open until it is finished. Another process that only tries to open the file has it open for
+    // a moment; the file is then removed by the next sweep.
     let open = open_files();
     let mut none_left = true;
     for (path, before) in unfinished {
         match path.symlink_metadata() {
             Err(_) => {}
             Ok(now) if now.ino() != before.ino() || !is_unfinished(&path, &now) => {}
-            Ok(now) if open.contains(&path) || is_young(&now) => none_left = false,
+            Ok(now) if open.contains(&path) || is_recent(&now) => none_left = false,
             Ok(_) => match std::fs::remove_file(&path) {
                 Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
                 _ => tracing::debug!(path = %path.display(), "removed a file whose maker was killed"),
@@ -102,20 +104,22 @@ pub(super) fn remove_unfinished(run_id: &str) -> io::Result<bool> {
     Ok(none_left)
 }
 
-/// Whether iceoryx2 has not finished the file: it has no size yet, or may not be read yet.
+/// Whether iceoryx2 has not finished the file: it has no size, or is not readable.
 fn is_unfinished(path: &Path, metadata: &Metadata) -> bool {
     let name = path.file_name().map(|name| name.to_string_lossy());
     let is_promise = name.is_some_and(|name| is_promise(&name));
     metadata.is_file() && !is_promise && (metadata.len() == 0 || metadata.mode() & 0o400 == 0)
 }
 
-fn is_young(metadata: &Metadata) -> bool {
+fn is_recent(metadata: &Metadata) -> bool {
     let since = Duration::new(metadata.ctime().max(0) as u64, metadata.ctime_nsec() as u32);
-    // A clock that was set back says nothing.
-    (SystemTime::UNIX_EPOCH + since).elapsed().is_ok_and(|age| age < YOUNG)
+    // A time in the future means that the clock was set back: the age is then unknown and counts as sufficient.
+    (SystemTime::UNIX_EPOCH + since)
+        .elapsed()
+        .is_ok_and(|age| age < MIN_AGE)
 }
 
-/// Files of shared memory that some process has open.
+/// Files in shared memory that any process has open.
 fn open_files() -> HashSet<PathBuf> {
     let listed = |path: PathBuf| std::fs::read_dir(path).into_iter().flatten().flatten();
     listed("/proc".into())
@@ -127,8 +131,8 @@ fn open_files() -> HashSet<PathBuf> {
 }
 
 impl Domain {
-    /// Removes from the services of run `run_id` whatever processes left in them that are no more; how many of those could
-    /// not be cleaned up after. Killed over it, it can be begun anew.
+    /// Cleans up after the dead processes of run `run_id`. Returns the number of processes for which that failed. If the
+    /// caller is killed during a clean-up, the clean-up can be repeated.
     ///
     /// # Errors
     /// When files cannot be listed or removed.
@@ -138,8 +142,8 @@ impl Domain {
             run_id: run_id.into(),
             cause,
         })?;
-        // A connection that is half made would cost its port's place.
-        let deadline = Instant::now() + MAKERS;
+        // iceoryx2 would never free a port with a half-made connection, so those are removed first.
+        let deadline = Instant::now() + MAKER_PATIENCE;
         let listing = || io_error("clean up", Path::new(SHARED_MEMORY));
         while !remove_unfinished(run_id).map_err(listing())? && Instant::now() < deadline {
             std::thread::sleep(Duration::from_millis(2));
@@ -149,7 +153,7 @@ impl Domain {
 }
 
 impl Domain {
-    /// Whether processes of the run have died and nobody has cleaned up after them.
+    /// Whether there are dead processes of the run that need a clean-up.
     pub fn has_dead_nodes(&self) -> bool {
         let mut dead = false;
         let listed = Node::<ipc::Service>::list(self.node().config(), |state| {
@@ -178,8 +182,8 @@ fn clean_up_dead_nodes(config: &Config) -> u32 {
     failed + u32::from(listed.is_err())
 }
 
-/// Whether the process that made the node lives.
-pub(super) fn lives(node: UniqueNodeId) -> bool {
+/// Whether the process that made the node is alive.
+pub(super) fn is_alive(node: UniqueNodeId) -> bool {
     let pid = node
         .pid::<ipc::Service>()
         .ok()
@@ -195,10 +199,10 @@ mod tests {
     use super::super::files::prefix;
     use super::*;
 
-    /// A file of a run of this test's own, removed with it.
-    struct Left(PathBuf);
+    /// A file of this test's own run, removed on drop.
+    struct Leftover(PathBuf);
 
-    impl Left {
+    impl Leftover {
         fn new(name: &str, mode: u32, bytes: &[u8]) -> (Self, File) {
             let path = Path::new(SHARED_MEMORY).join(format!("{}{name}", prefix(&run_id())));
             std::fs::write(&path, bytes).unwrap();
@@ -208,7 +212,7 @@ mod tests {
         }
     }
 
-    impl Drop for Left {
+    impl Drop for Leftover {
         fn drop(&mut self) {
             let _ = std::fs::remove_file(&self.0);
         }
@@ -219,16 +223,16 @@ mod tests {
     }
 
     #[test]
-    fn what_a_dead_process_was_making_is_removed_and_nothing_else() {
+    fn only_half_made_files_of_dead_processes_are_removed() {
         let ((empty, making), (closed, filling)) = (
-            Left::new("1_2.connection", 0o200, b""),
-            Left::new("1_3.connection", 0o200, b"half"),
+            Leftover::new("1_2.connection", 0o200, b""),
+            Leftover::new("1_3.connection", 0o200, b"half"),
         );
-        let (whole, _) = Left::new("1.data", 0o600, b"whole");
-        let (promise, _) = Left::new("promise_4096", 0o600, b"");
-        std::thread::sleep(2 * YOUNG);
+        let (whole, _) = Leftover::new("1.data", 0o600, b"whole");
+        let (promise, _) = Leftover::new("promise_4096", 0o600, b"");
+        std::thread::sleep(2 * MIN_AGE);
         assert!(!remove_unfinished(&run_id()).unwrap());
-        assert!(empty.0.exists() && closed.0.exists(), "their maker lives");
+        assert!(empty.0.exists() && closed.0.exists(), "their maker is alive");
         drop((making, filling));
         assert!(remove_unfinished(&run_id()).unwrap());
         assert!(!empty.0.exists() && !closed.0.exists());

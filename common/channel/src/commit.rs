@@ -1,8 +1,7 @@
-//! What the learner has committed to the replay, as every other process reads it: the header of the replay file.
+//! What the learner has committed to the replay: the header of the replay file.
 //!
 //! The learner is the only writer. Actors and `status` map the header read-only and follow the commit record with a
-//! [`CommitReader`]; the layout both sides share is stated once, in [`ReplayLayout::places`]. `ARCHITECTURE.md`, "The
-//! replay file", explains the whole.
+//! [`CommitReader`]. Both sides take the layout from [`ReplayLayout::places`]. `docs/REPLAY_FORMAT.md` describes the format.
 
 mod layout;
 mod reader;
@@ -11,5 +10,5 @@ mod words;
 
 pub use layout::{IdentityFault, Places, ReplayLayout, SLOTS, SYNCED};
 pub use reader::{CommitReader, OpenError};
-pub use record::{ActorCommit, ChunkMark, LAST_INCARNATION, Record};
+pub use record::{ActorCommit, ChunkMark, MAX_INCARNATION, Record};
 pub use words::{Words, WritableWords};

@@ -1,4 +1,4 @@
-//! Control of a run, from any other terminal: questions to its launcher, and the launcher's answers.
+//! Control of a run from another terminal: questions to its launcher, and the launcher's answers.
 
 use std::os::fd::{AsFd, BorrowedFd};
 use std::path::Path;
@@ -25,31 +25,35 @@ mod message;
 
 const CHANNEL: &str = "control";
 
-/// Terminals that may ask at the same time.
+/// Clients that may ask at the same time.
 const CLIENTS: usize = 8;
 
-/// Processes that may take part: askers that were killed count until the launcher has cleaned up after them.
+/// Processes that may have the service open. Killed clients count until the launcher has cleaned up after them.
 const NODES: usize = 2 * CLIENTS;
 
 const ACTIVE_REQUESTS: usize = 2;
 
-/// Bytes of the longest question, and of the longest answer to each role of the run and beside them.
+/// Most bytes of a question.
 const QUESTION: usize = 64;
+
+/// Most bytes of an answer without its roles.
 const ANSWER: usize = 1024;
-const ANSWER_OF_A_ROLE: usize = 96;
 
-/// How long the asker sleeps between looks. It rings for the launcher, which answers at once where it has nothing else to do.
-const NAP: Duration = Duration::from_millis(5);
+/// Most bytes of one role in an answer.
+const ANSWER_PER_ROLE: usize = 96;
 
-/// How often it asks itself whether there is still a launcher.
-const LOOK: Duration = Duration::from_millis(100);
+/// How long the client sleeps between checks for an answer. It notifies the launcher, which answers at once if it is idle.
+const POLL_INTERVAL: Duration = Duration::from_millis(5);
+
+/// How often the client checks that the launcher is still alive.
+const LIVENESS_INTERVAL: Duration = Duration::from_millis(100);
 
 /// The launcher's end.
 #[derive(Debug)]
 pub struct ControlPort {
     server: Server<ipc::Service, [u8], ControlHeader, [u8], ControlHeader>,
     listener: Listener,
-    /// Who will be answered later.
+    /// Requests that will be answered later.
     waiting: Vec<ControlRequest>,
 }
 
@@ -62,16 +66,16 @@ struct ControlHeader {
     reserved: u32,
 }
 
-/// Why a launcher's answer was not had.
+/// Why the launcher gave no answer.
 #[derive(Debug, thiserror::Error)]
 pub enum ControlError {
     /// The channel does not work.
     #[error(transparent)]
     Channel(#[from] ChannelError),
-    /// There is no launcher any more.
+    /// The launcher has ended.
     #[error("the launcher has ended")]
     Gone,
-    /// Nobody answers.
+    /// The launcher does not answer.
     #[error("the launcher does not answer; is it stopped?")]
     Silence,
     /// The answer cannot be read.
@@ -79,7 +83,7 @@ pub enum ControlError {
     Unreadable(String),
 }
 
-/// Readable when somebody has asked.
+/// The descriptor becomes readable when a question arrives.
 impl AsFd for ControlPort {
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.listener.as_fd()
@@ -87,10 +91,10 @@ impl AsFd for ControlPort {
 }
 
 impl ControlPort {
-    /// The answering end.
+    /// Opens the launcher's end.
     ///
     /// # Errors
-    /// When shared memory cannot be had.
+    /// When shared memory is unavailable.
     pub fn open(domain: &Domain) -> Result<Self, ChannelError> {
         let server = claim(|| {
             service(domain, Entry::Open)?
@@ -106,24 +110,24 @@ impl ControlPort {
         })
     }
 
-    /// Answers everything that was asked about `run`, which is in the directory `place`, since the last call; whom `answer`
-    /// has no answer for waits.
+    /// Answers all questions about `run`, which is in the directory `place`, that have arrived since the last call. If
+    /// `answer` returns `None`, the client waits for [`answer_waiting`](Self::answer_waiting).
     ///
     /// # Errors
     /// When the channel does not work, or `answer` fails.
-    pub fn attend<E: From<ChannelError>>(
+    pub fn answer_questions<E: From<ChannelError>>(
         &mut self,
         run: RunKey,
         place: &Path,
         mut answer: impl FnMut(Question) -> Result<Option<Answer>, E>,
     ) -> Result<(), E> {
-        // Before the questions are looked for: who asks later rings again.
+        // Clear the notifications before reading the questions: a later question notifies again.
         self.listener.notified()?;
         loop {
             let received = self
                 .server
                 .receive()
-                .map_err(|cause| ChannelError::new(CHANNEL, "hear a question", cause))?;
+                .map_err(|cause| ChannelError::new(CHANNEL, "receive a question", cause))?;
             let Some(request) = received else { return Ok(()) };
             let answer = match decode(request.user_header().version, request.payload()) {
                 Ok(Asked { run: asked, .. }) if asked != run => Some(Answer::AnotherRun(place.display().to_string())),
@@ -137,21 +141,23 @@ impl ControlPort {
         }
     }
 
-    /// Answers those who wait, and gives them a moment to hear it; for the end.
-    pub fn dismiss(&mut self, answer: &Answer) {
+    /// Answers the waiting clients and gives them a moment to receive the answer. For use before the launcher ends.
+    pub fn answer_waiting(&mut self, answer: &Answer) {
         if self.waiting.is_empty() {
             return;
         }
         self.waiting.drain(..).for_each(|request| send(&request, answer));
-        std::thread::sleep(10 * NAP);
+        std::thread::sleep(10 * POLL_INTERVAL);
     }
 }
 
-/// An asker that has gone, or has no memory left, is no reason for the launcher to fail.
+/// Sends an answer. Failures are only logged: the launcher must not fail because a client has gone or memory is exhausted.
 fn send(request: &ControlRequest, answer: &Answer) {
     let bytes = match encode(answer) {
         Ok(bytes) => bytes,
-        Err(cause) => return tracing::warn!("a question went without an answer, which cannot be written: {cause}"),
+        Err(cause) => {
+            return tracing::warn!("a question was not answered, because the answer cannot be encoded: {cause}");
+        }
     };
     let sent = request.loan_slice(bytes.len()).map(|mut response| {
         response.payload_mut().copy_from_slice(&bytes);
@@ -159,20 +165,20 @@ fn send(request: &ControlRequest, answer: &Answer) {
         response.send()
     });
     if !matches!(sent, Ok(Ok(()))) {
-        tracing::debug!(?sent, "a question went without an answer");
+        tracing::debug!(?sent, "a question was not answered");
     }
 }
 
-/// Asks the launcher of `run`, for as long as `lives` says that there is one.
+/// Asks the launcher of `run` and waits for the answer while `is_alive` returns true.
 ///
 /// # Errors
-/// When there is no answer within `patience`, or none that can be read.
+/// When the launcher ends, there is no answer within `patience`, or the answer cannot be read.
 pub fn ask(
     domain: &Domain,
     run: RunKey,
     question: Question,
     patience: Duration,
-    lives: impl Fn() -> bool,
+    is_alive: impl Fn() -> bool,
 ) -> Result<Answer, ControlError> {
     let deadline = Instant::now() + patience;
     let make_client = || {
@@ -182,13 +188,13 @@ pub fn ask(
             .create()
             .map_err(cannot_ask)
     };
-    // A launcher that starts has not made the service yet, and one that ends has it no more.
+    // A launcher that is starting has not created the service yet, and one that is ending has removed it.
     let client = loop {
         match make_client() {
             Ok(client) => break client,
-            Err(_) if !lives() => return Err(ControlError::Gone),
-            Err(error) if will_not_pass(&error) || Instant::now() >= deadline => return Err(error.into()),
-            Err(_) => std::thread::sleep(NAP),
+            Err(_) if !is_alive() => return Err(ControlError::Gone),
+            Err(error) if is_permanent(&error) || Instant::now() >= deadline => return Err(error.into()),
+            Err(_) => std::thread::sleep(POLL_INTERVAL),
         }
     };
     let ask = |bytes: &[u8]| {
@@ -199,10 +205,10 @@ pub fn ask(
     };
     let question = encode(&Asked { run, question }).map_err(cannot_ask)?;
     let launcher = Notifier::to_launcher(domain);
-    let ring = || launcher.iter().for_each(Notifier::notify);
+    let notify = || launcher.iter().for_each(Notifier::notify);
     let mut pending = ask(&question)?;
-    ring();
-    let mut looked = Instant::now();
+    notify();
+    let mut checked = Instant::now();
     let mut gone = false;
     loop {
         let received = pending.receive().map_err(cannot_ask)?;
@@ -215,15 +221,15 @@ pub fn ask(
         if Instant::now() >= deadline {
             return Err(ControlError::Silence);
         }
-        std::thread::sleep(NAP);
-        if looked.elapsed() >= LOOK {
-            looked = Instant::now();
-            gone = !lives();
+        std::thread::sleep(POLL_INTERVAL);
+        if checked.elapsed() >= LIVENESS_INTERVAL {
+            checked = Instant::now();
+            gone = !is_alive();
         }
-        // The launcher may have opened its end only now.
+        // Ask again: the launcher had not opened its end when the question was sent.
         if pending.number_of_server_connections() == 0 {
             pending = ask(&question)?;
-            ring();
+            notify();
         }
     }
 }
@@ -232,17 +238,17 @@ fn cannot_ask(cause: impl Cause) -> ChannelError {
     ChannelError::new(CHANNEL, "ask", cause)
 }
 
-/// A launcher that makes its shared memory anew changes everything but these.
-fn will_not_pass(error: &ChannelError) -> bool {
+/// Whether waiting cannot help. All other errors may end when the launcher creates its services.
+fn is_permanent(error: &ChannelError) -> bool {
     matches!(
         error.kind,
         ChannelErrorKind::Permission | ChannelErrorKind::Incompatible
     )
 }
 
-/// Bytes of shared memory that the conversation reserves in a run of up to so many actors.
+/// Bytes of shared memory that the service reserves in a run of up to `max_actors` actors.
 pub fn reserved(max_actors: usize) -> u64 {
-    // As in the conversation with an environment server, and with iceoryx2's own numbers of loans.
+    // The same formula as for an environment server, with iceoryx2's default numbers of loans.
     let questions = 2 * ACTIVE_REQUESTS + 2;
     let answers = 2 * ACTIVE_REQUESTS * 4;
     memory::service(NODES)
@@ -252,18 +258,18 @@ pub fn reserved(max_actors: usize) -> u64 {
         + CLIENTS as u64 * memory::connection(2 * ACTIVE_REQUESTS, 1, 1, CLIENTS * answers)
 }
 
-/// Learner, evaluator with its server, and for each actor a server.
+/// Most bytes of an answer. Its roles are the learner, the evaluator with its server, and each actor with its server.
 fn answer_length(max_actors: usize) -> usize {
-    ANSWER + ANSWER_OF_A_ROLE * (2 * max_actors + 3)
+    ANSWER + ANSWER_PER_ROLE * (2 * max_actors + 3)
 }
 
-/// Makes the service.
+/// Creates the service.
 pub(super) fn create(domain: &Domain) -> Result<Held, ChannelError> {
     let service = service(domain, Entry::Create)?;
-    Ok(Held::new(move |see| {
+    Ok(Held::new(move |visit| {
         let ports = service.dynamic_config();
-        ports.list_clients(|port| see(port.node_id, port.client_id.value()));
-        ports.list_servers(|port| see(port.node_id, port.server_id.value()));
+        ports.list_clients(|port| visit(port.node_id, port.client_id.value()));
+        ports.list_servers(|port| visit(port.node_id, port.server_id.value()));
     }))
 }
 
@@ -293,7 +299,7 @@ mod tests {
     use crate::Services;
 
     #[test]
-    fn who_asks_wakes_the_launcher() {
+    fn a_question_wakes_the_launcher() {
         let run_id = format!("a{:x}", std::process::id());
         let domain = Domain::join(&run_id, 1).unwrap();
         let mut services = Services::new(&domain).unwrap();
@@ -311,8 +317,8 @@ mod tests {
             let mut asked = 0;
             while asked == 0 {
                 let woken = poll(&mut [PollFd::new(&port, PollFlags::IN)], Some(&a_minute)).unwrap();
-                assert_eq!(woken, 1, "nobody notified");
-                port.attend::<ChannelError>(run, Path::new("run"), |question| {
+                assert_eq!(woken, 1, "there was no notification");
+                port.answer_questions::<ChannelError>(run, Path::new("run"), |question| {
                     assert_eq!(question, Question::Stop);
                     asked += 1;
                     Ok(Some(Answer::Accepted))

@@ -1,5 +1,5 @@
-//! A run's own corner of shared memory. Every run has a root directory and a file prefix of its own, below a directory
-//! that belongs to one user: two runs never meet, two users neither, and what a killed run left behind is known by name.
+//! A run's own part of shared memory. Every run has its own file prefix, and its own root directory inside a directory of
+//! its user. So runs and users never affect each other, and the leftovers of a killed run can be found by name.
 
 use std::fs::{DirBuilder, File, Metadata, Permissions};
 use std::io;
@@ -17,13 +17,13 @@ use shoal_base::file_lock;
 use super::files::{SHARED_MEMORY, files_of, prefix};
 use super::memory;
 
-/// How long others may have a run's lock: each needs it for some milliseconds.
+/// How long to wait for a run's lock. Each process holds it for some milliseconds.
 const LOCK_PATIENCE: Duration = Duration::from_secs(10);
 
-/// The name of processes that are in a run only to ask its launcher something.
+/// The node name of processes that join a run only to ask its launcher something.
 const VISITOR: &str = "visitor";
 
-/// Membership of a process in a run: what all its channels are opened through.
+/// The membership of a process in a run. All its channels are opened through it.
 #[derive(Debug)]
 pub struct Domain {
     node: Node<ipc::Service>,
@@ -31,7 +31,7 @@ pub struct Domain {
     max_actors: usize,
 }
 
-/// A run's corner of shared memory cannot be entered or left.
+/// Why a process cannot join or leave a run in shared memory.
 #[derive(Debug, thiserror::Error)]
 pub enum DomainError {
     /// The system refused.
@@ -44,21 +44,21 @@ pub enum DomainError {
         /// The system's reason.
         cause: io::Error,
     },
-    /// Somebody else owns the directory that should be ours.
+    /// Another user owns the directory of this user.
     #[error("{0} belongs to another user; remove it, or ask its owner to")]
     Foreign(PathBuf),
-    /// A process has the lock that each holds for a moment only.
-    #[error("{0} is locked by another shoal process that does not get on; is one stopped?")]
+    /// Another process has held the run's lock for too long.
+    #[error("{0} is locked by another shoal process that makes no progress; is one stopped?")]
     Locked(PathBuf),
-    /// Processes of the run's last launcher are still there.
+    /// Processes of the run's previous launcher are still alive.
     #[error(
-        "run {run_id} cannot go on: processes of it are still alive and do not end (stopped?): kill -9 {}",
+        "run {run_id} cannot continue: some of its processes are still alive and do not end (stopped?): kill -9 {}",
         pids.iter().map(i32::to_string).collect::<Vec<_>>().join(" ")
     )]
     StillAlive {
         /// The run.
         run_id: String,
-        /// Their numbers.
+        /// Their process ids.
         pids: Vec<i32>,
     },
     /// iceoryx2 refused.
@@ -72,15 +72,15 @@ pub enum DomainError {
 }
 
 impl Domain {
-    /// Joins the run `run_id`, whose channels are laid out for up to `max_actors` actors.
+    /// Joins the run `run_id`, whose channels are sized for up to `max_actors` actors.
     ///
     /// # Errors
-    /// When the user's directory cannot be made, or shared memory cannot be had.
+    /// When the user's directory cannot be created, or shared memory is unavailable.
     pub fn join(run_id: &str, max_actors: u32) -> Result<Self, DomainError> {
         Self::enter(run_id, max_actors, "")
     }
 
-    /// The same for who only asks the run's launcher something. The run does not wait for its visitors to end.
+    /// Joins the run as a visitor, which only asks its launcher something. The run does not wait for visitors to end.
     ///
     /// # Errors
     /// As [`join`](Self::join).
@@ -90,7 +90,7 @@ impl Domain {
 
     fn enter(run_id: &str, max_actors: u32, name: &str) -> Result<Self, DomainError> {
         let root = user_root()?;
-        // Held until the node exists, so that nobody who looks for abandoned runs takes this one for dead.
+        // Held until the node exists, so that a process that removes abandoned runs does not remove this one.
         let _lock = make_and_lock(&root.join(run_id))?;
         let failed = |cause: String| DomainError::Join {
             run_id: run_id.into(),
@@ -117,12 +117,12 @@ impl Domain {
         &self.run_id
     }
 
-    /// The most actors the run's channels have room for.
+    /// The most actors that the run's channels are sized for.
     pub fn max_actors(&self) -> usize {
         self.max_actors
     }
 
-    /// The directory of the run's files that are not in shared memory. What is put there goes with them.
+    /// The directory of the run's files outside `/dev/shm`. It is removed with the run, and so are all files in it.
     ///
     /// # Errors
     /// When the user's directory cannot be used.
@@ -130,16 +130,16 @@ impl Domain {
         Ok(user_root()?.join(&self.run_id))
     }
 
-    /// Notes that this run may take so many bytes of shared memory, so that
+    /// Records that this run may take this many bytes of shared memory, so that
     /// [`free_shared_memory`](super::free_shared_memory) does not offer them to the user's other runs.
     ///
     /// # Errors
-    /// When shared memory cannot be had.
+    /// When the record cannot be created.
     pub fn promise(&self, bytes: u64) -> Result<(), DomainError> {
-        memory::promise(&self.run_id, bytes).map_err(io_error("note the run's needs in", Path::new(SHARED_MEMORY)))
+        memory::promise(&self.run_id, bytes).map_err(io_error("record the run's needs in", Path::new(SHARED_MEMORY)))
     }
 
-    /// The text of the configuration file with which other iceoryx2 programs find this run.
+    /// The text of a configuration file with which other iceoryx2 programs find this run.
     ///
     /// # Errors
     /// When iceoryx2's configuration cannot be written as TOML.
@@ -151,8 +151,8 @@ impl Domain {
         &self.node
     }
 
-    /// Leaves the run. Whoever is the last to leave, be it because the launcher was killed, removes every trace of the run
-    /// from shared memory.
+    /// Leaves the run. The last process to leave removes all files of the run from shared memory, also when the launcher
+    /// was killed.
     ///
     /// # Errors
     /// When files cannot be removed.
@@ -160,25 +160,25 @@ impl Domain {
         let run_id = self.run_id.clone();
         drop(self);
         let root = user_root()?;
-        // Where the directory is gone, another one was the last, and removed the files before it.
+        // No directory: another process was the last, and removed the files before the directory.
         match lock(&root.join(&run_id))? {
             Some(_lock) => remove_if_dead(&root, &run_id),
             None => Ok(()),
         }
     }
 
-    /// Waits until no process of an earlier launcher is left in the run `run_id`: whose launcher was killed, they are about
-    /// to end. Whoever calls this holds the run's lock.
+    /// Waits until the processes of an earlier, killed launcher have left the run `run_id`: they end by themselves. The
+    /// caller must hold the lock of the run directory.
     ///
     /// # Errors
-    /// When some are still there after `patience`, as one that is stopped is.
-    pub fn wait_for_the_last(run_id: &str, patience: Duration) -> Result<(), DomainError> {
+    /// When some are still alive after `patience`, for example because they are stopped.
+    pub fn wait_for_earlier_processes(run_id: &str, patience: Duration) -> Result<(), DomainError> {
         let root = user_root()?;
         let deadline = Instant::now() + patience;
         loop {
             let left = {
                 let _lock = lock(&root.join(run_id))?;
-                living(&root, run_id)?
+                living_processes(&root, run_id)?
             };
             if left.is_empty() {
                 return Ok(());
@@ -193,7 +193,7 @@ impl Domain {
         }
     }
 
-    /// Removes what this user's runs left in shared memory that were killed with all their processes.
+    /// Removes the files of this user's runs that have no living process any more.
     ///
     /// # Errors
     /// When the user's directory cannot be read, or files cannot be removed.
@@ -203,7 +203,7 @@ impl Domain {
         for entry in listing.flatten() {
             if entry.path().is_dir()
                 && let Some(run_id) = entry.file_name().to_str()
-                // Where somebody has the lock, somebody is there.
+                // A held lock shows that a process of the run is alive.
                 && let Attempt::Locked(_lock) = try_lock(&entry.path())?
             {
                 remove_if_dead(&root, run_id)?;
@@ -213,11 +213,12 @@ impl Domain {
     }
 }
 
-/// Closes the one file that iceoryx2 opens to everybody, whatever the umask: the one that counts the run's nodes.
+/// Makes the file that counts the run's nodes private: iceoryx2 makes it accessible to everybody, whatever the umask.
 fn close_to_others(run_id: &str) -> Result<(), DomainError> {
     for (path, _) in files_of(run_id).map_err(io_error("list", Path::new(SHARED_MEMORY)))? {
         if path.extension().is_some_and(|extension| extension == "global_mgmt") {
-            std::fs::set_permissions(&path, Permissions::from_mode(0o600)).map_err(io_error("close", &path))?;
+            std::fs::set_permissions(&path, Permissions::from_mode(0o600))
+                .map_err(io_error("restrict the rights of", &path))?;
         }
     }
     Ok(())
@@ -227,8 +228,8 @@ pub(super) fn iox_config(root: &Path, run_id: &str) -> Result<Config, String> {
     let directory = root.join(run_id);
     let root_path = IoxPath::new(directory.as_os_str().as_encoded_bytes()).map_err(|e| format!("{e:?}"))?;
     let mut config = Config::default();
-    // Cleaning up after the dead is the launcher's, which puts back before what iceoryx2 0.10 misses where an earlier
-    // clean-up was killed (`cleanup.rs`).
+    // Only the launcher cleans up after dead processes: it first restores the port tags that iceoryx2 0.10 needs and that
+    // are missing when an earlier clean-up was killed (`cleanup.rs`).
     config.global.node.cleanup_dead_nodes_on_creation = false;
     config.global.node.cleanup_dead_nodes_on_destruction = false;
     config.global.service.cleanup_dead_nodes_on_open = false;
@@ -237,8 +238,8 @@ pub(super) fn iox_config(root: &Path, run_id: &str) -> Result<Config, String> {
     Ok(config)
 }
 
-/// Process numbers of those in the run that live, stopped ones included, and visitors not.
-fn living(root: &Path, run_id: &str) -> Result<Vec<i32>, DomainError> {
+/// Process ids of the living processes of the run, with stopped ones but without visitors.
+fn living_processes(root: &Path, run_id: &str) -> Result<Vec<i32>, DomainError> {
     let failed = |cause: String| DomainError::Join {
         run_id: run_id.into(),
         cause,
@@ -247,18 +248,18 @@ fn living(root: &Path, run_id: &str) -> Result<Vec<i32>, DomainError> {
     let mut living = Vec::new();
     Node::<ipc::Service>::list(&config, |state| {
         let pid = state.node_id().pid::<ipc::Service>().map_or(0, |pid| pid.value());
-        let lives = match state {
+        let is_alive = match state {
             NodeState::Dead(_) => false,
             NodeState::Alive(node) => {
                 let name = node.details().as_ref().map(|details| details.name().as_str());
                 name != Some(VISITOR)
             }
-            // As one is that was killed while it joined.
+            // For example, a process that was killed while it joined.
             NodeState::Inaccessible(_) | NodeState::Undefined(_) => {
                 rustix::process::Pid::from_raw(pid).is_some_and(|pid| rustix::process::test_kill_process(pid).is_ok())
             }
         };
-        if lives {
+        if is_alive {
             living.push(pid);
         }
         CallbackProgression::Continue
@@ -268,11 +269,11 @@ fn living(root: &Path, run_id: &str) -> Result<Vec<i32>, DomainError> {
 }
 
 fn remove_if_dead(root: &Path, run_id: &str) -> Result<(), DomainError> {
-    if !living(root, run_id)?.is_empty() {
+    if !living_processes(root, run_id)?.is_empty() {
         return Ok(());
     }
-    // No process of the run is left and its name is its own, so these files are nobody's. iceoryx2 itself never removes
-    // the file that counts its nodes.
+    // The files are unused: no process of the run is left, and no other run has its name. iceoryx2 itself never removes the
+    // file that counts its nodes.
     for (path, _) in files_of(run_id).map_err(io_error("list", Path::new(SHARED_MEMORY)))? {
         remove(&path, |path| std::fs::remove_file(path))?;
     }
@@ -286,7 +287,7 @@ fn remove(path: &Path, how: impl Fn(&Path) -> io::Result<()>) -> Result<(), Doma
     }
 }
 
-/// `/tmp/shoal-<user id>`, closed to everybody else.
+/// `/tmp/shoal-<user id>`, accessible to its owner alone.
 pub(super) fn user_root() -> Result<PathBuf, DomainError> {
     let user = rustix::process::getuid().as_raw();
     let root = PathBuf::from(format!("/tmp/shoal-{user}"));
@@ -301,16 +302,16 @@ pub(super) fn user_root() -> Result<PathBuf, DomainError> {
     Ok(root)
 }
 
-/// What became of asking for a run's lock.
+/// The result of an attempt to take a run's lock.
 enum Attempt {
     Locked(File),
-    /// Another process has it.
+    /// Another process holds it.
     Held,
-    /// Nothing of the run is there.
+    /// The run does not exist.
     Absent,
 }
 
-/// The lock of the run in this directory, which no other run has to do with; `None` where there is no such run.
+/// Takes the lock of the run in this directory; `None` if there is no such run.
 fn lock(directory: &Path) -> Result<Option<File>, DomainError> {
     let deadline = Instant::now() + LOCK_PATIENCE;
     loop {
@@ -323,7 +324,7 @@ fn lock(directory: &Path) -> Result<Option<File>, DomainError> {
     }
 }
 
-/// The same, of a run that is made where it is not there.
+/// Takes the lock of the run in this directory, and creates the run if it does not exist.
 fn make_and_lock(directory: &Path) -> Result<File, DomainError> {
     loop {
         match DirBuilder::new().mode(0o700).create(directory) {
@@ -332,7 +333,7 @@ fn make_and_lock(directory: &Path) -> Result<File, DomainError> {
             }
             _ => {}
         }
-        // The last of an earlier run may remove it at this moment.
+        // The last process of an earlier run may have removed the directory in between.
         if let Some(lock) = lock(directory)? {
             return Ok(lock);
         }
@@ -348,7 +349,7 @@ fn try_lock(directory: &Path) -> Result<Attempt, DomainError> {
         if !file_lock::lock(&file, Duration::ZERO).map_err(io_error("lock", directory))? {
             return Ok(Attempt::Held);
         }
-        // Who had it before may have removed the directory, and another one may be there now.
+        // The previous holder may have removed the directory, and another one may have been created.
         let inode = |metadata: io::Result<Metadata>| metadata.ok().map(|metadata| metadata.ino());
         if inode(file.metadata()) == inode(directory.metadata()) {
             return Ok(Attempt::Locked(file));

@@ -1,6 +1,6 @@
-//! The conversation between one actor and its environment server. A request carries one action for each environment, a
-//! response what came of them; observations are read where the server wrote them. A snapshot of the episodes under way
-//! comes back as words, from which any server of this environment goes on.
+//! Requests and responses between one actor and its environment server. A request to step has one action for each
+//! environment, and its response the outcomes; the actor reads observations where the server wrote them. A snapshot of the
+//! current episodes is returned as words, from which any server of this environment can continue.
 
 mod client;
 mod message;

@@ -1,4 +1,4 @@
-//! Why a channel does not work: the kind, by which the program decides, and the cause, for people.
+//! Errors of channels: the kind, which the program acts on, and the cause, for the user.
 
 use std::error::Error;
 use std::io;
@@ -18,7 +18,7 @@ use iceoryx2::service::port_factory::client::ClientCreateError;
 use iceoryx2::service::port_factory::server::ServerCreateError;
 use iceoryx2::service::service_name::ServiceNameError;
 
-/// A channel does not work: its service or port cannot be had, memory is exhausted, or the other side breaks the rules.
+/// Why a channel fails: its service or port is unavailable, memory is exhausted, or the other side violates the protocol.
 #[derive(Debug, thiserror::Error)]
 #[error("channel {channel}: cannot {action}: {}", reason(*kind, source.as_ref()))]
 pub struct ChannelError {
@@ -28,7 +28,7 @@ pub struct ChannelError {
     pub action: &'static str,
     /// What kind of failure it is.
     pub kind: ChannelErrorKind,
-    /// What exactly happened, as iceoryx2 or the system says it, or a [`PeerError`].
+    /// The exact cause: an error of iceoryx2 or the system, or a [`PeerError`].
     pub source: Box<dyn Error + Send + Sync>,
 }
 
@@ -42,9 +42,9 @@ impl ChannelError {
         }
     }
 
-    /// Whether the same attempt may succeed a moment later, without anybody's help but the launcher's: it cleans up after
-    /// processes that were killed.
-    pub fn may_pass(&self) -> bool {
+    /// Whether the same attempt may succeed a moment later without the user's help, once the launcher has cleaned up after
+    /// killed processes.
+    pub fn is_transient(&self) -> bool {
         match self.kind {
             ChannelErrorKind::Occupied | ChannelErrorKind::Unfinished | ChannelErrorKind::Interrupted => true,
             ChannelErrorKind::Missing
@@ -59,81 +59,82 @@ impl ChannelError {
     }
 }
 
-/// A kind of failure of a channel. Its text says what to do.
+/// A kind of failure of a channel. Its text states what to do.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ChannelErrorKind {
-    /// Every place is taken. A process that was killed has its place until the launcher has cleaned up after it.
-    #[error("its places are taken by other processes; end those first")]
+    /// All ports are taken. A killed process keeps its port until the launcher has cleaned up after it.
+    #[error("all its ports are used by other processes; end those first")]
     Occupied,
-    /// Somebody is making it, or was killed over that.
+    /// Another process is creating the service, or was killed while it did.
     #[error("it is half made, by a process that was killed or is stopped; try again")]
     Unfinished,
-    /// A signal came in between.
-    #[error("a signal came in between; try again")]
+    /// A signal interrupted the call.
+    #[error("a signal interrupted the call; try again")]
     Interrupted,
-    /// It is not there, or is just being removed.
-    #[error("it is not there; has the launcher ended?")]
+    /// The service does not exist, or is being removed.
+    #[error("it does not exist; has the launcher ended?")]
     Missing,
-    /// The system does not allow it.
-    #[error("the system does not allow it; does the run belong to another user?")]
+    /// The system denies access.
+    #[error("the system denies access; does the run belong to another user?")]
     Permission,
-    /// It is there, and made for other types or numbers.
-    #[error("it was made by another build of this program; use the same build for the whole run")]
+    /// The service exists, but with other types or limits.
+    #[error("it was created by another build of this program; use the same build for the whole run")]
     Incompatible,
-    /// It is there, and damaged.
+    /// The service exists, but is damaged.
     #[error("it is damaged; stop the run and resume it")]
     Corrupted,
-    /// Memory, files, or what may be in hand at the same time are used up.
-    #[error("nothing is left to make it of; is /dev/shm full?")]
+    /// Memory, files, or the samples that may be held at the same time are used up.
+    #[error("memory or files are used up; is /dev/shm full?")]
     Exhausted,
-    /// The other side is there, and its memory cannot be used.
+    /// The other side exists, but its memory cannot be used.
     #[error("no connection to the other side")]
     Unreachable,
-    /// The other side says what it must not say.
-    #[error("the other side breaks the rules")]
+    /// The other side violates the protocol.
+    #[error("the other side violates the protocol")]
     Peer,
     /// Anything else.
     #[error("an unexpected failure; is /dev/shm mounted and not full?")]
     Internal,
 }
 
-/// The other side of a channel says what it must not say, or what cannot be used.
+/// The other side of a channel violates the protocol, or sends something that cannot be used.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum PeerError {
-    /// A description has not all its numbers.
+    /// A description lacks some of its numbers.
     #[error("the answer is too short")]
     ShortAnswer,
-    /// A snapshot is of another environment, or another number of them.
-    #[error("{found} words for a snapshot of {expected}")]
+    /// A snapshot is of another environment, or of another number of environments.
+    #[error("the snapshot has {found} words instead of {expected}")]
     SnapshotLength {
-        /// Words there are.
+        /// Words in the snapshot.
         found: usize,
-        /// Words that the environments' states have.
+        /// Words in a snapshot of the environments.
         expected: usize,
     },
-    /// The environment server does not do what it is asked.
+    /// The environment server refused a request.
     #[error("the environment server refused the request")]
     Refused,
-    /// The environment server denies what it has answered before.
-    #[error("the environment server has begun episodes and says that it has not: it breaks the protocol")]
+    /// The environment server denies having begun the episodes that it has begun.
+    #[error("the environment server denies having begun the episodes that it has begun: it violates the protocol")]
     EpisodesDenied,
-    /// The environment server cannot be connected to, however often that is tried.
-    #[error("no connection to the environment server, which is there")]
+    /// Repeated attempts to connect to the environment server have failed, although it exists.
+    #[error("the environment server exists, but cannot be connected to")]
     NoConnection,
-    /// A chunk says that it has more rows than it has room for, or has another length.
+    /// A chunk claims more rows than it has space for, or has another length than the layout.
     #[error("a chunk of {numbers} numbers claims {rows} rows")]
     ChunkLength {
         /// Numbers in the chunk.
         numbers: usize,
-        /// Rows it claims to have.
+        /// Rows that it claims to have.
         rows: usize,
     },
-    /// A policy has other parameters than the reader's.
+    /// A policy has another layout than the reader expects.
     #[error("the learner's networks have another layout")]
     PolicyLayout,
 }
 
-/// What a peer did says itself what it is; the errors of iceoryx2 are names, after which people would have to search.
+/// The reason in an error's message. The text of a [`PeerError`] is sufficient; errors of iceoryx2 are only names, so the
+/// text of the kind comes first.
 fn reason(kind: ChannelErrorKind, source: &(dyn Error + Send + Sync)) -> String {
     match kind {
         ChannelErrorKind::Peer => source.to_string(),
@@ -141,7 +142,7 @@ fn reason(kind: ChannelErrorKind, source: &(dyn Error + Send + Sync)) -> String 
     }
 }
 
-/// An error that a channel may fail with, and its kind.
+/// An error that can be the cause of a [`ChannelError`].
 pub(super) trait Cause: Error + Send + Sync + 'static {
     fn kind(&self) -> ChannelErrorKind;
 }

@@ -1,4 +1,5 @@
-//! Waking each other: data channels never wake anybody, so whoever waits has a bell, and whoever has news for it rings.
+//! Notifications between processes. Data channels wake no process. So each waiting process has an event service, and a
+//! sender notifies that service after it has sent something.
 
 use std::cell::Cell;
 use std::fmt;
@@ -22,26 +23,26 @@ use super::error::{Cause, ChannelError};
 use super::service::{Entry, Held, claim, service_name};
 use super::{descriptor, memory};
 
-/// Polls before a waiting process blocks. A peer that is at work on another core answers within them; on a shared core
-/// they cost it some microseconds.
+/// Polls before a waiting process blocks. A peer that works on another core answers while they last. On a shared core they
+/// cost the peer some microseconds.
 const POLLS: u32 = 200;
 
-/// Waits in a row over which polling was in vain, after which a process blocks without it: an answerer that shares the
-/// asker's core gets that core at once, and one that always takes longer is not waited for by burning a core. Fewer, and
-/// one that answers in time every other try would be given up too often.
-const IN_VAIN: u32 = 64;
+/// After this many waits in a row without success from polling, a process blocks at once: a peer on the same core gets that
+/// core, and no core is busy waiting for a peer that always takes longer. With a smaller number, a process would too often
+/// stop polling for a peer that answers in time only now and then.
+const MAX_MISSES: u32 = 64;
 
-/// One of so many waits polls all the same: processes move from core to core.
-const TRIED_AGAIN: u32 = 32;
+/// After that, one in this many waits polls again, because processes move from core to core.
+const RETRY_EVERY: u32 = 32;
 
-/// How long a process blocks before it looks after its connections. Rings can be lost when their hearer restarts.
-const NAP: Duration = Duration::from_millis(50);
+/// How long a process blocks before it refreshes its connections. A notification can be lost when its receiver restarts.
+const MAX_SLEEP: Duration = Duration::from_millis(50);
 
-/// Where a bell hangs: a role of the run, and which one of that role.
+/// Names the event service of a process by its role and its index in that role.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct EventName(pub Role, pub u32);
 
-/// The channel of the launcher's own bell, which is no role.
+/// The event service of the launcher, which has no role.
 const LAUNCHER: &str = "bell/launcher";
 
 impl fmt::Display for EventName {
@@ -50,7 +51,7 @@ impl fmt::Display for EventName {
     }
 }
 
-/// Hears rings.
+/// Receives the notifications of one event service.
 #[derive(Debug)]
 pub struct Listener {
     listener: IoxListener<ipc::Service>,
@@ -58,59 +59,59 @@ pub struct Listener {
     polling: Polling,
 }
 
-/// Whether polling pays for who waits at a bell.
+/// Decides whether a waiting process polls before it sleeps.
 #[derive(Debug, Default)]
 struct Polling {
-    /// Waits in a row that ended asleep.
-    in_vain: Cell<u32>,
+    /// Waits in a row that had to sleep.
+    misses: Cell<u32>,
 }
 
 impl Polling {
-    /// Polls before the next sleep; at least one, for what came before the sleep is not rung for again.
+    /// Number of polls before the next sleep. It is at least one, because an earlier notification is not repeated.
     fn polls(&self) -> u32 {
-        let in_vain = self.in_vain.get();
-        if in_vain < IN_VAIN || in_vain.is_multiple_of(TRIED_AGAIN) {
+        let misses = self.misses.get();
+        if misses < MAX_MISSES || misses.is_multiple_of(RETRY_EVERY) {
             POLLS
         } else {
             1
         }
     }
 
-    /// Takes note of how a wait ended. What was there at the first poll says nothing.
+    /// Records how a wait ended. Success at the first poll does not count either way.
     fn learn(&self, slept: bool, polls: u32) {
         if slept {
-            self.in_vain.set(self.in_vain.get().wrapping_add(1));
+            self.misses.set(self.misses.get().wrapping_add(1));
         } else if polls > 0 {
-            self.in_vain.set(0);
+            self.misses.set(0);
         }
     }
 }
 
-/// Rings the bell of another process.
+/// Notifies the event service of another process.
 #[derive(Debug)]
 pub struct Notifier {
     notifier: IoxNotifier<ipc::Service>,
 }
 
 impl Listener {
-    /// Bytes of shared memory that a bell reserves in a run of up to so many actors.
+    /// Bytes of shared memory that an event service reserves in a run of up to `max_actors` actors.
     pub fn reserved(max_actors: usize) -> u64 {
-        // The second file holds what has rung: iceoryx2 has one of 2103 bytes for each listener.
-        memory::service(2 * parties(max_actors)) + memory::pages(2103)
+        // The second file holds pending notifications: iceoryx2 has one of 2103 bytes for each listener.
+        memory::service(2 * participants(max_actors)) + memory::pages(2103)
     }
 
-    /// Hangs the bell of this process.
+    /// Opens the listener of the event service `name`.
     ///
     /// # Errors
-    /// When shared memory cannot be had.
+    /// When shared memory is unavailable.
     pub fn bind(domain: &Domain, name: EventName) -> Result<Self, ChannelError> {
         Self::on(domain, name.to_string())
     }
 
-    /// Hangs the launcher's bell.
+    /// Opens the listener of the launcher.
     ///
     /// # Errors
-    /// When shared memory cannot be had.
+    /// When shared memory is unavailable.
     pub(super) fn of_launcher(domain: &Domain) -> Result<Self, ChannelError> {
         Self::on(domain, LAUNCHER.into())
     }
@@ -129,24 +130,24 @@ impl Listener {
         })
     }
 
-    /// Blocks until a ring or until `patience` is over; whether there was a ring.
+    /// Blocks until there is a notification, at most `patience`. Returns whether there was one.
     ///
     /// # Errors
-    /// When waiting is impossible.
+    /// When the system cannot wait for the listener.
     pub fn wait(&self, patience: Duration) -> Result<bool, ChannelError> {
-        // The listener's own `timed_wait` does the same with twice as many system calls. No wait is so long that it could not
-        // be said.
+        // The listener's own `timed_wait` does the same with twice as many system calls. The conversion fails only for a
+        // `patience` that is practically infinite; `None` then waits without a limit.
         let patience = Timespec::try_from(patience).ok();
         let mut ready = [PollFd::from_borrowed_fd(self.as_fd(), PollFlags::IN)];
         match poll(&mut ready, patience.as_ref()) {
-            // A process that was stopped and goes on has only been interrupted.
+            // An interruption is not an error: a process that was stopped and continued also returns here.
             Ok(_) | Err(Errno::INTR) => {}
             Err(errno) => return Err(self.failed(io::Error::from(errno))),
         }
         self.notified()
     }
 
-    /// Whether there was a ring since this was asked last. It does not block.
+    /// Whether there was a notification since the last call. It does not block.
     pub(super) fn notified(&self) -> Result<bool, ChannelError> {
         let mut notified = false;
         match self.listener.try_wait(|_| notified = true) {
@@ -167,16 +168,17 @@ impl AsFd for Listener {
 }
 
 impl Notifier {
-    /// Holds the cord of the bell at `place`, whether it hangs there yet or not.
+    /// Opens a notifier for the event service `name`. The service need not have a listener yet.
     ///
     /// # Errors
-    /// When shared memory cannot be had.
+    /// When shared memory is unavailable.
     pub fn new(domain: &Domain, name: EventName) -> Result<Self, ChannelError> {
         let channel = name.to_string();
         claim(|| Self::on(domain, &channel))
     }
 
-    /// Holds the cord of the launcher's bell, if it can be had at once: a launcher without one looks for itself.
+    /// Opens a notifier for the launcher, if that is possible at once. Otherwise the launcher finds the question when it next
+    /// looks by itself.
     pub(super) fn to_launcher(domain: &Domain) -> Option<Self> {
         Self::on(domain, LAUNCHER).ok()
     }
@@ -185,36 +187,36 @@ impl Notifier {
         let notifier = service(domain, channel, Entry::Open)?
             .notifier_builder()
             .create()
-            .map_err(|e| ChannelError::new(channel, "ring", e))?;
+            .map_err(|e| ChannelError::new(channel, "notify", e))?;
         Ok(Self { notifier })
     }
 
-    /// Rings. A ring that finds nobody is no error: the hearer may be restarting, and looks for itself then.
+    /// Sends a notification. A failure is only logged: the receiver may be restarting, and then looks for messages anyway.
     pub fn notify(&self) {
         if let Err(cause) = self.notifier.notify() {
-            tracing::debug!(?cause, "a ring was not heard");
+            tracing::debug!(?cause, "a notification was not delivered");
         }
     }
 }
 
-/// Waits until `poll` yields something: polls a short while, where that has helped of late, then sleeps at the bell; while
-/// it waits, `look_after` renews connections, some twenty times a second.
+/// Waits until `poll` returns something. It polls for a short while, if that has helped recently, and then sleeps at the
+/// listener. While it waits, it calls `refresh` some twenty times a second, which must renew connections.
 ///
 /// # Errors
-/// [`Exit::Stopped`] once `stop` is requested, and whatever `poll` or `look_after` fail with.
+/// [`Exit::Stopped`] once `stop` is requested, and the errors of `poll`, `refresh` and the listener.
 pub fn wait_for<T>(
     listener: &Listener,
     stop: &Stop,
     mut poll: impl FnMut() -> Result<Option<T>, ChannelError>,
-    mut look_after: impl FnMut() -> Result<(), ChannelError>,
+    mut refresh: impl FnMut() -> Result<(), ChannelError>,
 ) -> Result<T, Exit<ChannelError>> {
-    // The clock is not read for an answer that comes while it polls.
-    let mut looked_after = None;
+    // The time of the last refresh. The clock is not read if polling alone succeeds.
+    let mut refreshed = None;
     let most = listener.polling.polls();
     loop {
         for polls in 0..most {
             if let Some(found) = poll()? {
-                listener.polling.learn(looked_after.is_some(), polls);
+                listener.polling.learn(refreshed.is_some(), polls);
                 return Ok(found);
             }
             std::hint::spin_loop();
@@ -222,48 +224,48 @@ pub fn wait_for<T>(
         if stop.requested() {
             return Err(Exit::Stopped);
         }
-        let since = looked_after.get_or_insert_with(Instant::now);
-        listener.wait(NAP)?;
-        // By the clock: rings that bring nothing must not keep it from its connections.
-        if since.elapsed() >= NAP {
+        let since = refreshed.get_or_insert_with(Instant::now);
+        listener.wait(MAX_SLEEP)?;
+        // Decided by the clock, so that needless notifications cannot prevent the refresh.
+        if since.elapsed() >= MAX_SLEEP {
             *since = Instant::now();
-            look_after()?;
+            refresh()?;
         }
     }
 }
 
-/// Makes the service of the bell at `place`.
+/// Creates the event service `name`.
 pub(super) fn create(domain: &Domain, name: EventName) -> Result<Held, ChannelError> {
     create_on(domain, &name.to_string())
 }
 
-/// Makes the service of the launcher's bell.
+/// Creates the event service of the launcher.
 pub(super) fn create_of_launcher(domain: &Domain) -> Result<Held, ChannelError> {
     create_on(domain, LAUNCHER)
 }
 
 fn create_on(domain: &Domain, channel: &str) -> Result<Held, ChannelError> {
     let service = service(domain, channel, Entry::Create)?;
-    Ok(Held::new(move |see| {
+    Ok(Held::new(move |visit| {
         let ports = service.dynamic_config();
-        ports.list_listeners(|port| see(port.node_id, port.listener_id.value()));
-        ports.list_notifiers(|port| see(port.node_id, port.notifier_id.value()));
+        ports.list_listeners(|port| visit(port.node_id, port.listener_id.value()));
+        ports.list_notifiers(|port| visit(port.node_id, port.notifier_id.value()));
     }))
 }
 
-fn parties(max_actors: usize) -> usize {
+fn participants(max_actors: usize) -> usize {
     2 * max_actors + 8
 }
 
 fn service(domain: &Domain, channel: &str, entry: Entry) -> Result<PortFactory<ipc::Service>, ChannelError> {
-    let parties = parties(domain.max_actors());
+    let participants = participants(domain.max_actors());
     let builder = domain
         .node()
         .service_builder(&service_name(domain, channel)?)
         .event()
         .max_listeners(2)
-        .max_notifiers(parties)
-        .max_nodes(parties);
+        .max_notifiers(participants)
+        .max_nodes(participants);
     entry.service(channel, builder, |b| b.create(), |b| b.open())
 }
 
@@ -272,20 +274,20 @@ mod tests {
     use super::*;
 
     #[test]
-    fn who_polls_in_vain_sleeps_at_once_and_tries_again_now_and_then() {
+    fn polling_stops_after_many_misses_and_is_retried_now_and_then() {
         let polling = Polling::default();
-        let asleep = |times| {
+        let polled_waits = |times| {
             (0..times).filter(|_| {
                 let polled = polling.polls() == POLLS;
                 polling.learn(true, 0);
                 polled
             })
         };
-        assert_eq!(asleep(IN_VAIN).count(), IN_VAIN as usize);
-        assert_eq!(asleep(4 * TRIED_AGAIN).count(), 4);
+        assert_eq!(polled_waits(MAX_MISSES).count(), MAX_MISSES as usize);
+        assert_eq!(polled_waits(4 * RETRY_EVERY).count(), 4);
         polling.learn(true, 0);
         polling.learn(false, 0);
-        assert_eq!(polling.polls(), 1, "what was there at once says nothing");
+        assert_eq!(polling.polls(), 1, "success at the first poll does not count");
         polling.learn(false, 3);
         assert_eq!(polling.polls(), POLLS);
     }

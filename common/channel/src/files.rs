@@ -1,4 +1,4 @@
-//! The names of a run's files in shared memory.
+//! A run's files in shared memory.
 
 use std::fs::Metadata;
 use std::io;
@@ -7,18 +7,18 @@ use std::path::PathBuf;
 
 pub(super) const SHARED_MEMORY: &str = "/dev/shm";
 
-/// File names of the run in shared memory begin with this.
+/// The prefix of the run's file names in shared memory.
 pub(super) fn prefix(run_id: &str) -> String {
     format!("shoal_{run_id}_")
 }
 
-/// The run's files in shared memory. Others may put files there whose names begin alike: theirs are left alone.
+/// The run's files in shared memory. Files of other users with the same prefix are ignored.
 pub(super) fn files_of(run_id: &str) -> io::Result<Vec<(PathBuf, Metadata)>> {
     let (user, prefix) = (rustix::process::getuid().as_raw(), prefix(run_id));
     let ours = std::fs::read_dir(SHARED_MEMORY)?
         .flatten()
         .filter(|entry| entry.file_name().to_string_lossy().starts_with(&prefix))
-        // One that has gone in between is none.
+        // Skip a file that was removed in between.
         .filter_map(|entry| Some((entry.path(), entry.metadata().ok()?)))
         .filter(|(_, metadata)| metadata.uid() == user);
     Ok(ours.collect())

@@ -10,7 +10,8 @@ use super::reports::Reporter;
 
 const INTERVAL: Duration = Duration::from_millis(500);
 
-/// Tells the launcher that this role lives, how far it is, and what it waits for. The first beat says that it is ready.
+/// Reports to the launcher that this role is alive, how far it is, and what it waits for. The first heartbeat reports that
+/// it is ready.
 #[derive(Debug)]
 pub struct HeartbeatSender {
     reporter: Reporter<Heartbeat>,
@@ -19,10 +20,10 @@ pub struct HeartbeatSender {
 }
 
 impl HeartbeatSender {
-    /// The pulse of a role that is not ready yet.
+    /// Opens the channel. Nothing is sent yet.
     ///
     /// # Errors
-    /// When shared memory cannot be had.
+    /// When shared memory is unavailable.
     pub fn new(domain: &Domain, identity: Identity) -> Result<Self, ChannelError> {
         Ok(Self {
             reporter: Reporter::open(domain)?,
@@ -31,16 +32,15 @@ impl HeartbeatSender {
         })
     }
 
-    /// Says that work begins which a process may not survive; at once, where none was ever done. So the launcher tells one
-    /// that dies over its first step from one that was waiting.
+    /// Reports that the first step of the work begins, which the process may not survive. So the launcher can tell a role
+    /// that dies during its first step from one that was waiting.
     pub fn begin_work(&mut self) {
         if self.heartbeat.steps == 0 {
             self.beat_now(Activity::Working);
         }
     }
 
-    /// Counts `steps` more steps of the role's work. The first are told at once: a process that gets as far as that is able
-    /// to work.
+    /// Counts `steps` more steps of the role's work. The first count is sent at once: it shows that the process can work.
     pub fn count(&mut self, steps: u64) {
         let first = self.heartbeat.steps == 0;
         self.heartbeat.steps += steps;
@@ -49,22 +49,22 @@ impl HeartbeatSender {
         }
     }
 
-    /// Says which policy the role uses.
+    /// Sets the version of the policy that the role uses.
     pub fn set_policy_version(&mut self, version: u64) {
         self.heartbeat.policy_version = version;
     }
 
-    /// Beats if it is time to.
+    /// Sends a heartbeat if one is due.
     pub fn beat(&mut self, activity: Activity) {
         if self.last.is_none_or(|last| last.elapsed() >= INTERVAL) {
             self.last = Some(Instant::now());
             self.heartbeat.set_activity(activity);
-            self.reporter.look_after();
+            self.reporter.refresh_connections();
             self.reporter.send(self.heartbeat);
         }
     }
 
-    /// Beats at once.
+    /// Sends a heartbeat at once.
     pub fn beat_now(&mut self, activity: Activity) {
         self.last = None;
         self.beat(activity);

@@ -1,7 +1,8 @@
-//! Shared memory as room: how much of it a port or a service reserves, how much is free, and what runs have been promised.
+//! The capacity of shared memory: how much of it a port or a service reserves, how much is free, and how much is promised to
+//! runs.
 //!
-//! iceoryx2 makes its files at their full size and sparse: a page is taken when it is first written. So a file system
-//! that is full is a SIGBUS at some later write and no error, and what counts is what is reserved, not what is taken.
+//! iceoryx2 creates its files at their full size and sparse: a page is allocated when it is first written. A full file
+//! system then causes a SIGBUS at some later write instead of an error. So the reserved size counts, not the allocated one.
 
 use std::fs::{Metadata, OpenOptions};
 use std::io;
@@ -13,8 +14,7 @@ use super::files::{SHARED_MEMORY, prefix};
 /// The unit in which a file takes memory, in bytes.
 const PAGE: usize = 4096;
 
-// What iceoryx2 0.10 adds to what is asked of it, rounded up from what its files were seen to measure; tests/room.rs
-// compares.
+// What iceoryx2 0.10 adds to the requested sizes: measured and rounded up. `tests/room.rs` compares them with real files.
 const SEGMENT: usize = 512;
 const CHUNK_INDEX: usize = 4;
 const CONNECTION: usize = 512;
@@ -22,43 +22,43 @@ const CHANNEL: usize = 256;
 const SERVICE: usize = 768;
 const PARTY: usize = 96;
 
-/// An empty file says how much the run was promised: its name is the run's prefix, this, and the number of bytes. (Not its
-/// length: that may be limited.)
+/// An empty file records how much memory is promised to a run. Its name is the run's prefix, this word, and the number of
+/// bytes. (The length of a file may be limited, so it is not used.)
 const PROMISE: &str = "promise_";
 
-/// Whether a file of this name is such a note.
+/// Whether a file of this name records a promise.
 pub(super) fn is_promise(name: &str) -> bool {
     name.contains(PROMISE)
 }
 
-/// Bytes of a port's data: so many chunks with headers `H` and `U` and a payload of so many bytes.
+/// Bytes of a port's data: `chunks` chunks with headers `H` and `U` and `payload` bytes of payload.
 pub(super) fn segment<H, U>(chunks: usize, payload: usize) -> u64 {
     let chunk = (size_of::<H>() + size_of::<U>() + payload).next_multiple_of(align_of::<u64>());
     pages(chunks * (chunk + CHUNK_INDEX) + SEGMENT)
 }
 
-/// Bytes of a connection between two ports: in each channel a queue there and one back, and a mark for each chunk of the
+/// Bytes of a connection between two ports: in each channel a queue in each direction, and a mark for each chunk of the
 /// sender.
 pub(super) fn connection(channels: usize, buffer: usize, borrowed: usize, chunks: usize) -> u64 {
     let queues = size_of::<u64>() * (2 * buffer + borrowed);
     pages(channels * (queues + CHANNEL) + chunks + CONNECTION)
 }
 
-/// Bytes of what a service knows of the ports and processes that take part in it.
-pub(super) fn service(parties: usize) -> u64 {
-    pages(SERVICE + PARTY * parties)
+/// Bytes of a service's list of ports and processes.
+pub(super) fn service(participants: usize) -> u64 {
+    pages(SERVICE + PARTY * participants)
 }
 
-/// What so many bytes take up.
+/// The number of bytes, rounded up to whole pages.
 pub(super) fn pages(bytes: usize) -> u64 {
     bytes.next_multiple_of(PAGE) as u64
 }
 
-/// Bytes of shared memory that are free and not promised to another run of this user; `None` where there is no limit.
-/// What other programs and other users' runs have reserved and not yet taken is not known, and counts as free.
+/// Bytes of shared memory that are free and not promised to another run of this user; `None` if there is no limit. Memory
+/// that other programs and other users' runs have reserved but not allocated is unknown, and counts as free.
 ///
 /// # Errors
-/// When the file system cannot be asked.
+/// When the file system cannot be read.
 pub fn free_shared_memory(run_id: &str) -> io::Result<Option<u64>> {
     let status = rustix::fs::statvfs(SHARED_MEMORY)?;
     if status.f_blocks == 0 {
@@ -68,7 +68,7 @@ pub fn free_shared_memory(run_id: &str) -> io::Result<Option<u64>> {
     Ok(Some(free.saturating_sub(promised_to_others(run_id)?)))
 }
 
-/// Notes that the run may take so many bytes. The note goes with the run's other files.
+/// Records that the run may take this many bytes. The record is removed with the run's other files.
 pub(super) fn promise(run_id: &str, bytes: u64) -> io::Result<()> {
     let path = Path::new(SHARED_MEMORY).join(format!("{}{PROMISE}{bytes}", prefix(run_id)));
     let mut options = OpenOptions::new();
@@ -81,12 +81,12 @@ pub(super) fn promise(run_id: &str, bytes: u64) -> io::Result<()> {
     Ok(())
 }
 
-/// What this user's other runs were promised and have not taken.
+/// Bytes that are promised to this user's other runs and not allocated yet.
 fn promised_to_others(run_id: &str) -> io::Result<u64> {
     let user = rustix::process::getuid().as_raw();
     let files: Vec<(String, Metadata)> = std::fs::read_dir(SHARED_MEMORY)?
         .flatten()
-        // One that has gone in between takes nothing.
+        // Skip a file that was removed in between.
         .filter_map(|entry| Some((entry.file_name().into_string().ok()?, entry.metadata().ok()?)))
         .filter(|(_, metadata)| metadata.uid() == user)
         .collect();

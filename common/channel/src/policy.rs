@@ -1,5 +1,5 @@
-//! The policy, from the learner to everyone who acts: the latest wins. Readers evaluate it where it lies, in the learner's
-//! memory, and go on with it when the learner dies.
+//! The policy, from the learner to actors and evaluator; only the latest counts. Readers evaluate it in place, in the
+//! learner's memory, and can use it even after the learner has died.
 
 use std::rc::Rc;
 
@@ -19,23 +19,23 @@ use super::service::{Entry, Held, claim, service_name};
 
 const CHANNEL: &str = "policy";
 
-/// Policies that wait for a reader: the newest.
+/// Unread policies kept for each reader: the newest.
 const BUFFER: usize = 1;
 
-/// Policies a reader has in hand: one in use, and the next one before the first is let go.
+/// Policies that a reader holds at the same time: the current one, and the next one before the current is released.
 const BORROWED: usize = 2;
 
-/// What a reader knows of a policy.
+/// The header of a policy.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ZeroCopySend)]
 #[repr(C)]
 pub struct PolicyHeader {
-    /// The learner's start that published it.
+    /// Incarnation of the learner that published it.
     pub incarnation: u64,
-    /// Grows with each publication, and goes on from the checkpoint when a learner is restarted.
+    /// Grows with each publication; a restarted learner continues from its checkpoint.
     pub version: u64,
-    /// Environment steps it was learned from.
+    /// Environment steps that it was learned from.
     pub env_steps: u64,
-    /// Updates it was made by.
+    /// Gradient steps that made it; rows where each is used once.
     pub updates: u64,
     /// Fingerprint of the parameters' layout.
     pub fingerprint: u64,
@@ -47,7 +47,7 @@ pub struct PolicyPublisher {
     publisher: Publisher<ipc::Service, [f32], PolicyHeader>,
 }
 
-/// A reader's end, holding on to the newest policy it was given.
+/// A reader's end. It holds the newest policy that it has received.
 #[derive(Debug)]
 pub struct PolicyReader {
     subscriber: Subscriber<ipc::Service, [f32], PolicyHeader>,
@@ -56,17 +56,17 @@ pub struct PolicyReader {
     parameters: usize,
 }
 
-/// A policy in the learner's memory; it stays as it is for as long as this lives, and longer than the learner.
+/// A policy in the learner's memory. It stays valid and unchanged until this is dropped, even after the learner has ended.
 #[derive(Debug)]
 pub struct Policy {
     sample: Sample<ipc::Service, [f32], PolicyHeader>,
 }
 
 impl PolicyPublisher {
-    /// The publishing end, for policies of so many parameters.
+    /// Opens the publishing end for policies with this many parameters.
     ///
     /// # Errors
-    /// When shared memory cannot be had, or another learner lives.
+    /// When shared memory is unavailable, or another learner is alive.
     pub fn open(domain: &Domain, parameters: usize) -> Result<Self, ChannelError> {
         let samples = samples(domain.max_actors());
         let publisher = claim(|| {
@@ -84,7 +84,7 @@ impl PolicyPublisher {
     /// Publishes a policy.
     ///
     /// # Errors
-    /// When shared memory is exhausted.
+    /// When shared memory is exhausted, or a connection fails.
     pub fn publish(&self, parameters: &[f32], header: PolicyHeader) -> Result<(), ChannelError> {
         let mut loan = self
             .publisher
@@ -97,11 +97,11 @@ impl PolicyPublisher {
             .map_err(|cause| ChannelError::new(CHANNEL, "publish", cause))
     }
 
-    /// Hands the newest policy to readers that have come since. To be called while waiting.
+    /// Connects to new readers, which then receive the newest policy. Call this while waiting.
     ///
     /// # Errors
-    /// When the connection cannot be made.
-    pub fn look_after(&self) -> Result<(), ChannelError> {
+    /// When a connection fails.
+    pub fn refresh_connections(&self) -> Result<(), ChannelError> {
         self.publisher
             .update_connections()
             .map_err(|cause| ChannelError::new(CHANNEL, "reconnect", cause))
@@ -109,10 +109,10 @@ impl PolicyPublisher {
 }
 
 impl PolicyReader {
-    /// The reading end, for policies whose layout has this fingerprint and number of parameters.
+    /// Opens the reading end for policies whose layout has this fingerprint and number of parameters.
     ///
     /// # Errors
-    /// When shared memory cannot be had.
+    /// When shared memory is unavailable.
     pub fn open(domain: &Domain, fingerprint: u64, parameters: usize) -> Result<Self, ChannelError> {
         let subscriber = claim(|| {
             service(domain, Entry::Open)?
@@ -128,8 +128,8 @@ impl PolicyReader {
         })
     }
 
-    /// The newest policy there is; the same again when no newer one has come, `None` before the first. The one before it
-    /// must be let go before this is called again: a reader has no more than these two in hand.
+    /// The newest policy; the same one again if there is no newer, `None` before the first. Drop the previous policy before
+    /// calling this again: a reader can hold at most two.
     ///
     /// # Errors
     /// When the learner's memory cannot be mapped, or its policy has another layout.
@@ -149,20 +149,19 @@ impl PolicyReader {
 }
 
 impl Policy {
-    /// What is known of the policy.
+    /// The policy's header.
     pub fn header(&self) -> &PolicyHeader {
         self.sample.user_header()
     }
 
-    /// Its parameters, in the layout of the network.
+    /// Its parameters, in the layout of the policy.
     pub fn parameters(&self) -> &[f32] {
         self.sample.payload()
     }
 }
 
-/// Bytes of shared memory that policies of so many parameters reserve in a run of up to so many actors. Twice what one
-/// learner needs: readers go on with the policy of a learner that was killed, and its memory stays until they have
-/// another.
+/// Bytes of shared memory that policies with this many parameters reserve in a run of up to `max_actors` actors. This is
+/// twice what one learner needs, because the memory of a killed learner stays until the readers have a newer policy.
 pub fn reserved(max_actors: usize, parameters: usize) -> u64 {
     let (samples, readers) = (samples(max_actors), readers(max_actors));
     let learner = memory::segment::<Header, PolicyHeader>(samples, size_of::<f32>() * parameters)
@@ -170,7 +169,7 @@ pub fn reserved(max_actors: usize, parameters: usize) -> u64 {
     memory::service(readers + nodes(max_actors)) + 2 * learner
 }
 
-/// The evaluator, the actors, and one more.
+/// The evaluator, the actors, and one spare reader.
 fn readers(max_actors: usize) -> usize {
     max_actors + 2
 }
@@ -179,20 +178,20 @@ fn nodes(max_actors: usize) -> usize {
     max_actors + 4
 }
 
-/// Policies that can be in use at once. What waits for the readers is one policy, the newest, for all of them, and while
-/// it is being replaced two; iceoryx2 would reserve one for each reader.
+/// Policies that can be in use at once: those that readers hold, the newest one, its replacement while that is being
+/// published, and one being written. All readers share the newest; iceoryx2 alone would reserve one for each.
 fn samples(max_actors: usize) -> usize {
     let (waiting, being_written) = (2, 1);
     readers(max_actors) * BORROWED + waiting + being_written
 }
 
-/// Makes the service.
+/// Creates the service.
 pub(super) fn create(domain: &Domain) -> Result<Held, ChannelError> {
     let service = service(domain, Entry::Create)?;
-    Ok(Held::new(move |see| {
+    Ok(Held::new(move |visit| {
         let ports = service.dynamic_config();
-        ports.list_publishers(|port| see(port.node_id, port.publisher_id.value()));
-        ports.list_subscribers(|port| see(port.node_id, port.subscriber_id.value()));
+        ports.list_publishers(|port| visit(port.node_id, port.publisher_id.value()));
+        ports.list_subscribers(|port| visit(port.node_id, port.subscriber_id.value()));
     }))
 }
 
@@ -217,7 +216,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn there_is_room_for_the_next_policy_while_every_reader_holds_two_that_nobody_else_holds() {
+    fn a_policy_can_be_published_while_every_reader_holds_two_different_ones() {
         const MAX_ACTORS: u32 = 3;
         let run_id = format!("{:x}", std::process::id());
         let domain = Domain::join(&run_id, MAX_ACTORS).unwrap();

@@ -1,4 +1,4 @@
-//! Reports, from every role to the launcher. They never hold a role up: where nobody reads, the oldest are lost.
+//! Reports, from every role to the launcher. They never block a role: if nobody reads them, the oldest are lost.
 
 use std::fmt::Debug;
 
@@ -16,21 +16,21 @@ use super::error::ChannelError;
 use super::memory;
 use super::service::{Entry, Held, claim, service_name};
 
-/// Reports a reader has in hand: each is copied and let go.
+/// Reports that a reader holds at the same time: each is copied and released.
 const BORROWED: usize = 1;
 
-/// Reports a sender has in hand.
+/// Reports that a sender holds at the same time.
 const LOANED: usize = 1;
 
-/// A kind of report: its channel, and how many may wait to be read.
+/// A kind of report: its channel and the limits of that channel.
 pub trait Report: Copy + Debug + ZeroCopySend + 'static {
     /// The channel's name.
     const CHANNEL: &'static str;
-    /// Reports of one sender that may wait; older ones give way.
+    /// Unread reports kept for each sender; a newer one replaces the oldest.
     const BUFFER: usize;
-    /// Reports that a reader who comes late is still given.
+    /// Old reports that a late reader still receives.
     const HISTORY: usize;
-    /// Readers there may be: the launcher, the learner, and one more to look on.
+    /// Maximum number of readers: the launcher, the learner, and one observer.
     const READERS: usize = 3;
 
     /// Opens the sending end, as [`Reporter::open`] does.
@@ -42,8 +42,8 @@ pub trait Report: Copy + Debug + ZeroCopySend + 'static {
     fn receiver(domain: &Domain) -> Result<Box<dyn Receiver<Self>>, ChannelError>;
 }
 
-/// Declares a kind of report. Its ports are compiled here, and not once more in each crate that sends or reads it: a port
-/// brings half a megabyte of iceoryx2 with it.
+/// Declares a kind of report. Its ports are compiled once, here, and not again in each crate that uses them: that saves half
+/// a megabyte of iceoryx2 code for each.
 macro_rules! report {
     ($report:ty: $($constants:tt)*) => {
         impl Report for $report {
@@ -68,10 +68,10 @@ report! { Heartbeat:
 
 report! { EpisodeReport:
     const CHANNEL: &'static str = "reports/episodes";
-    // As many environments as an actor can have: a time limit ends all their episodes at the same step.
+    // The most environments that an actor can have: a time limit ends all their episodes at the same step.
     const BUFFER: usize = 4096;
     const HISTORY: usize = 0;
-    // The launcher alone: each further one would cost every actor 370 KB.
+    // The launcher alone: each further reader would cost every actor 370 KB.
     const READERS: usize = 1;
 }
 
@@ -84,7 +84,7 @@ report! { EvaluationReport:
 report! { EvaluatedReport:
     const CHANNEL: &'static str = "reports/judged";
     const BUFFER: usize = 8;
-    // A learner in lockstep that was restarted waits for it.
+    // A restarted lockstep learner waits for the last report.
     const HISTORY: usize = 1;
 }
 
@@ -106,19 +106,19 @@ impl<R: Report> Reporter<R> {
     /// Opens the sending end.
     ///
     /// # Errors
-    /// When shared memory cannot be had.
+    /// When shared memory is unavailable.
     pub fn open(domain: &Domain) -> Result<Self, ChannelError> {
         R::sender(domain).map(Self)
     }
 
-    /// Sends a report. One that cannot be sent is lost: reports must not stop the work they report on.
+    /// Sends a report. A report that cannot be sent is lost, because reports must not stop a role's work.
     pub fn send(&self, report: R) {
         self.0.send(report);
     }
 
-    /// Hands the newest reports to readers that have come since. To be called while waiting.
-    pub fn look_after(&self) {
-        self.0.look_after();
+    /// Connects to new readers, which then receive the newest reports. Call this while waiting.
+    pub fn refresh_connections(&self) {
+        self.0.refresh_connections();
     }
 }
 
@@ -126,7 +126,7 @@ impl<R: Report> Reports<R> {
     /// Opens the reading end.
     ///
     /// # Errors
-    /// When shared memory cannot be had.
+    /// When shared memory is unavailable.
     pub fn open(domain: &Domain) -> Result<Self, ChannelError> {
         R::receiver(domain).map(Self)
     }
@@ -140,14 +140,14 @@ impl<R: Report> Reports<R> {
     }
 }
 
-/// What a [`Reporter`] does, whatever port it has.
+/// The port of a [`Reporter`], whatever its type.
 #[doc(hidden)]
 pub trait Sender<R>: Debug {
     fn send(&self, report: R);
-    fn look_after(&self);
+    fn refresh_connections(&self);
 }
 
-/// What [`Reports`] do, whatever port they have.
+/// The port of [`Reports`], whatever its type.
 #[doc(hidden)]
 pub trait Receiver<R>: Debug {
     fn next(&self) -> Result<Option<R>, ChannelError>;
@@ -160,7 +160,7 @@ impl<R: Report> Sender<R> for Publisher<ipc::Service, R, ()> {
         }
     }
 
-    fn look_after(&self) {
+    fn refresh_connections(&self) {
         if let Err(cause) = self.update_connections() {
             tracing::debug!(?cause, channel = R::CHANNEL, "a reader was not connected");
         }
@@ -195,37 +195,37 @@ fn subscriber<R: Report>(domain: &Domain) -> Result<Subscriber<ipc::Service, R, 
     })
 }
 
-/// Bytes of shared memory that reports of kind `R` reserve in a run of up to so many actors, with so many senders.
+/// Bytes of shared memory that reports of kind `R` reserve with `senders` senders, in a run of up to `max_actors` actors.
 pub fn reserved<R: Report>(max_actors: usize, senders: usize) -> u64 {
     let samples = R::READERS * (R::BUFFER + BORROWED) + R::HISTORY + LOANED;
     let sender = memory::segment::<Header, ()>(samples, size_of::<R>())
         + R::READERS as u64 * memory::connection(1, R::BUFFER, BORROWED, samples);
-    memory::service(2 * parties(max_actors)) + senders as u64 * sender
+    memory::service(2 * participants(max_actors)) + senders as u64 * sender
 }
 
-fn parties(max_actors: usize) -> usize {
+fn participants(max_actors: usize) -> usize {
     2 * max_actors + 8
 }
 
-/// Makes the service of reports of kind `R`.
+/// Creates the service of reports of kind `R`.
 pub(super) fn create<R: Report>(domain: &Domain) -> Result<Held, ChannelError> {
     let service = service::<R>(domain, Entry::Create)?;
-    Ok(Held::new(move |see| {
+    Ok(Held::new(move |visit| {
         let ports = service.dynamic_config();
-        ports.list_publishers(|port| see(port.node_id, port.publisher_id.value()));
-        ports.list_subscribers(|port| see(port.node_id, port.subscriber_id.value()));
+        ports.list_publishers(|port| visit(port.node_id, port.publisher_id.value()));
+        ports.list_subscribers(|port| visit(port.node_id, port.subscriber_id.value()));
     }))
 }
 
 fn service<R: Report>(domain: &Domain, entry: Entry) -> Result<PortFactory<ipc::Service, R, ()>, ChannelError> {
-    let parties = parties(domain.max_actors());
+    let participants = participants(domain.max_actors());
     let builder = domain
         .node()
         .service_builder(&service_name(domain, R::CHANNEL)?)
         .publish_subscribe::<R>()
-        .max_publishers(parties)
+        .max_publishers(participants)
         .max_subscribers(R::READERS)
-        .max_nodes(parties)
+        .max_nodes(participants)
         .enable_safe_overflow(true)
         .history_size(R::HISTORY)
         .subscriber_max_buffer_size(R::BUFFER)

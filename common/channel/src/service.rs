@@ -1,4 +1,4 @@
-//! How a process comes to a service and to a port in it.
+//! Creating and opening services, and the ports in them.
 
 use std::fmt;
 use std::time::{Duration, Instant};
@@ -9,18 +9,18 @@ use iceoryx2::prelude::{CallbackProgression, ServiceName};
 use super::domain::Domain;
 use super::error::{Cause, ChannelError};
 
-/// How a process comes to a service.
+/// Whether a process creates or opens a service.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Entry {
-    /// Makes it: for the run's host alone, through [`Services`](super::Services).
+    /// Creates it. Only the run's launcher does this, through [`Services`](super::Services).
     Create,
-    /// Opens it. It is there before whoever opens it is started.
+    /// Opens it. It exists before a process that opens it is started.
     Open,
 }
 
 impl Entry {
-    /// Makes or opens the service that `builder` describes. iceoryx2's builders have no trait in common, so their two
-    /// methods are given.
+    /// Creates or opens the service that `builder` describes. The two methods are passed as arguments, because iceoryx2's
+    /// builders have no trait in common.
     pub(super) fn service<B, S, C: Cause, O: Cause>(
         self,
         channel: &str,
@@ -35,23 +35,23 @@ impl Entry {
     }
 }
 
-/// The service name of a channel; every process of the run and the ecosystem's tools see it under this name.
+/// The name of a channel's service, for the processes of the run and for iceoryx2's tools.
 pub(super) fn service_name(domain: &Domain, channel: &str) -> Result<ServiceName, ChannelError> {
     let name = format!("shoal/{}/{channel}", domain.run_id());
-    ServiceName::new(&name).map_err(|cause| ChannelError::new(channel, "be named", cause))
+    ServiceName::new(&name).map_err(|cause| ChannelError::new(channel, "make the service name", cause))
 }
 
-/// How long a dead predecessor may occupy a port before we give up.
+/// How long to wait for a port that a dead predecessor occupies.
 pub(super) const CLAIM_PATIENCE: Duration = Duration::from_secs(5);
 
-/// Opens a service and makes a port in it. A process that died may still hold the place until the launcher has cleaned up
-/// after it, and what it had half made is there until it is swept away. So where the failure may pass, the attempt is made
-/// again for a while; any other failure is returned at once.
+/// Calls `attempt`, which opens a service and creates a port in it, and retries for a while if the failure is transient: a
+/// dead process may occupy the port until the launcher has cleaned up after it, and its half-made files exist until they
+/// are removed. Any other failure is returned at once.
 pub(super) fn claim<T>(mut attempt: impl FnMut() -> Result<T, ChannelError>) -> Result<T, ChannelError> {
     let deadline = Instant::now() + CLAIM_PATIENCE;
     loop {
         match attempt() {
-            Err(error) if error.may_pass() && Instant::now() < deadline => {
+            Err(error) if error.is_transient() && Instant::now() < deadline => {
                 std::thread::sleep(Duration::from_millis(5));
             }
             result => return result,
@@ -59,25 +59,25 @@ pub(super) fn claim<T>(mut attempt: impl FnMut() -> Result<T, ChannelError>) -> 
     }
 }
 
-/// Is shown each port of a service: the node that made it, and its number.
-pub(super) type SeePort<'a> = &'a mut dyn FnMut(UniqueNodeId, u128) -> CallbackProgression;
+/// A callback for each port of a service. Its arguments are the node that created the port, and the port's id.
+pub(super) type VisitPort<'a> = &'a mut dyn FnMut(UniqueNodeId, u128) -> CallbackProgression;
 
-/// A service that is held, whatever its payload.
+/// A service that this process keeps open, whatever its payload.
 pub(super) struct Held {
-    list_ports: Box<dyn Fn(SeePort<'_>)>,
+    list_ports: Box<dyn Fn(VisitPort<'_>)>,
 }
 
 impl Held {
-    /// Holds the service that `list_ports` owns, and whose ports it shows.
-    pub(super) fn new(list_ports: impl Fn(SeePort<'_>) + 'static) -> Self {
+    /// Keeps the service open that `list_ports` owns. `list_ports` must visit its ports.
+    pub(super) fn new(list_ports: impl Fn(VisitPort<'_>) + 'static) -> Self {
         Self {
             list_ports: Box::new(list_ports),
         }
     }
 
-    /// Shows every port of the service.
-    pub(super) fn list_ports(&self, see: SeePort<'_>) {
-        (self.list_ports)(see);
+    /// Visits every port of the service.
+    pub(super) fn list_ports(&self, visit: VisitPort<'_>) {
+        (self.list_ports)(visit);
     }
 }
 
@@ -107,7 +107,7 @@ mod tests {
         Domain::join(&format!("{name}{:x}", std::process::id()), 1).unwrap()
     }
 
-    /// A service for numbers of type `T`, with room for one publisher.
+    /// A service for numbers of type `T`, with at most one publisher.
     fn service<T: fmt::Debug + ZeroCopySend>(
         domain: &Domain,
         entry: Entry,
@@ -123,7 +123,7 @@ mod tests {
     }
 
     #[test]
-    fn a_port_is_claimed_once_its_dead_holder_is_cleaned_up_after() {
+    fn a_port_can_be_claimed_after_its_dead_owner_is_cleaned_up() {
         let domain = domain("ca");
         let held = service(&domain, Entry::Create).unwrap();
         let mut predecessor = Some(publisher(&held).unwrap());
@@ -143,14 +143,14 @@ mod tests {
     }
 
     #[test]
-    fn a_service_that_is_half_made_is_tried_again() {
+    fn opening_a_half_made_service_is_retried() {
         let domain = domain("cb");
         let held = service::<u64>(&domain, Entry::Create).unwrap();
         let services = domain.directory().unwrap().join("services");
         let files = std::fs::read_dir(services).unwrap().map(|entry| entry.unwrap().path());
         let [file]: [PathBuf; 1] = files.collect::<Vec<_>>().try_into().unwrap();
         drop(held);
-        // As it stands before its maker has written it: iceoryx2 makes it read-only at last.
+        // An unfinished file of a service: iceoryx2 makes it read-only at the end.
         let mut options = std::fs::OpenOptions::new();
         options.write(true).create_new(true).mode(0o600).open(&file).unwrap();
         let (mut failures, mut made) = (Vec::new(), None);
@@ -170,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_pass_fails_at_once_and_says_what_to_do() {
+    fn a_permanent_failure_is_returned_at_once_and_states_what_to_do() {
         let domain = domain("cc");
         let claimed = |attempt: &dyn Fn() -> Result<(), ChannelError>| {
             let (begun, mut attempts) = (Instant::now(), 0);
@@ -186,7 +186,7 @@ mod tests {
         assert_eq!(missing.kind, ChannelErrorKind::Missing);
         assert_eq!(
             missing.to_string(),
-            "channel test: cannot open: it is not there; has the launcher ended? (PublishSubscribeOpenError::DoesNotExist)"
+            "channel test: cannot open: it does not exist; has the launcher ended? (PublishSubscribeOpenError::DoesNotExist)"
         );
         let held = service::<u64>(&domain, Entry::Create).unwrap();
         let incompatible = claimed(&|| service::<u8>(&domain, Entry::Open).map(drop));

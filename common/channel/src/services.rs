@@ -1,5 +1,5 @@
-//! The services of a run. Whoever hosts it makes each of them before a process that opens it is started, and holds them to
-//! the end; all others only open. So a process that is killed while it starts leaves no half-made service behind.
+//! The services of a run. The launcher creates each of them before it starts a process that opens it, and holds them to the
+//! end. Other processes only open services, so one that is killed while it starts leaves no half-made service behind.
 
 use std::fs::OpenOptions;
 use std::io;
@@ -9,7 +9,7 @@ use iceoryx2::identifiers::UniqueNodeId;
 use iceoryx2::prelude::CallbackProgression;
 use shoal_base::report::{EpisodeReport, EvaluatedReport, EvaluationReport, Heartbeat, LearnerReport, Role};
 
-use super::cleanup::{Sweeper, lives};
+use super::cleanup::{Sweeper, is_alive};
 use super::domain::{Domain, DomainError, io_error};
 use super::error::ChannelError;
 use super::event::EventName;
@@ -17,7 +17,8 @@ use super::files::prefix;
 use super::service::Held;
 use super::{control, environment, event, policy, reports, transitions};
 
-/// The services of a run that this process has made. They are gone when this is dropped and nobody else has them open.
+/// The services of a run that this process has created. A service is removed when this is dropped and no other process has
+/// it open.
 #[derive(Debug)]
 pub struct Services {
     held: Vec<Held>,
@@ -25,10 +26,10 @@ pub struct Services {
 }
 
 impl Services {
-    /// None yet. From now on, what killed processes have half made in the run's shared memory is removed.
+    /// Starts with no services, and starts a [`Sweeper`] that removes half-made files of killed processes.
     ///
     /// # Errors
-    /// When no thread can be started.
+    /// When the sweeper's thread cannot be started.
     pub fn new(domain: &Domain) -> Result<Self, ChannelError> {
         Ok(Self {
             held: Vec::new(),
@@ -36,10 +37,11 @@ impl Services {
         })
     }
 
-    /// Makes what a run has once: control, policy, reports, and what wakes launcher, learner and evaluator.
+    /// Creates the services that a run has once: control, policy, reports, and the event services of launcher, learner and
+    /// evaluator.
     ///
     /// # Errors
-    /// When a service is there already, or shared memory cannot be had.
+    /// When a service exists already, or shared memory is unavailable.
     pub fn create_common(&mut self, domain: &Domain) -> Result<(), ChannelError> {
         self.held.extend([
             event::create_of_launcher(domain)?,
@@ -56,7 +58,7 @@ impl Services {
         Ok(())
     }
 
-    /// Makes what environment server `index` needs.
+    /// Creates the services of environment server `index`.
     ///
     /// # Errors
     /// As [`create_common`](Self::create_common).
@@ -68,7 +70,7 @@ impl Services {
         Ok(())
     }
 
-    /// Makes what actor `index` needs, which may have `window` chunks uncommitted, and its environment server.
+    /// Creates the services of actor `index`, which may have `window` chunks uncommitted, and of its environment server.
     ///
     /// # Errors
     /// As [`create_common`](Self::create_common).
@@ -81,7 +83,7 @@ impl Services {
         Ok(())
     }
 
-    /// Makes what wakes one role, for who has no use of the rest.
+    /// Creates the event service of one role alone.
     ///
     /// # Errors
     /// As [`create_common`](Self::create_common).
@@ -90,18 +92,18 @@ impl Services {
         Ok(())
     }
 
-    /// Puts back what tells iceoryx2 of dead processes' ports, where it is gone and the port is not. To be called before a
+    /// Restores missing port tags of dead processes. Without its tag iceoryx2 never frees a port, so call this before a
     /// clean-up.
     ///
     /// # Errors
-    /// When a file cannot be made.
+    /// When a file cannot be created.
     pub fn restore_port_tags(&self, domain: &Domain) -> Result<(), DomainError> {
         let nodes = domain.directory()?.join("nodes");
         let mut restored = Ok(());
         self.each_port(|node, port| {
             let directory = nodes.join(node.value().to_string());
             let tag = directory.join(format!("{}{port}.port_tag", prefix(domain.run_id())));
-            if restored.is_ok() && !lives(node) && directory.is_dir() && !tag.exists() {
+            if restored.is_ok() && !is_alive(node) && directory.is_dir() && !tag.exists() {
                 let made = OpenOptions::new()
                     .write(true)
                     .create(true)
@@ -109,7 +111,7 @@ impl Services {
                     .mode(0o600)
                     .open(&tag);
                 restored = match made {
-                    // Another clean-up has done all there is to do.
+                    // The directory is gone: another clean-up has finished.
                     Err(cause) if cause.kind() == io::ErrorKind::NotFound => Ok(()),
                     made => made.map(drop).map_err(io_error("make", &tag)),
                 };
@@ -118,19 +120,19 @@ impl Services {
         restored
     }
 
-    /// Ports that dead processes occupy.
-    pub fn occupied_by_the_dead(&self) -> usize {
+    /// Number of ports that dead processes occupy.
+    pub fn ports_of_dead_processes(&self) -> usize {
         let mut occupied = 0;
-        self.each_port(|node, _| occupied += usize::from(!lives(node)));
+        self.each_port(|node, _| occupied += usize::from(!is_alive(node)));
         occupied
     }
 
-    /// Shows every port of every service.
-    fn each_port(&self, mut see: impl FnMut(UniqueNodeId, u128)) {
-        let mut see = |node, port| {
-            see(node, port);
+    /// Visits every port of every service.
+    fn each_port(&self, mut visit: impl FnMut(UniqueNodeId, u128)) {
+        let mut visit = |node, port| {
+            visit(node, port);
             CallbackProgression::Continue
         };
-        self.held.iter().for_each(|held| held.list_ports(&mut see));
+        self.held.iter().for_each(|held| held.list_ports(&mut visit));
     }
 }

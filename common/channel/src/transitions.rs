@@ -1,12 +1,12 @@
 //! Transitions, from one actor to the learner, in chunks of rows.
 //!
-//! An actor keeps at most `window` chunks sent but not committed, the service's history holds as many, and the learner's
-//! buffer twice as many (a new learner may find a whole history that it has committed already, and a whole window on top).
-//! So `send` always finds room, and what a dead learner had not committed reaches the next one.
+//! An actor has at most `window` chunks sent but not committed. The service's history holds as many, and the learner's
+//! buffer twice as many, because a new learner may receive a whole history that was committed before and a whole window on
+//! top. So `send` never runs out of space, and chunks that a dead learner had not committed reach the next one.
 //!
-//! What a dead actor had sent still arrives, and before anything of its next start, if the learner was connected to it.
-//! Nobody can ask for that, so an actor first sends an empty chunk, its [`Handshake`], and no row before that one is
-//! committed. By then it is certain what of its predecessor is in the replay, and its sequence goes on after that.
+//! Chunks of a dead actor still arrive, before any chunk of its successor, if the learner was connected to it. A new actor
+//! cannot know which of them will. So it first sends an empty chunk, its [`Handshake`], and sends no rows until that one is
+//! committed. Then the replay has all it will ever have of the predecessor, and the sequence continues from there.
 
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
@@ -29,32 +29,32 @@ use super::memory;
 use super::service::{Entry, Held, claim, service_name};
 use crate::commit::{ChunkMark, CommitReader};
 
-/// Chunks the learner has in hand.
+/// Chunks that the learner holds at the same time.
 const BORROWED: usize = 2;
 
-/// Chunks an actor has in hand.
+/// Chunks that an actor fills at the same time.
 const LOANED: usize = 2;
 
-/// Processes that may take part in one flow.
+/// Processes that may have the service open.
 const NODES: usize = 8;
 
-/// What a chunk's receiver knows of it.
+/// The header of a chunk.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ZeroCopySend)]
 #[repr(C)]
 pub struct ChunkHeader {
-    /// The actor's start that collected the rows.
+    /// Incarnation of the actor process that collected the rows.
     pub incarnation: u64,
-    /// Counts the chunks of this actor, from 1 and over all its starts; 0 for a handshake.
+    /// Number of the chunk, counted from 1 over all incarnations of this actor; 0 for a handshake.
     pub sequence: u64,
     /// Version of the policy that the last row was collected with.
     pub policy_version: u64,
-    /// Rows that are filled.
+    /// Rows in the chunk.
     pub rows: u32,
     /// The actor.
     pub actor: u32,
 }
 
-/// An actor's end.
+/// The actor's end.
 #[derive(Debug)]
 pub struct ChunkSender {
     service: ChunkService,
@@ -66,11 +66,11 @@ pub struct ChunkSender {
     sent: u64,
 }
 
-/// An actor's end that has said that it is there, and may send no row before that is committed.
+/// The actor's end after it has sent its handshake. It may send rows once the handshake is committed.
 #[derive(Debug)]
 pub struct Handshake(ChunkSender);
 
-/// A chunk being filled, in the memory it will be sent in.
+/// A chunk being filled, in the shared memory that it is sent in.
 #[derive(Debug)]
 pub struct Chunk {
     sample: SampleMut<ipc::Service, [f32], ChunkHeader>,
@@ -86,7 +86,7 @@ pub struct ChunkReceiver {
     layout: ChunkLayout,
 }
 
-/// A chunk in the sender's memory; its place is free again when this is dropped.
+/// A received chunk in the sender's memory. Dropping it frees the memory.
 #[derive(Debug)]
 pub struct ReceivedChunk {
     sample: Sample<ipc::Service, [f32], ChunkHeader>,
@@ -94,10 +94,10 @@ pub struct ReceivedChunk {
 }
 
 impl Handshake {
-    /// Waits until the handshake is committed; `idle` is called at each pause.
+    /// Waits until the handshake is committed, and calls `idle` at each pause.
     ///
     /// # Errors
-    /// When interrupted.
+    /// When `stop` is requested or the channel fails.
     pub fn wait(
         self,
         commits: &CommitReader,
@@ -115,7 +115,7 @@ impl Handshake {
             },
             || {
                 idle();
-                sender.look_after()
+                sender.refresh_connections()
             },
         )?;
         sender.sent = newest.sequence;
@@ -124,11 +124,11 @@ impl Handshake {
 }
 
 impl ChunkSender {
-    /// The sending end of `actor`, whose chunks have this layout and of which `window` may be uncommitted. Incarnations
-    /// count from 1.
+    /// Opens the sending end of `actor` and sends the handshake. The chunks have this layout, and at most `window` of them
+    /// may be uncommitted. Incarnations count from 1.
     ///
     /// # Errors
-    /// When shared memory cannot be had, or the actor before this one still lives.
+    /// When shared memory is unavailable, or the previous process of this actor is still alive.
     pub fn open(
         domain: &Domain,
         actor: u32,
@@ -160,12 +160,12 @@ impl ChunkSender {
         Ok(Handshake(sender))
     }
 
-    /// Sequence number of the chunk sent last; 0 before the first.
+    /// Sequence number of the last chunk sent; 0 before the first.
     pub fn sent(&self) -> u64 {
         self.sent
     }
 
-    /// Chunks sent that `committed`, the newest mark of this actor in the replay, does not cover.
+    /// Chunks sent but not committed. `committed` is the newest mark of this actor in the replay.
     pub fn in_flight(&self, committed: ChunkMark) -> u64 {
         self.sent.saturating_sub(committed.sequence)
     }
@@ -186,10 +186,10 @@ impl ChunkSender {
         })
     }
 
-    /// Sends a chunk, full or not, whose rows were collected with the policy up to `policy_version`.
+    /// Sends a chunk, full or not. `policy_version` is the version that its last row was collected with.
     ///
     /// # Errors
-    /// When the connection to the learner cannot be made.
+    /// When the connection to the learner fails.
     pub fn send(&mut self, chunk: Chunk, policy_version: u64) -> Result<(), ChannelError> {
         self.sent += 1;
         self.deliver(chunk, policy_version)
@@ -200,7 +200,7 @@ impl ChunkSender {
             incarnation: self.incarnation,
             sequence: self.sent,
             policy_version,
-            // A chunk's rows fit: the configuration bounds them.
+            // Fits into 32 bits: the configuration bounds the rows of a chunk.
             rows: chunk.filled as u32,
             actor: self.actor,
         };
@@ -213,16 +213,16 @@ impl ChunkSender {
         Ok(())
     }
 
-    /// Whether there is a learner to take chunks; one that was killed counts until the launcher has cleaned up after it.
-    pub fn is_heard(&self) -> bool {
+    /// Whether a learner is connected. A killed learner counts until the launcher has cleaned up after it.
+    pub fn has_receiver(&self) -> bool {
         self.service.dynamic_config().number_of_subscribers() > 0
     }
 
-    /// Hands what is not committed to a learner that has come anew. To be called while waiting.
+    /// Connects to a new learner, which then receives the chunks in the history. Call this while waiting.
     ///
     /// # Errors
-    /// When the connection cannot be made.
-    pub fn look_after(&self) -> Result<(), ChannelError> {
+    /// When the connection fails.
+    pub fn refresh_connections(&self) -> Result<(), ChannelError> {
         self.publisher
             .update_connections()
             .map_err(|cause| ChannelError::new(&self.channel, "reconnect", cause))
@@ -230,7 +230,7 @@ impl ChunkSender {
 }
 
 impl Chunk {
-    /// Writes the next row. A full chunk takes no more.
+    /// Writes the next row. A full chunk ignores it.
     pub fn push(&mut self, transition: &Transition<'_>) {
         let rows = self.layout.numbers_of_rows();
         let mut rows = self.sample.payload_mut()[..rows].chunks_exact_mut(self.layout.row.width());
@@ -240,16 +240,16 @@ impl Chunk {
         }
     }
 
-    /// Says where the actor stands after the last row.
+    /// Sets the actor's snapshot after the last row.
     ///
     /// # Panics
-    /// As `copy_from_slice` does: the layout says how many words there are.
-    pub fn set_standing(&mut self, words: &[u64]) {
+    /// If there are not exactly as many words as the layout requires.
+    pub fn set_actor_snapshot(&mut self, words: &[u64]) {
         let rows = self.layout.numbers_of_rows();
         self.sample.payload_mut()[rows..].copy_from_slice(numbers_of(words));
     }
 
-    /// Takes the rows back, so that it is filled anew.
+    /// Discards the rows.
     pub fn clear(&mut self) {
         self.filled = 0;
     }
@@ -271,10 +271,10 @@ impl Chunk {
 }
 
 impl ChunkReceiver {
-    /// The receiving end of `actor`'s chunks, which have this layout.
+    /// Opens the receiving end of `actor`'s chunks, which have this layout.
     ///
     /// # Errors
-    /// When shared memory cannot be had, or another learner lives.
+    /// When shared memory is unavailable, or another learner is still alive.
     pub fn open(domain: &Domain, actor: u32, layout: ChunkLayout, window: u32) -> Result<Self, ChannelError> {
         let channel = name(actor);
         let subscriber = claim(|| {
@@ -294,7 +294,7 @@ impl ChunkReceiver {
     /// The next chunk, if there is one.
     ///
     /// # Errors
-    /// When the sender's memory cannot be mapped, or the chunk contradicts itself.
+    /// When the sender's memory cannot be mapped, or the chunk does not have this layout.
     pub fn receive(&self) -> Result<Option<ReceivedChunk>, ChannelError> {
         let received = self
             .subscriber
@@ -314,20 +314,20 @@ impl ChunkReceiver {
 }
 
 impl ReceivedChunk {
-    /// What is known of the chunk.
+    /// The chunk's header.
     pub fn header(&self) -> &ChunkHeader {
         self.sample.user_header()
     }
 
-    /// Where the chunk stands in its actor's sequence, of which `committed` is the newest. A handshake takes no place of its
-    /// own: it says who goes on after it.
+    /// The chunk's mark. `committed` is the newest committed mark of its actor: a handshake keeps its sequence number, and
+    /// only announces the new incarnation.
     pub fn mark(&self, committed: ChunkMark) -> ChunkMark {
         let ChunkHeader {
             incarnation, sequence, ..
         } = *self.header();
         ChunkMark {
             incarnation,
-            sequence: if self.is_greeting() {
+            sequence: if self.is_handshake() {
                 committed.sequence
             } else {
                 sequence
@@ -335,24 +335,24 @@ impl ReceivedChunk {
         }
     }
 
-    fn is_greeting(&self) -> bool {
+    fn is_handshake(&self) -> bool {
         self.header().sequence == 0
     }
 
-    /// Its filled rows, one after the other.
+    /// Its rows, one after the other.
     pub fn rows(&self) -> &[f32] {
         &self.sample.payload()[..self.header().rows as usize * self.layout.row.width()]
     }
 
-    /// Where the actor stands after it; `None` for a handshake, and where nobody asks.
-    pub fn standing(&self) -> Option<Vec<u64>> {
+    /// The actor's snapshot after it; `None` for a handshake, and if the layout has no snapshots.
+    pub fn actor_snapshot(&self) -> Option<Vec<u64>> {
         let rows = self.layout.numbers_of_rows();
-        let asked = self.layout.actor_snapshot_words > 0 && !self.is_greeting();
-        asked.then(|| words_of(&self.sample.payload()[rows..]))
+        let present = self.layout.actor_snapshot_words > 0 && !self.is_handshake();
+        present.then(|| words_of(&self.sample.payload()[rows..]))
     }
 }
 
-/// Bytes of shared memory that one actor's chunks of this layout reserve, with such a window.
+/// Bytes of shared memory that one actor's chunks of this layout reserve with this window.
 pub fn reserved(layout: &ChunkLayout, window: u32) -> u64 {
     let chunks = buffer(window) + BORROWED + window as usize + LOANED;
     memory::service(NODES)
@@ -368,13 +368,13 @@ fn buffer(window: u32) -> usize {
     2 * window as usize
 }
 
-/// Makes the service for the chunks of `actor`, of which `window` may be uncommitted.
+/// Creates the service for the chunks of `actor`, of which at most `window` may be uncommitted.
 pub(super) fn create(domain: &Domain, actor: u32, window: u32) -> Result<Held, ChannelError> {
     let service = service(domain, &name(actor), window, Entry::Create)?;
-    Ok(Held::new(move |see| {
+    Ok(Held::new(move |visit| {
         let ports = service.dynamic_config();
-        ports.list_publishers(|port| see(port.node_id, port.publisher_id.value()));
-        ports.list_subscribers(|port| see(port.node_id, port.subscriber_id.value()));
+        ports.list_publishers(|port| visit(port.node_id, port.publisher_id.value()));
+        ports.list_subscribers(|port| visit(port.node_id, port.subscriber_id.value()));
     }))
 }
 

@@ -1,4 +1,4 @@
-//! What an algorithm is to everyone who need not know which one it is.
+//! The interface of an algorithm for code that does not depend on a particular one.
 
 use std::fmt::{self, Display, Formatter};
 
@@ -9,63 +9,63 @@ use shoal_policy::network::{Activation, Hidden, NetworkLayout};
 
 use super::behaviour::Behaviour;
 
-/// What an algorithm is, whatever its numbers are.
+/// The fixed properties of an algorithm, which do not depend on its settings.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct AlgorithmSpec {
-    /// Its name, which is its section's.
+    /// Its name, which is also the name of its section.
     pub name: &'static str,
-    /// Whether it may learn from what an older policy did. Else it runs in lockstep only.
+    /// Whether it can learn from transitions of older policies. If not, it runs in lockstep only.
     pub off_policy: bool,
-    /// How it takes the transitions.
+    /// How it uses transitions.
     pub experience: Experience,
 }
 
-/// How an algorithm takes the transitions that it learns from.
+/// How an algorithm uses the transitions that it learns from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Experience {
-    /// In minibatches drawn at random from the replay, again and again.
+    /// In minibatches drawn at random from the replay, each transition many times.
     Minibatches,
-    /// Each once, in order.
+    /// Each transition once, in order.
     Transitions,
-    /// In whole episodes, each once. A chunk is an episode.
+    /// In whole episodes, each transition once. A chunk is an episode.
     Episodes,
 }
 
-/// The settings of an algorithm: its section of the configuration, and what follows from it.
+/// The settings of an algorithm: its section of the configuration, and everything derived from it.
 pub trait AlgorithmSettings {
-    /// Whether every number makes sense; `section` is the section's name.
+    /// Checks every number. `section` is the section's name.
     ///
     /// # Errors
-    /// For the first one that does not.
+    /// For the first invalid number.
     fn check(&self, section: &str) -> Result<(), OutOfRange>;
 
     /// γ, the discount of one step.
     fn gamma(&self) -> f64;
 
-    /// Its policy in an environment like `spec`, for at most `batch` observations a call, and how actors explore around it.
-    /// `name` is the algorithm's.
+    /// Its policy in an environment like `spec`, for at most `batch` observations a call, and how actors explore with it.
+    /// `name` is the name of the algorithm.
     ///
     /// # Errors
     /// When it cannot control that environment.
     fn behaviour(&self, name: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError>;
 
-    /// Numbers that the exploration of one environment in `spec` carries from step to step; 0 where each step's is drawn anew.
+    /// Numbers of exploration state that one environment keeps from step to step; 0 if the steps are independent.
     fn exploration_state_width(&self, spec: &EnvironmentSpec) -> usize;
 
-    /// Transitions that the replay must be able to hold at least: a minibatch, or 1.
+    /// The smallest capacity of the replay, in transitions: a minibatch, or 1.
     fn least_capacity(&self) -> u64;
 
-    /// What it learns in an environment like `spec`.
+    /// The networks or tables that it learns in an environment like `spec`.
     fn learned(&self, spec: &EnvironmentSpec) -> Learned;
 }
 
-/// The networks or tables that an algorithm learns, each with a name and without target networks and what an optimiser
-/// remembers.
+/// The networks or tables that an algorithm learns, each with a name. Target networks and the state of the optimiser are not
+/// included.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Learned {
     /// The policy.
     pub policy: (&'static str, Shape),
-    /// All else.
+    /// All other networks or tables.
     pub others: Vec<(&'static str, Shape)>,
 }
 
@@ -75,28 +75,28 @@ impl Learned {
         std::iter::once(self.policy).chain(self.others.iter().copied())
     }
 
-    /// Numbers in all of them.
+    /// The number of parameters in all of them.
     pub fn parameters(&self) -> usize {
         self.iter().map(|(_, shape)| shape.parameters()).sum()
     }
 }
 
-/// The shape of something that is learned.
+/// The shape of a network or table.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Shape {
     /// A network.
     Network(NetworkLayout),
     /// A number for each state and action.
     Table {
-        /// How many states there are.
+        /// Number of states.
         states: usize,
-        /// How many actions.
+        /// Number of actions.
         actions: usize,
     },
 }
 
 impl Shape {
-    /// How many numbers there are.
+    /// The number of parameters.
     pub fn parameters(&self) -> usize {
         match self {
             Self::Network(network) => network.parameters(),
@@ -105,7 +105,7 @@ impl Shape {
     }
 }
 
-/// As it stands in the identity of a run (`config/identity.rs`): the words may not change.
+/// The text of a shape in the identity of a run (`config/identity.rs`). It must not change.
 impl Display for Shape {
     fn fmt(&self, to: &mut Formatter<'_>) -> fmt::Result {
         match self {
@@ -119,7 +119,7 @@ impl Display for Shape {
                     late => write!(to, " late {late}")?,
                 }
                 match activation {
-                    // Of runs from before there were others.
+                    // Not named, as in runs from before there were other activations.
                     Activation::Relu => Ok(()),
                     Activation::Tanh => write!(to, " tanh"),
                 }

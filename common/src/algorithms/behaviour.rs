@@ -1,19 +1,18 @@
-//! How an algorithm's actors act: its policy, and what they do to try what the policy would not.
+//! How an algorithm's actors act: its policy and their exploration.
 
 use shoal_policy::network::PolicyNetwork;
 use shoal_policy::{Policy, Scores};
 
 use super::exploration::ExplorationConfig;
 
-/// A policy with the exploration around it. Which kind of policy goes with which exploration is said by the variants, so that
-/// no other pair can be made.
+/// A policy with its exploration. Each variant is one valid combination, so no other can be made.
 #[derive(Clone, Debug)]
 pub enum Behaviour {
-    /// The policy says the action, and actors add noise to it.
+    /// The action of the policy, to which actors add noise.
     Noise(PolicyNetwork, ExplorationConfig),
-    /// An action drawn with the probabilities that the policy says.
+    /// An action drawn from the policy's probabilities.
     Sample(Scores),
-    /// The action with the highest score, but with this probability any of all.
+    /// The action with the highest score, or with this probability an action drawn uniformly from all.
     EpsilonGreedy(Scores, f64),
 }
 

@@ -20,14 +20,14 @@ pub(super) const SPEC: AlgorithmSpec = AlgorithmSpec {
 section! {
     /// Algorithm 4 with the numbers of section 4.3.1.
     pub struct DdpgConfig {
-        /// Units of each hidden layer, of actor and critic alike: a list of 1 to 8 layers. The critic takes the action in at the
-        /// second one, or at the only one.
+        /// Units of each hidden layer, for actor and critic: a list of 1 to 8 layers. The action enters the critic at the
+        /// second hidden layer, or at the only one.
         hidden: Layers = Layers::from([400, 300]), bounds: from(1, 8_192), unit: "units", source: "section 4.3.1";
-        /// What the units of the hidden layers do.
+        /// The activation function of the hidden layers.
         activation: Activation = Activation::Relu, unit: "–", source: "section 4.3.1";
         /// γ, the discount of one step.
         gamma: f64 = 0.99, bounds: from(0.0, 1.0), unit: "–", source: "section 4.3.1";
-        /// τ, how far the target networks follow in one update (equation 3.31).
+        /// τ, the share by which the target networks move in one gradient step (equation 3.31).
         tau: f64 = 0.001, bounds: above(0.0, 1.0), unit: "–", source: "equation 3.31, section 4.3.1";
         /// Adam's step size for the actor, α_μ.
         actor_learning_rate: f64 = 1e-4, bounds: above(0.0, 1.0), unit: "–", source: "section 4.3.1";
@@ -35,7 +35,7 @@ section! {
         critic_learning_rate: f64 = 1e-3, bounds: above(0.0, 1.0), unit: "–", source: "section 4.3.1";
         /// N, transitions in a minibatch.
         batch: usize = 64, bounds: from(1, 65_536), unit: "transitions", source: "Algorithm 4, section 4.3.1";
-        /// The noise of its actors: a section of its own, `[exploration]`.
+        /// The noise of its actors. It has its own section, `[exploration]`.
         #[serde(skip)]
         #[schemars(skip)]
         exploration: ExplorationConfig = ExplorationConfig::default();

@@ -23,7 +23,7 @@ section! {
     pub struct ReinforceConfig {
         /// Units of each of the policy's hidden layers: a list of 1 to 8 layers.
         hidden: Layers = Layers::from([10, 2]), bounds: from(1, 8_192), unit: "units", source: "section 4.2.1";
-        /// What the units of the hidden layers do, of policy and baseline alike.
+        /// The activation function of the hidden layers, for policy and baseline.
         activation: Activation = Activation::Relu, unit: "–", source: "section 4.2.1";
         /// γ, the discount of one step.
         gamma: f64 = 0.95, bounds: from(0.0, 1.0), unit: "–", source: "section 4.2.1";
@@ -31,11 +31,11 @@ section! {
         learning_rate: f64 = 0.01, bounds: from(0.0, 1.0), unit: "–", source: "section 4.2.1";
         /// What a step's ∇ ln π is multiplied by.
         weight: Weight = Weight::Normalised, unit: "–", source: "section 4.2.2";
-        /// Whether that is also multiplied by γᵗ, as line 6 of Algorithm 3 has it.
+        /// Whether the product is also multiplied by γᵗ, as in line 6 of Algorithm 3.
         discount_steps: bool = false, unit: "–", source: "Algorithm 3";
         /// Whether an episode that the time limit ended is learned from.
         learn_at_limit: bool = true, unit: "–", source: "section 4.2.2";
-        /// Units of each of the baseline's hidden layers, 1 to 8 of them; only where it is the weight.
+        /// Units of each of the baseline's hidden layers: a list of 1 to 8 layers. Used only with `weight = "baseline"`.
         baseline_hidden: Layers = Layers::from([32, 32]), bounds: from(1, 8_192), unit: "units", source: "ours";
         /// Adam's step size for the baseline.
         baseline_learning_rate: f64 = 0.01, bounds: from(0.0, 1.0), unit: "–", source: "ours";
@@ -48,9 +48,9 @@ section! {
 pub enum Weight {
     /// The return G.
     Return,
-    /// G, less its mean over the episode and divided by its standard deviation.
+    /// G minus its mean over the episode, divided by its standard deviation.
     Normalised,
-    /// δ = G − V(s), V learned beside the policy (equation 3.25).
+    /// δ = G − V(s), where V is learned together with the policy (equation 3.25).
     Baseline,
 }
 

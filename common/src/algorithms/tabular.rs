@@ -29,7 +29,7 @@ section! {
         gamma: f64 = 0.999, bounds: from(0.0, 1.0), unit: "–", source: "section 4.1";
         /// α, the step size.
         alpha: f64 = 0.03, bounds: from(0.0, 1.0), unit: "–", source: "section 4.1";
-        /// ε, how often an actor takes any action instead of the best.
+        /// ε, the probability that an actor takes a random action instead of the best.
         epsilon: f64 = 0.4, bounds: from(0.0, 1.0), unit: "share of the steps", source: "section 4.1";
     }
 }

@@ -1,21 +1,21 @@
-//! `[environment]`, and `[spec]`, which the environment says of itself.
+//! `[environment]`, and `[spec]`, which the environment's server supplies.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use shoal_base::section::{OutOfRange, from};
 use shoal_base::space::{EnvironmentSpec, Space};
 
-/// Numbers in an observation or an action: many more than any environment has, and few enough that sizes computed from
-/// them stay far from overflowing.
-const WIDEST: usize = 4_096;
+/// Most numbers in an observation or an action: many more than any environment has, and few enough that no size computed
+/// from them overflows.
+const MAX_WIDTH: usize = 4_096;
 
-/// What is controlled: an environment's name, and the parameters that this environment understands.
+/// The environment: its name and its parameters.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct EnvironmentConfig {
-    /// One of the environments' names, or what another program makes an environment from, as `gym:Pendulum-v1`.
+    /// The name of a built-in environment, or a name for an external server, such as `gym:Pendulum-v1`.
     #[schemars(extend("unit" = "–", "source" = "chapters 4 and 5"))]
     pub name: String,
-    /// The command that starts that program, an environment server as `docs/PROTOCOL.md` has it; empty for our own.
+    /// The command that starts the external environment server (`docs/PROTOCOL.md`); empty for built-in environments.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[schemars(extend("unit" = "–", "source" = "ours"))]
     pub server: Vec<String>,
@@ -25,10 +25,10 @@ pub struct EnvironmentConfig {
     pub parameters: toml::Table,
 }
 
-/// Whether what an environment says of itself makes sense.
+/// Checks an environment's description.
 ///
 /// # Errors
-/// For the first thing that does not.
+/// For the first invalid value.
 pub(super) fn check_spec(spec: &EnvironmentSpec) -> Result<(), OutOfRange> {
     check_size("spec.observation", &spec.observation)?;
     check_size("spec.action", &spec.action)?;
@@ -37,10 +37,10 @@ pub(super) fn check_spec(spec: &EnvironmentSpec) -> Result<(), OutOfRange> {
 
 fn check_size(key: &str, space: &Space) -> Result<(), OutOfRange> {
     let (value, expected) = match space {
-        Space::Discrete { n: 0 } => ("no index at all".into(), "one index or more".into()),
-        Space::Box { low, high } if low.len() != high.len() || !(1..=WIDEST).contains(&low.len()) => (
+        Space::Discrete { n: 0 } => ("no index".into(), "one index or more".into()),
+        Space::Box { low, high } if low.len() != high.len() || !(1..=MAX_WIDTH).contains(&low.len()) => (
             format!("{} lower and {} upper bounds", low.len(), high.len()),
-            format!("as many of each, from 1 to {WIDEST}"),
+            format!("equally many of both, from 1 to {MAX_WIDTH}"),
         ),
         _ => return Ok(()),
     };

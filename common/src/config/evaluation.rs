@@ -9,18 +9,18 @@ section! {
     pub struct EvaluationConfig {
         /// Environment steps from one evaluation to the next.
         every: u64 = 2_000, bounds: from(1, u64::MAX), unit: "environment steps", source: "ours";
-        /// Episodes of an evaluation, always from the same start states.
+        /// Episodes of an evaluation. Their start states are always the same.
         episodes: u32 = 10, bounds: from(1, 10_000), unit: "episodes", source: "ours";
-        /// Episodes of the last evaluation, whose mean is the run's result.
+        /// Episodes of the last evaluation. Their mean return is the run's result.
         final_episodes: u32 = 100, bounds: from(1, 100_000), unit: "episodes", source: "ours";
-        /// Whether every policy that was evaluated is kept, not only the best.
+        /// Whether every evaluated policy is kept, not only the best.
         keep_policies: bool = false, unit: "–", source: "ours";
     }
 }
 
 impl EvaluationConfig {
-    /// The period that a policy learned from so many environment steps falls into. A policy is evaluated when no policy of
-    /// its period or a later one was.
+    /// The evaluation period of a policy that was learned from `env_steps` environment steps. A policy is evaluated if no
+    /// policy of its period or a later one was evaluated before.
     pub fn period(&self, env_steps: u64) -> u64 {
         env_steps / self.every
     }

@@ -1,4 +1,4 @@
-//! Every section that somebody may write, with its keys.
+//! Every section that the user may write, with its keys.
 
 use shoal_base::section::describe;
 pub use shoal_base::section::{Key, Section, keys};
@@ -12,7 +12,7 @@ use super::replay::ReplayConfig;
 use super::run::RunConfig;
 use crate::algorithms::{Algorithm, ExplorationConfig};
 
-/// Every section that somebody may write, those of all algorithms included, but without an environment's own parameters.
+/// Every section that the user may write, including those of all algorithms, but without an environment's own parameters.
 pub fn sections() -> Vec<Section> {
     let environment = Section {
         name: "environment",
@@ -41,12 +41,12 @@ mod tests {
     use crate::config::{DdpgConfig, ReinforceConfig};
 
     #[test]
-    fn a_key_is_explained_by_its_declaration() {
+    fn the_explanation_of_a_key_comes_from_its_declaration() {
         let ddpg = keys::<DdpgConfig>();
         let tau = ddpg.iter().find(|key| key.name == "tau").unwrap();
         assert_eq!(
             tau.meaning,
-            "τ, how far the target networks follow in one update (equation 3.31)."
+            "τ, the share by which the target networks move in one gradient step (equation 3.31)."
         );
         assert_eq!(
             (tau.unit.as_str(), tau.source.as_str(), tau.bounds.as_str()),
@@ -62,7 +62,7 @@ mod tests {
         assert_eq!(mode.choices, ["free", "lockstep"]);
         assert!(
             ddpg.iter().all(|key| key.name != "exploration"),
-            "it has a section of its own"
+            "exploration has its own section"
         );
     }
 }

@@ -1,11 +1,12 @@
-//! What makes two runs the same run to the replay and the checkpoints: a text, of which both keep a fingerprint.
+//! The identity of a run: a text whose fingerprint is stored in the replay and the checkpoints. Files of another identity are
+//! refused.
 //!
-//! In the text stands what the rows and the weights depend on by their meaning: the environment, its spaces, the algorithm, the
-//! shapes of what it learns, seed, mode, γ, and a row's layout. Not in it stand the run's id, learning rates, exploration,
-//! evaluation, the run's length and its number of actors: those may differ when a run goes on.
+//! The text has everything that the meaning of rows and weights depends on: the environment, its spaces, the algorithm, the
+//! shapes of what it learns, seed, mode, γ, and the layout of a row. It does not have the run's id, learning rates,
+//! exploration, evaluation, the run's length and its number of actors: those may differ when a run is resumed.
 //!
-//! The text's form has a number, which `run.identity_format` notes when a run is made. A form that has been released never
-//! changes, because the files of old runs have its fingerprints; a change is a new form with the next number.
+//! The format of the text has a number, which is stored as `run.identity_format` when a run is created. A released format
+//! never changes, because the files of old runs have its fingerprints. A change needs a new format with the next number.
 
 mod legacy;
 
@@ -20,23 +21,23 @@ use super::identity_format::IdentityFormat;
 use super::run::Mode;
 
 impl Config {
-    /// What the rows of the replay and the weights of a checkpoint depend on, as text.
+    /// The text that the meaning of the replay's rows and a checkpoint's weights depends on.
     pub fn identity(&self) -> String {
         match self.run.identity_format {
-            // An algorithm that came later has no older form.
+            // Newer algorithms and networks have no unnumbered text.
             IdentityFormat::Unnumbered => legacy::text(self).unwrap_or_else(|| text(self)),
             IdentityFormat::One => text(self),
         }
     }
 
-    /// A number for the [identity](Self::identity): the first eight bytes of its SHA-256.
+    /// The fingerprint of the [identity](Self::identity): the first eight bytes of its SHA-256.
     pub fn fingerprint(&self) -> u64 {
         let digest = Sha256::digest(self.identity().as_bytes());
         digest.iter().take(8).fold(0, |word, &byte| word << 8 | u64::from(byte))
     }
 }
 
-/// Form 1: a line for each thing. A number is written in the fewest digits that give it back, without an exponent.
+/// Format 1: one line for each property. A number has the fewest digits that identify it, without an exponent.
 fn text(config: &Config) -> String {
     let Config {
         run,
@@ -89,7 +90,7 @@ fn space(space: &Space) -> String {
     }
 }
 
-/// The entries by their names, whatever order the table has.
+/// The entries, sorted by name.
 fn sorted(table: &Table) -> Vec<(&String, &Value)> {
     let mut entries: Vec<_> = table.iter().collect();
     entries.sort_by_key(|(name, _)| *name);
@@ -115,7 +116,7 @@ fn written(value: &Value) -> String {
     }
 }
 
-/// In quotes, as JSON has it.
+/// The text as a JSON string, in quotes.
 fn quoted(text: &str) -> String {
     serde_json::Value::from(text).to_string()
 }

@@ -1,23 +1,23 @@
-//! Which form the text has that a run's files are known by (`identity.rs`).
+//! The format number of a run's identity (`identity.rs`).
 
 use serde::{Deserialize, Serialize};
 
-/// The form of a run's identity.
+/// The format of a run's identity.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "u32", into = "u32")]
 pub enum IdentityFormat {
-    /// That of runs whose configuration notes no form.
+    /// The format of runs whose configuration has no format number.
     #[default]
     Unnumbered,
-    /// That of runs made now.
+    /// Format 1.
     One,
 }
 
 impl IdentityFormat {
-    /// The form of runs made now.
+    /// The format of new runs.
     pub const NEWEST: Self = Self::One;
 
-    /// Whether none is noted.
+    /// Whether the configuration has no format number.
     pub(super) fn is_unnumbered(&self) -> bool {
         *self == Self::Unnumbered
     }
@@ -31,7 +31,7 @@ impl TryFrom<u32> for IdentityFormat {
             0 => Ok(Self::Unnumbered),
             1 => Ok(Self::One),
             other => Err(format!(
-                "run.identity_format = {other}: this version of the program knows 1 and nothing newer"
+                "run.identity_format = {other}: this version of the program supports only 1"
             )),
         }
     }

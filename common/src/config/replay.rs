@@ -5,28 +5,29 @@ use shoal_base::section::{OutOfRange, from};
 
 use crate::algorithms::{Algorithm, Experience};
 
-/// Transitions that the replay may be asked to hold.
-const MOST: u64 = 1_000_000_000;
+/// Most transitions in a replay.
+const MAX_ROWS: u64 = 1_000_000_000;
 
 section! {
-    /// What is remembered, and how often it is used.
+    /// The replay, and the ratio of updates to environment steps.
     pub struct ReplayConfig {
-        /// The newest so many transitions are sampled from.
-        capacity: u64 = 1_000_000, bounds: from(1, MOST), unit: "transitions", source: "section 4.3.1";
+        /// Minibatches are sampled from this many newest transitions.
+        capacity: u64 = 1_000_000, bounds: from(1, MAX_ROWS), unit: "transitions", source: "section 4.3.1";
         /// Transitions collected before the first update.
-        warmup: u64 = 1_000, bounds: from(0, MOST), unit: "transitions", source: "ours";
-        /// Updates for each environment step beyond the warm-up. The thesis: 1.
+        warmup: u64 = 1_000, bounds: from(0, MAX_ROWS), unit: "transitions", source: "ours";
+        /// Updates for each environment step beyond the warm-up: gradient steps, or rows for methods that use each row
+        /// once. The thesis has 1.
         updates_per_step: f64 = 1.0, bounds: from(0.0, 1_000.0), unit: "updates per environment step", source: "Algorithm 4";
-        /// Steps the actors may be ahead of that ratio before the learner stops taking transitions.
-        tolerance: u64 = 512, bounds: from(1, MOST), unit: "environment steps", source: "ours";
+        /// Environment steps that the actors may be ahead of that ratio before the learner stops taking transitions.
+        tolerance: u64 = 512, bounds: from(1, MAX_ROWS), unit: "environment steps", source: "ours";
     }
 }
 
 impl ReplayConfig {
-    /// Whether every number makes sense, for this algorithm.
+    /// Checks every number for this algorithm.
     ///
     /// # Errors
-    /// For the first one that does not.
+    /// For the first invalid number.
     pub fn check(&self, algorithm: &Algorithm) -> Result<(), OutOfRange> {
         self.check_bounds("replay")?;
         let Self {
@@ -38,7 +39,7 @@ impl ReplayConfig {
         match algorithm.spec().experience {
             Experience::Minibatches => {
                 let least = algorithm.settings().least_capacity();
-                from(least, MOST).check("replay.capacity", capacity)?;
+                from(least, MAX_ROWS).check("replay.capacity", capacity)?;
                 from(1, *capacity).check("replay.warmup", warmup)
             }
             Experience::Transitions | Experience::Episodes => {
@@ -46,7 +47,7 @@ impl ReplayConfig {
                     key: key.into(),
                     value,
                     expected: format!(
-                        "{only}: {} learns from each step once, from the first on",
+                        "{only}: {} learns from each step once, beginning with the first",
                         algorithm.name()
                     ),
                 };

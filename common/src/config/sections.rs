@@ -1,4 +1,4 @@
-//! The configuration as it is written: a section for each part, and of the algorithms' sections one at most.
+//! The sections of the configuration's text. At most one of the algorithms' sections may be present.
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer, de};
 use shoal_base::space::EnvironmentSpec;
@@ -9,7 +9,7 @@ use super::{
     LearnerConfig, ReplayConfig, RunConfig, explanation,
 };
 
-/// What is read.
+/// The sections as they are read.
 #[derive(Deserialize)]
 struct Sections {
     run: RunConfig,
@@ -26,12 +26,12 @@ struct Sections {
     evaluation: EvaluationConfig,
     #[serde(default)]
     checkpoint: CheckpointConfig,
-    /// Those of algorithms, and what is no section.
+    /// Sections of algorithms, and unknown keys.
     #[serde(flatten)]
     others: Table,
 }
 
-/// What is written.
+/// The sections as they are written.
 #[derive(Serialize)]
 struct Written<'a> {
     run: &'a RunConfig,
@@ -61,10 +61,10 @@ impl TryFrom<Sections> for Config {
     fn try_from(sections: Sections) -> Result<Self, String> {
         let mut algorithm = one_algorithm(sections.others)?;
         if let Some(exploration) = sections.exploration {
-            // Only DDPG's noise has a section of its own.
+            // Only DDPG has a section for its exploration.
             let Algorithm::Ddpg(ddpg) = &mut algorithm else {
                 return Err(format!(
-                    "[exploration] is the noise of ddpg, and this is a configuration for {}",
+                    "[exploration] is the noise of ddpg, but this configuration is for {}",
                     algorithm.name()
                 ));
             };
@@ -84,7 +84,7 @@ impl TryFrom<Sections> for Config {
     }
 }
 
-/// The algorithm that has a section, or the default one where none has.
+/// The algorithm that has a section, or the default algorithm if none has one.
 fn one_algorithm(mut sections: Table) -> Result<Algorithm, String> {
     let names = Algorithm::all().into_iter().map(|algorithm| algorithm.name());
     let named: Vec<(&str, Value)> = names.filter_map(|name| Some((name, sections.remove(name)?))).collect();
@@ -138,7 +138,7 @@ mod tests {
     }
 
     #[test]
-    fn an_algorithm_is_named_by_its_section_and_is_ddpg_else() {
+    fn the_algorithm_is_the_one_with_a_section_and_ddpg_by_default() {
         assert_eq!(algorithm("").unwrap().name(), "ddpg");
         assert_eq!(algorithm("[exploration]\nsigma = 0.1").unwrap().name(), "ddpg");
         for name in ["reinforce", "q-learning", "sarsa"] {
@@ -148,7 +148,7 @@ mod tests {
     }
 
     #[test]
-    fn one_algorithm_is_enough() {
+    fn sections_of_two_algorithms_and_unknown_sections_are_refused() {
         for (text, part) in [
             ("[sarsa]\n[ddpg]", "[ddpg] and [sarsa]"),
             ("[reinforce]\n[q-learning]", "[reinforce] and [q-learning]"),

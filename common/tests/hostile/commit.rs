@@ -48,7 +48,7 @@ fn file() -> Vec<u8> {
     let mut words = [0; WORDS];
     words[..6].copy_from_slice(&[2, 6, 0, 1, 3, 6]);
     sealed(&mut bytes, places().slots[0], &words);
-    word(&mut bytes, places().selector, 2);
+    word(&mut bytes, places().published, 2);
     bytes
 }
 
@@ -122,8 +122,8 @@ proptest! {
         for (slot, words) in places().slots.into_iter().zip(records) {
             sealed(&mut bytes, slot, &words);
         }
-        word(&mut bytes, places().selector, selector);
-        word(&mut bytes, places().reach, reach);
+        word(&mut bytes, places().published, selector);
+        word(&mut bytes, places().write_horizon, reach);
         let (_directory, path) = written(&bytes);
         ask(&path);
     }

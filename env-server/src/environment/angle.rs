@@ -7,8 +7,9 @@ pub fn wrap(angle: f64) -> f64 {
     (angle + PI).rem_euclid(TAU) - PI
 }
 
-/// The same angles without jumps, as they follow one another from `start` on. It turns by less than half a turn a step.
-pub fn followed(angles: impl Iterator<Item = f64>, start: f64) -> Vec<f64> {
+/// The same angles without jumps between them, beginning near `start`. Successive angles must differ by less than half
+/// a turn.
+pub fn unwrapped(angles: impl Iterator<Item = f64>, start: f64) -> Vec<f64> {
     angles
         .scan(start, |angle, seen| {
             *angle += wrap(seen - *angle);
@@ -22,7 +23,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn whole_turns_vanish() {
+    fn wrapping_removes_whole_turns() {
         for (angle, wrapped) in [
             (0.5, 0.5),
             (PI + 0.1, 0.1 - PI),

@@ -27,10 +27,10 @@ const FORCE: f64 = 10.0;
 const DT: f64 = 0.02;
 /// The cart leaves the track beyond this |x|, in m.
 const X_LIMIT: f64 = 2.4;
-/// The pole has fallen beyond this |θ|: 12° in rad. (The thesis's table shows twice this: the observation's range.)
+/// The pole has fallen beyond this |θ|: 12° in rad. (The thesis's table shows twice this, the observation's range.)
 const THETA_LIMIT: f64 = 12.0 / 180.0 * std::f64::consts::PI;
 
-/// What can be set.
+/// Parameters of the cart with the pole.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct CartPoleParameters {
@@ -45,8 +45,8 @@ impl Default for CartPoleParameters {
     }
 }
 
-/// A pole to be kept upright. Observation (x, ẋ, θ, θ̇), action 0 (push left) or 1 (push right), reward 1 a step;
-/// terminates when the pole has fallen or the cart has left the track.
+/// A pole on a cart that must be kept upright. Observation (x, ẋ, θ, θ̇), action 0 (push left) or 1 (push right),
+/// reward 1 per step. It terminates when the pole has fallen or the cart has left the track.
 #[derive(Clone, Debug)]
 pub struct CartPole {
     parameters: CartPoleParameters,
@@ -98,8 +98,8 @@ impl Environment for CartPole {
         observation.copy_from_slice(&self.state.map(|x| x as f32));
     }
 
-    /// Gymnasium's equations of motion (after Florian, "Correct equations for the dynamics of the cart-pole system") and
-    /// its explicit Euler.
+    /// Gymnasium's equations of motion (after Florian, "Correct equations for the dynamics of the cart-pole system"),
+    /// integrated by explicit Euler as there.
     fn step(&mut self, action: &[f64], _: &mut Stream) -> Step {
         let [x, x_dot, theta, theta_dot] = self.state;
         let force = if action[0] < 0.5 { -FORCE } else { FORCE };

@@ -1,8 +1,8 @@
-//! What can be wrong with an environment: its configuration (a person corrects it), or a request (the client does).
+//! Errors of an environment: in its configuration, which the user corrects, or in a request, which the client corrects.
 
 use std::ops::RangeInclusive;
 
-/// An environment that cannot be made. Each message is one line for a person.
+/// Why an environment cannot be made. Each message is one line for the user.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum EnvironmentError {
     /// No environment has this name.
@@ -10,7 +10,7 @@ pub enum EnvironmentError {
     UnknownName {
         /// The name asked for.
         name: String,
-        /// The names there are, with commas.
+        /// The known names, separated by commas.
         known: String,
     },
     /// A parameter is unknown, of the wrong type or out of its range.
@@ -18,7 +18,7 @@ pub enum EnvironmentError {
     Parameters {
         /// The environment's name.
         environment: &'static str,
-        /// Which parameter, and what it may be.
+        /// The parameter and its valid values.
         reason: String,
     },
 }
@@ -41,46 +41,46 @@ pub enum RequestError {
     State {
         /// The state asked for.
         state: Vec<f64>,
-        /// The states there are.
+        /// The valid states, in words.
         expected: &'static str,
     },
-    /// Not as many numbers as the environments together take.
-    #[error("{given} numbers of {what} for {environments} environments: give {expected}")]
+    /// A wrong count of numbers for all environments together.
+    #[error("{what}: {given} numbers for {environments} environments; give {expected}")]
     Count {
-        /// Actions, states, episodes or snapshot.
+        /// `actions`, `states`, `episodes` or `snapshot`.
         what: &'static str,
-        /// How many came.
+        /// How many were given.
         given: usize,
         /// How many environments there are.
         environments: usize,
-        /// How many numbers are wanted, in words.
+        /// How many are expected, in words.
         expected: String,
     },
-    /// An action that is not finite, or no index of a discrete action.
+    /// An action that is not finite, or not an index of a discrete action.
     #[error("action {action} of environment {environment} is not in its action space: is the policy diverging?")]
     Action {
-        /// Which environment of the vector.
+        /// The environment's index in the vector.
         environment: usize,
         /// The offending number.
         action: f32,
     },
-    /// A snapshot of environments that cannot say their state.
-    #[error("this environment cannot say its state: there are no snapshots of it")]
-    Unsayable,
-    /// A snapshot while no training episodes are under way.
-    #[error("no training episodes are under way: reset or restore first")]
+    /// A snapshot of environments that cannot save their state.
+    #[error("this environment cannot save its state, so it has no snapshots")]
+    NoSnapshots,
+    /// A snapshot outside training episodes.
+    #[error("the environments are not in training episodes: reset or restore them first")]
     NoTraining,
-    /// Words that say what no episode can come to.
-    #[error("no snapshot: environment {environment} cannot have this {what}")]
+    /// A snapshot with a value that no episode can have.
+    #[error("invalid snapshot: environment {environment} cannot have this {what}")]
     Snapshot {
-        /// Which environment of the vector.
+        /// The environment's index in the vector.
         environment: usize,
-        /// Which part of its words.
+        /// Which value of its snapshot.
         what: &'static str,
     },
 }
 
-/// Lets `value` pass when it lies in `range`; NaN never does.
+/// Refuses a `value` outside `range`, and NaN.
 pub(super) fn check(key: &'static str, value: f64, range: RangeInclusive<f64>) -> Result<(), OutOfRange> {
     let (low, high) = range.into_inner();
     if low <= value && value <= high {
@@ -90,13 +90,13 @@ pub(super) fn check(key: &'static str, value: f64, range: RangeInclusive<f64>) -
     }
 }
 
-/// `check` for the parameter that every environment has.
+/// Checks the parameter that every environment has.
 pub(super) fn check_time_limit(time_limit: u32) -> Result<(), OutOfRange> {
     check("time_limit", time_limit.into(), 1.0..=1e6)
 }
 
-/// The one-line form of a TOML error, in words for people who do not write Rust.
-pub(super) fn for_people(error: &toml::de::Error) -> String {
+/// A TOML error as one line, without names of Rust types.
+pub(super) fn one_line(error: &toml::de::Error) -> String {
     let line = error.to_string().split_whitespace().collect::<Vec<_>>().join(" ");
     line.replace("expected f64", "expected a number")
         .replace("expected u32", "expected a positive whole number")

@@ -13,16 +13,16 @@ use super::{
     error::{OutOfRange, check_time_limit},
 };
 
-/// Row by row: S the start, F frozen, H a hole, G the goal.
+/// The map, row by row: S the start, F frozen, H a hole, G the goal.
 pub const MAP: &[u8; STATES] = b"SFFFFHFHFFFHHFFG";
 const SIDE: usize = 4;
 
-/// How many states there are: fields of the lake, numbered row by row.
+/// The number of states: the cells of the lake, numbered row by row.
 pub const STATES: usize = SIDE * SIDE;
-/// How many actions there are: 0 left, 1 down, 2 right, 3 up.
+/// The number of actions: 0 left, 1 down, 2 right, 3 up.
 pub const ACTIONS: usize = 4;
 
-/// What can be set.
+/// Parameters of the frozen lake.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct FrozenLakeParameters {
@@ -37,10 +37,10 @@ impl Default for FrozenLakeParameters {
     }
 }
 
-/// One way a step may turn out.
+/// A possible outcome of a step.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LakeTransition {
-    /// How likely it is.
+    /// Its probability.
     pub p: f64,
     /// The state after the step.
     pub next: usize,
@@ -50,8 +50,8 @@ pub struct LakeTransition {
     pub terminated: bool,
 }
 
-/// How `action` may turn out in `state`, in Gymnasium's order: the direction before, the one meant, the one after
-/// (equation 4.1). A hole or the goal is never left: one outcome, without reward.
+/// The outcomes of `action` in `state` (equation 4.1), in Gymnasium's order: the intended direction lies between the
+/// two that the walker may slip to. Holes and the goal are never left: they have one outcome, without reward.
 ///
 /// Panics unless `state < STATES` and `action < ACTIONS`.
 pub fn transitions(state: usize, action: usize) -> impl Iterator<Item = LakeTransition> {
@@ -60,12 +60,13 @@ pub fn transitions(state: usize, action: usize) -> impl Iterator<Item = LakeTran
     (0..ways).map(move |slip| outcome(state, slipped(action, slip), 1.0 / f64::from(ways)))
 }
 
-/// The direction before the one meant (`slip` 0), the one meant (1), or the one after (2).
+/// The direction of the move: the number before the intended one (`slip` 0), the intended one (1), or the number after
+/// it (2).
 fn slipped(action: usize, slip: u32) -> usize {
     (action + ACTIONS - 1 + slip as usize) % ACTIONS
 }
 
-/// What comes of moving in `direction`, which happens with probability `p`.
+/// The outcome of moving in `direction`, which happens with probability `p`.
 fn outcome(state: usize, direction: usize, p: f64) -> LakeTransition {
     if is_terminal(state) {
         return LakeTransition {
@@ -88,7 +89,7 @@ fn is_terminal(state: usize) -> bool {
     matches!(MAP[state], b'H' | b'G')
 }
 
-/// The field one step away; at the shore, the field itself.
+/// The cell one step away; at the edge of the lake, the cell itself.
 fn neighbour(state: usize, direction: usize) -> usize {
     let (row, column) = (state / SIDE, state % SIDE);
     let (row, column) = match direction {
@@ -100,7 +101,8 @@ fn neighbour(state: usize, direction: usize) -> usize {
     row * SIDE + column
 }
 
-/// A walk over ice. Observation and action are indices; reward 1 at the goal, where it terminates, as in a hole.
+/// A walk over ice. Observation and action are indices. It terminates at the goal, with reward 1, and in a hole,
+/// without reward.
 #[derive(Clone, Debug)]
 pub struct FrozenLake {
     parameters: FrozenLakeParameters,
@@ -131,8 +133,8 @@ impl Environment for FrozenLake {
 
     fn reset_to(&mut self, state: &[f64]) -> Result<(), RequestError> {
         match *state {
-            [field] if field.fract() == 0.0 && (0.0..STATES as f64).contains(&field) => {
-                self.state = field as usize;
+            [cell] if cell.fract() == 0.0 && (0.0..STATES as f64).contains(&cell) => {
+                self.state = cell as usize;
                 Ok(())
             }
             _ => Err(RequestError::State {
@@ -165,13 +167,13 @@ impl Environment for FrozenLake {
     fn signals(&self) -> Vec<Signal> {
         vec![
             Signal::observation(0, "field", ""),
-            Signal::action(0, "direction", "").label("direction meant (0 ←, 1 ↓, 2 →, 3 ↑)"),
+            Signal::action(0, "direction", "").label("intended direction (0 ←, 1 ↓, 2 →, 3 ↑)"),
         ]
     }
 
     fn picture(&self) -> Picture {
         Picture::Grid {
-            map: MAP.iter().map(|field| char::from(*field)).collect(),
+            map: MAP.iter().map(|cell| char::from(*cell)).collect(),
         }
     }
 }
@@ -182,7 +184,7 @@ mod tests {
     use shoal_base::stream::{Purpose, stream};
 
     #[test]
-    fn the_table_has_equation_4_1() {
+    fn the_outcomes_are_those_of_equation_4_1() {
         let third = 1.0 / 3.0;
         let outcome = |next, terminated| LakeTransition {
             p: third,
@@ -200,7 +202,7 @@ mod tests {
     }
 
     #[test]
-    fn steps_follow_the_table() {
+    fn steps_have_the_probabilities_of_the_outcomes() {
         let mut lake = FrozenLake::new(FrozenLakeParameters::default()).unwrap();
         let mut rng = stream(3, Purpose::Environment, 0, 0);
         let mut visits = [0; STATES];
@@ -219,7 +221,7 @@ mod tests {
     }
 
     #[test]
-    fn only_fields_of_the_lake_are_states() {
+    fn only_cells_of_the_lake_are_states() {
         let mut lake = FrozenLake::new(FrozenLakeParameters::default()).unwrap();
         for state in [&[16.0][..], &[-1.0], &[0.5], &[f64::NAN], &[], &[1.0, 2.0]] {
             assert!(lake.reset_to(state).is_err(), "{state:?}");

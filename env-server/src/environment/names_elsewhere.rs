@@ -1,11 +1,11 @@
-//! No other crate knows an environment by its name: what there is to know, the trait says. Names stand in the thesis's own
-//! figures and analysis, in lists of presets, and in tests.
+//! Checks that no other crate refers to an environment by its name: the trait provides what they need. Exceptions are
+//! the thesis's figures and analysis, lists of presets, and tests.
 
 use std::path::{Path, PathBuf};
 
 use super::names;
 
-/// Whose sources are searched. `reproduce` and `bench` run presets.
+/// The directories that are searched. `reproduce` and `bench` are not: they run presets.
 const SEARCHED: [&str; 9] = [
     "common/base/src",
     "common/channel/src",
@@ -18,7 +18,7 @@ const SEARCHED: [&str; 9] = [
     "src",
 ];
 
-const MAY_NAME_THEM: [&str; 6] = [
+const ALLOWED: [&str; 6] = [
     "run/src/analysis",
     "run/src/plan.rs",
     "run/src/testing.rs",
@@ -27,7 +27,7 @@ const MAY_NAME_THEM: [&str; 6] = [
     "report/src/plots/thesis.rs",
 ];
 
-/// The program of a source: without comments, and without tests.
+/// A source without its comments and tests.
 fn code(source: &str) -> String {
     let mut code = String::new();
     let mut lines = source.lines().peekable();
@@ -49,7 +49,7 @@ fn code(source: &str) -> String {
     code
 }
 
-/// The environments that a program treats apart: by their names as text, by their modules, or as a name in JavaScript.
+/// The environments that `code` refers to: by their names as text, by their modules, or as a name in JavaScript.
 fn named_in(code: &str) -> Vec<&'static str> {
     let is_named = |name: &&str| {
         let module = name.replace('-', "_");
@@ -72,10 +72,13 @@ fn files_below(directory: &Path, into: &mut Vec<PathBuf>) {
 }
 
 #[test]
-fn no_environment_is_known_by_its_name() {
+fn no_other_crate_refers_to_an_environment_by_name() {
     let workspace = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
-    for place in MAY_NAME_THEM {
-        assert!(workspace.join(place).exists(), "{place} is elsewhere now");
+    for place in ALLOWED {
+        assert!(
+            workspace.join(place).exists(),
+            "{place} does not exist: correct the list"
+        );
     }
     let mut files = Vec::new();
     for place in SEARCHED {
@@ -88,14 +91,14 @@ fn no_environment_is_known_by_its_name() {
         let is_source = path
             .extension()
             .is_some_and(|kind| kind == "rs" || kind == "js" || kind == "html");
-        if is_test || !is_source || MAY_NAME_THEM.iter().any(|place| path.starts_with(place)) {
+        if is_test || !is_source || ALLOWED.iter().any(|place| path.starts_with(place)) {
             continue;
         }
         searched += 1;
         let named = named_in(&code(&std::fs::read_to_string(&file).unwrap()));
         assert!(
             named.is_empty(),
-            "{}: {named:?}: let the trait Environment say what is to be known of them",
+            "{}: refers to {named:?}: use the trait Environment instead",
             path.display()
         );
     }
@@ -103,20 +106,20 @@ fn no_environment_is_known_by_its_name() {
 }
 
 #[test]
-fn a_name_in_a_program_is_found_and_one_in_a_comment_or_test_is_not() {
-    for program in [
+fn names_are_found_in_code_but_not_in_comments_or_tests() {
+    for source in [
         "if name == \"point-mass\" {}\n",
         "use shoal_env_server::environment::point_mass::DT;\n",
         "const SCENES = {\n  \"point-mass\"(scene) {}\n};\n",
         "#[cfg(test)]\nmod tests {\n}\n\nfn of() -> &'static str {\n    \"point-mass\"\n}\n",
     ] {
-        assert_eq!(named_in(&code(program)), ["point-mass"], "{program}");
+        assert_eq!(named_in(&code(source)), ["point-mass"], "{source}");
     }
-    for program in [
+    for source in [
         "// if name == \"point-mass\" {}\n/* point_mass: */\n",
         "#[cfg(test)]\nmod tests {\n    const NAME: &str = \"point-mass\";\n}\n",
         "let label = \"a point-mass of 1 kg\";\n",
     ] {
-        assert!(named_in(&code(program)).is_empty(), "{program}");
+        assert!(named_in(&code(source)).is_empty(), "{source}");
     }
 }

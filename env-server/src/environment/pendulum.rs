@@ -29,11 +29,11 @@ const MAX_SPEED: f64 = 8.0;
 /// Greatest |τ| in N m.
 const MAX_TORQUE: f64 = 2.0;
 
-/// What can be set.
+/// Parameters of the pendulum.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct PendulumParameters {
-    /// Episodes start with |θ̇| up to this, in rad/s. The thesis's 2 by default; Gymnasium's own is 1.
+    /// Episodes start with |θ̇| up to this, in rad/s. The default of 2 is the thesis's; Gymnasium's is 1.
     #[schemars(extend("unit" = "rad/s", "source" = "section 4.3"))]
     pub start_speed: f64,
     /// Steps after which an episode is truncated.
@@ -50,7 +50,8 @@ impl Default for PendulumParameters {
     }
 }
 
-/// A rod on a joint, swung by a torque τ; θ = 0 is upright. Observation (cos θ, sin θ, θ̇), action (τ), never terminates.
+/// A rod on a joint, driven by a torque τ; θ = 0 is upright. Observation (cos θ, sin θ, θ̇), action (τ). It never
+/// terminates.
 #[derive(Clone, Debug)]
 pub struct Pendulum {
     parameters: PendulumParameters,
@@ -113,7 +114,7 @@ impl Environment for Pendulum {
         observation.copy_from_slice(&observed.map(|x| x as f32));
     }
 
-    /// Equation (4.2) on the state *before* the step, as Gymnasium has it, then semi-implicit Euler.
+    /// Equation (4.2) for the state *before* the step, as in Gymnasium, then semi-implicit Euler.
     fn step(&mut self, action: &[f64], _: &mut Stream) -> Step {
         let tau = action[0].clamp(-MAX_TORQUE, MAX_TORQUE);
         let reward = -(wrap(self.theta).powi(2) + 0.1 * self.theta_dot.powi(2) + 0.001 * tau.powi(2));
@@ -186,7 +187,7 @@ mod tests {
     }
 
     #[test]
-    fn starts_fill_their_range_and_no_more() {
+    fn start_states_fill_exactly_their_range() {
         let parameters = PendulumParameters {
             start_speed: 0.5,
             ..PendulumParameters::default()

@@ -23,21 +23,21 @@ const WALL: f64 = 4.0;
 const MAX_SPEED: f64 = 1.0;
 /// Greatest F_u, in N.
 const MAX_FORCE: f64 = 2.0;
-/// Nearer than this at an episode's end the vehicle has reached the goal, in m.
+/// The goal is reached if d is below this at an episode's end, in m.
 pub const REACHED: f64 = 0.05;
 
 /// A vehicle on a plane whose goal is the origin. Observation (x̃, ỹ, ẋ, ẏ, d, ḋ) of equation (5.7), action (θ, F_u) of
-/// equation (5.8) with θ in rad and F_u in N, never terminates. Episodes start at rest.
+/// equation (5.8) with θ in rad and F_u in N. Episodes start at rest and never terminate.
 #[derive(Clone, Debug)]
 pub struct PointMass {
     parameters: PointMassParameters,
     x: Axis,
     y: Axis,
-    /// The action before, (θ, F_u); none on an episode's first step.
-    before: Option<(f64, f64)>,
+    /// The previous action (θ, F_u); none before an episode's first step.
+    previous_action: Option<(f64, f64)>,
 }
 
-/// Stands in a saved state for the action before an episode's first: no clipped action is infinite.
+/// The previous action in a saved state where there is none. A clipped action is never infinite.
 const NO_ACTION: (f64, f64) = (f64::INFINITY, f64::INFINITY);
 
 /// One coordinate's motion.
@@ -50,9 +50,10 @@ struct Axis {
 }
 
 impl Axis {
-    /// Explicit Euler (equations 5.4 and 5.5: the position moves by the velocity before the step) under the applied force
-    /// `f`, with friction as equation (5.6) means it: it holds an axis at rest while |f| ≤ `f_s` and never pushes it, and
-    /// opposes the motion (at breakaway, the motion that begins) with `f_c`. A wall stops what moves towards it.
+    /// Takes a step of explicit Euler (equations 5.4 and 5.5; the position changes by the velocity before the step)
+    /// under the applied force `f`. Friction acts as equation (5.6) intends: it holds an axis at rest while |f| ≤
+    /// `f_s`, never pushes it, and opposes the motion (at breakaway, the motion that begins) with `f_c`. A wall stops
+    /// motion towards it.
     fn step(&mut self, f: f64, m: f64, f_c: f64, f_s: f64) {
         let v = self.velocity;
         let next = if v == 0.0 {
@@ -63,7 +64,7 @@ impl Axis {
             }
         } else {
             let next = v + DT / m * (f - f_c * v.signum());
-            // Euler steps over ẋ = 0, where stiction would have caught the axis.
+            // Euler has stepped over ẋ = 0, where stiction would have held the axis.
             if next * v <= 0.0 && f.abs() <= f_s { 0.0 } else { next }
         };
         self.position += DT * v;
@@ -85,16 +86,16 @@ impl PointMass {
             parameters,
             x: Axis::default(),
             y: Axis::default(),
-            before: None,
+            previous_action: None,
         })
     }
 
-    /// d in m.
+    /// The distance to the goal, d, in m.
     fn d(&self) -> f64 {
         self.x.position.hypot(self.y.position)
     }
 
-    /// ḋ in m/s; 0 at the goal, where it has no value.
+    /// ḋ in m/s; 0 at the goal, where it is undefined.
     fn d_dot(&self) -> f64 {
         let d = self.d();
         if d == 0.0 {
@@ -103,20 +104,20 @@ impl PointMass {
         (self.x.position * self.x.velocity + self.y.position * self.y.velocity) / d
     }
 
-    /// d as it is observed.
+    /// The signal of d.
     fn distance() -> Signal {
         Signal::observation(4, "distance", "m").label("distance to the goal")
     }
 
-    /// x, y, ẋ, ẏ, and the action before.
+    /// x, y, ẋ, ẏ, and the previous action.
     fn saved(&self) -> [f64; 6] {
         let Self { x, y, .. } = self;
-        let (theta, force) = self.before.unwrap_or(NO_ACTION);
+        let (theta, force) = self.previous_action.unwrap_or(NO_ACTION);
         [x.position, y.position, x.velocity, y.velocity, theta, force]
     }
 
     fn start(&mut self, x: Axis, y: Axis) {
-        (self.x, self.y, self.before) = (x, y, None);
+        (self.x, self.y, self.previous_action) = (x, y, None);
     }
 }
 
@@ -187,7 +188,7 @@ impl Environment for PointMass {
         let f_s = stiction_ratio * f_c;
         self.x.step(force * theta.cos(), m, f_c, f_s);
         self.y.step(force * theta.sin(), m, f_c, f_s);
-        let (theta_before, force_before) = self.before.replace((theta, force)).unwrap_or((theta, force));
+        let (theta_before, force_before) = self.previous_action.replace((theta, force)).unwrap_or((theta, force));
         let motion = Motion {
             d: self.d(),
             d_dot: self.d_dot(),
@@ -205,9 +206,9 @@ impl Environment for PointMass {
         state.copy_from_slice(&self.saved());
     }
 
-    /// `reset_to` knows of no action before.
+    /// Unlike `reset_to`, this also restores the previous action.
     fn restore(&mut self, state: &[f64]) -> Result<(), RequestError> {
-        let before = match *state {
+        let previous_action = match *state {
             [_, _, _, _, theta, force] if (theta, force) == NO_ACTION => None,
             [_, _, _, _, theta, force] if theta.abs() <= PI && (0.0..=MAX_FORCE).contains(&force) => {
                 Some((theta, force))
@@ -215,12 +216,12 @@ impl Environment for PointMass {
             _ => {
                 return Err(RequestError::State {
                     state: state.to_vec(),
-                    expected: "six numbers: x and y, their velocities, and the action before or twice infinity",
+                    expected: "six numbers: x and y, their velocities, and the previous action (infinity if none)",
                 });
             }
         };
         self.reset_to(&state[..4])?;
-        self.before = before;
+        self.previous_action = previous_action;
         Ok(())
     }
 
@@ -284,7 +285,7 @@ mod tests {
         vehicle.step(&[theta, force], &mut rng()).reward
     }
 
-    fn near(ours: [f64; 4], by_hand: [f64; 4]) {
+    fn assert_near(ours: [f64; 4], by_hand: [f64; 4]) {
         assert!(
             ours.iter().zip(by_hand).all(|(a, b)| (a - b).abs() < 1e-12),
             "{ours:?}, by hand {by_hand:?}"
@@ -306,15 +307,15 @@ mod tests {
     fn beyond_stiction_it_breaks_away_against_coulomb_friction() {
         let mut vehicle = at("", [1.0, -1.0, 0.0, 0.0]);
         step(&mut vehicle, PI, F_S + 0.01);
-        near(state(&vehicle), [1.0, -1.0, -0.05 * (F_S + 0.01 - F_C), 0.0]);
+        assert_near(state(&vehicle), [1.0, -1.0, -0.05 * (F_S + 0.01 - F_C), 0.0]);
     }
 
     #[test]
-    fn euler_moves_the_position_by_the_velocity_before() {
+    fn euler_moves_the_position_by_the_old_velocity() {
         let mut vehicle = at("mass = 2.0", [0.0, 0.0, 0.5, -0.5]);
         step(&mut vehicle, FRAC_PI_2, 2.0);
         let f_c = 2.0 * F_C;
-        near(
+        assert_near(
             state(&vehicle),
             [0.025, -0.025, 0.5 - 0.025 * f_c, -0.5 + 0.025 * (2.0 + f_c)],
         );
@@ -334,24 +335,24 @@ mod tests {
             before = now;
         }
         assert_eq!(before[2..], [0.0, 0.0]);
-        // Sliding 0.7 m/s to rest takes 0.7² / (2 μ g) m, up to Euler's first half step.
+        // Sliding from 0.7 m/s to rest takes 0.7² / (2 μ g) m, apart from half of Euler's first step.
         assert!((before[0] - 0.49 / (2.0 * F_C)).abs() < 0.02, "{before:?}");
         step(&mut vehicle, 0.3, 0.9 * F_S);
         assert_eq!(state(&vehicle), before);
     }
 
     #[test]
-    fn a_force_beyond_stiction_reverses_without_a_rest() {
+    fn a_force_beyond_stiction_reverses_the_motion_without_a_stop() {
         let mut vehicle = at("", [0.0, 0.0, 0.01, 0.0]);
         step(&mut vehicle, PI, 1.0);
-        near(state(&vehicle), [0.0005, 0.0, 0.01 - 0.05 * (1.0 + F_C), 0.0]);
+        assert_near(state(&vehicle), [0.0005, 0.0, 0.01 - 0.05 * (1.0 + F_C), 0.0]);
         let mut held = at("", [0.0, 0.0, 0.01, 0.0]);
         step(&mut held, PI, F_S);
         assert_eq!(held.x.velocity, 0.0);
     }
 
     #[test]
-    fn velocity_is_clipped_and_walls_stop_their_axis_alone() {
+    fn velocity_is_clipped_and_a_wall_stops_only_its_axis() {
         let mut vehicle = at("", [3.0, 0.0, 0.99, 0.0]);
         step(&mut vehicle, 0.25 * PI, 2.0);
         assert_eq!(vehicle.x.velocity, 1.0);
@@ -371,12 +372,12 @@ mod tests {
         }
         assert!(
             vehicle.x.position < 4.0 && vehicle.x.velocity < 0.0,
-            "a wall does not hold what leaves it"
+            "a wall does not hold a vehicle that leaves it"
         );
     }
 
     #[test]
-    fn directions_either_side_of_pi_are_close() {
+    fn directions_on_either_side_of_pi_are_close() {
         // d_dot is 0 at rest, so only the θ̇ and force terms of r2 remain.
         let reward = |first, second| {
             let mut vehicle = at("reward = 'r2'\nc_force_dot = 0.01", [1.0, 1.0, 0.0, 0.0]);
@@ -395,12 +396,12 @@ mod tests {
         assert_eq!(
             step(&mut vehicle, -1.0, 0.0),
             0.0,
-            "a new episode has no direction before"
+            "a new episode has no previous direction"
         );
     }
 
     #[test]
-    fn the_reward_sees_the_state_after_the_step() {
+    fn the_reward_uses_the_state_after_the_step() {
         let mut vehicle = at("reward = 'r3'", [0.3, -0.4, -0.6, 0.8]);
         let (x, y, x_dot, y_dot): (f64, f64, f64, f64) = (0.27, -0.36, -0.6 + 0.05 * F_C, 0.8 - 0.05 * (F_C + 2.0));
         let d_dot = (x * x_dot + y * y_dot) / x.hypot(y);
@@ -421,7 +422,7 @@ mod tests {
     }
 
     #[test]
-    fn starts_are_at_rest_anywhere_and_impossible_states_are_refused() {
+    fn episodes_start_at_rest_anywhere_and_impossible_states_are_refused() {
         let mut vehicle = at("", [0.0; 4]);
         let (mut rng, mut furthest) = (rng(), [0.0f64; 2]);
         for _ in 0..1000 {

@@ -1,19 +1,19 @@
-//! What an environment's numbers mean: its signals, its goal, and what is drawn of it.
+//! The meaning of an environment's numbers: its signals, its goal, and its picture.
 
 use serde::Serialize;
 use shoal_base::space::{EnvironmentSpec, Space};
 
-/// How many numbers of an observation, and how many of an action, are signals where nothing names them.
-const BY_NUMBER: usize = 8;
+/// If an environment names no signals, at most this many numbers of its observation, and of its action, become signals.
+const MAX_UNNAMED: usize = 8;
 
-/// A number that changes from step to step, and what it means.
+/// A number that changes from step to step, with its meaning.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Signal {
-    /// Programs find it by this. It stays the same and is unique within an environment.
+    /// Identifies the signal to programs. It never changes and is unique within an environment.
     pub key: String,
-    /// People read this.
+    /// Shown to the user.
     pub label: String,
-    /// Empty for what is counted.
+    /// Empty for counts and indices.
     pub unit: &'static str,
     /// Where its values come from.
     pub source: Source,
@@ -26,8 +26,8 @@ pub enum Source {
     Observation(usize),
     /// A number of the action.
     Action(usize),
-    /// The angle in rad that has its cosine and its sine in these numbers of the observation. It turns by less than half a
-    /// turn a step, so it is followed through whole turns.
+    /// An angle in rad whose cosine and sine are numbers of the observation. It is unwrapped across whole turns, so it
+    /// must change by less than half a turn per step.
     Angle {
         /// Index of the cosine.
         cos: usize,
@@ -37,7 +37,7 @@ pub enum Source {
 }
 
 impl Signal {
-    /// Number `index` of the observation. The label is the key until `label` gives another.
+    /// Number `index` of the observation. The label is the key unless `label` sets another.
     pub fn observation(index: usize, key: &str, unit: &'static str) -> Self {
         Self::new(key, unit, Source::Observation(index))
     }
@@ -70,13 +70,13 @@ impl Signal {
         }
     }
 
-    /// The first eight numbers of the observation and of the action, called by their place: what is known of an
-    /// environment that names no signals.
+    /// The first eight numbers of the observation and of the action, named by their position, for an environment that
+    /// names no signals.
     pub fn by_number(spec: &EnvironmentSpec) -> Vec<Self> {
-        let signals = |space: &Space, called: &'static str, source: fn(usize) -> Source| {
-            (0..space.width().min(BY_NUMBER)).map(move |i| {
+        let signals = |space: &Space, name: &'static str, source: fn(usize) -> Source| {
+            (0..space.width().min(MAX_UNNAMED)).map(move |i| {
                 let number = i + 1;
-                Self::new(&format!("{called}-{number}"), "", source(i)).label(&format!("{called} {number}"))
+                Self::new(&format!("{name}-{number}"), "", source(i)).label(&format!("{name} {number}"))
             })
         };
         let observed = signals(&spec.observation, "observation", Source::Observation);
@@ -85,7 +85,7 @@ impl Signal {
             .collect()
     }
 
-    /// The least and the greatest value, as the spaces say them; `None` where there is no such bound.
+    /// The least and the greatest value according to the spaces; `None` if there are no finite bounds.
     pub fn range(&self, spec: &EnvironmentSpec) -> Option<[f64; 2]> {
         let (space, i) = match self.source {
             Source::Observation(i) => (&spec.observation, i),
@@ -100,20 +100,20 @@ impl Signal {
     }
 }
 
-/// What success is at an episode's end: a distance below a bound.
+/// The criterion of success at an episode's end: a distance below a bound.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Goal {
     /// The distance to the goal.
     pub distance: Signal,
-    /// Nearer than this the goal is reached, in the distance's unit.
+    /// The goal is reached below this distance, in the distance's unit.
     pub within: f64,
 }
 
-/// What the report draws of an episode. A picture reads the signals that `keys` names, and the ranges that `scales` names.
+/// What the report draws of an episode, from the signals in `keys` and the ranges of those in `scales`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 #[serde(tag = "kind", rename_all = "kebab-case")]
 pub enum Picture {
-    /// Nothing: the signals are shown as lines.
+    /// Nothing; the signals are shown as lines.
     #[default]
     None,
     /// A rod on a joint. `angle` in rad, 0 upright and growing counterclockwise; `torque` in N m.
@@ -127,9 +127,10 @@ pub enum Picture {
         /// The pole's length, in m.
         pole: f64,
     },
-    /// A walk over a square of fields. `field` is the field's number, row by row; `direction` is 0 left, 1 down, 2 right, 3 up.
+    /// A walk over a square grid. `field` is the number of the cell, row by row; `direction` is 0 left, 1 down, 2
+    /// right, 3 up.
     Grid {
-        /// A letter for each field, row by row: S the start, F free, H a hole, G the goal.
+        /// A letter for each cell, row by row: S the start, F free, H a hole, G the goal.
         map: String,
     },
 }
@@ -146,7 +147,7 @@ impl Picture {
         }
     }
 
-    /// Those of the keys whose signals must have a range: it sets the picture's scale.
+    /// The keys whose signals must have a range, because it sets the picture's scale.
     pub fn scales(&self) -> &'static [&'static str] {
         match self {
             Self::None | Self::Cart { .. } | Self::Grid { .. } => &[],
@@ -170,7 +171,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_without_a_name_are_called_by_their_place() {
+    fn unnamed_signals_are_named_by_their_position() {
         let wide = Space::boxed(&[(0.0, 1.0); 30]);
         let signals = Signal::by_number(&spec(wide, Space::Discrete { n: 3 }));
         assert_eq!(signals.len(), 8 + 1);
@@ -182,7 +183,7 @@ mod tests {
     }
 
     #[test]
-    fn a_range_is_what_the_space_says_and_finite() {
+    fn a_range_is_that_of_the_space_and_finite() {
         let spec = spec(
             Space::boxed(&[(-4.0, 4.0), (f32::NEG_INFINITY, 1.0)]),
             Space::Discrete { n: 3 },

@@ -1,9 +1,10 @@
-//! What the training episodes under way are, as words: another vector made alike goes on from them, bit for bit.
+//! Snapshots: the current training episodes as words. Another vector made with the same arguments continues them bit
+//! for bit.
 
 use super::{EPISODE_BITS, VectorEnvironment, training_stream, wrong_count};
 use crate::environment::RequestError;
 
-/// A training episode under way, as its words say it; the state comes after these.
+/// The first words of a training episode in a snapshot. The environment's state follows them.
 struct Counters {
     episode: u64,
     steps: u32,
@@ -11,19 +12,20 @@ struct Counters {
 }
 
 impl VectorEnvironment {
-    /// Words in a snapshot; 0 where the environments cannot say their state.
+    /// Words in a snapshot; 0 if the environments cannot save their state.
     pub fn snapshot_words(&self) -> usize {
         self.spec.snapshot_words(self.count())
     }
 
-    /// Writes the training episodes under way: for each environment the words that
-    /// [`snapshot_words`](shoal_base::space::EnvironmentSpec::snapshot_words) counts, the state as the bits of its numbers.
+    /// Writes the current training episodes: for each environment the words that
+    /// [`snapshot_words`](shoal_base::space::EnvironmentSpec::snapshot_words) counts, with the state as the bits of its
+    /// numbers.
     ///
-    /// There are none of evaluation episodes: whoever loses those begins them again by their number.
-    /// Panics unless `words` has `snapshot_words()` words.
+    /// Evaluation episodes have no snapshots: they are repeated by their number. Panics unless `words` has
+    /// `snapshot_words()` words.
     ///
     /// # Errors
-    /// When the environments cannot say their state, or no training episodes are under way.
+    /// When the environments cannot save their state, or are not in training episodes.
     pub fn snapshot(&self, words: &mut [u64]) -> Result<(), RequestError> {
         assert_eq!(words.len(), self.snapshot_words(), "length of `words`");
         let width = self.snapshot_width()?;
@@ -41,19 +43,19 @@ impl VectorEnvironment {
             words
                 .iter_mut()
                 .zip(counters.into_iter().chain(numbers))
-                .for_each(|(word, said)| *word = said);
+                .for_each(|(word, value)| *word = value);
         }
         Ok(())
     }
 
-    /// Goes on with the training episodes of a snapshot of as many environments, made of the same name, parameters, seed,
-    /// server and incarnation: from here all observations, rewards and flags are what they would have been there. Writes
-    /// the E observations to act on next.
+    /// Continues the training episodes of a snapshot. The snapshot must come from as many environments, made with the
+    /// same name, parameters, seed, server and incarnation. All later observations, rewards and flags are then the same
+    /// as in the original. Writes the E observations to act on next.
     ///
     /// Panics unless `observations` has E × observation width numbers.
     ///
     /// # Errors
-    /// When the words are no such snapshot; then nothing has changed.
+    /// When the words are not such a snapshot; then nothing has changed.
     pub fn restore(&mut self, words: &[u64], observations: &mut [f32]) -> Result<(), RequestError> {
         let (count, observed) = (self.count(), self.spec.observation.width());
         assert_eq!(observations.len(), count * observed, "length of `observations`");
@@ -64,7 +66,7 @@ impl VectorEnvironment {
         let mut episodes = Vec::with_capacity(count);
         for (e, words) in words.chunks_exact(width).enumerate() {
             let (counters, state) = self.read(e, words)?;
-            self.trial.restore(&state)?;
+            self.scratch.restore(&state)?;
             episodes.push((counters, state));
         }
         for (e, (counters, state)) in episodes.into_iter().enumerate() {
@@ -85,12 +87,12 @@ impl VectorEnvironment {
     /// Words for one environment.
     fn snapshot_width(&self) -> Result<usize, RequestError> {
         match self.spec.snapshot_words(1) {
-            0 => Err(RequestError::Unsayable),
+            0 => Err(RequestError::NoSnapshots),
             width => Ok(width),
         }
     }
 
-    /// The words of environment `e`, if an episode can have got there.
+    /// Reads the words of environment `e`; an error if no episode can have these counters.
     fn read(&self, e: usize, words: &[u64]) -> Result<(Counters, Vec<f64>), RequestError> {
         let impossible = |what| RequestError::Snapshot { environment: e, what };
         let Some((&[episode, steps, position], state)) = words.split_first_chunk() else {

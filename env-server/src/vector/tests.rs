@@ -1,7 +1,7 @@
 use super::*;
 
 /// A vector with the buffers that a server has in shared memory.
-pub(super) struct Bench {
+pub(super) struct Fixture {
     pub(super) vector: VectorEnvironment,
     pub(super) observations: Vec<f32>,
     pub(super) next_observations: Vec<f32>,
@@ -10,7 +10,7 @@ pub(super) struct Bench {
     pub(super) truncated: Vec<f32>,
 }
 
-impl Bench {
+impl Fixture {
     pub(super) fn of(name: &str, parameters: &str, count: u32, [seed, server, incarnation]: [u64; 3]) -> Self {
         let parameters = parameters.parse().unwrap();
         let vector = VectorEnvironment::new(name, &parameters, count, seed, server, incarnation).unwrap();
@@ -59,38 +59,41 @@ impl Bench {
 
 #[test]
 fn the_time_limit_truncates_and_the_next_episode_begins() {
-    let mut bench = Bench::new("pendulum", "time_limit = 3", 2);
-    bench.reset(Start::Next);
+    let mut fixture = Fixture::new("pendulum", "time_limit = 3", 2);
+    fixture.reset(Start::Next);
     for step in 1..=7 {
-        bench.step(&[0.5, -0.5]).unwrap();
+        fixture.step(&[0.5, -0.5]).unwrap();
         let ended = if step % 3 == 0 { 1.0 } else { 0.0 };
-        assert_eq!(bench.truncated, [ended; 2], "step {step}");
-        assert_eq!(bench.terminated, [0.0; 2]);
+        assert_eq!(fixture.truncated, [ended; 2], "step {step}");
+        assert_eq!(fixture.terminated, [0.0; 2]);
         assert_eq!(
-            bench.observations != bench.next_observations,
+            fixture.observations != fixture.next_observations,
             ended == 1.0,
             "step {step}"
         );
-        assert!(bench.rewards.iter().all(|r| *r < 0.0));
+        assert!(fixture.rewards.iter().all(|r| *r < 0.0));
     }
-    let mut from_the_start = Bench::new("pendulum", "", 2);
+    let mut from_the_start = Fixture::new("pendulum", "", 2);
     let third = from_the_start.reset(Start::Episodes(&[2, 2]));
-    bench.reset(Start::Episodes(&[1, 1]));
+    fixture.reset(Start::Episodes(&[1, 1]));
     for _ in 0..3 {
-        bench.step(&[0.0, 0.0]).unwrap();
+        fixture.step(&[0.0, 0.0]).unwrap();
     }
-    assert_eq!(bench.observations, third, "autoreset started the episode that follows");
+    assert_eq!(
+        fixture.observations, third,
+        "the automatic reset started the next episode"
+    );
 }
 
 #[test]
-fn termination_is_no_truncation_even_in_the_last_step() {
-    // Pushed one way from upright, the pole falls in a step of its own.
+fn termination_in_the_last_step_is_not_truncation() {
+    // The number of the step in which the pole falls if it is always pushed the same way.
     let fall = {
-        let mut bench = Bench::new("cart-pole", "", 1);
-        bench.reset(Start::States(&[0.0; 4]));
+        let mut fixture = Fixture::new("cart-pole", "", 1);
+        fixture.reset(Start::States(&[0.0; 4]));
         (1..).find(|_| {
-            bench.step(&[1.0]).unwrap();
-            bench.terminated == [1.0]
+            fixture.step(&[1.0]).unwrap();
+            fixture.terminated == [1.0]
         })
     }
     .unwrap();
@@ -99,62 +102,62 @@ fn termination_is_no_truncation_even_in_the_last_step() {
         (fall, ([1.0], [0.0])),
         (fall + 1, ([1.0], [0.0])),
     ] {
-        let mut bench = Bench::new("cart-pole", &format!("time_limit = {time_limit}"), 1);
-        bench.reset(Start::States(&[0.0; 4]));
+        let mut fixture = Fixture::new("cart-pole", &format!("time_limit = {time_limit}"), 1);
+        fixture.reset(Start::States(&[0.0; 4]));
         for _ in 0..time_limit.min(fall) - 1 {
-            bench.step(&[1.0]).unwrap();
-            assert_eq!((bench.terminated[0], bench.truncated[0]), (0.0, 0.0));
+            fixture.step(&[1.0]).unwrap();
+            assert_eq!((fixture.terminated[0], fixture.truncated[0]), (0.0, 0.0));
         }
-        bench.step(&[1.0]).unwrap();
+        fixture.step(&[1.0]).unwrap();
         assert_eq!(
-            (bench.terminated[..].as_ref(), bench.truncated[..].as_ref()),
+            (fixture.terminated[..].as_ref(), fixture.truncated[..].as_ref()),
             (&ended.0[..], &ended.1[..])
         );
         assert!(
-            bench.next_observations[2].abs() > 0.1,
+            fixture.next_observations[2].abs() > 0.1,
             "s' is the state the pole fell into"
         );
         assert!(
-            bench.observations.iter().all(|x| x.abs() <= 0.05),
-            "the next episode's start"
+            fixture.observations.iter().all(|x| x.abs() <= 0.05),
+            "this is the next episode's start"
         );
-        bench.step(&[1.0]).unwrap();
+        fixture.step(&[1.0]).unwrap();
         assert_eq!(
-            (bench.terminated[0], bench.truncated[0]),
+            (fixture.terminated[0], fixture.truncated[0]),
             (0.0, 0.0),
-            "the count starts again"
+            "the steps are counted from 0 again"
         );
     }
 }
 
 #[test]
-fn every_word_of_the_counters_names_other_starts() {
-    let starts = |name: [u64; 3]| Bench::of("point-mass", "", 3, name).reset(Start::Next);
+fn every_counter_changes_the_start_states() {
+    let starts = |name: [u64; 3]| Fixture::of("point-mass", "", 3, name).reset(Start::Next);
     let base = starts([1, 0, 0]);
     assert_eq!(base, starts([1, 0, 0]));
     assert!(
         base[..2] != base[6..8] && base[6..8] != base[12..14],
-        "environments start apart"
+        "each environment has its own start state"
     );
     for other in [[2, 0, 0], [1, 1, 0], [1, 0, 1]] {
         assert_ne!(base[..6], starts(other)[..6], "{other:?}");
     }
-    let mut bench = Bench::new("point-mass", "", 3);
-    assert_eq!(bench.reset(Start::Next), base);
-    let second = bench.reset(Start::Next);
+    let mut fixture = Fixture::new("point-mass", "", 3);
+    assert_eq!(fixture.reset(Start::Next), base);
+    let second = fixture.reset(Start::Next);
     assert_ne!(second[..6], base[..6]);
     assert_eq!(
-        Bench::new("point-mass", "", 3).reset(Start::Episodes(&[1, 1, 1])),
+        Fixture::new("point-mass", "", 3).reset(Start::Episodes(&[1, 1, 1])),
         second
     );
-    assert_eq!(bench.reset(Start::Episodes(&[0, 0, 0])), base);
+    assert_eq!(fixture.reset(Start::Episodes(&[0, 0, 0])), base);
 }
 
 #[test]
-fn an_evaluation_episode_starts_alike_always_and_everywhere() {
+fn an_evaluation_episode_always_starts_the_same_way() {
     let evaluation = |first| Start::Evaluation { seed: 9, first };
-    let five = Bench::of("pendulum", "", 5, [1, 0, 0]).reset(evaluation(0));
-    let mut other = Bench::of("pendulum", "time_limit = 2", 2, [2, 3, 4]);
+    let five = Fixture::of("pendulum", "", 5, [1, 0, 0]).reset(evaluation(0));
+    let mut other = Fixture::of("pendulum", "time_limit = 2", 2, [2, 3, 4]);
     other.reset(Start::Next);
     other.step(&[0.1, 0.2]).unwrap();
     assert_eq!(other.reset(evaluation(0)), five[..6]);
@@ -164,7 +167,7 @@ fn an_evaluation_episode_starts_alike_always_and_everywhere() {
     assert_eq!(
         other.observations,
         five[6..12],
-        "environment e goes on with the episode E later"
+        "environment e continues with the episode E later"
     );
     assert_eq!(other.reset(evaluation(3)), five[9..]);
     assert_ne!(other.reset(Start::Evaluation { seed: 8, first: 3 }), five[9..]);
@@ -173,43 +176,43 @@ fn an_evaluation_episode_starts_alike_always_and_everywhere() {
 
 #[test]
 fn evaluation_does_not_disturb_training_episodes() {
-    let mut bench = Bench::new("pendulum", "", 1);
-    bench.reset(Start::Next);
-    bench.reset(Start::Evaluation { seed: 1, first: 0 });
-    let second = bench.reset(Start::Next);
-    assert_eq!(second, Bench::new("pendulum", "", 1).reset(Start::Episodes(&[1])));
+    let mut fixture = Fixture::new("pendulum", "", 1);
+    fixture.reset(Start::Next);
+    fixture.reset(Start::Evaluation { seed: 1, first: 0 });
+    let second = fixture.reset(Start::Next);
+    assert_eq!(second, Fixture::new("pendulum", "", 1).reset(Start::Episodes(&[1])));
 }
 
 #[test]
-fn a_frozen_lake_episode_slips_alike_when_it_is_run_again() {
-    let walk = |bench: &mut Bench| -> Vec<f32> {
+fn a_repeated_frozen_lake_episode_slips_the_same_way() {
+    let walk = |fixture: &mut Fixture| -> Vec<f32> {
         let slide = |_| {
-            bench.step(&[2.0]).unwrap();
-            bench.next_observations[0]
+            fixture.step(&[2.0]).unwrap();
+            fixture.next_observations[0]
         };
         (0..20).map(slide).collect()
     };
-    let mut bench = Bench::new("frozen-lake", "", 1);
-    bench.reset(Start::Next);
-    let first = walk(&mut bench);
-    bench.reset(Start::Episodes(&[0]));
-    assert_eq!(walk(&mut bench), first);
-    bench.reset(Start::Episodes(&[100]));
-    assert_ne!(walk(&mut bench), first);
+    let mut fixture = Fixture::new("frozen-lake", "", 1);
+    fixture.reset(Start::Next);
+    let first = walk(&mut fixture);
+    fixture.reset(Start::Episodes(&[0]));
+    assert_eq!(walk(&mut fixture), first);
+    fixture.reset(Start::Episodes(&[100]));
+    assert_ne!(walk(&mut fixture), first);
 }
 
 #[test]
 fn episodes_start_from_given_states() {
-    let mut bench = Bench::new("point-mass", "", 2);
-    let observations = bench.reset(Start::States(&[3.0, 4.0, 0.0, 0.0, -2.0, 0.0, 0.5, 0.0]));
+    let mut fixture = Fixture::new("point-mass", "", 2);
+    let observations = fixture.reset(Start::States(&[3.0, 4.0, 0.0, 0.0, -2.0, 0.0, 0.5, 0.0]));
     assert_eq!(
         observations,
         [3.0, 4.0, 0.0, 0.0, 5.0, 0.0, -2.0, 0.0, 0.5, 0.0, 2.0, -0.5]
     );
     let mut refusal = |states| {
-        bench
+        fixture
             .vector
-            .reset(Start::States(states), &mut bench.observations)
+            .reset(Start::States(states), &mut fixture.observations)
             .unwrap_err()
     };
     assert!(matches!(refusal(&[0.0; 7]), RequestError::Count { given: 7, .. }));
@@ -225,20 +228,20 @@ fn episodes_start_from_given_states() {
 #[test]
 fn a_refused_action_changes_nothing() {
     for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
-        let mut bench = Bench::new("pendulum", "", 2);
-        bench.reset(Start::Next);
+        let mut fixture = Fixture::new("pendulum", "", 2);
+        fixture.reset(Start::Next);
         assert!(matches!(
-            bench.step(&[1.0, bad]),
+            fixture.step(&[1.0, bad]),
             Err(RequestError::Action { environment: 1, .. })
         ));
-        assert!(bench.rewards[0].is_nan(), "nothing was written");
-        bench.step(&[1.0, 1.0]).unwrap();
-        let mut undisturbed = Bench::new("pendulum", "", 2);
+        assert!(fixture.rewards[0].is_nan(), "nothing was written");
+        fixture.step(&[1.0, 1.0]).unwrap();
+        let mut undisturbed = Fixture::new("pendulum", "", 2);
         undisturbed.reset(Start::Next);
         undisturbed.step(&[1.0, 1.0]).unwrap();
-        assert_eq!(bench.observations, undisturbed.observations);
+        assert_eq!(fixture.observations, undisturbed.observations);
     }
-    let mut cart_pole = Bench::new("cart-pole", "", 1);
+    let mut cart_pole = Fixture::new("cart-pole", "", 1);
     cart_pole.reset(Start::Next);
     for bad in [2.0, -1.0, 0.5, f32::NAN] {
         assert!(
@@ -246,17 +249,20 @@ fn a_refused_action_changes_nothing() {
             "{bad}"
         );
     }
-    let short = Bench::new("point-mass", "", 2).step(&[0.0; 3]).unwrap_err().to_string();
-    assert_eq!(short, "3 numbers of actions for 2 environments: give 2 each");
+    let short = Fixture::new("point-mass", "", 2)
+        .step(&[0.0; 3])
+        .unwrap_err()
+        .to_string();
+    assert_eq!(short, "actions: 3 numbers for 2 environments; give 2 each");
 }
 
 #[test]
 fn actions_outside_the_box_are_clipped() {
     let reward = |action| {
-        let mut bench = Bench::new("pendulum", "", 1);
-        bench.reset(Start::States(&[0.0, 0.0]));
-        bench.step(&[action]).unwrap();
-        (bench.rewards[0], bench.observations)
+        let mut fixture = Fixture::new("pendulum", "", 1);
+        fixture.reset(Start::States(&[0.0, 0.0]));
+        fixture.step(&[action]).unwrap();
+        (fixture.rewards[0], fixture.observations)
     };
     assert_eq!(reward(2.0), reward(1e30));
 }

@@ -1,4 +1,4 @@
-//! What a learning method is to the learner's process.
+//! The interface between a learning method and the learner's process.
 
 use shoal_common::config::Config;
 use shoal_common::policy::{PolicyError, PolicyLayout};
@@ -7,44 +7,44 @@ use shoal_common::space::EnvironmentSpec;
 use crate::networks::threads::Threads;
 use crate::replay::Replay;
 
-/// A learning method by its settings, before it learns.
+/// A learning method with its settings, before it learns.
 pub trait Method {
-    /// The learner of an environment like `spec`, before its first update; its first weights are drawn from `seed`.
+    /// The learner for an environment with this `spec`, before its first update. `seed` determines the initial weights.
     ///
     /// # Errors
     /// When the method cannot control that environment.
-    fn start(&self, spec: &EnvironmentSpec, seed: u64, room: Room) -> Result<Box<dyn Algorithm>, PolicyError>;
+    fn start(&self, spec: &EnvironmentSpec, seed: u64, sizes: RunSizes) -> Result<Box<dyn Algorithm>, PolicyError>;
 
-    /// Names of the sections that hold what was learned, as opposed to what the learning remembers.
+    /// Names of the sections that hold what was learned, as opposed to the state of the optimiser.
     fn weights(&self) -> &'static [&'static str];
 
-    /// Numbers in all sections of the learner's state.
-    fn state_numbers(&self, spec: &EnvironmentSpec, room: Room) -> usize;
+    /// The total length of all sections of the learner's state.
+    fn state_numbers(&self, spec: &EnvironmentSpec, sizes: RunSizes) -> usize;
 }
 
-/// A learner at work: what it does with the rows of the replay, what actors act with, and what a checkpoint keeps of it.
+/// A running learner: its updates from rows of the replay, its policy for the actors, and its state for checkpoints.
 pub trait Algorithm {
     /// The policy's parameters.
     fn policy(&self) -> &[f32];
 
-    /// What they are.
+    /// The layout of the policy's parameters.
     fn layout(&self) -> PolicyLayout;
 
-    /// Updates done. A method that learns from each row once has as many as it has learned from rows.
+    /// Gradient steps taken; for methods that use each row once, rows consumed.
     fn updates(&self) -> u64;
 
-    /// Does what is due next, on the replay as it was at `rows` rows, and counts it: an update or several. To be called
-    /// while the rows allow more updates than are done.
+    /// Makes the next update, or several, on the replay as it was after `rows` rows, and counts them in `updates`. It
+    /// is called while the rows allow more updates than that.
     fn update(&mut self, replay: &Replay, rows: u64) -> Losses;
 
-    /// Shares the work of updates among these threads from now on, where there is enough of it. Not a bit of what is
-    /// learned depends on them.
+    /// Shares the work of updates among these threads from now on, if there is enough of it. The bits of the results do
+    /// not depend on them.
     fn set_threads(&mut self, _: Threads) {}
 
-    /// All that the next update depends on besides the rows, by name.
+    /// Everything that the next update depends on besides the rows, by name.
     fn state(&self) -> Vec<Section<'_>>;
 
-    /// Goes back to a state of the same method after so many updates.
+    /// Restores a state of the same method after `updates` updates.
     ///
     /// # Errors
     /// When the state is another method's. The method is unusable afterwards.
@@ -54,31 +54,31 @@ pub trait Algorithm {
 /// A part of a method's state: its name and its numbers.
 pub type Section<'a> = (&'static str, &'a [f32]);
 
-/// How an update went.
+/// The losses of an update.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Losses {
-    /// Mean squared error of what estimates values: the critic, the baseline, or the table.
+    /// Mean squared error of the value estimates: of the critic, the baseline, or the table.
     pub critic_loss: f32,
-    /// What the policy's step makes smaller; 0 where the policy follows from the values.
+    /// The loss that the policy's step reduces; 0 if the policy follows from the values.
     pub actor_loss: f32,
-    /// Mean of the values estimated, or of the returns where none are.
+    /// Mean of the estimated values, or of the returns if there are no estimates.
     pub q_mean: f32,
 }
 
-/// What every method is told.
+/// The sizes of a run that methods depend on.
 #[derive(Clone, Copy, Debug)]
-pub struct Room {
+pub struct RunSizes {
     /// Transitions that minibatches are sampled from.
     pub capacity: u64,
     /// Rows in a full chunk.
     pub chunk_rows: usize,
-    /// Actors that take part.
+    /// The number of actors.
     pub actors: u32,
-    /// Environments of each.
+    /// The number of environments of each actor.
     pub envs: u32,
 }
 
-impl From<&Config> for Room {
+impl From<&Config> for RunSizes {
     fn from(config: &Config) -> Self {
         Self {
             capacity: config.replay.capacity,
@@ -89,11 +89,11 @@ impl From<&Config> for Room {
     }
 }
 
-/// A method's state as a checkpoint gives it back: numbers by name.
+/// A method's state as read from a checkpoint: numbers by name.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct SavedState(Vec<(String, Vec<f32>)>);
 
-/// A state does not hold what the method expects.
+/// A section of a saved state is not what the method expects.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("the checkpoint's section `{name}` {reason}; it was written by another version of the program")]
 pub struct SectionError {
@@ -108,7 +108,7 @@ impl From<Vec<(String, Vec<f32>)>> for SavedState {
 }
 
 impl SectionError {
-    /// A section has not as many numbers as it should.
+    /// A section has the wrong length.
     pub(super) fn of_length(name: &str, found: usize, expected: usize) -> Self {
         Self {
             name: name.into(),
@@ -118,10 +118,10 @@ impl SectionError {
 }
 
 impl SavedState {
-    /// Takes out a section.
+    /// Removes a section and returns it.
     ///
     /// # Errors
-    /// When it is not there, or has not `length` numbers.
+    /// When it is missing, or does not have `length` numbers.
     pub fn take(&mut self, name: &str, length: usize) -> Result<Vec<f32>, SectionError> {
         let at = self.0.iter().position(|(found, _)| found == name);
         let at = at.ok_or_else(|| SectionError {

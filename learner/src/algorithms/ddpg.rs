@@ -22,17 +22,17 @@ use crate::networks::pass::{Pass, Samples};
 use crate::networks::product;
 use crate::networks::threads::Threads;
 
-/// Everything an update changes, as a checkpoint keeps it.
+/// Everything that a gradient step changes, as stored in a checkpoint.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct DdpgState<'a> {
-    /// Updates done.
+    /// Gradient steps taken.
     pub updates: u64,
     /// Flat numbers, in the order of [`DdpgState::PARTS`].
     pub parts: [&'a [f32]; 8],
 }
 
 impl DdpgState<'_> {
-    /// What each of the parts is.
+    /// The names of the parts.
     pub const PARTS: [&'static str; 8] = [
         "actor",
         "critic",
@@ -45,7 +45,7 @@ impl DdpgState<'_> {
     ];
 }
 
-/// A network that learns, the target that follows it, and what its optimiser remembers.
+/// A network, the target network that follows it, and the state of its optimiser.
 #[derive(Clone, Debug)]
 struct Learned {
     layout: NetworkLayout,
@@ -68,19 +68,19 @@ impl Learned {
         }
     }
 
-    /// One step of Adam along −gradient, and the target's after it.
+    /// Takes one step of Adam against the gradient, and then the step of the target.
     fn descend(&mut self, threads: &Threads, t: u64, tau: f32) {
         self.adam
             .step(threads, t, &self.gradient, &mut self.parameters, tau, &mut self.target);
     }
 }
 
-/// Samples, or units of a hidden layer, that are worth being cut in two; asked of each hidden layer but the last, or of the
-/// only one. faer adds up the terms of a transposed product in another order where a dimension is 1, or the whole product
-/// small, and nobody shall see in the bits how many threads there were.
-const LEAST_CUT: usize = 4;
-/// As [`LEAST_CUT`]: samples times units of a hidden layer; asked of each but the first, or of the only one.
-const LEAST_WORK: usize = 8_192;
+/// Two threads are used only if there are at least this many samples, and units in each hidden layer but the last (or
+/// in the only one). If a dimension is 1 or the product is small, faer adds the terms of a transposed product in
+/// another order, and the bits must not depend on the number of threads.
+const MIN_SPLIT: usize = 4;
+/// As [`MIN_SPLIT`], for samples times units of each hidden layer but the first (or of the only one).
+const MIN_WORK: usize = 8_192;
 
 /// The learner of DDPG: both networks, their targets, both optimisers.
 #[derive(Clone, Debug)]
@@ -91,7 +91,7 @@ pub struct Ddpg {
     updates: u64,
     actor: Learned,
     critic: Learned,
-    // Room for what an update computes on its way.
+    // Buffers for the intermediate results of a gradient step.
     mu: Pass,
     q: Pass,
     target_mu: Pass,
@@ -132,21 +132,21 @@ impl Ddpg {
         })
     }
 
-    /// Shares the work of an update among these threads from now on, if there is enough of it. Not a bit of what is computed
-    /// depends on them.
+    /// Shares the work of a gradient step among these threads from now on, if there is enough of it. The bits of the
+    /// results do not depend on them.
     pub fn set_threads(&mut self, threads: Threads) {
         let (layers, batch) = (self.critic.layout.hidden().layers, self.y.len());
         let others = layers.len() - 1;
         let (all_but_last, all_but_first) = (&layers[..others.max(1)], &layers[others.min(1)..]);
-        let enough = batch >= LEAST_CUT
-            && all_but_last.iter().all(|units| *units >= LEAST_CUT)
-            && all_but_first.iter().all(|units| units * batch >= LEAST_WORK);
+        let enough = batch >= MIN_SPLIT
+            && all_but_last.iter().all(|units| *units >= MIN_SPLIT)
+            && all_but_first.iter().all(|units| units * batch >= MIN_WORK);
         self.threads = if enough { threads } else { Threads::ALONE };
     }
 
-    /// One update from a minibatch of N transitions: lines 12 to 16. Returns L of line 13, −mean of Q(s, μ(s)), Q after its step,
-    /// and the mean of Q(s, a), Q before it. Panics when the batch has other dimensions than the
-    /// networks and settings. Nothing is allocated.
+    /// Takes a gradient step with a minibatch of N transitions: lines 12 to 16. Returns L of line 13, −mean of Q(s,
+    /// μ(s)) with Q after its step, and the mean of Q(s, a) with Q before it. Panics if the batch has other dimensions
+    /// than the networks and settings. Nothing is allocated.
     pub fn update(&mut self, batch: &Minibatch) -> Losses {
         assert_eq!(batch.size(), self.y.len(), "transitions in the minibatch");
         let t = self.updates + 1;
@@ -164,8 +164,9 @@ impl Ddpg {
         }
     }
 
-    /// What the four networks say before any of them changes: one thread asks Q(s, a) and μ(s), the other one
-    /// Q'(s', μ'(s')). Line 12: y = r + discount · Q'(s', μ'(s')). Nothing is asked of a terminal s', whatever it holds.
+    /// Evaluates the four networks before any of them changes: one thread computes μ(s) and Q(s, a), the other one
+    /// Q'(s', μ'(s')). Then line 12: y = r + discount · Q'(s', μ'(s')). The value of a terminal s' is not used, even if
+    /// it is NaN.
     fn evaluate(&mut self, batch: &Minibatch) {
         let (actor, critic, range) = (&self.actor, &self.critic, &self.range);
         let (s, a, s_next) = (batch.s.as_slice(), batch.a.as_slice(), batch.s_next.as_slice());
@@ -205,9 +206,8 @@ impl Ddpg {
         (loss, mean(self.q.output.iter().copied()))
     }
 
-    /// Line 14 and equation 3.30: the gradient of −1/N Σ Q(s, μ(s)), which descending ascends Q, through the critic as line
-    /// 13 left it: ∇_a Q · ∇_θμ μ. Returns the loss. Up to the gradients of θ_μ, samples have nothing to do with each other,
-    /// and each thread has its share of them.
+    /// Line 14 and equation 3.30: the gradient of the loss −1/N Σ Q(s, μ(s)), with the critic after line 13: ∇_a Q ·
+    /// ∇_θμ μ. Returns the loss. Up to the gradients of θ_μ the samples are independent, and the threads share them.
     fn actor_gradient(&mut self, s: &DMatrix<f32>) -> f32 {
         let (actor, critic, half) = (&self.actor, &self.critic, self.range.half());
         self.d_q.fill(-1.0 / self.y.len() as f32);
@@ -243,7 +243,7 @@ impl Ddpg {
         -mean(self.q.output.iter().copied())
     }
 
-    /// θ_μ, laid out as [`policy_layout`](Self::policy_layout) says: what actors evaluate.
+    /// θ_μ, the policy's parameters, in the layout [`policy_layout`](Self::policy_layout).
     pub fn policy(&self) -> &[f32] {
         &self.actor.parameters
     }
@@ -258,7 +258,7 @@ impl Ddpg {
         &self.critic.layout
     }
 
-    /// Updates done.
+    /// Gradient steps taken.
     pub fn updates(&self) -> u64 {
         self.updates
     }
@@ -268,12 +268,12 @@ impl Ddpg {
         sha256(&self.state().parts[..4])
     }
 
-    /// Floating-point operations of the matrix products of one update.
+    /// Floating-point operations of the matrix products of one gradient step.
     pub fn flop_per_update(&self) -> u64 {
         product::flop_per_update(&self.actor.layout, &self.critic.layout, self.y.len())
     }
 
-    /// Everything the next update depends on.
+    /// Everything that the next gradient step depends on.
     pub fn state(&self) -> DdpgState<'_> {
         let (actor, critic) = (&self.actor, &self.critic);
         DdpgState {
@@ -291,10 +291,11 @@ impl Ddpg {
         }
     }
 
-    /// Starts again from given networks (actor, critic, target actor, target critic), with optimisers that took no step.
+    /// Starts again from given networks (actor, critic, target actor, target critic), with optimisers before their
+    /// first step.
     ///
     /// # Errors
-    /// When they are of other sizes; nothing is changed then.
+    /// When their sizes differ; then nothing has changed.
     pub fn restart_from(&mut self, networks: [&[f32]; 4]) -> Result<(), SectionError> {
         let [actor, critic] =
             [self.actor.parameters.len(), self.critic.parameters.len()].map(|length| vec![0.0; length]);
@@ -305,10 +306,10 @@ impl Ddpg {
         })
     }
 
-    /// Goes back to a state, of this or of another [`Ddpg`] with networks of the same sizes.
+    /// Restores a state of this or of another [`Ddpg`] with networks of the same sizes.
     ///
     /// # Errors
-    /// When the sizes are others; nothing is changed then.
+    /// When the sizes differ; then nothing has changed.
     pub fn restore(&mut self, state: &DdpgState<'_>) -> Result<(), SectionError> {
         for ((part, own), given) in DdpgState::PARTS.into_iter().zip(self.state().parts).zip(state.parts) {
             if given.len() != own.len() {
@@ -334,8 +335,8 @@ impl Ddpg {
     }
 }
 
-/// Fills `actions` with the policy's, in environment units, and leaves the tanh they come from in `mu.output`. The
-/// bits are those of [`PolicyNetwork`](shoal_common::network::PolicyNetwork).
+/// Fills `actions` with the policy's actions, in environment units, and leaves their tanh in `mu.output`. The bits are
+/// those of [`PolicyNetwork`](shoal_common::network::PolicyNetwork).
 fn act(mu: &mut Pass, range: &ActionRange, parameters: &[f32], s: &[f32], actions: &mut DMatrix<f32>) {
     mu.forward(parameters, s, &[]);
     for (mut action, mut z) in actions.column_iter_mut().zip(mu.output.column_iter_mut()) {

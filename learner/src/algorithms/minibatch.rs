@@ -1,11 +1,11 @@
-//! A batch of transitions as the matrices an update reads.
+//! A batch of transitions as the matrices that a gradient step reads.
 
 use nalgebra::{DMatrix, DVector};
 use shoal_common::transition::{RowLayout, Transition};
 
 use crate::replay::Replay;
 
-/// N transitions (s, a, r, discount, s'), one column a sample.
+/// N transitions (s, a, r, discount, s'), one column per sample.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Minibatch {
     /// Observations s.
@@ -14,14 +14,14 @@ pub struct Minibatch {
     pub a: DMatrix<f32>,
     /// Rewards r.
     pub r: DVector<f32>,
-    /// What the value of s' counts for: γⁿ, or 0 where s' is terminal.
+    /// The factor of the value of s': γ, or 0 if s' is terminal.
     pub discount: DVector<f32>,
     /// Observations s' after the step.
     pub s_next: DMatrix<f32>,
 }
 
 impl Minibatch {
-    /// Room for `size` transitions, all zero.
+    /// `size` transitions, all zero.
     pub fn new(layout: RowLayout, size: usize) -> Self {
         Self {
             s: DMatrix::zeros(layout.observation_width(), size),
@@ -32,16 +32,16 @@ impl Minibatch {
         }
     }
 
-    /// How many transitions it holds.
+    /// The number of transitions.
     pub fn size(&self) -> usize {
         self.r.len()
     }
 
-    /// Copies the rows of these numbers into the columns, from the first on. Panics where the replay does not hold one of
-    /// them, or they are more than the columns.
+    /// Copies the rows with these numbers into the columns, from the first on. Panics if the replay does not hold one
+    /// of them, or if there are more than columns.
     pub fn gather(&mut self, replay: &Replay, indices: &[u64]) {
-        // A row drawn at random is a wait for memory. Asked for before anything is copied, the rows are waited for
-        // together, not one after the other: three times as fast. A row may lie on two cache lines.
+        // Random rows are cache misses. Both ends of all rows are read before any is copied, so that the misses
+        // overlap; this is three times as fast. Both ends, because a row may lie on two cache lines.
         let ends = |row: &[f32]| row[0] + row[row.len() - 1];
         std::hint::black_box(indices.iter().map(|&index| ends(replay.row(index))).sum::<f32>());
         let layout = replay.layout().row;
@@ -50,7 +50,7 @@ impl Minibatch {
         }
     }
 
-    /// Copies a transition into `column`. Panics when it has other widths than the batch, or there is no such column.
+    /// Copies a transition into `column`. Panics if its widths are not the batch's, or if there is no such column.
     pub fn set(&mut self, column: usize, transition: &Transition<'_>) {
         copy_into_column(&mut self.s, column, transition.s);
         copy_into_column(&mut self.a, column, transition.a);

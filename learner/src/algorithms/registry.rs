@@ -1,12 +1,12 @@
-//! The learning methods there are: a line for each.
+//! The list of the learning methods.
 
 use shoal_common::config::{self, Config};
 use shoal_common::policy::PolicyError;
 
-use super::algorithm::{Algorithm, Method, Room};
+use super::algorithm::{Algorithm, Method, RunSizes};
 use super::tabular;
 
-/// The method that learns by the settings of a configuration.
+/// The method for the settings of a configuration.
 fn method(algorithm: &config::Algorithm) -> Box<dyn Method + '_> {
     match algorithm {
         config::Algorithm::Ddpg(settings) => Box::new(settings),
@@ -21,17 +21,17 @@ fn method(algorithm: &config::Algorithm) -> Box<dyn Method + '_> {
 /// # Errors
 /// When the method cannot control the environment.
 pub fn new(config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
-    method(&config.algorithm).start(&config.spec, config.run.seed, Room::from(config))
+    method(&config.algorithm).start(&config.spec, config.run.seed, RunSizes::from(config))
 }
 
-/// Names of the sections of a checkpoint that hold what was learned, as opposed to what the learning remembers.
+/// Names of the sections of a checkpoint that hold what was learned, as opposed to the state of the optimiser.
 pub fn weights(algorithm: &config::Algorithm) -> &'static [&'static str] {
     method(algorithm).weights()
 }
 
-/// Numbers in the state of that learner, without making it.
+/// The total length of that learner's state, computed without creating the learner.
 pub fn state_numbers(config: &Config) -> usize {
-    method(&config.algorithm).state_numbers(&config.spec, Room::from(config))
+    method(&config.algorithm).state_numbers(&config.spec, RunSizes::from(config))
 }
 
 #[cfg(test)]
@@ -44,7 +44,7 @@ mod tests {
     }
 
     #[test]
-    fn the_size_of_a_state_and_its_weights_are_known_before_it_is_made() {
+    fn the_size_and_the_weights_of_a_state_are_known_before_it_exists() {
         let real = "box = { low = [-1.0, -1.0], high = [1.0, 1.0] }";
         let in_order = "[replay]\nwarmup = 0\n[spec]\ntime_limit = 8";
         for (rest, observation, action) in [
@@ -71,7 +71,7 @@ mod tests {
             assert_eq!(state_numbers(&config), numbers, "{rest}");
             let named = |name: &&str| state.iter().any(|(section, _)| section == name);
             let weights = weights(&config.algorithm);
-            // The baseline's are there where there is one.
+            // Only some learners have a baseline.
             assert!(weights.iter().filter(|name| **name != "baseline").all(named), "{rest}");
         }
     }

@@ -2,10 +2,10 @@
 //!
 //! Symbols as there: policy π with parameters θ, return G, baseline V with parameters θ_v, δ = G − V(s).
 //!
-//! The reading of Algorithm 3: its line 6 is averaged over an episode's time steps, and Adam takes one step an episode, so
-//! that the whole of it was collected with the policy that the step begins at. Where several actors take part a round has
-//! an episode of each, and the step follows the mean of theirs. What the other readings do is told in
-//! `docs/REPRODUCTION.md`.
+//! Algorithm 3 leaves some choices. Here, its line 6 is averaged over an episode's time steps, and Adam takes one step
+//! per episode, so that the whole episode was collected with the policy that the step starts from. With several actors,
+//! a round has an episode of each, and the step follows their mean. `docs/REPRODUCTION.md` describes the effect of
+//! other choices.
 
 use nalgebra::DMatrix;
 use shoal_common::algorithms::AlgorithmSettings;
@@ -15,7 +15,7 @@ use shoal_common::policy::{self, PolicyError, PolicyLayout};
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::transition::Transition;
 
-use super::algorithm::{Algorithm, Losses, Method, Room, SavedState, Section, SectionError};
+use super::algorithm::{Algorithm, Losses, Method, RunSizes, SavedState, Section, SectionError};
 use crate::networks::adam::Adam;
 use crate::networks::aligned::Aligned;
 use crate::networks::initialise::glorot;
@@ -23,10 +23,10 @@ use crate::networks::pass::Pass;
 use crate::networks::threads::Threads;
 use crate::replay::Replay;
 
-/// Added to a standard deviation before it divides. An episode whose returns are all equal then weighs nothing.
+/// Added to a standard deviation before dividing by it. An episode whose returns are all equal then has no weight.
 const SPREAD_FLOOR: f32 = 1e-8;
 
-/// A network that learns by itself, and what its optimiser remembers.
+/// A network without a target network, and the state of its optimiser.
 #[derive(Clone, Debug)]
 struct Learned {
     layout: NetworkLayout,
@@ -55,7 +55,8 @@ impl Learned {
         self.pass.forward(&self.parameters, s.as_slice(), &[]);
     }
 
-    /// One step of Adam against the gradient that the first `steps` columns of `d` make of the pass before.
+    /// Takes one step of Adam against the gradient that follows from the first `steps` columns of `d` and the forward
+    /// pass before.
     fn descend(&mut self, t: u64, steps: usize, s: &DMatrix<f32>) {
         self.d.columns_mut(steps, s.ncols() - steps).fill(0.0);
         self.pass.backward(
@@ -65,7 +66,7 @@ impl Learned {
             &self.d,
             &mut self.gradient,
         );
-        self.adam.step_alone(t, &self.gradient, &mut self.parameters);
+        self.adam.step_without_target(t, &self.gradient, &mut self.parameters);
     }
 }
 
@@ -77,9 +78,9 @@ pub struct Reinforce {
     baseline: Option<Learned>,
     /// Rows learned from.
     rows: u64,
-    /// Steps that Adam took, as a checkpoint keeps it: exact up to 2²⁴, more episodes than any run has.
+    /// Steps taken by Adam, as stored in a checkpoint. The `f32` is exact up to 2²⁴, more episodes than any run has.
     steps: [f32; 1],
-    /// Room for the observations of a round, a column a time step.
+    /// A buffer for the observations of a round, one column per time step.
     s: DMatrix<f32>,
 }
 
@@ -95,16 +96,16 @@ impl Reinforce {
     /// New networks, drawn from `seed`, for an environment like `spec`.
     ///
     /// # Errors
-    /// When it has real-valued actions or counted observations.
+    /// When it has continuous actions or discrete observations.
     pub fn new(
         settings: &config::ReinforceConfig,
         spec: &EnvironmentSpec,
         seed: u64,
-        room: Room,
+        sizes: RunSizes,
     ) -> Result<Self, PolicyError> {
         let observation = spec.observation.width();
         let actions = policy::softmax("reinforce", settings.hidden_layers(), spec, 0)?.actions();
-        let steps = room.chunk_rows * room.actors as usize;
+        let steps = sizes.chunk_rows * sizes.actors as usize;
         let network = NetworkLayout::policy(observation, settings.hidden_layers(), actions);
         let baseline = (settings.weight == Weight::Baseline).then(|| {
             let network = NetworkLayout::policy(observation, settings.baseline_hidden_layers(), 1);
@@ -148,7 +149,7 @@ impl Reinforce {
                 let weight = match (self.settings.weight, &mut self.baseline) {
                     (Weight::Normalised, _) => (g - mean) / (spread + SPREAD_FLOOR),
                     (_, Some(baseline)) => {
-                        // Of ½ δ², equation 3.22.
+                        // The gradient of ½ δ² (equation 3.22).
                         let delta = g - baseline.pass.output[column];
                         baseline.d[column] = -share * delta;
                         losses.critic_loss += share * delta * delta;
@@ -160,7 +161,7 @@ impl Reinforce {
                 let mut d = self.policy.d.column_mut(column);
                 let action = (step.a[0] as usize).min(logits.len() - 1);
                 let ln_normaliser = ln_sum_exp(logits.as_slice());
-                // Of −weight · ln π(a|s): weight · (π(·|s) − 1[·= a]).
+                // The gradient of −weight · ln π(a|s): weight · (π(·|s) − 1[·= a]).
                 let scale = share * gamma_t * weight;
                 for (k, (d, logit)) in d.iter_mut().zip(logits.iter()).enumerate() {
                     *d = scale * ((logit - ln_normaliser).exp() - f32::from(u8::from(k == action)));
@@ -182,7 +183,7 @@ impl Reinforce {
         losses
     }
 
-    /// Whether an episode is over, and not by the time limit where that is no lesson.
+    /// Whether an episode is over and, unless `learn_at_limit` is set, was not ended by the time limit.
     fn learns_from(&self, episode: &[Transition<'_>]) -> bool {
         episode
             .last()
@@ -194,7 +195,7 @@ impl Reinforce {
     }
 }
 
-/// Line 5: G of each step, from the last one back. After the last one nothing comes, whatever ended the episode.
+/// Line 5: G of each step, from the last one back. Nothing is added after the last one, whatever ended the episode.
 fn returns(episode: &[Transition<'_>]) -> Vec<f32> {
     let mut returns: Vec<f32> = episode
         .iter()
@@ -208,7 +209,7 @@ fn returns(episode: &[Transition<'_>]) -> Vec<f32> {
     returns
 }
 
-/// Mean and standard deviation of all the numbers.
+/// Mean and standard deviation of the numbers.
 fn mean_and_spread(numbers: &[f32]) -> (f32, f32) {
     let n = numbers.len() as f32;
     let mean = numbers.iter().sum::<f32>() / n;
@@ -222,16 +223,16 @@ fn ln_sum_exp(logits: &[f32]) -> f32 {
 }
 
 impl Method for &config::ReinforceConfig {
-    fn start(&self, spec: &EnvironmentSpec, seed: u64, room: Room) -> Result<Box<dyn Algorithm>, PolicyError> {
-        Ok(Box::new(Reinforce::new(self, spec, seed, room)?))
+    fn start(&self, spec: &EnvironmentSpec, seed: u64, sizes: RunSizes) -> Result<Box<dyn Algorithm>, PolicyError> {
+        Ok(Box::new(Reinforce::new(self, spec, seed, sizes)?))
     }
 
     fn weights(&self) -> &'static [&'static str] {
         &Reinforce::WEIGHTS
     }
 
-    fn state_numbers(&self, spec: &EnvironmentSpec, _: Room) -> usize {
-        // Each network and two moments; and the steps of Adam.
+    fn state_numbers(&self, spec: &EnvironmentSpec, _: RunSizes) -> usize {
+        // Each network with its two moments, and the steps of Adam.
         3 * self.learned(spec).parameters() + 1
     }
 }

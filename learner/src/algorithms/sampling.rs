@@ -1,5 +1,5 @@
-//! Which rows a minibatch takes: a function of the run's seed and the update's number, so that an update done again
-//! after a crash takes the same rows.
+//! The rows of a minibatch. They are a function of the run's seed and the update's number, so that an update that is
+//! repeated after a crash takes the same rows.
 
 use std::ops::Range;
 
@@ -24,13 +24,13 @@ impl Sampler {
     /// Fills `out` with rows of `window`, each uniform and independent of the others, for update number `update`.
     ///
     /// Element k comes from 64-bit number k of the update's stream by multiply and shift. Two of the `n` rows of a
-    /// window differ in probability by at most 2⁻⁶⁴, a bias no run is long enough to see; rejecting it away would make
-    /// the position of a number depend on the window.
+    /// window differ in probability by at most 2⁻⁶⁴, a bias that no run is long enough to show. Rejection sampling
+    /// would avoid it, but then a number's position in the stream would depend on the window.
     ///
     /// # Panics
     /// If the window is empty.
     pub fn indices(&self, update: u64, window: Range<u64>, out: &mut [u64]) {
-        assert!(!window.is_empty(), "a minibatch of an empty window");
+        assert!(!window.is_empty(), "cannot draw a minibatch from an empty window");
         let rows = window.end - window.start;
         let mut numbers = self.key.clone();
         numbers.set_stream(update);
@@ -53,7 +53,7 @@ mod tests {
     }
 
     #[test]
-    fn an_update_done_again_takes_the_same_rows() {
+    fn a_repeated_update_takes_the_same_rows() {
         let sampler = Sampler::new(7);
         let mut first = [0; 64];
         let mut again = [0; 64];
@@ -66,7 +66,7 @@ mod tests {
     }
 
     #[test]
-    fn the_rows_are_those_of_every_machine_and_version() {
+    fn the_rows_are_the_same_on_every_machine_and_version() {
         assert_eq!(draw(1, 2, 1000..1_001_000)[..4], [949_753, 490_657, 400_442, 578_053]);
     }
 

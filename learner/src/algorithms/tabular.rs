@@ -6,16 +6,16 @@ use shoal_common::policy::{self, PolicyError, PolicyLayout};
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::transition::Transition;
 
-use super::algorithm::{Algorithm, Losses, Method, Room, SavedState, Section, SectionError};
+use super::algorithm::{Algorithm, Losses, Method, RunSizes, SavedState, Section, SectionError};
 use crate::replay::Replay;
 
-/// Which value of s' a step is led by.
+/// Which value of s' an update bootstraps from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Lead {
+pub enum Bootstrap {
     /// max Q(s', ·): equation 3.13.
-    Greatest,
-    /// Q(s', a') of the action that was taken there: equation 3.12.
-    Taken,
+    Max,
+    /// Q(s', a') with the action a' that was taken there: equation 3.12.
+    NextAction,
 }
 
 /// Q-learning with these settings.
@@ -27,59 +27,59 @@ pub struct QLearning<'a>(pub &'a config::TabularConfig);
 pub struct Sarsa<'a>(pub &'a config::TabularConfig);
 
 impl Method for QLearning<'_> {
-    fn start(&self, spec: &EnvironmentSpec, _: u64, room: Room) -> Result<Box<dyn Algorithm>, PolicyError> {
-        Ok(Box::new(Tabular::new(Lead::Greatest, self.0, spec, room)?))
+    fn start(&self, spec: &EnvironmentSpec, _: u64, sizes: RunSizes) -> Result<Box<dyn Algorithm>, PolicyError> {
+        Ok(Box::new(Tabular::new(Bootstrap::Max, self.0, spec, sizes)?))
     }
 
     fn weights(&self) -> &'static [&'static str] {
         &Tabular::WEIGHTS
     }
 
-    fn state_numbers(&self, spec: &EnvironmentSpec, room: Room) -> usize {
-        state_numbers(self.0, spec, room)
+    fn state_numbers(&self, spec: &EnvironmentSpec, sizes: RunSizes) -> usize {
+        state_numbers(self.0, spec, sizes)
     }
 }
 
 impl Method for Sarsa<'_> {
-    fn start(&self, spec: &EnvironmentSpec, _: u64, room: Room) -> Result<Box<dyn Algorithm>, PolicyError> {
-        Ok(Box::new(Tabular::new(Lead::Taken, self.0, spec, room)?))
+    fn start(&self, spec: &EnvironmentSpec, _: u64, sizes: RunSizes) -> Result<Box<dyn Algorithm>, PolicyError> {
+        Ok(Box::new(Tabular::new(Bootstrap::NextAction, self.0, spec, sizes)?))
     }
 
     fn weights(&self) -> &'static [&'static str] {
         &Tabular::WEIGHTS
     }
 
-    fn state_numbers(&self, spec: &EnvironmentSpec, room: Room) -> usize {
-        state_numbers(self.0, spec, room)
+    fn state_numbers(&self, spec: &EnvironmentSpec, sizes: RunSizes) -> usize {
+        state_numbers(self.0, spec, sizes)
     }
 }
 
 /// The table, and a pending step for each environment.
-fn state_numbers(settings: &config::TabularConfig, spec: &EnvironmentSpec, room: Room) -> usize {
-    settings.learned(spec).parameters() + slots(room) * PENDING
+fn state_numbers(settings: &config::TabularConfig, spec: &EnvironmentSpec, sizes: RunSizes) -> usize {
+    settings.learned(spec).parameters() + slots(sizes) * PENDING
 }
 
-/// Environments of all actors.
-fn slots(room: Room) -> usize {
-    room.actors as usize * room.envs as usize
+/// The number of environments of all actors.
+fn slots(sizes: RunSizes) -> usize {
+    sizes.actors as usize * sizes.envs as usize
 }
 
 /// Action-values Q(s, a), learned from each transition once, in the order they happened.
 #[derive(Clone, Debug)]
 pub struct Tabular {
-    lead: Lead,
+    bootstrap: Bootstrap,
     alpha: f32,
     layout: PolicyLayout,
     actions: usize,
-    /// Q, state after state; 0 at first.
+    /// Q, one state after another; initially 0.
     q: Vec<f32>,
-    /// SARSA: of each environment the step whose a' is still to come, as [`Pending`] has it.
+    /// SARSA: for each environment, the [`Pending`] step whose a' is not known yet.
     pending: Vec<f32>,
-    room: Room,
+    sizes: RunSizes,
     rows: u64,
 }
 
-/// A step s, a, r, s' in the table's terms.
+/// A step s, a, r, s' with indices into the table.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Pending {
     s: usize,
@@ -89,7 +89,7 @@ struct Pending {
     s_next: usize,
 }
 
-/// Numbers that a pending step takes: 1 where there is one, and its fields.
+/// Numbers stored for a pending step: 1 if there is one, and its fields.
 const PENDING: usize = 6;
 
 impl Tabular {
@@ -100,31 +100,31 @@ impl Tabular {
     /// A table of zeros for an environment like `spec`.
     ///
     /// # Errors
-    /// When states or actions cannot be counted.
+    /// When states or actions are not discrete.
     pub fn new(
-        lead: Lead,
+        bootstrap: Bootstrap,
         settings: &config::TabularConfig,
         spec: &EnvironmentSpec,
-        room: Room,
+        sizes: RunSizes,
     ) -> Result<Self, PolicyError> {
-        let name = match lead {
-            Lead::Greatest => "q-learning",
-            Lead::Taken => "sarsa",
+        let name = match bootstrap {
+            Bootstrap::Max => "q-learning",
+            Bootstrap::NextAction => "sarsa",
         };
         let scores = policy::table(name, spec, 0)?;
         Ok(Self {
-            lead,
+            bootstrap,
             alpha: settings.alpha as f32,
             layout: scores.layout(),
             actions: scores.actions(),
             q: vec![0.0; scores.layout().parameters()],
-            pending: vec![0.0; slots(room) * PENDING],
-            room,
+            pending: vec![0.0; slots(sizes) * PENDING],
+            sizes,
             rows: 0,
         })
     }
 
-    /// Learns from one transition, of the environment in `slot`.
+    /// Learns from one transition of the environment in `slot`.
     fn learn(&mut self, transition: &Transition<'_>, slot: usize) -> Losses {
         let step = Pending {
             s: self.state_of(transition.s[0]),
@@ -133,29 +133,30 @@ impl Tabular {
             discount: transition.discount,
             s_next: self.state_of(transition.s_next[0]),
         };
-        if self.lead == Lead::Greatest {
+        if self.bootstrap == Bootstrap::Max {
             let values = self.values(step.s_next);
             let greatest = values[policy::highest(values)];
-            return self.improve(&step, greatest);
+            return self.update_value(&step, greatest);
         }
         let mut losses = Losses::default();
-        // Where the last chunk of a run was cut off, and the run was given more steps, the next row is of another walk.
-        let before = self.take(slot).filter(|before| before.s_next == step.s);
+        // If the last chunk of a run was cut off and the run then got more steps, the next row is not this step's
+        // successor.
+        let before = self.take_pending(slot).filter(|before| before.s_next == step.s);
         if let Some(before) = before {
             let value = self.values(before.s_next)[step.a];
-            losses = self.improve(&before, value);
+            losses = self.update_value(&before, value);
         }
         if step.discount == 0.0 {
-            losses = self.improve(&step, 0.0);
+            losses = self.update_value(&step, 0.0);
         } else if !transition.last {
-            self.put(slot, &step);
+            self.put_pending(slot, &step);
         }
-        // Where the time limit ended the episode no a' was chosen, and nothing is learned from that step.
+        // If the time limit ended the episode, no a' was chosen, and nothing is learned from its last step.
         losses
     }
 
-    /// Q(s, a) ← Q(s, a) + α [r + γ value − Q(s, a)]. Nothing is asked of a terminal s'.
-    fn improve(&mut self, step: &Pending, value: f32) -> Losses {
+    /// Q(s, a) ← Q(s, a) + α [r + γ value − Q(s, a)]. The value of a terminal s' is not used.
+    fn update_value(&mut self, step: &Pending, value: f32) -> Losses {
         let q = &mut self.q[step.s * self.actions + step.a];
         let bootstrapped = if step.discount == 0.0 {
             0.0
@@ -180,17 +181,17 @@ impl Tabular {
         (observation as usize).min(self.q.len() / self.actions - 1)
     }
 
-    /// Which environment a row is of: actors take turns with full chunks, and environments within a chunk.
+    /// The environment of a row: actors take turns with full chunks, and environments take turns within a chunk.
     fn slot(&self, row: u64) -> usize {
-        let (chunk, actors) = (self.room.chunk_rows as u64, u64::from(self.room.actors));
-        let envs = u64::from(self.room.envs);
+        let (chunk, actors) = (self.sizes.chunk_rows as u64, u64::from(self.sizes.actors));
+        let envs = u64::from(self.sizes.envs);
         (row / chunk % actors * envs + row % chunk % envs) as usize
     }
 
-    fn take(&mut self, slot: usize) -> Option<Pending> {
+    fn take_pending(&mut self, slot: usize) -> Option<Pending> {
         let slot = &mut self.pending[slot * PENDING..][..PENDING];
-        let there = std::mem::take(&mut slot[0]) != 0.0;
-        there.then(|| Pending {
+        let exists = std::mem::take(&mut slot[0]) != 0.0;
+        exists.then(|| Pending {
             s: slot[1] as usize,
             a: slot[2] as usize,
             r: slot[3],
@@ -199,7 +200,7 @@ impl Tabular {
         })
     }
 
-    fn put(&mut self, slot: usize, step: &Pending) {
+    fn put_pending(&mut self, slot: usize, step: &Pending) {
         let numbers = [
             1.0,
             step.s as f32,
@@ -226,7 +227,7 @@ impl Algorithm for Tabular {
     }
 
     fn update(&mut self, replay: &Replay, _: u64) -> Losses {
-        // After a crash of a free run the ring may have lost what came since the checkpoint.
+        // After a crash of a free run the ring may have lost rows since the checkpoint.
         let row = self.rows.max(replay.rows().start);
         self.rows = row + 1;
         let slot = self.slot(row);

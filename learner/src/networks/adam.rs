@@ -9,14 +9,13 @@ const BETA_1: f64 = 0.9;
 const BETA_2: f64 = 0.999;
 const EPSILON: f32 = 1e-8;
 
-/// Moments closer to zero than this become zero. Those of units that get no gradient decay for ever, and soon a
-/// denormal number each, which costs a processor a hundred times a normal one. Their step is then below 1e-18 / ε of the
-/// learning rate: nothing is lost.
+/// Moments closer to zero than this become zero. Without a gradient they would decay to denormal numbers, which are a
+/// hundred times as slow. The steps that this drops are below 1e-18 / ε of the learning rate.
 const FIRST_MOMENT_FLOOR: f32 = 1e-18;
-/// As [`FIRST_MOMENT_FLOOR`], for squares: its root is lost beside ε.
+/// As [`FIRST_MOMENT_FLOOR`], for squares. The root of this is negligible beside ε.
 const SECOND_MOMENT_FLOOR: f32 = 1e-30;
 
-/// Adam's memory of a network: running means of its gradient and of the gradient's square.
+/// Adam's state for a network: running means of its gradient and of the gradient's square.
 #[derive(Clone, Debug)]
 pub struct Adam {
     learning_rate: f64,
@@ -25,7 +24,7 @@ pub struct Adam {
 }
 
 impl Adam {
-    /// No step taken yet, for so many parameters.
+    /// The state before the first step, for this number of parameters.
     pub fn new(learning_rate: f64, parameters: usize) -> Self {
         Self {
             learning_rate,
@@ -35,7 +34,7 @@ impl Adam {
     }
 
     /// Takes step number `t` (from 1) of `parameters` θ against `gradient`; then `target` ← τ θ + (1 − τ) `target`
-    /// (equation 3.31). All slices are as long as the network has parameters; each thread has its share of them.
+    /// (equation 3.31). All slices have the length of the network's parameters. The threads share the work.
     ///
     /// Bias correction as in PyTorch: θ ← θ − α / (1 − β₁ᵗ) · m / (√v / √(1 − β₂ᵗ) + ε).
     pub fn step(
@@ -70,8 +69,8 @@ impl Adam {
         );
     }
 
-    /// As [`step`](Self::step), of a network that no target follows.
-    pub fn step_alone(&mut self, t: u64, gradient: &[f32], parameters: &mut [f32]) {
+    /// As [`step`](Self::step), for a network without a target.
+    pub fn step_without_target(&mut self, t: u64, gradient: &[f32], parameters: &mut [f32]) {
         let bias = self.bias(t);
         let moments = self.first_moment.iter_mut().zip(self.second_moment.iter_mut());
         for ((g, (m, v)), weight) in gradient.iter().zip(moments).zip(parameters) {
@@ -87,7 +86,7 @@ impl Adam {
     }
 }
 
-/// What a step's number makes of learning rate and moments.
+/// The bias correction of learning rate and moments, which depends on a step's number.
 #[derive(Clone, Copy)]
 struct Bias {
     step_size: f32,
@@ -95,11 +94,11 @@ struct Bias {
 }
 
 impl Bias {
-    /// How far a parameter goes against `g`, whose moments become newer by it.
+    /// Updates the moments of a parameter with its gradient `g`. Returns how far the parameter moves against `g`.
     #[inline(always)]
     fn step(self, g: f32, m: &mut f32, v: &mut f32) -> f32 {
         let (fresh_1, fresh_2) = ((1.0 - BETA_1) as f32, (1.0 - BETA_2) as f32);
-        // A gradient below the floor cannot lift either moment over its own; its square would be denormal.
+        // A gradient below the floor cannot raise either moment above its floor, and its square would be denormal.
         let g = floored(g, FIRST_MOMENT_FLOOR);
         *m = floored(*m + fresh_1 * (g - *m), FIRST_MOMENT_FLOOR);
         *v = floored(*v + fresh_2 * (g * g - *v), SECOND_MOMENT_FLOOR);
@@ -117,7 +116,7 @@ fn floored(x: f32, floor: f32) -> f32 {
 mod tests {
     use super::*;
 
-    /// The algorithm as its paper has it, in `f64`, one number.
+    /// The algorithm of the paper for one number, in `f64`.
     #[derive(Default)]
     struct Reference {
         m: f64,
@@ -137,7 +136,7 @@ mod tests {
     }
 
     #[test]
-    fn it_follows_the_paper_for_a_thousand_steps() {
+    fn adam_follows_the_paper_for_a_thousand_steps() {
         let count = 37;
         let mut adam = Adam::new(1e-3, count);
         let (mut weights, mut targets) = (vec![0.5f32; count], vec![-0.5f32; count]);
@@ -164,13 +163,13 @@ mod tests {
     }
 
     #[test]
-    fn a_step_alone_is_the_step_beside_a_target() {
-        let (mut alone, mut beside) = (Adam::new(1e-2, 3), Adam::new(1e-2, 3));
+    fn a_step_without_a_target_is_the_step_with_one() {
+        let (mut without, mut with) = (Adam::new(1e-2, 3), Adam::new(1e-2, 3));
         let (mut weights, mut same, mut target) = ([0.5_f32; 3], [0.5_f32; 3], [0.0_f32; 3]);
         for t in 1..=20 {
             let gradient = [0.3, -0.1 * t as f32, 0.0];
-            alone.step_alone(t, &gradient, &mut weights);
-            beside.step(&Threads::ALONE, t, &gradient, &mut same, 0.1, &mut target);
+            without.step_without_target(t, &gradient, &mut weights);
+            with.step(&Threads::ALONE, t, &gradient, &mut same, 0.1, &mut target);
         }
         assert_eq!(weights, same);
         assert_ne!(weights[..2], [0.5; 2]);

@@ -1,17 +1,16 @@
-//! Numbers that a sweep reads side by side with others, placed so that the processor's vectors fit the cache's lines.
+//! Slices that are read together in one sweep, aligned to cache lines.
 
 use std::ops::{Deref, DerefMut};
 
 /// `f32`s in a page of 4096 bytes.
 pub const PAGE: usize = 1024;
-/// `f32`s between the places within a page where two neighbouring streams start: 512 bytes.
+/// `f32`s between the offsets within a page of two neighbouring streams: 512 bytes.
 const STAGGER: usize = 128;
 
-/// A slice of fixed length that starts on a cache line, at a place within a page that its stream number chooses.
+/// A slice of fixed length that starts on a cache line, at an offset within a page that its stream number determines.
 ///
-/// Adam reads and writes five such slices in step. Where the allocator places them, each vector straddles two lines, and
-/// all five stand at the same place of their pages, so that a load seems to wait for an unrelated store: the sweep then
-/// took 275 µs, against 108 µs so (two networks of the thesis, Zen 4).
+/// Adam reads and writes five such slices in step. Without the alignment its vectors would straddle cache lines; with
+/// equal offsets, loads would wait for unrelated stores. Together that makes the sweep more than twice as slow.
 #[derive(Debug)]
 pub struct Aligned {
     numbers: Vec<f32>,
@@ -21,10 +20,10 @@ pub struct Aligned {
 }
 
 impl Aligned {
-    /// `length` zeros, for the stream with this number (0 to 7) of those that are read together.
+    /// `length` zeros. `stream` (0 to 7) numbers the slices that are read together.
     pub fn zeros(length: usize, stream: usize) -> Self {
         let numbers = vec![0.0; length + PAGE + STAGGER * stream];
-        // The distance to the page's start is not promised, only usual: it decides the speed, nothing else.
+        // `align_offset` does not promise a result. It affects only the speed.
         let start = numbers.as_ptr().align_offset(PAGE * size_of::<f32>()).min(PAGE) + STAGGER * stream;
         Self {
             numbers,
@@ -67,13 +66,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn streams_start_on_lines_at_their_own_places() {
-        let place = |aligned: &Aligned| aligned.as_ptr() as usize % (PAGE * 4);
+    fn streams_start_on_cache_lines_at_their_own_offsets() {
+        let offset = |aligned: &Aligned| aligned.as_ptr() as usize % (PAGE * 4);
         for length in [1, 16, 121_901] {
             for stream in 0..8 {
                 let aligned = Aligned::zeros(length, stream);
-                assert_eq!((aligned.len(), place(&aligned)), (length, 512 * stream));
-                assert_eq!(place(&aligned.clone()), 512 * stream);
+                assert_eq!((aligned.len(), offset(&aligned)), (length, 512 * stream));
+                assert_eq!(offset(&aligned.clone()), 512 * stream);
             }
         }
     }

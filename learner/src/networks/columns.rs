@@ -1,8 +1,8 @@
-//! Matrices whose columns are slices: each column lies in one piece by construction, so that a sweep over it needs no check.
+//! Matrices whose columns are contiguous slices by construction, so that a sweep over a column needs no check.
 
 use faer::{MatMut, MatRef};
 
-/// Some rows of a column-major matrix, neighbours of each other.
+/// A range of rows of a column-major matrix.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Columns<'a> {
     numbers: &'a [f32],
@@ -13,7 +13,7 @@ pub(super) struct Columns<'a> {
 }
 
 impl<'a> Columns<'a> {
-    /// A matrix with so many rows, at least one. `numbers` are whole columns.
+    /// A matrix with `rows` rows, at least one. `numbers` are whole columns.
     pub(super) fn new(numbers: &'a [f32], rows: usize) -> Self {
         Self {
             numbers,
@@ -23,7 +23,7 @@ impl<'a> Columns<'a> {
         }
     }
 
-    /// The rows from `first` on, so many. Panics where there are fewer.
+    /// `rows` rows, from `first` on. Panics if there are fewer.
     pub(super) fn rows(self, first: usize, rows: usize) -> Self {
         assert!(first + rows <= self.rows, "rows of a matrix");
         Self {
@@ -41,7 +41,7 @@ impl<'a> Columns<'a> {
             .map(move |column| &column[first..][..rows])
     }
 
-    /// For products.
+    /// The matrix for products.
     pub(super) fn as_mat(self) -> MatRef<'a, f32> {
         MatRef::from_column_major_slice(self.numbers, self.stride, self.numbers.len() / self.stride)
             .subrows(self.first, self.rows)
@@ -70,12 +70,12 @@ impl<'a> ColumnsMut<'a> {
         self.numbers.chunks_exact_mut(self.rows.max(1))
     }
 
-    /// For products.
+    /// The matrix for products.
     pub(super) fn as_mat_mut(&mut self) -> MatMut<'_, f32> {
         MatMut::from_column_major_slice_mut(self.numbers, self.rows, self.columns)
     }
 
-    /// For products that read it.
+    /// The matrix for products that read it.
     pub(super) fn as_mat(&self) -> MatRef<'_, f32> {
         MatRef::from_column_major_slice(self.numbers, self.rows, self.columns)
     }

@@ -1,4 +1,4 @@
-//! One line that tells two sets of weights apart.
+//! A hash that identifies a set of weights.
 
 use std::fmt::Write;
 
@@ -22,7 +22,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn it_is_the_hash_of_the_bytes() {
+    fn the_digest_is_the_hash_of_the_bytes() {
         // printf '\x00\x00\x80\x3f\x00\x00\x00\xc0' | sha256sum
         let expected = "ee4ac73c2bd27756ab82780f27c73a7bc4d3f0bb6acb37e008bc27eccd7e588b";
         assert_eq!(sha256(&[&[1.0], &[-2.0]]), expected);
@@ -30,7 +30,7 @@ mod tests {
     }
 
     #[test]
-    fn one_bit_changes_it() {
+    fn one_bit_changes_the_digest() {
         let weights = [0.5f32, -0.25, 3e-3];
         let mut changed = weights;
         changed[2] = f32::from_bits(changed[2].to_bits() ^ 1);

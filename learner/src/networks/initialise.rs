@@ -1,16 +1,17 @@
-//! First weights of a network.
+//! Initial weights of a network.
 
 use rand::RngExt;
 use shoal_common::network::NetworkLayout;
 use shoal_common::stream::{Purpose, stream};
 
-/// Bound of the output layer's weights and biases, so that first actions and values are near the middle (Lillicrap et
-/// al. 2015, section 7).
+/// Bound of the output layer's weights and biases, so that the first actions and values are near the middle of their
+/// range (Lillicrap et al. 2015, section 7).
 const OUTPUT_BOUND: f32 = 3e-3;
 
-/// Seeded first weights: hidden layers uniform within ±1/√fan-in (late inputs counted), the output layer within ±3e-3.
+/// Seeded initial weights: hidden layers uniform within ±1/√fan-in (including late inputs), the output layer within
+/// ±3e-3.
 ///
-/// `index` tells the networks of one run apart.
+/// `index` distinguishes the networks of one run.
 pub fn initialise(layout: &NetworkLayout, seed: u64, index: u64) -> Vec<f32> {
     let mut stream = stream(seed, Purpose::Initialisation, index, 0);
     let output_layer = layout.hidden().layers.len();
@@ -26,10 +27,10 @@ pub fn initialise(layout: &NetworkLayout, seed: u64, index: u64) -> Vec<f32> {
     parameters
 }
 
-/// Seeded first weights as the thesis's tool has them where nothing is said (Glorot and Bengio 2010): each layer's weights
-/// uniform within ±√(6 / (inputs + outputs)), biases zero.
+/// Seeded initial weights by the default of the thesis's tool (Glorot and Bengio 2010): each layer's weights uniform
+/// within ±√(6 / (inputs + outputs)), biases zero.
 ///
-/// `index` tells the networks of one run apart.
+/// `index` distinguishes the networks of one run.
 pub fn glorot(layout: &NetworkLayout, seed: u64, index: u64) -> Vec<f32> {
     let mut stream = stream(seed, Purpose::Initialisation, index, 0);
     let mut parameters = vec![0.0; layout.parameters()];
@@ -66,7 +67,7 @@ mod tests {
     }
 
     #[test]
-    fn each_layer_fills_its_bounds_and_keeps_them() {
+    fn each_layer_fills_its_bounds_and_stays_within_them() {
         for (hidden, inputs) in [
             (Hidden::relu([40, 30]), vec![3.0, 42.0]),
             (Hidden::relu([40]), vec![5.0]),
@@ -87,7 +88,7 @@ mod tests {
     }
 
     #[test]
-    fn seed_and_index_name_the_weights() {
+    fn seed_and_index_determine_the_weights() {
         let layout = NetworkLayout::policy(3, Hidden::relu([8, 6]), 1);
         assert_eq!(initialise(&layout, 1, 0), initialise(&layout, 1, 0));
         assert_ne!(initialise(&layout, 1, 0), initialise(&layout, 2, 0));

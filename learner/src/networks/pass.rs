@@ -1,4 +1,4 @@
-//! One network over one batch: forward, keeping the activations, and by hand backward through them.
+//! One network over one batch: the forward pass, which keeps the activations, and a hand-written backward pass.
 
 use faer::{MatMut, MatRef};
 use nalgebra::DMatrix;
@@ -9,15 +9,15 @@ use super::columns::{Columns, ColumnsMut, sum_columns};
 use super::product::{input_gradient, weight_gradient};
 use super::threads::Threads;
 
-/// The activations of a forward pass and room for their gradients; one column a sample.
+/// The activations of a forward pass and buffers for their gradients; one column per sample.
 ///
 /// Layers are counted from 0: the hidden ones, and then the output layer.
 #[derive(Clone, Debug)]
 pub struct Pass {
     layout: NetworkLayout,
-    /// The inputs with the late ones below them, where these enter at the first layer; else without rows.
+    /// The inputs with the late inputs below them, if these enter at the first layer; otherwise it has no rows.
     joined: DMatrix<f32>,
-    /// Each hidden layer; below it the late inputs where they enter at the next layer.
+    /// Each hidden layer's activations, with the late inputs below them if these enter at the next layer.
     h: Vec<DMatrix<f32>>,
     /// The output layer's values, linear.
     pub output: DMatrix<f32>,
@@ -26,7 +26,7 @@ pub struct Pass {
 }
 
 impl Pass {
-    /// Room for `batch` samples.
+    /// Buffers for `batch` samples.
     pub fn new(layout: NetworkLayout, batch: usize) -> Self {
         let zeros = |rows| DMatrix::zeros(rows, batch);
         Self {
@@ -40,13 +40,13 @@ impl Pass {
         }
     }
 
-    /// Computes `output` for inputs `x` and late inputs `late` (empty where the network has none).
+    /// Computes `output` for inputs `x` and late inputs `late` (empty if the network has none).
     pub fn forward(&mut self, parameters: &[f32], x: &[f32], late: &[f32]) {
         self.samples().forward(parameters, x, late);
     }
 
-    /// Writes ∂L/∂θ, laid out as the parameters θ, into `gradient`, given `d` = ∂L/∂output of the forward pass that
-    /// went before, with the same parameters and inputs.
+    /// Writes ∂L/∂θ, laid out as the parameters θ, into `gradient`, given `d` = ∂L/∂output. A forward pass with the
+    /// same parameters and inputs must come before.
     pub fn backward(
         &mut self,
         threads: &Threads,
@@ -55,7 +55,8 @@ impl Pass {
         d: &DMatrix<f32>,
         gradient: &mut [f32],
     ) {
-        // Below the last hidden layer the products are large enough to be shared. With two of them there is none.
+        // Below the last hidden layer the products are large enough to be shared. With two hidden layers there are
+        // none.
         if self.d.len() > 2 {
             let cut = threads.first_share(d.ncols());
             let d = d.as_slice().split_at(cut * d.nrows());
@@ -81,9 +82,9 @@ impl Pass {
         }
     }
 
-    /// What is left of [`backward`](Self::backward) once [`Samples::backward`] was called for all samples, down to the second
-    /// layer. Each thread has its share of the units that a layer's weights are multiplied by, and of the gradient that
-    /// is passed down to the first layer.
+    /// The rest of [`backward`](Self::backward) after [`Samples::backward`] for all samples, down to the second layer.
+    /// The threads share the units that a layer's weights are multiplied by, and the gradient that is passed down to
+    /// the first layer.
     pub fn gradients(
         &mut self,
         threads: &Threads,
@@ -102,9 +103,9 @@ impl Pass {
         let activation = layout.hidden().activation;
         let batch = d.ncols();
         let last = h.len();
-        // The first layer's, which comes below, and those of the layers above it.
+        // The gradient of the first layer, which is computed below, and those of the layers above it.
         let (d1, dz) = dz.split_at_mut(1);
-        // The output layer has none of its own.
+        // The output layer's is `d` itself.
         let d_of = |layer: usize| dz.get(layer - 1).unwrap_or(d);
 
         let mut rest = gradient;
@@ -151,15 +152,15 @@ impl Pass {
                 let [to_w1, to_w2] = to;
                 weight_gradient(d2.as_mat(), h1.as_mat(), to_w2);
                 input_gradient(w2, d2.as_mat(), d1.as_mat_mut());
-                through(activation, d1.iter_mut(), h1.iter());
+                apply_slope(activation, d1.iter_mut(), h1.iter());
                 d1.sum_into(b1);
                 weight_gradient(d1.as_mat(), matrix(x, inputs), to_w1);
             };
-        // The late inputs, which come last, are the second thread's, or the only one's.
+        // The late inputs come last: the second thread has them, or the only one.
         let weights = matrix(&second.weights[..h1 * h2], h2).split_at_col(cut);
         let units = Columns::new(h[0].as_slice(), inputs_2);
         let units = (units.rows(0, cut), units.rows(cut, inputs_2 - cut));
-        // A matrix for each thread, not rows of the same one: each has its columns in one piece.
+        // A matrix for each thread, not rows of the same one, so that columns are contiguous.
         let (first_d1, rest) = ColumnsMut::take(d1[0].as_mut_slice(), cut, batch);
         let d1 = (first_d1, ColumnsMut::take(rest, h1 - cut, batch).0);
         let w1 = matrix_mut(w1, h1).split_at_row_mut(cut);
@@ -172,7 +173,7 @@ impl Pass {
     }
 }
 
-/// Rows of the inputs with the late ones below them: 0 where these do not enter at the first layer.
+/// Rows of `Pass::joined`: 0 if late inputs do not enter at the first layer.
 fn rows_of_joined(layout: &NetworkLayout) -> usize {
     match layout.late_layer() {
         Some(0) => layout.layer_size(0).0,
@@ -180,8 +181,8 @@ fn rows_of_joined(layout: &NetworkLayout) -> usize {
     }
 }
 
-/// A matrix for each hidden layer, and behind them nothing.
-type EachLayer<'a> = [&'a mut [f32]; Layers::MOST];
+/// A matrix for each hidden layer. The rest are empty.
+type EachLayer<'a> = [&'a mut [f32]; Layers::MAX];
 
 fn each_layer(matrices: &mut [DMatrix<f32>]) -> EachLayer<'_> {
     let mut each = EachLayer::default();
@@ -191,7 +192,7 @@ fn each_layer(matrices: &mut [DMatrix<f32>]) -> EachLayer<'_> {
     each
 }
 
-/// Each matrix cut behind so many columns; `rows` are those of each.
+/// Splits each matrix after `columns` columns. `rows` has the rows of each.
 fn split_each<'a>(
     matrices: EachLayer<'a>,
     columns: usize,
@@ -205,7 +206,7 @@ fn split_each<'a>(
     parts
 }
 
-/// Some samples of a [`Pass`], neighbours of each other.
+/// A range of samples of a [`Pass`].
 #[derive(Debug)]
 pub struct Samples<'a> {
     layout: &'a NetworkLayout,
@@ -217,7 +218,7 @@ pub struct Samples<'a> {
 }
 
 impl<'a> Samples<'a> {
-    /// The first so many, and the others.
+    /// The first `samples` samples, and the others.
     pub fn split_at(self, samples: usize) -> (Self, Self) {
         let layout = self.layout;
         let joined = self.joined.split_at_mut(samples * rows_of_joined(layout));
@@ -234,7 +235,7 @@ impl<'a> Samples<'a> {
         (part(joined.0, h.0, output.0, d.0), part(joined.1, h.1, output.1, d.1))
     }
 
-    /// As [`Pass::forward`], of these samples.
+    /// As [`Pass::forward`], for these samples.
     pub fn forward(&mut self, parameters: &[f32], x: &[f32], late: &[f32]) {
         let to = Activations {
             joined: self.joined,
@@ -244,8 +245,8 @@ impl<'a> Samples<'a> {
         self.layout.forward(parameters, x, late, to);
     }
 
-    /// Computes ∂L/∂z of the hidden layers, from the last one down to `lowest`, given `d` = ∂L/∂output of the forward pass
-    /// that went before. Nothing where `lowest` is the output layer.
+    /// Computes ∂L/∂z of the hidden layers, from the last one down to `lowest`, given `d` = ∂L/∂output of the forward
+    /// pass before. Does nothing if `lowest` is the output layer.
     pub fn backward(&mut self, parameters: &[f32], d: &[f32], lowest: usize) {
         let layout = self.layout;
         let Hidden { layers, activation } = layout.hidden();
@@ -255,13 +256,13 @@ impl<'a> Samples<'a> {
             let (inputs, outputs) = layout.layer_size(layer + 1);
             let w = &layout.layer(layer + 1, parameters).weights[..units * outputs];
             input_gradient(matrix(w, outputs), matrix(d_above, outputs), matrix_mut(d, *units));
-            through(activation, d.chunks_exact_mut(*units), h.chunks_exact(inputs));
+            apply_slope(activation, d.chunks_exact_mut(*units), h.chunks_exact(inputs));
             d_above = &**d;
         }
     }
 
-    /// Writes ∂L/∂late into `to`, given `d` = ∂L/∂output. Layers below the one that they enter are not looked at: late inputs
-    /// reach no further down. Nothing where there are none.
+    /// Writes ∂L/∂late into `to`, given `d` = ∂L/∂output. It does not go below the layer where the late inputs enter,
+    /// and does nothing if there are none.
     pub fn backward_to_late_inputs(&mut self, parameters: &[f32], d: &[f32], to: &mut [f32]) {
         let layout = self.layout;
         let Some(layer) = layout.late_layer() else {
@@ -279,9 +280,9 @@ impl<'a> Samples<'a> {
     }
 }
 
-/// From ∂L/∂h to ∂L/∂z, column by column, by what h says of the activation's slope there. A column of `h` may be longer than
-/// that of `d`.
-fn through<'a>(activation: Activation, d: impl Iterator<Item = &'a mut [f32]>, h: impl Iterator<Item = &'a [f32]>) {
+/// Turns ∂L/∂h into ∂L/∂z, column by column, by the activation's slope, which follows from h. A column of `h` may be
+/// longer than that of `d`.
+fn apply_slope<'a>(activation: Activation, d: impl Iterator<Item = &'a mut [f32]>, h: impl Iterator<Item = &'a [f32]>) {
     match activation {
         Activation::Relu => Arch::new().dispatch(Slope {
             d,
@@ -296,7 +297,7 @@ fn through<'a>(activation: Activation, d: impl Iterator<Item = &'a mut [f32]>, h
     }
 }
 
-/// A closure of this length would be called by the dispatch, not inlined into it, and so go without vector instructions.
+/// Not a closure, because the dispatch would not inline such a long one, and it would have no vector instructions.
 struct Slope<D, H, F> {
     d: D,
     h: H,

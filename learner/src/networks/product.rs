@@ -1,15 +1,15 @@
-//! The matrix products of an update: those of the backward pass, and a list of all of them for the benchmark.
+//! The matrix products of a gradient step: those of the backward pass, and a list of all of them for the benchmark.
 
 use faer::linalg::matmul::matmul;
 use faer::{Accum, MatMut, MatRef, Par};
 use shoal_common::network::NetworkLayout;
 
-/// ∂L/∂W = d xᵀ, summed over the batch: `d` is ∂L/∂z of the layer's outputs, `x` its inputs, one column a sample.
+/// ∂L/∂W = d xᵀ, summed over the batch: `d` is ∂L/∂z of the layer's outputs, `x` its inputs, one column per sample.
 pub fn weight_gradient(d: MatRef<'_, f32>, x: MatRef<'_, f32>, gradient: MatMut<'_, f32>) {
     matmul(gradient, Accum::Replace, d, x.transpose(), 1.0, Par::Seq);
 }
 
-/// ∂L/∂x = Wᵀ d, column by column: the gradient a layer of weights `w` passes down to its inputs.
+/// ∂L/∂x = Wᵀ d, column by column: the gradient that a layer with weights `w` passes down to its inputs.
 pub fn input_gradient(w: MatRef<'_, f32>, d: MatRef<'_, f32>, to: MatMut<'_, f32>) {
     matmul(to, Accum::Replace, w.transpose(), d, 1.0, Par::Seq);
 }
@@ -30,7 +30,7 @@ pub enum Transposed {
 pub struct Product {
     /// Rows of the result.
     pub m: usize,
-    /// What is summed over.
+    /// The dimension that is summed over.
     pub k: usize,
     /// Columns of the result.
     pub n: usize,
@@ -45,17 +45,17 @@ impl Product {
     }
 }
 
-/// Every matrix product of one DDPG update of a batch, in the order they run.
+/// Every matrix product of one DDPG gradient step, in the order in which they run.
 ///
-/// With the thesis's networks, three observations and a batch of 64 their operations come to 140 million, nearly all of
-/// them in nine products of the size 300 × 400 × 64.
+/// With the thesis's networks, three observations and a batch of 64 they take 140 million operations, nearly all of
+/// them in nine products of size 300 × 400 × 64.
 pub fn products_of_update(actor: &NetworkLayout, critic: &NetworkLayout, batch: usize) -> Vec<Product> {
     let product = |m, k, n, transposed| Product { m, k, n, transposed };
     let forward = |net: &NetworkLayout| -> Vec<Product> {
         let sizes = net.layer_sizes();
         sizes.map(|(i, o)| product(o, i, batch, Transposed::Neither)).collect()
     };
-    // What a layer's gradient passes down to the units below it.
+    // The gradient that a layer passes down to the units below it.
     let down = |net: &NetworkLayout, layer: usize| {
         let units = net.hidden().layers[layer - 1];
         product(units, net.layer_size(layer).1, batch, Transposed::Left)
@@ -86,7 +86,7 @@ pub fn products_of_update(actor: &NetworkLayout, critic: &NetworkLayout, batch: 
         .collect()
 }
 
-/// Floating-point operations of the matrix products of one DDPG update: 140 million for Pendulum at batch 64.
+/// Floating-point operations of the matrix products of one DDPG gradient step: 140 million for Pendulum at batch 64.
 pub fn flop_per_update(actor: &NetworkLayout, critic: &NetworkLayout, batch: usize) -> u64 {
     products_of_update(actor, critic, batch).iter().map(Product::flop).sum()
 }
@@ -112,7 +112,7 @@ mod tests {
     }
 
     #[test]
-    fn an_update_of_the_thesis_takes_140_million_operations() {
+    fn a_gradient_step_of_the_thesis_takes_140_million_operations() {
         let (actor, critic) = (
             NetworkLayout::policy(3, Hidden::relu([400, 300]), 1),
             NetworkLayout::critic(3, Hidden::relu([400, 300]), 1),

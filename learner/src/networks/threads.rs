@@ -1,30 +1,30 @@
-//! Who computes an update: this thread alone, or two that share it.
+//! The threads that compute an update: the calling one alone, or two that share the work.
 
 use std::sync::Arc;
 
 use rayon::{ThreadPool, ThreadPoolBuilder};
 
-/// The threads of a learner: the one that made this, and perhaps a second one beside it.
+/// The threads of a learner: the one that created this, and possibly a second one.
 ///
-/// Two is all there can be: one thread takes the first part of what is to be done, the other one the rest.
+/// There are at most two: one takes the first part of the work, the other one the rest.
 #[derive(Clone, Debug)]
 pub struct Threads(Option<Arc<ThreadPool>>);
 
-/// Why a second thread cannot be had.
+/// Why the second thread cannot be started.
 #[derive(Debug, thiserror::Error)]
 #[error("cannot start the learner's second thread: {0}")]
 pub struct ThreadsError(#[from] rayon::ThreadPoolBuildError);
 
 impl Threads {
-    /// The thread that asks, and no other.
+    /// The calling thread alone.
     pub const ALONE: Self = Self(None);
 
-    /// The thread that asks, and a new one beside it. A thread can ask once.
+    /// The calling thread and a new one. A thread can call this only once.
     ///
     /// # Errors
-    /// When the system gives no thread, or the one that asks has a second one already.
+    /// When the system cannot start a thread, or the calling thread has a second one already.
     pub fn two() -> Result<Self, ThreadsError> {
-        // As a member of its pool this thread works while it waits, and does not have to be woken.
+        // The calling thread is a member of the pool, so that it works while it waits and does not have to be woken.
         let pool = ThreadPoolBuilder::new()
             .num_threads(2)
             .use_current_thread()
@@ -33,7 +33,7 @@ impl Threads {
         Ok(Self(Some(Arc::new(pool))))
     }
 
-    /// How many of `items` the first thread takes: half of them, or all where there is no other.
+    /// How many of `items` the first thread takes: half of them, or all if it is the only one.
     pub fn first_share(&self, items: usize) -> usize {
         match self.0 {
             Some(_) => items.div_ceil(2),
@@ -41,7 +41,7 @@ impl Threads {
         }
     }
 
-    /// Does both: at the same time where there are two threads, one after the other where there is one.
+    /// Calls both: at the same time on two threads, or one after the other on one.
     pub fn both(&self, first: impl FnOnce() + Send, second: impl FnOnce() + Send) {
         match &self.0 {
             Some(pool) => {

@@ -1,7 +1,8 @@
-//! Checkpoints: all a learner needs to go on, in one file, and the one before it in another.
+//! Checkpoints: a file with everything that a learner needs to continue, and a second one with the checkpoint before.
 //!
-//! `latest.ckpt` is written under a temporary name and synced before its predecessor becomes `previous.ckpt` and it takes
-//! the name. So at any moment at least one of the two is whole, and the older one is never given up for a damaged one.
+//! A new checkpoint is written under a temporary name and synced. Then `latest.ckpt` is renamed to `previous.ckpt`, and
+//! the new file to `latest.ckpt`. So at any moment at least one of the two is whole, and a damaged one never replaces
+//! the older one.
 
 use std::fs;
 use std::io::{self, Write};
@@ -19,34 +20,34 @@ const KIND: Kind = Kind {
 const LATEST: &str = "latest.ckpt";
 const PREVIOUS: &str = "previous.ckpt";
 
-/// How far a learner has come.
+/// A learner's progress.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Counters {
-    /// Updates done.
+    /// Gradient steps taken; for methods that use each row once, rows consumed.
     pub updates: u64,
-    /// Environment steps learned from, over all actors: the rows of the replay that the updates were allowed by.
+    /// Environment steps of all actors that count for the ratio of updates: rows of the replay.
     pub rows: u64,
     /// Episodes that end within those rows.
     pub episodes: u64,
-    /// Version of the policy last published.
+    /// Version of the policy published last.
     pub policy_version: u64,
 }
 
 /// A learner's state as read back.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Checkpoint {
-    /// How far it had come.
+    /// The learner's progress.
     pub counters: Counters,
-    /// Its numbers by name, as they were given to `save`.
+    /// The learner's numbers by name, as they were given to `save`.
     pub sections: Vec<(String, Vec<f32>)>,
 }
 
-/// Why a checkpoint was not written or read. Those on the disk are as they were.
+/// Why a checkpoint was not written or read. The files on the disk have not changed.
 #[derive(Debug, thiserror::Error)]
 pub enum CheckpointError {
-    /// It could not be written; the last one stands.
+    /// It could not be written. The last one is intact.
     #[error(
-        "{path}: cannot write the checkpoint: {source}; free some space or check the rights of the directory (the \
+        "{path}: cannot write the checkpoint: {source}; free some space or check the permissions of the directory (the \
              last checkpoint is intact)"
     )]
     Write {
@@ -55,7 +56,7 @@ pub enum CheckpointError {
         /// The system's reason.
         source: io::Error,
     },
-    /// It is of another program or configuration, and whole: not to be overwritten.
+    /// It is whole, but of another program version or configuration, so it must not be overwritten.
     #[error(
         "{path}: this checkpoint {reason}; the file was left as it is: resume with the run's own configuration and \
              program"
@@ -68,8 +69,8 @@ pub enum CheckpointError {
     },
     /// There are checkpoints, and none of them can be used.
     #[error(
-        "{directory}: no checkpoint here can be used ({reasons}); the files were left as they are: put back a copy \
-             of one, or move them away to learn anew on the same replay"
+        "{directory}: no checkpoint here can be used ({reasons}); the files were left as they are: restore a copy \
+             of one, or move them away to start learning again on the same replay"
     )]
     AllDamaged {
         /// The checkpoints' directory.
@@ -84,16 +85,16 @@ pub enum CheckpointError {
 pub struct Loaded {
     /// The newest checkpoint that is whole.
     pub checkpoint: Checkpoint,
-    /// What is wrong with a newer one, for the run's log.
+    /// What is wrong with newer ones, for the run's log.
     pub warnings: Vec<String>,
 }
 
-/// What `save` has just done to the directory; for tests that stop it there.
+/// A step that `save` has just finished. Tests stop it there.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SaveStep {
     /// The new checkpoint is on the disk, under its temporary name.
     Prepared,
-    /// `latest.ckpt` has become `previous.ckpt`, or was put aside.
+    /// `latest.ckpt` has become `previous.ckpt` or, if it was damaged, `damaged-<number>.ckpt`.
     Kept,
     /// The new checkpoint is `latest.ckpt`.
     Published,
@@ -104,7 +105,7 @@ pub enum SaveStep {
 pub struct Checkpoints {
     directory: PathBuf,
     fingerprint: u64,
-    /// Whether `latest.ckpt` is there and whole; `None` before anybody has looked.
+    /// Whether `latest.ckpt` exists and is whole; `None` if that has not been checked.
     latest_is_sound: Option<bool>,
     hook: fn(SaveStep),
 }
@@ -113,11 +114,11 @@ pub struct Checkpoints {
 struct Header {
     fingerprint: u64,
     counters: Counters,
-    /// Name and number count of each section, in the order their numbers follow.
+    /// Name and length of each section, in the order of their numbers.
     sections: Vec<(String, u64)>,
 }
 
-/// What one of the two files turned out to be.
+/// The content of one of the two files.
 enum Found {
     Missing,
     Whole(Checkpoint),
@@ -135,7 +136,7 @@ impl Checkpoints {
         }
     }
 
-    /// Calls `hook` after each step of every later `save`. A seam for crash tests.
+    /// Calls `hook` after each step of every later `save`, for crash tests.
     pub fn on_step(&mut self, hook: fn(SaveStep)) {
         self.hook = hook;
     }
@@ -160,12 +161,12 @@ impl Checkpoints {
             Found::Whole(checkpoint) => {
                 if warnings.is_empty() {
                     warnings.push(format!(
-                        "{}: missing, as after a crash while it was replaced",
+                        "{}: missing, probably after a crash while it was being replaced",
                         latest_path.display()
                     ));
                 }
                 let used = format!(
-                    "going on from {}, after {} updates",
+                    "continuing from {}, after {} updates",
                     previous.display(),
                     checkpoint.counters.updates
                 );
@@ -184,7 +185,7 @@ impl Checkpoints {
         })
     }
 
-    /// Writes a checkpoint. When this returns it is on the disk, and a power loss leaves it or a later one.
+    /// Writes a checkpoint. When this returns it is on the disk: a power loss leaves it or a later one.
     pub fn save(&mut self, counters: &Counters, sections: &[(&str, &[f32])]) -> Result<(), CheckpointError> {
         let prepared = self.prepare(counters, sections)?;
         (self.hook)(SaveStep::Prepared);
@@ -216,7 +217,7 @@ impl Checkpoints {
         .map_err(|source| CheckpointError::Write { path, source })
     }
 
-    /// Makes room for a new `latest.ckpt`: a whole one becomes the previous one, a damaged one is put aside.
+    /// Frees the name `latest.ckpt`: a whole one becomes the previous one, a damaged one is put aside.
     fn keep_latest(&mut self) -> Result<(), CheckpointError> {
         let latest = self.directory.join(LATEST);
         let sound = match self.latest_is_sound {
@@ -234,7 +235,7 @@ impl Checkpoints {
                 path: latest,
                 source: error,
             }),
-            // In this order on the disk too: the new one must not replace the old one before that has its other name.
+            // Synced to keep this order on the disk: the old one must have its new name before it is replaced.
             _ => sync_directory_of(&latest).map_err(|source| CheckpointError::Write { path: latest, source }),
         }
     }
@@ -288,11 +289,11 @@ impl Checkpoints {
     }
 }
 
-/// More updates, rows and versions than any run will have, and far from overflowing when they are counted on.
+/// No run reaches this many updates, rows, episodes or versions, and counting on from here does not overflow.
 const LIMIT: u64 = 1 << 60;
 
-/// Splits a body into its header and the numbers of each section; `None` unless it is used up exactly and a run can have
-/// come so far.
+/// Splits a body into its header and the numbers of each section; `None` unless the lengths add up to the body's and
+/// all counters are below `LIMIT`.
 fn parse(body: &[u8]) -> Option<(Header, Vec<Vec<f32>>)> {
     let (header, read): (Header, usize) = bincode::serde::decode_from_slice(body, encoding()).ok()?;
     let (mut rest, odd) = body.get(read..)?.as_chunks::<{ size_of::<f32>() }>();
@@ -314,7 +315,7 @@ fn parse(body: &[u8]) -> Option<(Header, Vec<Vec<f32>>)> {
     (rest.is_empty() && odd.is_empty()).then_some((header, sections))
 }
 
-/// The limit keeps a count that no checkpoint has from asking for memory.
+/// The limit keeps an absurd length from allocating memory.
 fn encoding() -> impl Config {
     config::standard().with_fixed_int_encoding().with_limit::<{ 1 << 16 }>()
 }

@@ -10,7 +10,7 @@ use shoal_common::report::{Activity, EvaluatedReport};
 use super::learner::Learner;
 use super::settings::LearnerError;
 
-/// What is known of the evaluator's work.
+/// The evaluator's progress, as far as the learner knows it.
 pub(crate) struct EvaluationWait {
     reports: Reports<EvaluatedReport>,
     /// The period of the policy evaluated last.
@@ -25,12 +25,13 @@ impl EvaluationWait {
         })
     }
 
-    /// Waits until a policy of this period is evaluated, the one just published if none was before, but no longer than
-    /// `patience`. An evaluator that dies over it has a successor, which is given the same policy.
+    /// Waits until a policy of the current period has been evaluated, but no longer than `timeout`. If none has been,
+    /// that is the policy just published. If the evaluator dies during the evaluation, its successor evaluates the same
+    /// policy.
     pub(crate) fn wait(
         &mut self,
         learner: &mut Learner<'_>,
-        patience: Option<Duration>,
+        timeout: Option<Duration>,
     ) -> Result<(), Exit<LearnerError>> {
         let due = Some(learner.settings.config.evaluation.period(learner.rows));
         let Learner {
@@ -51,12 +52,12 @@ impl EvaluationWait {
                 while let Some(report) = self.reports.receive()? {
                     self.evaluated_period = self.evaluated_period.max(Some(report.period));
                 }
-                let waited = patience.is_some_and(|patience| begun.elapsed() >= patience);
-                Ok((self.evaluated_period >= due || waited).then_some(()))
+                let timed_out = timeout.is_some_and(|timeout| begun.elapsed() >= timeout);
+                Ok((self.evaluated_period >= due || timed_out).then_some(()))
             },
             || {
                 heartbeat.beat(Activity::WaitingForPeer);
-                publisher.look_after()
+                publisher.refresh_connections()
             },
         );
         waited.map_err(Exit::widen)

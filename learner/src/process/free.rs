@@ -1,4 +1,4 @@
-//! The free run: takes chunks as they come and updates as often as they allow.
+//! The free run: takes chunks as they arrive and updates as often as the ratio allows.
 
 use std::time::{Duration, Instant};
 
@@ -10,23 +10,25 @@ use super::learner::Learner;
 use super::ratio::Ratio;
 use super::settings::LearnerError;
 
-/// Updates from one publication to the next. Publishing copies the actor's weights once: about a thirtieth of an update.
+/// Updates between two publications of the policy. Publishing copies the policy's weights once, about a thirtieth of an
+/// update.
 const PUBLISH_EVERY: u64 = 4;
 
-/// Chunks of an actor that are taken in before updates get their turn.
+/// Chunks of each actor that are taken at most before the next update.
 const CHUNKS_AT_ONCE: u32 = 8;
 
-/// How long an idle learner sleeps before it looks after its connections.
-const NAP: Duration = Duration::from_millis(50);
+/// How long an idle learner sleeps before it refreshes its connections.
+const IDLE_WAIT: Duration = Duration::from_millis(50);
 
-/// How long the evaluator may take over the last policy. Only a learner can give it to an evaluator that has come since.
+/// How long the learner waits for the evaluation of the last policy. A restarted evaluator can get that policy only
+/// from a live learner.
 const LAST_EVALUATION: Duration = Duration::from_secs(5);
 
 pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
     let ratio = Ratio::from(&learner.settings.config.replay);
     let every = Duration::from_secs_f64(learner.settings.config.checkpoint.every_seconds);
     let mut saved = Instant::now();
-    // After a crash the replay is ahead of the checkpoint: those rows count.
+    // After a crash the replay is ahead of the checkpoint. Those rows count.
     learner.count_rows(learner.replay.head());
     loop {
         if learner.stop.requested() {
@@ -34,7 +36,8 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
         }
         learner.connect_new_actors()?;
         let updates = learner.updates();
-        // A power loss may leave a replay of many rows without one that can be read: new ones have to come first.
+        // After a power loss the replay may have had many rows of which none is readable. Then new rows must come
+        // first.
         let drained = learner.intake.drain(&mut learner.replay, CHUNKS_AT_ONCE, |replay| {
             !replay.rows().is_empty() && ratio.is_behind(replay.head(), updates)
         })?;
@@ -45,10 +48,10 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
             if learner.updates().is_multiple_of(PUBLISH_EVERY) {
                 learner.publish()?;
             }
-            learner.tell(Activity::Working);
+            learner.report_activity(Activity::Working);
         } else if learner.has_all_rows() {
             learner.publish()?;
-            learner.announce();
+            learner.notify_all();
             return EvaluationWait::new(learner)?.wait(learner, Some(LAST_EVALUATION));
         } else {
             let activity = if learner.rows < ratio.warmup {
@@ -57,9 +60,9 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
                 Activity::WaitingForRatio
             };
             if !drained {
-                learner.listener.wait(NAP)?;
+                learner.listener.wait(IDLE_WAIT)?;
             }
-            learner.look_after(activity)?;
+            learner.refresh_connections(activity)?;
         }
         if saved.elapsed() >= every {
             learner.save()?;

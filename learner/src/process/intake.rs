@@ -1,4 +1,4 @@
-//! Takes the actors' chunks into the replay, each exactly once.
+//! Receives the actors' chunks and appends them to the replay, each exactly once.
 
 use shoal_common::channel::transitions::{ChunkReceiver, ReceivedChunk};
 use shoal_common::channel::{ChannelError, Domain, EventName, Notifier};
@@ -7,31 +7,31 @@ use shoal_common::transition::ChunkLayout;
 
 use crate::replay::{Appended, ChunkError, Replay};
 
-/// Why a chunk was not taken in.
+/// Why a chunk was not appended.
 #[derive(Debug, thiserror::Error)]
 pub enum IntakeError {
-    /// The channel does not work.
+    /// The channel failed.
     #[error(transparent)]
     Channel(#[from] ChannelError),
-    /// The chunk is none of this run.
-    #[error("actor {actor} sent a chunk that is none of this run: {cause}")]
+    /// The chunk does not belong to this run.
+    #[error("actor {actor} sent a chunk that does not belong to this run: {cause}")]
     Chunk {
-        /// Who sent it.
+        /// The actor that sent it.
         actor: usize,
         /// What is wrong with it.
         cause: ChunkError,
     },
 }
 
-/// The receiving ends of all actors.
+/// The receivers of all actors' chunks.
 #[derive(Debug)]
 pub struct Intake {
     sources: Vec<Source>,
     chunk: ChunkLayout,
     window: u32,
-    /// Rows after which nothing more is taken.
+    /// The number of rows after which no more are taken.
     limit: u64,
-    /// Whose turn it is. Kept from one call to the next: a learner that takes one chunk at a time must not take all of
+    /// The actor whose turn it is. Kept between calls: a learner that takes one chunk at a time must not take all of
     /// them from the first actor.
     turn: usize,
 }
@@ -39,14 +39,14 @@ pub struct Intake {
 #[derive(Debug)]
 struct Source {
     receiver: ChunkReceiver,
-    listener: Notifier,
+    notifier: Notifier,
 }
 
 impl Intake {
-    /// Opens the receiving ends of actors `0 .. actors`; nothing is taken beyond `limit` rows.
+    /// Opens the receivers for actors `0 .. actors`. No rows are taken beyond `limit`.
     ///
     /// # Errors
-    /// When shared memory cannot be had, or another learner lives.
+    /// When shared memory is unavailable, or another learner is alive.
     pub fn open(
         domain: &Domain,
         actors: u32,
@@ -61,35 +61,35 @@ impl Intake {
             limit,
             turn: 0,
         };
-        intake.widen(domain, actors)?;
+        intake.open_receivers(domain, actors)?;
         Ok(intake)
     }
 
-    /// Opens the receiving ends of actors `0 .. actors` where they are not open yet. None is ever closed: an actor that
-    /// has retired costs a look, and may come back.
+    /// Opens the receivers for actors `0 .. actors` that are not open yet. None is ever closed: that of a retired actor
+    /// costs little, and the actor may come back.
     ///
     /// # Errors
     /// As `open`.
-    pub fn widen(&mut self, domain: &Domain, actors: u32) -> Result<(), ChannelError> {
+    pub fn open_receivers(&mut self, domain: &Domain, actors: u32) -> Result<(), ChannelError> {
         for actor in self.sources.len() as u32..actors {
             self.sources.push(Source {
                 receiver: ChunkReceiver::open(domain, actor, self.chunk, self.window)?,
-                listener: Notifier::new(domain, EventName(Role::Actor, actor))?,
+                notifier: Notifier::new(domain, EventName(Role::Actor, actor))?,
             });
         }
         Ok(())
     }
 
-    /// How many actors there are.
+    /// The number of actors with an open receiver.
     pub fn actors(&self) -> usize {
         self.sources.len()
     }
 
-    /// Takes chunks in turn, one of each actor at a time, until none is waiting, there were `most` of each, or `enough`
-    /// says so of the replay. Returns whether there was any.
+    /// Takes one chunk of each actor in turn, until none is waiting, `most` of each were taken, or `enough` returns
+    /// true. Returns whether any chunk was taken.
     ///
     /// # Errors
-    /// When a channel does not work or a chunk is none of this run.
+    /// When a channel fails, or a chunk does not belong to this run.
     pub fn drain(
         &mut self,
         replay: &mut Replay,
@@ -112,37 +112,37 @@ impl Intake {
         Ok(any)
     }
 
-    /// Takes the next chunk of one actor, whether it is new or was committed before.
+    /// Takes the next chunk of one actor, which is new or was committed before.
     ///
     /// # Errors
-    /// When the channel does not work or the chunk is none of this run.
+    /// When the channel fails, or the chunk does not belong to this run.
     pub fn take_from(&self, actor: usize, replay: &mut Replay) -> Result<Option<Appended>, IntakeError> {
         let source = &self.sources[actor];
         let Some(chunk) = source.receiver.receive()? else {
             return Ok(None);
         };
-        let room = (self.limit - replay.head()).min(chunk.header().rows.into()) as usize * self.chunk.row.width();
-        let appended = append(replay, actor, &chunk, room)?;
+        let accepted = (self.limit - replay.head()).min(chunk.header().rows.into()) as usize * self.chunk.row.width();
+        let appended = append(replay, actor, &chunk, accepted)?;
         drop(chunk);
-        source.listener.notify();
+        source.notifier.notify();
         Ok(Some(appended))
     }
 
-    /// Rings every actor's bell: there is a policy to go on with.
-    pub fn ring_all(&self) {
-        self.sources.iter().for_each(|source| source.listener.notify());
+    /// Notifies every actor that there is a new policy.
+    pub fn notify_all(&self) {
+        self.sources.iter().for_each(|source| source.notifier.notify());
     }
 }
 
-fn append(replay: &mut Replay, actor: usize, chunk: &ReceivedChunk, room: usize) -> Result<Appended, IntakeError> {
+fn append(replay: &mut Replay, actor: usize, chunk: &ReceivedChunk, numbers: usize) -> Result<Appended, IntakeError> {
     let mark = chunk.mark(replay.committed(actor).mark);
     let refused = |cause| IntakeError::Chunk { actor, cause };
     let Some(reserved) = replay.begin(actor, mark).map_err(refused)? else {
         return Ok(Appended::Duplicate);
     };
-    let filled = reserved.fill(&chunk.rows()[..room]).map_err(refused)?;
-    match chunk.standing() {
-        Some(words) => filled.standing(&words).commit(),
+    let filled = reserved.fill(&chunk.rows()[..numbers]).map_err(refused)?;
+    match chunk.actor_snapshot() {
+        Some(words) => filled.with_snapshot(&words).commit(),
         None => filled.commit(),
     }
     Ok(Appended::Accepted)

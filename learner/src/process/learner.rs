@@ -1,4 +1,4 @@
-//! What free and lockstep runs share: the learner with its replay, its method, its channels and its checkpoints.
+//! The learner that free and lockstep runs share, with its replay, method, channels and checkpoints.
 
 use std::io;
 use std::thread::JoinHandle;
@@ -22,16 +22,16 @@ use crate::replay::{Replay, SyncedRows};
 
 const REPORT_INTERVAL: Duration = Duration::from_millis(500);
 
-/// How often the learner looks whether there are actors that it does not listen to yet.
-const ROLL_CALL: Duration = Duration::from_millis(100);
+/// How often the learner looks for actors that it has no receiver for yet.
+const NEW_ACTORS_INTERVAL: Duration = Duration::from_millis(100);
 
-/// How long nothing must have come before the end for the learner to believe that everything has.
-const QUIET: Duration = Duration::from_millis(200);
+/// At the end, the learner takes chunks until none has arrived for this long.
+const QUIET_TIME: Duration = Duration::from_millis(200);
 
-/// How long it takes in at most what the actors have sent before the end.
-const LAST_CHUNKS: Duration = Duration::from_secs(2);
+/// At the end, the learner takes chunks for no longer than this.
+const LAST_CHUNKS_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// A learner at work.
+/// A running learner.
 pub(crate) struct Learner<'a> {
     pub(crate) domain: &'a Domain,
     pub(crate) settings: &'a LearnerSettings,
@@ -40,9 +40,10 @@ pub(crate) struct Learner<'a> {
     pub(crate) replay: Replay,
     pub(crate) intake: Intake,
     pub(crate) heartbeat: HeartbeatSender,
-    /// Rows that updates have been allowed by. In a free run, the replay's head; in lockstep, the rows of whole rounds.
+    /// Environment steps that count for the ratio: in a free run the replay's head, in lockstep the rows of complete
+    /// rounds.
     pub(crate) rows: u64,
-    /// Episodes that end within them.
+    /// Episodes that end within these steps.
     episodes: u64,
     algorithm: Box<dyn Algorithm>,
     pub(crate) publisher: PolicyPublisher,
@@ -54,7 +55,7 @@ pub(crate) struct Learner<'a> {
     report: LearnerReport,
     reported: Instant,
     heartbeats: Reports<Heartbeat>,
-    called: Instant,
+    looked_for_actors: Instant,
 }
 
 impl<'a> Learner<'a> {
@@ -81,14 +82,14 @@ impl<'a> Learner<'a> {
                 let counters = loaded.checkpoint.counters;
                 algorithm.restore(counters.updates, &mut SavedState::from(loaded.checkpoint.sections))?;
                 tracing::info!(
-                    "going on after {} updates and {} of {} rows",
+                    "continuing after {} updates and {} of {} rows",
                     counters.updates,
                     counters.rows,
                     replay.head()
                 );
                 if replay.head() < counters.rows {
                     tracing::warn!(
-                        "{} has {} rows, and its checkpoint was made with {}: those are collected again",
+                        "{} has {} rows, but the checkpoint was made with {}: the missing rows are collected again",
                         file.display(),
                         replay.head(),
                         counters.rows
@@ -117,7 +118,7 @@ impl<'a> Learner<'a> {
             reported: Instant::now(),
             sync: None,
             heartbeats: Reports::open(domain)?,
-            called: Instant::now(),
+            looked_for_actors: Instant::now(),
             domain,
             settings,
             stop,
@@ -134,12 +135,12 @@ impl<'a> Learner<'a> {
         Ok(learner)
     }
 
-    /// Updates done.
+    /// Gradient steps taken; for methods that use each row once, rows consumed.
     pub(crate) fn updates(&self) -> u64 {
         self.algorithm.updates()
     }
 
-    /// Learns what is due next, on the replay as it was at `self.rows` rows.
+    /// Makes the next update, on the replay as it was after `self.rows` rows.
     pub(crate) fn update(&mut self) -> Result<(), LearnerError> {
         let before = self.updates();
         self.heartbeat.begin_work();
@@ -157,7 +158,7 @@ impl<'a> Learner<'a> {
         Ok(())
     }
 
-    /// Rows that updates are allowed by from now on, and the episodes that end within them.
+    /// Sets the environment steps that count for the ratio, and counts the episodes that end within them.
     pub(crate) fn count_rows(&mut self, rows: u64) {
         let newest = self.rows.max(self.replay.rows().start)..rows;
         let layout = self.replay.layout().row;
@@ -166,7 +167,7 @@ impl<'a> Learner<'a> {
         self.rows = rows;
     }
 
-    /// Whether the steps are taken that were to be taken, or the episodes.
+    /// Whether all environment steps of the run, or all its episodes, have been collected.
     pub(crate) fn has_all_rows(&self) -> bool {
         self.settings.config.run.has_all_steps(self.rows, self.episodes)
     }
@@ -188,25 +189,26 @@ impl<'a> Learner<'a> {
         Ok(self.publisher.publish(self.algorithm.policy(), header)?)
     }
 
-    /// Listens to actors that have come since: a run is scaled while it goes on.
+    /// Opens receivers for new actors: a run can be scaled while it is running.
     pub(crate) fn connect_new_actors(&mut self) -> Result<(), LearnerError> {
-        if self.called.elapsed() < ROLL_CALL {
+        if self.looked_for_actors.elapsed() < NEW_ACTORS_INTERVAL {
             return Ok(());
         }
-        self.called = Instant::now();
+        self.looked_for_actors = Instant::now();
         while let Some(heartbeat) = self.heartbeats.receive()? {
             if heartbeat.role() == Some(Role::Actor) && heartbeat.index < self.settings.config.actors.max {
-                self.intake.widen(self.domain, heartbeat.index + 1)?;
+                self.intake.open_receivers(self.domain, heartbeat.index + 1)?;
             }
         }
         Ok(())
     }
 
-    /// Takes in what the actors had sent when the end came, whatever the ratio says: its updates are for who goes on.
-    pub(crate) fn take_the_last(&mut self) -> Result<(), LearnerError> {
+    /// Takes the chunks that the actors sent before the end, regardless of the ratio. A resumed run makes the updates
+    /// that they allow.
+    pub(crate) fn take_last_chunks(&mut self) -> Result<(), LearnerError> {
         let begun = Instant::now();
         let mut quiet = begun;
-        while quiet.elapsed() < QUIET && begun.elapsed() < LAST_CHUNKS {
+        while quiet.elapsed() < QUIET_TIME && begun.elapsed() < LAST_CHUNKS_TIMEOUT {
             if self.intake.drain(&mut self.replay, u32::MAX, |_| false)? {
                 quiet = Instant::now();
             } else {
@@ -217,21 +219,21 @@ impl<'a> Learner<'a> {
         Ok(())
     }
 
-    /// Wakes everyone who may be waiting for a policy.
-    pub(crate) fn announce(&self) {
-        self.intake.ring_all();
+    /// Notifies the actors and the evaluator, which may be waiting for a policy.
+    pub(crate) fn notify_all(&self) {
+        self.intake.notify_all();
         self.evaluator.notify();
     }
 
-    /// Renews connections and lets the launcher know what the learner waits for.
-    pub(crate) fn look_after(&mut self, activity: Activity) -> Result<(), LearnerError> {
-        self.publisher.look_after()?;
-        self.tell(activity);
+    /// Refreshes connections and reports to the launcher what the learner waits for.
+    pub(crate) fn refresh_connections(&mut self, activity: Activity) -> Result<(), LearnerError> {
+        self.publisher.refresh_connections()?;
+        self.report_activity(activity);
         Ok(())
     }
 
-    /// Reports, if it is time to.
-    pub(crate) fn tell(&mut self, activity: Activity) {
+    /// Sends a heartbeat and, if it is time, a report.
+    pub(crate) fn report_activity(&mut self, activity: Activity) {
         self.heartbeat.set_policy_version(self.policy_version);
         self.heartbeat.beat(activity);
         if self.reported.elapsed() >= REPORT_INTERVAL {
@@ -250,12 +252,12 @@ impl<'a> Learner<'a> {
         report.episodes = self.episodes;
         report.updates = self.algorithm.updates();
         report.policy_version = self.policy_version;
-        self.reporter.look_after();
+        self.reporter.refresh_connections();
         self.reporter.send(report);
     }
 
-    /// Saves the state. The replay is brought to the disk by and by, in lockstep before: there the state is worth nothing
-    /// without its rows.
+    /// Saves a checkpoint. A free run syncs the replay in the background. A lockstep run flushes it first, because
+    /// there a checkpoint is useless without its rows.
     pub(crate) fn save(&mut self) -> Result<(), LearnerError> {
         if self.settings.config.run.mode == Mode::Lockstep {
             self.replay.flush()?;
@@ -264,11 +266,9 @@ impl<'a> Learner<'a> {
             let pending = self.replay.start_sync()?;
             self.sync = match std::thread::Builder::new().name("sync".into()).spawn(|| pending.run()) {
                 Ok(thread) => Some(thread),
-                // The next checkpoint brings these rows to the disk too.
+                // The next checkpoint syncs these rows too.
                 Err(cause) => {
-                    tracing::warn!(
-                        "the replay is not brought to the disk this time: no thread can be started: {cause}"
-                    );
+                    tracing::warn!("the replay is not synced with this checkpoint: cannot start a thread: {cause}");
                     None
                 }
             };
@@ -285,7 +285,7 @@ impl<'a> Learner<'a> {
     fn end_sync(&mut self) {
         match self.sync.take().map(JoinHandle::join) {
             Some(Ok(Ok(synced))) => self.replay.finish_sync(synced),
-            Some(Ok(Err(cause))) => tracing::warn!("the replay could not be brought to the disk: {cause}"),
+            Some(Ok(Err(cause))) => tracing::warn!("cannot sync the replay: {cause}"),
             Some(Err(panic)) => std::panic::resume_unwind(panic),
             None => {}
         }

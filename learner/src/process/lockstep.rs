@@ -1,8 +1,8 @@
-//! The lockstep run: the same seed and actor count give the same bits, whatever the timing.
+//! The lockstep run: the same seed and actor count give the same bits with any timing.
 //!
 //! Round k takes chunk k of actor 0, 1, …, N − 1, all collected with policy version k − 1, does the updates they allow,
-//! and publishes version k. A learner that goes on from a checkpoint finds the rows of the rounds since then in the
-//! replay and does the same updates again.
+//! and publishes version k. A learner that continues from a checkpoint finds the rows of the rounds since then in the
+//! replay, and repeats the same updates.
 
 use shoal_common::algorithms::Experience;
 use shoal_common::channel::wait_for;
@@ -27,7 +27,7 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
     if learner.updates() == 0 {
         learner.save()?;
     }
-    learner.announce();
+    learner.notify_all();
     evaluation_wait.wait(learner, None)?;
     while !learner.has_all_rows() {
         let (before, updates) = (learner.rows, learner.updates());
@@ -35,14 +35,14 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
         for actor in 0..learner.intake.actors() {
             rows = await_chunk(learner, actor, rows)?;
         }
-        // Only now: whoever is interrupted within a round goes on from its beginning.
+        // Only now, so that a round that is interrupted begins again.
         learner.count_rows(rows);
         while learner.updates() < ratio.allowed(learner.rows) {
             learner.update()?;
-            learner.tell(Activity::Working);
+            learner.report_activity(Activity::Working);
         }
         learner.publish()?;
-        learner.announce();
+        learner.notify_all();
         evaluation_wait.wait(learner, None)?;
         if learner.updates() / interval > updates / interval {
             learner.save()?;
@@ -69,7 +69,7 @@ fn await_chunk(learner: &mut Learner<'_>, actor: usize, first: u64) -> Result<u6
             heartbeat,
             ..
         } = learner;
-        // The inner result is what is wrong with the chunk, the outer one what is wrong with waiting for it.
+        // The inner error is about the chunk, the outer one about the wait for it.
         let taken = wait_for(
             listener,
             stop,
@@ -79,16 +79,16 @@ fn await_chunk(learner: &mut Learner<'_>, actor: usize, first: u64) -> Result<u6
             },
             || {
                 heartbeat.beat(Activity::WaitingForPeer);
-                publisher.look_after()
+                publisher.refresh_connections()
             },
         );
         taken.map_err(Exit::widen)??;
-        learner.tell(Activity::Working);
+        learner.report_activity(Activity::Working);
     }
 }
 
-/// The row after the chunk that begins at row `first`, if it is in the replay: a chunk is full, or one whole episode, or
-/// was cut off where the run's steps end.
+/// The row after the chunk that begins at row `first`, if that chunk is in the replay. A chunk is full, is one episode,
+/// or ends with the last environment step of the run.
 fn end_of_chunk(learner: &Learner<'_>, first: u64) -> Option<u64> {
     let Learner { settings, replay, .. } = learner;
     let (config, steps) = (&settings.config, settings.config.run.steps);

@@ -1,15 +1,16 @@
-//! Updates per environment step, kept from both sides.
+//! The ratio of updates to environment steps. Neither the learner nor the actors may get ahead of it.
 
 use shoal_common::config;
 
-/// How many updates the rows collected so far allow.
+/// How many updates the environment steps collected so far allow. An update is a gradient step or, for methods that use
+/// each row once, a row.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Ratio {
-    /// Rows before the first update.
+    /// Environment steps before the first update.
     pub warmup: u64,
-    /// Updates for each row beyond the warm-up.
+    /// Updates for each environment step after the warm-up.
     pub updates_per_step: f64,
-    /// Rows by which the actors may be ahead.
+    /// Environment steps by which the actors may be ahead.
     pub tolerance: u64,
 }
 
@@ -24,12 +25,12 @@ impl From<&config::ReplayConfig> for Ratio {
 }
 
 impl Ratio {
-    /// Updates that may have been done when the replay has seen `rows` rows.
+    /// How many updates are allowed in total after `rows` environment steps.
     pub fn allowed(&self, rows: u64) -> u64 {
         (rows.saturating_sub(self.warmup) as f64 * self.updates_per_step) as u64
     }
 
-    /// Whether so many more rows are waiting for their updates that the learner should take no further ones.
+    /// Whether the learner is behind by more than the tolerance, so that it should take no more rows.
     pub fn is_behind(&self, rows: u64, updates: u64) -> bool {
         rows.saturating_sub(self.tolerance) > self.warmup && self.allowed(rows - self.tolerance) > updates
     }
@@ -40,7 +41,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn neither_side_gets_further_ahead_than_agreed() {
+    fn neither_side_gets_ahead_by_more_than_the_tolerance() {
         let ratio = Ratio {
             warmup: 100,
             updates_per_step: 0.5,

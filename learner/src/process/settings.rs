@@ -1,4 +1,4 @@
-//! What a learner is told, and why it may not be able to go on.
+//! A learner's settings and its errors.
 
 use std::path::PathBuf;
 
@@ -16,7 +16,7 @@ use crate::algorithms::registry;
 use crate::networks::threads::ThreadsError;
 use crate::replay::{ReplayError, ReplayLayout};
 
-/// What a learner is told.
+/// The settings of a learner.
 #[derive(Clone, Debug)]
 pub struct LearnerSettings {
     /// Which process this is.
@@ -29,13 +29,13 @@ pub struct LearnerSettings {
     pub evaluated_period: Option<u64>,
 }
 
-/// Why a learner cannot go on.
+/// Why a learner fails.
 #[derive(Debug, thiserror::Error)]
 pub enum LearnerError {
-    /// A channel does not work.
+    /// A channel failed.
     #[error(transparent)]
     Channel(#[from] ChannelError),
-    /// An actor sent what cannot be used.
+    /// An actor sent a chunk that cannot be used.
     #[error(transparent)]
     Intake(#[from] IntakeError),
     /// The replay cannot be used.
@@ -44,26 +44,26 @@ pub enum LearnerError {
     /// A checkpoint cannot be read or written.
     #[error(transparent)]
     Checkpoint(#[from] CheckpointError),
-    /// A checkpoint is of another program.
+    /// A checkpoint was written by another version of the program.
     #[error(transparent)]
     Section(#[from] SectionError),
     /// The algorithm cannot control the environment.
     #[error(transparent)]
     Algorithm(#[from] PolicyError),
-    /// There is no second thread.
+    /// The second thread cannot be started.
     #[error(transparent)]
     Threads(#[from] ThreadsError),
-    /// The policy cannot be left behind.
+    /// The last policy cannot be written.
     #[error(transparent)]
     PolicyFile(#[from] PolicyFileError),
-    /// The weights are no numbers any more.
+    /// The losses are no longer finite.
     #[error("the losses are no longer finite after {updates} updates: lower the learning rates or the rewards' scale")]
     Diverged {
-        /// Updates done.
+        /// Gradient steps taken; for methods that use each row once, rows consumed.
         updates: u64,
     },
-    /// A lockstep run needs rows again that the ring has lost.
-    #[error("{path}: the rows before row {needed} are gone, which the checkpoint needs again; start a new run")]
+    /// A lockstep run must repeat updates on rows that the ring no longer holds.
+    #[error("{path}: some rows from row {needed} on are gone, and the checkpoint needs them again; start a new run")]
     RowsLost {
         /// The replay.
         path: PathBuf,
@@ -72,27 +72,28 @@ pub enum LearnerError {
     },
 }
 
-/// Why the files of a run cannot have a size.
+/// Why the files of a run would be too large.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum SizeError {
     /// The replay would be larger than a file can be.
-    #[error("replay.capacity = {capacity}: no file can be so large; remember less")]
+    #[error("replay.capacity = {capacity}: no file can be that large; reduce it")]
     Replay {
         /// Transitions that it should hold.
         capacity: u64,
     },
     /// All files together would be larger than can be counted.
-    #[error("the run's files would have more than 2⁶⁴ bytes; remember less (replay.capacity = {capacity})")]
+    #[error("the run's files would have more than 2⁶⁴ bytes; reduce replay.capacity = {capacity}")]
     Sum {
         /// Transitions that the replay should hold.
         capacity: u64,
     },
 }
 
-/// Bytes that the learner's files need on the disk beyond what is there already, for a run in the directory `run`.
+/// Bytes that the learner's files need on the disk, for a run in the directory `run`. A replay that exists already is
+/// not counted.
 ///
 /// # Errors
-/// When a replay so large is not possible.
+/// When the files would be too large.
 pub fn disk_bytes(config: &Config, run: &RunDir) -> Result<u64, SizeError> {
     let capacity = config.replay.capacity;
     let replay = if run.replay_file().exists() {
@@ -102,7 +103,8 @@ pub fn disk_bytes(config: &Config, run: &RunDir) -> Result<u64, SizeError> {
         places.end as u64
     };
     let (_, policy) = config.algorithm.settings().learned(&config.spec).policy;
-    // The latest, the one before it, and the next one while it is written; the best policy and the last likewise.
+    // Three checkpoints: the latest, the one before, and the next one while it is written. Three policies: the best,
+    // the last, and one while it is written.
     let numbers = 3 * (registry::state_numbers(config) + policy.parameters()) as u64;
     let sum = numbers
         .checked_mul(size_of::<f32>() as u64)
@@ -110,7 +112,7 @@ pub fn disk_bytes(config: &Config, run: &RunDir) -> Result<u64, SizeError> {
     sum.ok_or(SizeError::Sum { capacity })
 }
 
-/// What the replay of a run holds.
+/// The layout of a run's replay.
 pub(super) fn replay_layout(config: &Config) -> ReplayLayout {
     let chunk = config.chunk_layout();
     ReplayLayout {
@@ -122,20 +124,20 @@ pub(super) fn replay_layout(config: &Config) -> ReplayLayout {
     }
 }
 
-/// Rows the ring holds: the sampling window, and in lockstep the rows of two checkpoint intervals beyond it, because a learner
-/// that goes on from a checkpoint samples them again.
+/// Rows in the ring: the sampling window and, in lockstep, the rows of two checkpoint intervals and two rounds, because
+/// a learner that continues from a checkpoint samples them again.
 fn ring_rows(config: &Config) -> u64 {
     let chunk = config.chunk_rows() as u64;
     let slack = match config.run.mode {
         Mode::Free => 0,
         Mode::Lockstep => {
-            // Without updates there are no checkpoints to go back to.
+            // Without updates there are no checkpoints to continue from.
             let interval = config.checkpoint.every_updates as f64 / config.replay.updates_per_step;
             let rows = if interval.is_finite() { 2.0 * interval } else { 0.0 };
             let round = chunk * u64::from(config.actors.count);
             (rows as u64).saturating_add(2 * round)
         }
     };
-    // A ring must have room for a chunk, however small the window.
+    // The ring must hold a chunk even if the window is smaller.
     config.replay.capacity.saturating_add(slack).max(chunk)
 }

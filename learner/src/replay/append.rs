@@ -1,4 +1,4 @@
-//! How a chunk becomes part of the replay: reserved, filled, committed, each step a type that the next one consumes.
+//! Appending a chunk in three steps: reserved, filled, committed. Each step is a type that the next one consumes.
 
 use std::sync::atomic::{Ordering, compiler_fence, fence};
 
@@ -8,12 +8,12 @@ use super::error::ChunkError;
 use super::step::{WriteStep, observe};
 use super::store::Replay;
 
-/// What became of a chunk.
+/// The result of appending a chunk.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Appended {
-    /// It is committed now.
+    /// It is now committed.
     Accepted,
-    /// It, or a later one of its actor, had been committed before; nothing was done.
+    /// It, or a later chunk of its actor, was committed before; nothing was done.
     Duplicate,
 }
 
@@ -26,7 +26,7 @@ pub struct Reserved<'a> {
     mark: ChunkMark,
 }
 
-/// A chunk whose rows stand in the ring, beyond what is committed.
+/// A chunk whose rows are in the ring but not committed.
 #[must_use = "nothing is in the replay before `commit`"]
 #[derive(Debug)]
 pub struct Filled<'a> {
@@ -35,11 +35,11 @@ pub struct Filled<'a> {
 }
 
 impl Replay {
-    /// Starts a chunk, or gives `None` if it or a later one of its actor was committed before.
+    /// Starts a chunk. Returns `None` if it or a later one of its actor was committed before.
     ///
     /// # Errors
-    /// When the actor is unknown, or the chunk is not the one that comes next: that has the next sequence number of the same
-    /// incarnation, or is a later incarnation's first, which has no rows and leaves the sequence as it is.
+    /// When the actor is unknown, or the chunk is not the next one. The next one has the same incarnation and the next
+    /// sequence number, or it is the first of a later incarnation, which has no rows and keeps the sequence number.
     pub fn begin(&mut self, actor: usize, mark: ChunkMark) -> Result<Option<Reserved<'_>>, ChunkError> {
         let actors = self.layout.actors;
         if actor >= actors {
@@ -72,7 +72,7 @@ impl Replay {
 }
 
 impl<'a> Reserved<'a> {
-    /// Copies the chunk's rows into the ring, over the oldest ones. On error nothing was touched.
+    /// Copies the chunk's rows into the ring, over the oldest ones. On an error nothing has changed.
     pub fn fill(self, numbers: &[f32]) -> Result<Filled<'a>, ChunkError> {
         let Replay {
             layout,
@@ -100,25 +100,26 @@ impl<'a> Reserved<'a> {
             });
         }
         let head = record.head();
-        // Before the first row is overwritten, so that who opens the file after a kill knows why those rows are gone.
-        words.store(places.reach, head + rows);
+        // Set before the first row is overwritten: after a kill, recovery sees by it why these rows are gone.
+        words.store(places.write_horizon, head + rows);
         record.set_tail(record.tail().max((head + rows).saturating_sub(layout.ring)));
         compiler_fence(Ordering::SeqCst);
-        observe(hook, WriteStep::ReachSet);
+        observe(hook, WriteStep::WriteHorizonSet);
         ring.put(head, numbers, |step| observe(hook, step));
-        // The rows stand in the file before a record can name them: for the file's sake, no reader looks at rows.
+        // The rows are in the file before a record names them. This is for recovery: no reader reads rows.
         fence(Ordering::Release);
         Ok(Filled { chunk: self, rows })
     }
 }
 
 impl Filled<'_> {
-    /// Says where the actor stands after the chunk, in as many words as the layout has; otherwise it stays as it was.
+    /// Sets the actor's snapshot after the chunk, in as many words as the layout has. Without this call, the previous
+    /// snapshot stays.
     ///
     /// # Panics
-    /// As `copy_from_slice` does when there are more or fewer.
-    pub fn standing(self, words: &[u64]) -> Self {
-        self.chunk.replay.record.set_standing(self.chunk.actor, words);
+    /// If there are more or fewer words.
+    pub fn with_snapshot(self, words: &[u64]) -> Self {
+        self.chunk.replay.record.set_actor_snapshot(self.chunk.actor, words);
         self
     }
 

@@ -1,23 +1,23 @@
-//! Errors of the replay, split by what the caller does next.
+//! Errors of the replay, separated by what the caller does next.
 
 use std::io;
 use std::path::PathBuf;
 
 use shoal_common::commit::ChunkMark;
 
-/// Why a replay file was not made, opened or synced. Nothing was overwritten.
+/// Why a replay file was not created, opened or synced. Nothing was overwritten.
 #[derive(Debug, thiserror::Error)]
 pub enum ReplayError {
     /// `create` found a file: open it, or choose another run directory.
-    #[error("{0}: there is a replay already, and it is never overwritten; resume its run or choose another directory")]
+    #[error("{0}: a replay exists already and is never overwritten; resume its run or choose another directory")]
     Exists(PathBuf),
     /// `open` found none.
     #[error("{0}: there is no replay; was the run ever started?")]
     Missing(PathBuf),
-    /// Another process writes it: it has to end first.
+    /// Another process writes it and must end first.
     #[error("{0}: another learner is writing this replay; stop that run first")]
     InUse(PathBuf),
-    /// The file is there and cannot be used.
+    /// The file exists but cannot be used.
     #[error(
         "{path}: the replay cannot be used: {reason}; the file was left as it is: resume with the run's own \
              configuration and program, or move the file away"
@@ -28,7 +28,7 @@ pub enum ReplayError {
         /// What differs or is damaged.
         reason: String,
     },
-    /// No file can be of this layout.
+    /// No file can have this layout.
     #[error("{path}: a replay of {ring} rows for {actors} actors cannot be made; choose another capacity")]
     Impossible {
         /// The file.
@@ -40,8 +40,8 @@ pub enum ReplayError {
     },
     /// The space cannot be reserved.
     #[error(
-        "{path}: the replay needs {bytes} bytes and there is no room for them: {source}; free some space, raise \
-             the limit or make the replay's capacity smaller"
+        "{path}: the replay needs {bytes} bytes and there is not enough space: {source}; free some space, raise \
+             the limit or reduce the replay's capacity"
     )]
     NoSpace {
         /// The file.
@@ -51,7 +51,7 @@ pub enum ReplayError {
         /// The system's reason.
         source: io::Error,
     },
-    /// The system refuses for another reason.
+    /// The system reports another error.
     #[error("{path}: cannot {doing} the replay: {source}")]
     Io {
         /// The file.
@@ -63,32 +63,35 @@ pub enum ReplayError {
     },
 }
 
-/// Why a chunk cannot be part of the replay, now or later: whoever sent it is wrong about the run. Nothing was written.
+/// Why a chunk can never be part of the replay: its sender disagrees with the learner about the run. Nothing was
+/// written.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ChunkError {
-    /// Its actor has no place in the commit record.
-    #[error("a chunk of actor {actor} for a replay of {actors} actors")]
+    /// The commit record has no such actor.
+    #[error("a chunk from actor {actor}, but the replay has {actors} actors")]
     Actor {
         /// The actor's index.
         actor: usize,
-        /// How many there may be.
+        /// How many actors the replay has.
         actors: usize,
     },
     /// It is neither the next chunk of its actor nor the first one of the actor's next incarnation.
     #[error(
-        "chunk {} of incarnation {} from actor {actor}, where chunk {} of incarnation {} was the last one: some are missing",
+        "chunk {} of incarnation {} from actor {actor} after chunk {} of incarnation {}: some between them are missing",
         mark.sequence, mark.incarnation, committed.sequence, committed.incarnation
     )]
     OutOfOrder {
         /// The actor's index.
         actor: usize,
-        /// Which chunk it is.
+        /// The chunk's mark.
         mark: ChunkMark,
-        /// The actor's last committed one.
+        /// The mark of the actor's last committed chunk.
         committed: ChunkMark,
     },
     /// It ends within a row.
-    #[error("a chunk of {numbers} numbers from actor {actor}, which are no whole rows of {width}")]
+    #[error(
+        "a chunk of {numbers} numbers from actor {actor}, which is not a multiple of {width}, the numbers in a row"
+    )]
     Ragged {
         /// The actor's index.
         actor: usize,
@@ -98,13 +101,13 @@ pub enum ChunkError {
         width: usize,
     },
     /// It would overwrite itself.
-    #[error("a chunk of {rows} rows from actor {actor} for a ring of {ring}")]
+    #[error("a chunk of {rows} rows from actor {actor}, but the ring has {ring}")]
     TooLong {
         /// The actor's index.
         actor: usize,
         /// Rows in the chunk.
         rows: u64,
-        /// Rows the ring has room for.
+        /// Rows in the ring.
         ring: u64,
     },
 }

@@ -1,4 +1,4 @@
-//! Making and opening the file: space, rights, lock, and whether it is the file that is meant.
+//! Creates and opens the file: space, permissions, lock, and the check that it is the run's file.
 
 use std::fs::{self, File, OpenOptions, Permissions};
 use std::io::{self, Write};
@@ -15,7 +15,7 @@ use shoal_common::file_lock;
 
 use super::error::ReplayError;
 
-/// Makes an empty replay: under a temporary name, then renamed, so that a file with the replay's name is whole.
+/// Creates an empty replay under a temporary name and renames it, so that a file with the replay's name is whole.
 pub(super) fn create(path: &Path, layout: &ReplayLayout) -> Result<(File, Places), ReplayError> {
     let places = places(path, layout)?;
     if fs::exists(path).map_err(io(path, "look for"))? {
@@ -26,7 +26,7 @@ pub(super) fn create(path: &Path, layout: &ReplayLayout) -> Result<(File, Places
     let temporary = PathBuf::from(temporary);
 
     let mut options = OpenOptions::new();
-    // Not truncated before the lock says that nobody else is making it.
+    // Truncated only under the lock, because another process may be creating it.
     let file = options
         .read(true)
         .write(true)
@@ -48,11 +48,11 @@ pub(super) fn create(path: &Path, layout: &ReplayLayout) -> Result<(File, Places
     }
     let mut record = Record::empty(layout);
     record.set_generation(1);
-    // As committed, and as synced: whatever a power loss destroys later, this one is a state to fall back to.
+    // As committed and as synced, so that a power loss always leaves a state to fall back to.
     for slot in [1, SYNCED] {
         record.store(&mut words, places.slots[slot], |_| ());
     }
-    words.store(places.selector, record.generation());
+    words.store(places.published, record.generation());
     drop(words);
 
     file.sync_all().map_err(io(path, "sync"))?;
@@ -102,9 +102,10 @@ fn places(path: &Path, layout: &ReplayLayout) -> Result<Places, ReplayError> {
     })
 }
 
-/// The lock goes with the open file and its mappings: the kernel drops it when the process is gone, however it went.
+/// Locks the file. The kernel releases the lock with the file's last descriptor and mapping, so also when the process
+/// is killed.
 fn lock(path: &Path, file: &File) -> Result<(), ReplayError> {
-    // A process killed a moment ago, or a child forked and not yet executed, may still hold it.
+    // A process that was just killed, or a forked child before its `exec`, may still hold it.
     match file_lock::lock(file, Duration::from_secs(1)).map_err(io(path, "lock"))? {
         true => Ok(()),
         false => Err(ReplayError::InUse(path.into())),
@@ -118,7 +119,7 @@ fn reserve(path: &Path, file: &File, bytes: u64) -> Result<(), ReplayError> {
         bytes,
         source: source.into(),
     };
-    // Asked for first: beyond the limit the kernel sends SIGXFSZ, which ends a process that has not said otherwise.
+    // Checked first: beyond the limit the kernel sends SIGXFSZ, which by default ends the process.
     if getrlimit(Resource::Fsize).current.is_some_and(|limit| limit < bytes) {
         return Err(no_space(Errno::FBIG));
     }
@@ -133,7 +134,7 @@ fn reserve(path: &Path, file: &File, bytes: u64) -> Result<(), ReplayError> {
     }
 }
 
-/// Reserves by writing, where the file system knows no other way.
+/// Reserves the space by writing zeros, for file systems without `fallocate`.
 fn fill(path: &Path, mut file: &File, bytes: u64) -> Result<(), ReplayError> {
     static ZEROS: [u8; 1 << 16] = [0; 1 << 16];
     let mut left = bytes;
@@ -155,7 +156,8 @@ fn rename_to_new(temporary: &Path, path: &Path) -> Result<(), ReplayError> {
     match renameat_with(CWD, temporary, CWD, path, RenameFlags::NOREPLACE) {
         Ok(()) => Ok(()),
         Err(Errno::EXIST) => Err(ReplayError::Exists(path.into())),
-        // A file system without the flag: `create` has looked, and the temporary name's lock keeps other learners out.
+        // A file system without the flag: `create` has checked the name, and the lock on the temporary file keeps other
+        // learners out.
         Err(Errno::INVAL | Errno::NOSYS) => fs::rename(temporary, path).map_err(io(path, "create")),
         Err(error) => Err(io(path, "create")(error.into())),
     }

@@ -1,16 +1,17 @@
-//! Which of the file's commit records to believe. After a `kill -9` it is the newest, and nothing is lost. After a power
-//! loss any block of the file may be older than any other, and each record is as good as the rows it can show.
+//! Chooses one of the file's commit records. After a `kill -9` it is the newest, and nothing is lost. After a power
+//! loss any block of the file may be older than any other, so records are compared by the rows that are intact under
+//! them.
 
 use shoal_common::commit::{Places, Record, ReplayLayout, SLOTS, SYNCED, Words};
 
 use super::ring::Ring;
 
-/// What the file proves.
+/// The result of the recovery.
 pub(super) struct Found {
     pub(super) record: Record,
-    /// The generation to publish first; its slot is as it should be.
-    pub(super) selector: u64,
-    /// For the record that the caller publishes then: newer than all others, and in the other slot.
+    /// The generation to publish first. Its slot is left as it is.
+    pub(super) first_generation: u64,
+    /// The generation to publish next, with `record`. It is newer than all others and belongs to the other slot.
     pub(super) next_generation: u64,
     pub(super) next_synced: usize,
     pub(super) synced_generation: u64,
@@ -19,10 +20,10 @@ pub(super) struct Found {
 
 const NONE_LEFT: &str = "all of its commit records are damaged";
 
-/// A published generation this far beyond all records is no generation: that word is damaged.
-const FAR: u64 = 1 << 48;
+/// If the published generation is further than this beyond all records, that word is damaged.
+const MAX_DISTANCE: u64 = 1 << 48;
 
-/// A record that was written to the end, and the first of the rows before its head that are all intact.
+/// A sealed record. The rows from `tail` to its head are intact.
 struct Candidate<'a> {
     slot: usize,
     record: &'a Record,
@@ -30,8 +31,8 @@ struct Candidate<'a> {
 }
 
 impl Candidate<'_> {
-    /// Greater is better. A power loss must not cost a row that was synced: they count first. Rows before `replaced` count
-    /// for nothing.
+    /// Greater is better. Synced rows count first, because a power loss must not lose any of them. Rows before
+    /// `replaced` do not count.
     fn rank(&self, replaced: u64, synced: u64, layout: &ReplayLayout) -> (u64, u64, bool, u64) {
         let (head, tail) = (self.record.head(), self.tail.max(replaced));
         let of_synced = head.min(synced).saturating_sub(tail);
@@ -49,8 +50,8 @@ impl Candidate<'_> {
     }
 }
 
-/// Chooses the newest record if all its rows are intact, but for those that were being replaced. Otherwise the one under which most of the synced rows are, and
-/// of those the one with most rows.
+/// Chooses the newest record if all its rows are intact, except those that were being overwritten. Otherwise, the
+/// record under which most of the synced rows are intact, then the one with most rows.
 pub(super) fn recover(words: &Words, places: &Places, layout: &ReplayLayout, ring: &Ring) -> Result<Found, String> {
     let slots: [Option<Record>; SLOTS] = places.slots.map(|slot| Record::load(words, slot, layout));
     let newest_of = |from: usize| {
@@ -63,9 +64,9 @@ pub(super) fn recover(words: &Words, places: &Places, layout: &ReplayLayout, rin
     };
     let (newest_slot, newest) = newest_of(0).ok_or(NONE_LEFT)?;
 
-    // Rows that a write under way when the process died was about to replace: nobody misses them.
+    // Rows before this number may be missing: an interrupted append was overwriting them.
     let replaced = words
-        .load(places.reach)
+        .load(places.write_horizon)
         .min(newest.head() + layout.ring)
         .saturating_sub(layout.ring);
     let synced = newest_of(SYNCED).map_or(0, |(_, record)| record.head());
@@ -87,21 +88,23 @@ pub(super) fn recover(words: &Words, places: &Places, layout: &ReplayLayout, rin
             .ok_or(NONE_LEFT)?;
     }
 
-    let published = words.load(places.selector);
+    let published = words.load(places.published);
     let warnings = warnings(&best, newest, published, replaced.max(oldest(best.record, layout)));
-    // Readers may be looking at the published slot: make it the chosen one, where that can be published, and then write
-    // the other.
-    let selector = if best.slot < SYNCED {
+    // Readers may be reading the published slot. So publish the chosen record first, if it is in slot 0 or 1, and then
+    // write the other slot.
+    let first_generation = if best.slot < SYNCED {
         best.record.generation()
     } else {
         published
     };
-    let last = newest.generation().max(if published < newest.generation() + FAR {
-        published
-    } else {
-        0
-    });
-    let next_generation = if (last + 1) % 2 == selector % 2 {
+    let last = newest
+        .generation()
+        .max(if published < newest.generation() + MAX_DISTANCE {
+            published
+        } else {
+            0
+        });
+    let next_generation = if (last + 1) % 2 == first_generation % 2 {
         last + 2
     } else {
         last + 1
@@ -117,7 +120,7 @@ pub(super) fn recover(words: &Words, places: &Places, layout: &ReplayLayout, rin
     record.set_tail(best.tail);
     Ok(Found {
         record,
-        selector,
+        first_generation,
         next_generation,
         next_synced: older,
         synced_generation: generation(newer),
@@ -125,36 +128,36 @@ pub(super) fn recover(words: &Words, places: &Places, layout: &ReplayLayout, rin
     })
 }
 
-/// What of the file had to be given up: the record `published`, rows after those of `best`, rows from `expected` on.
+/// What is lost: the record `published`, rows after those of `best`, or rows from `expected` on.
 fn warnings(best: &Candidate<'_>, newest: &Record, published: u64, expected: u64) -> Vec<String> {
     let mut warnings = Vec::new();
     if newest.generation() < published {
         let number = newest.generation();
         warnings.push(format!(
-            "the commit record published last is damaged; going on from the newest that is not (number {number})"
+            "the commit record published last is damaged; continuing from the newest one that is not (number {number})"
         ));
     }
     let (head, lost) = (best.record.head(), newest.head().saturating_sub(best.record.head()));
     if lost > 0 {
         warnings.push(format!(
-            "the newest {lost} rows did not reach the disk; going on from the {head} rows that did"
+            "the newest {lost} rows did not reach the disk; continuing from the {head} rows that did"
         ));
     }
     if best.tail > expected {
         let (damaged, left) = (best.tail - 1, head - best.tail);
         warnings.push(format!(
-            "row {damaged} is damaged; going on with the {left} rows after it"
+            "row {damaged} is damaged; continuing with the {left} rows after it"
         ));
     }
     warnings
 }
 
-/// The first row the ring holds under `record` if none is damaged.
+/// The first row that the ring holds under `record` if none is damaged.
 fn oldest(record: &Record, layout: &ReplayLayout) -> u64 {
     record.tail().max(record.head().saturating_sub(layout.ring))
 }
 
-/// The first row from which on all are intact up to the record's head.
+/// The first row from which on all rows up to the record's head are intact.
 fn intact_from(record: &Record, layout: &ReplayLayout, ring: &Ring) -> u64 {
     let rows = oldest(record, layout)..record.head();
     rows.clone()

@@ -1,4 +1,4 @@
-//! The rows and their checks, mapped. The only place that makes ordinary memory of the file.
+//! The mapped rows and their checks. Only this module accesses the file as ordinary memory.
 
 use std::fs::File;
 use std::io;
@@ -10,7 +10,7 @@ use shoal_common::commit::{Places, ReplayLayout};
 use super::check;
 use super::step::WriteStep;
 
-/// The places of the ring. Row `index` stands in place `index` mod `ring`.
+/// The places of the ring. Row `index` is stored in place `index` mod `ring`.
 pub(super) struct Ring {
     map: MmapMut,
     /// Where the rows begin in the mapping, in bytes; the checks begin at 0.
@@ -26,10 +26,10 @@ impl Ring {
         options
             .offset(places.checks.start as u64)
             .len(places.end - places.checks.start);
-        // SAFETY: the bytes change under a mapping only if someone else writes the file. Rows and checks are written
-        // and read by the process that holds the file's lock, which is this one, through this one mapping; everybody
-        // else maps the header, which ends before it. The file is never shortened: its space was reserved when it was
-        // made, and its length has been checked.
+        // SAFETY: the bytes change under a mapping only if another process writes the file. Rows and checks are written
+        // and read only by the process that holds the file's lock, which is this one, and only through this mapping.
+        // Other processes map the header, which ends before it. The file is never shortened: its space was reserved
+        // when it was created, and its length has been checked.
         let map = unsafe { options.map_mut(file)? };
         let rows = places.rows.start - places.checks.start;
         Ok(Self {
@@ -41,7 +41,7 @@ impl Ring {
     }
 
     fn place(&self, index: u64) -> usize {
-        // A place is less than the ring's length, which fits: the file was mapped.
+        // A place is less than the ring's length, which fits in `usize`: the file was mapped.
         (index % self.ring) as usize
     }
 
@@ -86,18 +86,18 @@ impl Ring {
         check != check::NONE && check == check::of_row(index, self.row(index))
     }
 
-    /// Empties the places outside `rows`, so that a row that was written and never committed, or given up after a power
-    /// loss, does not pass for the one that will get its number. True if one was not empty.
-    pub(super) fn forget_outside(&mut self, rows: Range<u64>) -> bool {
-        let mut forgotten = false;
+    /// Empties the places outside `rows`. Otherwise a row that was never committed, or was given up after a power loss,
+    /// could pass for the later row with its number. Returns true if a place was not empty.
+    pub(super) fn clear_outside(&mut self, rows: Range<u64>) -> bool {
+        let mut cleared = false;
         for index in rows.end..rows.start + self.ring {
-            // Only the checks: reading the rows of a ring that is not full yet would fill memory with them.
+            // Only the checks are read: reading the rows of a ring that is not full would load it into memory.
             if self.check(index) != check::NONE {
                 let place = self.place(index);
                 self.parts().0[place] = check::NONE;
-                forgotten = true;
+                cleared = true;
             }
         }
-        forgotten
+        cleared
     }
 }

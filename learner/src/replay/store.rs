@@ -1,4 +1,4 @@
-//! The replay as its writer has it: the mapped file, its ring of rows and its record.
+//! The replay of the writer: the mapped file, its ring of rows and its record.
 
 use std::fs::File;
 use std::ops::Range;
@@ -12,7 +12,7 @@ use super::ring::Ring;
 use super::step::{Hook, WriteStep, observe, step_of_record};
 use super::{file, recovery};
 
-/// The replay of a run. Holding one is the right to write the file: a second one is refused while it lives.
+/// The replay of a run, with the right to write its file: a second one is refused while this one exists.
 pub struct Replay {
     pub(super) path: PathBuf,
     pub(super) layout: ReplayLayout,
@@ -20,24 +20,26 @@ pub struct Replay {
     pub(super) file: File,
     pub(super) words: WritableWords,
     pub(super) ring: Ring,
-    /// What is committed, as in the published slot; its tail is already that of a chunk being filled.
+    /// What is committed, as in the active slot. Only the tail already allows for the chunk that is being filled.
     pub(super) record: Record,
-    /// Which of the two slots for synced records is written next, and the newest generation in them.
+    /// Which of the two slots for synced records is written next.
     pub(super) next_synced: usize,
+    /// The newest generation in these two slots.
     pub(super) synced_generation: u64,
     pub(super) warnings: Vec<String>,
     pub(super) hook: Option<Hook>,
 }
 
 impl Replay {
-    /// Makes the replay of a new run, with all its space reserved. Never replaces a file; leaves none behind on error.
+    /// Creates the replay of a new run, with all its space reserved. Never replaces a file, and leaves none after an
+    /// error.
     pub fn create(path: &Path, layout: &ReplayLayout) -> Result<Self, ReplayError> {
         let (file, places) = file::create(path, layout)?;
         Self::map(path, layout, places, file)
     }
 
-    /// Maps the replay of a run that goes on, and repairs what a crash has left (see `warnings`). A file that is not
-    /// exactly of this layout and configuration is refused and left as it is.
+    /// Maps the replay of a run that is resumed, and repairs it after a crash (see `warnings`). A file of another
+    /// layout or configuration is refused and left as it is.
     pub fn open(path: &Path, layout: &ReplayLayout) -> Result<Self, ReplayError> {
         let (file, places) = file::open(path, layout)?;
         Self::map(path, layout, places, file)
@@ -68,33 +70,34 @@ impl Replay {
             warnings: found.warnings,
             hook: None,
         };
-        replay.words.store(replay.places.selector, found.selector);
+        replay.words.store(replay.places.published, found.first_generation);
         replay.publish(found.next_generation);
-        replay.words.store(replay.places.reach, replay.record.head());
-        let forgotten = replay.ring.forget_outside(replay.rows());
-        if forgotten || !replay.warnings.is_empty() {
-            // A later power loss must not bring back what was given up here.
+        replay.words.store(replay.places.write_horizon, replay.record.head());
+        let cleared = replay.ring.clear_outside(replay.rows());
+        if cleared || !replay.warnings.is_empty() {
+            // A later power loss must not bring back the rows that were given up here.
             replay.file.sync_data().map_err(|source| replay.cannot_sync(source))?;
         }
         Ok(replay)
     }
 
-    /// What opening the file had to repair or give up, one line each, for the run's log. Empty after a mere `kill -9`.
+    /// What was lost or repaired when the file was opened, one line each, for the run's log. Empty after just a `kill
+    /// -9`.
     pub fn warnings(&self) -> &[String] {
         &self.warnings
     }
 
-    /// The file.
+    /// The path of the file.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// What the file holds.
+    /// The layout of the file.
     pub fn layout(&self) -> &ReplayLayout {
         &self.layout
     }
 
-    /// Rows ever committed; the next one has this number.
+    /// The number of rows ever committed, which is the number of the next row.
     pub fn head(&self) -> u64 {
         self.record.head()
     }
@@ -107,7 +110,7 @@ impl Replay {
     /// What is committed of an actor.
     ///
     /// # Panics
-    /// As indexing a slice does: `actor` must be less than the layout's `actors`.
+    /// Unless `actor` is less than the layout's `actors`.
     pub fn committed(&self, actor: usize) -> ActorCommit {
         self.record.actor(actor)
     }
@@ -115,44 +118,44 @@ impl Replay {
     /// A row, in place.
     ///
     /// # Panics
-    /// As indexing a slice does: `index` must be in `rows()`.
+    /// Unless `index` is in `rows()`.
     #[inline]
     pub fn row(&self, index: u64) -> &[f32] {
         let rows = self.rows();
         assert!(
             rows.contains(&index),
-            "row {index} of a replay that holds the rows {rows:?}"
+            "row {index} is not in the replay, which holds the rows {rows:?}"
         );
         self.ring.row(index)
     }
 
-    /// The rows a minibatch is drawn from when the replay is to be seen as it was at `logical_head` rows: the newest
-    /// `capacity` before it. Shorter where there are not so many, where rows were lost, and where the ring has gone on
-    /// too far; a caller for whom the last matters compares its start with `logical_head - capacity`.
+    /// The rows to draw a minibatch from, for a replay as it was after `logical_head` rows: the newest `capacity` rows
+    /// before it. There are fewer if the replay had fewer, if rows were lost, or if the ring has overwritten some
+    /// since. A caller that must rule out the last case compares the start with `logical_head - capacity`.
     pub fn window(&self, logical_head: u64, capacity: u64) -> Range<u64> {
         let rows = self.rows();
         let end = logical_head.clamp(rows.start, rows.end);
         end.saturating_sub(capacity).max(rows.start)..end
     }
 
-    /// Calls `hook` after each step of every later write. A seam for crash tests.
+    /// Calls `hook` after each step of every later write, for crash tests.
     pub fn on_step(&mut self, hook: impl FnMut(WriteStep) + Send + 'static) {
         self.hook = Some(Box::new(hook));
     }
 
-    /// Writes `self.record` into the slot of `generation` and makes it the one the readers use.
+    /// Writes `self.record` into the slot of `generation` and makes it the active slot.
     pub(super) fn publish(&mut self, generation: u64) {
-        let published = self.words.read().load(self.places.selector);
-        assert_ne!(generation % 2, published % 2, "the published slot is never written");
+        let published = self.words.read().load(self.places.published);
+        assert_ne!(generation % 2, published % 2, "the active slot is never written");
         self.record.set_generation(generation);
         let slot = self.places.slots[(generation % 2) as usize];
         let hook = &mut self.hook;
         self.record
             .store(&mut self.words, slot, |step| observe(hook, step_of_record(step)));
         // SYNC POINT with the first Acquire fence of `CommitReader::consistent`; the Release fence is `Record::store`'s last.
-        self.words.store(self.places.selector, generation);
-        // A kill cannot come between two instructions in another order than the compiler gave them: keep it from
-        // moving the next chunk's rows, plain stores, up over this one.
+        self.words.store(self.places.published, generation);
+        // After a kill, the stores in the file are those in program order as compiled. This fence keeps the compiler
+        // from moving the next chunk's rows, which are plain stores, before this store.
         compiler_fence(Ordering::SeqCst);
         observe(hook, WriteStep::Published);
     }

@@ -1,8 +1,7 @@
-//! What survives a power loss: rows reach the disk first, then a record that says so.
+//! Syncing for a power loss: first the rows reach the disk, then a record that names them.
 //!
-//! `fdatasync` and not `msync`: the kernel writes the pages dirtied through a mapping all the same, only those (5 s of
-//! 700 rows of 44 bytes are 150 KB, whatever the file's size), and it needs no borrow of the mapping, so that it can run
-//! on another thread while rows are sampled and appended.
+//! `fdatasync` also writes the pages that were changed through the mapping, and only those. Unlike `msync` it needs no
+//! borrow of the mapping, so it can run on another thread while rows are sampled and appended.
 
 use std::fs::File;
 use std::io;
@@ -13,7 +12,7 @@ use super::error::ReplayError;
 use super::step::{WriteStep, observe, step_of_record};
 use super::store::Replay;
 
-/// The replay as it was at some moment, to be brought to the disk by any thread.
+/// The replay as it was at one moment, to be synced by any thread.
 #[must_use = "nothing is synced before `run`"]
 #[derive(Debug)]
 pub struct PendingSync {
@@ -21,15 +20,16 @@ pub struct PendingSync {
     record: Record,
 }
 
-/// The replay as it was at some moment, on the disk.
-#[must_use = "the file does not say so before `finish_sync`"]
+/// The replay as it was at one moment, now on the disk.
+#[must_use = "the file does not record this before `finish_sync`"]
 #[derive(Debug)]
 pub struct SyncedRows {
     record: Record,
 }
 
 impl PendingSync {
-    /// Waits until the disk has all of it. Slow (a disk's write cache is emptied): milliseconds, on a busy disk more.
+    /// Syncs the file and waits until the disk has all of it. This takes milliseconds, on a busy disk more, because the
+    /// disk's write cache is flushed.
     pub fn run(self) -> io::Result<SyncedRows> {
         self.file.sync_data()?;
         Ok(SyncedRows { record: self.record })
@@ -37,7 +37,7 @@ impl PendingSync {
 }
 
 impl Replay {
-    /// Takes note of what is committed now, for `PendingSync::run` on another thread.
+    /// Copies the record of what is committed now, for `PendingSync::run` on another thread.
     pub fn start_sync(&self) -> Result<PendingSync, ReplayError> {
         let file = self.file.try_clone().map_err(|source| self.cannot_sync(source))?;
         Ok(PendingSync {
@@ -46,10 +46,10 @@ impl Replay {
         })
     }
 
-    /// Records in the file what has reached the disk. The record itself is on the disk after the next sync: a power loss
-    /// before that falls back to the one before.
+    /// Records in the file what has reached the disk. This record reaches the disk with the next sync; after a power
+    /// loss before that, recovery falls back to the previous one.
     pub fn finish_sync(&mut self, synced: SyncedRows) {
-        // Two syncs may end in another order than they began.
+        // Two syncs may end in a different order than they began.
         if synced.record.generation() <= self.synced_generation {
             return;
         }
@@ -64,12 +64,12 @@ impl Replay {
         observe(hook, WriteStep::SyncRecorded);
     }
 
-    /// Brings all that is committed to the disk and waits: after this, a power loss leaves at least these rows (but for
-    /// the oldest, which rows committed later have replaced).
+    /// Syncs everything that is committed and waits. After this, a power loss leaves at least these rows, except the
+    /// oldest ones that later rows have replaced.
     pub fn flush(&mut self) -> Result<(), ReplayError> {
         let synced = self.start_sync()?.run().map_err(|source| self.cannot_sync(source))?;
         self.finish_sync(synced);
-        // The record that says so: one block.
+        // Syncs the record too, which is one block.
         self.file.sync_data().map_err(|source| self.cannot_sync(source))
     }
 

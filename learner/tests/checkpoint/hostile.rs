@@ -1,4 +1,4 @@
-//! Files that are no checkpoints, or whole ones that lie.
+//! Files that are not checkpoints, and hostile ones whose checksums are right.
 
 use std::fs;
 use std::io::Write;
@@ -14,10 +14,10 @@ use tempfile::TempDir;
 
 const NAMES: [&str; 2] = ["latest.ckpt", "previous.ckpt"];
 
-/// As the header is written: fingerprint, counters, sections.
+/// The header as it is written: fingerprint, counters, sections.
 type Header = (u64, (u64, u64, u64, u64), Vec<(String, u64)>);
 
-/// Whoever asks for more memory than any of these files has gets none.
+/// Limits memory, so that allocating by a hostile length fails.
 fn limit_memory() {
     let limit = Some(1 << 30);
     setrlimit(
@@ -41,7 +41,7 @@ fn save(directory: &Path, updates: u64) {
     Checkpoints::new(directory, 7).save(&counters, &sections).unwrap();
 }
 
-/// Loads; the files stay as they are.
+/// Loads, and asserts that the files have not changed.
 fn load(directory: &Path) -> Result<Option<Loaded>, CheckpointError> {
     let read = || NAMES.map(|name| fs::read(directory.join(name)).ok());
     let before = read();
@@ -79,7 +79,7 @@ fn damage() -> impl Strategy<Value = Damage> {
 
 fn damaged(mut bytes: Vec<u8>, damage: Vec<Damage>) -> Vec<u8> {
     for damage in damage {
-        // One place more than there are bytes: the end.
+        // One place more than there are bytes, for the end.
         let place = |at: Index| at.index(bytes.len() + 1);
         match damage {
             Damage::Flip(at, bits) => {
@@ -109,7 +109,7 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 150, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
-    fn any_bytes_in_any_of_the_two_are_refused(
+    fn arbitrary_bytes_in_either_file_are_refused(
         bytes in prop::array::uniform2(prop::option::of(prop::collection::vec(any::<u8>(), 0..200))),
     ) {
         let directory = TempDir::new().unwrap();
@@ -122,9 +122,9 @@ proptest! {
         }
     }
 
-    /// What is loaded was saved.
+    /// Whatever is loaded was saved.
     #[test]
-    fn damaged_checkpoints_give_way_or_are_refused(
+    fn damaged_checkpoints_fall_back_or_are_refused(
         latest in prop::collection::vec(damage(), 0..4),
         previous in prop::collection::vec(damage(), 0..3),
     ) {
@@ -150,14 +150,15 @@ proptest! {
         }
     }
 
-    /// With a checksum that fits.
+    /// The checksum is right.
     #[test]
-    fn a_body_of_any_bytes_is_refused(body in prop::collection::vec(any::<u8>(), 0..200), lengths in prop::array::uniform3(extreme())) {
+    fn a_body_of_arbitrary_bytes_is_refused(body in prop::collection::vec(any::<u8>(), 0..200), lengths in prop::array::uniform3(extreme())) {
         limit_memory();
         let directory = TempDir::new().unwrap();
         save(directory.path(), 1);
         let path = directory.path().join("latest.ckpt");
-        // Bytes, and bytes where the sections' count and the first name's length are hostile.
+        // The bytes alone, and the bytes after hostile values for the number of sections and the length of the first
+        // name.
         let [sections, name, numbers] = lengths;
         let mut claims = [7, 1, 2, 3, 4, sections, name].map(u64::to_le_bytes).concat();
         claims.extend(&body);
@@ -166,7 +167,7 @@ proptest! {
             sealed(&path, body);
             match load(directory.path()) {
                 Err(CheckpointError::AllDamaged { .. } | CheckpointError::Refused { .. }) => {}
-                // Nothing follows a count of none.
+                // With no sections, there is nothing after their number.
                 Ok(Some(_)) => prop_assert!(sections == 0),
                 other => prop_assert!(false, "{:?}", other),
             }
@@ -174,7 +175,7 @@ proptest! {
     }
 
     #[test]
-    fn a_header_that_lies_is_refused(
+    fn a_hostile_header_is_refused(
         fingerprint in prop_oneof![Just(7), extreme()],
         counters in (extreme(), extreme(), extreme(), extreme()),
         sections in prop::collection::vec(("[a-z]{0,5}", prop_oneof![0..9_u64, extreme()]), 0..4),
@@ -201,7 +202,7 @@ proptest! {
             Ok(Some(loaded)) => {
                 prop_assert!(fits && possible && fingerprint == 7);
                 let counters = loaded.checkpoint.counters;
-                // A learner counts on from there.
+                // A learner continues to count from there.
                 prop_assert!([counters.updates, counters.rows, counters.episodes, counters.policy_version].iter().all(|n| *n < 1 << 60));
             }
             Err(CheckpointError::Refused { .. }) => prop_assert!(fingerprint != 7),

@@ -13,9 +13,9 @@ use tempfile::TempDir;
 const DIRECTORY: &str = "SHOAL_TEST_DIRECTORY";
 /// The step after which the child is killed.
 const STEP: &str = "SHOAL_TEST_STEP";
-/// How many updates the newest checkpoint has that was published, 0 before the first.
+/// The updates of the newest published checkpoint; 0 before the first.
 const NEWEST: &str = "SHOAL_TEST_NEWEST";
-/// How many updates the child's checkpoint has.
+/// The updates of the child's checkpoint.
 const NEXT: &str = "SHOAL_TEST_NEXT";
 
 const STEPS: [SaveStep; 3] = [SaveStep::Prepared, SaveStep::Kept, SaveStep::Published];
@@ -33,12 +33,12 @@ fn number(name: &str) -> u64 {
     std::env::var(name).unwrap().parse().unwrap()
 }
 
-/// Loads what there is, and checks that it is the newest checkpoint that was published.
+/// Loads, and asserts that the result is the newest published checkpoint.
 fn load(directory: &Path, newest: u64) -> (Checkpoints, Vec<String>) {
     let mut store = Checkpoints::new(directory, 7);
     let warnings = match store.load_newest().unwrap() {
         None => {
-            assert_eq!(newest, 0, "a checkpoint was published and none is found");
+            assert_eq!(newest, 0, "a published checkpoint was not found");
             vec![]
         }
         Some(loaded) => {
@@ -57,7 +57,7 @@ fn load(directory: &Path, newest: u64) -> (Checkpoints, Vec<String>) {
 #[test]
 #[ignore = "a child of the tests below"]
 fn child_saves() {
-    // Somebody may run the ignored tests by hand.
+    // The user may run the ignored tests by hand.
     let Some(directory) = std::env::var_os(DIRECTORY).map(PathBuf::from) else {
         return;
     };
@@ -73,7 +73,7 @@ fn child_saves() {
         .unwrap();
 }
 
-/// A process that loads checkpoint `newest` and saves `next`, killed after `step`.
+/// Runs a process that loads checkpoint `newest` and saves `next`, and is killed after `step`.
 fn saves(directory: &Path, newest: u64, next: u64, step: Option<SaveStep>) -> ExitStatus {
     Command::new(std::env::current_exe().unwrap())
         .args(["kills::child_saves", "--exact", "--ignored"])
@@ -93,10 +93,10 @@ fn names(directory: &Path) -> BTreeSet<String> {
         .collect()
 }
 
-/// One process after the other saves and is killed: whatever the steps, the next one goes on from the last checkpoint that
-/// was published.
+/// Processes save one after another, and each is killed after some step. The next one always continues from the newest
+/// published checkpoint.
 #[test]
-fn a_learner_killed_at_any_step_of_any_save_goes_on_from_the_newest_checkpoint() {
+fn a_learner_killed_at_any_step_of_any_save_continues_from_the_newest_checkpoint() {
     for first in STEPS {
         for second in STEPS {
             for third in STEPS {
@@ -115,7 +115,7 @@ fn a_learner_killed_at_any_step_of_any_save_goes_on_from_the_newest_checkpoint()
                     } else {
                         assert_eq!(warnings.len(), 2);
                         assert!(
-                            warnings[0].contains("latest.ckpt: missing, as after a crash")
+                            warnings[0].contains("latest.ckpt: missing, probably after a crash")
                                 && warnings[1].contains(&format!("previous.ckpt, after {newest} updates")),
                             "{warnings:?}"
                         );
@@ -136,7 +136,7 @@ fn a_learner_killed_at_any_step_of_any_save_goes_on_from_the_newest_checkpoint()
                     "{:?}",
                     names(directory.path())
                 );
-                // The one before it is the newest there was, not an older one.
+                // The previous checkpoint is the newest before this one, not an older one.
                 if newest > 0 {
                     assert!(before < newest);
                     fs::remove_file(directory.path().join("latest.ckpt")).unwrap();
@@ -147,9 +147,9 @@ fn a_learner_killed_at_any_step_of_any_save_goes_on_from_the_newest_checkpoint()
     }
 }
 
-/// Between the two renames there is no `latest.ckpt`: the one point at which the older name counts.
+/// Between the two renames there is no `latest.ckpt`. Only then is `previous.ckpt` the newest.
 #[test]
-fn each_step_leaves_the_files_it_says() {
+fn each_step_leaves_the_expected_files() {
     for (step, files) in [
         (
             SaveStep::Prepared,

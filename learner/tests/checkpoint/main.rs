@@ -1,4 +1,4 @@
-//! Checkpoints, with writers that are killed and bytes that nobody should have written.
+//! Checkpoints with killed writers and hostile content.
 
 #![allow(
     clippy::unwrap_used,

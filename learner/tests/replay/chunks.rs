@@ -1,17 +1,21 @@
-//! What becomes of a chunk, and which rows can be read.
+//! Which chunks are committed, and which rows can be read.
 
 use shoal_learner::replay::{Appended, ChunkError, Replay};
 
 use crate::model::{chunk, filled, layout, mark};
 
 #[test]
-fn a_chunk_is_committed_once_and_an_old_incarnation_no_more() {
+fn a_chunk_is_committed_once_and_not_from_an_old_incarnation() {
     let (directory, mut model) = filled(100, &[(0, 3), (1, 2), (0, 4)]);
     let mut replay = Replay::open(&directory.replay(), &layout(100)).unwrap();
     let mut append = |mark| replay.append_and_commit(0, mark, &chunk(0, mark, 2)).unwrap();
     assert_eq!(append(mark(0, 1)), Appended::Duplicate);
     assert_eq!(append(mark(0, 2)), Appended::Duplicate);
-    assert_eq!(append(mark(1, 2)), Appended::Accepted, "an incarnation's first");
+    assert_eq!(
+        append(mark(1, 2)),
+        Appended::Accepted,
+        "the first chunk of an incarnation"
+    );
     assert_eq!(append(mark(0, 3)), Appended::Duplicate);
     assert_eq!(append(mark(1, 2)), Appended::Duplicate);
     assert_eq!(append(mark(1, 3)), Appended::Accepted);
@@ -22,11 +26,11 @@ fn a_chunk_is_committed_once_and_an_old_incarnation_no_more() {
 }
 
 #[test]
-fn a_chunk_that_is_not_the_next_one_is_refused_and_nothing_written() {
+fn a_chunk_that_is_not_the_next_one_is_refused_and_nothing_is_written() {
     let (directory, model) = filled(100, &[(0, 3), (1, 2), (0, 4)]);
     let mut replay = Replay::open(&directory.replay(), &layout(100)).unwrap();
     let last = u64::MAX;
-    // Of actor 0, chunk 2 of incarnation 0 was the last one.
+    // The last chunk of actor 0 was chunk 2 of incarnation 0.
     for (incarnation, sequence) in [
         (0, 4),
         (0, last),
@@ -53,7 +57,7 @@ fn a_chunk_that_is_not_the_next_one_is_refused_and_nothing_written() {
 }
 
 #[test]
-fn what_cannot_be_a_chunk_is_refused_and_nothing_written() {
+fn an_invalid_chunk_is_refused_and_nothing_is_written() {
     let (directory, model) = filled(10, &[(0, 10)]);
     let mut replay = Replay::open(&directory.replay(), &layout(10)).unwrap();
     let mut append = |actor, rows: &[f32]| replay.append_and_commit(actor, mark(0, 2), rows).unwrap_err();
@@ -79,7 +83,7 @@ fn what_cannot_be_a_chunk_is_refused_and_nothing_written() {
 }
 
 #[test]
-fn a_chunk_that_was_filled_and_dropped_is_not_committed_and_its_places_are_not_read() {
+fn a_chunk_that_was_filled_and_dropped_is_not_committed_and_the_rows_it_overwrote_are_not_readable() {
     let (directory, model) = filled(10, &[(0, 10)]);
     let mut replay = Replay::open(&directory.replay(), &layout(10)).unwrap();
     drop(

@@ -1,4 +1,4 @@
-//! Killed after any step, power lost, bytes damaged: without a second process.
+//! Kills after any step, power losses and damaged bytes, without a second process.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -10,13 +10,13 @@ use shoal_learner::replay::{Appended, Replay, WriteStep};
 
 use crate::model::{ACTORS, Directory, Model, WIDTH, chunk, filled, layout, mark, places, reopen};
 
-/// The file as it stood after each step.
+/// The content of the file after each step.
 type Images = Vec<(WriteStep, Vec<u8>)>;
 
 proptest! {
     #![proptest_config(ProptestConfig { cases: 24, failure_persistence: None, ..ProptestConfig::default() })]
 
-    /// The file as it stands after each step of each write, opened as a new learner would.
+    /// Opens the file as it was after each step of each write, as a new learner would.
     #[test]
     fn a_learner_killed_after_any_step_leaves_the_last_committed_state(
         ring in 9_u64..60,
@@ -44,8 +44,8 @@ proptest! {
             let mut committed = false;
             for (step, mut image) in images.lock().unwrap().drain(..) {
                 committed |= step == WriteStep::Sealed;
-                if step == WriteStep::ReachSet {
-                    // Killed within the copy: any part of the places about to be written may be anything.
+                if step == WriteStep::WriteHorizonSet {
+                    // If the kill comes while rows are copied, their places may hold anything.
                     for index in before.head()..after.head() {
                         let place = places(ring).rows.start + (index % ring) as usize * 4 * WIDTH;
                         if noise >> (index % 32) & 1 == 1 {
@@ -73,7 +73,7 @@ proptest! {
         prop_assert_eq!(rows, before.head().saturating_sub(ring)..before.head());
     }
 
-    /// After a power loss each block of the file is of any moment since the last sync.
+    /// After a power loss each block of the file may be from any moment since the last sync.
     #[test]
     fn a_power_loss_leaves_at_least_what_was_synced(
         before in prop::collection::vec((0..ACTORS, 1_u64..300), 0..12),
@@ -119,9 +119,9 @@ proptest! {
         states[&head].check(&Replay::open(&copy, &layout(ring)).unwrap());
     }
 
-    /// Damage anywhere behind the identity: the rows that are given out are right all the same.
+    /// After damage anywhere behind the identity, the readable rows are still right.
     #[test]
-    fn no_damage_passes_for_a_row(
+    fn a_damaged_row_is_never_readable(
         writes in prop::collection::vec((0..ACTORS, 1_u64..9), 1..20),
         damage in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 1..20),
     ) {
@@ -138,7 +138,7 @@ proptest! {
         }
         let places = places(ring);
         // The used parts of the file, so that the damage hits something.
-        let used: Vec<usize> = (places.selector..places.selector + 16)
+        let used: Vec<usize> = (places.published..places.published + 16)
             .chain(places.slots.iter().flat_map(|&slot| slot..slot + 104))
             .chain(places.checks.clone())
             .chain(places.rows.clone())
@@ -154,13 +154,13 @@ proptest! {
 }
 
 #[test]
-fn a_torn_newest_record_falls_back_to_the_one_before_and_says_so() {
+fn a_torn_newest_record_falls_back_to_the_previous_one_with_a_warning() {
     let (directory, _) = filled(100, &[(0, 3), (1, 2), (0, 4)]);
     let mut image = fs::read(directory.replay()).unwrap();
-    let newest = u64::from_le_bytes(image[places(100).selector..][..8].try_into().unwrap());
+    let newest = u64::from_le_bytes(image[places(100).published..][..8].try_into().unwrap());
     let slot = places(100).slots[newest as usize % 2];
     image[slot + 16] ^= 1;
-    // An actor that comes first waits: the learner has to mend it.
+    // An actor that opens it first waits until the learner has repaired it.
     fs::write(directory.replay(), &image).unwrap();
     assert!(matches!(
         CommitReader::open(&directory.replay()),
@@ -170,7 +170,7 @@ fn a_torn_newest_record_falls_back_to_the_one_before_and_says_so() {
     assert_eq!(replay.head(), 5);
     assert_eq!(replay.warnings().len(), 1);
     assert!(
-        replay.warnings()[0].contains("is damaged; going on from the newest that is not"),
+        replay.warnings()[0].contains("is damaged; continuing from the newest one that is not"),
         "{:?}",
         replay.warnings()
     );
@@ -195,7 +195,7 @@ fn a_torn_newest_record_falls_back_to_the_one_before_and_says_so() {
 }
 
 #[test]
-fn a_damaged_row_costs_the_rows_before_it() {
+fn a_damaged_row_also_loses_the_rows_before_it() {
     let (directory, model) = filled(100, &[(0, 60), (1, 30)]);
     let mut image = fs::read(directory.replay()).unwrap();
     image[places(100).rows.start + 20 * 4 * WIDTH] ^= 1;
@@ -204,7 +204,7 @@ fn a_damaged_row_costs_the_rows_before_it() {
     assert_eq!(replay.rows(), 21..90);
     assert_eq!(
         replay.warnings(),
-        ["row 20 is damaged; going on with the 69 rows after it"]
+        ["row 20 is damaged; continuing with the 69 rows after it"]
     );
 }
 
@@ -218,7 +218,7 @@ fn a_sync_on_another_thread_counts_once_it_is_finished() {
     let new = replay.start_sync().unwrap();
     let new = std::thread::spawn(|| new.run().unwrap()).join().unwrap();
     replay.finish_sync(new);
-    // The slower of two counts for nothing.
+    // The older of two syncs has no effect if it ends last.
     let before = fs::read(directory.replay()).unwrap();
     replay.finish_sync(old.run().unwrap());
     assert_eq!(fs::read(directory.replay()).unwrap(), before);
@@ -231,7 +231,7 @@ fn a_sync_on_another_thread_counts_once_it_is_finished() {
     model.check(&reopen(&directory.replay(), &image, 100).unwrap());
 }
 
-/// The files as they stand after each step of committing a second chunk to a synced first one.
+/// The content of the file after each step of committing a second chunk.
 fn images_of_a_commit() -> (Directory, Images) {
     let (directory, model) = filled(100, &[(0, 30)]);
     let path = directory.replay();
@@ -251,21 +251,21 @@ fn word(image: &[u8], at: usize) -> u64 {
 }
 
 #[test]
-fn a_record_under_construction_has_no_seal() {
+fn a_record_that_is_being_written_has_no_seal() {
     let (_directory, images) = images_of_a_commit();
     for (step, image) in images {
-        let other = places(100).slots[1 - (word(&image, places(100).selector) % 2) as usize];
-        let broken = word(&image, other) == 0;
+        let other = places(100).slots[1 - (word(&image, places(100).published) % 2) as usize];
+        let cleared = word(&image, other) == 0;
         assert_eq!(
-            broken,
-            matches!(step, WriteStep::SealBroken | WriteStep::RecordWritten),
+            cleared,
+            matches!(step, WriteStep::SealCleared | WriteStep::RecordWritten),
             "after {step:?}"
         );
     }
 }
 
 #[test]
-fn opening_leaves_the_record_it_goes_on_from() {
+fn opening_leaves_the_record_that_it_continues_from() {
     let (directory, images) = images_of_a_commit();
     for (step, image) in images {
         let slots = places(100).slots;
@@ -284,7 +284,7 @@ fn opening_leaves_the_record_it_goes_on_from() {
 }
 
 #[test]
-fn a_power_loss_that_spares_only_the_newest_rows_goes_back_to_the_synced_ones() {
+fn a_power_loss_among_unsynced_rows_goes_back_to_the_synced_ones() {
     let (directory, mut model) = filled(100, &[(0, 30)]);
     let mut replay = Replay::open(&directory.replay(), &layout(100)).unwrap();
     replay.flush().unwrap();
@@ -300,9 +300,9 @@ fn a_power_loss_that_spares_only_the_newest_rows_goes_back_to_the_synced_ones() 
     assert_eq!(replay.rows(), 0..30);
     assert_eq!(
         replay.warnings(),
-        ["the newest 60 rows did not reach the disk; going on from the 30 rows that did"]
+        ["the newest 60 rows did not reach the disk; continuing from the 30 rows that did"]
     );
-    // What was given up does not come back under the numbers that the next rows get.
+    // The lost rows do not come back under the numbers of the next rows.
     let numbers = chunk(2, mark(0, 1), 5);
     replay.append_and_commit(2, mark(0, 1), &numbers).unwrap();
     model.add(2, mark(0, 1), &numbers);

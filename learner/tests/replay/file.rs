@@ -1,4 +1,4 @@
-//! Which files are made, and which are refused.
+//! Which files are created, and which are refused.
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
@@ -30,17 +30,17 @@ proptest! {
 }
 
 #[test]
-fn a_file_that_is_not_the_one_meant_is_refused_by_name_and_left_alone() {
+fn a_file_of_another_run_is_refused_by_name_and_left_as_it_is() {
     let (directory, _) = filled(100, &[(0, 3)]);
     let path = directory.replay();
     let image = fs::read(&path).unwrap();
-    let refused = |image: &[u8], layout: &ReplayLayout, says: &str| {
+    let refused = |image: &[u8], layout: &ReplayLayout, expected: &str| {
         fs::write(&path, image).unwrap();
         let error = Replay::open(&path, layout).unwrap_err();
         assert!(matches!(error, ReplayError::Refused { .. }), "{error}");
         let line = error.to_string();
         assert!(
-            line.contains(says) && line.contains("replay.rows") && !line.contains('\n'),
+            line.contains(expected) && line.contains("replay.rows") && !line.contains('\n'),
             "{line}"
         );
         assert_eq!(fs::read(&path).unwrap(), image);
@@ -85,7 +85,7 @@ fn a_file_that_is_not_the_one_meant_is_refused_by_name_and_left_alone() {
             actor_snapshot_words: 0,
             ..right.clone()
         },
-        "it has room for 3 actors, this run's 4",
+        "it has space for 3 actors, this run's 4",
     );
     refused(
         &image,
@@ -132,12 +132,12 @@ fn a_file_that_is_not_the_one_meant_is_refused_by_name_and_left_alone() {
 }
 
 #[test]
-fn a_replay_is_made_once_and_written_by_one() {
+fn a_replay_is_created_once_and_has_one_writer() {
     let directory = Directory::new();
     let path = directory.replay();
     assert!(matches!(Replay::open(&path, &layout(10)), Err(ReplayError::Missing(_))));
     assert!(matches!(CommitReader::open(&path), Err(OpenError::NotYet { .. })));
-    // What a learner killed while it made the file has left.
+    // Left by a learner that was killed while it created the file.
     fs::write(path.with_extension("rows.new"), "half").unwrap();
     let replay = Replay::create(&path, &layout(10)).unwrap();
     assert_eq!(directory.names(), ["replay.rows"]);

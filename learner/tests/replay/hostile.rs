@@ -1,4 +1,4 @@
-//! Files whose header was written by nobody who means well, with every checksum right.
+//! Files with hostile headers whose checksums are right.
 
 use std::fs;
 
@@ -9,14 +9,14 @@ use shoal_learner::replay::{Appended, ChunkMark, Replay, ReplayError};
 use crate::model::{ACTORS, chunk, filled, layout, mark, places, reopen};
 
 const RING: u64 = 40;
-/// Words of a record: generation, head, tail, and three an actor.
+/// Words of a record: generation, head, tail, and three per actor.
 const WORDS: usize = 3 + 3 * ACTORS;
 
 fn extreme() -> impl Strategy<Value = u64> {
     prop_oneof![
         3 => 0..90_u64,
         1 => (0..64_u32).prop_map(|bit| 1 << bit),
-        // Around the greatest that is believed.
+        // Around the greatest value that is accepted.
         2 => (0..60_u64).prop_map(|below| (1 << 60) - 1 - below),
         1 => (0..40_u64).prop_map(|below| u64::MAX - below),
         1 => any::<u64>(),
@@ -32,11 +32,11 @@ fn seal(image: &mut [u8], slot: usize) {
     put(image, slot, seal);
 }
 
-/// Opened by a learner, written to and opened again; looked at by an actor each time.
-fn used(path: &std::path::Path, image: &[u8]) -> Result<(), TestCaseError> {
+/// Opens the file as a learner, writes to it and opens it again. Each time, reads it as an actor.
+fn use_file(path: &std::path::Path, image: &[u8]) -> Result<(), TestCaseError> {
     fs::write(path, image).unwrap();
     for life in 0..3 {
-        let look = || match CommitReader::open(path) {
+        let read_as_actor = || match CommitReader::open(path) {
             Ok(reader) => {
                 reader.rows();
                 (0..ACTORS).for_each(|actor| assert_eq!(reader.actor(actor).mark, reader.committed(actor)));
@@ -45,7 +45,7 @@ fn used(path: &std::path::Path, image: &[u8]) -> Result<(), TestCaseError> {
             Err(OpenError::NotYet { .. } | OpenError::Refused { .. }) => {}
             Err(error) => panic!("{error}"),
         };
-        look();
+        read_as_actor();
         let before = fs::read(path).unwrap();
         let mut replay = match Replay::open(path, &layout(RING)) {
             Ok(replay) => replay,
@@ -55,7 +55,7 @@ fn used(path: &std::path::Path, image: &[u8]) -> Result<(), TestCaseError> {
             }
             Err(error) => return Err(TestCaseError::fail(error.to_string())),
         };
-        look();
+        read_as_actor();
         let rows = replay.rows();
         prop_assert!(rows.end - rows.start <= RING);
         rows.clone().for_each(|index| drop(replay.row(index).to_vec()));
@@ -72,7 +72,7 @@ fn used(path: &std::path::Path, image: &[u8]) -> Result<(), TestCaseError> {
             prop_assert_eq!(appended == Appended::Duplicate, sequence == u64::MAX);
         }
         replay.flush().unwrap();
-        look();
+        read_as_actor();
     }
     Ok(())
 }
@@ -80,41 +80,42 @@ fn used(path: &std::path::Path, image: &[u8]) -> Result<(), TestCaseError> {
 proptest! {
     #![proptest_config(ProptestConfig { cases: 200, failure_persistence: None, ..ProptestConfig::default() })]
 
-    /// Any words of a whole file's records, selector and reach replaced; sealed again or not.
+    /// Replaces any words of a whole file's records, its published generation and its write horizon, with right or
+    /// wrong checksums.
     #[test]
-    fn records_that_lie_are_used_or_refused(
+    fn hostile_records_are_used_or_refused(
         writes in prop::collection::vec((0..ACTORS, 1_u64..20), 0..8),
-        lies in prop::collection::vec((0..4_usize, 0..WORDS, extreme()), 0..10),
+        changes in prop::collection::vec((0..4_usize, 0..WORDS, extreme()), 0..10),
         sealed in prop::array::uniform4(prop::bool::weighted(0.8)),
-        selector in prop::option::of(extreme()),
-        reach in prop::option::of(extreme()),
+        published in prop::option::of(extreme()),
+        write_horizon in prop::option::of(extreme()),
     ) {
         let (directory, _) = filled(RING, &writes);
         let mut image = fs::read(directory.replay()).unwrap();
-        for (slot, word, lie) in lies {
-            put(&mut image, places(RING).slots[slot] + 8 * (1 + word), lie);
+        for (slot, word, value) in changes {
+            put(&mut image, places(RING).slots[slot] + 8 * (1 + word), value);
         }
         for (slot, sealed) in places(RING).slots.into_iter().zip(sealed) {
             if sealed {
                 seal(&mut image, slot);
             }
         }
-        for (at, lie) in [(places(RING).selector, selector), (places(RING).reach, reach)] {
-            if let Some(lie) = lie {
-                put(&mut image, at, lie);
+        for (at, value) in [(places(RING).published, published), (places(RING).write_horizon, write_horizon)] {
+            if let Some(value) = value {
+                put(&mut image, at, value);
             }
         }
-        used(&directory.replay(), &image)?;
+        use_file(&directory.replay(), &image)?;
     }
 
-    /// An identity with any numbers and a checksum that fits is refused unless it is the run's own.
+    /// An identity with any numbers and a right checksum is refused unless it is the run's own.
     #[test]
-    fn an_identity_that_lies_is_refused(lies in prop::collection::vec((2..9_usize, extreme()), 1..4)) {
+    fn a_hostile_identity_is_refused(changes in prop::collection::vec((2..9_usize, extreme()), 1..4)) {
         let (directory, _) = filled(RING, &[(0, 10)]);
         let mut image = fs::read(directory.replay()).unwrap();
         let own = image[..72].to_vec();
-        for (word, lie) in lies {
-            put(&mut image, 8 * word, lie);
+        for (word, value) in changes {
+            put(&mut image, 8 * word, value);
         }
         let checksum = crc32fast::hash(&image[..72]);
         put(&mut image, 72, checksum.into());

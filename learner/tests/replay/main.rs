@@ -1,4 +1,4 @@
-//! The replay file, used, crashed and damaged.
+//! The replay file in use, after crashes, and damaged.
 
 #![allow(
     clippy::unwrap_used,

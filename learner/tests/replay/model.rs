@@ -1,4 +1,4 @@
-//! What a replay should hold, and a directory to try it in.
+//! A model of what the replay should hold, and a directory for the tests.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -30,7 +30,7 @@ pub(crate) fn mark(incarnation: u64, sequence: u64) -> ChunkMark {
     ChunkMark { incarnation, sequence }
 }
 
-/// A chunk whose rows say who they are.
+/// A chunk whose rows identify themselves.
 pub(crate) fn chunk(actor: usize, mark: ChunkMark, rows: u64) -> Vec<f32> {
     let row = |i| {
         [
@@ -69,7 +69,7 @@ impl Model {
         self.rows.len() as u64
     }
 
-    /// The replay holds this, and of the rows those that `rows()` says.
+    /// Asserts that the replay agrees with the model, with the rows in `rows()`.
     pub(crate) fn check(&self, replay: &Replay) {
         assert_eq!(replay.head(), self.head());
         for (actor, commit) in self.actors.iter().enumerate() {

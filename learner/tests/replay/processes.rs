@@ -1,4 +1,4 @@
-//! The replay file with real processes: writers that are killed, readers beside them, limits that are met.
+//! The replay file with real processes: killed writers, concurrent readers, and resource limits.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -12,7 +12,7 @@ use shoal_learner::replay::{ChunkMark, Replay, ReplayError, ReplayLayout};
 use tempfile::TempDir;
 
 const ACTORS: usize = 2;
-/// Names the file to the children: this binary again, one ignored test each.
+/// The environment variable with the file's path for child processes, which run an ignored test of this binary.
 const PATH: &str = "SHOAL_TEST_PATH";
 
 fn layout() -> ReplayLayout {
@@ -50,7 +50,7 @@ fn append(replay: &mut Replay, actor: usize) {
         .unwrap();
 }
 
-/// A child that is gone when the test is.
+/// A child process that is killed when the test ends.
 struct Writer(Child);
 
 impl Writer {
@@ -73,7 +73,7 @@ impl Drop for Writer {
 
 #[test]
 #[ignore = "a child of the tests below"]
-fn child_appends_without_end() {
+fn child_appends_forever() {
     let path = path_of_child();
     let mut replay = match Replay::open(&path, &layout()) {
         Err(ReplayError::Missing(_)) => Replay::create(&path, &layout()).unwrap(),
@@ -81,23 +81,24 @@ fn child_appends_without_end() {
     };
     assert_eq!(replay.warnings(), &[] as &[String]);
     for round in 1_u64.. {
-        // In turn, also after a kill between the two.
-        let behind = usize::from(replay.committed(0).mark > replay.committed(1).mark);
-        append(&mut replay, behind);
+        // The actors take turns, also after a kill between the two.
+        let actor = usize::from(replay.committed(0).mark > replay.committed(1).mark);
+        append(&mut replay, actor);
         if round.is_multiple_of(2000) {
             replay.flush().unwrap();
         }
     }
 }
 
-/// A record is of one moment: the actors' rows add up to its head, and each has the rows of its chunks.
+/// Asserts that a record is of one moment: the actors' rows add up to its head, and the actors took turns.
 fn check_record(record: &Record) {
     let actors = (0..ACTORS).map(|actor| record.actor(actor));
     assert_eq!(actors.map(|actor| actor.rows).sum::<u64>(), record.head());
     assert!(record.actor(0).mark.sequence - record.actor(1).mark.sequence <= 1);
 }
 
-/// The rows are those of chunks 1 to the last of each actor, whole and in order, as far back as the ring reaches.
+/// Asserts that the rows are those of each actor's chunks, from chunk 1 to the last, whole and in order, as far back as
+/// the ring goes.
 fn check_rows(replay: &Replay) {
     for actor in 0..ACTORS {
         let commit = replay.committed(actor);
@@ -130,12 +131,12 @@ fn check_rows(replay: &Replay) {
 }
 
 #[test]
-fn a_learner_killed_again_and_again_loses_nothing_that_was_committed() {
+fn a_learner_killed_repeatedly_loses_nothing_that_was_committed() {
     let directory = TempDir::new().unwrap();
     let path = directory.path().join("replay.rows");
     let mut seen = 0;
     for kill in 0..40 {
-        let writer = Writer::start("processes::child_appends_without_end", &path);
+        let writer = Writer::start("processes::child_appends_forever", &path);
         let start = Instant::now();
         let reader = loop {
             match CommitReader::open(&path) {
@@ -143,18 +144,21 @@ fn a_learner_killed_again_and_again_loses_nothing_that_was_committed() {
                 reader => break reader.unwrap(),
             }
         };
-        // Watch it go on, and for another while of up to 16 ms that no kill shares with another.
+        // Wait until it commits, and then up to 16 ms more: a different time before each kill.
         let before = seen;
         let mut until = None;
         while until.is_none_or(|until| Instant::now() < until) {
             let record = reader.snapshot().unwrap();
             check_record(&record);
-            assert!(record.head() >= seen, "committed rows never get fewer");
+            assert!(record.head() >= seen, "the number of committed rows never decreases");
             seen = record.head();
             if seen > before && until.is_none() {
                 until = Some(Instant::now() + Duration::from_micros(kill * 397));
             }
-            assert!(start.elapsed() < Duration::from_secs(20), "the writer goes on");
+            assert!(
+                start.elapsed() < Duration::from_secs(20),
+                "the writer makes no progress"
+            );
         }
         drop(writer);
         let replay = Replay::open(&path, &layout()).unwrap();
@@ -168,7 +172,7 @@ fn a_learner_killed_again_and_again_loses_nothing_that_was_committed() {
         );
         check_rows(&replay);
     }
-    assert!(seen > 2 * 4096, "the ring went round: {seen}");
+    assert!(seen > 2 * 4096, "the ring wrapped around: {seen}");
 }
 
 #[test]
@@ -177,7 +181,7 @@ fn readers_see_whole_records_that_only_grow() {
     let path = directory.path().join("replay.rows");
     let mut replay = Replay::create(&path, &layout()).unwrap();
     let check = |reader: &CommitReader, head: &mut u64, marks: &mut [ChunkMark]| {
-        let record = reader.snapshot().expect("a published record is never torn");
+        let record = reader.snapshot().expect("a published record can always be read");
         check_record(&record);
         assert!(record.head() >= *head && reader.rows() >= record.head());
         *head = record.head();
@@ -219,7 +223,7 @@ fn under_limit(set_up: &str, test: &str, path: &Path) {
 
 #[test]
 #[ignore = "a child of the test below"]
-fn child_makes_a_replay_that_is_too_large() {
+fn child_creates_a_replay_that_is_too_large() {
     let path = path_of_child();
     let error = Replay::create(&path, &layout()).unwrap_err();
     let bytes = layout().places().unwrap().end;
@@ -233,12 +237,12 @@ fn child_makes_a_replay_that_is_too_large() {
 }
 
 #[test]
-fn a_replay_beyond_the_file_size_limit_is_an_error_and_no_file() {
+fn a_replay_beyond_the_file_size_limit_is_an_error_and_leaves_no_file() {
     let directory = TempDir::new().unwrap();
-    // SIGXFSZ would end the child: nothing is set up against it.
+    // SIGXFSZ would end the child, which does not ignore it.
     under_limit(
         "",
-        "processes::child_makes_a_replay_that_is_too_large",
+        "processes::child_creates_a_replay_that_is_too_large",
         &directory.path().join("replay.rows"),
     );
 }
@@ -262,7 +266,7 @@ fn child_writes_a_checkpoint_that_is_too_large() {
 }
 
 #[test]
-fn a_checkpoint_that_finds_no_room_leaves_the_last_one() {
+fn a_checkpoint_without_space_leaves_the_last_one() {
     let directory = TempDir::new().unwrap();
     let mut store = Checkpoints::new(directory.path(), 1);
     store

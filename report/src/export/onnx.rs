@@ -1,4 +1,4 @@
-//! A policy as an ONNX model. It takes any number of observations at once: the first dimension is named, not fixed.
+//! A policy as an ONNX model. The first dimension of its inputs and outputs is the batch size, which is not fixed.
 
 mod message;
 
@@ -10,10 +10,10 @@ use prost::Message;
 
 use super::{Activation, Body, Network, Portable};
 
-/// Of the file's form and of the operators: old enough for every runtime, and new enough for `ArgMax` to say which of
-/// equals it takes.
-const FORM: i64 = 8;
-const OPERATORS: i64 = 13;
+/// The versions of the file format and of the operator set. They are old enough for every runtime, and new enough for
+/// `ArgMax` to have `select_last_index`, which decides between equal values.
+const IR_VERSION: i64 = 8;
+const OPERATOR_SET_VERSION: i64 = 13;
 
 /// The name of the first dimension.
 const BATCH: &str = "batch";
@@ -21,8 +21,10 @@ const BATCH: &str = "batch";
 /// The bytes of the model.
 ///
 /// - DDPG: `observation` (batch × n) to `action` (batch × m, in the environment's units).
-/// - REINFORCE: `observation` to `logits`, `probabilities` (batch × actions) and `action` (batch: the likeliest).
-/// - Tables: `state` (batch, 64-bit) to `action_values` (batch × actions) and `action` (batch: the best).
+/// - REINFORCE: `observation` to `logits`, `probabilities` (batch × actions) and `action` (batch, the most probable
+///   one).
+/// - Tables: `state` (batch, 64-bit) to `action_values` (batch × actions) and `action` (batch, the one of highest
+///   value).
 pub(super) fn model(policy: &Portable) -> Vec<u8> {
     let mut graph = Graph {
         name: "policy".into(),
@@ -34,56 +36,58 @@ pub(super) fn model(policy: &Portable) -> Vec<u8> {
             let half = range.half().to_vec();
             let centre: Vec<f32> = elements.map(|element| range.action(element, 0.0)).collect();
             let outputs = half.len();
-            graph.takes("observation", FLOAT, &[network.layers[0].inputs]);
-            graph.network(network, "z");
-            graph.does("Tanh", &["z"], "tanh", vec![]);
-            graph.holds("action_half_width", &[outputs], &half);
-            graph.does("Mul", &["tanh", "action_half_width"], "scaled", vec![]);
-            graph.holds("action_centre", &[outputs], &centre);
-            graph.does("Add", &["scaled", "action_centre"], "action", vec![]);
-            graph.gives("action", FLOAT, &[outputs]);
+            graph.add_input("observation", FLOAT, &[network.layers[0].inputs]);
+            graph.add_network(network, "z");
+            graph.add_node("Tanh", &["z"], "tanh", vec![]);
+            graph.add_tensor("action_half_width", &[outputs], &half);
+            graph.add_node("Mul", &["tanh", "action_half_width"], "scaled", vec![]);
+            graph.add_tensor("action_centre", &[outputs], &centre);
+            graph.add_node("Add", &["scaled", "action_centre"], "action", vec![]);
+            graph.add_output("action", FLOAT, &[outputs]);
         }
         Body::Probabilities { network } => {
-            graph.takes("observation", FLOAT, &[network.layers[0].inputs]);
-            graph.network(network, "logits");
-            graph.does("Softmax", &["logits"], "probabilities", vec![integer("axis", 1)]);
-            graph.first_of_the_highest("logits");
+            graph.add_input("observation", FLOAT, &[network.layers[0].inputs]);
+            graph.add_network(network, "logits");
+            graph.add_node("Softmax", &["logits"], "probabilities", vec![integer("axis", 1)]);
+            graph.add_arg_max("logits");
             let actions = network.layers.last().map_or(0, |last| last.biases.len());
-            graph.gives("logits", FLOAT, &[actions]);
-            graph.gives("probabilities", FLOAT, &[actions]);
-            graph.gives("action", INT64, &[]);
+            graph.add_output("logits", FLOAT, &[actions]);
+            graph.add_output("probabilities", FLOAT, &[actions]);
+            graph.add_output("action", INT64, &[]);
         }
         Body::Table {
             states,
             actions,
             values,
         } => {
-            graph.takes("state", INT64, &[]);
-            graph.holds("table", &[*states, *actions], values);
-            graph.does("Gather", &["table", "state"], "action_values", vec![integer("axis", 0)]);
-            graph.first_of_the_highest("action_values");
-            graph.gives("action_values", FLOAT, &[*actions]);
-            graph.gives("action", INT64, &[]);
+            graph.add_input("state", INT64, &[]);
+            graph.add_tensor("table", &[*states, *actions], values);
+            graph.add_node("Gather", &["table", "state"], "action_values", vec![integer("axis", 0)]);
+            graph.add_arg_max("action_values");
+            graph.add_output("action_values", FLOAT, &[*actions]);
+            graph.add_output("action", INT64, &[]);
         }
     }
-    let about = policy.about.iter().map(|(key, value)| Metadata {
+    let metadata = policy.metadata.iter().map(|(key, value)| Metadata {
         key: key.clone(),
         value: value.clone(),
     });
     Model {
-        ir_version: FORM,
+        ir_version: IR_VERSION,
         producer_name: "shoal".into(),
         producer_version: env!("CARGO_PKG_VERSION").into(),
         graph: Some(graph),
-        opset_import: vec![Operators { version: OPERATORS }],
-        metadata_props: about.collect(),
+        opset_import: vec![Operators {
+            version: OPERATOR_SET_VERSION,
+        }],
+        metadata_props: metadata.collect(),
     }
     .encode_to_vec()
 }
 
 impl Graph {
-    /// The layers, with the activation between them; the last one's output is named `output`.
-    fn network(&mut self, network: &Network, output: &str) {
+    /// Adds the layers with the activation between them. The output of the last one is named `output`.
+    fn add_network(&mut self, network: &Network, output: &str) {
         let Network { activation, layers } = network;
         let activation = match activation {
             Activation::Relu => "Relu",
@@ -92,29 +96,29 @@ impl Graph {
         let mut x = "observation".to_owned();
         for (number, layer) in layers.iter().enumerate() {
             let [weight, bias] = ["weight", "bias"].map(|what| format!("layers.{number}.{what}"));
-            self.holds(&weight, &[layer.biases.len(), layer.inputs], &layer.weights);
-            self.holds(&bias, &[layer.biases.len()], &layer.biases);
+            self.add_tensor(&weight, &[layer.biases.len(), layer.inputs], &layer.weights);
+            self.add_tensor(&bias, &[layer.biases.len()], &layer.biases);
             let last = number + 1 == layers.len();
             let z: String = if last { output.into() } else { format!("z{number}") };
-            self.does("Gemm", &[&x, &weight, &bias], &z, vec![integer("transB", 1)]);
+            self.add_node("Gemm", &[&x, &weight, &bias], &z, vec![integer("transB", 1)]);
             if !last {
                 x = format!("h{number}");
-                self.does(activation, &[&z], &x, vec![]);
+                self.add_node(activation, &[&z], &x, vec![]);
             }
         }
     }
 
-    /// The index of the highest, the first of equals, as `action`.
-    fn first_of_the_highest(&mut self, scores: &str) {
+    /// Adds `action`: the index of the highest score, the first one among equal scores.
+    fn add_arg_max(&mut self, scores: &str) {
         let attributes = vec![
             integer("axis", 1),
             integer("keepdims", 0),
             integer("select_last_index", 0),
         ];
-        self.does("ArgMax", &[scores], "action", attributes);
+        self.add_node("ArgMax", &[scores], "action", attributes);
     }
 
-    fn does(&mut self, operator: &str, inputs: &[&str], output: &str, attribute: Vec<Attribute>) {
+    fn add_node(&mut self, operator: &str, inputs: &[&str], output: &str, attribute: Vec<Attribute>) {
         self.node.push(Node {
             input: inputs.iter().map(|input| (*input).to_owned()).collect(),
             output: vec![output.into()],
@@ -124,7 +128,7 @@ impl Graph {
         });
     }
 
-    fn holds(&mut self, name: &str, shape: &[usize], numbers: &[f32]) {
+    fn add_tensor(&mut self, name: &str, shape: &[usize], numbers: &[f32]) {
         self.initializer.push(Tensor {
             dims: shape.iter().map(|size| *size as i64).collect(),
             data_type: FLOAT,
@@ -133,16 +137,16 @@ impl Graph {
         });
     }
 
-    fn takes(&mut self, name: &str, element: i32, shape: &[usize]) {
+    fn add_input(&mut self, name: &str, element: i32, shape: &[usize]) {
         self.input.push(value(name, element, shape));
     }
 
-    fn gives(&mut self, name: &str, element: i32, shape: &[usize]) {
+    fn add_output(&mut self, name: &str, element: i32, shape: &[usize]) {
         self.output.push(value(name, element, shape));
     }
 }
 
-/// A batch of tensors of this shape.
+/// An input or output: a batch of tensors of this shape.
 fn value(name: &str, element: i32, shape: &[usize]) -> ValueInfo {
     let batch = Dimension {
         dim_param: Some(BATCH.into()),

@@ -1,12 +1,13 @@
-//! A policy as a safetensors file: tensors with the names of a PyTorch module's `state_dict`, and what they are for.
+//! A policy as a safetensors file: tensors with the names of a PyTorch module's `state_dict`, and metadata.
 
 use safetensors::Dtype;
 use safetensors::tensor::TensorView;
 
 use super::{Body, Dense, Portable};
 
-/// `layers.<i>.weight` (outputs × inputs, row after row) and `layers.<i>.bias` for each layer from 0 on, the output layer
-/// last; of a table, `action_values` (states × actions). Metadata says the rest.
+/// The bytes of the file. A network has `layers.<i>.weight` (outputs × inputs, row-major) and `layers.<i>.bias` for
+/// each layer i from 0, the output layer last. A table has `action_values` (states × actions). The metadata describes
+/// the rest.
 pub(super) fn file(policy: &Portable) -> anyhow::Result<Vec<u8>> {
     let tensors = match &policy.body {
         Body::Actions { network, .. } | Body::Probabilities { network } => of_layers(&network.layers),
@@ -23,8 +24,8 @@ pub(super) fn file(policy: &Portable) -> anyhow::Result<Vec<u8>> {
             view.map(|view| (name.as_str(), view))
         })
         .collect();
-    let about = policy.about.clone().into_iter().collect();
-    Ok(safetensors::serialize(views?, Some(about))?)
+    let metadata = policy.metadata.clone().into_iter().collect();
+    Ok(safetensors::serialize(views?, Some(metadata))?)
 }
 
 type Named<'a> = (String, Vec<usize>, &'a [f32]);
@@ -62,7 +63,7 @@ mod tests {
         (tensor.shape().to_vec(), numbers.collect())
     }
 
-    /// y = W x + b as `torch.nn.Linear` has it, with the tensors that are in the file.
+    /// y = W x + b as in `torch.nn.Linear`, with the tensors of the file.
     fn linear(tensors: &SafeTensors<'_>, layer: usize, x: &[f32]) -> Vec<f32> {
         let (shape, weights) = numbers(tensors, &format!("layers.{layer}.weight"));
         let (_, biases) = numbers(tensors, &format!("layers.{layer}.bias"));
@@ -73,7 +74,7 @@ mod tests {
     }
 
     #[test]
-    fn who_computes_with_the_tensors_and_the_metadata_acts_alike() {
+    fn tensors_and_metadata_suffice_to_compute_the_same_actions() {
         for (config, policy) in policies() {
             let bytes = Portable::new(&config, &policy, "best")
                 .unwrap()
@@ -81,25 +82,25 @@ mod tests {
                 .unwrap();
             let tensors = SafeTensors::deserialize(&bytes).unwrap();
             let (_, header) = SafeTensors::read_metadata(&bytes).unwrap();
-            let about = header.metadata().clone().unwrap();
-            assert_eq!(about["environment"], config.environment.name);
+            let metadata = header.metadata().clone().unwrap();
+            assert_eq!(metadata["environment"], config.environment.name);
             let observations = some_observations(&config, 5);
             let mut ours = config.algorithm.policy(&config.spec, 1).unwrap();
             let width = config.spec.observation.width();
             for observation in observations.chunks_exact(width) {
                 let mut expected = vec![0.0; config.spec.action.width()];
                 ours.act(&policy.parameters, observation, &mut expected);
-                if !about.contains_key("hidden_activation") {
+                if !metadata.contains_key("hidden_activation") {
                     let (shape, values) = numbers(&tensors, "action_values");
                     let row = &values[observation[0] as usize * shape[1]..][..shape[1]];
                     assert_eq!(shoal_common::policy::highest(row) as f32, expected[0]);
                     continue;
                 }
                 let mut x = observation.to_vec();
-                let activation: fn(f32) -> f32 = match about["hidden_activation"].as_str() {
+                let activation: fn(f32) -> f32 = match metadata["hidden_activation"].as_str() {
                     "relu" => |z| z.max(0.0),
                     "tanh" => f32::tanh,
-                    other => panic!("{other} is no activation"),
+                    other => panic!("unknown activation {other}"),
                 };
                 let last = tensors.len() / 2 - 1;
                 for layer in 0..last {
@@ -110,7 +111,7 @@ mod tests {
                     assert_eq!(shoal_common::policy::highest(&z) as f32, expected[0]);
                     continue;
                 }
-                let bound = |name: &str| -> Vec<f32> { serde_json::from_str(&about[name]).unwrap() };
+                let bound = |name: &str| -> Vec<f32> { serde_json::from_str(&metadata[name]).unwrap() };
                 let (low, high) = (bound("action_low"), bound("action_high"));
                 for (i, z) in z.iter().enumerate() {
                     let action = low[i] + (high[i] - low[i]) * (z.tanh() + 1.0) / 2.0;

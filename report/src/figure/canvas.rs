@@ -1,4 +1,4 @@
-//! A white sheet that becomes an SVG file, and what everything drawn on it has in common: colours, type, stroke widths.
+//! A white sheet that becomes an SVG file, and the shared colours, fonts and stroke widths.
 
 use std::io::Write;
 use std::path::Path;
@@ -12,7 +12,7 @@ use shoal_common::durable::write_atomically;
 /// A rectangle of the sheet.
 pub(super) type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
 
-/// Okabe and Ito's colours, which people of every kind of colour vision tell apart.
+/// The colours of Okabe and Ito, which colour-blind readers can distinguish too.
 pub(super) const BLUE: RGBColor = RGBColor(0, 114, 178);
 pub(super) const VERMILION: RGBColor = RGBColor(213, 94, 0);
 pub(super) const GREEN: RGBColor = RGBColor(0, 158, 115);
@@ -20,11 +20,11 @@ pub(super) const PURPLE: RGBColor = RGBColor(204, 121, 167);
 pub(super) const INK: RGBColor = RGBColor(38, 38, 38);
 pub(super) const FAINT: RGBColor = RGBColor(224, 224, 224);
 
-/// plotters' coordinates are whole numbers. The sheet is drawn this many times too large and shown at its proper size,
-/// so that lines have no steps.
+/// plotters uses integer coordinates. The sheet is therefore drawn this many times larger than it is shown, so that
+/// lines are smooth.
 const FINE: f64 = 16.0;
 
-/// A length in pixels of the shown picture, in plotters' coordinates.
+/// Converts a length in pixels of the shown figure to plotters' coordinates.
 pub(super) fn px(length: f64) -> i32 {
     (length * FINE).round() as i32
 }
@@ -34,7 +34,7 @@ pub(super) fn stroke(color: RGBColor, opacity: f64, width: f64) -> ShapeStyle {
     color.mix(opacity).stroke_width(px(width) as u32)
 }
 
-/// Text `size` pixels high, anchored at its left or right end or its centre, and half-way up.
+/// Text `size` pixels high, anchored horizontally at `anchor` and vertically at its centre.
 pub(super) fn text<'a>(size: f64, anchor: HPos) -> TextStyle<'a> {
     // plotters' SVG backend divides sizes by 1.24.
     let font = ("Helvetica, Arial, sans-serif", size * FINE * 1.24).into_font();
@@ -48,12 +48,13 @@ pub(super) fn bold<'a>(size: f64, anchor: HPos) -> TextStyle<'a> {
     style
 }
 
-/// About how many pixels wide a text of this size is; only the reader's machine knows exactly.
+/// Approximate width of a text in pixels; the exact width depends on the viewer's fonts.
 pub(super) fn width_of(text: &str, size: f64) -> f64 {
     text.chars().count() as f64 * size * 0.58
 }
 
-/// Draws a picture of `width` × `height` pixels into the file `path`. What was there before stays until it is complete.
+/// Draws a figure of `width` × `height` pixels into the file `path`. An existing file is replaced only when the new one
+/// is complete.
 pub(super) fn save(
     path: &Path,
     (width, height): (u32, u32),
@@ -79,7 +80,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_picture_is_shown_at_its_proper_size() {
+    fn a_figure_is_shown_at_its_nominal_size() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("empty.svg");
         save(&path, (300, 200), |_| Ok(())).unwrap();
@@ -91,12 +92,12 @@ mod tests {
         assert_eq!(
             std::fs::read_dir(dir.path()).unwrap().count(),
             1,
-            "no partial file stays"
+            "no partial file remains"
         );
     }
 
     #[test]
-    fn a_place_that_cannot_be_written_is_named() {
+    fn the_error_names_a_path_that_cannot_be_written() {
         let error = save(Path::new("/nowhere/at/all.svg"), (300, 200), |_| Ok(())).unwrap_err();
         assert_eq!(error.to_string(), "cannot write /nowhere/at/all.svg");
     }

@@ -1,4 +1,4 @@
-//! Agents beside each other, as in figures 5.10 and 5.11.
+//! Several agents side by side, as in figures 5.10 and 5.11.
 
 use std::path::Path;
 
@@ -8,29 +8,29 @@ use super::canvas::{BLUE, save};
 use super::panel::{Axis, Panel, Series};
 use super::point_mass::{CELL, draw_actions, draw_distance, extent, goal, starts};
 
-/// What an agent is called, and what it does.
+/// An agent and its episodes.
 pub struct Agent<'a> {
-    /// What the legend calls it.
+    /// Its name in the diagram's title.
     pub name: String,
-    /// Its episodes, one from each start.
+    /// Its episodes, one from each start position.
     pub drives: Vec<&'a Drive>,
 }
 
-/// Draws the paths of each agent in a diagram of its own.
-pub fn paths_beside(agents: &[Agent<'_>], path: &Path) -> anyhow::Result<()> {
-    let everywhere = agents
+/// Draws one diagram for each agent, with the paths of all its episodes.
+pub fn compare_paths(agents: &[Agent<'_>], path: &Path) -> anyhow::Result<()> {
+    let points = agents
         .iter()
         .flat_map(|agent| &agent.drives)
         .flat_map(|drive| drive.path());
-    let range = extent(everywhere);
+    let range = extent(points);
     let size = (agents.len().max(1) as u32 * 420, 450);
     save(path, size, |sheet| {
         for (agent, cell) in agents.iter().zip(sheet.split_evenly((1, agents.len().max(1)))) {
-            let ways = agent.drives.iter().map(|drive| Series {
+            let paths = agent.drives.iter().map(|drive| Series {
                 width: 1.5,
                 ..Series::line("", BLUE, drive.path().collect())
             });
-            let begins = agent.drives.iter().map(|drive| (drive.start[0], drive.start[1]));
+            let start_points = agent.drives.iter().map(|drive| (drive.start[0], drive.start[1]));
             Panel {
                 title: &agent.name,
                 note: "",
@@ -42,7 +42,7 @@ pub fn paths_beside(agents: &[Agent<'_>], path: &Path) -> anyhow::Result<()> {
                     label: "y (m)",
                     range: range.clone(),
                 },
-                series: ways.chain([starts(begins.collect()), goal()]).collect(),
+                series: paths.chain([starts(start_points.collect()), goal()]).collect(),
                 equal_scale: true,
             }
             .draw(&cell)?;
@@ -51,8 +51,8 @@ pub fn paths_beside(agents: &[Agent<'_>], path: &Path) -> anyhow::Result<()> {
     })
 }
 
-/// Draws what each agent does on its first drive in a row of its own: actions, and distance to the goal.
-pub fn actions_beside(agents: &[Agent<'_>], path: &Path) -> anyhow::Result<()> {
+/// Draws one row for each agent, with the actions and the distance to the goal in its first episode.
+pub fn compare_actions(agents: &[Agent<'_>], path: &Path) -> anyhow::Result<()> {
     let firsts: Vec<(&str, &Drive)> = agents
         .iter()
         .filter_map(|agent| Some((agent.name.as_str(), *agent.drives.first()?)))
@@ -77,7 +77,7 @@ mod tests {
     use shoal_run::testing::drive;
 
     #[test]
-    fn agents_are_drawn_beside_each_other() {
+    fn agents_are_drawn_side_by_side() {
         let dir = tempfile::tempdir().unwrap();
         let drives = [
             drive([2.0, -2.0], 0.0, 1.0, 2.0, 1.0),
@@ -91,8 +91,8 @@ mod tests {
             .into();
         for agents in [&agents[..], &[]] {
             let [paths, actions] = ["paths.svg", "actions.svg"].map(|file| dir.path().join(file));
-            paths_beside(agents, &paths).unwrap();
-            actions_beside(agents, &actions).unwrap();
+            compare_paths(agents, &paths).unwrap();
+            compare_actions(agents, &actions).unwrap();
             let svg = std::fs::read_to_string(actions).unwrap();
             assert_eq!(svg.contains("r2: control actions"), !agents.is_empty());
         }

@@ -1,4 +1,4 @@
-//! An environment's signals over one episode, one diagram below the other.
+//! An environment's signals over one episode, one diagram for each.
 
 use std::path::Path;
 
@@ -12,7 +12,7 @@ use super::panel::{Axis, Panel, Series, range_of};
 const WIDTH: u32 = 860;
 const HEIGHT: u32 = 210;
 
-/// Draws the signals over the time, in s, or over the steps where a step has no time.
+/// Draws the signals over time. `time_step` is the duration of a step in s; without it the x axis counts steps.
 pub fn episode(signals: &[Signal], time_step: Option<f64>, trajectory: &Trajectory, path: &Path) -> anyhow::Result<()> {
     let (unit, label) = match time_step {
         Some(seconds) => (seconds, "time (s)"),
@@ -49,7 +49,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_signal_has_its_diagram() {
+    fn every_signal_has_a_diagram() {
         let trajectory = Trajectory {
             observations: (0..=40u8).map(|t| vec![f32::from(t), f32::NAN]).collect(),
             actions: (0..40u8).map(|t| vec![f32::from(t % 2)]).collect(),

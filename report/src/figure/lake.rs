@@ -1,4 +1,4 @@
-//! The lake as a grid: what a policy does in each field, and what its actions are worth there (figure 4.4).
+//! FrozenLake as a grid: a policy's actions in each cell, and their values (figure 4.4).
 
 use std::path::Path;
 
@@ -15,11 +15,11 @@ const CELL: f64 = 120.0;
 const MARGIN: f64 = 30.0;
 const TITLE: f64 = 34.0;
 
-/// From a field's middle to where an action means to go: left, down, right, up.
+/// The directions of the actions 0 to 3: left, down, right, up; y points down.
 const DIRECTIONS: [(f64, f64); 4] = [(-1.0, 0.0), (0.0, 1.0), (1.0, 0.0), (0.0, -1.0)];
 
-/// Draws two lakes side by side: for each field the actions to be taken there, more than one where they are equally good,
-/// and the value of each action, darker where it is higher.
+/// Draws two grids side by side: the policy's actions in each cell (several if they are equally good), and the value of
+/// each action, darker for higher values.
 pub fn lake(policy: &[Vec<usize>], values: &[[f64; 4]], path: &Path) -> anyhow::Result<()> {
     let side = SIDE as f64 * CELL;
     let width = 2.0 * side + 3.0 * MARGIN;
@@ -30,23 +30,23 @@ pub fn lake(policy: &[Vec<usize>], values: &[[f64; 4]], path: &Path) -> anyhow::
         for (state, kind) in MAP.iter().enumerate() {
             let (row, column) = (state / SIDE, state % SIDE);
             let (x, y) = (column as f64 * CELL, TITLE + row as f64 * CELL);
-            field(sheet, MARGIN + x, y, state)?;
-            field(sheet, right + x, y, state)?;
+            draw_cell(sheet, MARGIN + x, y, state)?;
+            draw_cell(sheet, right + x, y, state)?;
             if matches!(kind, b'H' | b'G') {
                 continue;
             }
             for action in policy.get(state).into_iter().flatten() {
-                arrow(sheet, MARGIN + x + CELL / 2.0, y + CELL / 2.0, DIRECTIONS[*action])?;
+                draw_arrow(sheet, MARGIN + x + CELL / 2.0, y + CELL / 2.0, DIRECTIONS[*action])?;
             }
             if let Some(values) = values.get(state) {
-                triangles(sheet, right + x, y, values)?;
+                draw_values(sheet, right + x, y, values)?;
             }
         }
         Ok(())
     })
 }
 
-fn field(sheet: &Area<'_>, x: f64, y: f64, state: usize) -> anyhow::Result<()> {
+fn draw_cell(sheet: &Area<'_>, x: f64, y: f64, state: usize) -> anyhow::Result<()> {
     let corners = [(px(x), px(y)), (px(x + CELL), px(y + CELL))];
     let fill = match MAP[state] {
         b'H' => RGBColor(90, 90, 90),
@@ -71,7 +71,7 @@ fn field(sheet: &Area<'_>, x: f64, y: f64, state: usize) -> anyhow::Result<()> {
     Ok(sheet.draw_text(name, &text(14.0, HPos::Center).color(&ink), middle)?)
 }
 
-fn arrow(sheet: &Area<'_>, x: f64, y: f64, (dx, dy): (f64, f64)) -> anyhow::Result<()> {
+fn draw_arrow(sheet: &Area<'_>, x: f64, y: f64, (dx, dy): (f64, f64)) -> anyhow::Result<()> {
     let at = |along: f64, across: f64| (px(x + along * dx - across * dy), px(y + along * dy + across * dx));
     sheet.draw(&PathElement::new([at(6.0, 0.0), at(38.0, 0.0)], stroke(BLUE, 1.0, 2.6)))?;
     Ok(sheet.draw(&Polygon::new(
@@ -80,8 +80,8 @@ fn arrow(sheet: &Area<'_>, x: f64, y: f64, (dx, dy): (f64, f64)) -> anyhow::Resu
     ))?)
 }
 
-/// The field in four triangles, one for each action.
-fn triangles(sheet: &Area<'_>, x: f64, y: f64, values: &[f64; 4]) -> anyhow::Result<()> {
+/// Draws the values of the four actions as four triangles of the cell.
+fn draw_values(sheet: &Area<'_>, x: f64, y: f64, values: &[f64; 4]) -> anyhow::Result<()> {
     let (cx, cy, half) = (x + CELL / 2.0, y + CELL / 2.0, CELL / 2.0);
     for ((dx, dy), value) in DIRECTIONS.iter().zip(values) {
         let corner = |side: f64| (px(cx + half * (dx - side * dy)), px(cy + half * (dy + side * dx)));
@@ -99,7 +99,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_frozen_field_has_its_values_and_holes_have_none() {
+    fn frozen_cells_show_values_and_holes_and_goal_do_not() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("lake.svg");
         lake(&vec![vec![0, 2]; 16], &[[0.25, 0.5, 0.75, 1.0]; 16], &path).unwrap();

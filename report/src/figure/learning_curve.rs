@@ -10,7 +10,7 @@ use super::panel::{Axis, Look, Panel, Series, range_of};
 
 const SIZE: (u32, u32) = (860, 470);
 
-/// Draws the evaluations as they were, thin, and their moving average, thick.
+/// Draws the evaluations as a thin line and their moving average as a thick one.
 pub fn learning_curve(evaluations: &[EvaluationRecord], path: &Path) -> anyhow::Result<()> {
     let mut evaluations: Vec<&EvaluationRecord> = evaluations.iter().collect();
     evaluations.sort_by_key(|evaluation| evaluation.env_steps);
@@ -79,7 +79,7 @@ pub fn learning_curve(evaluations: &[EvaluationRecord], path: &Path) -> anyhow::
     })
 }
 
-/// In what steps are counted on an axis that reaches to `last`.
+/// The divisor and the label of an axis of environment steps that ends at `last`.
 pub(super) fn unit_of(last: u64) -> (f64, &'static str) {
     match last {
         0..20_000 => (1.0, "environment steps"),
@@ -88,7 +88,8 @@ pub(super) fn unit_of(last: u64) -> (f64, &'static str) {
     }
 }
 
-/// How many evaluations are averaged: about a twelfth of them, an odd number, and 1 where there is nothing to smooth.
+/// Number of evaluations in the moving average: about a twelfth of them, always odd, and 1 (no smoothing) if there are
+/// few.
 fn window(evaluations: usize) -> usize {
     match evaluations {
         0..5 => 1,
@@ -96,7 +97,7 @@ fn window(evaluations: usize) -> usize {
     }
 }
 
-/// The mean of the `window` points around each one; at the ends, of those of them that there are.
+/// The mean of the `window` points centred on each point; near the ends, of the part of the window that exists.
 fn smooth(points: &[(f64, f64)], window: usize) -> Vec<(f64, f64)> {
     let half = window / 2;
     let mean = |of: &[(f64, f64)]| of.iter().map(|(_, y)| y).sum::<f64>() / of.len() as f64;
@@ -131,7 +132,7 @@ mod tests {
     }
 
     #[test]
-    fn any_number_of_evaluations_makes_a_picture() {
+    fn any_number_of_evaluations_can_be_drawn() {
         let dir = tempfile::tempdir().unwrap();
         for count in [0, 1, 2, 5, 60, 400, 5_000] {
             let path = dir.path().join(format!("learning-curve-{count}.svg"));
@@ -152,7 +153,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_a_number_is_left_out() {
+    fn values_that_are_not_numbers_are_left_out() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("curve.svg");
         let mut evaluations = evaluations(20);
@@ -164,9 +165,9 @@ mod tests {
     proptest! {
         #![proptest_config(ProptestConfig { cases: 150, failure_persistence: None, ..ProptestConfig::default() })]
 
-        /// `evaluations.csv` may say anything.
+        /// `evaluations.csv` may contain any numbers.
         #[test]
-        fn any_numbers_are_drawn(
+        fn any_numbers_can_be_drawn(
             numbers in prop::collection::vec((
                 prop_oneof![0..9_u64, any::<u64>()],
                 prop_oneof![

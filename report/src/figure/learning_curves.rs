@@ -1,4 +1,5 @@
-//! The learning curves of several seeds in one diagram: each one thin, their median thick, the middle half as a band.
+//! The learning curves of several seeds in one diagram: thin lines, their median as a thick line, and the middle half
+//! as a band.
 
 use std::path::Path;
 
@@ -8,7 +9,8 @@ use super::panel::{Axis, Look, Panel, Series, range_of};
 
 const SIZE: (u32, u32) = (860, 470);
 
-/// Draws one curve of (environment steps, mean return) for each seed, and where steps are to be marked a line at them.
+/// Draws one curve of (environment steps, mean return) for each seed. `mark` is a number of environment steps to be
+/// marked by a vertical line, with the line's label.
 pub fn learning_curves(
     title: &str,
     curves: &[Vec<(u64, f64)>],
@@ -24,11 +26,11 @@ pub fn learning_curves(
     let mut series = Vec::new();
     let [lower, median, upper] = [0.25, 0.5, 0.75].map(|share| quantiles(curves, share));
     if curves.len() > 2 {
-        let round = &mut lower.iter().chain(upper.iter().rev()).copied();
+        let outline = &mut lower.iter().chain(upper.iter().rev()).copied();
         series.push(Series {
             look: Look::Area,
             opacity: 0.18,
-            ..Series::line("middle half", BLUE, scaled(round))
+            ..Series::line("middle half", BLUE, scaled(outline))
         });
     }
     for (i, curve) in curves.iter().enumerate() {
@@ -71,7 +73,7 @@ pub fn learning_curves(
     save(path, SIZE, |sheet| panel.draw(sheet))
 }
 
-/// At each evaluation that all curves have, the value that this share of them does not exceed.
+/// The quantile `share` of the curves' values at each evaluation that all curves have.
 fn quantiles(curves: &[Vec<(u64, f64)>], share: f64) -> Vec<(u64, f64)> {
     let common = curves.iter().map(Vec::len).min().unwrap_or(0);
     let at = |i: usize| {
@@ -82,7 +84,7 @@ fn quantiles(curves: &[Vec<(u64, f64)>], share: f64) -> Vec<(u64, f64)> {
     (0..common).map(at).collect()
 }
 
-/// Between the two nearest of the sorted values, in proportion.
+/// The quantile `share` (0 to 1) of sorted values, interpolated linearly. There must be at least one value.
 pub fn quantile(sorted: &[f64], share: f64) -> f64 {
     let place = share * (sorted.len() - 1) as f64;
     let (below, above) = (sorted[place.floor() as usize], sorted[place.ceil() as usize]);
@@ -94,7 +96,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_quantile_lies_between_its_neighbours() {
+    fn quantiles_are_interpolated() {
         let values = [1.0, 2.0, 4.0, 8.0];
         assert_eq!(
             [0.0, 0.25, 0.5, 1.0].map(|share| quantile(&values, share)),
@@ -105,7 +107,7 @@ mod tests {
     }
 
     #[test]
-    fn any_number_of_seeds_makes_a_picture() {
+    fn any_number_of_seeds_can_be_drawn() {
         let dir = tempfile::tempdir().unwrap();
         for seeds in [0, 1, 2, 5] {
             let path = dir.path().join(format!("{seeds}.svg"));

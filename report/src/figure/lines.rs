@@ -1,4 +1,4 @@
-//! Curves of different settings in one diagram, or a diagram for each with the runs behind its curve.
+//! Curves of different settings, in one diagram or in a diagram for each setting with its runs.
 
 use std::path::Path;
 
@@ -9,23 +9,23 @@ use super::panel::{Axis, Panel, Series};
 
 const COLORS: [RGBColor; 4] = [BLUE, VERMILION, GREEN, PURPLE];
 
-/// What several diagrams of a figure have in common.
+/// The title, axes and reference line shared by the diagrams of a figure.
 pub struct Frame<'a> {
     /// Above the diagram.
     pub title: &'a str,
-    /// Label and greatest value; the least is 0.
+    /// Label and maximum of the x axis, which starts at 0.
     pub x: (&'a str, f64),
-    /// Label, least and greatest value.
+    /// Label, minimum and maximum of the y axis.
     pub y: (&'a str, f64, f64),
-    /// A height to compare with.
+    /// Label and y value of a horizontal reference line.
     pub level: Option<(&'a str, f64)>,
 }
 
-/// A setting: the curve that stands for its runs, and theirs.
+/// A setting, with the curves of its runs and one curve that summarises them.
 pub struct Setting {
-    /// What the legend calls it.
+    /// Its name in the legend or title.
     pub label: String,
-    /// The curve that stands for all runs.
+    /// The curve that summarises all runs.
     pub curve: Vec<(f64, f64)>,
     /// The curve of each run.
     pub runs: Vec<Vec<(f64, f64)>>,
@@ -57,7 +57,7 @@ impl<'a> Frame<'a> {
     }
 }
 
-/// Draws the curves of all settings in one diagram. More than four have colours in common.
+/// Draws the summary curves of all settings in one diagram. There are four colours, which repeat.
 pub fn lines(frame: &Frame<'_>, settings: &[Setting], path: &Path) -> anyhow::Result<()> {
     let series = settings.iter().zip(COLORS.iter().cycle());
     let series = series.map(|(setting, color)| Series::line(&setting.label, *color, setting.curve.clone()));
@@ -65,8 +65,8 @@ pub fn lines(frame: &Frame<'_>, settings: &[Setting], path: &Path) -> anyhow::Re
     save(path, (860, 470), |sheet| panel.draw(sheet))
 }
 
-/// Draws each setting in a diagram of its own, two in a row: its runs thin, its curve thick.
-pub fn lines_apart(frame: &Frame<'_>, settings: &[Setting], path: &Path) -> anyhow::Result<()> {
+/// Draws one diagram for each setting, two in a row: thin lines for its runs, a thick one for its summary curve.
+pub fn lines_by_setting(frame: &Frame<'_>, settings: &[Setting], path: &Path) -> anyhow::Result<()> {
     let rows = settings.len().div_ceil(2).max(1);
     save(path, (1160, 380 * rows as u32), |sheet| {
         for (setting, cell) in settings.iter().zip(sheet.split_evenly((rows, 2))) {
@@ -85,14 +85,14 @@ pub fn lines_apart(frame: &Frame<'_>, settings: &[Setting], path: &Path) -> anyh
     })
 }
 
-/// One curve of several with the same points on the x axis, as far as all of them go: at each point what `of` makes of
-/// their values, sorted.
-pub fn pointwise(curves: &[Vec<(f64, f64)>], of: impl Fn(&[f64]) -> f64) -> Vec<(f64, f64)> {
+/// Summarises curves with the same x values, up to the end of the shortest: `summary` gets their sorted values at each
+/// x.
+pub fn pointwise(curves: &[Vec<(f64, f64)>], summary: impl Fn(&[f64]) -> f64) -> Vec<(f64, f64)> {
     let common = curves.iter().map(Vec::len).min().unwrap_or(0);
     let at = |i: usize| {
         let mut values: Vec<f64> = curves.iter().map(|curve| curve[i].1).collect();
         values.sort_by(f64::total_cmp);
-        (curves[0][i].0, of(&values))
+        (curves[0][i].0, summary(&values))
     };
     (0..common).map(at).collect()
 }
@@ -102,14 +102,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn curves_are_joined_as_far_as_all_of_them_go() {
+    fn curves_are_summarised_up_to_the_end_of_the_shortest() {
         let curves = [vec![(1.0, 4.0), (2.0, 5.0)], vec![(1.0, 2.0)]];
         assert_eq!(pointwise(&curves, |sorted| sorted[0]), [(1.0, 2.0)]);
         assert_eq!(pointwise(&[], |_| 0.0), []);
     }
 
     #[test]
-    fn settings_have_their_names_and_the_level_is_drawn() {
+    fn settings_and_the_reference_line_are_labelled() {
         let frame = Frame {
             title: "CartPole",
             x: ("episode", 5_000.0),
@@ -127,7 +127,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         for (file, settings) in [("together.svg", &settings[..]), ("none.svg", &[])] {
             lines(&frame, settings, &dir.path().join(file)).unwrap();
-            lines_apart(&frame, settings, &dir.path().join(format!("apart-{file}"))).unwrap();
+            lines_by_setting(&frame, settings, &dir.path().join(format!("apart-{file}"))).unwrap();
         }
         for file in ["together.svg", "apart-together.svg"] {
             let svg = std::fs::read_to_string(dir.path().join(file)).unwrap();

@@ -1,4 +1,4 @@
-//! One diagram: a title, a legend above the data, two axes, and lines.
+//! One diagram: a title, a legend above the data, two axes, and series of points.
 
 use std::ops::Range;
 
@@ -19,7 +19,7 @@ const MARGIN: f64 = 8.0;
 const TITLE_ROW: f64 = 30.0;
 const LEGEND_ROW: f64 = 22.0;
 
-/// An axis: what it shows, with its unit, and from where to where.
+/// An axis: its label with unit, and its range.
 pub(super) struct Axis<'a> {
     pub(super) label: &'a str,
     pub(super) range: Range<f64>,
@@ -29,22 +29,22 @@ pub(super) struct Axis<'a> {
 #[derive(Clone, Copy)]
 pub(super) enum Look {
     Line,
-    /// The inside of the polygon that the points go round.
+    /// The interior of the polygon with these corners.
     Area,
     Dots,
     Rings,
     Crosses,
 }
 
-/// Points that belong together. Those that are not finite, or beyond all measure, are left out.
+/// A series of points. Those beyond [`LARGEST`] or not finite are left out.
 pub(super) struct Series<'a> {
-    /// Its place in the legend; none where it is empty.
+    /// Its name in the legend; empty if it has no entry.
     pub(super) label: &'a str,
     pub(super) points: Vec<(f64, f64)>,
     pub(super) look: Look,
     pub(super) color: RGBColor,
     pub(super) opacity: f64,
-    /// Of the line, in pixels.
+    /// Width of the line, in pixels.
     pub(super) width: f64,
 }
 
@@ -64,13 +64,13 @@ impl<'a> Series<'a> {
 /// A diagram.
 pub(super) struct Panel<'a> {
     pub(super) title: &'a str,
-    /// Said below the title, after the legend.
+    /// Text after the legend.
     pub(super) note: &'a str,
     pub(super) x: Axis<'a>,
     pub(super) y: Axis<'a>,
     /// Drawn in this order.
     pub(super) series: Vec<Series<'a>>,
-    /// Widens the x axis, so that both have the same scale.
+    /// Adapts the range of the x axis, so that both axes have the same scale.
     pub(super) equal_scale: bool,
 }
 
@@ -84,7 +84,7 @@ impl Panel<'_> {
         )?;
         self.draw_legend(&header)?;
         if self.equal_scale {
-            self.equalise(&body);
+            self.equalise_scales(&body);
         }
 
         let mut chart = ChartBuilder::on(&body)
@@ -167,7 +167,7 @@ impl Panel<'_> {
         Ok(())
     }
 
-    fn equalise(&mut self, body: &Area<'_>) {
+    fn equalise_scales(&mut self, body: &Area<'_>) {
         let (width, height) = body.dim_in_pixel();
         let width = f64::from(width) - f64::from(px(MARGIN + LEFT + RIGHT));
         let height = f64::from(height) - f64::from(px(2.0 * MARGIN + BOTTOM));
@@ -177,14 +177,14 @@ impl Panel<'_> {
     }
 }
 
-/// How the numbers along an axis are written: with as many decimals as its length asks for.
+/// Formats the numbers along an axis, with as many decimals as the length of its range requires.
 struct Ticks {
     decimals: usize,
 }
 
 impl Ticks {
     fn of(range: &Range<f64>) -> Self {
-        // An axis has about four ticks or more, so two decimals follow the first digit of its length at most.
+        // An axis has about four ticks or more. They need at most two decimals after the first digit of its length.
         let digits = (range.end - range.start).log10().floor();
         Self {
             decimals: (1.0 - digits).clamp(0.0, 6.0) as usize,
@@ -206,11 +206,11 @@ impl Ticks {
     }
 }
 
-/// What is larger belongs to no diagram: the numbers between its ticks could not be computed with.
+/// Points with larger coordinates are not drawn: the distance between ticks could not be computed.
 const LARGEST: f64 = 1e30;
 
-/// A range that holds all of `values` that can be drawn with a little room to both sides, whatever they are. It is never so
-/// narrow that its ticks would be the same number: then looking for the next one never ends.
+/// A range that contains all drawable `values`, with a margin on both sides. It is never so narrow that consecutive
+/// ticks would be the same number: plotters would then search for the next tick forever.
 pub(super) fn range_of(values: impl Iterator<Item = f64>) -> Range<f64> {
     let drawn = values.filter(|value| value.abs() <= LARGEST);
     let (low, high) = drawn.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| {
@@ -219,13 +219,13 @@ pub(super) fn range_of(values: impl Iterator<Item = f64>) -> Range<f64> {
     if low > high {
         return 0.0..1.0;
     }
-    let room = if high > low {
+    let margin = if high > low {
         let magnitude = low.abs().max(high.abs()).max(1e-3);
         (0.05 * (high - low)).max(1e-6 * magnitude)
     } else {
         (0.05 * high.abs()).max(0.5)
     };
-    low - room..high + room
+    low - margin..high + margin
 }
 
 #[cfg(test)]
@@ -233,7 +233,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn ticks_are_written_as_people_write_them() {
+    fn tick_labels_have_no_needless_decimals_and_a_true_minus_sign() {
         let written = |range, values: &[f64]| values.iter().map(|v| Ticks::of(&range).format(*v)).collect::<Vec<_>>();
         assert_eq!(
             written(-1600.0..0.0, &[-1500.0, -500.0, -0.0]),

@@ -9,7 +9,7 @@ use shoal_run::analysis::pendulum::SwingUp;
 use super::canvas::{BLUE, INK, VERMILION, save};
 use super::panel::{Axis, Panel, Series, range_of};
 
-/// Draws the torque, and the angle and angular velocity.
+/// Draws two diagrams side by side: the torque, and the angle with the angular velocity.
 pub fn swing_up(swing: &SwingUp, path: &Path) -> anyhow::Result<()> {
     let over_time = |values: &[f64]| {
         let timed = values.iter().enumerate();
@@ -78,7 +78,7 @@ mod tests {
     use shoal_run::testing::swing;
 
     #[test]
-    fn a_swing_up_makes_a_picture() {
+    fn a_swing_up_is_drawn() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("swing-up.svg");
         swing_up(&swing(0.0, 0.1), &path).unwrap();

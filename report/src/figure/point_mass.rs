@@ -1,4 +1,5 @@
-//! The vehicle on its way to the goal: test runs as in figures 5.5, 5.7, 5.9 and A.4 to A.11, and all paths in one as in figure 5.10.
+//! The vehicle on its way to the goal: test runs as in figures 5.5, 5.7, 5.9 and A.4 to A.11, and all paths in one
+//! diagram as in figure 5.10.
 
 use std::f64::consts::PI;
 use std::ops::Range;
@@ -16,7 +17,7 @@ pub(super) fn distances(run: &Drive) -> Vec<(f64, f64)> {
     over_steps(run.distances())
 }
 
-/// Draws each run in a row of its own: path, distance, actions, rewards.
+/// Draws one row of diagrams for each run: path, distance, actions, rewards.
 pub fn test_runs(runs: &[Drive], path: &Path) -> anyhow::Result<()> {
     let rewards = range_of(
         runs.iter()
@@ -37,7 +38,7 @@ pub fn test_runs(runs: &[Drive], path: &Path) -> anyhow::Result<()> {
     })
 }
 
-/// Draws the paths of all runs in one diagram, and their distances in another.
+/// Draws the paths of all runs in one diagram and their distances to the goal in another.
 pub fn trajectories(runs: &[Drive], path: &Path) -> anyhow::Result<()> {
     let extent = extent(runs.iter().flat_map(Drive::path));
     let thin = |points| Series {
@@ -45,9 +46,9 @@ pub fn trajectories(runs: &[Drive], path: &Path) -> anyhow::Result<()> {
         width: 1.4,
         ..Series::line("", BLUE, points)
     };
-    let mut ways: Vec<_> = runs.iter().map(|run| thin(run.path().collect())).collect();
-    ways.push(starts(runs.iter().map(|run| (run.start[0], run.start[1])).collect()));
-    ways.push(goal());
+    let mut lines: Vec<_> = runs.iter().map(|run| thin(run.path().collect())).collect();
+    lines.push(starts(runs.iter().map(|run| (run.start[0], run.start[1])).collect()));
+    lines.push(goal());
     let farthest = runs.iter().flat_map(distances).map(|(_, d)| d).fold(1.0, f64::max);
     let mean = runs.iter().map(Drive::final_distance).sum::<f64>() / runs.len().max(1) as f64;
     let note = format!("mean at the end: {mean:.3} m");
@@ -62,7 +63,7 @@ pub fn trajectories(runs: &[Drive], path: &Path) -> anyhow::Result<()> {
             label: "y (m)",
             range: extent,
         },
-        series: ways,
+        series: lines,
         equal_scale: true,
     };
     let distances = Panel {
@@ -186,13 +187,13 @@ pub(super) fn time_steps<'a>(steps: Option<usize>) -> Axis<'a> {
     }
 }
 
-/// A square around the goal that holds all the points.
+/// The x and y range of a square that is centred on the goal and contains all points.
 pub(super) fn extent(points: impl Iterator<Item = (f64, f64)>) -> Range<f64> {
-    let reach = points
+    let farthest = points
         .flat_map(|(x, y)| [x.abs(), y.abs()])
         .filter(|r| r.is_finite())
         .fold(0.5, f64::max);
-    -1.15 * reach..1.15 * reach
+    -1.15 * farthest..1.15 * farthest
 }
 
 #[cfg(test)]
@@ -205,7 +206,7 @@ mod tests {
     }
 
     #[test]
-    fn runs_make_a_row_of_diagrams_each() {
+    fn each_run_has_a_row_of_diagrams() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("test-runs.svg");
         test_runs(&[run([2.0, -2.0]), run([-2.0, 2.0])], &path).unwrap();
@@ -217,7 +218,7 @@ mod tests {
     }
 
     #[test]
-    fn many_or_no_paths_make_one_picture() {
+    fn any_number_of_paths_can_be_drawn() {
         let dir = tempfile::tempdir().unwrap();
         let starts = [[3.0, 3.0], [3.0, 0.0], [3.0, -3.0], [0.0, -3.0], [2.0, 2.0]];
         trajectories(&starts.map(run), &dir.path().join("trajectories.svg")).unwrap();

@@ -1,15 +1,15 @@
-//! An SVG picture as a PNG picture, with a font of our own, so that it looks the same on every machine. The feature `png` builds
-//! it in.
+//! Converts SVG figures to PNG. The font is built in, so that figures look the same on every machine. This needs the
+//! feature `png`.
 
 use std::path::Path;
 
-/// Whether this build can draw PNG pictures.
+/// Whether this build can convert figures to PNG.
 pub const CAN_RASTERISE: bool = cfg!(feature = "png");
 
-/// Writes the picture `svg` once more as `png`.
+/// Converts the figure in the file `svg` to the file `png`.
 ///
 /// # Errors
-/// When a file cannot be read or written, `svg` is no picture, or this build cannot draw PNG pictures.
+/// If a file cannot be read or written, `svg` is not a valid SVG file, or this build has no feature `png`.
 pub fn rasterise(svg: &Path, png: &Path) -> anyhow::Result<()> {
     #[cfg(feature = "png")]
     return with_resvg::rasterise(svg, png);
@@ -34,25 +34,29 @@ mod with_resvg {
     use resvg::usvg::{Options, Tree};
     use shoal_common::durable::write_atomically;
 
-    /// Pixels of the PNG for each pixel of the shown SVG.
+    /// Pixels of the PNG per pixel of the SVG.
     const SCALE: f32 = 1.5;
 
     pub(super) fn rasterise(svg: &Path, png: &Path) -> anyhow::Result<()> {
         let text = std::fs::read_to_string(svg).with_context(|| format!("cannot read {}", svg.display()))?;
-        let picture = draw(&text).with_context(|| format!("cannot rasterise {}", svg.display()))?;
+        let picture = draw(&text).with_context(|| format!("cannot convert {} to PNG", svg.display()))?;
         let bytes = picture.encode_png()?;
         write_atomically(png, |file| file.write_all(&bytes)).with_context(|| format!("cannot write {}", png.display()))
     }
 
     pub(super) fn draw(svg: &str) -> anyhow::Result<Pixmap> {
         let tree = Tree::from_str(svg, &options())?;
-        let size = tree.size().to_int_size().scale_by(SCALE).context("it is empty")?;
-        let mut picture = Pixmap::new(size.width(), size.height()).context("it is empty")?;
+        let size = tree
+            .size()
+            .to_int_size()
+            .scale_by(SCALE)
+            .context("the figure is empty")?;
+        let mut picture = Pixmap::new(size.width(), size.height()).context("the figure is empty")?;
         resvg::render(&tree, Transform::from_scale(SCALE, SCALE), &mut picture.as_mut());
         Ok(picture)
     }
 
-    /// The one font stands for every family.
+    /// Uses the built-in font for every font family.
     fn options() -> Options<'static> {
         let mut fonts = Database::new();
         fonts.load_font_data(UBUNTU_LIGHT.to_vec());
@@ -88,17 +92,21 @@ mod tests {
     }
 
     #[test]
-    fn every_letter_of_the_figures_shows() {
+    fn every_character_of_the_figures_is_drawn() {
         let (nothing, missing) = (drawn(" "), drawn("\u{10FFFD}"));
         for letter in "aZ09(/)±πθ\u{2212}".chars() {
             let letter = (letter, drawn(&letter.to_string()));
             assert!(letter.1 != nothing && letter.1 != missing, "{}", letter.0);
         }
-        assert_eq!(drawn("\u{10FFFC}"), missing, "what no font has looks alike");
+        assert_eq!(
+            drawn("\u{10FFFC}"),
+            missing,
+            "all characters that the font lacks look the same"
+        );
     }
 
     #[test]
-    fn the_picture_has_its_size_and_is_a_png() {
+    fn the_png_has_the_scaled_size() {
         let dir = tempfile::tempdir().unwrap();
         let [svg, png] = ["a.svg", "a.png"].map(|file| dir.path().join(file));
         std::fs::write(
@@ -113,7 +121,7 @@ mod tests {
             (&bytes[16..20], &bytes[20..24]),
             (&90_u32.to_be_bytes()[..], &45_u32.to_be_bytes()[..])
         );
-        std::fs::write(&svg, "no picture").unwrap();
+        std::fs::write(&svg, "not an SVG file").unwrap();
         let error = format!("{:#}", rasterise(&svg, &png).unwrap_err());
         assert!(error.contains("a.svg") && !error.contains('\n'), "{error}");
     }

@@ -1,4 +1,4 @@
-/* Axes: which numbers stand at them, and how they are written. */
+/* Axes: ticks, number formats, scales, and zoom shared by several diagrams. */
 
 /** About `count` round numbers from `low` to `high`. */
 function ticks(low, high, count) {
@@ -13,7 +13,7 @@ function ticks(low, high, count) {
   return found;
 }
 
-/** How numbers up to `high`, `step` apart, are written in units of `unit`. */
+/** The format of an axis in units of `unit`; `suffix` follows its label. */
 function inUnits(unit, suffix) {
   return { unit, write: (value) => `${Number((value / unit).toPrecision(6)).toLocaleString("en-GB").replace("-", "−")}`, suffix };
 }
@@ -22,18 +22,18 @@ function inUnits(unit, suffix) {
 const STEPS = {
   label: "environment steps",
   scale: (high) => (high < 2e4 ? inUnits(1, "") : high < 2e7 ? inUnits(1e3, " (thousands)") : inUnits(1e6, " (millions)")),
-  say: (value) => `step ${whole(Math.round(value))}`,
+  format: (value) => `step ${whole(Math.round(value))}`,
 };
 
-/** Time since the run began. */
+/** Time since the start of the run, in s. */
 const TIME = {
   label: "time",
   scale: (high) => (high < 180 ? inUnits(1, " (s)") : high < 10800 ? inUnits(60, " (min)") : inUnits(3600, " (h)")),
-  say: duration,
+  format: duration,
 };
 
-/** A range that holds the values, with some air; a single value stands in its middle. */
-function rangeOf(values, air = 0.06) {
+/** A range that contains the values, with a margin as a share of its width. A single value is centred. */
+function rangeOf(values, margin = 0.06) {
   let low = Infinity;
   let high = -Infinity;
   for (const value of values) {
@@ -43,10 +43,10 @@ function rangeOf(values, air = 0.06) {
   }
   if (low > high) return [0, 1];
   const width = high - low || Math.abs(low) * 0.1 || 1;
-  return high === low ? [low - width / 2, high + width / 2] : [low - air * width, high + air * width];
+  return high === low ? [low - width / 2, high + width / 2] : [low - margin * width, high + margin * width];
 }
 
-/** Maps `from` onto `to`, and back with `inverse`. */
+/** A linear map of [a, b] onto [c, d], with its `inverse`. */
 function scale([a, b], [c, d]) {
   const factor = (d - c) / (b - a || 1);
   const map = (value) => c + (value - a) * factor;
@@ -54,7 +54,7 @@ function scale([a, b], [c, d]) {
   return map;
 }
 
-/** The index of the number nearest to `value`; `numbers` grow. */
+/** The index of the number nearest to `value`; `numbers` are sorted. */
 function nearest(numbers, value) {
   let [low, high] = [0, numbers.length - 1];
   while (low < high) {
@@ -65,14 +65,14 @@ function nearest(numbers, value) {
   return low > 0 && value - numbers[low - 1] < numbers[low] - value ? low - 1 : low;
 }
 
-/** Diagrams over the same axis, zoomed together. */
+/** Diagrams that share an x axis and are zoomed together. */
 class Link {
   constructor() {
     this.members = [];
     this.shown = null;
   }
 
-  /** What all of them have from their first point to their last. */
+  /** The range of all points of all diagrams, including 0. */
   get whole() {
     const ends = this.members.flatMap((member) => member.extent());
     const [low, high] = rangeOf(ends, 0);
@@ -96,7 +96,7 @@ class Link {
     for (const member of this.members) member.draw();
   }
 
-  /** Nearer (`factor` below 1) or farther, around `centre`. */
+  /** Zooms in (`factor` below 1) or out around `centre`. */
   zoom(factor, centre) {
     const [low, high] = this.domain;
     const middle = centre ?? (low + high) / 2;

@@ -1,14 +1,15 @@
-/* A diagram of curves and bands over steps or time, with zoom and a pointer that reads values. */
+/* A diagram of curves and bands over steps or time, with zoom and a pointer that shows values. */
 
 const MARGIN = { left: 62, right: 14, top: 12, bottom: 44 };
-const TOLD = 8;
-/** More names than are listed unasked. */
-const MANY = 12;
+/** At most this many curves are described in text at once. */
+const DESCRIBED = 8;
+/** A legend with more names is collapsed. */
+const LONG_LEGEND = 12;
 
 /**
- * options: `title`, `unit` (of y), `axis` (STEPS or TIME), `link`, `series`, and perhaps `marks`, `height`, `line` (a value to
- * be met). A series has `name`, `colour`, `x`, `y` and perhaps `low`, `high`, `band` (what lies between), `look` (thin, thick).
- * A mark has `x` and `text`.
+ * options: `title`, `unit` (of y), `axis` (STEPS or TIME), `link`, `series`; optionally `marks`, `height`, `line` (a target
+ * value). A series has `name`, `colour`, `x`, `y`; optionally `low`, `high`, `band` (what lies between them), `look` (thin,
+ * fine, thick). A mark has `x`, `kind` and `text`.
  */
 class Chart {
   constructor(options) {
@@ -17,14 +18,14 @@ class Chart {
     this.cursor = null;
     this.picture = svg("svg", { role: "img", "aria-label": this.described() });
     this.readout = html("div", { class: "readout", hidden: true });
-    this.spoken = html("p", { class: "unseen", "aria-live": "polite" });
+    this.announcement = html("p", { class: "visually-hidden", "aria-live": "polite" });
     this.plot = html(
       "div",
       {
         class: "plot",
         tabindex: 0,
         role: "group",
-        "aria-label": `${this.title}: left and right arrows read values, plus and minus zoom, 0 shows all`,
+        "aria-label": `${this.title}: left and right arrows read values, plus and minus zoom, 0 shows everything`,
         onkeydown: (event) => this.key(event),
         onpointerdown: (event) => this.press(event),
         onpointermove: (event) => this.point(event),
@@ -38,7 +39,7 @@ class Chart {
       this.picture,
       this.readout,
     );
-    const button = (sign, name, act) => html("button", { type: "button", "aria-label": `${this.title}: ${name}`, title: name, onclick: act }, sign);
+    const button = (sign, name, onclick) => html("button", { type: "button", "aria-label": `${this.title}: ${name}`, title: name, onclick }, sign);
     this.element = html(
       "figure",
       { class: "chart" },
@@ -56,7 +57,7 @@ class Chart {
       ),
       this.plot,
       this.legend(),
-      this.spoken,
+      this.announcement,
     );
     this.link.members.push(this);
     new ResizeObserver(() => this.draw()).observe(this.plot);
@@ -64,11 +65,11 @@ class Chart {
 
   described() {
     const named = this.series.filter((series) => series.name && series.y.some(isNumber));
-    const told = named.slice(0, TOLD).map((series) => {
+    const texts = named.slice(0, DESCRIBED).map((series) => {
       const values = series.y.filter(isNumber);
       return `${series.name} from ${text(values[0])} to ${text(values[values.length - 1])}`;
     });
-    return `${this.title} over ${this.axis.label}: ${told.join("; ") || "nothing yet"}`;
+    return `${this.title} over ${this.axis.label}: ${texts.join("; ") || "no data yet"}`;
   }
 
   legend() {
@@ -88,10 +89,10 @@ class Chart {
         html("i", {}),
         series.band ? `${series.name} (band: ${series.band})` : series.name,
       );
-    // A single curve that the title names needs no other name.
+    // A single curve needs no legend: the title describes it.
     const named = this.series.filter((series) => series.name);
     const legend = html("div", { class: "legend", hidden: named.length === 1 && !named[0].band }, named.map(entry));
-    return named.length > MANY ? html("details", {}, html("summary", {}, `Names of the ${named.length} curves`), legend) : legend;
+    return named.length > LONG_LEGEND ? html("details", {}, html("summary", {}, `Names of the ${named.length} curves`), legend) : legend;
   }
 
   extent() {
@@ -124,7 +125,7 @@ class Chart {
     );
     if (!visible.some(isNumber)) {
       const middle = { class: "nothing", x: width / 2, y: (height - MARGIN.bottom) / 2, "text-anchor": "middle" };
-      this.picture.append(svg("text", middle, "nothing to show here yet"));
+      this.picture.append(svg("text", middle, "no data yet"));
     }
   }
 
@@ -146,7 +147,7 @@ class Chart {
     part.append(svg("line", { class: "base", x1: MARGIN.left, x2: width - MARGIN.right, y1: bottom, y2: bottom }));
     part.append(svg("text", { class: "label", x: width - MARGIN.right, y: height - 6, "text-anchor": "end" }, this.axis.label + across.suffix));
     if (this.line !== undefined) {
-      part.append(svg("line", { class: "wanted", x1: MARGIN.left, x2: width - MARGIN.right, y1: y(this.line), y2: y(this.line) }));
+      part.append(svg("line", { class: "target", x1: MARGIN.left, x2: width - MARGIN.right, y1: y(this.line), y2: y(this.line) }));
     }
     return part;
   }
@@ -181,21 +182,21 @@ class Chart {
     return group;
   }
 
-  /** Shows what the curves are at the place `at` of the x axis. */
-  read(at, aloud = false, height = null) {
+  /** Shows the values of the curves at `at` on the x axis: those nearest to `height` (in pixels) if it is given. */
+  read(at, announce = false, height = null) {
     this.cursor = at;
     const found = this.shown().filter((series) => series.name && series.x.length).map((series) => ({ series, i: nearest(series.x, at) }));
     const values = found.filter(({ series, i }) => isNumber(series.y[i]));
     const distance = ({ series, i }) => (height === null ? 0 : Math.abs(this.y(series.y[i]) - height));
-    const told = values.sort((a, b) => distance(a) - distance(b)).slice(0, TOLD);
+    const shown = values.sort((a, b) => distance(a) - distance(b)).slice(0, DESCRIBED);
     this.pointer.replaceChildren(
       svg("line", { x1: this.x(at), x2: this.x(at), y1: MARGIN.top, y2: this.height - MARGIN.bottom }),
-      ...told.map(({ series, i }) => svg("circle", { class: `c${series.colour}`, r: 4, cx: this.x(series.x[i]), cy: this.y(series.y[i]) })),
+      ...shown.map(({ series, i }) => svg("circle", { class: `c${series.colour}`, r: 4, cx: this.x(series.x[i]), cy: this.y(series.y[i]) })),
     );
     const marks = this.marks.filter((mark) => Math.abs(this.x(mark.x) - this.x(at)) < 6).slice(0, 4);
-    const lines = told.map(({ series, i }) => [series, `${series.name}: ${text(series.y[i])}${this.unit ? ` ${this.unit}` : ""}${series.low ? `, ${text(series.low[i])} to ${text(series.high[i])}` : ""}`]);
+    const lines = shown.map(({ series, i }) => [series, `${series.name}: ${text(series.y[i])}${this.unit ? ` ${this.unit}` : ""}${series.low ? `, ${text(series.low[i])} to ${text(series.high[i])}` : ""}`]);
     this.readout.replaceChildren(
-      html("b", {}, this.axis.say(at)),
+      html("b", {}, this.axis.format(at)),
       ...lines.map(([series, line]) => html("span", { class: `c${series.colour}` }, html("i", {}), line)),
       ...marks.map((mark) => html("span", { class: "c1" }, mark.text)),
     );
@@ -203,7 +204,7 @@ class Chart {
     const right = this.x(at) > this.plot.clientWidth / 2;
     this.readout.style.left = right ? "auto" : `${this.x(at) + 12}px`;
     this.readout.style.right = right ? `${this.plot.clientWidth - this.x(at) + 12}px` : "auto";
-    if (aloud) this.spoken.textContent = `${this.axis.say(at)}. ${lines.map(([, line]) => line).join(". ")}`;
+    if (announce) this.announcement.textContent = `${this.axis.format(at)}. ${lines.map(([, line]) => line).join(". ")}`;
   }
 
   place(event) {
@@ -248,7 +249,7 @@ class Chart {
 
   key(event) {
     const [low, high] = this.link.domain;
-    const acts = {
+    const actions = {
       ArrowLeft: () => this.step(-1),
       ArrowRight: () => this.step(1),
       "+": () => this.link.zoom(0.5, this.cursor),
@@ -258,13 +259,13 @@ class Chart {
       PageUp: () => this.link.move(-0.5),
       PageDown: () => this.link.move(0.5),
     };
-    const act = acts[event.key];
-    if (!act || !(high > low) || event.ctrlKey || event.altKey || event.metaKey) return;
+    const action = actions[event.key];
+    if (!action || !(high > low) || event.ctrlKey || event.altKey || event.metaKey) return;
     event.preventDefault();
-    act();
+    action();
   }
 
-  /** Reads the next place at which something shown has a value. */
+  /** Moves the pointer to the next x value of a shown curve. */
   step(direction) {
     const [low, high] = this.link.domain;
     const from = this.cursor ?? (direction > 0 ? low - 1 : high + 1);

@@ -1,4 +1,4 @@
-//! Runs beside each other: those of one environment in one picture, repetitions with their median and spread.
+//! Comparison of runs: one diagram for each environment; repetitions also get their median and spread.
 
 use serde::Serialize;
 use shoal_run::recorder::EvaluationRecord;
@@ -8,11 +8,11 @@ use super::run::Run;
 use super::settings::{Setting, in_common};
 use crate::figure::quantile;
 
-/// Places at which repetitions are compared.
+/// Number of x values at which repetitions are compared.
 const PLACES: usize = 200;
 
-/// Settings named to tell sets of runs apart.
-const TOLD: usize = 3;
+/// At most this many differing settings are named in the label of a set.
+const LABEL_SETTINGS: usize = 3;
 
 /// The runs of one environment.
 #[derive(Clone, Debug, Serialize)]
@@ -21,21 +21,21 @@ pub(super) struct Comparison {
     pub(super) sets: Vec<Set>,
 }
 
-/// Runs with equal settings: repetitions of each other.
+/// Runs with the same settings, that is, repetitions.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Set {
     pub(super) label: String,
-    /// Their places in the report.
+    /// Their indices in the report.
     pub(super) runs: Vec<usize>,
-    /// Over environment steps and over seconds, as far as all of them have come; nothing for a single run.
+    /// Over environment steps and over seconds, in the range that all runs cover. `None` for a single run.
     pub(super) by_steps: Option<Spread>,
     pub(super) by_time: Option<Spread>,
 }
 
-/// The median, and between which values the rest lies.
+/// The median of several curves, and a band around it.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub(super) struct Spread {
-    /// What the band is.
+    /// What the band covers.
     pub(super) band: &'static str,
     pub(super) x: Vec<f64>,
     pub(super) low: Vec<f64>,
@@ -43,7 +43,7 @@ pub(super) struct Spread {
     pub(super) high: Vec<f64>,
 }
 
-/// Sorts the runs by environment and settings, in the order in which they came.
+/// Groups the runs by environment and settings. Groups and runs keep the order of `runs`.
 pub(super) fn compare(runs: &[Run]) -> Vec<Comparison> {
     let mut comparisons: Vec<Comparison> = Vec::new();
     for (i, run) in runs.iter().enumerate() {
@@ -89,7 +89,8 @@ pub(super) fn compare(runs: &[Run]) -> Vec<Comparison> {
     comparisons
 }
 
-/// A run's name, or how many there are and what sets them apart from the other sets.
+/// The name of a single run; otherwise the number of runs, their algorithm, and the settings in which they differ from
+/// the other sets.
 fn label(sets: &[Set], i: usize, runs: &[Run]) -> String {
     let first = |set: &Set| &runs[set.runs[0]];
     let set = &sets[i];
@@ -103,13 +104,13 @@ fn label(sets: &[Set], i: usize, runs: &[Run]) -> String {
             there.is_none_or(|(_, there)| there != value)
         })
     };
-    for (key, value) in in_common(&first(set).settings).filter(differs).take(TOLD) {
+    for (key, value) in in_common(&first(set).settings).filter(differs).take(LABEL_SETTINGS) {
         label += &format!(", {key} = {value}");
     }
     label
 }
 
-/// (x, mean return) by increasing x.
+/// (x, mean return), sorted by x.
 fn curve(rows: &[EvaluationRecord], x: fn(&EvaluationRecord) -> f64) -> Vec<(f64, f64)> {
     let points = rows.iter().map(|row| (x(row), row.return_mean));
     let mut curve: Vec<_> = points.filter(|(x, y)| x.is_finite() && y.is_finite()).collect();
@@ -117,7 +118,7 @@ fn curve(rows: &[EvaluationRecord], x: fn(&EvaluationRecord) -> f64) -> Vec<(f64
     curve
 }
 
-/// Of two curves or more, where all of them are.
+/// The spread of the curves in the range that all of them cover; `None` for fewer than two curves or an empty range.
 fn spread(curves: &[Vec<(f64, f64)>]) -> Option<Spread> {
     if curves.len() < 2 {
         return None;
@@ -130,9 +131,9 @@ fn spread(curves: &[Vec<(f64, f64)>]) -> Option<Spread> {
     if from >= to {
         return None;
     }
-    // The quartiles of two or three are hardly inside of them.
+    // The quartiles of two or three values are close to their minimum and maximum.
     let (band, low, high) = match curves.len() {
-        2 | 3 => ("least to greatest", 0.0, 1.0),
+        2 | 3 => ("minimum to maximum", 0.0, 1.0),
         _ => ("middle half", 0.25, 0.75),
     };
     let mut spread = Spread {
@@ -158,7 +159,7 @@ fn spread(curves: &[Vec<(f64, f64)>]) -> Option<Spread> {
     Some(spread)
 }
 
-/// The curve's value at `x`, on the line between its neighbours.
+/// The curve's value at `x`, interpolated linearly.
 fn at(curve: &[(f64, f64)], x: f64) -> f64 {
     let after = curve.partition_point(|(place, _)| *place <= x).min(curve.len() - 1);
     let (left, right) = (curve[after.saturating_sub(1)], curve[after]);
@@ -174,7 +175,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn curves_are_compared_where_all_of_them_are() {
+    fn curves_are_compared_in_the_range_that_all_cover() {
         let long = vec![(0.0, 0.0), (100.0, 100.0), (200.0, 0.0)];
         let late = vec![(50.0, 10.0), (100.0, 10.0)];
         let spread = super::spread(&[long.clone(), late.clone()]).unwrap();
@@ -194,7 +195,7 @@ mod tests {
     }
 
     #[test]
-    fn of_many_the_middle_half_is_shown() {
+    fn the_band_of_many_curves_is_their_middle_half() {
         let curves: Vec<_> = (0..5).map(|y| vec![(0.0, f64::from(y)), (1.0, f64::from(y))]).collect();
         let spread = spread(&curves).unwrap();
         assert_eq!((spread.low[7], spread.median[7], spread.high[7]), (1.0, 2.0, 3.0));

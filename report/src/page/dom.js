@@ -1,4 +1,4 @@
-/* Elements, and numbers as text. */
+/* Functions that create elements and format numbers. */
 
 const SVG = "http://www.w3.org/2000/svg";
 
@@ -11,12 +11,12 @@ function build(element, attributes, children) {
   return element;
 }
 
-/** An HTML element: attributes by name, listeners as `onclick` and the like, then children. */
+/** Creates an HTML element with attributes, listeners (`onclick` and so on) and children. */
 function html(name, attributes = {}, ...children) {
   return build(document.createElement(name), attributes, children);
 }
 
-/** The same for SVG. */
+/** Creates an SVG element in the same way. */
 function svg(name, attributes = {}, ...children) {
   return build(document.createElementNS(SVG, name), attributes, children);
 }
@@ -25,12 +25,12 @@ function set(element, attributes) {
   for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
 }
 
-/** A name that no other element of the page has. */
+/** An id that is unique within the page. */
 const freshId = ((count) => () => `part-${(count += 1)}`)(0);
 
 const isNumber = (value) => typeof value === "number" && Number.isFinite(value);
 
-/** A value with about four digits, and a true minus sign. */
+/** A value with about four digits and a true minus sign. */
 function text(value) {
   if (!isNumber(value)) return "–";
   const size = Math.abs(value);
@@ -42,7 +42,7 @@ function text(value) {
 
 const whole = (value) => (isNumber(value) ? value.toLocaleString("en-GB") : "–");
 
-/** Seconds as people say them. */
+/** Seconds as a duration, such as "3 min 20 s". */
 function duration(seconds) {
   if (!isNumber(seconds)) return "–";
   if (seconds < 60) return `${Number(seconds.toFixed(seconds < 10 ? 2 : 1))} s`;

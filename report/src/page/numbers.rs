@@ -1,19 +1,19 @@
-//! Fewer and shorter numbers, as a picture needs them.
+//! Rounds and thins out numbers for the page's diagrams.
 
 use std::ops::Range;
 
-/// Five significant digits: finer than any screen.
+/// Rounds to five significant digits, which is finer than any screen.
 pub(super) fn short(value: f64) -> f64 {
     format!("{value:.4e}").parse().unwrap_or(value)
 }
 
-/// At most `most` parts of `0 .. len`, one after the other and about equally long.
+/// Divides `0..len` into at most `most` consecutive parts of about equal length.
 pub(super) fn parts(len: usize, most: usize) -> impl Iterator<Item = Range<usize>> {
     let count = len.min(most.max(1));
     (0..count).map(move |i| i * len / count..(i + 1) * len / count)
 }
 
-/// The mean of those that are numbers; NaN where there are none.
+/// The mean of the finite values; NaN if there are none.
 pub(super) fn mean(values: impl Iterator<Item = f64>) -> f64 {
     let (mut sum, mut count) = (0.0, 0);
     for value in values.filter(|value| value.is_finite()) {
@@ -23,9 +23,9 @@ pub(super) fn mean(values: impl Iterator<Item = f64>) -> f64 {
     short(sum / f64::from(count))
 }
 
-/// At most `most` (or four) places in `values`, in order: the first, the last, and the least and greatest of each part
-/// between, so that no peak is lost.
-pub(super) fn telling(values: &[f64], most: usize) -> Vec<usize> {
+/// Indices of at most `most` values (but at least four), in ascending order: the first, the last, and the minimum and
+/// maximum of each part. Peaks are therefore kept.
+pub(super) fn downsample(values: &[f64], most: usize) -> Vec<usize> {
     if values.len() <= most {
         return (0..values.len()).collect();
     }
@@ -48,7 +48,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn five_digits_are_kept() {
+    fn numbers_are_rounded_to_five_digits() {
         assert_eq!(
             [2.345_678_9, -0.000_123_456_78, 0.0, 1_234_567.0].map(short),
             [2.345_7, -0.000_123_46, 0.0, 1_234_600.0]
@@ -62,11 +62,11 @@ mod tests {
         #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::default() })]
 
         #[test]
-        fn ends_and_peaks_are_kept_and_nothing_is_there_twice(
+        fn downsampling_keeps_ends_and_peaks_and_repeats_nothing(
             values in prop::collection::vec(-1e9..1e9_f64, 1..300),
             most in 4..100_usize,
         ) {
-            let places = telling(&values, most);
+            let places = downsample(&values, most);
             prop_assert!(places.len() <= most.max(values.len().min(most)), "{} of {most}", places.len());
             prop_assert!(places.windows(2).all(|pair| pair[0] < pair[1]));
             prop_assert_eq!((places[0], places[places.len() - 1]), (0, values.len() - 1));

@@ -1,11 +1,11 @@
-/* The page: what there is to see of the runs, section by section. */
+/* The page, section by section. */
 
 const report = JSON.parse(document.getElementById("data").textContent);
 const { runs } = report;
 const COLOURS = 6;
 const several = runs.length > 1;
 
-/** A section with its heading and its place in the list at the top. */
+/** Adds a section with its heading, and a link to it at the top of the page. */
 function section(title, ...parts) {
   const id = title.toLowerCase().replaceAll(" ", "-");
   document.querySelector("nav").append(html("a", { href: `#${id}` }, title));
@@ -13,28 +13,28 @@ function section(title, ...parts) {
   document.querySelector("main").append(html("section", { id, "aria-labelledby": heading.id }, heading, ...parts));
 }
 
-/** What is said of runs, once for all of whom it is said: `of` gives a sentence or nothing. */
-function said(of) {
+/** Paragraphs about runs. `sentence` returns a sentence about a run, or null; runs with the same sentence share a paragraph. */
+function remarks(sentence) {
   const names = new Map();
   for (const run of runs) {
-    const words = of(run);
+    const words = sentence(run);
     if (words) names.set(words, [...(names.get(words) ?? []), run.name]);
   }
-  return [...names].map(([words, who]) => aside(several ? `${who.join(", ")}: ${words}` : words));
+  return [...names].map(([words, of]) => aside(several ? `${of.join(", ")}: ${words}` : words));
 }
 
 const aside = (words) => html("p", { class: "aside" }, words);
 
-/** A table with a row for each fact and a column for each run. */
+/** A table with a row for each property and a column for each run. */
 function table(label, rows) {
   const head = html("tr", {}, html("td", {}), ...runs.map((run, i) => html("th", { scope: "col" }, html("i", { class: `swatch c${i % COLOURS}` }), run.name)));
   const row = ([name, values, differs]) => html("tr", { class: differs ? "differs" : "" }, html("th", { scope: "row" }, name), ...values.map((value) => html("td", {}, value)));
   return html("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": label }, html("table", {}, html("thead", {}, head), html("tbody", {}, rows.map(row))));
 }
 
-function glance() {
+function overview() {
   const evaluated = (of) => (of ? `${text(of.mean)} ± ${text(of.std)} (${plural(of.episodes, "episode")}, step ${whole(of.env_steps)})` : "not evaluated yet");
-  const states = { training: "being trained", finished: "finished", unfinished: "not finished" };
+  const states = { training: "training", finished: "finished", unfinished: "not finished" };
   const planned = (run) => `${whole(run.env_steps)} of ${whole(run.planned_steps)}`;
   const episodes = (run) => (run.planned_episodes === null ? whole(run.episodes) : `${whole(run.episodes)} of ${whole(run.planned_episodes)}`);
   const incidents = ({ incidents }) => (incidents ? `${plural(incidents.kills, "kill")}, ${plural(incidents.restarts, "restart")}` : "not recorded");
@@ -63,7 +63,7 @@ function returns(comparison, axis) {
   const x = (curve) => (axis === STEPS ? curve.steps : curve.time);
   const spreads = comparison.sets.filter((set) => set.by_steps);
   const all = comparison.sets.flatMap((set) => set.runs);
-  // Where nothing but one median stands out from few runs, each run keeps the colour it has everywhere.
+  // With few runs and at most one median, each run keeps its colour of the other diagrams.
   const own = spreads.length <= 1 && all.length <= COLOURS;
   const series = [];
   comparison.sets.forEach((set, at) => {
@@ -99,12 +99,12 @@ function learning() {
     "Learning curves",
     html("fieldset", {}, html("legend", {}, "over"), choice("environment steps", STEPS, true), choice("time", TIME, false)),
     place,
-    aside("Drag over a diagram to look closer, double-click to see all; a name below it hides or shows its curve."),
+    aside("Drag over a diagram to zoom in and double-click it to see everything. A click on a name in the legend hides or shows its curve."),
   );
   draw(STEPS);
 }
 
-/** A curve of each run that has one. */
+/** One curve for each run with values. */
 function perRun(of, which = runs.map((_, i) => i)) {
   const series = which.map((i) => ({ name: runs[i].name, colour: i % COLOURS, look: "fine", ...of(runs[i]) }));
   return series.filter((series) => series.y.some(isNumber));
@@ -119,27 +119,27 @@ function explored(comparison, axis) {
 
 function episodes() {
   const playable = runs.filter((run) => run.played.episodes.length);
-  section("Episodes", playable.length ? new Player(playable).element : null, ...said((run) => run.played.why_not));
+  section("Episodes", playable.length ? new Player(playable).element : null, ...remarks((run) => run.played.why_not));
 }
 
 function time() {
   const link = new Link();
   const parts = runs.filter((run) => run.incidents?.rows.length).map((run) => new Timeline(run, link, several).element);
-  parts.push(...said((run) => (run.incidents ? null : "What became of processes is not on record: an older build made this.")));
-  parts.push(...said((run) => (run.incidents?.rows.length === 0 ? "No process ended before its time." : null)));
+  parts.push(...remarks((run) => (run.incidents ? null : "This run was made by an older version, which recorded no incidents.")));
+  parts.push(...remarks((run) => (run.incidents?.rows.length === 0 ? "No incidents were recorded." : null)));
   const marks = runs.length <= COLOURS ? runs.flatMap((run) => marksOf(run).map((mark) => ({ ...mark, text: several ? `${run.name}: ${mark.text}` : mark.text }))) : [];
   const chart = (title, key, more = {}) => {
     const series = perRun(({ learner }) => ({ x: learner.time, y: learner[key] }));
     if (series.length) parts.push(new Chart({ title, axis: TIME, link, series, marks, height: 220, unit: "", ...more }).element);
   };
-  const agreed = [...new Set(runs.map((run) => run.updates_per_step))];
-  chart("Ratio: updates per step after the warm-up", "ratio", agreed.length === 1 ? { line: agreed[0] } : {});
+  const configured = [...new Set(runs.map((run) => run.updates_per_step))];
+  chart("Ratio: updates per step after the warm-up", "ratio", configured.length === 1 ? { line: configured[0] } : {});
   chart("Environment steps per second", "env_steps_per_second", { unit: "steps/s" });
   chart("Updates per second", "updates_per_second", { unit: "updates/s" });
   chart("Loss of the critic", "critic_loss");
   chart("Loss of the actor", "actor_loss");
   chart("Mean value of the sampled actions (Q)", "q_mean");
-  section("Over time", ...parts, aside("The diagrams of this section are zoomed together. Lines across them mark what became of processes; a dashed level is what was agreed."));
+  section("Over time", ...parts, aside("The diagrams of this section are zoomed together. Vertical lines mark incidents. A horizontal dashed line is the configured ratio."));
 }
 
 function settings() {
@@ -158,5 +158,5 @@ function settings() {
 
 document.getElementById("made").textContent =
   `Made ${new Date(report.made * 1000).toISOString().slice(0, 16).replace("T", " ")} UTC by shoal ${report.version}` +
-  (runs.some((run) => run.state === "training") ? "; training was going on." : ".");
-for (const part of [glance, learning, episodes, time, settings]) part();
+  (runs.some((run) => run.state === "training") ? "; training was still running." : ".");
+for (const part of [overview, learning, episodes, time, settings]) part();

@@ -1,4 +1,4 @@
-//! Evaluation episodes of a run's best policy, step by step, to be played.
+//! Evaluation episodes of a run's best policy, recorded step by step for the page's player.
 
 use serde::Serialize;
 use shoal_common::config::Config;
@@ -12,21 +12,21 @@ use shoal_run::rollout::{Rollout, Trajectory};
 use super::numbers::short;
 use super::signals::{Trace, traces};
 
-/// Pictures of an episode; of a longer one every second step is left out, or more.
+/// At most about this many frames of an episode. A longer episode shows every second step, every third, and so on.
 const FRAMES: usize = 1_000;
 
-/// Steps taken for all episodes of a run together, about.
+/// Approximate limit on the steps of all episodes of a run.
 const STEPS: usize = 20_000;
 
-/// Episodes to be played, or why there are none.
+/// Playable episodes, or the reason why there are none.
 #[derive(Clone, Debug, Default, Serialize)]
 pub(super) struct Played {
-    /// One sentence for the reader.
+    /// A sentence for the reader of the page if there are no episodes.
     pub(super) why_not: Option<String>,
     picture: Picture,
-    /// Δt of a step in s, where the environment has a time.
+    /// Δt of a step in s; `None` if a step of the environment has no duration.
     time_step: Option<f64>,
-    /// Which policy acts.
+    /// Describes the policy that acts.
     policy: String,
     pub(super) episodes: Vec<Episode>,
 }
@@ -36,7 +36,7 @@ pub(super) struct Episode {
     /// Its number among the evaluation episodes of the run's seed.
     number: usize,
     pub(super) steps: usize,
-    /// Steps from one picture to the next; the last may be nearer.
+    /// Steps between frames. There may be fewer before the last frame.
     stride: usize,
     #[serde(rename = "return")]
     episode_return: f64,
@@ -45,7 +45,8 @@ pub(super) struct Episode {
 }
 
 impl Played {
-    /// Plays the first `episodes` evaluation episodes of the run's seed. What cannot be played is said, and no error.
+    /// Runs the first `episodes` evaluation episodes of the run's seed. A failure is no error: its reason is in
+    /// `why_not`.
     pub(super) fn of(run: &RunDir, config: &Config, episodes: usize) -> Self {
         let why_not = |why_not: String| Self {
             why_not: Some(why_not),
@@ -53,7 +54,9 @@ impl Played {
         };
         if episodes == 0 {
             return why_not(
-                "There is no room for played episodes of so many runs; a report of this run alone has them.".into(),
+                "A report of this many runs has no space for this run's episodes; a report of this run alone shows \
+                 them."
+                    .into(),
             );
         }
         let which = match (run.best_policy().exists(), run.last_policy().exists()) {
@@ -62,7 +65,7 @@ impl Played {
             (false, false) => return why_not("No policy has been evaluated yet.".into()),
         };
         Self::try_of(run, config, which, episodes)
-            .unwrap_or_else(|error| why_not(format!("This cannot be played: {error:#}.")))
+            .unwrap_or_else(|error| why_not(format!("The episodes cannot be played: {error:#}.")))
     }
 
     fn try_of(run: &RunDir, config: &Config, which: WhichPolicy, episodes: usize) -> anyhow::Result<Self> {
@@ -99,7 +102,7 @@ impl Played {
 }
 
 impl Episode {
-    /// The traces are asked for at the frames that the episode is shown by.
+    /// `of_frames` returns the traces at the given frames.
     fn of(number: usize, trajectory: &Trajectory, of_frames: impl Fn(&[usize]) -> Vec<Trace>) -> Self {
         let steps = trajectory.actions.len();
         let stride = steps.div_ceil(FRAMES).max(1);

@@ -1,8 +1,8 @@
-/* Plays episodes: a picture, a slider, and the signals beside it. */
+/* Plays episodes: a picture with a slider, and the signals beside it. */
 
 const SPEEDS = [0.25, 0.5, 1, 2, 4];
-/** Seconds a frame stays where an environment has no time of its own. */
-const UNTIMED = 0.5;
+/** Seconds per frame if a step of the environment has no duration. */
+const SECONDS_PER_FRAME = 0.5;
 
 class Player {
   constructor(runs) {
@@ -36,13 +36,13 @@ class Player {
       html(
         "div",
         { class: "show" },
-        html("div", { class: "watch" }, this.stage, html("div", { class: "controls" }, step("|◀", -1, "one step back"), this.play, step("▶|", 1, "one step on"), this.slider), this.time),
+        html("div", { class: "watch" }, this.stage, html("div", { class: "controls" }, step("|◀", -1, "one step back"), this.play, step("▶|", 1, "one step forward"), this.slider), this.time),
         this.signals,
       ),
       this.policy,
-      html("p", { class: "aside" }, "Space plays and pauses, the arrow keys step, Home and End jump; a click into a line goes there."),
+      html("p", { class: "aside" }, "Space plays and pauses, the arrow keys step, Home and End jump. A click on a signal's line jumps to that step."),
     );
-    // Space plays from anywhere on the page that has no use for it, as long as the picture can be seen.
+    // Keys work without focus on the player too, as long as the picture is visible.
     document.addEventListener("keydown", (event) => {
       const box = this.element.getBoundingClientRect();
       if (event.target === document.body && box.top < innerHeight * 0.8 && box.bottom > innerHeight * 0.2) this.key(event);
@@ -58,20 +58,20 @@ class Player {
     this.episode = played.episodes[number];
     this.frames = this.episode.signals[0].values.length;
     this.dt = played.time_step;
-    const told = (episode, i) => [i, `${episode.number + 1}: return ${text(episode.return)}, ${plural(episode.steps, "step")}${episode.terminated ? ", terminated" : ""}`];
-    this.episodes.replaceChildren(this.choice("Episode", played.episodes.map(told), number, (i) => this.load(run, i)));
+    const option = (episode, i) => [i, `${episode.number + 1}: return ${text(episode.return)}, ${plural(episode.steps, "step")}${episode.terminated ? ", terminated" : ""}`];
+    this.episodes.replaceChildren(this.choice("Episode", played.episodes.map(option), number, (i) => this.load(run, i)));
     const byKey = Object.fromEntries(this.episode.signals.map((signal) => [signal.key, signal]));
     const { element, draw } = SCENES[picture.kind](picture, byKey);
     this.drawScene = draw;
     this.stage.replaceChildren(element);
     this.element.classList.toggle("without-picture", picture.kind === "none");
     this.cursors = this.episode.signals.map((signal) => this.strip(signal));
-    this.policy.textContent = `${run.name}: ${played.policy}, without exploration, from the starts that every evaluation has.`;
+    this.policy.textContent = `${run.name}: ${played.policy}, without exploration, from the start states of the evaluations.`;
     set(this.slider, { max: this.frames - 1 });
     this.go(0);
   }
 
-  /** A signal's line, its present value, and where it is now. */
+  /** A signal's line, its current value, and a line at the current frame. */
   strip(signal) {
     const range = rangeOf(signal.values, 0.08);
     const across = scale([0, Math.max(1, this.frames - 1)], [0, 1000]);
@@ -109,7 +109,7 @@ class Player {
     return { element, move };
   }
 
-  /** Shows a frame; where the episode has no such, the nearest. */
+  /** Shows a frame; a number outside the episode is clamped. */
   go(frame) {
     this.frame = Math.max(0, Math.min(this.frames - 1, frame));
     if (this.signals.firstChild !== this.cursors[0].element) this.signals.replaceChildren(...this.cursors.map(({ element }) => element));
@@ -135,7 +135,7 @@ class Player {
     let [before, due] = [null, 0];
     const tick = (now) => {
       if (!this.playing) return;
-      const seconds = this.dt === null ? UNTIMED : this.dt * this.episode.stride;
+      const seconds = this.dt === null ? SECONDS_PER_FRAME : this.dt * this.episode.stride;
       due += before === null ? 0 : (Math.min(250, now - before) / 1000 / seconds) * this.speed;
       before = now;
       const frames = Math.floor(due);
@@ -160,15 +160,14 @@ class Player {
 
   key(event) {
     const { target } = event;
-    const slides = target === this.slider;
     if (event.ctrlKey || event.altKey || event.metaKey || target.matches("select")) return;
-    // A button's own key is space, and it does what it says.
+    // Space activates the focused button, as usual.
     if (event.key === " " && target.matches("button")) return;
-    const acts = { " ": () => this.toggle(), ArrowLeft: () => this.step(-1), ArrowRight: () => this.step(1), Home: () => this.step(-this.frames), End: () => this.step(this.frames) };
-    if (!acts[event.key] || (target === document.body && event.key !== " " && !event.key.startsWith("Arrow"))) return;
+    const actions = { " ": () => this.toggle(), ArrowLeft: () => this.step(-1), ArrowRight: () => this.step(1), Home: () => this.step(-this.frames), End: () => this.step(this.frames) };
+    if (!actions[event.key] || (target === document.body && event.key !== " " && !event.key.startsWith("Arrow"))) return;
     event.preventDefault();
     event.stopPropagation();
-    if (slides) this.pause();
-    acts[event.key]();
+    if (target === this.slider) this.pause();
+    actions[event.key]();
   }
 }

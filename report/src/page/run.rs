@@ -1,4 +1,4 @@
-//! What is shown of one run.
+//! The data that the page shows of one run.
 
 use serde::Serialize;
 use shoal_common::config::{Config, Mode};
@@ -9,19 +9,19 @@ use shoal_run::recorder::{
     read_learner,
 };
 
-use super::Room;
-use super::numbers::{mean, parts, short, telling};
+use super::Limits;
+use super::numbers::{downsample, mean, parts, short};
 use super::played::Played;
 use super::settings::{self, Setting};
 
-/// Incidents listed of a run.
+/// At most this many incidents of a run are listed.
 const INCIDENTS: usize = 400;
 
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Run {
-    /// Tells it from the other runs of the report.
+    /// Unique within the report.
     pub(super) name: String,
-    /// The environment, with what sets its kind of reward apart.
+    /// The environment's name with its textual parameters, such as the reward.
     pub(super) environment: String,
     pub(super) algorithm: &'static str,
     seed: u64,
@@ -42,7 +42,7 @@ pub(super) struct Run {
     learner: Rates,
     incidents: Option<Incidents>,
     pub(super) played: Played,
-    /// All of them, for medians.
+    /// Every record, for medians.
     #[serde(skip)]
     pub(super) evaluation_records: Vec<EvaluationRecord>,
 }
@@ -64,23 +64,23 @@ struct EvaluatedPolicy {
     episodes: u32,
 }
 
-/// Returns over steps and time.
+/// Returns over environment steps and time.
 #[derive(Clone, Debug, Serialize)]
 struct Curve {
     steps: Vec<u64>,
     /// In s.
     time: Vec<f64>,
     mean: Vec<f64>,
-    /// Of the episodes of one evaluation; empty where each point is no evaluation.
+    /// Standard deviation over the episodes of one evaluation; empty if the points are not evaluations.
     std: Vec<f64>,
-    /// What stands for a point: all rows there are, or fewer.
+    /// Number of records that the points were selected or averaged from.
     rows: usize,
 }
 
-/// A rate over less than so many seconds says nothing.
+/// Rates measured over a shorter time, in s, are not shown: they are not meaningful.
 const SPAN: f64 = 0.2;
 
-/// What the learner told of itself, averaged where there was more than there is room for. NaN where there was nothing.
+/// The learner's records, averaged if there are more than the page may contain. NaN where nothing was recorded.
 #[derive(Clone, Debug, Serialize)]
 struct Rates {
     steps: Vec<u64>,
@@ -97,31 +97,31 @@ struct Rates {
 #[derive(Clone, Debug, Serialize)]
 struct Incidents {
     rows: Vec<IncidentRow>,
-    /// Those that there was no room for, later than the others.
+    /// Number of later incidents that are not listed.
     more: usize,
     restarts: usize,
     kills: usize,
 }
 
 impl Run {
-    pub(super) fn read(run: &RunDir, name: String, room: Room) -> anyhow::Result<Self> {
+    pub(super) fn read(run: &RunDir, name: String, limits: Limits) -> anyhow::Result<Self> {
         let config = configuration(run)?;
-        // Asked first: what a run that ends meanwhile writes last is read below.
-        let goes_on = run.goes_on()?;
+        // This comes first, so that the last records of a run that ends now are read below.
+        let is_training = run.is_running()?;
         let evaluation_records = read_evaluations(&run.evaluations())?;
         let learner = read_learner(&run.learner_log())?;
         let explored = read_episodes(&run.episodes())?;
         let now = learner.last().cloned().unwrap_or_default();
         let all_steps = config.run.has_all_steps(now.env_steps, now.episodes);
-        let outcome = RunOutcome::read(run)?.is_none_or(|outcome| outcome.state == RunState::Finished);
-        let through = all_steps && outcome;
+        let outcome_allows = RunOutcome::read(run)?.is_none_or(|outcome| outcome.state == RunState::Finished);
+        let is_finished = all_steps && outcome_allows;
         Ok(Self {
             name,
             environment: kind(&config),
             algorithm: config.algorithm.name(),
             seed: config.run.seed,
             mode: config.run.mode,
-            state: match (goes_on, through) {
+            state: match (is_training, is_finished) {
                 (true, _) => PageState::Training,
                 (false, true) => PageState::Finished,
                 (false, false) => PageState::Unfinished,
@@ -129,7 +129,7 @@ impl Run {
             settings: settings::of(&config)?,
             env_steps: now.env_steps,
             planned_steps: config.run.steps,
-            // Older builds counted them in this record alone.
+            // Older versions did not record the count in learner.csv, only the episodes themselves.
             episodes: now.episodes.max(explored.len() as u64),
             planned_episodes: config.run.episodes,
             updates: now.updates,
@@ -141,11 +141,11 @@ impl Run {
                 .find(|row| row.best == 1)
                 .map(EvaluatedPolicy::of),
             last: evaluation_records.last().map(EvaluatedPolicy::of),
-            evaluations: Curve::of_evaluations(&evaluation_records, room.points),
-            exploration: Curve::of_episodes(&explored, room.points),
-            learner: Rates::of(learner, room.points),
+            evaluations: Curve::of_evaluations(&evaluation_records, limits.points),
+            exploration: Curve::of_episodes(&explored, limits.points),
+            learner: Rates::of(learner, limits.points),
             incidents: read_incidents(&run.incidents())?.map(Incidents::of),
-            played: Played::of(run, &config, room.episodes),
+            played: Played::of(run, &config, limits.episodes),
             evaluation_records,
         })
     }
@@ -165,7 +165,7 @@ impl EvaluatedPolicy {
 impl Curve {
     fn of_evaluations(rows: &[EvaluationRecord], points: usize) -> Self {
         let means: Vec<f64> = rows.iter().map(|row| row.return_mean).collect();
-        let shown: Vec<&EvaluationRecord> = telling(&means, points).into_iter().map(|i| &rows[i]).collect();
+        let shown: Vec<&EvaluationRecord> = downsample(&means, points).into_iter().map(|i| &rows[i]).collect();
         Self {
             steps: shown.iter().map(|row| row.env_steps).collect(),
             time: shown.iter().map(|row| short(row.wall_seconds)).collect(),
@@ -175,7 +175,7 @@ impl Curve {
         }
     }
 
-    /// Means over episodes that ended one after the other.
+    /// Means over consecutive episodes.
     fn of_episodes(rows: &[EpisodeRecord], points: usize) -> Self {
         let shown: Vec<&[EpisodeRecord]> = parts(rows.len(), points).map(|part| &rows[part]).collect();
         let last = |part: &&[EpisodeRecord]| part.last().cloned().unwrap_or_default();
@@ -194,9 +194,9 @@ impl Curve {
 
 impl Rates {
     fn of(mut rows: Vec<LearnerRecord>, points: usize) -> Self {
-        let hasty = |pair: &[LearnerRecord]| pair[1].wall_seconds - pair[0].wall_seconds < SPAN;
-        let hasty: Vec<usize> = (1..rows.len()).filter(|i| hasty(&rows[i - 1..=*i])).collect();
-        for i in hasty {
+        let is_too_short = |i: &usize| rows[*i].wall_seconds - rows[i - 1].wall_seconds < SPAN;
+        let too_short: Vec<usize> = (1..rows.len()).filter(is_too_short).collect();
+        for i in too_short {
             (rows[i].env_steps_per_second, rows[i].updates_per_second) = (None, None);
         }
         let shown: Vec<&[LearnerRecord]> = parts(rows.len(), points).map(|part| &rows[part]).collect();
@@ -219,9 +219,9 @@ impl Rates {
 
 impl Incidents {
     fn of(mut rows: Vec<IncidentRow>) -> Self {
-        use shoal_run::recorder::What;
+        use shoal_run::recorder::IncidentKind;
         let count = |what| rows.iter().filter(|row| row.what == what).count();
-        let (restarts, kills) = (count(What::StartedAgain), count(What::Killed));
+        let (restarts, kills) = (count(IncidentKind::StartedAgain), count(IncidentKind::Killed));
         let more = rows.len().saturating_sub(INCIDENTS);
         rows.truncate(INCIDENTS);
         Self {
@@ -233,16 +233,16 @@ impl Incidents {
     }
 }
 
-/// Of several runs, the one whose configuration is refused is named.
+/// The run's configuration. An error names the file, so that it is clear which of several runs is meant.
 fn configuration(run: &RunDir) -> anyhow::Result<Config> {
     let path = run.config_file().display().to_string();
     run.config().map_err(|error| match error.to_string() {
-        said if said.contains(&path) => error.into(),
-        said => anyhow::anyhow!("{path}: {said}"),
+        message if message.contains(&path) => error.into(),
+        message => anyhow::anyhow!("{path}: {message}"),
     })
 }
 
-/// The environment's name and those of its parameters that are words: returns of different rewards do not compare.
+/// The environment's name and its textual parameters: returns of different rewards cannot be compared.
 fn kind(config: &Config) -> String {
     let environment = &config.environment;
     let words = environment.parameters.values().filter_map(toml::Value::as_str);
@@ -253,7 +253,7 @@ fn kind(config: &Config) -> String {
         .join(" ")
 }
 
-/// A name for each run: its directory's, with the directory above where two are called alike.
+/// A name for each run: that of its directory, with the parent directory if two runs have the same name.
 pub(super) fn names(runs: &[RunDir]) -> Vec<String> {
     let short: Vec<String> = runs.iter().map(RunDir::name).collect();
     let name = |(run, name): (&RunDir, &String)| {

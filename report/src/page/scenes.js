@@ -1,7 +1,7 @@
-/* What an episode looks like: the pictures that environments name, by the `kind` of `Picture` (env-server). Each reads the
-   episode's signals by their keys. `draw(i)` shows its frame i. */
+/* Pictures of an episode, by the `kind` of the environment's `Picture` (env-server). Each reads the episode's signals by their
+   keys. `draw(i)` shows frame i. */
 
-/** An arrow from (x, y) by (dx, dy); nothing where it is too short to see. */
+/** Draws an arrow from (x, y) by (dx, dy), or nothing if it is too short to be seen. */
 function arrow(shape, x, y, dx, dy, head) {
   const length = Math.hypot(dx, dy);
   if (!(length > head * 0.2)) return set(shape, { d: "" });
@@ -24,7 +24,7 @@ const SCENES = {
     const angles = signals.angle.values;
     const torques = signals.torque.values;
     const greatest = signals.torque.range[1];
-    // Upright is 0, and angles grow against the clock.
+    // Upright is 0; angles increase counterclockwise.
     const bob = (i) => [-Math.sin(angles[i]), -Math.cos(angles[i])];
     const trail = svg("path", { class: "trail" });
     const rod = svg("line", { class: "rod", x1: 0, y1: 0 });
@@ -33,7 +33,7 @@ const SCENES = {
     const caption = svg("text", { class: "note", x: -1.55, y: 1.5 });
     const element = drawing(
       "-1.6 -1.3 3.2 2.9",
-      "The pendulum; upright is up, the arc at the joint is the torque",
+      "The pendulum; the arc at the joint is the torque",
       svg("circle", { class: "guide", r: 1 }),
       svg("line", { class: "guide", x1: 0, y1: -1.2, x2: 0, y2: -1.05 }),
       trail,
@@ -56,7 +56,7 @@ const SCENES = {
       const tangent = [-Math.cos(along) * Math.sign(share), Math.sin(along) * Math.sign(share)];
       if (turn < 0.05) set(torque, { d: "" });
       else {
-        // The head lies along the arc and is never longer than it.
+        // The arrowhead follows the arc and is never longer than it.
         const length = Math.min(0.16, radius * turn);
         arrow(torque, end[0] - tangent[0] * length, end[1] - tangent[1] * length, tangent[0] * length, tangent[1] * length, 0.12);
         set(torque, { d: torque.getAttribute("d").replace(/^M[^L]*L[^M]*/, "") });
@@ -105,7 +105,7 @@ const SCENES = {
       const angle = directions[i] ?? 0;
       arrow(force, x, y, Math.cos(angle) * length, -Math.sin(angle) * length, wall * 0.05);
       const degrees = Math.round(((angle * 180) / Math.PI + 360) % 360);
-      caption.textContent = isNumber(forces[i]) ? `force ${text(forces[i])} N towards ${degrees}°` : "the end";
+      caption.textContent = isNumber(forces[i]) ? `force ${text(forces[i])} N towards ${degrees}°` : "end of the episode";
     };
     return { element, draw };
   },
@@ -139,13 +139,13 @@ const SCENES = {
       set(tip, { cx: top[0], cy: top[1] });
       const side = isNumber(pushes[i]) ? (pushes[i] < 0.5 ? -1 : 1) : 0;
       arrow(push, x + side * 0.27, -0.13, side * 0.4, 0, 0.12);
-      caption.textContent = ["push to the left", "the end", "push to the right"][side + 1];
+      caption.textContent = ["push to the left", "end of the episode", "push to the right"][side + 1];
     };
     return { element, draw };
   },
 
   grid(picture, signals) {
-    const [fields, meant] = [signals.field.values, signals.direction.values];
+    const [fields, directions] = [signals.field.values, signals.direction.values];
     const side = Math.round(Math.sqrt(picture.map.length));
     const middle = (field) => [(field % side) + 0.5, Math.floor(field / side) + 0.5];
     const names = { S: "start", F: "", H: "hole", G: "goal" };
@@ -158,23 +158,23 @@ const SCENES = {
     });
     const trail = svg("path", { class: "trail" });
     const walker = svg("circle", { class: "body", r: 0.16, "data-part": "moves" });
-    const wish = svg("path", { class: "force" });
+    const intended = svg("path", { class: "force" });
     const caption = svg("text", { class: "note", x: 0, y: side + 0.28 });
-    const label = "The lake from above; the dot walks, the arrow is where it means to go, and it may slip";
-    const element = drawing(`-0.05 -0.05 ${side + 0.1} ${side + 0.45}`, label, lake, trail, walker, wish, caption);
+    const label = "The lake from above; the dot is the agent, the arrow its action, and it may slip";
+    const element = drawing(`-0.05 -0.05 ${side + 0.1} ${side + 0.45}`, label, lake, trail, walker, intended, caption);
     const ways = [[-1, 0, "left"], [0, 1, "down"], [1, 0, "right"], [0, -1, "up"]];
     const draw = (i) => {
       const [x, y] = middle(fields[i]);
       set(walker, { cx: x, cy: y });
       set(trail, { d: line(fields.slice(0, i + 1).map(middle)) });
-      const [dx, dy, word] = ways[meant[i]] ?? [0, 0, ""];
-      arrow(wish, x + dx * 0.2, y + dy * 0.2, dx * 0.3, dy * 0.3, 0.12);
-      caption.textContent = word ? `means to go ${word}` : "the end";
+      const [dx, dy, word] = ways[directions[i]] ?? [0, 0, ""];
+      arrow(intended, x + dx * 0.2, y + dy * 0.2, dx * 0.3, dy * 0.3, 0.12);
+      caption.textContent = word ? `action: ${word}` : "end of the episode";
     };
     return { element, draw };
   },
 
   none() {
-    return { element: html("p", {}, "This environment has no picture; these are the numbers that the policy sees and gives."), draw() {} };
+    return { element: html("p", {}, "This environment has no picture; the signals are the policy's observations and actions."), draw() {} };
   },
 };

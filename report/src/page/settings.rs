@@ -5,13 +5,13 @@ use shoal_common::config::Config;
 /// A key with its sections, as `--set` takes it, and its value.
 pub(super) type Setting = (String, String);
 
-/// Settings in which runs that are repetitions of each other may differ.
-const NOT_WHAT_IS_COMPARED: [&str; 3] = ["run.seed", "run.steps", "run.episodes"];
+/// Settings in which repetitions may differ.
+const NOT_COMPARED: [&str; 3] = ["run.seed", "run.steps", "run.episodes"];
 
-/// What the program fills in: the run's name in shared memory, and the form of its identity.
+/// Settings that the program fills in: the run's name in shared memory, and the format of its identity.
 const FILLED_IN: [&str; 2] = ["run.id", "run.identity_format"];
 
-/// All settings in the order of `config.toml`, but for what the program fills in.
+/// All settings in the order of `config.toml`, except those that the program fills in.
 pub(super) fn of(config: &Config) -> anyhow::Result<Vec<Setting>> {
     let table: toml::Table = config.to_toml()?.parse()?;
     let mut settings = Vec::new();
@@ -31,9 +31,9 @@ fn flatten(prefix: &str, table: &toml::Table, into: &mut Vec<Setting>) {
     }
 }
 
-/// What repetitions have in common.
+/// The settings that repetitions have in common.
 pub(super) fn in_common(settings: &[Setting]) -> impl Iterator<Item = &Setting> {
-    let counts = |(key, _): &&Setting| !NOT_WHAT_IS_COMPARED.contains(&key.as_str());
+    let counts = |(key, _): &&Setting| !NOT_COMPARED.contains(&key.as_str());
     settings.iter().filter(counts)
 }
 
@@ -43,7 +43,7 @@ mod tests {
     use shoal_run::testing::small;
 
     #[test]
-    fn every_setting_is_a_line_as_it_would_be_typed() {
+    fn every_setting_is_listed_as_it_is_typed() {
         let (config, _) = small("name = \"point-mass\"\nreward = \"r2\"");
         let settings = of(&config).unwrap();
         for (key, value) in [

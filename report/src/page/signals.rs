@@ -1,4 +1,4 @@
-//! The signals of an episode, as the page shows them.
+//! The signals of an episode in the form that the page shows.
 
 use serde::Serialize;
 use shoal_common::space::EnvironmentSpec;
@@ -7,21 +7,22 @@ use shoal_run::rollout::Trajectory;
 
 use super::numbers::short;
 
-/// A signal with its values, from picture to picture; NaN where it has none.
+/// A signal with its value at each frame; NaN where it has none.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub(super) struct Trace {
-    /// The scripts find it by this.
+    /// The name under which the page's scripts find it.
     pub(super) key: String,
     pub(super) label: String,
-    /// Empty for what is counted.
+    /// Empty for counts.
     pub(super) unit: &'static str,
-    /// Its bounds, where the environment's spaces have such.
+    /// Its bounds, if the environment's spaces have any.
     pub(super) range: Option<[f64; 2]>,
     pub(super) values: Vec<f64>,
 }
 
-/// The environment's signals in an episode at these of its T + 1 states, and after them the reward and the return. An action
-/// belongs to the state that it is taken in, a reward to the one that it leads to.
+/// The environment's signals in an episode, followed by the reward and the return so far, at `frames`, which are
+/// indices of the episode's T + 1 states. An action belongs to the state in which it is taken, a reward to the state
+/// that follows.
 pub(super) fn traces(
     signals: &[Signal],
     spec: &EnvironmentSpec,
@@ -64,7 +65,7 @@ mod tests {
     use shoal_run::rollout::Rollout;
     use shoal_run::testing::small;
 
-    /// Of the small policy's episode from this state.
+    /// Traces of the episode that starts in this state.
     fn traces_from(config: &Config, parameters: &[f32], state: &[f64], frames: &[usize]) -> Vec<Trace> {
         let mut rollout = Rollout::new(config, parameters).unwrap();
         let trajectory = rollout.episode_from(state).unwrap();
@@ -77,7 +78,7 @@ mod tests {
     }
 
     #[test]
-    fn actions_belong_to_the_state_they_are_taken_in_and_rewards_to_the_one_they_lead_to() {
+    fn actions_belong_to_the_state_before_the_step_and_rewards_to_the_state_after_it() {
         let trajectory = Trajectory {
             observations: vec![vec![0.0], vec![1.0], vec![2.0]],
             actions: vec![vec![5.0], vec![6.0]],
@@ -102,7 +103,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pendulum_that_hangs_is_half_a_turn_from_upright() {
+    fn a_hanging_pendulum_is_half_a_turn_from_upright() {
         let (config, parameters) = small("name = \"pendulum\"\ntime_limit = 3");
         let traces = traces_from(&config, &parameters, &[std::f64::consts::PI, 0.0], &[0, 3]);
         assert_eq!(traces[0].key, "angle");
@@ -116,7 +117,7 @@ mod tests {
     }
 
     #[test]
-    fn the_vehicle_is_where_its_observation_says() {
+    fn the_position_of_the_vehicle_comes_from_the_observation() {
         let (config, parameters) = small("name = \"point-mass\"\nreward = \"r3\"");
         let traces = traces_from(&config, &parameters, &[1.5, -2.0, 0.0, 0.0], &[0]);
         let first: Vec<(&str, f64)> = traces.iter().map(|t| (t.label.as_str(), t.values[0])).take(3).collect();

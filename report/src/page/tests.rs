@@ -6,7 +6,7 @@ use shoal_run::testing::small;
 
 use super::*;
 
-/// A run directory as a launcher makes it, with a policy where one is given.
+/// A run directory as the launcher makes it, with a best policy if `parameters` are given.
 fn directory(parent: &std::path::Path, name: &str, config: &Config, parameters: Option<Vec<f32>>) -> RunDir {
     let run = RunDir::create(&parent.join(name)).unwrap();
     run.write_config(config).unwrap();
@@ -26,7 +26,7 @@ fn directory(parent: &std::path::Path, name: &str, config: &Config, parameters: 
     run
 }
 
-/// The data as the page's script finds it.
+/// The data that the page's script reads.
 fn data(page: &str) -> serde_json::Value {
     let (_, after) = page
         .split_once("<script type=\"application/json\" id=\"data\">")
@@ -35,7 +35,7 @@ fn data(page: &str) -> serde_json::Value {
     serde_json::from_str(data).unwrap()
 }
 
-/// A small configuration for an environment, with a method that can control it.
+/// A small configuration for an environment, with an algorithm that supports its spaces.
 fn configuration(name: &str) -> Config {
     let method = match name {
         "cart-pole" => {
@@ -51,7 +51,7 @@ fn configuration(name: &str) -> Config {
 }
 
 #[test]
-fn every_environment_is_played() {
+fn episodes_of_every_environment_can_be_played() {
     let parent = tempfile::tempdir().unwrap();
     for (i, name) in names().enumerate() {
         let config = configuration(name);
@@ -78,7 +78,7 @@ fn every_environment_is_played() {
 }
 
 #[test]
-fn what_cannot_be_played_is_said_in_a_sentence_and_the_rest_is_shown() {
+fn a_run_without_playable_episodes_is_shown_with_the_reason() {
     let parent = tempfile::tempdir().unwrap();
     let (mut config, parameters) = small("name = \"pendulum\"");
     let begun = directory(parent.path(), "begun", &config, None);
@@ -110,7 +110,7 @@ fn what_cannot_be_played_is_said_in_a_sentence_and_the_rest_is_shown() {
 }
 
 #[test]
-fn no_name_gets_out_of_the_data_and_nothing_is_loaded() {
+fn run_names_cannot_inject_markup_and_the_page_loads_nothing() {
     let parent = tempfile::tempdir().unwrap();
     let (config, parameters) = small("name = \"pendulum\"");
     let name = "</script><script>alert(1)<!-- {{script}}";
@@ -126,14 +126,14 @@ fn no_name_gets_out_of_the_data_and_nothing_is_loaded() {
     assert_eq!(data(&page)["runs"][0]["name"], name);
     assert_eq!(page.matches("<script").count(), 2);
     for foreign in ["http://", "https://", "src=", "@import", "url("] {
-        // The namespace of SVG is a name and no place; a part of the page itself may be referred to.
+        // The SVG namespace is a name, not an address, and references within the page are allowed.
         let found = page.replace("http://www.w3.org/2000/svg", "").replace("url(#", "");
         assert!(!found.contains(foreign), "{foreign}");
     }
 }
 
 #[test]
-fn a_long_run_makes_a_small_page_and_keeps_its_peak() {
+fn the_page_of_a_long_run_is_small_and_shows_its_peak() {
     let parent = tempfile::tempdir().unwrap();
     let (config, parameters) = small("name = \"point-mass\"\nreward = \"r3\"");
     let run = directory(parent.path(), "long", &config, Some(parameters));
@@ -170,18 +170,18 @@ fn a_long_run_makes_a_small_page_and_keeps_its_peak() {
 }
 
 #[test]
-fn many_runs_share_the_room_there_is() {
+fn many_runs_share_the_points_and_episodes() {
     let sizes: Vec<_> = [1, 3, 5, 30, 500]
         .iter()
-        .map(|runs| Room::of(29, *runs))
+        .map(|runs| Limits::of(29, *runs))
         .map(|r| (r.points, r.episodes))
         .collect();
     assert_eq!(sizes, [(800, 6), (800, 6), (800, 4), (133, 0), (60, 0)]);
-    assert_eq!(Room::of(0, 500).episodes, 1);
+    assert_eq!(Limits::of(0, 500).episodes, 1);
 }
 
 #[test]
-fn a_damaged_record_is_refused_in_one_line_that_names_it() {
+fn a_damaged_record_is_refused_with_one_line_that_names_the_file() {
     let parent = tempfile::tempdir().unwrap();
     let (config, _) = small("name = \"pendulum\"");
     let run = directory(parent.path(), "run", &config, None);

@@ -1,4 +1,5 @@
-/* Who was killed, failed, was started again, and when: a line for each role, over the same time as the other diagrams. */
+/* The time line of incidents, such as kills and restarts: a line for each role, over the same time axis as the other
+   diagrams. */
 
 const ROLES = [
   ["launcher", "launcher"],
@@ -8,7 +9,7 @@ const ROLES = [
   ["env-server", "environment servers"],
 ];
 
-/** How each kind is shown: its words, its colour, its sign. */
+/** The words, colour and sign of each kind of incident. */
 const KINDS = {
   killed: ["killed", "bad", "M-5-5L5 5M-5 5L5-5"],
   failed: ["failed", "bad", "M-5-5L5 5M-5 5L5-5M-7 0H7"],
@@ -20,17 +21,17 @@ const KINDS = {
 };
 
 /** An incident in words. */
-function told(row) {
+function describe(row) {
   const who = row.role === "launcher" ? "run" : `${row.role} ${row.index}`;
   const [words] = KINDS[row.what] ?? [row.what];
   return `${who} ${row.detail.startsWith(words) ? row.detail : [words, row.detail].filter(Boolean).join(": ")}`;
 }
 
-/** Lines for other diagrams, without those of the restart that follows at once. */
+/** The incidents as marks for other diagrams, without restarts, which follow immediately, and retirements. */
 function marksOf(run) {
   const rows = run.incidents?.rows ?? [];
   const shown = rows.filter((row) => row.what !== "started-again" && row.what !== "retired");
-  return shown.map((row) => ({ x: row.wall_seconds, kind: KINDS[row.what]?.[1] ?? "calm", text: told(row) }));
+  return shown.map((row) => ({ x: row.wall_seconds, kind: KINDS[row.what]?.[1] ?? "calm", text: describe(row) }));
 }
 
 class Timeline {
@@ -63,14 +64,14 @@ class Timeline {
 
   table() {
     const { rows, more } = this.run.incidents;
-    const cells = (row) => html("tr", {}, html("td", {}, duration(row.wall_seconds)), html("td", {}, whole(row.env_steps)), html("td", {}, told(row)));
+    const cells = (row) => html("tr", {}, html("td", {}, duration(row.wall_seconds)), html("td", {}, whole(row.env_steps)), html("td", {}, describe(row)));
     const head = ["time", "environment steps", "what happened"].map((name) => html("th", { scope: "col" }, name));
     return html(
       "details",
       {},
-      html("summary", {}, `All ${rows.length + more} as a list`),
+      html("summary", {}, `All ${rows.length + more} incidents as a list`),
       html("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": `Incidents of ${this.run.name}` }, html("table", {}, html("thead", {}, html("tr", {}, head)), html("tbody", {}, rows.map(cells)))),
-      more ? html("p", { class: "aside" }, `and ${whole(more)} more, later ones: see incidents.csv`) : null,
+      more ? html("p", { class: "aside" }, `${whole(more)} later incidents are not listed: see incidents.csv`) : null,
     );
   }
 
@@ -90,7 +91,7 @@ class Timeline {
       for (const row of this.run.incidents.rows) {
         if (row.role !== role || row.wall_seconds < domain[0] || row.wall_seconds > domain[1]) continue;
         const [, look, sign] = KINDS[row.what] ?? KINDS.scaled;
-        const words = svg("title", {}, `${duration(row.wall_seconds)}: ${told(row)}`);
+        const words = svg("title", {}, `${duration(row.wall_seconds)}: ${describe(row)}`);
         signs.append(svg("path", { class: `sign ${look}`, d: sign, transform: `translate(${x(row.wall_seconds).toFixed(1)} ${look === "good" ? y + 11 : y})` }, words));
       }
     });

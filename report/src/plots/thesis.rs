@@ -1,4 +1,5 @@
-//! The thesis's own figures of one run. They start in states that the thesis names, so they belong to its environments by name.
+//! The thesis's figures of one run. They start from states given in the thesis, so each belongs to a particular
+//! environment.
 
 use std::path::{Path, PathBuf};
 
@@ -9,7 +10,8 @@ use shoal_run::rollout::Rollout;
 
 use crate::figure;
 
-/// Draws what the policy does from the thesis's starts, and gives the files; `None` where the thesis has no such figure.
+/// Draws the policy's behaviour from the thesis's start states and returns the files; `None` if the thesis has no such
+/// figure.
 pub(super) fn behaviour(
     config: &Config,
     rollout: &mut Rollout<'_>,
@@ -38,7 +40,7 @@ fn drives(config: &Config, rollout: &mut Rollout<'_>, out: &Path) -> anyhow::Res
     Ok(files.into())
 }
 
-/// The two starts of the thesis's figure for the run's reward: 5.5 (r1), 5.7 (r2), 5.9 (r3).
+/// The two start positions in the thesis's figure for the run's reward: 5.5 (r1), 5.7 (r2), 5.9 (r3).
 fn starts_shown(config: &Config) -> &'static [[f64; 2]] {
     let reward = config
         .environment
@@ -58,7 +60,7 @@ mod tests {
     use shoal_run::testing::small;
 
     #[test]
-    fn the_starts_are_those_of_the_rewards_figure() {
+    fn the_starts_are_those_of_the_figure_for_the_reward() {
         let starts = |reward: &str| starts_shown(&small(&format!("name = \"point-mass\"\nreward = \"{reward}\"")).0);
         assert_eq!(starts("r1"), [[2.0, -2.0], [-2.0, 2.0]]);
         assert_eq!(starts("r2"), [[2.0, 2.0], [-2.0, -2.0]]);

@@ -1,4 +1,4 @@
-//! What section 4.1 claims.
+//! The claims of section 4.1.
 
 use shoal_run::analysis::lake::{Values, Walk, dangers, greedy, mistakes};
 
@@ -6,7 +6,7 @@ use super::super::claim::{Claim, Scope, spread};
 use super::super::result::SeedResult;
 use super::{EPISODES, Sweep, Tests};
 
-/// Probabilities of the goal that differ by less count as the same.
+/// Probabilities of reaching the goal count as equal if they differ by less than this.
 const SAME: f64 = 0.05;
 
 pub(super) fn all(
@@ -39,18 +39,18 @@ fn together(thesis: &'static str, criterion: &'static str, ours: String, held: O
     }
 }
 
-/// In the mean over the seeds, from one episode to another; not a number where there are none.
+/// The probability of reaching the goal between two episodes, as mean over the seeds; NaN without seeds.
 fn reached(seeds: &[SeedResult<Tests>], from: u64, to: u64) -> f64 {
     mean(seeds, |tests| tests.reached(from, to))
 }
 
-/// Over the seeds; not a number where there are none.
+/// The mean over the seeds; NaN without seeds.
 fn mean(seeds: &[SeedResult<Tests>], of: impl Fn(&Tests) -> f64) -> f64 {
     seeds.iter().map(|seed| of(&seed.tests)).sum::<f64>() / seeds.len() as f64
 }
 
-/// A mean, or that there is none.
-fn say(mean: f64, decimals: usize) -> String {
+/// Formats a mean, or "no results" for NaN.
+fn format_mean(mean: f64, decimals: usize) -> String {
     if mean.is_nan() {
         return "no results".into();
     }
@@ -75,7 +75,7 @@ fn optimal(good: &[SeedResult<Tests>], q_star: &Values) -> Claim {
     };
     together(
         "The optimal policy is learned with the good setting (ε = 0.4, α = 0.03)",
-        "the greedy policy is value iteration's in every state, ties counted as equal, in at least 9 of 10 seeds",
+        "with at least 9 of 10 seeds, the greedy policy takes an optimal action (by value iteration) in every state",
         format!("{right} of {} seeds{elsewhere}", good.len()),
         (!good.is_empty()).then_some(10 * right >= 9 * good.len()),
     )
@@ -86,9 +86,10 @@ fn slow(epsilon: &[Sweep<'_>; 3], best: Walk) -> Claim {
     let there = epsilon.iter().all(|(_, seeds)| !seeds.is_empty());
     together(
         "The lowest ε of 0.1 does not converge within the 10,000 episodes",
-        "over the last 1,000 episodes its mean probability of the goal is more than 0.05 below the best policy's, and those of \
-         the other two are not",
-        ends.map(|(label, end)| format!("{label}: {}", say(end, 2))).join("; "),
+        "over the last 1,000 episodes, the mean probability of reaching the goal is more than 0.05 below the optimal \
+         policy's for ε = 0.1, and not for the other two",
+        ends.map(|(label, end)| format!("{label}: {}", format_mean(end, 2)))
+            .join("; "),
         there.then(|| {
             let converged = ends.map(|(_, end)| end > best.reached - SAME);
             converged == [false, true, true]
@@ -100,12 +101,12 @@ fn early(low: &[SeedResult<Tests>], good: &[SeedResult<Tests>], high: &[SeedResu
     let [low, middle, high_mean] = [low, good, high].map(|seeds| reached(seeds, 500, 2_000));
     together(
         "ε = 0.7 looks as though it will be the best exploration rate early on",
-        "its mean probability of the goal between episodes 500 and 2,000 is the highest",
+        "between episodes 500 and 2,000, its mean probability of reaching the goal is the highest",
         format!(
             "0.1: {}; 0.4: {}; 0.7: {}",
-            say(low, 3),
-            say(middle, 3),
-            say(high_mean, 3)
+            format_mean(low, 3),
+            format_mean(middle, 3),
+            format_mean(high_mean, 3)
         ),
         (!good.is_empty() && !high.is_empty()).then_some(high_mean > middle && high_mean > low),
     )
@@ -119,11 +120,11 @@ fn late(good: &[SeedResult<Tests>], high: &[SeedResult<Tests>]) -> Claim {
     };
     together(
         "ε = 0.7 is surpassed by ε = 0.4",
-        "between episodes 5,000 and 8,000 the mean probability of the goal is higher with 0.4",
+        "between episodes 5,000 and 8,000, the mean probability of reaching the goal is higher with ε = 0.4",
         format!(
-            "0.4: {}; 0.7: {}; the learned value of the start (q* 0.786) ends at {} and {}",
-            say(middle, 3),
-            say(high_mean, 3),
+            "0.4: {}; 0.7: {}; learned values of the start state at the end (q* is 0.786): {} and {}",
+            format_mean(middle, 3),
+            format_mean(high_mean, 3),
             start(good),
             start(high)
         ),
@@ -147,14 +148,14 @@ fn state_six(good: &[SeedResult<Tests>]) -> Claim {
     let dangerous = |seed: &SeedResult<Tests>| dangers(&greedy(&seed.tests.q)) == [6];
     let count = |holds: &dyn Fn(&SeedResult<Tests>) -> bool| good.iter().filter(|seed| holds(seed)).count();
     Claim {
-        thesis: "Following the policy, the only state with any possibility of falling into a hole is state 6, and its Q-values are \
-                 the lowest of all",
-        criterion: "both are so",
+        thesis: "Following the policy, the only state with any possibility of falling into a hole is state 6, and its \
+                 Q-values are the lowest of all",
+        criterion: "both are true",
         ours: format!(
-            "only 6 is dangerous in {}, its value the lowest in {} of {} seeds",
+            "of {} seeds, state 6 alone is dangerous in {}, and has the lowest value in {}",
+            good.len(),
             count(&dangerous),
-            count(&|seed| lowest(seed) == Some(6)),
-            good.len()
+            count(&|seed| lowest(seed) == Some(6))
         ),
         scope: Scope::EachSeed,
         held: good
@@ -169,11 +170,11 @@ fn alike(good: &[SeedResult<Tests>], q_star: &Values) -> Claim {
     let [left, right] = [0, 2].map(|action| mean(good, |tests| f64::from(tests.q[4 * 6 + action])));
     together(
         "q*(6, left) = q*(6, right); the learned Q is only close to optimal",
-        "the two differ by less than 0.1 in the mean over the seeds",
+        "the means of the two over the seeds differ by less than 0.1",
         format!(
-            "left {}, right {} in the mean (both {:.3} in q*); within a seed they differ by {}",
-            say(left, 3),
-            say(right, 3),
+            "means: left {}, right {} (q*: both {:.3}); difference within a seed: {}",
+            format_mean(left, 3),
+            format_mean(right, 3),
             q_star[6][0],
             spread(good.iter().map(difference), 2)
         ),
@@ -186,8 +187,10 @@ fn learning_rates(alpha: &[Sweep<'_>; 4]) -> Claim {
     let there = alpha.iter().all(|(_, seeds)| !seeds.is_empty());
     together(
         "A low learning rate leads to slow convergence, a high one may not converge; α = 0.03 is appropriate",
-        "over the last 1,000 episodes the mean probability of the goal is highest with 0.03, by more than 0.05 before 0.01 and 0.3",
-        ends.map(|(label, end)| format!("{label}: {}", say(end, 2))).join("; "),
+        "over the last 1,000 episodes, the mean probability of reaching the goal is highest with α = 0.03, and more \
+         than 0.05 higher than with 0.01 and 0.3",
+        ends.map(|(label, end)| format!("{label}: {}", format_mean(end, 2)))
+            .join("; "),
         there.then(|| {
             let [low, good, middle, high] = ends.map(|(_, end)| end);
             good > middle && good - low > SAME && good - high > SAME
@@ -199,10 +202,15 @@ fn on_policy(good: &[SeedResult<Tests>], sarsa: &[SeedResult<Tests>], q_star: &V
     let best = q_star[0].iter().copied().fold(f64::NEG_INFINITY, f64::max);
     let [off, on] = [good, sarsa].map(|seeds| mean(seeds, |tests| highest(tests, 0)));
     together(
-        "Q-learning approximates q* directly, without depending on the policy being followed; SARSA estimates the value of the \
-         policy that explores (section 3.3.2)",
-        "with the same ε and α the learned value of the start is nearer to q* with Q-learning, and SARSA's is below half of it",
-        format!("Q-learning {}, SARSA {}, q* {best:.2}", say(off, 2), say(on, 2)),
+        "Q-learning approximates q* directly, without depending on the policy being followed; SARSA estimates the \
+         value of the policy that explores (section 3.3.2)",
+        "with the same ε and α, the learned value of the start state is nearer to q* with Q-learning, and below half \
+         of q* with SARSA",
+        format!(
+            "Q-learning {}, SARSA {}, q* {best:.2}",
+            format_mean(off, 2),
+            format_mean(on, 2)
+        ),
         (!good.is_empty() && !sarsa.is_empty()).then_some((best - off).abs() < (best - on).abs() && on < best / 2.0),
     )
 }
@@ -214,7 +222,8 @@ mod tests {
     use super::*;
     use shoal_run::analysis::lake;
 
-    /// A seed that has learned so much of the goal by this episode, and ends with these action-values.
+    /// A seed with these (episodes, probability of reaching the goal) during training, and these action-values at the
+    /// end.
     fn seed(number: u64, rises: &[(u64, f64)], q: &Values) -> SeedResult<Tests> {
         let evaluated = rises.iter().map(|(episodes, reached)| EvaluatedPolicy {
             episodes: *episodes,
@@ -231,7 +240,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_thesis_saw_holds_and_its_opposite_does_not() {
+    fn claims_hold_for_results_like_the_thesis_and_fail_for_the_opposite() {
         let q_star = lake::optimal(0.999);
         let best = Walk {
             reached: 0.74,
@@ -258,7 +267,7 @@ mod tests {
         };
         assert_eq!(held(all(&epsilon, &alpha, &low, &q_star, best)), [true; 8]);
 
-        // Everything the other way round: the quick one is slow, nothing is learned, and SARSA knows better.
+        // The opposite: the fast setting is slow, the policy is not optimal, and SARSA's values are better.
         let mut flat = q_star;
         flat[6] = [0.9, 0.0, 0.5, 0.0];
         flat[2] = [0.0, 1.0, 0.0, 0.0];
@@ -271,9 +280,9 @@ mod tests {
             ("0.3", &high[..]),
         ];
         let mut wrong = held(all(&epsilon, &alpha, &good, &q_star, best));
-        // The value of the start is the same.
+        // Both have the same value of the start state.
         assert_eq!(wrong.pop(), Some(false));
-        assert_eq!(wrong, [false, false, false, false, false, false, false]);
+        assert_eq!(wrong, [false; 7]);
         let nothing = [("", &[][..]); 3];
         assert!(
             all(&nothing, &[("", &[][..]); 4], &[], &q_star, best)

@@ -8,7 +8,7 @@ use super::Tests;
 
 type Seed = SeedResult<Tests>;
 
-/// A number of one drive.
+/// A measure of one test run.
 type Number = fn(&Measures) -> f64;
 
 const DISTANCE: Number = |it| it.final_distance;
@@ -17,12 +17,12 @@ const TURNING_AT_REST: Number = |it| it.turning_at_rest;
 const FORCE_AT_REST: Number = |it| it.force_at_rest;
 const FORCE_ON_THE_WAY: Number = |it| it.force_on_the_way;
 
-/// The drives from the starts of section 5.3.
+/// The test runs from the starts of section 5.3.
 fn near(measures: &[Measures]) -> &[Measures] {
     &measures[..NEAR_STARTS.len().min(measures.len())]
 }
 
-/// The drives from the starts of appendix A.2.
+/// The test runs from the starts of appendix A.2.
 fn far(measures: &[Measures]) -> &[Measures] {
     &measures[NEAR_STARTS.len().min(measures.len())..]
 }
@@ -35,12 +35,12 @@ fn greatest(measures: &[Measures], number: Number) -> f64 {
     measures.iter().map(number).fold(0.0, f64::max)
 }
 
-/// Of the best policy, in the mean of the starts of section 5.3.
+/// The best policy's mean over the starts of section 5.3.
 fn near_mean(seed: &Seed, number: Number) -> f64 {
     mean(near(&seed.tests.best), number)
 }
 
-/// The median over the seeds: of the best policy, and of the last.
+/// The spread over the seeds of the best policy's and the last policy's means over the starts of section 5.3.
 fn both(seeds: &[Seed], number: Number, decimals: usize, unit: &str) -> String {
     if seeds.is_empty() {
         return "no results".into();
@@ -68,18 +68,18 @@ fn claim(
     }
 }
 
-/// The seeds that both have.
+/// Pairs of results with the same seed.
 fn pairs<'a>(a: &'a [Seed], b: &'a [Seed]) -> impl Iterator<Item = (&'a Seed, &'a Seed)> {
     a.iter()
         .filter_map(|one| Some((one, b.iter().find(|other| other.header.seed == one.header.seed)?)))
 }
 
-/// What the final evaluation says of the way to the goal.
+/// The distances to the goal in the final evaluation.
 fn reached(seeds: &[Seed]) -> String {
     let shares = seeds.iter().filter_map(|seed| seed.best.evaluation.reached_fraction);
     let distances = seeds.iter().filter_map(|seed| seed.best.evaluation.final_distance_mean);
     format!(
-        "from 100 random starts {} m, and {} % end within {REACHED} m",
+        "from 100 random starts {} m, with {} % ending within {REACHED} m",
         spread(distances, 3),
         spread(shares.map(|share| 100.0 * share), 0)
     )
@@ -91,7 +91,7 @@ fn arrives(seeds: &[Seed], thesis: &'static str) -> Claim {
         thesis,
         "from each of the four starts of section 5.3 it ends within 0.05 m of the goal",
         format!(
-            "farthest of the four at the end: {} m; {}",
+            "largest of the four distances at the end: {} m; {}",
             spread(seeds.iter().map(farthest), 3),
             reached(seeds)
         ),
@@ -123,7 +123,8 @@ pub(super) fn of_r1(seeds: &[Seed]) -> Vec<Claim> {
     ]
 }
 
-/// Steps after which a seed had learned nearly all it ever did, if that brings the vehicle to the goal.
+/// See [`SeedResult::learned_by`]; `None` unless the best policy reaches the goal from at least half of the starts of
+/// section 5.3.
 fn converged_by(seed: &Seed) -> Option<u64> {
     let starts = near(&seed.tests.best);
     let arrived = starts.iter().filter(|it| it.final_distance < REACHED).count();
@@ -132,12 +133,12 @@ fn converged_by(seed: &Seed) -> Option<u64> {
 
 pub(super) fn of_r2(r1: &[Seed], r2: &[Seed]) -> Vec<Claim> {
     let steady: Number = |it| it.drift_at_rest;
-    let rose = |seeds: &[Seed]| {
+    let converged = |seeds: &[Seed]| {
         let steps = seeds.iter().filter_map(converged_by);
         let never = seeds.iter().filter(|seed| converged_by(seed).is_none()).count();
         let episodes = spread(steps.map(|steps| steps as f64 / 200.0), 0);
         if never > 0 {
-            format!("{episodes}, and {never} never")
+            format!("{episodes} (never: {never})")
         } else {
             episodes
         }
@@ -148,11 +149,12 @@ pub(super) fn of_r2(r1: &[Seed], r2: &[Seed]) -> Vec<Claim> {
     };
     vec![
         Claim {
-            thesis: "Reward r2 causes the solution to converge after only 2000 episodes, significantly less than with r1",
-            criterion: "the first evaluation that has made nine tenths of the way from the run's first to its best one comes \
-                        in fewer episodes than with r1 and the same seed (never, where the best policy arrives from fewer than \
-                        two of the four starts)",
-            ours: format!("episodes with r2: {}; with r1: {}", rose(r2), rose(r1)),
+            thesis: "Reward r2 causes the solution to converge after only 2000 episodes, significantly less than with \
+                     r1",
+            criterion: "fewer episodes than with r1 and the same seed until an evaluation has covered nine tenths of \
+                        the way from the run's first return to its best (never, if the best policy arrives from fewer \
+                        than two of the four starts)",
+            ours: format!("episodes with r2: {}; with r1: {}", converged(r2), converged(r1)),
             scope: Scope::EachSeed,
             held: pairs(r1, r2).map(sooner).collect(),
         },
@@ -165,7 +167,8 @@ pub(super) fn of_r2(r1: &[Seed], r2: &[Seed]) -> Vec<Claim> {
         ),
         claim(
             "The vehicle remains stationary, which leads to a steady state error in position",
-            "at rest its distance to the goal changes by less than 0.01 m, and at the end it is between 0.005 m and 0.5 m",
+            "at rest the distance to the goal changes by less than 0.01 m, and at the end it is between 0.005 m and \
+             0.5 m",
             format!(
                 "distance at the end {}; change at rest {}; {}",
                 both(r2, DISTANCE, 3, "m"),
@@ -200,7 +203,7 @@ pub(super) fn of_r3(r1: &[Seed], r2: &[Seed], r3: &[Seed]) -> Vec<Claim> {
         ),
         Claim {
             thesis: "The agent applies less force than previously",
-            criterion: "the mean force until the goal is reached is smaller than with r1 and than with r2 and the same seed",
+            criterion: "the mean force until the goal is reached is smaller than with r1 and with r2 for the same seed",
             ours: format!(
                 "force on the way with r3: {}; with r1: {}; with r2: {}",
                 both(r3, FORCE_ON_THE_WAY, 2, "N"),
@@ -220,7 +223,7 @@ pub(super) fn of_r3(r1: &[Seed], r2: &[Seed], r3: &[Seed]) -> Vec<Claim> {
             "Paths taken when the starting position is further from the goal (appendix A.2) end at the goal too",
             "from each of the eight starts of appendix A.2 it ends within 0.05 m of the goal",
             format!(
-                "farthest of the eight at the end: {} m; of the eight, {} arrive with the worst seed",
+                "largest of the eight distances at the end: {} m; the worst seed arrives from {} of the eight",
                 spread(r3.iter().map(farthest), 3),
                 percent(least_arrived)
             ),
@@ -232,15 +235,15 @@ pub(super) fn of_r3(r1: &[Seed], r2: &[Seed], r3: &[Seed]) -> Vec<Claim> {
 
 pub(super) fn of_comparison(r1: &[Seed], r2: &[Seed], r3: &[Seed]) -> Vec<Claim> {
     let turning = |seed: &Seed| mean(&seed.tests.best, TURNING);
-    let say = |seeds: &[Seed]| spread(seeds.iter().map(turning), 1);
+    let turnings = |seeds: &[Seed]| spread(seeds.iter().map(turning), 1);
     let calmer = |thesis, criterion, than: &[Seed], seeds: &[Seed], names: [&str; 2]| Claim {
         thesis,
         criterion,
         ours: format!(
             "turning from all twelve starts: {} rad with {}, {} rad with {}",
-            say(seeds),
+            turnings(seeds),
             names[0],
-            say(than),
+            turnings(than),
             names[1]
         ),
         scope: Scope::EachSeed,
@@ -273,7 +276,7 @@ pub(super) fn of_comparison(r1: &[Seed], r2: &[Seed], r3: &[Seed]) -> Vec<Claim>
     ]
 }
 
-/// `before` are the runs at the end of the first training, `after` the same at the end of the additional one.
+/// `before` are the results at the end of the first training, `after` those at the end of the additional training.
 pub(super) fn of_longer(before: &[Seed], after: &[Seed]) -> Vec<Claim> {
     let value = |before: &Seed, after: &Seed, number: Number| {
         (near_mean(before, number), mean(near(&after.tests.last), number))
@@ -282,7 +285,7 @@ pub(super) fn of_longer(before: &[Seed], after: &[Seed]) -> Vec<Claim> {
         thesis,
         criterion,
         ours: format!(
-            "{what}: best policy of the first training {}; last policy of the additional one {}",
+            "{what}: best policy of the first training {}; last policy of the additional training {}",
             spread(pairs(before, after).map(|(b, a)| value(b, a, number).0), decimals),
             spread(pairs(before, after).map(|(b, a)| value(b, a, number).1), decimals)
         ),
@@ -295,7 +298,8 @@ pub(super) fn of_longer(before: &[Seed], after: &[Seed]) -> Vec<Claim> {
     vec![
         check(
             "With additional training the agent has learned to reduce the position error",
-            "the last policy of the additional training ends nearer to the goal than the best one of the first training",
+            "the last policy of the additional training ends nearer to the goal than the best policy of the first \
+             training",
             "distance at the end in m",
             DISTANCE,
             3,
@@ -303,7 +307,7 @@ pub(super) fn of_longer(before: &[Seed], after: &[Seed]) -> Vec<Claim> {
         ),
         check(
             "… but it no longer understands how to reduce the derivative of the input",
-            "the last policy of the additional training turns more than the best one of the first training",
+            "the last policy of the additional training turns more than the best policy of the first training",
             "turning in rad",
             TURNING,
             1,
@@ -311,10 +315,10 @@ pub(super) fn of_longer(before: &[Seed], after: &[Seed]) -> Vec<Claim> {
         ),
         Claim {
             thesis: "Early stopping is the most important regularisation: an agent that trains for too long gets worse",
-            criterion: "in the final evaluation the last policy of the additional training has a smaller return than the best \
-                        one of the first training",
+            criterion: "in the final evaluation, the last policy of the additional training has a lower return than \
+                        the best policy of the first training",
             ours: format!(
-                "best policy of the first training {}; last policy of it {}; last policy of the additional one {}; best \
+                "first training: best policy {}, last policy {}; after the additional training: last policy {}, best \
                  policy of both {}",
                 spread(before.iter().map(|seed| seed.best.evaluation.return_mean), 1),
                 spread(before.iter().map(|seed| seed.last.evaluation.return_mean), 1),
@@ -339,18 +343,18 @@ mod tests {
     }
 
     #[test]
-    fn r1_arrives_and_is_shaky() {
+    fn the_claims_about_r1_are_checked_for_each_seed() {
         let seeds = [seed(1, 0.01, 0.5, 1.8, 0.5), seed(2, 2.0, 0.01, 0.5, 0.01)];
         assert_eq!(held(of_r1(&seeds)), [[true, false]; 3]);
         assert!(held(of_r1(&[])).iter().all(Vec::is_empty));
     }
 
     #[test]
-    fn r2_is_sooner_and_stands_beside_the_goal() {
+    fn the_claims_about_r2_are_checked_for_each_seed() {
         let mut late = [seed(1, 0.01, 0.5, 1.8, 0.5), seed(2, 0.01, 0.5, 1.8, 0.5)];
         late[1].evaluations.truncate(4);
         let r2 = [seed(1, 0.03, 0.05, 1.0, 0.02), seed(2, 0.001, 0.05, 1.0, 0.5)];
-        // The synthetic curves rise alike; the first seed of r1 only later.
+        // The synthetic curves rise at the same steps; this makes the first seed of r1 slower.
         for it in &mut late[0].evaluations {
             it.steps *= 2;
         }
@@ -360,25 +364,29 @@ mod tests {
         assert_eq!(
             held(of_r2(&never, &r2))[0],
             [true],
-            "who learned nothing did not converge at once"
+            "a run that never converges is slower"
         );
         let never_r2 = [seed(1, 2.0, 0.05, 1.0, 0.02)];
         assert_eq!(held(of_r2(&late, &never_r2))[0], [false]);
     }
 
     #[test]
-    fn r3_arrives_from_far_with_little_force() {
+    fn the_claims_about_r3_are_checked_for_each_seed() {
         let r1 = [seed(1, 0.01, 0.5, 1.8, 0.5), seed(2, 0.01, 0.5, 1.8, 0.5)];
         let r2 = [seed(1, 0.03, 0.1, 1.5, 0.0), seed(2, 0.03, 0.1, 0.5, 0.0)];
         let r3 = [seed(1, 0.01, 0.05, 1.0, 0.0), seed(2, 0.2, 0.05, 1.0, 0.5)];
         assert_eq!(held(of_r3(&r1, &r2, &r3)), [[true, false]; 4]);
-        assert_eq!(held(of_r3(&r1, &r2[1..], &r3))[2], [false], "only what all three have");
+        assert_eq!(
+            held(of_r3(&r1, &r2[1..], &r3))[2],
+            [false],
+            "only seeds with results for all three rewards"
+        );
         assert_eq!(held(of_comparison(&r1, &r2, &r3)), [[true, true]; 3]);
         assert_eq!(held(of_comparison(&r2, &r1, &r3))[0], [false, false]);
     }
 
     #[test]
-    fn too_much_training_is_seen() {
+    fn the_claims_about_additional_training_are_checked_for_each_seed() {
         let before = [seed(1, 0.05, 0.1, 1.0, 0.0), seed(2, 0.05, 0.1, 1.0, 0.0)];
         let mut after = [seed(1, 0.01, 1.0, 1.0, 0.5), seed(2, 0.1, 0.05, 1.0, 0.5)];
         after[1].last.evaluation.return_mean = 200.0;

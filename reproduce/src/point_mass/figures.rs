@@ -4,16 +4,16 @@ use std::ops::Range;
 
 use shoal_report::figure::{self, Agent};
 
-use super::super::album::{Album, Figure};
 use super::super::result::{SeedResult, representative};
+use super::super::section::{Figure, FigureWriter};
 use super::Tests;
 
-/// What the figures of a reward show.
+/// The figures of a reward.
 pub(super) struct OfReward {
     name: &'static str,
     curve: &'static str,
     tests: &'static str,
-    /// Which drives of a result the thesis shows.
+    /// The test runs of a result that the thesis shows.
     shown: Range<usize>,
 }
 
@@ -36,12 +36,16 @@ const R3: OfReward = OfReward {
     shown: 0..2,
 };
 
-/// The drives from the starts of section 5.3, and of the two halves of appendix A.2.
+/// The test runs from the starts of section 5.3, and those of the two halves of appendix A.2.
 const NEAR: Range<usize> = 0..4;
 const FAR: [(Range<usize>, &str, &str); 2] = [(4..8, "far-1", "A.4 to A.7"), (8..12, "far-2", "A.8 to A.11")];
 
-/// The learning curves, and two test runs.
-pub(super) fn of_reward(album: &Album, of: &OfReward, seeds: &[SeedResult<Tests>]) -> anyhow::Result<Vec<Figure>> {
+/// The figures of learning curves and of two test runs.
+pub(super) fn of_reward(
+    writer: &FigureWriter,
+    of: &OfReward,
+    seeds: &[SeedResult<Tests>],
+) -> anyhow::Result<Vec<Figure>> {
     let Some(middle) = representative(seeds) else {
         return Ok(Vec::new());
     };
@@ -53,12 +57,12 @@ pub(super) fn of_reward(album: &Album, of: &OfReward, seeds: &[SeedResult<Tests>
     } = of;
     let curves: Vec<_> = seeds.iter().map(SeedResult::curve).collect();
     Ok(vec![
-        album.add(
+        writer.add(
             &format!("point-mass-{name}-learning-curve"),
             format!("Mean return of the evaluations during training with {name}, every seed (figure {curve})"),
             |path| figure::learning_curves(&format!("Point mass with {name}"), &curves, None, path),
         )?,
-        album.add(
+        writer.add(
             &format!("point-mass-{name}-test-runs"),
             format!(
                 "Two test runs with {name}, seed {} (figure {tests})",
@@ -69,16 +73,16 @@ pub(super) fn of_reward(album: &Album, of: &OfReward, seeds: &[SeedResult<Tests>
     ])
 }
 
-/// The same, and the runs from far away.
-pub(super) fn of_r3(album: &Album, seeds: &[SeedResult<Tests>]) -> anyhow::Result<Vec<Figure>> {
-    let mut figures = of_reward(album, &R3, seeds)?;
+/// The same figures for r3, and those of the test runs from far away.
+pub(super) fn of_r3(writer: &FigureWriter, seeds: &[SeedResult<Tests>]) -> anyhow::Result<Vec<Figure>> {
+    let mut figures = of_reward(writer, &R3, seeds)?;
     if let Some(middle) = representative(seeds) {
         for (range, file, numbers) in FAR {
             let caption = format!(
                 "Test runs with r3 from far away, seed {} (figures {numbers})",
                 middle.header.seed
             );
-            figures.push(album.add(&format!("point-mass-r3-{file}"), caption, |path| {
+            figures.push(writer.add(&format!("point-mass-r3-{file}"), caption, |path| {
                 figure::test_runs(&middle.tests.drives[range], path)
             })?);
         }
@@ -86,8 +90,8 @@ pub(super) fn of_r3(album: &Album, seeds: &[SeedResult<Tests>]) -> anyhow::Resul
     Ok(figures)
 }
 
-/// Paths, actions and distances of the agents that are there.
-pub(super) fn of_comparison(album: &Album, rewards: [&[SeedResult<Tests>]; 3]) -> anyhow::Result<Vec<Figure>> {
+/// The figures of paths, actions and distances of the agents that have results.
+pub(super) fn of_comparison(writer: &FigureWriter, rewards: [&[SeedResult<Tests>]; 3]) -> anyhow::Result<Vec<Figure>> {
     let named = ["r1", "r2", "r3"].into_iter().zip(rewards);
     let agents: Vec<Agent<'_>> = named
         .filter_map(|(name, seeds)| {
@@ -102,30 +106,30 @@ pub(super) fn of_comparison(album: &Album, rewards: [&[SeedResult<Tests>]; 3]) -
         return Ok(Vec::new());
     }
     Ok(vec![
-        album.add(
+        writer.add(
             "point-mass-paths",
             "Paths from the four starts of section 5.3 (figure 5.10)",
-            |path| figure::paths_beside(&agents, path),
+            |path| figure::compare_paths(&agents, path),
         )?,
-        album.add(
+        writer.add(
             "point-mass-actions",
             "Actions and position error from (2, \u{2212}2) (figure 5.11)",
-            |path| figure::actions_beside(&agents, path),
+            |path| figure::compare_actions(&agents, path),
         )?,
     ])
 }
 
-/// What became of r2.
-pub(super) fn of_longer(album: &Album, seeds: &[SeedResult<Tests>]) -> anyhow::Result<Vec<Figure>> {
+/// The figures of r2 after the additional training.
+pub(super) fn of_longer(writer: &FigureWriter, seeds: &[SeedResult<Tests>]) -> anyhow::Result<Vec<Figure>> {
     let Some(middle) = representative(seeds) else {
         return Ok(Vec::new());
     };
     let curves: Vec<_> = seeds.iter().map(SeedResult::curve).collect();
-    // Where the curves end, in half.
+    // The additional training is as long as the first one.
     let end = middle.evaluations.last().map_or(0, |it| it.steps);
     let half = (end / 2, "end of the first training");
     Ok(vec![
-        album.add(
+        writer.add(
             "point-mass-r2-longer-test-runs",
             format!(
                 "Two test runs of the last policy after additional training with r2, seed {} (figures A.1 and A.2)",
@@ -133,7 +137,7 @@ pub(super) fn of_longer(album: &Album, seeds: &[SeedResult<Tests>]) -> anyhow::R
             ),
             |path| figure::test_runs(&middle.tests.last_drives[R2.shown.clone()], path),
         )?,
-        album.add(
+        writer.add(
             "point-mass-r2-longer-learning-curve",
             "Mean return of the evaluations during training with r2, with additional training (figure A.3)",
             |path| figure::learning_curves("Point mass with r2, trained for longer", &curves, Some(half), path),

@@ -1,4 +1,4 @@
-//! The slippery lake: what a policy is worth, computed from the lake's table, and the best there is.
+//! The slippery lake: the exact value of a policy and the optimal values, computed from the transition table.
 
 use serde::{Deserialize, Serialize};
 use shoal_common::policy::highest;
@@ -7,23 +7,23 @@ use shoal_env_server::environment::frozen_lake::{ACTIONS, STATES, transitions};
 /// Steps after which an evaluation episode ends.
 pub const LIMIT: u32 = 100;
 
-/// Values closer to each other than this count as equal: f64 adds up a bit differently by another way.
+/// Values closer to each other than this count as equal; it covers rounding errors.
 const TIE: f64 = 1e-9;
 
-/// Action-values, state after state.
+/// Action values by state and action.
 pub type Values = [[f64; ACTIONS]; STATES];
 
-/// What comes of walking from the start for at most [`LIMIT`] steps, in the mean over how the ice may slip.
+/// The expected result of an episode of at most [`LIMIT`] steps from the start.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Walk {
-    /// How likely the goal is reached.
+    /// Probability of reaching the goal.
     pub reached: f64,
-    /// Steps to the goal, [`LIMIT`] where it is not reached.
+    /// Expected number of steps to the goal, where an episode that does not reach it counts as [`LIMIT`].
     pub steps: f64,
 }
 
 impl Walk {
-    /// With this action in each state.
+    /// Of the policy that takes this action in each state.
     pub fn of(policy: &[usize; STATES]) -> Self {
         let mut here = [0.0; STATES];
         here[0] = 1.0;
@@ -51,7 +51,7 @@ impl Walk {
 }
 
 impl Walk {
-    /// To four decimals: enough for a figure.
+    /// Rounded to four decimals, enough for a figure.
     pub fn rounded(self) -> Self {
         let round = |value: f64| (1e4 * value).round() / 1e4;
         Self {
@@ -61,7 +61,7 @@ impl Walk {
     }
 }
 
-/// The action with the highest value in each state, the first of equals.
+/// The action with the highest value in each state; among equal ones the first.
 pub fn greedy(table: &[f32]) -> [usize; STATES] {
     std::array::from_fn(|state| highest(&table[state * ACTIONS..][..ACTIONS]))
 }
@@ -90,7 +90,7 @@ pub fn optimal(gamma: f64) -> Values {
     }
 }
 
-/// States in which this action is not one of the best.
+/// States in which the policy's action is not one of the best.
 pub fn mistakes(policy: &[usize; STATES], q_star: &Values) -> Vec<usize> {
     let best = |state: usize| q_star[state].iter().copied().fold(f64::NEG_INFINITY, f64::max);
     (0..STATES)
@@ -98,10 +98,10 @@ pub fn mistakes(policy: &[usize; STATES], q_star: &Values) -> Vec<usize> {
         .collect()
 }
 
-/// States in which this action may end in a hole.
+/// States in which the policy's action may lead into a hole.
 pub fn dangers(policy: &[usize; STATES]) -> Vec<usize> {
     let falls = |state: &usize| {
-        // Holes and the goal have one way to go: staying.
+        // Holes and the goal have one outcome: staying.
         let mut outcomes = transitions(*state, policy[*state]);
         outcomes.any(|outcome| outcome.terminated && outcome.reward == 0.0 && outcome.next != *state)
     };
@@ -112,14 +112,14 @@ pub fn dangers(policy: &[usize; STATES]) -> Vec<usize> {
 mod tests {
     use super::*;
 
-    /// One of the best policies; of states with equal actions the first.
+    /// An optimal policy; among equally good actions it takes the first.
     fn best() -> [usize; STATES] {
         let table: Vec<f32> = optimal(0.999).iter().flatten().map(|q| *q as f32).collect();
         greedy(&table)
     }
 
     #[test]
-    fn the_best_policy_is_the_best_and_reaches_the_goal_three_times_in_four() {
+    fn the_optimal_policy_makes_no_mistakes_and_reaches_the_goal_three_times_in_four() {
         let q_star = optimal(0.999);
         assert!((q_star[0].iter().copied().fold(0.0, f64::max) - 0.785_53).abs() < 1e-4);
         let policy = best();
@@ -131,7 +131,7 @@ mod tests {
     }
 
     #[test]
-    fn a_bad_policy_is_found_out() {
+    fn a_bad_policy_has_mistakes_and_dangers() {
         let left = [0; STATES];
         assert_eq!(
             Walk::of(&left),

@@ -3,63 +3,63 @@
 use std::f64::consts::PI;
 
 use serde::{Deserialize, Serialize};
-use shoal_env_server::environment::angle::{followed, wrap};
+use shoal_env_server::environment::angle::{unwrapped, wrap};
 
 use super::{AT_REST, mean, round, tail};
 use crate::rollout::{Rollout, Trajectory};
 
-/// Nearer to upright than this the swinging is over, in rad.
+/// The swing-up ends when the pendulum is nearer to upright than this, in rad.
 const UP: f64 = 0.5;
 
-/// An episode of T steps that starts at rest at the bottom.
+/// An episode of T steps that starts hanging down at rest.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SwingUp {
-    /// θ in rad, T + 1 of them, without jumps: 0 and whole turns are upright.
+    /// θ in rad, T + 1 values without jumps. 0 and whole turns are upright.
     pub angle: Vec<f64>,
-    /// θ̇ in rad/s, T + 1 of them.
+    /// θ̇ in rad/s, T + 1 values.
     pub velocity: Vec<f64>,
-    /// τ in N m.
+    /// τ in N m, T values.
     pub torque: Vec<f64>,
-    /// One for each step.
+    /// T rewards.
     pub rewards: Vec<f64>,
 }
 
-/// What is measured of a swing-up.
+/// The measured quantities of a swing-up.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Measures {
     /// The sum of the rewards.
     pub episode_return: f64,
-    /// How often the motion turned back before the pendulum was up.
+    /// How often the direction of rotation changed before the pendulum was up.
     pub reversals: u32,
-    /// Greatest distance from upright at rest, in rad.
+    /// Greatest |θ| from upright at rest, in rad.
     pub angle_at_rest: f64,
     /// Greatest |θ̇| at rest, in rad/s.
     pub velocity_at_rest: f64,
     /// Mean |τ| at rest, in N m.
     pub torque_at_rest: f64,
-    /// Mean |τ − τ of the step before| at rest, in N m.
+    /// Mean |τ − τ of the previous step| at rest, in N m.
     pub chatter_at_rest: f64,
 }
 
 impl SwingUp {
-    /// Runs the policy from θ = π, at rest.
+    /// Runs the policy from rest at θ = π.
     pub fn run(rollout: &mut Rollout<'_>) -> anyhow::Result<Self> {
         Ok(Self::of(&rollout.episode_from(&[PI, 0.0])?, PI))
     }
 
-    /// From observations (cos θ, sin θ, θ̇) that start at `theta`. It turns by less than half a turn a step.
+    /// From observations (cos θ, sin θ, θ̇) that start at `theta`. The angle must change by less than π each step.
     pub fn of(trajectory: &Trajectory, theta: f64) -> Self {
         let observations = trajectory.observations.iter();
         let seen = observations.map(|o| f64::from(o[1]).atan2(o[0].into()));
         Self {
-            angle: followed(seen, theta),
+            angle: unwrapped(seen, theta),
             velocity: trajectory.observations.iter().map(|o| o[2].into()).collect(),
             torque: trajectory.actions.iter().map(|a| a[0].into()).collect(),
             rewards: trajectory.rewards.clone(),
         }
     }
 
-    /// With numbers that are short to write.
+    /// The episode with rounded numbers, for a smaller file.
     pub fn rounded(mut self) -> Self {
         for column in [&mut self.angle, &mut self.velocity, &mut self.torque, &mut self.rewards] {
             round(column);
@@ -94,7 +94,7 @@ mod tests {
     use crate::testing::swing;
 
     #[test]
-    fn the_angle_goes_on_through_whole_turns() {
+    fn the_angle_is_continuous_over_whole_turns() {
         for direction in [1.0, -1.0] {
             let turning: Vec<f64> = (0..100).map(|t| PI + direction * 0.39 * f64::from(t)).collect();
             let seen = |theta: &f64| vec![theta.cos() as f32, theta.sin() as f32, 0.0];
@@ -109,7 +109,7 @@ mod tests {
     }
 
     #[test]
-    fn rest_is_measured_from_the_nearest_upright() {
+    fn rest_is_measured_from_the_nearest_upright_angle() {
         let measures = swing(TAU - 0.05, 0.125).measures();
         assert!((measures.angle_at_rest - 0.05).abs() < 1e-9, "{measures:?}");
         assert_eq!(

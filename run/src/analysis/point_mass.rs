@@ -7,9 +7,9 @@ pub use shoal_env_server::environment::point_mass::REACHED;
 use super::{AT_REST, mean, round, tail};
 use crate::rollout::{Rollout, Trajectory};
 
-/// Start positions of the thesis's section 5.3, (x, y) in m.
+/// Start positions in section 5.3 of the thesis, (x, y) in m.
 pub const NEAR_STARTS: [[f64; 2]; 4] = [[2.0, -2.0], [-2.0, 2.0], [2.0, 2.0], [-2.0, -2.0]];
-/// Start positions of the thesis's appendix A.2, (x, y) in m, in its order.
+/// Start positions in appendix A.2 of the thesis, (x, y) in m, in its order.
 pub const FAR_STARTS: [[f64; 2]; 8] = [
     [3.0, 3.0],
     [3.0, 0.0],
@@ -21,33 +21,33 @@ pub const FAR_STARTS: [[f64; 2]; 8] = [
     [0.0, 3.0],
 ];
 
-/// An episode of T steps from a chosen start position, at rest.
+/// An episode of T steps from rest at a chosen position.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Drive {
     /// (x, y) in m; the goal is the origin.
     pub start: [f64; 2],
-    /// x in m, T + 1 of them.
+    /// x in m, T + 1 values.
     pub x: Vec<f64>,
-    /// y in m, T + 1 of them.
+    /// y in m, T + 1 values.
     pub y: Vec<f64>,
-    /// θ in rad, one for each step.
+    /// θ in rad, T values.
     pub direction: Vec<f64>,
-    /// F_u in N, one for each step.
+    /// F_u in N, T values.
     pub force: Vec<f64>,
-    /// One for each step.
+    /// T rewards.
     pub rewards: Vec<f64>,
 }
 
-/// What is measured of a drive.
+/// The measured quantities of a drive.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Measures {
     /// (x, y) in m; the goal is the origin.
     pub start: [f64; 2],
     /// The sum of the rewards.
     pub episode_return: f64,
-    /// d at the end, in m.
+    /// Distance d to the goal at the end, in m.
     pub final_distance: f64,
-    /// How far apart the least and the greatest d at rest are, in m.
+    /// The difference between the greatest and the least d at rest, in m.
     pub drift_at_rest: f64,
     /// Σ |Δθ| over the whole episode, in rad.
     pub turning: f64,
@@ -55,20 +55,20 @@ pub struct Measures {
     pub turning_second_half: f64,
     /// Σ |Δθ| at rest, in rad.
     pub turning_at_rest: f64,
-    /// Mean F_u until the goal is reached, or over the whole episode, in N.
+    /// Mean F_u until the goal is reached, or over the whole episode if it is not, in N.
     pub force_on_the_way: f64,
     /// Mean F_u at rest, in N.
     pub force_at_rest: f64,
 }
 
 impl Drive {
-    /// Runs the policy from rest at each of these places.
+    /// Runs the policy from rest at each of these positions.
     pub fn run_from(rollout: &mut Rollout<'_>, starts: &[[f64; 2]]) -> anyhow::Result<Vec<Self>> {
         let run = |&[x, y]: &[f64; 2]| Ok(Self::of([x, y], &rollout.episode_from(&[x, y, 0.0, 0.0])?));
         starts.iter().map(run).collect()
     }
 
-    /// From observations that begin with (x, y) and actions (θ, F_u).
+    /// From observations that start with (x, y), and actions (θ, F_u).
     pub fn of(start: [f64; 2], trajectory: &Trajectory) -> Self {
         let column = |rows: &[Vec<f32>], i: usize| rows.iter().map(|row| row[i].into()).collect();
         Self {
@@ -81,7 +81,7 @@ impl Drive {
         }
     }
 
-    /// With numbers that are short to write.
+    /// The episode with rounded numbers, for a smaller file.
     pub fn rounded(mut self) -> Self {
         for column in [
             &mut self.x,
@@ -95,22 +95,22 @@ impl Drive {
         self
     }
 
-    /// T.
+    /// The number of steps T.
     pub fn steps(&self) -> usize {
         self.force.len()
     }
 
-    /// The places (x, y) on the way.
+    /// The positions (x, y) in m, T + 1 of them.
     pub fn path(&self) -> impl Iterator<Item = (f64, f64)> {
         self.x.iter().copied().zip(self.y.iter().copied())
     }
 
-    /// d at each of them.
+    /// d at each position, in m.
     pub fn distances(&self) -> impl Iterator<Item = f64> {
         self.path().map(|(x, y)| x.hypot(y))
     }
 
-    /// d at the end, in m.
+    /// Distance d to the goal at the end, in m.
     pub fn final_distance(&self) -> f64 {
         self.distances().last().unwrap_or(f64::NAN)
     }
@@ -152,10 +152,10 @@ mod tests {
     use crate::testing::drive;
 
     #[test]
-    fn a_drive_is_measured() {
+    fn the_quantities_of_a_drive_are_measured() {
         let measures = drive([2.0, -2.0], 0.03, 0.25, 1.5, 0.5).measures();
         assert!((measures.final_distance - 0.03).abs() < 1e-9, "{measures:?}");
-        // Across the jump from π to −π the turn is still a small one.
+        // A turn across the jump from π to −π still counts as small.
         assert!((measures.turning - 199.0 * 0.25).abs() < 1e-9, "{measures:?}");
         assert!(
             (measures.turning_second_half - 100.0 * 0.25).abs() < 1e-9,
@@ -167,7 +167,7 @@ mod tests {
     }
 
     #[test]
-    fn who_never_arrives_is_on_the_way_all_the_time() {
+    fn a_drive_that_never_reaches_the_goal_is_on_the_way_throughout() {
         let measures = drive([3.0, 0.0], 1.0, 0.0, 2.0, 1.0).measures();
         assert!((measures.force_on_the_way - (80.0 * 2.0 + 120.0) / 200.0).abs() < 1e-9);
     }

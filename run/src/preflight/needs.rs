@@ -1,4 +1,5 @@
-//! What a run needs of the machine, from its configuration alone: upper bounds over everything it may be scaled to.
+//! The resources a run needs, from its configuration alone: upper bounds for every number of actors it may be scaled
+//! to.
 
 use shoal_common::channel::{Listener, control, environment, policy, reports, transitions};
 use shoal_common::config::Config;
@@ -6,26 +7,26 @@ use shoal_common::report::{EpisodeReport, EvaluatedReport, EvaluationReport, Hea
 use shoal_common::run_dir::RunDir;
 use shoal_learner::process::{self, SizeError};
 
-/// Log, records, figures and configuration of a run of usual length. They grow with the run, and a disk that fills up with
-/// them is an error and no SIGBUS.
+/// Log, records, figures and configuration of a run of usual length. They grow with the run; a disk that they fill up
+/// causes an error, not a SIGBUS.
 const RECORDS: u64 = 4 << 20;
 
-/// What a policy's file has besides its parameters, and the block it may begin.
+/// Bytes of a policy file besides its parameters, including the unused part of its last disk block.
 const POLICY_HEADER: u64 = 4 << 10;
 
-/// Files that any process has open, and what the launcher or the learner adds for each actor. The learner was seen to have
-/// 70 and 19, the launcher 70 and 18: a service that is held takes two, and a port or a connection one.
+/// Files that a process has open without actors, and the files per actor in the launcher or the learner. A service
+/// takes two, a port or a connection one. Measured: 70 and 19 in the learner, 70 and 18 in the launcher.
 const FILES: u64 = 100;
-const FILES_OF_AN_ACTOR: u64 = 22;
+const FILES_PER_ACTOR: u64 = 22;
 
-/// Bytes of shared memory that the run's files may come to have, with as many actors as it may be scaled to.
+/// Bytes of shared memory that the run may come to use with `actors.max` actors.
 pub(super) fn shared_memory(config: &Config) -> u64 {
     let max = config.actors.max as usize;
     let (spec, actors) = (&config.spec, max as u64);
     let parameters = parameters(config);
     let explorer = environment::reserved(spec, config.actors.envs as usize)
         + transitions::reserved(&config.chunk_layout(), config.actors.window);
-    // An environment server and whom it serves, for each actor and the evaluator; and the learner.
+    // The actors and the evaluator, an environment server for each, and the learner.
     let roles = 2 * (max + 1) + 1;
     actors * explorer
         + environment::reserved(spec, config.evaluation_envs() as usize)
@@ -36,14 +37,14 @@ pub(super) fn shared_memory(config: &Config) -> u64 {
         + reports::reserved::<EvaluationReport>(max, 1)
         + reports::reserved::<EvaluatedReport>(max, 1)
         + reports::reserved::<LearnerReport>(max, 1)
-        // One for each role, and the launcher's.
+        // One for each process, and one for the launcher.
         + (roles as u64 + 1) * Listener::reserved(max)
 }
 
-/// Bytes of disk that the run's directory may come to need beyond what is in it.
+/// Bytes of disk that the run's directory may come to need beyond what it holds now.
 ///
 /// # Errors
-/// Where that is more than there can be.
+/// When the number does not fit into 64 bits.
 pub(super) fn disk(config: &Config, run: &RunDir) -> Result<u64, SizeError> {
     let learner = process::disk_bytes(config, run)?;
     let policies = if config.evaluation.keep_policies {
@@ -58,7 +59,7 @@ pub(super) fn disk(config: &Config, run: &RunDir) -> Result<u64, SizeError> {
     })
 }
 
-/// Parameters of the policy. Who cannot control the environment is refused elsewhere.
+/// Parameters of the policy; 0 for an algorithm that cannot control the environment, which is refused elsewhere.
 fn parameters(config: &Config) -> usize {
     config
         .algorithm
@@ -66,7 +67,7 @@ fn parameters(config: &Config) -> usize {
         .map_or(0, |layout| layout.parameters())
 }
 
-/// Files that the hungriest process of the run may have open.
+/// Files that any one process of the run may have open.
 pub(super) fn open_files(config: &Config) -> u64 {
-    FILES + FILES_OF_AN_ACTOR * u64::from(config.actors.max)
+    FILES + FILES_PER_ACTOR * u64::from(config.actors.max)
 }

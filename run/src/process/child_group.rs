@@ -1,4 +1,4 @@
-//! A child process and all it starts: none of its process group outlives it.
+//! A child process and everything it starts: no process of its group outlives it.
 
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
@@ -10,10 +10,10 @@ use rustix::process::{Pid, PidfdFlags, Signal, WaitId, WaitIdOptions, kill_proce
 
 use super::wait_for_any;
 
-/// How long a process may take to be gone that was killed: more only where the kernel waits for a device.
-const GONE: Duration = Duration::from_secs(5);
+/// How long a killed process may take to disappear. It takes longer only while the kernel waits for a device.
+const KILL_PATIENCE: Duration = Duration::from_secs(5);
 
-/// A child process that leads a process group. Dropped, it is killed. As a descriptor it is readable once it has ended.
+/// A child process that leads a process group. It is killed on drop. Its descriptor becomes readable when it has ended.
 #[derive(Debug)]
 pub struct ChildGroup {
     child: Child,
@@ -22,7 +22,7 @@ pub struct ChildGroup {
 }
 
 impl ChildGroup {
-    /// Starts the command, with its standard input and standard error open to this process.
+    /// Starts the command, with its standard input and standard error piped to this process.
     ///
     /// # Errors
     /// When it cannot be started.
@@ -31,12 +31,12 @@ impl ChildGroup {
             .stdin(Stdio::piped())
             .stdout(Stdio::null())
             .stderr(Stdio::piped())
-            // Ctrl-C is for this process, which ends the others in order.
+            // Ctrl-C reaches only this process, which ends the others in order.
             .process_group(0)
             .spawn()?;
-        // Held apart from the child: waiting for a child closes its own.
+        // Taken out of the child, because waiting for a child closes its standard input.
         let (stdin, stderr) = (child.stdin.take(), child.stderr.take());
-        // It has not been waited for, so the number is still its own.
+        // The child has not been waited for, so its process id is not reused.
         let descriptor = match pidfd_open(Pid::from_child(&child), PidfdFlags::empty()) {
             Ok(descriptor) => descriptor,
             Err(error) => {
@@ -53,17 +53,17 @@ impl ChildGroup {
         Ok((group, stdin, stderr))
     }
 
-    /// Its number.
+    /// Its process id.
     pub fn pid(&self) -> Pid {
         Pid::from_child(&self.child)
     }
 
-    /// How it ended, if it has. None of its group is left then.
+    /// Its exit status, once it has ended. Its group has been killed by then.
     pub fn exit_status(&mut self) -> Option<ExitStatus> {
         if self.ended.is_none() {
             let look = WaitIdOptions::EXITED | WaitIdOptions::NOHANG | WaitIdOptions::NOWAIT;
             if let Ok(Some(_)) = waitid(WaitId::Pid(self.pid()), look) {
-                // Before it is waited for: its number is not anybody else's yet.
+                // Before it is waited for, so that its process id is not reused yet.
                 self.kill();
             }
             self.ended = self.child.try_wait().ok().flatten();
@@ -71,7 +71,7 @@ impl ChildGroup {
         self.ended
     }
 
-    /// Waits for its end, but no longer than `patience`; how it ended, if it has.
+    /// Waits at most `patience` for its end; its exit status, if it has ended.
     pub fn wait(&mut self, patience: Duration) -> Option<ExitStatus> {
         let deadline = Instant::now() + patience;
         loop {
@@ -84,15 +84,15 @@ impl ChildGroup {
         }
     }
 
-    /// Whether its end is still to be seen.
+    /// Whether its end has not been observed yet.
     pub fn is_alive(&self) -> bool {
         self.ended.is_none()
     }
 
-    /// Ends it and its group without asking.
+    /// Kills it and its group.
     pub fn kill(&mut self) {
         if self.ended.is_none() {
-            // It has not been waited for, so the group is there, if only with a dead process in it.
+            // It has not been waited for, so the group still exists, if only with a zombie in it.
             let _ = kill_process_group(self.pid(), Signal::KILL);
         }
     }
@@ -101,7 +101,7 @@ impl ChildGroup {
 impl Drop for ChildGroup {
     fn drop(&mut self) {
         self.kill();
-        self.wait(GONE);
+        self.wait(KILL_PATIENCE);
     }
 }
 

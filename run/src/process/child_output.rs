@@ -1,30 +1,30 @@
-//! What a child process writes on its standard error, read on a thread of its own: whatever that is, it costs bounded memory
-//! and a bounded log, and does nothing to a terminal it is shown on.
+//! Reads a child process's standard error on a thread. Any output takes bounded memory and bounded space in the log,
+//! and is harmless to a terminal that shows it.
 
 use std::fmt::Write as _;
 use std::io::{self, Read};
 use std::sync::mpsc::{self, Receiver, Sender};
 use std::time::{Duration, Instant};
 
-/// Bytes of a line that are kept.
+/// Bytes kept of a line.
 const LINE: usize = 4096;
 
-/// Bytes a child may write at once, and each second for ever.
+/// Bytes that a child may write in a burst, and bytes per second that it may write permanently.
 const BURST: f64 = 4.0 * 1024.0 * 1024.0;
 const RATE: f64 = 256.0 * 1024.0;
 
-/// How long the last words of a process that has ended are waited for. They are there at once, unless a child of its own
-/// keeps the pipe open.
-const LAST_WORDS: Duration = Duration::from_millis(200);
+/// How long to wait for the last output of a process that has ended. It arrives at once unless another process keeps
+/// the pipe open.
+const LAST_OUTPUT: Duration = Duration::from_millis(200);
 
-/// A child's output that is being read.
+/// The thread that reads a child's output.
 #[derive(Debug)]
 pub struct ChildOutput {
     all_read: Receiver<()>,
 }
 
 impl ChildOutput {
-    /// Hands each line of `from` to `take`.
+    /// Starts to pass each line of `from` to `take`.
     ///
     /// # Errors
     /// When the thread cannot be started.
@@ -40,10 +40,10 @@ impl ChildOutput {
         Ok(Self { all_read })
     }
 
-    /// Waits until all that the child wrote is handed over, but not for long.
+    /// Waits briefly until all output has been passed on.
     pub fn wait(&self) {
-        // Either answer will do.
-        let _ = self.all_read.recv_timeout(LAST_WORDS);
+        // A timeout and the thread's end are both fine.
+        let _ = self.all_read.recv_timeout(LAST_OUTPUT);
     }
 }
 
@@ -61,12 +61,12 @@ fn forward(mut from: impl Read, mut take: impl FnMut(&str), _all_read: &Sender<(
     lines.end(&mut take);
 }
 
-/// Bytes that are becoming lines.
+/// Splits bytes into lines and applies the limits.
 struct Lines {
     line: Vec<u8>,
-    /// Bytes of the line that were not kept.
+    /// Bytes dropped from the current line.
     cut: usize,
-    /// Bytes that may be written now.
+    /// Bytes that the child may write now.
     allowance: f64,
     counted: Option<Instant>,
     left_out: u64,
@@ -105,7 +105,7 @@ impl Lines {
             self.left_out += 1;
         } else {
             self.allowance -= length;
-            self.tell_what_is_left_out(take);
+            self.report_left_out(take);
             let mut text = harmless(&String::from_utf8_lossy(&self.line));
             if self.cut > 0 {
                 text += &format!(" … ({} more bytes)", self.cut);
@@ -116,7 +116,7 @@ impl Lines {
         self.cut = 0;
     }
 
-    fn tell_what_is_left_out(&mut self, take: &mut impl FnMut(&str)) {
+    fn report_left_out(&mut self, take: &mut impl FnMut(&str)) {
         if self.left_out > 0 {
             take(&format!("… ({} lines left out: too many at once)", self.left_out));
             self.left_out = 0;
@@ -127,11 +127,12 @@ impl Lines {
         if !self.line.is_empty() {
             self.take_line(take);
         }
-        self.tell_what_is_left_out(take);
+        self.report_left_out(take);
     }
 }
 
-/// The text without characters that would move a terminal's cursor, change its colours or answer for its user.
+/// The text with control characters escaped. Otherwise they could move a terminal's cursor, change its colours or send
+/// input in the user's name.
 pub fn harmless(text: &str) -> String {
     let mut harmless = String::with_capacity(text.len());
     for character in text.trim_end_matches('\r').chars() {
@@ -161,13 +162,13 @@ mod tests {
     }
 
     #[test]
-    fn pieces_become_lines_and_the_last_needs_no_end() {
+    fn pieces_are_joined_to_lines_and_the_last_needs_no_newline() {
         assert_eq!(lines_of(&[b"a", b"b\nc\n\nd"]), ["ab", "c", "", "d"]);
         assert_eq!(lines_of(&[b"a\r\n"]), ["a"]);
     }
 
     #[test]
-    fn a_line_without_an_end_is_cut_and_costs_no_memory() {
+    fn an_endless_line_is_cut_and_takes_bounded_memory() {
         let mut lines = Lines::default();
         let (now, mut taken) = (Instant::now(), Vec::new());
         let mut take = |line: &str| taken.push(line.to_owned());
@@ -185,7 +186,7 @@ mod tests {
     }
 
     #[test]
-    fn a_flood_is_left_out_and_told_of() {
+    fn a_flood_is_cut_and_later_lines_are_kept() {
         let (mut lines, mut taken) = (Lines::default(), 0);
         let (now, mut last) = (Instant::now(), String::new());
         let line = [[b'x'; 99].as_slice(), b"\n"].concat();
@@ -201,7 +202,7 @@ mod tests {
     }
 
     #[test]
-    fn what_would_command_a_terminal_is_shown_as_what_it_is() {
+    fn control_characters_are_escaped() {
         assert_eq!(lines_of(&[b"\x1b[31mred\x07\ttab\n"]), ["\\u{1b}[31mred\\u{7}\ttab"]);
     }
 }

@@ -1,4 +1,5 @@
-//! Another process that works for this one outside of any run: a role that is measured, an environment server that is asked.
+//! A child process that no launcher manages: a role that is measured, an environment server outside a run, or a whole
+//! training.
 
 use std::os::fd::{AsFd, BorrowedFd};
 use std::os::unix::process::CommandExt;
@@ -15,21 +16,21 @@ use shoal_common::run_dir::RunDir;
 use crate::process::ChildGroup;
 use crate::process::ChildOutput;
 
-/// How long a learner may take to bring its replay to the disk.
-const FAREWELL: Duration = Duration::from_secs(15);
+/// How long a process may take to end in order. A learner writes its replay to the disk.
+const END_PATIENCE: Duration = Duration::from_secs(15);
 
-/// How long one may take that is not needed any more.
-const DISMISSAL: Duration = Duration::from_secs(2);
+/// How long a process whose state does not matter may take to end.
+const SHUT_DOWN_PATIENCE: Duration = Duration::from_secs(2);
 
 /// Exit code of a launcher that Ctrl-C has ended in order.
 const INTERRUPTED: i32 = 130;
 
-/// A process. It ends when its standard input closes, be it because this process is no more.
+/// A process that ends when its standard input closes, and therefore also when this process is gone.
 #[derive(Debug)]
 pub struct Peer {
     group: ChildGroup,
     stdin: Option<ChildStdin>,
-    /// What the process writes, and its last line so far.
+    /// Reads what the process writes.
     output: Option<ChildOutput>,
     last_line: Arc<Mutex<Option<String>>>,
     what: String,
@@ -65,7 +66,7 @@ impl Peer {
         Self::start(&mut command, role.name().into()).with_context(|| format!("cannot start the {}", role.name()))
     }
 
-    /// Starts a process that messages call `what`.
+    /// Starts a process; messages name it `what`.
     pub fn start(command: &mut Command, what: String) -> std::io::Result<Self> {
         let (group, stdin, stderr) = ChildGroup::start(command)?;
         let mut peer = Self {
@@ -87,12 +88,15 @@ impl Peer {
         Ok(peer)
     }
 
-    /// Its number.
+    /// Its process id.
     pub fn pid(&self) -> Pid {
         self.group.pid()
     }
 
-    /// An error if the process has ended, with what it said last.
+    /// Checks that the process is still running.
+    ///
+    /// # Errors
+    /// When it has ended, with the last line it wrote.
     pub fn check(&mut self) -> anyhow::Result<()> {
         match self.group.exit_status() {
             Some(status) => self.ended_early(status),
@@ -100,31 +104,30 @@ impl Peer {
         }
     }
 
-    /// Has the process's first thread run on these cores only; threads that it starts later do as well.
+    /// Restricts the process's first thread to these cores, and thereby the threads that it starts later.
     pub fn pin(&self, cores: &CpuSet) -> anyhow::Result<()> {
-        sched_setaffinity(Some(self.pid()), cores)
-            .with_context(|| format!("cannot choose a core for the {}", self.what))
+        sched_setaffinity(Some(self.pid()), cores).with_context(|| format!("cannot pin the {} to a core", self.what))
     }
 
-    /// Stops the process where it is, until [`Peer::go_on`].
+    /// Pauses the process (SIGSTOP) until [`Peer::resume`].
     pub fn pause(&self) -> anyhow::Result<()> {
         self.signal(Signal::STOP)
     }
 
-    /// Lets a paused process go on.
-    pub fn go_on(&self) -> anyhow::Result<()> {
+    /// Lets a paused process continue.
+    pub fn resume(&self) -> anyhow::Result<()> {
         self.signal(Signal::CONT)
     }
 
     /// Sends the process a signal.
     ///
     /// # Errors
-    /// When it cannot be reached.
+    /// When it cannot be sent.
     pub fn signal(&self, signal: Signal) -> anyhow::Result<()> {
         kill_process(self.pid(), signal).with_context(|| format!("cannot signal the {}", self.what))
     }
 
-    /// Asks the process to end, and does not wait for it.
+    /// Asks the process to end without waiting for it.
     pub fn ask_to_end(&mut self) {
         self.stdin = None;
     }
@@ -132,13 +135,13 @@ impl Peer {
     /// Asks the process to end, and waits for it.
     pub fn end(mut self) -> anyhow::Result<()> {
         self.ask_to_end();
-        match self.await_end(FAREWELL)? {
+        match self.await_end(END_PATIENCE)? {
             status if status.success() => Ok(()),
             status => self.ended_early(status),
         }
     }
 
-    /// Ends a launcher, which hears signals and not its standard input, and waits for it.
+    /// Ends a launcher with SIGINT and waits for it. A launcher does not watch its standard input.
     pub fn interrupt(mut self, patience: Duration) -> anyhow::Result<()> {
         self.signal(Signal::INT)?;
         let status = self.await_end(patience)?;
@@ -148,7 +151,7 @@ impl Peer {
         }
     }
 
-    /// Waits for its end, but no longer than `patience`; how it ended, if it has.
+    /// Waits at most `patience` for its end; its exit status, if it has ended.
     pub fn wait(&mut self, patience: Duration) -> Option<ExitStatus> {
         self.group.wait(patience)
     }
@@ -158,23 +161,24 @@ impl Peer {
         ended.with_context(|| format!("the {} did not end when asked to", self.what))
     }
 
-    /// Asks the process to end; one that does not is killed when this is dropped.
-    pub fn dismiss(&mut self) {
+    /// Asks the process to end and waits briefly. If it does not end, it is killed on drop.
+    pub fn shut_down(&mut self) {
         self.stdin = None;
-        self.group.wait(DISMISSAL);
+        self.group.wait(SHUT_DOWN_PATIENCE);
     }
 
     fn ended_early(&mut self, status: ExitStatus) -> anyhow::Result<()> {
-        let said = self.last_words().unwrap_or_else(|| "it said nothing".into());
-        bail!("the {} ended ({status}): {said}", self.what);
+        let line = self.last_error_line().unwrap_or_else(|| "it wrote no message".into());
+        bail!("the {} ended ({status}): {line}", self.what);
     }
 
-    /// The last line that it wrote on standard error, if it has ended and wrote any.
-    pub fn last_words(&mut self) -> Option<String> {
+    /// The last line that it wrote on standard error, without a leading `error: `, if it wrote any. Waits briefly for
+    /// the output of a process that has just ended.
+    pub fn last_error_line(&mut self) -> Option<String> {
         if let Some(output) = &self.output {
             output.wait();
         }
-        let said = self.last_line.lock().unwrap_or_else(PoisonError::into_inner).take()?;
-        Some(said.strip_prefix("error: ").unwrap_or(&said).to_owned())
+        let line = self.last_line.lock().unwrap_or_else(PoisonError::into_inner).take()?;
+        Some(line.strip_prefix("error: ").unwrap_or(&line).to_owned())
     }
 }

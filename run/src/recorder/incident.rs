@@ -1,47 +1,47 @@
-//! What became of a run's processes on the way, apart from starting once and ending with the run.
+//! Incidents: what happens to a run's processes besides their first start and their end with the run.
 
 use serde::{Deserialize, Serialize};
 use shoal_common::report::Identity;
 
-/// What happened to a role's process.
+/// The kind of an incident.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum What {
-    /// A signal ended it.
+pub enum IncidentKind {
+    /// A signal ended the process.
     #[default]
     Killed,
-    /// It ended itself before its time.
+    /// The process ended early by itself.
     Failed,
-    /// It made no progress, and was ended to be replaced.
+    /// The process made no progress and was killed to be replaced.
     Stalled,
-    /// It has a successor now.
+    /// The role's process was started again.
     StartedAgain,
-    /// It failed too often and gets no successor.
+    /// The role failed too often and is not started again.
     GivenUp,
-    /// It was one too many and has handed over what it had.
+    /// The actor was no longer needed and has handed over its transitions, or its environment server ended.
     Retired,
     /// The number of actors was changed.
     Scaled,
-    /// A new launcher went on with the run.
+    /// A new launcher continued the run.
     Resumed,
 }
 
-/// An incident, as it is handed to the recorder.
+/// An incident for the recorder.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Incident {
     /// The role's name.
     pub role: &'static str,
-    /// Which one of that role.
+    /// The process's index within its role.
     pub index: u32,
     /// What happened.
-    pub what: What,
-    /// More of it in words; may be empty.
+    pub what: IncidentKind,
+    /// Details in words; may be empty.
     pub detail: String,
 }
 
 impl Incident {
-    /// What became of this process.
-    pub fn of(process: Identity, what: What, detail: String) -> Self {
+    /// An incident of this process.
+    pub fn of(process: Identity, what: IncidentKind, detail: String) -> Self {
         Self {
             role: process.role.name(),
             index: process.index,
@@ -50,8 +50,8 @@ impl Incident {
         }
     }
 
-    /// An incident of the launcher's own.
-    pub fn of_launcher(what: What, detail: String) -> Self {
+    /// An incident of the launcher itself.
+    pub fn of_launcher(what: IncidentKind, detail: String) -> Self {
         Self {
             role: "launcher",
             index: 0,
@@ -64,16 +64,16 @@ impl Incident {
 /// A row of `incidents.csv`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct IncidentRow {
-    /// Seconds the run had taken, over all its launchers.
+    /// Running time of the run so far in seconds, over all its launchers.
     pub wall_seconds: f64,
-    /// Environment steps the learner had last reported.
+    /// Environment steps by the learner's last report.
     pub env_steps: u64,
     /// The role's name.
     pub role: String,
-    /// Which one of that role.
+    /// The process's index within its role.
     pub index: u32,
     /// What happened.
-    pub what: What,
-    /// More of it in words; may be empty.
+    pub what: IncidentKind,
+    /// Details in words; may be empty.
     pub detail: String,
 }

@@ -1,4 +1,4 @@
-//! A CSV file that grows by rows of one kind.
+//! A CSV file of rows of one type, opened for appending.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, BufRead, BufReader, Read, Seek, SeekFrom};
@@ -10,15 +10,15 @@ use serde::de::DeserializeOwned;
 /// Why a record was not written or read.
 #[derive(Debug, thiserror::Error)]
 pub enum RecordError {
-    /// The system refused.
-    #[error("cannot write {path}: {cause}; free some space or check the rights of the directory")]
+    /// The system refused to write.
+    #[error("cannot write {path}: {cause}; free some space or check the permissions of the directory")]
     Write {
         /// The file.
         path: PathBuf,
         /// The system's reason.
         cause: io::Error,
     },
-    /// The system refused.
+    /// The system refused to read.
     #[error("cannot read {path}: {cause}")]
     Read {
         /// The file.
@@ -26,7 +26,7 @@ pub enum RecordError {
         /// The system's reason.
         cause: io::Error,
     },
-    /// The file is not what its name says.
+    /// The file is not such a table.
     #[error("{path} is not a record of this program: {reason}")]
     Malformed {
         /// The file.
@@ -44,8 +44,8 @@ pub(super) struct Table {
 }
 
 impl Table {
-    /// Opens the table at `path`, a new one where there is none. A last line that a crash cut short is removed; a file that
-    /// is no such table is left as it is.
+    /// Opens the table at `path`, or creates it. Removes a last line that a crash cut short. A file with another header
+    /// is refused and left unchanged.
     pub(super) fn open<Row: Serialize + Default>(path: &Path) -> Result<Self, RecordError> {
         let write = |cause| RecordError::Write {
             path: path.to_owned(),
@@ -75,7 +75,7 @@ impl Table {
         Ok(Self::onto(path, file, lines))
     }
 
-    /// Onto a file that has so many whole lines, its header included.
+    /// Appends to a file that has `lines` complete lines, including its header.
     pub(super) fn onto(path: &Path, file: File, lines: u64) -> Self {
         let rows = csv::WriterBuilder::new().has_headers(lines == 0).from_writer(file);
         Self {
@@ -99,7 +99,7 @@ impl Table {
     }
 }
 
-/// All rows of the table at `path`, none where there is no file. A last line without an end is not a row yet.
+/// All rows of the table at `path`; empty if there is no file. A last line without a newline does not count.
 pub(super) fn rows<Row: DeserializeOwned>(path: &Path) -> Result<Vec<Row>, RecordError> {
     let read = |cause| RecordError::Read {
         path: path.to_owned(),
@@ -121,7 +121,7 @@ pub(super) fn last<Row: DeserializeOwned>(path: &Path) -> Result<Option<Row>, Re
     rows(path).map(|mut rows: Vec<Row>| rows.pop())
 }
 
-/// Where the whole lines end, and how many they are.
+/// The length in bytes of the complete lines, and their number.
 fn whole_lines(file: &File) -> io::Result<(u64, u64)> {
     let (mut end, mut lines, mut line) = (0, 0, Vec::new());
     let mut reader = BufReader::with_capacity(1 << 16, file);
@@ -136,7 +136,7 @@ fn whole_lines(file: &File) -> io::Result<(u64, u64)> {
     }
 }
 
-/// The first line with its end, or as much of it as shows that it is not `length` bytes long.
+/// The first line with its newline, but at most `length` + 1 bytes of it.
 fn first_line(mut file: &File, length: usize) -> io::Result<Vec<u8>> {
     let mut line = Vec::new();
     file.rewind()?;
@@ -144,7 +144,7 @@ fn first_line(mut file: &File, length: usize) -> io::Result<Vec<u8>> {
     Ok(line)
 }
 
-/// The line that a table of such rows begins with.
+/// The header line of a table of such rows.
 fn header_of<Row: Serialize + Default>(path: &Path) -> Result<Vec<u8>, RecordError> {
     let mut writer = csv::Writer::from_writer(Vec::new());
     writer

@@ -1,4 +1,5 @@
-//! TensorBoard event files, scalars only. Written here because the crates for it need `protoc` or bring old image crates.
+//! TensorBoard event files, scalars only. Written here because the crates that do this need `protoc` or depend on
+//! outdated image crates.
 
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
@@ -31,7 +32,7 @@ struct Summary {
 struct Value {
     #[prost(string, tag = "1")]
     tag: String,
-    /// Optional, so that a zero is written too.
+    /// Optional, because a plain zero would not be written.
     #[prost(float, optional, tag = "2")]
     simple_value: Option<f32>,
 }
@@ -43,11 +44,11 @@ pub(crate) struct EventFile {
 }
 
 impl EventFile {
-    /// Begins a new file in `directory`, which is made if need be. TensorBoard reads all files there as one run.
+    /// Creates a new file in `directory`, and the directory if necessary. TensorBoard reads all files there as one run.
     pub(crate) fn create(directory: &Path) -> io::Result<Self> {
         std::fs::create_dir_all(directory)?;
         let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-        // TensorBoard takes the files in the order of their names.
+        // TensorBoard reads the files in the order of their names.
         let name = format!(
             "events.out.tfevents.{:010}.{:09}.{}",
             now.as_secs(),
@@ -79,7 +80,7 @@ impl EventFile {
         })
     }
 
-    /// Hands what was written to the system.
+    /// Hands the buffered bytes to the kernel.
     pub(crate) fn flush(&mut self) -> io::Result<()> {
         self.file.flush()
     }
@@ -92,7 +93,7 @@ impl EventFile {
         }
         .encode_to_vec();
         let length = (data.len() as u64).to_le_bytes();
-        // One write, so that a record is in the buffer as a whole or not at all.
+        // One write, so that the buffer holds only whole records.
         let parts = [
             &length[..],
             &masked_crc(&length).to_le_bytes(),
@@ -103,7 +104,7 @@ impl EventFile {
     }
 }
 
-/// The checksum of TensorFlow's record files: CRC-32C, rotated and shifted so that a CRC of data with CRCs in it stays good.
+/// The checksum of TensorFlow's record files: CRC-32C, masked because a CRC of data that contains CRCs is weak.
 fn masked_crc(data: &[u8]) -> u32 {
     crc32c::crc32c(data).rotate_right(15).wrapping_add(0xa282_ead8)
 }
@@ -136,7 +137,7 @@ mod tests {
     }
 
     #[test]
-    fn scalars_read_back_with_good_checksums() {
+    fn scalars_are_read_back_with_valid_checksums() {
         let dir = tempfile::tempdir().unwrap();
         let mut events = EventFile::create(&dir.path().join("tensorboard")).unwrap();
         events.scalars(0, &[("episode/return", 0.0)]).unwrap();
@@ -161,7 +162,7 @@ mod tests {
         assert_eq!(
             values(&events[1]),
             [("episode/return".into(), 0.0)],
-            "a zero is a value too"
+            "a zero is written"
         );
         assert_eq!(events[2].step, 120_000);
         assert_eq!(
@@ -172,14 +173,14 @@ mod tests {
     }
 
     #[test]
-    fn the_checksum_is_tensorflows() {
+    fn the_checksum_is_that_of_tensorflow() {
         // CRC-32C of "123456789" is 0xe3069283 (RFC 3720's polynomial); masked as in tsl/lib/hash/crc32c.h.
         assert_eq!(crc32c::crc32c(b"123456789"), 0xe306_9283);
         assert_eq!(masked_crc(b"123456789"), 0xc78a_b0e5);
     }
 
     #[test]
-    fn every_start_of_a_run_has_its_own_file() {
+    fn every_launcher_writes_its_own_file() {
         let dir = tempfile::tempdir().unwrap();
         for _ in 0..3 {
             EventFile::create(dir.path()).unwrap();

@@ -57,7 +57,7 @@ fn text(path: &Path) -> String {
 }
 
 #[test]
-fn every_report_is_a_row() {
+fn every_report_becomes_a_row() {
     let (_parent, run) = run();
     let mut recorder = Recorder::open(&run, 1_000).unwrap();
     recorder.episode(&episode(200), seconds(0.25)).unwrap();
@@ -89,7 +89,7 @@ fn every_report_is_a_row() {
 }
 
 #[test]
-fn a_resumed_run_goes_on_in_the_same_tables() {
+fn a_resumed_run_continues_the_same_tables() {
     let (_parent, run) = run();
     for session in 0..3 {
         let mut recorder = Recorder::open(&run, 0).unwrap();
@@ -118,7 +118,7 @@ fn a_resumed_run_goes_on_in_the_same_tables() {
 }
 
 #[test]
-fn a_line_cut_short_by_a_crash_is_not_continued() {
+fn a_line_cut_short_by_a_crash_is_removed() {
     let (_parent, run) = run();
     let mut recorder = Recorder::open(&run, 0).unwrap();
     recorder.evaluation(&evaluation(1_000, -100.0), seconds(1.0)).unwrap();
@@ -139,17 +139,17 @@ fn a_line_cut_short_by_a_crash_is_not_continued() {
 }
 
 #[test]
-fn incidents_are_written_at_once_and_say_when_by_seconds_and_by_steps() {
+fn incidents_are_written_at_once_with_their_time_and_steps() {
     let (_parent, run) = run();
     assert_eq!(
         read_incidents(&run.incidents()).unwrap(),
         None,
-        "as in a run of an older build"
+        "as in a run of an earlier version"
     );
     let killed = Incident {
         role: "actor",
         index: 3,
-        what: What::Killed,
+        what: IncidentKind::Killed,
         detail: "killed by signal 9".into(),
     };
     let mut recorder = Recorder::open(&run, 0).unwrap();
@@ -167,7 +167,7 @@ fn incidents_are_written_at_once_and_say_when_by_seconds_and_by_steps() {
 }
 
 #[test]
-fn a_restarted_learner_has_no_rate_rather_than_a_wrong_one() {
+fn a_learner_that_fell_back_to_a_checkpoint_has_no_update_rate() {
     let (_parent, run) = run();
     let mut recorder = Recorder::open(&run, 0).unwrap();
     recorder.learner(&learner(2_000, 500, 1), seconds(1.0)).unwrap();
@@ -180,7 +180,7 @@ fn a_restarted_learner_has_no_rate_rather_than_a_wrong_one() {
 }
 
 #[test]
-fn a_foreign_file_and_a_full_disk_are_errors_in_one_line() {
+fn a_foreign_file_and_a_full_disk_are_one_line_errors() {
     let (_parent, run) = run();
     std::fs::write(run.evaluations(), "a,b\n1,2\n").unwrap();
     let message = Recorder::open(&run, 0).unwrap_err().to_string();
@@ -188,9 +188,9 @@ fn a_foreign_file_and_a_full_disk_are_errors_in_one_line() {
         message.contains("its first line is \"a,b\", not \"wall_seconds,") && !message.contains('\n'),
         "{message}"
     );
-    assert_eq!(text(&run.evaluations()), "a,b\n1,2\n", "left as it was");
+    assert_eq!(text(&run.evaluations()), "a,b\n1,2\n", "left unchanged");
 
-    // Without an end of line too: nothing of it is a line that was cut short.
+    // Also if the last line has no newline: it is not taken for a line that was cut short.
     for foreign in [
         "a,b",
         "a,b\n1,2",
@@ -201,7 +201,7 @@ fn a_foreign_file_and_a_full_disk_are_errors_in_one_line() {
         assert!(Recorder::open(&run, 0).is_err(), "{foreign:?}");
         assert_eq!(text(&run.evaluations()), foreign);
     }
-    // But a header that was is.
+    // A header that was cut short is replaced.
     std::fs::write(run.evaluations(), "wall_seconds,env_").unwrap();
     Recorder::open(&run, 0).unwrap();
 
@@ -218,7 +218,7 @@ fn a_foreign_file_and_a_full_disk_are_errors_in_one_line() {
 }
 
 #[test]
-fn no_evaluations_yet_is_no_error() {
+fn a_run_without_evaluations_is_valid() {
     let (_parent, run) = run();
     assert_eq!(read_evaluations(&run.evaluations()).unwrap(), []);
     Recorder::open(&run, 0).unwrap();
@@ -228,8 +228,8 @@ fn no_evaluations_yet_is_no_error() {
 proptest! {
     #![proptest_config(ProptestConfig { cases: 200, failure_persistence: None, ..ProptestConfig::default() })]
 
-    /// Rows come back or an error does, whatever is in the file; a file that is refused stays, of others at most the end of
-    /// the last line goes.
+    /// Any content is read or gives an error. A refused file is left unchanged; an accepted one loses at most an
+    /// incomplete last line.
     #[test]
     fn any_file_is_continued_or_refused(
         header in any::<bool>(),

@@ -2,7 +2,7 @@ use ratatui::Terminal;
 use ratatui::backend::TestBackend;
 use shoal_common::channel::control::RunStatus;
 
-use super::super::News;
+use super::super::RunEvent;
 use super::*;
 
 fn status() -> RunStatus {
@@ -45,7 +45,7 @@ fn screen() -> Screen {
     let mut screen = Screen::new("runs/pendulum-1".into(), "pendulum, ddpg, free".into(), true);
     let evaluations = vec![(2_000.0, -1_400.0), (4_000.0, -900.0), (6_000.0, -140.5)];
     for _ in 0..3 {
-        screen.hear(News::Running(Box::new(status()), evaluations.clone()));
+        screen.handle(RunEvent::Running(Box::new(status()), evaluations.clone()));
     }
     screen
 }
@@ -64,7 +64,7 @@ fn lines(screen: &Screen, width: u16, height: u16) -> Vec<String> {
 }
 
 #[test]
-fn a_usual_terminal_shows_everything() {
+fn a_terminal_of_usual_size_shows_everything() {
     let lines = lines(&screen(), 80, 24);
     assert_eq!(lines[0], "runs/pendulum-1 running  pendulum, ddpg, free");
     assert!(
@@ -97,7 +97,7 @@ fn a_usual_terminal_shows_everything() {
 }
 
 #[test]
-fn a_small_terminal_shows_what_matters_most() {
+fn a_small_terminal_shows_the_most_important_part() {
     let lines = lines(&screen(), 40, 10);
     assert!(lines[0].starts_with("runs/pendulum-1 running"), "{lines:#?}");
     assert!(lines[1].contains("60,000 of 120,000"), "{lines:#?}");
@@ -111,18 +111,18 @@ fn a_small_terminal_shows_what_matters_most() {
 }
 
 #[test]
-fn no_terminal_is_too_small_to_draw_on() {
+fn terminals_of_any_size_are_drawn_on() {
     let mut screen = screen();
     for (width, height) in [(1, 1), (2, 40), (10, 3), (200, 2), (200, 60)] {
-        for over in [Over::Nothing, Over::Help, Over::Stop] {
-            screen.over = over;
+        for overlay in [Overlay::Nothing, Overlay::Help, Overlay::Stop] {
+            screen.overlay = overlay;
             terminal(&screen, width, height);
         }
     }
 }
 
 #[test]
-fn without_colours_there_is_none() {
+fn no_colours_are_used_if_switched_off() {
     let mut screen = screen();
     screen.colours = false;
     let terminal = terminal(&screen, 80, 24);
@@ -136,14 +136,14 @@ fn without_colours_there_is_none() {
 }
 
 #[test]
-fn the_end_is_said_and_a_question_is_asked() {
+fn boxes_and_the_end_of_the_run_are_shown() {
     let mut screen = screen();
     screen.press('s');
     assert!(lines(&screen, 80, 24).join("\n").contains("Stop the run?"));
     screen.press('n');
     screen.press('?');
     assert!(lines(&screen, 40, 10).join("\n").contains("one actor more"));
-    screen.hear(News::Ended(Box::new(status()), Vec::new()));
+    screen.handle(RunEvent::Ended(Box::new(status()), Vec::new()));
     let lines = lines(&screen, 80, 24);
     assert!(lines[0].contains("has ended"), "{lines:#?}");
     assert!(lines[23].contains("shoal resume runs/pendulum-1"), "{lines:#?}");

@@ -1,13 +1,13 @@
-//! What a number of the configuration may be.
+//! Bounds of the numbers in a configuration.
 
 use std::fmt::{self, Display, Formatter};
 
-/// The least and the greatest that a number may be.
+/// The least and the greatest value of a number.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Bounds<T> {
     low: T,
     high: T,
-    /// Whether `low` itself is too little.
+    /// Whether `low` itself is excluded.
     open: bool,
 }
 
@@ -19,7 +19,7 @@ pub struct OutOfRange {
     pub key: String,
     /// The value found.
     pub value: String,
-    /// What would be accepted.
+    /// The accepted values, in words.
     pub expected: String,
 }
 
@@ -28,7 +28,7 @@ pub const fn from<T>(low: T, high: T) -> Bounds<T> {
     Bounds { low, high, open: false }
 }
 
-/// Above `low`, and at most `high`.
+/// Above `low` and at most `high`.
 pub const fn above<T>(low: T, high: T) -> Bounds<T> {
     Bounds { low, high, open: true }
 }
@@ -45,10 +45,10 @@ impl<T: Display> Display for Bounds<T> {
 }
 
 impl<T: PartialOrd + Display> Bounds<T> {
-    /// Whether `value`, the value of `key`, is within the bounds.
+    /// Checks that `value`, the value of `key`, is within the bounds.
     ///
     /// # Errors
-    /// When it is not, or is no number.
+    /// When it is outside or NaN.
     pub fn check(&self, key: impl Into<String>, value: &T) -> Result<(), OutOfRange> {
         let enough = if self.open {
             self.low < *value
@@ -66,19 +66,19 @@ impl<T: PartialOrd + Display> Bounds<T> {
     }
 }
 
-/// What bounds may be declared for: a number, several, or perhaps one.
+/// A value that can have bounds: a number, a list of numbers, or an optional number.
 pub trait Bounded {
-    /// What is compared.
+    /// The type of the numbers.
     type Number;
 
-    /// Whether every number of it is within the bounds.
+    /// Checks that every number is within the bounds.
     ///
     /// # Errors
-    /// For the first one that is not.
+    /// For the first number that is not.
     fn check(&self, section: &str, key: &str, bounds: &Bounds<Self::Number>) -> Result<(), OutOfRange>;
 }
 
-/// The bounds of a value of type `T`, as they are told: `from 0 to 1`.
+/// The bounds of a value of type `T` in words: `from 0 to 1`.
 pub fn in_words<T: Bounded<Number: Display>>(bounds: &Bounds<T::Number>) -> String {
     bounds.to_string()
 }
@@ -118,7 +118,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_number_outside_is_refused_with_its_key_and_its_bounds() {
+    fn a_number_out_of_bounds_is_refused_with_its_key_and_bounds() {
         let line = |checked: Result<(), OutOfRange>| checked.unwrap_err().to_string();
         assert_eq!(line(from(1, 8_u32).check("a.b", &9)), "a.b = 9: must be from 1 to 8");
         let rate = above(0.0, 1.0);

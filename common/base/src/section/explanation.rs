@@ -1,36 +1,36 @@
-//! What each key of a configuration means, in words. The words are the doc comments of the fields; unit, source and bounds
-//! stand beside them as attributes.
+//! Explanations of the configuration's keys. The text of a key is the doc comment of its field; unit, source and bounds are
+//! attributes of the field.
 
 use schemars::{JsonSchema, schema_for};
 use serde::Serialize;
 use serde_json::Value;
 use toml::Table;
 
-/// What is to be known of a key.
+/// The explanation of a key.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Key {
     /// The key within its section.
     pub name: String,
-    /// What it is: whole sentences on one line.
+    /// Its meaning: whole sentences on one line.
     pub meaning: String,
-    /// What a number of it counts or measures; `–` for a pure number and for what is no number.
+    /// The unit of its numbers; `–` for pure numbers and for values that are not numbers.
     pub unit: String,
     /// Where its default comes from: a place in the thesis, or `ours`.
     pub source: String,
-    /// What it may be, where that can be listed.
+    /// Its possible values, if they can be listed.
     pub choices: Vec<String>,
-    /// What a number of it may be, as `from 0 to 1`; empty where no bounds are declared.
+    /// The bounds of its numbers, such as `from 0 to 1`; empty if none are declared.
     pub bounds: String,
 }
 
-/// A section of `config.toml`, but for an environment's own parameters.
+/// A section of `config.toml`, without an environment's own parameters.
 #[derive(Clone, Debug)]
 pub struct Section {
     /// Its name.
     pub name: &'static str,
     /// Its keys.
     pub keys: Vec<Key>,
-    /// What the keys are where nothing else is said; some have no default.
+    /// The default values; some keys have none.
     pub defaults: Table,
 }
 
@@ -39,12 +39,12 @@ pub fn describe<T: JsonSchema + Default + Serialize>(name: &'static str) -> Sect
     Section {
         name,
         keys: keys::<T>(),
-        // Every default is a number, a word or a list of them.
+        // This cannot fail: every default is a number, a word or a list of them.
         defaults: Table::try_from(T::default()).unwrap_or_default(),
     }
 }
 
-/// The keys of a section whose type is `T`; what is not said of one is empty.
+/// The keys of a section whose type is `T`. A field is empty if the key's declaration has nothing for it.
 pub fn keys<T: JsonSchema>() -> Vec<Key> {
     let schema = schema_for!(T).to_value();
     let text = |property: &Value, what: &str| property[what].as_str().unwrap_or_default().replace('\n', " ");
@@ -60,7 +60,7 @@ pub fn keys<T: JsonSchema>() -> Vec<Key> {
     key.collect()
 }
 
-/// The words that a property may be.
+/// The possible values of a property, if it is a word.
 fn choices(schema: &Value, property: &Value) -> Vec<String> {
     if property["type"] == "boolean" {
         return vec!["false".into(), "true".into()];

@@ -1,4 +1,4 @@
-//! The layout of the replay file. Offsets are chained: each is the end of what comes before it.
+//! The layout of the replay file. Each offset is the end of the part before it.
 
 use std::ops::Range;
 
@@ -7,66 +7,65 @@ use shoal_base::transition::RowLayout;
 use super::words::Words;
 
 #[cfg(not(all(target_endian = "little", target_pointer_width = "64")))]
-compile_error!("the replay file and the checkpoints are written as they stand in memory: 64-bit little-endian only");
+compile_error!("the replay file and the checkpoints have the layout of memory: 64-bit little-endian only");
 
 /// "SHOALRPL", read as a number.
 const MAGIC: u64 = u64::from_le_bytes(*b"SHOALRPL");
-/// The format this build reads and writes. Raise it with every change of the layout or of a checksum.
+/// The format that this build reads and writes. Increase it with every change of the layout or of a checksum.
 const VERSION: u64 = 2;
 
 /// Bytes of a header word; every field of the header is one.
 const WORD: usize = size_of::<u64>();
-/// The unit of the layout, in bytes: what is written at different times never shares one, so that a power loss that
-/// tears one leaves its neighbours whole.
+/// The unit of the layout, in bytes. Parts that are written at different times never share a block, so that a block torn by
+/// a power loss leaves its neighbours whole.
 const BLOCK: usize = 4096;
-/// Words of the identity, its seal included.
+/// Words of the identity, including its checksum.
 const IDENTITY_WORDS: usize = 10;
 
 /// Words of a commit record before those of the actors: generation, head, tail.
 pub(super) const RECORD_WORDS: usize = 3;
-/// Words of an actor in a commit record, before those that say where it stood: incarnation, sequence, rows.
+/// Words of an actor in a commit record, before its snapshot: incarnation, sequence, rows.
 pub(super) const ACTOR_WORDS: usize = 3;
 
-/// More actors than any run has. A file that claims more, and is as long as it says, asks its reader for memory without
-/// end.
-const MOST_ACTORS: usize = 1 << 16;
+/// More actors than any run has. The limit keeps the header of a forged file from exhausting the reader's memory.
+const MAX_ACTORS: usize = 1 << 16;
 
-/// More words than tell where any actor stands, for the same reason.
-const MOST_STANDING_WORDS: usize = 1 << 24;
+/// More words than any actor's snapshot has; a limit for the same reason.
+const MAX_ACTOR_SNAPSHOT_WORDS: usize = 1 << 24;
 
-/// Slots that hold a commit record: two for what is committed (a record of generation g goes to slot g mod 2), then
-/// two for what is known to have reached the disk.
+/// Slots for commit records: two for what is committed (a record of generation g goes to slot g mod 2), then two for what
+/// is known to be on the disk.
 pub const SLOTS: usize = 4;
-/// The first of the two slots for what has reached the disk.
+/// The first of the two slots for what is on the disk.
 pub const SYNCED: usize = 2;
 
-/// What a replay file holds. Two files with equal layouts are interchangeable; a file of another layout is refused.
+/// The sizes of a replay file, and the run that it belongs to. A file of another layout is refused.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ReplayLayout {
     /// The fields of a row.
     pub row: RowLayout,
-    /// Rows the ring has room for: the sampling window, and the slack beyond it.
+    /// Rows in the ring: the sampling window, and the reserve that lockstep runs need beyond it.
     pub ring: u64,
-    /// Actors there may ever be; their indices are `0 .. actors`.
+    /// The most actors; their indices are `0 .. actors`.
     pub actors: usize,
-    /// Words that say where an actor stood after its last chunk; 0 where nobody asks.
+    /// Words of an actor's snapshot after its last chunk; 0 if the file has no snapshots.
     pub actor_snapshot_words: usize,
-    /// Identifies the configuration the rows were collected under; the caller's to choose.
+    /// Identifies the configuration that the rows were collected under. The caller chooses it.
     pub fingerprint: u64,
 }
 
-/// Where everything lies in a replay file, in bytes from its beginning.
+/// The offsets of the parts of a replay file, in bytes.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Places {
-    /// The word that names the published generation.
-    pub selector: usize,
-    /// The word that says up to which row the ring is being written.
-    pub reach: usize,
+    /// The word with the published generation, which selects the active slot.
+    pub published: usize,
+    /// The word with the write horizon: the row number up to which the ring may have been written.
+    pub write_horizon: usize,
     /// The slots of commit records.
     pub slots: [usize; SLOTS],
-    /// End of the header: what the readers map.
+    /// End of the header, which readers map.
     pub header: usize,
-    /// The rows' checks, one `u32` a place of the ring.
+    /// The rows' checks, one `u32` for each place of the ring.
     pub checks: Range<usize>,
     /// The rows.
     pub rows: Range<usize>,
@@ -74,7 +73,7 @@ pub struct Places {
     pub end: usize,
 }
 
-/// Why a file's identity cannot be what this build expects.
+/// Why a file's identity cannot be used.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum IdentityFault {
     /// The file does not begin as a replay file does.
@@ -83,21 +82,21 @@ pub enum IdentityFault {
     /// A replay file of another format.
     #[error("its format version is {0}, this program reads version {VERSION}")]
     Version(u64),
-    /// The identity's checksum does not fit.
+    /// The identity's checksum does not match.
     #[error("its header is damaged (checksum)")]
     Checksum,
-    /// The identity is whole and its numbers are not possible.
+    /// The identity is undamaged, but its numbers are impossible.
     #[error("its header asks for an impossible size")]
     Size,
 }
 
 impl ReplayLayout {
-    /// Where everything lies, or `None` if the ring or the actors are none, the actors too many, or the file would be
-    /// larger than a file can be.
+    /// The offsets of all parts. `None` if there are no rows or no actors, if there are too many actors or snapshot words,
+    /// or if the file would be larger than a file can be.
     pub fn places(&self) -> Option<Places> {
         if self.ring == 0
-            || !(1..=MOST_ACTORS).contains(&self.actors)
-            || self.actor_snapshot_words > MOST_STANDING_WORDS
+            || !(1..=MAX_ACTORS).contains(&self.actors)
+            || self.actor_snapshot_words > MAX_ACTOR_SNAPSHOT_WORDS
         {
             return None;
         }
@@ -109,9 +108,9 @@ impl ReplayLayout {
             .checked_next_multiple_of(BLOCK)?;
         let row = self.row.width().checked_mul(size_of::<f32>())?;
 
-        let selector = BLOCK;
-        let reach = selector + WORD;
-        let first = selector + BLOCK;
+        let published = BLOCK;
+        let write_horizon = published + WORD;
+        let first = published + BLOCK;
         let header = first.checked_add(slot.checked_mul(SLOTS)?)?;
         let checks = header..header.checked_add(ring.checked_mul(size_of::<u32>())?)?;
         let rows = checks.end.checked_next_multiple_of(BLOCK)?;
@@ -120,8 +119,8 @@ impl ReplayLayout {
         i64::try_from(end).ok()?;
         let slots = std::array::from_fn(|i| first + i * slot);
         Some(Places {
-            selector,
-            reach,
+            published,
+            write_horizon,
             slots,
             header,
             checks,
@@ -130,13 +129,13 @@ impl ReplayLayout {
         })
     }
 
-    /// Words of a commit record; `None` if there are more than can be counted.
+    /// Words of a commit record; `None` on overflow.
     fn record_words(&self) -> Option<usize> {
         let stride = self.actor_snapshot_words.checked_add(ACTOR_WORDS)?;
         self.actors.checked_mul(stride)?.checked_add(RECORD_WORDS)
     }
 
-    /// The words a file of this layout begins with.
+    /// The words that a file of this layout begins with.
     pub fn identity(&self) -> Vec<u64> {
         let mut words = vec![
             MAGIC,
@@ -153,7 +152,7 @@ impl ReplayLayout {
         words
     }
 
-    /// Reads the layout from a file's first block; the words may be any bytes.
+    /// Reads the layout from a file's first block, which may have any contents.
     pub fn read(words: &Words) -> Result<Self, IdentityFault> {
         let identity: Vec<u64> = (0..IDENTITY_WORDS).map(|i| words.load(i * WORD)).collect();
         if identity[0] != MAGIC {
@@ -162,8 +161,8 @@ impl ReplayLayout {
         if identity[1] != VERSION {
             return Err(IdentityFault::Version(identity[1]));
         }
-        let (fields, seal) = identity.split_at(IDENTITY_WORDS - 1);
-        if seal[0] != u64::from(crc32fast::hash(bytemuck::cast_slice(fields))) {
+        let (fields, checksum) = identity.split_at(IDENTITY_WORDS - 1);
+        if checksum[0] != u64::from(crc32fast::hash(bytemuck::cast_slice(fields))) {
             return Err(IdentityFault::Checksum);
         }
         // The bound keeps `RowLayout::width` from overflowing.
@@ -181,7 +180,7 @@ impl ReplayLayout {
         Ok(layout)
     }
 
-    /// Names the first thing in which a file of layout `found` differs from this one.
+    /// Describes the first difference between this layout and the layout `found` of a file.
     pub fn difference(&self, found: &Self) -> Option<String> {
         let differs = |before: &str, expected: usize, found: usize, after: &str| {
             (expected != found).then(|| format!("{before} {found} {after}, this run's {expected}"))
@@ -202,10 +201,10 @@ impl ReplayLayout {
             )
         })
         .or_else(|| differs("its ring has", self.ring as usize, found.ring as usize, "rows"))
-        .or_else(|| differs("it has room for", self.actors, found.actors, "actors"))
+        .or_else(|| differs("it has space for", self.actors, found.actors, "actors"))
         .or_else(|| {
             differs(
-                "where an actor stands takes",
+                "its actor snapshots have",
                 self.actor_snapshot_words,
                 found.actor_snapshot_words,
                 "words",
@@ -222,5 +221,5 @@ impl ReplayLayout {
     }
 }
 
-/// Bytes of the file that hold its identity.
+/// Bytes of the file that contain its identity.
 pub(super) const IDENTITY_BYTES: usize = BLOCK;

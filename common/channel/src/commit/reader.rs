@@ -1,4 +1,4 @@
-//! The reading side: what an actor and `status` see of the replay.
+//! The reading side, for actors and `shoal status`.
 
 use std::fs::File;
 use std::io;
@@ -9,7 +9,7 @@ use super::layout::{IDENTITY_BYTES, Places, ReplayLayout};
 use super::record::{self, ActorCommit, ChunkMark, Record};
 use super::words::Words;
 
-/// Follows the commit record of a replay file that a learner may be writing. Never waits for the learner, alive or dead.
+/// Follows the commit record of a replay file that a learner may be writing. It never waits for the learner, alive or dead.
 #[derive(Debug)]
 pub struct CommitReader {
     words: Words,
@@ -20,7 +20,7 @@ pub struct CommitReader {
 /// Why a replay's commit record cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub enum OpenError {
-    /// The learner has not made the file yet, or has still to repair its record: try again later.
+    /// The learner has not created the file yet, or must repair its record first: try again later.
     #[error("{path}: {reason}; waiting for the learner")]
     NotYet {
         /// The replay file.
@@ -28,7 +28,7 @@ pub enum OpenError {
         /// What is missing.
         reason: &'static str,
     },
-    /// The file is there and waiting will not make it readable.
+    /// The file exists, and waiting will not make it readable.
     #[error("{path}: {reason}; the file was left as it is: move it away, or use the program that wrote it")]
     Refused {
         /// The replay file.
@@ -76,33 +76,33 @@ impl CommitReader {
             .ok_or_else(|| refused("its header asks for an impossible size".into()))?;
         if length != places.end as u64 {
             return Err(refused(format!(
-                "the file has {length} bytes, its header says {}",
+                "the file has {length} bytes, its header requires {}",
                 places.end
             )));
         }
         let words = Words::map(&file, places.header).map_err(io)?;
         let reader = Self { words, places, layout };
-        // After a power loss the record may be damaged until the learner has opened the file: later reads trust it.
+        // Later reads trust the record. After a power loss it may be damaged until the learner has opened the file.
         if reader.snapshot().is_none() {
             return Err(not_yet("its commit record is damaged"));
         }
         Ok(reader)
     }
 
-    /// What the file holds.
+    /// The file's layout.
     pub fn layout(&self) -> &ReplayLayout {
         &self.layout
     }
 
-    /// Rows ever committed.
+    /// Rows committed over the life of the file.
     pub fn rows(&self) -> u64 {
         self.consistent(|slot| record::load_head(&self.words, slot))
     }
 
-    /// The last chunk committed of an actor; the default mark before its first.
+    /// The mark of an actor's last committed chunk; the default mark before its first.
     ///
     /// # Panics
-    /// As indexing a slice does: `actor` must be less than `layout().actors`.
+    /// If `actor` is not less than `layout().actors`.
     pub fn committed(&self, actor: usize) -> ChunkMark {
         self.actor(actor).mark
     }
@@ -110,7 +110,7 @@ impl CommitReader {
     /// What is committed of an actor.
     ///
     /// # Panics
-    /// As indexing a slice does: `actor` must be less than `layout().actors`.
+    /// If `actor` is not less than `layout().actors`.
     pub fn actor(&self, actor: usize) -> ActorCommit {
         assert!(
             actor < self.layout.actors,
@@ -120,35 +120,36 @@ impl CommitReader {
         self.consistent(|slot| record::load_actor(&self.words, slot, &self.layout, actor))
     }
 
-    /// Where an actor stood after its last chunk, as it said it; zeros before the first.
+    /// An actor's snapshot after its last committed chunk; zeros before the first.
     ///
     /// # Panics
-    /// As indexing a slice does: `actor` must be less than `layout().actors`.
-    pub fn standing(&self, actor: usize) -> Vec<u64> {
+    /// If `actor` is not less than `layout().actors`.
+    pub fn actor_snapshot(&self, actor: usize) -> Vec<u64> {
         self.snapshot().map_or_else(
             || vec![0; self.layout.actor_snapshot_words],
-            |record| record.standing(actor).to_vec(),
+            |record| record.actor_snapshot(actor).to_vec(),
         )
     }
 
-    /// The whole record, all of one moment. `None` if it is damaged, which only the learner can repair.
+    /// A consistent copy of the whole record. `None` if it is damaged; only the learner can repair it.
     pub fn snapshot(&self) -> Option<Record> {
         self.consistent(|slot| Record::load(&self.words, slot, &self.layout))
     }
 
-    /// Reads from the published slot until no other record was published meanwhile. The writer touches a slot only
-    /// after it has published the other one, so two equal selectors prove that the slot was left alone between them.
+    /// Reads from the active slot, and repeats if another record was published in between. The writer changes a slot only
+    /// after it has published the other one. So if the published generation is the same before and after the read, the slot
+    /// was not touched.
     fn consistent<T>(&self, read: impl Fn(usize) -> T) -> T {
         loop {
-            let generation = self.words.load(self.places.selector);
-            // SYNC POINT with the last Release fence of `Record::store`, after which the learner published: the record
-            // is complete.
+            let generation = self.words.load(self.places.published);
+            // SYNC POINT with the last Release fence of `Record::store`, after which the learner published the generation:
+            // the record is complete.
             fence(Ordering::Acquire);
             let value = read(self.places.slots[(generation % 2) as usize]);
-            // SYNC POINT with the first Release fence of `Record::store`: who has read a word of the next record but one
-            // also sees that the selector has moved.
+            // SYNC POINT with the first Release fence of `Record::store`: if `read` has seen a word of a later record in this
+            // slot, the load below sees a newer generation.
             fence(Ordering::Acquire);
-            if self.words.load(self.places.selector) == generation {
+            if self.words.load(self.places.published) == generation {
                 return value;
             }
             std::hint::spin_loop();

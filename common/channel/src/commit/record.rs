@@ -1,11 +1,11 @@
-//! The commit record: how far the replay is filled and which chunks are in it.
+//! The commit record: which rows and which chunks are in the replay.
 
 use std::sync::atomic::{Ordering, fence};
 
 use super::layout::{ACTOR_WORDS, RECORD_WORDS, ReplayLayout};
 use super::words::{Words, WritableWords};
 
-/// Identifies a chunk of one actor. Ordered: a later incarnation comes after every chunk of the earlier ones.
+/// Identifies a chunk of one actor. Marks are ordered by incarnation, then by sequence number.
 ///
 /// The default means "none": incarnations and sequence numbers count from 1.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
@@ -16,18 +16,18 @@ pub struct ChunkMark {
     pub sequence: u64,
 }
 
-/// More processes than any run starts, and far from overflowing when it is counted on.
-pub const LAST_INCARNATION: u64 = 1 << 60;
+/// More processes than any run starts, and far below overflow.
+pub const MAX_INCARNATION: u64 = 1 << 60;
 
 impl ChunkMark {
-    /// Whether it comes right after `committed`: it has the next sequence number of the same incarnation, or is a later
-    /// incarnation's first, which leaves the sequence as it is.
+    /// Whether this chunk comes right after `committed`: it has the next sequence number of the same incarnation, or it is
+    /// the handshake of a later incarnation, which keeps the sequence number.
     pub fn is_next(self, committed: Self) -> bool {
         let Self { incarnation, sequence } = self;
         if incarnation == committed.incarnation {
             committed.sequence.checked_add(1) == Some(sequence)
         } else {
-            (committed.incarnation..=LAST_INCARNATION).contains(&incarnation) && sequence == committed.sequence
+            (committed.incarnation..=MAX_INCARNATION).contains(&incarnation) && sequence == committed.sequence
         }
     }
 }
@@ -37,14 +37,14 @@ impl ChunkMark {
 pub struct ActorCommit {
     /// The last chunk.
     pub mark: ChunkMark,
-    /// Rows of all its chunks, of all incarnations.
+    /// Rows of all its chunks, over all incarnations.
     pub rows: u64,
 }
 
 /// A commit record. Rows are numbered from 0 in the order they were committed, for the life of the file.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Record {
-    /// Exactly as in a slot: the three fields below, then for each actor three words and where it stood.
+    /// Exactly as in a slot: the three fields below, then for each actor three words and its snapshot.
     words: Vec<u64>,
     /// Words of an actor.
     stride: usize,
@@ -53,17 +53,17 @@ pub struct Record {
 const GENERATION: usize = 0;
 const HEAD: usize = 1;
 const TAIL: usize = 2;
-/// Where the actors' words begin.
+/// Index of the actors' first word.
 const ACTORS: usize = RECORD_WORDS;
 
 const WORD: usize = size_of::<u64>();
-/// A slot's seal while its record is being written. No finished record has it: see `seal`.
+/// The seal of a slot whose record is being written. No finished record has it: see `seal`.
 const OPEN: u64 = 0;
 /// More rows and records than any run will write.
 const LIMIT: u64 = 1 << 60;
 
 impl Record {
-    /// The record of an empty replay of this layout, which is one that has `places`.
+    /// The record of an empty replay of this layout, which must have [`places`](ReplayLayout::places).
     pub fn empty(layout: &ReplayLayout) -> Self {
         let stride = ACTOR_WORDS + layout.actor_snapshot_words;
         Self {
@@ -72,22 +72,22 @@ impl Record {
         }
     }
 
-    /// Counts the records ever written: the greater one is the newer.
+    /// The record's number; a newer record has a greater one.
     pub fn generation(&self) -> u64 {
         self.words[GENERATION]
     }
 
-    /// Rows ever committed, which is also the number of the next one.
+    /// Rows committed over the life of the file, which is also the number of the next row.
     pub fn head(&self) -> u64 {
         self.words[HEAD]
     }
 
-    /// The oldest row that can be read: those before it were overwritten or lost.
+    /// Number of the oldest row that can be read. Earlier rows were overwritten or lost.
     pub fn tail(&self) -> u64 {
         self.words[TAIL]
     }
 
-    /// Actors there is room for.
+    /// Number of actors that the record has space for.
     pub fn actors(&self) -> usize {
         (self.words.len() - ACTORS) / self.stride
     }
@@ -95,7 +95,7 @@ impl Record {
     /// What is committed of an actor.
     ///
     /// # Panics
-    /// As indexing a slice does: `actor` must be less than `actors()`.
+    /// If `actor` is not less than `actors()`.
     pub fn actor(&self, actor: usize) -> ActorCommit {
         actor_from(|i| self.words[ACTORS + self.stride * actor + i])
     }
@@ -103,7 +103,7 @@ impl Record {
     /// Adds a chunk.
     ///
     /// # Panics
-    /// As indexing a slice does: `actor` must be less than `actors()`.
+    /// If `actor` is not less than `actors()`.
     pub fn add(&mut self, actor: usize, mark: ChunkMark, rows: u64) {
         let at = ACTORS + self.stride * actor;
         self.words[at] = mark.incarnation;
@@ -112,23 +112,23 @@ impl Record {
         self.words[HEAD] += rows;
     }
 
-    /// Where an actor stood after its last chunk, in words of its own; zeros before the first.
+    /// An actor's snapshot after its last chunk; zeros before the first.
     ///
     /// # Panics
-    /// As indexing a slice does: `actor` must be less than `actors()`.
-    pub fn standing(&self, actor: usize) -> &[u64] {
+    /// If `actor` is not less than `actors()`.
+    pub fn actor_snapshot(&self, actor: usize) -> &[u64] {
         &self.words[ACTORS + self.stride * actor..][..self.stride][ACTOR_WORDS..]
     }
 
-    /// Says where an actor stands.
+    /// Sets an actor's snapshot.
     ///
     /// # Panics
-    /// As `copy_from_slice` does: the layout says how many words there are.
-    pub fn set_standing(&mut self, actor: usize, words: &[u64]) {
+    /// If there are not exactly as many words as the layout requires, or `actor` is not less than `actors()`.
+    pub fn set_actor_snapshot(&mut self, actor: usize, words: &[u64]) {
         self.words[ACTORS + self.stride * actor..][..self.stride][ACTOR_WORDS..].copy_from_slice(words);
     }
 
-    /// Makes it the record of another generation.
+    /// Sets the generation.
     pub fn set_generation(&mut self, generation: u64) {
         self.words[GENERATION] = generation;
     }
@@ -138,7 +138,8 @@ impl Record {
         self.words[TAIL] = tail;
     }
 
-    /// Never `OPEN`, so that a record that was not finished is recognised by more than its checksum.
+    /// The seal of this record, once finished. It is never `OPEN`, so that an unfinished record is recognised by more than
+    /// its checksum.
     fn seal(&self) -> u64 {
         1 << 32 | u64::from(crc32fast::hash(bytemuck::cast_slice(&self.words)))
     }
@@ -149,22 +150,22 @@ impl Record {
         for (i, word) in record.words.iter_mut().enumerate() {
             *word = words.load(offset + (1 + i) * WORD);
         }
-        // The limit keeps sums of what a file says from overflowing: all rows are some actor's.
+        // `LIMIT` keeps sums of a file's numbers from overflowing. No actor has more rows than all actors together.
         let possible = record.tail() <= record.head()
             && record.head().max(record.generation()) < LIMIT
             && (0..layout.actors).all(|actor| record.actor(actor).rows <= record.head());
         (words.load(offset) == record.seal() && possible).then_some(record)
     }
 
-    /// Writes the record into the slot at `offset`, which must not be the published one; `step` is called after each of
-    /// the three steps: seal broken, record written, seal set. What is stored afterwards comes after all of it.
+    /// Writes the record into the slot at `offset`, which must not be the active one. `step` is called after each of the
+    /// three steps: seal cleared, record written, seal set. Later stores are ordered after all of these.
     pub fn store(&self, words: &mut WritableWords, offset: usize, mut step: impl FnMut(usize)) {
-        // SYNC POINT with the second Acquire fence of `CommitReader::consistent`: a reader that has read a word stored
-        // below also sees that the other slot was published before.
+        // SYNC POINT with the second Acquire fence of `CommitReader::consistent`: a reader that has read a word stored below
+        // also sees the newer generation, which was published before.
         fence(Ordering::Release);
         words.store(offset, OPEN);
         step(0);
-        // These two are for who opens the file after a kill: a sealed slot is a finished one.
+        // This fence and the next are for a process that opens the file after a kill: a sealed slot must be complete.
         fence(Ordering::Release);
         for (i, word) in self.words.iter().enumerate() {
             words.store(offset + (1 + i) * WORD, *word);
@@ -173,17 +174,17 @@ impl Record {
         fence(Ordering::Release);
         words.store(offset, self.seal());
         step(2);
-        // SYNC POINT with the first Acquire fence of `CommitReader::consistent`: the caller publishes next.
+        // SYNC POINT with the first Acquire fence of `CommitReader::consistent`: the caller publishes the generation next.
         fence(Ordering::Release);
     }
 }
 
-/// Number of rows committed, by the record in the slot at `offset`.
+/// Number of rows committed, according to the record in the slot at `offset`.
 pub(super) fn load_head(words: &Words, offset: usize) -> u64 {
     words.load(offset + (1 + HEAD) * WORD)
 }
 
-/// What is committed of an actor, by the record in the slot at `offset`.
+/// What is committed of an actor, according to the record in the slot at `offset`.
 pub(super) fn load_actor(words: &Words, offset: usize, layout: &ReplayLayout, actor: usize) -> ActorCommit {
     let stride = ACTOR_WORDS + layout.actor_snapshot_words;
     actor_from(|i| words.load(offset + (1 + ACTORS + stride * actor + i) * WORD))

@@ -1,4 +1,4 @@
-//! The header's words as atomics in shared memory: the only place of this crate that looks at mapped bytes.
+//! The words of the replay's header as atomics in shared memory: the only module of this crate that accesses mapped bytes.
 
 use std::fs::File;
 use std::io;
@@ -13,7 +13,7 @@ pub struct Words {
 }
 
 impl Words {
-    /// Maps the first `bytes` bytes, which the file must have: reading beyond its end would be a SIGBUS.
+    /// Maps the first `bytes` bytes. Fails if the file is shorter, because reading beyond its end would raise SIGBUS.
     pub fn map(file: &File, bytes: usize) -> io::Result<Self> {
         require(file, bytes)?;
         Ok(Self {
@@ -36,14 +36,14 @@ impl Words {
     }
 }
 
-/// The same words for the one process that writes them.
+/// The words for the single process that writes them.
 #[derive(Debug)]
 pub struct WritableWords {
     words: Words,
 }
 
 impl WritableWords {
-    /// Maps the first `bytes` bytes for writing; the file must have them.
+    /// Maps the first `bytes` bytes for writing. Fails if the file is shorter.
     pub fn map(file: &File, bytes: usize) -> io::Result<Self> {
         require(file, bytes)?;
         Ok(Self {

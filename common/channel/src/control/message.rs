@@ -1,36 +1,36 @@
-//! What travels between a terminal and a run's launcher.
+//! The messages between another terminal and a run's launcher.
 
 use bincode::config::{self, Config};
 use bincode::error::EncodeError;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
-/// The form of the messages. Raise it with every change: launcher and asker may be of different builds.
+/// The format version of the messages. Increase it with every change: launcher and client may be of different builds.
 pub(super) const VERSION: u32 = 3;
 
-/// What can be asked of a launcher.
+/// A request to a launcher.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Question {
-    /// How the run gets on.
+    /// Report the status of the run.
     Status,
-    /// Go on with so many actors.
+    /// Continue with this many actors.
     Scale {
-        /// How many.
+        /// The number of actors.
         actors: u32,
     },
-    /// End the run in order.
+    /// End the run in an orderly way.
     Stop,
 }
 
-/// A question, and the run it is about. A copy of a run directory has the run's name, and so reaches the original's
-/// launcher.
+/// A question and the run that it is about. The run is checked because a copy of a run directory has the same name in
+/// shared memory: a question about the copy reaches the launcher of the original.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Asked {
     pub(super) run: RunKey,
     pub(super) question: Question,
 }
 
-/// What tells a run directory from its copies: the device and the number of its inode.
+/// Distinguishes a run directory from its copies by device and inode.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RunKey {
     /// The device.
@@ -39,20 +39,20 @@ pub struct RunKey {
     pub inode: u64,
 }
 
-/// What a launcher answers.
+/// The answer of a launcher.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub enum Answer {
-    /// How the run gets on.
+    /// The status of the run.
     Status(RunStatus),
-    /// It is being done.
+    /// The request is being carried out.
     Accepted,
-    /// It cannot be done, and why.
+    /// The request is refused, with the reason.
     Refused(String),
-    /// The launcher runs another directory, of which the one that was asked about is a copy.
+    /// The launcher runs this other directory; the one that was asked about is a copy of it.
     AnotherRun(String),
 }
 
-/// How a run gets on.
+/// The status of a run.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct RunStatus {
     /// Every process of the run.
@@ -65,15 +65,15 @@ pub struct RunStatus {
     pub episodes: u64,
     /// Episodes after which training ends, if that is earlier.
     pub episodes_limit: Option<u64>,
-    /// Updates done.
+    /// Gradient steps made so far; rows where each is used once.
     pub updates: u64,
-    /// Rows committed to the replay over the whole run.
+    /// Environment steps committed to the replay over the whole run.
     pub replay_rows: u64,
-    /// Actors the run is to have.
+    /// Configured number of actors.
     pub actors: u32,
-    /// Updates for each step beyond the warm-up, so far.
+    /// Updates for each environment step beyond the warm-up, so far.
     pub ratio: f64,
-    /// The ratio agreed on.
+    /// The configured ratio.
     pub updates_per_step: f64,
     /// Version of the policy published last.
     pub policy_version: u64,
@@ -83,58 +83,58 @@ pub struct RunStatus {
     pub env_steps_per_second: f64,
     /// Mean return of the last evaluation.
     pub eval_return_mean: Option<f64>,
-    /// Who waits for whom; `None` where nobody waits.
+    /// Which processes wait, and what for; `None` if none waits.
     pub waiting: Option<String>,
-    /// Whether nothing is left to be done: no step, no update, no evaluation.
+    /// Whether all environment steps, updates and evaluations are done.
     pub finished: bool,
 }
 
-/// How a process of a run gets on.
+/// The status of a process of a run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RoleStatus {
-    /// What it is for.
+    /// The name of its role.
     pub role: String,
-    /// Which one of that role.
+    /// Its index among the processes of that role.
     pub index: u32,
-    /// Its process, if there is one.
+    /// Its process id, if it is running.
     pub pid: Option<u32>,
-    /// What it does.
+    /// Its state.
     pub state: RoleState,
-    /// How often it was started again.
+    /// Number of restarts.
     pub restarts: u32,
-    /// Environment steps a second, or updates of a learner.
+    /// Environment steps a second; for a learner, updates a second.
     pub rate: f64,
     /// Version of the policy it uses or publishes; `None` for an environment server.
     pub policy_version: Option<u64>,
-    /// Versions that its policy is behind the learner's.
+    /// How many versions its policy is behind the learner's.
     pub policy_lag: Option<u64>,
 }
 
-/// What a process of a run does.
+/// The state of a process of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum RoleState {
-    /// Started, and not ready yet.
+    /// Started but not ready yet.
     Starting,
-    /// At work.
+    /// Doing its work.
     Working,
     /// Waiting for another role to appear or to answer.
     WaitingForPeer,
     /// Waiting for the other side of the ratio.
     WaitingForRatio,
-    /// Has not been heard of for seconds: stopped, or stuck.
+    /// No heartbeat for seconds: it is stopped or stuck.
     Silent,
-    /// Handing over what it has, to end for good.
+    /// Handing over what it has, before it ends for good.
     Retiring,
     /// Asked to end with the whole run.
     Ending,
-    /// Ended, and about to be started again.
+    /// Ended, and about to be restarted.
     Restarting,
-    /// Through with everything.
+    /// Finished with all its work.
     Done,
 }
 
-/// A message as bytes.
+/// Encodes a message.
 ///
 /// # Errors
 /// When its type cannot be serialised.
@@ -142,10 +142,10 @@ pub(super) fn encode(message: &impl Serialize) -> Result<Vec<u8>, EncodeError> {
     bincode::serde::encode_to_vec(message, encoding())
 }
 
-/// The message that the bytes are, or what is wrong with them.
+/// Decodes a message; the error describes what is wrong with the bytes.
 pub(super) fn decode<T: DeserializeOwned>(version: u32, bytes: &[u8]) -> Result<T, String> {
     if version != VERSION {
-        return Err(format!("it is of form {version}, this program's is {VERSION}"));
+        return Err(format!("it has format {version}, this program uses format {VERSION}"));
     }
     match bincode::serde::decode_from_slice(bytes, encoding()) {
         Ok((message, used)) if used == bytes.len() => Ok(message),
@@ -154,7 +154,7 @@ pub(super) fn decode<T: DeserializeOwned>(version: u32, bytes: &[u8]) -> Result<
     }
 }
 
-/// The limit keeps a length that no message has from asking for memory.
+/// The encoding. Its limit keeps a damaged length from allocating memory without bound.
 fn encoding() -> impl Config {
     config::standard().with_limit::<{ 1 << 20 }>()
 }
@@ -184,19 +184,19 @@ mod tests {
     }
 
     #[test]
-    fn a_message_arrives_as_it_was_and_another_builds_is_refused() {
+    fn a_message_arrives_unchanged_and_another_format_is_refused() {
         let answer = Answer::Status(status());
         assert_eq!(decode(VERSION, &encode(&answer).unwrap()), Ok(answer.clone()));
         assert!(
             decode::<Answer>(VERSION + 1, &encode(&answer).unwrap())
                 .unwrap_err()
-                .contains("form")
+                .contains("format")
         );
         assert!(decode::<Answer>(VERSION, &[]).is_err());
     }
 
     #[test]
-    fn a_message_that_is_cut_or_too_long_is_refused() {
+    fn a_truncated_or_too_long_message_is_refused() {
         let whole = encode(&Answer::Status(status())).unwrap();
         for end in 0..whole.len() {
             assert!(
@@ -214,13 +214,14 @@ mod tests {
         }
     }
 
-    /// What is read is a message: sent on, it arrives as the same. (As bytes: NaN is not equal to itself.)
-    fn is_read_for_what_it_is<T: Serialize + DeserializeOwned>(bytes: &[u8]) -> bool {
+    /// Whether the bytes are refused, or decode to a message that survives encoding and decoding. Compares bytes, because
+    /// NaN is not equal to itself.
+    fn is_refused_or_round_trips<T: Serialize + DeserializeOwned>(bytes: &[u8]) -> bool {
         match decode::<T>(VERSION, bytes) {
             Ok(message) => {
-                let sent_on = encode(&message).unwrap();
-                let arrived: T = decode(VERSION, &sent_on).unwrap();
-                encode(&arrived).unwrap() == sent_on
+                let encoded = encode(&message).unwrap();
+                let decoded: T = decode(VERSION, &encoded).unwrap();
+                encode(&decoded).unwrap() == encoded
             }
             Err(reason) => !reason.is_empty(),
         }
@@ -228,14 +229,14 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_bytes_are_a_message_or_an_error(bytes in proptest::collection::vec(any::<u8>(), 0..300)) {
-            prop_assert!(is_read_for_what_it_is::<Question>(&bytes));
-            prop_assert!(is_read_for_what_it_is::<Asked>(&bytes));
-            prop_assert!(is_read_for_what_it_is::<Answer>(&bytes));
+        fn any_bytes_decode_to_a_message_or_an_error(bytes in proptest::collection::vec(any::<u8>(), 0..300)) {
+            prop_assert!(is_refused_or_round_trips::<Question>(&bytes));
+            prop_assert!(is_refused_or_round_trips::<Asked>(&bytes));
+            prop_assert!(is_refused_or_round_trips::<Answer>(&bytes));
         }
 
         #[test]
-        fn a_changed_message_is_an_error_or_another_message(at in any::<prop::sample::Index>(), by in 1_u8..) {
+        fn a_changed_message_decodes_to_an_error_or_another_message(at in any::<prop::sample::Index>(), by in 1_u8..) {
             let sent = encode(&Answer::Status(status())).unwrap();
             let mut changed = sent.clone();
             changed[at.index(sent.len())] ^= by;

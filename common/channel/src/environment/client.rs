@@ -24,30 +24,30 @@ use crate::service::{CLAIM_PATIENCE, Entry, claim};
 /// Which episodes a reset begins.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Begin {
-    /// The next one of each environment.
+    /// The next training episode of each environment.
     Next,
-    /// This one of each environment's own stream.
+    /// The training episode with this number, of each environment's own stream.
     Training(u64),
-    /// Of environment `e`, the evaluation episode that far after this one.
+    /// In environment `e`, the evaluation episode with this number plus `e`.
     Evaluation(u64),
 }
 
-/// What an environment server can say to a step.
+/// The result of a step.
 #[derive(Debug)]
 pub enum Stepped {
     /// Every environment took the step.
     Taken(Observed),
-    /// The server died, and another one has taken its place: the episodes under way are lost.
+    /// The server died and another one has taken its place: the current episodes are lost.
     Lost,
 }
 
-/// What an environment server can say when a snapshot is asked for.
+/// The result of a request for a snapshot.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Snapshot {
-    /// The words to restore from: as many as
-    /// [`EnvironmentSpec::snapshot_words`](shoal_base::space::EnvironmentSpec::snapshot_words) counts.
+    /// The words to restore from; their number is
+    /// [`EnvironmentSpec::snapshot_words`](shoal_base::space::EnvironmentSpec::snapshot_words).
     Taken(Vec<u64>),
-    /// The server died, and another one has taken its place: the episodes under way are lost.
+    /// The server died and another one has taken its place: the current episodes are lost.
     Lost,
 }
 
@@ -58,11 +58,11 @@ pub struct Observed {
     layout: ResponseLayout,
 }
 
-/// The actor's end. While it waits for an answer it calls `idle`, some twenty times a second.
+/// The actor's end. While it waits for an answer, it calls `idle` some twenty times a second.
 #[derive(Debug)]
 pub struct EnvironmentClient {
     service: EnvironmentService,
-    /// The server that runs the episodes under way.
+    /// The server that runs the current episodes.
     episodes: Cell<Option<UniqueServerId>>,
     client: Client<ipc::Service, [f32], RequestHeader, [f32], ResponseHeader>,
     channel: String,
@@ -83,17 +83,17 @@ impl Observed {
         &block[e * width..][..width]
     }
 
-    /// What to act on next, environment after environment: the columns of a batch.
+    /// The observations to act on next, environment after environment: the columns of a batch.
     pub fn observations(&self) -> &[f32] {
         self.block(Block::Observations)
     }
 
-    /// What environment `e` is to act on next.
+    /// The observation of environment `e` to act on next.
     pub fn observation(&self, e: usize) -> &[f32] {
         self.of_environment(e, Block::Observations)
     }
 
-    /// s' of environment `e`.
+    /// The observation s' of environment `e` after the step.
     pub fn next_observation(&self, e: usize) -> &[f32] {
         self.of_environment(e, Block::NextObservations)
     }
@@ -114,10 +114,10 @@ impl Observed {
     }
 }
 
-/// Asks environment server `index`, of which nothing is known, for its spaces and the number of its environments.
+/// Asks environment server `index` for its spaces and the number of its environments, when neither is known yet.
 ///
 /// # Errors
-/// When interrupted.
+/// When `stop` is requested, or the channel fails.
 pub fn describe(
     domain: &Domain,
     index: u32,
@@ -135,11 +135,11 @@ pub fn describe(
 }
 
 impl EnvironmentClient {
-    /// Opens the conversation with environment server `index`, which is expected to step so many environments of this
-    /// kind. Whether it does, [`describe`](Self::describe) tells. Waiting for an answer ends when `stop` is requested.
+    /// Connects to environment server `index`, which is expected to step this many environments like `spec`; use
+    /// [`describe`](Self::describe) to verify it. Waiting for an answer ends when `stop` is requested.
     ///
     /// # Errors
-    /// When shared memory cannot be had.
+    /// When shared memory is unavailable.
     pub fn open(
         domain: &Domain,
         index: u32,
@@ -175,13 +175,13 @@ impl EnvironmentClient {
     /// Asks the server for its spaces and the number of its environments.
     ///
     /// # Errors
-    /// When interrupted.
+    /// When a stop is requested, the channel fails, or the answer is too short.
     pub fn describe(
         &self,
         listener: &Listener,
         mut idle: impl FnMut(),
     ) -> Result<(EnvironmentSpec, usize), Exit<ChannelError>> {
-        let response = self.insist(listener, Ask::Describe, 0, &[], &mut idle)?;
+        let response = self.ask_until_answered(listener, Ask::Describe, 0, &[], &mut idle)?;
         let (header, payload) = (response.user_header(), response.payload());
         let described = header.described(payload);
         described.ok_or_else(|| ChannelError::new(&self.channel, "describe", PeerError::ShortAnswer).into())
@@ -190,7 +190,7 @@ impl EnvironmentClient {
     /// Every environment begins an episode.
     ///
     /// # Errors
-    /// When interrupted.
+    /// When a stop is requested, the channel fails, or the server refuses.
     pub fn reset(
         &self,
         listener: &Listener,
@@ -202,13 +202,13 @@ impl EnvironmentClient {
             Begin::Training(episode) => (Ask::ResetToTraining, episode),
             Begin::Evaluation(first) => (Ask::ResetToEvaluation, first),
         };
-        self.begun(self.insist(listener, ask, episode, &[], &mut idle)?)
+        self.begun(self.ask_until_answered(listener, ask, episode, &[], &mut idle)?)
     }
 
     /// Every environment takes a step with its action.
     ///
     /// # Errors
-    /// When interrupted, or the server refuses the actions or has forgotten its episodes.
+    /// When a stop is requested, the channel fails, the server refuses the actions, or it denies having begun the episodes.
     pub fn step(
         &self,
         listener: &Listener,
@@ -221,10 +221,11 @@ impl EnvironmentClient {
         }
     }
 
-    /// Asks for the training episodes under way, which stay as they are.
+    /// Asks for a snapshot of the current training episodes, which are not changed by it.
     ///
     /// # Errors
-    /// When interrupted, or the server refuses: its environments cannot say their state, or run evaluation episodes.
+    /// When a stop is requested, the channel fails, or the server refuses because its environments cannot save their state
+    /// or run evaluation episodes.
     pub fn snapshot(&self, listener: &Listener, mut idle: impl FnMut()) -> Result<Snapshot, Exit<ChannelError>> {
         let Some(response) = self.ask_within_episodes(listener, Ask::Snapshot, &[], &mut idle)? else {
             return Ok(Snapshot::Lost);
@@ -236,11 +237,11 @@ impl EnvironmentClient {
         Ok(Snapshot::Taken(words))
     }
 
-    /// Every environment goes on with its training episode of a snapshot; what to act on next is the answer, as after
-    /// [`reset`](Self::reset).
+    /// Every environment continues its training episode from a snapshot. The result has the observations to act on next, as
+    /// after [`reset`](Self::reset).
     ///
     /// # Errors
-    /// When interrupted, or the server refuses the words; it stays as it was then.
+    /// When a stop is requested, the channel fails, or the server refuses the words; the server is then unchanged.
     pub fn restore(
         &self,
         listener: &Listener,
@@ -254,10 +255,10 @@ impl EnvironmentClient {
             };
             return Err(ChannelError::new(&self.channel, "restore", cause).into());
         }
-        self.begun(self.insist(listener, Ask::Restore, 0, numbers_of(words), &mut idle)?)
+        self.begun(self.ask_until_answered(listener, Ask::Restore, 0, numbers_of(words), &mut idle)?)
     }
 
-    /// The first observations of new episodes, which the server that sent them runs from now on.
+    /// Takes the response to a reset or restore, and notes which server runs the new episodes.
     fn begun(&self, response: Answer) -> Result<Observed, Exit<ChannelError>> {
         let server = response.origin();
         let observed = self.observed(response)?;
@@ -275,7 +276,7 @@ impl EnvironmentClient {
         })
     }
 
-    /// The payload of what is no refusal.
+    /// The payload of a response; an error if the server refused.
     fn answered<'a>(&self, response: &'a Answer) -> Result<&'a [f32], ChannelError> {
         if response.user_header().verdict == Verdict::Answered as u32 {
             Ok(response.payload())
@@ -288,7 +289,7 @@ impl EnvironmentClient {
         ChannelError::new(&self.channel, "ask", PeerError::Refused)
     }
 
-    /// Asks once: for requests about the episodes under way. `None` when the server that ran them is no more.
+    /// Asks once: for requests about the current episodes. `None` if the server that ran them is gone.
     fn ask_within_episodes(
         &self,
         listener: &Listener,
@@ -312,8 +313,8 @@ impl EnvironmentClient {
         Ok(None)
     }
 
-    /// Asks until some server answers: for requests that may be asked twice.
-    fn insist(
+    /// Asks until a server answers: for requests that may be sent twice.
+    fn ask_until_answered(
         &self,
         listener: &Listener,
         ask: Ask,
@@ -336,8 +337,8 @@ impl EnvironmentClient {
     }
 
     fn send(&self, ask: Ask, episode: u64, payload: &[f32]) -> Result<Sent, ChannelError> {
-        // Before the request is sent: where another server has come since, it counts as lost and is asked anew, and never
-        // the other way round.
+        // Look up the server before sending. If another server takes its place in between, the request counts as lost and
+        // is sent again. In the other order, a lost request could count as delivered.
         let server = self.server();
         let mut request = self
             .client
@@ -352,7 +353,7 @@ impl EnvironmentClient {
         Ok(Sent { pending, server })
     }
 
-    /// Waits for the answer; `None` when the server that was asked is no more, or was not reached.
+    /// Waits for the answer; `None` if the server that was asked is gone or did not get the request.
     fn answer(
         &self,
         listener: &Listener,
@@ -367,12 +368,12 @@ impl EnvironmentClient {
                 Ok(Some(response)) => Ok(Some(Some(response))),
                 Ok(None) if lost.get() => Ok(Some(None)),
                 Ok(None) => Ok(None),
-                Err(cause) => Err(ChannelError::new(&self.channel, "hear the answer", cause)),
+                Err(cause) => Err(ChannelError::new(&self.channel, "receive the answer", cause)),
             },
             || {
                 idle();
-                // A dead server is there until the launcher has cleaned up after it. `is_connected` would not tell: it is
-                // true for as long as an answer of a dead server is in hand, and one always is.
+                // A dead server is listed until the launcher has cleaned up after it. `is_connected` does not help: it stays
+                // true while a response of the dead server is held, and the actor always holds one.
                 lost.set(!sent.is_delivered() || self.server() != sent.server);
                 Ok(())
             },
@@ -380,7 +381,7 @@ impl EnvironmentClient {
         Ok(answer)
     }
 
-    /// The server that is there.
+    /// The server that is connected to the service.
     fn server(&self) -> Option<UniqueServerId> {
         let mut found = None;
         self.service.dynamic_config().list_servers(|server| {
@@ -391,10 +392,10 @@ impl EnvironmentClient {
     }
 }
 
-/// A request under way.
+/// A request that waits for its response.
 struct Sent {
     pending: Pending,
-    /// The server that was there when it was sent.
+    /// The server that was connected when it was sent.
     server: Option<UniqueServerId>,
 }
 

@@ -1,5 +1,5 @@
-//! What travels between an actor and its environment server. `docs/PROTOCOL.md` has it for whoever writes a server in
-//! another language.
+//! The messages between an actor and its environment server. `docs/PROTOCOL.md` describes them for servers in other
+//! languages.
 
 use iceoryx2::prelude::ZeroCopySend;
 use shoal_base::space::{EnvironmentSpec, Space};
@@ -8,19 +8,19 @@ use shoal_base::space::{EnvironmentSpec, Space};
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u32)]
 pub enum Ask {
-    /// The spaces and the number of environments.
+    /// Return the spaces and the number of environments.
     Describe = 0,
-    /// Every environment begins an episode of its own stream.
+    /// Every environment begins the next training episode of its own stream.
     Reset = 1,
-    /// Environment `e` begins the evaluation episode `episode + e`, whose start is the same always and everywhere.
+    /// Environment `e` begins the evaluation episode `episode + e`, whose start state is always the same.
     ResetToEvaluation = 2,
     /// Every environment takes a step with its action.
     Step = 3,
-    /// The training episodes under way, as words.
+    /// Return a snapshot of the current training episodes.
     Snapshot = 4,
-    /// The environments go on with the training episodes of a snapshot.
+    /// The environments continue the training episodes of a snapshot.
     Restore = 5,
-    /// Every environment begins the training episode `episode` of its own stream, and counts on from there.
+    /// Every environment begins the training episode `episode` of its own stream; later resets count from there.
     ResetToTraining = 6,
 }
 
@@ -36,15 +36,15 @@ impl Ask {
     ];
 }
 
-/// Header of a request. Its payload is the actions, environment after environment, for [`Ask::Step`], the words of the
-/// snapshot for [`Ask::Restore`], and empty otherwise.
+/// Header of a request. The payload has the actions, environment after environment, for [`Ask::Step`], the words of the
+/// snapshot for [`Ask::Restore`], and is empty otherwise.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ZeroCopySend)]
 #[type_name("ShoalEnvironmentRequest")]
 #[repr(C)]
 pub struct RequestHeader {
     pub(super) ask: u32,
     pub(super) reserved: u32,
-    /// The episode of [`Ask::ResetToTraining`], the first one of [`Ask::ResetToEvaluation`].
+    /// The episode of [`Ask::ResetToTraining`], or the first episode of [`Ask::ResetToEvaluation`].
     pub episode: u64,
 }
 
@@ -58,19 +58,19 @@ impl RequestHeader {
     }
 }
 
-/// How a request was taken.
+/// The outcome of a request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u32)]
 pub(super) enum Verdict {
     Answered = 0,
-    /// A step or a snapshot before a reset or a restore: the server is not the one that the episode began with.
+    /// A step or a snapshot before a reset or a restore: the server is not the one that began the episode.
     NotStarted = 1,
-    /// The request has the wrong length, says what cannot be, or is of an unknown kind.
+    /// The request has the wrong length, invalid contents, or an unknown kind.
     Refused = 2,
 }
 
-/// Header of a response. The payload answers [`Ask::Describe`] with the least and greatest values of an observation and of
-/// an action (for boxes), [`Ask::Snapshot`] with its words, and everything else with the blocks of [`ResponseLayout`].
+/// Header of a response. For [`Ask::Describe`] the payload has the least and greatest values of an observation and of an
+/// action (for boxes), for [`Ask::Snapshot`] the snapshot's words, and otherwise the blocks of [`ResponseLayout`].
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ZeroCopySend)]
 #[type_name("ShoalEnvironmentResponse")]
 #[repr(C)]
@@ -88,13 +88,13 @@ pub struct ResponseHeader {
     pub action_width: u32,
     /// Steps after which an episode is truncated.
     pub time_limit: u32,
-    /// Numbers in an environment's state; 0 where it cannot be said.
+    /// Numbers in an environment's state; 0 if it cannot be saved.
     pub state_width: u32,
 }
 
 impl ResponseHeader {
-    /// What the server says of itself, where `bounds` is its answer to [`Ask::Describe`]: the spaces, and how many
-    /// environments there are. `None` for an answer that is too short.
+    /// The spaces and the number of environments in a response to [`Ask::Describe`] with payload `bounds`. `None` if the
+    /// payload is too short.
     pub(super) fn described(&self, bounds: &[f32]) -> Option<(EnvironmentSpec, usize)> {
         let mut rest = bounds;
         let mut space = |discrete: u32, width: u32| {
@@ -119,14 +119,14 @@ impl ResponseHeader {
     }
 }
 
-/// Where the blocks of a response lie, each of them environment after environment.
+/// The layout of a response: its blocks, each of them environment after environment.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ResponseLayout {
     pub(super) environments: usize,
     observation: usize,
 }
 
-/// A block of a response, in the order they lie in.
+/// The blocks of a response, in their order.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Block {
     Observations,
@@ -136,23 +136,23 @@ pub(super) enum Block {
     Truncated,
 }
 
-/// The blocks of a response to [`Ask::Step`], to be written. A reset or restore fills `observations` alone.
+/// Mutable blocks of a response to [`Ask::Step`]. A reset or restore fills `observations` alone.
 #[derive(Debug)]
 pub struct StepBlocks<'a> {
-    /// What to act on next: where an episode has ended, the first observation of the next one.
+    /// The observations to act on next. After the end of an episode this is the first observation of the next one.
     pub observations: &'a mut [f32],
-    /// The observation after the step, s', whether or not the episode ended with it.
+    /// The observations after the step, s', also if the episode ended with it.
     pub next_observations: &'a mut [f32],
-    /// Reward of the step.
+    /// The rewards of the step.
     pub rewards: &'a mut [f32],
-    /// 1 where the step led to a terminal state, 0 elsewhere.
+    /// 1 if the step led to a terminal state, otherwise 0.
     pub terminated: &'a mut [f32],
-    /// 1 where the time limit ended the episode, 0 elsewhere.
+    /// 1 if the time limit ended the episode, otherwise 0.
     pub truncated: &'a mut [f32],
 }
 
 impl ResponseLayout {
-    /// Blocks for so many environments with observations of this width.
+    /// The layout for this many environments with observations of this width.
     pub fn new(environments: usize, observation: usize) -> Self {
         Self {
             environments,
@@ -205,7 +205,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_a_server_says_of_itself_is_read_as_far_as_it_goes() {
+    fn a_description_is_read_unless_it_is_too_short() {
         let header = ResponseHeader {
             environments: 3,
             observation_width: 2,
@@ -224,7 +224,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_written_into_a_block_is_read_from_it() {
+    fn a_block_is_read_back_as_written() {
         let layout = ResponseLayout::new(2, 3);
         let mut response = vec![f32::NAN; layout.len()];
         let blocks = layout.split_mut(&mut response);

@@ -27,7 +27,7 @@ pub struct EnvironmentPort {
     spec: EnvironmentSpec,
 }
 
-/// A request that waits for its answer.
+/// A received request that must be answered.
 #[derive(Debug)]
 pub struct Request<'a> {
     request: ActiveRequest<ipc::Service, [f32], RequestHeader, [f32], ResponseHeader>,
@@ -35,10 +35,10 @@ pub struct Request<'a> {
 }
 
 impl EnvironmentPort {
-    /// The answering end of environment server `index`, which serves so many environments of this kind to `client`.
+    /// Opens the end of environment server `index`, which serves this many environments like `spec` to `client`.
     ///
     /// # Errors
-    /// When shared memory cannot be had, or another server lives at this place.
+    /// When shared memory is unavailable, or another server with this index is alive.
     pub fn open(
         domain: &Domain,
         index: u32,
@@ -69,10 +69,11 @@ impl EnvironmentPort {
         })
     }
 
-    /// Waits for the next request that is not answered here; `idle` is called at each pause.
+    /// Waits for the next request, and calls `idle` at each pause. Requests for a description and requests of an unknown
+    /// kind are answered here.
     ///
     /// # Errors
-    /// When interrupted.
+    /// When `stop` is requested or the channel fails.
     pub fn next(&self, stop: &Stop, mut idle: impl FnMut()) -> Result<Request<'_>, Exit<ChannelError>> {
         loop {
             let request = wait_for(
@@ -81,7 +82,7 @@ impl EnvironmentPort {
                 || {
                     self.server
                         .receive()
-                        .map_err(|cause| ChannelError::new(&self.channel, "hear a request", cause))
+                        .map_err(|cause| ChannelError::new(&self.channel, "receive a request", cause))
                 },
                 || {
                     idle();
@@ -99,22 +100,22 @@ impl EnvironmentPort {
 }
 
 impl Request<'_> {
-    /// What is asked; `None` for what this build does not know.
+    /// The kind of the request; `None` if this build does not know it.
     pub fn ask(&self) -> Option<Ask> {
         let code = self.request.user_header().ask;
         Ask::ALL.into_iter().find(|ask| *ask as u32 == code)
     }
 
-    /// The evaluation episode that environment 0 shall begin, or the training episode that each shall.
+    /// The evaluation episode that environment 0 must begin, or the training episode that each environment must begin.
     pub fn episode(&self) -> u64 {
         self.request.user_header().episode
     }
 
-    /// Answers with what `write` makes of the actions, environment after environment; where it fails, the request is
-    /// refused, and the failure returned.
+    /// Answers with the blocks that `write` fills from the actions, environment after environment. If `write` fails, the
+    /// request is refused and the inner result is that error.
     ///
     /// # Errors
-    /// When shared memory is exhausted.
+    /// When the response cannot be sent.
     pub fn answer<E>(
         self,
         write: impl FnOnce(&[f32], StepBlocks<'_>) -> Result<(), E>,
@@ -132,15 +133,16 @@ impl Request<'_> {
         Ok(result)
     }
 
-    /// The words of the snapshot to go on from.
+    /// The words of the snapshot to restore.
     pub fn words(&self) -> Vec<u64> {
         words_of(self.request.payload())
     }
 
-    /// Answers with the snapshot that `write` writes; where it fails, the request is refused, and the failure returned.
+    /// Answers with the snapshot that `write` writes. If `write` fails, the request is refused and the inner result is that
+    /// error.
     ///
     /// # Errors
-    /// When shared memory is exhausted.
+    /// When the response cannot be sent.
     pub fn answer_snapshot<E>(
         self,
         write: impl FnOnce(&mut [u64]) -> Result<(), E>,
@@ -159,18 +161,18 @@ impl Request<'_> {
         Ok(Ok(()))
     }
 
-    /// Answers that no episode is under way.
+    /// Answers that no episode has begun.
     ///
     /// # Errors
-    /// When shared memory is exhausted.
+    /// When the response cannot be sent.
     pub fn not_started(self) -> Result<(), ChannelError> {
         self.respond(0, |_| Verdict::NotStarted)
     }
 
-    /// Answers that the request makes no sense.
+    /// Answers that the request is invalid.
     ///
     /// # Errors
-    /// When shared memory is exhausted.
+    /// When the response cannot be sent.
     pub fn refuse(self) -> Result<(), ChannelError> {
         self.respond(0, |_| Verdict::Refused)
     }

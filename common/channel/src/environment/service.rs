@@ -1,4 +1,4 @@
-//! The conversation's service: its name, its limits, and the memory it reserves.
+//! The service of an environment server: its name, its limits, and the memory that it reserves.
 
 use iceoryx2::prelude::*;
 use iceoryx2::service::header::request_response::{
@@ -6,7 +6,7 @@ use iceoryx2::service::header::request_response::{
 };
 use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::request_response::PortFactory;
-use shoal_base::packing::NUMBERS_OF_A_WORD;
+use shoal_base::packing::NUMBERS_PER_WORD;
 use shoal_base::space::EnvironmentSpec;
 
 use super::message::{RequestHeader, ResponseHeader, ResponseLayout};
@@ -15,20 +15,20 @@ use crate::error::ChannelError;
 use crate::memory;
 use crate::service::{Entry, Held, service_name};
 
-/// Requests that may wait for their answers: one, and those that a killed server left unanswered.
+/// Requests that may wait for an answer: the current one, and those that a killed server left unanswered.
 const ACTIVE_REQUESTS: usize = 4;
 const LOANED_REQUESTS: usize = 2;
-/// Answers of a request that may wait.
+/// Unread responses to one request.
 const RESPONSE_BUFFER: usize = 2;
-/// Answers of a request in hand: the observation acted on is held until its transition is written.
+/// Responses that a client holds at the same time: it keeps the last observations until the transitions are written.
 const BORROWED_RESPONSES: usize = 4;
 pub(super) const LOANED_RESPONSES: usize = 2;
-/// Processes that may take part in one conversation.
+/// Processes that may have the service open.
 const NODES: usize = 8;
 
-/// Bytes of shared memory that the conversation with one server of so many such environments reserves.
+/// Bytes of shared memory that the service of one server with this many environments like `spec` reserves.
 pub fn reserved(spec: &EnvironmentSpec, environments: usize) -> u64 {
-    // A client may have let go of as many requests as it may wait for, and the server still hold them.
+    // Twice: the server may still hold as many requests that the client has already given up.
     let requests = 2 * ACTIVE_REQUESTS + LOANED_REQUESTS;
     let of_a_request = RESPONSE_BUFFER + BORROWED_RESPONSES + LOANED_RESPONSES;
     let responses = 2 * ACTIVE_REQUESTS * of_a_request;
@@ -40,16 +40,16 @@ pub fn reserved(spec: &EnvironmentSpec, environments: usize) -> u64 {
         + memory::connection(2 * ACTIVE_REQUESTS, RESPONSE_BUFFER, BORROWED_RESPONSES, responses)
 }
 
-/// The most numbers in a request: actions, or a snapshot.
+/// The most numbers in a request: the actions or a snapshot.
 pub(super) fn question_length(spec: &EnvironmentSpec, environments: usize) -> usize {
-    let snapshot = NUMBERS_OF_A_WORD * spec.snapshot_words(environments);
+    let snapshot = NUMBERS_PER_WORD * spec.snapshot_words(environments);
     (environments * spec.action.width()).max(snapshot)
 }
 
-/// The most numbers in a response: those of [`ResponseLayout`], of a description, or of a snapshot.
+/// The most numbers in a response: the blocks of [`ResponseLayout`], a description or a snapshot.
 pub(super) fn answer_length(spec: &EnvironmentSpec, environments: usize) -> usize {
     let described = 2 * (spec.observation.width() + spec.action.width());
-    let snapshot = NUMBERS_OF_A_WORD * spec.snapshot_words(environments);
+    let snapshot = NUMBERS_PER_WORD * spec.snapshot_words(environments);
     let blocks = ResponseLayout::new(environments, spec.observation.width()).len();
     blocks.max(described).max(snapshot)
 }
@@ -58,19 +58,19 @@ pub(super) fn name(index: u32) -> String {
     format!("env/{index}")
 }
 
-/// Makes the service of the conversation with environment server `index`.
+/// Creates the service of environment server `index`.
 pub(crate) fn create(domain: &Domain, index: u32) -> Result<Held, ChannelError> {
     let service = service(domain, &name(index), Entry::Create)?;
-    Ok(Held::new(move |see| {
+    Ok(Held::new(move |visit| {
         let ports = service.dynamic_config();
-        ports.list_clients(|port| see(port.node_id, port.client_id.value()));
-        ports.list_servers(|port| see(port.node_id, port.server_id.value()));
+        ports.list_clients(|port| visit(port.node_id, port.client_id.value()));
+        ports.list_servers(|port| visit(port.node_id, port.server_id.value()));
     }))
 }
 
 pub(super) type EnvironmentService = PortFactory<ipc::Service, [f32], RequestHeader, [f32], ResponseHeader>;
 
-/// One client, one server: the port is the claim.
+/// Creates or opens the service. It admits one client and one server, so holding the port claims the role.
 pub(super) fn service(domain: &Domain, channel: &str, entry: Entry) -> Result<EnvironmentService, ChannelError> {
     let builder = domain
         .node()

@@ -14,18 +14,18 @@ use shoal_base::section::{Bounded, Bounds, OutOfRange};
 #[schemars(with = "Vec<usize>")]
 pub struct Layers {
     /// 0 where there is no layer.
-    units: [usize; Layers::MOST],
+    units: [usize; Layers::MAX],
     count: usize,
 }
 
 /// A list of layers is empty or too long.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("must be a list of 1 to {} numbers, one for each layer", Layers::MOST)]
+#[error("must be a list of 1 to {} numbers, one for each layer", Layers::MAX)]
 pub struct LayersError;
 
 impl Layers {
     /// The most layers there can be.
-    pub const MOST: usize = 8;
+    pub const MAX: usize = 8;
 }
 
 impl Deref for Layers {
@@ -45,8 +45,8 @@ impl DerefMut for Layers {
 /// A list of a length that cannot be does not compile.
 impl<const N: usize> From<[usize; N]> for Layers {
     fn from(list: [usize; N]) -> Self {
-        const { assert!(1 <= N && N <= Layers::MOST, "1 to 8 layers") };
-        let mut units = [0; Self::MOST];
+        const { assert!(1 <= N && N <= Layers::MAX, "1 to 8 layers") };
+        let mut units = [0; Self::MAX];
         units[..N].copy_from_slice(&list);
         Self { units, count: N }
     }
@@ -56,10 +56,10 @@ impl TryFrom<Vec<usize>> for Layers {
     type Error = LayersError;
 
     fn try_from(list: Vec<usize>) -> Result<Self, LayersError> {
-        if list.is_empty() || list.len() > Self::MOST {
+        if list.is_empty() || list.len() > Self::MAX {
             return Err(LayersError);
         }
-        let mut units = [0; Self::MOST];
+        let mut units = [0; Self::MAX];
         units[..list.len()].copy_from_slice(&list);
         let count = list.len();
         Ok(Self { units, count })

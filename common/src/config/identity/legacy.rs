@@ -1,5 +1,5 @@
-//! The identity of runs made before its form had a number: what Rust's `{:?}` wrote of the configuration's parts at that time.
-//! It is written out here field by field, so that no change of a type can change it.
+//! The identity of runs from before its format had a number: at that time it was the `{:?}` output of parts of the
+//! configuration. It is written field by field here, so that a change of a type cannot change it.
 
 use toml::{Table, Value};
 
@@ -8,7 +8,7 @@ use crate::algorithms::{Algorithm, DdpgConfig, ExplorationConfig, ReinforceConfi
 use crate::config::{Config, Mode};
 use shoal_policy::network::Activation;
 
-/// The text; `None` for an algorithm or a network that there was not then.
+/// The text; `None` for an algorithm or a network that did not exist then.
 pub(super) fn text(config: &Config) -> Option<String> {
     let Config { run, environment, .. } = config;
     let mode = match run.mode {
@@ -20,7 +20,7 @@ pub(super) fn text(config: &Config) -> Option<String> {
         Algorithm::Reinforce(settings) => reinforce(settings)?,
         Algorithm::QLearning(settings) => format!("QLearning({})", tabular(settings)),
         Algorithm::Sarsa(settings) => format!("Sarsa({})", tabular(settings)),
-        #[allow(unreachable_patterns, reason = "an algorithm that comes later has no such text")]
+        #[allow(unreachable_patterns, reason = "an algorithm that is added later has no such text")]
         _ => return None,
     };
     Some(format!(
@@ -105,7 +105,7 @@ fn value(value: &Value) -> String {
         Value::Integer(number) => format!("Integer({number})"),
         Value::Float(number) => format!("Float({number:?})"),
         Value::Boolean(truth) => format!("Boolean({truth})"),
-        // No environment had such a parameter.
+        // No environment of that time had a parameter of these types.
         Value::Datetime(time) => format!("Datetime({time:?})"),
         Value::Array(values) => {
             let values: Vec<_> = values.iter().map(self::value).collect();

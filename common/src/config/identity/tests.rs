@@ -1,7 +1,7 @@
 use super::*;
 use shoal_policy::network::Activation;
 
-/// Runs that commit 2d50610 made, as `tests/data/2d50610` has them, and the fingerprint in the header of each one's replay.
+/// Runs of commit 2d50610 from `tests/data/2d50610`: name, fingerprint in the replay's header, and configuration.
 const OLD: [(&str, u64, &str); 4] = [
     (
         "free-finished",
@@ -111,20 +111,20 @@ fn config(text: &str) -> Config {
 }
 
 #[test]
-fn a_run_without_a_noted_form_has_the_fingerprint_it_was_made_with() {
+fn a_run_without_a_format_number_keeps_its_original_fingerprint() {
     for (name, fingerprint, text) in OLD {
         let config = config(text);
         assert_eq!(config.fingerprint(), fingerprint, "{name}: {}", config.identity());
         assert!(
             !config.to_toml().unwrap().contains("identity_format"),
-            "{name}: nothing is added to an old run"
+            "{name}: a format number was added"
         );
     }
 }
 
-/// No run of SARSA is kept.
+/// `tests/data` has no run of SARSA.
 #[test]
-fn the_unnumbered_text_of_sarsa_is_as_it_was() {
+fn the_unnumbered_text_of_sarsa_is_unchanged() {
     let sarsa = config(&OLD[3].2.replace("q-learning", "sarsa"));
     assert_eq!(
         sarsa.identity(),
@@ -138,7 +138,7 @@ fn numbered(text: &str) -> Config {
 }
 
 #[test]
-fn form_1_is_this_text() {
+fn the_text_of_format_1_is_unchanged() {
     let texts = OLD.map(|(_, _, text)| numbered(text).identity());
     assert_eq!(
         texts[0],
@@ -176,7 +176,7 @@ fn form_1_is_this_text() {
 }
 
 #[test]
-fn form_1_says_any_list_of_layers_and_tanh() {
+fn format_1_describes_any_list_of_layers_and_tanh() {
     let network = |settings: &str| {
         let text = OLD[0].2.replace("hidden = [8, 8]", settings);
         let identity = numbered(&text).identity();
@@ -200,9 +200,9 @@ fn form_1_says_any_list_of_layers_and_tanh() {
     );
 }
 
-/// A configuration without a noted form can be written by hand. Its text is the numbered one, where the old one had no words.
+/// A handwritten configuration has no format number. It gets the numbered text if the old one cannot describe its networks.
 #[test]
-fn networks_that_there_were_not_have_no_unnumbered_text() {
+fn new_kinds_of_networks_have_no_unnumbered_text() {
     for settings in ["hidden = [8]", "hidden = [8, 8]\nactivation = \"tanh\""] {
         for old in [OLD[0].2, OLD[2].2] {
             let config = config(&old.replace("hidden = [8, 8]", settings));
@@ -211,14 +211,13 @@ fn networks_that_there_were_not_have_no_unnumbered_text() {
     }
 }
 
-/// A change of a configuration that says the same, and one that says something else.
 #[test]
-fn form_1_changes_with_what_rows_and_weights_depend_on_and_with_nothing_else() {
+fn format_1_changes_only_with_what_rows_and_weights_depend_on() {
     let base = numbered(OLD[0].2);
     type Change = fn(&mut Config);
     fn ddpg(config: &mut Config) -> &mut crate::algorithms::DdpgConfig {
         let crate::algorithms::Algorithm::Ddpg(ddpg) = &mut config.algorithm else {
-            panic!("the base is ddpg's");
+            panic!("the base configuration is for ddpg");
         };
         ddpg
     }
@@ -251,7 +250,7 @@ fn form_1_changes_with_what_rows_and_weights_depend_on_and_with_nothing_else() {
         ("a parameter's value", |c| {
             c.environment.parameters.insert("mass".into(), 2.0.into());
         }),
-        ("a parameter more", |c| {
+        ("an additional parameter", |c| {
             c.environment.parameters.insert("wind".into(), 2.0.into());
         }),
         ("spec.observation", |c| {
@@ -264,7 +263,7 @@ fn form_1_changes_with_what_rows_and_weights_depend_on_and_with_nothing_else() {
             c.algorithm = crate::algorithms::Algorithm::Sarsa(Default::default())
         }),
         ("ddpg.hidden", |c| ddpg(c).hidden[1] += 1),
-        ("a hidden layer more", |c| ddpg(c).hidden = [8, 8, 8].into()),
+        ("an additional hidden layer", |c| ddpg(c).hidden = [8, 8, 8].into()),
         ("ddpg.activation", |c| ddpg(c).activation = Activation::Tanh),
         ("ddpg.gamma", |c| ddpg(c).gamma = 0.98),
         ("run.seed", |c| c.run.seed += 1),
@@ -279,7 +278,7 @@ fn form_1_changes_with_what_rows_and_weights_depend_on_and_with_nothing_else() {
 }
 
 #[test]
-fn a_form_that_is_not_known_is_refused_in_one_line() {
+fn an_unknown_format_is_refused_in_one_line() {
     let text = OLD[0].2.replace("[run]", "[run]\nidentity_format = 2");
     let line = Config::from_table(text.parse().unwrap(), "config.toml")
         .unwrap_err()
@@ -291,7 +290,7 @@ fn a_form_that_is_not_known_is_refused_in_one_line() {
 }
 
 #[test]
-fn text_and_number_are_told_apart_and_the_order_of_keys_does_not_count() {
+fn text_and_numbers_differ_and_the_order_of_keys_does_not_matter() {
     let value = |text: &str| written(&text.parse::<Table>().unwrap()["x"]);
     assert_eq!(value("x = 1"), value("x = 1.0"));
     assert_ne!(value("x = 1"), value("x = \"1\""));

@@ -1,4 +1,5 @@
-//! What can be set of the point mass: flat in TOML, so that one key changes one number; here each reward with its own.
+//! Parameters of the point mass. They are flat in TOML, so that one key changes one number. In Rust, each reward has
+//! its own parameters.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -8,8 +9,8 @@ use super::{
     reward::Reward,
 };
 
-/// What can be set. In TOML, `reward` is `"r1"`, `"r2"` or `"r3"` and the reward's parameters stand beside it; those of
-/// another reward are refused.
+/// Parameters of the point mass. In TOML, `reward` is `"r1"`, `"r2"` or `"r3"`, and the reward's parameters are keys
+/// beside it; those of another reward are refused.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(try_from = "PointMassTable", into = "PointMassTable")]
 pub struct PointMassParameters {
@@ -30,7 +31,7 @@ pub struct PointMassParameters {
 }
 
 impl PointMassParameters {
-    /// Refuses what is out of range.
+    /// Refuses values out of range.
     pub(super) fn check(&self) -> Result<(), OutOfRange> {
         check("mass", self.mass, 1e-3..=1e3)?;
         check("friction", self.friction, 0.0..=1.0)?;
@@ -99,7 +100,7 @@ struct PointMassTable {
     /// μ, the friction coefficient.
     #[schemars(extend("unit" = "–", "source" = "ours (docs/POINT_MASS.md)"))]
     friction: f64,
-    /// F_s / F_c, how much more force it takes to start moving than to go on; at least 1.
+    /// F_s / F_c, the ratio of the force to start moving to the friction while moving; at least 1.
     #[schemars(extend("unit" = "–", "source" = "ours (docs/POINT_MASS.md)"))]
     stiction_ratio: f64,
     /// g, the gravity of earth.
@@ -120,7 +121,7 @@ struct PointMassTable {
     /// σ², the variance of the Gaussian.
     #[schemars(extend("unit" = "m²", "source" = "section 5.3"))]
     variance: Option<f64>,
-    /// c_d: of r1 the bonus at the goal; of r2 and r3 the weight of ḋ on the way there.
+    /// c_d: in r1 the bonus at the goal; in r2 and r3 the weight of ḋ outside the goal radius.
     #[schemars(extend("unit" = "r1: –; r2, r3: s/m", "source" = "section 5.3"))]
     c_d: Option<f64>,
     /// Weight of θ̇² (r2 and r3).
@@ -135,7 +136,7 @@ struct PointMassTable {
 }
 
 impl Default for PointMassTable {
-    /// The thesis prints neither m, μ nor F_s; these fit its figures.
+    /// The thesis does not print m, μ or F_s; these values fit its figures.
     fn default() -> Self {
         Self {
             mass: 1.0,
@@ -159,34 +160,34 @@ impl TryFrom<PointMassTable> for PointMassParameters {
     type Error = String;
 
     fn try_from(mut flat: PointMassTable) -> Result<Self, String> {
-        let taken = |given: &mut Option<f64>, default| given.take().unwrap_or(default);
+        let given_or = |given: &mut Option<f64>, default| given.take().unwrap_or(default);
         let (name, reward) = match flat.reward {
             Name::R1 => (
                 "r1",
                 Reward::R1 {
-                    amplitude: taken(&mut flat.amplitude, 1.0),
-                    variance: taken(&mut flat.variance, 0.4),
-                    c_d: taken(&mut flat.c_d, 1.0),
+                    amplitude: given_or(&mut flat.amplitude, 1.0),
+                    variance: given_or(&mut flat.variance, 0.4),
+                    c_d: given_or(&mut flat.c_d, 1.0),
                 },
             ),
             Name::R2 => (
                 "r2",
                 Reward::R2 {
-                    amplitude: taken(&mut flat.amplitude, 2.0),
-                    variance: taken(&mut flat.variance, 0.1),
-                    c_d: taken(&mut flat.c_d, std::f64::consts::FRAC_1_SQRT_2),
-                    c_theta_dot: taken(&mut flat.c_theta_dot, 0.0015),
-                    c_force_dot: taken(&mut flat.c_force_dot, 0.0),
+                    amplitude: given_or(&mut flat.amplitude, 2.0),
+                    variance: given_or(&mut flat.variance, 0.1),
+                    c_d: given_or(&mut flat.c_d, std::f64::consts::FRAC_1_SQRT_2),
+                    c_theta_dot: given_or(&mut flat.c_theta_dot, 0.0015),
+                    c_force_dot: given_or(&mut flat.c_force_dot, 0.0),
                 },
             ),
             Name::R3 => (
                 "r3",
                 Reward::R3 {
-                    amplitude: taken(&mut flat.amplitude, 2.0),
-                    variance: taken(&mut flat.variance, 0.1),
-                    c_d: taken(&mut flat.c_d, std::f64::consts::FRAC_1_SQRT_2),
-                    c_theta_dot: taken(&mut flat.c_theta_dot, 0.0015),
-                    c_force: taken(&mut flat.c_force, 0.03),
+                    amplitude: given_or(&mut flat.amplitude, 2.0),
+                    variance: given_or(&mut flat.variance, 0.1),
+                    c_d: given_or(&mut flat.c_d, std::f64::consts::FRAC_1_SQRT_2),
+                    c_theta_dot: given_or(&mut flat.c_theta_dot, 0.0015),
+                    c_force: given_or(&mut flat.c_force, 0.03),
                 },
             ),
         };
@@ -197,7 +198,7 @@ impl TryFrom<PointMassTable> for PointMassParameters {
         ];
         if let Some((key, _, owner)) = others.iter().find(|(_, given, _)| given.is_some()) {
             return Err(format!(
-                "`{key}` is no parameter of reward {name}: remove it, or set reward to {owner}"
+                "`{key}` is not a parameter of reward {name}: remove it, or set reward to {owner}"
             ));
         }
         let PointMassTable {
@@ -288,7 +289,7 @@ mod tests {
     }
 
     #[test]
-    fn each_reward_has_the_numbers_of_its_section() {
+    fn each_reward_has_the_defaults_of_its_section() {
         assert_eq!(
             parameters("reward = 'r1'").reward,
             Reward::R1 {
@@ -332,7 +333,7 @@ mod tests {
     }
 
     #[test]
-    fn the_resolved_table_holds_the_rewards_own_parameters_and_no_others() {
+    fn the_resolved_table_has_only_the_parameters_of_its_reward() {
         let resolved = |text: &str| resolve("point-mass", &text.parse().unwrap()).unwrap();
         for (reward, count) in [("r1", 10), ("r2", 12), ("r3", 12)] {
             let table = resolved(&format!("reward = '{reward}'"));
@@ -342,10 +343,13 @@ mod tests {
     }
 
     #[test]
-    fn wrong_parameters_are_told_apart() {
+    fn wrong_parameters_are_named() {
         let refusal = |text: &str| make("point-mass", &text.parse().unwrap()).err().unwrap().to_string();
         let foreign = refusal("reward = 'r1'\nc_force = 0.1");
-        assert!(foreign.contains("`c_force` is no parameter of reward r1"), "{foreign}");
+        assert!(
+            foreign.contains("`c_force` is not a parameter of reward r1"),
+            "{foreign}"
+        );
         let unknown = refusal("reward = 'r4'");
         assert!(
             unknown.contains("r4") && unknown.contains("r3") && unknown.contains("`reward`"),

@@ -1,6 +1,6 @@
 //! The reward functions of section 5.2, each with its own parameters.
 
-/// Which reward, with its parameters. The defaults of a reward are those of its part of section 5.3.
+/// A reward function and its parameters. The defaults are those of its part of section 5.3.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Reward {
     /// Equation (5.10): a Gaussian of the distance, and a bonus at the goal.
@@ -40,7 +40,7 @@ pub enum Reward {
     },
 }
 
-/// What a reward looks at: the state after a step, and the inputs of the step.
+/// What a reward depends on: the state after a step, and the inputs of the step.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Motion {
     /// Distance d to the goal, in m.
@@ -56,7 +56,7 @@ pub struct Motion {
 }
 
 impl Reward {
-    /// The reward, where the goal's area is `d < goal_radius` (the thesis: 0.05).
+    /// The reward of a step. The vehicle is at the goal if `d < goal_radius` (0.05 in the thesis).
     pub fn of(&self, motion: &Motion, goal_radius: f64) -> f64 {
         let Motion {
             d,
@@ -117,7 +117,7 @@ mod tests {
         force_dot: 4.0,
     };
 
-    fn is(reward: Reward, motion: Motion, by_hand: f64) {
+    fn assert_reward(reward: Reward, motion: Motion, by_hand: f64) {
         let ours = reward.of(&motion, 0.05);
         assert!(
             (ours - by_hand).abs() < 1e-12,
@@ -132,10 +132,10 @@ mod tests {
             variance: 0.4,
             c_d: 1.0,
         };
-        is(r1, MOTION, (-0.3125f64).exp());
-        is(r1, Motion { d: 0.04, ..MOTION }, (-0.002f64).exp() + 1.0);
-        is(r1, Motion { d: 0.05, ..MOTION }, (-0.003125f64).exp());
-        is(r1, Motion { d: 0.0, ..MOTION }, 2.0);
+        assert_reward(r1, MOTION, (-0.3125f64).exp());
+        assert_reward(r1, Motion { d: 0.04, ..MOTION }, (-0.002f64).exp() + 1.0);
+        assert_reward(r1, Motion { d: 0.05, ..MOTION }, (-0.003125f64).exp());
+        assert_reward(r1, Motion { d: 0.0, ..MOTION }, 2.0);
     }
 
     #[test]
@@ -148,10 +148,10 @@ mod tests {
             c_theta_dot: 0.0015,
             c_force_dot,
         };
-        is(r2(0.0), MOTION, -0.15 + 0.6 * c_d);
-        is(r2(0.01), MOTION, -0.16 - 0.15 + 0.6 * c_d);
-        is(r2(0.0), Motion { d: 0.04, ..MOTION }, -0.15 + 2.0 * (-0.008f64).exp());
-        is(
+        assert_reward(r2(0.0), MOTION, -0.15 + 0.6 * c_d);
+        assert_reward(r2(0.01), MOTION, -0.16 - 0.15 + 0.6 * c_d);
+        assert_reward(r2(0.0), Motion { d: 0.04, ..MOTION }, -0.15 + 2.0 * (-0.008f64).exp());
+        assert_reward(
             r2(0.0),
             Motion {
                 theta_dot: 20.0,
@@ -172,8 +172,8 @@ mod tests {
             c_theta_dot: 0.0015,
             c_force: 0.03,
         };
-        is(r3, MOTION, -0.0675 - 0.15 + 0.6 * c_d);
-        is(
+        assert_reward(r3, MOTION, -0.0675 - 0.15 + 0.6 * c_d);
+        assert_reward(
             r3,
             Motion {
                 d: 0.0,
@@ -183,7 +183,7 @@ mod tests {
             },
             2.0,
         );
-        is(
+        assert_reward(
             r3,
             Motion {
                 force_dot: 1e3,

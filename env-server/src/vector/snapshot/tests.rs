@@ -7,52 +7,52 @@ use shoal_base::stream::{Purpose, Stream, stream};
 
 use super::*;
 use crate::environment::{Environment, Step, make, names};
-use crate::vector::{Start, tests::Bench};
+use crate::vector::{Start, tests::Fixture};
 
-const NAME: [u64; 3] = [11, 2, 3];
-/// Crosses the ends of episodes of every environment.
-const AFTERWARDS: u32 = 450;
+const STREAM: [u64; 3] = [11, 2, 3];
+/// Steps after the restore: enough for episodes of every environment to end.
+const STEPS_AFTER: u32 = 450;
 
-/// Every environment with its default parameters, and those whose parameters say what the future depends on.
+/// Every environment with its default parameters, and the rewards that also depend on the previous action.
 fn kinds() -> Vec<(&'static str, &'static str)> {
-    let rates = ["reward = 'r2'", "reward = 'r3'"].map(|reward| ("point-mass", reward));
-    names().map(|name| (name, "")).chain(rates).collect()
+    let rewards = ["reward = 'r2'", "reward = 'r3'"].map(|reward| ("point-mass", reward));
+    names().map(|name| (name, "")).chain(rewards).collect()
 }
 
-/// Actions for all environments, some of them beyond their box.
-fn actions(bench: &Bench, rng: &mut Stream) -> Vec<f32> {
-    let each = |rng: &mut Stream| match &bench.vector.spec().action {
+/// Actions for all environments, some of them outside their box.
+fn actions(fixture: &Fixture, rng: &mut Stream) -> Vec<f32> {
+    let each = |rng: &mut Stream| match &fixture.vector.spec().action {
         Space::Box { low, high } => (low.iter().zip(high))
             .map(|(low, high)| rng.random_range(1.1 * low - 0.1..=1.1 * high + 0.1))
             .collect(),
         Space::Discrete { n } => vec![rng.random_range(0..*n) as f32],
     };
-    (0..bench.vector.count()).flat_map(|_| each(rng)).collect()
+    (0..fixture.vector.count()).flat_map(|_| each(rng)).collect()
 }
 
-fn snapshot(bench: &Bench) -> Vec<u64> {
-    let mut words = vec![u64::MAX; bench.vector.snapshot_words()];
-    bench.vector.snapshot(&mut words).unwrap();
+fn snapshot(fixture: &Fixture) -> Vec<u64> {
+    let mut words = vec![u64::MAX; fixture.vector.snapshot_words()];
+    fixture.vector.snapshot(&mut words).unwrap();
     words
 }
 
-/// Restores and gives the observations.
-fn restore(bench: &mut Bench, words: &[u64]) -> Result<Vec<f32>, RequestError> {
-    let Bench {
+/// Restores and returns the observations.
+fn restore(fixture: &mut Fixture, words: &[u64]) -> Result<Vec<f32>, RequestError> {
+    let Fixture {
         vector, observations, ..
-    } = bench;
+    } = fixture;
     vector.restore(words, observations)?;
     Ok(observations.clone())
 }
 
-/// All that a step gave, as bits.
-fn bits(bench: &Bench) -> Vec<u32> {
+/// All results of a step, as bits.
+fn bits(fixture: &Fixture) -> Vec<u32> {
     let blocks = [
-        &bench.observations,
-        &bench.next_observations,
-        &bench.rewards,
-        &bench.terminated,
-        &bench.truncated,
+        &fixture.observations,
+        &fixture.next_observations,
+        &fixture.rewards,
+        &fixture.terminated,
+        &fixture.truncated,
     ];
     blocks
         .iter()
@@ -60,9 +60,9 @@ fn bits(bench: &Bench) -> Vec<u32> {
         .collect()
 }
 
-/// Steps both and compares, to beyond the ends of their episodes.
-fn go_on_alike(one: &mut Bench, other: &mut Bench, rng: &mut Stream) {
-    for step in 0..AFTERWARDS {
+/// Steps both past the ends of their episodes, and compares them.
+fn assert_same_future(one: &mut Fixture, other: &mut Fixture, rng: &mut Stream) {
+    for step in 0..STEPS_AFTER {
         let actions = actions(one, rng);
         one.step(&actions).unwrap();
         other.step(&actions).unwrap();
@@ -75,26 +75,26 @@ proptest! {
     #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
-    fn a_fresh_vector_goes_on_from_a_snapshot_bit_for_bit(
+    fn a_new_vector_continues_from_a_snapshot_bit_for_bit(
         (name, parameters) in prop::sample::select(kinds()),
         count in 0_u32..5,
-        steps in 0..AFTERWARDS,
+        steps in 0..STEPS_AFTER,
         episode in 0_u64..1 << 39,
         seed in any::<u64>(),
     ) {
         let mut rng = stream(seed, Purpose::Exploration, 0, 0);
-        let mut whole = Bench::of(name, parameters, count, NAME);
+        let mut whole = Fixture::of(name, parameters, count, STREAM);
         whole.reset(Start::Episodes(&vec![episode; count as usize]));
         for _ in 0..steps {
             let actions = actions(&whole, &mut rng);
             whole.step(&actions).unwrap();
         }
         let words = snapshot(&whole);
-        let mut fresh = Bench::of(name, parameters, count, NAME);
+        let mut fresh = Fixture::of(name, parameters, count, STREAM);
         let observations = restore(&mut fresh, &words).unwrap();
         prop_assert_eq!(&observations, &whole.observations);
         prop_assert_eq!(snapshot(&fresh), words);
-        go_on_alike(&mut whole, &mut fresh, &mut rng);
+        assert_same_future(&mut whole, &mut fresh, &mut rng);
     }
 
     #[test]
@@ -104,97 +104,97 @@ proptest! {
         seed in any::<u64>(),
     ) {
         let mut rng = stream(seed, Purpose::Exploration, 0, 0);
-        let mut bench = Bench::new(name, parameters, 2);
-        bench.reset(Start::Next);
-        let before = snapshot(&bench);
+        let mut fixture = Fixture::new(name, parameters, 2);
+        fixture.reset(Start::Next);
+        let before = snapshot(&fixture);
         for length in [length, before.len()] {
             let garbage: Vec<u64> = (0..length).map(|_| rng.random()).collect();
-            prop_assert!(restore(&mut bench, &garbage).is_err());
-            prop_assert_eq!(&snapshot(&bench), &before);
+            prop_assert!(restore(&mut fixture, &garbage).is_err());
+            prop_assert_eq!(&snapshot(&fixture), &before);
         }
     }
 
     #[test]
-    fn a_snapshot_with_a_word_of_garbage_is_refused_or_runs(
+    fn a_snapshot_with_one_word_of_garbage_is_refused_or_runs(
         (name, parameters) in prop::sample::select(kinds()),
         place in any::<prop::sample::Index>(),
         garbage in any::<u64>(),
         seed in any::<u64>(),
     ) {
         let mut rng = stream(seed, Purpose::Exploration, 0, 0);
-        let mut bench = Bench::new(name, parameters, 2);
-        bench.reset(Start::Next);
-        let mut words = snapshot(&bench);
+        let mut fixture = Fixture::new(name, parameters, 2);
+        fixture.reset(Start::Next);
+        let mut words = snapshot(&fixture);
         *place.get_mut(&mut words) = garbage;
-        bench.reset(Start::Next);
-        let before = snapshot(&bench);
-        let mut fresh = Bench::new(name, parameters, 2);
-        match (restore(&mut bench, &words), restore(&mut fresh, &words)) {
-            (Ok(_), Ok(_)) => go_on_alike(&mut bench, &mut fresh, &mut rng),
-            (Err(_), Err(_)) => prop_assert_eq!(snapshot(&bench), before),
-            other => panic!("the present state decided: {other:?}"),
+        fixture.reset(Start::Next);
+        let before = snapshot(&fixture);
+        let mut fresh = Fixture::new(name, parameters, 2);
+        match (restore(&mut fixture, &words), restore(&mut fresh, &words)) {
+            (Ok(_), Ok(_)) => assert_same_future(&mut fixture, &mut fresh, &mut rng),
+            (Err(_), Err(_)) => prop_assert_eq!(snapshot(&fixture), before),
+            other => panic!("the result depends on the current state: {other:?}"),
         }
     }
 }
 
 #[test]
 fn whole_turns_and_the_sign_of_zero_are_kept() {
-    let mut whole = Bench::new("pendulum", "", 2);
+    let mut whole = Fixture::new("pendulum", "", 2);
     whole.reset(Start::States(&[-0.0, -0.0, 1e6 * TAU + 0.1, 3.0]));
     let words = snapshot(&whole);
     assert_eq!(words[3..5], [(-0.0_f64).to_bits(); 2]);
-    let mut fresh = Bench::new("pendulum", "", 2);
+    let mut fresh = Fixture::new("pendulum", "", 2);
     restore(&mut fresh, &words).unwrap();
     assert_eq!(snapshot(&fresh), words);
     let mut rng = stream(5, Purpose::Exploration, 0, 0);
-    go_on_alike(&mut whole, &mut fresh, &mut rng);
+    assert_same_future(&mut whole, &mut fresh, &mut rng);
 }
 
 #[test]
-fn what_no_episode_can_come_to_is_refused_by_name() {
-    let mut bench = Bench::new("cart-pole", "time_limit = 9", 2);
-    bench.reset(Start::Next);
-    let words = snapshot(&bench);
-    bench.reset(Start::Next);
-    let before = snapshot(&bench);
+fn a_value_that_no_episode_can_have_is_refused_by_name() {
+    let mut fixture = Fixture::new("cart-pole", "time_limit = 9", 2);
+    fixture.reset(Start::Next);
+    let words = snapshot(&fixture);
+    fixture.reset(Start::Next);
+    let before = snapshot(&fixture);
     let mut refusal = |place: usize, word: u64| {
         let mut words = words.clone();
         words[place] = word;
-        restore(&mut bench, &words).unwrap_err().to_string()
+        restore(&mut fixture, &words).unwrap_err().to_string()
     };
     assert_eq!(
         refusal(7, 1 << 40),
-        "no snapshot: environment 1 cannot have this episode"
+        "invalid snapshot: environment 1 cannot have this episode"
     );
     assert_eq!(
         refusal(8, 9),
-        "no snapshot: environment 1 cannot have this number of steps"
+        "invalid snapshot: environment 1 cannot have this number of steps"
     );
     assert!(refusal(10, f64::NAN.to_bits()).contains("cannot be in state [NaN"));
     assert_eq!(
-        restore(&mut bench, &words[1..]).unwrap_err().to_string(),
-        "13 numbers of snapshot for 2 environments: give 7 each"
+        restore(&mut fixture, &words[1..]).unwrap_err().to_string(),
+        "snapshot: 13 numbers for 2 environments; give 7 each"
     );
-    assert_eq!(snapshot(&bench), before, "and nothing has changed");
+    assert_eq!(snapshot(&fixture), before, "nothing has changed");
 }
 
 #[test]
-fn there_are_snapshots_of_training_alone_and_a_restore_goes_back_to_it() {
-    let mut bench = Bench::new("frozen-lake", "", 2);
-    let mut words = vec![0; bench.vector.snapshot_words()];
-    assert_eq!(bench.vector.snapshot(&mut words), Err(RequestError::NoTraining));
-    bench.reset(Start::Next);
-    let training = snapshot(&bench);
-    bench.reset(Start::Evaluation { seed: 1, first: 0 });
-    assert_eq!(bench.vector.snapshot(&mut words), Err(RequestError::NoTraining));
-    restore(&mut bench, &training).unwrap();
-    assert_eq!(snapshot(&bench), training);
+fn only_training_has_snapshots_and_a_restore_returns_to_it() {
+    let mut fixture = Fixture::new("frozen-lake", "", 2);
+    let mut words = vec![0; fixture.vector.snapshot_words()];
+    assert_eq!(fixture.vector.snapshot(&mut words), Err(RequestError::NoTraining));
+    fixture.reset(Start::Next);
+    let training = snapshot(&fixture);
+    fixture.reset(Start::Evaluation { seed: 1, first: 0 });
+    assert_eq!(fixture.vector.snapshot(&mut words), Err(RequestError::NoTraining));
+    restore(&mut fixture, &training).unwrap();
+    assert_eq!(snapshot(&fixture), training);
 }
 
-/// As one of another maker would be: it has a state, and no way to say it.
-struct Foreign(Box<dyn Environment>);
+/// An environment that cannot save its state, as an external one may be.
+struct Unsaved(Box<dyn Environment>);
 
-impl Environment for Foreign {
+impl Environment for Unsaved {
     fn spec(&self) -> EnvironmentSpec {
         EnvironmentSpec {
             state_width: 0,
@@ -220,13 +220,13 @@ impl Environment for Foreign {
 }
 
 #[test]
-fn an_environment_that_cannot_say_its_state_says_that() {
-    let mut bench = Bench::new("pendulum", "", 1);
-    let vector = &mut bench.vector;
-    vector.trial = Box::new(Foreign(make("pendulum", &toml::Table::new()).unwrap()));
-    vector.spec = vector.trial.spec();
-    bench.reset(Start::Next);
-    assert_eq!(bench.vector.snapshot_words(), 0);
-    assert_eq!(bench.vector.snapshot(&mut []), Err(RequestError::Unsayable));
-    assert_eq!(restore(&mut bench, &[]), Err(RequestError::Unsayable));
+fn an_environment_that_cannot_save_its_state_refuses_snapshots() {
+    let mut fixture = Fixture::new("pendulum", "", 1);
+    let vector = &mut fixture.vector;
+    vector.scratch = Box::new(Unsaved(make("pendulum", &toml::Table::new()).unwrap()));
+    vector.spec = vector.scratch.spec();
+    fixture.reset(Start::Next);
+    assert_eq!(fixture.vector.snapshot_words(), 0);
+    assert_eq!(fixture.vector.snapshot(&mut []), Err(RequestError::NoSnapshots));
+    assert_eq!(restore(&mut fixture, &[]), Err(RequestError::NoSnapshots));
 }

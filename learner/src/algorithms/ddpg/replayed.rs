@@ -7,13 +7,13 @@ use shoal_common::space::EnvironmentSpec;
 use shoal_common::transition::RowLayout;
 
 use super::{Ddpg, DdpgState};
-use crate::algorithms::algorithm::{Algorithm, Losses, Method, Room, SavedState, Section, SectionError};
+use crate::algorithms::algorithm::{Algorithm, Losses, Method, RunSizes, SavedState, Section, SectionError};
 use crate::algorithms::minibatch::Minibatch;
 use crate::algorithms::sampling::Sampler;
 use crate::networks::threads::Threads;
 use crate::replay::Replay;
 
-/// DDPG and its way of drawing from the replay.
+/// DDPG with its sampling from the replay.
 #[derive(Debug)]
 pub struct ReplayedDdpg {
     /// The networks.
@@ -47,16 +47,16 @@ impl ReplayedDdpg {
 }
 
 impl Method for &config::DdpgConfig {
-    fn start(&self, spec: &EnvironmentSpec, seed: u64, room: Room) -> Result<Box<dyn Algorithm>, PolicyError> {
-        Ok(Box::new(ReplayedDdpg::new(spec, self, seed, room.capacity)?))
+    fn start(&self, spec: &EnvironmentSpec, seed: u64, sizes: RunSizes) -> Result<Box<dyn Algorithm>, PolicyError> {
+        Ok(Box::new(ReplayedDdpg::new(spec, self, seed, sizes.capacity)?))
     }
 
     fn weights(&self) -> &'static [&'static str] {
         &DdpgState::PARTS[..4]
     }
 
-    fn state_numbers(&self, spec: &EnvironmentSpec, _: Room) -> usize {
-        // Each network, its target and two moments.
+    fn state_numbers(&self, spec: &EnvironmentSpec, _: RunSizes) -> usize {
+        // Each network with its target and two moments.
         4 * self.learned(spec).parameters()
     }
 }

@@ -28,7 +28,7 @@ fn settings() -> config::DdpgConfig {
     }
 }
 
-/// Lists of hidden layers of every kind: the shortest, the thesis's, one between, and the longest.
+/// Lists of hidden layers of every kind: the shortest, two layers as in the thesis, three, and the longest.
 fn lists() -> Vec<Hidden> {
     let lists: [Layers; 4] = [
         [9].into(),
@@ -44,7 +44,7 @@ fn learner(seed: u64) -> Ddpg {
     learner_of(settings().hidden_layers(), seed)
 }
 
-/// Output layers as large as the others, so that every gradient is well above rounding.
+/// A learner whose output layers are as large as the others, so that every gradient is well above rounding errors.
 fn learner_of(hidden: Hidden, seed: u64) -> Ddpg {
     let settings = config::DdpgConfig {
         hidden: hidden.layers,
@@ -52,18 +52,18 @@ fn learner_of(hidden: Hidden, seed: u64) -> Ddpg {
         ..settings()
     };
     let mut ddpg = Ddpg::new(&spec(), &settings, seed).unwrap();
-    // Through many layers numbers get smaller.
-    let most = if hidden.layers.len() > 3 { 1.2 } else { 0.7 };
+    // Numbers shrink through many layers.
+    let bound = if hidden.layers.len() > 3 { 1.2 } else { 0.7 };
     let mut numbers = stream(seed, Purpose::Sampling, 0, 0);
     for network in [&mut ddpg.actor, &mut ddpg.critic] {
         network
             .parameters
             .iter_mut()
-            .for_each(|x| *x = numbers.random_range(-most..most));
+            .for_each(|x| *x = numbers.random_range(-bound..bound));
         network
             .target
             .iter_mut()
-            .for_each(|x| *x = numbers.random_range(-most..most));
+            .for_each(|x| *x = numbers.random_range(-bound..bound));
     }
     ddpg
 }
@@ -93,7 +93,7 @@ fn minibatch(seed: u64) -> Minibatch {
     batch
 }
 
-/// A network's output for one sample by the definition, in `f64`: the parameters, too.
+/// A network's output for one sample by the definition, with parameters in `f64`.
 fn network(layout: &NetworkLayout, parameters: &[f64], x: &[f64], late: &[f64]) -> Vec<f64> {
     let mut x = x.to_vec();
     let Hidden { layers, activation } = layout.hidden();
@@ -149,8 +149,8 @@ fn actor_loss(ddpg: &Ddpg, theta: &[f64], batch: &Minibatch) -> f64 {
     -(0..BATCH).map(value).sum::<f64>() / BATCH as f64
 }
 
-/// Compares with central differences of `loss`. A step so small rarely crosses a ReLU's corner, and `f64` bears it. Returns the
-/// share of the gradient that says something.
+/// Compares `gradient` with central differences of `loss`. They are in `f64`, so that the step can be small enough to
+/// rarely cross a ReLU's corner. Returns the share of the gradient that is not nearly zero.
 fn assert_is_gradient_of(loss: impl Fn(&[f64]) -> f64, gradient: &[f32], parameters: &[f32]) -> f64 {
     const STEP: f64 = 1e-6;
     let mut theta = wide(parameters);
@@ -171,8 +171,9 @@ fn assert_is_gradient_of(loss: impl Fn(&[f64]) -> f64, gradient: &[f32], paramet
     gradient.iter().filter(|g| g.abs() > 1e-3).count() as f64 / gradient.len() as f64
 }
 
-/// Whether enough of the gradients said something. Through many ReLU layers some samples reach no output.
-fn enough(hidden: Hidden, shares: &[f64]) {
+/// Asserts that enough of the gradient was not nearly zero. With many ReLU layers, some samples do not affect the
+/// output.
+fn assert_enough(hidden: Hidden, shares: &[f64]) {
     let mean = shares.iter().sum::<f64>() / shares.len() as f64;
     let least = if hidden.layers.len() > 3 { 0.2 } else { 0.4 };
     assert!(mean > least, "{hidden:?}: {mean} of the gradient");
@@ -190,7 +191,7 @@ fn the_critics_gradient_is_that_of_its_loss() {
             assert!((f64::from(loss) - expected).abs() < 1e-5 * (1.0 + expected));
             assert_is_gradient_of(|theta| critic_loss(&ddpg, theta, &batch), &ddpg.critic.gradient, theta)
         });
-        enough(hidden, &shares.collect::<Vec<_>>());
+        assert_enough(hidden, &shares.collect::<Vec<_>>());
     }
 }
 
@@ -206,12 +207,12 @@ fn the_actors_gradient_is_that_of_its_loss() {
             assert!((f64::from(loss) - expected).abs() < 1e-5 * (1.0 + expected.abs()));
             assert_is_gradient_of(|theta| actor_loss(&ddpg, theta, &batch), &ddpg.actor.gradient, theta)
         });
-        enough(hidden, &shares.collect::<Vec<_>>());
+        assert_enough(hidden, &shares.collect::<Vec<_>>());
     }
 }
 
 #[test]
-fn nothing_is_asked_of_a_terminal_state() {
+fn the_value_of_a_terminal_state_is_not_used() {
     let (mut one, mut other) = (learner(1), learner(1));
     let (batch, mut changed) = (minibatch(1), minibatch(1));
     assert_eq!(batch.discount[2], 0.0);
@@ -241,7 +242,7 @@ fn the_same_seed_gives_the_same_bits() {
     assert_ne!(run(1), run(2));
 }
 
-/// Products are cut where a kernel's blocks are not, at sizes that are no multiples of anything, and not where they are small.
+/// The sizes include odd ones, whose products are split within a kernel's blocks, and small ones, which are not split.
 #[test]
 fn two_threads_compute_the_same_bits_as_one() {
     for (hidden, size) in [
@@ -284,14 +285,14 @@ fn two_threads_compute_the_same_bits_as_one() {
             }
             ddpg.digest()
         };
-        // A thread can have a second one beside it only once.
+        // A thread can start a second one only once.
         let shared = std::thread::scope(|scope| scope.spawn(|| run(Threads::two().unwrap())).join().unwrap());
         assert_eq!(shared, run(Threads::ALONE), "{hidden:?}, batch {size}");
     }
 }
 
 #[test]
-fn targets_start_as_copies_and_follow() {
+fn targets_start_as_copies_and_follow_their_networks() {
     let mut ddpg = Ddpg::new(&spec(), &settings(), 1).unwrap();
     assert_eq!(*ddpg.actor.parameters, *ddpg.actor.target);
     assert_eq!(*ddpg.critic.parameters, *ddpg.critic.target);
@@ -304,7 +305,7 @@ fn targets_start_as_copies_and_follow() {
 }
 
 #[test]
-fn a_restored_learner_goes_on_with_the_same_bits() {
+fn a_restored_learner_continues_with_the_same_bits() {
     let mut ddpg = learner(1);
     for t in 0..3 {
         ddpg.update(&minibatch(t));
@@ -331,7 +332,7 @@ fn a_restored_learner_goes_on_with_the_same_bits() {
 }
 
 #[test]
-fn actors_act_with_the_learners_bits() {
+fn actors_compute_the_same_bits_as_the_learner() {
     for hidden in lists() {
         let mut ddpg = learner_of(hidden, 1);
         let batch = minibatch(1);
@@ -351,7 +352,7 @@ fn actors_act_with_the_learners_bits() {
 }
 
 #[test]
-fn what_cannot_work_is_refused() {
+fn discrete_actions_are_refused() {
     let discrete = EnvironmentSpec {
         action: Space::Discrete { n: 4 },
         ..spec()

@@ -5,7 +5,7 @@ use shoal_common::stream::{Purpose, stream};
 
 use super::*;
 
-const ROOM: Room = Room {
+const SIZES: RunSizes = RunSizes {
     capacity: 100,
     chunk_rows: 12,
     actors: 2,
@@ -30,9 +30,9 @@ fn settings(weight: Weight) -> config::ReinforceConfig {
     }
 }
 
-/// Output layers as large as the others, so that every gradient is well above rounding.
+/// A learner whose output layers are as large as the others, so that every gradient is well above rounding errors.
 fn learner(settings: &config::ReinforceConfig) -> Reinforce {
-    let mut learner = Reinforce::new(settings, &spec(), 1, ROOM).unwrap();
+    let mut learner = Reinforce::new(settings, &spec(), 1, SIZES).unwrap();
     let mut numbers = stream(1, Purpose::Sampling, 0, 0);
     for network in std::iter::once(&mut learner.policy).chain(&mut learner.baseline) {
         network
@@ -43,7 +43,7 @@ fn learner(settings: &config::ReinforceConfig) -> Reinforce {
     learner
 }
 
-/// An episode's steps, each number its own; `terminated` or ended by the time limit.
+/// An episode of distinct numbers, terminated or ended by the time limit.
 struct Episode {
     s: Vec<[f32; 3]>,
     a: Vec<[f32; 1]>,
@@ -77,7 +77,7 @@ impl Episode {
         (0..=end).map(step).collect()
     }
 
-    /// Σ γᵏ r from each step on, each sum by itself.
+    /// Σ γᵏ r from each step on, each sum computed separately.
     fn returns(&self) -> Vec<f64> {
         let tail = |t: usize| {
             (t..self.r.len())
@@ -88,7 +88,7 @@ impl Episode {
     }
 }
 
-/// ln π(a|s), or V(s), computed by the network alone.
+/// The network's output for one sample: logits, or V(s).
 fn output(layout: &NetworkLayout, parameters: &[f32], s: &[f32]) -> Vec<f64> {
     let mut out = vec![0.0; layout.outputs()];
     Network::new(*layout, 1).forward(parameters, s, &mut out);
@@ -100,7 +100,7 @@ fn ln_pi(layout: &NetworkLayout, parameters: &[f32], step: &Transition<'_>) -> f
     logits[step.a[0] as usize] - logits.iter().map(|logit| logit.exp()).sum::<f64>().ln()
 }
 
-/// Mean over the episodes of the mean over the steps of weight · ln π: what a step ascends.
+/// Mean over the episodes of the mean over the steps of weight · ln π, which a gradient step increases.
 fn objective(layout: &NetworkLayout, parameters: &[f32], episodes: &[(&Episode, Vec<f64>)]) -> f64 {
     let of = |(episode, weights): &(&Episode, Vec<f64>)| {
         let steps = episode.steps();
@@ -113,7 +113,7 @@ fn objective(layout: &NetworkLayout, parameters: &[f32], episodes: &[(&Episode, 
     episodes.iter().map(of).sum::<f64>() / episodes.len() as f64
 }
 
-fn agrees_with_finite_differences(
+fn assert_finite_differences(
     layout: &NetworkLayout,
     parameters: &[f32],
     gradient: &[f32],
@@ -129,7 +129,7 @@ fn agrees_with_finite_differences(
         };
         let (minus, here, plus) = (at(-h), at(0.0), at(h));
         let [left, right] = [here - minus, plus - here].map(|rise| rise / f64::from(h));
-        // A ReLU that changes sides within h has two slopes here.
+        // A ReLU whose input changes sign within h has two slopes here.
         if (left - right).abs() > 3e-4 + 1e-2 * left.abs() {
             continue;
         }
@@ -188,14 +188,14 @@ fn the_gradient_is_that_of_the_objective() {
         };
         let episodes = [(&long, weights(&long)), (&short, weights(&short))];
         let descended = learner.policy.gradient.to_vec();
-        agrees_with_finite_differences(&learner.policy.layout, &before, &descended, |layout, parameters| {
+        assert_finite_differences(&learner.policy.layout, &before, &descended, |layout, parameters| {
             -objective(layout, parameters, &episodes)
         });
     }
 }
 
 #[test]
-fn the_baseline_is_taken_off_the_return_and_follows_it() {
+fn the_baseline_is_subtracted_from_the_return_and_learns_it() {
     let episode = Episode::random(3, 12, true);
     let mut learner = learner(&settings(Weight::Baseline));
     let before = learner.policy.parameters.to_vec();
@@ -209,17 +209,17 @@ fn the_baseline_is_taken_off_the_return_and_follows_it() {
     };
     let weights = [(&episode, deltas(&values))];
     let descended = learner.policy.gradient.to_vec();
-    agrees_with_finite_differences(&learner.policy.layout, &before, &descended, |layout, parameters| {
+    assert_finite_differences(&learner.policy.layout, &before, &descended, |layout, parameters| {
         -objective(layout, parameters, &weights)
     });
     let descended = learner.baseline.as_ref().unwrap().gradient.to_vec();
-    agrees_with_finite_differences(&layout, &values, &descended, |_, values| {
+    assert_finite_differences(&layout, &values, &descended, |_, values| {
         deltas(values).iter().map(|delta| delta * delta / 2.0).sum::<f64>() / 12.0
     });
 }
 
 #[test]
-fn only_whole_episodes_are_learned_from_and_at_the_limit_only_where_that_is_wanted() {
+fn only_complete_episodes_are_learned_from_and_those_at_the_limit_only_if_configured() {
     let (cut, over) = (Episode::random(1, 12, false), Episode::random(2, 5, true));
     let mut skips = learner(&config::ReinforceConfig {
         learn_at_limit: false,
@@ -234,7 +234,7 @@ fn only_whole_episodes_are_learned_from_and_at_the_limit_only_where_that_is_want
     learns.learn(&cut.steps());
     assert_ne!(*learns.policy.parameters, before);
 
-    // Of a round with both, the skipping one learns from the one that is over alone.
+    // From a round with both, `skips` learns only from the episode that terminated.
     let mut alone = skips.clone();
     alone.learn(&over.steps());
     skips.learn(&[cut.steps(), over.steps()].concat());
@@ -253,7 +253,7 @@ fn an_episode_of_equal_returns_changes_nothing_when_normalised() {
 }
 
 #[test]
-fn a_state_reads_back_and_goes_on_with_the_same_bits() {
+fn a_restored_state_continues_with_the_same_bits() {
     let rounds: Vec<Episode> = (0..4).map(|seed| Episode::random(seed, 9, true)).collect();
     let mut straight = learner(&settings(Weight::Baseline));
     for round in &rounds[..2] {
@@ -264,7 +264,7 @@ fn a_state_reads_back_and_goes_on_with_the_same_bits() {
         .into_iter()
         .map(|(name, numbers)| (name.into(), numbers.into()));
     let mut saved = SavedState::from(sections.collect::<Vec<_>>());
-    let mut resumed = Reinforce::new(&settings(Weight::Baseline), &spec(), 2, ROOM).unwrap();
+    let mut resumed = Reinforce::new(&settings(Weight::Baseline), &spec(), 2, SIZES).unwrap();
     resumed.restore(18, &mut saved).unwrap();
     for learner in [&mut straight, &mut resumed] {
         for round in &rounds[2..] {

@@ -2,7 +2,7 @@ use shoal_common::space::Space;
 
 use super::*;
 
-const ROOM: Room = Room {
+const SIZES: RunSizes = RunSizes {
     capacity: 100,
     chunk_rows: 4,
     actors: 2,
@@ -18,12 +18,12 @@ fn lake(states: u32, actions: u32) -> EnvironmentSpec {
     }
 }
 
-fn table(lead: Lead, alpha: f64) -> Tabular {
+fn table(bootstrap: Bootstrap, alpha: f64) -> Tabular {
     let settings = config::TabularConfig {
         alpha,
         ..config::TabularConfig::default()
     };
-    Tabular::new(lead, &settings, &lake(3, 2), ROOM).unwrap()
+    Tabular::new(bootstrap, &settings, &lake(3, 2), SIZES).unwrap()
 }
 
 /// s, a, r, discount, s', last
@@ -42,24 +42,24 @@ fn teach(table: &mut Tabular, slot: usize, (s, a, r, discount, s_next, last): Ro
 }
 
 #[test]
-fn q_learning_takes_the_best_of_the_next_state() {
-    let mut table = table(Lead::Greatest, 0.5);
+fn q_learning_uses_the_best_action_of_the_next_state() {
+    let mut table = table(Bootstrap::Max, 0.5);
     table.q = vec![1.0, 2.0, 10.0, 30.0, 0.0, 0.0];
     teach(&mut table, 0, (0, 1, 4.0, 0.5, 1, false));
     // 2 + ½ (4 + ½ · 30 − 2)
     assert_eq!(table.q, [1.0, 10.5, 10.0, 30.0, 0.0, 0.0]);
     teach(&mut table, 0, (1, 0, 1.0, 0.0, 0, true));
-    assert_eq!(table.q[2], 5.5, "nothing comes after a terminal state");
+    assert_eq!(table.q[2], 5.5, "a terminal state has no value");
     teach(&mut table, 0, (0, 0, 0.0, 0.5, 1, true));
     assert_eq!(
         table.q[0], 8.0,
-        "but something after one that the time limit cut off: 1 + ½ (½ · 30 − 1)"
+        "a state at the time limit has a value: 1 + ½ (½ · 30 − 1)"
     );
 }
 
 #[test]
-fn sarsa_takes_the_action_that_was_taken_next_in_the_same_environment() {
-    let mut table = table(Lead::Taken, 0.5);
+fn sarsa_uses_the_next_action_of_the_same_environment() {
+    let mut table = table(Bootstrap::NextAction, 0.5);
     table.q = vec![1.0, 2.0, 10.0, 30.0, 0.0, 0.0];
     teach(&mut table, 0, (0, 1, 4.0, 0.5, 1, false));
     // Another environment's step is not its successor.
@@ -70,26 +70,23 @@ fn sarsa_takes_the_action_that_was_taken_next_in_the_same_environment() {
     assert_eq!(table.q, [1.0, 5.5, 9.0, 30.0, 0.0, 0.0]);
     teach(&mut table, 0, (0, 0, 100.0, 0.5, 1, true));
     teach(&mut table, 0, (1, 0, 0.0, 0.5, 1, false));
-    assert_eq!(
-        table.q[0], 1.0,
-        "of a step that the time limit cut off nothing is known to come after"
-    );
-    // The other environment's turn: 0 + ½ (0 + ½ · 30 − 0)
+    assert_eq!(table.q[0], 1.0, "a step at the time limit has no next action");
+    // The other environment's step: 0 + ½ (0 + ½ · 30 − 0)
     teach(&mut table, 1, (1, 1, 0.0, 0.5, 1, false));
     assert_eq!(table.q[4], 7.5);
 }
 
 #[test]
-fn a_row_is_of_the_environment_that_its_place_says() {
+fn the_number_of_a_row_determines_its_environment() {
     // Two actors with two environments each, two steps a chunk.
-    let table = table(Lead::Taken, 0.5);
+    let table = table(Bootstrap::NextAction, 0.5);
     let slots: Vec<usize> = (0..12).map(|row| table.slot(row)).collect();
     assert_eq!(slots, [0, 1, 0, 1, 2, 3, 2, 3, 0, 1, 0, 1]);
 }
 
 #[test]
-fn a_state_reads_back_and_anothers_is_refused() {
-    let mut old = table(Lead::Taken, 0.5);
+fn a_state_reads_back_and_an_incomplete_one_is_refused() {
+    let mut old = table(Bootstrap::NextAction, 0.5);
     teach(&mut old, 3, (0, 1, 4.0, 0.5, 1, false));
     teach(&mut old, 1, (1, 1, 4.0, 0.0, 1, true));
     let sections = old
@@ -98,19 +95,24 @@ fn a_state_reads_back_and_anothers_is_refused() {
         .map(|(name, numbers)| (name.into(), numbers.into()));
     let sections: Vec<_> = sections.collect();
     let saved = |sections: &[_]| SavedState::from(sections.to_vec());
-    let mut new = table(Lead::Taken, 0.5);
+    let mut new = table(Bootstrap::NextAction, 0.5);
     new.restore(7, &mut saved(&sections)).unwrap();
     assert_eq!((&new.q, &new.pending, new.updates()), (&old.q, &old.pending, 7));
     assert!(new.restore(7, &mut saved(&sections[1..])).is_err());
 }
 
 #[test]
-fn real_numbers_are_no_states() {
+fn continuous_observations_are_refused() {
     let pendulum = EnvironmentSpec {
         observation: Space::boxed(&[(-1.0, 1.0)]),
         ..lake(1, 2)
     };
-    let refused = Tabular::new(Lead::Taken, &config::TabularConfig::default(), &pendulum, ROOM);
+    let refused = Tabular::new(
+        Bootstrap::NextAction,
+        &config::TabularConfig::default(),
+        &pendulum,
+        SIZES,
+    );
     assert!(
         refused
             .unwrap_err()

@@ -50,7 +50,7 @@ fn an_empty_directory_has_no_checkpoint() {
 }
 
 #[test]
-fn what_was_saved_is_loaded_to_the_bit() {
+fn a_saved_checkpoint_is_loaded_bit_for_bit() {
     let (directory, latest, previous) = two();
     let Loaded { checkpoint, warnings } = load(&directory).unwrap().unwrap();
     assert!(warnings.is_empty());
@@ -84,7 +84,7 @@ impl MapBits for Vec<f32> {
 }
 
 #[test]
-fn a_newest_one_cut_short_anywhere_gives_way_to_the_previous_one() {
+fn a_newest_checkpoint_cut_short_anywhere_falls_back_to_the_previous_one() {
     let (directory, latest, _) = two();
     let whole = fs::read(&latest).unwrap();
     for length in 0..whole.len() {
@@ -101,7 +101,7 @@ fn a_newest_one_cut_short_anywhere_gives_way_to_the_previous_one() {
 }
 
 #[test]
-fn a_newest_one_changed_anywhere_gives_way_to_the_previous_one() {
+fn a_newest_checkpoint_changed_anywhere_falls_back_to_the_previous_one() {
     let (directory, latest, _) = two();
     let whole = fs::read(&latest).unwrap();
     for at in 0..whole.len() {
@@ -113,7 +113,7 @@ fn a_newest_one_changed_anywhere_gives_way_to_the_previous_one() {
 }
 
 #[test]
-fn where_all_are_damaged_nothing_is_loaded_and_nothing_touched() {
+fn if_all_are_damaged_nothing_is_loaded_and_nothing_changes() {
     let (directory, latest, previous) = two();
     fs::write(&latest, "short").unwrap();
     fs::write(&previous, [0; 4096]).unwrap();
@@ -125,14 +125,14 @@ fn where_all_are_damaged_nothing_is_loaded_and_nothing_touched() {
         "{line}"
     );
     assert_eq!(fs::read(&latest).unwrap(), b"short");
-    // A run begun anew all the same puts them aside.
+    // If a run begins again here, it puts them aside.
     save(&mut Checkpoints::new(directory.path(), 7), 9);
     assert_eq!(fs::read(directory.path().join("damaged-0.ckpt")).unwrap(), b"short");
     assert_eq!(updates(&directory), 9);
 }
 
 #[test]
-fn a_damaged_newest_one_never_replaces_the_previous_one() {
+fn a_damaged_newest_checkpoint_never_replaces_the_previous_one() {
     for look_first in [true, false] {
         let (directory, latest, previous) = two();
         let kept = fs::read(&previous).unwrap();
@@ -151,7 +151,7 @@ fn a_damaged_newest_one_never_replaces_the_previous_one() {
 }
 
 #[test]
-fn killed_while_writing_the_last_ones_stand() {
+fn a_kill_while_writing_leaves_the_last_checkpoints() {
     let (directory, latest, _) = two();
     fs::write(latest.with_extension("ckpt.new"), "half").unwrap();
     assert_eq!(updates(&directory), 2);
@@ -160,7 +160,7 @@ fn killed_while_writing_the_last_ones_stand() {
 }
 
 #[test]
-fn one_of_another_configuration_is_refused_and_not_replaced() {
+fn a_checkpoint_of_another_configuration_is_refused_and_not_replaced() {
     let (directory, latest, _) = two();
     let before = fs::read(&latest).unwrap();
     let mut other = Checkpoints::new(directory.path(), 8);
@@ -179,7 +179,7 @@ fn one_of_another_configuration_is_refused_and_not_replaced() {
 }
 
 #[test]
-fn one_of_another_version_is_refused() {
+fn a_checkpoint_of_another_version_is_refused() {
     let (directory, latest, _) = two();
     durable::write_atomically(&latest, |file| {
         durable::seal(Kind { version: 1, ..KIND }, file, |_| Ok(()))
@@ -193,7 +193,7 @@ fn one_of_another_version_is_refused() {
 }
 
 #[test]
-fn a_directory_that_is_not_there_is_named() {
+fn a_missing_directory_is_named() {
     let directory = TempDir::new().unwrap().path().join("gone");
     let error = Checkpoints::new(&directory, 7).save(&counters(1), &[]).unwrap_err();
     assert!(matches!(error, CheckpointError::Write { .. }));
@@ -202,12 +202,12 @@ fn a_directory_that_is_not_there_is_named() {
 
 proptest! {
     #[test]
-    fn whatever_a_body_holds_it_is_read_or_refused(body in prop::collection::vec(any::<u8>(), 0..300)) {
+    fn any_body_is_read_or_refused(body in prop::collection::vec(any::<u8>(), 0..300)) {
         let _ = parse(&body);
     }
 
     #[test]
-    fn a_body_whose_header_lies_is_refused(length in any::<u64>(), numbers in 0_usize..20) {
+    fn a_header_with_a_wrong_length_is_refused(length in any::<u64>(), numbers in 0_usize..20) {
         let header = Header { fingerprint: 0, counters: Counters::default(), sections: vec![("a".into(), length)] };
         let mut body = bincode::serde::encode_to_vec(&header, encoding()).unwrap();
         body.resize(body.len() + 4 * numbers, 0);

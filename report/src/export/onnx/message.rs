@@ -1,4 +1,4 @@
-//! The part of ONNX's `onnx.proto` that a policy needs.
+//! The messages of ONNX's `onnx.proto` that a policy needs, each with its name there.
 
 use prost::Message;
 
@@ -26,7 +26,7 @@ pub(super) struct Model {
     pub(super) metadata_props: Vec<Metadata>,
 }
 
-/// `OperatorSetIdProto`, of ONNX's own operators.
+/// `OperatorSetIdProto`, for ONNX's own operators.
 #[derive(Clone, PartialEq, Message)]
 pub(super) struct Operators {
     #[prost(int64, tag = "2")]
@@ -72,12 +72,12 @@ pub(super) struct Node {
     pub(super) attribute: Vec<Attribute>,
 }
 
-/// `AttributeProto`, of an integer.
+/// `AttributeProto`, for an integer.
 #[derive(Clone, PartialEq, Message)]
 pub(super) struct Attribute {
     #[prost(string, tag = "1")]
     pub(super) name: String,
-    /// Optional, so that a zero is written too.
+    /// Optional, so that zero is written as well.
     #[prost(int64, optional, tag = "3")]
     pub(super) i: Option<i64>,
     #[prost(int32, tag = "20")]
@@ -87,14 +87,14 @@ pub(super) struct Attribute {
 /// `TensorProto`.
 #[derive(Clone, PartialEq, Message)]
 pub(super) struct Tensor {
-    /// One by one, as the second form of the language has it: not every reader takes them packed.
+    /// Not packed, as in proto2: some readers do not accept packed values.
     #[prost(int64, repeated, packed = "false", tag = "1")]
     pub(super) dims: Vec<i64>,
     #[prost(int32, tag = "2")]
     pub(super) data_type: i32,
     #[prost(string, tag = "8")]
     pub(super) name: String,
-    /// Little-endian, row after row.
+    /// Little-endian, in row-major order.
     #[prost(bytes = "vec", tag = "9")]
     pub(super) raw_data: Vec<u8>,
 }
@@ -108,7 +108,7 @@ pub(super) struct ValueInfo {
     pub(super) r#type: Option<Type>,
 }
 
-/// `TypeProto`, of a tensor.
+/// `TypeProto`, for a tensor.
 #[derive(Clone, PartialEq, Message)]
 pub(super) struct Type {
     #[prost(message, optional, tag = "1")]

@@ -6,14 +6,14 @@ use shoal_common::policy_file::PolicyFile;
 use super::super::tests_support::{policies, some_observations};
 use super::*;
 
-/// What a runtime that is not ours makes of so many observations.
+/// The output that an independent ONNX runtime computes from the observations.
 fn computed(model: &Model, config: &Config, observations: &[f32], output: &str) -> Value {
-    let counted = model.find_node("state").is_some();
-    let input = model.node_id(if counted { "state" } else { "observation" }).unwrap();
+    let is_table = model.find_node("state").is_some();
+    let input = model.node_id(if is_table { "state" } else { "observation" }).unwrap();
     let width = config.spec.observation.width();
     let batch = observations.len() / width;
-    let value = if counted {
-        // This runtime takes indices of 64 bits as 32.
+    let value = if is_table {
+        // This runtime represents 64-bit indices with 32 bits.
         let states = observations.iter().map(|state| *state as i32).collect();
         Value::from_shape(&[batch], states).unwrap()
     } else {
@@ -24,11 +24,11 @@ fn computed(model: &Model, config: &Config, observations: &[f32], output: &str) 
     outputs.remove(0)
 }
 
-fn real(model: &Model, config: &Config, observations: &[f32], output: &str) -> ([usize; 2], Vec<f32>) {
+fn computed_floats(model: &Model, config: &Config, observations: &[f32], output: &str) -> ([usize; 2], Vec<f32>) {
     computed(model, config, observations, output).into_shape_vec().unwrap()
 }
 
-fn close(found: &[f32], expected: &[f32]) {
+fn assert_close(found: &[f32], expected: &[f32]) {
     assert_eq!(found.len(), expected.len());
     for (found, expected) in found.iter().zip(expected) {
         assert!((found - expected).abs() < 1e-5, "{found} for {expected}");
@@ -46,7 +46,7 @@ fn scores(config: &Config, policy: &PolicyFile, observations: &[f32], batch: usi
 }
 
 #[test]
-fn another_runtime_computes_what_we_do_whatever_the_batch() {
+fn another_runtime_computes_the_same_outputs_for_any_batch_size() {
     for (config, policy) in policies() {
         let bytes = Portable::new(&config, &policy, "best").unwrap().to_onnx();
         let model = Model::load(bytes).unwrap();
@@ -57,9 +57,9 @@ fn another_runtime_computes_what_we_do_whatever_the_batch() {
             let mut ours = config.algorithm.policy(&config.spec, batch).unwrap();
             ours.act(&policy.parameters, &observations, &mut actions);
             if let PolicyLayout::Deterministic(_) = layout {
-                let (shape, found) = real(&model, &config, &observations, "action");
+                let (shape, found) = computed_floats(&model, &config, &observations, "action");
                 assert_eq!(shape, [batch, config.spec.action.width()]);
-                close(&found, &actions);
+                assert_close(&found, &actions);
                 continue;
             }
             let chosen = computed(&model, &config, &observations, "action");
@@ -68,23 +68,30 @@ fn another_runtime_computes_what_we_do_whatever_the_batch() {
             assert_eq!(chosen, actions.iter().map(|a| *a as i32).collect::<Vec<_>>());
             let scores = scores(&config, &policy, &observations, batch);
             let PolicyLayout::Softmax(network) = layout else {
-                close(&real(&model, &config, &observations, "action_values").1, &scores);
+                assert_close(
+                    &computed_floats(&model, &config, &observations, "action_values").1,
+                    &scores,
+                );
                 continue;
             };
-            close(&real(&model, &config, &observations, "logits").1, &scores);
+            assert_close(&computed_floats(&model, &config, &observations, "logits").1, &scores);
             let probabilities = scores.chunks_exact(network.outputs()).flat_map(|scores| {
                 let sum: f32 = scores.iter().map(|score| score.exp()).sum();
                 scores.iter().map(move |score| score.exp() / sum)
             });
             let expected: Vec<f32> = probabilities.collect();
-            close(&real(&model, &config, &observations, "probabilities").1, &expected);
+            assert_close(
+                &computed_floats(&model, &config, &observations, "probabilities").1,
+                &expected,
+            );
         }
     }
 }
 
-/// Asked for in the model, not computed: the runtime of these tests takes the last of equals, whatever the model says.
+/// This checks the model's attribute, not the result: the runtime of these tests ignores it and returns the last of
+/// equals.
 #[test]
-fn of_equal_scores_the_first_is_asked_for() {
+fn the_model_requests_the_first_of_equal_scores() {
     let (config, policy) = policies().pop().unwrap();
     let bytes = Portable::new(&config, &policy, "last").unwrap().to_onnx();
     let graph = super::message::Model::decode(bytes.as_slice()).unwrap().graph.unwrap();
@@ -92,27 +99,27 @@ fn of_equal_scores_the_first_is_asked_for() {
     let last = chosen
         .attribute
         .iter()
-        .find(|said| said.name == "select_last_index")
+        .find(|attribute| attribute.name == "select_last_index")
         .unwrap();
     assert_eq!(last.i, Some(0));
 }
 
 #[test]
-fn the_model_says_where_it_comes_from() {
+fn the_model_contains_its_origin() {
     let (config, policy) = policies().remove(0);
     let bytes = Portable::new(&config, &policy, "best").unwrap().to_onnx();
     let model = super::message::Model::decode(bytes.as_slice()).unwrap();
-    let said = |key: &str| {
+    let value = |key: &str| {
         model
             .metadata_props
             .iter()
-            .find(|said| said.key == key)
+            .find(|entry| entry.key == key)
             .unwrap()
             .value
             .clone()
     };
-    assert_eq!(said("environment"), "pendulum");
-    assert_eq!(said("action_low"), "[-2.0]");
-    assert_eq!(said("evaluation_return"), "-150.5");
-    assert_eq!(said("policy_version"), "7");
+    assert_eq!(value("environment"), "pendulum");
+    assert_eq!(value("action_low"), "[-2.0]");
+    assert_eq!(value("evaluation_return"), "-150.5");
+    assert_eq!(value("policy_version"), "7");
 }

@@ -1,5 +1,5 @@
-//! The program as one user has it, and a directory in which one run is made. Every process of the run is found by a mark
-//! in its environment, and nothing of it outlives the directory.
+//! The program of one user, and a temporary directory for one run. An environment variable marks every process of the
+//! run, and none of them outlives the directory.
 
 use std::fs::{self, File};
 use std::os::unix::fs::{PermissionsExt, chown};
@@ -11,25 +11,25 @@ use std::time::{Duration, Instant};
 use rustix::process::{Pid, Signal, kill_process};
 use tempfile::TempDir;
 
-/// The mark: its value is the run's place.
+/// The environment variable that marks processes. Its value is the run's directory.
 const MARK: &str = "SHOAL_CRASH_POINTS_PLACE";
 
-/// The ordinary user that root can be.
+/// The ordinary user as which root runs the program.
 const NOBODY: u32 = 65534;
 
-/// Whoever is killed is gone after so long.
-const DEATH: Duration = Duration::from_secs(10);
+/// Longest wait for the end of killed processes.
+const KILL_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// Who runs the program.
+/// The user who runs the program.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum User {
-    /// Whoever runs the tests.
+    /// The user who runs the tests.
     Own,
-    /// An ordinary user, where root runs the tests.
+    /// An ordinary user, while root runs the tests.
     Nobody,
 }
 
-/// The program where its user can start it.
+/// The program, in a place where its user can start it.
 pub(crate) struct Program {
     path: PathBuf,
     pub(crate) user: User,
@@ -46,7 +46,7 @@ impl Program {
                 _copy: None,
             };
         }
-        // The program's own directory may be closed to others.
+        // Other users may not have access to the build directory.
         let copy = tempfile::tempdir().unwrap();
         fs::set_permissions(copy.path(), fs::Permissions::from_mode(0o755)).unwrap();
         let path = copy.path().join("shoal");
@@ -59,13 +59,13 @@ impl Program {
     }
 }
 
-/// A directory in which a run is made, by one user.
-pub(crate) struct Place<'a> {
+/// A directory for a run of one user.
+pub(crate) struct Workplace<'a> {
     directory: TempDir,
     program: &'a Program,
 }
 
-impl<'a> Place<'a> {
+impl<'a> Workplace<'a> {
     pub(crate) fn new(program: &'a Program) -> Self {
         let directory = tempfile::tempdir().unwrap();
         if program.user == User::Nobody {
@@ -83,16 +83,16 @@ impl<'a> Place<'a> {
         String::from_utf8_lossy(&bytes).into_owned()
     }
 
-    /// The words that start the program with these arguments.
-    pub(crate) fn words(&self, arguments: &[&str]) -> Vec<String> {
+    /// The command line that starts the program with these arguments.
+    pub(crate) fn command_line(&self, arguments: &[&str]) -> Vec<String> {
         let program = self.program.path.display().to_string();
         std::iter::once(program)
             .chain(arguments.iter().map(|word| (*word).into()))
             .collect()
     }
 
-    /// Has a command work here as the user, and write into `NAME.out` and `NAME.err`.
-    pub(crate) fn settle(&self, command: &mut Command, name: &str) {
+    /// Makes a command run in this directory as the user, with its output in `NAME.out` and `NAME.err`.
+    pub(crate) fn prepare(&self, command: &mut Command, name: &str) {
         let file = |end: &str| File::create(self.path(&format!("{name}.{end}"))).unwrap();
         command
             .current_dir(self.directory.path())
@@ -101,7 +101,7 @@ impl<'a> Place<'a> {
             .stdin(Stdio::null())
             .stdout(file("out"))
             .stderr(file("err"))
-            // A signal to the group of the tests is not for the run.
+            // So that signals to the process group of the tests do not reach the run.
             .process_group(0);
         if self.program.user == User::Nobody {
             command.uid(NOBODY).gid(NOBODY);
@@ -110,19 +110,20 @@ impl<'a> Place<'a> {
 
     /// Starts the program.
     pub(crate) fn start(&self, name: &str, arguments: &[&str]) -> Child {
-        let words = self.words(arguments);
+        let words = self.command_line(arguments);
         let mut command = Command::new(&words[0]);
         command.args(&words[1..]);
-        self.settle(&mut command, name);
+        self.prepare(&mut command, name);
         command.spawn().unwrap()
     }
 
-    /// Runs the program to its end; its exit code, and the signal that ended it negative.
+    /// Runs the program to its end. Returns its exit code, or the negated signal that ended it.
     pub(crate) fn run(&self, name: &str, arguments: &[&str], limit: Duration) -> Result<i32, String> {
         let child = self.start(name, arguments);
         self.wait(child, name, limit)
     }
 
+    /// Waits for the end of a child, with the result of [`Workplace::run`]. After `limit` it kills all processes.
     pub(crate) fn wait(&self, mut child: Child, what: &str, limit: Duration) -> Result<i32, String> {
         use std::os::unix::process::ExitStatusExt;
         let deadline = Instant::now() + limit;
@@ -131,16 +132,16 @@ impl<'a> Place<'a> {
                 return Ok(status.code().unwrap_or_else(|| -status.signal().unwrap_or(0)));
             }
             if Instant::now() >= deadline {
-                let there = self.census();
+                let running = self.process_list();
                 self.kill_all();
                 let _ = child.wait();
-                return Err(format!("{what} did not end within {limit:?}; there were {there}"));
+                return Err(format!("{what} did not end within {limit:?}; still running: {running}"));
             }
             std::thread::sleep(Duration::from_millis(10));
         }
     }
 
-    /// Every process of this place that lives: its number and its words.
+    /// Id and command line of every process of this directory.
     pub(crate) fn processes(&self) -> Vec<(i32, String)> {
         let mark = format!("{MARK}={}\0", self.directory.path().display()).into_bytes();
         let is_marked = |pid: &i32| {
@@ -159,8 +160,8 @@ impl<'a> Place<'a> {
         pids.filter(is_marked).map(words).collect()
     }
 
-    /// Who lives, for a person: number, beginning of the words, and what each waits for.
-    fn census(&self) -> String {
+    /// Text for the user: id and beginning of the command line of each process, and what it waits for.
+    fn process_list(&self) -> String {
         let mut lines = Vec::new();
         for (pid, words) in self.processes() {
             let words: Vec<&str> = words.split(' ').skip(1).take(3).collect();
@@ -170,9 +171,9 @@ impl<'a> Place<'a> {
         lines.join(", ")
     }
 
-    /// Kills every process of this place, and waits until all are gone.
+    /// Kills every process of this directory and waits until all are gone.
     pub(crate) fn kill_all(&self) {
-        let deadline = Instant::now() + DEATH;
+        let deadline = Instant::now() + KILL_TIMEOUT;
         loop {
             let left = self.processes();
             if left.is_empty() || Instant::now() >= deadline {
@@ -185,31 +186,31 @@ impl<'a> Place<'a> {
         }
     }
 
-    /// Waits until no process of this place is left.
-    pub(crate) fn is_left_within(&self, limit: Duration) -> Result<(), String> {
+    /// Waits until no process of this directory is left.
+    pub(crate) fn wait_until_empty(&self, limit: Duration) -> Result<(), String> {
         let deadline = Instant::now() + limit;
         while !self.processes().is_empty() {
             if Instant::now() >= deadline {
-                return Err(format!("left after {limit:?}: {}", self.census()));
+                return Err(format!("still running after {limit:?}: {}", self.process_list()));
             }
             std::thread::sleep(Duration::from_millis(10));
         }
         Ok(())
     }
 
-    /// What is left of a run of this place outside its directory.
-    pub(crate) fn traces(&self, run: &str) -> Vec<PathBuf> {
+    /// Files of a run outside this directory.
+    pub(crate) fn leftovers(&self, run: &str) -> Vec<PathBuf> {
         let Some(id) = self.run_id(run) else { return Vec::new() };
         let prefix = format!("shoal_{id}_");
         let listing = fs::read_dir("/dev/shm").unwrap().flatten();
         let ours = listing.filter(|entry| entry.file_name().to_string_lossy().starts_with(&prefix));
-        let mut traces: Vec<_> = ours.map(|entry| entry.path()).collect();
+        let mut leftovers: Vec<_> = ours.map(|entry| entry.path()).collect();
         let user = match self.program.user {
             User::Own => rustix::process::getuid().as_raw(),
             User::Nobody => NOBODY,
         };
-        traces.extend(Some(PathBuf::from(format!("/tmp/shoal-{user}/{id}"))).filter(|root| root.exists()));
-        traces
+        leftovers.extend(Some(PathBuf::from(format!("/tmp/shoal-{user}/{id}"))).filter(|root| root.exists()));
+        leftovers
     }
 
     fn run_id(&self, run: &str) -> Option<String> {
@@ -218,25 +219,26 @@ impl<'a> Place<'a> {
     }
 }
 
-impl Drop for Place<'_> {
+impl Drop for Workplace<'_> {
     fn drop(&mut self) {
         self.kill_all();
-        // A run that failed may leave what its own program would remove at the next start.
+        // A failed run may leave files that the program would remove at its next start.
         let runs = fs::read_dir(self.directory.path()).into_iter().flatten().flatten();
         for run in runs.filter_map(|entry| entry.file_name().into_string().ok()) {
-            for trace in self.traces(&run) {
-                let _ = fs::remove_file(&trace).or_else(|_| fs::remove_dir_all(&trace));
+            for leftover in self.leftovers(&run) {
+                let _ = fs::remove_file(&leftover).or_else(|_| fs::remove_dir_all(&leftover));
             }
         }
     }
 }
 
-/// Kills a process; whether it was there.
+/// Kills a process. Returns whether it existed.
 pub(crate) fn kill(pid: i32) -> bool {
     Pid::from_raw(pid).is_some_and(|pid| kill_process(pid, Signal::KILL).is_ok())
 }
 
-/// Kills every process of a place once so long has passed, unless it is dropped before: whoever waits for them goes on.
+/// Kills every process of a directory after a time limit, so that a thread that waits for them can continue. Dropping
+/// it cancels this.
 pub(crate) struct Watchdog<'scope> {
     waker: Option<std::sync::mpsc::Sender<()>>,
     watching: Option<std::thread::ScopedJoinHandle<'scope, Option<String>>>,
@@ -245,19 +247,19 @@ pub(crate) struct Watchdog<'scope> {
 impl<'scope> Watchdog<'scope> {
     pub(crate) fn new<'env>(
         scope: &'scope std::thread::Scope<'scope, 'env>,
-        place: &'env Place<'env>,
+        place: &'env Workplace<'env>,
         limit: Duration,
     ) -> Self {
         use std::sync::mpsc::{RecvTimeoutError, channel};
         let (waker, over) = channel();
         let watching = scope.spawn(move || {
             let mut found = None;
-            let mut patience = limit;
-            while over.recv_timeout(patience) == Err(RecvTimeoutError::Timeout) {
-                let there = format!("did not end within {limit:?}; there were {}", place.census());
-                found.get_or_insert(there);
+            let mut wait = limit;
+            while over.recv_timeout(wait) == Err(RecvTimeoutError::Timeout) {
+                let running = format!("did not end within {limit:?}; still running: {}", place.process_list());
+                found.get_or_insert(running);
                 place.kill_all();
-                patience = Duration::from_millis(100);
+                wait = Duration::from_millis(100);
             }
             found
         });
@@ -267,7 +269,7 @@ impl<'scope> Watchdog<'scope> {
         }
     }
 
-    /// What it had to kill.
+    /// Ends the watchdog. Returns the processes that it had to kill, as text.
     pub(crate) fn found(mut self) -> Option<String> {
         drop(self.waker.take());
         self.watching.take().and_then(|watching| watching.join().unwrap())

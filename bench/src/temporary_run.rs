@@ -1,4 +1,4 @@
-//! The run that a measurement is about: the preset `pendulum` in a temporary directory that goes with it.
+//! The run that is measured: the preset `pendulum` in a temporary directory.
 
 use anyhow::Context;
 use rustix::thread::CpuSet;
@@ -15,26 +15,27 @@ use tempfile::TempDir;
 
 use super::processes::Processes;
 
-/// A run that exists until this is dropped.
+/// A run whose directory is removed when this is dropped.
 #[derive(Debug)]
-pub(super) struct Scene {
+pub(super) struct TemporaryRun {
     pub(super) config: Config,
     pub(super) run: RunDir,
     directory: TempDir,
 }
 
-/// DDPG's numbers: the only learner that is measured.
+/// The settings of DDPG, the only algorithm that is measured.
 pub(super) fn ddpg(config: &Config) -> anyhow::Result<&DdpgConfig> {
     config.algorithm.ddpg().context("only DDPG is measured")
 }
 
-impl Scene {
-    /// The preset with one actor of one environment and these settings, as `--set` takes them.
+impl TemporaryRun {
+    /// The preset with one actor, one environment, and the assignments `set` in the form of `--set`.
     pub(super) fn new(set: &[&str]) -> anyhow::Result<Self> {
         Self::of(1, 1, set)
     }
 
-    /// The preset with so many actors, so many environments of each, and these settings.
+    /// The preset with `actors` actors, `envs` environments per actor, and the assignments `set` in the form of
+    /// `--set`.
     pub(super) fn of(actors: u32, envs: u32, set: &[&str]) -> anyhow::Result<Self> {
         let directory = tempfile::Builder::new()
             .prefix("shoal-bench-")
@@ -53,7 +54,7 @@ impl Scene {
         Ok(Self { config, run, directory })
     }
 
-    /// The replay that a learner of this run has when it is not in lockstep.
+    /// The replay layout of a learner that is not in lockstep.
     pub(super) fn replay_layout(&self) -> ReplayLayout {
         ReplayLayout {
             row: self.config.row_layout(),
@@ -64,13 +65,13 @@ impl Scene {
         }
     }
 
-    /// Removes the directory now; what is mapped of it stays mapped.
+    /// Removes the directory now. Files that are mapped stay mapped.
     pub(super) fn remove_directory(self) -> anyhow::Result<Config> {
         self.directory.close().context("cannot remove a temporary directory")?;
         Ok(self.config)
     }
 
-    /// Does `act` while another process plays `role` 0 of the run; nothing of the run is left in shared memory after it.
+    /// Calls `act` while another process runs as `role` 0 of the run. Leaves nothing of the run in shared memory.
     pub(super) fn with_peer<T>(
         &self,
         role: Role,
@@ -86,16 +87,16 @@ impl Scene {
         })
     }
 
-    /// Does `act` while a learner, the run's actors and their environment servers are there; nothing of the run is left in
-    /// shared memory after it. `chosen` says on which cores a role shall run.
-    pub(super) fn with_crew<T>(
+    /// Calls `act` while a learner, the run's actors and their environment servers are running. Leaves nothing of the
+    /// run in shared memory. `cores_for` returns the cores to bind a role to.
+    pub(super) fn with_processes<T>(
         &self,
-        chosen: impl Fn(Role) -> Option<CpuSet>,
+        cores_for: impl Fn(Role) -> Option<CpuSet>,
         act: impl FnOnce(&Domain, &mut Processes) -> anyhow::Result<T>,
     ) -> anyhow::Result<T> {
         self.in_shared_memory(|domain| {
-            preflight::claim(&self.config, &self.run, domain)?;
-            let mut processes = Processes::start(&self.run, self.config.actors.count, chosen)?;
+            preflight::reserve(&self.config, &self.run, domain)?;
+            let mut processes = Processes::start(&self.run, self.config.actors.count, cores_for)?;
             let acted = act(domain, &mut processes);
             let ended = processes.end();
             let acted = acted?;
@@ -104,7 +105,7 @@ impl Scene {
         })
     }
 
-    /// The run's services, for as long as somebody uses them.
+    /// Creates the run's services. They exist while this or a process of the run holds them.
     fn services(&self, domain: &Domain) -> anyhow::Result<Services> {
         let mut services = Services::new(domain)?;
         services.create_common(domain)?;
@@ -113,7 +114,7 @@ impl Scene {
         Ok(services)
     }
 
-    /// Does `act` as a member of the run; nothing of the run is left in shared memory after it.
+    /// Calls `act` as a member of the run. Leaves nothing of the run in shared memory.
     pub(super) fn in_shared_memory<T>(&self, act: impl FnOnce(&Domain) -> anyhow::Result<T>) -> anyhow::Result<T> {
         Domain::remove_abandoned()?;
         let domain = Domain::join(&self.config.run.id, self.config.actors.max)?;
@@ -125,20 +126,20 @@ impl Scene {
     }
 }
 
-/// Settings of a run that is counted.
-pub(super) fn counted_settings(actors: u32, updates: bool) -> Vec<&'static str> {
+/// Assignments for a run whose steps are counted.
+pub(super) fn settings_for_counting(actors: u32, updates: bool) -> Vec<&'static str> {
     let mut settings = vec![
         "run.steps=1_000_000_000_000",
-        // A checkpoint has the disk brought up to date: another stage's work.
+        // Writing a checkpoint to disk would disturb the measurement.
         "checkpoint.every_seconds=86_400",
-        // What the model knows an update of.
+        // The model's cost of a gradient step is that of one thread.
         "learner.threads=1",
     ];
     if actors > 16 {
         settings.push("actors.max=256");
     }
     if updates {
-        // Rows come faster than updates, so that one for each row is more than can be made; and no actor waits for them.
+        // One gradient step per row is more than the learner can make, and with this tolerance no actor waits for it.
         settings.extend(["replay.updates_per_step=1", "replay.tolerance=1_000_000_000"]);
     } else {
         settings.push("replay.updates_per_step=0");

@@ -1,4 +1,4 @@
-//! The parts that the report is put together from, and its figures.
+//! The sections of the report and its figures.
 
 use std::path::{Path, PathBuf};
 
@@ -10,38 +10,39 @@ use super::claim::Claim;
 /// A part of the report.
 pub(super) struct Section {
     pub(super) title: &'static str,
-    /// Whose results it is made from: experiments, and their stages' suffixes.
+    /// The results that it uses: experiments with the suffixes of their stages.
     pub(super) from: Vec<(&'static str, &'static str)>,
-    /// What is to be known beforehand, in whole sentences.
+    /// Markdown before the table of claims; may be empty.
     pub(super) remark: String,
     pub(super) claims: Vec<Claim>,
     pub(super) figures: Vec<Figure>,
 }
 
-/// A figure that is drawn.
+/// A figure that has been drawn.
 #[derive(Clone, Debug)]
 pub(super) struct Figure {
-    /// Without an ending.
+    /// Its file name without extension.
     pub(super) file: String,
     pub(super) caption: String,
-    /// Whether it is there as PNG as well.
+    /// Whether there is a PNG file too.
     pub(super) png: bool,
 }
 
-/// Where figures are drawn.
-pub(super) struct Album {
+/// Draws figures into a directory.
+pub(super) struct FigureWriter {
     directory: PathBuf,
-    /// Whether each is drawn as PNG as well.
+    /// Whether to convert each figure to PNG too.
     png: bool,
 }
 
-impl Album {
+impl FigureWriter {
     pub(super) fn in_directory(directory: PathBuf, png: bool) -> anyhow::Result<Self> {
-        std::fs::create_dir_all(&directory).with_context(|| format!("cannot make {}", directory.display()))?;
+        std::fs::create_dir_all(&directory).with_context(|| format!("cannot create {}", directory.display()))?;
         Ok(Self { directory, png })
     }
 
-    /// Has `draw` draw the figure `name` as SVG. A PNG of what it was before is removed, and made anew if it is wanted.
+    /// Draws the figure `name` as SVG with `draw`. If that changes it, an existing PNG is removed, and made again if
+    /// PNG is on.
     pub(super) fn add(
         &self,
         name: &str,

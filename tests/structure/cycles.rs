@@ -1,32 +1,32 @@
-//! Circles of files that import from each other, and which of them are allowed.
+//! Import cycles between files, and which of them are allowed.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use crate::scan::Imports;
 
-/// A circle of so many files in one folder can still be read as one.
-const FEW: usize = 3;
+/// Most files in an allowed cycle. They can be read as one unit if they are in one folder.
+const MAX_FILES: usize = 3;
 
-/// Files each of which imports, over some others of them, from every other one.
-pub(crate) type Circle = BTreeSet<PathBuf>;
+/// Files each of which imports, directly or indirectly, from all others.
+pub(crate) type Cycle = BTreeSet<PathBuf>;
 
-/// All circles, each as large as it is.
-pub(crate) fn circles(imports: &Imports) -> Vec<Circle> {
+/// All maximal cycles.
+pub(crate) fn cycles(imports: &Imports) -> Vec<Cycle> {
     let reached: BTreeMap<&PathBuf, BTreeSet<&PathBuf>> =
         imports.keys().map(|file| (file, reached_from(imports, file))).collect();
-    let mut circles = BTreeSet::new();
+    let mut cycles = BTreeSet::new();
     for (file, others) in &reached {
-        let circle: Circle = others
+        let cycle: Cycle = others
             .iter()
             .filter(|other| reached.get(*other).is_some_and(|back| back.contains(file)))
             .map(|other| (*other).clone())
             .collect();
-        if !circle.is_empty() {
-            circles.insert(circle);
+        if !cycle.is_empty() {
+            cycles.insert(cycle);
         }
     }
-    circles.into_iter().collect()
+    cycles.into_iter().collect()
 }
 
 fn reached_from<'a>(imports: &'a Imports, file: &PathBuf) -> BTreeSet<&'a PathBuf> {
@@ -40,18 +40,18 @@ fn reached_from<'a>(imports: &'a Imports, file: &PathBuf) -> BTreeSet<&'a PathBu
     reached
 }
 
-/// Why a circle is not allowed; `None` for one of few files in one folder.
-pub(crate) fn fault(circle: &Circle) -> Option<String> {
+/// The reason why a cycle is not allowed; `None` for a small one in one folder.
+pub(crate) fn fault(cycle: &Cycle) -> Option<String> {
     let mut common: Option<BTreeSet<PathBuf>> = None;
-    for file in circle {
+    for file in cycle {
         let folders = folders(file);
         common = Some(match common {
             None => folders,
             Some(common) => &common & &folders,
         });
     }
-    if circle.len() > FEW {
-        Some(format!("{} files, and {FEW} are the most", circle.len()))
+    if cycle.len() > MAX_FILES {
+        Some(format!("{} files, at most {MAX_FILES} are allowed", cycle.len()))
     } else if common.is_none_or(|folders| folders.is_empty()) {
         Some("it is not inside one folder".into())
     } else {
@@ -59,17 +59,17 @@ pub(crate) fn fault(circle: &Circle) -> Option<String> {
     }
 }
 
-/// The folder that a file lies in, and the one that is its own: `a.rs` belongs to `a/` too.
+/// The folder that contains a file, and the folder of its submodules: `a.rs` also belongs to `a/`.
 fn folders(file: &Path) -> BTreeSet<PathBuf> {
     [file.parent().unwrap().to_owned(), file.with_extension("")].into()
 }
 
-/// The circle for a person, with the imports that close it.
-pub(crate) fn text(circle: &Circle, imports: &Imports) -> String {
+/// Text for the user: the cycle's files, and the imports between them.
+pub(crate) fn text(cycle: &Cycle, imports: &Imports) -> String {
     let mut text = String::new();
-    for file in circle {
+    for file in cycle {
         let within: Vec<_> = imports[file]
-            .intersection(circle)
+            .intersection(cycle)
             .map(|it| it.display().to_string())
             .collect();
         text += &format!("    {} imports from {}\n", file.display(), within.join(", "));

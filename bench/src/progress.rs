@@ -1,4 +1,4 @@
-//! What gets through a run that is measured: rows, by its commit record, and updates, by the policies that are published.
+//! The progress of a measured run: rows from its commit record, gradient steps from the published policies.
 
 use std::time::{Duration, Instant};
 
@@ -9,58 +9,58 @@ use shoal_common::commit::{CommitReader, OpenError};
 use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
 
-use super::measurement::Patience;
+use super::measurement::Budget;
 use super::processes::Processes;
-use super::scene::Scene;
+use super::temporary_run::TemporaryRun;
 
-/// How often it is looked whether something has come.
-pub(super) const LOOK: Duration = Duration::from_millis(1);
+/// Time between two polls.
+pub(super) const POLL_INTERVAL: Duration = Duration::from_millis(1);
 
-/// How long a run may take until all its actors have sent rows.
-const BEGINNING: Duration = Duration::from_secs(60);
+/// Longest wait until every actor has sent rows.
+const STARTUP_TIMEOUT: Duration = Duration::from_secs(60);
 
-/// A run whose actors all send rows.
+/// The counters of a run in which every actor sends rows.
 #[derive(Debug)]
-pub(super) struct Flow<'a> {
-    scene: &'a Scene,
+pub(super) struct Progress<'a> {
+    temporary: &'a TemporaryRun,
     commits: CommitReader,
     policies: PolicyReader,
 }
 
-impl<'a> Flow<'a> {
+impl<'a> Progress<'a> {
     /// Waits until rows of every actor are committed.
     pub(super) fn begin(
-        scene: &'a Scene,
+        temporary: &'a TemporaryRun,
         domain: &Domain,
         processes: &mut Processes,
-        patience: &Patience,
+        budget: &Budget,
     ) -> anyhow::Result<Self> {
-        let policies = policy_reader(&scene.config, domain)?;
+        let policies = policy_reader(&temporary.config, domain)?;
         let begun = Instant::now();
         let mut commits = None;
         loop {
             processes.check()?;
-            patience.check()?;
+            budget.check()?;
             if commits.is_none() {
-                commits = commits_of(&scene.run)?;
+                commits = open_commits(&temporary.run)?;
             }
-            // The first chunk is the handshake, and takes no number.
+            // The handshake has sequence number 0.
             let has_sent = |commits: &CommitReader, actor: u32| commits.committed(actor as usize).sequence > 0;
-            let all = 0..scene.config.actors.count;
+            let all = 0..temporary.config.actors.count;
             match commits.take() {
                 Some(commits) if all.clone().all(|actor| has_sent(&commits, actor)) => {
                     return Ok(Self {
-                        scene,
+                        temporary,
                         commits,
                         policies,
                     });
                 }
-                there => commits = there,
+                other => commits = other,
             }
-            if begun.elapsed() >= BEGINNING {
-                bail!("not every actor had sent rows after {} s", BEGINNING.as_secs());
+            if begun.elapsed() >= STARTUP_TIMEOUT {
+                bail!("not every actor had sent rows after {} s", STARTUP_TIMEOUT.as_secs());
             }
-            std::thread::sleep(LOOK);
+            std::thread::sleep(POLL_INTERVAL);
         }
     }
 
@@ -69,16 +69,16 @@ impl<'a> Flow<'a> {
         self.commits.rows()
     }
 
-    /// Updates that the newest policy was made by.
+    /// Gradient steps that led to the newest policy.
     pub(super) fn updates(&mut self) -> anyhow::Result<u64> {
         Ok(newest(&mut self.policies)?.map_or(0, |header| header.updates))
     }
 
-    /// Sleeps, unless somebody asks for the end or a role has ended.
-    pub(super) fn sleep(&self, length: Duration, processes: &mut Processes, patience: &Patience) -> anyhow::Result<()> {
+    /// Sleeps for `length`. Returns an error early if the user interrupts or a role ends.
+    pub(super) fn sleep(&self, length: Duration, processes: &mut Processes, budget: &Budget) -> anyhow::Result<()> {
         let begun = Instant::now();
         loop {
-            patience.check()?;
+            budget.check()?;
             processes.check()?;
             let left = length.saturating_sub(begun.elapsed());
             if left.is_zero() {
@@ -88,14 +88,14 @@ impl<'a> Flow<'a> {
         }
     }
 
-    /// Whether the run's learner is to make updates.
+    /// Whether the run's learner makes gradient steps.
     pub(super) fn expects_updates(&self) -> bool {
-        self.scene.config.replay.updates_per_step > 0.0
+        self.temporary.config.replay.updates_per_step > 0.0
     }
 }
 
-/// The run's commit record; `None` while there is none.
-pub(super) fn commits_of(run: &RunDir) -> anyhow::Result<Option<CommitReader>> {
+/// Opens the run's commit record; `None` while it does not exist.
+pub(super) fn open_commits(run: &RunDir) -> anyhow::Result<Option<CommitReader>> {
     match CommitReader::open(&run.replay_file()) {
         Ok(reader) => Ok(Some(reader)),
         Err(OpenError::NotYet { .. }) => Ok(None),
@@ -103,13 +103,13 @@ pub(super) fn commits_of(run: &RunDir) -> anyhow::Result<Option<CommitReader>> {
     }
 }
 
-/// Reads the run's policies. There is room for one reader besides the roles.
+/// Opens a reader of the run's policies. The service allows one reader besides the roles.
 pub(super) fn policy_reader(config: &Config, domain: &Domain) -> anyhow::Result<PolicyReader> {
     let layout = config.algorithm.policy_layout(&config.spec)?;
     Ok(PolicyReader::open(domain, layout.fingerprint(), layout.parameters())?)
 }
 
-/// What is known of the newest policy. A learner publishes one every few updates (four).
+/// The header of the newest policy, or `None` before the first. The learner publishes one every few gradient steps.
 pub(super) fn newest(policies: &mut PolicyReader) -> anyhow::Result<Option<PolicyHeader>> {
     Ok(policies.latest()?.map(|policy| *policy.header()))
 }
