@@ -176,8 +176,8 @@ impl Child {
         self.has_ended_at(status, Instant::now())
     }
 
-    /// After a process that was able to work, the role is restarted and its failures are forgotten. Being killed while it
-    /// waited, after its first step, or within the usual time of a start is not a failure either. Any other end is.
+    /// After a process that was able to work, the role is restarted and its failures are forgotten. Being killed while
+    /// it waited, after its first step, or within the usual time of a start is not a failure either. Any other end is.
     fn has_ended_at(&mut self, status: ExitStatus, now: Instant) -> Consequence {
         (self.process, self.ended) = (None, None);
         let crash_signals = [SIGABRT, SIGBUS, SIGFPE, SIGILL, SIGSEGV];

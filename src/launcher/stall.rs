@@ -32,8 +32,8 @@ impl Stalls {
         }
     }
 
-    /// The processes to replace, with the reasons. `busy` is the time that the launcher has spent on clean-ups since the
-    /// last call.
+    /// The processes to replace, with the reasons. `busy` is the time that the launcher has spent on clean-ups since
+    /// the last call.
     pub(super) fn find(&mut self, children: &mut [Child], busy: Duration) -> Vec<(usize, &'static str)> {
         let now = Instant::now();
         let since = now - std::mem::replace(&mut self.looked, now);
