@@ -1,4 +1,4 @@
-//! The kinds of policy, as everyone evaluates them who acts: from a flat slice of parameters, in place.
+//! The kinds of policy. Actors and evaluator compute actions from a flat slice of parameters, in place.
 
 pub mod network;
 pub mod policy_file;
@@ -9,18 +9,18 @@ use shoal_base::space::{EnvironmentSpec, Space};
 
 use crate::network::{ActionRange, ActionRangeError, Hidden, NetworkLayout, PolicyNetwork};
 
-/// What a policy's parameters are: what every process of a run must agree on.
+/// The layout of a policy's parameters, which all processes of a run must agree on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PolicyLayout {
     /// A network whose tanh outputs are the action: DDPG's μ.
     Deterministic(NetworkLayout),
     /// A network whose outputs, after softmax, are the actions' probabilities: REINFORCE's π.
     Softmax(NetworkLayout),
-    /// Action-values Q(s, a), state after state.
+    /// A table of action-values Q(s, a), state after state.
     Table {
-        /// How many states there are.
+        /// Number of states.
         states: usize,
-        /// How many actions.
+        /// Number of actions.
         actions: usize,
     },
 }
@@ -31,30 +31,30 @@ pub enum PolicyError {
     /// DDPG needs real-valued actions.
     #[error(transparent)]
     Action(#[from] ActionRangeError),
-    /// A stochastic policy or a table needs actions that can be counted.
-    #[error("{algorithm} needs a discrete action space, and these actions are real-valued (a box)")]
+    /// A softmax policy or a table needs discrete actions.
+    #[error("{algorithm} needs a discrete action space, but these actions are real-valued (a box)")]
     CountedActions {
-        /// Which algorithm.
+        /// The algorithm.
         algorithm: &'static str,
     },
-    /// A table needs states that can be counted.
-    #[error("{algorithm} needs a discrete observation space, and these observations are real-valued (a box)")]
+    /// A table needs discrete observations.
+    #[error("{algorithm} needs a discrete observation space, but these observations are real-valued (a box)")]
     CountedStates {
-        /// Which algorithm.
+        /// The algorithm.
         algorithm: &'static str,
     },
-    /// A network would read an index as a quantity.
-    #[error("{algorithm} needs real-valued observations (a box), and these are indices of {n} states")]
+    /// A network needs real-valued observations: it would use an index as a quantity.
+    #[error("{algorithm} needs real-valued observations (a box), but these are indices of {n} states")]
     RealStates {
-        /// Which algorithm.
+        /// The algorithm.
         algorithm: &'static str,
-        /// How many states there are.
+        /// Number of states.
         n: u32,
     },
 }
 
 impl PolicyLayout {
-    /// How many parameters there are.
+    /// The number of parameters.
     pub fn parameters(&self) -> usize {
         match self {
             Self::Deterministic(network) | Self::Softmax(network) => network.parameters(),
@@ -62,7 +62,7 @@ impl PolicyLayout {
         }
     }
 
-    /// A number that two layouts share only if they read parameters alike.
+    /// The fingerprint: two layouts have the same one only if they read parameters alike.
     pub fn fingerprint(&self) -> u64 {
         match self {
             Self::Deterministic(network) => network.fingerprint(),
@@ -72,18 +72,18 @@ impl PolicyLayout {
     }
 }
 
-/// A policy with room for a batch of observations, without exploration. Its parameters are not its own: each call
-/// borrows them.
+/// A policy without exploration, with buffers for a batch of observations. It does not own its parameters: each call borrows
+/// them.
 #[derive(Clone, Debug)]
 pub enum Policy {
-    /// Says the action.
+    /// A network whose output is the action.
     Deterministic(PolicyNetwork),
-    /// Says a score for every action, and takes the highest: π(a|s) or Q(s, a).
+    /// A score for every action, π(a|s) or Q(s, a). The action with the highest score is taken.
     Scored(Scores),
 }
 
 impl Policy {
-    /// What its parameters are.
+    /// The layout of its parameters.
     pub fn layout(&self) -> PolicyLayout {
         match self {
             Self::Deterministic(network) => PolicyLayout::Deterministic(*network.layout()),
@@ -91,16 +91,17 @@ impl Policy {
         }
     }
 
-    /// Writes the policy's action for every observation, one after the other, into `actions`. Of actions with the same
-    /// score the first is taken.
+    /// Writes the policy's action for every observation, one after the other, into `actions`. If several actions have the
+    /// highest score, the first is taken. Nothing is allocated.
     ///
-    /// Panics when the slices do not fit the layout, or hold more than the batch. Nothing is allocated.
+    /// # Panics
+    /// If the slices do not match the layout, or have more observations than the batch.
     pub fn act(&mut self, parameters: &[f32], observations: &[f32], actions: &mut [f32]) {
         match self {
             Self::Deterministic(network) => network.forward(parameters, observations, actions),
             Self::Scored(scores) => {
-                let of_each = scores.of(parameters, observations);
-                for (action, scores) in actions.iter_mut().zip(of_each) {
+                let all_scores = scores.of(parameters, observations);
+                for (action, scores) in actions.iter_mut().zip(all_scores) {
                     *action = highest(scores) as f32;
                 }
             }
@@ -111,17 +112,17 @@ impl Policy {
 /// A deterministic policy with these hidden layers in an environment like `spec`, for at most `batch` observations a call.
 ///
 /// # Errors
-/// When the actions are no real numbers in finite ranges.
+/// When the actions are not real numbers in finite ranges.
 pub fn deterministic(hidden: Hidden, spec: &EnvironmentSpec, batch: usize) -> Result<PolicyNetwork, PolicyError> {
     let range = ActionRange::new(&spec.action)?;
     Ok(PolicyNetwork::new(spec.observation.width(), hidden, range, batch))
 }
 
-/// A softmax policy with these hidden layers in an environment like `spec`, for at most `batch` observations a call;
-/// `algorithm` is named where it does not fit.
+/// A softmax policy with these hidden layers in an environment like `spec`, for at most `batch` observations a call.
+/// `algorithm` is named in errors.
 ///
 /// # Errors
-/// When the actions cannot be counted, or the observations are no real numbers.
+/// When the actions are not discrete, or the observations are not real numbers.
 pub fn softmax(
     algorithm: &'static str,
     hidden: Hidden,
@@ -138,11 +139,11 @@ pub fn softmax(
     }
 }
 
-/// A table of action-values in an environment like `spec`, for at most `batch` observations a call; `algorithm` is named where
-/// it does not fit.
+/// A table of action-values in an environment like `spec`, for at most `batch` observations a call. `algorithm` is named in
+/// errors.
 ///
 /// # Errors
-/// When states or actions cannot be counted.
+/// When observations or actions are not discrete.
 pub fn table(algorithm: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Scores, PolicyError> {
     let actions = counted_actions(algorithm, spec)?;
     match spec.observation {
@@ -158,7 +159,7 @@ fn counted_actions(algorithm: &'static str, spec: &EnvironmentSpec) -> Result<us
     }
 }
 
-/// The index of the highest score, the first of equals. What is not a number is no score.
+/// The index of the highest score; the first one of equal scores. A NaN is never higher than another score.
 pub fn highest(scores: &[f32]) -> usize {
     let mut best = 0;
     for (index, score) in scores.iter().enumerate() {
@@ -183,7 +184,7 @@ mod tests {
     }
 
     #[test]
-    fn a_table_is_read_state_after_state_and_the_first_of_equals_taken() {
+    fn a_table_is_read_state_after_state_and_the_first_of_equal_actions_is_taken() {
         let lake = spec(Space::Discrete { n: 3 }, Space::Discrete { n: 2 });
         let mut policy = Policy::Scored(table("q-learning", &lake, 4).unwrap());
         assert_eq!(policy.layout().parameters(), 6);
@@ -193,14 +194,14 @@ mod tests {
     }
 
     #[test]
-    fn parameters_of_one_kind_are_not_taken_for_another() {
+    fn different_kinds_of_policies_have_different_fingerprints() {
         let network = NetworkLayout::policy(4, Hidden::relu([10, 2]), 2);
         let (deterministic, softmax) = (PolicyLayout::Deterministic(network), PolicyLayout::Softmax(network));
         assert_ne!(deterministic.fingerprint(), softmax.fingerprint());
         assert_eq!(
             deterministic.fingerprint(),
             network.fingerprint(),
-            "of files that are there"
+            "as in existing files"
         );
         let table = |states, actions| PolicyLayout::Table { states, actions }.fingerprint();
         assert_ne!(table(16, 4), table(4, 16));

@@ -1,4 +1,4 @@
-//! A policy kept on the disk: the best by evaluation. The evaluator writes it, `shoal eval` and `shoal plot` read it.
+//! Policy files, for example the best policy of a run.
 
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
@@ -13,14 +13,14 @@ const KIND: Kind = Kind {
     name: "a policy file",
 };
 
-/// An actor's parameters, what they are for, and how they did.
+/// A policy's parameters, the fingerprint of their layout, and the result of the policy's evaluation.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PolicyFile {
-    /// Identifies the network's layout, as in the `policy` flow.
+    /// Identifies the layout of the parameters, as in the `policy` channel.
     pub fingerprint: u64,
     /// The policy's version.
     pub version: u64,
-    /// Environment steps it was trained on, over all actors.
+    /// Environment steps of all actors that it was learned from.
     pub env_steps: u64,
     /// Mean return of its evaluation.
     pub return_mean: f64,
@@ -28,17 +28,17 @@ pub struct PolicyFile {
     pub return_std: f64,
     /// Episodes of its evaluation.
     pub episodes: u64,
-    /// The network's parameters, flat.
+    /// The parameters, as a flat list.
     pub parameters: Vec<f32>,
 }
 
-/// Why a policy file was not read or written.
+/// Why a policy file cannot be read or written.
 #[derive(Debug, thiserror::Error)]
 pub enum PolicyFileError {
-    /// There is none (yet).
+    /// The file does not exist (yet).
     #[error("{0}: there is no policy here; has the run been evaluated yet?")]
     Missing(PathBuf),
-    /// The file is there and cannot be used.
+    /// The file exists, but cannot be used.
     #[error("{path}: {reason}; the file was left as it is")]
     Refused {
         /// The file.
@@ -46,7 +46,7 @@ pub enum PolicyFileError {
         /// What is wrong with it.
         reason: String,
     },
-    /// It could not be written; what was there before is intact.
+    /// The file cannot be written. An older file is intact.
     #[error("{path}: cannot write the policy: {source}; free some space or check the rights of the directory")]
     Write {
         /// The file.
@@ -57,7 +57,7 @@ pub enum PolicyFileError {
 }
 
 impl PolicyFile {
-    /// Writes the policy to `path`, which holds the old one or the new one at any moment.
+    /// Writes the policy atomically to `path`.
     pub fn write(&self, path: &Path) -> Result<(), PolicyFileError> {
         durable::write_atomically(path, |file| {
             durable::seal(KIND, file, |body| {
@@ -71,7 +71,7 @@ impl PolicyFile {
         })
     }
 
-    /// Reads the policy at `path`, which must be of this layout and have all its parameters.
+    /// Reads the policy at `path`, which must have this layout and the right number of parameters.
     pub fn read(path: &Path, layout: &PolicyLayout) -> Result<Self, PolicyFileError> {
         let refused = |reason| PolicyFileError::Refused {
             path: path.into(),
@@ -93,12 +93,12 @@ impl PolicyFile {
         }
         if policy.parameters.len() != parameters {
             let found = policy.parameters.len();
-            return Err(refused(format!("it has {found} parameters, its network {parameters}")));
+            return Err(refused(format!("it has {found} parameters, but its network has {parameters}")));
         }
         Ok(policy)
     }
 
-    /// The words before the parameters, in the file's order.
+    /// The words before the parameters, in the order of the file.
     fn head(&self) -> [u64; HEAD_WORDS] {
         [
             self.fingerprint,
@@ -157,7 +157,7 @@ mod tests {
     }
 
     #[test]
-    fn a_policy_reads_back_as_written_and_a_better_one_replaces_it() {
+    fn a_policy_is_read_back_as_written_and_replaced_by_a_better_one() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("best.policy");
         assert!(matches!(
@@ -178,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn a_policy_cut_short_changed_or_for_another_network_is_refused() {
+    fn a_truncated_or_changed_policy_or_one_for_another_network_is_refused() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("best.policy");
         policy().write(&path).unwrap();
@@ -216,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn a_write_that_fails_leaves_the_old_policy_and_nothing_else() {
+    fn a_failed_write_leaves_only_the_old_policy() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("best.policy");
         policy().write(&path).unwrap();

@@ -3,7 +3,7 @@
 use super::PolicyLayout;
 use crate::network::{Network, NetworkLayout};
 
-/// Says what every action is worth, for a batch of observations.
+/// Computes a score for every action, for a batch of observations.
 #[derive(Clone, Debug)]
 pub struct Scores {
     source: Source,
@@ -36,7 +36,7 @@ impl Scores {
         }
     }
 
-    /// What the parameters of [`of`](Self::of) are.
+    /// The layout of the parameters of [`of`](Self::of).
     pub fn layout(&self) -> PolicyLayout {
         match &self.source {
             Source::Network(network) => PolicyLayout::Softmax(*network.layout()),
@@ -47,15 +47,16 @@ impl Scores {
         }
     }
 
-    /// How many actions there are.
+    /// The number of actions.
     pub fn actions(&self) -> usize {
         self.actions
     }
 
-    /// The scores of all actions for each of the observations, one observation after the other.
+    /// The scores of all actions for each of the observations, one observation after the other. A state beyond the table's
+    /// last counts as its last. Nothing is allocated.
     ///
-    /// A state beyond the table's last counts as its last. Panics when the slices do not fit the layout, or hold more than
-    /// the batch. Nothing is allocated.
+    /// # Panics
+    /// If the slices do not match the layout, or have more observations than the batch.
     pub fn of(&mut self, parameters: &[f32], observations: &[f32]) -> impl Iterator<Item = &[f32]> {
         let actions = self.actions;
         let batch = match &mut self.source {

@@ -1,9 +1,9 @@
-//! Ways to spoil bytes.
+//! Random damage to bytes.
 
 use proptest::prelude::*;
 use proptest::sample::Index;
 
-/// One thing that happens to a file.
+/// One damage to a file.
 #[derive(Clone, Debug)]
 pub(crate) enum Damage {
     Flip(Index, u8),
@@ -14,7 +14,7 @@ pub(crate) enum Damage {
 
 impl Damage {
     pub(crate) fn apply(self, bytes: &mut Vec<u8>) {
-        // One place more than there are bytes: the end.
+        // One more place than there are bytes: the end of the file.
         let place = |at: Index| at.index(bytes.len() + 1);
         match self {
             Self::Flip(at, bits) => {
@@ -43,7 +43,7 @@ pub(crate) fn damage() -> impl Strategy<Value = Damage> {
     ]
 }
 
-/// Numbers at the edges, and any others.
+/// Extreme numbers, mixed with arbitrary ones.
 pub(crate) fn extreme() -> impl Strategy<Value = u64> {
     prop_oneof![
         0..5_u64,

@@ -1,4 +1,4 @@
-//! The header of the replay, as its readers see it.
+//! Invalid headers of the replay, for its readers.
 
 use std::fs::{self, File};
 use std::os::unix::fs::FileExt;
@@ -32,7 +32,7 @@ fn word(bytes: &mut [u8], at: usize, word: u64) {
     bytes[at..at + 8].copy_from_slice(&word.to_le_bytes());
 }
 
-/// A slot with these words and the seal that fits them.
+/// Writes these words into a slot, with a matching seal.
 fn sealed(bytes: &mut [u8], slot: usize, words: &[u64]) {
     let record: Vec<u8> = words.iter().flat_map(|word| word.to_le_bytes()).collect();
     word(bytes, slot, 1 << 32 | u64::from(crc32fast::hash(&record)));
@@ -59,8 +59,8 @@ fn written(bytes: &[u8]) -> (TempDir, PathBuf) {
     (directory, path)
 }
 
-/// Opens and asks everything.
-fn ask(path: &Path) -> Option<CommitReader> {
+/// Opens the file and reads everything. Returns `None` if it is refused or not ready; the file must not change.
+fn read_all(path: &Path) -> Option<CommitReader> {
     let before = fs::read(path).unwrap();
     let reader = match CommitReader::open(path) {
         Ok(reader) => Some(reader),
@@ -87,7 +87,7 @@ proptest! {
         let mut bytes = file();
         for damage in damage {
             match damage {
-                // Where it hurts.
+                // Only bytes that are used.
                 Damage::Flip(at, bits) if in_use => {
                     let slot = places().slots[0];
                     let used: Vec<usize> = (0..72).chain(4096..4112).chain(slot..slot + 8 * (WORDS + 1)).collect();
@@ -100,37 +100,37 @@ proptest! {
             }
         }
         let (_directory, path) = written(&bytes);
-        if let Some(reader) = ask(&path) {
+        if let Some(reader) = read_all(&path) {
             prop_assert_eq!(reader.layout(), &layout());
             prop_assert_eq!(reader.rows(), 6);
         }
     }
 
-    /// With seals that fit.
+    /// With matching seals.
     #[test]
-    fn records_that_lie_are_read_or_refused(
-        lies in prop::collection::vec((0..4_usize, 0..WORDS, extreme()), 1..12),
-        selector in prop_oneof![Just(2), extreme()],
-        reach in extreme(),
+    fn records_with_false_numbers_are_read_or_refused(
+        changes in prop::collection::vec((0..4_usize, 0..WORDS, extreme()), 1..12),
+        published in prop_oneof![Just(2), extreme()],
+        write_horizon in extreme(),
     ) {
         let mut bytes = file();
         let mut records = [[0; WORDS]; 4];
         records.iter_mut().for_each(|words| words[..6].copy_from_slice(&[2, 6, 0, 1, 3, 6]));
-        for (slot, which, lie) in lies {
-            records[slot][which] = lie;
+        for (slot, which, value) in changes {
+            records[slot][which] = value;
         }
         for (slot, words) in places().slots.into_iter().zip(records) {
             sealed(&mut bytes, slot, &words);
         }
-        word(&mut bytes, places().published, selector);
-        word(&mut bytes, places().write_horizon, reach);
+        word(&mut bytes, places().published, published);
+        word(&mut bytes, places().write_horizon, write_horizon);
         let (_directory, path) = written(&bytes);
-        ask(&path);
+        read_all(&path);
     }
 
-    /// With a checksum that fits, in a file as long as the header says where a file can be.
+    /// With a matching checksum, and with the length that the header requires if a file can have it.
     #[test]
-    fn an_identity_that_lies_is_refused(
+    fn an_identity_with_false_numbers_is_refused(
         words in prop::array::uniform5(extreme()),
         width in any::<bool>(),
         sizes in any::<bool>(),
@@ -153,12 +153,12 @@ proptest! {
             actor_snapshot_words: 0,
             fingerprint: 5,
         };
-        // Nothing is in it: the space is not used.
+        // The file is sparse, so it takes no space.
         let length = claimed.places().map_or(1 << 20, |places| places.end as u64);
         if file.set_len(if sizes { length } else { 1 << 20 }).is_ok() {
             match CommitReader::open(&path) {
                 Err(OpenError::NotYet { .. } | OpenError::Refused { .. }) => {}
-                // A header larger than the memory there is to map it into.
+                // The header is too large to be mapped.
                 Err(OpenError::Io { .. }) => prop_assert!(length > 1 << 40),
                 Ok(reader) => panic!("nothing was committed: {reader:?}"),
             }
@@ -167,9 +167,9 @@ proptest! {
 }
 
 #[test]
-fn a_whole_file_is_read() {
+fn an_undamaged_file_is_read() {
     let (_directory, path) = written(&file());
-    let reader = ask(&path).unwrap();
+    let reader = read_all(&path).unwrap();
     assert_eq!(
         (reader.rows(), reader.actor(0).rows, reader.committed(0).sequence),
         (6, 6, 3)
@@ -177,17 +177,17 @@ fn a_whole_file_is_read() {
 }
 
 #[test]
-fn a_record_with_more_rows_of_an_actor_than_rows_is_damaged() {
+fn a_record_in_which_an_actor_has_more_rows_than_all_is_damaged() {
     let mut bytes = file();
     let mut words = [0; WORDS];
     words[..6].copy_from_slice(&[2, 6, 0, 1, 3, u64::MAX]);
     sealed(&mut bytes, places().slots[0], &words);
     let (_directory, path) = written(&bytes);
-    assert!(ask(&path).is_none());
+    assert!(read_all(&path).is_none());
 }
 
 #[test]
-fn a_file_for_more_actors_than_there_can_be_is_refused_and_not_read() {
+fn a_file_for_too_many_actors_is_refused() {
     let many = ReplayLayout {
         actors: u32::MAX as usize,
         actor_snapshot_words: 0,
@@ -195,7 +195,7 @@ fn a_file_for_more_actors_than_there_can_be_is_refused_and_not_read() {
     };
     let bytes: Vec<u8> = many.identity().iter().flat_map(|word| word.to_le_bytes()).collect();
     let (_directory, path) = written(&bytes);
-    // As long as it would have to be: half a terabyte, none of which is there.
+    // The length that such a layout would need: a sparse file of half a terabyte.
     let slot = (u64::from(u32::MAX) * 3 + 4) * 8;
     let length = 8192 + 4 * slot.next_multiple_of(4096) + 8192;
     File::options()

@@ -1,4 +1,4 @@
-//! Configurations.
+//! Invalid configurations.
 
 use proptest::prelude::*;
 use shoal_common::commit::ReplayLayout;
@@ -26,7 +26,7 @@ fn whole() -> Table {
     read.to_toml().unwrap().parse().unwrap()
 }
 
-/// Every key below `value`.
+/// The paths of all keys below `value`.
 fn keys(value: &Value, path: &[String]) -> Vec<Vec<String>> {
     let children: Vec<(String, &Value)> = match value {
         Value::Table(table) => table.iter().map(|(key, value)| (key.clone(), value)).collect(),
@@ -74,8 +74,8 @@ fn anything() -> impl Strategy<Value = Value> {
     })
 }
 
-/// Everything that is computed from a configuration can be.
-fn usable(config: &Config) {
+/// Asserts that everything computed from an accepted configuration can be computed.
+fn assert_usable(config: &Config) {
     let row = config.row_layout();
     let chunk = config.chunk_rows().checked_mul(row.width()).unwrap();
     assert!(
@@ -84,7 +84,7 @@ fn usable(config: &Config) {
                 .checked_mul(size_of::<f32>() * 4 * config.actors.window as usize)
                 .is_some()
     );
-    // At most the sampling window, all rows of the run, and a few rounds.
+    // An upper bound: the sampling window, all rows of the run, and a few rounds.
     let round = config.chunk_rows() as u64 * u64::from(config.actors.max);
     let ring = config.replay.capacity + config.run.steps + 4 * round;
     let layout = ReplayLayout {
@@ -105,7 +105,7 @@ fn usable(config: &Config) {
     assert_eq!(config.evaluation.period(0), 0);
     assert!(std::time::Duration::try_from_secs_f64(config.checkpoint.every_seconds).is_ok());
     let written = config.to_toml().unwrap().parse().unwrap();
-    let read = Config::from_table(written, "what was written").unwrap();
+    let read = Config::from_table(written, "the written configuration").unwrap();
     assert_eq!(read.fingerprint(), config.fingerprint());
 }
 
@@ -113,19 +113,19 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 3000, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
-    fn one_key_with_any_value_is_used_or_refused_in_one_line(which in any::<prop::sample::Index>(), new in anything()) {
+    fn any_value_of_a_key_is_accepted_or_refused_in_one_line(which in any::<prop::sample::Index>(), new in anything()) {
         let mut table = Value::Table(whole());
         let keys = keys(&table, &[]);
         replace(&mut table, which.get::<Vec<String>>(&keys), new);
         let Value::Table(table) = table else { unreachable!() };
         match Config::from_table(table, "test") {
-            Ok(config) => usable(&config),
+            Ok(config) => assert_usable(&config),
             Err(error) => prop_assert!(!error.to_string().contains('\n'), "{}", error),
         }
     }
 
     #[test]
-    fn any_text_is_no_configuration(text in ".{0,200}", lines in prop::collection::vec("\\[?\\[?[a-z\".]{0,6}\\]? ?=? ?[-\\[{\"0-9a-z_.]{0,20}\n", 0..10)) {
+    fn random_text_is_refused(text in ".{0,200}", lines in prop::collection::vec("\\[?\\[?[a-z\".]{0,6}\\]? ?=? ?[-\\[{\"0-9a-z_.]{0,20}\n", 0..10)) {
         for text in [text, lines.concat()] {
             if let Ok(table) = text.parse::<Table>() {
                 prop_assert!(Config::from_table(table, "test").is_err());
@@ -147,15 +147,15 @@ fn accepted(value: &Value) -> Option<Config> {
     Config::from_table(value.as_table().unwrap().clone(), "test").ok()
 }
 
-/// Searched, so that who raises a limit is told what it breaks.
+/// The limits are found by bisection, so that raising a limit too far fails here.
 #[test]
-fn the_least_and_the_largest_numbers_that_are_allowed_can_be_computed_with() {
+fn the_least_and_the_greatest_allowed_numbers_do_not_overflow() {
     let mut table = Value::Table(whole());
     let integers: Vec<_> = keys(&table, &[])
         .into_iter()
         .filter(|path| at(&table, path).is_integer())
         .collect();
-    // Twice: some limits are other numbers.
+    // Twice, because some limits are the values of other keys.
     for path in integers.iter().chain(&integers) {
         for furthest in [-1, i64::MAX] {
             let (mut good, mut bad) = (at(&table, path).as_integer().unwrap(), furthest);
@@ -172,14 +172,14 @@ fn the_least_and_the_largest_numbers_that_are_allowed_can_be_computed_with() {
             if accepted(&table).is_none() {
                 replace(&mut table, path, Value::Integer(good));
             }
-            usable(&accepted(&table).unwrap());
+            assert_usable(&accepted(&table).unwrap());
         }
     }
     for space in ["observation", "action"] {
         let bounds = ["low", "high"].map(|bound| ["spec", space, "box", bound].map(String::from));
         let mut width = 1;
         while accepted(&table).is_some() && width < 1 << 20 {
-            usable(&accepted(&table).unwrap());
+            assert_usable(&accepted(&table).unwrap());
             width *= 2;
             for (bound, end) in bounds.iter().zip([-1.0, 1.0]) {
                 replace(&mut table, bound, Value::Array(vec![Value::Float(end); width]));
@@ -198,11 +198,11 @@ fn the_least_and_the_largest_numbers_that_are_allowed_can_be_computed_with() {
         ),
         (256, 256, 4096)
     );
-    usable(&largest);
+    assert_usable(&largest);
 }
 
 #[test]
-fn an_id_that_could_name_other_files_is_refused() {
+fn an_id_that_could_match_other_files_is_refused() {
     for id in [
         "",
         ".",
@@ -224,7 +224,7 @@ fn an_id_that_could_name_other_files_is_refused() {
 }
 
 #[test]
-fn a_space_without_size_is_refused() {
+fn a_space_with_an_invalid_size_is_refused() {
     for (space, bounds) in [
         ("observation", "box = { low = [], high = [] }"),
         ("observation", "box = { low = [0.0, 0.0], high = [1.0] }"),

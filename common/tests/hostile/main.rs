@@ -1,9 +1,9 @@
-//! Bytes that nobody should have written: read or refused, never a panic, and the file stays as it is.
+//! Damaged and forged files: they are read or refused without a panic, and are never changed.
 
 #![allow(
     clippy::unwrap_used,
     clippy::expect_used,
-    reason = "a failure anywhere in here is a failed test"
+    reason = "a panic is a failed test"
 )]
 
 mod bytes;

@@ -1,4 +1,4 @@
-//! Policy files.
+//! Invalid policy files.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -34,7 +34,7 @@ fn directory() -> (TempDir, PathBuf) {
     (directory, path)
 }
 
-/// A whole policy, or refused; the file stays.
+/// Reads the file. Returns `None` if it is refused; the file must not change.
 fn read(path: &Path) -> Option<PolicyFile> {
     let before = fs::read(path).unwrap();
     let read = PolicyFile::read(path, &layout());
@@ -70,9 +70,9 @@ proptest! {
         prop_assert_eq!(read(&path), (bytes == whole).then(policy));
     }
 
-    /// With a checksum that fits.
+    /// With a matching checksum.
     #[test]
-    fn a_body_that_lies_is_refused(
+    fn a_body_with_false_numbers_is_refused(
         words in prop::array::uniform7(extreme()),
         right_network in any::<bool>(),
         right_count in any::<bool>(),
@@ -98,7 +98,7 @@ proptest! {
 }
 
 #[test]
-fn a_policy_of_the_right_network_without_its_parameters_is_refused() {
+fn a_policy_with_a_wrong_number_of_parameters_is_refused() {
     let (_directory, path) = directory();
     for count in [0, 1, layout().parameters() - 1, layout().parameters() + 1] {
         let policy = PolicyFile {

@@ -1,4 +1,4 @@
-//! The forward pass: one product a layer, then bias and activation in one sweep.
+//! The forward pass: for each layer one matrix product, then bias and activation in a single pass over the result.
 
 use faer::linalg::matmul::matmul;
 use faer::{Accum, MatMut, MatRef, Par};
@@ -24,33 +24,36 @@ impl<'a> Layer<'a> {
     }
 }
 
-/// Where a forward pass leaves what each layer reads or gives, one column a sample.
+/// The buffers of a forward pass, one column for each sample.
 #[derive(Debug)]
 pub struct Activations<'a, H> {
-    /// The inputs, and below them the late ones, where these enter at the first layer; empty where they do not.
+    /// The inputs, followed by the late inputs, if those enter at the first layer; otherwise empty.
     pub joined: &'a mut [f32],
-    /// Each hidden layer, after its activation; below it the late inputs where they enter at the next layer.
+    /// The outputs of each hidden layer, followed by the late inputs if those enter at the next layer.
     pub hidden: H,
-    /// Output layer: linear.
+    /// The linear outputs of the output layer.
     pub output: &'a mut [f32],
 }
 
-/// A column-major slice as a matrix with so many rows. Panics when the slice is not whole columns.
+/// A column-major slice as a matrix with this many rows.
+///
+/// # Panics
+/// If the slice does not consist of whole columns.
 pub fn matrix(slice: &[f32], rows: usize) -> MatRef<'_, f32> {
     MatRef::from_column_major_slice(slice, rows, slice.len() / rows)
 }
 
-/// As [`matrix`], to be written.
+/// As [`matrix`], but mutable.
 pub fn matrix_mut(slice: &mut [f32], rows: usize) -> MatMut<'_, f32> {
     let columns = slice.len() / rows;
     MatMut::from_column_major_slice_mut(slice, rows, columns)
 }
 
 impl NetworkLayout {
-    /// Computes the network's output for a batch of `inputs` and `late_inputs` (empty where the layout has none).
+    /// Computes the network's output for a batch of `inputs` and `late_inputs` (empty if the layout has none).
     ///
-    /// The batch is as wide as the output has columns; every slice must fit it, and of `to.hidden` there are as many as hidden
-    /// layers at least. The same numbers give the same bits wherever the slices lie in memory. Nothing is allocated.
+    /// Every slice must have one column for each sample of the batch, and `to.hidden` must have a slice for each hidden
+    /// layer. The same numbers give the same bits, whatever the alignment of the slices. Nothing is allocated.
     pub fn forward<'a>(
         &self,
         parameters: &[f32],
@@ -130,8 +133,9 @@ struct OneSample<'a> {
 impl WithSimd for OneSample<'_> {
     type Output = ();
 
-    /// Reading W takes all the time there is. So columns that a rectified unit of 0 multiplies are left out (also where they
-    /// hold what is not a number: the learner, whose batches are larger, sees that), and four others go by before z is stored.
+    /// Reading W takes most of the time. So columns whose factor is 0, as of an inactive ReLU unit, are skipped, and four
+    /// others are read before z is stored. A NaN in a skipped column is missed here; the learner, which computes larger
+    /// batches, detects it.
     #[inline(always)]
     fn with_simd<S: Simd>(self, _: S) {
         let Self { z, w, x } = self;
@@ -147,8 +151,8 @@ impl WithSimd for OneSample<'_> {
     }
 }
 
-/// z ← max(z + b, 0) for the first elements of every column of `rows` numbers, as many as there are biases. What is
-/// not a number stays so, for the loss to show it.
+/// z ← max(z + b, 0) for the first elements of every column of `rows` numbers, one for each bias. NaN stays NaN, so that it
+/// shows in the loss.
 fn add_bias_and_rectify(z: &mut [f32], rows: usize, biases: &[f32]) {
     Arch::new().dispatch(|| {
         for column in z.chunks_exact_mut(rows) {
@@ -160,7 +164,7 @@ fn add_bias_and_rectify(z: &mut [f32], rows: usize, biases: &[f32]) {
     });
 }
 
-/// As [`add_bias_and_rectify`]: z ← tanh(z + b).
+/// z ← tanh(z + b), as [`add_bias_and_rectify`].
 fn add_bias_and_squash(z: &mut [f32], rows: usize, biases: &[f32]) {
     for column in z.chunks_exact_mut(rows) {
         for (z, b) in column.iter_mut().zip(biases) {
@@ -199,7 +203,7 @@ mod tests {
         output
     }
 
-    /// One sample, by the definition, in `f64`.
+    /// The output for one sample, computed in `f64` from the definition.
     fn by_definition(layout: &NetworkLayout, parameters: &[f32], input: &[f32], late: &[f32]) -> Vec<f64> {
         let mut x: Vec<f64> = input.iter().map(|&x| x.into()).collect();
         for (number, layer) in layout.layers(parameters).enumerate() {
@@ -225,7 +229,7 @@ mod tests {
     }
 
     #[test]
-    fn a_batch_is_what_the_definition_says_of_each_sample() {
+    fn a_batch_agrees_with_the_definition_for_each_sample() {
         for (layout, batch) in [
             (NetworkLayout::policy(3, Hidden::relu([40, 30]), 2), 1),
             (NetworkLayout::policy(6, Hidden::relu([40, 30]), 1), 7),
@@ -247,14 +251,14 @@ mod tests {
                 let input = &inputs[sample * layout.inputs()..][..layout.inputs()];
                 let late = &late[sample * layout.late_inputs()..][..layout.late_inputs()];
                 for (found, expected) in column.iter().zip(by_definition(&layout, &parameters, input, late)) {
-                    assert!((f64::from(*found) - expected).abs() < 1e-4, "{found} for {expected}");
+                    assert!((f64::from(*found) - expected).abs() < 1e-4, "{found} instead of {expected}");
                 }
             }
         }
     }
 
     #[test]
-    fn where_the_parameters_lie_does_not_change_a_bit() {
+    fn the_alignment_of_the_parameters_does_not_change_the_bits() {
         for (batch, hidden) in [1, 2, 8, 64].into_iter().flat_map(|batch| {
             let lists = [
                 Hidden::relu([400, 300]),
@@ -280,7 +284,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_a_number_is_not_rectified_away() {
+    fn nan_passes_through_the_activations() {
         for hidden in [Hidden::relu([2, 2]), Hidden::tanh([2, 2, 2])] {
             let layout = NetworkLayout::policy(1, hidden, 1);
             let mut parameters = vec![1.0; layout.parameters()];

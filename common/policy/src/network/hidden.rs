@@ -1,4 +1,4 @@
-//! The hidden layers of a network: how many there are, how many units each has, and what a unit does.
+//! The hidden layers of a network: their number, their units, and their activation function.
 
 use std::ops::{Deref, DerefMut};
 
@@ -6,14 +6,14 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use shoal_base::section::{Bounded, Bounds, OutOfRange};
 
-/// Units in each hidden layer, from the first on: a list of 1 to 8 numbers, written as `[400, 300]`.
+/// Units of each hidden layer, from the first to the last: a list of 1 to 8 numbers, written as `[400, 300]`.
 ///
-/// The numbers may change, how many there are may not.
+/// The numbers can be changed in place, but not the length of the list.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(try_from = "Vec<usize>", into = "Vec<usize>")]
 #[schemars(with = "Vec<usize>")]
 pub struct Layers {
-    /// 0 where there is no layer.
+    /// Unused entries are 0.
     units: [usize; Layers::MAX],
     count: usize,
 }
@@ -24,7 +24,7 @@ pub struct Layers {
 pub struct LayersError;
 
 impl Layers {
-    /// The most layers there can be.
+    /// The most hidden layers of a network.
     pub const MAX: usize = 8;
 }
 
@@ -42,7 +42,7 @@ impl DerefMut for Layers {
     }
 }
 
-/// A list of a length that cannot be does not compile.
+/// A list of an invalid length does not compile.
 impl<const N: usize> From<[usize; N]> for Layers {
     fn from(list: [usize; N]) -> Self {
         const { assert!(1 <= N && N <= Layers::MAX, "1 to 8 layers") };
@@ -80,7 +80,7 @@ impl Bounded for Layers {
     }
 }
 
-/// What a hidden unit makes of its sum z.
+/// The activation function of a hidden unit with weighted sum z.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Activation {
@@ -93,14 +93,14 @@ pub enum Activation {
 /// The hidden layers of a network.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Hidden {
-    /// Units in each.
+    /// Units of each layer.
     pub layers: Layers,
-    /// What each unit does.
+    /// The activation function of all units.
     pub activation: Activation,
 }
 
 impl Hidden {
-    /// Layers of ReLU units, as the thesis has them.
+    /// Layers of ReLU units, as in the thesis.
     pub fn relu(layers: impl Into<Layers>) -> Self {
         Self {
             layers: layers.into(),
@@ -137,7 +137,7 @@ mod tests {
     }
 
     #[test]
-    fn each_number_is_compared() {
+    fn each_number_is_checked_against_the_bounds() {
         let error = Layers::from([1, 2, 9]).check("a", "b", &from(1, 8)).unwrap_err();
         assert_eq!(error.to_string(), "a.b[2] = 9: must be from 1 to 8");
     }

@@ -1,11 +1,11 @@
-//! The place of each parameter.
+//! The layout of a network's parameters.
 
 use std::ops::Range;
 
 use super::forward::Layer;
 use super::hidden::{Activation, Hidden};
 
-/// The sizes of a network, and with them the place of each of its parameters.
+/// The sizes of a network, which determine the place of each of its parameters.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct NetworkLayout {
     pub(super) inputs: usize,
@@ -19,12 +19,12 @@ pub struct NetworkLayout {
 pub struct LayerRange {
     /// The weights W, outputs × inputs.
     pub weights: Range<usize>,
-    /// The biases b, one an output.
+    /// The biases b, one for each output.
     pub biases: Range<usize>,
 }
 
 impl NetworkLayout {
-    /// A policy μ: observations to actions.
+    /// A policy μ: from observations to actions.
     pub fn policy(observation: usize, hidden: Hidden, action: usize) -> Self {
         Self {
             inputs: observation,
@@ -34,7 +34,7 @@ impl NetworkLayout {
         }
     }
 
-    /// An action-value function Q: observations, and actions as late inputs, to one value.
+    /// An action-value function Q: from observations, and actions as late inputs, to one value.
     pub fn critic(observation: usize, hidden: Hidden, action: usize) -> Self {
         Self {
             inputs: observation,
@@ -64,14 +64,15 @@ impl NetworkLayout {
         self.outputs
     }
 
-    /// The layer that the late inputs enter, from 0: the second one, or the only hidden one. `None` where there are none.
+    /// The layer that the late inputs enter, counted from 0: the second hidden layer, or the only one. `None` if there are
+    /// no late inputs.
     pub fn late_layer(&self) -> Option<usize> {
         let second = self.hidden.layers.len().min(2) - 1;
         (self.late_inputs > 0).then_some(second)
     }
 
-    /// The `(inputs, outputs)` of a layer, from 0; its inputs end with the late ones where they enter there. The hidden layers
-    /// come first, and the output layer is the last.
+    /// The `(inputs, outputs)` of a layer, counted from 0. The output layer comes after the hidden layers. The inputs include
+    /// the late inputs if those enter at this layer.
     pub fn layer_size(&self, layer: usize) -> (usize, usize) {
         let units = &*self.hidden.layers;
         let below = layer.checked_sub(1).map_or(self.inputs, |below| units[below]);
@@ -83,12 +84,12 @@ impl NetworkLayout {
         (below + late, units.get(layer).copied().unwrap_or(self.outputs))
     }
 
-    /// The `(inputs, outputs)` of every layer: of the hidden ones and the output layer.
+    /// The `(inputs, outputs)` of every hidden layer and of the output layer.
     pub fn layer_sizes(&self) -> impl Iterator<Item = (usize, usize)> {
         (0..=self.hidden.layers.len()).map(|layer| self.layer_size(layer))
     }
 
-    /// Where every layer lies in the parameter slice.
+    /// The place of every layer in the parameter slice.
     pub fn layer_ranges(&self) -> impl Iterator<Item = LayerRange> {
         self.layer_sizes().scan(0, |end, (inputs, outputs)| {
             let weights = *end..*end + outputs * inputs;
@@ -98,7 +99,7 @@ impl NetworkLayout {
         })
     }
 
-    /// Where a layer, from 0, lies in the parameter slice.
+    /// The place of a layer, counted from 0, in the parameter slice.
     pub fn layer_range(&self, layer: usize) -> LayerRange {
         let start = self.layer_sizes().take(layer).map(parameters).sum();
         let (inputs, outputs) = self.layer_size(layer);
@@ -109,25 +110,25 @@ impl NetworkLayout {
         }
     }
 
-    /// Parameters of the network: the length of its slice.
+    /// The number of parameters: the length of the slice.
     pub fn parameters(&self) -> usize {
         self.layer_sizes().map(parameters).sum()
     }
 
-    /// Every layer of a slice of `parameters()` numbers.
+    /// All layers of a slice of `parameters()` numbers.
     pub fn layers<'a>(&self, parameters: &'a [f32]) -> impl Iterator<Item = Layer<'a>> {
         self.layer_ranges().map(|range| Layer::at(range, parameters))
     }
 
-    /// A layer, from 0, of a slice of `parameters()` numbers.
+    /// A layer, counted from 0, of a slice of `parameters()` numbers.
     pub fn layer<'a>(&self, layer: usize, parameters: &'a [f32]) -> Layer<'a> {
         Layer::at(self.layer_range(layer), parameters)
     }
 
-    /// A number that two layouts share only if they read parameters alike (FNV-1a over the sizes).
+    /// The fingerprint: two layouts have the same one only if they read parameters alike (FNV-1a over the sizes).
     ///
-    /// That of two ReLU layers is the one of files from before there were others. Any other list is followed by
-    /// its length and the activation, so that no two layouts give the same numbers.
+    /// With two ReLU layers it is that of files from before other networks existed. For any other list the length and the
+    /// activation are appended, so that no two layouts hash the same numbers.
     pub fn fingerprint(&self) -> u64 {
         let Hidden { layers, activation } = self.hidden;
         let marks = match (layers.len(), activation) {
@@ -144,7 +145,7 @@ impl NetworkLayout {
     }
 }
 
-/// Parameters of a layer of this size.
+/// The number of parameters of a layer of this size.
 fn parameters((inputs, outputs): (usize, usize)) -> usize {
     (inputs + 1) * outputs
 }
@@ -154,7 +155,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_ranges_cover_the_parameters_without_gap_or_overlap() {
+    fn the_ranges_cover_the_parameters_without_gaps_or_overlaps() {
         for (hidden, expected) in [
             (Hidden::relu([5]), (3 + 2) * 5 + 5 + 5 + 1),
             (Hidden::relu([5, 4]), 3 * 5 + 5 + (5 + 2) * 4 + 4 + 4 + 1),
@@ -174,7 +175,7 @@ mod tests {
     }
 
     #[test]
-    fn fingerprints_tell_layouts_apart() {
+    fn different_layouts_have_different_fingerprints() {
         let layouts = [
             NetworkLayout::policy(3, Hidden::relu([400, 300]), 1),
             NetworkLayout::policy(4, Hidden::relu([400, 300]), 1),
@@ -185,14 +186,14 @@ mod tests {
             NetworkLayout::policy(3, Hidden::relu([400]), 1),
             NetworkLayout::policy(3, Hidden::tanh([400]), 1),
             NetworkLayout::policy(3, Hidden::relu([400, 300, 300]), 1),
-            // The same numbers in the same order as a critic of two layers.
+            // The same numbers in the same order as for a critic with two layers.
             NetworkLayout::critic(3, Hidden::relu([400, 300]), 2),
             NetworkLayout::critic(3, Hidden::tanh([400, 300]), 2),
             NetworkLayout::critic(3, Hidden::relu([400, 300, 2]), 1),
         ];
         let fingerprints: std::collections::HashSet<u64> = layouts.iter().map(NetworkLayout::fingerprint).collect();
         assert_eq!(fingerprints.len(), layouts.len());
-        // In the headers of policies that earlier versions wrote.
+        // This fingerprint is in the headers of policies from earlier versions.
         assert_eq!(layouts[0].fingerprint(), 0x879f_248f_4c7e_52a3);
     }
 }

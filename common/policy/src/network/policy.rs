@@ -1,10 +1,11 @@
-//! The policy μ as an actor evaluates it: the network's tanh output scaled to the action's range.
+//! The policy μ: the network's output, after tanh, scaled to the range of the actions.
 
 use shoal_base::space::Space;
 
 use super::{Hidden, Network, NetworkLayout};
 
-/// The middle and half the width of each action element's range: tanh outputs become actions in environment units.
+/// The middle and half the width of the range of each action element. It converts tanh outputs to actions in environment
+/// units.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ActionRange {
     centre: Vec<f32>,
@@ -14,21 +15,21 @@ pub struct ActionRange {
 /// Why a policy with tanh outputs cannot act in a space.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum ActionRangeError {
-    /// The actions are indices.
+    /// The actions are discrete.
     #[error("the action space is discrete ({n} actions), but a deterministic policy needs real-valued actions (a box)")]
     Discrete {
-        /// How many actions there are.
+        /// Number of actions.
         n: u32,
     },
-    /// A box without elements.
+    /// The box has no elements.
     #[error("the action space is a box without elements")]
     Empty,
-    /// The bounds are infinite, not numbers, or leave no room between them.
+    /// The bounds are infinite or NaN, or the lower is not below the upper.
     #[error(
         "action element {element} ranges from {low} to {high}, but a policy needs finite bounds, the lower below the upper"
     )]
     Bounds {
-        /// Which element, from 0.
+        /// Index of the element.
         element: usize,
         /// Its lower bound.
         low: f32,
@@ -60,28 +61,28 @@ impl ActionRange {
         })
     }
 
-    /// Elements of an action.
+    /// Number of elements of an action.
     pub fn width(&self) -> usize {
         self.centre.len()
     }
 
-    /// Half the width of each element's range: what exploration noise is scaled by, and ∂action/∂tanh.
+    /// Half the width of each element's range: the scale of exploration noise, and ∂action/∂tanh.
     pub fn half(&self) -> &[f32] {
         &self.half
     }
 
-    /// The nearest to `a` that element `element` of an action may be.
+    /// Clips `a` to the range of element `element`.
     pub fn clip(&self, element: usize, a: f32) -> f32 {
         a.clamp(self.action(element, -1.0), self.action(element, 1.0))
     }
 
-    /// Element `element` of an action from the tanh output `t`.
+    /// The value of element `element` of an action for the tanh output `t`.
     pub fn action(&self, element: usize, t: f32) -> f32 {
         self.centre[element] + self.half[element] * t
     }
 }
 
-/// The policy μ with room for a batch of observations. Its parameters are not its own: each call borrows them.
+/// The policy μ with buffers for a batch of observations. It does not own its parameters: each call borrows them.
 #[derive(Clone, Debug)]
 pub struct PolicyNetwork {
     network: Network,
@@ -98,7 +99,7 @@ impl PolicyNetwork {
         }
     }
 
-    /// How the parameters of [`forward`](Self::forward) are laid out.
+    /// The layout of the parameters of [`forward`](Self::forward).
     pub fn layout(&self) -> &NetworkLayout {
         self.network.layout()
     }
@@ -109,8 +110,10 @@ impl PolicyNetwork {
     }
 
     /// Writes μ(s) in environment units into `actions` for every observation s in `observations`, one after the other.
+    /// Nothing is allocated.
     ///
-    /// Panics when the slices do not fit the layout, or hold more than the batch. Nothing is allocated.
+    /// # Panics
+    /// If the slices do not match the layout, or have more observations than the batch.
     pub fn forward(&mut self, parameters: &[f32], observations: &[f32], actions: &mut [f32]) {
         self.network.forward(parameters, observations, actions);
         for action in actions.chunks_exact_mut(self.range.width()) {
@@ -126,7 +129,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn actions_stay_within_the_range_and_reach_both_ends() {
+    fn actions_cover_the_range_including_both_ends() {
         let space = Space::boxed(&[(-1.0, 3.0), (-2.0, 2.0)]);
         let mut policy = PolicyNetwork::new(1, Hidden::relu([1, 1]), ActionRange::new(&space).unwrap(), 3);
         // h1 = h2 = max(s, 0); z = ±1000 h2
