@@ -52,9 +52,9 @@ fn ddpg(settings: &DdpgConfig) -> Option<String> {
         Warmup::Uniform => "Uniform",
     };
     Some(format!(
-        "DdpgConfig {{ hidden: [{h1}, {h2}], gamma: {gamma:?}, tau: {tau:?}, actor_learning_rate: {actor_learning_rate:?}, \
+        "Ddpg {{ hidden: [{h1}, {h2}], gamma: {gamma:?}, tau: {tau:?}, actor_learning_rate: {actor_learning_rate:?}, \
          critic_learning_rate: {critic_learning_rate:?}, batch: {batch} }} \
-         ExplorationConfig {{ theta: {theta:?}, sigma: {sigma:?}, warmup: {warmup} }}"
+         Exploration {{ theta: {theta:?}, sigma: {sigma:?}, warmup: {warmup} }}"
     ))
 }
 
@@ -80,7 +80,7 @@ fn reinforce(settings: &ReinforceConfig) -> Option<String> {
         Weight::Baseline => "Baseline",
     };
     Some(format!(
-        "ReinforceConfig(ReinforceConfig {{ hidden: [{h1}, {h2}], gamma: {gamma:?}, learning_rate: {learning_rate:?}, \
+        "Reinforce(Reinforce {{ hidden: [{h1}, {h2}], gamma: {gamma:?}, learning_rate: {learning_rate:?}, \
          weight: {weight}, discount_steps: {discount_steps}, learn_at_limit: {learn_at_limit}, \
          baseline_hidden: [{b1}, {b2}], baseline_learning_rate: {baseline_learning_rate:?} }})"
     ))
