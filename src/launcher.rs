@@ -379,12 +379,13 @@ impl<'a> Launcher<'a> {
 
     fn read_reports(&mut self) -> anyhow::Result<()> {
         let wall = self.begun.elapsed();
-        for incident in self.supervisor.take_incidents() {
-            self.recorder.incident(&incident, wall)?;
-        }
         while let Some(heartbeat) = self.heartbeats.receive()? {
             self.supervisor.hear(&heartbeat);
         }
+        for incident in self.supervisor.take_incidents() {
+            self.recorder.incident(&incident, wall)?;
+        }
+        self.supervisor.check_faults(self.config.environment.faults)?;
         let filled = [
             each(&self.episode_reports, |report| {
                 Ok(self.recorder.episode(&report, wall)?)

@@ -18,7 +18,7 @@ use shoal_common::space::EnvironmentSpec;
 use shoal_common::stop::Stop;
 
 use crate::error::ActorError;
-use crate::explorer::connect;
+use crate::explorer::{after_fault, connect};
 
 /// What an evaluator is told.
 #[derive(Clone, Debug)]
@@ -154,8 +154,13 @@ impl<'a> Evaluator<'a> {
         let mut returns = Vec::new();
         while (returns.len() as u32) < self.settings.evaluation.episodes {
             // A server that dies takes its episodes with it; they are run again.
-            if let Some(some) = self.run_episodes(published.parameters(), returns.len() as u64)? {
-                returns.extend(some);
+            match self.run_episodes(published.parameters(), returns.len() as u32) {
+                Ok(Some(some)) => returns.extend(some),
+                Ok(None) => {}
+                Err(Exit::Failed(ActorError::Channel(error))) if error.fault().is_some() => {
+                    after_fault(&error, &mut self.heartbeat, &self.listener, self.stop).map_err(Exit::widen)?;
+                }
+                Err(exit) => return Err(exit),
             }
         }
         returns.truncate(self.settings.evaluation.episodes as usize);
@@ -225,7 +230,7 @@ impl<'a> Evaluator<'a> {
 
     /// Returns of the episodes from `first` on under these parameters, one in each environment; `None` when the server was
     /// lost over them.
-    fn run_episodes(&mut self, parameters: &[f32], first: u64) -> Result<Option<Vec<f64>>, Exit<ActorError>> {
+    fn run_episodes(&mut self, parameters: &[f32], first: u32) -> Result<Option<Vec<f64>>, Exit<ActorError>> {
         let Self {
             client,
             listener,
@@ -234,12 +239,18 @@ impl<'a> Evaluator<'a> {
             actions,
             ..
         } = self;
-        let begun = client.reset(listener, Begin::Evaluation(first), || {
+        // No environment is reset more often than an episode is needed.
+        let episodes = (self.settings.evaluation.episodes - first).min(self.settings.envs as u32);
+        let begin = Begin::Evaluation {
+            first: first.into(),
+            episodes,
+        };
+        let begun = client.reset(listener, begin, || {
             heartbeat.beat(Activity::WaitingForServer);
         });
         let mut current = begun.map_err(Exit::widen)?;
         let mut returns = vec![0.0; self.settings.envs];
-        let mut under_way = vec![true; self.settings.envs];
+        let mut under_way: Vec<_> = (0..self.settings.envs).map(|e| (e as u32) < episodes).collect();
         while under_way.contains(&true) {
             policy.act(parameters, current.observations(), actions);
             let stepped = client.step(listener, actions, || heartbeat.beat(Activity::WaitingForServer));

@@ -2,6 +2,7 @@
 //! outside of any run, to learn what it serves or to try a policy in it.
 
 use std::ffi::OsString;
+use std::io::Write;
 use std::os::fd::AsFd;
 use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::path::{Path, PathBuf};
@@ -15,7 +16,7 @@ use rustix::process::{
     Pid, PidfdFlags, Signal, getpgrp, getpid, getppid, kill_process, kill_process_group, pidfd_open,
     set_parent_process_death_signal,
 };
-use shoal_common::channel::environment::{Begin, EnvironmentClient, Observed, Stepped, describe};
+use shoal_common::channel::environment::{Begin, EnvironmentClient, Fault, Observed, Stepped, describe};
 use shoal_common::channel::{ChannelError, Domain, EventName, Listener, Services};
 use shoal_common::config::EnvironmentConfig;
 use shoal_common::exit::Exit;
@@ -28,8 +29,8 @@ use crate::process::{Peer, wait_for_any};
 /// Environments whose name begins with this are Gymnasium's.
 pub const GYMNASIUM: &str = "gym:";
 
-/// How long a program may take until it says what it serves: a simulator's libraries have to be loaded.
-const PATIENCE: Duration = Duration::from_secs(120);
+/// A start that takes longer is reported to the user.
+const SLOW: Duration = Duration::from_secs(10);
 
 /// The command that serves environments of this name where the configuration names none.
 pub fn default_command(name: &str) -> Option<Vec<String>> {
@@ -252,8 +253,15 @@ impl ExternalEnvironment {
     /// # Errors
     /// When the program has ended or refuses.
     pub fn begin_evaluation(&mut self, number: u64) -> anyhow::Result<Observed> {
-        let begun = self.client.reset(&self.listener, Begin::Evaluation(number), || ());
-        answered(begun, &mut self.program)
+        let begun = self.client.reset(
+            &self.listener,
+            Begin::Evaluation {
+                first: number,
+                episodes: 1,
+            },
+            || (),
+        );
+        answered(begun, &mut self.program)?.context("the environment server has ended")
     }
 
     /// Every environment takes a step with its action.
@@ -262,7 +270,7 @@ impl ExternalEnvironment {
     /// When the program has ended or refuses.
     pub fn step(&mut self, actions: &[f32]) -> anyhow::Result<Observed> {
         let stepped = self.client.step(&self.listener, actions, || ());
-        match answered(stepped, &mut self.program)? {
+        match answered(stepped, &mut self.program)?.context("the environment server has ended")? {
             Stepped::Taken(observed) => Ok(observed),
             Stepped::Lost => bail!("the environment server gave up its episodes"),
         }
@@ -289,12 +297,20 @@ fn opened(domain: &Domain, launch: &LaunchSpec<'_>, environment: &EnvironmentCon
     let mut program =
         Peer::start(&mut tied(&command)?, "environment server".into()).with_context(|| cannot_start(&command))?;
     let heard = Stop::default();
-    let stop = stopped_when_it_ends(&program, heard.clone())?;
+    let stop = stopped_when_it_ends(&program, heard.clone(), environment)?;
     let described = describe(domain, launch.index, &listener, stop.clone());
     heard.request();
-    let (spec, environments) = answered(described, &mut program).map_err(with_advice)?;
+    let (spec, environments) = match answered(described, &mut program).map_err(with_advice)? {
+        Some(described) => described,
+        None => bail!(
+            "{} did not say within {} s what it serves; if it takes longer to start: --set environment.start_seconds={}",
+            environment.name,
+            environment.start_seconds,
+            environment.start_seconds.saturating_mul(5)
+        ),
+    };
     let opened = EnvironmentClient::open(domain, launch.index, &spec, environments, stop);
-    let client = answered(opened.map_err(Exit::from), &mut program)?;
+    let client = answered(opened.map_err(Exit::from), &mut program)?.context("the environment server has ended")?;
     Ok((services, client, listener, spec, program))
 }
 
@@ -306,29 +322,44 @@ fn with_advice(error: anyhow::Error) -> anyhow::Error {
     error
 }
 
-/// A stop that is requested once the program has ended, or was not `heard` of for too long.
-fn stopped_when_it_ends(program: &Peer, heard: Stop) -> anyhow::Result<Stop> {
+/// A stop that is requested once the program has ended, or was not `heard` of within its limit. A slow start is reported.
+fn stopped_when_it_ends(program: &Peer, heard: Stop, environment: &EnvironmentConfig) -> anyhow::Result<Stop> {
     let stop = Stop::default();
     let flag = stop.clone();
+    let (name, limit) = (environment.name.clone(), environment.start_limit());
     let process = program.as_fd().try_clone_to_owned();
     let process = process.context("cannot watch the environment server")?;
     std::thread::Builder::new()
         .name("watch".into())
         .spawn(move || {
-            let ended = || wait_for_any(&[process.as_fd()], PATIENCE);
-            while !ended() && heard.requested() {}
+            let ended = |most| wait_for_any(&[process.as_fd()], most);
+            if !ended(SLOW.min(limit)) && !heard.requested() {
+                let _ = writeln!(
+                    std::io::stderr(),
+                    "waiting for {name} to start, for at most {} s",
+                    limit.as_secs()
+                );
+            }
+            if !ended(limit.saturating_sub(SLOW)) && heard.requested() {
+                while !ended(Duration::MAX) {}
+            }
             flag.request();
         })
         .context("cannot watch the environment server")?;
     Ok(stop)
 }
 
-fn answered<T>(answer: Result<T, Exit<ChannelError>>, program: &mut Peer) -> anyhow::Result<T> {
-    answer.or_else(|exit| {
+/// What it answered; `None` where it has not within its limit.
+fn answered<T>(answer: Result<T, Exit<ChannelError>>, program: &mut Peer) -> anyhow::Result<Option<T>> {
+    answer.map(Some).or_else(|exit| {
         program.check()?;
         match exit {
-            Exit::Stopped => bail!("the environment server did not answer within {PATIENCE:?}"),
-            Exit::Failed(error) => Err(error.into()),
+            Exit::Stopped => Ok(None),
+            Exit::Failed(error) => match (error.fault(), program.last_line()) {
+                // What it was stands there.
+                (Some(Fault::Reported), Some(line)) => bail!("{line}"),
+                _ => Err(error.into()),
+            },
         }
     })
 }

@@ -92,7 +92,11 @@ impl<'a> Rollout<'a> {
 
     /// Runs evaluation episode `number` of `seed`: it starts where every evaluation's episode of this number starts.
     pub fn evaluation_episode(&mut self, seed: u64, number: u64) -> anyhow::Result<Trajectory> {
-        self.episode(Start::Evaluation { seed, first: number })
+        self.episode(Start::Evaluation {
+            seed,
+            first: number,
+            episodes: Some(1),
+        })
     }
 
     /// Runs an episode that starts in a physical state of the environment, which must be one of ours.
@@ -146,7 +150,7 @@ impl Stage {
                 environment.reset(start, &mut observation)?;
                 Ok(observation)
             }
-            (Self::Elsewhere(conversation), Start::Evaluation { seed, first }) => {
+            (Self::Elsewhere(conversation), Start::Evaluation { seed, first, .. }) => {
                 if conversation.as_ref().is_none_or(|(of, _)| *of != seed) {
                     // One at a time.
                     *conversation = None;
@@ -210,7 +214,7 @@ impl Stage {
 fn same_spec(config: &Config, said: &EnvironmentSpec) -> anyhow::Result<()> {
     let name = &config.environment.name;
     ensure!(
-        *said == config.spec,
+        said.is(&config.spec),
         "config.toml: [spec] is not what environment {name} says of itself"
     );
     Ok(())

@@ -135,6 +135,11 @@ impl Child {
         self.rate = 0.0;
     }
 
+    /// Invalid answers of its environment server that it has reported since it started.
+    pub(super) fn faults(&self) -> u32 {
+        self.heard.map_or(0, |(_, heartbeat)| heartbeat.faults)
+    }
+
     pub(super) fn is_ready(&self) -> bool {
         self.heard.is_some()
     }

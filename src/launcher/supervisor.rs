@@ -63,6 +63,9 @@ pub(super) struct Supervisor {
     /// Where the number of processes ever started is kept: incarnations are never used twice, not by a resumed run either.
     counter: PathBuf,
     started: u64,
+    /// Invalid answers of environments since the launcher started, and the last one.
+    faults: u32,
+    last_fault: String,
     all_ready: bool,
     cleaned: Instant,
     learner_done: bool,
@@ -106,6 +109,8 @@ impl Supervisor {
             run: run.path().into(),
             counter,
             started,
+            faults: 0,
+            last_fault: String::new(),
             all_ready: false,
             cleaned: Instant::now(),
             learner_done: false,
@@ -189,14 +194,46 @@ impl Supervisor {
             (heartbeat.role(), heartbeat.index, heartbeat.incarnation) == (Some(role), index, incarnation)
         });
         let Some(child) = child else { return };
+        let faults = heartbeat.faults.saturating_sub(child.faults());
+        let server = child.server();
         if let Some(after) = child.hear(heartbeat) {
             self.log
                 .note(&name(child.identity), &format!("ready after {} ms", after.as_millis()));
+        }
+        if let Some(index) = server {
+            (0..faults).for_each(|_| self.note_fault(index));
         }
         if !self.all_ready && self.children.iter().all(Child::is_ready) {
             self.all_ready = true;
             self.log.note("launcher", "every role is ready");
         }
+    }
+
+    fn note_fault(&mut self, index: u32) {
+        self.faults = self.faults.saturating_add(1);
+        let server = self.children.iter().find(|child| child.is(Role::EnvServer, index));
+        if let Some(server) = server {
+            let last = self.log.last_lines(&name(server.identity)).pop().unwrap_or_default();
+            let last = last.strip_prefix("error: ").unwrap_or(&last);
+            self.last_fault = format!("{}: {last}", name(server.identity));
+            self.incidents
+                .push(Incident::of(server.identity, What::Fault, last.into()));
+        }
+    }
+
+    /// Whether environments may still return something invalid, or have done so too often.
+    ///
+    /// # Errors
+    /// When they have: with what the last one was.
+    pub(super) fn check_faults(&self, most: u32) -> anyhow::Result<()> {
+        if self.faults < most {
+            return Ok(());
+        }
+        bail!(
+            "the environments returned something invalid {} times, and environment.faults is {most}; the last time: {}",
+            self.faults,
+            self.last_fault
+        );
     }
 
     /// What the children of a role are doing: what the first one says that was heard of.

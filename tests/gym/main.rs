@@ -153,7 +153,7 @@ fn discrete_spaces_are_counted_from_zero_and_learned_by_a_table() {
     let spec = config(&place).spec;
     assert_eq!(
         (spec.observation, spec.action),
-        (Space::Discrete { n: 4 }, Space::Discrete { n: 3 })
+        (Space::Discrete { n: 4, start: 1 }, Space::Discrete { n: 3, start: -1 })
     );
     assert_eq!(support::json(&output)["eval_return_mean"], 3.0, "it walks to the end");
 }

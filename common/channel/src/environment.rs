@@ -2,11 +2,13 @@
 //! response what came of them; observations are read where the server wrote them. A snapshot of the episodes under way
 //! comes back as words, from which any server of this environment goes on.
 
+mod check;
 mod client;
 mod message;
 mod port;
 mod service;
 
+pub use check::Fault;
 pub use client::{Begin, EnvironmentClient, Observed, Snapshot, Stepped, describe};
 pub use message::{Ask, RequestHeader, ResponseHeader, ResponseLayout, StepBlocks};
 pub use port::{EnvironmentPort, Request};

@@ -18,6 +18,8 @@ use iceoryx2::service::port_factory::client::ClientCreateError;
 use iceoryx2::service::port_factory::server::ServerCreateError;
 use iceoryx2::service::service_name::ServiceNameError;
 
+use super::environment::Fault;
+
 /// A channel does not work: its service or port cannot be had, memory is exhausted, or the other side breaks the rules.
 #[derive(Debug, thiserror::Error)]
 #[error("channel {channel}: cannot {action}: {}", reason(*kind, source.as_ref()))]
@@ -39,6 +41,14 @@ impl ChannelError {
             action,
             kind: cause.kind(),
             source: Box::new(cause),
+        }
+    }
+
+    /// What an environment returned that it may not, if that is why; it can go on with new episodes.
+    pub fn fault(&self) -> Option<&Fault> {
+        match self.source.downcast_ref() {
+            Some(PeerError::Invalid(fault)) => Some(fault),
+            _ => None,
         }
     }
 
@@ -98,7 +108,7 @@ pub enum ChannelErrorKind {
 }
 
 /// The other side of a channel says what it must not say, or what cannot be used.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum PeerError {
     /// A description has not all its numbers.
     #[error("the answer is too short")]
@@ -109,6 +119,17 @@ pub enum PeerError {
         /// Words there are.
         found: usize,
         /// Words that the environments' states have.
+        expected: usize,
+    },
+    /// An environment returned what it may not.
+    #[error(transparent)]
+    Invalid(Fault),
+    /// A response has not the numbers of its environments.
+    #[error("an answer of {found} numbers instead of {expected}")]
+    AnswerLength {
+        /// Numbers there are.
+        found: usize,
+        /// Numbers that the environments have.
         expected: usize,
     },
     /// The environment server does not do what it is asked.

@@ -152,7 +152,11 @@ fn every_word_of_the_counters_names_other_starts() {
 
 #[test]
 fn an_evaluation_episode_starts_alike_always_and_everywhere() {
-    let evaluation = |first| Start::Evaluation { seed: 9, first };
+    let evaluation = |first| Start::Evaluation {
+        seed: 9,
+        first,
+        episodes: None,
+    };
     let five = Bench::of("pendulum", "", 5, [1, 0, 0]).reset(evaluation(0));
     let mut other = Bench::of("pendulum", "time_limit = 2", 2, [2, 3, 4]);
     other.reset(Start::Next);
@@ -167,7 +171,14 @@ fn an_evaluation_episode_starts_alike_always_and_everywhere() {
         "environment e goes on with the episode E later"
     );
     assert_eq!(other.reset(evaluation(3)), five[9..]);
-    assert_ne!(other.reset(Start::Evaluation { seed: 8, first: 3 }), five[9..]);
+    assert_ne!(
+        other.reset(Start::Evaluation {
+            seed: 8,
+            first: 3,
+            episodes: None
+        }),
+        five[9..]
+    );
     assert_ne!(five[..3], five[3..6]);
 }
 
@@ -175,7 +186,11 @@ fn an_evaluation_episode_starts_alike_always_and_everywhere() {
 fn evaluation_does_not_disturb_training_episodes() {
     let mut bench = Bench::new("pendulum", "", 1);
     bench.reset(Start::Next);
-    bench.reset(Start::Evaluation { seed: 1, first: 0 });
+    bench.reset(Start::Evaluation {
+        seed: 1,
+        first: 0,
+        episodes: None,
+    });
     let second = bench.reset(Start::Next);
     assert_eq!(second, Bench::new("pendulum", "", 1).reset(Start::Episodes(&[1])));
 }

@@ -14,6 +14,8 @@ pub enum What {
     Failed,
     /// It made no progress, and was ended to be replaced.
     Stalled,
+    /// An environment of it returned something invalid; its episodes were given up.
+    Fault,
     /// It has a successor now.
     StartedAgain,
     /// It failed too often and gets no successor.

@@ -25,7 +25,7 @@ fn actions(bench: &Bench, rng: &mut Stream) -> Vec<f32> {
         Space::Box { low, high } => (low.iter().zip(high))
             .map(|(low, high)| rng.random_range(1.1 * low - 0.1..=1.1 * high + 0.1))
             .collect(),
-        Space::Discrete { n } => vec![rng.random_range(0..*n) as f32],
+        Space::Discrete { n, .. } => vec![rng.random_range(0..*n) as f32],
     };
     (0..bench.vector.count()).flat_map(|_| each(rng)).collect()
 }
@@ -185,7 +185,11 @@ fn there_are_snapshots_of_training_alone_and_a_restore_goes_back_to_it() {
     assert_eq!(bench.vector.snapshot(&mut words), Err(RequestError::NoTraining));
     bench.reset(Start::Next);
     let training = snapshot(&bench);
-    bench.reset(Start::Evaluation { seed: 1, first: 0 });
+    bench.reset(Start::Evaluation {
+        seed: 1,
+        first: 0,
+        episodes: None,
+    });
     assert_eq!(bench.vector.snapshot(&mut words), Err(RequestError::NoTraining));
     restore(&mut bench, &training).unwrap();
     assert_eq!(snapshot(&bench), training);

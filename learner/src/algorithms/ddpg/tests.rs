@@ -353,7 +353,7 @@ fn actors_act_with_the_learners_bits() {
 #[test]
 fn what_cannot_work_is_refused() {
     let discrete = EnvironmentSpec {
-        action: Space::Discrete { n: 4 },
+        action: Space::discrete(4),
         ..spec()
     };
     let error = Ddpg::new(&discrete, &settings(), 1).unwrap_err();
