@@ -34,6 +34,9 @@ use crate::actor_snapshot::ActorSnapshot;
 use crate::error::ActorError;
 use crate::exploration::Exploration;
 
+/// What the line about an invalid answer of an environment server ends with; the launcher looks for it.
+pub const GIVEN_UP: &str = "its episodes are given up";
+
 /// How long an actor waits after an invalid answer before it begins new episodes.
 const AFTER_FAULT: Duration = Duration::from_millis(50);
 
@@ -480,7 +483,7 @@ pub(crate) fn after_fault(
     listener: &Listener,
     stop: &Stop,
 ) -> Result<(), Exit<ChannelError>> {
-    tracing::warn!("{error}; its episodes are given up");
+    tracing::warn!("{error}; {GIVEN_UP}");
     heartbeat.count_fault();
     let since = Instant::now();
     while since.elapsed() < AFTER_FAULT {

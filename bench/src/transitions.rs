@@ -176,9 +176,9 @@ fn sample(replay: &Replay, config: &Config, patience: &Patience) -> anyhow::Resu
     let mut update = 0;
     let mut gather = || {
         let newest = replay.window(replay.head(), config.replay.capacity);
-        sampler.indices(update, newest, &mut indices);
+        sampler.indices(update, newest.clone(), &mut indices);
         update += 1;
-        batch.gather(replay, &indices);
+        batch.gather(replay, &indices, &newest);
         std::hint::black_box(&mut batch);
     };
     // The mapping is new: its pages come in first.

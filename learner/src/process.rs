@@ -20,7 +20,7 @@ use shoal_common::exit::Exit;
 use shoal_common::stop::Stop;
 
 use self::learner::Learner;
-pub use self::settings::{LearnerError, LearnerSettings, SizeError, disk_bytes};
+pub use self::settings::{LearnerError, LearnerSettings, SizeError, disk_bytes, replay_layout};
 
 /// Learns until the run's steps are taken and learned from, or until `stop`; either way the state is saved.
 ///

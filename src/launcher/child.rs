@@ -60,6 +60,8 @@ pub(super) struct Child {
     pub(super) stalls: u32,
     /// The environment server that it asks, if it asks one.
     server: Option<u32>,
+    /// Whether the user was told that it is slow, since it was last heard of or started.
+    reported_slow: bool,
     /// When its rate was taken, and its steps then.
     span: (Instant, u64),
     rate: f64,
@@ -100,6 +102,7 @@ impl Child {
             stalls: 0,
             server: (role == Role::Actor).then_some(index),
             span: (now, 0),
+            reported_slow: false,
             rate: 0.0,
         }
     }
@@ -132,6 +135,7 @@ impl Child {
         self.begun = now;
         self.moved = now;
         self.heard = None;
+        self.reported_slow = false;
         self.rate = 0.0;
     }
 
@@ -154,6 +158,7 @@ impl Child {
     }
 
     fn hear_at(&mut self, heartbeat: &Heartbeat, now: Instant) -> Option<Duration> {
+        self.reported_slow = false;
         let before = self.heard.replace((now, *heartbeat)).map(|(_, before)| before);
         let first = before.is_none();
         let position = |heartbeat: &Heartbeat| (heartbeat.steps, heartbeat.policy_version, heartbeat.activity());
@@ -234,6 +239,24 @@ impl Child {
     /// How long nothing was heard of it.
     pub(super) fn silent_for(&self) -> Duration {
         self.heard.map_or(self.moved, |(then, _)| then).elapsed()
+    }
+
+    /// How long it has been starting; `None` once it is ready, and while it has no process.
+    pub(super) fn starting_for(&self) -> Option<Duration> {
+        (self.is_present() && !self.is_ready()).then(|| self.begun.elapsed())
+    }
+
+    /// Ends its process, which has not become ready in time.
+    pub(super) fn end_slow_start(&mut self) {
+        self.begun = Instant::now();
+        if let Some(process) = &mut self.process {
+            process.kill();
+        }
+    }
+
+    /// Takes note that the user is told that it is slow; whether that is news.
+    pub(super) fn report_slow(&mut self) -> bool {
+        !std::mem::replace(&mut self.reported_slow, true)
     }
 
     /// Whether its process is stopped.

@@ -7,7 +7,9 @@ use std::process::ExitStatus;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
+use shoal_actor::explorer::GIVEN_UP;
 use shoal_common::channel::control::RoleStatus;
+use shoal_common::channel::environment::Fault;
 use shoal_common::channel::{Domain, Services};
 use shoal_common::config::Config;
 use shoal_common::durable::write_atomically;
@@ -28,6 +30,9 @@ const CLEANING: Duration = Duration::from_secs(2);
 /// How long clean-ups may leave places occupied, and how soon the next one follows. A process may be dead and not yet gone.
 const HOPELESS: Duration = Duration::from_secs(2);
 const SOON: Duration = Duration::from_millis(200);
+
+/// A start that takes longer is reported to the user.
+const SLOW_START: Duration = Duration::from_secs(10);
 
 /// More processes than are started without any of them sending a chunk.
 const NEVER_SENT: u64 = 100_000;
@@ -195,13 +200,13 @@ impl Supervisor {
         });
         let Some(child) = child else { return };
         let faults = heartbeat.faults.saturating_sub(child.faults());
-        let server = child.server();
+        let (client, server) = (name(child.identity), child.server());
         if let Some(after) = child.hear(heartbeat) {
             self.log
                 .note(&name(child.identity), &format!("ready after {} ms", after.as_millis()));
         }
         if let Some(index) = server {
-            (0..faults).for_each(|_| self.note_fault(index));
+            (0..faults).for_each(|_| self.note_fault(&client, index));
         }
         if !self.all_ready && self.children.iter().all(Child::is_ready) {
             self.all_ready = true;
@@ -209,11 +214,16 @@ impl Supervisor {
         }
     }
 
-    fn note_fault(&mut self, index: u32) {
+    fn note_fault(&mut self, client: &str, index: u32) {
         self.faults = self.faults.saturating_add(1);
         let server = self.children.iter().find(|child| child.is(Role::EnvServer, index));
         if let Some(server) = server {
-            let last = self.log.last_lines(&name(server.identity)).pop().unwrap_or_default();
+            // The server has written what it was, unless it is one that does not check itself: then its client has.
+            let by_client = self.log.last_lines(client).pop().filter(|line| line.contains(GIVEN_UP));
+            let last = by_client.filter(|line| !line.contains(&Fault::Reported.to_string()));
+            let last = last
+                .or_else(|| self.log.last_lines(&name(server.identity)).pop())
+                .unwrap_or_default();
             let last = last.strip_prefix("error: ").unwrap_or(&last);
             self.last_fault = format!("{}: {last}", name(server.identity));
             self.incidents
@@ -378,6 +388,34 @@ impl Supervisor {
                 process.kill();
             }
             self.note_incident(i, What::Stalled, why.into());
+        }
+        said
+    }
+
+    /// What is to be said of processes that are slow, each once: environment servers over one step or reset, and roles that
+    /// are starting. An environment's program that is not ready within `start_limit` is ended, which counts as a failure.
+    pub(super) fn report_slow(&mut self, stalls: &Stalls, start_limit: Option<Duration>) -> Vec<String> {
+        let mut said = Vec::new();
+        for (i, silent) in stalls.slow_servers(&self.children) {
+            let child = &mut self.children[i];
+            if child.report_slow() {
+                let (name, seconds) = (name(child.identity), silent.as_secs());
+                said.push(format!(
+                    "{name} has been over one step or reset of its environments for {seconds} s; it is left alone"
+                ));
+            }
+        }
+        for child in &mut self.children {
+            let Some(starting) = child.starting_for() else { continue };
+            let limit = start_limit.filter(|_| child.identity.role == Role::EnvServer);
+            if limit.is_some_and(|limit| starting >= limit) {
+                let text = "is not ready within environment.start_seconds and is ended";
+                self.log.note(&name(child.identity), text);
+                child.end_slow_start();
+            } else if starting >= SLOW_START && child.report_slow() {
+                let limit = limit.map_or(String::new(), |limit| format!(", for at most {} s", limit.as_secs()));
+                said.push(format!("waiting for {} to start{limit}", name(child.identity)));
+            }
         }
         said
     }

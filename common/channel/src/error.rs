@@ -124,14 +124,6 @@ pub enum PeerError {
     /// An environment returned what it may not.
     #[error(transparent)]
     Invalid(Fault),
-    /// A response has not the numbers of its environments.
-    #[error("an answer of {found} numbers instead of {expected}")]
-    AnswerLength {
-        /// Numbers there are.
-        found: usize,
-        /// Numbers that the environments have.
-        expected: usize,
-    },
     /// The environment server does not do what it is asked.
     #[error("the environment server refused the request")]
     Refused,

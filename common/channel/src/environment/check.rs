@@ -11,6 +11,14 @@ pub enum Fault {
     /// The server has found it, and has written to its standard error what it was.
     #[error("the environment server reports that an environment returned something invalid")]
     Reported,
+    /// The answer has not the numbers of its environments.
+    #[error("the environment server answered with {found} numbers instead of {expected}")]
+    Length {
+        /// Numbers there are.
+        found: usize,
+        /// Numbers that the environments have.
+        expected: usize,
+    },
     /// A number that cannot be.
     #[error("an environment returned {value} as {what} (environment {environment}); {expected}")]
     Number {

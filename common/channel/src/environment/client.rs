@@ -282,11 +282,11 @@ impl EnvironmentClient {
     fn observed(&self, response: Answer, part: Part) -> Result<Observed, ChannelError> {
         let numbers = self.answered(&response)?;
         if numbers.len() != self.layout.len() {
-            let cause = PeerError::AnswerLength {
+            let fault = Fault::Length {
                 found: numbers.len(),
                 expected: self.layout.len(),
             };
-            return Err(ChannelError::new(&self.channel, "ask", cause));
+            return Err(ChannelError::new(&self.channel, "ask", PeerError::Invalid(fault)));
         }
         find_fault(&self.spec, &self.layout, numbers, part)
             .map_err(|fault| ChannelError::new(&self.channel, "ask", PeerError::Invalid(fault)))?;
