@@ -287,6 +287,12 @@ impl<'a> Launcher<'a> {
                 self.log.note("launcher", &stalled);
                 self.progress.note(&stalled);
             }
+            let start_limit =
+                (!self.config.environment.server.is_empty()).then(|| self.config.environment.start_limit());
+            for slow in self.supervisor.report_slow(&self.stalls, start_limit) {
+                self.log.note("launcher", &slow);
+                self.progress.note(&slow);
+            }
             // A learner that has just died shall come back and take in what was sent, before everybody ends.
             let may_end = |asked: Instant| self.supervisor.has_learner() || asked.elapsed() >= LEARNER_BACK;
             if self.to_end.is_some_and(may_end) {
@@ -379,12 +385,13 @@ impl<'a> Launcher<'a> {
 
     fn read_reports(&mut self) -> anyhow::Result<()> {
         let wall = self.begun.elapsed();
-        for incident in self.supervisor.take_incidents() {
-            self.recorder.incident(&incident, wall)?;
-        }
         while let Some(heartbeat) = self.heartbeats.receive()? {
             self.supervisor.hear(&heartbeat);
         }
+        for incident in self.supervisor.take_incidents() {
+            self.recorder.incident(&incident, wall)?;
+        }
+        self.supervisor.check_faults(self.config.environment.faults)?;
         let filled = [
             each(&self.episode_reports, |report| {
                 Ok(self.recorder.episode(&report, wall)?)

@@ -155,7 +155,7 @@ mod tests {
     #[test]
     fn each_algorithm_accepts_the_spaces_that_it_can_control() {
         let real = || Space::boxed(&[(-1.0, 1.0); 4]);
-        let counted = || Space::Discrete { n: 3 };
+        let counted = || Space::discrete(3);
         let takes = |observation: fn() -> Space, action: fn() -> Space| -> Vec<bool> {
             let spec = spec(observation(), action());
             let all = Algorithm::all().into_iter();
@@ -179,7 +179,7 @@ mod tests {
 
     #[test]
     fn the_learned_policy_has_as_many_parameters_as_the_policy_layout() {
-        let (real, counted) = (|| Space::boxed(&[(-1.0, 1.0); 4]), || Space::Discrete { n: 3 });
+        let (real, counted) = (|| Space::boxed(&[(-1.0, 1.0); 4]), || Space::discrete(3));
         let specs = [
             spec(real(), real()),
             spec(real(), counted()),

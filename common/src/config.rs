@@ -173,6 +173,7 @@ impl Config {
     /// For the first invalid value.
     pub fn check(&self) -> Result<(), ConfigError> {
         self.run.check()?;
+        self.environment.check()?;
         environment::check_spec(&self.spec)?;
         self.actors.check()?;
         self.algorithm.check()?;

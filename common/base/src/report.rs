@@ -89,7 +89,8 @@ pub struct Heartbeat {
     /// Its index among the processes of that role.
     pub index: u32,
     activity: u32,
-    reserved: u32,
+    /// Of an actor or the evaluator: invalid answers of its environment server, since it started.
+    pub faults: u32,
     /// Its incarnation.
     pub incarnation: u64,
     /// Environment steps since it started; for a learner gradient steps, or rows where each is used once.
@@ -111,7 +112,7 @@ impl Heartbeat {
             role: role as u32,
             index,
             activity,
-            reserved: 0,
+            faults: 0,
             incarnation,
             steps: 0,
             policy_version: 0,

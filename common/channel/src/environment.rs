@@ -2,11 +2,13 @@
 //! environment, and its response the outcomes; the actor reads observations where the server wrote them. A snapshot of the
 //! current episodes is returned as words, from which any server of this environment can continue.
 
+mod check;
 mod client;
 mod message;
 mod port;
 mod service;
 
+pub use check::Fault;
 pub use client::{Begin, EnvironmentClient, Observed, Snapshot, Stepped, describe};
 pub use message::{Ask, RequestHeader, ResponseHeader, ResponseLayout, StepBlocks};
 pub use port::{EnvironmentPort, Request};

@@ -18,6 +18,8 @@ use iceoryx2::service::port_factory::client::ClientCreateError;
 use iceoryx2::service::port_factory::server::ServerCreateError;
 use iceoryx2::service::service_name::ServiceNameError;
 
+use super::environment::Fault;
+
 /// Why a channel fails: its service or port is unavailable, memory is exhausted, or the other side violates the protocol.
 #[derive(Debug, thiserror::Error)]
 #[error("channel {channel}: cannot {action}: {}", reason(*kind, source.as_ref()))]
@@ -39,6 +41,14 @@ impl ChannelError {
             action,
             kind: cause.kind(),
             source: Box::new(cause),
+        }
+    }
+
+    /// What an environment returned that it may not, if that is why; it can go on with new episodes.
+    pub fn fault(&self) -> Option<&Fault> {
+        match self.source.downcast_ref() {
+            Some(PeerError::Invalid(fault)) => Some(fault),
+            _ => None,
         }
     }
 
@@ -98,7 +108,7 @@ pub enum ChannelErrorKind {
 }
 
 /// The other side of a channel violates the protocol, or sends something that cannot be used.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum PeerError {
     /// A description lacks some of its numbers.
     #[error("the answer is too short")]
@@ -111,6 +121,9 @@ pub enum PeerError {
         /// Words in a snapshot of the environments.
         expected: usize,
     },
+    /// An environment returned what it may not.
+    #[error(transparent)]
+    Invalid(Fault),
     /// The environment server refused a request.
     #[error("the environment server refused the request")]
     Refused,

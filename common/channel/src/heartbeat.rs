@@ -49,6 +49,12 @@ impl HeartbeatSender {
         }
     }
 
+    /// Counts an invalid answer of the environment server, and reports it at once.
+    pub fn count_fault(&mut self) {
+        self.heartbeat.faults = self.heartbeat.faults.saturating_add(1);
+        self.beat_now(Activity::Working);
+    }
+
     /// Sets the version of the policy that the role uses.
     pub fn set_policy_version(&mut self, version: u64) {
         self.heartbeat.policy_version = version;

@@ -130,7 +130,7 @@ pub fn softmax(
 ) -> Result<Scores, PolicyError> {
     let actions = counted_actions(algorithm, spec)?;
     match spec.observation {
-        Space::Discrete { n } => Err(PolicyError::RealStates { algorithm, n }),
+        Space::Discrete { n, .. } => Err(PolicyError::RealStates { algorithm, n }),
         Space::Box { .. } => {
             let network = NetworkLayout::policy(spec.observation.width(), hidden, actions);
             Ok(Scores::softmax(network, batch))
@@ -146,14 +146,14 @@ pub fn softmax(
 pub fn table(algorithm: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Scores, PolicyError> {
     let actions = counted_actions(algorithm, spec)?;
     match spec.observation {
-        Space::Discrete { n } => Ok(Scores::table(n as usize, actions, batch)),
+        Space::Discrete { n, .. } => Ok(Scores::table(n as usize, actions, batch)),
         Space::Box { .. } => Err(PolicyError::CountedStates { algorithm }),
     }
 }
 
 fn counted_actions(algorithm: &'static str, spec: &EnvironmentSpec) -> Result<usize, PolicyError> {
     match spec.action {
-        Space::Discrete { n } => Ok(n as usize),
+        Space::Discrete { n, .. } => Ok(n as usize),
         Space::Box { .. } => Err(PolicyError::CountedActions { algorithm }),
     }
 }
@@ -184,7 +184,7 @@ mod tests {
 
     #[test]
     fn a_table_is_read_state_after_state_and_the_first_of_equals_taken() {
-        let lake = spec(Space::Discrete { n: 3 }, Space::Discrete { n: 2 });
+        let lake = spec(Space::discrete(3), Space::discrete(2));
         let mut policy = Policy::Scored(table("q-learning", &lake, 4).unwrap());
         assert_eq!(policy.layout().parameters(), 6);
         let mut actions = [f32::NAN; 4];

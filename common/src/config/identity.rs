@@ -86,7 +86,7 @@ fn space(space: &Space) -> String {
             .iter()
             .zip(high)
             .fold("box".into(), |text, (low, high)| text + &format!(" {low} .. {high}")),
-        Space::Discrete { n } => format!("discrete {n}"),
+        Space::Discrete { n, .. } => format!("discrete {n}"),
     }
 }
 

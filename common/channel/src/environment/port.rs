@@ -111,6 +111,11 @@ impl Request<'_> {
         self.request.user_header().episode
     }
 
+    /// How many evaluation episodes there are, from [`episode`](Self::episode) on; `None` where there is no limit.
+    pub fn episodes(&self) -> Option<u32> {
+        Some(self.request.user_header().episodes).filter(|episodes| *episodes > 0)
+    }
+
     /// Answers with the blocks that `write` fills from the actions, environment after environment. If `write` fails, the
     /// request is refused and the inner result is that error.
     ///
@@ -180,9 +185,12 @@ impl Request<'_> {
     fn describe(self) -> Result<(), ChannelError> {
         let mut bounds = Vec::new();
         for space in [&self.port.spec.observation, &self.port.spec.action] {
-            if let Space::Box { low, high } = space {
-                bounds.extend(low);
-                bounds.extend(high);
+            match space {
+                Space::Box { low, high } => {
+                    bounds.extend(low);
+                    bounds.extend(high);
+                }
+                Space::Discrete { start, .. } => bounds.push(*start as f32),
             }
         }
         self.respond(bounds.len(), |payload| {
@@ -195,7 +203,7 @@ impl Request<'_> {
         let EnvironmentPort {
             spec, layout, channel, ..
         } = self.port;
-        let discrete = |space: &Space| if let Space::Discrete { n } = space { *n } else { 0 };
+        let discrete = |space: &Space| if let Space::Discrete { n, .. } = space { *n } else { 0 };
         let mut response = self
             .request
             .loan_slice(length)
