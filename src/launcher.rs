@@ -1,4 +1,4 @@
-//! The launcher: starts the roles of a run, watches them, keeps the records, and ends all of them.
+//! The launcher: starts the roles of a run, watches them, writes the records, and ends the roles.
 
 mod child;
 mod cleaner;
@@ -29,60 +29,60 @@ use shoal_run::{preflight, status};
 
 pub(crate) use self::cleaner::work as clean_up;
 use self::log::Log;
-pub(crate) use self::log::{EVERYBODY_ENDED, FAILED};
+pub(crate) use self::log::{ALL_ENDED, FAILED};
 use self::progress::Progress;
 use self::stall::Stalls;
 use self::supervisor::Supervisor;
 
-/// How often the launcher reads reports and looks round where nothing wakes it. It begins with the shortest tick, and a tick is
-/// longer than the one before where reports come slowly: the oldest of a full buffer are lost.
+/// How often the launcher reads reports and checks its children if nothing wakes it. Ticks start short and become
+/// longer while reports arrive slowly: a full buffer loses its oldest reports.
 const TICK: Duration = Duration::from_millis(500);
 const SHORTEST_TICK: Duration = Duration::from_millis(20);
 
-/// How full a buffer of reports may become in a tick that is followed by a longer one.
-const SLOWLY: f64 = 0.1;
+/// The largest part of a report buffer that may be filled in a tick for the next tick to be longer.
+const LOW_FILL: f64 = 0.1;
 
-/// How long the last evaluation's report may take once the learner, which has waited for it, is through.
+/// How long the last evaluation's report may take after the learner is done. The learner has waited for the evaluation.
 const LAST_EVALUATION: Duration = Duration::from_secs(1);
 
-/// How long a learner may take to come back when the run is to end.
-const LEARNER_BACK: Duration = Duration::from_secs(5);
+/// How long to wait for a learner that is being restarted when the run is asked to stop.
+const LEARNER_RESTART: Duration = Duration::from_secs(5);
 
-/// How long actors may take to hand over their last chunks, and the others to end; the learner saves its state.
+/// How long actors may take to hand over their last chunks, and the other roles to end. The learner saves its state.
 const ACTORS_END: Duration = Duration::from_secs(3);
 const OTHERS_END: Duration = Duration::from_secs(15);
 
-/// How long the roles of a launcher that was killed may take to end: one that is stuck ends after [`GRACE`].
+/// How long the roles of a killed launcher may take to end. One that is stuck ends after [`GRACE`].
 const PREDECESSORS_END: Duration = GRACE.saturating_add(Duration::from_secs(5));
 
-/// How often the run's shared memory may be made anew without an hour between.
-const RENEWALS: usize = 5;
+/// How often the run's shared memory may be created anew within an hour.
+const MAX_RENEWALS: usize = 5;
 const HOUR: Duration = Duration::from_secs(3600);
 
-/// How a run came to its end.
+/// How a run ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Ending {
-    /// All its steps are taken and learned from.
+    /// All steps are taken and learned from.
     Finished,
-    /// As somebody asked for; the learner saved its state.
+    /// It was stopped by `shoal stop`; the learner saved its state.
     Stopped,
-    /// By this signal; the learner saved its state.
+    /// This signal ended it; the learner saved its state.
     Interrupted(i32),
-    /// Dead processes occupy places in shared memory that cannot be freed: it goes on in shared memory that is made anew.
+    /// Dead processes occupy shared memory that cannot be freed: the run continues in new shared memory.
     Renewed,
 }
 
-/// What is known of a run when it ends.
+/// The result of a training.
 #[derive(Clone, Debug)]
 pub(crate) struct TrainingOutcome {
     pub(crate) ending: Ending,
     pub(crate) wall: Duration,
-    /// How the run stood when it began, and how it stands now.
+    /// The run's status when this launcher started, and now.
     pub(crate) before: RunStatus,
     pub(crate) after: RunStatus,
 }
 
-/// Runs all roles until the learner is through, a signal comes, or somebody asks for the end.
+/// Runs all roles until the learner is done, a signal arrives, or `shoal stop` asks for the end.
 pub(crate) fn run(mut config: Config, run: &RunDir, quiet: bool) -> anyhow::Result<TrainingOutcome> {
     let signals = Signals::register()?;
     let (mut renewals, mut before, mut wall) = (Vec::new(), None, Duration::ZERO);
@@ -100,10 +100,10 @@ pub(crate) fn run(mut config: Config, run: &RunDir, quiet: bool) -> anyhow::Resu
         }
         renewals.retain(|then: &Instant| then.elapsed() < HOUR);
         renewals.push(Instant::now());
-        if renewals.len() > RENEWALS {
-            anyhow::bail!("the run's shared memory had to be made anew {RENEWALS} times within an hour");
+        if renewals.len() > MAX_RENEWALS {
+            anyhow::bail!("the run's shared memory was already created anew {MAX_RENEWALS} times within an hour");
         }
-        // It may have been scaled.
+        // The run may have been scaled.
         config = run.config()?;
     }
 }
@@ -115,19 +115,19 @@ fn run_once(config: Config, run: &RunDir, signals: &Signals, quiet: bool) -> any
     let outcome = preflight::reserve(&config, run, &domain)
         .and_then(|()| Launcher::new(config, run, &domain, signals, quiet))
         .and_then(Launcher::run);
-    // Even where something failed: no role is left by now.
+    // Also after an error: no role is left by now.
     let left = domain.leave();
     let outcome = outcome?;
     left?;
     Ok(outcome)
 }
 
-/// Says whose processes they are that keep a run from beginning.
+/// Adds to the error which run the processes belong to that prevent the start.
 fn explain(error: DomainError, run: &RunDir) -> anyhow::Error {
     let DomainError::StillAlive { pids, .. } = &error else {
         return error.into();
     };
-    // A role's arguments are its name, the run's directory, and two numbers; a launcher's are what somebody typed.
+    // Only roles name their directory in a fixed place: their arguments are role, run directory and two numbers.
     let roles = [Role::EnvServer, Role::Actor, Role::Evaluator, Role::Learner].map(Role::name);
     let directory = |pid: &i32| {
         let arguments = std::fs::read(format!("/proc/{pid}/cmdline")).ok()?;
@@ -142,7 +142,7 @@ fn explain(error: DomainError, run: &RunDir) -> anyhow::Error {
         .find_map(directory)
         .filter(|there| *there != here.to_string())
     {
-        Some(there) => anyhow::anyhow!("{here} is a copy of {there}, which is going on: end that one first"),
+        Some(there) => anyhow::anyhow!("{here} is a copy of {there}, which is running: stop that run first"),
         None => error.into(),
     }
 }
@@ -152,12 +152,12 @@ struct Launcher<'a> {
     run: &'a RunDir,
     domain: &'a Domain,
     control: ControlPort,
-    /// How the run stood when this launcher began.
-    rest: RunStatus,
-    /// When somebody asked for the end first.
-    to_end: Option<Instant>,
-    /// The end has begun.
-    ends: bool,
+    /// The run's status when this launcher started.
+    initial: RunStatus,
+    /// When the end was first requested.
+    stop_requested: Option<Instant>,
+    /// Whether the roles are being ended.
+    ending: bool,
     supervisor: Supervisor,
     log: Log,
     recorder: Recorder,
@@ -182,20 +182,20 @@ impl<'a> Launcher<'a> {
     ) -> anyhow::Result<Self> {
         let log = Log::open(&run.log())?;
         write_iox_config(domain, run)?;
-        std::fs::create_dir_all(run.checkpoints()).context("cannot make the directory for checkpoints")?;
+        std::fs::create_dir_all(run.checkpoints()).context("cannot create the directory for checkpoints")?;
         if config.evaluation.keep_policies {
-            std::fs::create_dir_all(run.policies()).context("cannot make the directory for policies")?;
+            std::fs::create_dir_all(run.policies()).context("cannot create the directory for policies")?;
         }
         let recorder = Recorder::open(run, config.replay.warmup)?;
-        let rest = status::saved_status(&config, run)?;
-        RunOutcome::new(RunState::Running, rest.env_steps, rest.episodes).write(run)?;
-        // Makes the services that are opened below.
+        let initial = status::saved_status(&config, run)?;
+        RunOutcome::new(RunState::Running, initial.env_steps, initial.episodes).write(run)?;
+        // Creates the services that are opened below.
         let supervisor = Supervisor::new(&config, run, domain, log.clone())?;
         Ok(Self {
             control: ControlPort::open(domain)?,
-            rest,
-            to_end: None,
-            ends: false,
+            initial,
+            stop_requested: None,
+            ending: false,
             run,
             domain,
             heartbeats: Reports::open(domain)?,
@@ -216,9 +216,9 @@ impl<'a> Launcher<'a> {
 
     fn run(mut self) -> anyhow::Result<TrainingOutcome> {
         let ending = self.watch();
-        // Whatever happened, nobody is left behind.
-        self.progress.say("ending");
-        let ended = self.end_everyone();
+        // The roles are ended in every case, also after an error.
+        self.progress.set_message("ending");
+        let ended = self.end_all();
         self.progress.clear();
         self.control.answer_waiting(&match &ended {
             Ok(()) => Answer::Accepted,
@@ -229,35 +229,35 @@ impl<'a> Launcher<'a> {
         if let Some(error) = failure {
             let why = format!("{error:#}").replace('\n', " ");
             self.log.note("launcher", &format!("{FAILED}{why}"));
-            // The error itself is what is to be told.
+            // An error here must not hide the original one.
             let _ = self
                 .outcome(RunState::Failed)
                 .map(|outcome| outcome.with_reason(why).write(self.run));
         }
         let ending = ending?;
-        // Where shared memory is made anew, the learner goes on from its newest checkpoint.
+        // With new shared memory, the learner continues from its newest checkpoint.
         ended.or_else(|error| if ending == Ending::Renewed { Ok(()) } else { Err(error) })?;
         self.recorder.flush()?;
-        // What the learner saved: its last report may have come too late to be heard.
+        // What the learner saved: its last report may have arrived too late.
         let after = status::saved_status(&self.config, self.run)?;
         let stopped = RunOutcome::new(RunState::Stopped, after.env_steps, after.episodes);
         match ending {
-            Ending::Stopped => stopped.with_reason("somebody asked for it").write(self.run)?,
+            Ending::Stopped => stopped.with_reason("by request").write(self.run)?,
             Ending::Interrupted(signal) => stopped.with_reason(format!("signal {signal}")).write(self.run)?,
-            // A finished run is still to be evaluated.
+            // The final evaluation of a finished run is still to come.
             Ending::Finished | Ending::Renewed => {}
         }
         Ok(TrainingOutcome {
             ending,
             wall: self.begun.elapsed(),
             after,
-            before: self.rest,
+            before: self.initial,
         })
     }
 
     fn outcome(&self, state: RunState) -> anyhow::Result<RunOutcome> {
-        let rest = status::saved_status(&self.config, self.run)?;
-        Ok(RunOutcome::new(state, rest.env_steps, rest.episodes))
+        let saved = status::saved_status(&self.config, self.run)?;
+        Ok(RunOutcome::new(state, saved.env_steps, saved.episodes))
     }
 
     fn watch(&mut self) -> anyhow::Result<Ending> {
@@ -267,35 +267,34 @@ impl<'a> Launcher<'a> {
                 return Ok(Ending::Interrupted(signal));
             }
             self.read_reports()?;
-            self.attend()?;
-            match self.supervisor.look_after(self.domain)? {
+            self.answer_requests()?;
+            match self.supervisor.maintain(self.domain)? {
                 supervisor::Situation::AtWork => {}
                 supervisor::Situation::LearnerDone => {
                     self.await_last_evaluation()?;
                     return Ok(Ending::Finished);
                 }
-                supervisor::Situation::SharedMemoryOccupied if self.to_end.is_some() => {}
+                supervisor::Situation::SharedMemoryOccupied if self.stop_requested.is_some() => {}
                 supervisor::Situation::SharedMemoryOccupied => {
-                    let why =
-                        "dead processes occupy places in shared memory: the run goes on in shared memory made anew";
+                    let why = "dead processes occupy shared memory for good: the run continues in new shared memory";
                     self.log.note("launcher", why);
-                    self.progress.note(why);
+                    self.progress.print(why);
                     return Ok(Ending::Renewed);
                 }
             }
             for stalled in self.supervisor.replace_stalled(&mut self.stalls) {
                 self.log.note("launcher", &stalled);
-                self.progress.note(&stalled);
+                self.progress.print(&stalled);
             }
             let start_limit =
                 (!self.config.environment.server.is_empty()).then(|| self.config.environment.start_limit());
             for slow in self.supervisor.report_slow(&self.stalls, start_limit) {
                 self.log.note("launcher", &slow);
-                self.progress.note(&slow);
+                self.progress.print(&slow);
             }
-            // A learner that has just died shall come back and take in what was sent, before everybody ends.
-            let may_end = |asked: Instant| self.supervisor.has_learner() || asked.elapsed() >= LEARNER_BACK;
-            if self.to_end.is_some_and(may_end) {
+            // A learner that has just died is restarted first, so that it takes in what the actors have sent.
+            let may_end = |asked: Instant| self.supervisor.has_learner() || asked.elapsed() >= LEARNER_RESTART;
+            if self.stop_requested.is_some_and(may_end) {
                 return Ok(Ending::Stopped);
             }
             self.progress.draw(&self.supervisor);
@@ -303,54 +302,56 @@ impl<'a> Launcher<'a> {
         }
     }
 
-    /// Sleeps until a process ends, a signal comes or somebody asks, but no longer than `most`.
+    /// Sleeps at most `most`, until a process ends, a signal arrives or a request comes.
     fn sleep(&mut self, most: Duration) {
-        let mut wakers: Vec<_> = self.supervisor.ends().collect();
+        let mut wakers: Vec<_> = self.supervisor.exit_descriptors().collect();
         wakers.extend([self.signals.as_fd(), self.control.as_fd()]);
         if wait_for_any(&wakers, most) {
             self.tick = SHORTEST_TICK;
         }
-        // What it has woken for is not to wake it again.
+        // So that the same events do not wake it again.
         self.signals.received();
-        self.supervisor.see_ends();
+        self.supervisor.collect_exits();
     }
 
-    /// Answers who asks from another terminal. Who asks for the end is answered when it is there.
-    fn attend(&mut self) -> anyhow::Result<()> {
+    /// Answers requests from other terminals. A request to stop is answered when the run has ended.
+    fn answer_requests(&mut self) -> anyhow::Result<()> {
         let Self {
             config,
             run,
             control,
             supervisor,
             progress,
-            rest,
-            ends,
-            to_end,
+            initial,
+            ending,
+            stop_requested,
             ..
         } = self;
         control.answer_questions(run.key()?, run.path(), |question| -> anyhow::Result<Option<Answer>> {
             match question {
-                Question::Status => Ok(Some(match requests::status(config, run, supervisor, progress, rest) {
-                    Ok(status) => Answer::Status(status),
-                    Err(error) => Answer::Refused(error.to_string()),
-                })),
-                Question::Scale { .. } if *ends => Ok(Some(Answer::Refused("the run is ending".into()))),
+                Question::Status => Ok(Some(
+                    match requests::status(config, run, supervisor, progress, initial) {
+                        Ok(status) => Answer::Status(status),
+                        Err(error) => Answer::Refused(error.to_string()),
+                    },
+                )),
+                Question::Scale { .. } if *ending => Ok(Some(Answer::Refused("the run is ending".into()))),
                 Question::Scale { actors } => requests::scale(config, run, supervisor, actors).map(Some),
                 Question::Stop => {
-                    to_end.get_or_insert_with(Instant::now);
+                    stop_requested.get_or_insert_with(Instant::now);
                     Ok(None)
                 }
             }
         })
     }
 
-    /// The evaluator may still be at the policy of the last period.
+    /// Waits for the report on the last period's policy.
     fn await_last_evaluation(&mut self) -> anyhow::Result<()> {
         let last = status::saved_status(&self.config, self.run)?.env_steps;
         let patience = Instant::now();
         while patience.elapsed() < LAST_EVALUATION && self.signals.received().is_none() {
             self.read_reports()?;
-            self.attend()?;
+            self.answer_requests()?;
             let period = |steps| self.config.evaluation.period(steps);
             if self.recorder.evaluated().map(period) >= Some(period(last)) {
                 break;
@@ -360,11 +361,10 @@ impl<'a> Launcher<'a> {
         Ok(())
     }
 
-    /// Ends everyone: the actors first, so that the learner still takes what they send.
-    fn end_everyone(&mut self) -> anyhow::Result<()> {
-        self.ends = true;
-        let actors = |role| role == Role::Actor;
-        self.end(actors, ACTORS_END);
+    /// Ends all roles, the actors first, so that the learner still receives what they send.
+    fn end_all(&mut self) -> anyhow::Result<()> {
+        self.ending = true;
+        self.end(|role| role == Role::Actor, ACTORS_END);
         self.end(|_| true, OTHERS_END);
         self.read_reports()?;
         self.supervisor.check_saved()
@@ -377,8 +377,8 @@ impl<'a> Launcher<'a> {
             if Instant::now() >= deadline {
                 self.supervisor.kill(which);
             }
-            // No question keeps a run from ending.
-            let _ = self.attend();
+            // An error here must not prevent the end.
+            let _ = self.answer_requests();
             self.sleep(deadline.saturating_duration_since(Instant::now()).min(TICK));
         }
     }
@@ -386,45 +386,45 @@ impl<'a> Launcher<'a> {
     fn read_reports(&mut self) -> anyhow::Result<()> {
         let wall = self.begun.elapsed();
         while let Some(heartbeat) = self.heartbeats.receive()? {
-            self.supervisor.hear(&heartbeat);
+            self.supervisor.record(&heartbeat);
         }
         for incident in self.supervisor.take_incidents() {
             self.recorder.incident(&incident, wall)?;
         }
         self.supervisor.check_faults(self.config.environment.faults)?;
-        let filled = [
+        let fills = [
             each(&self.episode_reports, |report| {
                 Ok(self.recorder.episode(&report, wall)?)
             })?,
             each(&self.evaluation_reports, |report| {
-                self.progress.heard_evaluation(&report);
+                self.progress.set_evaluation(&report);
                 Ok(self.recorder.evaluation(&report, wall)?)
             })?,
             each(&self.learner_reports, |report| {
-                self.progress.heard_learner(&report, wall);
+                self.progress.add_learner_report(&report, wall);
                 Ok(self.recorder.learner(&report, wall)?)
             })?,
         ];
-        self.tick = match filled.into_iter().fold(0.0, f64::max) {
-            0.0..=SLOWLY => (self.tick * 3 / 2).min(TICK),
-            filled => self.tick.mul_f64(SLOWLY / filled).max(SHORTEST_TICK),
+        self.tick = match fills.into_iter().fold(0.0, f64::max) {
+            0.0..=LOW_FILL => (self.tick * 3 / 2).min(TICK),
+            fill => self.tick.mul_f64(LOW_FILL / fill).max(SHORTEST_TICK),
         };
         Ok(())
     }
 }
 
-/// Uses all reports that are there; how full one sender's buffer would be with them.
-fn each<R: Report>(reports: &Reports<R>, mut use_it: impl FnMut(R) -> anyhow::Result<()>) -> anyhow::Result<f64> {
+/// Passes all received reports to `handle`. Returns the fraction of one sender's buffer that they would fill.
+fn each<R: Report>(reports: &Reports<R>, mut handle: impl FnMut(R) -> anyhow::Result<()>) -> anyhow::Result<f64> {
     let mut count = 0;
     while let Some(report) = reports.receive()? {
-        use_it(report)?;
+        handle(report)?;
         count += 1;
     }
     Ok(f64::from(count) / R::BUFFER as f64)
 }
 
-/// With this file, iceoryx2's own tools find the run's services when they are started in the run directory, and so do
-/// environment servers that are programs of their own.
+/// Writes the iceoryx2 configuration of the run. With it, external environment servers find the run's services, as do
+/// iceoryx2's own tools when started in the run directory.
 fn write_iox_config(domain: &Domain, run: &RunDir) -> anyhow::Result<()> {
     let file = run.iceoryx2_config();
     file.parent().map_or(Ok(()), std::fs::create_dir_all)?;

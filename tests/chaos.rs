@@ -94,7 +94,9 @@ fn ready_again(log: &str, kill: &Kill) -> Option<f64> {
     let ready = after
         .iter()
         .position(|(_, message)| message.starts_with("ready after"))?;
-    let was_needed = !after[..ready].iter().any(|(_, message)| message.contains("not needed"));
+    let was_needed = !after[..ready]
+        .iter()
+        .any(|(_, message)| message.contains("no longer needed"));
     was_needed.then_some(after[ready].0)
 }
 

@@ -178,7 +178,7 @@ fn a_run_whose_shared_memory_cannot_be_cleaned_up_continues_in_new_shared_memory
     }
     running.signal(Signal::CONT);
     until("new shared memory is reported", || {
-        running.log().contains("shared memory made anew")
+        running.log().contains("continues in new shared memory")
     });
     running.wait_for_learning();
     running.wait_for_learning();

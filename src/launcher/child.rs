@@ -143,7 +143,7 @@ impl Child {
 
     /// Invalid answers of its environment server that it has reported since it started.
     pub(super) fn faults(&self) -> u32 {
-        self.heard.map_or(0, |(_, heartbeat)| heartbeat.faults)
+        self.last_heartbeat.map_or(0, |(_, heartbeat)| heartbeat.faults)
     }
 
     pub(super) fn is_ready(&self) -> bool {
@@ -186,8 +186,8 @@ impl Child {
         self.has_ended_at(status, Instant::now())
     }
 
-    /// After a process that was able to work, the role is restarted and its failures are forgotten. Being killed while it
-    /// waited, after its first step, or within the usual time of a start is not a failure either. Any other end is.
+    /// After a process that was able to work, the role is restarted and its failures are forgotten. Being killed while
+    /// it waited, after its first step, or within the usual time of a start is not a failure either. Any other end is.
     fn has_ended_at(&mut self, status: ExitStatus, now: Instant) -> Consequence {
         (self.process, self.ended) = (None, None);
         let crash_signals = [SIGABRT, SIGBUS, SIGFPE, SIGILL, SIGSEGV];
@@ -245,7 +245,7 @@ impl Child {
 
     /// How long it has been starting; `None` once it is ready, and while it has no process.
     pub(super) fn starting_for(&self) -> Option<Duration> {
-        (self.is_present() && !self.is_ready()).then(|| self.begun.elapsed())
+        (self.is_active() && !self.is_ready()).then(|| self.begun.elapsed())
     }
 
     /// Ends its process, which has not become ready in time.

@@ -32,8 +32,8 @@ impl Stalls {
         }
     }
 
-    /// The processes to replace, with the reasons. `busy` is the time that the launcher has spent on clean-ups since the
-    /// last call.
+    /// The processes to replace, with the reasons. `busy` is the time that the launcher has spent on clean-ups since
+    /// the last call.
     pub(super) fn find(&mut self, children: &mut [Child], busy: Duration) -> Vec<(usize, &'static str)> {
         let now = Instant::now();
         let since = now - std::mem::replace(&mut self.looked, now);
@@ -60,10 +60,10 @@ impl Stalls {
     pub(super) fn slow_servers(&self, children: &[Child]) -> Vec<(usize, Duration)> {
         let is_waited_for = |index| {
             let mut clients = children.iter().filter(|client| client.server() == Some(index));
-            clients.any(|client| client.is_heard() && client.activity() == Some(Activity::WaitingForServer))
+            clients.any(|client| client.is_responsive() && client.activity() == Some(Activity::WaitingForServer))
         };
         let servers = children.iter().enumerate().filter(|(_, child)| {
-            child.identity.role == Role::EnvServer && child.is_present() && child.is_ready() && !child.is_stopped()
+            child.identity.role == Role::EnvServer && child.is_active() && child.is_ready() && !child.is_stopped()
         });
         servers
             .map(|(i, server)| (i, server.silent_for()))

@@ -27,8 +27,8 @@ use super::stall::Stalls;
 /// How often to look for dead processes whose end the launcher does not observe, such as `shoal status`.
 const CLEANING: Duration = Duration::from_secs(2);
 
-/// How long dead processes may keep occupying shared memory in spite of clean-ups, and how soon a clean-up is repeated. A
-/// killed process may take a moment to disappear.
+/// How long dead processes may keep occupying shared memory in spite of clean-ups, and how soon a clean-up is repeated.
+/// A killed process may take a moment to disappear.
 const OCCUPIED_PATIENCE: Duration = Duration::from_secs(2);
 const CLEANING_AGAIN: Duration = Duration::from_millis(200);
 
@@ -85,7 +85,7 @@ impl Supervisor {
         let mut started = read_counter(&counter)?;
         let committed = last_committed(run)?;
         if started < committed {
-            // The counter was lost. Chunks of a reused incarnation would be taken for old ones, and its noise would repeat.
+            // The counter was lost. A reused incarnation would repeat noise, and its chunks would count as old ones.
             started = committed.saturating_add(STARTS_WITHOUT_CHUNK);
             log.note(
                 "launcher",
@@ -495,7 +495,8 @@ impl Supervisor {
             Some(_) => format!("its last messages:\n  {}", lines.join("\n  ")),
         };
         bail!(
-            "{name} failed {starts} times and is given up ({}); fix the cause, then `shoal resume {}` continues; {output}",
+            "{name} failed {starts} times and is given up ({}); fix the cause, then resume with `shoal resume {}`; \
+             {output}",
             ending(status),
             self.run.display()
         );

@@ -118,9 +118,11 @@ pub enum Picture {
     None,
     /// A rod on a joint. `angle` in rad, 0 upright and growing counterclockwise; `torque` in N m.
     Rod,
-    /// A body on a square seen from above, with its goal in the middle. `x` and `y` in m; `force` in N; `direction` in rad.
+    /// A body on a square, seen from above, with its goal in the middle. `x` and `y` in m; `force` in N; `direction` in
+    /// rad.
     Plane,
-    /// A pole on a cart. `position` in m; `angle` in rad, 0 upright and growing clockwise; `push` 0 to the left, 1 to the right.
+    /// A pole on a cart. `position` in m; `angle` in rad, 0 upright and growing clockwise; `push` is 0 to the left, 1
+    /// to the right.
     Cart {
         /// The track ends at this |x|, in m.
         track: f64,

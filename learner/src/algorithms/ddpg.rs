@@ -1,8 +1,8 @@
 //! Deep deterministic policy gradient: Algorithm 4 of the thesis (section 3.4.3), after Lillicrap et al. 2015.
 //!
 //! Symbols as there: policy μ with parameters θ_μ, action-value function Q with θ_Q, their slowly following targets μ'
-//! and Q', batch size N, target y, loss L, target rate τ. Lines 1, 2 and 11 to 16 are here; the others run in the actors
-//! and the environment servers.
+//! and Q', batch size N, target y, loss L, target rate τ. Lines 1, 2 and 11 to 16 are here. The others run in the
+//! actors and environment servers.
 
 pub mod replayed;
 

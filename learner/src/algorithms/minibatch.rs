@@ -41,7 +41,7 @@ impl Minibatch {
 
     /// Copies the rows with these numbers into the columns, from the first on. A row with a number that is not finite is
     /// replaced by the next good one of `window`. Panics if the replay does not hold one of the rows, or if there are
-    /// more than columns.
+    /// more rows than columns.
     pub fn gather(&mut self, replay: &Replay, indices: &[u64], window: &Range<u64>) {
         // Random rows are cache misses. Both ends of all rows are read before any is copied, so that the misses
         // overlap; this is three times as fast. Both ends, because a row may lie on two cache lines.

@@ -121,8 +121,8 @@ impl Reinforce {
         })
     }
 
-    /// Lines 4 to 7 for the episodes of a round, one after the other. Returns the means, over episodes and their steps, of
-    /// δ² (0 without a baseline), of −weight · ln π, and of G.
+    /// Lines 4 to 7 for the episodes of a round, one after another. Returns the means, over episodes and their steps,
+    /// of δ² (0 without a baseline), of −weight · ln π, and of G.
     fn learn(&mut self, steps: &[Transition<'_>]) -> Losses {
         let episodes: Vec<&[Transition<'_>]> = steps
             .split_inclusive(|step| step.last)

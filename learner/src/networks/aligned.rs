@@ -23,7 +23,7 @@ impl Aligned {
     /// `length` zeros. `stream` (0 to 7) numbers the slices that are read together.
     pub fn zeros(length: usize, stream: usize) -> Self {
         let numbers = vec![0.0; length + PAGE + STAGGER * stream];
-        // `align_offset` does not promise a result. It affects only the speed.
+        // `align_offset` may find no offset. That would cost only speed.
         let start = numbers.as_ptr().align_offset(PAGE * size_of::<f32>()).min(PAGE) + STAGGER * stream;
         Self {
             numbers,

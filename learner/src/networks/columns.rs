@@ -48,7 +48,7 @@ impl<'a> Columns<'a> {
     }
 }
 
-/// A column-major matrix to be written. It may have no rows.
+/// A mutable column-major matrix. It may have no rows.
 #[derive(Debug)]
 pub(super) struct ColumnsMut<'a> {
     numbers: &'a mut [f32],
@@ -66,7 +66,7 @@ impl<'a> ColumnsMut<'a> {
 
     /// Every column.
     pub(super) fn iter_mut(&mut self) -> impl Iterator<Item = &mut [f32]> {
-        // Without rows there are no numbers, and no column to go over.
+        // Without rows there are no numbers, and nothing to iterate over.
         self.numbers.chunks_exact_mut(self.rows.max(1))
     }
 
@@ -86,7 +86,7 @@ impl<'a> ColumnsMut<'a> {
     }
 }
 
-/// Adds columns up.
+/// Sums the columns.
 pub(super) fn sum_columns<'a>(columns: impl Iterator<Item = &'a [f32]>, sum: &mut [f32]) {
     sum.fill(0.0);
     pulp::Arch::new().dispatch(|| {

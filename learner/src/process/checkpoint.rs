@@ -217,7 +217,7 @@ impl Checkpoints {
         .map_err(|source| CheckpointError::Write { path, source })
     }
 
-    /// Frees the name `latest.ckpt`: a whole one becomes the previous one, a damaged one is put aside.
+    /// Frees the name `latest.ckpt`: a whole one becomes the previous one, a damaged one is renamed to an unused name.
     fn keep_latest(&mut self) -> Result<(), CheckpointError> {
         let latest = self.directory.join(LATEST);
         let sound = match self.latest_is_sound {
@@ -289,7 +289,7 @@ impl Checkpoints {
     }
 }
 
-/// No run reaches this many updates, rows, episodes or versions, and counting on from here does not overflow.
+/// No run reaches this many updates, rows, episodes or versions, and counting further from here does not overflow.
 const LIMIT: u64 = 1 << 60;
 
 /// Splits a body into its header and the numbers of each section; `None` unless the lengths add up to the body's and

@@ -10,8 +10,8 @@ use super::learner::Learner;
 use super::ratio::Ratio;
 use super::settings::LearnerError;
 
-/// Updates between two publications of the policy. Publishing copies the policy's weights once, about a thirtieth of an
-/// update.
+/// Updates between two publications of the policy. Publishing copies the policy's weights once, which takes about a
+/// thirtieth of an update's time.
 const PUBLISH_EVERY: u64 = 4;
 
 /// Chunks of each actor that are taken at most before the next update.

@@ -39,7 +39,7 @@ pub struct Intake {
     sources: Vec<Source>,
     chunk: ChunkLayout,
     window: u32,
-    /// The number of rows after which no more are taken.
+    /// The number of rows beyond which none are taken.
     limit: u64,
     /// The actor whose turn it is. Kept between calls: a learner that takes one chunk at a time must not take all of
     /// them from the first actor.

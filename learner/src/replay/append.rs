@@ -100,7 +100,7 @@ impl<'a> Reserved<'a> {
             });
         }
         let head = record.head();
-        // Set before the first row is overwritten: after a kill, recovery sees by it why these rows are gone.
+        // Set before the first row is overwritten, so that recovery after a kill can tell why these rows are gone.
         words.store(places.write_horizon, head + rows);
         record.set_tail(record.tail().max((head + rows).saturating_sub(layout.ring)));
         compiler_fence(Ordering::SeqCst);

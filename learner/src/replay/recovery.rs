@@ -134,7 +134,7 @@ fn warnings(best: &Candidate<'_>, newest: &Record, published: u64, expected: u64
     if newest.generation() < published {
         let number = newest.generation();
         warnings.push(format!(
-            "the commit record published last is damaged; continuing from the newest one that is not (number {number})"
+            "the commit record published last is damaged; continuing from the newest intact one (number {number})"
         ));
     }
     let (head, lost) = (best.record.head(), newest.head().saturating_sub(best.record.head()));

@@ -91,7 +91,7 @@ impl Ring {
     pub(super) fn clear_outside(&mut self, rows: Range<u64>) -> bool {
         let mut cleared = false;
         for index in rows.end..rows.start + self.ring {
-            // Only the checks are read: reading the rows of a ring that is not full would load it into memory.
+            // Only the checks are read: reading the rows too would load a ring that is not full into memory.
             if self.check(index) != check::NONE {
                 let place = self.place(index);
                 self.parts().0[place] = check::NONE;

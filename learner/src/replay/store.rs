@@ -20,7 +20,8 @@ pub struct Replay {
     pub(super) file: File,
     pub(super) words: WritableWords,
     pub(super) ring: Ring,
-    /// What is committed, as in the active slot. Only the tail already allows for the chunk that is being filled.
+    /// What is committed, as in the active slot, except that the tail already excludes the rows that the chunk being
+    /// filled overwrites.
     pub(super) record: Record,
     /// Which of the two slots for synced records is written next.
     pub(super) next_synced: usize,
@@ -89,8 +90,8 @@ impl Replay {
         Ok(replay)
     }
 
-    /// What was lost or repaired when the file was opened, one line each, for the run's log. Empty after just a `kill
-    /// -9`.
+    /// What was lost or repaired when the file was opened, one line each, for the run's log. A mere `kill -9` leaves it
+    /// empty.
     pub fn warnings(&self) -> &[String] {
         &self.warnings
     }
@@ -187,7 +188,8 @@ impl Replay {
         let hook = &mut self.hook;
         self.record
             .store(&mut self.words, slot, |step| observe(hook, step_of_record(step)));
-        // SYNC POINT with the first Acquire fence of `CommitReader::consistent`; the Release fence is `Record::store`'s last.
+        // SYNC POINT with the first Acquire fence of `CommitReader::consistent`. The Release fence is the last one of
+        // `Record::store`.
         self.words.store(self.places.published, generation);
         // After a kill, the stores in the file are those in program order as compiled. This fence keeps the compiler
         // from moving the next chunk's rows, which are plain stores, before this store.

@@ -170,7 +170,7 @@ fn a_torn_newest_record_falls_back_to_the_previous_one_with_a_warning() {
     assert_eq!(replay.head(), 5);
     assert_eq!(replay.warnings().len(), 1);
     assert!(
-        replay.warnings()[0].contains("is damaged; continuing from the newest one that is not"),
+        replay.warnings()[0].contains("is damaged; continuing from the newest intact one"),
         "{:?}",
         replay.warnings()
     );

@@ -125,7 +125,7 @@ fn if_all_are_damaged_nothing_is_loaded_and_nothing_changes() {
         "{line}"
     );
     assert_eq!(fs::read(&latest).unwrap(), b"short");
-    // If a run begins again here, it puts them aside.
+    // If a run begins again here, it keeps them under another name.
     save(&mut Checkpoints::new(directory.path(), 7), 9);
     assert_eq!(fs::read(directory.path().join("damaged-0.ckpt")).unwrap(), b"short");
     assert_eq!(updates(&directory), 9);
