@@ -286,6 +286,12 @@ impl<'a> Launcher<'a> {
                 self.log.note("launcher", &stalled);
                 self.progress.print(&stalled);
             }
+            let start_limit =
+                (!self.config.environment.server.is_empty()).then(|| self.config.environment.start_limit());
+            for slow in self.supervisor.report_slow(&self.stalls, start_limit) {
+                self.log.note("launcher", &slow);
+                self.progress.print(&slow);
+            }
             // A learner that has just died is restarted first, so that it takes in what the actors have sent.
             let may_end = |asked: Instant| self.supervisor.has_learner() || asked.elapsed() >= LEARNER_RESTART;
             if self.stop_requested.is_some_and(may_end) {
@@ -379,12 +385,13 @@ impl<'a> Launcher<'a> {
 
     fn read_reports(&mut self) -> anyhow::Result<()> {
         let wall = self.begun.elapsed();
-        for incident in self.supervisor.take_incidents() {
-            self.recorder.incident(&incident, wall)?;
-        }
         while let Some(heartbeat) = self.heartbeats.receive()? {
             self.supervisor.record(&heartbeat);
         }
+        for incident in self.supervisor.take_incidents() {
+            self.recorder.incident(&incident, wall)?;
+        }
+        self.supervisor.check_faults(self.config.environment.faults)?;
         let fills = [
             each(&self.episode_reports, |report| {
                 Ok(self.recorder.episode(&report, wall)?)

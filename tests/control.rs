@@ -223,7 +223,7 @@ fn a_stopped_run_resumes_where_it_stopped() {
     );
     let busy = place.output(&["resume", "run"]);
     assert!(
-        !busy.status.success() && stderr(&busy).contains("is going on"),
+        !busy.status.success() && stderr(&busy).contains("is already running"),
         "{}",
         stderr(&busy)
     );

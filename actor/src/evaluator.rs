@@ -18,7 +18,7 @@ use shoal_common::space::EnvironmentSpec;
 use shoal_common::stop::Stop;
 
 use crate::error::ActorError;
-use crate::explorer::connect;
+use crate::explorer::{after_fault, connect};
 
 /// The settings of an evaluator.
 #[derive(Clone, Debug)]
@@ -156,8 +156,13 @@ impl<'a> Evaluator<'a> {
         let mut returns = Vec::new();
         while (returns.len() as u32) < self.settings.evaluation.episodes {
             // If the server dies, its episodes are run again.
-            if let Some(more) = self.run_episodes(published.parameters(), returns.len() as u64)? {
-                returns.extend(more);
+            match self.run_episodes(published.parameters(), returns.len() as u32) {
+                Ok(Some(more)) => returns.extend(more),
+                Ok(None) => {}
+                Err(Exit::Failed(ActorError::Channel(error))) if error.fault().is_some() => {
+                    after_fault(&error, &mut self.heartbeat, &self.listener, self.stop).map_err(Exit::widen)?;
+                }
+                Err(exit) => return Err(exit),
             }
         }
         returns.truncate(self.settings.evaluation.episodes as usize);
@@ -227,7 +232,7 @@ impl<'a> Evaluator<'a> {
 
     /// Runs one evaluation episode in each environment with these parameters, from number `first` on. Returns their
     /// returns, or `None` if the server was lost.
-    fn run_episodes(&mut self, parameters: &[f32], first: u64) -> Result<Option<Vec<f64>>, Exit<ActorError>> {
+    fn run_episodes(&mut self, parameters: &[f32], first: u32) -> Result<Option<Vec<f64>>, Exit<ActorError>> {
         let Self {
             client,
             listener,
@@ -236,12 +241,18 @@ impl<'a> Evaluator<'a> {
             actions,
             ..
         } = self;
-        let begun = client.reset(listener, Begin::Evaluation(first), || {
+        // No environment is reset more often than an episode is needed.
+        let episodes = (self.settings.evaluation.episodes - first).min(self.settings.envs as u32);
+        let begin = Begin::Evaluation {
+            first: first.into(),
+            episodes,
+        };
+        let begun = client.reset(listener, begin, || {
             heartbeat.beat(Activity::WaitingForServer);
         });
         let mut current = begun.map_err(Exit::widen)?;
         let mut returns = vec![0.0; self.settings.envs];
-        let mut running = vec![true; self.settings.envs];
+        let mut running: Vec<_> = (0..self.settings.envs).map(|e| (e as u32) < episodes).collect();
         while running.contains(&true) {
             policy.act(parameters, current.observations(), actions);
             let stepped = client.step(listener, actions, || heartbeat.beat(Activity::WaitingForServer));

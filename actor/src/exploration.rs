@@ -130,8 +130,8 @@ mod tests {
 
     fn lake(epsilon: f64) -> Exploration {
         let spec = EnvironmentSpec {
-            observation: Space::Discrete { n: 2 },
-            action: Space::Discrete { n: 4 },
+            observation: Space::discrete(2),
+            action: Space::discrete(4),
             time_limit: 100,
             state_width: 1,
         };
@@ -172,7 +172,7 @@ mod tests {
     fn actions_are_drawn_from_the_softmax_and_depend_only_on_the_step() {
         let spec = EnvironmentSpec {
             observation: Space::boxed(&[(-1.0, 1.0)]),
-            action: Space::Discrete { n: 2 },
+            action: Space::discrete(2),
             time_limit: 100,
             state_width: 1,
         };

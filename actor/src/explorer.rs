@@ -34,6 +34,12 @@ use crate::actor_snapshot::ActorSnapshot;
 use crate::error::ActorError;
 use crate::exploration::Exploration;
 
+/// What the line about an invalid answer of an environment server ends with; the launcher looks for it.
+pub const GIVEN_UP: &str = "its episodes are given up";
+
+/// How long an actor waits after an invalid answer before it begins new episodes.
+const AFTER_FAULT: Duration = Duration::from_millis(50);
+
 /// How long an actor waits for its last chunk to be committed when the whole run ends.
 const LAST_COMMIT_TIMEOUT: Duration = Duration::from_secs(1);
 
@@ -182,10 +188,15 @@ impl<'a> Explorer<'a> {
 
     fn run(&mut self) -> Exit<ActorError> {
         loop {
-            if let Err(exit) = self.run_until_server_lost() {
-                return exit;
+            match self.run_until_server_lost() {
+                Ok(()) => tracing::warn!("the environment server was restarted"),
+                Err(Exit::Failed(ActorError::Channel(error))) if error.fault().is_some() => {
+                    if let Err(exit) = after_fault(&error, &mut self.heartbeat, &self.listener, self.stop) {
+                        return exit.widen();
+                    }
+                }
+                Err(exit) => return exit,
             }
-            tracing::warn!("the environment server was restarted");
         }
     }
 
@@ -453,7 +464,7 @@ pub(crate) fn connect(
 ) -> Result<EnvironmentClient, Exit<ActorError>> {
     let client = EnvironmentClient::open(domain, index, spec, envs, stop.clone())?;
     let (served, served_envs) = client.describe(listener, || ()).map_err(Exit::widen)?;
-    if served != *spec || served_envs != envs {
+    if !served.is(spec) || served_envs != envs {
         let served = format!("{served_envs} times {served:?}");
         let configured = format!("{envs} times {spec:?}");
         return Err(Exit::Failed(ActorError::Server {
@@ -463,6 +474,26 @@ pub(crate) fn connect(
         }));
     }
     Ok(client)
+}
+
+/// Takes note of an answer that no environment may give; the next thing is to begin new episodes. The pause keeps an
+/// environment that always answers so from filling the log before the launcher ends the run for it.
+pub(crate) fn after_fault(
+    error: &ChannelError,
+    heartbeat: &mut HeartbeatSender,
+    listener: &Listener,
+    stop: &Stop,
+) -> Result<(), Exit<ChannelError>> {
+    tracing::warn!("{error}; {GIVEN_UP}");
+    heartbeat.count_fault();
+    let since = Instant::now();
+    while since.elapsed() < AFTER_FAULT {
+        if stop.requested() {
+            return Err(Exit::Stopped);
+        }
+        listener.wait(AFTER_FAULT)?;
+    }
+    Ok(())
 }
 
 fn wait_for_replay(

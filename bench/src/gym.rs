@@ -46,11 +46,8 @@ struct Gymnasium {
 }
 
 pub(super) fn measure(budget: &Budget) -> anyhow::Result<GymFigures> {
-    let environment = EnvironmentConfig {
-        name: NAME.into(),
-        server: default_command(NAME).context("found no server for Gymnasium's environments")?,
-        parameters: toml::Table::new(),
-    };
+    let server = default_command(NAME).context("found no server for Gymnasium's environments")?;
+    let environment = EnvironmentConfig::new(NAME.into(), server, toml::Table::new());
     let length = budget.length.mul_f64(SHARE);
     let mut alone = times(&environment, 1, length, budget)?;
     let together = times(&environment, ENVIRONMENTS, length, budget)?;

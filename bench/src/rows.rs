@@ -34,7 +34,7 @@ impl Rows {
         let layout = ResponseLayout::new(ENVIRONMENTS, row.observation_width());
         let bounds = match &config.spec.action {
             Space::Box { low, high } => low.iter().copied().zip(high.iter().copied()).collect(),
-            Space::Discrete { n } => vec![(0.0, *n as f32 - 1.0)],
+            Space::Discrete { n, .. } => vec![(0.0, *n as f32 - 1.0)],
         };
         Ok(Self {
             environments,

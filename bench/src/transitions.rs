@@ -175,9 +175,9 @@ fn sample(replay: &Replay, config: &Config, budget: &Budget) -> anyhow::Result<W
     let mut update = 0;
     let mut gather = || {
         let newest = replay.window(replay.head(), config.replay.capacity);
-        sampler.indices(update, newest, &mut indices);
+        sampler.indices(update, newest.clone(), &mut indices);
         update += 1;
-        batch.gather(replay, &indices);
+        batch.gather(replay, &indices, &newest);
         std::hint::black_box(&mut batch);
     };
     // Warms up: the first access to each page of the new mapping is a page fault.

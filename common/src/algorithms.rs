@@ -1,5 +1,5 @@
-//! The algorithms: the registry, and for each algorithm a file with its section of the configuration, its policy and its
-//! exploration. How each learns is part of the crate `learner`.
+//! The algorithms: the registry, and for each algorithm a file with its section of the configuration, its policy and
+//! its exploration. How each learns is part of the crate `learner`.
 
 mod algorithm;
 mod behaviour;
@@ -67,7 +67,8 @@ macro_rules! registry {
     };
 }
 
-// The registry: a line for each algorithm. The variant in kebab case is the section's name (`QLearning`: `[q-learning]`).
+// The registry: a line for each algorithm. The variant in kebab case is the section's name (`QLearning`:
+// `[q-learning]`).
 registry! {
     /// `[ddpg]` and `[exploration]`.
     Ddpg(DdpgConfig) is ddpg::SPEC;
@@ -155,7 +156,7 @@ mod tests {
     #[test]
     fn each_algorithm_accepts_the_spaces_that_it_can_control() {
         let real = || Space::boxed(&[(-1.0, 1.0); 4]);
-        let counted = || Space::Discrete { n: 3 };
+        let counted = || Space::discrete(3);
         let takes = |observation: fn() -> Space, action: fn() -> Space| -> Vec<bool> {
             let spec = spec(observation(), action());
             let all = Algorithm::all().into_iter();
@@ -179,7 +180,7 @@ mod tests {
 
     #[test]
     fn the_learned_policy_has_as_many_parameters_as_the_policy_layout() {
-        let (real, counted) = (|| Space::boxed(&[(-1.0, 1.0); 4]), || Space::Discrete { n: 3 });
+        let (real, counted) = (|| Space::boxed(&[(-1.0, 1.0); 4]), || Space::discrete(3));
         let specs = [
             spec(real(), real()),
             spec(real(), counted()),

@@ -1,5 +1,5 @@
-//! The run's resolved configuration, which is stored in `config.toml`. Each section has a file here or in `algorithms/`,
-//! which declares each of its keys once.
+//! The run's resolved configuration, which is stored in `config.toml`. Each section has a file here or in
+//! `algorithms/`, which declares each of its keys once.
 
 mod actors;
 mod checkpoint;
@@ -153,13 +153,14 @@ impl Config {
         }
     }
 
-    /// Words of an actor's snapshot between two chunks; 0 if there are no snapshots. Snapshots exist in lockstep runs whose
-    /// environments can save their state: the replacement of a killed process then continues with the same bits.
+    /// Words of an actor's snapshot between two chunks; 0 if there are no snapshots. Snapshots exist in lockstep runs
+    /// whose environments can save their state: the replacement of a killed process then continues with the same bits.
     pub fn actor_snapshot_words(&self) -> usize {
         let envs = self.actors.envs as usize;
         match (self.run.mode, self.spec.snapshot_words(envs)) {
             (Mode::Free, _) | (_, 0) => 0,
-            // The actor's step, and for each environment the state of its exploration and its episode's return and length.
+            // The actor's step, and for each environment the state of its exploration and its episode's return and
+            // length.
             (Mode::Lockstep, snapshot) => {
                 let exploration = self.algorithm.settings().exploration_state_width(&self.spec);
                 snapshot + 1 + envs * (exploration + 2)
@@ -173,6 +174,7 @@ impl Config {
     /// For the first invalid value.
     pub fn check(&self) -> Result<(), ConfigError> {
         self.run.check()?;
+        self.environment.check()?;
         environment::check_spec(&self.spec)?;
         self.actors.check()?;
         self.algorithm.check()?;

@@ -1,5 +1,5 @@
-//! What an evaluator leaves to its successor: the newest evaluations. So no policy is evaluated twice, and no evaluation is
-//! missing in the records if the launcher is killed before it records it.
+//! What an evaluator leaves to its successor: the newest evaluations. So no policy is evaluated twice, and no
+//! evaluation is missing in the records if the launcher is killed before it records it.
 
 use std::collections::VecDeque;
 use std::io::{self, Write};

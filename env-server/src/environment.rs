@@ -116,7 +116,7 @@ mod tests {
                         .iter()
                         .enumerate()
                         .all(|(i, x)| (low[i]..=high[i]).contains(x)),
-                    Space::Discrete { n } => observation[0] < *n as f32,
+                    Space::Discrete { n, .. } => observation[0] < *n as f32,
                 };
                 assert!(inside, "{name} observed {observation:?}");
             }

@@ -31,7 +31,11 @@ pub fn serve(
                 let episodes = vec![first; environments.count()];
                 let start = match ask {
                     Ask::ResetToTraining => Start::Episodes(&episodes),
-                    Ask::ResetToEvaluation => Start::Evaluation { seed, first },
+                    Ask::ResetToEvaluation => Start::Evaluation {
+                        seed,
+                        first,
+                        episodes: request.episodes(),
+                    },
                     _ => Start::Next,
                 };
                 started = true;

@@ -20,7 +20,7 @@ const EPISODE_BITS: u32 = 40;
 pub struct VectorEnvironment {
     spec: EnvironmentSpec,
     training: Stream,
-    evaluation_seed: Option<u64>,
+    evaluation: Option<Evaluation>,
     running: Vec<Running>,
     action: Vec<f64>,
     /// Tries states before they are restored, so that a refused one changes nothing.
@@ -33,6 +33,16 @@ struct Running {
     steps: u32,
     next_training: u64,
     next_evaluation: u64,
+    /// Whether it has run all its evaluation episodes.
+    done: bool,
+}
+
+/// Evaluation episodes under way.
+#[derive(Clone, Copy)]
+struct Evaluation {
+    seed: u64,
+    /// The first number that is none of them.
+    end: Option<u64>,
 }
 
 /// Where the environments start.
@@ -49,6 +59,9 @@ pub enum Start<'a> {
         seed: u64,
         /// Number of the first episode.
         first: u64,
+        /// How many episodes there are; an environment whose next one is none of them stays as it is at its end, whatever it
+        /// is asked to do. `None`: no limit.
+        episodes: Option<u32>,
     },
     /// Environment e in state e of E concatenated physical states. Training episodes follow.
     States(&'a [f64]),
@@ -76,12 +89,13 @@ impl VectorEnvironment {
                 steps: 0,
                 next_training: 0,
                 next_evaluation: 0,
+                done: false,
             })
         };
         Ok(Self {
             running: (0..count).map(running).collect::<Result<_, _>>()?,
             action: Vec::with_capacity(spec.action.width()),
-            evaluation_seed: None,
+            evaluation: None,
             spec,
             training,
             scratch,
@@ -109,12 +123,13 @@ impl VectorEnvironment {
             count * self.spec.observation.width(),
             "length of `observations`"
         );
-        self.evaluation_seed = match start {
-            Start::Evaluation { seed, first } => {
+        self.evaluation = match start {
+            Start::Evaluation { seed, first, episodes } => {
                 for (number, running) in (first..).zip(&mut self.running) {
                     running.next_evaluation = number;
                 }
-                Some(seed)
+                let end = episodes.map(|episodes| first.saturating_add(episodes.into()));
+                Some(Evaluation { seed, end })
             }
             Start::Episodes(episodes) => {
                 if episodes.len() != count {
@@ -171,6 +186,14 @@ impl VectorEnvironment {
         );
         for (e, action) in actions.chunks_exact(self.spec.action.width()).enumerate() {
             let running = &mut self.running[e];
+            if running.done {
+                [rewards[e], terminated[e], truncated[e]] = [0.0; 3];
+                running
+                    .environment
+                    .observe(&mut next_observations[e * width..][..width]);
+                running.environment.observe(&mut observations[e * width..][..width]);
+                continue;
+            }
             self.action.clear();
             self.action.extend(action.iter().map(|a| f64::from(*a)));
             let step = running.environment.step(&self.action, &mut running.rng);
@@ -196,8 +219,13 @@ impl VectorEnvironment {
     fn begin_episode(&mut self, e: usize) {
         let stride = self.running.len() as u64;
         let running = &mut self.running[e];
-        match self.evaluation_seed {
-            Some(seed) => {
+        running.done = false;
+        match self.evaluation {
+            Some(Evaluation { end: Some(end), .. }) if running.next_evaluation >= end => {
+                running.done = true;
+                return;
+            }
+            Some(Evaluation { seed, .. }) => {
                 running.rng = stream(seed, Purpose::Evaluation, running.next_evaluation, 0);
                 running.next_evaluation = running.next_evaluation.wrapping_add(stride);
             }
@@ -217,7 +245,7 @@ impl VectorEnvironment {
         }
         let refused = |action: &f32| match self.spec.action {
             Space::Box { .. } => !action.is_finite(),
-            Space::Discrete { n } => action.fract() != 0.0 || !(0.0..n as f32).contains(action),
+            Space::Discrete { n, .. } => action.fract() != 0.0 || !(0.0..n as f32).contains(action),
         };
         match actions.iter().position(refused) {
             Some(i) => Err(RequestError::Action {

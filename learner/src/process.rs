@@ -20,7 +20,7 @@ use shoal_common::exit::Exit;
 use shoal_common::stop::Stop;
 
 use self::learner::Learner;
-pub use self::settings::{LearnerError, LearnerSettings, SizeError, disk_bytes};
+pub use self::settings::{LearnerError, LearnerSettings, SizeError, disk_bytes, replay_layout};
 
 /// Learns until all of the run's environment steps are collected and learned from, or until `stop`. Saves its state in
 /// both cases.

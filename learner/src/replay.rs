@@ -20,5 +20,5 @@ pub use shoal_common::commit::{ActorCommit, ChunkMark, ReplayLayout};
 pub use self::append::{Appended, Filled, Reserved};
 pub use self::error::{ChunkError, ReplayError};
 pub use self::step::WriteStep;
-pub use self::store::Replay;
+pub use self::store::{Replay, are_finite};
 pub use self::sync::{PendingSync, SyncedRows};

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import os
 import sys
 
 import gymnasium as gym
@@ -25,6 +26,9 @@ def main() -> int:
     parser.add_argument("--name", required=True, help="gym: and the environment's id")
     parser.add_argument("--parameters", type=json.loads, required=True, help="arguments of gymnasium.make, in JSON")
     arguments = parser.parse_args()
+    # What follows is for the environment: code that is imported may read options or input of its own, and print.
+    sys.argv = [arguments.client]
+    control = _take_streams()
     try:
         environments = Environments(
             arguments.name.removeprefix("gym:"),
@@ -45,6 +49,7 @@ def main() -> int:
             arguments.incarnation,
             arguments.client,
             longest(environments),
+            control,
         )
         serve(environments, port)
     except Ended:
@@ -55,6 +60,18 @@ def main() -> int:
     finally:
         environments.close()
     return 0
+
+
+def _take_streams() -> int:
+    """Leaves empty input to the environment and sends what it prints to the log. The descriptor by which the launcher ends
+    this process."""
+    control = os.dup(0)
+    empty = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(empty, 0)
+    os.close(empty)
+    os.dup2(2, 1)
+    sys.stdout = sys.stderr
+    return control
 
 
 if __name__ == "__main__":

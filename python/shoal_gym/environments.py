@@ -1,6 +1,8 @@
 """A vector of Gymnasium environments of one kind, with autoreset and an episode's seed for every counter."""
 
 import enum
+import os
+import random
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,14 +10,19 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from .spaces import Unsupported, served
+from . import spaces
+from .spaces import Invalid, Unsupported, served
 
+SEEDS = 2**31
+"""Seeds of episodes are below this: some simulators take no others."""
 
 class Purpose(enum.IntEnum):
     """What an episode is for; part of its seed."""
 
     TRAINING = 1
     EVALUATION = 2
+    PROCESS = 3
+    """No episode: the seed of ``random`` and ``numpy.random``."""
 
 
 @dataclass
@@ -55,8 +62,11 @@ class Environments:
     def __init__(
         self, name: str, parameters: dict[str, Any], count: int, seed: int, server: int, stream: int
     ) -> None:
+        self._name = name
+        _seed_process(seed, server, stream)
         parameters = {"disable_env_checker": True, **parameters}
-        self._environments = [gym.make(name, **parameters) for _ in range(count)]
+        os.environ["SHOAL_SERVER"] = str(server)
+        self._environments = [_make(name, parameters, e) for e in range(count)]
         first = self._environments[0]
         self.observation = served(first.observation_space, "observations")
         self.action = served(first.action_space, "actions")
@@ -70,35 +80,53 @@ class Environments:
         self._purpose = Purpose.TRAINING
         self._next_training = [0] * count
         self._next_evaluation = [0] * count
+        self._end_of_evaluation: int | None = None
+        self._episode = [0] * count
+        self._steps = [0] * count
+        self._over = [False] * count
 
     def __len__(self) -> int:
         return len(self._environments)
 
     def begin_next(self, blocks: Blocks) -> None:
-        """Each environment begins its next training episode."""
+        """Each environment begins its next training episode. ``Invalid`` where an environment breaks Gymnasium's interface."""
         self._purpose = Purpose.TRAINING
         self._begin_all(blocks)
 
     def begin_training(self, episode: int, blocks: Blocks) -> None:
-        """Each environment begins this training episode of its own, and counts on from there."""
+        """Each environment begins this training episode of its own, and counts on from there. ``Invalid`` as above."""
         self._next_training = [episode] * len(self)
         self.begin_next(blocks)
 
-    def begin_evaluation(self, first: int, blocks: Blocks) -> None:
-        """Environment e begins evaluation episode ``first`` + e; at its end it goes on with the one ``len(self)`` later."""
+    def begin_evaluation(self, first: int, count: int, blocks: Blocks) -> None:
+        """Environment e begins evaluation episode ``first`` + e; at its end it continues with the one ``len(self)`` later, as
+        long as that is one of the ``count`` first; 0 is no limit. ``Invalid`` as above."""
         self._purpose = Purpose.EVALUATION
         self._next_evaluation = [first + e for e in range(len(self))]
+        self._end_of_evaluation = first + count if count else None
         self._begin_all(blocks)
 
-    def step(self, actions: NDArray[np.float32], blocks: Blocks) -> None:
-        """Every environment takes a step; ``ValueError``, and nothing done, where an action is none."""
-        chosen = self.action.elements(actions)
+    def step(self, actions: NDArray[Any], blocks: Blocks) -> None:
+        """Every environment takes a step with its action, an element of the action space. ``Invalid`` where an environment
+        breaks Gymnasium's interface; then new episodes have to be begun."""
         next_observations = self.observation.view(blocks.next_observations)
         over = []
-        for e, (environment, action) in enumerate(zip(self._environments, chosen, strict=True)):
-            observation, reward, terminated, truncated, _ = environment.step(action)
-            next_observations[e] = self.observation.number(observation)
-            blocks.rewards[e] = reward
+        for e, (environment, action) in enumerate(zip(self._environments, actions, strict=True)):
+            if self._over[e]:
+                # Its last evaluation episode has ended.
+                next_observations[e] = self.observation.view(blocks.observations)[e] = 0
+                blocks.rewards[e] = blocks.terminated[e] = blocks.truncated[e] = 0
+                continue
+            self._steps[e] += 1
+            try:
+                # Gymnasium's own wrappers see to it that there are five.
+                observation, reward, terminated, truncated, _ = environment.step(action)
+                next_observations[e] = self.observation.number(observation)
+                blocks.rewards[e] = spaces.reward(reward)
+                terminated = spaces.flag(terminated, "terminated")
+                truncated = spaces.flag(truncated, "truncated")
+            except Invalid as reason:
+                raise self._invalid(e, "step", reason) from None
             blocks.terminated[e] = terminated
             # A terminal state is one, at whatever step it is reached.
             blocks.truncated[e] = truncated and not terminated
@@ -118,11 +146,50 @@ class Environments:
 
     def _begin(self, e: int, blocks: Blocks) -> None:
         if self._purpose is Purpose.EVALUATION:
-            words = [self._seed, Purpose.EVALUATION, self._next_evaluation[e]]
+            episode = self._next_evaluation[e]
+            self._over[e] = self._end_of_evaluation is not None and episode >= self._end_of_evaluation
+            if self._over[e]:
+                blocks.observations[e] = 0
+                return
+            words = [self._seed, Purpose.EVALUATION, episode]
             self._next_evaluation[e] += len(self)
         else:
-            words = [self._seed, Purpose.TRAINING, self._server, self._stream, e, self._next_training[e]]
+            episode = self._next_training[e]
+            self._over[e] = False
+            words = [self._seed, Purpose.TRAINING, self._server, self._stream, e, episode]
             self._next_training[e] += 1
-        seed = int(np.random.SeedSequence(words).generate_state(1)[0])
-        observation, _ = self._environments[e].reset(seed=seed)
-        self.observation.view(blocks.observations)[e] = self.observation.number(observation)
+        self._episode[e], self._steps[e] = episode, 0
+        try:
+            observation = _pair(self._environments[e].reset(seed=_seed_of(words)))
+            self.observation.view(blocks.observations)[e] = self.observation.number(observation)
+        except Invalid as reason:
+            raise self._invalid(e, "reset", reason) from None
+
+    def _invalid(self, e: int, method: str, reason: Invalid) -> Invalid:
+        """``reason``, and where the value came from."""
+        purpose = "evaluation" if self._purpose is Purpose.EVALUATION else "training"
+        where = f"environment {e}, {purpose} episode {self._episode[e]}, step {self._steps[e]}"
+        return Invalid(f"{self._name}: {method} returned {reason} ({where})")
+
+
+def _make(name: str, parameters: dict[str, Any], e: int) -> gym.Env[Any, Any]:
+    os.environ["SHOAL_ENVIRONMENT"] = str(e)
+    return gym.make(name, **parameters)
+
+
+def _seed_of(words: list[int]) -> int:
+    return int(np.random.SeedSequence(words).generate_state(1)[0]) % SEEDS
+
+
+def _seed_process(seed: int, server: int, stream: int) -> None:
+    """Seeds what an environment may draw from behind Gymnasium's back: in lockstep every start draws alike."""
+    word = _seed_of([seed, Purpose.PROCESS, server, stream])
+    random.seed(word)
+    np.random.seed(word)
+
+
+def _pair(result: Any) -> Any:
+    """The observation of what ``reset`` returns."""
+    if not isinstance(result, tuple) or len(result) != 2 or not isinstance(result[1], dict):
+        raise Invalid("something else than a pair of observation and info")
+    return result[0]

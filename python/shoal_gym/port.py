@@ -1,8 +1,7 @@
-"""The server's end of the conversation with an actor, in the run's shared memory."""
+"""The server's end of the channel to its client, in the run's shared memory."""
 
 import ctypes
 import select
-import sys
 import time
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -15,8 +14,8 @@ from .protocol import Activity, Heartbeat, RequestHeader, ResponseHeader
 POLLS = 200
 """Polls before a waiting process blocks: the client's next request comes soon, where it has a core to itself."""
 
-NAP = 0.05
-"""Seconds a process blocks before it looks after its connections."""
+SLEEP = 0.05
+"""Seconds a process blocks before it refreshes its connections."""
 
 BEAT = 0.5
 """Seconds between heartbeats."""
@@ -51,11 +50,11 @@ T = TypeVar("T")
 
 
 class Ended(Exception):
-    """The launcher wants this process to end, or is no more."""
+    """The launcher wants this process to end, or is gone."""
 
 
 class Unreachable(Exception):
-    """A port in the run's shared memory cannot be had."""
+    """A port in the run's shared memory is unavailable."""
 
 
 def claim(attempt: Callable[[], T], look_out: Callable[[], None]) -> T:
@@ -78,9 +77,11 @@ class Port:
     """The run's services are there before this process is started: it only opens them."""
 
     def __init__(
-        self, config: str, run: str, index: int, incarnation: int, client: str, longest: int
+        self, config: str, run: str, index: int, incarnation: int, client: str, longest: int, control: int
     ) -> None:
-        """``longest``: the most numbers in a response."""
+        """``longest``: the most numbers in a response. ``control``: a descriptor; once it has something to read, or is
+        closed at its other end, ``Ended`` is raised."""
+        self._control = control
         iox2.set_log_level(iox2.LogLevel.Fatal)
         self._node = (
             iox2.NodeBuilder.new()
@@ -89,7 +90,7 @@ class Port:
             .create(iox2.ServiceType.Ipc)
         )
         self._server = claim(
-            lambda: self._service(protocol.conversation(run, index))
+            lambda: self._service(protocol.requests(run, index))
             .request_response(iox2.Slice[ctypes.c_float], iox2.Slice[ctypes.c_float])
             .request_header(RequestHeader)
             .response_header(ResponseHeader)
@@ -100,19 +101,19 @@ class Port:
             .create(),
             self._look_out,
         )
-        self._bell = claim(
-            lambda: self._service(protocol.bell(run, f"env-server/{index}"))
+        self._listener = claim(
+            lambda: self._service(protocol.event(run, f"env-server/{index}"))
             .event()
             .open()
             .listener_builder()
             .create(),
             self._look_out,
         )
-        self._ringer = claim(
-            lambda: self._service(protocol.bell(run, client)).event().open().notifier_builder().create(),
+        self._notifier = claim(
+            lambda: self._service(protocol.event(run, client)).event().open().notifier_builder().create(),
             self._look_out,
         )
-        self._heart: Any = None
+        self._heartbeat_port: Any = None
         self._heartbeats = protocol.heartbeats(run)
         self._heartbeat = Heartbeat(
             role=protocol.ENV_SERVER,
@@ -131,12 +132,12 @@ class Port:
                     return request
             self._look_out()
             self.beat(Activity.WAITING_FOR_PEER)
-            self._bell.timed_wait(iox2.Duration.from_secs_f64(NAP))
+            self._listener.timed_wait(iox2.Duration.from_secs_f64(SLEEP))
 
-    def ring(self) -> None:
+    def notify(self) -> None:
         """Wakes the client. One that is not there looks for itself when it comes."""
         try:
-            self._ringer.notify()
+            self._notifier.notify()
         except iox2.NotifierNotifyError:
             pass
 
@@ -165,16 +166,16 @@ class Port:
         self._heartbeat.activity = activity
         try:
             # Outside of a run there is no launcher to tell.
-            if self._heart is None:
-                self._heart = (
+            if self._heartbeat_port is None:
+                self._heartbeat_port = (
                     self._service(self._heartbeats)
                     .publish_subscribe(Heartbeat)
                     .open()
                     .publisher_builder()
                     .create()
                 )
-            self._heart.update_connections()
-            self._heart.send_copy(self._heartbeat)
+            self._heartbeat_port.update_connections()
+            self._heartbeat_port.send_copy(self._heartbeat)
         except (
             iox2.PublishSubscribeOpenError,
             iox2.PublisherCreateError,
@@ -188,8 +189,7 @@ class Port:
     def _service(self, name: str) -> Any:
         return self._node.service_builder(iox2.ServiceName.new(name))
 
-    @staticmethod
-    def _look_out() -> None:
-        """Raises ``Ended`` once standard input says or ends something."""
-        if select.select([sys.stdin], [], [], 0.0)[0]:
+    def _look_out(self) -> None:
+        """Raises ``Ended`` once the launcher ends this process, or is gone itself."""
+        if select.select([self._control], [], [], 0.0)[0]:
             raise Ended

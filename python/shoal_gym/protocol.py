@@ -22,6 +22,7 @@ class Verdict(enum.IntEnum):
     ANSWERED = 0
     NOT_STARTED = 1
     REFUSED = 2
+    INVALID = 3
 
 
 class Activity(enum.IntEnum):
@@ -40,7 +41,7 @@ class RequestHeader(ctypes.Structure):
 
     _fields_ = [
         ("ask", ctypes.c_uint32),
-        ("reserved", ctypes.c_uint32),
+        ("episodes", ctypes.c_uint32),
         ("episode", ctypes.c_uint64),
     ]
 
@@ -86,14 +87,14 @@ class Heartbeat(ctypes.Structure):
         return "ShoalHeartbeat"
 
 
-def conversation(run: str, index: int) -> str:
+def requests(run: str, index: int) -> str:
     """The service in which server ``index`` is asked."""
     return f"shoal/{run}/env/{index}"
 
 
-def bell(run: str, place: str) -> str:
-    """The service that wakes a process; ``place`` is its role and index, as ``actor/0``."""
-    return f"shoal/{run}/bell/{place}"
+def event(run: str, role: str) -> str:
+    """The service that wakes a process; ``role`` is its role and index, as ``actor/0``."""
+    return f"shoal/{run}/bell/{role}"
 
 
 def heartbeats(run: str) -> str:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from .environments import Blocks, Environments
 from .port import Port
 from .protocol import Ask, ResponseHeader, Verdict
+from .spaces import Invalid
 
 
 def longest(environments: Environments) -> int:
@@ -28,7 +29,7 @@ def serve(environments: Environments, port: Port) -> None:
         if request.user_header().contents.ask != Ask.DESCRIBE:
             port.begin_work()
         server.answer(request)
-        port.ring()
+        port.notify()
         port.count(server.stepped())
 
 
@@ -57,7 +58,10 @@ class Server:
             case Ask.RESET_TO_TRAINING:
                 self._begin(request, lambda blocks: self._environments.begin_training(header.episode, blocks))
             case Ask.RESET_TO_EVALUATION:
-                self._begin(request, lambda blocks: self._environments.begin_evaluation(header.episode, blocks))
+                self._begin(
+                    request,
+                    lambda blocks: self._environments.begin_evaluation(header.episode, header.episodes, blocks),
+                )
             case Ask.STEP | Ask.SNAPSHOT if not self._started:
                 self._send(self._loan(request, 0), Verdict.NOT_STARTED)
             case Ask.STEP:
@@ -68,7 +72,12 @@ class Server:
 
     def _begin(self, request: Any, begin: Callable[[Blocks], None]) -> None:
         response, blocks = self._loan_blocks(request)
-        begin(blocks)
+        try:
+            begin(blocks)
+        except Invalid as reason:
+            del response, blocks
+            self._invalid(request, reason)
+            return
         self._started = True
         self._send(response, Verdict.ANSWERED)
 
@@ -78,15 +87,26 @@ class Server:
         if len(actions) != len(environments) * environments.action.width:
             self._refuse(request, f"{len(actions)} numbers for the actions of {len(environments)} environments")
             return
+        try:
+            chosen = environments.action.elements(actions)
+        except ValueError as reason:
+            self._refuse(request, str(reason))
+            return
         response, blocks = self._loan_blocks(request)
         try:
-            environments.step(actions, blocks)
-        except ValueError as reason:
+            environments.step(chosen, blocks)
+        except Invalid as reason:
             del response, blocks
-            self._refuse(request, str(reason))
+            self._invalid(request, reason)
             return
         self._stepped += len(environments)
         self._send(response, Verdict.ANSWERED)
+
+    def _invalid(self, request: Any, reason: Invalid) -> None:
+        """The episodes end here: the client begins new ones."""
+        print(f"error: {reason}", file=sys.stderr, flush=True)
+        self._started = False
+        self._send(self._loan(request, 0), Verdict.INVALID)
 
     def _refuse(self, request: Any, reason: str) -> None:
         print(f"a request was refused: {reason}", file=sys.stderr, flush=True)

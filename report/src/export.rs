@@ -207,7 +207,7 @@ mod tests_support {
     /// `count` observations of the environment, concatenated.
     pub(super) fn some_observations(config: &Config, count: usize) -> Vec<f32> {
         match config.spec.observation {
-            Space::Discrete { n } => (0..count).map(|i| (i * 5 % n as usize) as f32).collect(),
+            Space::Discrete { n, .. } => (0..count).map(|i| (i * 5 % n as usize) as f32).collect(),
             Space::Box { .. } => numbers(count * config.spec.observation.width(), 2),
         }
     }

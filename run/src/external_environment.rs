@@ -2,6 +2,7 @@
 //! its spaces or to evaluate a policy.
 
 use std::ffi::OsString;
+use std::io::Write;
 use std::os::fd::AsFd;
 use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::path::{Path, PathBuf};
@@ -15,7 +16,7 @@ use rustix::process::{
     Pid, PidfdFlags, Signal, getpgrp, getpid, getppid, kill_process, kill_process_group, pidfd_open,
     set_parent_process_death_signal,
 };
-use shoal_common::channel::environment::{Begin, EnvironmentClient, Observed, Stepped, describe};
+use shoal_common::channel::environment::{Begin, EnvironmentClient, Fault, Observed, Stepped, describe};
 use shoal_common::channel::{ChannelError, Domain, EventName, Listener, Services};
 use shoal_common::config::EnvironmentConfig;
 use shoal_common::exit::Exit;
@@ -28,8 +29,8 @@ use crate::process::{Peer, wait_for_any};
 /// The prefix of the names of Gymnasium environments.
 pub const GYMNASIUM: &str = "gym:";
 
-/// How long a server may take to describe its environments. A simulator may load large libraries.
-const PATIENCE: Duration = Duration::from_secs(120);
+/// A start that takes longer is reported to the user.
+const SLOW: Duration = Duration::from_secs(10);
 
 /// The default command that serves environments of this name; `None` for built-in environments.
 pub fn default_command(name: &str) -> Option<Vec<String>> {
@@ -254,8 +255,15 @@ impl ExternalEnvironment {
     /// # Errors
     /// When the server has ended or refuses.
     pub fn begin_evaluation(&mut self, number: u64) -> anyhow::Result<Observed> {
-        let begun = self.client.reset(&self.listener, Begin::Evaluation(number), || ());
-        checked(begun, &mut self.program)
+        let begun = self.client.reset(
+            &self.listener,
+            Begin::Evaluation {
+                first: number,
+                episodes: 1,
+            },
+            || (),
+        );
+        checked(begun, &mut self.program)?.context("the environment server has ended")
     }
 
     /// Steps every environment with its action.
@@ -264,7 +272,7 @@ impl ExternalEnvironment {
     /// When the server has ended or refuses.
     pub fn step(&mut self, actions: &[f32]) -> anyhow::Result<Observed> {
         let stepped = self.client.step(&self.listener, actions, || ());
-        match checked(stepped, &mut self.program)? {
+        match checked(stepped, &mut self.program)?.context("the environment server has ended")? {
             Stepped::Taken(observed) => Ok(observed),
             Stepped::Lost => bail!("the environment server has lost its episodes"),
         }
@@ -291,12 +299,20 @@ fn open(domain: &Domain, launch: &LaunchSpec<'_>, environment: &EnvironmentConfi
     let mut program =
         Peer::start(&mut tied(&command)?, "environment server".into()).with_context(|| cannot_start(&command))?;
     let has_answered = Stop::default();
-    let stop = stop_when_it_ends(&program, has_answered.clone())?;
+    let stop = stop_when_it_ends(&program, has_answered.clone(), environment)?;
     let described = describe(domain, launch.index, &listener, stop.clone());
     has_answered.request();
-    let (spec, environments) = checked(described, &mut program).map_err(with_advice)?;
+    let (spec, environments) = match checked(described, &mut program).map_err(with_advice)? {
+        Some(described) => described,
+        None => bail!(
+            "{} did not describe itself within {} s; if it takes longer to start: --set environment.start_seconds={}",
+            environment.name,
+            environment.start_seconds,
+            environment.start_seconds.saturating_mul(5)
+        ),
+    };
     let opened = EnvironmentClient::open(domain, launch.index, &spec, environments, stop);
-    let client = checked(opened.map_err(Exit::from), &mut program)?;
+    let client = checked(opened.map_err(Exit::from), &mut program)?.context("the environment server has ended")?;
     Ok((services, client, listener, spec, program))
 }
 
@@ -308,30 +324,44 @@ fn with_advice(error: anyhow::Error) -> anyhow::Error {
     error
 }
 
-/// A stop that is requested when the program has ended, or after [`PATIENCE`] without `has_answered`.
-fn stop_when_it_ends(program: &Peer, has_answered: Stop) -> anyhow::Result<Stop> {
+/// A stop that is requested when the program has ended, or has not answered within its limit. A slow start is reported.
+fn stop_when_it_ends(program: &Peer, has_answered: Stop, environment: &EnvironmentConfig) -> anyhow::Result<Stop> {
     let stop = Stop::default();
     let flag = stop.clone();
+    let (name, limit) = (environment.name.clone(), environment.start_limit());
     let process = program.as_fd().try_clone_to_owned();
     let process = process.context("cannot watch the environment server")?;
     std::thread::Builder::new()
         .name("watch".into())
         .spawn(move || {
-            let ended = || wait_for_any(&[process.as_fd()], PATIENCE);
-            while !ended() && has_answered.requested() {}
+            let ended = |most| wait_for_any(&[process.as_fd()], most);
+            if !ended(SLOW.min(limit)) && !has_answered.requested() {
+                let _ = writeln!(
+                    std::io::stderr(),
+                    "waiting for {name} to start, for at most {} s",
+                    limit.as_secs()
+                );
+            }
+            if !ended(limit.saturating_sub(SLOW)) && has_answered.requested() {
+                while !ended(Duration::MAX) {}
+            }
             flag.request();
         })
         .context("cannot watch the environment server")?;
     Ok(stop)
 }
 
-/// The result, where the end of the program takes precedence as the error.
-fn checked<T>(result: Result<T, Exit<ChannelError>>, program: &mut Peer) -> anyhow::Result<T> {
-    result.or_else(|exit| {
+/// The result, where the end of the program takes precedence as the error; `None` if it has not answered within its limit.
+fn checked<T>(result: Result<T, Exit<ChannelError>>, program: &mut Peer) -> anyhow::Result<Option<T>> {
+    result.map(Some).or_else(|exit| {
         program.check()?;
         match exit {
-            Exit::Stopped => bail!("the environment server did not answer within {PATIENCE:?}"),
-            Exit::Failed(error) => Err(error.into()),
+            Exit::Stopped => Ok(None),
+            Exit::Failed(error) => match (error.fault(), program.last_line()) {
+                // What it was stands there.
+                (Some(Fault::Reported), Some(line)) => bail!("{line}"),
+                _ => Err(error.into()),
+            },
         }
     })
 }

@@ -4,6 +4,7 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
+use serde::de::DeserializeOwned;
 use shoal_common::algorithms::Experience;
 use shoal_common::config::{ActorsConfig, Algorithm, Config, EnvironmentConfig, IdentityFormat};
 use shoal_common::run_dir::{RunDir, RunLock};
@@ -210,31 +211,22 @@ fn describe_environment(table: &mut Table) -> anyhow::Result<()> {
             environment::names().collect::<Vec<_>>().join(", ")
         );
     };
-    let server = match section.remove("server") {
-        Some(command) => Some(
-            command
-                .try_into()
-                .map_err(|error| anyhow::anyhow!("environment.server: {}", one_line(&error)))?,
-        ),
-        None => external_environment::default_command(&name),
+    let server = take(section, "server")?.or_else(|| external_environment::default_command(&name));
+    let (faults, start_seconds) = (take(section, "faults")?, take(section, "start_seconds")?);
+    let configured = |name, server, parameters| {
+        let mut environment = EnvironmentConfig::new(name, server, parameters);
+        environment.faults = faults.unwrap_or(environment.faults);
+        environment.start_seconds = start_seconds.unwrap_or(environment.start_seconds);
+        environment
     };
     let (environment, spec) = if let Some(server) = server {
-        let environment = EnvironmentConfig {
-            name,
-            server,
-            parameters: section.clone(),
-        };
+        let environment = configured(name, server, section.clone());
         let spec = ExternalEnvironment::begin(&environment, 1, 0)?.spec().clone();
         (environment, spec)
     } else {
         let parameters = environment::resolve(&name, section)?;
         let spec = environment::make(&name, &parameters)?.spec();
-        let environment = EnvironmentConfig {
-            name,
-            server: vec![],
-            parameters,
-        };
-        (environment, spec)
+        (configured(name, Vec::new(), parameters), spec)
     };
     if environment.name.starts_with(GYMNASIUM) {
         add_method_defaults(table, &spec)?;
@@ -242,6 +234,12 @@ fn describe_environment(table: &mut Table) -> anyhow::Result<()> {
     table.insert("environment".into(), Value::try_from(environment)?);
     table.insert("spec".into(), Value::try_from(spec)?);
     Ok(())
+}
+
+/// Takes a key of `[environment]` that is no parameter of the environment.
+fn take<T: DeserializeOwned>(section: &mut Table, key: &str) -> anyhow::Result<Option<T>> {
+    let value = section.remove(key).map(Value::try_into).transpose();
+    value.map_err(|error| anyhow::anyhow!("environment.{key}: {}", one_line(&error)))
 }
 
 /// Adds the default settings of a method that suits the environment's spaces. Keeps existing settings, and adds nothing

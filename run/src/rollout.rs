@@ -97,7 +97,11 @@ impl<'a> Rollout<'a> {
 
     /// Runs evaluation episode `number` of `seed`. The two determine its start state.
     pub fn evaluation_episode(&mut self, seed: u64, number: u64) -> anyhow::Result<Trajectory> {
-        self.episode(Start::Evaluation { seed, first: number })
+        self.episode(Start::Evaluation {
+            seed,
+            first: number,
+            episodes: Some(1),
+        })
     }
 
     /// Runs an episode that starts in this physical state of the environment, which must be a built-in one.
@@ -151,7 +155,7 @@ impl Host {
                 environment.reset(start, &mut observation)?;
                 Ok(observation)
             }
-            (Self::External(server), Start::Evaluation { seed, first }) => {
+            (Self::External(server), Start::Evaluation { seed, first, .. }) => {
                 if server.as_ref().is_none_or(|(of, _)| *of != seed) {
                     // The old server ends before the new one starts.
                     *server = None;
@@ -212,7 +216,7 @@ impl Host {
 fn check_spec(config: &Config, found: &EnvironmentSpec) -> anyhow::Result<()> {
     let name = &config.environment.name;
     ensure!(
-        *found == config.spec,
+        found.is(&config.spec),
         "config.toml: [spec] does not match the environment {name}"
     );
     Ok(())

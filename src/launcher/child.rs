@@ -62,6 +62,8 @@ pub(super) struct Child {
     pub(super) stalls: u32,
     /// The environment server that it uses, if any.
     server: Option<u32>,
+    /// Whether the user was told that it is slow, since it was last heard of or started.
+    reported_slow: bool,
     /// The time and the steps at which its rate was last computed.
     span: (Instant, u64),
     rate: f64,
@@ -102,6 +104,7 @@ impl Child {
             stalls: 0,
             server: (role == Role::Actor).then_some(index),
             span: (now, 0),
+            reported_slow: false,
             rate: 0.0,
         }
     }
@@ -134,7 +137,13 @@ impl Child {
         self.begun = now;
         self.moved = now;
         self.last_heartbeat = None;
+        self.reported_slow = false;
         self.rate = 0.0;
+    }
+
+    /// Invalid answers of its environment server that it has reported since it started.
+    pub(super) fn faults(&self) -> u32 {
+        self.last_heartbeat.map_or(0, |(_, heartbeat)| heartbeat.faults)
     }
 
     pub(super) fn is_ready(&self) -> bool {
@@ -151,6 +160,7 @@ impl Child {
     }
 
     fn record_at(&mut self, heartbeat: &Heartbeat, now: Instant) -> Option<Duration> {
+        self.reported_slow = false;
         let before = self.last_heartbeat.replace((now, *heartbeat)).map(|(_, before)| before);
         let first = before.is_none();
         let position = |heartbeat: &Heartbeat| (heartbeat.steps, heartbeat.policy_version, heartbeat.activity());
@@ -231,6 +241,24 @@ impl Child {
     /// The time since its last heartbeat, or since its start.
     pub(super) fn silent_for(&self) -> Duration {
         self.last_heartbeat.map_or(self.moved, |(then, _)| then).elapsed()
+    }
+
+    /// How long it has been starting; `None` once it is ready, and while it has no process.
+    pub(super) fn starting_for(&self) -> Option<Duration> {
+        (self.is_active() && !self.is_ready()).then(|| self.begun.elapsed())
+    }
+
+    /// Ends its process, which has not become ready in time.
+    pub(super) fn end_slow_start(&mut self) {
+        self.begun = Instant::now();
+        if let Some(process) = &mut self.process {
+            process.kill();
+        }
+    }
+
+    /// Takes note that the user is told that it is slow; whether that is news.
+    pub(super) fn report_slow(&mut self) -> bool {
+        !std::mem::replace(&mut self.reported_slow, true)
     }
 
     /// Whether its process is stopped, as by SIGSTOP or a debugger.

@@ -55,6 +55,22 @@ impl Stalls {
         found
     }
 
+    /// Environment servers that have been over one step or reset for longer than the patience while their clients wait, and for
+    /// how long. They are left alone.
+    pub(super) fn slow_servers(&self, children: &[Child]) -> Vec<(usize, Duration)> {
+        let is_waited_for = |index| {
+            let mut clients = children.iter().filter(|client| client.server() == Some(index));
+            clients.any(|client| client.is_responsive() && client.activity() == Some(Activity::WaitingForServer))
+        };
+        let servers = children.iter().enumerate().filter(|(_, child)| {
+            child.identity.role == Role::EnvServer && child.is_active() && child.is_ready() && !child.is_stopped()
+        });
+        servers
+            .map(|(i, server)| (i, server.silent_for()))
+            .filter(|(i, silent)| *silent >= self.patience && is_waited_for(children[*i].identity.index))
+            .collect()
+    }
+
     /// Why one child must be replaced, by its own state and that of its environment server or client.
     fn fault(&self, children: &[Child], i: usize) -> Option<&'static str> {
         let child = &children[i];

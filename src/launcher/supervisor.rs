@@ -7,7 +7,9 @@ use std::process::ExitStatus;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
+use shoal_actor::explorer::GIVEN_UP;
 use shoal_common::channel::control::RoleStatus;
+use shoal_common::channel::environment::Fault;
 use shoal_common::channel::{Domain, Services};
 use shoal_common::config::Config;
 use shoal_common::durable::write_atomically;
@@ -29,6 +31,9 @@ const CLEANING: Duration = Duration::from_secs(2);
 /// A killed process may take a moment to disappear.
 const OCCUPIED_PATIENCE: Duration = Duration::from_secs(2);
 const CLEANING_AGAIN: Duration = Duration::from_millis(200);
+
+/// A start that takes longer is reported to the user.
+const SLOW_START: Duration = Duration::from_secs(10);
 
 /// More starts than ever happen without any of the processes sending a chunk.
 const STARTS_WITHOUT_CHUNK: u64 = 100_000;
@@ -64,6 +69,9 @@ pub(super) struct Supervisor {
     /// The file with the number of processes ever started. It lasts over resumes: incarnations are never used twice.
     counter: PathBuf,
     started: u64,
+    /// Invalid answers of environments since the launcher started, and the last one.
+    faults: u32,
+    last_fault: String,
     all_ready: bool,
     cleaned: Instant,
     learner_done: bool,
@@ -107,6 +115,8 @@ impl Supervisor {
             run: run.path().into(),
             counter,
             started,
+            faults: 0,
+            last_fault: String::new(),
             all_ready: false,
             cleaned: Instant::now(),
             learner_done: false,
@@ -189,14 +199,51 @@ impl Supervisor {
             (heartbeat.role(), heartbeat.index, heartbeat.incarnation) == (Some(role), index, incarnation)
         });
         let Some(child) = child else { return };
+        let faults = heartbeat.faults.saturating_sub(child.faults());
+        let (client, server) = (name(child.identity), child.server());
         if let Some(after) = child.record(heartbeat) {
             self.log
                 .note(&name(child.identity), &format!("ready after {} ms", after.as_millis()));
+        }
+        if let Some(index) = server {
+            (0..faults).for_each(|_| self.note_fault(&client, index));
         }
         if !self.all_ready && self.children.iter().all(Child::is_ready) {
             self.all_ready = true;
             self.log.note("launcher", "every role is ready");
         }
+    }
+
+    fn note_fault(&mut self, client: &str, index: u32) {
+        self.faults = self.faults.saturating_add(1);
+        let server = self.children.iter().find(|child| child.is(Role::EnvServer, index));
+        if let Some(server) = server {
+            // The server has written what it was, unless it is one that does not check itself: then its client has.
+            let by_client = self.log.last_lines(client).pop().filter(|line| line.contains(GIVEN_UP));
+            let last = by_client.filter(|line| !line.contains(&Fault::Reported.to_string()));
+            let last = last
+                .or_else(|| self.log.last_lines(&name(server.identity)).pop())
+                .unwrap_or_default();
+            let last = last.strip_prefix("error: ").unwrap_or(&last);
+            self.last_fault = format!("{}: {last}", name(server.identity));
+            self.incidents
+                .push(Incident::of(server.identity, IncidentKind::Fault, last.into()));
+        }
+    }
+
+    /// Whether environments may still return something invalid, or have done so too often.
+    ///
+    /// # Errors
+    /// When they have: with what the last one was.
+    pub(super) fn check_faults(&self, most: u32) -> anyhow::Result<()> {
+        if self.faults < most {
+            return Ok(());
+        }
+        bail!(
+            "the environments returned something invalid {} times, and environment.faults is {most}; the last time: {}",
+            self.faults,
+            self.last_fault
+        );
     }
 
     /// The activity of a role: that of its first process with a heartbeat.
@@ -347,6 +394,34 @@ impl Supervisor {
             self.note_incident(i, IncidentKind::Stalled, why.into());
         }
         messages
+    }
+
+    /// What is to be said of processes that are slow, each once: environment servers over one step or reset, and roles that
+    /// are starting. An environment's program that is not ready within `start_limit` is ended, which counts as a failure.
+    pub(super) fn report_slow(&mut self, stalls: &Stalls, start_limit: Option<Duration>) -> Vec<String> {
+        let mut said = Vec::new();
+        for (i, silent) in stalls.slow_servers(&self.children) {
+            let child = &mut self.children[i];
+            if child.report_slow() {
+                let (name, seconds) = (name(child.identity), silent.as_secs());
+                said.push(format!(
+                    "{name} has been over one step or reset of its environments for {seconds} s; it is left alone"
+                ));
+            }
+        }
+        for child in &mut self.children {
+            let Some(starting) = child.starting_for() else { continue };
+            let limit = start_limit.filter(|_| child.identity.role == Role::EnvServer);
+            if limit.is_some_and(|limit| starting >= limit) {
+                let text = "is not ready within environment.start_seconds and is ended";
+                self.log.note(&name(child.identity), text);
+                child.end_slow_start();
+            } else if starting >= SLOW_START && child.report_slow() {
+                let limit = limit.map_or(String::new(), |limit| format!(", for at most {} s", limit.as_secs()));
+                said.push(format!("waiting for {} to start{limit}", name(child.identity)));
+            }
+        }
+        said
     }
 
     fn note_incident(&mut self, i: usize, what: IncidentKind, detail: String) {

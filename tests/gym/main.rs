@@ -10,11 +10,11 @@ mod support;
 
 use std::path::Path;
 use std::process::{Command, ExitCode};
-use std::time::Duration;
 
 use rustix::process::{Pid, Signal, kill_process};
 use shoal_common::config::Config;
 use shoal_common::space::Space;
+use shoal_learner::replay::{Replay, ReplayLayout, are_finite};
 use suite::{PYTHON, test};
 use support::{Workplace, error_line, final_result, output_of, parse, until, wait_for_rows};
 
@@ -40,6 +40,10 @@ fn main() -> ExitCode {
         test!(a_stuck_server_ends_with_its_launcher, PYTHON),
         test!(a_killed_start_leaves_no_process_and_no_file, PYTHON),
         test!(a_server_that_ignores_requests_is_replaced, PYTHON),
+        test!(an_invalid_answer_ends_its_episodes_and_is_counted_and_named, PYTHON),
+        test!(too_many_invalid_answers_end_a_run_that_can_be_resumed, PYTHON),
+        test!(a_server_with_any_answers_is_survived_or_named_in_one_line, PYTHON),
+        test!(a_module_sees_no_arguments_and_no_input_and_prints_to_the_log, PYTHON),
         test!(a_slow_environment_is_not_replaced, PYTHON),
     ])
 }
@@ -144,7 +148,7 @@ fn discrete_spaces_with_an_offset_are_learned_by_a_table() {
     let spec = config(&place).spec;
     assert_eq!(
         (spec.observation, spec.action),
-        (Space::Discrete { n: 4 }, Space::Discrete { n: 3 })
+        (Space::Discrete { n: 4, start: 5 }, Space::Discrete { n: 3, start: -1 })
     );
     assert_eq!(
         support::json(&output)["eval_return_mean"],
@@ -357,7 +361,107 @@ fn a_slow_environment_is_not_replaced() {
     let running = place.start_in("run", &format!("{OURS}Sleeps-v0"), &arguments);
     running.wait_for_learning();
     std::fs::write(place.path().join("sleep"), "").unwrap();
-    // Far longer than `run.stall_seconds`, but the server is busy.
-    std::thread::sleep(Duration::from_secs(12));
+    // Longer than `run.stall_seconds`, but the server is busy.
+    until("it is named", || {
+        running
+            .log()
+            .contains("has been over one step or reset of its environments")
+    });
     assert!(!running.log().contains("makes no progress"), "{}", running.log());
+    let named = running.log().matches("env-server-0 has been over one step").count();
+    assert!(named <= 1, "{}", running.log());
+}
+
+fn an_invalid_answer_ends_its_episodes_and_is_counted_and_named() {
+    let place = place();
+    for (what, words) in [
+        ("nan-reward", "a reward that is nan"),
+        ("none-reward", "a reward that is None"),
+        ("nan-observation", "number 1 is nan"),
+        ("shape", "shape (1,)"),
+        ("terminated", "terminated that is 2"),
+    ] {
+        let how = format!("environment.what={what}");
+        let arguments = [&SHORT[..], &["--steps", "2000", "--set", &how]].concat();
+        let running = place.start_in(what, &format!("{OURS}Invalid-v0"), &arguments);
+        let run = running.run.clone();
+        assert_eq!(running.wait().0, Some(0), "{what}: {}", place.stderr());
+        let incidents = std::fs::read_to_string(run.join("incidents.csv")).unwrap();
+        let fault = incidents.lines().find(|line| line.contains(",fault,"));
+        let fault = fault.unwrap_or_else(|| panic!("{what}: {incidents}"));
+        assert!(
+            fault.contains("env-server")
+                && fault.contains(words)
+                && fault.contains("Invalid-v0")
+                && fault.contains("episode"),
+            "{fault}"
+        );
+        let replay = Replay::open(&run.join("replay.bin"), &layout_of(&place, what)).unwrap();
+        assert!(replay.rows().all(|row| are_finite(replay.row(row))), "{what}");
+    }
+}
+
+fn layout_of(place: &Workplace, run: &str) -> ReplayLayout {
+    let config = Config::load(&place.path().join(run).join("config.toml")).unwrap();
+    shoal_learner::process::replay_layout(&config)
+}
+
+fn too_many_invalid_answers_end_a_run_that_can_be_resumed() {
+    let place = place();
+    let environment = format!("{OURS}Invalid-v0");
+    let always = ["--set", "environment.what=shape", "--set", "environment.always=true"];
+    let few = ["--steps", "2000", "--set", "environment.faults=7"];
+    let command = [&["train", &environment, "--run", "run"][..], &SHORT, &always, &few].concat();
+    let output = place.output(&command);
+    assert_eq!(output.status.code(), Some(1));
+    let said = error_line(&output);
+    assert!(
+        said.contains("environment.faults is 7") && said.contains("shape (1,)") && said.contains("env-server"),
+        "{said}"
+    );
+    // Its environment is mended.
+    std::fs::write(place.path().join("mended"), "").unwrap();
+    let resumed = place.resume("run", &[]);
+    assert_eq!(resumed.wait().0, Some(0), "{}", place.stderr());
+}
+
+fn a_server_with_any_answers_is_survived_or_named_in_one_line() {
+    let place = place();
+    for how in ["nan", "flags", "short", "long", "twice", "verdict", "huge"] {
+        let server =
+            format!("from shoal_test_environments import hostile_server; raise SystemExit(hostile_server({how:?}))");
+        let server = serde_json::to_string(&["python3", "-c", &server]).unwrap();
+        let server = format!("environment.server={server}");
+        let few = ["--steps", "600", "--set", "environment.faults=20", "--set", &server];
+        let output = place.output(&[&["train", "gym:Pendulum-v1", "--run", how][..], &SHORT, &few].concat());
+        let said = String::from_utf8_lossy(&output.stderr);
+        match output.status.code() {
+            Some(0) => {}
+            Some(1) => assert!(
+                said.contains("error: ") && (said.contains("env-server") || said.contains("environment server")),
+                "{how}: {said}"
+            ),
+            code => panic!("{how}: {code:?}: {said}"),
+        }
+        if let Ok(config) = Config::load(&place.path().join(how).join("config.toml")) {
+            let layout = shoal_learner::process::replay_layout(&config);
+            let replay = Replay::open(&place.path().join(how).join("replay.bin"), &layout).unwrap();
+            assert!(replay.rows().all(|row| are_finite(replay.row(row))), "{how}");
+        }
+    }
+}
+
+fn a_module_sees_no_arguments_and_no_input_and_prints_to_the_log() {
+    let place = place();
+    let environment = "gym:shoal_test_arguments:Plain-v0";
+    let module = "import sys, gymnasium\n\
+        from shoal_test_environments import Talks\n\
+        print('arguments', len(sys.argv), 'input', repr(sys.stdin.read()))\n\
+        gymnasium.register('Plain-v0', entry_point=lambda: Talks(how='escapes'), max_episode_steps=5)\n";
+    std::fs::write(place.path().join("shoal_test_arguments.py"), module).unwrap();
+    let running = place.start_in("run", environment, &[&SHORT[..], &["--steps", "300"]].concat());
+    let log = running.run.join("shoal.log");
+    assert_eq!(running.wait().0, Some(0), "{}", place.stderr());
+    let log = std::fs::read_to_string(log).unwrap();
+    assert!(log.contains("arguments 1 input ''"), "{log}");
 }

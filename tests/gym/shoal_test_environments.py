@@ -115,6 +115,46 @@ class Offset(gym.Env):
         return self.state, float(is_right), bool(not is_right or self.state == 8), False, {}
 
 
+class Invalid(gym.Env):
+    """Returns something invalid: once in the life of a run directory's neighbourhood, or always until it is mended."""
+
+    observation_space = gym.spaces.Box(-1.0, 1.0, (3,), np.float32)
+    action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def __init__(self, what, always=False):
+        self.what, self.always, self.taken = what, always, 0
+
+    def _now(self):
+        if self.always:
+            return not os.path.exists("mended")
+        if self.taken != 40 or os.path.exists(f"returned-{self.what}"):
+            return False
+        with open(f"returned-{self.what}", "w"):
+            return True
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(3, np.float32), {}
+
+    def step(self, action):
+        self.taken += 1
+        observation, reward, terminated = np.zeros(3, np.float32), 0.0, False
+        if self._now():
+            match self.what:
+                case "nan-reward":
+                    reward = float("nan")
+                case "none-reward":
+                    reward = None
+                case "nan-observation":
+                    observation[1] = np.nan
+                case "shape":
+                    observation = np.zeros(1, np.float32)
+                case "terminated":
+                    terminated = 2
+        return observation, reward, terminated, False, {}
+
+
+gym.register("Invalid-v0", entry_point=Invalid, max_episode_steps=5)
 gym.register("Ends-v0", entry_point=Ends, max_episode_steps=5)
 gym.register("Endless-v0", entry_point=Ends)
 gym.register("Fails-v0", entry_point=Fails, max_episode_steps=5)
@@ -139,6 +179,49 @@ def deaf_server():
         return original(self)
 
     port.Port.next_request = next_request
+    from shoal_gym.__main__ import main
+
+    return main()
+
+
+def hostile_server(how):
+    """An environment server whose answers are wrong now and then, and which does not check them."""
+    from shoal_gym import server
+
+    luck = np.random.default_rng(1)
+    send = server.Server._send
+
+    def wrong(self, response, verdict):
+        numbers = server._numbers(response.payload())
+        if len(numbers) > 10 and luck.random() < 0.2:
+            match how:
+                case "nan":
+                    numbers[luck.integers(len(numbers))] = np.nan
+                case "flags":
+                    numbers[-1] = 0.5
+                case "huge":
+                    numbers[:] = np.inf
+                case "verdict":
+                    verdict = 77
+        send(self, response, verdict)
+
+    def another_length(self, request):
+        response, blocks = loan_blocks(self, request)
+        if luck.random() < 0.1:
+            return self._loan(request, 3 if how == "short" else 9), blocks
+        return response, blocks
+
+    def twice(self, request):
+        answer(self, request)
+        if luck.random() < 0.2:
+            self._send(self._loan(request, 0), server.Verdict.REFUSED)
+
+    server.Server._send = wrong
+    loan_blocks, answer = server.Server._loan_blocks, server.Server.answer
+    if how in ("short", "long"):
+        server.Server._loan_blocks = another_length
+    if how == "twice":
+        server.Server.answer = twice
     from shoal_gym.__main__ import main
 
     return main()

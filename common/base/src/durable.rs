@@ -16,8 +16,8 @@ pub struct Prepared {
 }
 
 impl Prepared {
-    /// Writes and syncs a file for `path`, readable by the owner alone. The temporary name is `path` with `.new` appended;
-    /// a file that a killed process left there is overwritten.
+    /// Writes and syncs a file for `path`, readable by the owner alone. The temporary name is `path` with `.new`
+    /// appended; a file that a killed process left there is overwritten.
     pub fn write<E: From<io::Error>>(
         path: &Path,
         write: impl FnOnce(&mut BufWriter<File>) -> Result<(), E>,
@@ -74,7 +74,8 @@ impl Drop for Prepared {
     }
 }
 
-/// Writes a file atomically: at any moment `path` is either the old file or the complete new one, also after a power loss.
+/// Writes a file atomically: at any moment `path` is either the old file or the complete new one, also after a power
+/// loss.
 pub fn write_atomically<E: From<io::Error>>(
     path: &Path,
     write: impl FnOnce(&mut BufWriter<File>) -> Result<(), E>,
@@ -82,8 +83,8 @@ pub fn write_atomically<E: From<io::Error>>(
     Ok(Prepared::write(path, write)?.publish()?)
 }
 
-/// Like [`write_atomically`], but without waiting for the disk: the file is whole after any process dies, but a power loss
-/// may damage it.
+/// Like [`write_atomically`], but without waiting for the disk: the file is whole after any process dies, but a power
+/// loss may damage it.
 pub fn write_atomically_unsynced<E: From<io::Error>>(
     path: &Path,
     write: impl FnOnce(&mut BufWriter<File>) -> Result<(), E>,

@@ -5,8 +5,8 @@ use std::fmt;
 
 /// Why a role's loop ends early: it was asked to stop, or it failed with an `E`.
 ///
-/// It does not implement [`Error`], so that `?` can convert every error that converts into `E`. To convert between exits
-/// with different errors, use [`map_err`](Result::map_err) with [`Exit::widen`].
+/// It does not implement [`Error`], so that `?` can convert every error that converts into `E`. To convert between
+/// exits with different errors, use [`map_err`](Result::map_err) with [`Exit::widen`].
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Exit<E> {
     /// The role was asked to end, which is not a failure.

@@ -67,8 +67,8 @@ pub struct Identity {
 pub enum Activity {
     /// Doing its work.
     Working,
-    /// Waiting for another role to appear or to send: an actor for its policy, a learner for rows, an environment server
-    /// for a request.
+    /// Waiting for another role to appear or to send: an actor for its policy, a learner for rows, an environment
+    /// server for a request.
     WaitingForPeer,
     /// An actor whose window is full, or a learner ahead of the ratio.
     WaitingForRatio,
@@ -89,7 +89,8 @@ pub struct Heartbeat {
     /// Its index among the processes of that role.
     pub index: u32,
     activity: u32,
-    reserved: u32,
+    /// Of an actor or the evaluator: invalid answers of its environment server, since it started.
+    pub faults: u32,
     /// Its incarnation.
     pub incarnation: u64,
     /// Environment steps since it started; for a learner gradient steps, or rows where each is used once.
@@ -111,7 +112,7 @@ impl Heartbeat {
             role: role as u32,
             index,
             activity,
-            reserved: 0,
+            faults: 0,
             incarnation,
             steps: 0,
             policy_version: 0,
@@ -194,8 +195,8 @@ pub struct LearnerReport {
     pub updates: u64,
     /// Version of the policy published last.
     pub policy_version: u64,
-    /// Mean squared error of the value estimates (the critic, line 13 of Algorithm 4; the baseline; or the table), averaged
-    /// over the updates since the last report.
+    /// Mean squared error of the value estimates (the critic, line 13 of Algorithm 4; the baseline; or the table),
+    /// averaged over the updates since the last report.
     pub critic_loss: f64,
     /// The loss of the policy, averaged likewise: −mean Q(s, μ(s)), or for REINFORCE the negative of its objective.
     pub actor_loss: f64,

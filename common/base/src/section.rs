@@ -13,7 +13,8 @@ use toml::{Table, Value};
 /// Reads the section `name`, whose type is `T`. Every key is optional.
 ///
 /// # Errors
-/// When a key is unknown or of the wrong type. If a single key is at fault, the error begins with that key and its value.
+/// When a key is unknown or of the wrong type. If a single key is at fault, the error begins with that key and its
+/// value.
 pub fn read<T: DeserializeOwned>(name: &str, section: Value) -> Result<T, toml::de::Error> {
     // serde's error does not name the key, so each key is read alone to find the faulty one.
     let alone = |(key, value): (&String, &Value)| {
@@ -34,8 +35,9 @@ pub fn read<T: DeserializeOwned>(name: &str, section: Value) -> Result<T, toml::
 /// gamma: f64 = 0.99, bounds: from(0.0, 1.0), unit: "–", source: "section 4.3.1";
 /// ```
 ///
-/// Leave out `bounds` for values that are not numbers, and where a bound is the value of another key; the section's `check`
-/// or `Config::check` then compares. The struct gets `Default`, the traits of serde and schemars, and `check_bounds`.
+/// Leave out `bounds` for values that are not numbers, and where a bound is the value of another key; the section's
+/// `check` or `Config::check` then compares. The struct gets `Default`, the traits of serde and schemars, and
+/// `check_bounds`.
 #[macro_export]
 macro_rules! section {
     (

@@ -17,6 +17,9 @@ pub enum Space {
     Discrete {
         /// Number of indices.
         n: u32,
+        /// What the environment itself calls index 0. Nothing but an exported policy counts from there.
+        #[serde(default, skip_serializing_if = "is_zero")]
+        start: i32,
     },
 }
 
@@ -26,6 +29,27 @@ impl Space {
         Self::Box {
             low: ranges.iter().map(|r| r.0).collect(),
             high: ranges.iter().map(|r| r.1).collect(),
+        }
+    }
+
+    /// The indices `0 .. n`.
+    pub fn discrete(n: u32) -> Self {
+        Self::Discrete { n, start: 0 }
+    }
+
+    /// What the environment calls index 0; 0 in a box.
+    pub fn start(&self) -> i32 {
+        match self {
+            Self::Box { .. } => 0,
+            Self::Discrete { start, .. } => *start,
+        }
+    }
+
+    /// Whether this is `configured`. Configurations of earlier versions do not have where a space starts.
+    fn is(&self, configured: &Self) -> bool {
+        match (self, configured) {
+            (Self::Discrete { n, .. }, Self::Discrete { n: expected, start: 0 }) => n == expected,
+            _ => self == configured,
         }
     }
 
@@ -41,7 +65,7 @@ impl Space {
     pub fn size(&self) -> usize {
         match self {
             Self::Box { low, .. } => low.len(),
-            Self::Discrete { n } => *n as usize,
+            Self::Discrete { n, .. } => *n as usize,
         }
     }
 }
@@ -60,9 +84,21 @@ pub struct EnvironmentSpec {
     pub state_width: usize,
 }
 
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde asks so")]
+fn is_zero(number: &i32) -> bool {
+    *number == 0
+}
+
 impl EnvironmentSpec {
-    /// Words in a snapshot of this many environments. For each environment: the number of its episode, the steps taken in
-    /// it, the position in its random stream, and the state. 0 if the environment cannot save its state.
+    /// Whether an environment with this description is the one that was `configured`.
+    pub fn is(&self, configured: &Self) -> bool {
+        self.observation.is(&configured.observation)
+            && self.action.is(&configured.action)
+            && (self.time_limit, self.state_width) == (configured.time_limit, configured.state_width)
+    }
+
+    /// Words in a snapshot of this many environments. For each environment: the number of its episode, the steps taken
+    /// in it, the position in its random stream, and the state. 0 if the environment cannot save its state.
     pub fn snapshot_words(&self, environments: usize) -> usize {
         const COUNTERS: usize = 3;
         match self.state_width {
@@ -79,8 +115,8 @@ mod tests {
     #[test]
     fn an_environment_that_cannot_save_its_state_has_no_snapshots() {
         let lake = |state_width| EnvironmentSpec {
-            observation: Space::Discrete { n: 16 },
-            action: Space::Discrete { n: 4 },
+            observation: Space::discrete(16),
+            action: Space::discrete(4),
             time_limit: 100,
             state_width,
         };

@@ -2,8 +2,8 @@
 //!
 //! A role's standard input closes when the launcher asks it to end, and also when the launcher dies, because the system
 //! closes the pipe. If the role is still there some time later, stuck in a call that does not return, the thread that
-//! watches standard input kills it. A line on standard input asks the role to retire: the run continues without it, and it
-//! may take the time to hand over everything it has.
+//! watches standard input kills it. A line on standard input asks the role to retire: the run continues without it, and
+//! it may take the time to hand over everything it has.
 
 use std::io::{ErrorKind, Read};
 use std::sync::Arc;
@@ -23,8 +23,8 @@ const END: u8 = 2;
 pub struct Stop(Arc<AtomicU8>);
 
 impl Stop {
-    /// A stop that is requested when this process's standard input receives a line or closes. [`GRACE`] after it closed,
-    /// the process is killed if it still runs, together with its process group if it leads one.
+    /// A stop that is requested when this process's standard input receives a line or closes. [`GRACE`] after it
+    /// closed, the process is killed if it still runs, together with its process group if it leads one.
     ///
     /// # Errors
     /// When the thread that watches standard input cannot be started.

@@ -1,11 +1,11 @@
 //! Removal of what killed processes leave in shared memory.
 //!
-//! iceoryx2 0.10 creates a file in steps: create, set the size, fill, make readable. If a process dies in between, others
-//! retry to open its half-made file for a second, or forever if they run as root and the file has no size yet. So half-made
-//! files of dead processes are removed here as soon as they are seen.
+//! iceoryx2 0.10 creates a file in steps: create, set the size, fill, make readable. If a process dies in between,
+//! others retry to open its half-made file for a second, or forever if they run as root and the file has no size yet.
+//! So half-made files of dead processes are removed here as soon as they are seen.
 //!
-//! iceoryx2 also never frees a port whose port tag is removed before the port. So missing tags are restored before iceoryx2
-//! cleans up ([`Services::restore_port_tags`](super::Services::restore_port_tags)).
+//! iceoryx2 also never frees a port whose port tag is removed before the port. So missing tags are restored before
+//! iceoryx2 cleans up ([`Services::restore_port_tags`](super::Services::restore_port_tags)).
 
 use std::collections::HashSet;
 use std::fs::Metadata;
@@ -45,8 +45,8 @@ pub struct Sweeper {
 }
 
 impl Sweeper {
-    /// Starts to remove half-made files of a run. It is used by the run's launcher, and by a process that asks a launcher,
-    /// because the launcher may be killed while it answers.
+    /// Starts to remove half-made files of a run. It is used by the run's launcher, and by a process that asks a
+    /// launcher, because the launcher may be killed while it answers.
     ///
     /// # Errors
     /// When the thread cannot be started.
@@ -86,8 +86,8 @@ pub(super) fn remove_unfinished(run_id: &str) -> io::Result<bool> {
     if unfinished.is_empty() {
         return Ok(true);
     }
-    // The maker keeps its file open until it is finished. Another process that only tries to open the file has it open for
-    // a moment; the file is then removed by the next sweep.
+    // The maker keeps its file open until it is finished. Another process that only tries to open the file has it open
+    // for a moment; the file is then removed by the next sweep.
     let open = open_files();
     let mut none_left = true;
     for (path, before) in unfinished {
@@ -131,8 +131,8 @@ fn open_files() -> HashSet<PathBuf> {
 }
 
 impl Domain {
-    /// Cleans up after the dead processes of run `run_id`. Returns the number of processes for which that failed. If the
-    /// caller is killed during a clean-up, the clean-up can be repeated.
+    /// Cleans up after the dead processes of run `run_id`. Returns the number of processes for which that failed. If
+    /// the caller is killed during a clean-up, the clean-up can be repeated.
     ///
     /// # Errors
     /// When files cannot be listed or removed.

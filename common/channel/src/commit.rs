@@ -1,7 +1,8 @@
 //! What the learner has committed to the replay: the header of the replay file.
 //!
 //! The learner is the only writer. Actors and `status` map the header read-only and follow the commit record with a
-//! [`CommitReader`]. Both sides take the layout from [`ReplayLayout::places`]. `docs/REPLAY_FORMAT.md` describes the format.
+//! [`CommitReader`]. Both sides take the layout from [`ReplayLayout::places`]. `docs/REPLAY_FORMAT.md` describes the
+//! format.
 
 mod layout;
 mod reader;

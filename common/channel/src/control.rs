@@ -42,7 +42,8 @@ const ANSWER: usize = 1024;
 /// Most bytes of one role in an answer.
 const ANSWER_PER_ROLE: usize = 96;
 
-/// How long the client sleeps between checks for an answer. It notifies the launcher, which answers at once if it is idle.
+/// How long the client sleeps between checks for an answer. It notifies the launcher, which answers at once if it is
+/// idle.
 const POLL_INTERVAL: Duration = Duration::from_millis(5);
 
 /// How often the client checks that the launcher is still alive.
@@ -151,7 +152,8 @@ impl ControlPort {
     }
 }
 
-/// Sends an answer. Failures are only logged: the launcher must not fail because a client has gone or memory is exhausted.
+/// Sends an answer. Failures are only logged: the launcher must not fail because a client has gone or memory is
+/// exhausted.
 fn send(request: &ControlRequest, answer: &Answer) {
     let bytes = match encode(answer) {
         Ok(bytes) => bytes,

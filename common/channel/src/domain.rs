@@ -1,5 +1,5 @@
-//! A run's own part of shared memory. Every run has its own file prefix, and its own root directory inside a directory of
-//! its user. So runs and users never affect each other, and the leftovers of a killed run can be found by name.
+//! A run's own part of shared memory. Every run has its own file prefix, and its own root directory inside a directory
+//! of its user. So runs and users never affect each other, and the leftovers of a killed run can be found by name.
 
 use std::fs::{DirBuilder, File, Metadata, Permissions};
 use std::io;
@@ -151,8 +151,8 @@ impl Domain {
         &self.node
     }
 
-    /// Leaves the run. The last process to leave removes all files of the run from shared memory, also when the launcher
-    /// was killed.
+    /// Leaves the run. The last process to leave removes all files of the run from shared memory, also when the
+    /// launcher was killed.
     ///
     /// # Errors
     /// When files cannot be removed.
@@ -228,8 +228,8 @@ pub(super) fn iox_config(root: &Path, run_id: &str) -> Result<Config, String> {
     let directory = root.join(run_id);
     let root_path = IoxPath::new(directory.as_os_str().as_encoded_bytes()).map_err(|e| format!("{e:?}"))?;
     let mut config = Config::default();
-    // Only the launcher cleans up after dead processes: it first restores the port tags that iceoryx2 0.10 needs and that
-    // are missing when an earlier clean-up was killed (`cleanup.rs`).
+    // Only the launcher cleans up after dead processes: it first restores the port tags that iceoryx2 0.10 needs and
+    // that are missing when an earlier clean-up was killed (`cleanup.rs`).
     config.global.node.cleanup_dead_nodes_on_creation = false;
     config.global.node.cleanup_dead_nodes_on_destruction = false;
     config.global.service.cleanup_dead_nodes_on_open = false;
@@ -272,8 +272,8 @@ fn remove_if_dead(root: &Path, run_id: &str) -> Result<(), DomainError> {
     if !living_processes(root, run_id)?.is_empty() {
         return Ok(());
     }
-    // The files are unused: no process of the run is left, and no other run has its name. iceoryx2 itself never removes the
-    // file that counts its nodes.
+    // The files are unused: no process of the run is left, and no other run has its name. iceoryx2 itself never removes
+    // the file that counts its nodes.
     for (path, _) in files_of(run_id).map_err(io_error("list", Path::new(SHARED_MEMORY)))? {
         remove(&path, |path| std::fs::remove_file(path))?;
     }

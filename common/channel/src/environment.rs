@@ -1,12 +1,14 @@
 //! Requests and responses between one actor and its environment server. A request to step has one action for each
-//! environment, and its response the outcomes; the actor reads observations where the server wrote them. A snapshot of the
-//! current episodes is returned as words, from which any server of this environment can continue.
+//! environment, and its response the outcomes; the actor reads observations where the server wrote them. A snapshot of
+//! the current episodes is returned as words, from which any server of this environment can continue.
 
+mod check;
 mod client;
 mod message;
 mod port;
 mod service;
 
+pub use check::Fault;
 pub use client::{Begin, EnvironmentClient, Observed, Snapshot, Stepped, describe};
 pub use message::{Ask, RequestHeader, ResponseHeader, ResponseLayout, StepBlocks};
 pub use port::{EnvironmentPort, Request};

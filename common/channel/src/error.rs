@@ -18,7 +18,10 @@ use iceoryx2::service::port_factory::client::ClientCreateError;
 use iceoryx2::service::port_factory::server::ServerCreateError;
 use iceoryx2::service::service_name::ServiceNameError;
 
-/// Why a channel fails: its service or port is unavailable, memory is exhausted, or the other side violates the protocol.
+use super::environment::Fault;
+
+/// Why a channel fails: its service or port is unavailable, memory is exhausted, or the other side violates the
+/// protocol.
 #[derive(Debug, thiserror::Error)]
 #[error("channel {channel}: cannot {action}: {}", reason(*kind, source.as_ref()))]
 pub struct ChannelError {
@@ -42,8 +45,16 @@ impl ChannelError {
         }
     }
 
-    /// Whether the same attempt may succeed a moment later without the user's help, once the launcher has cleaned up after
-    /// killed processes.
+    /// What an environment returned that it may not, if that is why; it can go on with new episodes.
+    pub fn fault(&self) -> Option<&Fault> {
+        match self.source.downcast_ref() {
+            Some(PeerError::Invalid(fault)) => Some(fault),
+            _ => None,
+        }
+    }
+
+    /// Whether the same attempt may succeed a moment later without the user's help, once the launcher has cleaned up
+    /// after killed processes.
     pub fn is_transient(&self) -> bool {
         match self.kind {
             ChannelErrorKind::Occupied | ChannelErrorKind::Unfinished | ChannelErrorKind::Interrupted => true,
@@ -98,7 +109,7 @@ pub enum ChannelErrorKind {
 }
 
 /// The other side of a channel violates the protocol, or sends something that cannot be used.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum PeerError {
     /// A description lacks some of its numbers.
     #[error("the answer is too short")]
@@ -111,6 +122,9 @@ pub enum PeerError {
         /// Words in a snapshot of the environments.
         expected: usize,
     },
+    /// An environment returned what it may not.
+    #[error(transparent)]
+    Invalid(Fault),
     /// The environment server refused a request.
     #[error("the environment server refused the request")]
     Refused,
@@ -133,8 +147,8 @@ pub enum PeerError {
     PolicyLayout,
 }
 
-/// The reason in an error's message. The text of a [`PeerError`] is sufficient; errors of iceoryx2 are only names, so the
-/// text of the kind comes first.
+/// The reason in an error's message. The text of a [`PeerError`] is sufficient; errors of iceoryx2 are only names, so
+/// the text of the kind comes first.
 fn reason(kind: ChannelErrorKind, source: &(dyn Error + Send + Sync)) -> String {
     match kind {
         ChannelErrorKind::Peer => source.to_string(),

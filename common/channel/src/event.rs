@@ -23,19 +23,20 @@ use super::error::{Cause, ChannelError};
 use super::service::{Entry, Held, claim, service_name};
 use super::{descriptor, memory};
 
-/// Polls before a waiting process blocks. A peer that works on another core answers while they last. On a shared core they
-/// cost the peer some microseconds.
+/// Polls before a waiting process blocks. A peer that works on another core answers while they last. On a shared core
+/// they cost the peer some microseconds.
 const POLLS: u32 = 200;
 
-/// After this many waits in a row without success from polling, a process blocks at once: a peer on the same core gets that
-/// core, and no core is busy waiting for a peer that always takes longer. With a smaller number, a process would too often
-/// stop polling for a peer that answers in time only now and then.
+/// After this many waits in a row without success from polling, a process blocks at once: a peer on the same core gets
+/// that core, and no core is busy waiting for a peer that always takes longer. With a smaller number, a process would
+/// too often stop polling for a peer that answers in time only now and then.
 const MAX_MISSES: u32 = 64;
 
 /// After that, one in this many waits polls again, because processes move from core to core.
 const RETRY_EVERY: u32 = 32;
 
-/// How long a process blocks before it refreshes its connections. A notification can be lost when its receiver restarts.
+/// How long a process blocks before it refreshes its connections. A notification can be lost when its receiver
+/// restarts.
 const MAX_SLEEP: Duration = Duration::from_millis(50);
 
 /// Names the event service of a process by its role and its index in that role.
@@ -135,8 +136,8 @@ impl Listener {
     /// # Errors
     /// When the system cannot wait for the listener.
     pub fn wait(&self, patience: Duration) -> Result<bool, ChannelError> {
-        // The listener's own `timed_wait` does the same with twice as many system calls. The conversion fails only for a
-        // `patience` that is practically infinite; `None` then waits without a limit.
+        // The listener's own `timed_wait` does the same with twice as many system calls. The conversion fails only for
+        // a `patience` that is practically infinite; `None` then waits without a limit.
         let patience = Timespec::try_from(patience).ok();
         let mut ready = [PollFd::from_borrowed_fd(self.as_fd(), PollFlags::IN)];
         match poll(&mut ready, patience.as_ref()) {
@@ -177,8 +178,8 @@ impl Notifier {
         claim(|| Self::on(domain, &channel))
     }
 
-    /// Opens a notifier for the launcher, if that is possible at once. Otherwise the launcher finds the question when it next
-    /// looks by itself.
+    /// Opens a notifier for the launcher, if that is possible at once. Otherwise the launcher finds the question when
+    /// it next looks by itself.
     pub(super) fn to_launcher(domain: &Domain) -> Option<Self> {
         Self::on(domain, LAUNCHER).ok()
     }
@@ -191,7 +192,8 @@ impl Notifier {
         Ok(Self { notifier })
     }
 
-    /// Sends a notification. A failure is only logged: the receiver may be restarting, and then looks for messages anyway.
+    /// Sends a notification. A failure is only logged: the receiver may be restarting, and then looks for messages
+    /// anyway.
     pub fn notify(&self) {
         if let Err(cause) = self.notifier.notify() {
             tracing::debug!(?cause, "a notification was not delivered");
@@ -199,8 +201,8 @@ impl Notifier {
     }
 }
 
-/// Waits until `poll` returns something. It polls for a short while, if that has helped recently, and then sleeps at the
-/// listener. While it waits, it calls `refresh` some twenty times a second, which must renew connections.
+/// Waits until `poll` returns something. It polls for a short while, if that has helped recently, and then sleeps at
+/// the listener. While it waits, it calls `refresh` some twenty times a second, which must renew connections.
 ///
 /// # Errors
 /// [`Exit::Stopped`] once `stop` is requested, and the errors of `poll`, `refresh` and the listener.

@@ -10,8 +10,8 @@ use super::reports::Reporter;
 
 const INTERVAL: Duration = Duration::from_millis(500);
 
-/// Reports to the launcher that this role is alive, how far it is, and what it waits for. The first heartbeat reports that
-/// it is ready.
+/// Reports to the launcher that this role is alive, how far it is, and what it waits for. The first heartbeat reports
+/// that it is ready.
 #[derive(Debug)]
 pub struct HeartbeatSender {
     reporter: Reporter<Heartbeat>,
@@ -32,21 +32,28 @@ impl HeartbeatSender {
         })
     }
 
-    /// Reports that the first step of the work begins, which the process may not survive. So the launcher can tell a role
-    /// that dies during its first step from one that was waiting.
+    /// Reports that the first step of the work begins, which the process may not survive. So the launcher can tell a
+    /// role that dies during its first step from one that was waiting.
     pub fn begin_work(&mut self) {
         if self.heartbeat.steps == 0 {
             self.beat_now(Activity::Working);
         }
     }
 
-    /// Counts `steps` more steps of the role's work. The first count is sent at once: it shows that the process can work.
+    /// Counts `steps` more steps of the role's work. The first count is sent at once: it shows that the process can
+    /// work.
     pub fn count(&mut self, steps: u64) {
         let first = self.heartbeat.steps == 0;
         self.heartbeat.steps += steps;
         if first {
             self.beat_now(Activity::Working);
         }
+    }
+
+    /// Counts an invalid answer of the environment server, and reports it at once.
+    pub fn count_fault(&mut self) {
+        self.heartbeat.faults = self.heartbeat.faults.saturating_add(1);
+        self.beat_now(Activity::Working);
     }
 
     /// Sets the version of the policy that the role uses.

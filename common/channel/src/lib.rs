@@ -1,5 +1,5 @@
-//! The typed channels between the processes of a run. Each flow of data has one module, which declares its service's name,
-//! payload, header and limits. Both ends are made from that declaration.
+//! The typed channels between the processes of a run. Each flow of data has one module, which declares its service's
+//! name, payload, header and limits. Both ends are made from that declaration.
 
 mod cleanup;
 pub mod commit;

@@ -1,8 +1,9 @@
-//! The capacity of shared memory: how much of it a port or a service reserves, how much is free, and how much is promised to
-//! runs.
+//! The capacity of shared memory: how much of it a port or a service reserves, how much is free, and how much is
+//! promised to runs.
 //!
 //! iceoryx2 creates its files at their full size and sparse: a page is allocated when it is first written. A full file
-//! system then causes a SIGBUS at some later write instead of an error. So the reserved size counts, not the allocated one.
+//! system then causes a SIGBUS at some later write instead of an error. So the reserved size counts, not the allocated
+//! one.
 
 use std::fs::{Metadata, OpenOptions};
 use std::io;
@@ -14,7 +15,8 @@ use super::files::{SHARED_MEMORY, prefix};
 /// The unit in which a file takes memory, in bytes.
 const PAGE: usize = 4096;
 
-// What iceoryx2 0.10 adds to the requested sizes: measured and rounded up. `tests/room.rs` compares them with real files.
+// What iceoryx2 0.10 adds to the requested sizes: measured and rounded up. `tests/room.rs` compares them with real
+// files.
 const SEGMENT: usize = 512;
 const CHUNK_INDEX: usize = 4;
 const CONNECTION: usize = 512;
@@ -22,8 +24,8 @@ const CHANNEL: usize = 256;
 const SERVICE: usize = 768;
 const PARTY: usize = 96;
 
-/// An empty file records how much memory is promised to a run. Its name is the run's prefix, this word, and the number of
-/// bytes. (The length of a file may be limited, so it is not used.)
+/// An empty file records how much memory is promised to a run. Its name is the run's prefix, this word, and the number
+/// of bytes. (The length of a file may be limited, so it is not used.)
 const PROMISE: &str = "promise_";
 
 /// Whether a file of this name records a promise.
@@ -54,8 +56,8 @@ pub(super) fn pages(bytes: usize) -> u64 {
     bytes.next_multiple_of(PAGE) as u64
 }
 
-/// Bytes of shared memory that are free and not promised to another run of this user; `None` if there is no limit. Memory
-/// that other programs and other users' runs have reserved but not allocated is unknown, and counts as free.
+/// Bytes of shared memory that are free and not promised to another run of this user; `None` if there is no limit.
+/// Memory that other programs and other users' runs have reserved but not allocated is unknown, and counts as free.
 ///
 /// # Errors
 /// When the file system cannot be read.

@@ -56,7 +56,8 @@ pub struct PolicyReader {
     parameters: usize,
 }
 
-/// A policy in the learner's memory. It stays valid and unchanged until this is dropped, even after the learner has ended.
+/// A policy in the learner's memory. It stays valid and unchanged until this is dropped, even after the learner has
+/// ended.
 #[derive(Debug)]
 pub struct Policy {
     sample: Sample<ipc::Service, [f32], PolicyHeader>,
@@ -128,8 +129,8 @@ impl PolicyReader {
         })
     }
 
-    /// The newest policy; the same one again if there is no newer, `None` before the first. Drop the previous policy before
-    /// calling this again: a reader can hold at most two.
+    /// The newest policy; the same one again if there is no newer, `None` before the first. Drop the previous policy
+    /// before calling this again: a reader can hold at most two.
     ///
     /// # Errors
     /// When the learner's memory cannot be mapped, or its policy has another layout.
@@ -160,8 +161,8 @@ impl Policy {
     }
 }
 
-/// Bytes of shared memory that policies with this many parameters reserve in a run of up to `max_actors` actors. This is
-/// twice what one learner needs, because the memory of a killed learner stays until the readers have a newer policy.
+/// Bytes of shared memory that policies with this many parameters reserve in a run of up to `max_actors` actors. This
+/// is twice what one learner needs, because the memory of a killed learner stays until the readers have a newer policy.
 pub fn reserved(max_actors: usize, parameters: usize) -> u64 {
     let (samples, readers) = (samples(max_actors), readers(max_actors));
     let learner = memory::segment::<Header, PolicyHeader>(samples, size_of::<f32>() * parameters)

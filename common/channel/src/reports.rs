@@ -42,8 +42,8 @@ pub trait Report: Copy + Debug + ZeroCopySend + 'static {
     fn receiver(domain: &Domain) -> Result<Box<dyn Receiver<Self>>, ChannelError>;
 }
 
-/// Declares a kind of report. Its ports are compiled once, here, and not again in each crate that uses them: that saves half
-/// a megabyte of iceoryx2 code for each.
+/// Declares a kind of report. Its ports are compiled once, here, and not again in each crate that uses them: that saves
+/// half a megabyte of iceoryx2 code for each.
 macro_rules! report {
     ($report:ty: $($constants:tt)*) => {
         impl Report for $report {
@@ -195,7 +195,8 @@ fn subscriber<R: Report>(domain: &Domain) -> Result<Subscriber<ipc::Service, R, 
     })
 }
 
-/// Bytes of shared memory that reports of kind `R` reserve with `senders` senders, in a run of up to `max_actors` actors.
+/// Bytes of shared memory that reports of kind `R` reserve with `senders` senders, in a run of up to `max_actors`
+/// actors.
 pub fn reserved<R: Report>(max_actors: usize, senders: usize) -> u64 {
     let samples = R::READERS * (R::BUFFER + BORROWED) + R::HISTORY + LOANED;
     let sender = memory::segment::<Header, ()>(samples, size_of::<R>())

@@ -19,8 +19,8 @@ pub(super) enum Entry {
 }
 
 impl Entry {
-    /// Creates or opens the service that `builder` describes. The two methods are passed as arguments, because iceoryx2's
-    /// builders have no trait in common.
+    /// Creates or opens the service that `builder` describes. The two methods are passed as arguments, because
+    /// iceoryx2's builders have no trait in common.
     pub(super) fn service<B, S, C: Cause, O: Cause>(
         self,
         channel: &str,
@@ -44,9 +44,9 @@ pub(super) fn service_name(domain: &Domain, channel: &str) -> Result<ServiceName
 /// How long to wait for a port that a dead predecessor occupies.
 pub(super) const CLAIM_PATIENCE: Duration = Duration::from_secs(5);
 
-/// Calls `attempt`, which opens a service and creates a port in it, and retries for a while if the failure is transient: a
-/// dead process may occupy the port until the launcher has cleaned up after it, and its half-made files exist until they
-/// are removed. Any other failure is returned at once.
+/// Calls `attempt`, which opens a service and creates a port in it, and retries for a while if the failure is
+/// transient: a dead process may occupy the port until the launcher has cleaned up after it, and its half-made files
+/// exist until they are removed. Any other failure is returned at once.
 pub(super) fn claim<T>(mut attempt: impl FnMut() -> Result<T, ChannelError>) -> Result<T, ChannelError> {
     let deadline = Instant::now() + CLAIM_PATIENCE;
     loop {

@@ -1,5 +1,6 @@
-//! The services of a run. The launcher creates each of them before it starts a process that opens it, and holds them to the
-//! end. Other processes only open services, so one that is killed while it starts leaves no half-made service behind.
+//! The services of a run. The launcher creates each of them before it starts a process that opens it, and holds them to
+//! the end. Other processes only open services, so one that is killed while it starts leaves no half-made service
+//! behind.
 
 use std::fs::OpenOptions;
 use std::io;
@@ -17,8 +18,8 @@ use super::files::prefix;
 use super::service::Held;
 use super::{control, environment, event, policy, reports, transitions};
 
-/// The services of a run that this process has created. A service is removed when this is dropped and no other process has
-/// it open.
+/// The services of a run that this process has created. A service is removed when this is dropped and no other process
+/// has it open.
 #[derive(Debug)]
 pub struct Services {
     held: Vec<Held>,
@@ -37,8 +38,8 @@ impl Services {
         })
     }
 
-    /// Creates the services that a run has once: control, policy, reports, and the event services of launcher, learner and
-    /// evaluator.
+    /// Creates the services that a run has once: control, policy, reports, and the event services of launcher, learner
+    /// and evaluator.
     ///
     /// # Errors
     /// When a service exists already, or shared memory is unavailable.
@@ -70,7 +71,8 @@ impl Services {
         Ok(())
     }
 
-    /// Creates the services of actor `index`, which may have `window` chunks uncommitted, and of its environment server.
+    /// Creates the services of actor `index`, which may have `window` chunks uncommitted, and of its environment
+    /// server.
     ///
     /// # Errors
     /// As [`create_common`](Self::create_common).

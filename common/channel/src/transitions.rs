@@ -1,12 +1,13 @@
 //! Transitions, from one actor to the learner, in chunks of rows.
 //!
 //! An actor has at most `window` chunks sent but not committed. The service's history holds as many, and the learner's
-//! buffer twice as many, because a new learner may receive a whole history that was committed before and a whole window on
-//! top. So `send` never runs out of space, and chunks that a dead learner had not committed reach the next one.
+//! buffer twice as many, because a new learner may receive a whole history that was committed before and a whole window
+//! on top. So `send` never runs out of space, and chunks that a dead learner had not committed reach the next one.
 //!
-//! Chunks of a dead actor still arrive, before any chunk of its successor, if the learner was connected to it. A new actor
-//! cannot know which of them will. So it first sends an empty chunk, its [`Handshake`], and sends no rows until that one is
-//! committed. Then the replay has all it will ever have of the predecessor, and the sequence continues from there.
+//! Chunks of a dead actor still arrive, before any chunk of its successor, if the learner was connected to it. A new
+//! actor cannot know which of them will. So it first sends an empty chunk, its [`Handshake`], and sends no rows until
+//! that one is committed. Then the replay has all it will ever have of the predecessor, and the sequence continues from
+//! there.
 
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
@@ -124,8 +125,8 @@ impl Handshake {
 }
 
 impl ChunkSender {
-    /// Opens the sending end of `actor` and sends the handshake. The chunks have this layout, and at most `window` of them
-    /// may be uncommitted. Incarnations count from 1.
+    /// Opens the sending end of `actor` and sends the handshake. The chunks have this layout, and at most `window` of
+    /// them may be uncommitted. Incarnations count from 1.
     ///
     /// # Errors
     /// When shared memory is unavailable, or the previous process of this actor is still alive.
@@ -319,8 +320,8 @@ impl ReceivedChunk {
         self.sample.user_header()
     }
 
-    /// The chunk's mark. `committed` is the newest committed mark of its actor: a handshake keeps its sequence number, and
-    /// only announces the new incarnation.
+    /// The chunk's mark. `committed` is the newest committed mark of its actor: a handshake keeps its sequence number,
+    /// and only announces the new incarnation.
     pub fn mark(&self, committed: ChunkMark) -> ChunkMark {
         let ChunkHeader {
             incarnation, sequence, ..

@@ -72,8 +72,8 @@ impl PolicyLayout {
     }
 }
 
-/// A policy without exploration, with buffers for a batch of observations. It does not own its parameters: each call borrows
-/// them.
+/// A policy without exploration, with buffers for a batch of observations. It does not own its parameters: each call
+/// borrows them.
 #[derive(Clone, Debug)]
 pub enum Policy {
     /// A network whose output is the action.
@@ -91,8 +91,8 @@ impl Policy {
         }
     }
 
-    /// Writes the policy's action for every observation, one after the other, into `actions`. If several actions have the
-    /// highest score, the first is taken. Nothing is allocated.
+    /// Writes the policy's action for every observation, one after the other, into `actions`. If several actions have
+    /// the highest score, the first is taken. Nothing is allocated.
     ///
     /// # Panics
     /// If the slices do not match the layout, or have more observations than the batch.
@@ -109,7 +109,8 @@ impl Policy {
     }
 }
 
-/// A deterministic policy with these hidden layers in an environment like `spec`, for at most `batch` observations a call.
+/// A deterministic policy with these hidden layers in an environment like `spec`, for at most `batch` observations a
+/// call.
 ///
 /// # Errors
 /// When the actions are not real numbers in finite ranges.
@@ -131,7 +132,7 @@ pub fn softmax(
 ) -> Result<Scores, PolicyError> {
     let actions = counted_actions(algorithm, spec)?;
     match spec.observation {
-        Space::Discrete { n } => Err(PolicyError::RealStates { algorithm, n }),
+        Space::Discrete { n, .. } => Err(PolicyError::RealStates { algorithm, n }),
         Space::Box { .. } => {
             let network = NetworkLayout::policy(spec.observation.width(), hidden, actions);
             Ok(Scores::softmax(network, batch))
@@ -139,22 +140,22 @@ pub fn softmax(
     }
 }
 
-/// A table of action-values in an environment like `spec`, for at most `batch` observations a call. `algorithm` is named in
-/// errors.
+/// A table of action-values in an environment like `spec`, for at most `batch` observations a call. `algorithm` is
+/// named in errors.
 ///
 /// # Errors
 /// When observations or actions are not discrete.
 pub fn table(algorithm: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Scores, PolicyError> {
     let actions = counted_actions(algorithm, spec)?;
     match spec.observation {
-        Space::Discrete { n } => Ok(Scores::table(n as usize, actions, batch)),
+        Space::Discrete { n, .. } => Ok(Scores::table(n as usize, actions, batch)),
         Space::Box { .. } => Err(PolicyError::CountedStates { algorithm }),
     }
 }
 
 fn counted_actions(algorithm: &'static str, spec: &EnvironmentSpec) -> Result<usize, PolicyError> {
     match spec.action {
-        Space::Discrete { n } => Ok(n as usize),
+        Space::Discrete { n, .. } => Ok(n as usize),
         Space::Box { .. } => Err(PolicyError::CountedActions { algorithm }),
     }
 }
@@ -185,7 +186,7 @@ mod tests {
 
     #[test]
     fn a_table_is_read_state_after_state_and_the_first_of_equal_actions_is_taken() {
-        let lake = spec(Space::Discrete { n: 3 }, Space::Discrete { n: 2 });
+        let lake = spec(Space::discrete(3), Space::discrete(2));
         let mut policy = Policy::Scored(table("q-learning", &lake, 4).unwrap());
         assert_eq!(policy.layout().parameters(), 6);
         let mut actions = [f32::NAN; 4];

@@ -1,16 +1,16 @@
-//! The layout of networks for every process: where each weight lies in a flat parameter slice, and the forward pass, which
-//! reads the slice in place, in the learner's own memory or in shared memory.
+//! The layout of networks for every process: where each weight lies in a flat parameter slice, and the forward pass,
+//! which reads the slice in place, in the learner's own memory or in shared memory.
 //!
-//! Every network has 1 to 8 hidden layers of ReLU or tanh units and a linear output. With two hidden layers, its parameters
-//! are
+//! Every network has 1 to 8 hidden layers of ReLU or tanh units and a linear output. With two hidden layers, its
+//! parameters are
 //!
 //! ```text
 //! [ W1 | b1 | W2 | b2 | W3 | b3 ]        each W column-major, outputs × inputs
 //! ```
 //!
 //! *Late inputs* enter at the second hidden layer, as the last columns of W2. They are the action of a critic (thesis,
-//! section 4.3.1); a policy has none. With a single hidden layer they enter there, as the last columns of W1: at the output
-//! layer a critic would be linear in the action, and the best action would be the same in every state.
+//! section 4.3.1); a policy has none. With a single hidden layer they enter there, as the last columns of W1: at the
+//! output layer a critic would be linear in the action, and the best action would be the same in every state.
 //!
 //! A batch of vectors is a column-major matrix, one vector after the other.
 

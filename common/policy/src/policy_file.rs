@@ -93,7 +93,9 @@ impl PolicyFile {
         }
         if policy.parameters.len() != parameters {
             let found = policy.parameters.len();
-            return Err(refused(format!("it has {found} parameters, but its network has {parameters}")));
+            return Err(refused(format!(
+                "it has {found} parameters, but its network has {parameters}"
+            )));
         }
         Ok(policy)
     }

@@ -52,8 +52,8 @@ impl Scores {
         self.actions
     }
 
-    /// The scores of all actions for each of the observations, one observation after the other. A state beyond the table's
-    /// last counts as its last. Nothing is allocated.
+    /// The scores of all actions for each of the observations, one observation after the other. A state beyond the
+    /// table's last counts as its last. Nothing is allocated.
     ///
     /// # Panics
     /// If the slices do not match the layout, or have more observations than the batch.

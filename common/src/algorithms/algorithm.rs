@@ -42,8 +42,8 @@ pub trait AlgorithmSettings {
     /// γ, the discount of one step.
     fn gamma(&self) -> f64;
 
-    /// Its policy in an environment like `spec`, for at most `batch` observations a call, and how actors explore with it.
-    /// `name` is the name of the algorithm.
+    /// Its policy in an environment like `spec`, for at most `batch` observations a call, and how actors explore with
+    /// it. `name` is the name of the algorithm.
     ///
     /// # Errors
     /// When it cannot control that environment.
@@ -59,8 +59,8 @@ pub trait AlgorithmSettings {
     fn learned(&self, spec: &EnvironmentSpec) -> Learned;
 }
 
-/// The networks or tables that an algorithm learns, each with a name. Target networks and the state of the optimiser are not
-/// included.
+/// The networks or tables that an algorithm learns, each with a name. Target networks and the state of the optimiser
+/// are not included.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Learned {
     /// The policy.

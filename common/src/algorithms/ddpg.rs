@@ -20,8 +20,8 @@ pub(super) const SPEC: AlgorithmSpec = AlgorithmSpec {
 section! {
     /// Algorithm 4 with the numbers of section 4.3.1.
     pub struct DdpgConfig {
-        /// Units of each hidden layer, for actor and critic: a list of 1 to 8 layers. The action enters the critic at the
-        /// second hidden layer, or at the only one.
+        /// Units of each hidden layer, for actor and critic: a list of 1 to 8 layers. The action enters the critic at
+        /// the second hidden layer, or at the only one.
         hidden: Layers = Layers::from([400, 300]), bounds: from(1, 8_192), unit: "units", source: "section 4.3.1";
         /// The activation function of the hidden layers.
         activation: Activation = Activation::Relu, unit: "–", source: "section 4.3.1";

@@ -6,7 +6,8 @@ use shoal_base::section;
 use shoal_base::section::from;
 
 section! {
-    /// Ornstein-Uhlenbeck noise: x ← x − θ x + σ N(0, 1) at each step. It is added to the action in units of half the range.
+    /// Ornstein-Uhlenbeck noise: x ← x − θ x + σ N(0, 1) at each step. It is added to the action in units of half the
+    /// range.
     pub struct ExplorationConfig {
         /// θ, the pull towards zero.
         theta: f64 = 0.15, bounds: from(0.0, 1.0), unit: "1 / step", source: "section 4.3.1";

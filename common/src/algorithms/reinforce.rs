@@ -35,7 +35,8 @@ section! {
         discount_steps: bool = false, unit: "–", source: "Algorithm 3";
         /// Whether an episode that the time limit ended is learned from.
         learn_at_limit: bool = true, unit: "–", source: "section 4.2.2";
-        /// Units of each of the baseline's hidden layers: a list of 1 to 8 layers. Used only with `weight = "baseline"`.
+        /// Units of each of the baseline's hidden layers: a list of 1 to 8 layers. Used only with `weight =
+        /// "baseline"`.
         baseline_hidden: Layers = Layers::from([32, 32]), bounds: from(1, 8_192), unit: "units", source: "ours";
         /// Adam's step size for the baseline.
         baseline_learning_rate: f64 = 0.01, bounds: from(0.0, 1.0), unit: "–", source: "ours";

@@ -1,12 +1,14 @@
 //! `[environment]`, and `[spec]`, which the environment's server supplies.
 
+use std::time::Duration;
+
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use shoal_base::section::{OutOfRange, from};
 use shoal_base::space::{EnvironmentSpec, Space};
 
-/// Most numbers in an observation or an action: many more than any environment has, and few enough that no size computed
-/// from them overflows.
+/// Most numbers in an observation or an action: many more than any environment has, and few enough that no size
+/// computed from them overflows.
 const MAX_WIDTH: usize = 4_096;
 
 /// The environment: its name and its parameters.
@@ -19,10 +21,67 @@ pub struct EnvironmentConfig {
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[schemars(extend("unit" = "–", "source" = "ours"))]
     pub server: Vec<String>,
+    /// Invalid answers, as a reward that is not finite, after which the run ends. Each ends the episodes of its server,
+    /// which begin anew.
+    #[serde(default = "faults", skip_serializing_if = "is_usual")]
+    #[schemars(extend("unit" = "answers", "source" = "ours"))]
+    pub faults: u32,
+    /// How long that program may take to start. From 10 s on the terminal names whom the run waits for.
+    #[serde(default = "start_seconds", skip_serializing_if = "is_usual_start")]
+    #[schemars(extend("unit" = "s", "source" = "ours"))]
+    pub start_seconds: u32,
     /// The environment's own parameters.
     #[serde(flatten)]
     #[schemars(skip)]
     pub parameters: toml::Table,
+}
+
+/// Where the configuration does not say: few enough to be seen while somebody looks, and more than a simulator's rare
+/// hiccup makes in an hour.
+fn faults() -> u32 {
+    100
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde asks so")]
+fn is_usual(number: &u32) -> bool {
+    *number == faults()
+}
+
+/// A simulator's libraries have to be loaded.
+fn start_seconds() -> u32 {
+    120
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde asks so")]
+fn is_usual_start(number: &u32) -> bool {
+    *number == start_seconds()
+}
+
+impl EnvironmentConfig {
+    /// An environment with the usual limits.
+    pub fn new(name: String, server: Vec<String>, parameters: toml::Table) -> Self {
+        Self {
+            name,
+            server,
+            faults: faults(),
+            start_seconds: start_seconds(),
+            parameters,
+        }
+    }
+
+    /// How long its program may take to start.
+    pub fn start_limit(&self) -> Duration {
+        Duration::from_secs(self.start_seconds.into())
+    }
+
+    /// Whether the limits make sense.
+    ///
+    /// # Errors
+    /// For the first one that does not.
+    pub(super) fn check(&self) -> Result<(), OutOfRange> {
+        from(1, u32::MAX).check("environment.faults", &self.faults)?;
+        from(1, 86_400).check("environment.start_seconds", &self.start_seconds)
+    }
 }
 
 /// Checks an environment's description.
@@ -37,7 +96,7 @@ pub(super) fn check_spec(spec: &EnvironmentSpec) -> Result<(), OutOfRange> {
 
 fn check_size(key: &str, space: &Space) -> Result<(), OutOfRange> {
     let (value, expected) = match space {
-        Space::Discrete { n: 0 } => ("no index".into(), "one index or more".into()),
+        Space::Discrete { n: 0, .. } => ("no index".into(), "one index or more".into()),
         Space::Box { low, high } if low.len() != high.len() || !(1..=MAX_WIDTH).contains(&low.len()) => (
             format!("{} lower and {} upper bounds", low.len(), high.len()),
             format!("equally many of both, from 1 to {MAX_WIDTH}"),

@@ -19,8 +19,8 @@ section! {
 }
 
 impl EvaluationConfig {
-    /// The evaluation period of a policy that was learned from `env_steps` environment steps. A policy is evaluated if no
-    /// policy of its period or a later one was evaluated before.
+    /// The evaluation period of a policy that was learned from `env_steps` environment steps. A policy is evaluated if
+    /// no policy of its period or a later one was evaluated before.
     pub fn period(&self, env_steps: u64) -> u64 {
         env_steps / self.every
     }

@@ -12,7 +12,8 @@ use super::replay::ReplayConfig;
 use super::run::RunConfig;
 use crate::algorithms::{Algorithm, ExplorationConfig};
 
-/// Every section that the user may write, including those of all algorithms, but without an environment's own parameters.
+/// Every section that the user may write, including those of all algorithms, but without an environment's own
+/// parameters.
 pub fn sections() -> Vec<Section> {
     let environment = Section {
         name: "environment",

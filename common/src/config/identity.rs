@@ -1,12 +1,13 @@
-//! The identity of a run: a text whose fingerprint is stored in the replay and the checkpoints. Files of another identity are
-//! refused.
+//! The identity of a run: a text whose fingerprint is stored in the replay and the checkpoints. Files of another
+//! identity are refused.
 //!
-//! The text has everything that the meaning of rows and weights depends on: the environment, its spaces, the algorithm, the
-//! shapes of what it learns, seed, mode, γ, and the layout of a row. It does not have the run's id, learning rates,
+//! The text has everything that the meaning of rows and weights depends on: the environment, its spaces, the algorithm,
+//! the shapes of what it learns, seed, mode, γ, and the layout of a row. It does not have the run's id, learning rates,
 //! exploration, evaluation, the run's length and its number of actors: those may differ when a run is resumed.
 //!
-//! The format of the text has a number, which is stored as `run.identity_format` when a run is created. A released format
-//! never changes, because the files of old runs have its fingerprints. A change needs a new format with the next number.
+//! The format of the text has a number, which is stored as `run.identity_format` when a run is created. A released
+//! format never changes, because the files of old runs have its fingerprints. A change needs a new format with the next
+//! number.
 
 mod legacy;
 
@@ -86,7 +87,7 @@ fn space(space: &Space) -> String {
             .iter()
             .zip(high)
             .fold("box".into(), |text, (low, high)| text + &format!(" {low} .. {high}")),
-        Space::Discrete { n } => format!("discrete {n}"),
+        Space::Discrete { n, .. } => format!("discrete {n}"),
     }
 }
 

@@ -22,10 +22,11 @@ section! {
         /// Episodes of all actors after which training ends, if that is earlier.
         #[serde(skip_serializing_if = "Option::is_none")]
         episodes: Option<u64> = None, bounds: from(1, 1_000_000_000), unit: "episodes", source: "sections 4.1 and 4.2";
-        /// A process is replaced after this time without progress if the processes that it waits for are alive and wait too.
-        /// Stopped processes and environments with long steps are not replaced.
+        /// A process is replaced after this time without progress if the processes that it waits for are alive and wait
+        /// too. Stopped processes and environments with long steps are not replaced.
         stall_seconds: u64 = 10, bounds: from(1, 86_400), unit: "s", source: "ours";
-        /// The format of the text that identifies the run's files. Chosen by the program when the run directory is created.
+        /// The format of the text that identifies the run's files. Chosen by the program when the run directory is
+        /// created.
         #[serde(skip_serializing_if = "IdentityFormat::is_unnumbered")]
         #[schemars(with = "u32")]
         identity_format: IdentityFormat = IdentityFormat::Unnumbered, unit: "–", source: "ours";
@@ -57,8 +58,8 @@ impl RunConfig {
         self.check_bounds("run")
     }
 
-    /// Checks the id, which is part of the names of files that are removed when the run ends. With an id such as `..` other
-    /// files would be removed.
+    /// Checks the id, which is part of the names of files that are removed when the run ends. With an id such as `..`
+    /// other files would be removed.
     fn check_id(&self) -> Result<(), OutOfRange> {
         let id = &self.id;
         if (1..=32).contains(&id.len()) && id.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'-') {

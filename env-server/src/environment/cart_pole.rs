@@ -71,7 +71,7 @@ impl Environment for CartPole {
         let any = (f32::NEG_INFINITY, f32::INFINITY);
         EnvironmentSpec {
             observation: Space::boxed(&[(-x, x), any, (-theta, theta), any]),
-            action: Space::Discrete { n: 2 },
+            action: Space::discrete(2),
             time_limit: self.parameters.time_limit,
             state_width: self.state.len(),
         }

@@ -120,8 +120,8 @@ impl FrozenLake {
 impl Environment for FrozenLake {
     fn spec(&self) -> EnvironmentSpec {
         EnvironmentSpec {
-            observation: Space::Discrete { n: STATES as u32 },
-            action: Space::Discrete { n: ACTIONS as u32 },
+            observation: Space::discrete(STATES as u32),
+            action: Space::discrete(ACTIONS as u32),
             time_limit: self.parameters.time_limit,
             state_width: 1,
         }

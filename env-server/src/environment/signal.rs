@@ -94,7 +94,7 @@ impl Signal {
         };
         let range = match space {
             Space::Box { low, high } => [f64::from(*low.get(i)?), f64::from(*high.get(i)?)],
-            Space::Discrete { n } => [0.0, f64::from(n.saturating_sub(1))],
+            Space::Discrete { n, .. } => [0.0, f64::from(n.saturating_sub(1))],
         };
         range.iter().all(|bound| bound.is_finite()).then_some(range)
     }
@@ -175,7 +175,7 @@ mod tests {
     #[test]
     fn unnamed_signals_are_named_by_their_position() {
         let wide = Space::boxed(&[(0.0, 1.0); 30]);
-        let signals = Signal::by_number(&spec(wide, Space::Discrete { n: 3 }));
+        let signals = Signal::by_number(&spec(wide, Space::discrete(3)));
         assert_eq!(signals.len(), 8 + 1);
         assert_eq!(
             signals[7],
@@ -188,7 +188,7 @@ mod tests {
     fn a_range_is_that_of_the_space_and_finite() {
         let spec = spec(
             Space::boxed(&[(-4.0, 4.0), (f32::NEG_INFINITY, 1.0)]),
-            Space::Discrete { n: 3 },
+            Space::discrete(3),
         );
         let range = |signal: Signal| signal.range(&spec);
         assert_eq!(range(Signal::observation(0, "x", "m")), Some([-4.0, 4.0]));

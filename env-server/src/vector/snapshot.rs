@@ -31,7 +31,7 @@ impl VectorEnvironment {
         let width = self.snapshot_width()?;
         let mut state = vec![0.0; self.spec.state_width];
         for (words, running) in words.chunks_exact_mut(width).zip(&self.running) {
-            let episode = match self.evaluation_seed {
+            let episode = match self.evaluation {
                 None => running.next_training.checked_sub(1),
                 Some(_) => None,
             };
@@ -80,7 +80,7 @@ impl VectorEnvironment {
                 .environment
                 .observe(&mut observations[e * observed..][..observed]);
         }
-        self.evaluation_seed = None;
+        self.evaluation = None;
         Ok(())
     }
 

@@ -155,7 +155,11 @@ fn every_counter_changes_the_start_states() {
 
 #[test]
 fn an_evaluation_episode_always_starts_the_same_way() {
-    let evaluation = |first| Start::Evaluation { seed: 9, first };
+    let evaluation = |first| Start::Evaluation {
+        seed: 9,
+        first,
+        episodes: None,
+    };
     let five = Fixture::of("pendulum", "", 5, [1, 0, 0]).reset(evaluation(0));
     let mut other = Fixture::of("pendulum", "time_limit = 2", 2, [2, 3, 4]);
     other.reset(Start::Next);
@@ -170,7 +174,14 @@ fn an_evaluation_episode_always_starts_the_same_way() {
         "environment e continues with the episode E later"
     );
     assert_eq!(other.reset(evaluation(3)), five[9..]);
-    assert_ne!(other.reset(Start::Evaluation { seed: 8, first: 3 }), five[9..]);
+    assert_ne!(
+        other.reset(Start::Evaluation {
+            seed: 8,
+            first: 3,
+            episodes: None
+        }),
+        five[9..]
+    );
     assert_ne!(five[..3], five[3..6]);
 }
 
@@ -178,7 +189,11 @@ fn an_evaluation_episode_always_starts_the_same_way() {
 fn evaluation_does_not_disturb_training_episodes() {
     let mut fixture = Fixture::new("pendulum", "", 1);
     fixture.reset(Start::Next);
-    fixture.reset(Start::Evaluation { seed: 1, first: 0 });
+    fixture.reset(Start::Evaluation {
+        seed: 1,
+        first: 0,
+        episodes: None,
+    });
     let second = fixture.reset(Start::Next);
     assert_eq!(second, Fixture::new("pendulum", "", 1).reset(Start::Episodes(&[1])));
 }

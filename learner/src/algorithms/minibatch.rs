@@ -1,5 +1,7 @@
 //! A batch of transitions as the matrices that a gradient step reads.
 
+use std::ops::Range;
+
 use nalgebra::{DMatrix, DVector};
 use shoal_common::transition::{RowLayout, Transition};
 
@@ -37,16 +39,17 @@ impl Minibatch {
         self.r.len()
     }
 
-    /// Copies the rows with these numbers into the columns, from the first on. Panics if the replay does not hold one
-    /// of them, or if there are more rows than columns.
-    pub fn gather(&mut self, replay: &Replay, indices: &[u64]) {
+    /// Copies the rows with these numbers into the columns, from the first on. A row with a number that is not finite is
+    /// replaced by the next good one of `window`. Panics if the replay does not hold one of the rows, or if there are
+    /// more rows than columns.
+    pub fn gather(&mut self, replay: &Replay, indices: &[u64], window: &Range<u64>) {
         // Random rows are cache misses. Both ends of all rows are read before any is copied, so that the misses
         // overlap; this is three times as fast. Both ends, because a row may lie on two cache lines.
         let ends = |row: &[f32]| row[0] + row[row.len() - 1];
         std::hint::black_box(indices.iter().map(|&index| ends(replay.row(index))).sum::<f32>());
         let layout = replay.layout().row;
         for (column, &index) in indices.iter().enumerate() {
-            self.set(column, &layout.read(replay.row(index)));
+            self.set(column, &layout.read(replay.finite_row(index, window)));
         }
     }
 
@@ -110,7 +113,7 @@ mod tests {
         };
         replay.append_and_commit(0, mark, &rows).unwrap();
         let (mut gathered, mut expected) = (Minibatch::new(layout.row, 3), Minibatch::new(layout.row, 3));
-        gathered.gather(&replay, &[3, 0, 3]);
+        gathered.gather(&replay, &[3, 0, 3], &replay.rows());
         for (column, row) in [3, 0, 3].into_iter().enumerate() {
             expected.set(
                 column,
@@ -118,5 +121,33 @@ mod tests {
             );
         }
         assert_eq!(gathered, expected);
+    }
+
+    #[test]
+    fn a_row_with_a_number_that_is_not_finite_is_replaced_by_the_next_good_one() {
+        let layout = ReplayLayout {
+            row: RowLayout::new(2, 1),
+            ring: 5,
+            actors: 1,
+            actor_snapshot_words: 0,
+            fingerprint: 0,
+        };
+        let directory = tempfile::tempdir().unwrap();
+        let mut replay = Replay::create(&directory.path().join("replay"), &layout).unwrap();
+        let width = layout.row.width();
+        let mut rows: Vec<f32> = (0..4 * width).map(|i| i as f32).collect();
+        rows[width] = f32::NAN;
+        rows[4 * width - 2] = f32::INFINITY;
+        let mark = ChunkMark {
+            incarnation: 0,
+            sequence: 1,
+        };
+        replay.append_and_commit(0, mark, &rows).unwrap();
+        let (mut gathered, mut expected) = (Minibatch::new(layout.row, 4), Minibatch::new(layout.row, 4));
+        gathered.gather(&replay, &[0, 1, 2, 3], &replay.rows());
+        for (column, row) in [0, 2, 2, 0].into_iter().enumerate() {
+            expected.set(column, &layout.row.read(&rows[row * width..][..width]));
+        }
+        assert_eq!(gathered, expected, "after the last row the first follows");
     }
 }

@@ -21,7 +21,7 @@ use crate::networks::aligned::Aligned;
 use crate::networks::initialise::glorot;
 use crate::networks::pass::Pass;
 use crate::networks::threads::Threads;
-use crate::replay::Replay;
+use crate::replay::{Replay, are_finite};
 
 /// Added to a standard deviation before dividing by it. An episode whose returns are all equal then has no weight.
 const SPREAD_FLOOR: f32 = 1e-8;
@@ -185,9 +185,12 @@ impl Reinforce {
 
     /// Whether an episode is over and, unless `learn_at_limit` is set, was not ended by the time limit.
     fn learns_from(&self, episode: &[Transition<'_>]) -> bool {
+        let is_finite = |step: &Transition<'_>| are_finite(step.s) && are_finite(step.s_next) && step.r.is_finite();
         episode
             .last()
             .is_some_and(|end| end.last && (self.settings.learn_at_limit || end.discount == 0.0))
+            // Those of a learner that did not check what it committed may not be.
+            && episode.iter().all(is_finite)
     }
 
     fn networks(&self) -> impl Iterator<Item = &Learned> {

@@ -7,7 +7,7 @@ use shoal_common::space::EnvironmentSpec;
 use shoal_common::transition::Transition;
 
 use super::algorithm::{Algorithm, Losses, Method, RunSizes, SavedState, Section, SectionError};
-use crate::replay::Replay;
+use crate::replay::{Replay, are_finite};
 
 /// Which value of s' an update bootstraps from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -231,7 +231,13 @@ impl Algorithm for Tabular {
         let row = self.rows.max(replay.rows().start);
         self.rows = row + 1;
         let slot = self.slot(row);
-        self.learn(&replay.layout().row.read(replay.row(row)), slot)
+        let numbers = replay.row(row);
+        if !are_finite(numbers) {
+            // Of a learner that did not check what it committed. The step before has lost its successor.
+            self.take_pending(slot);
+            return Losses::default();
+        }
+        self.learn(&replay.layout().row.read(numbers), slot)
     }
 
     fn state(&self) -> Vec<Section<'_>> {

@@ -5,7 +5,7 @@ use shoal_common::channel::{ChannelError, Domain, EventName, Notifier};
 use shoal_common::report::Role;
 use shoal_common::transition::ChunkLayout;
 
-use crate::replay::{Appended, ChunkError, Replay};
+use crate::replay::{Appended, ChunkError, Replay, are_finite};
 
 /// Why a chunk was not appended.
 #[derive(Debug, thiserror::Error)]
@@ -20,6 +20,16 @@ pub enum IntakeError {
         actor: usize,
         /// What is wrong with it.
         cause: ChunkError,
+    },
+    /// A row holds a number that no environment or policy may give.
+    #[error("actor {actor} sent a row that is not learned from: its number {number} is {value}")]
+    NotFinite {
+        /// Who sent it.
+        actor: usize,
+        /// Which number of the row: of s, a, r, discount, s' and last, one after the other.
+        number: usize,
+        /// The number.
+        value: f32,
     },
 }
 
@@ -135,12 +145,22 @@ impl Intake {
 }
 
 fn append(replay: &mut Replay, actor: usize, chunk: &ReceivedChunk, numbers: usize) -> Result<Appended, IntakeError> {
+    let rows = &chunk.rows()[..numbers];
+    if !are_finite(rows) {
+        let width = replay.layout().row.width();
+        let bad = rows.iter().position(|number| !number.is_finite()).unwrap_or_default();
+        return Err(IntakeError::NotFinite {
+            actor,
+            number: bad % width,
+            value: rows[bad],
+        });
+    }
     let mark = chunk.mark(replay.committed(actor).mark);
     let refused = |cause| IntakeError::Chunk { actor, cause };
     let Some(reserved) = replay.begin(actor, mark).map_err(refused)? else {
         return Ok(Appended::Duplicate);
     };
-    let filled = reserved.fill(&chunk.rows()[..numbers]).map_err(refused)?;
+    let filled = reserved.fill(rows).map_err(refused)?;
     match chunk.actor_snapshot() {
         Some(words) => filled.with_snapshot(&words).commit(),
         None => filled.commit(),

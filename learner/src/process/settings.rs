@@ -113,7 +113,7 @@ pub fn disk_bytes(config: &Config, run: &RunDir) -> Result<u64, SizeError> {
 }
 
 /// The layout of a run's replay.
-pub(super) fn replay_layout(config: &Config) -> ReplayLayout {
+pub fn replay_layout(config: &Config) -> ReplayLayout {
     let chunk = config.chunk_layout();
     ReplayLayout {
         row: chunk.row,

@@ -3,7 +3,7 @@
 use std::fs::File;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{Ordering, compiler_fence};
+use std::sync::atomic::{AtomicBool, Ordering, compiler_fence};
 
 use shoal_common::commit::{ActorCommit, Places, Record, ReplayLayout, WritableWords};
 
@@ -29,6 +29,13 @@ pub struct Replay {
     pub(super) synced_generation: u64,
     pub(super) warnings: Vec<String>,
     pub(super) hook: Option<Hook>,
+    /// Whether the log has been told of rows that are not learned from.
+    warned: AtomicBool,
+}
+
+/// Whether every number of these is finite. Without an early end, which is nearly never taken: this can be done in vectors.
+pub fn are_finite(numbers: &[f32]) -> bool {
+    numbers.iter().fold(true, |all, number| all & number.is_finite())
 }
 
 impl Replay {
@@ -70,6 +77,7 @@ impl Replay {
             synced_generation: found.synced_generation,
             warnings: found.warnings,
             hook: None,
+            warned: AtomicBool::new(false),
         };
         replay.words.store(replay.places.published, found.first_generation);
         replay.publish(found.next_generation);
@@ -128,6 +136,33 @@ impl Replay {
             "row {index} is not in the replay, which holds the rows {rows:?}"
         );
         self.ring.row(index)
+    }
+
+    /// The row `index`, or the next one of `within` whose numbers are all finite; after the last the first follows. Learners
+    /// check chunks before they commit them, but those of earlier versions did not. The row itself if there is no finite one.
+    ///
+    /// # Panics
+    /// As [`row`](Self::row).
+    #[inline]
+    pub fn finite_row(&self, index: u64, within: &Range<u64>) -> &[f32] {
+        let row = self.row(index);
+        if are_finite(row) {
+            row
+        } else {
+            self.next_finite_row(index, within)
+        }
+    }
+
+    #[cold]
+    fn next_finite_row(&self, index: u64, within: &Range<u64>) -> &[f32] {
+        if !self.warned.swap(true, Ordering::Relaxed) {
+            let path = self.path.display();
+            tracing::warn!("{path}: row {index} holds a number that is not finite; such rows are not learned from");
+        }
+        let mut others = (index + 1..within.end)
+            .chain(within.start..index)
+            .map(|other| self.row(other));
+        others.find(|row| are_finite(row)).unwrap_or_else(|| self.row(index))
     }
 
     /// The rows to draw a minibatch from, for a replay as it was after `logical_head` rows: the newest `capacity` rows

@@ -178,7 +178,12 @@ impl Peer {
         if let Some(output) = &self.output {
             output.wait();
         }
-        let line = self.last_line.lock().unwrap_or_else(PoisonError::into_inner).take()?;
+        self.last_line()
+    }
+
+    /// The last line that it has written on standard error so far. It may take a moment to arrive.
+    pub fn last_line(&self) -> Option<String> {
+        let line = self.last_line.lock().unwrap_or_else(PoisonError::into_inner).clone()?;
         Some(line.strip_prefix("error: ").unwrap_or(&line).to_owned())
     }
 }

@@ -14,6 +14,8 @@ pub enum IncidentKind {
     Failed,
     /// The process made no progress and was killed to be replaced.
     Stalled,
+    /// An environment of it returned something invalid; its episodes were given up.
+    Fault,
     /// The role's process was started again.
     StartedAgain,
     /// The role failed too often and is not started again.

@@ -1,5 +1,5 @@
-//! Explanations of the configuration's keys. The text of a key is the doc comment of its field; unit, source and bounds are
-//! attributes of the field.
+//! Explanations of the configuration's keys. The text of a key is the doc comment of its field; unit, source and bounds
+//! are attributes of the field.
 
 use schemars::{JsonSchema, schema_for};
 use serde::Serialize;

@@ -16,8 +16,8 @@ const VERSION: u64 = 2;
 
 /// Bytes of a header word; every field of the header is one.
 const WORD: usize = size_of::<u64>();
-/// The unit of the layout, in bytes. Parts that are written at different times never share a block, so that a block torn by
-/// a power loss leaves its neighbours whole.
+/// The unit of the layout, in bytes. Parts that are written at different times never share a block, so that a block
+/// torn by a power loss leaves its neighbours whole.
 const BLOCK: usize = 4096;
 /// Words of the identity, including its checksum.
 const IDENTITY_WORDS: usize = 10;
@@ -33,8 +33,8 @@ const MAX_ACTORS: usize = 1 << 16;
 /// More words than any actor's snapshot has; a limit for the same reason.
 const MAX_ACTOR_SNAPSHOT_WORDS: usize = 1 << 24;
 
-/// Slots for commit records: two for what is committed (a record of generation g goes to slot g mod 2), then two for what
-/// is known to be on the disk.
+/// Slots for commit records: two for what is committed (a record of generation g goes to slot g mod 2), then two for
+/// what is known to be on the disk.
 pub const SLOTS: usize = 4;
 /// The first of the two slots for what is on the disk.
 pub const SYNCED: usize = 2;
@@ -91,8 +91,8 @@ pub enum IdentityFault {
 }
 
 impl ReplayLayout {
-    /// The offsets of all parts. `None` if there are no rows or no actors, if there are too many actors or snapshot words,
-    /// or if the file would be larger than a file can be.
+    /// The offsets of all parts. `None` if there are no rows or no actors, if there are too many actors or snapshot
+    /// words, or if the file would be larger than a file can be.
     pub fn places(&self) -> Option<Places> {
         if self.ring == 0
             || !(1..=MAX_ACTORS).contains(&self.actors)

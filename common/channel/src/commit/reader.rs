@@ -9,7 +9,8 @@ use super::layout::{IDENTITY_BYTES, Places, ReplayLayout};
 use super::record::{self, ActorCommit, ChunkMark, Record};
 use super::words::Words;
 
-/// Follows the commit record of a replay file that a learner may be writing. It never waits for the learner, alive or dead.
+/// Follows the commit record of a replay file that a learner may be writing. It never waits for the learner, alive or
+/// dead.
 #[derive(Debug)]
 pub struct CommitReader {
     words: Words,
@@ -136,18 +137,18 @@ impl CommitReader {
         self.consistent(|slot| Record::load(&self.words, slot, &self.layout))
     }
 
-    /// Reads from the active slot, and repeats if another record was published in between. The writer changes a slot only
-    /// after it has published the other one. So if the published generation is the same before and after the read, the slot
-    /// was not touched.
+    /// Reads from the active slot, and repeats if another record was published in between. The writer changes a slot
+    /// only after it has published the other one. So if the published generation is the same before and after the read,
+    /// the slot was not touched.
     fn consistent<T>(&self, read: impl Fn(usize) -> T) -> T {
         loop {
             let generation = self.words.load(self.places.published);
-            // SYNC POINT with the last Release fence of `Record::store`, after which the learner published the generation:
-            // the record is complete.
+            // SYNC POINT with the last Release fence of `Record::store`, after which the learner published the
+            // generation: the record is complete.
             fence(Ordering::Acquire);
             let value = read(self.places.slots[(generation % 2) as usize]);
-            // SYNC POINT with the first Release fence of `Record::store`: if `read` has seen a word of a later record in this
-            // slot, the load below sees a newer generation.
+            // SYNC POINT with the first Release fence of `Record::store`: if `read` has seen a word of a later record
+            // in this slot, the load below sees a newer generation.
             fence(Ordering::Acquire);
             if self.words.load(self.places.published) == generation {
                 return value;

@@ -20,8 +20,8 @@ pub struct ChunkMark {
 pub const MAX_INCARNATION: u64 = 1 << 60;
 
 impl ChunkMark {
-    /// Whether this chunk comes right after `committed`: it has the next sequence number of the same incarnation, or it is
-    /// the handshake of a later incarnation, which keeps the sequence number.
+    /// Whether this chunk comes right after `committed`: it has the next sequence number of the same incarnation, or it
+    /// is the handshake of a later incarnation, which keeps the sequence number.
     pub fn is_next(self, committed: Self) -> bool {
         let Self { incarnation, sequence } = self;
         if incarnation == committed.incarnation {
@@ -138,8 +138,8 @@ impl Record {
         self.words[TAIL] = tail;
     }
 
-    /// The seal of this record, once finished. It is never `OPEN`, so that an unfinished record is recognised by more than
-    /// its checksum.
+    /// The seal of this record, once finished. It is never `OPEN`, so that an unfinished record is recognised by more
+    /// than its checksum.
     fn seal(&self) -> u64 {
         1 << 32 | u64::from(crc32fast::hash(bytemuck::cast_slice(&self.words)))
     }
@@ -157,11 +157,11 @@ impl Record {
         (words.load(offset) == record.seal() && possible).then_some(record)
     }
 
-    /// Writes the record into the slot at `offset`, which must not be the active one. `step` is called after each of the
-    /// three steps: seal cleared, record written, seal set. Later stores are ordered after all of these.
+    /// Writes the record into the slot at `offset`, which must not be the active one. `step` is called after each of
+    /// the three steps: seal cleared, record written, seal set. Later stores are ordered after all of these.
     pub fn store(&self, words: &mut WritableWords, offset: usize, mut step: impl FnMut(usize)) {
-        // SYNC POINT with the second Acquire fence of `CommitReader::consistent`: a reader that has read a word stored below
-        // also sees the newer generation, which was published before.
+        // SYNC POINT with the second Acquire fence of `CommitReader::consistent`: a reader that has read a word stored
+        // below also sees the newer generation, which was published before.
         fence(Ordering::Release);
         words.store(offset, OPEN);
         step(0);
@@ -174,7 +174,8 @@ impl Record {
         fence(Ordering::Release);
         words.store(offset, self.seal());
         step(2);
-        // SYNC POINT with the first Acquire fence of `CommitReader::consistent`: the caller publishes the generation next.
+        // SYNC POINT with the first Acquire fence of `CommitReader::consistent`: the caller publishes the generation
+        // next.
         fence(Ordering::Release);
     }
 }

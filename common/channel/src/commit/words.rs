@@ -1,4 +1,5 @@
-//! The words of the replay's header as atomics in shared memory: the only module of this crate that accesses mapped bytes.
+//! The words of the replay's header as atomics in shared memory: the only module of this crate that accesses mapped
+//! bytes.
 
 use std::fs::File;
 use std::io;

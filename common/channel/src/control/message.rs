@@ -214,8 +214,8 @@ mod tests {
         }
     }
 
-    /// Whether the bytes are refused, or decode to a message that survives encoding and decoding. Compares bytes, because
-    /// NaN is not equal to itself.
+    /// Whether the bytes are refused, or decode to a message that survives encoding and decoding. Compares bytes,
+    /// because NaN is not equal to itself.
     fn is_refused_or_round_trips<T: Serialize + DeserializeOwned>(bytes: &[u8]) -> bool {
         match decode::<T>(VERSION, bytes) {
             Ok(message) => {

@@ -14,6 +14,7 @@ use shoal_base::report::Role;
 use shoal_base::space::{EnvironmentSpec, Space};
 use shoal_base::stop::Stop;
 
+use super::check::{Fault, Part, find_fault};
 use super::message::{Ask, Block, RequestHeader, ResponseHeader, ResponseLayout, Verdict};
 use super::service::{EnvironmentService, name, question_length, service};
 use crate::domain::Domain;
@@ -28,8 +29,13 @@ pub enum Begin {
     Next,
     /// The training episode with this number, of each environment's own stream.
     Training(u64),
-    /// In environment `e`, the evaluation episode with this number plus `e`.
-    Evaluation(u64),
+    /// Evaluation episodes: environment `e` begins with episode `first + e`.
+    Evaluation {
+        /// The first one.
+        first: u64,
+        /// How many there are. An environment whose next episode is none of them is not reset at its end; 0: no limit.
+        episodes: u32,
+    },
 }
 
 /// The result of a step.
@@ -67,6 +73,7 @@ pub struct EnvironmentClient {
     client: Client<ipc::Service, [f32], RequestHeader, [f32], ResponseHeader>,
     channel: String,
     notifier: Notifier,
+    spec: EnvironmentSpec,
     layout: ResponseLayout,
     snapshot_words: usize,
     stop: Stop,
@@ -166,6 +173,7 @@ impl EnvironmentClient {
             client,
             channel,
             notifier,
+            spec: spec.clone(),
             layout: ResponseLayout::new(environments, spec.observation.width()),
             snapshot_words,
             stop,
@@ -181,7 +189,7 @@ impl EnvironmentClient {
         listener: &Listener,
         mut idle: impl FnMut(),
     ) -> Result<(EnvironmentSpec, usize), Exit<ChannelError>> {
-        let response = self.ask_until_answered(listener, Ask::Describe, 0, &[], &mut idle)?;
+        let response = self.ask_until_answered(listener, RequestHeader::new(Ask::Describe, 0, 0), &[], &mut idle)?;
         let (header, payload) = (response.user_header(), response.payload());
         let described = header.described(payload);
         described.ok_or_else(|| ChannelError::new(&self.channel, "describe", PeerError::ShortAnswer).into())
@@ -197,18 +205,19 @@ impl EnvironmentClient {
         begin: Begin,
         mut idle: impl FnMut(),
     ) -> Result<Observed, Exit<ChannelError>> {
-        let (ask, episode) = match begin {
-            Begin::Next => (Ask::Reset, 0),
-            Begin::Training(episode) => (Ask::ResetToTraining, episode),
-            Begin::Evaluation(first) => (Ask::ResetToEvaluation, first),
+        let question = match begin {
+            Begin::Next => RequestHeader::new(Ask::Reset, 0, 0),
+            Begin::Training(episode) => RequestHeader::new(Ask::ResetToTraining, episode, 0),
+            Begin::Evaluation { first, episodes } => RequestHeader::new(Ask::ResetToEvaluation, first, episodes),
         };
-        self.begun(self.ask_until_answered(listener, ask, episode, &[], &mut idle)?)
+        self.begun(self.ask_until_answered(listener, question, &[], &mut idle)?)
     }
 
     /// Every environment takes a step with its action.
     ///
     /// # Errors
-    /// When a stop is requested, the channel fails, the server refuses the actions, or it denies having begun the episodes.
+    /// When a stop is requested, the channel fails, the server refuses the actions, or it denies having begun the
+    /// episodes; and for an [invalid answer](ChannelError::fault), after which new episodes have to be begun.
     pub fn step(
         &self,
         listener: &Listener,
@@ -216,7 +225,7 @@ impl EnvironmentClient {
         mut idle: impl FnMut(),
     ) -> Result<Stepped, Exit<ChannelError>> {
         match self.ask_within_episodes(listener, Ask::Step, actions, &mut idle)? {
-            Some(response) => Ok(Stepped::Taken(self.observed(response)?)),
+            Some(response) => Ok(Stepped::Taken(self.observed(response, Part::Step)?)),
             None => Ok(Stepped::Lost),
         }
     }
@@ -224,8 +233,8 @@ impl EnvironmentClient {
     /// Asks for a snapshot of the current training episodes, which are not changed by it.
     ///
     /// # Errors
-    /// When a stop is requested, the channel fails, or the server refuses because its environments cannot save their state
-    /// or run evaluation episodes.
+    /// When a stop is requested, the channel fails, or the server refuses because its environments cannot save their
+    /// state or run evaluation episodes.
     pub fn snapshot(&self, listener: &Listener, mut idle: impl FnMut()) -> Result<Snapshot, Exit<ChannelError>> {
         let Some(response) = self.ask_within_episodes(listener, Ask::Snapshot, &[], &mut idle)? else {
             return Ok(Snapshot::Lost);
@@ -237,8 +246,8 @@ impl EnvironmentClient {
         Ok(Snapshot::Taken(words))
     }
 
-    /// Every environment continues its training episode from a snapshot. The result has the observations to act on next, as
-    /// after [`reset`](Self::reset).
+    /// Every environment continues its training episode from a snapshot. The result has the observations to act on
+    /// next, as after [`reset`](Self::reset).
     ///
     /// # Errors
     /// When a stop is requested, the channel fails, or the server refuses the words; the server is then unchanged.
@@ -255,21 +264,33 @@ impl EnvironmentClient {
             };
             return Err(ChannelError::new(&self.channel, "restore", cause).into());
         }
-        self.begun(self.ask_until_answered(listener, Ask::Restore, 0, numbers_of(words), &mut idle)?)
+        self.begun(self.ask_until_answered(
+            listener,
+            RequestHeader::new(Ask::Restore, 0, 0),
+            numbers_of(words),
+            &mut idle,
+        )?)
     }
 
     /// Takes the response to a reset or restore, and notes which server runs the new episodes.
     fn begun(&self, response: Answer) -> Result<Observed, Exit<ChannelError>> {
         let server = response.origin();
-        let observed = self.observed(response)?;
+        let observed = self.observed(response, Part::Observations)?;
         self.episodes.set(Some(server));
         Ok(observed)
     }
 
-    fn observed(&self, response: Answer) -> Result<Observed, ChannelError> {
-        if self.answered(&response)?.len() != self.layout.len() {
-            return Err(self.refused());
+    fn observed(&self, response: Answer, part: Part) -> Result<Observed, ChannelError> {
+        let numbers = self.answered(&response)?;
+        if numbers.len() != self.layout.len() {
+            let fault = Fault::Length {
+                found: numbers.len(),
+                expected: self.layout.len(),
+            };
+            return Err(ChannelError::new(&self.channel, "ask", PeerError::Invalid(fault)));
         }
+        find_fault(&self.spec, &self.layout, numbers, part)
+            .map_err(|fault| ChannelError::new(&self.channel, "ask", PeerError::Invalid(fault)))?;
         Ok(Observed {
             response,
             layout: self.layout,
@@ -278,11 +299,15 @@ impl EnvironmentClient {
 
     /// The payload of a response; an error if the server refused.
     fn answered<'a>(&self, response: &'a Answer) -> Result<&'a [f32], ChannelError> {
-        if response.user_header().verdict == Verdict::Answered as u32 {
-            Ok(response.payload())
-        } else {
-            Err(self.refused())
+        let verdict = response.user_header().verdict;
+        if verdict == Verdict::Answered as u32 {
+            return Ok(response.payload());
         }
+        if verdict == Verdict::Invalid as u32 {
+            let cause = PeerError::Invalid(Fault::Reported);
+            return Err(ChannelError::new(&self.channel, "ask", cause));
+        }
+        Err(self.refused())
     }
 
     fn refused(&self) -> ChannelError {
@@ -300,7 +325,7 @@ impl EnvironmentClient {
         if self.server() != self.episodes.get() {
             return Ok(None);
         }
-        let sent = self.send(ask, 0, payload)?;
+        let sent = self.send(RequestHeader::new(ask, 0, 0), payload)?;
         let Some(response) = self.answer(listener, &sent, idle)? else {
             return Ok(None);
         };
@@ -317,14 +342,13 @@ impl EnvironmentClient {
     fn ask_until_answered(
         &self,
         listener: &Listener,
-        ask: Ask,
-        episode: u64,
+        question: RequestHeader,
         payload: &[f32],
         idle: &mut dyn FnMut(),
     ) -> Result<Answer, Exit<ChannelError>> {
         let mut unreachable = None;
         loop {
-            let sent = self.send(ask, episode, payload)?;
+            let sent = self.send(question, payload)?;
             if let Some(response) = self.answer(listener, &sent, idle)? {
                 return Ok(response);
             }
@@ -336,15 +360,15 @@ impl EnvironmentClient {
         }
     }
 
-    fn send(&self, ask: Ask, episode: u64, payload: &[f32]) -> Result<Sent, ChannelError> {
-        // Look up the server before sending. If another server takes its place in between, the request counts as lost and
-        // is sent again. In the other order, a lost request could count as delivered.
+    fn send(&self, question: RequestHeader, payload: &[f32]) -> Result<Sent, ChannelError> {
+        // Look up the server before sending. If another server takes its place in between, the request counts as lost
+        // and is sent again. In the other order, a lost request could count as delivered.
         let server = self.server();
         let mut request = self
             .client
             .loan_slice_uninit(payload.len())
             .map_err(|cause| ChannelError::new(&self.channel, "ask", cause))?;
-        *request.user_header_mut() = RequestHeader::new(ask, episode);
+        *request.user_header_mut() = question;
         let pending = request
             .write_from_slice(payload)
             .send()
@@ -372,8 +396,8 @@ impl EnvironmentClient {
             },
             || {
                 idle();
-                // A dead server is listed until the launcher has cleaned up after it. `is_connected` does not help: it stays
-                // true while a response of the dead server is held, and the actor always holds one.
+                // A dead server is listed until the launcher has cleaned up after it. `is_connected` does not help: it
+                // stays true while a response of the dead server is held, and the actor always holds one.
                 lost.set(!sent.is_delivered() || self.server() != sent.server);
                 Ok(())
             },

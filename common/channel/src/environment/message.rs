@@ -43,16 +43,18 @@ impl Ask {
 #[repr(C)]
 pub struct RequestHeader {
     pub(super) ask: u32,
-    pub(super) reserved: u32,
+    /// Evaluation episodes that [`Ask::ResetToEvaluation`] is for, from `episode` on: an environment whose next one is
+    /// none of them is not reset at its end. 0: no limit.
+    pub episodes: u32,
     /// The episode of [`Ask::ResetToTraining`], or the first episode of [`Ask::ResetToEvaluation`].
     pub episode: u64,
 }
 
 impl RequestHeader {
-    pub(super) fn new(ask: Ask, episode: u64) -> Self {
+    pub(super) fn new(ask: Ask, episode: u64, episodes: u32) -> Self {
         Self {
             ask: ask as u32,
-            reserved: 0,
+            episodes,
             episode,
         }
     }
@@ -67,10 +69,12 @@ pub(super) enum Verdict {
     NotStarted = 1,
     /// The request has the wrong length, invalid contents, or an unknown kind.
     Refused = 2,
+    /// An environment returned what it may not, and the server has logged what that was. Its episodes end.
+    Invalid = 3,
 }
 
-/// Header of a response. For [`Ask::Describe`] the payload has the least and greatest values of an observation and of an
-/// action (for boxes), for [`Ask::Snapshot`] the snapshot's words, and otherwise the blocks of [`ResponseLayout`].
+/// Header of a response. For [`Ask::Describe`] the payload has the least and greatest values of an observation and of
+/// an action (for boxes), for [`Ask::Snapshot`] the snapshot's words, and otherwise the blocks of [`ResponseLayout`].
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ZeroCopySend)]
 #[type_name("ShoalEnvironmentResponse")]
 #[repr(C)]
@@ -93,13 +97,29 @@ pub struct ResponseHeader {
 }
 
 impl ResponseHeader {
-    /// The spaces and the number of environments in a response to [`Ask::Describe`] with payload `bounds`. `None` if the
-    /// payload is too short.
+    /// The spaces and the number of environments in a response to [`Ask::Describe`] with payload `bounds`. `None` if
+    /// the payload has another length.
     pub(super) fn described(&self, bounds: &[f32]) -> Option<(EnvironmentSpec, usize)> {
+        let spaces = [
+            (self.discrete_observations, self.observation_width),
+            (self.discrete_actions, self.action_width),
+        ];
+        let length = |(discrete, width): (u32, u32)| if discrete > 0 { 0 } else { 2 * width as usize };
+        let without_starts: usize = spaces.into_iter().map(length).sum();
+        // Servers of earlier versions do not state where a discrete space starts.
+        let with_starts = bounds.len() != without_starts;
         let mut rest = bounds;
-        let mut space = |discrete: u32, width: u32| {
+        let mut space = |(discrete, width): (u32, u32)| {
             if discrete > 0 {
-                return Some(Space::Discrete { n: discrete });
+                let start = match (with_starts, rest) {
+                    (false, _) => 0,
+                    (true, [start, others @ ..]) => {
+                        rest = others;
+                        whole(*start)?
+                    }
+                    (true, []) => return None,
+                };
+                return Some(Space::Discrete { n: discrete, start });
             }
             let width = width as usize;
             let (low, high) = (rest.get(..width)?, rest.get(width..)?.get(..width)?);
@@ -110,13 +130,19 @@ impl ResponseHeader {
             })
         };
         let spec = EnvironmentSpec {
-            observation: space(self.discrete_observations, self.observation_width)?,
-            action: space(self.discrete_actions, self.action_width)?,
+            observation: space(spaces[0])?,
+            action: space(spaces[1])?,
             time_limit: self.time_limit,
             state_width: self.state_width as usize,
         };
-        Some((spec, self.environments as usize))
+        rest.is_empty().then_some((spec, self.environments as usize))
     }
+}
+
+/// A whole number that is exact as an `f32`.
+fn whole(number: f32) -> Option<i32> {
+    const EXACT: f32 = 16_777_216.0;
+    (number.fract() == 0.0 && number.abs() <= EXACT).then_some(number as i32)
 }
 
 /// The layout of a response: its blocks, each of them environment after environment.
@@ -218,7 +244,7 @@ mod tests {
         assert_eq!(spec.observation, Space::boxed(&[(-1.0, 1.0), (-2.0, 2.0)]));
         assert_eq!(
             (spec.action, spec.time_limit, environments),
-            (Space::Discrete { n: 4 }, 200, 3)
+            (Space::discrete(4), 200, 3)
         );
         assert_eq!(header.described(&[-1.0, -2.0, 1.0]), None);
     }

@@ -69,8 +69,8 @@ impl EnvironmentPort {
         })
     }
 
-    /// Waits for the next request, and calls `idle` at each pause. Requests for a description and requests of an unknown
-    /// kind are answered here.
+    /// Waits for the next request, and calls `idle` at each pause. Requests for a description and requests of an
+    /// unknown kind are answered here.
     ///
     /// # Errors
     /// When `stop` is requested or the channel fails.
@@ -111,8 +111,13 @@ impl Request<'_> {
         self.request.user_header().episode
     }
 
-    /// Answers with the blocks that `write` fills from the actions, environment after environment. If `write` fails, the
-    /// request is refused and the inner result is that error.
+    /// How many evaluation episodes there are, from [`episode`](Self::episode) on; `None` where there is no limit.
+    pub fn episodes(&self) -> Option<u32> {
+        Some(self.request.user_header().episodes).filter(|episodes| *episodes > 0)
+    }
+
+    /// Answers with the blocks that `write` fills from the actions, environment after environment. If `write` fails,
+    /// the request is refused and the inner result is that error.
     ///
     /// # Errors
     /// When the response cannot be sent.
@@ -138,8 +143,8 @@ impl Request<'_> {
         words_of(self.request.payload())
     }
 
-    /// Answers with the snapshot that `write` writes. If `write` fails, the request is refused and the inner result is that
-    /// error.
+    /// Answers with the snapshot that `write` writes. If `write` fails, the request is refused and the inner result is
+    /// that error.
     ///
     /// # Errors
     /// When the response cannot be sent.
@@ -180,9 +185,12 @@ impl Request<'_> {
     fn describe(self) -> Result<(), ChannelError> {
         let mut bounds = Vec::new();
         for space in [&self.port.spec.observation, &self.port.spec.action] {
-            if let Space::Box { low, high } = space {
-                bounds.extend(low);
-                bounds.extend(high);
+            match space {
+                Space::Box { low, high } => {
+                    bounds.extend(low);
+                    bounds.extend(high);
+                }
+                Space::Discrete { start, .. } => bounds.push(*start as f32),
             }
         }
         self.respond(bounds.len(), |payload| {
@@ -195,7 +203,7 @@ impl Request<'_> {
         let EnvironmentPort {
             spec, layout, channel, ..
         } = self.port;
-        let discrete = |space: &Space| if let Space::Discrete { n } = space { *n } else { 0 };
+        let discrete = |space: &Space| if let Space::Discrete { n, .. } = space { *n } else { 0 };
         let mut response = self
             .request
             .loan_slice(length)

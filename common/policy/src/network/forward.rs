@@ -133,9 +133,9 @@ struct OneSample<'a> {
 impl WithSimd for OneSample<'_> {
     type Output = ();
 
-    /// Reading W takes most of the time. So columns whose factor is 0, as of an inactive ReLU unit, are skipped, and four
-    /// others are read before z is stored. A NaN in a skipped column is missed here; the learner, which computes larger
-    /// batches, detects it.
+    /// Reading W takes most of the time. So columns whose factor is 0, as of an inactive ReLU unit, are skipped, and
+    /// four others are read before z is stored. A NaN in a skipped column is missed here; the learner, which computes
+    /// larger batches, detects it.
     #[inline(always)]
     fn with_simd<S: Simd>(self, _: S) {
         let Self { z, w, x } = self;
@@ -151,8 +151,8 @@ impl WithSimd for OneSample<'_> {
     }
 }
 
-/// z ← max(z + b, 0) for the first elements of every column of `rows` numbers, one for each bias. NaN stays NaN, so that it
-/// shows in the loss.
+/// z ← max(z + b, 0) for the first elements of every column of `rows` numbers, one for each bias. NaN stays NaN, so
+/// that it shows in the loss.
 fn add_bias_and_rectify(z: &mut [f32], rows: usize, biases: &[f32]) {
     Arch::new().dispatch(|| {
         for column in z.chunks_exact_mut(rows) {
@@ -251,7 +251,10 @@ mod tests {
                 let input = &inputs[sample * layout.inputs()..][..layout.inputs()];
                 let late = &late[sample * layout.late_inputs()..][..layout.late_inputs()];
                 for (found, expected) in column.iter().zip(by_definition(&layout, &parameters, input, late)) {
-                    assert!((f64::from(*found) - expected).abs() < 1e-4, "{found} instead of {expected}");
+                    assert!(
+                        (f64::from(*found) - expected).abs() < 1e-4,
+                        "{found} instead of {expected}"
+                    );
                 }
             }
         }

@@ -64,15 +64,15 @@ impl NetworkLayout {
         self.outputs
     }
 
-    /// The layer that the late inputs enter, counted from 0: the second hidden layer, or the only one. `None` if there are
-    /// no late inputs.
+    /// The layer that the late inputs enter, counted from 0: the second hidden layer, or the only one. `None` if there
+    /// are no late inputs.
     pub fn late_layer(&self) -> Option<usize> {
         let second = self.hidden.layers.len().min(2) - 1;
         (self.late_inputs > 0).then_some(second)
     }
 
-    /// The `(inputs, outputs)` of a layer, counted from 0. The output layer comes after the hidden layers. The inputs include
-    /// the late inputs if those enter at this layer.
+    /// The `(inputs, outputs)` of a layer, counted from 0. The output layer comes after the hidden layers. The inputs
+    /// include the late inputs if those enter at this layer.
     pub fn layer_size(&self, layer: usize) -> (usize, usize) {
         let units = &*self.hidden.layers;
         let below = layer.checked_sub(1).map_or(self.inputs, |below| units[below]);
@@ -127,8 +127,8 @@ impl NetworkLayout {
 
     /// The fingerprint: two layouts have the same one only if they read parameters alike (FNV-1a over the sizes).
     ///
-    /// With two ReLU layers it is that of files from before other networks existed. For any other list the length and the
-    /// activation are appended, so that no two layouts hash the same numbers.
+    /// With two ReLU layers it is that of files from before other networks existed. For any other list the length and
+    /// the activation are appended, so that no two layouts hash the same numbers.
     pub fn fingerprint(&self) -> u64 {
         let Hidden { layers, activation } = self.hidden;
         let marks = match (layers.len(), activation) {

@@ -4,8 +4,8 @@ use shoal_base::space::Space;
 
 use super::{Hidden, Network, NetworkLayout};
 
-/// The middle and half the width of the range of each action element. It converts tanh outputs to actions in environment
-/// units.
+/// The middle and half the width of the range of each action element. It converts tanh outputs to actions in
+/// environment units.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ActionRange {
     centre: Vec<f32>,
@@ -43,7 +43,7 @@ impl ActionRange {
     pub fn new(space: &Space) -> Result<Self, ActionRangeError> {
         let (low, high) = match space {
             Space::Box { low, high } => (low, high),
-            Space::Discrete { n } => return Err(ActionRangeError::Discrete { n: *n }),
+            Space::Discrete { n, .. } => return Err(ActionRangeError::Discrete { n: *n }),
         };
         if low.is_empty() {
             return Err(ActionRangeError::Empty);
@@ -142,7 +142,7 @@ mod tests {
     #[test]
     fn spaces_without_a_finite_range_are_refused() {
         assert_eq!(
-            ActionRange::new(&Space::Discrete { n: 4 }),
+            ActionRange::new(&Space::discrete(4)),
             Err(ActionRangeError::Discrete { n: 4 })
         );
         assert_eq!(ActionRange::new(&Space::boxed(&[])), Err(ActionRangeError::Empty));

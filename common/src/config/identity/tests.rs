@@ -200,7 +200,8 @@ fn format_1_describes_any_list_of_layers_and_tanh() {
     );
 }
 
-/// A handwritten configuration has no format number. It gets the numbered text if the old one cannot describe its networks.
+/// A handwritten configuration has no format number. It gets the numbered text if the old one cannot describe its
+/// networks.
 #[test]
 fn new_kinds_of_networks_have_no_unnumbered_text() {
     for settings in ["hidden = [8]", "hidden = [8, 8]\nactivation = \"tanh\""] {

@@ -25,7 +25,7 @@ fn actions(fixture: &Fixture, rng: &mut Stream) -> Vec<f32> {
         Space::Box { low, high } => (low.iter().zip(high))
             .map(|(low, high)| rng.random_range(1.1 * low - 0.1..=1.1 * high + 0.1))
             .collect(),
-        Space::Discrete { n } => vec![rng.random_range(0..*n) as f32],
+        Space::Discrete { n, .. } => vec![rng.random_range(0..*n) as f32],
     };
     (0..fixture.vector.count()).flat_map(|_| each(rng)).collect()
 }
@@ -185,7 +185,11 @@ fn only_training_has_snapshots_and_a_restore_returns_to_it() {
     assert_eq!(fixture.vector.snapshot(&mut words), Err(RequestError::NoTraining));
     fixture.reset(Start::Next);
     let training = snapshot(&fixture);
-    fixture.reset(Start::Evaluation { seed: 1, first: 0 });
+    fixture.reset(Start::Evaluation {
+        seed: 1,
+        first: 0,
+        episodes: None,
+    });
     assert_eq!(fixture.vector.snapshot(&mut words), Err(RequestError::NoTraining));
     restore(&mut fixture, &training).unwrap();
     assert_eq!(snapshot(&fixture), training);

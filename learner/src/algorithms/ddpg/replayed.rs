@@ -76,8 +76,9 @@ impl Algorithm for ReplayedDdpg {
 
     fn update(&mut self, replay: &Replay, rows: u64) -> Losses {
         let window = replay.window(rows, self.capacity);
-        self.sampler.indices(self.ddpg.updates(), window, &mut self.indices);
-        self.batch.gather(replay, &self.indices);
+        self.sampler
+            .indices(self.ddpg.updates(), window.clone(), &mut self.indices);
+        self.batch.gather(replay, &self.indices, &window);
         self.ddpg.update(&self.batch)
     }
 

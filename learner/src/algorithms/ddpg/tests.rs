@@ -354,7 +354,7 @@ fn actors_compute_the_same_bits_as_the_learner() {
 #[test]
 fn discrete_actions_are_refused() {
     let discrete = EnvironmentSpec {
-        action: Space::Discrete { n: 4 },
+        action: Space::discrete(4),
         ..spec()
     };
     let error = Ddpg::new(&discrete, &settings(), 1).unwrap_err();

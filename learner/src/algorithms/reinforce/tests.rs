@@ -15,7 +15,7 @@ const SIZES: RunSizes = RunSizes {
 fn spec() -> EnvironmentSpec {
     EnvironmentSpec {
         observation: Space::boxed(&[(-1.0, 1.0); 3]),
-        action: Space::Discrete { n: 3 },
+        action: Space::discrete(3),
         time_limit: 12,
         state_width: 1,
     }

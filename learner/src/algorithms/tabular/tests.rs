@@ -11,8 +11,8 @@ const SIZES: RunSizes = RunSizes {
 
 fn lake(states: u32, actions: u32) -> EnvironmentSpec {
     EnvironmentSpec {
-        observation: Space::Discrete { n: states },
-        action: Space::Discrete { n: actions },
+        observation: Space::discrete(states),
+        action: Space::discrete(actions),
         time_limit: 100,
         state_width: 1,
     }

@@ -1,0 +1,180 @@
+//! What an environment may return. Whatever program serves it, its answers are checked where they come in, and nothing
+//! else that follows need expect a number that is none.
+
+use shoal_base::space::{EnvironmentSpec, Space};
+
+use super::message::{Block, ResponseLayout};
+
+/// An answer that no environment may give. Its episodes are over.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum Fault {
+    /// The server has found it, and has written to its standard error what it was.
+    #[error("the environment server reports that an environment returned something invalid")]
+    Reported,
+    /// The answer has not the numbers of its environments.
+    #[error("the environment server answered with {found} numbers instead of {expected}")]
+    Length {
+        /// Numbers there are.
+        found: usize,
+        /// Numbers that the environments have.
+        expected: usize,
+    },
+    /// A number that cannot be.
+    #[error("an environment returned {value} as {what} (environment {environment}); {expected}")]
+    Number {
+        /// Which of the server's environments.
+        environment: usize,
+        /// What the number is.
+        what: &'static str,
+        /// The number.
+        value: f32,
+        /// What would be right.
+        expected: String,
+    },
+}
+
+/// Which parts of a response count.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Part {
+    /// All of it: the answer to a step.
+    Step,
+    /// The observations to act on: the answer to a reset or a restore.
+    Observations,
+}
+
+/// Finds the first number of a response that cannot be.
+pub(super) fn find_fault(
+    spec: &EnvironmentSpec,
+    layout: &ResponseLayout,
+    response: &[f32],
+    part: Part,
+) -> Result<(), Fault> {
+    let block = |block| layout.block(block, response);
+    let all = [
+        (Block::Observations, "an observation"),
+        (Block::NextObservations, "an observation"),
+        (Block::Rewards, "a reward"),
+        (Block::Terminated, "terminated"),
+        (Block::Truncated, "truncated"),
+    ];
+    let counts = match part {
+        Part::Step => &all[..],
+        Part::Observations => &all[..1],
+    };
+    for (which, what) in counts {
+        let numbers = block(*which);
+        let wrong = match (which, &spec.observation) {
+            (Block::Observations | Block::NextObservations, Space::Discrete { n, .. }) => first(numbers, |number| {
+                number.fract() == 0.0 && (0.0..*n as f32).contains(&number)
+            }),
+            (Block::Terminated | Block::Truncated, _) => first(numbers, |number| number == 0.0 || number == 1.0),
+            _ => first(numbers, f32::is_finite),
+        };
+        if let Some(i) = wrong {
+            let width = numbers.len() / layout.environments;
+            return Err(Fault::Number {
+                environment: i / width,
+                what,
+                value: numbers[i],
+                expected: expected(*which, &spec.observation),
+            });
+        }
+    }
+    Ok(())
+}
+
+fn first(numbers: &[f32], right: impl Fn(f32) -> bool) -> Option<usize> {
+    // Without an early end for what is nearly always all right: this can be done in vectors.
+    if numbers.iter().fold(true, |all, number| all & right(*number)) {
+        return None;
+    }
+    numbers.iter().position(|number| !right(*number))
+}
+
+fn expected(block: Block, observation: &Space) -> String {
+    match (block, observation) {
+        (Block::Observations | Block::NextObservations, Space::Discrete { n, .. }) => {
+            format!("expected: an index from 0 to {}", n.saturating_sub(1))
+        }
+        (Block::Terminated | Block::Truncated, _) => "expected: 0 or 1".into(),
+        _ => "expected: a finite number".into(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn spec(observation: Space) -> EnvironmentSpec {
+        EnvironmentSpec {
+            observation,
+            action: Space::discrete(2),
+            time_limit: 10,
+            state_width: 0,
+        }
+    }
+
+    /// Two environments' answer to a step, with one number changed.
+    fn fault_of(observation: Space, at: usize, value: f32, part: Part) -> Result<(), Fault> {
+        let spec = spec(observation);
+        let layout = ResponseLayout::new(2, spec.observation.width());
+        let mut response = vec![1.0; layout.len()];
+        response[at] = value;
+        find_fault(&spec, &layout, &response, part)
+    }
+
+    #[test]
+    fn a_number_that_cannot_be_is_found_and_named() {
+        let boxed = || Space::boxed(&[(-1.0, 1.0); 3]);
+        // Two times: observations 0 to 5, next observations 6 to 11, rewards 12 and 13, terminated 14, truncated 16.
+        for (at, value, environment, what) in [
+            (1, f32::NAN, 0, "an observation"),
+            (4, f32::INFINITY, 1, "an observation"),
+            (11, f32::NEG_INFINITY, 1, "an observation"),
+            (12, f32::NAN, 0, "a reward"),
+            (15, 2.0, 1, "terminated"),
+            (16, 0.5, 0, "truncated"),
+            (17, f32::NAN, 1, "truncated"),
+        ] {
+            let Err(Fault::Number {
+                environment: found,
+                what: named,
+                ..
+            }) = fault_of(boxed(), at, value, Part::Step)
+            else {
+                panic!("{at}: {value} passed");
+            };
+            assert_eq!((found, named), (environment, what), "{at}");
+        }
+        assert_eq!(
+            fault_of(boxed(), 0, 7.0, Part::Step),
+            Ok(()),
+            "outside its bounds is no fault"
+        );
+        assert_eq!(
+            fault_of(boxed(), 12, f32::NAN, Part::Observations),
+            Ok(()),
+            "a reset has no reward"
+        );
+        assert!(fault_of(boxed(), 5, f32::NAN, Part::Observations).is_err());
+    }
+
+    #[test]
+    fn an_index_is_within_its_space() {
+        for (value, right) in [
+            (0.0, true),
+            (2.0, true),
+            (3.0, false),
+            (-1.0, false),
+            (1.5, false),
+            (f32::NAN, false),
+        ] {
+            let found = fault_of(Space::discrete(3), 0, value, Part::Observations);
+            assert_eq!(found.is_ok(), right, "{value}");
+        }
+        let text = fault_of(Space::discrete(3), 1, 3.0, Part::Step)
+            .unwrap_err()
+            .to_string();
+        assert!(text.contains("environment 1") && text.contains("0 to 2"), "{text}");
+    }
+}
