@@ -21,6 +21,7 @@ use shoal_common::config::Config;
 use shoal_common::report::{EpisodeReport, EvaluationReport, Heartbeat, LearnerReport, Role};
 use shoal_common::run_dir::RunDir;
 use shoal_common::stop::GRACE;
+use shoal_run::external_environment::server_iceoryx2_config;
 use shoal_run::outcome::{RunOutcome, RunState};
 use shoal_run::process::wait_for_any;
 use shoal_run::recorder::Recorder;
@@ -423,11 +424,17 @@ fn each<R: Report>(reports: &Reports<R>, mut handle: impl FnMut(R) -> anyhow::Re
     Ok(f64::from(count) / R::BUFFER as f64)
 }
 
-/// Writes the iceoryx2 configuration of the run. With it, external environment servers find the run's services, as do
-/// iceoryx2's own tools when started in the run directory.
+/// Writes the iceoryx2 configuration of the run twice. iceoryx2's own tools find the run's services with the first file if
+/// they are started in the run directory. The second is for external environment servers: iceoryx2 cannot read a file at
+/// every path that a run may have.
 fn write_iox_config(domain: &Domain, run: &RunDir) -> anyhow::Result<()> {
-    let file = run.iceoryx2_config();
-    file.parent().map_or(Ok(()), std::fs::create_dir_all)?;
-    std::fs::write(file, domain.iox_config()?)?;
+    let text = domain.iox_config()?;
+    for file in [run.iceoryx2_config(), server_iceoryx2_config(domain.run_id())?] {
+        let write = || {
+            file.parent().map_or(Ok(()), std::fs::create_dir_all)?;
+            std::fs::write(&file, &text)
+        };
+        write().with_context(|| format!("cannot write {}", file.display()))?;
+    }
     Ok(())
 }

@@ -14,7 +14,8 @@ use shoal_common::run_dir::RunDir;
 use shoal_common::stop::Stop;
 use shoal_env_server::vector::VectorEnvironment;
 use shoal_learner::process;
-use shoal_run::external_environment::{self, LaunchSpec};
+use shoal_run::external_environment::{self, LaunchSpec, server_iceoryx2_config};
+use shoal_run::server_location::Surroundings;
 use shoal_run::status::evaluated_period;
 use tracing_subscriber::filter::LevelFilter;
 
@@ -43,7 +44,7 @@ pub(crate) fn run(role: Role, args: &RoleArgs) -> anyhow::Result<ExitCode> {
         incarnation: args.incarnation,
     };
     if role == Role::EnvServer
-        && let Some(program) = launch_spec(&config, &run, identity).command(&config.environment)?
+        && let Some(program) = launch_spec(&config, &run, identity)?.command(&config.environment)?
     {
         return external_environment::serve_with(&program);
     }
@@ -67,7 +68,7 @@ fn log_level() -> LevelFilter {
 
 fn work(domain: &Domain, config: &Config, run: &RunDir, identity: Identity, stop: &Stop) -> anyhow::Result<()> {
     match identity.role {
-        Role::EnvServer => serve(domain, config, &launch_spec(config, run, identity), identity, stop),
+        Role::EnvServer => serve(domain, config, &launch_spec(config, run, identity)?, identity, stop),
         Role::Actor => {
             let settings = explorer::ExplorerSettings::new(config, run, identity);
             Ok(explorer::explore(domain, &settings, stop)?)
@@ -89,15 +90,15 @@ fn work(domain: &Domain, config: &Config, run: &RunDir, identity: Identity, stop
 }
 
 /// The arguments of an environment server.
-fn launch_spec<'a>(config: &'a Config, run: &RunDir, identity: Identity) -> LaunchSpec<'a> {
+fn launch_spec<'a>(config: &'a Config, run: &RunDir, identity: Identity) -> anyhow::Result<LaunchSpec<'a>> {
     let Identity { index, incarnation, .. } = identity;
     let (client, environments) = if index == config.evaluation_server() {
         (EventName(Role::Evaluator, 0), config.evaluation_envs())
     } else {
         (EventName(Role::Actor, index), config.actors.envs)
     };
-    LaunchSpec {
-        iceoryx2: run.iceoryx2_config(),
+    Ok(LaunchSpec {
+        iceoryx2: server_iceoryx2_config(&config.run.id)?,
         run_id: &config.run.id,
         index,
         incarnation,
@@ -110,7 +111,8 @@ fn launch_spec<'a>(config: &'a Config, run: &RunDir, identity: Identity) -> Laun
         } else {
             incarnation
         },
-    }
+        surroundings: Surroundings::of_run(run, config)?,
+    })
 }
 
 fn serve(

@@ -136,7 +136,7 @@ impl Config {
 
     /// Environments that the evaluator steps at once.
     pub fn evaluation_envs(&self) -> u32 {
-        self.evaluation.episodes.min(64)
+        self.evaluation.episodes.min(self.evaluation.envs)
     }
 
     /// The layout of a transition's row.

@@ -58,16 +58,26 @@ impl RunDir {
             let path = path.to_owned();
             move |cause| RunDirError::Io { action, path, cause }
         };
-        if let Some(parent) = path.parent() {
-            std::fs::create_dir_all(parent).map_err(io("create the directory", parent))?;
-        }
-        DirBuilder::new()
-            .mode(0o700)
-            .create(path)
-            .map_err(|cause| match cause.kind() {
-                ErrorKind::AlreadyExists => RunDirError::Exists(path.to_owned()),
-                _ => io("create the run directory", path)(cause),
-            })?;
+        let is_missing = |above: &&Path| !above.as_os_str().is_empty() && !above.exists();
+        let missing: Vec<&Path> = path.ancestors().skip(1).take_while(is_missing).collect();
+        let make = || {
+            if let Some(parent) = path.parent() {
+                std::fs::create_dir_all(parent).map_err(io("create the directory", parent))?;
+            }
+            DirBuilder::new()
+                .mode(0o700)
+                .create(path)
+                .map_err(|cause| match cause.kind() {
+                    ErrorKind::AlreadyExists => RunDirError::Exists(path.to_owned()),
+                    _ => io("create the run directory", path)(cause),
+                })
+        };
+        make().inspect_err(|_| {
+            // Directories that another process uses meanwhile are not empty, and stay.
+            for above in missing {
+                let _ = std::fs::remove_dir(above);
+            }
+        })?;
         // The path is absolute, because roles may have another working directory.
         let path = std::fs::canonicalize(path).map_err(io("resolve", path))?;
         Ok(Self { path })
@@ -265,6 +275,11 @@ impl RunDir {
         self.path.join("outcome.json")
     }
 
+    /// `server.json`: where the run's environment server is started, if it is another program.
+    pub fn server_file(&self) -> PathBuf {
+        self.path.join("server.json")
+    }
+
     /// `shoal.log`: the log of all processes.
     pub fn log(&self) -> PathBuf {
         self.path.join("shoal.log")
@@ -296,6 +311,11 @@ mod tests {
         );
         assert!(matches!(RunDir::create(first.path()), Err(RunDirError::Exists(_))));
         assert!(matches!(RunDir::open(first.path()), Err(RunDirError::NotARun(_))));
+
+        // A name that no file system takes.
+        let nowhere = parent.path().join("a/b").join("x".repeat(300)).join("run");
+        assert!(matches!(RunDir::create(&nowhere), Err(RunDirError::Io { .. })));
+        assert!(!parent.path().join("a").exists(), "what it made is removed");
 
         let lock = first.lock().unwrap();
         assert!(matches!(first.lock(), Err(RunDirError::Busy(_))));

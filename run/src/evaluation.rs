@@ -50,7 +50,26 @@ pub struct EvaluationSummary {
 
 /// Runs the evaluation episodes 0 … `episodes` − 1 of `seed`. They start in the same states every time.
 pub fn evaluate(config: &Config, parameters: &[f32], episodes: u32, seed: u64) -> anyhow::Result<EvaluationSummary> {
-    let mut rollout = Rollout::new(config, parameters)?;
+    evaluate_by(Rollout::new(config, parameters)?, config, episodes, seed)
+}
+
+/// The same for this run: an environment that another program serves is served as in training.
+pub fn evaluate_run(
+    run: &RunDir,
+    config: &Config,
+    parameters: &[f32],
+    episodes: u32,
+    seed: u64,
+) -> anyhow::Result<EvaluationSummary> {
+    evaluate_by(Rollout::of_run(run, config, parameters)?, config, episodes, seed)
+}
+
+fn evaluate_by(
+    mut rollout: Rollout<'_>,
+    config: &Config,
+    episodes: u32,
+    seed: u64,
+) -> anyhow::Result<EvaluationSummary> {
     let goal = Description::of(config)?.goal;
     let (mut returns, mut distances) = (Vec::new(), Vec::new());
     for number in 0..episodes {

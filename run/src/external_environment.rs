@@ -1,6 +1,8 @@
 //! Environment servers that are other programs (`docs/PROTOCOL.md`): starting one, and using one outside a run to learn
 //! its spaces or to evaluate a policy.
 
+mod parameters;
+
 use std::ffi::OsString;
 use std::io::Write;
 use std::os::fd::AsFd;
@@ -25,6 +27,7 @@ use shoal_common::space::EnvironmentSpec;
 use shoal_common::stop::{GRACE, Stop};
 
 use crate::process::{Peer, wait_for_any};
+use crate::server_location::Surroundings;
 
 /// The prefix of the names of Gymnasium environments.
 pub const GYMNASIUM: &str = "gym:";
@@ -36,6 +39,14 @@ const SLOW: Duration = Duration::from_secs(10);
 pub fn default_command(name: &str) -> Option<Vec<String>> {
     let gymnasium = || ["python3", "-m", "shoal_gym"].map(Into::into).into();
     name.starts_with(GYMNASIUM).then(gymnasium)
+}
+
+/// The file with which other programs find the run `run_id` in shared memory. It goes with the run's files there.
+///
+/// # Errors
+/// When the user's directory cannot be used.
+pub fn server_iceoryx2_config(run_id: &str) -> anyhow::Result<PathBuf> {
+    Ok(Domain::directory_of(run_id)?.join("config/iceoryx2.toml"))
 }
 
 /// The arguments of an environment server.
@@ -56,6 +67,8 @@ pub struct LaunchSpec<'a> {
     pub seed: u64,
     /// With seed and index, selects the random streams of its training episodes.
     pub stream: u64,
+    /// Where it is started, and with what.
+    pub surroundings: Surroundings,
 }
 
 impl LaunchSpec<'_> {
@@ -64,7 +77,18 @@ impl LaunchSpec<'_> {
         let Some((program, arguments)) = environment.server.split_first() else {
             return Ok(None);
         };
-        let mut command = Command::new(program);
+        let Surroundings { location, hash_seed } = &self.surroundings;
+        let mut command = match location {
+            Some(location) => {
+                let mut command = Command::new(location.program());
+                command.current_dir(location.directory());
+                command
+            }
+            None => Command::new(program),
+        };
+        if let Some(seed) = hash_seed {
+            command.env("PYTHONHASHSEED", seed.to_string());
+        }
         command
             .args(arguments)
             .arg("--iceoryx2")
@@ -77,7 +101,7 @@ impl LaunchSpec<'_> {
             .args(["--seed", &self.seed.to_string()])
             .args(["--stream", &self.stream.to_string()])
             .args(["--name", &environment.name])
-            .args(["--parameters", &serde_json::to_string(&environment.parameters)?]);
+            .args(["--parameters", &parameters::json(&environment.parameters)?]);
         Ok(Some(command))
     }
 }
@@ -103,6 +127,15 @@ fn tied(program: &Command) -> anyhow::Result<Command> {
         .arg0("shoal")
         .args([TIED_COMMAND, &std::process::id().to_string()]);
     command.arg(program.get_program()).args(program.get_args());
+    if let Some(directory) = program.get_current_dir() {
+        command.current_dir(directory);
+    }
+    for (name, value) in program.get_envs() {
+        match value {
+            Some(value) => command.env(name, value),
+            None => command.env_remove(name),
+        };
+    }
     Ok(command)
 }
 
@@ -215,6 +248,19 @@ impl ExternalEnvironment {
     /// # Errors
     /// When the server cannot be started, ends, or does not answer; with the last line it wrote.
     pub fn begin(environment: &EnvironmentConfig, environments: u32, seed: u64) -> anyhow::Result<Self> {
+        Self::begin_in(environment, environments, seed, Surroundings::default())
+    }
+
+    /// The same in these surroundings.
+    ///
+    /// # Errors
+    /// As for [`begin`](Self::begin).
+    pub fn begin_in(
+        environment: &EnvironmentConfig,
+        environments: u32,
+        seed: u64,
+        surroundings: Surroundings,
+    ) -> anyhow::Result<Self> {
         Domain::remove_abandoned()?;
         let run_id = format!("{:08x}", rand::random::<u32>());
         let domain = Domain::join(&run_id, 1)?;
@@ -228,6 +274,7 @@ impl ExternalEnvironment {
             environments,
             seed,
             stream: 0,
+            surroundings,
         };
         match open(&domain, &launch, environment) {
             Ok((services, client, listener, spec, program)) => Ok(Self {

@@ -14,6 +14,7 @@ pub mod rate;
 pub mod recorder;
 pub mod remote;
 pub mod rollout;
+pub mod server_location;
 pub mod signals;
 pub mod status;
 #[cfg(any(test, feature = "testing"))]

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 use serde::de::DeserializeOwned;
 use shoal_common::algorithms::Experience;
-use shoal_common::config::{ActorsConfig, Algorithm, Config, EnvironmentConfig, IdentityFormat};
+use shoal_common::config::{ActorsConfig, Algorithm, Config, EnvironmentConfig, IdentityFormat, Mode, RunConfig};
 use shoal_common::run_dir::{RunDir, RunLock};
 use shoal_common::space::{EnvironmentSpec, Space};
 use shoal_env_server::environment;
@@ -14,6 +14,7 @@ use toml::{Table, Value};
 
 use crate::external_environment::{self, ExternalEnvironment, GYMNASIUM};
 use crate::preflight;
+use crate::server_location::{ServerLocation, Surroundings, hash_seed};
 
 const PRESETS: [(&str, &str); 7] = [
     ("pendulum", include_str!("../../presets/pendulum.toml")),
@@ -93,13 +94,22 @@ impl Plan {
             None => RunDir::create_next(Path::new("runs"), &name)?,
         };
         let lock = run.lock()?;
-        if let Err(error) = run.write_config(&config) {
+        let config = fill(&run, &config).inspect_err(|_| {
             // The directory would block the next attempt.
             let _ = std::fs::remove_dir_all(run.path());
-            return Err(error.into());
-        }
+        })?;
         Ok(Self { config, run, lock })
     }
+}
+
+/// Writes the first files of a new run directory and returns the configuration as the roles read it: a date among the
+/// environment's parameters is a string there, and all processes must compute the same identity.
+fn fill(run: &RunDir, config: &Config) -> anyhow::Result<Config> {
+    if let Some(location) = ServerLocation::here(&config.environment.server)? {
+        location.write(run)?;
+    }
+    run.write_config(config)?;
+    Ok(run.config()?)
 }
 
 /// The configuration of a preset or a file with these overrides, and the default name of its run. Creates nothing.
@@ -202,6 +212,15 @@ fn resolve(mut table: Table, overrides: &RunOverrides, origin: &str) -> anyhow::
 /// Fills in `[spec]` from the environment. Adds every parameter of a built-in environment, and for a Gymnasium
 /// environment the settings of a suitable method if the configuration names none.
 fn describe_environment(table: &mut Table) -> anyhow::Result<()> {
+    let run = table.get("run");
+    let mode = run.and_then(|run| run.get("mode")).and_then(Value::as_str);
+    let mode = if mode == Some("lockstep") {
+        Mode::Lockstep
+    } else {
+        Mode::Free
+    };
+    let seed = run.and_then(|run| run.get("seed")).and_then(Value::as_integer);
+    let seed = seed.map_or(RunConfig::default().seed, i64::cast_unsigned);
     let Some(Value::Table(section)) = table.get_mut("environment") else {
         bail!("the section [environment] is missing: it must have a name");
     };
@@ -221,7 +240,13 @@ fn describe_environment(table: &mut Table) -> anyhow::Result<()> {
     };
     let (environment, spec) = if let Some(server) = server {
         let environment = configured(name, server, section.clone());
-        let spec = ExternalEnvironment::begin(&environment, 1, 0)?.spec().clone();
+        let surroundings = Surroundings {
+            location: ServerLocation::here(&environment.server)?,
+            hash_seed: hash_seed(mode, seed),
+        };
+        let spec = ExternalEnvironment::begin_in(&environment, 1, 0, surroundings)?
+            .spec()
+            .clone();
         (environment, spec)
     } else {
         let parameters = environment::resolve(&name, section)?;
@@ -304,7 +329,6 @@ fn one_line(error: &toml::de::Error) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use shoal_common::config::Mode;
 
     fn plan(what: &str, set: &[&str]) -> anyhow::Result<Config> {
         let overrides = RunOverrides {
@@ -344,6 +368,25 @@ mod tests {
             );
         }
         assert_eq!(all, include_str!("../../tests/data/identity-1.txt"));
+    }
+
+    #[test]
+    fn a_new_run_has_the_identity_that_its_directory_has() {
+        let parent = tempfile::tempdir().unwrap();
+        let run = RunDir::create(&parent.path().join("run")).unwrap();
+        let mut config = plan("pendulum", &[]).unwrap();
+        // Parameters that other programs may take.
+        let parameters = "day = 1979-05-27\nx = [nan, -inf, 1e300]\n[parameters]\nname = \"x\"";
+        config.environment.parameters = parameters.parse().unwrap();
+        let filled = fill(&run, &config).unwrap();
+        let read = run.config().unwrap();
+        assert_eq!(filled.identity(), read.identity());
+        run.write_config(&read).unwrap();
+        assert_eq!(
+            filled.identity(),
+            run.config().unwrap().identity(),
+            "as resume and scale write it"
+        );
     }
 
     #[test]

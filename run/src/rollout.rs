@@ -5,12 +5,14 @@ use anyhow::{Context, bail, ensure};
 use shoal_common::channel::environment::StepBlocks;
 use shoal_common::config::Config;
 use shoal_common::policy::{Policy, PolicyLayout};
+use shoal_common::run_dir::RunDir;
 use shoal_common::space::EnvironmentSpec;
 use shoal_env_server::environment::Source;
 use shoal_env_server::environment::angle::unwrapped;
 use shoal_env_server::vector::{Start, VectorEnvironment};
 
 use crate::external_environment::ExternalEnvironment;
+use crate::server_location::Surroundings;
 
 /// An episode of T steps.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -56,6 +58,7 @@ pub struct Rollout<'a> {
     host: Host,
     policy: Policy,
     parameters: &'a [f32],
+    surroundings: Surroundings,
 }
 
 /// Where the environment runs.
@@ -92,6 +95,15 @@ impl<'a> Rollout<'a> {
             host: Host::new(config)?,
             policy,
             parameters,
+            surroundings: Surroundings::default(),
+        })
+    }
+
+    /// The same for this run: an environment that another program serves is served as in training.
+    pub fn of_run(run: &RunDir, config: &'a Config, parameters: &'a [f32]) -> anyhow::Result<Self> {
+        Ok(Self {
+            surroundings: Surroundings::of_run(run, config)?,
+            ..Self::new(config, parameters)?
         })
     }
 
@@ -110,7 +122,7 @@ impl<'a> Rollout<'a> {
     }
 
     fn episode(&mut self, start: Start<'_>) -> anyhow::Result<Trajectory> {
-        let mut observation = self.host.begin(self.config, start)?;
+        let mut observation = self.host.begin(self.config, &self.surroundings, start)?;
         let mut action = vec![0.0; self.config.spec.action.width()];
         let mut trajectory = Trajectory {
             observations: vec![observation.clone()],
@@ -148,7 +160,7 @@ impl Host {
     }
 
     /// Begins an episode and returns its first observation.
-    fn begin(&mut self, config: &Config, start: Start<'_>) -> anyhow::Result<Vec<f32>> {
+    fn begin(&mut self, config: &Config, surroundings: &Surroundings, start: Start<'_>) -> anyhow::Result<Vec<f32>> {
         match (self, start) {
             (Self::Builtin(environment), start) => {
                 let mut observation = vec![0.0; config.spec.observation.width()];
@@ -161,10 +173,8 @@ impl Host {
                     *server = None;
                 }
                 let begin = || {
-                    anyhow::Ok((
-                        seed,
-                        Box::new(ExternalEnvironment::begin(&config.environment, 1, seed)?),
-                    ))
+                    let begun = ExternalEnvironment::begin_in(&config.environment, 1, seed, surroundings.clone());
+                    anyhow::Ok((seed, Box::new(begun?)))
                 };
                 let (_, server) = match server {
                     Some(begun) => begun,

@@ -10,7 +10,7 @@ use shoal_common::policy_file::PolicyFile;
 use shoal_common::run_dir::RunDir;
 use shoal_env_server::environment::Goal;
 use shoal_run::description::Description;
-use shoal_run::evaluation::{EvaluationSummary, WhichPolicy, evaluate};
+use shoal_run::evaluation::{EvaluationSummary, WhichPolicy, evaluate_run};
 
 #[derive(Args, Clone, Debug)]
 pub(crate) struct EvalArgs {
@@ -36,7 +36,7 @@ pub(crate) fn run(args: &EvalArgs) -> anyhow::Result<()> {
     let config = run.config()?;
     let policy = args.policy.read(&run, &config)?;
     let seed = args.seed.unwrap_or(config.run.seed);
-    let summary = evaluate(&config, &policy.parameters, args.episodes, seed)?;
+    let summary = evaluate_run(&run, &config, &policy.parameters, args.episodes, seed)?;
     let goal = Description::of(&config)?.goal;
     let table = table(&summary, &policy, seed, goal.as_ref());
     if args.json {

@@ -6,6 +6,7 @@ use std::process::ExitCode;
 use anyhow::{Context, bail};
 use clap::Args;
 use shoal_common::run_dir::RunDir;
+use shoal_run::server_location::ServerLocation;
 use shoal_run::status;
 
 use super::training::OutputMode;
@@ -45,6 +46,8 @@ pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
             bail!("{here} has finished {episodes_ended} of {episodes} episodes already: give it more with --episodes");
         }
     }
+    // Found now, and not by roles that fail one after the other.
+    ServerLocation::of_run(&run).with_context(|| format!("cannot resume {here}"))?;
     if (steps, episodes) != (config.run.steps, config.run.episodes) {
         (config.run.steps, config.run.episodes) = (steps, episodes);
         config.check()?;

@@ -14,7 +14,7 @@ use shoal_learner::algorithms::registry;
 use shoal_learner::networks::digest;
 use shoal_learner::process::checkpoint::Checkpoints;
 use shoal_report::plots;
-use shoal_run::evaluation::{EvaluationSummary, WhichPolicy, evaluate};
+use shoal_run::evaluation::{EvaluationSummary, WhichPolicy, evaluate_run};
 use shoal_run::numbers::thousands;
 use shoal_run::outcome::{RunOutcome, RunState};
 use shoal_run::signals::exit_code;
@@ -95,7 +95,13 @@ fn final_evaluation(config: &Config, run: &RunDir) -> anyhow::Result<Vec<(&'stat
             let parameters = which.read(run, config)?.parameters;
             evaluated.push((
                 name,
-                evaluate(config, &parameters, config.evaluation.final_episodes, config.run.seed)?,
+                evaluate_run(
+                    run,
+                    config,
+                    &parameters,
+                    config.evaluation.final_episodes,
+                    config.run.seed,
+                )?,
             ));
         }
     }

@@ -45,6 +45,8 @@ fn main() -> ExitCode {
         test!(a_server_with_any_answers_is_survived_or_named_in_one_line, PYTHON),
         test!(a_module_sees_no_arguments_and_no_input_and_prints_to_the_log, PYTHON),
         test!(a_slow_environment_is_not_replaced, PYTHON),
+        test!(a_run_remembers_where_its_server_is_started_and_with_what, PYTHON),
+        test!(a_run_with_another_program_may_lie_at_any_path, PYTHON),
     ])
 }
 
@@ -464,4 +466,90 @@ fn a_module_sees_no_arguments_and_no_input_and_prints_to_the_log() {
     assert_eq!(running.wait().0, Some(0), "{}", place.stderr());
     let log = std::fs::read_to_string(log).unwrap();
     assert!(log.contains("arguments 1 input ''"), "{log}");
+}
+
+fn a_run_remembers_where_its_server_is_started_and_with_what() {
+    let place = place();
+    let python = std::env::split_paths(&std::env::var_os("PATH").unwrap())
+        .map(|directory| directory.join("python3"))
+        .find(|python| python.is_file())
+        .unwrap();
+    // A virtual environment is found by the link's own place, so there must be one.
+    let venv = python.parent().and_then(Path::parent).unwrap();
+    std::os::unix::fs::symlink(venv, place.path().join("vënv")).unwrap();
+    let name = format!("{OURS}Tells-v0");
+    let arguments = [
+        &[
+            "train",
+            &name,
+            "--run",
+            "run",
+            "--lockstep",
+            "--seed",
+            "4294967303",
+            "--steps",
+            "300",
+        ],
+        &SHORT[..],
+        &["--set", r#"environment.server=["./vënv/bin/python3","-m","shoal_gym"]"#],
+        &[
+            "--set",
+            "environment.parameters.name=x",
+            "--set",
+            "environment.day=1979-05-27",
+        ],
+        &[
+            "--set",
+            "environment.limit=inf",
+            "--set",
+            "evaluation.envs=1",
+            "--quiet",
+        ],
+    ]
+    .concat();
+    let output = place.output(&arguments);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let elsewhere = |arguments: &[&str]| {
+        let mut command = place.shoal(arguments);
+        command.current_dir("/").env_remove("PATH");
+        support::output_of(&mut command)
+    };
+    let run = place.path().join("run").display().to_string();
+    for arguments in [
+        vec!["eval", &run, "--episodes", "2", "--json"],
+        vec!["resume", &run, "--steps", "400", "--quiet"],
+    ] {
+        let output = elsewhere(&arguments);
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    }
+    let told = std::fs::read_to_string(place.path().join("told")).unwrap();
+    let expected = "7 [('day', '1979-05-27'), ('limit', inf), ('name', 'x')]";
+    assert!(
+        told.lines().count() > 6 && told.lines().all(|line| line == expected),
+        "{told}"
+    );
+
+    std::fs::remove_file(place.path().join("vënv")).unwrap();
+    let log = std::fs::read_to_string(place.path().join("run/shoal.log")).unwrap();
+    for arguments in [vec!["eval", &run], vec!["resume", &run, "--steps", "500"]] {
+        let said = error_line(&elsewhere(&arguments));
+        assert!(
+            said.contains("vënv/bin/python3") && said.contains("server.json"),
+            "{said}"
+        );
+    }
+    let after = std::fs::read_to_string(place.path().join("run/shoal.log")).unwrap();
+    assert_eq!(after, log, "nothing was started");
+}
+
+fn a_run_with_another_program_may_lie_at_any_path() {
+    let place = place();
+    let long = format!("{}/{}", "a long name ".repeat(20), "实验 ü|?*".repeat(10));
+    let arguments = [&SHORT[..], &["--steps", "300"]].concat();
+    let running = place.start_in(&long, "gym:Pendulum-v1", &arguments);
+    let (code, _, leftovers) = running.wait();
+    assert_eq!(code, Some(0), "{}", place.stderr());
+    assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
+    let output = place.output(&["eval", &long, "--episodes", "2", "--json"]);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
 }

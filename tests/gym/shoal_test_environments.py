@@ -57,6 +57,15 @@ class Parent(Ends):
         self.child = subprocess.Popen(["sleep", "54321"], start_new_session=alone)
 
 
+class Tells(Ends):
+    """Tells in a file where and how it was started."""
+
+    def __init__(self, **arguments):
+        super().__init__(after=0)
+        with open("told", "a") as told:
+            told.write(f"{os.environ.get('PYTHONHASHSEED')} {sorted(arguments.items())}\n")
+
+
 class Talks(Ends):
     """Writes endlessly to standard error, or writes terminal control sequences."""
 
@@ -159,6 +168,7 @@ gym.register("Ends-v0", entry_point=Ends, max_episode_steps=5)
 gym.register("Endless-v0", entry_point=Ends)
 gym.register("Fails-v0", entry_point=Fails, max_episode_steps=5)
 gym.register("Parent-v0", entry_point=Parent, max_episode_steps=5)
+gym.register("Tells-v0", entry_point=Tells, max_episode_steps=5)
 gym.register("Talks-v0", entry_point=Talks, max_episode_steps=5)
 gym.register("Sleeps-v0", entry_point=Sleeps, max_episode_steps=5)
 gym.register("Odd-v0", entry_point=Odd, max_episode_steps=5)

@@ -127,7 +127,16 @@ impl Domain {
     /// # Errors
     /// When the user's directory cannot be used.
     pub fn directory(&self) -> Result<PathBuf, DomainError> {
-        Ok(user_root()?.join(&self.run_id))
+        Self::directory_of(&self.run_id)
+    }
+
+    /// The same of the run `run_id`, for who has not joined it. Its path is short plain text, wherever the run's own
+    /// directory is: iceoryx2 refuses to read a file whose path is longer than 255 bytes or has other than plain characters.
+    ///
+    /// # Errors
+    /// When the user's directory cannot be used.
+    pub fn directory_of(run_id: &str) -> Result<PathBuf, DomainError> {
+        Ok(user_root()?.join(run_id))
     }
 
     /// Records that this run may take this many bytes of shared memory, so that

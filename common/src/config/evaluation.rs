@@ -11,6 +11,8 @@ section! {
         every: u64 = 2_000, bounds: from(1, u64::MAX), unit: "environment steps", source: "ours";
         /// Episodes of an evaluation. Their start states are always the same.
         episodes: u32 = 10, bounds: from(1, 10_000), unit: "episodes", source: "ours";
+        /// Environments that the evaluator steps at once, and no more than an evaluation has episodes.
+        envs: u32 = 64, bounds: from(1, 64), unit: "environments", source: "ours";
         /// Episodes of the last evaluation. Their mean return is the run's result.
         final_episodes: u32 = 100, bounds: from(1, 100_000), unit: "episodes", source: "ours";
         /// Whether every evaluated policy is kept, not only the best.

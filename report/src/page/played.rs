@@ -76,7 +76,7 @@ impl Played {
             picture,
             ..
         } = Description::of(config)?;
-        let mut rollout = Rollout::new(config, &policy.parameters)?;
+        let mut rollout = Rollout::of_run(run, config, &policy.parameters)?;
         let limit = config.spec.time_limit.max(1) as usize;
         let mut played = Vec::new();
         for number in 0..episodes.min(STEPS / limit).max(1) {
