@@ -216,8 +216,8 @@ fn remark(optimal: f64) -> String {
     format!(
         "\
 The run is in lockstep with one actor, and a chunk has one transition: after each environment step there is one update,
-then the next action. That is exactly Algorithm 2. For `{SARSA}` it is Algorithm 1, where a' is chosen before the
-update.
+then the next action. That is exactly Algorithm 2. For `{SARSA}` it is Algorithm 1, where a' is chosen before
+the update.
 
 - Of equal action-values the first is taken. With probability ε one of the four actions is taken at random, which may be
   the greedy one.

@@ -89,7 +89,7 @@ pub struct Heartbeat {
     /// Its index among the processes of that role.
     pub index: u32,
     activity: u32,
-    /// Of an actor or the evaluator: invalid answers of its environment server, since it started.
+    /// For an actor or the evaluator: invalid answers of its environment server since it started.
     pub faults: u32,
     /// Its incarnation.
     pub incarnation: u64,

@@ -17,7 +17,7 @@ pub enum Space {
     Discrete {
         /// Number of indices.
         n: u32,
-        /// What the environment itself calls index 0. Nothing but an exported policy counts from there.
+        /// The environment's own number for index 0. Only exported policies use it.
         #[serde(default, skip_serializing_if = "is_zero")]
         start: i32,
     },
@@ -37,7 +37,7 @@ impl Space {
         Self::Discrete { n, start: 0 }
     }
 
-    /// What the environment calls index 0; 0 in a box.
+    /// The environment's own number for index 0; 0 for a box.
     pub fn start(&self) -> i32 {
         match self {
             Self::Box { .. } => 0,
@@ -45,7 +45,8 @@ impl Space {
         }
     }
 
-    /// Whether this is `configured`. Configurations of earlier versions do not have where a space starts.
+    /// Whether this space is the `configured` one. Configurations of earlier versions have no `start`, so 0 matches
+    /// any.
     fn is(&self, configured: &Self) -> bool {
         match (self, configured) {
             (Self::Discrete { n, .. }, Self::Discrete { n: expected, start: 0 }) => n == expected,
@@ -84,13 +85,13 @@ pub struct EnvironmentSpec {
     pub state_width: usize,
 }
 
-#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde asks so")]
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde requires this signature")]
 fn is_zero(number: &i32) -> bool {
     *number == 0
 }
 
 impl EnvironmentSpec {
-    /// Whether an environment with this description is the one that was `configured`.
+    /// Whether this description of an environment matches the `configured` one.
     pub fn is(&self, configured: &Self) -> bool {
         self.observation.is(&configured.observation)
             && self.action.is(&configured.action)

@@ -45,7 +45,7 @@ impl ChannelError {
         }
     }
 
-    /// What an environment returned that it may not, if that is why; it can go on with new episodes.
+    /// The invalid answer of an environment server, if that is the cause. The server can continue with new episodes.
     pub fn fault(&self) -> Option<&Fault> {
         match self.source.downcast_ref() {
             Some(PeerError::Invalid(fault)) => Some(fault),
@@ -122,7 +122,7 @@ pub enum PeerError {
         /// Words in a snapshot of the environments.
         expected: usize,
     },
-    /// An environment returned what it may not.
+    /// An environment returned something invalid.
     #[error(transparent)]
     Invalid(Fault),
     /// The environment server refused a request.

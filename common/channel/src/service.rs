@@ -186,7 +186,8 @@ mod tests {
         assert_eq!(missing.kind, ChannelErrorKind::Missing);
         assert_eq!(
             missing.to_string(),
-            "channel test: cannot open: it does not exist; has the launcher ended? (PublishSubscribeOpenError::DoesNotExist)"
+            "channel test: cannot open: it does not exist; has the launcher ended? \
+             (PublishSubscribeOpenError::DoesNotExist)"
         );
         let held = service::<u64>(&domain, Entry::Create).unwrap();
         let incompatible = claimed(&|| service::<u8>(&domain, Entry::Open).map(drop));

@@ -21,13 +21,13 @@ pub struct EnvironmentConfig {
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[schemars(extend("unit" = "–", "source" = "ours"))]
     pub server: Vec<String>,
-    /// Invalid answers, as a reward that is not finite, after which the run ends. Each ends the episodes of its server,
-    /// which begin anew.
-    #[serde(default = "faults", skip_serializing_if = "is_usual")]
+    /// Invalid answers, such as an infinite reward, after which the run ends. Each one ends the episodes of its server,
+    /// and new ones begin.
+    #[serde(default = "default_faults", skip_serializing_if = "is_default_faults")]
     #[schemars(extend("unit" = "answers", "source" = "ours"))]
     pub faults: u32,
-    /// How long that program may take to start. From 10 s on the terminal names whom the run waits for.
-    #[serde(default = "start_seconds", skip_serializing_if = "is_usual_start")]
+    /// How long the server may take to start. After 10 s the terminal shows which server the run waits for.
+    #[serde(default = "default_start_seconds", skip_serializing_if = "is_default_start_seconds")]
     #[schemars(extend("unit" = "s", "source" = "ours"))]
     pub start_seconds: u32,
     /// The environment's own parameters.
@@ -36,48 +36,47 @@ pub struct EnvironmentConfig {
     pub parameters: toml::Table,
 }
 
-/// Where the configuration does not say: few enough to be seen while somebody looks, and more than a simulator's rare
-/// hiccup makes in an hour.
-fn faults() -> u32 {
+/// More than a simulator's rare faults in an hour, and few enough that a broken environment is noticed soon.
+fn default_faults() -> u32 {
     100
 }
 
-#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde asks so")]
-fn is_usual(number: &u32) -> bool {
-    *number == faults()
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde requires this signature")]
+fn is_default_faults(number: &u32) -> bool {
+    *number == default_faults()
 }
 
-/// A simulator's libraries have to be loaded.
-fn start_seconds() -> u32 {
+/// Long enough to load the libraries of a simulator.
+fn default_start_seconds() -> u32 {
     120
 }
 
-#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde asks so")]
-fn is_usual_start(number: &u32) -> bool {
-    *number == start_seconds()
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde requires this signature")]
+fn is_default_start_seconds(number: &u32) -> bool {
+    *number == default_start_seconds()
 }
 
 impl EnvironmentConfig {
-    /// An environment with the usual limits.
+    /// An environment with the default limits.
     pub fn new(name: String, server: Vec<String>, parameters: toml::Table) -> Self {
         Self {
             name,
             server,
-            faults: faults(),
-            start_seconds: start_seconds(),
+            faults: default_faults(),
+            start_seconds: default_start_seconds(),
             parameters,
         }
     }
 
-    /// How long its program may take to start.
+    /// How long its server may take to start.
     pub fn start_limit(&self) -> Duration {
         Duration::from_secs(self.start_seconds.into())
     }
 
-    /// Whether the limits make sense.
+    /// Checks the limits.
     ///
     /// # Errors
-    /// For the first one that does not.
+    /// For the first invalid limit.
     pub(super) fn check(&self) -> Result<(), OutOfRange> {
         from(1, u32::MAX).check("environment.faults", &self.faults)?;
         from(1, 86_400).check("environment.start_seconds", &self.start_seconds)

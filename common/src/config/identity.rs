@@ -22,7 +22,7 @@ use super::identity_format::IdentityFormat;
 use super::run::Mode;
 
 impl Config {
-    /// The text that the meaning of the replay's rows and a checkpoint's weights depends on.
+    /// The identity: everything that the meaning of the replay's rows and a checkpoint's weights depends on.
     pub fn identity(&self) -> String {
         match self.run.identity_format {
             // Newer algorithms and networks have no unnumbered text.

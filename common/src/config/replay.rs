@@ -17,7 +17,8 @@ section! {
         warmup: u64 = 1_000, bounds: from(0, MAX_ROWS), unit: "transitions", source: "ours";
         /// Updates for each environment step beyond the warm-up: gradient steps, or rows for methods that use each row
         /// once. The thesis has 1.
-        updates_per_step: f64 = 1.0, bounds: from(0.0, 1_000.0), unit: "updates per environment step", source: "Algorithm 4";
+        updates_per_step: f64 = 1.0, bounds: from(0.0, 1_000.0),
+            unit: "updates per environment step", source: "Algorithm 4";
         /// Environment steps that the actors may be ahead of that ratio before the learner stops taking transitions.
         tolerance: u64 = 512, bounds: from(1, MAX_ROWS), unit: "environment steps", source: "ours";
     }

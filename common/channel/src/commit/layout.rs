@@ -86,7 +86,7 @@ pub enum IdentityFault {
     #[error("its header is damaged (checksum)")]
     Checksum,
     /// The identity is undamaged, but its numbers are impossible.
-    #[error("its header asks for an impossible size")]
+    #[error("its header has an impossible size")]
     Size,
 }
 

@@ -74,7 +74,7 @@ impl CommitReader {
         let layout = ReplayLayout::read(&identity).map_err(|fault| refused(fault.to_string()))?;
         let places = layout
             .places()
-            .ok_or_else(|| refused("its header asks for an impossible size".into()))?;
+            .ok_or_else(|| refused("its header has an impossible size".into()))?;
         if length != places.end as u64 {
             return Err(refused(format!(
                 "the file has {length} bytes, its header requires {}",

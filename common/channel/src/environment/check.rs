@@ -1,39 +1,39 @@
-//! What an environment may return. Whatever program serves it, its answers are checked where they come in, and nothing
-//! else that follows need expect a number that is none.
+//! Checks of what an environment returns. The client checks every answer, whatever program serves the environment, so
+//! that later code need not expect NaN, infinities or impossible indices.
 
 use shoal_base::space::{EnvironmentSpec, Space};
 
 use super::message::{Block, ResponseLayout};
 
-/// An answer that no environment may give. Its episodes are over.
+/// An invalid answer. It ends the server's episodes.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum Fault {
-    /// The server has found it, and has written to its standard error what it was.
+    /// The server itself has found invalid numbers, and has written them to its standard error.
     #[error("the environment server reports that an environment returned something invalid")]
     Reported,
-    /// The answer has not the numbers of its environments.
+    /// The answer has a wrong length.
     #[error("the environment server answered with {found} numbers instead of {expected}")]
     Length {
-        /// Numbers there are.
+        /// Numbers in the answer.
         found: usize,
-        /// Numbers that the environments have.
+        /// Numbers in a valid answer.
         expected: usize,
     },
-    /// A number that cannot be.
+    /// An invalid number.
     #[error("an environment returned {value} as {what} (environment {environment}); {expected}")]
     Number {
-        /// Which of the server's environments.
+        /// Index of the environment within the server.
         environment: usize,
-        /// What the number is.
+        /// What the number stands for.
         what: &'static str,
         /// The number.
         value: f32,
-        /// What would be right.
+        /// The valid numbers, in words.
         expected: String,
     },
 }
 
-/// Which parts of a response count.
+/// Which part of a response is used.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Part {
     /// All of it: the answer to a step.
@@ -42,7 +42,7 @@ pub(super) enum Part {
     Observations,
 }
 
-/// Finds the first number of a response that cannot be.
+/// Finds the first invalid number of a response.
 pub(super) fn find_fault(
     spec: &EnvironmentSpec,
     layout: &ResponseLayout,
@@ -84,7 +84,7 @@ pub(super) fn find_fault(
 }
 
 fn first(numbers: &[f32], right: impl Fn(f32) -> bool) -> Option<usize> {
-    // Without an early end for what is nearly always all right: this can be done in vectors.
+    // Nearly always all numbers are valid. Without an early exit the compiler can use vector instructions.
     if numbers.iter().fold(true, |all, number| all & right(*number)) {
         return None;
     }
@@ -114,7 +114,7 @@ mod tests {
         }
     }
 
-    /// Two environments' answer to a step, with one number changed.
+    /// Checks an answer of two environments to a step, with one number changed.
     fn fault_of(observation: Space, at: usize, value: f32, part: Part) -> Result<(), Fault> {
         let spec = spec(observation);
         let layout = ResponseLayout::new(2, spec.observation.width());
@@ -124,7 +124,7 @@ mod tests {
     }
 
     #[test]
-    fn a_number_that_cannot_be_is_found_and_named() {
+    fn an_invalid_number_is_found_and_named() {
         let boxed = || Space::boxed(&[(-1.0, 1.0); 3]);
         // Two times: observations 0 to 5, next observations 6 to 11, rewards 12 and 13, terminated 14, truncated 16.
         for (at, value, environment, what) in [
@@ -149,7 +149,7 @@ mod tests {
         assert_eq!(
             fault_of(boxed(), 0, 7.0, Part::Step),
             Ok(()),
-            "outside its bounds is no fault"
+            "a number outside its bounds is allowed"
         );
         assert_eq!(
             fault_of(boxed(), 12, f32::NAN, Part::Observations),
@@ -160,7 +160,7 @@ mod tests {
     }
 
     #[test]
-    fn an_index_is_within_its_space() {
+    fn an_index_must_be_within_its_space() {
         for (value, right) in [
             (0.0, true),
             (2.0, true),

@@ -31,9 +31,10 @@ pub enum Begin {
     Training(u64),
     /// Evaluation episodes: environment `e` begins with episode `first + e`.
     Evaluation {
-        /// The first one.
+        /// Number of the first episode.
         first: u64,
-        /// How many there are. An environment whose next episode is none of them is not reset at its end; 0: no limit.
+        /// Number of episodes; 0 means no limit. An environment whose next episode would be beyond them is not reset
+        /// again.
         episodes: u32,
     },
 }
@@ -216,8 +217,8 @@ impl EnvironmentClient {
     /// Every environment takes a step with its action.
     ///
     /// # Errors
-    /// When a stop is requested, the channel fails, the server refuses the actions, or it denies having begun the
-    /// episodes; and for an [invalid answer](ChannelError::fault), after which new episodes have to be begun.
+    /// When a stop is requested, the channel fails, the server refuses the actions, it denies having begun the
+    /// episodes, or its answer is [invalid](ChannelError::fault). After an invalid answer new episodes must be begun.
     pub fn step(
         &self,
         listener: &Listener,

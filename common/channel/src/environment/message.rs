@@ -4,7 +4,7 @@
 use iceoryx2::prelude::ZeroCopySend;
 use shoal_base::space::{EnvironmentSpec, Space};
 
-/// What a request asks for.
+/// The kinds of requests.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u32)]
 pub enum Ask {
@@ -43,8 +43,8 @@ impl Ask {
 #[repr(C)]
 pub struct RequestHeader {
     pub(super) ask: u32,
-    /// Evaluation episodes that [`Ask::ResetToEvaluation`] is for, from `episode` on: an environment whose next one is
-    /// none of them is not reset at its end. 0: no limit.
+    /// Number of evaluation episodes of [`Ask::ResetToEvaluation`], of which `episode` is the first; 0 means no limit.
+    /// An environment whose next episode would be beyond them is not reset again.
     pub episodes: u32,
     /// The episode of [`Ask::ResetToTraining`], or the first episode of [`Ask::ResetToEvaluation`].
     pub episode: u64,
@@ -69,7 +69,7 @@ pub(super) enum Verdict {
     NotStarted = 1,
     /// The request has the wrong length, invalid contents, or an unknown kind.
     Refused = 2,
-    /// An environment returned what it may not, and the server has logged what that was. Its episodes end.
+    /// An environment returned something invalid, which the server has logged. The server's episodes end.
     Invalid = 3,
 }
 
@@ -106,7 +106,7 @@ impl ResponseHeader {
         ];
         let length = |(discrete, width): (u32, u32)| if discrete > 0 { 0 } else { 2 * width as usize };
         let without_starts: usize = spaces.into_iter().map(length).sum();
-        // Servers of earlier versions do not state where a discrete space starts.
+        // Servers of earlier versions do not send the start of a discrete space.
         let with_starts = bounds.len() != without_starts;
         let mut rest = bounds;
         let mut space = |(discrete, width): (u32, u32)| {
