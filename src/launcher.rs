@@ -392,7 +392,7 @@ impl<'a> Launcher<'a> {
         for incident in self.supervisor.take_incidents() {
             self.recorder.incident(&incident, wall)?;
         }
-        self.supervisor.check_faults(self.config.environment.faults)?;
+        self.supervisor.check_faults()?;
         let fills = [
             each(&self.episode_reports, |report| {
                 Ok(self.recorder.episode(&report, wall)?)

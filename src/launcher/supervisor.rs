@@ -71,6 +71,7 @@ pub(super) struct Supervisor {
     started: u64,
     /// Invalid answers of environments since the launcher started, and the last one.
     faults: u32,
+    max_faults: u32,
     last_fault: String,
     all_ready: bool,
     cleaned: Instant,
@@ -116,6 +117,7 @@ impl Supervisor {
             counter,
             started,
             faults: 0,
+            max_faults: config.environment.faults,
             last_fault: String::new(),
             all_ready: false,
             cleaned: Instant::now(),
@@ -206,7 +208,8 @@ impl Supervisor {
                 .note(&name(child.identity), &format!("ready after {} ms", after.as_millis()));
         }
         if let Some(index) = server {
-            (0..faults).for_each(|_| self.note_fault(&client, index));
+            // No process can make the launcher list more than the run may have.
+            (0..faults.min(self.max_faults)).for_each(|_| self.note_fault(&client, index));
         }
         if !self.all_ready && self.children.iter().all(Child::is_ready) {
             self.all_ready = true;
@@ -231,17 +234,18 @@ impl Supervisor {
         }
     }
 
-    /// Whether environments may still return something invalid, or have done so too often.
+    /// Checks that environments have not returned something invalid too often.
     ///
     /// # Errors
-    /// When they have: with what the last one was.
-    pub(super) fn check_faults(&self, most: u32) -> anyhow::Result<()> {
-        if self.faults < most {
+    /// When they have, with the last invalid answer.
+    pub(super) fn check_faults(&self) -> anyhow::Result<()> {
+        if self.faults < self.max_faults {
             return Ok(());
         }
         bail!(
-            "the environments returned something invalid {} times, and environment.faults is {most}; the last time: {}",
+            "the environments returned something invalid {} times, and environment.faults is {}; the last time: {}",
             self.faults,
+            self.max_faults,
             self.last_fault
         );
     }
