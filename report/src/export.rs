@@ -16,6 +16,7 @@ use shoal_run::rollout::policy_layout;
 #[derive(Clone, Debug)]
 pub struct Portable {
     body: Body,
+    starts: Starts,
     /// What it is and where it comes from, by name; a list is written as JSON.
     about: BTreeMap<String, String>,
 }
@@ -33,6 +34,13 @@ enum Body {
         actions: usize,
         values: Vec<f32>,
     },
+}
+
+/// What the environment itself calls the first observation and the first action of a discrete space; 0 of a box.
+#[derive(Clone, Copy, Debug)]
+struct Starts {
+    observation: i32,
+    action: i32,
 }
 
 /// Layers one after the other, with the activation between them.
@@ -69,7 +77,11 @@ impl Portable {
             },
         };
         let about = about(config, file, which, &body)?;
-        Ok(Self { body, about })
+        let starts = Starts {
+            observation: config.spec.observation.start(),
+            action: config.spec.action.start(),
+        };
+        Ok(Self { body, starts, about })
     }
 
     /// The bytes of an ONNX model.
@@ -114,6 +126,14 @@ fn about(config: &Config, file: &PolicyFile, which: &str, body: &Body) -> anyhow
     };
     if file.episodes > 0 {
         tell("evaluation_return", file.return_mean.to_string());
+    }
+    for (name, space) in [
+        ("observation_start", &config.spec.observation),
+        ("action_start", &config.spec.action),
+    ] {
+        if let Space::Discrete { start, .. } = space {
+            tell(name, start.to_string());
+        }
     }
     if let Body::Actions { network, .. } | Body::Probabilities { network } = body {
         let activation = match network.activation {
@@ -201,6 +221,19 @@ mod tests_support {
             episodes: 10,
             parameters: numbers(layout.parameters(), 1),
         };
+        (config, policy)
+    }
+
+    /// A task whose environment counts its observations from 1 and its actions from 5, and a policy of it.
+    pub(super) fn with_starts() -> (Config, PolicyFile) {
+        let (mut config, policy) = with_policy(
+            "[run]\nid = \"1a\"\n[environment]\nname = \"frozen-lake\"\n[q-learning]\n[replay]\nwarmup = 0\n",
+        );
+        for (space, first) in [(&mut config.spec.observation, 1), (&mut config.spec.action, 5)] {
+            if let Space::Discrete { start, .. } = space {
+                *start = first;
+            }
+        }
         (config, policy)
     }
 

@@ -23,6 +23,8 @@ const BATCH: &str = "batch";
 /// - DDPG: `observation` (batch × n) to `action` (batch × m, in the environment's units).
 /// - REINFORCE: `observation` to `logits`, `probabilities` (batch × actions) and `action` (batch: the likeliest).
 /// - Tables: `state` (batch, 64-bit) to `action_values` (batch × actions) and `action` (batch: the best).
+///
+/// Discrete states and actions are counted as the environment counts them, from its spaces' starts on.
 pub(super) fn model(policy: &Portable) -> Vec<u8> {
     let mut graph = Graph {
         name: "policy".into(),
@@ -40,14 +42,19 @@ pub(super) fn model(policy: &Portable) -> Vec<u8> {
             graph.holds("action_half_width", &[outputs], &half);
             graph.does("Mul", &["tanh", "action_half_width"], "scaled", vec![]);
             graph.holds("action_centre", &[outputs], &centre);
-            graph.does("Add", &["scaled", "action_centre"], "action", vec![]);
+            graph.does("Add", &["scaled", "action_centre"], "unclipped", vec![]);
+            // Rounding may lead out of the bounds.
+            graph.holds("action_low", &[outputs], range.low());
+            graph.does("Max", &["unclipped", "action_low"], "bounded_below", vec![]);
+            graph.holds("action_high", &[outputs], range.high());
+            graph.does("Min", &["bounded_below", "action_high"], "action", vec![]);
             graph.gives("action", FLOAT, &[outputs]);
         }
         Body::Probabilities { network } => {
             graph.takes("observation", FLOAT, &[network.layers[0].inputs]);
             graph.network(network, "logits");
             graph.does("Softmax", &["logits"], "probabilities", vec![integer("axis", 1)]);
-            graph.first_of_the_highest("logits");
+            graph.first_of_the_highest("logits", policy.starts.action);
             let actions = network.layers.last().map_or(0, |last| last.biases.len());
             graph.gives("logits", FLOAT, &[actions]);
             graph.gives("probabilities", FLOAT, &[actions]);
@@ -60,8 +67,14 @@ pub(super) fn model(policy: &Portable) -> Vec<u8> {
         } => {
             graph.takes("state", INT64, &[]);
             graph.holds("table", &[*states, *actions], values);
-            graph.does("Gather", &["table", "state"], "action_values", vec![integer("axis", 0)]);
-            graph.first_of_the_highest("action_values");
+            let mut row = "state";
+            if policy.starts.observation != 0 {
+                graph.holds_integer("observation_start", policy.starts.observation);
+                graph.does("Sub", &["state", "observation_start"], "row", vec![]);
+                row = "row";
+            }
+            graph.does("Gather", &["table", row], "action_values", vec![integer("axis", 0)]);
+            graph.first_of_the_highest("action_values", policy.starts.action);
             graph.gives("action_values", FLOAT, &[*actions]);
             graph.gives("action", INT64, &[]);
         }
@@ -104,14 +117,19 @@ impl Graph {
         }
     }
 
-    /// The index of the highest, the first of equals, as `action`.
-    fn first_of_the_highest(&mut self, scores: &str) {
+    /// The index of the highest, the first of equals, as `action`, which the environment counts from `start`.
+    fn first_of_the_highest(&mut self, scores: &str, start: i32) {
         let attributes = vec![
             integer("axis", 1),
             integer("keepdims", 0),
             integer("select_last_index", 0),
         ];
-        self.does("ArgMax", &[scores], "action", attributes);
+        let index = if start == 0 { "action" } else { "action_index" };
+        self.does("ArgMax", &[scores], index, attributes);
+        if start != 0 {
+            self.holds_integer("action_start", start);
+            self.does("Add", &["action_index", "action_start"], "action", vec![]);
+        }
     }
 
     fn does(&mut self, operator: &str, inputs: &[&str], output: &str, attribute: Vec<Attribute>) {
@@ -130,6 +148,15 @@ impl Graph {
             data_type: FLOAT,
             name: name.into(),
             raw_data: numbers.iter().flat_map(|number| number.to_le_bytes()).collect(),
+        });
+    }
+
+    fn holds_integer(&mut self, name: &str, number: i32) {
+        self.initializer.push(Tensor {
+            dims: Vec::new(),
+            data_type: INT64,
+            name: name.into(),
+            raw_data: i64::from(number).to_le_bytes().into(),
         });
     }
 
