@@ -103,8 +103,18 @@ struct Evaluator<'a> {
     actions: Vec<f32>,
     /// The period of the policy evaluated last.
     evaluated_period: Option<u64>,
-    /// Mean return and version of the best policy.
-    best: Option<(f64, u64)>,
+    best: Option<Best>,
+}
+
+/// The best policy so far.
+struct Best {
+    /// Its version.
+    version: u64,
+    /// Mean return of its evaluation; finite.
+    mean: f64,
+    parameters: Vec<f32>,
+    /// Mean return of the episodes that a better policy is confirmed on, once they were run.
+    confirmed: Option<f64>,
 }
 
 impl<'a> Evaluator<'a> {
@@ -117,7 +127,13 @@ impl<'a> Evaluator<'a> {
         let reader = PolicyReader::open(domain, layout.fingerprint(), layout.parameters())?;
         let best = if settings.run.best_policy().exists() {
             let best = PolicyFile::read(&settings.run.best_policy(), &layout)?;
-            Some((best.return_mean, best.version))
+            // Earlier versions may have kept one that diverged.
+            best.return_mean.is_finite().then_some(Best {
+                version: best.version,
+                mean: best.return_mean,
+                parameters: best.parameters,
+                confirmed: None,
+            })
         } else {
             None
         };
@@ -151,27 +167,11 @@ impl<'a> Evaluator<'a> {
     fn evaluate_next(&mut self) -> Result<(), Exit<ActorError>> {
         let published = self.await_due_policy().map_err(Exit::widen)?;
         let header = published.header();
-        let mut returns = Vec::new();
-        while (returns.len() as u32) < self.settings.evaluation.episodes {
-            // A server that dies takes its episodes with it; they are run again.
-            match self.run_episodes(published.parameters(), returns.len() as u32) {
-                Ok(Some(some)) => returns.extend(some),
-                Ok(None) => {}
-                Err(Exit::Failed(ActorError::Channel(error))) if error.fault().is_some() => {
-                    after_fault(&error, &mut self.heartbeat, &self.listener, self.stop).map_err(Exit::widen)?;
-                }
-                Err(exit) => return Err(exit),
-            }
-        }
-        returns.truncate(self.settings.evaluation.episodes as usize);
+        let returns = self.returns(published.parameters(), 0, self.settings.evaluation.episodes)?;
         let (return_mean, return_std) = mean_and_std(&returns);
-        // An evaluator may have died when it had kept this policy and not said so.
-        let best = self
-            .best
-            .is_none_or(|(mean, version)| return_mean > mean || version == header.version);
+        let best = self.becomes_best(&published, return_mean)?;
         if best {
             self.keep(&published, return_mean, return_std, &self.settings.run.best_policy())?;
-            self.best = Some((return_mean, header.version));
         }
         if self.settings.evaluation.keep_policies {
             let path = self.settings.run.evaluated_policy(header.env_steps);
@@ -196,6 +196,65 @@ impl<'a> Evaluator<'a> {
         self.evaluated_reports.send(EvaluatedReport { period });
         self.learner.notify();
         Ok(())
+    }
+
+    /// Whether this policy is the best so far; it is remembered as such. Few episodes flatter some policy of many: one that seems
+    /// better than the best has to be better on other episodes too.
+    fn becomes_best(&mut self, published: &policy::Policy, return_mean: f64) -> Result<bool, Exit<ActorError>> {
+        if !return_mean.is_finite() {
+            return Ok(false);
+        }
+        let version = published.header().version;
+        let mut confirmed = None;
+        // An evaluator may have died when it had kept this policy and not said so.
+        if let Some(mut best) = self.best.take_if(|best| best.version != version) {
+            let evaluation = &self.settings.evaluation;
+            let (first, episodes) = (
+                evaluation.episodes,
+                evaluation.episodes.saturating_mul(evaluation.confirm),
+            );
+            let mut better = return_mean > best.mean;
+            if better && episodes > 0 {
+                let kept = match best.confirmed {
+                    Some(mean) => mean,
+                    None => mean_and_std(&self.returns(&best.parameters, first, episodes)?).0,
+                };
+                best.confirmed = Some(kept);
+                let candidate = mean_and_std(&self.returns(published.parameters(), first, episodes)?).0;
+                confirmed = Some(candidate);
+                better = candidate.is_finite() && (candidate > kept || !kept.is_finite());
+            }
+            if !better {
+                self.best = Some(best);
+                return Ok(false);
+            }
+        }
+        self.best = Some(Best {
+            version,
+            mean: return_mean,
+            parameters: published.parameters().to_vec(),
+            confirmed,
+        });
+        Ok(true)
+    }
+
+    /// Returns of so many evaluation episodes from number `first` on under these parameters.
+    fn returns(&mut self, parameters: &[f32], first: u32, episodes: u32) -> Result<Vec<f64>, Exit<ActorError>> {
+        let mut returns = Vec::new();
+        while (returns.len() as u32) < episodes {
+            let over = returns.len() as u32;
+            // A server that dies takes its episodes with it; they are run again.
+            match self.run_episodes(parameters, first.saturating_add(over), episodes - over) {
+                Ok(Some(some)) => returns.extend(some),
+                Ok(None) => {}
+                Err(Exit::Failed(ActorError::Channel(error))) if error.fault().is_some() => {
+                    after_fault(&error, &mut self.heartbeat, &self.listener, self.stop).map_err(Exit::widen)?;
+                }
+                Err(exit) => return Err(exit),
+            }
+        }
+        returns.truncate(episodes as usize);
+        Ok(returns)
     }
 
     /// Waits for a policy of a period that was not evaluated yet.
@@ -228,9 +287,14 @@ impl<'a> Evaluator<'a> {
         Ok(published)
     }
 
-    /// Returns of the episodes from `first` on under these parameters, one in each environment; `None` when the server was
-    /// lost over them.
-    fn run_episodes(&mut self, parameters: &[f32], first: u32) -> Result<Option<Vec<f64>>, Exit<ActorError>> {
+    /// Returns of the episodes from `first` on under these parameters, one in each environment as long as there are any of the
+    /// `left` ones; `None` when the server was lost over them.
+    fn run_episodes(
+        &mut self,
+        parameters: &[f32],
+        first: u32,
+        left: u32,
+    ) -> Result<Option<Vec<f64>>, Exit<ActorError>> {
         let Self {
             client,
             listener,
@@ -240,7 +304,7 @@ impl<'a> Evaluator<'a> {
             ..
         } = self;
         // No environment is reset more often than an episode is needed.
-        let episodes = (self.settings.evaluation.episodes - first).min(self.settings.envs as u32);
+        let episodes = left.min(self.settings.envs as u32);
         let begin = Begin::Evaluation {
             first: first.into(),
             episodes,

@@ -265,6 +265,11 @@ impl RunDir {
         self.path.join("outcome.json")
     }
 
+    /// `final-evaluation.json`: how its policies did at the end.
+    pub fn final_evaluation(&self) -> PathBuf {
+        self.path.join("final-evaluation.json")
+    }
+
     /// `shoal.log`: what every process had to say.
     pub fn log(&self) -> PathBuf {
         self.path.join("shoal.log")

@@ -10,6 +10,7 @@ use shoal_common::network::{ActionRange, Activation, NetworkLayout};
 use shoal_common::policy::PolicyLayout;
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::space::Space;
+use shoal_run::final_evaluation::FinallyEvaluated;
 use shoal_run::rollout::policy_layout;
 
 /// A policy without anything of ours that it would need to run.
@@ -82,6 +83,20 @@ impl Portable {
             action: config.spec.action.start(),
         };
         Ok(Self { body, starts, about })
+    }
+
+    /// Tells in the metadata how the policy did in its run's final evaluation.
+    pub fn evaluated(mut self, seed: u64, evaluated: &FinallyEvaluated) -> anyhow::Result<Self> {
+        let entries = [
+            ("return", serde_json::to_string(&evaluated.return_mean)?),
+            ("std", serde_json::to_string(&evaluated.return_std)?),
+            ("interval", serde_json::to_string(&evaluated.interval)?),
+            ("episodes", evaluated.episodes.to_string()),
+            ("seed", seed.to_string()),
+        ];
+        let entries = entries.map(|(name, value)| (format!("final_evaluation_{name}"), value));
+        self.about.extend(entries);
+        Ok(self)
     }
 
     /// The bytes of an ONNX model.

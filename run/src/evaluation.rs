@@ -9,6 +9,7 @@ use shoal_env_server::environment::Goal;
 
 use crate::description::Description;
 use crate::rollout::{Rollout, policy_layout};
+use crate::signals::Interrupt;
 
 /// One of a run's policies.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
@@ -50,12 +51,27 @@ pub struct EvaluationSummary {
 
 /// Runs the evaluation episodes 0 … `episodes` − 1 of `seed`, the same start states every time.
 pub fn evaluate(config: &Config, parameters: &[f32], episodes: u32, seed: u64) -> anyhow::Result<EvaluationSummary> {
-    let mut rollout = Rollout::new(config, parameters)?;
+    evaluate_until(config, parameters, (episodes, seed), &Interrupt::default(), |_| ())
+}
+
+/// As [`evaluate`], but a signal ends it with an error. `over` is told how many episodes are over.
+///
+/// # Errors
+/// When the environment fails, or a signal has come.
+pub fn evaluate_until(
+    config: &Config,
+    parameters: &[f32],
+    (episodes, seed): (u32, u64),
+    interrupt: &Interrupt,
+    mut over: impl FnMut(u32),
+) -> anyhow::Result<EvaluationSummary> {
+    let mut rollout = Rollout::new(config, parameters)?.until(interrupt.clone());
     let goal = Description::of(config)?.goal;
     let (mut returns, mut distances) = (Vec::new(), Vec::new());
     for number in 0..episodes {
         let trajectory = rollout.evaluation_episode(seed, number.into())?;
         returns.push(trajectory.episode_return());
+        over(number + 1);
         if let Some(goal) = &goal {
             distances.extend(trajectory.values(goal.distance.source).last().copied());
         }

@@ -1,6 +1,7 @@
 //! Environment servers that are other programs (`docs/PROTOCOL.md`): how one is started, and a conversation with one
 //! outside of any run, to learn what it serves or to try a policy in it.
 
+use std::cell::Cell;
 use std::ffi::OsString;
 use std::io::Write;
 use std::os::fd::AsFd;
@@ -25,6 +26,7 @@ use shoal_common::space::EnvironmentSpec;
 use shoal_common::stop::{GRACE, Stop};
 
 use crate::process::{Peer, wait_for_any};
+use crate::signals::Interrupt;
 
 /// Environments whose name begins with this are Gymnasium's.
 pub const GYMNASIUM: &str = "gym:";
@@ -191,6 +193,13 @@ pub struct ExternalEnvironment {
     listener: Listener,
     spec: EnvironmentSpec,
     program: Peer,
+    /// Ends every wait for an answer.
+    stop: Stop,
+    interrupt: Interrupt,
+    /// An answer was not waited for any longer.
+    silent: Cell<bool>,
+    /// How long an answer may take.
+    limit: Duration,
     // The last to go, in this order.
     _services: Services,
     _domain: TidyDomain,
@@ -213,6 +222,19 @@ impl ExternalEnvironment {
     /// # Errors
     /// When it cannot be started, ends, or does not answer; with what it said last.
     pub fn begin(environment: &EnvironmentConfig, environments: u32, seed: u64) -> anyhow::Result<Self> {
+        Self::begin_unless(environment, environments, seed, Interrupt::default())
+    }
+
+    /// As [`begin`](Self::begin); a signal ends this and every later wait for an answer.
+    ///
+    /// # Errors
+    /// As [`begin`](Self::begin), and when a signal has come.
+    pub fn begin_unless(
+        environment: &EnvironmentConfig,
+        environments: u32,
+        seed: u64,
+        interrupt: Interrupt,
+    ) -> anyhow::Result<Self> {
         Domain::remove_abandoned()?;
         let run_id = format!("{:08x}", rand::random::<u32>());
         let domain = Domain::join(&run_id, 1)?;
@@ -227,12 +249,16 @@ impl ExternalEnvironment {
             seed,
             stream: 0,
         };
-        match opened(&domain, &launch, environment) {
-            Ok((services, client, listener, spec, program)) => Ok(Self {
+        match opened(&domain, &launch, environment, &interrupt) {
+            Ok((services, client, listener, spec, program, stop)) => Ok(Self {
                 client,
                 listener,
                 spec,
                 program,
+                stop,
+                interrupt,
+                silent: Cell::new(false),
+                limit: environment.start_limit(),
                 _services: services,
                 _domain: TidyDomain(Some(domain)),
             }),
@@ -251,29 +277,58 @@ impl ExternalEnvironment {
     /// Begins evaluation episode `number`.
     ///
     /// # Errors
-    /// When the program has ended or refuses.
+    /// When the program has ended, refuses or does not answer, or a signal has come.
     pub fn begin_evaluation(&mut self, number: u64) -> anyhow::Result<Observed> {
+        let asked = Instant::now();
         let begun = self.client.reset(
             &self.listener,
             Begin::Evaluation {
                 first: number,
                 episodes: 1,
             },
-            || (),
+            || self.give_up(asked),
         );
-        answered(begun, &mut self.program)?.context("the environment server has ended")
+        answered(begun, &mut self.program)?.map_or_else(|| self.unanswered(asked), Ok)
     }
 
     /// Every environment takes a step with its action.
     ///
     /// # Errors
-    /// When the program has ended or refuses.
+    /// When the program has ended, refuses or does not answer, or a signal has come.
     pub fn step(&mut self, actions: &[f32]) -> anyhow::Result<Observed> {
-        let stepped = self.client.step(&self.listener, actions, || ());
-        match answered(stepped, &mut self.program)?.context("the environment server has ended")? {
+        let asked = Instant::now();
+        let stepped = self.client.step(&self.listener, actions, || self.give_up(asked));
+        match answered(stepped, &mut self.program)?.map_or_else(|| self.unanswered(asked), Ok)? {
             Stepped::Taken(observed) => Ok(observed),
             Stepped::Lost => bail!("the environment server gave up its episodes"),
         }
+    }
+
+    /// Whether it was asked something that it did not answer in time: asking another one would take as long.
+    pub fn is_silent(&self) -> bool {
+        self.silent.get()
+    }
+
+    /// Ends the wait for an answer that is not worth waiting for.
+    fn give_up(&self, asked: Instant) {
+        if self.interrupt.signal().is_some() || asked.elapsed() >= self.limit {
+            self.silent.set(true);
+            self.stop.request();
+        }
+    }
+
+    fn unanswered<T>(&self, asked: Instant) -> anyhow::Result<T> {
+        if let Some(signal) = self.interrupt.signal() {
+            bail!("ended by signal {signal}");
+        }
+        if asked.elapsed() >= self.limit {
+            bail!(
+                "the environment server did not answer within {} s; if it needs more: --set environment.start_seconds={}",
+                self.limit.as_secs(),
+                self.limit.as_secs().saturating_mul(5)
+            );
+        }
+        bail!("the environment server has ended")
     }
 }
 
@@ -283,9 +338,14 @@ impl Drop for ExternalEnvironment {
     }
 }
 
-type Opened = (Services, EnvironmentClient, Listener, EnvironmentSpec, Peer);
+type Opened = (Services, EnvironmentClient, Listener, EnvironmentSpec, Peer, Stop);
 
-fn opened(domain: &Domain, launch: &LaunchSpec<'_>, environment: &EnvironmentConfig) -> anyhow::Result<Opened> {
+fn opened(
+    domain: &Domain,
+    launch: &LaunchSpec<'_>,
+    environment: &EnvironmentConfig,
+    interrupt: &Interrupt,
+) -> anyhow::Result<Opened> {
     let Some(command) = launch.command(environment)? else {
         bail!("environment {} is not served by another program", environment.name);
     };
@@ -298,10 +358,15 @@ fn opened(domain: &Domain, launch: &LaunchSpec<'_>, environment: &EnvironmentCon
         Peer::start(&mut tied(&command)?, "environment server".into()).with_context(|| cannot_start(&command))?;
     let heard = Stop::default();
     let stop = stopped_when_it_ends(&program, heard.clone(), environment)?;
-    let described = describe(domain, launch.index, &listener, stop.clone());
+    let described = describe(domain, launch.index, &listener, stop.clone(), || {
+        if interrupt.signal().is_some() {
+            stop.request();
+        }
+    });
     heard.request();
     let (spec, environments) = match answered(described, &mut program).map_err(with_advice)? {
         Some(described) => described,
+        None if interrupt.signal().is_some() => bail!("ended by a signal"),
         None => bail!(
             "{} did not say within {} s what it serves; if it takes longer to start: --set environment.start_seconds={}",
             environment.name,
@@ -309,9 +374,9 @@ fn opened(domain: &Domain, launch: &LaunchSpec<'_>, environment: &EnvironmentCon
             environment.start_seconds.saturating_mul(5)
         ),
     };
-    let opened = EnvironmentClient::open(domain, launch.index, &spec, environments, stop);
+    let opened = EnvironmentClient::open(domain, launch.index, &spec, environments, stop.clone());
     let client = answered(opened.map_err(Exit::from), &mut program)?.context("the environment server has ended")?;
-    Ok((services, client, listener, spec, program))
+    Ok((services, client, listener, spec, program, stop))
 }
 
 /// Says what to do where Gymnasium's server is not installed.

@@ -11,6 +11,10 @@ use shoal_env_server::environment::angle::followed;
 use shoal_env_server::vector::{Start, VectorEnvironment};
 
 use crate::external_environment::ExternalEnvironment;
+use crate::signals::Interrupt;
+
+/// How often an episode is run that another program's failure breaks, each time with a program started anew.
+const TRIES: u32 = 5;
 
 /// An episode of T steps.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -55,6 +59,7 @@ pub struct Rollout<'a> {
     stage: Stage,
     policy: Policy,
     parameters: &'a [f32],
+    interrupt: Interrupt,
 }
 
 /// Where one environment is stepped.
@@ -87,7 +92,13 @@ impl<'a> Rollout<'a> {
             stage: Stage::of(config)?,
             policy,
             parameters,
+            interrupt: Interrupt::default(),
         })
+    }
+
+    /// Ends an episode with an error once a signal has come.
+    pub fn until(self, interrupt: Interrupt) -> Self {
+        Self { interrupt, ..self }
     }
 
     /// Runs evaluation episode `number` of `seed`: it starts where every evaluation's episode of this number starts.
@@ -104,14 +115,31 @@ impl<'a> Rollout<'a> {
         self.episode(Start::States(state))
     }
 
+    /// An episode that the environment's program breaks is run again by a program that is started anew.
     fn episode(&mut self, start: Start<'_>) -> anyhow::Result<Trajectory> {
-        let mut observation = self.stage.begin(self.config, start)?;
+        let mut tries = 1;
+        loop {
+            match self.try_episode(start) {
+                Err(_) if tries < TRIES && self.interrupt.signal().is_none() && self.stage.may_be_started_anew() => {
+                    tries += 1;
+                }
+                Err(error) if tries > 1 => bail!("{error:#} (the episode was begun {tries} times)"),
+                result => return result,
+            }
+        }
+    }
+
+    fn try_episode(&mut self, start: Start<'_>) -> anyhow::Result<Trajectory> {
+        let mut observation = self.stage.begin(self.config, start, &self.interrupt)?;
         let mut action = vec![0.0; self.config.spec.action.width()];
         let mut trajectory = Trajectory {
             observations: vec![observation.clone()],
             ..Trajectory::default()
         };
         loop {
+            if let Some(signal) = self.interrupt.signal() {
+                bail!("ended by signal {signal}");
+            }
             self.policy.act(self.parameters, &observation, &mut action);
             let step = self.stage.step(&action)?;
             observation.clone_from(&step.s_next);
@@ -142,8 +170,18 @@ impl Stage {
         Ok(Self::Here(Box::new(environment)))
     }
 
+    /// Whether a program has run part of an episode and may do better when it is started anew; the old one is ended.
+    fn may_be_started_anew(&mut self) -> bool {
+        match self {
+            Self::Here(_) => false,
+            Self::Elsewhere(conversation) => conversation
+                .take()
+                .is_some_and(|(_, conversation)| !conversation.is_silent()),
+        }
+    }
+
     /// Begins an episode; its first observation.
-    fn begin(&mut self, config: &Config, start: Start<'_>) -> anyhow::Result<Vec<f32>> {
+    fn begin(&mut self, config: &Config, start: Start<'_>, interrupt: &Interrupt) -> anyhow::Result<Vec<f32>> {
         match (self, start) {
             (Self::Here(environment), start) => {
                 let mut observation = vec![0.0; config.spec.observation.width()];
@@ -156,16 +194,14 @@ impl Stage {
                     *conversation = None;
                 }
                 let begin = || {
-                    anyhow::Ok((
-                        seed,
-                        Box::new(ExternalEnvironment::begin(&config.environment, 1, seed)?),
-                    ))
+                    let begun = ExternalEnvironment::begin_unless(&config.environment, 1, seed, interrupt.clone())?;
+                    same_spec(config, begun.spec())?;
+                    anyhow::Ok((seed, Box::new(begun)))
                 };
                 let (_, conversation) = match conversation {
                     Some(begun) => begun,
                     None => conversation.insert(begin()?),
                 };
-                same_spec(config, conversation.spec())?;
                 Ok(conversation.begin_evaluation(first)?.observation(0).to_vec())
             }
             (Self::Elsewhere(_), _) => bail!(

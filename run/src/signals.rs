@@ -12,6 +12,20 @@ use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 use crate::process::wait_for_any;
 
+/// Whether a signal has come that ends this process in order. The default is that none ever comes.
+#[derive(Clone, Debug, Default)]
+pub struct Interrupt(Arc<AtomicUsize>);
+
+impl Interrupt {
+    /// The last signal that has come.
+    pub fn signal(&self) -> Option<i32> {
+        match self.0.load(Ordering::Relaxed) {
+            0 => None,
+            signal => Some(signal as i32),
+        }
+    }
+}
+
 /// SIGINT, SIGTERM and SIGHUP are received from now on. Once this is dropped they end the process again, as they do everywhere
 /// else.
 #[derive(Debug)]
@@ -47,10 +61,12 @@ impl Signals {
     pub fn received(&self) -> Option<i32> {
         // It wakes once for each signal. Nothing is read where none has come.
         let _ = (&self.wake).read(&mut [0; 64]);
-        match self.last.load(Ordering::Relaxed) {
-            0 => None,
-            signal => Some(signal as i32),
-        }
+        self.interrupt().signal()
+    }
+
+    /// What tells of the signals to code that does not wait for them.
+    pub fn interrupt(&self) -> Interrupt {
+        Interrupt(Arc::clone(&self.last))
     }
 
     /// Waits for a signal; the one that has come, if one has.

@@ -11,6 +11,9 @@ section! {
         every: u64 = 2_000, bounds: from(1, u64::MAX), unit: "environment steps", source: "ours";
         /// Episodes of an evaluation, always from the same start states.
         episodes: u32 = 10, bounds: from(1, 10_000), unit: "episodes", source: "ours";
+        /// A policy that seems better than the best one has to be better on so many times the episodes, other ones, as well. 0:
+        /// the first comparison decides.
+        confirm: u32 = 2, bounds: from(0, 100), unit: "–", source: "ours";
         /// Episodes of the last evaluation, whose mean is the run's result.
         final_episodes: u32 = 100, bounds: from(1, 100_000), unit: "episodes", source: "ours";
         /// Whether every policy that was evaluated is kept, not only the best.

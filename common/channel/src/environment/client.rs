@@ -121,7 +121,8 @@ impl Observed {
     }
 }
 
-/// Asks environment server `index`, of which nothing is known, for its spaces and the number of its environments.
+/// Asks environment server `index`, of which nothing is known, for its spaces and the number of its environments. While it
+/// waits for the answer it calls `idle`, some twenty times a second.
 ///
 /// # Errors
 /// When interrupted.
@@ -130,6 +131,7 @@ pub fn describe(
     index: u32,
     listener: &Listener,
     stop: Stop,
+    idle: impl FnMut(),
 ) -> Result<(EnvironmentSpec, usize), Exit<ChannelError>> {
     let unknown = Space::boxed(&[]);
     let spec = EnvironmentSpec {
@@ -138,7 +140,7 @@ pub fn describe(
         time_limit: 0,
         state_width: 0,
     };
-    EnvironmentClient::open(domain, index, &spec, 0, stop)?.describe(listener, || ())
+    EnvironmentClient::open(domain, index, &spec, 0, stop)?.describe(listener, idle)
 }
 
 impl EnvironmentClient {
