@@ -57,6 +57,36 @@ impl EvaluatorSettings {
     }
 }
 
+/// The better one of the best policy and a candidate, and whether it is the candidate. Few episodes flatter some policy of many:
+/// one that seems better than the best has to be better on other episodes too, whose mean return `confirm` gives; `None` where
+/// nothing is to be confirmed.
+fn challenge<E>(
+    best: Option<Best>,
+    mut candidate: Best,
+    mut confirm: impl FnMut(&[f32]) -> Result<Option<f64>, E>,
+) -> Result<(Option<Best>, bool), E> {
+    if !candidate.mean.is_finite() {
+        return Ok((best, false));
+    }
+    // An evaluator may have died when it had kept this policy and not said so.
+    let Some(mut best) = best.filter(|best| best.version != candidate.version) else {
+        return Ok((Some(candidate), true));
+    };
+    let mut better = candidate.mean > best.mean;
+    if better {
+        if best.confirmed.is_none() {
+            best.confirmed = confirm(&best.parameters)?;
+        }
+        if let Some(confirmed) = best.confirmed {
+            candidate.confirmed = confirm(&candidate.parameters)?;
+            better = candidate
+                .confirmed
+                .is_some_and(|mean| mean.is_finite() && (mean > confirmed || !confirmed.is_finite()));
+        }
+    }
+    Ok((Some(if better { candidate } else { best }), better))
+}
+
 /// Mean and standard deviation (of the sample; 0 for fewer than two) of returns.
 pub fn mean_and_std(returns: &[f64]) -> (f64, f64) {
     let n = returns.len() as f64;
@@ -198,44 +228,26 @@ impl<'a> Evaluator<'a> {
         Ok(())
     }
 
-    /// Whether this policy is the best so far; it is remembered as such. Few episodes flatter some policy of many: one that seems
-    /// better than the best has to be better on other episodes too.
-    fn becomes_best(&mut self, published: &policy::Policy, return_mean: f64) -> Result<bool, Exit<ActorError>> {
-        if !return_mean.is_finite() {
-            return Ok(false);
-        }
-        let version = published.header().version;
-        let mut confirmed = None;
-        // An evaluator may have died when it had kept this policy and not said so.
-        if let Some(mut best) = self.best.take_if(|best| best.version != version) {
-            let evaluation = &self.settings.evaluation;
-            let (first, episodes) = (
-                evaluation.episodes,
-                evaluation.episodes.saturating_mul(evaluation.confirm),
-            );
-            let mut better = return_mean > best.mean;
-            if better && episodes > 0 {
-                let kept = match best.confirmed {
-                    Some(mean) => mean,
-                    None => mean_and_std(&self.returns(&best.parameters, first, episodes)?).0,
-                };
-                best.confirmed = Some(kept);
-                let candidate = mean_and_std(&self.returns(published.parameters(), first, episodes)?).0;
-                confirmed = Some(candidate);
-                better = candidate.is_finite() && (candidate > kept || !kept.is_finite());
-            }
-            if !better {
-                self.best = Some(best);
-                return Ok(false);
-            }
-        }
-        self.best = Some(Best {
-            version,
-            mean: return_mean,
+    /// Whether this policy is the best so far; it is remembered as such.
+    fn becomes_best(&mut self, published: &policy::Policy, mean: f64) -> Result<bool, Exit<ActorError>> {
+        let candidate = Best {
+            version: published.header().version,
+            mean,
             parameters: published.parameters().to_vec(),
-            confirmed,
-        });
-        Ok(true)
+            confirmed: None,
+        };
+        let evaluation = &self.settings.evaluation;
+        let first = evaluation.episodes;
+        let episodes = first.saturating_mul(evaluation.confirm);
+        let best = self.best.take();
+        let (best, replaced) = challenge(best, candidate, |parameters| -> Result<_, Exit<ActorError>> {
+            if episodes == 0 {
+                return Ok(None);
+            }
+            Ok(Some(mean_and_std(&self.returns(parameters, first, episodes)?).0))
+        })?;
+        self.best = best;
+        Ok(replaced)
     }
 
     /// Returns of so many evaluation episodes from number `first` on under these parameters.
@@ -355,5 +367,73 @@ impl<'a> Evaluator<'a> {
             parameters: published.parameters().to_vec(),
         };
         Ok(file.write(path)?)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::convert::Infallible;
+
+    use super::*;
+
+    /// A policy whose one parameter is its mean return on the episodes that confirm.
+    fn policy(version: u64, mean: f64, confirmed: f32) -> Best {
+        Best {
+            version,
+            mean,
+            parameters: vec![confirmed],
+            confirmed: None,
+        }
+    }
+
+    /// The version that is the best one, whether it is the candidate, and how often something was confirmed.
+    fn decided(best: Option<Best>, candidate: Best) -> (Option<u64>, bool, u32) {
+        let mut asked = 0;
+        let confirm = |parameters: &[f32]| {
+            asked += 1;
+            Ok::<_, Infallible>(Some(f64::from(parameters[0])))
+        };
+        let Ok((best, replaced)) = challenge(best, candidate, confirm);
+        (best.map(|best| best.version), replaced, asked)
+    }
+
+    #[test]
+    fn a_better_policy_is_confirmed_and_one_that_diverged_never_is_the_best() {
+        assert_eq!(decided(None, policy(1, 5.0, 5.0)), (Some(1), true, 0), "the first one");
+        for diverged in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
+            assert_eq!(decided(None, policy(1, diverged, 5.0)), (None, false, 0));
+            assert_eq!(
+                decided(Some(policy(1, 5.0, 5.0)), policy(2, diverged, 9.0)),
+                (Some(1), false, 0)
+            );
+        }
+        let best = || Some(policy(1, 5.0, 5.0));
+        assert_eq!(
+            decided(best(), policy(2, 6.0, 5.5)),
+            (Some(2), true, 2),
+            "better in both"
+        );
+        assert_eq!(decided(best(), policy(2, 6.0, 4.5)), (Some(1), false, 2), "lucky");
+        assert_eq!(decided(best(), policy(2, 6.0, f32::NAN)), (Some(1), false, 2));
+        assert_eq!(decided(best(), policy(2, 4.0, 9.0)), (Some(1), false, 0), "worse");
+        assert_eq!(
+            decided(best(), policy(1, 4.0, 4.0)),
+            (Some(1), true, 0),
+            "the same one again"
+        );
+        let known = Some(Best {
+            confirmed: Some(5.0),
+            ..policy(1, 5.0, 5.0)
+        });
+        assert_eq!(
+            decided(known, policy(2, 6.0, 5.5)),
+            (Some(2), true, 1),
+            "known from before"
+        );
+        let Ok((best, replaced)) = challenge(best(), policy(2, 6.0, 0.0), |_| Ok::<_, Infallible>(None));
+        assert!(
+            replaced && best.is_some_and(|best| best.version == 2),
+            "nothing is confirmed"
+        );
     }
 }

@@ -31,6 +31,9 @@ use crate::signals::Interrupt;
 /// Environments whose name begins with this are Gymnasium's.
 pub const GYMNASIUM: &str = "gym:";
 
+/// How long a program may take to end that has left shared memory.
+const LAST_WORDS: Duration = Duration::from_secs(2);
+
 /// A start that takes longer is reported to the user.
 const SLOW: Duration = Duration::from_secs(10);
 
@@ -300,7 +303,12 @@ impl ExternalEnvironment {
         let stepped = self.client.step(&self.listener, actions, || self.give_up(asked));
         match answered(stepped, &mut self.program)?.map_or_else(|| self.unanswered(asked), Ok)? {
             Stepped::Taken(observed) => Ok(observed),
-            Stepped::Lost => bail!("the environment server gave up its episodes"),
+            Stepped::Lost => {
+                // It has left shared memory and is about to end; its last words say why.
+                self.program.wait(LAST_WORDS);
+                self.program.check()?;
+                bail!("the environment server gave up its episodes")
+            }
         }
     }
 
