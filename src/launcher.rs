@@ -84,11 +84,10 @@ pub(crate) struct TrainingOutcome {
 }
 
 /// Runs all roles until the learner is done, a signal arrives, or `shoal stop` asks for the end.
-pub(crate) fn run(mut config: Config, run: &RunDir, quiet: bool) -> anyhow::Result<TrainingOutcome> {
-    let signals = Signals::register()?;
+pub(crate) fn run(mut config: Config, run: &RunDir, signals: &Signals, quiet: bool) -> anyhow::Result<TrainingOutcome> {
     let (mut renewals, mut before, mut wall) = (Vec::new(), None, Duration::ZERO);
     loop {
-        let outcome = run_once(config, run, &signals, quiet)?;
+        let outcome = run_once(config, run, signals, quiet)?;
         wall += outcome.wall;
         let before = before.get_or_insert(outcome.before.clone());
         if outcome.ending != Ending::Renewed {

@@ -8,6 +8,8 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 use shoal_common::channel::control::RunStatus;
 use shoal_common::run_dir::RunDir;
+use shoal_run::evaluation::WhichPolicy;
+use shoal_run::final_evaluation::FinalEvaluation;
 use shoal_run::outcome::{RunOutcome, RunState};
 use shoal_run::recorder::read_evaluations;
 use shoal_run::remote::Remote;
@@ -72,6 +74,8 @@ pub(crate) struct Listed {
     pub(crate) episodes_limit: Option<u64>,
     /// The highest mean return of its evaluations.
     pub(crate) best_return: Option<f64>,
+    /// The mean return of its best policy in the final evaluation.
+    pub(crate) final_return: Option<f64>,
 }
 
 impl Listed {
@@ -90,6 +94,7 @@ impl Listed {
             episodes: None,
             episodes_limit: None,
             best_return: None,
+            final_return: None,
         };
         if let Err(error) = listed.read() {
             listed.reason = Some(format!("{error:#}"));
@@ -119,6 +124,8 @@ impl Listed {
                 } else {
                     state_after_early_end(run)?
                 };
+                let evaluation = FinalEvaluation::read(run, status.env_steps)?;
+                self.final_return = evaluation.and_then(|it| it.of(WhichPolicy::Best)?.return_mean);
                 self.set_progress(&status);
             }
             Err(error) => {

@@ -58,6 +58,36 @@ impl EvaluatorSettings {
     }
 }
 
+/// The better one of the best policy and a candidate, and whether it is the candidate. On few episodes one of many policies
+/// looks better than it is. So a better candidate must also be better on other episodes. `confirm` runs these and returns
+/// their mean return, or `None` if nothing is to be confirmed.
+fn challenge<E>(
+    best: Option<Best>,
+    mut candidate: Best,
+    mut confirm: impl FnMut(&[f32]) -> Result<Option<f64>, E>,
+) -> Result<(Option<Best>, bool), E> {
+    if !candidate.mean.is_finite() {
+        return Ok((best, false));
+    }
+    // A previous evaluator may have died after it wrote this policy and before it reported that.
+    let Some(mut best) = best.filter(|best| best.version != candidate.version) else {
+        return Ok((Some(candidate), true));
+    };
+    let mut better = candidate.mean > best.mean;
+    if better {
+        if best.confirmed.is_none() {
+            best.confirmed = confirm(&best.parameters)?;
+        }
+        if let Some(confirmed) = best.confirmed {
+            candidate.confirmed = confirm(&candidate.parameters)?;
+            better = candidate
+                .confirmed
+                .is_some_and(|mean| mean.is_finite() && (mean > confirmed || !confirmed.is_finite()));
+        }
+    }
+    Ok((Some(if better { candidate } else { best }), better))
+}
+
 /// Mean and sample standard deviation of returns; the latter is 0 for fewer than two.
 pub fn mean_and_std(returns: &[f64]) -> (f64, f64) {
     let n = returns.len() as f64;
@@ -105,8 +135,18 @@ struct Evaluator<'a> {
     actions: Vec<f32>,
     /// The period of the policy evaluated last.
     evaluated_period: Option<u64>,
-    /// Mean return and version of the best policy.
-    best: Option<(f64, u64)>,
+    best: Option<Best>,
+}
+
+/// The best policy so far.
+struct Best {
+    /// Its version.
+    version: u64,
+    /// Mean return of its evaluation; finite.
+    mean: f64,
+    parameters: Vec<f32>,
+    /// Mean return of the episodes that a better policy is confirmed on, once they were run.
+    confirmed: Option<f64>,
 }
 
 impl<'a> Evaluator<'a> {
@@ -119,7 +159,13 @@ impl<'a> Evaluator<'a> {
         let reader = PolicyReader::open(domain, layout.fingerprint(), layout.parameters())?;
         let best = if settings.run.best_policy().exists() {
             let best = PolicyFile::read(&settings.run.best_policy(), &layout)?;
-            Some((best.return_mean, best.version))
+            // Earlier versions may have kept one that diverged.
+            best.return_mean.is_finite().then_some(Best {
+                version: best.version,
+                mean: best.return_mean,
+                parameters: best.parameters,
+                confirmed: None,
+            })
         } else {
             None
         };
@@ -153,27 +199,11 @@ impl<'a> Evaluator<'a> {
     fn evaluate_next(&mut self) -> Result<(), Exit<ActorError>> {
         let published = self.await_due_policy().map_err(Exit::widen)?;
         let header = published.header();
-        let mut returns = Vec::new();
-        while (returns.len() as u32) < self.settings.evaluation.episodes {
-            // If the server dies, its episodes are run again.
-            match self.run_episodes(published.parameters(), returns.len() as u32) {
-                Ok(Some(more)) => returns.extend(more),
-                Ok(None) => {}
-                Err(Exit::Failed(ActorError::Channel(error))) if error.fault().is_some() => {
-                    after_fault(&error, &mut self.heartbeat, &self.listener, self.stop).map_err(Exit::widen)?;
-                }
-                Err(exit) => return Err(exit),
-            }
-        }
-        returns.truncate(self.settings.evaluation.episodes as usize);
+        let returns = self.returns(published.parameters(), 0, self.settings.evaluation.episodes)?;
         let (return_mean, return_std) = mean_and_std(&returns);
-        // A previous evaluator may have died after it wrote this policy and before it reported that.
-        let best = self
-            .best
-            .is_none_or(|(mean, version)| return_mean > mean || version == header.version);
+        let best = self.becomes_best(&published, return_mean)?;
         if best {
             self.write_policy(&published, return_mean, return_std, &self.settings.run.best_policy())?;
-            self.best = Some((return_mean, header.version));
         }
         if self.settings.evaluation.keep_policies {
             let path = self.settings.run.evaluated_policy(header.env_steps);
@@ -198,6 +228,47 @@ impl<'a> Evaluator<'a> {
         self.evaluated_reports.send(EvaluatedReport { period });
         self.learner.notify();
         Ok(())
+    }
+
+    /// Whether this policy is the best so far. If so, it is remembered.
+    fn becomes_best(&mut self, published: &policy::Policy, mean: f64) -> Result<bool, Exit<ActorError>> {
+        let candidate = Best {
+            version: published.header().version,
+            mean,
+            parameters: published.parameters().to_vec(),
+            confirmed: None,
+        };
+        let evaluation = &self.settings.evaluation;
+        let first = evaluation.episodes;
+        let episodes = first.saturating_mul(evaluation.confirm);
+        let best = self.best.take();
+        let (best, replaced) = challenge(best, candidate, |parameters| -> Result<_, Exit<ActorError>> {
+            if episodes == 0 {
+                return Ok(None);
+            }
+            Ok(Some(mean_and_std(&self.returns(parameters, first, episodes)?).0))
+        })?;
+        self.best = best;
+        Ok(replaced)
+    }
+
+    /// Runs `episodes` evaluation episodes with these parameters, from number `first` on, and returns their returns.
+    fn returns(&mut self, parameters: &[f32], first: u32, episodes: u32) -> Result<Vec<f64>, Exit<ActorError>> {
+        let mut returns = Vec::new();
+        while (returns.len() as u32) < episodes {
+            let over = returns.len() as u32;
+            // If the server dies, its episodes are run again.
+            match self.run_episodes(parameters, first.saturating_add(over), episodes - over) {
+                Ok(Some(more)) => returns.extend(more),
+                Ok(None) => {}
+                Err(Exit::Failed(ActorError::Channel(error))) if error.fault().is_some() => {
+                    after_fault(&error, &mut self.heartbeat, &self.listener, self.stop).map_err(Exit::widen)?;
+                }
+                Err(exit) => return Err(exit),
+            }
+        }
+        returns.truncate(episodes as usize);
+        Ok(returns)
     }
 
     /// Waits for a policy of a period that has not been evaluated.
@@ -230,9 +301,14 @@ impl<'a> Evaluator<'a> {
         Ok(published)
     }
 
-    /// Runs one evaluation episode in each environment with these parameters, from number `first` on. Returns their
-    /// returns, or `None` if the server was lost.
-    fn run_episodes(&mut self, parameters: &[f32], first: u32) -> Result<Option<Vec<f64>>, Exit<ActorError>> {
+    /// Runs one evaluation episode in each environment with these parameters, from number `first` on, and at most `left`.
+    /// Returns their returns, or `None` if the server was lost.
+    fn run_episodes(
+        &mut self,
+        parameters: &[f32],
+        first: u32,
+        left: u32,
+    ) -> Result<Option<Vec<f64>>, Exit<ActorError>> {
         let Self {
             client,
             listener,
@@ -242,7 +318,7 @@ impl<'a> Evaluator<'a> {
             ..
         } = self;
         // No environment is reset more often than an episode is needed.
-        let episodes = (self.settings.evaluation.episodes - first).min(self.settings.envs as u32);
+        let episodes = left.min(self.settings.envs as u32);
         let begin = Begin::Evaluation {
             first: first.into(),
             episodes,
@@ -293,5 +369,73 @@ impl<'a> Evaluator<'a> {
             parameters: published.parameters().to_vec(),
         };
         Ok(file.write(path)?)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::convert::Infallible;
+
+    use super::*;
+
+    /// A policy whose one parameter is its mean return on the episodes that confirm.
+    fn policy(version: u64, mean: f64, confirmed: f32) -> Best {
+        Best {
+            version,
+            mean,
+            parameters: vec![confirmed],
+            confirmed: None,
+        }
+    }
+
+    /// The version that is the best one, whether it is the candidate, and how often something was confirmed.
+    fn decided(best: Option<Best>, candidate: Best) -> (Option<u64>, bool, u32) {
+        let mut asked = 0;
+        let confirm = |parameters: &[f32]| {
+            asked += 1;
+            Ok::<_, Infallible>(Some(f64::from(parameters[0])))
+        };
+        let Ok((best, replaced)) = challenge(best, candidate, confirm);
+        (best.map(|best| best.version), replaced, asked)
+    }
+
+    #[test]
+    fn a_better_policy_is_confirmed_and_one_that_diverged_never_is_the_best() {
+        assert_eq!(decided(None, policy(1, 5.0, 5.0)), (Some(1), true, 0), "the first one");
+        for diverged in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
+            assert_eq!(decided(None, policy(1, diverged, 5.0)), (None, false, 0));
+            assert_eq!(
+                decided(Some(policy(1, 5.0, 5.0)), policy(2, diverged, 9.0)),
+                (Some(1), false, 0)
+            );
+        }
+        let best = || Some(policy(1, 5.0, 5.0));
+        assert_eq!(
+            decided(best(), policy(2, 6.0, 5.5)),
+            (Some(2), true, 2),
+            "better in both"
+        );
+        assert_eq!(decided(best(), policy(2, 6.0, 4.5)), (Some(1), false, 2), "lucky");
+        assert_eq!(decided(best(), policy(2, 6.0, f32::NAN)), (Some(1), false, 2));
+        assert_eq!(decided(best(), policy(2, 4.0, 9.0)), (Some(1), false, 0), "worse");
+        assert_eq!(
+            decided(best(), policy(1, 4.0, 4.0)),
+            (Some(1), true, 0),
+            "the same one again"
+        );
+        let known = Some(Best {
+            confirmed: Some(5.0),
+            ..policy(1, 5.0, 5.0)
+        });
+        assert_eq!(
+            decided(known, policy(2, 6.0, 5.5)),
+            (Some(2), true, 1),
+            "known from before"
+        );
+        let Ok((best, replaced)) = challenge(best(), policy(2, 6.0, 0.0), |_| Ok::<_, Infallible>(None));
+        assert!(
+            replaced && best.is_some_and(|best| best.version == 2),
+            "nothing is confirmed"
+        );
     }
 }

@@ -10,12 +10,14 @@ use shoal_common::network::{ActionRange, Activation, NetworkLayout};
 use shoal_common::policy::PolicyLayout;
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::space::Space;
+use shoal_run::final_evaluation::FinallyEvaluated;
 use shoal_run::rollout::policy_layout;
 
 /// A policy in a form that needs no part of Shoal to run.
 #[derive(Clone, Debug)]
 pub struct Portable {
     body: Body,
+    starts: Starts,
     /// Describes the policy and its origin; the file contains it as key-value pairs. Lists are written as JSON.
     metadata: BTreeMap<String, String>,
 }
@@ -33,6 +35,13 @@ enum Body {
         actions: usize,
         values: Vec<f32>,
     },
+}
+
+/// What the environment itself calls the first observation and the first action of a discrete space; 0 of a box.
+#[derive(Clone, Copy, Debug)]
+struct Starts {
+    observation: i32,
+    action: i32,
 }
 
 /// A sequence of layers, with the activation between them.
@@ -69,7 +78,25 @@ impl Portable {
             },
         };
         let metadata = metadata(config, file, which, &body)?;
-        Ok(Self { body, metadata })
+        let starts = Starts {
+            observation: config.spec.observation.start(),
+            action: config.spec.action.start(),
+        };
+        Ok(Self { body, starts, metadata })
+    }
+
+    /// Adds the result of the run's final evaluation to the metadata.
+    pub fn evaluated(mut self, seed: u64, evaluated: &FinallyEvaluated) -> anyhow::Result<Self> {
+        let entries = [
+            ("return", serde_json::to_string(&evaluated.return_mean)?),
+            ("std", serde_json::to_string(&evaluated.return_std)?),
+            ("interval", serde_json::to_string(&evaluated.interval)?),
+            ("episodes", evaluated.episodes.to_string()),
+            ("seed", seed.to_string()),
+        ];
+        let entries = entries.map(|(name, value)| (format!("final_evaluation_{name}"), value));
+        self.metadata.extend(entries);
+        Ok(self)
     }
 
     /// The bytes of an ONNX model.
@@ -114,6 +141,14 @@ fn metadata(config: &Config, file: &PolicyFile, which: &str, body: &Body) -> any
     };
     if file.episodes > 0 {
         insert("evaluation_return", file.return_mean.to_string());
+    }
+    for (name, space) in [
+        ("observation_start", &config.spec.observation),
+        ("action_start", &config.spec.action),
+    ] {
+        if let Space::Discrete { start, .. } = space {
+            insert(name, start.to_string());
+        }
     }
     if let Body::Actions { network, .. } | Body::Probabilities { network } = body {
         let activation = match network.activation {
@@ -201,6 +236,19 @@ mod tests_support {
             episodes: 10,
             parameters: numbers(layout.parameters(), 1),
         };
+        (config, policy)
+    }
+
+    /// A task whose environment counts its observations from 1 and its actions from 5, and a policy of it.
+    pub(super) fn with_starts() -> (Config, PolicyFile) {
+        let (mut config, policy) = with_policy(
+            "[run]\nid = \"1a\"\n[environment]\nname = \"frozen-lake\"\n[q-learning]\n[replay]\nwarmup = 0\n",
+        );
+        for (space, first) in [(&mut config.spec.observation, 1), (&mut config.spec.action, 5)] {
+            if let Space::Discrete { start, .. } = space {
+                *start = first;
+            }
+        }
         (config, policy)
     }
 

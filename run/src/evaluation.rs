@@ -9,6 +9,7 @@ use shoal_env_server::environment::Goal;
 
 use crate::description::Description;
 use crate::rollout::{Rollout, policy_layout};
+use crate::signals::Interrupt;
 
 /// One of a run's policies.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
@@ -50,10 +51,14 @@ pub struct EvaluationSummary {
 
 /// Runs the evaluation episodes 0 … `episodes` − 1 of `seed`. They start in the same states every time.
 pub fn evaluate(config: &Config, parameters: &[f32], episodes: u32, seed: u64) -> anyhow::Result<EvaluationSummary> {
-    evaluate_by(Rollout::new(config, parameters)?, config, episodes, seed)
+    let rollout = Rollout::new(config, parameters)?;
+    evaluate_by(rollout, config, (episodes, seed), |_| ())
 }
 
 /// The same for this run: an environment that another program serves is served as in training.
+///
+/// # Errors
+/// As [`evaluate`].
 pub fn evaluate_run(
     run: &RunDir,
     config: &Config,
@@ -61,20 +66,38 @@ pub fn evaluate_run(
     episodes: u32,
     seed: u64,
 ) -> anyhow::Result<EvaluationSummary> {
-    evaluate_by(Rollout::of_run(run, config, parameters)?, config, episodes, seed)
+    let rollout = Rollout::of_run(run, config, parameters)?;
+    evaluate_by(rollout, config, (episodes, seed), |_| ())
+}
+
+/// As [`evaluate_run`], but a signal ends it with an error. `over` is told how many episodes are over.
+///
+/// # Errors
+/// When the environment fails, or a signal has come.
+pub fn evaluate_run_until(
+    run: &RunDir,
+    config: &Config,
+    parameters: &[f32],
+    (episodes, seed): (u32, u64),
+    interrupt: &Interrupt,
+    over: impl FnMut(u32),
+) -> anyhow::Result<EvaluationSummary> {
+    let rollout = Rollout::of_run(run, config, parameters)?.until(interrupt.clone());
+    evaluate_by(rollout, config, (episodes, seed), over)
 }
 
 fn evaluate_by(
     mut rollout: Rollout<'_>,
     config: &Config,
-    episodes: u32,
-    seed: u64,
+    (episodes, seed): (u32, u64),
+    mut over: impl FnMut(u32),
 ) -> anyhow::Result<EvaluationSummary> {
     let goal = Description::of(config)?.goal;
     let (mut returns, mut distances) = (Vec::new(), Vec::new());
     for number in 0..episodes {
         let trajectory = rollout.evaluation_episode(seed, number.into())?;
         returns.push(trajectory.episode_return());
+        over(number + 1);
         if let Some(goal) = &goal {
             distances.extend(trajectory.values(goal.distance.source).last().copied());
         }

@@ -3,6 +3,7 @@
 
 mod parameters;
 
+use std::cell::Cell;
 use std::ffi::OsString;
 use std::io::Write;
 use std::os::fd::AsFd;
@@ -28,9 +29,13 @@ use shoal_common::stop::{GRACE, Stop};
 
 use crate::process::{Peer, wait_for_any};
 use crate::server_location::Surroundings;
+use crate::signals::Interrupt;
 
 /// The prefix of the names of Gymnasium environments.
 pub const GYMNASIUM: &str = "gym:";
+
+/// How long a program may take to end that has left shared memory.
+const LAST_WORDS: Duration = Duration::from_secs(2);
 
 /// A start that takes longer is reported to the user.
 const SLOW: Duration = Duration::from_secs(10);
@@ -226,6 +231,13 @@ pub struct ExternalEnvironment {
     listener: Listener,
     spec: EnvironmentSpec,
     program: Peer,
+    /// Ends every wait for an answer.
+    stop: Stop,
+    interrupt: Interrupt,
+    /// An answer was not waited for any longer.
+    silent: Cell<bool>,
+    /// How long an answer may take.
+    limit: Duration,
     // Dropped last, in this order.
     _services: Services,
     _domain: LeaveOnDrop,
@@ -248,18 +260,25 @@ impl ExternalEnvironment {
     /// # Errors
     /// When the server cannot be started, ends, or does not answer; with the last line it wrote.
     pub fn begin(environment: &EnvironmentConfig, environments: u32, seed: u64) -> anyhow::Result<Self> {
-        Self::begin_in(environment, environments, seed, Surroundings::default())
+        Self::begin_in(
+            environment,
+            environments,
+            seed,
+            Surroundings::default(),
+            Interrupt::default(),
+        )
     }
 
-    /// The same in these surroundings.
+    /// The same in these surroundings. A signal ends this and every later wait for an answer.
     ///
     /// # Errors
-    /// As for [`begin`](Self::begin).
+    /// As for [`begin`](Self::begin), and when a signal has come.
     pub fn begin_in(
         environment: &EnvironmentConfig,
         environments: u32,
         seed: u64,
         surroundings: Surroundings,
+        interrupt: Interrupt,
     ) -> anyhow::Result<Self> {
         Domain::remove_abandoned()?;
         let run_id = format!("{:08x}", rand::random::<u32>());
@@ -276,12 +295,16 @@ impl ExternalEnvironment {
             stream: 0,
             surroundings,
         };
-        match open(&domain, &launch, environment) {
-            Ok((services, client, listener, spec, program)) => Ok(Self {
+        match open(&domain, &launch, environment, &interrupt) {
+            Ok((services, client, listener, spec, program, stop)) => Ok(Self {
                 client,
                 listener,
                 spec,
                 program,
+                stop,
+                interrupt,
+                silent: Cell::new(false),
+                limit: environment.start_limit(),
                 _services: services,
                 _domain: LeaveOnDrop(Some(domain)),
             }),
@@ -300,29 +323,63 @@ impl ExternalEnvironment {
     /// Begins evaluation episode `number`.
     ///
     /// # Errors
-    /// When the server has ended or refuses.
+    /// When the program has ended, refuses or does not answer, or a signal has come.
     pub fn begin_evaluation(&mut self, number: u64) -> anyhow::Result<Observed> {
+        let asked = Instant::now();
         let begun = self.client.reset(
             &self.listener,
             Begin::Evaluation {
                 first: number,
                 episodes: 1,
             },
-            || (),
+            || self.give_up(asked),
         );
-        checked(begun, &mut self.program)?.context("the environment server has ended")
+        checked(begun, &mut self.program)?.map_or_else(|| self.unanswered(asked), Ok)
     }
 
     /// Steps every environment with its action.
     ///
     /// # Errors
-    /// When the server has ended or refuses.
+    /// When the program has ended, refuses or does not answer, or a signal has come.
     pub fn step(&mut self, actions: &[f32]) -> anyhow::Result<Observed> {
-        let stepped = self.client.step(&self.listener, actions, || ());
-        match checked(stepped, &mut self.program)?.context("the environment server has ended")? {
+        let asked = Instant::now();
+        let stepped = self.client.step(&self.listener, actions, || self.give_up(asked));
+        match checked(stepped, &mut self.program)?.map_or_else(|| self.unanswered(asked), Ok)? {
             Stepped::Taken(observed) => Ok(observed),
-            Stepped::Lost => bail!("the environment server has lost its episodes"),
+            Stepped::Lost => {
+                // It has left shared memory and is about to end; its last words say why.
+                self.program.wait(LAST_WORDS);
+                self.program.check()?;
+                bail!("the environment server has lost its episodes")
+            }
         }
+    }
+
+    /// Whether it was asked something that it did not answer in time: asking another one would take as long.
+    pub fn is_silent(&self) -> bool {
+        self.silent.get()
+    }
+
+    /// Ends the wait for an answer that is not worth waiting for.
+    fn give_up(&self, asked: Instant) {
+        if self.interrupt.signal().is_some() || asked.elapsed() >= self.limit {
+            self.silent.set(true);
+            self.stop.request();
+        }
+    }
+
+    fn unanswered<T>(&self, asked: Instant) -> anyhow::Result<T> {
+        if let Some(signal) = self.interrupt.signal() {
+            bail!("ended by signal {signal}");
+        }
+        if asked.elapsed() >= self.limit {
+            bail!(
+                "the environment server did not answer within {} s; if it needs more: --set environment.start_seconds={}",
+                self.limit.as_secs(),
+                self.limit.as_secs().saturating_mul(5)
+            );
+        }
+        bail!("the environment server has ended")
     }
 }
 
@@ -332,9 +389,14 @@ impl Drop for ExternalEnvironment {
     }
 }
 
-type Opened = (Services, EnvironmentClient, Listener, EnvironmentSpec, Peer);
+type Opened = (Services, EnvironmentClient, Listener, EnvironmentSpec, Peer, Stop);
 
-fn open(domain: &Domain, launch: &LaunchSpec<'_>, environment: &EnvironmentConfig) -> anyhow::Result<Opened> {
+fn open(
+    domain: &Domain,
+    launch: &LaunchSpec<'_>,
+    environment: &EnvironmentConfig,
+    interrupt: &Interrupt,
+) -> anyhow::Result<Opened> {
     let Some(command) = launch.command(environment)? else {
         bail!("environment {} is not served by another program", environment.name);
     };
@@ -347,10 +409,15 @@ fn open(domain: &Domain, launch: &LaunchSpec<'_>, environment: &EnvironmentConfi
         Peer::start(&mut tied(&command)?, "environment server".into()).with_context(|| cannot_start(&command))?;
     let has_answered = Stop::default();
     let stop = stop_when_it_ends(&program, has_answered.clone(), environment)?;
-    let described = describe(domain, launch.index, &listener, stop.clone());
+    let described = describe(domain, launch.index, &listener, stop.clone(), || {
+        if interrupt.signal().is_some() {
+            stop.request();
+        }
+    });
     has_answered.request();
     let (spec, environments) = match checked(described, &mut program).map_err(with_advice)? {
         Some(described) => described,
+        None if interrupt.signal().is_some() => bail!("ended by a signal"),
         None => bail!(
             "{} did not describe itself within {} s; if it takes longer to start: --set environment.start_seconds={}",
             environment.name,
@@ -358,9 +425,9 @@ fn open(domain: &Domain, launch: &LaunchSpec<'_>, environment: &EnvironmentConfi
             environment.start_seconds.saturating_mul(5)
         ),
     };
-    let opened = EnvironmentClient::open(domain, launch.index, &spec, environments, stop);
+    let opened = EnvironmentClient::open(domain, launch.index, &spec, environments, stop.clone());
     let client = checked(opened.map_err(Exit::from), &mut program)?.context("the environment server has ended")?;
-    Ok((services, client, listener, spec, program))
+    Ok((services, client, listener, spec, program, stop))
 }
 
 /// Adds what to do if the server for Gymnasium is not installed.

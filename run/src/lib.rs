@@ -5,6 +5,7 @@ pub mod analysis;
 pub mod description;
 pub mod evaluation;
 pub mod external_environment;
+pub mod final_evaluation;
 pub mod numbers;
 pub mod outcome;
 pub mod plan;

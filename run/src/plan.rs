@@ -15,6 +15,7 @@ use toml::{Table, Value};
 use crate::external_environment::{self, ExternalEnvironment, GYMNASIUM};
 use crate::preflight;
 use crate::server_location::{ServerLocation, Surroundings, hash_seed};
+use crate::signals::Interrupt;
 
 const PRESETS: [(&str, &str); 7] = [
     ("pendulum", include_str!("../../presets/pendulum.toml")),
@@ -244,7 +245,7 @@ fn describe_environment(table: &mut Table) -> anyhow::Result<()> {
             location: ServerLocation::here(&environment.server)?,
             hash_seed: hash_seed(mode, seed),
         };
-        let spec = ExternalEnvironment::begin_in(&environment, 1, 0, surroundings)?
+        let spec = ExternalEnvironment::begin_in(&environment, 1, 0, surroundings, Interrupt::default())?
             .spec()
             .clone();
         (environment, spec)

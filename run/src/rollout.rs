@@ -13,6 +13,10 @@ use shoal_env_server::vector::{Start, VectorEnvironment};
 
 use crate::external_environment::ExternalEnvironment;
 use crate::server_location::Surroundings;
+use crate::signals::Interrupt;
+
+/// How often an episode is run that another program's failure breaks, each time with a program started anew.
+const TRIES: u32 = 5;
 
 /// An episode of T steps.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -59,6 +63,7 @@ pub struct Rollout<'a> {
     policy: Policy,
     parameters: &'a [f32],
     surroundings: Surroundings,
+    interrupt: Interrupt,
 }
 
 /// Where the environment runs.
@@ -96,6 +101,7 @@ impl<'a> Rollout<'a> {
             policy,
             parameters,
             surroundings: Surroundings::default(),
+            interrupt: Interrupt::default(),
         })
     }
 
@@ -105,6 +111,11 @@ impl<'a> Rollout<'a> {
             surroundings: Surroundings::of_run(run, config)?,
             ..Self::new(config, parameters)?
         })
+    }
+
+    /// Ends an episode with an error when a signal has come.
+    pub fn until(self, interrupt: Interrupt) -> Self {
+        Self { interrupt, ..self }
     }
 
     /// Runs evaluation episode `number` of `seed`. The two determine its start state.
@@ -121,14 +132,33 @@ impl<'a> Rollout<'a> {
         self.episode(Start::States(state))
     }
 
+    /// An episode that the environment's program breaks is run again by a program that is started anew.
     fn episode(&mut self, start: Start<'_>) -> anyhow::Result<Trajectory> {
-        let mut observation = self.host.begin(self.config, &self.surroundings, start)?;
+        let mut tries = 1;
+        loop {
+            match self.try_episode(start) {
+                Err(_) if tries < TRIES && self.interrupt.signal().is_none() && self.host.may_be_started_anew() => {
+                    tries += 1;
+                }
+                Err(error) if tries > 1 => bail!("{error:#} (the episode was begun {tries} times)"),
+                result => return result,
+            }
+        }
+    }
+
+    fn try_episode(&mut self, start: Start<'_>) -> anyhow::Result<Trajectory> {
+        let mut observation = self
+            .host
+            .begin(self.config, &self.surroundings, &self.interrupt, start)?;
         let mut action = vec![0.0; self.config.spec.action.width()];
         let mut trajectory = Trajectory {
             observations: vec![observation.clone()],
             ..Trajectory::default()
         };
         loop {
+            if let Some(signal) = self.interrupt.signal() {
+                bail!("ended by signal {signal}");
+            }
             self.policy.act(self.parameters, &observation, &mut action);
             let step = self.host.step(&action)?;
             observation.clone_from(&step.s_next);
@@ -159,8 +189,22 @@ impl Host {
         Ok(Self::Builtin(Box::new(environment)))
     }
 
+    /// Whether a program has run part of an episode and may do better when it is started anew; the old one is ended.
+    fn may_be_started_anew(&mut self) -> bool {
+        match self {
+            Self::Builtin(_) => false,
+            Self::External(server) => server.take().is_some_and(|(_, server)| !server.is_silent()),
+        }
+    }
+
     /// Begins an episode and returns its first observation.
-    fn begin(&mut self, config: &Config, surroundings: &Surroundings, start: Start<'_>) -> anyhow::Result<Vec<f32>> {
+    fn begin(
+        &mut self,
+        config: &Config,
+        surroundings: &Surroundings,
+        interrupt: &Interrupt,
+        start: Start<'_>,
+    ) -> anyhow::Result<Vec<f32>> {
         match (self, start) {
             (Self::Builtin(environment), start) => {
                 let mut observation = vec![0.0; config.spec.observation.width()];
@@ -173,14 +217,15 @@ impl Host {
                     *server = None;
                 }
                 let begin = || {
-                    let begun = ExternalEnvironment::begin_in(&config.environment, 1, seed, surroundings.clone());
-                    anyhow::Ok((seed, Box::new(begun?)))
+                    let (surroundings, interrupt) = (surroundings.clone(), interrupt.clone());
+                    let begun = ExternalEnvironment::begin_in(&config.environment, 1, seed, surroundings, interrupt)?;
+                    check_spec(config, begun.spec())?;
+                    anyhow::Ok((seed, Box::new(begun)))
                 };
                 let (_, server) = match server {
                     Some(begun) => begun,
                     None => server.insert(begin()?),
                 };
-                check_spec(config, server.spec())?;
                 Ok(server.begin_evaluation(first)?.observation(0).to_vec())
             }
             (Self::External(_), _) => bail!("episodes of {} cannot start in a chosen state", config.environment.name),

@@ -12,6 +12,20 @@ use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 use crate::process::wait_for_any;
 
+/// Whether a signal has come that ends this process in order. The default is that none ever comes.
+#[derive(Clone, Debug, Default)]
+pub struct Interrupt(Arc<AtomicUsize>);
+
+impl Interrupt {
+    /// The last signal that has come.
+    pub fn signal(&self) -> Option<i32> {
+        match self.0.load(Ordering::Relaxed) {
+            0 => None,
+            signal => Some(signal as i32),
+        }
+    }
+}
+
 /// Receives SIGINT, SIGTERM and SIGHUP. Once this is dropped, they end the process again.
 #[derive(Debug)]
 pub struct Signals {
@@ -46,10 +60,12 @@ impl Signals {
     pub fn received(&self) -> Option<i32> {
         // Empties the stream, so that each signal wakes only once.
         let _ = (&self.wake).read(&mut [0; 64]);
-        match self.last.load(Ordering::Relaxed) {
-            0 => None,
-            signal => Some(signal as i32),
-        }
+        self.interrupt().signal()
+    }
+
+    /// What tells of the signals to code that does not wait for them.
+    pub fn interrupt(&self) -> Interrupt {
+        Interrupt(Arc::clone(&self.last))
     }
 
     /// Waits at most `patience` for a signal; the last one that has arrived, if any.

@@ -10,6 +10,7 @@ use shoal_common::durable::write_atomically;
 use shoal_common::run_dir::RunDir;
 use shoal_report::export::Portable;
 use shoal_run::evaluation::WhichPolicy;
+use shoal_run::final_evaluation::FinalEvaluation;
 
 #[derive(Args, Clone, Debug)]
 pub(crate) struct ExportArgs {
@@ -43,7 +44,15 @@ pub(crate) fn run(args: &ExportArgs) -> anyhow::Result<()> {
         value.map_or_else(String::new, |value| value.get_name().to_owned())
     };
     let which = name(args.policy.to_possible_value());
-    let policy = Portable::new(&config, &args.policy.read(&run, &config)?, &which)?;
+    let file = args.policy.read(&run, &config)?;
+    let mut policy = Portable::new(&config, &file, &which)?;
+    // Whether it is of this very policy its version tells.
+    let evaluation = FinalEvaluation::read(&run, 0)?;
+    if let Some(evaluation) = evaluation
+        && let Some(evaluated) = evaluation.of(args.policy).filter(|it| it.version == file.version)
+    {
+        policy = policy.evaluated(evaluation.seed, evaluated)?;
+    }
     let bytes = match args.format {
         Format::Onnx => policy.to_onnx(),
         Format::Safetensors => policy.to_safetensors()?,

@@ -61,9 +61,18 @@ pub(crate) fn run(args: &ListArgs) -> anyhow::Result<()> {
 fn table(runs: &[Listed]) -> Table {
     let mut table = Table::new();
     table.load_style(NOTHING);
-    table.set_header(["run", "state", "environment", "method", "steps", "of", "best return"]);
+    table.set_header([
+        "run",
+        "state",
+        "environment",
+        "method",
+        "steps",
+        "of",
+        "best return",
+        "final return",
+    ]);
     for run in runs {
-        let return_ = run.best_return.map_or_else(String::new, |best| format!("{best:.2}"));
+        let returned = |number: Option<f64>| number.map_or_else(String::new, |number| format!("{number:.2}"));
         let number = |number: Option<u64>| number.map_or_else(String::new, thousands);
         let (done, all) = match (run.episodes, run.episodes_limit) {
             (Some(episodes), Some(limit)) => (Some(episodes), format!("{} episodes", thousands(limit))),
@@ -76,11 +85,12 @@ fn table(runs: &[Listed]) -> Table {
             &run.algorithm,
             &number(done),
             &all,
-            &return_,
+            &returned(run.best_return),
+            &returned(run.final_return),
         ];
         table.add_row(row);
     }
-    for column in [4, 6] {
+    for column in [4, 6, 7] {
         if let Some(column) = table.column_mut(column) {
             column.set_cell_alignment(CellAlignment::Right);
         }

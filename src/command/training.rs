@@ -6,18 +6,21 @@ use std::process::ExitCode;
 use clap::Args;
 use comfy_table::Table;
 use comfy_table::presets::UTF8_BORDERS_ONLY;
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
 use shoal_common::channel::control::RunStatus;
 use shoal_common::config::Config;
+use shoal_common::policy_file::PolicyFile;
 use shoal_common::run_dir::{RunDir, RunLock};
 use shoal_learner::algorithms::registry;
 use shoal_learner::networks::digest;
 use shoal_learner::process::checkpoint::Checkpoints;
 use shoal_report::plots;
-use shoal_run::evaluation::{EvaluationSummary, WhichPolicy, evaluate_run};
+use shoal_run::evaluation::{EvaluationSummary, WhichPolicy, evaluate_run_until};
+use shoal_run::final_evaluation::{FinalEvaluation, FinalPolicy, FinallyEvaluated};
 use shoal_run::numbers::thousands;
 use shoal_run::outcome::{RunOutcome, RunState};
-use shoal_run::signals::exit_code;
+use shoal_run::signals::{Interrupt, Signals, exit_code};
 
 use crate::launcher::{self, Ending, TrainingOutcome};
 
@@ -58,17 +61,38 @@ pub(crate) fn run_training(
     _lock: RunLock,
     output: &OutputMode,
 ) -> anyhow::Result<ExitCode> {
-    let outcome = launcher::run(config.clone(), run, output.quiet)?;
-    let evaluated = match outcome.ending {
-        Ending::Finished => final_evaluation(&config, run)?,
-        Ending::Stopped | Ending::Interrupted(_) | Ending::Renewed => Vec::new(),
-    };
-    plots::draw(run, &config, run.path())?;
+    let signals = Signals::register()?;
+    let outcome = launcher::run(config.clone(), run, &signals, output.quiet)?;
+    let mut evaluated = Vec::new();
+    let RunStatus {
+        env_steps, episodes, ..
+    } = outcome.after;
+    let mut finished = RunOutcome::new(RunState::Finished, env_steps, episodes);
     if outcome.ending == Ending::Finished {
-        let RunStatus {
-            env_steps, episodes, ..
-        } = outcome.after;
-        RunOutcome::new(RunState::Finished, env_steps, episodes).write(run)?;
+        let interrupt = signals.interrupt();
+        match final_evaluation(&config, run, env_steps, &interrupt, output.quiet) {
+            Ok(policies) => evaluated = policies,
+            Err(error) => {
+                let why = match interrupt.signal() {
+                    Some(signal) => format!("the final evaluation was ended by signal {signal}"),
+                    None => format!("the final evaluation failed: {error:#}").replace('\n', " "),
+                };
+                let here = run.path().display();
+                writeln!(
+                    std::io::stderr(),
+                    "{why}; the training is finished; to evaluate it: shoal eval {here}"
+                )?;
+                finished = finished.with_reason(why);
+                keep_some_policy(&config, run)?;
+            }
+        }
+    }
+    if let Err(error) = plots::draw(run, &config, run.path()) {
+        let why = format!("{error:#}").replace('\n', " ");
+        writeln!(std::io::stderr(), "the figures could not be drawn: {why}")?;
+    }
+    if outcome.ending == Ending::Finished {
+        finished.write(run)?;
     }
     let summary = Summary::new(&config, run, &outcome, evaluated.first().map(|(_, summary)| summary))?;
     if !output.quiet {
@@ -78,34 +102,90 @@ pub(crate) fn run_training(
         writeln!(std::io::stdout().lock(), "{}", serde_json::to_string(&summary)?)?;
     }
     Ok(match outcome.ending {
-        Ending::Finished | Ending::Stopped | Ending::Renewed => ExitCode::SUCCESS,
+        // The final evaluation may have been interrupted.
+        Ending::Finished => signals.interrupt().signal().map_or(ExitCode::SUCCESS, exit_code),
+        Ending::Stopped | Ending::Renewed => ExitCode::SUCCESS,
         // As a shell reports a process that was ended by the signal.
         Ending::Interrupted(signal) => exit_code(signal),
     })
 }
 
-/// The final evaluation: the policy with the best evaluation first, then the last one.
-fn final_evaluation(config: &Config, run: &RunDir) -> anyhow::Result<Vec<(&'static str, EvaluationSummary)>> {
+/// The final evaluation: the policy with the best evaluation first, then the last one. The better of them is `best.policy` from
+/// then on.
+fn final_evaluation(
+    config: &Config,
+    run: &RunDir,
+    env_steps: u64,
+    interrupt: &Interrupt,
+    quiet: bool,
+) -> anyhow::Result<Vec<(&'static str, EvaluationSummary)>> {
+    let target = if quiet {
+        ProgressDrawTarget::hidden()
+    } else {
+        ProgressDrawTarget::stderr()
+    };
+    let (episodes, seed) = (config.evaluation.final_episodes, config.run.seed);
+    let bar = ProgressBar::with_draw_target(Some(episodes.into()), target);
+    bar.set_style(ProgressStyle::with_template(
+        "final evaluation, {msg} {bar:16.cyan/dim} {pos}/{len} episodes",
+    )?);
     let mut evaluated = Vec::new();
-    for (name, path, which) in [
-        ("best policy", run.best_policy(), WhichPolicy::Best),
-        ("last policy", run.last_policy(), WhichPolicy::Last),
+    for (name, path, which, policy) in [
+        ("best policy", run.best_policy(), WhichPolicy::Best, FinalPolicy::Best),
+        ("last policy", run.last_policy(), WhichPolicy::Last, FinalPolicy::Last),
     ] {
         if path.exists() {
-            let parameters = which.read(run, config)?.parameters;
-            evaluated.push((
-                name,
-                evaluate_run(
-                    run,
-                    config,
-                    &parameters,
-                    config.evaluation.final_episodes,
-                    config.run.seed,
-                )?,
-            ));
+            bar.set_message(name);
+            let file = which.read(run, config)?;
+            if !file.parameters.iter().all(|parameter| parameter.is_finite()) {
+                continue;
+            }
+            let tell = |over: u32| bar.set_position(over.into());
+            let summary = evaluate_run_until(run, config, &file.parameters, (episodes, seed), interrupt, tell);
+            let summary = summary.inspect_err(|_| bar.finish_and_clear())?;
+            evaluated.push((name, policy, file, summary));
         }
     }
-    Ok(evaluated)
+    bar.finish_and_clear();
+    // The last policy has to be better, not as good.
+    let mut kept: Option<&(&str, FinalPolicy, PolicyFile, EvaluationSummary)> = None;
+    for candidate in evaluated.iter().filter(|(.., summary)| summary.return_mean.is_finite()) {
+        if kept.is_none_or(|(.., summary)| candidate.3.return_mean > summary.return_mean) {
+            kept = Some(candidate);
+        }
+    }
+    let Some((_, kept_policy, file, kept_summary)) = kept else {
+        anyhow::bail!("no policy has a finite return");
+    };
+    if *kept_policy == FinalPolicy::Last {
+        let best = PolicyFile {
+            return_mean: kept_summary.return_mean,
+            return_std: kept_summary.return_std,
+            episodes: kept_summary.episodes.into(),
+            ..file.clone()
+        };
+        best.write(&run.best_policy())?;
+    }
+    let entry = |(_, policy, file, summary): &(_, FinalPolicy, PolicyFile, _)| {
+        FinallyEvaluated::new(*policy, (file.version, file.env_steps), summary)
+    };
+    FinalEvaluation::new(seed, env_steps, evaluated.iter().map(entry).collect(), *kept_policy).write(run)?;
+    let best = ("best policy", kept_summary.clone());
+    let last = evaluated.iter().filter(|(_, policy, ..)| *policy == FinalPolicy::Last);
+    let last = last.map(|(name, .., summary)| (*name, summary.clone()));
+    Ok(std::iter::once(best).chain(last).collect())
+}
+
+/// Keeps the last policy as the best one where no policy with a finite evaluation is kept: what was learned can be used.
+fn keep_some_policy(config: &Config, run: &RunDir) -> anyhow::Result<()> {
+    let kept = run.best_policy().exists() && WhichPolicy::Best.read(run, config)?.return_mean.is_finite();
+    if !kept && run.last_policy().exists() {
+        let last = WhichPolicy::Last.read(run, config)?;
+        if last.parameters.iter().all(|parameter| parameter.is_finite()) {
+            last.write(&run.best_policy())?;
+        }
+    }
+    Ok(())
 }
 
 impl Summary {

@@ -47,6 +47,8 @@ fn main() -> ExitCode {
         test!(a_slow_environment_is_not_replaced, PYTHON),
         test!(a_run_remembers_where_its_server_is_started_and_with_what, PYTHON),
         test!(a_run_with_another_program_may_lie_at_any_path, PYTHON),
+        test!(a_failure_in_the_final_evaluation_costs_an_episode_or_a_line, PYTHON),
+        test!(a_signal_ends_the_final_evaluation_in_order, PYTHON),
     ])
 }
 
@@ -212,6 +214,59 @@ fn an_unsupported_environment_is_refused_in_one_line_and_leaves_no_run() {
         assert!(message.contains(part), "{arguments:?}: {message}");
         assert!(!place.path().join("runs").exists(), "{arguments:?}");
     }
+}
+
+/// A run of an environment that fails in its final evaluation, and has no other one: an evaluation is not due before.
+fn with_a_finale<'a>(how: &'a str) -> Vec<&'a str> {
+    vec!["--steps", "200", "--set", "evaluation.every=1000000", "--set", how]
+}
+
+fn outcome_of(place: &Workplace) -> serde_json::Value {
+    parse(&std::fs::read_to_string(place.path().join("run/outcome.json")).unwrap())
+}
+
+fn a_failure_in_the_final_evaluation_costs_an_episode_or_a_line() {
+    let environment = format!("{OURS}Finale-v0");
+    let found = |place: &Workplace| place.path().join("run/final-evaluation.json").exists();
+    let place_of_one = place();
+    let running = place_of_one.start_in("run", &environment, &with_a_finale("environment.how=once"));
+    let (code, printed, _) = running.wait();
+    assert_eq!(code, Some(0), "{}", place_of_one.stderr());
+    assert!(place_of_one.path().join("final").exists(), "it has failed once");
+    assert!(found(&place_of_one) && parse(&printed)["eval_episodes"] == 3);
+
+    let place = place();
+    let running = place.start_in("run", &environment, &with_a_finale("environment.how=always"));
+    let (code, printed, leftovers) = running.wait();
+    let said = place.stderr();
+    assert_eq!(code, Some(0), "{said}");
+    assert!(
+        said.contains("the final evaluation failed") && said.contains("the last act fails"),
+        "{said}"
+    );
+    assert_eq!(parse(&printed)["env_steps"], 200);
+    assert_eq!(parse(&printed)["eval_return_mean"], serde_json::Value::Null);
+    assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
+    assert!(!found(&place) && outcome_of(&place)["state"] == "finished");
+    let output = place.output(&["export", "run", "--format", "onnx"]);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+}
+
+fn a_signal_ends_the_final_evaluation_in_order() {
+    let place = place();
+    let environment = format!("{OURS}Finale-v0");
+    let running = place.start_in("run", &environment, &with_a_finale("environment.how=sleeps"));
+    until("the final evaluation is asleep", || place.path().join("final").exists());
+    running.signal(Signal::TERM);
+    let (code, printed, leftovers) = running.wait();
+    assert_eq!(code, Some(143), "{}", place.stderr());
+    assert_eq!(parse(&printed)["env_steps"], 200);
+    assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
+    assert!(processes_of(&place, "shoal_gym").is_empty());
+    let outcome = outcome_of(&place);
+    assert_eq!(outcome["state"], "finished");
+    assert!(outcome["reason"].to_string().contains("signal 15"), "{outcome}");
+    assert!(place.path().join("run/checkpoints/best.policy").exists());
 }
 
 fn servers_end_with_their_launcher_and_the_run_can_be_resumed() {

@@ -25,6 +25,8 @@ const BATCH: &str = "batch";
 ///   one).
 /// - Tables: `state` (batch, 64-bit) to `action_values` (batch × actions) and `action` (batch, the one of highest
 ///   value).
+///
+/// Discrete states and actions are counted as the environment counts them, from its spaces' starts on.
 pub(super) fn model(policy: &Portable) -> Vec<u8> {
     let mut graph = Graph {
         name: "policy".into(),
@@ -42,14 +44,19 @@ pub(super) fn model(policy: &Portable) -> Vec<u8> {
             graph.add_tensor("action_half_width", &[outputs], &half);
             graph.add_node("Mul", &["tanh", "action_half_width"], "scaled", vec![]);
             graph.add_tensor("action_centre", &[outputs], &centre);
-            graph.add_node("Add", &["scaled", "action_centre"], "action", vec![]);
+            graph.add_node("Add", &["scaled", "action_centre"], "unclipped", vec![]);
+            // Rounding may lead out of the bounds.
+            graph.add_tensor("action_low", &[outputs], range.low());
+            graph.add_node("Max", &["unclipped", "action_low"], "bounded_below", vec![]);
+            graph.add_tensor("action_high", &[outputs], range.high());
+            graph.add_node("Min", &["bounded_below", "action_high"], "action", vec![]);
             graph.add_output("action", FLOAT, &[outputs]);
         }
         Body::Probabilities { network } => {
             graph.add_input("observation", FLOAT, &[network.layers[0].inputs]);
             graph.add_network(network, "logits");
             graph.add_node("Softmax", &["logits"], "probabilities", vec![integer("axis", 1)]);
-            graph.add_arg_max("logits");
+            graph.add_arg_max("logits", policy.starts.action);
             let actions = network.layers.last().map_or(0, |last| last.biases.len());
             graph.add_output("logits", FLOAT, &[actions]);
             graph.add_output("probabilities", FLOAT, &[actions]);
@@ -62,8 +69,14 @@ pub(super) fn model(policy: &Portable) -> Vec<u8> {
         } => {
             graph.add_input("state", INT64, &[]);
             graph.add_tensor("table", &[*states, *actions], values);
-            graph.add_node("Gather", &["table", "state"], "action_values", vec![integer("axis", 0)]);
-            graph.add_arg_max("action_values");
+            let mut row = "state";
+            if policy.starts.observation != 0 {
+                graph.add_integer("observation_start", policy.starts.observation);
+                graph.add_node("Sub", &["state", "observation_start"], "row", vec![]);
+                row = "row";
+            }
+            graph.add_node("Gather", &["table", row], "action_values", vec![integer("axis", 0)]);
+            graph.add_arg_max("action_values", policy.starts.action);
             graph.add_output("action_values", FLOAT, &[*actions]);
             graph.add_output("action", INT64, &[]);
         }
@@ -108,14 +121,19 @@ impl Graph {
         }
     }
 
-    /// Adds `action`: the index of the highest score, the first one among equal scores.
-    fn add_arg_max(&mut self, scores: &str) {
+    /// Adds `action`: the index of the highest score, the first one among equal scores, counted from `start`.
+    fn add_arg_max(&mut self, scores: &str, start: i32) {
         let attributes = vec![
             integer("axis", 1),
             integer("keepdims", 0),
             integer("select_last_index", 0),
         ];
-        self.add_node("ArgMax", &[scores], "action", attributes);
+        let index = if start == 0 { "action" } else { "action_index" };
+        self.add_node("ArgMax", &[scores], index, attributes);
+        if start != 0 {
+            self.add_integer("action_start", start);
+            self.add_node("Add", &["action_index", "action_start"], "action", vec![]);
+        }
     }
 
     fn add_node(&mut self, operator: &str, inputs: &[&str], output: &str, attribute: Vec<Attribute>) {
@@ -134,6 +152,15 @@ impl Graph {
             data_type: FLOAT,
             name: name.into(),
             raw_data: numbers.iter().flat_map(|number| number.to_le_bytes()).collect(),
+        });
+    }
+
+    fn add_integer(&mut self, name: &str, number: i32) {
+        self.initializer.push(Tensor {
+            dims: Vec::new(),
+            data_type: INT64,
+            name: name.into(),
+            raw_data: i64::from(number).to_le_bytes().into(),
         });
     }
 

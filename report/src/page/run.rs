@@ -3,6 +3,8 @@
 use serde::Serialize;
 use shoal_common::config::{Config, Mode};
 use shoal_common::run_dir::RunDir;
+use shoal_run::evaluation::WhichPolicy;
+use shoal_run::final_evaluation::{FinalEvaluation, FinallyEvaluated};
 use shoal_run::outcome::{RunOutcome, RunState};
 use shoal_run::recorder::{
     EpisodeRecord, EvaluationRecord, IncidentRow, LearnerRecord, read_episodes, read_evaluations, read_incidents,
@@ -37,6 +39,8 @@ pub(super) struct Run {
     updates_per_step: f64,
     best: Option<EvaluatedPolicy>,
     last: Option<EvaluatedPolicy>,
+    /// The best policy's final evaluation.
+    finally: Option<FinallyEvaluated>,
     evaluations: Curve,
     exploration: Curve,
     learner: Rates,
@@ -141,6 +145,7 @@ impl Run {
                 .find(|row| row.best == 1)
                 .map(EvaluatedPolicy::of),
             last: evaluation_records.last().map(EvaluatedPolicy::of),
+            finally: FinalEvaluation::read(run, now.env_steps)?.and_then(|it| it.of(WhichPolicy::Best).cloned()),
             evaluations: Curve::of_evaluations(&evaluation_records, limits.points),
             exploration: Curve::of_episodes(&explored, limits.points),
             learner: Rates::of(learner, limits.points),

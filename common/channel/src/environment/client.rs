@@ -122,7 +122,8 @@ impl Observed {
     }
 }
 
-/// Asks environment server `index` for its spaces and the number of its environments, when neither is known yet.
+/// Asks environment server `index` for its spaces and the number of its environments, when neither is known yet. While it
+/// waits for the answer it calls `idle`, about 20 times a second.
 ///
 /// # Errors
 /// When `stop` is requested, or the channel fails.
@@ -131,6 +132,7 @@ pub fn describe(
     index: u32,
     listener: &Listener,
     stop: Stop,
+    idle: impl FnMut(),
 ) -> Result<(EnvironmentSpec, usize), Exit<ChannelError>> {
     let unknown = Space::boxed(&[]);
     let spec = EnvironmentSpec {
@@ -139,7 +141,7 @@ pub fn describe(
         time_limit: 0,
         state_width: 0,
     };
-    EnvironmentClient::open(domain, index, &spec, 0, stop)?.describe(listener, || ())
+    EnvironmentClient::open(domain, index, &spec, 0, stop)?.describe(listener, idle)
 }
 
 impl EnvironmentClient {

@@ -4,10 +4,12 @@ use shoal_base::space::Space;
 
 use super::{Hidden, Network, NetworkLayout};
 
-/// The middle and half the width of the range of each action element. It converts tanh outputs to actions in
+/// The bounds of each action element, their middle and half their distance. It converts tanh outputs to actions in
 /// environment units.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ActionRange {
+    low: Vec<f32>,
+    high: Vec<f32>,
     centre: Vec<f32>,
     half: Vec<f32>,
 }
@@ -56,9 +58,21 @@ impl ActionRange {
         }
         let pairs = || low.iter().zip(high);
         Ok(Self {
+            low: low.clone(),
+            high: high.clone(),
             centre: pairs().map(|(low, high)| low / 2.0 + high / 2.0).collect(),
             half: pairs().map(|(low, high)| high / 2.0 - low / 2.0).collect(),
         })
+    }
+
+    /// The least value of each element.
+    pub fn low(&self) -> &[f32] {
+        &self.low
+    }
+
+    /// The greatest value of each element.
+    pub fn high(&self) -> &[f32] {
+        &self.high
     }
 
     /// Number of elements of an action.
@@ -76,9 +90,10 @@ impl ActionRange {
         a.clamp(self.action(element, -1.0), self.action(element, 1.0))
     }
 
-    /// The value of element `element` of an action for the tanh output `t`.
+    /// The value of element `element` of an action for the tanh output `t`. Rounding never takes it out of
+    /// the space's bounds.
     pub fn action(&self, element: usize, t: f32) -> f32 {
-        self.centre[element] + self.half[element] * t
+        (self.centre[element] + self.half[element] * t).clamp(self.low[element], self.high[element])
     }
 }
 
@@ -137,6 +152,20 @@ mod tests {
         let mut actions = [f32::NAN; 6];
         policy.forward(&parameters, &[1.0, 0.0, -1.0], &mut actions);
         assert_eq!(actions, [3.0, -2.0, 1.0, 0.0, 1.0, 0.0]);
+    }
+
+    #[test]
+    fn rounding_does_not_take_an_action_out_of_its_bounds() {
+        let ranges = [(0.05, 0.45), (0.1, 1.0), (-0.3, 0.7), (1e-3, 3.3), (-0.1, 1.1)];
+        let range = ActionRange::new(&Space::boxed(&ranges)).unwrap();
+        for (element, (low, high)) in ranges.into_iter().enumerate() {
+            for t in [-1.0, -0.999_999_94, 0.999_999_94, 1.0] {
+                let (action, clipped) = (range.action(element, t), range.clip(element, t * f32::MAX));
+                assert!((low..=high).contains(&action), "{action} in {low} ..= {high}");
+                assert!((low..=high).contains(&clipped), "{clipped} in {low} ..= {high}");
+            }
+        }
+        assert!(range.action(0, f32::NAN).is_nan(), "what diverges is not hidden");
     }
 
     #[test]

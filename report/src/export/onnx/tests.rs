@@ -3,7 +3,7 @@ use shoal_common::config::Config;
 use shoal_common::policy::{PolicyLayout, Scores, softmax, table};
 use shoal_common::policy_file::PolicyFile;
 
-use super::super::tests_support::{policies, some_observations};
+use super::super::tests_support::{policies, some_observations, with_starts};
 use super::*;
 
 /// The output that an independent ONNX runtime computes from the observations.
@@ -85,6 +85,39 @@ fn another_runtime_computes_the_same_outputs_for_any_batch_size() {
                 &expected,
             );
         }
+    }
+}
+
+#[test]
+fn states_and_actions_are_counted_as_the_environment_counts_them() {
+    let (config, policy) = with_starts();
+    let bytes = Portable::new(&config, &policy, "best").unwrap().to_onnx();
+    let model = Model::load(bytes).unwrap();
+    let indices = some_observations(&config, 33);
+    let states: Vec<f32> = indices.iter().map(|index| index + 1.0).collect();
+    let mut expected = vec![0.0; 33];
+    let mut ours = config.algorithm.policy(&config.spec, 33).unwrap();
+    ours.act(&policy.parameters, &indices, &mut expected);
+    let chosen = computed(&model, &config, &states, "action");
+    let (_, chosen) = chosen.into_shape_vec::<i32, 1>().unwrap();
+    assert_eq!(chosen, expected.iter().map(|a| *a as i32 + 5).collect::<Vec<_>>());
+}
+
+#[test]
+fn actions_of_the_model_stay_inside_the_bounds() {
+    let (mut config, mut policy) = policies().remove(0);
+    config.spec.action = shoal_common::space::Space::boxed(&[(0.05, 0.45)]);
+    // The last bias: tanh is −1, then 1.
+    for (bias, bound) in [(-1000.0, 0.05), (1000.0, 0.45)] {
+        *policy.parameters.last_mut().unwrap() = bias;
+        let bytes = Portable::new(&config, &policy, "best").unwrap().to_onnx();
+        let model = Model::load(bytes).unwrap();
+        let observations = some_observations(&config, 4);
+        let (_, actions) = computed_floats(&model, &config, &observations, "action");
+        assert!(
+            actions.iter().all(|action| (0.05..=0.45).contains(action)),
+            "{actions:?} near {bound}"
+        );
     }
 }
 

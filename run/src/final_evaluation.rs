@@ -1,0 +1,199 @@
+//! The evaluation at the end of a run: `final-evaluation.json` in its directory, written by its launcher, whole or not at all.
+
+use std::io::{ErrorKind, Write};
+
+use anyhow::Context;
+use serde::{Deserialize, Serialize};
+use shoal_common::durable::write_atomically;
+use shoal_common::run_dir::RunDir;
+
+use crate::evaluation::{EvaluationSummary, WhichPolicy};
+
+/// The number of the file's form.
+const FORMAT: u32 = 1;
+
+/// What the final evaluation of a run found.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct FinalEvaluation {
+    format: u32,
+    /// The seed of the start states.
+    pub seed: u64,
+    /// Environment steps of the run when it was made. A run that has more by now was resumed since.
+    pub env_steps: u64,
+    /// Each policy that was evaluated.
+    pub policies: Vec<FinallyEvaluated>,
+    /// The policy that is `best.policy` since: the better one by this evaluation.
+    pub kept: FinalPolicy,
+}
+
+/// Which policy was evaluated.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum FinalPolicy {
+    /// The one with the best evaluation during the training.
+    Best,
+    /// The one that the learner ended with.
+    Last,
+}
+
+/// How a policy did in the final evaluation. A number that is not finite is `None`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct FinallyEvaluated {
+    /// Which one it was when it was evaluated.
+    pub policy: FinalPolicy,
+    /// Its version.
+    pub version: u64,
+    /// Environment steps it was learned from.
+    pub env_steps: u64,
+    /// Mean of the episodes' returns.
+    pub return_mean: Option<f64>,
+    /// Their standard deviation (n − 1).
+    pub return_std: Option<f64>,
+    /// How many episodes.
+    pub episodes: u32,
+    /// The 95 % interval of the mean, by Student's t; `None` for a single episode.
+    pub interval: Option<(f64, f64)>,
+}
+
+impl FinallyEvaluated {
+    /// The entry of a policy.
+    pub fn new(policy: FinalPolicy, (version, env_steps): (u64, u64), summary: &EvaluationSummary) -> Self {
+        let finite = |number: f64| Some(number).filter(|number| number.is_finite());
+        Self {
+            policy,
+            version,
+            env_steps,
+            return_mean: finite(summary.return_mean),
+            return_std: finite(summary.return_std),
+            episodes: summary.episodes,
+            interval: interval(summary),
+        }
+    }
+}
+
+impl FinalEvaluation {
+    /// The final evaluation of a run with so many environment steps.
+    pub fn new(seed: u64, env_steps: u64, policies: Vec<FinallyEvaluated>, kept: FinalPolicy) -> Self {
+        Self {
+            format: FORMAT,
+            seed,
+            env_steps,
+            policies,
+            kept,
+        }
+    }
+
+    /// How the policy did that a person asks for by this name today.
+    pub fn of(&self, which: WhichPolicy) -> Option<&FinallyEvaluated> {
+        let policy = match which {
+            WhichPolicy::Best => self.kept,
+            WhichPolicy::Last => FinalPolicy::Last,
+        };
+        self.policies.iter().find(|evaluated| evaluated.policy == policy)
+    }
+
+    /// The final evaluation of a run that has `env_steps` environment steps; `None` where there is none, or where the run was
+    /// resumed since.
+    ///
+    /// # Errors
+    /// When the file cannot be read, or is damaged or of another form.
+    pub fn read(run: &RunDir, env_steps: u64) -> anyhow::Result<Option<Self>> {
+        let path = run.final_evaluation();
+        let text = match std::fs::read(&path) {
+            Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
+            text => text.with_context(|| format!("cannot read {}", path.display()))?,
+        };
+        let read: Self = serde_json::from_slice(&text)
+            .with_context(|| format!("{} is damaged; without it nothing else is missing", path.display()))?;
+        if read.format != FORMAT {
+            anyhow::bail!(
+                "{} is of form {}, this program's is {FORMAT}",
+                path.display(),
+                read.format
+            );
+        }
+        Ok(Some(read).filter(|read| read.env_steps >= env_steps))
+    }
+
+    /// Writes it, whole or not at all.
+    ///
+    /// # Errors
+    /// When it cannot be written.
+    pub fn write(&self, run: &RunDir) -> anyhow::Result<()> {
+        let path = run.final_evaluation();
+        let text = serde_json::to_string(self)?;
+        write_atomically(&path, |file| writeln!(file, "{text}"))
+            .with_context(|| format!("cannot write {}", path.display()))
+    }
+}
+
+/// The 97.5 % quantiles of Student's t for 1, 2, … degrees of freedom.
+const STUDENT: [f64; 30] = [
+    12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228, 2.201, 2.179, 2.160, 2.145, 2.131, 2.120,
+    2.110, 2.101, 2.093, 2.086, 2.080, 2.074, 2.069, 2.064, 2.060, 2.056, 2.052, 2.048, 2.045, 2.042,
+];
+
+fn interval(summary: &EvaluationSummary) -> Option<(f64, f64)> {
+    let freedom = summary.episodes.checked_sub(1).filter(|freedom| *freedom > 0)?;
+    // Beyond the table: the first terms of the quantile's expansion in 1/ν.
+    let t = STUDENT
+        .get(freedom as usize - 1)
+        .copied()
+        .unwrap_or_else(|| 1.959_964 + 2.372_27 / f64::from(freedom));
+    let half = t * summary.return_std / f64::from(summary.episodes).sqrt();
+    let (low, high) = (summary.return_mean - half, summary.return_mean + half);
+    (low.is_finite() && high.is_finite()).then_some((low, high))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn summary(return_mean: f64, return_std: f64, episodes: u32) -> EvaluationSummary {
+        EvaluationSummary {
+            return_mean,
+            return_std,
+            episodes,
+            final_distance_mean: None,
+            reached_fraction: None,
+        }
+    }
+
+    #[test]
+    fn the_interval_is_students() {
+        let (low, high) = interval(&summary(-150.0, 10.0, 100)).unwrap();
+        assert!(
+            (high + 150.0 - 1.984_217).abs() < 1e-3 && (low + high + 300.0).abs() < 1e-9,
+            "{high}"
+        );
+        assert_eq!(
+            interval(&summary(1.0, 2.0, 2)).unwrap().1,
+            1.0 + 12.706 * 2.0 / 2.0_f64.sqrt()
+        );
+        assert_eq!(interval(&summary(1.0, 0.0, 1)), None);
+        assert_eq!(interval(&summary(f64::NAN, 0.0, 9)), None);
+    }
+
+    #[test]
+    fn it_reads_back_until_the_run_has_more_steps() {
+        let parent = tempfile::tempdir().unwrap();
+        let run = RunDir::create(&parent.path().join("run")).unwrap();
+        assert_eq!(FinalEvaluation::read(&run, 10).unwrap(), None);
+        let policies = vec![
+            FinallyEvaluated::new(FinalPolicy::Best, (3, 5), &summary(f64::NAN, 0.0, 9)),
+            FinallyEvaluated::new(FinalPolicy::Last, (4, 10), &summary(-1.0, 0.5, 9)),
+        ];
+        let written = FinalEvaluation::new(1, 10, policies, FinalPolicy::Last);
+        written.write(&run).unwrap();
+        assert_eq!(FinalEvaluation::read(&run, 10).unwrap(), Some(written.clone()));
+        assert_eq!(FinalEvaluation::read(&run, 11).unwrap(), None);
+        assert_eq!(written.of(WhichPolicy::Best).unwrap().version, 4);
+        assert_eq!(written.policies[0].return_mean, None);
+        let other = serde_json::to_string(&written)
+            .unwrap()
+            .replace("\"format\":1", "\"format\":2");
+        std::fs::write(run.final_evaluation(), other).unwrap();
+        let refused = FinalEvaluation::read(&run, 10).unwrap_err().to_string();
+        assert!(refused.contains("form 2") && !refused.contains('\n'), "{refused}");
+    }
+}
