@@ -121,7 +121,7 @@ fn scaling_actors_during_training_loses_no_rows() {
         });
         running.wait_for_learning();
     }
-    for (actors, part) in [("0", "room for 1 to 16"), ("17", "room for 1 to 16")] {
+    for (actors, part) in [("0", "1 to 16 actors"), ("17", "1 to 16 actors")] {
         let output = place.output(&["scale", "run", "--actors", actors]);
         assert!(
             !output.status.success() && stderr(&output).contains(part),
