@@ -217,7 +217,7 @@ fn an_unsupported_environment_is_refused_in_one_line_and_leaves_no_run() {
 }
 
 /// A run of an environment that fails in its final evaluation, and has no other one: an evaluation is not due before.
-fn with_a_finale<'a>(how: &'a str) -> Vec<&'a str> {
+fn with_a_finale(how: &str) -> Vec<&str> {
     vec!["--steps", "200", "--set", "evaluation.every=1000000", "--set", how]
 }
 
