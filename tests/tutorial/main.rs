@@ -48,7 +48,7 @@ fn the_tutorials_commands_work() {
         "runs/first/swing-up.svg",
         "first.onnx",
         "actors: 4",
-        "stopped; to go on",
+        "stopped; to continue",
     ] {
         assert!(printed.contains(part), "{part}: {printed}\n{errors}");
     }
