@@ -58,9 +58,9 @@ impl EvaluatorSettings {
     }
 }
 
-/// The better one of the best policy and a candidate, and whether it is the candidate. On few episodes one of many policies
-/// looks better than it is. So a better candidate must also be better on other episodes. `confirm` runs these and returns
-/// their mean return, or `None` if nothing is to be confirmed.
+/// The better of the best policy and a candidate, and whether it is the candidate. Among many policies, some do well on a
+/// few episodes by chance. A candidate that seems better than the best must therefore be better on other episodes too.
+/// `confirm` returns the mean return on those, or `None` if nothing is to be confirmed.
 fn challenge<E>(
     best: Option<Best>,
     mut candidate: Best,
@@ -230,7 +230,7 @@ impl<'a> Evaluator<'a> {
         Ok(())
     }
 
-    /// Whether this policy is the best so far. If so, it is remembered.
+    /// Compares this policy with the best one and remembers the better one. Returns whether it is this policy.
     fn becomes_best(&mut self, published: &policy::Policy, mean: f64) -> Result<bool, Exit<ActorError>> {
         let candidate = Best {
             version: published.header().version,
@@ -252,13 +252,13 @@ impl<'a> Evaluator<'a> {
         Ok(replaced)
     }
 
-    /// Runs `episodes` evaluation episodes with these parameters, from number `first` on, and returns their returns.
+    /// Runs `episodes` evaluation episodes with these parameters, from number `first` on. Returns their returns.
     fn returns(&mut self, parameters: &[f32], first: u32, episodes: u32) -> Result<Vec<f64>, Exit<ActorError>> {
         let mut returns = Vec::new();
         while (returns.len() as u32) < episodes {
-            let over = returns.len() as u32;
+            let done = returns.len() as u32;
             // If the server dies, its episodes are run again.
-            match self.run_episodes(parameters, first.saturating_add(over), episodes - over) {
+            match self.run_episodes(parameters, first.saturating_add(done), episodes - done) {
                 Ok(Some(more)) => returns.extend(more),
                 Ok(None) => {}
                 Err(Exit::Failed(ActorError::Channel(error))) if error.fault().is_some() => {
@@ -301,8 +301,8 @@ impl<'a> Evaluator<'a> {
         Ok(published)
     }
 
-    /// Runs one evaluation episode in each environment with these parameters, from number `first` on, and at most `left`.
-    /// Returns their returns, or `None` if the server was lost.
+    /// Runs evaluation episodes with these parameters, from number `first` on: one in each environment, and at most
+    /// `left`. Returns their returns, or `None` if the server was lost.
     fn run_episodes(
         &mut self,
         parameters: &[f32],

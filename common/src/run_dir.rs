@@ -275,14 +275,14 @@ impl RunDir {
         self.path.join("outcome.json")
     }
 
-    /// `final-evaluation.json`: how its policies did at the end.
-    pub fn final_evaluation(&self) -> PathBuf {
-        self.path.join("final-evaluation.json")
-    }
-
     /// `server.json`: where the run's environment server is started, if it is another program.
     pub fn server_file(&self) -> PathBuf {
         self.path.join("server.json")
+    }
+
+    /// `final-evaluation.json`: the results of the evaluation at the end of the run.
+    pub fn final_evaluation(&self) -> PathBuf {
+        self.path.join("final-evaluation.json")
     }
 
     /// `shoal.log`: the log of all processes.

@@ -37,7 +37,7 @@ enum Body {
     },
 }
 
-/// What the environment itself calls the first observation and the first action of a discrete space; 0 of a box.
+/// The environment's own numbers of the first observation and the first action of discrete spaces; 0 for a box.
 #[derive(Clone, Copy, Debug)]
 struct Starts {
     observation: i32,
@@ -85,7 +85,7 @@ impl Portable {
         Ok(Self { body, starts, metadata })
     }
 
-    /// Adds the result of the run's final evaluation to the metadata.
+    /// Adds the policy's result in its run's final evaluation to the metadata.
     pub fn evaluated(mut self, seed: u64, evaluated: &FinallyEvaluated) -> anyhow::Result<Self> {
         let entries = [
             ("return", serde_json::to_string(&evaluated.return_mean)?),
@@ -239,7 +239,7 @@ mod tests_support {
         (config, policy)
     }
 
-    /// A task whose environment counts its observations from 1 and its actions from 5, and a policy of it.
+    /// A task whose environment numbers its observations from 1 and its actions from 5, and a policy for it.
     pub(super) fn with_starts() -> (Config, PolicyFile) {
         let (mut config, policy) = with_policy(
             "[run]\nid = \"1a\"\n[environment]\nname = \"frozen-lake\"\n[q-learning]\n[replay]\nwarmup = 0\n",

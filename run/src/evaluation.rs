@@ -51,14 +51,10 @@ pub struct EvaluationSummary {
 
 /// Runs the evaluation episodes 0 … `episodes` − 1 of `seed`. They start in the same states every time.
 pub fn evaluate(config: &Config, parameters: &[f32], episodes: u32, seed: u64) -> anyhow::Result<EvaluationSummary> {
-    let rollout = Rollout::new(config, parameters)?;
-    evaluate_by(rollout, config, (episodes, seed), |_| ())
+    evaluate_by(Rollout::new(config, parameters)?, config, episodes, seed, |_| ())
 }
 
 /// The same for this run: an environment that another program serves is served as in training.
-///
-/// # Errors
-/// As [`evaluate`].
 pub fn evaluate_run(
     run: &RunDir,
     config: &Config,
@@ -66,38 +62,45 @@ pub fn evaluate_run(
     episodes: u32,
     seed: u64,
 ) -> anyhow::Result<EvaluationSummary> {
-    let rollout = Rollout::of_run(run, config, parameters)?;
-    evaluate_by(rollout, config, (episodes, seed), |_| ())
+    evaluate_by(
+        Rollout::of_run(run, config, parameters)?,
+        config,
+        episodes,
+        seed,
+        |_| (),
+    )
 }
 
-/// As [`evaluate_run`], but a signal ends it with an error. `over` is told how many episodes are over.
+/// The same as [`evaluate_run`], but a signal ends it with an error. It calls `progress` with the number of finished
+/// episodes.
 ///
 /// # Errors
-/// When the environment fails, or a signal has come.
-pub fn evaluate_run_until(
+/// When the environment fails, or a signal has arrived.
+pub fn evaluate_until(
     run: &RunDir,
     config: &Config,
     parameters: &[f32],
     (episodes, seed): (u32, u64),
     interrupt: &Interrupt,
-    over: impl FnMut(u32),
+    progress: impl FnMut(u32),
 ) -> anyhow::Result<EvaluationSummary> {
     let rollout = Rollout::of_run(run, config, parameters)?.until(interrupt.clone());
-    evaluate_by(rollout, config, (episodes, seed), over)
+    evaluate_by(rollout, config, episodes, seed, progress)
 }
 
 fn evaluate_by(
     mut rollout: Rollout<'_>,
     config: &Config,
-    (episodes, seed): (u32, u64),
-    mut over: impl FnMut(u32),
+    episodes: u32,
+    seed: u64,
+    mut progress: impl FnMut(u32),
 ) -> anyhow::Result<EvaluationSummary> {
     let goal = Description::of(config)?.goal;
     let (mut returns, mut distances) = (Vec::new(), Vec::new());
     for number in 0..episodes {
         let trajectory = rollout.evaluation_episode(seed, number.into())?;
         returns.push(trajectory.episode_return());
-        over(number + 1);
+        progress(number + 1);
         if let Some(goal) = &goal {
             distances.extend(trajectory.values(goal.distance.source).last().copied());
         }

@@ -234,9 +234,9 @@ pub struct ExternalEnvironment {
     /// Ends every wait for an answer.
     stop: Stop,
     interrupt: Interrupt,
-    /// An answer was not waited for any longer.
+    /// Whether the wait for an answer was given up.
     silent: Cell<bool>,
-    /// How long an answer may take.
+    /// The longest time that an answer may take.
     limit: Duration,
     // Dropped last, in this order.
     _services: Services,
@@ -272,7 +272,7 @@ impl ExternalEnvironment {
     /// The same in these surroundings. A signal ends this and every later wait for an answer.
     ///
     /// # Errors
-    /// As for [`begin`](Self::begin), and when a signal has come.
+    /// As for [`begin`](Self::begin), and when a signal has arrived.
     pub fn begin_in(
         environment: &EnvironmentConfig,
         environments: u32,
@@ -323,7 +323,7 @@ impl ExternalEnvironment {
     /// Begins evaluation episode `number`.
     ///
     /// # Errors
-    /// When the program has ended, refuses or does not answer, or a signal has come.
+    /// When the server has ended, refuses or does not answer, or a signal has arrived.
     pub fn begin_evaluation(&mut self, number: u64) -> anyhow::Result<Observed> {
         let asked = Instant::now();
         let begun = self.client.reset(
@@ -340,14 +340,14 @@ impl ExternalEnvironment {
     /// Steps every environment with its action.
     ///
     /// # Errors
-    /// When the program has ended, refuses or does not answer, or a signal has come.
+    /// When the server has ended, refuses or does not answer, or a signal has arrived.
     pub fn step(&mut self, actions: &[f32]) -> anyhow::Result<Observed> {
         let asked = Instant::now();
         let stepped = self.client.step(&self.listener, actions, || self.give_up(asked));
         match checked(stepped, &mut self.program)?.map_or_else(|| self.unanswered(asked), Ok)? {
             Stepped::Taken(observed) => Ok(observed),
             Stepped::Lost => {
-                // It has left shared memory and is about to end; its last words say why.
+                // It has left shared memory and is about to end. The last lines it writes name the reason.
                 self.program.wait(LAST_WORDS);
                 self.program.check()?;
                 bail!("the environment server has lost its episodes")
@@ -355,12 +355,12 @@ impl ExternalEnvironment {
         }
     }
 
-    /// Whether it was asked something that it did not answer in time: asking another one would take as long.
+    /// Whether the server did not answer a request in time. A new server would take as long.
     pub fn is_silent(&self) -> bool {
         self.silent.get()
     }
 
-    /// Ends the wait for an answer that is not worth waiting for.
+    /// Ends the wait for an answer after a signal or the time limit.
     fn give_up(&self, asked: Instant) {
         if self.interrupt.signal().is_some() || asked.elapsed() >= self.limit {
             self.silent.set(true);

@@ -1,4 +1,4 @@
-//! The evaluation at the end of a run: `final-evaluation.json` in its directory, written by its launcher, whole or not at all.
+//! The evaluation at the end of a run: `final-evaluation.json` in its directory. Its launcher writes it atomically.
 
 use std::io::{ErrorKind, Write};
 
@@ -9,7 +9,7 @@ use shoal_common::run_dir::RunDir;
 
 use crate::evaluation::{EvaluationSummary, WhichPolicy};
 
-/// The number of the file's form.
+/// The number of the file's format.
 const FORMAT: u32 = 1;
 
 /// What the final evaluation of a run found.
@@ -18,11 +18,11 @@ pub struct FinalEvaluation {
     format: u32,
     /// The seed of the start states.
     pub seed: u64,
-    /// Environment steps of the run when it was made. A run that has more by now was resumed since.
+    /// The run's environment steps at the time. A run that has more now was resumed since.
     pub env_steps: u64,
-    /// Each policy that was evaluated.
+    /// The evaluated policies.
     pub policies: Vec<FinallyEvaluated>,
-    /// The policy that is `best.policy` since: the better one by this evaluation.
+    /// The better policy by this evaluation. It is `best.policy` since.
     pub kept: FinalPolicy,
 }
 
@@ -30,33 +30,33 @@ pub struct FinalEvaluation {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum FinalPolicy {
-    /// The one with the best evaluation during the training.
+    /// The policy with the best evaluation in training.
     Best,
-    /// The one that the learner ended with.
+    /// The learner's last policy.
     Last,
 }
 
-/// How a policy did in the final evaluation. A number that is not finite is `None`.
+/// A policy's result in the final evaluation. A number that is not finite is `None`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct FinallyEvaluated {
-    /// Which one it was when it was evaluated.
+    /// Which policy it was when it was evaluated.
     pub policy: FinalPolicy,
     /// Its version.
     pub version: u64,
-    /// Environment steps it was learned from.
+    /// Environment steps that it was learned from.
     pub env_steps: u64,
     /// Mean of the episodes' returns.
     pub return_mean: Option<f64>,
     /// Their standard deviation (n − 1).
     pub return_std: Option<f64>,
-    /// How many episodes.
+    /// Number of episodes.
     pub episodes: u32,
     /// The 95 % interval of the mean, by Student's t; `None` for a single episode.
     pub interval: Option<(f64, f64)>,
 }
 
 impl FinallyEvaluated {
-    /// The entry of a policy.
+    /// The entry of a policy of this version and number of environment steps.
     pub fn new(policy: FinalPolicy, (version, env_steps): (u64, u64), summary: &EvaluationSummary) -> Self {
         let finite = |number: f64| Some(number).filter(|number| number.is_finite());
         Self {
@@ -72,7 +72,7 @@ impl FinallyEvaluated {
 }
 
 impl FinalEvaluation {
-    /// The final evaluation of a run with so many environment steps.
+    /// The final evaluation of a run with this number of environment steps.
     pub fn new(seed: u64, env_steps: u64, policies: Vec<FinallyEvaluated>, kept: FinalPolicy) -> Self {
         Self {
             format: FORMAT,
@@ -83,7 +83,7 @@ impl FinalEvaluation {
         }
     }
 
-    /// How the policy did that a person asks for by this name today.
+    /// The result of the policy that now has this name.
     pub fn of(&self, which: WhichPolicy) -> Option<&FinallyEvaluated> {
         let policy = match which {
             WhichPolicy::Best => self.kept,
@@ -92,11 +92,11 @@ impl FinalEvaluation {
         self.policies.iter().find(|evaluated| evaluated.policy == policy)
     }
 
-    /// The final evaluation of a run that has `env_steps` environment steps; `None` where there is none, or where the run was
+    /// The final evaluation of a run that has `env_steps` environment steps; `None` if there is none, or if the run was
     /// resumed since.
     ///
     /// # Errors
-    /// When the file cannot be read, or is damaged or of another form.
+    /// When the file cannot be read, is damaged or has another format.
     pub fn read(run: &RunDir, env_steps: u64) -> anyhow::Result<Option<Self>> {
         let path = run.final_evaluation();
         let text = match std::fs::read(&path) {
@@ -104,10 +104,10 @@ impl FinalEvaluation {
             text => text.with_context(|| format!("cannot read {}", path.display()))?,
         };
         let read: Self = serde_json::from_slice(&text)
-            .with_context(|| format!("{} is damaged; without it nothing else is missing", path.display()))?;
+            .with_context(|| format!("{} is damaged; delete it: nothing else depends on it", path.display()))?;
         if read.format != FORMAT {
             anyhow::bail!(
-                "{} is of form {}, this program's is {FORMAT}",
+                "{} has format {}, this program reads format {FORMAT}",
                 path.display(),
                 read.format
             );
@@ -115,7 +115,7 @@ impl FinalEvaluation {
         Ok(Some(read).filter(|read| read.env_steps >= env_steps))
     }
 
-    /// Writes it, whole or not at all.
+    /// Writes it atomically.
     ///
     /// # Errors
     /// When it cannot be written.
@@ -194,6 +194,6 @@ mod tests {
             .replace("\"format\":1", "\"format\":2");
         std::fs::write(run.final_evaluation(), other).unwrap();
         let refused = FinalEvaluation::read(&run, 10).unwrap_err().to_string();
-        assert!(refused.contains("form 2") && !refused.contains('\n'), "{refused}");
+        assert!(refused.contains("format 2") && !refused.contains('\n'), "{refused}");
     }
 }

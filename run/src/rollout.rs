@@ -15,7 +15,7 @@ use crate::external_environment::ExternalEnvironment;
 use crate::server_location::Surroundings;
 use crate::signals::Interrupt;
 
-/// How often an episode is run that another program's failure breaks, each time with a program started anew.
+/// How often an episode is begun if the environment's server fails in it, each time with a new server.
 const TRIES: u32 = 5;
 
 /// An episode of T steps.
@@ -113,7 +113,7 @@ impl<'a> Rollout<'a> {
         })
     }
 
-    /// Ends an episode with an error when a signal has come.
+    /// After a signal, episodes end with an error.
     pub fn until(self, interrupt: Interrupt) -> Self {
         Self { interrupt, ..self }
     }
@@ -132,12 +132,12 @@ impl<'a> Rollout<'a> {
         self.episode(Start::States(state))
     }
 
-    /// An episode that the environment's program breaks is run again by a program that is started anew.
+    /// Runs an episode. If the environment's server fails in it, it is run again with a new server.
     fn episode(&mut self, start: Start<'_>) -> anyhow::Result<Trajectory> {
         let mut tries = 1;
         loop {
             match self.try_episode(start) {
-                Err(_) if tries < TRIES && self.interrupt.signal().is_none() && self.host.may_be_started_anew() => {
+                Err(_) if tries < TRIES && self.interrupt.signal().is_none() && self.host.can_be_restarted() => {
                     tries += 1;
                 }
                 Err(error) if tries > 1 => bail!("{error:#} (the episode was begun {tries} times)"),
@@ -149,7 +149,7 @@ impl<'a> Rollout<'a> {
     fn try_episode(&mut self, start: Start<'_>) -> anyhow::Result<Trajectory> {
         let mut observation = self
             .host
-            .begin(self.config, &self.surroundings, &self.interrupt, start)?;
+            .begin(self.config, &self.surroundings, start, &self.interrupt)?;
         let mut action = vec![0.0; self.config.spec.action.width()];
         let mut trajectory = Trajectory {
             observations: vec![observation.clone()],
@@ -189,8 +189,8 @@ impl Host {
         Ok(Self::Builtin(Box::new(environment)))
     }
 
-    /// Whether a program has run part of an episode and may do better when it is started anew; the old one is ended.
-    fn may_be_started_anew(&mut self) -> bool {
+    /// Ends the server that has failed in an episode. Returns whether a new one may do better.
+    fn can_be_restarted(&mut self) -> bool {
         match self {
             Self::Builtin(_) => false,
             Self::External(server) => server.take().is_some_and(|(_, server)| !server.is_silent()),
@@ -202,8 +202,8 @@ impl Host {
         &mut self,
         config: &Config,
         surroundings: &Surroundings,
-        interrupt: &Interrupt,
         start: Start<'_>,
+        interrupt: &Interrupt,
     ) -> anyhow::Result<Vec<f32>> {
         match (self, start) {
             (Self::Builtin(environment), start) => {

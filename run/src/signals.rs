@@ -12,12 +12,12 @@ use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 use crate::process::wait_for_any;
 
-/// Whether a signal has come that ends this process in order. The default is that none ever comes.
+/// Whether a signal has arrived that ends this process in order. By default, none ever arrives.
 #[derive(Clone, Debug, Default)]
 pub struct Interrupt(Arc<AtomicUsize>);
 
 impl Interrupt {
-    /// The last signal that has come.
+    /// The last signal that has arrived.
     pub fn signal(&self) -> Option<i32> {
         match self.0.load(Ordering::Relaxed) {
             0 => None,
@@ -63,7 +63,7 @@ impl Signals {
         self.interrupt().signal()
     }
 
-    /// What tells of the signals to code that does not wait for them.
+    /// A handle with which other code learns of the signals without waiting for them.
     pub fn interrupt(&self) -> Interrupt {
         Interrupt(Arc::clone(&self.last))
     }

@@ -46,7 +46,7 @@ pub(crate) fn run(args: &ExportArgs) -> anyhow::Result<()> {
     let which = name(args.policy.to_possible_value());
     let file = args.policy.read(&run, &config)?;
     let mut policy = Portable::new(&config, &file, &which)?;
-    // Whether it is of this very policy its version tells.
+    // The version tells whether the evaluation was of this policy.
     let evaluation = FinalEvaluation::read(&run, 0)?;
     if let Some(evaluation) = evaluation
         && let Some(evaluated) = evaluation.of(args.policy).filter(|it| it.version == file.version)

@@ -16,7 +16,7 @@ use shoal_learner::algorithms::registry;
 use shoal_learner::networks::digest;
 use shoal_learner::process::checkpoint::Checkpoints;
 use shoal_report::plots;
-use shoal_run::evaluation::{EvaluationSummary, WhichPolicy, evaluate_run_until};
+use shoal_run::evaluation::{EvaluationSummary, WhichPolicy, evaluate_until};
 use shoal_run::final_evaluation::{FinalEvaluation, FinalPolicy, FinallyEvaluated};
 use shoal_run::numbers::thousands;
 use shoal_run::outcome::{RunOutcome, RunState};
@@ -110,8 +110,8 @@ pub(crate) fn run_training(
     })
 }
 
-/// The final evaluation: the policy with the best evaluation first, then the last one. The better of them is `best.policy` from
-/// then on.
+/// The final evaluation: first of the policy with the best evaluation, then of the last one. Afterwards `best.policy` is
+/// the better of them.
 fn final_evaluation(
     config: &Config,
     run: &RunDir,
@@ -140,14 +140,14 @@ fn final_evaluation(
             if !file.parameters.iter().all(|parameter| parameter.is_finite()) {
                 continue;
             }
-            let tell = |over: u32| bar.set_position(over.into());
-            let summary = evaluate_run_until(run, config, &file.parameters, (episodes, seed), interrupt, tell);
+            let progress = |finished: u32| bar.set_position(finished.into());
+            let summary = evaluate_until(run, config, &file.parameters, (episodes, seed), interrupt, progress);
             let summary = summary.inspect_err(|_| bar.finish_and_clear())?;
             evaluated.push((name, policy, file, summary));
         }
     }
     bar.finish_and_clear();
-    // The last policy has to be better, not as good.
+    // The last policy replaces the best one only if it is better.
     let mut kept: Option<&(&str, FinalPolicy, PolicyFile, EvaluationSummary)> = None;
     for candidate in evaluated.iter().filter(|(.., summary)| summary.return_mean.is_finite()) {
         if kept.is_none_or(|(.., summary)| candidate.3.return_mean > summary.return_mean) {
@@ -176,7 +176,8 @@ fn final_evaluation(
     Ok(std::iter::once(best).chain(last).collect())
 }
 
-/// Keeps the last policy as the best one where no policy with a finite evaluation is kept: what was learned can be used.
+/// Keeps the last policy as the best one if there is no policy with a finite evaluation, so that the run has a policy to
+/// use.
 fn keep_some_policy(config: &Config, run: &RunDir) -> anyhow::Result<()> {
     let kept = run.best_policy().exists() && WhichPolicy::Best.read(run, config)?.return_mean.is_finite();
     if !kept && run.last_policy().exists() {

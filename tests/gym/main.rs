@@ -216,7 +216,7 @@ fn an_unsupported_environment_is_refused_in_one_line_and_leaves_no_run() {
     }
 }
 
-/// A run of an environment that fails in its final evaluation, and has no other one: an evaluation is not due before.
+/// The arguments of a run whose environment fails in the final evaluation. No other evaluation is due.
 fn with_a_finale(how: &str) -> Vec<&str> {
     vec!["--steps", "200", "--set", "evaluation.every=1000000", "--set", how]
 }

@@ -164,6 +164,29 @@ class Invalid(gym.Env):
 
 
 gym.register("Invalid-v0", entry_point=Invalid, max_episode_steps=5)
+
+
+class Finale(Ends):
+    """Fails in the final evaluation, when the run in ``run`` has its last policy: once, always, or by sleeping."""
+
+    def __init__(self, how):
+        super().__init__(after=0)
+        self.how = how
+
+    def step(self, action):
+        # Actors may still step when the last policy is written.
+        in_run = "config/iceoryx2.toml" in open("/proc/self/cmdline").read()
+        if os.path.exists("run/checkpoints/last.policy") and not in_run:
+            first = not os.path.exists("final")
+            open("final", "w").close()
+            if self.how == "sleeps":
+                time.sleep(54321)
+            if self.how == "always" or first:
+                raise RuntimeError("the last act fails")
+        return super().step(action)
+
+
+gym.register("Finale-v0", entry_point=Finale, max_episode_steps=5)
 gym.register("Ends-v0", entry_point=Ends, max_episode_steps=5)
 gym.register("Endless-v0", entry_point=Ends)
 gym.register("Fails-v0", entry_point=Fails, max_episode_steps=5)

@@ -11,11 +11,11 @@ section! {
         every: u64 = 2_000, bounds: from(1, u64::MAX), unit: "environment steps", source: "ours";
         /// Episodes of an evaluation. Their start states are always the same.
         episodes: u32 = 10, bounds: from(1, 10_000), unit: "episodes", source: "ours";
+        /// A policy that seems better than the best one must also be better on this many times `episodes` other episodes.
+        /// 0: the first comparison decides.
+        confirm: u32 = 2, bounds: from(0, 100), unit: "–", source: "ours";
         /// Environments that the evaluator steps at once, and no more than an evaluation has episodes.
         envs: u32 = 64, bounds: from(1, 64), unit: "environments", source: "ours";
-        /// A policy with a better evaluation than the best one must also be better on this many times `episodes` other
-        /// episodes. 0: the first comparison decides.
-        confirm: u32 = 2, bounds: from(0, 100), unit: "–", source: "ours";
         /// Episodes of the last evaluation. Their mean return is the run's result.
         final_episodes: u32 = 100, bounds: from(1, 100_000), unit: "episodes", source: "ours";
         /// Whether every evaluated policy is kept, not only the best.

@@ -26,7 +26,7 @@ const BATCH: &str = "batch";
 /// - Tables: `state` (batch, 64-bit) to `action_values` (batch × actions) and `action` (batch, the one of highest
 ///   value).
 ///
-/// Discrete states and actions are counted as the environment counts them, from its spaces' starts on.
+/// Discrete states and actions have the environment's own numbers, which begin at their spaces' starts.
 pub(super) fn model(policy: &Portable) -> Vec<u8> {
     let mut graph = Graph {
         name: "policy".into(),
@@ -45,7 +45,7 @@ pub(super) fn model(policy: &Portable) -> Vec<u8> {
             graph.add_node("Mul", &["tanh", "action_half_width"], "scaled", vec![]);
             graph.add_tensor("action_centre", &[outputs], &centre);
             graph.add_node("Add", &["scaled", "action_centre"], "unclipped", vec![]);
-            // Rounding may lead out of the bounds.
+            // Rounding can leave the bounds.
             graph.add_tensor("action_low", &[outputs], range.low());
             graph.add_node("Max", &["unclipped", "action_low"], "bounded_below", vec![]);
             graph.add_tensor("action_high", &[outputs], range.high());
@@ -121,7 +121,8 @@ impl Graph {
         }
     }
 
-    /// Adds `action`: the index of the highest score, the first one among equal scores, counted from `start`.
+    /// Adds `action`: the index of the highest score, the first one among equal scores. The environment numbers its
+    /// actions from `start` on.
     fn add_arg_max(&mut self, scores: &str, start: i32) {
         let attributes = vec![
             integer("axis", 1),

@@ -34,7 +34,7 @@ function table(label, rows) {
 
 function overview() {
   const evaluated = (of) => (of ? `${text(of.mean)} ± ${text(of.std)} (${plural(of.episodes, "episode")}, step ${whole(of.env_steps)})` : "not evaluated yet");
-  const finally_ = (of) => (of && of.return_mean !== null ? `${text(of.return_mean)} ± ${text(of.return_std)} (${plural(of.episodes, "episode")}${of.interval ? `, mean in ${text(of.interval[0])} … ${text(of.interval[1])} with 95 %` : ""})` : "none");
+  const finalEvaluation = (of) => (of && of.return_mean !== null ? `${text(of.return_mean)} ± ${text(of.return_std)} (${plural(of.episodes, "episode")}${of.interval ? `, 95 % interval of the mean ${text(of.interval[0])} … ${text(of.interval[1])}` : ""})` : "none");
   const states = { training: "training", finished: "finished", unfinished: "not finished" };
   const planned = (run) => `${whole(run.env_steps)} of ${whole(run.planned_steps)}`;
   const episodes = (run) => (run.planned_episodes === null ? whole(run.episodes) : `${whole(run.episodes)} of ${whole(run.planned_episodes)}`);
@@ -50,7 +50,7 @@ function overview() {
     ["time", (run) => duration(run.wall_seconds)],
     ["best return", (run) => evaluated(run.best)],
     ["last return", (run) => evaluated(run.last)],
-    ["final evaluation", (run) => finally_(run.finally)],
+    ["final evaluation", (run) => finalEvaluation(run.final_evaluation)],
     ["processes", incidents],
   ];
   section(

@@ -40,7 +40,7 @@ pub(super) struct Run {
     best: Option<EvaluatedPolicy>,
     last: Option<EvaluatedPolicy>,
     /// The best policy's final evaluation.
-    finally: Option<FinallyEvaluated>,
+    final_evaluation: Option<FinallyEvaluated>,
     evaluations: Curve,
     exploration: Curve,
     learner: Rates,
@@ -145,7 +145,8 @@ impl Run {
                 .find(|row| row.best == 1)
                 .map(EvaluatedPolicy::of),
             last: evaluation_records.last().map(EvaluatedPolicy::of),
-            finally: FinalEvaluation::read(run, now.env_steps)?.and_then(|it| it.of(WhichPolicy::Best).cloned()),
+            final_evaluation: FinalEvaluation::read(run, now.env_steps)?
+                .and_then(|it| it.of(WhichPolicy::Best).cloned()),
             evaluations: Curve::of_evaluations(&evaluation_records, limits.points),
             exploration: Curve::of_episodes(&explored, limits.points),
             learner: Rates::of(learner, limits.points),

@@ -122,8 +122,8 @@ impl Observed {
     }
 }
 
-/// Asks environment server `index` for its spaces and the number of its environments, when neither is known yet. While it
-/// waits for the answer it calls `idle`, about 20 times a second.
+/// Asks environment server `index` for its spaces and the number of its environments, when neither is known yet.
+/// While it waits for the answer, it calls `idle` about twenty times a second.
 ///
 /// # Errors
 /// When `stop` is requested, or the channel fails.

@@ -65,12 +65,12 @@ impl ActionRange {
         })
     }
 
-    /// The least value of each element.
+    /// The lowest value of each element.
     pub fn low(&self) -> &[f32] {
         &self.low
     }
 
-    /// The greatest value of each element.
+    /// The highest value of each element.
     pub fn high(&self) -> &[f32] {
         &self.high
     }
@@ -90,8 +90,8 @@ impl ActionRange {
         a.clamp(self.action(element, -1.0), self.action(element, 1.0))
     }
 
-    /// The value of element `element` of an action for the tanh output `t`. Rounding never takes it out of
-    /// the space's bounds.
+    /// The value of element `element` of an action for the tanh output `t`. It is within the space's bounds,
+    /// whatever the rounding.
     pub fn action(&self, element: usize, t: f32) -> f32 {
         (self.centre[element] + self.half[element] * t).clamp(self.low[element], self.high[element])
     }
