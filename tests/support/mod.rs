@@ -8,6 +8,7 @@ use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process, test_kill_process};
+use shoal_common::channel::Domain;
 
 /// A wait that takes longer has failed, even on a slow machine.
 const TIMEOUT: Duration = Duration::from_secs(120);
@@ -52,10 +53,9 @@ impl Workplace {
 
     /// A directory whose runs log every chunk that is sent.
     pub(crate) fn logging_chunks() -> Self {
-        Self {
-            log: "debug",
-            ..Self::new()
-        }
+        let mut place = Self::new();
+        place.log = "debug";
+        place
     }
 
     pub(crate) fn path(&self) -> &Path {
@@ -249,11 +249,24 @@ impl Drop for Running {
     fn drop(&mut self) {
         let _ = self.child.kill();
         let _ = self.child.wait();
-        for (_, pid) in pids(&self.log()) {
-            if is_ours(pid) {
-                let _ = kill_process(Pid::from_raw(pid).unwrap(), Signal::KILL);
+        let processes = pids(&self.log());
+        for (_, pid) in &processes {
+            if is_ours(*pid) {
+                let _ = kill_process(Pid::from_raw(*pid).unwrap(), Signal::KILL);
             }
         }
+        // Not `until`: a panic while another one unwinds would abort the suite.
+        let begun = Instant::now();
+        while processes.iter().any(|(_, pid)| is_ours(*pid)) && begun.elapsed() < TIMEOUT {
+            std::thread::sleep(Duration::from_millis(10));
+        }
+    }
+}
+
+/// Killed processes leave their shared memory to the next start of a run. This test may be the last to start one.
+impl Drop for Workplace {
+    fn drop(&mut self) {
+        let _ = Domain::remove_abandoned();
     }
 }
 

@@ -73,6 +73,28 @@ mod tests {
     use super::*;
     use crate::replay::{ChunkMark, ReplayLayout};
 
+    fn layout() -> ReplayLayout {
+        ReplayLayout {
+            row: RowLayout::new(2, 1),
+            ring: 5,
+            actors: 1,
+            actor_snapshot_words: 0,
+            fingerprint: 0,
+        }
+    }
+
+    /// A replay that holds these rows, and the directory of its file.
+    fn replay_of(rows: &[f32]) -> (tempfile::TempDir, Replay) {
+        let directory = tempfile::tempdir().unwrap();
+        let mut replay = Replay::create(&directory.path().join("replay"), &layout()).unwrap();
+        let mark = ChunkMark {
+            incarnation: 0,
+            sequence: 1,
+        };
+        replay.append_and_commit(0, mark, rows).unwrap();
+        (directory, replay)
+    }
+
     #[test]
     fn a_transition_becomes_a_column() {
         let mut batch = Minibatch::new(RowLayout::new(2, 1), 3);
@@ -97,21 +119,9 @@ mod tests {
 
     #[test]
     fn rows_of_the_replay_become_columns_in_the_order_asked_for() {
-        let layout = ReplayLayout {
-            row: RowLayout::new(2, 1),
-            ring: 5,
-            actors: 1,
-            actor_snapshot_words: 0,
-            fingerprint: 0,
-        };
-        let directory = tempfile::tempdir().unwrap();
-        let mut replay = Replay::create(&directory.path().join("replay"), &layout).unwrap();
+        let layout = layout();
         let rows: Vec<f32> = (0..4 * layout.row.width()).map(|i| i as f32).collect();
-        let mark = ChunkMark {
-            incarnation: 0,
-            sequence: 1,
-        };
-        replay.append_and_commit(0, mark, &rows).unwrap();
+        let (_directory, replay) = replay_of(&rows);
         let (mut gathered, mut expected) = (Minibatch::new(layout.row, 3), Minibatch::new(layout.row, 3));
         gathered.gather(&replay, &[3, 0, 3], &replay.rows());
         for (column, row) in [3, 0, 3].into_iter().enumerate() {
@@ -125,24 +135,12 @@ mod tests {
 
     #[test]
     fn a_row_with_a_number_that_is_not_finite_is_replaced_by_the_next_good_one() {
-        let layout = ReplayLayout {
-            row: RowLayout::new(2, 1),
-            ring: 5,
-            actors: 1,
-            actor_snapshot_words: 0,
-            fingerprint: 0,
-        };
-        let directory = tempfile::tempdir().unwrap();
-        let mut replay = Replay::create(&directory.path().join("replay"), &layout).unwrap();
+        let layout = layout();
         let width = layout.row.width();
         let mut rows: Vec<f32> = (0..4 * width).map(|i| i as f32).collect();
         rows[width] = f32::NAN;
         rows[4 * width - 2] = f32::INFINITY;
-        let mark = ChunkMark {
-            incarnation: 0,
-            sequence: 1,
-        };
-        replay.append_and_commit(0, mark, &rows).unwrap();
+        let (_directory, replay) = replay_of(&rows);
         let (mut gathered, mut expected) = (Minibatch::new(layout.row, 4), Minibatch::new(layout.row, 4));
         gathered.gather(&replay, &[0, 1, 2, 3], &replay.rows());
         for (column, row) in [0, 2, 2, 0].into_iter().enumerate() {
