@@ -11,11 +11,12 @@ use shoal_common::channel::environment::ResponseLayout;
 use shoal_common::commit::CommitReader;
 use shoal_common::config::{Algorithm, Config, Warmup};
 use shoal_common::network::{ActionRange, PolicyNetwork};
-use shoal_common::stream::{Purpose, stream};
+use shoal_common::stream::{Purpose, seek, stream};
 use shoal_common::transition::Transition;
 use shoal_env_server::vector::{Start, VectorEnvironment};
 use shoal_learner::algorithms::ddpg::Ddpg;
 use shoal_learner::algorithms::minibatch::Minibatch;
+use shoal_learner::algorithms::replayed::MinibatchLearner;
 use shoal_learner::algorithms::sampling::Sampler;
 use support::{QUICK, Workplace, final_result, json, until, wait_for_rows};
 
@@ -314,8 +315,7 @@ fn twin(config: &Config) -> String {
     environment.reset(Start::Next, &mut s).unwrap();
     for t in 0..config.run.steps {
         if learner.updates() == 0 && exploration.warmup == Warmup::Uniform {
-            uniform.set_stream(t);
-            uniform.set_word_pos(0);
+            let uniform = seek(&mut uniform, t);
             for (i, a) in a.iter_mut().enumerate() {
                 *a = mu.range().action(i, uniform.random_range(-1.0..=1.0));
             }

@@ -1,10 +1,11 @@
 //! How actors explore: a variant for each kind of exploration.
 
 use rand::RngExt;
-use shoal_common::algorithms::{Behaviour, Warmup};
-use shoal_common::network::PolicyNetwork;
+use rand_distr::StandardNormal;
+use shoal_common::algorithms::{Behaviour, Epsilon, Warmup};
+use shoal_common::network::{ActionRange, GaussianPolicy, PolicyNetwork};
 use shoal_common::policy::{PolicyLayout, Scores, highest};
-use shoal_common::stream::Stream;
+use shoal_common::stream::{Stream, seek};
 
 use crate::noise::OrnsteinUhlenbeck;
 
@@ -12,13 +13,24 @@ use crate::noise::OrnsteinUhlenbeck;
 /// so that a repeated step gets the same ones.
 #[derive(Clone, Debug)]
 pub enum Exploration {
-    /// DDPG: the policy's action and noise (line 8 of Algorithm 4).
+    /// DDPG and TD3: the policy's action and noise (line 8 of Algorithm 4).
     Noise(PolicyNetwork, OrnsteinUhlenbeck),
+    /// SAC: an action drawn from π(·|s).
+    Gaussian(GaussianPolicy, Stream),
     /// REINFORCE: an action drawn from π(·|s), the softmax of the scores (line 3 of Algorithm 3).
     Sample(Scores, Stream),
-    /// Q-learning and SARSA: with probability ε a uniformly random action, otherwise the action with the highest value,
-    /// the first among equals (section 3.3.2).
-    EpsilonGreedy(Scores, Stream, f64),
+    /// DQN, Q-learning and SARSA: with probability ε a uniformly random action, otherwise the action with the highest
+    /// value, the first among equals (section 3.3.2).
+    EpsilonGreedy(Scores, Stream, Epsilon),
+}
+
+/// How far a run has come when actions are chosen.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Progress {
+    /// Steps that each environment has made before, since the actor's random stream began.
+    pub step: u64,
+    /// Environment steps of all actors that the policy was learned from.
+    pub env_steps: u64,
 }
 
 impl Exploration {
@@ -29,6 +41,7 @@ impl Exploration {
                 let noise = OrnsteinUhlenbeck::new(&noise, environments, network.range().width(), stream);
                 Self::Noise(network, noise)
             }
+            Behaviour::Gaussian(policy) => Self::Gaussian(policy, stream),
             Behaviour::Sample(scores) => Self::Sample(scores, stream),
             Behaviour::EpsilonGreedy(scores, epsilon) => Self::EpsilonGreedy(scores, stream, epsilon),
         }
@@ -38,42 +51,50 @@ impl Exploration {
     pub fn layout(&self) -> PolicyLayout {
         match self {
             Self::Noise(network, _) => PolicyLayout::Deterministic(*network.layout()),
+            Self::Gaussian(policy, _) => PolicyLayout::Gaussian(*policy.layout()),
             Self::Sample(scores, _) | Self::EpsilonGreedy(scores, ..) => scores.layout(),
         }
     }
 
-    /// Chooses the actions of step number `step` before the policy's first update.
-    pub fn warm_up(&mut self, parameters: &[f32], observations: &[f32], step: u64, actions: &mut [f32]) {
+    /// Chooses the actions before the policy's first update.
+    pub fn warm_up(&mut self, parameters: &[f32], observations: &[f32], progress: Progress, actions: &mut [f32]) {
         match self {
             Self::Noise(network, noise) if noise.warmup() == Warmup::Uniform => {
-                noise.draw_uniformly(step, actions, network.range());
+                draw_uniformly(noise.stream_at(progress.step), actions, network.range());
             }
-            _ => self.act(parameters, observations, step, actions),
+            Self::Gaussian(policy, stream) => draw_uniformly(seek(stream, progress.step), actions, policy.range()),
+            _ => self.act(parameters, observations, progress, actions),
         }
     }
 
-    /// Chooses the actions of step number `step`, one for each observation.
-    pub fn act(&mut self, parameters: &[f32], observations: &[f32], step: u64, actions: &mut [f32]) {
+    /// Chooses the actions, one for each observation.
+    pub fn act(&mut self, parameters: &[f32], observations: &[f32], progress: Progress, actions: &mut [f32]) {
+        let Progress { step, env_steps } = progress;
         match self {
             Self::Noise(network, noise) => {
                 network.forward(parameters, observations, actions);
                 noise.advance(step);
                 noise.add_to(actions, network.range());
             }
+            Self::Gaussian(policy, stream) => {
+                let stream = seek(stream, step);
+                policy.sample(parameters, observations, || stream.sample(StandardNormal), actions);
+            }
             Self::Sample(logits, stream) => {
-                seek(stream, step);
+                let stream = seek(stream, step);
                 for (action, logits) in actions.iter_mut().zip(logits.of(parameters, observations)) {
                     *action = draw(logits, stream.random()) as f32;
                 }
             }
             Self::EpsilonGreedy(values, stream, epsilon) => {
-                seek(stream, step);
+                let stream = seek(stream, step);
+                let epsilon = epsilon.after(env_steps);
                 let count = values.actions();
                 for (action, values) in actions.iter_mut().zip(values.of(parameters, observations)) {
                     // Both are always drawn, so that the next environment's numbers do not depend on the first.
                     let (explore, which): (f64, f64) = (stream.random(), stream.random());
                     let any = (which * count as f64) as usize;
-                    *action = if explore < *epsilon { any } else { highest(values) } as f32;
+                    *action = if explore < epsilon { any } else { highest(values) } as f32;
                 }
             }
         }
@@ -90,7 +111,7 @@ impl Exploration {
     pub(crate) fn state(&self) -> &[f64] {
         match self {
             Self::Noise(_, noise) => noise.state(),
-            Self::Sample(..) | Self::EpsilonGreedy(..) => &[],
+            Self::Gaussian(..) | Self::Sample(..) | Self::EpsilonGreedy(..) => &[],
         }
     }
 
@@ -102,9 +123,13 @@ impl Exploration {
     }
 }
 
-fn seek(stream: &mut Stream, step: u64) {
-    stream.set_stream(step);
-    stream.set_word_pos(0);
+/// Draws every element of the actions uniformly from its range.
+fn draw_uniformly(stream: &mut Stream, actions: &mut [f32], range: &ActionRange) {
+    for action in actions.chunks_exact_mut(range.width()) {
+        for (element, a) in action.iter_mut().enumerate() {
+            *a = range.action(element, stream.random_range(-1.0..=1.0));
+        }
+    }
 }
 
 /// Draws an action from the softmax of these logits by `u`, which is uniform in [0, 1).
@@ -124,9 +149,15 @@ fn draw(logits: &[f32], u: f64) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use shoal_common::config::{Algorithm, DdpgConfig, ReinforceConfig, TabularConfig};
+    use shoal_common::config::{
+        Algorithm, DdpgConfig, DqnConfig, ReinforceConfig, SacConfig, TabularConfig, Td3Config,
+    };
     use shoal_common::space::{EnvironmentSpec, Space};
     use shoal_common::stream::{Purpose, stream};
+
+    fn at(step: u64) -> Progress {
+        Progress { step, env_steps: 0 }
+    }
 
     fn lake(epsilon: f64) -> Exploration {
         let spec = EnvironmentSpec {
@@ -148,7 +179,7 @@ mod tests {
         let mut counts = vec![0; 4];
         let mut action = [f32::NAN];
         for step in 0..4_000 {
-            exploration.act(parameters, observation, step, &mut action);
+            exploration.act(parameters, observation, at(step), &mut action);
             counts[action[0] as usize] += 1;
         }
         counts
@@ -197,23 +228,25 @@ mod tests {
             time_limit: 100,
             state_width: 1,
         };
+        let new_for = |algorithm: Algorithm| {
+            let behaviour = algorithm.behaviour(&spec, 1).unwrap();
+            Exploration::new(behaviour, 1, stream(7, Purpose::Exploration, 0, 0))
+        };
         let new = |warmup| {
             let noise = shoal_common::config::ExplorationConfig {
                 warmup,
                 ..Default::default()
             };
-            let algorithm = Algorithm::Ddpg(DdpgConfig {
+            new_for(Algorithm::Ddpg(DdpgConfig {
                 exploration: noise,
                 ..DdpgConfig::default()
-            });
-            let behaviour = algorithm.behaviour(&spec, 1).unwrap();
-            Exploration::new(behaviour, 1, stream(7, Purpose::Exploration, 0, 0))
+            }))
         };
-        type Act = fn(&mut Exploration, &[f32], &[f32], u64, &mut [f32]);
+        type Act = fn(&mut Exploration, &[f32], &[f32], Progress, &mut [f32]);
         let choose = |exploration: &mut Exploration, act: Act, step| {
             let parameters = vec![0.0; exploration.layout().parameters()];
             let mut action = [f32::NAN; 2];
-            act(exploration, &parameters, &[0.5], step, &mut action);
+            act(exploration, &parameters, &[0.5], at(step), &mut action);
             action
         };
         let (warm_up, act): (Act, Act) = (Exploration::warm_up, Exploration::act);
@@ -232,6 +265,12 @@ mod tests {
                 );
             }
         }
+        for algorithm in [
+            Algorithm::Td3(Td3Config::default()),
+            Algorithm::Sac(SacConfig::default()),
+        ] {
+            assert_eq!(choose(&mut new_for(algorithm), warm_up, 77), warm[77]);
+        }
         let mut with_policy = new(Warmup::Policy);
         let noisy = choose(&mut with_policy, warm_up, 0);
         assert_eq!(
@@ -240,6 +279,69 @@ mod tests {
             "the noise begins at rest after a uniform warm-up"
         );
         assert_eq!(choose(&mut new(Warmup::Policy), act, 0), noisy);
+    }
+
+    #[test]
+    fn sacs_actions_have_the_policys_distribution_and_depend_only_on_the_step() {
+        let spec = EnvironmentSpec {
+            observation: Space::boxed(&[(-1.0, 1.0)]),
+            action: Space::boxed(&[(-1.0, 1.0)]),
+            time_limit: 100,
+            state_width: 1,
+        };
+        let algorithm = Algorithm::Sac(SacConfig {
+            hidden: [1].into(),
+            ..SacConfig::default()
+        });
+        let behaviour = algorithm.behaviour(&spec, 1).unwrap();
+        let mut exploration = Exploration::new(behaviour, 1, stream(7, Purpose::Exploration, 0, 0));
+        // Whatever is observed, μ = 0.3 and log σ = −1.
+        let parameters = [0.0, 0.0, 0.0, 0.0, 0.3, -1.0];
+        let mut u = |step| {
+            let mut action = [f32::NAN];
+            exploration.act(&parameters, &[0.5], at(step), &mut action);
+            f64::from(action[0]).atanh()
+        };
+        let drawn: Vec<f64> = (0..4_000).map(&mut u).collect();
+        let mean = drawn.iter().sum::<f64>() / 4_000.0;
+        let sigma = (drawn.iter().map(|u| (u - mean).powi(2)).sum::<f64>() / 4_000.0).sqrt();
+        // Their standard errors are 0.006 and 0.004.
+        assert!((mean - 0.3).abs() < 0.03, "mean {mean}");
+        assert!((sigma - (-1.0_f64).exp()).abs() < 0.02, "standard deviation {sigma}");
+        assert_eq!(u(77), drawn[77]);
+    }
+
+    #[test]
+    fn dqns_epsilon_follows_the_environment_steps_that_the_policy_was_learned_from() {
+        let spec = EnvironmentSpec {
+            observation: Space::boxed(&[(-1.0, 1.0)]),
+            action: Space::discrete(4),
+            time_limit: 100,
+            state_width: 1,
+        };
+        let algorithm = Algorithm::Dqn(DqnConfig {
+            hidden: [1].into(),
+            epsilon_end: 0.0,
+            epsilon_steps: 1_000,
+            ..DqnConfig::default()
+        });
+        let behaviour = algorithm.behaviour(&spec, 1).unwrap();
+        let mut exploration = Exploration::new(behaviour, 1, stream(7, Purpose::Exploration, 0, 0));
+        // The third action has the highest value.
+        let parameters = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.5];
+        let mut best = |env_steps| {
+            let mut action = [f32::NAN];
+            let steps = (0..2_000).filter(|step| {
+                let progress = Progress { step: *step, env_steps };
+                exploration.act(&parameters, &[0.5], progress, &mut action);
+                action[0] == 2.0
+            });
+            steps.count()
+        };
+        // A quarter of the random actions is the best one: 500, 1,250 and 2,000 with standard deviations of 19 and 22.
+        assert!(best(0).abs_diff(500) < 100);
+        assert!(best(500).abs_diff(1_250) < 110);
+        assert_eq!(best(1_000), 2_000);
     }
 
     #[test]

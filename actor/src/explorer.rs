@@ -32,7 +32,7 @@ use shoal_common::transition::{ChunkLayout, Transition};
 
 use crate::actor_snapshot::ActorSnapshot;
 use crate::error::ActorError;
-use crate::exploration::Exploration;
+use crate::exploration::{Exploration, Progress};
 
 /// What the line about an invalid answer of an environment server ends with; the launcher looks for it.
 pub const GIVEN_UP: &str = "its episodes are given up";
@@ -309,11 +309,15 @@ impl<'a> Explorer<'a> {
             0 => Exploration::warm_up,
             _ => Exploration::act,
         };
+        let progress = Progress {
+            step: self.step,
+            env_steps: policy.header().env_steps,
+        };
         act(
             &mut self.exploration,
             policy.parameters(),
             current.observations(),
-            self.step,
+            progress,
             &mut self.actions,
         );
     }

@@ -4,7 +4,7 @@ use rand::RngExt;
 use rand_distr::StandardNormal;
 use shoal_common::config::{ExplorationConfig, Warmup};
 use shoal_common::network::ActionRange;
-use shoal_common::stream::Stream;
+use shoal_common::stream::{Stream, seek};
 
 /// The noise of one actor's environments. A step's normal numbers depend only on its number, so that a repeated step
 /// gets the same ones.
@@ -48,30 +48,19 @@ impl OrnsteinUhlenbeck {
         self.settings.warmup
     }
 
-    /// Draws every element of the actions uniformly from its range, with the random numbers of step `step`. The noise
-    /// does not change.
-    pub fn draw_uniformly(&mut self, step: u64, actions: &mut [f32], range: &ActionRange) {
-        self.seek(step);
-        for action in actions.chunks_exact_mut(range.width()) {
-            for (i, a) in action.iter_mut().enumerate() {
-                *a = range.action(i, self.stream.random_range(-1.0..=1.0));
-            }
-        }
+    /// The random numbers of step number `step`.
+    pub(crate) fn stream_at(&mut self, step: u64) -> &mut Stream {
+        seek(&mut self.stream, step)
     }
 
     /// Advances every process by step number `step`: x ← x − θ x + σ N(0, 1).
     pub fn advance(&mut self, step: u64) {
-        self.seek(step);
         let ExplorationConfig { theta, sigma, .. } = self.settings;
+        let stream = seek(&mut self.stream, step);
         for x in &mut self.x {
-            let normal: f64 = self.stream.sample(StandardNormal);
+            let normal: f64 = stream.sample(StandardNormal);
             *x += -theta * *x + sigma * normal;
         }
-    }
-
-    fn seek(&mut self, step: u64) {
-        self.stream.set_stream(step);
-        self.stream.set_word_pos(0);
     }
 
     /// Adds the noise to the actions, in units of half the range of each action element, and clips the sum to the range

@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::bail;
 use serde::Serialize;
-use shoal_actor::exploration::Exploration;
+use shoal_actor::exploration::{Exploration, Progress};
 use shoal_common::channel::environment::{Begin, EnvironmentClient, ResponseLayout, Stepped};
 use shoal_common::channel::transitions::ChunkSender;
 use shoal_common::channel::{Domain, EventName, Listener, Notifier};
@@ -100,7 +100,8 @@ pub(super) fn measure(length: Duration, budget: &Budget) -> anyhow::Result<Costs
             actions,
             ..
         } = &mut inference;
-        exploration.act(parameters, std::hint::black_box(observations), step, actions);
+        let progress = Progress { step, env_steps: 0 };
+        exploration.act(parameters, std::hint::black_box(observations), progress, actions);
         step += 1;
         std::hint::black_box(actions);
     })?;

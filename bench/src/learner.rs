@@ -2,29 +2,30 @@
 
 use std::time::Duration;
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use serde::Serialize;
+use shoal_common::algorithms::Experience;
 use shoal_common::commit::ChunkMark;
-use shoal_common::config::{self, Config};
+use shoal_common::config::Config;
 use shoal_common::stream::{Purpose, stream};
 use shoal_learner::algorithms::algorithm::Algorithm;
-use shoal_learner::algorithms::ddpg::Ddpg;
-use shoal_learner::algorithms::ddpg::replayed::ReplayedDdpg;
-use shoal_learner::networks::product::products_of_update;
+use shoal_learner::algorithms::registry;
+use shoal_learner::networks::product::Products;
 use shoal_learner::networks::threads::Threads;
 use shoal_learner::replay::Replay;
+use toml::{Table, Value};
 
 use super::measurement::{Budget, Figures};
 use super::product::Multiplication;
 use super::rows::{ENVIRONMENTS, Rows};
 use super::target::{Line, Target};
-use super::temporary_run::{TemporaryRun, ddpg};
+use super::temporary_run::TemporaryRun;
 use super::window::{self, Windows};
 
 const WINDOW: Duration = Duration::from_millis(100);
 
 /// Share of the time for each of seven measurements: for both minibatch sizes the gradient steps, the fastest product
-/// and all products; and gradient steps on two threads.
+/// and all products; and gradient steps on two threads. A method whose minibatches are large has only four.
 const SHARE: f64 = 1.0 / 7.0;
 
 /// The second minibatch size, large enough that Adam takes little of the time.
@@ -39,14 +40,17 @@ const WARM_UP: f64 = 0.05;
 /// The fields of `bench learner --json`.
 #[derive(Serialize)]
 pub(super) struct LearnerFigures {
+    method: String,
     #[serde(flatten)]
     configured: Figure,
-    large_batch: Figure,
+    /// Missing if the configured minibatches have this size.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    large_batch: Option<Figure>,
     two_threads: TwoThreads,
     replay_rows: u64,
 }
 
-/// The results for one minibatch size, on one thread. An update is one gradient step of critic and actor.
+/// The results for one minibatch size, on one thread. An update is one gradient step of every network.
 #[derive(Serialize)]
 struct Figure {
     batch: usize,
@@ -79,40 +83,66 @@ struct TwoThreads {
     updates: Windows,
 }
 
-pub(super) fn measure(budget: &Budget) -> anyhow::Result<LearnerFigures> {
-    let temporary = TemporaryRun::new(&[])?;
+/// Measures a method, by default DDPG.
+pub(super) fn measure(method: Option<&str>, budget: &Budget) -> anyhow::Result<LearnerFigures> {
+    let temporary = TemporaryRun::with_method(method)?;
     let replay = Replay::create(&temporary.run.replay_file(), &temporary.replay_layout())?;
     // The mapping outlives the file, so nothing is left behind even if this process is killed.
     let config = temporary.remove_directory()?;
     let replay = filled(&config, replay, budget)?;
 
-    let batch = ddpg(&config)?.batch;
+    let batch = batch(&config)?;
     let mut configured = Case::new(&config, batch)?;
-    let mut large = Case::new(&config, LARGE_BATCH)?;
-    let mut shared = method(&config, batch)?;
+    let mut large = (batch != LARGE_BATCH)
+        .then(|| Case::new(&config, LARGE_BATCH))
+        .transpose()?;
+    let mut shared = learner(&config, batch)?;
     shared.set_threads(Threads::two()?);
     let mut updates_of_two = Windows::default();
-    for method in [&mut configured.method, &mut large.method, &mut shared] {
-        window::rate(budget.length.mul_f64(WARM_UP), || update(method, &replay));
+    let cases = [&mut configured]
+        .into_iter()
+        .chain(&mut large)
+        .map(|case| &mut case.learner);
+    for learner in cases.chain([&mut shared]) {
+        window::rate(budget.length.mul_f64(WARM_UP), || update(learner, &replay));
     }
     for _ in 0..window::count(budget.length, SHARE, WINDOW) {
         budget.check()?;
         configured.measure(&replay);
         updates_of_two.add(window::rate(WINDOW, || update(&mut shared, &replay)));
-        large.measure(&replay);
+        large.iter_mut().for_each(|large| large.measure(&replay));
     }
 
     let configured = configured.figure();
     Ok(LearnerFigures {
+        method: config.algorithm.name().into(),
         two_threads: TwoThreads {
             updates_per_second: updates_of_two.median(),
             speedup: updates_of_two.median() / configured.updates_per_second,
             updates: updates_of_two,
         },
         configured,
-        large_batch: large.figure(),
+        large_batch: large.map(Case::figure),
         replay_rows: replay.head(),
     })
+}
+
+/// Transitions in a minibatch.
+fn batch(config: &Config) -> anyhow::Result<usize> {
+    let name = config.algorithm.name();
+    if config.algorithm.spec().experience != Experience::Minibatches {
+        bail!("{name} does not learn from minibatches: measure ddpg, td3, sac or dqn");
+    }
+    Ok(config.algorithm.settings().least_capacity() as usize)
+}
+
+/// The configuration with minibatches of this size.
+fn with_batch(config: &Config, size: usize) -> anyhow::Result<Config> {
+    let mut table: Table = config.to_toml()?.parse()?;
+    if let Some(Value::Table(section)) = table.get_mut(config.algorithm.name()) {
+        section.insert("batch".into(), i64::try_from(size)?.into());
+    }
+    Ok(Config::from_table(table, "bench")?)
 }
 
 /// Fills the replay to its capacity.
@@ -133,28 +163,22 @@ fn filled(config: &Config, mut replay: Replay, budget: &Budget) -> anyhow::Resul
 }
 
 /// A new learner with minibatches of `batch` rows.
-fn method(config: &Config, batch: usize) -> anyhow::Result<ReplayedDdpg> {
-    let settings = config::DdpgConfig {
-        batch,
-        ..ddpg(config)?.clone()
-    };
-    Ok(ReplayedDdpg::new(
-        &config.spec,
-        &settings,
-        config.run.seed,
-        config.replay.capacity,
-    )?)
+fn learner(config: &Config, batch: usize) -> anyhow::Result<Box<dyn Algorithm>> {
+    Ok(registry::new(&with_batch(config, batch)?)?)
 }
 
 /// One gradient step, as in the learner's loop.
-fn update(method: &mut ReplayedDdpg, replay: &Replay) {
-    std::hint::black_box(method.update(replay, replay.head()));
+fn update(learner: &mut Box<dyn Algorithm>, replay: &Replay) {
+    std::hint::black_box(learner.update(replay, replay.head()));
 }
 
 /// The measurement of one minibatch size.
 struct Case {
-    method: ReplayedDdpg,
+    learner: Box<dyn Algorithm>,
     batch: usize,
+    flop_per_update: u64,
+    /// Updates that the list has the products of.
+    updates_of_list: f64,
     list: List,
     fastest: Multiplication,
     updates: Windows,
@@ -164,11 +188,13 @@ struct Case {
 
 impl Case {
     fn new(config: &Config, batch: usize) -> anyhow::Result<Self> {
-        let method = method(config, batch)?;
-        let (list, fastest) = multiplications(config, &method.ddpg, batch);
+        let products = registry::products(&with_batch(config, batch)?);
+        let (list, fastest) = multiplications(config, &products);
         Ok(Self {
-            method,
+            learner: learner(config, batch)?,
             batch,
+            flop_per_update: products.flop_per_update(),
+            updates_of_list: products.updates as f64,
             list,
             fastest,
             updates: Windows::default(),
@@ -179,16 +205,16 @@ impl Case {
 
     /// Adds one window to each measurement.
     fn measure(&mut self, replay: &Replay) {
-        let flop = self.method.ddpg.flop_per_update() as f64;
+        let flop_of_list = self.flop_per_update as f64 * self.updates_of_list;
         self.updates
-            .add(window::rate(WINDOW, || update(&mut self.method, replay)));
+            .add(window::rate(WINDOW, || update(&mut self.learner, replay)));
         self.limit.add(self.fastest.gflops(WINDOW));
         self.products
-            .add(window::rate(WINDOW, || self.list.multiply_all()) * flop / 1e9);
+            .add(window::rate(WINDOW, || self.list.multiply_all()) * flop_of_list / 1e9);
     }
 
     fn figure(self) -> Figure {
-        let flop = self.method.ddpg.flop_per_update();
+        let flop = self.flop_per_update;
         let achieved = flop as f64 * self.updates.median() / 1e9;
         Figure {
             batch: self.batch,
@@ -221,11 +247,11 @@ impl List {
     }
 }
 
-/// All products of an update, each with its best kernel, and a copy of the fastest one.
-fn multiplications(config: &Config, ddpg: &Ddpg, batch: usize) -> (List, Multiplication) {
+/// All products, each with its best kernel, and a copy of the fastest one.
+fn multiplications(config: &Config, products: &Products) -> (List, Multiplication) {
     let mut random = stream(config.run.seed, Purpose::Exploration, 1, 0);
     let (mut distinct, mut order): (Vec<Multiplication>, Vec<usize>) = Default::default();
-    for product in products_of_update(ddpg.policy_layout(), ddpg.critic_layout(), batch) {
+    for &product in &products.products {
         let known = distinct.iter().position(|known| known.product == product);
         order.push(known.unwrap_or(distinct.len()));
         if known.is_none() {
@@ -291,9 +317,10 @@ impl Figures for LearnerFigures {
             self.configured.batch,
             two.speedup
         );
-        let mut lines = Vec::from(self.configured.lines());
+        let mut lines = vec![("method", self.method.clone())];
+        lines.extend(self.configured.lines());
         lines.push(("updates a second", two));
-        lines.extend(self.large_batch.lines());
+        lines.extend(self.large_batch.iter().flat_map(Figure::lines));
         lines.push(("rows in the replay", self.replay_rows.to_string()));
         lines
     }
@@ -310,9 +337,9 @@ impl Figures for LearnerFigures {
             share: Some(figure.share_of_limit),
             target,
         };
-        let [small, large] = [self.configured.share_of_limit, self.large_batch.share_of_limit];
         let two = &self.two_threads;
-        vec![
+        let small = self.configured.share_of_limit;
+        let mut lines = vec![
             of(
                 &self.configured,
                 "learner, batch 64",
@@ -328,11 +355,11 @@ impl Figures for LearnerFigures {
                 share: Some(two.speedup / 2.0),
                 target: Target::at_least(1.6, two.speedup, "1.6 times one thread"),
             },
-            of(
-                &self.large_batch,
-                "learner, batch 256",
-                Target::at_least(0.85, large, "0.85 of the limit"),
-            ),
-        ]
+        ];
+        lines.extend(self.large_batch.iter().map(|large| {
+            let target = Target::at_least(0.85, large.share_of_limit, "0.85 of the limit");
+            of(large, "learner, batch 256", target)
+        }));
+        lines
     }
 }

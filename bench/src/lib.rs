@@ -30,7 +30,7 @@ use self::measurement::{Budget, print};
 /// A stage to measure.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum Stage {
-    /// DDPG gradient steps per second, sampling included.
+    /// Gradient steps per second, sampling included.
     Learner,
     /// Transitions per second from an actor process into the replay of a learner process.
     Transitions,
@@ -51,17 +51,20 @@ pub enum Stage {
 }
 
 /// Measures a stage and prints the result, as a table or with `json` also as one JSON object. `actors` lists the
-/// numbers of actors that [`Stage::Actors`] measures.
+/// numbers of actors that [`Stage::Actors`] measures, `method` is that of [`Stage::Learner`].
 ///
 /// # Errors
 /// If a measured process fails, or the user interrupts.
-pub fn run(stage: Stage, actors: Option<&str>, json: bool) -> anyhow::Result<()> {
+pub fn run(stage: Stage, actors: Option<&str>, method: Option<&str>, json: bool) -> anyhow::Result<()> {
     let budget = Budget::new()?;
     if actors.is_some() && stage != Stage::Actors {
         bail!("--actors is only for `shoal bench actors`");
     }
+    if method.is_some() && stage != Stage::Learner {
+        bail!("--method is only for `shoal bench learner`");
+    }
     match stage {
-        Stage::Learner => learner::measure(&budget).and_then(|it| print(&it, json)),
+        Stage::Learner => learner::measure(method, &budget).and_then(|it| print(&it, json)),
         Stage::Transitions => transitions::measure(&budget).and_then(|it| print(&it, json)),
         Stage::Step => step::measure(&budget).and_then(|it| print(&it, json)),
         Stage::Policy => policy::measure(&budget).and_then(|it| print(&it, json)),

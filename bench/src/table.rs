@@ -30,7 +30,7 @@ pub(super) fn measure_all(json: bool, budget: &Budget) -> anyhow::Result<()> {
         stages: Map::new(),
         lines: Vec::new(),
     };
-    all.add("learner", &learner::measure(budget)?)?;
+    all.add("learner", &learner::measure(None, budget)?)?;
     all.add("transitions", &transitions::measure(budget)?)?;
     all.add("step", &step::measure(budget)?)?;
     all.add("policy", &policy::measure(budget)?)?;

@@ -34,22 +34,41 @@ impl TemporaryRun {
         Self::of(1, 1, set)
     }
 
+    /// The preset for a method, or as it is, with one actor and one environment. For DQN it is `cart-pole`.
+    pub(super) fn with_method(method: Option<&str>) -> anyhow::Result<Self> {
+        let preset = if method == Some("dqn") { "cart-pole" } else { "pendulum" };
+        let overrides = RunOverrides {
+            method: method.map(Into::into),
+            actors: Some(1),
+            envs: Some(1),
+            ..RunOverrides::default()
+        };
+        Self::from_plan(preset, overrides)
+    }
+
     /// The preset with `actors` actors, `envs` environments per actor, and the assignments `set` in the form of
     /// `--set`.
     pub(super) fn of(actors: u32, envs: u32, set: &[&str]) -> anyhow::Result<Self> {
-        let directory = tempfile::Builder::new()
-            .prefix("shoal-bench-")
-            .tempdir()
-            .context("cannot make a temporary directory")?;
-        let choices = RunOverrides {
-            run: Some(directory.path().join("run")),
-            seed: Some(1),
+        let overrides = RunOverrides {
             actors: Some(actors),
             envs: Some(envs),
             set: set.iter().map(|assignment| (*assignment).into()).collect(),
             ..RunOverrides::default()
         };
-        let Plan { config, run, .. } = Plan::new("pendulum", &choices)?;
+        Self::from_plan("pendulum", overrides)
+    }
+
+    fn from_plan(preset: &str, overrides: RunOverrides) -> anyhow::Result<Self> {
+        let directory = tempfile::Builder::new()
+            .prefix("shoal-bench-")
+            .tempdir()
+            .context("cannot make a temporary directory")?;
+        let overrides = RunOverrides {
+            run: Some(directory.path().join("run")),
+            seed: Some(1),
+            ..overrides
+        };
+        let Plan { config, run, .. } = Plan::new(preset, &overrides)?;
         std::fs::create_dir(run.checkpoints()).context("cannot make the directory for checkpoints")?;
         Ok(Self { config, run, directory })
     }

@@ -4,20 +4,26 @@
 mod algorithm;
 mod behaviour;
 mod ddpg;
+mod dqn;
 mod exploration;
 mod reinforce;
+mod sac;
 mod tabular;
+mod td3;
 
 pub use algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Learned, Shape};
-pub use behaviour::Behaviour;
+pub use behaviour::{Behaviour, Epsilon};
 pub use ddpg::DdpgConfig;
+pub use dqn::DqnConfig;
 pub use exploration::{ExplorationConfig, Warmup};
 pub use reinforce::{ReinforceConfig, Weight};
+pub use sac::SacConfig;
 use serde::Serialize;
 use shoal_base::section::{self, OutOfRange, Section, describe};
 use shoal_base::space::EnvironmentSpec;
 use shoal_policy::{Policy, PolicyError, PolicyLayout};
 pub use tabular::TabularConfig;
+pub use td3::Td3Config;
 
 macro_rules! registry {
     ($($(#[$attribute:meta])* $variant:ident($settings:ty) is $spec:expr;)*) => {
@@ -72,6 +78,12 @@ macro_rules! registry {
 registry! {
     /// `[ddpg]` and `[exploration]`.
     Ddpg(DdpgConfig) is ddpg::SPEC;
+    /// `[td3]`.
+    Td3(Td3Config) is td3::SPEC;
+    /// `[sac]`.
+    Sac(SacConfig) is sac::SPEC;
+    /// `[dqn]`.
+    Dqn(DqnConfig) is dqn::SPEC;
     /// `[reinforce]`.
     Reinforce(ReinforceConfig) is reinforce::SPEC;
     /// `[q-learning]`.
@@ -162,9 +174,11 @@ mod tests {
             let all = Algorithm::all().into_iter();
             all.map(|algorithm| algorithm.policy_layout(&spec).is_ok()).collect()
         };
-        assert_eq!(takes(real, real), [true, false, false, false]);
-        assert_eq!(takes(real, counted), [false, true, false, false]);
-        assert_eq!(takes(counted, counted), [false, false, true, true]);
+        let (yes, no) = (true, false);
+        // DDPG, TD3, SAC, DQN, REINFORCE, Q-learning, SARSA.
+        assert_eq!(takes(real, real), [yes, yes, yes, no, no, no, no]);
+        assert_eq!(takes(real, counted), [no, no, no, yes, yes, no, no]);
+        assert_eq!(takes(counted, counted), [no, no, no, no, no, yes, yes]);
     }
 
     #[test]

@@ -30,7 +30,10 @@ use shoal_base::transition::{ChunkLayout, RowLayout};
 use shoal_policy::PolicyError;
 
 use crate::algorithms::Experience;
-pub use crate::algorithms::{Algorithm, DdpgConfig, ExplorationConfig, ReinforceConfig, TabularConfig, Warmup, Weight};
+pub use crate::algorithms::{
+    Algorithm, DdpgConfig, DqnConfig, ExplorationConfig, ReinforceConfig, SacConfig, TabularConfig, Td3Config, Warmup,
+    Weight,
+};
 
 /// The complete configuration of a run.
 #[derive(Clone, Debug, PartialEq)]
@@ -78,7 +81,7 @@ pub enum ConfigError {
     #[error(transparent)]
     OutOfRange(#[from] OutOfRange),
     /// The algorithm does not fit the environment.
-    #[error("{algorithm} cannot control {environment}: {cause}; choose another algorithm or another environment")]
+    #[error("{algorithm} cannot control {environment}: {cause}; choose {fitting}")]
     Control {
         /// The algorithm.
         algorithm: &'static str,
@@ -86,6 +89,8 @@ pub enum ConfigError {
         environment: String,
         /// What does not fit.
         cause: PolicyError,
+        /// The algorithms that can.
+        fitting: String,
     },
 }
 
@@ -184,12 +189,25 @@ impl Config {
                 algorithm: self.algorithm.name(),
                 environment: self.environment.name.clone(),
                 cause,
+                fitting: self.fitting(),
             })?;
         self.replay.check(&self.algorithm)?;
         self.check_collection()?;
         self.learner.check_bounds("learner")?;
         self.evaluation.check_bounds("evaluation")?;
         Ok(self.checkpoint.check_bounds("checkpoint")?)
+    }
+
+    /// The names of the algorithms that can control the environment.
+    fn fitting(&self) -> String {
+        let all = Algorithm::all().into_iter();
+        let fitting = all.filter(|algorithm| algorithm.policy_layout(&self.spec).is_ok());
+        let names: Vec<&str> = fitting.map(|algorithm| algorithm.name()).collect();
+        if names.is_empty() {
+            "another environment".into()
+        } else {
+            format!("one of {}, or another environment", names.join(", "))
+        }
     }
 
     /// Checks the algorithm's requirements on the collection of transitions.

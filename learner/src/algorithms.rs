@@ -2,8 +2,15 @@
 
 pub mod algorithm;
 pub mod ddpg;
+pub mod dqn;
 pub mod minibatch;
 pub mod registry;
 pub mod reinforce;
+pub mod replayed;
+pub mod sac;
 pub mod sampling;
 pub mod tabular;
+pub mod td3;
+#[cfg(test)]
+mod testing;
+mod twin_critics;

@@ -1,4 +1,5 @@
-//! The parts of a gradient step: initial weights, forward and backward passes, products, Adam, and threads.
+//! The parts of a gradient step: initial weights, forward and backward passes, products, Adam, threads, and a network
+//! with all that belongs to it.
 
 pub mod adam;
 pub mod aligned;
@@ -8,3 +9,4 @@ pub mod initialise;
 pub mod pass;
 pub mod product;
 pub mod threads;
+pub mod trained;

@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 
 use shoal_common::config::Config;
 use shoal_common::network::{ActionRange, Activation, NetworkLayout};
-use shoal_common::policy::PolicyLayout;
+use shoal_common::policy::{PolicyLayout, combine_heads};
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::space::Space;
 use shoal_run::final_evaluation::FinallyEvaluated;
@@ -25,10 +25,12 @@ pub struct Portable {
 /// The computation from an observation to the outputs.
 #[derive(Clone, Debug)]
 enum Body {
-    /// DDPG's μ: the network, tanh, and the scaling to the range of the actions.
+    /// μ of DDPG and TD3, or the mean of SAC's π: the network, tanh, and the scaling to the range of the actions.
     Actions { network: Network, range: ActionRange },
     /// REINFORCE's π: the network, and softmax.
     Probabilities { network: Network },
+    /// DQN's action-values: the network.
+    Values { network: Network },
     /// Action-values Q(s, a), state by state.
     Table {
         states: usize,
@@ -68,8 +70,21 @@ impl Portable {
                 network: Network::new(&network, &file.parameters),
                 range: ActionRange::new(&config.spec.action)?,
             },
+            PolicyLayout::Gaussian(network) => {
+                let range = ActionRange::new(&config.spec.action)?;
+                Body::Actions {
+                    network: Network::new(&network, &file.parameters).with_first_outputs(range.width()),
+                    range,
+                }
+            }
             PolicyLayout::Softmax(network) => Body::Probabilities {
                 network: Network::new(&network, &file.parameters),
+            },
+            PolicyLayout::ActionValues(network) => Body::Values {
+                network: Network::new(&network, &file.parameters),
+            },
+            PolicyLayout::Dueling(network) => Body::Values {
+                network: Network::new(&network, &file.parameters).with_combined_heads(),
             },
             PolicyLayout::Table { states, actions } => Body::Table {
                 states,
@@ -126,6 +141,37 @@ impl Network {
             layers: dense.collect(),
         }
     }
+
+    /// The network with the first `count` of its outputs.
+    fn with_first_outputs(mut self, count: usize) -> Self {
+        if let Some(last) = self.layers.last_mut() {
+            last.weights.truncate(count * last.inputs);
+            last.biases.truncate(count);
+        }
+        self
+    }
+
+    /// A dueling network as a plain one. Action-values are linear in its outputs, so the last layer can compute them.
+    fn with_combined_heads(mut self) -> Self {
+        if let Some(last) = self.layers.last_mut() {
+            // Each input's weights, and the biases, are a column of one number for each output.
+            let columns = (0..=last.inputs).map(|input| {
+                let mut heads: Vec<f32> = match last.weights.get(input..) {
+                    Some(weights) if input < last.inputs => weights.iter().step_by(last.inputs).copied().collect(),
+                    _ => last.biases.clone(),
+                };
+                combine_heads(&mut heads);
+                heads
+            });
+            let columns: Vec<Vec<f32>> = columns.collect();
+            let (biases, weights) = columns.split_last().map_or((&[][..], &[][..]), |(b, w)| (&b[1..], w));
+            last.weights = (1..=biases.len())
+                .flat_map(|output| weights.iter().map(move |column| column[output]))
+                .collect();
+            last.biases = biases.to_vec();
+        }
+        self
+    }
 }
 
 fn metadata(config: &Config, file: &PolicyFile, which: &str, body: &Body) -> anyhow::Result<BTreeMap<String, String>> {
@@ -150,7 +196,7 @@ fn metadata(config: &Config, file: &PolicyFile, which: &str, body: &Body) -> any
             insert(name, start.to_string());
         }
     }
-    if let Body::Actions { network, .. } | Body::Probabilities { network } = body {
+    if let Body::Actions { network, .. } | Body::Probabilities { network } | Body::Values { network } = body {
         let activation = match network.activation {
             Activation::Relu => "relu",
             Activation::Tanh => "tanh",
@@ -169,6 +215,7 @@ fn metadata(config: &Config, file: &PolicyFile, which: &str, body: &Body) -> any
             }
         }
         Body::Probabilities { .. } => insert("output_activation", "softmax".into()),
+        Body::Values { .. } => insert("output_activation", "none: the outputs are action values".into()),
         Body::Table { .. } => insert("contents", "action values, a row for each state".into()),
     }
     Ok(metadata)
@@ -211,6 +258,10 @@ mod tests_support {
              [reinforce]\nhidden = [6, 5, 4]\nactivation = \"tanh\"\n[replay]\nwarmup = 0\n",
             "mode = \"lockstep\"\n[environment]\nname = \"cart-pole\"\n[actors]\nchunk_steps = 200\n\
              [reinforce]\n[replay]\nwarmup = 0\n",
+            "[environment]\nname = \"point-mass\"\n[td3]\nhidden = [9, 8]\n",
+            "[environment]\nname = \"point-mass\"\n[sac]\nhidden = [9, 8]\n",
+            "[environment]\nname = \"cart-pole\"\n[dqn]\nhidden = [9, 8]\n",
+            "[environment]\nname = \"cart-pole\"\n[dqn]\nhidden = [9]\nactivation = \"tanh\"\ndueling = true\n",
             "[environment]\nname = \"frozen-lake\"\n[q-learning]\n[replay]\nwarmup = 0\n",
         ];
         tasks

@@ -6,6 +6,7 @@ pub mod description;
 pub mod evaluation;
 pub mod external_environment;
 pub mod final_evaluation;
+pub mod method;
 pub mod numbers;
 pub mod outcome;
 pub mod plan;

@@ -5,19 +5,18 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 use serde::de::DeserializeOwned;
-use shoal_common::algorithms::Experience;
 use shoal_common::config::{ActorsConfig, Algorithm, Config, EnvironmentConfig, IdentityFormat, Mode, RunConfig};
 use shoal_common::run_dir::{RunDir, RunLock};
-use shoal_common::space::{EnvironmentSpec, Space};
 use shoal_env_server::environment;
 use toml::{Table, Value};
 
 use crate::external_environment::{self, ExternalEnvironment, GYMNASIUM};
+use crate::method;
 use crate::preflight;
 use crate::server_location::{ServerLocation, Surroundings, hash_seed};
 use crate::signals::Interrupt;
 
-const PRESETS: [(&str, &str); 7] = [
+const PRESETS: [(&str, &str); 15] = [
     ("pendulum", include_str!("../../presets/pendulum.toml")),
     ("point-mass-r1", include_str!("../../presets/point-mass-r1.toml")),
     ("point-mass-r2", include_str!("../../presets/point-mass-r2.toml")),
@@ -28,12 +27,34 @@ const PRESETS: [(&str, &str); 7] = [
         include_str!("../../presets/frozen-lake-sarsa.toml"),
     ),
     ("cart-pole", include_str!("../../presets/cart-pole.toml")),
+    // Those for another method than the thesis's have the name of their task and that of the method.
+    ("pendulum-sac", include_str!("../../presets/pendulum-sac.toml")),
+    ("pendulum-td3", include_str!("../../presets/pendulum-td3.toml")),
+    (
+        "point-mass-r1-sac",
+        include_str!("../../presets/point-mass-r1-sac.toml"),
+    ),
+    (
+        "point-mass-r1-td3",
+        include_str!("../../presets/point-mass-r1-td3.toml"),
+    ),
+    (
+        "point-mass-r2-sac",
+        include_str!("../../presets/point-mass-r2-sac.toml"),
+    ),
+    (
+        "point-mass-r2-td3",
+        include_str!("../../presets/point-mass-r2-td3.toml"),
+    ),
+    (
+        "point-mass-r3-sac",
+        include_str!("../../presets/point-mass-r3-sac.toml"),
+    ),
+    (
+        "point-mass-r3-td3",
+        include_str!("../../presets/point-mass-r3-td3.toml"),
+    ),
 ];
-
-/// The defaults for a Gymnasium environment, by the kinds of its observations and actions.
-const FOR_CONTINUOUS_ACTIONS: &str = include_str!("../../presets/gym-continuous.toml");
-const FOR_DISCRETE_ACTIONS: &str = include_str!("../../presets/gym-discrete.toml");
-const FOR_A_TABLE: &str = include_str!("../../presets/gym-table.toml");
 
 /// The keys that the program sets itself.
 pub const FILLED_IN: [&str; 2] = ["run.id", "run.identity_format"];
@@ -53,6 +74,8 @@ pub fn resolved(what: &str) -> anyhow::Result<Config> {
 pub struct RunOverrides {
     /// Run directory to create; by default `runs/<name>-<n>`.
     pub run: Option<PathBuf>,
+    /// The method, by its name.
+    pub method: Option<String>,
     /// `run.seed`.
     pub seed: Option<u64>,
     /// `actors.count`.
@@ -115,13 +138,35 @@ fn fill(run: &RunDir, config: &Config) -> anyhow::Result<Config> {
 
 /// The configuration of a preset or a file with these overrides, and the default name of its run. Creates nothing.
 pub fn decide(what: &str, overrides: &RunOverrides) -> anyhow::Result<(String, Config)> {
-    let (name, table) = sections(what)?;
+    let (mut name, mut table) = sections(what)?;
+    if let Some(method) = method::asked_for(overrides.method.as_deref(), &overrides.set)? {
+        let named = method::named_in(&table);
+        if let Some((own, text)) = preset(&format!("{what}-{method}")) {
+            (name, table) = (own.into(), text.parse().with_context(|| format!("preset {own}"))?);
+        } else if preset(what).is_some() {
+            if named.unwrap_or(Algorithm::default().name()) != method {
+                method::replace(&mut table, method)?;
+                name = format!("{name}-{method}");
+            }
+        } else if let Some(other) = named.filter(|named| *named != method) {
+            bail!("{what} is for {other}, but {method} is asked for: remove what belongs to {other} from the file");
+        } else {
+            let environment = table.get("environment").and_then(|section| section.get("name"));
+            let environment = environment.and_then(Value::as_str).unwrap_or_default().to_owned();
+            method::add_defaults(&mut table, &environment, method)?;
+        }
+        table.entry(method).or_insert_with(|| Table::new().into());
+    }
     Ok((name, resolve(table, overrides, what)?))
+}
+
+fn preset(name: &str) -> Option<(&'static str, &'static str)> {
+    PRESETS.into_iter().find(|(known, _)| *known == name)
 }
 
 /// The sections of a preset or a file, and the default name of its run.
 fn sections(what: &str) -> anyhow::Result<(String, Table)> {
-    if let Some((name, text)) = PRESETS.into_iter().find(|(name, _)| *name == what) {
+    if let Some((name, text)) = preset(what) {
         return Ok((name.into(), text.parse().with_context(|| format!("preset {name}"))?));
     }
     if let Some(id) = what.strip_prefix(GYMNASIUM) {
@@ -207,6 +252,11 @@ fn resolve(mut table: Table, overrides: &RunOverrides, origin: &str) -> anyhow::
     let mut config = Config::from_table(table, origin)?;
     // A short run must end with an evaluation too.
     config.evaluation.every = config.evaluation.every.min(config.run.steps);
+    if let Algorithm::Dqn(dqn) = &mut config.algorithm
+        && dqn.epsilon_steps == 0
+    {
+        dqn.epsilon_steps = (config.run.steps / 10).max(1);
+    }
     Ok(config)
 }
 
@@ -254,9 +304,12 @@ fn describe_environment(table: &mut Table) -> anyhow::Result<()> {
         let spec = environment::make(&name, &parameters)?.spec();
         (configured(name, Vec::new(), parameters), spec)
     };
+    let named = method::named_in(table);
     if environment.name.starts_with(GYMNASIUM) {
-        add_method_defaults(table, &spec)?;
+        let method = named.unwrap_or_else(|| method::suitable(&spec));
+        method::add_defaults(table, &environment.name, method)?;
     }
+    method::fit(table, &spec);
     table.insert("environment".into(), Value::try_from(environment)?);
     table.insert("spec".into(), Value::try_from(spec)?);
     Ok(())
@@ -266,38 +319,6 @@ fn describe_environment(table: &mut Table) -> anyhow::Result<()> {
 fn take<T: DeserializeOwned>(section: &mut Table, key: &str) -> anyhow::Result<Option<T>> {
     let value = section.remove(key).map(Value::try_into).transpose();
     value.map_err(|error| anyhow::anyhow!("environment.{key}: {}", one_line(&error)))
-}
-
-/// Adds the default settings of a method that suits the environment's spaces. Keeps existing settings, and adds nothing
-/// if the table names another method.
-fn add_method_defaults(table: &mut Table, spec: &EnvironmentSpec) -> anyhow::Result<()> {
-    let text = match (&spec.observation, &spec.action) {
-        (_, Space::Box { .. }) => FOR_CONTINUOUS_ACTIONS,
-        (Space::Box { .. }, Space::Discrete { .. }) => FOR_DISCRETE_ACTIONS,
-        (Space::Discrete { .. }, Space::Discrete { .. }) => FOR_A_TABLE,
-    };
-    let mut method: Table = text.parse()?;
-    let algorithms = Algorithm::all();
-    let is_another = |name: &str| table.contains_key(name) && !method.contains_key(name);
-    if algorithms.iter().any(|algorithm| is_another(algorithm.name())) {
-        return Ok(());
-    }
-    let chosen = algorithms
-        .iter()
-        .find(|algorithm| method.contains_key(algorithm.name()));
-    if chosen.is_some_and(|algorithm| algorithm.spec().experience == Experience::Episodes) {
-        // A chunk holds a whole episode.
-        put(&mut method, &["actors", "chunk_steps"], spec.time_limit.into())?;
-    }
-    for (section, values) in method {
-        let there = table.entry(section).or_insert_with(|| Table::new().into());
-        if let (Value::Table(there), Value::Table(values)) = (there, values) {
-            values.into_iter().for_each(|(key, value)| {
-                there.entry(key).or_insert(value);
-            });
-        }
-    }
-    Ok(())
 }
 
 fn put(table: &mut Table, path: &[&str], value: Value) -> anyhow::Result<()> {

@@ -1,6 +1,7 @@
 //! `shoal bench`: measures the speed of each stage on this machine.
 
 use clap::Args;
+use clap::builder::PossibleValuesParser;
 use shoal_bench::Stage;
 
 #[derive(Args, Clone, Debug)]
@@ -11,6 +12,9 @@ pub(crate) struct BenchArgs {
     /// With `actors`: the numbers of actors to measure [default: 1,2,4, … up to the number of cores].
     #[arg(long, value_name = "N,N,…", allow_hyphen_values = true)]
     pub(crate) actors: Option<String>,
+    /// With `learner`: the method to measure [default: ddpg].
+    #[arg(long, value_parser = PossibleValuesParser::new(shoal_run::method::names()))]
+    pub(crate) method: Option<String>,
     /// Print one JSON object on standard output.
     #[arg(long)]
     pub(crate) json: bool,
@@ -18,5 +22,5 @@ pub(crate) struct BenchArgs {
 
 /// Measures a stage and prints the result as a table or as JSON.
 pub(crate) fn run(args: &BenchArgs) -> anyhow::Result<()> {
-    shoal_bench::run(args.stage, args.actors.as_deref(), args.json)
+    shoal_bench::run(args.stage, args.actors.as_deref(), args.method.as_deref(), args.json)
 }

@@ -5,6 +5,7 @@ use std::process::ExitCode;
 
 use anyhow::Context;
 use clap::Args;
+use clap::builder::PossibleValuesParser;
 use clap_complete::engine::ArgValueCompleter;
 use shoal_run::plan::{Plan, RunOverrides};
 
@@ -16,7 +17,8 @@ use crate::completion;
 #[derive(Args, Clone, Debug)]
 pub(crate) struct TrainArgs {
     /// What to train: frozen-lake, frozen-lake-sarsa, cart-pole, pendulum, point-mass-r1, point-mass-r2, point-mass-r3,
-    /// gym: with a Gymnasium environment (gym:HalfCheetah-v5), or a configuration file (FILE.toml).
+    /// one of the last four with -sac or -td3, gym: with a Gymnasium environment (gym:HalfCheetah-v5), or a
+    /// configuration file (FILE.toml).
     #[arg(value_name = "PRESET|gym:ID|FILE.toml", required_unless_present = "help_config")]
     #[arg(add = ArgValueCompleter::new(completion::what_to_train))]
     pub(crate) what: Option<String>,
@@ -35,6 +37,10 @@ pub(crate) struct RunArgs {
     /// Run directory to create [default: runs/<preset>-<n>].
     #[arg(long, value_name = "DIR")]
     pub(crate) run: Option<PathBuf>,
+    /// How to learn: ddpg, td3, sac, dqn, reinforce, q-learning or sarsa [default: the preset's; for gym: the one that
+    /// suits the spaces].
+    #[arg(long, value_name = "METHOD", value_parser = PossibleValuesParser::new(shoal_run::method::names()))]
+    pub(crate) method: Option<String>,
     /// Seed of every random stream.
     #[arg(long)]
     pub(crate) seed: Option<u64>,
@@ -62,6 +68,7 @@ impl RunArgs {
     fn overrides(&self) -> RunOverrides {
         let Self {
             run,
+            method,
             seed,
             actors,
             envs,
@@ -72,6 +79,7 @@ impl RunArgs {
         } = self.clone();
         RunOverrides {
             run,
+            method,
             seed,
             actors,
             envs,

@@ -1,6 +1,6 @@
 //! Algorithms 1, 2 and 3 as plain single-process programs, with one environment and the same random streams.
 
-use shoal_actor::exploration::Exploration;
+use shoal_actor::exploration::{Exploration, Progress};
 use shoal_common::channel::environment::ResponseLayout;
 use shoal_common::config::{Algorithm, Config};
 use shoal_common::stream::{Purpose, stream};
@@ -49,7 +49,11 @@ impl World {
 
     fn choose(&mut self, parameters: &[f32]) -> f32 {
         let mut a = [f32::NAN];
-        self.exploration.act(parameters, &self.s, self.t, &mut a);
+        let progress = Progress {
+            step: self.t,
+            env_steps: self.t,
+        };
+        self.exploration.act(parameters, &self.s, progress, &mut a);
         self.t += 1;
         a[0]
     }

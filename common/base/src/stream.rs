@@ -18,6 +18,8 @@ pub enum Purpose {
     Initialisation = 4,
     /// Start states of evaluation episodes.
     Evaluation = 5,
+    /// Random numbers within an update: TD3's noise on target actions, SAC's draws.
+    Update = 6,
 }
 
 /// The stream of `purpose` for the process `index` in its `incarnation`, under the run's `seed`.
@@ -30,6 +32,13 @@ pub fn stream(seed: u64, purpose: Purpose, index: u64, incarnation: u64) -> Stre
         bytes.copy_from_slice(&word.to_le_bytes());
     }
     Stream::from_seed(key)
+}
+
+/// Moves to the beginning of the `number`-th of the 2⁶⁴ parts of a stream, for example the part of a step or an update.
+pub fn seek(stream: &mut Stream, number: u64) -> &mut Stream {
+    stream.set_stream(number);
+    stream.set_word_pos(0);
+    stream
 }
 
 #[cfg(test)]

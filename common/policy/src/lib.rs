@@ -4,18 +4,24 @@ pub mod network;
 pub mod policy_file;
 mod scores;
 
-pub use scores::Scores;
+pub use scores::{Scores, combine_heads};
 use shoal_base::space::{EnvironmentSpec, Space};
 
-use crate::network::{ActionRange, ActionRangeError, Hidden, NetworkLayout, PolicyNetwork};
+use crate::network::{ActionRange, ActionRangeError, GaussianPolicy, Hidden, NetworkLayout, PolicyNetwork};
 
 /// The layout of a policy's parameters, which all processes of a run must agree on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PolicyLayout {
-    /// A network whose tanh outputs are the action: DDPG's μ.
+    /// A network whose tanh outputs are the action: μ of DDPG and TD3.
     Deterministic(NetworkLayout),
+    /// A network whose outputs are the means and log standard deviations of a squashed normal distribution: SAC's π.
+    Gaussian(NetworkLayout),
     /// A network whose outputs, after softmax, are the actions' probabilities: REINFORCE's π.
     Softmax(NetworkLayout),
+    /// A network whose outputs are the action-values: DQN's Q.
+    ActionValues(NetworkLayout),
+    /// A network whose outputs are V(s) and the advantages of the actions: DQN's Q with dueling heads.
+    Dueling(NetworkLayout),
     /// A table of action-values Q(s, a), state after state.
     Table {
         /// Number of states.
@@ -28,10 +34,10 @@ pub enum PolicyLayout {
 /// Why an algorithm cannot control an environment.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum PolicyError {
-    /// DDPG needs real-valued actions.
+    /// A policy with tanh outputs needs real-valued actions.
     #[error(transparent)]
     Action(#[from] ActionRangeError),
-    /// A softmax policy or a table needs discrete actions.
+    /// A score for every action needs discrete actions.
     #[error("{algorithm} needs a discrete action space, but these actions are real-valued (a box)")]
     CountedActions {
         /// The algorithm.
@@ -57,7 +63,11 @@ impl PolicyLayout {
     /// The number of parameters.
     pub fn parameters(&self) -> usize {
         match self {
-            Self::Deterministic(network) | Self::Softmax(network) => network.parameters(),
+            Self::Deterministic(network)
+            | Self::Gaussian(network)
+            | Self::Softmax(network)
+            | Self::ActionValues(network)
+            | Self::Dueling(network) => network.parameters(),
             Self::Table { states, actions } => states * actions,
         }
     }
@@ -67,6 +77,9 @@ impl PolicyLayout {
         match self {
             Self::Deterministic(network) => network.fingerprint(),
             Self::Softmax(network) => !network.fingerprint(),
+            Self::Gaussian(network) => network.fingerprint() ^ u64::from_le_bytes(*b"gaussian"),
+            Self::ActionValues(network) => network.fingerprint() ^ u64::from_le_bytes(*b"q-values"),
+            Self::Dueling(network) => network.fingerprint() ^ u64::from_le_bytes(*b"dueling "),
             Self::Table { states, actions } => ((*states as u64) << 32) | *actions as u64,
         }
     }
@@ -78,6 +91,8 @@ impl PolicyLayout {
 pub enum Policy {
     /// A network whose output is the action.
     Deterministic(PolicyNetwork),
+    /// A squashed normal distribution. The action of its mean is taken.
+    Gaussian(GaussianPolicy),
     /// A score for every action, π(a|s) or Q(s, a). The action with the highest score is taken.
     Scored(Scores),
 }
@@ -87,6 +102,7 @@ impl Policy {
     pub fn layout(&self) -> PolicyLayout {
         match self {
             Self::Deterministic(network) => PolicyLayout::Deterministic(*network.layout()),
+            Self::Gaussian(policy) => PolicyLayout::Gaussian(*policy.layout()),
             Self::Scored(scores) => scores.layout(),
         }
     }
@@ -99,6 +115,7 @@ impl Policy {
     pub fn act(&mut self, parameters: &[f32], observations: &[f32], actions: &mut [f32]) {
         match self {
             Self::Deterministic(network) => network.forward(parameters, observations, actions),
+            Self::Gaussian(policy) => policy.mean(parameters, observations, actions),
             Self::Scored(scores) => {
                 let all_scores = scores.of(parameters, observations);
                 for (action, scores) in actions.iter_mut().zip(all_scores) {
@@ -119,6 +136,16 @@ pub fn deterministic(hidden: Hidden, spec: &EnvironmentSpec, batch: usize) -> Re
     Ok(PolicyNetwork::new(spec.observation.width(), hidden, range, batch))
 }
 
+/// A squashed Gaussian policy with these hidden layers in an environment like `spec`, for at most `batch` observations
+/// a call.
+///
+/// # Errors
+/// When the actions are not real numbers in finite ranges.
+pub fn gaussian(hidden: Hidden, spec: &EnvironmentSpec, batch: usize) -> Result<GaussianPolicy, PolicyError> {
+    let range = ActionRange::new(&spec.action)?;
+    Ok(GaussianPolicy::new(spec.observation.width(), hidden, range, batch))
+}
+
 /// A softmax policy with these hidden layers in an environment like `spec`, for at most `batch` observations a call.
 /// `algorithm` is named in errors.
 ///
@@ -130,13 +157,39 @@ pub fn softmax(
     spec: &EnvironmentSpec,
     batch: usize,
 ) -> Result<Scores, PolicyError> {
+    let (observation, actions) = real_to_counted(algorithm, spec)?;
+    Ok(Scores::softmax(
+        NetworkLayout::policy(observation, hidden, actions),
+        batch,
+    ))
+}
+
+/// A network of action-values with these hidden layers, and with dueling heads if asked for, in an environment like
+/// `spec`, for at most `batch` observations a call. `algorithm` is named in errors.
+///
+/// # Errors
+/// When the actions are not discrete, or the observations are not real numbers.
+pub fn action_values(
+    algorithm: &'static str,
+    hidden: Hidden,
+    dueling: bool,
+    spec: &EnvironmentSpec,
+    batch: usize,
+) -> Result<Scores, PolicyError> {
+    let (observation, actions) = real_to_counted(algorithm, spec)?;
+    Ok(if dueling {
+        Scores::dueling(NetworkLayout::policy(observation, hidden, actions + 1), batch)
+    } else {
+        Scores::values(NetworkLayout::policy(observation, hidden, actions), batch)
+    })
+}
+
+/// The numbers in an observation, which must be real, and the number of actions, which must be discrete.
+fn real_to_counted(algorithm: &'static str, spec: &EnvironmentSpec) -> Result<(usize, usize), PolicyError> {
     let actions = counted_actions(algorithm, spec)?;
     match spec.observation {
         Space::Discrete { n, .. } => Err(PolicyError::RealStates { algorithm, n }),
-        Space::Box { .. } => {
-            let network = NetworkLayout::policy(spec.observation.width(), hidden, actions);
-            Ok(Scores::softmax(network, batch))
-        }
+        Space::Box { .. } => Ok((spec.observation.width(), actions)),
     }
 }
 
@@ -197,13 +250,16 @@ mod tests {
     #[test]
     fn different_kinds_of_policies_have_different_fingerprints() {
         let network = NetworkLayout::policy(4, Hidden::relu([10, 2]), 2);
-        let (deterministic, softmax) = (PolicyLayout::Deterministic(network), PolicyLayout::Softmax(network));
-        assert_ne!(deterministic.fingerprint(), softmax.fingerprint());
-        assert_eq!(
-            deterministic.fingerprint(),
-            network.fingerprint(),
-            "as in existing files"
-        );
+        let kinds = [
+            PolicyLayout::Deterministic(network),
+            PolicyLayout::Gaussian(network),
+            PolicyLayout::Softmax(network),
+            PolicyLayout::ActionValues(network),
+            PolicyLayout::Dueling(network),
+        ];
+        let fingerprints: std::collections::HashSet<u64> = kinds.iter().map(PolicyLayout::fingerprint).collect();
+        assert_eq!(fingerprints.len(), kinds.len());
+        assert_eq!(kinds[0].fingerprint(), network.fingerprint(), "as in existing files");
         let table = |states, actions| PolicyLayout::Table { states, actions }.fingerprint();
         assert_ne!(table(16, 4), table(4, 16));
     }

@@ -1,4 +1,4 @@
-//! A score for every action: the logits of a softmax policy, or the row of a table of action-values.
+//! A score for every action: the logits of a softmax policy, or action-values of a network or a table.
 
 use super::PolicyLayout;
 use crate::network::{Network, NetworkLayout};
@@ -13,15 +13,40 @@ pub struct Scores {
 
 #[derive(Clone, Debug)]
 enum Source {
-    Network(Network),
+    /// The logits of a softmax policy.
+    Logits(Network),
+    /// Action-values.
+    Values(Network),
+    /// The heads of a dueling network, from which action-values follow.
+    Dueling(Network),
+    /// Action-values.
     Table { states: usize },
 }
 
 impl Scores {
     /// The logits of a softmax policy, for at most `batch` observations a call.
     pub(super) fn softmax(network: NetworkLayout, batch: usize) -> Self {
+        Self::of_network(Source::Logits(Network::new(network, batch)), network, batch)
+    }
+
+    /// The action-values that a network computes, for at most `batch` observations a call.
+    pub(super) fn values(network: NetworkLayout, batch: usize) -> Self {
+        Self::of_network(Source::Values(Network::new(network, batch)), network, batch)
+    }
+
+    /// The action-values of a dueling network, whose outputs are V(s) and the advantages, for at most `batch`
+    /// observations a call.
+    pub(super) fn dueling(network: NetworkLayout, batch: usize) -> Self {
+        let scores = Self::of_network(Source::Dueling(Network::new(network, batch)), network, batch);
         Self {
-            source: Source::Network(Network::new(network, batch)),
+            actions: network.outputs() - 1,
+            ..scores
+        }
+    }
+
+    fn of_network(source: Source, network: NetworkLayout, batch: usize) -> Self {
+        Self {
+            source,
             actions: network.outputs(),
             scores: vec![0.0; network.outputs() * batch],
         }
@@ -39,7 +64,9 @@ impl Scores {
     /// The layout of the parameters of [`of`](Self::of).
     pub fn layout(&self) -> PolicyLayout {
         match &self.source {
-            Source::Network(network) => PolicyLayout::Softmax(*network.layout()),
+            Source::Logits(network) => PolicyLayout::Softmax(*network.layout()),
+            Source::Values(network) => PolicyLayout::ActionValues(*network.layout()),
+            Source::Dueling(network) => PolicyLayout::Dueling(*network.layout()),
             Source::Table { states } => PolicyLayout::Table {
                 states: *states,
                 actions: self.actions,
@@ -59,20 +86,51 @@ impl Scores {
     /// If the slices do not match the layout, or have more observations than the batch.
     pub fn of(&mut self, parameters: &[f32], observations: &[f32]) -> impl Iterator<Item = &[f32]> {
         let actions = self.actions;
-        let batch = match &mut self.source {
-            Source::Network(network) => {
-                let batch = observations.len() / network.layout().inputs();
-                network.forward(parameters, observations, &mut self.scores[..actions * batch]);
-                batch
+        let (batch, outputs) = match &mut self.source {
+            Source::Logits(network) | Source::Values(network) | Source::Dueling(network) => {
+                let (batch, outputs) = (
+                    observations.len() / network.layout().inputs(),
+                    network.layout().outputs(),
+                );
+                network.forward(parameters, observations, &mut self.scores[..outputs * batch]);
+                (batch, outputs)
             }
             Source::Table { states } => {
                 for (scores, state) in self.scores.chunks_exact_mut(actions).zip(observations) {
                     let state = (*state as usize).min(*states - 1);
                     scores.copy_from_slice(&parameters[state * actions..][..actions]);
                 }
-                observations.len()
+                (observations.len(), actions)
             }
         };
-        self.scores[..actions * batch].chunks_exact(actions)
+        if let Source::Dueling(_) = self.source {
+            self.scores[..outputs * batch]
+                .chunks_exact_mut(outputs)
+                .for_each(combine_heads);
+        }
+        self.scores[..outputs * batch]
+            .chunks_exact(outputs)
+            .map(move |scores| &scores[outputs - actions..])
+    }
+}
+
+/// Turns the outputs V, A₁, A₂, … of a dueling network into V, Q₁, Q₂, …: Qᵢ = V + Aᵢ − mean of A (Wang et al. 2016,
+/// equation 9).
+pub fn combine_heads(heads: &mut [f32]) {
+    if let [value, advantages @ ..] = heads {
+        let shift = *value - advantages.iter().sum::<f32>() / advantages.len() as f32;
+        advantages.iter_mut().for_each(|advantage| *advantage += shift);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_heads_of_a_dueling_network_become_action_values() {
+        let mut heads = [10.0, 1.0, 2.0, 6.0];
+        combine_heads(&mut heads);
+        assert_eq!(heads, [10.0, 8.0, 9.0, 13.0]);
     }
 }

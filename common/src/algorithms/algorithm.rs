@@ -114,9 +114,10 @@ impl Display for Shape {
                 write!(to, "network {}", network.inputs())?;
                 layers.iter().try_for_each(|units| write!(to, " {units}"))?;
                 write!(to, " {}", network.outputs())?;
-                match network.late_inputs() {
-                    0 => {}
-                    late => write!(to, " late {late}")?,
+                match (network.late_inputs(), network.late_layer()) {
+                    (0, _) | (_, None) => {}
+                    (late, Some(0)) if layers.len() > 1 => write!(to, " joined {late}")?,
+                    (late, Some(_)) => write!(to, " late {late}")?,
                 }
                 match activation {
                     // Not named, as in runs from before there were other activations.

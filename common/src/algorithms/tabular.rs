@@ -6,7 +6,7 @@ use shoal_base::space::EnvironmentSpec;
 use shoal_policy::PolicyError;
 
 use super::algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Learned, Shape};
-use super::behaviour::Behaviour;
+use super::behaviour::{Behaviour, Epsilon};
 
 /// Q-learning.
 pub(super) const Q_LEARNING: AlgorithmSpec = AlgorithmSpec {
@@ -45,7 +45,7 @@ impl AlgorithmSettings for TabularConfig {
 
     fn behaviour(&self, name: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError> {
         let values = shoal_policy::table(name, spec, batch)?;
-        Ok(Behaviour::EpsilonGreedy(values, self.epsilon))
+        Ok(Behaviour::EpsilonGreedy(values, Epsilon::constant(self.epsilon)))
     }
 
     fn exploration_state_width(&self, _: &EnvironmentSpec) -> usize {

@@ -4,6 +4,7 @@ use shoal_common::config::Config;
 use shoal_common::policy::{PolicyError, PolicyLayout};
 use shoal_common::space::EnvironmentSpec;
 
+use crate::networks::product::Products;
 use crate::networks::threads::Threads;
 use crate::replay::Replay;
 
@@ -17,6 +18,10 @@ pub trait Method {
 
     /// Names of the sections that hold what was learned, as opposed to the state of the optimiser.
     fn weights(&self) -> &'static [&'static str];
+
+    /// The matrix products of one or a few updates in an environment like `spec`; none if the method has no networks,
+    /// or if its updates have no fixed size.
+    fn products(&self, spec: &EnvironmentSpec) -> Products;
 
     /// The total length of all sections of the learner's state.
     fn state_numbers(&self, spec: &EnvironmentSpec, sizes: RunSizes) -> usize;
@@ -54,10 +59,14 @@ pub trait Algorithm {
 /// A part of a method's state: its name and its numbers.
 pub type Section<'a> = (&'static str, &'a [f32]);
 
+/// As [`Section`], but the numbers can be overwritten.
+pub type SectionMut<'a> = (&'static str, &'a mut [f32]);
+
 /// The losses of an update.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Losses {
-    /// Mean squared error of the value estimates: of the critic, the baseline, or the table.
+    /// Error of the value estimates: of the critics, the baseline, or the table. It is the mean squared error, of two
+    /// critics their sum, or for DQN the mean of Huber's loss.
     pub critic_loss: f32,
     /// The loss that the policy's step reduces; 0 if the policy follows from the values.
     pub actor_loss: f32,

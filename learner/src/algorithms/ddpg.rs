@@ -4,83 +4,34 @@
 //! and Q', batch size N, target y, loss L, target rate τ. Lines 1, 2 and 11 to 16 are here. The others run in the
 //! actors and environment servers.
 
-pub mod replayed;
-
 use nalgebra::{DMatrix, DVector};
+use shoal_common::algorithms::AlgorithmSettings;
 use shoal_common::config;
 use shoal_common::network::{ActionRange, NetworkLayout};
-use shoal_common::policy::PolicyError;
+use shoal_common::policy::{PolicyError, PolicyLayout};
 use shoal_common::space::EnvironmentSpec;
 
-use super::algorithm::{Losses, SectionError};
+use super::algorithm::{Algorithm, Losses, Method, RunSizes, Section, SectionMut};
 use super::minibatch::Minibatch;
-use crate::networks::adam::Adam;
-use crate::networks::aligned::Aligned;
+use super::replayed::{MinibatchLearner, Replayed, mean, targets};
 use crate::networks::digest::sha256;
 use crate::networks::initialise::initialise;
 use crate::networks::pass::{Pass, Samples};
-use crate::networks::product;
+use crate::networks::product::{self, Products};
 use crate::networks::threads::Threads;
+use crate::networks::trained::{Targeted, threads_for};
 
-/// Everything that a gradient step changes, as stored in a checkpoint.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct DdpgState<'a> {
-    /// Gradient steps taken.
-    pub updates: u64,
-    /// Flat numbers, in the order of [`DdpgState::PARTS`].
-    pub parts: [&'a [f32]; 8],
-}
-
-impl DdpgState<'_> {
-    /// The names of the parts.
-    pub const PARTS: [&'static str; 8] = [
-        "actor",
-        "critic",
-        "target actor",
-        "target critic",
-        "actor's first moment",
-        "actor's second moment",
-        "critic's first moment",
-        "critic's second moment",
-    ];
-}
-
-/// A network, the target network that follows it, and the state of its optimiser.
-#[derive(Clone, Debug)]
-struct Learned {
-    layout: NetworkLayout,
-    parameters: Aligned,
-    target: Aligned,
-    adam: Adam,
-    gradient: Aligned,
-}
-
-impl Learned {
-    /// Lines 1 and 2: θ at random, θ' ← θ.
-    fn new(layout: NetworkLayout, learning_rate: f64, seed: u64, index: u64) -> Self {
-        let parameters = initialise(&layout, seed, index);
-        Self {
-            layout,
-            parameters: Aligned::from_slice(&parameters, 0),
-            target: Aligned::from_slice(&parameters, 1),
-            gradient: Aligned::zeros(parameters.len(), 2),
-            adam: Adam::new(learning_rate, parameters.len()),
-        }
-    }
-
-    /// Takes one step of Adam against the gradient, and then the step of the target.
-    fn descend(&mut self, threads: &Threads, t: u64, tau: f32) {
-        self.adam
-            .step(threads, t, &self.gradient, &mut self.parameters, tau, &mut self.target);
-    }
-}
-
-/// Two threads are used only if there are at least this many samples, and units in each hidden layer but the last (or
-/// in the only one). If a dimension is 1 or the product is small, faer adds the terms of a transposed product in
-/// another order, and the bits must not depend on the number of threads.
-const MIN_SPLIT: usize = 4;
-/// As [`MIN_SPLIT`], for samples times units of each hidden layer but the first (or of the only one).
-const MIN_WORK: usize = 8_192;
+/// The parts of the learner's state, as named in a checkpoint.
+const PARTS: [&str; 8] = [
+    "actor",
+    "critic",
+    "target actor",
+    "target critic",
+    "actor's first moment",
+    "actor's second moment",
+    "critic's first moment",
+    "critic's second moment",
+];
 
 /// The learner of DDPG: both networks, their targets, both optimisers.
 #[derive(Clone, Debug)]
@@ -89,8 +40,8 @@ pub struct Ddpg {
     tau: f32,
     threads: Threads,
     updates: u64,
-    actor: Learned,
-    critic: Learned,
+    actor: Targeted,
+    critic: Targeted,
     // Buffers for the intermediate results of a gradient step.
     mu: Pass,
     q: Pass,
@@ -118,8 +69,9 @@ impl Ddpg {
             tau: settings.tau as f32,
             threads: Threads::ALONE,
             updates: 0,
-            actor: Learned::new(mu, settings.actor_learning_rate, seed, 0),
-            critic: Learned::new(q, settings.critic_learning_rate, seed, 1),
+            // Lines 1 and 2: θ at random, θ' ← θ.
+            actor: Targeted::new(mu, settings.actor_learning_rate, &initialise(&mu, seed, 0)),
+            critic: Targeted::new(q, settings.critic_learning_rate, &initialise(&q, seed, 1)),
             mu: Pass::new(mu, batch),
             q: Pass::new(q, batch),
             target_mu: Pass::new(mu, batch),
@@ -132,18 +84,6 @@ impl Ddpg {
         })
     }
 
-    /// Shares the work of a gradient step among these threads from now on, if there is enough of it. The bits of the
-    /// results do not depend on them.
-    pub fn set_threads(&mut self, threads: Threads) {
-        let (layers, batch) = (self.critic.layout.hidden().layers, self.y.len());
-        let others = layers.len() - 1;
-        let (all_but_last, all_but_first) = (&layers[..others.max(1)], &layers[others.min(1)..]);
-        let enough = batch >= MIN_SPLIT
-            && all_but_last.iter().all(|units| *units >= MIN_SPLIT)
-            && all_but_first.iter().all(|units| units * batch >= MIN_WORK);
-        self.threads = if enough { threads } else { Threads::ALONE };
-    }
-
     /// Takes a gradient step with a minibatch of N transitions: lines 12 to 16. Returns L of line 13, −mean of Q(s,
     /// μ(s)) with Q after its step, and the mean of Q(s, a) with Q before it. Panics if the batch has other dimensions
     /// than the networks and settings. Nothing is allocated.
@@ -153,9 +93,9 @@ impl Ddpg {
         self.evaluate(batch);
         let (critic_loss, q_mean) = self.critic_gradient(batch);
         // Lines 13 and 15 in one sweep: Q' is not read again in this update. Likewise μ' of lines 14 and 16.
-        self.critic.descend(&self.threads, t, self.tau);
+        self.critic.descend_and_follow(&self.threads, t, self.tau);
         let actor_loss = self.actor_gradient(&batch.s);
-        self.actor.descend(&self.threads, t, self.tau);
+        self.actor.descend_and_follow(&self.threads, t, self.tau);
         self.updates = t;
         Losses {
             critic_loss,
@@ -174,23 +114,15 @@ impl Ddpg {
         let (target_mu, target_q, target_actions) = (&mut self.target_mu, &mut self.target_q, &mut self.target_actions);
         self.threads.both(
             || {
-                act(mu, range, &actor.parameters, s, actions);
-                q.forward(&critic.parameters, s, a);
+                act(mu, range, &actor.online.parameters, s, actions);
+                q.forward(&critic.online.parameters, s, a);
             },
             || {
                 act(target_mu, range, &actor.target, s_next, target_actions);
                 target_q.forward(&critic.target, s_next, target_actions.as_slice());
             },
         );
-        for (i, y) in self.y.iter_mut().enumerate() {
-            let discount = batch.discount[i];
-            *y = batch.r[i]
-                + if discount == 0.0 {
-                    0.0
-                } else {
-                    discount * self.target_q.output[i]
-                };
-        }
+        targets(batch, |i| self.target_q.output[i], &mut self.y);
     }
 
     /// Line 13: the gradient of L = 1/N Σ (y − Q(s, a))², through ∂L/∂Q = 2/N (Q − y). Returns L and the mean of Q.
@@ -199,7 +131,8 @@ impl Ddpg {
         for (d, (q, y)) in self.d_q.iter_mut().zip(self.q.output.iter().zip(&self.y)) {
             *d = scale * (q - y);
         }
-        let (parameters, gradient) = (&self.critic.parameters, &mut self.critic.gradient);
+        let critic = &mut self.critic.online;
+        let (parameters, gradient) = (&critic.parameters, &mut critic.gradient);
         self.q
             .backward(&self.threads, parameters, batch.s.as_slice(), &self.d_q, gradient);
         let loss = mean(self.q.output.iter().zip(&self.y).map(|(q, y)| (y - q) * (y - q)));
@@ -209,7 +142,7 @@ impl Ddpg {
     /// Line 14 and equation 3.30: the gradient of the loss −1/N Σ Q(s, μ(s)), with the critic after line 13: ∇_a Q ·
     /// ∇_θμ μ. Returns the loss. Up to the gradients of θ_μ the samples are independent, and the threads share them.
     fn actor_gradient(&mut self, s: &DMatrix<f32>) -> f32 {
-        let (actor, critic, half) = (&self.actor, &self.critic, self.range.half());
+        let (actor, critic, half) = (&self.actor.online, &self.critic.online, self.range.half());
         self.d_q.fill(-1.0 / self.y.len() as f32);
         let cut = self.threads.first_share(self.y.len());
         let per_sample = |matrix: &DMatrix<f32>| cut * matrix.nrows();
@@ -237,101 +170,114 @@ impl Ddpg {
             || part(mu.0, q.0, observations.0, actions.0, d_q.0, d_mu.0),
             || part(mu.1, q.1, observations.1, actions.1, d_q.1, d_mu.1),
         );
-        let (parameters, gradient) = (&self.actor.parameters, &mut self.actor.gradient);
+        let actor = &mut self.actor.online;
+        let (parameters, gradient) = (&actor.parameters, &mut actor.gradient);
         self.mu
             .gradients(&self.threads, parameters, s.as_slice(), &self.d_mu, gradient);
         -mean(self.q.output.iter().copied())
     }
 
-    /// θ_μ, the policy's parameters, in the layout [`policy_layout`](Self::policy_layout).
-    pub fn policy(&self) -> &[f32] {
-        &self.actor.parameters
-    }
-
-    /// The layout of the policy's parameters.
-    pub fn policy_layout(&self) -> &NetworkLayout {
-        &self.actor.layout
-    }
-
-    /// The layout of the critic's parameters.
-    pub fn critic_layout(&self) -> &NetworkLayout {
-        &self.critic.layout
-    }
-
-    /// Gradient steps taken.
-    pub fn updates(&self) -> u64 {
-        self.updates
+    /// The layouts of the actor's and the critic's parameters.
+    pub fn layouts(&self) -> (&NetworkLayout, &NetworkLayout) {
+        (&self.actor.online.layout, &self.critic.online.layout)
     }
 
     /// SHA-256 over actor, critic, target actor and target critic as little-endian `f32`, in hexadecimal.
     pub fn digest(&self) -> String {
-        sha256(&self.state().parts[..4])
+        sha256(&self.parts()[..4])
     }
 
-    /// Floating-point operations of the matrix products of one gradient step.
-    pub fn flop_per_update(&self) -> u64 {
-        product::flop_per_update(&self.actor.layout, &self.critic.layout, self.y.len())
-    }
-
-    /// Everything that the next gradient step depends on.
-    pub fn state(&self) -> DdpgState<'_> {
+    /// In the order of [`PARTS`].
+    fn parts(&self) -> [&[f32]; 8] {
         let (actor, critic) = (&self.actor, &self.critic);
-        DdpgState {
-            updates: self.updates,
-            parts: [
-                &actor.parameters,
-                &critic.parameters,
-                &actor.target,
-                &critic.target,
-                &actor.adam.first_moment,
-                &actor.adam.second_moment,
-                &critic.adam.first_moment,
-                &critic.adam.second_moment,
-            ],
-        }
+        [
+            &actor.online.parameters,
+            &critic.online.parameters,
+            &actor.target,
+            &critic.target,
+            &actor.online.adam.first_moment,
+            &actor.online.adam.second_moment,
+            &critic.online.adam.first_moment,
+            &critic.online.adam.second_moment,
+        ]
+    }
+}
+
+impl MinibatchLearner for Ddpg {
+    fn policy(&self) -> &[f32] {
+        &self.actor.online.parameters
     }
 
-    /// Starts again from given networks (actor, critic, target actor, target critic), with optimisers before their
-    /// first step.
-    ///
-    /// # Errors
-    /// When their sizes differ; then nothing has changed.
-    pub fn restart_from(&mut self, networks: [&[f32]; 4]) -> Result<(), SectionError> {
-        let [actor, critic] =
-            [self.actor.parameters.len(), self.critic.parameters.len()].map(|length| vec![0.0; length]);
-        let [mu, q, target_mu, target_q] = networks;
-        self.restore(&DdpgState {
-            updates: 0,
-            parts: [mu, q, target_mu, target_q, &actor, &actor, &critic, &critic],
-        })
+    fn layout(&self) -> PolicyLayout {
+        PolicyLayout::Deterministic(self.actor.online.layout)
     }
 
-    /// Restores a state of this or of another [`Ddpg`] with networks of the same sizes.
-    ///
-    /// # Errors
-    /// When the sizes differ; then nothing has changed.
-    pub fn restore(&mut self, state: &DdpgState<'_>) -> Result<(), SectionError> {
-        for ((part, own), given) in DdpgState::PARTS.into_iter().zip(self.state().parts).zip(state.parts) {
-            if given.len() != own.len() {
-                return Err(SectionError::of_length(part, given.len(), own.len()));
-            }
-        }
+    fn updates(&self) -> u64 {
+        self.updates
+    }
+
+    fn set_threads(&mut self, threads: Threads) {
+        self.threads = threads_for(&self.critic.online.layout, self.y.len(), threads);
+    }
+
+    fn learn(&mut self, batch: &Minibatch) -> Losses {
+        self.update(batch)
+    }
+
+    fn state(&self) -> Vec<Section<'_>> {
+        PARTS.into_iter().zip(self.parts()).collect()
+    }
+
+    fn state_mut(&mut self, updates: u64) -> Vec<SectionMut<'_>> {
+        self.updates = updates;
         let (actor, critic) = (&mut self.actor, &mut self.critic);
-        let own = [
-            &mut actor.parameters,
-            &mut critic.parameters,
+        let parts: [&mut [f32]; 8] = [
+            &mut actor.online.parameters,
+            &mut critic.online.parameters,
             &mut actor.target,
             &mut critic.target,
-            &mut actor.adam.first_moment,
-            &mut actor.adam.second_moment,
-            &mut critic.adam.first_moment,
-            &mut critic.adam.second_moment,
+            &mut actor.online.adam.first_moment,
+            &mut actor.online.adam.second_moment,
+            &mut critic.online.adam.first_moment,
+            &mut critic.online.adam.second_moment,
         ];
-        for (own, given) in own.into_iter().zip(state.parts) {
-            own.copy_from_slice(given);
+        PARTS.into_iter().zip(parts).collect()
+    }
+}
+
+impl Method for &config::DdpgConfig {
+    fn start(&self, spec: &EnvironmentSpec, seed: u64, sizes: RunSizes) -> Result<Box<dyn Algorithm>, PolicyError> {
+        let ddpg = Ddpg::new(spec, self, seed)?;
+        Ok(Box::new(Replayed::new(ddpg, spec, self.batch, seed, sizes)))
+    }
+
+    fn weights(&self) -> &'static [&'static str] {
+        &PARTS[..4]
+    }
+
+    /// With the thesis's networks, three observations and a batch of 64 they take 140 million operations, nearly all of
+    /// them in nine products of size 300 × 400 × 64.
+    fn products(&self, spec: &EnvironmentSpec) -> Products {
+        let (observation, action) = (spec.observation.width(), spec.action.width());
+        let mu = &NetworkLayout::policy(observation, self.hidden_layers(), action);
+        let q = &NetworkLayout::critic(observation, self.hidden_layers(), action);
+        let batch = self.batch;
+        let both = || product::forward(mu, batch).chain(product::forward(q, batch));
+        let products = (both()
+            .chain(product::forward(q, batch))
+            .chain(product::backward(q, batch)))
+        .chain(both())
+        .chain(product::backward_to_late_inputs(q, batch))
+        .chain(product::backward(mu, batch));
+        Products {
+            updates: 1,
+            products: products.collect(),
         }
-        self.updates = state.updates;
-        Ok(())
+    }
+
+    fn state_numbers(&self, spec: &EnvironmentSpec, _: RunSizes) -> usize {
+        // Each network with its target and two moments.
+        4 * self.learned(spec).parameters()
     }
 }
 
@@ -345,11 +291,6 @@ fn act(mu: &mut Pass, range: &ActionRange, parameters: &[f32], s: &[f32], action
             action[element] = range.action(element, z[element]);
         }
     }
-}
-
-fn mean(numbers: impl ExactSizeIterator<Item = f32>) -> f32 {
-    let count = numbers.len() as f32;
-    numbers.sum::<f32>() / count
 }
 
 #[cfg(test)]

@@ -5,11 +5,15 @@ use shoal_common::policy::PolicyError;
 
 use super::algorithm::{Algorithm, Method, RunSizes};
 use super::tabular;
+use crate::networks::product::Products;
 
 /// The method for the settings of a configuration.
 fn method(algorithm: &config::Algorithm) -> Box<dyn Method + '_> {
     match algorithm {
         config::Algorithm::Ddpg(settings) => Box::new(settings),
+        config::Algorithm::Td3(settings) => Box::new(settings),
+        config::Algorithm::Sac(settings) => Box::new(settings),
+        config::Algorithm::Dqn(settings) => Box::new(settings),
         config::Algorithm::Reinforce(settings) => Box::new(settings),
         config::Algorithm::QLearning(settings) => Box::new(tabular::QLearning(settings)),
         config::Algorithm::Sarsa(settings) => Box::new(tabular::Sarsa(settings)),
@@ -27,6 +31,12 @@ pub fn new(config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
 /// Names of the sections of a checkpoint that hold what was learned, as opposed to the state of the optimiser.
 pub fn weights(algorithm: &config::Algorithm) -> &'static [&'static str] {
     method(algorithm).weights()
+}
+
+/// The matrix products of one or a few updates of that learner; none if its method has no networks, or if its updates
+/// have no fixed size.
+pub fn products(config: &Config) -> Products {
+    method(&config.algorithm).products(&config.spec)
 }
 
 /// The total length of that learner's state, computed without creating the learner.
@@ -51,6 +61,14 @@ mod tests {
             ("[ddpg]\nhidden = [7, 5]\n[spec]\ntime_limit = 8", real, real),
             ("[ddpg]\nhidden = [7]\n[spec]\ntime_limit = 8", real, real),
             ("[ddpg]\nhidden = [7, 5, 6]\n[spec]\ntime_limit = 8", real, real),
+            ("[td3]\nhidden = [7, 5]\n[spec]\ntime_limit = 8", real, real),
+            ("[sac]\nhidden = [7, 5]\n[spec]\ntime_limit = 8", real, real),
+            ("[dqn]\nhidden = [7, 5]\n[spec]\ntime_limit = 8", real, "discrete.n = 3"),
+            (
+                "[dqn]\ndueling = true\nhidden = [7]\n[spec]\ntime_limit = 8",
+                real,
+                "discrete.n = 3",
+            ),
             (&format!("[reinforce]\n{in_order}"), real, "discrete.n = 3"),
             (
                 &format!("[reinforce]\nweight = \"baseline\"\n{in_order}"),

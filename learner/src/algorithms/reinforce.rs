@@ -20,6 +20,7 @@ use crate::networks::adam::Adam;
 use crate::networks::aligned::Aligned;
 use crate::networks::initialise::glorot;
 use crate::networks::pass::Pass;
+use crate::networks::product::Products;
 use crate::networks::threads::Threads;
 use crate::replay::{Replay, are_finite};
 
@@ -66,7 +67,7 @@ impl Learned {
             &self.d,
             &mut self.gradient,
         );
-        self.adam.step_without_target(t, &self.gradient, &mut self.parameters);
+        self.adam.step(&Threads::ALONE, t, &self.gradient, &mut self.parameters);
     }
 }
 
@@ -232,6 +233,10 @@ impl Method for &config::ReinforceConfig {
 
     fn weights(&self) -> &'static [&'static str] {
         &Reinforce::WEIGHTS
+    }
+
+    fn products(&self, _: &EnvironmentSpec) -> Products {
+        Products::default()
     }
 
     fn state_numbers(&self, spec: &EnvironmentSpec, _: RunSizes) -> usize {

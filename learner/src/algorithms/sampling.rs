@@ -4,7 +4,7 @@
 use std::ops::Range;
 
 use rand::Rng;
-use shoal_common::stream::{Purpose, Stream, stream};
+use shoal_common::stream::{Purpose, Stream, seek, stream};
 
 /// Draws minibatches.
 #[derive(Clone, Debug)]
@@ -33,8 +33,7 @@ impl Sampler {
         assert!(!window.is_empty(), "cannot draw a minibatch from an empty window");
         let rows = window.end - window.start;
         let mut numbers = self.key.clone();
-        numbers.set_stream(update);
-        numbers.set_word_pos(0);
+        seek(&mut numbers, update);
         for index in out {
             let scaled = u128::from(numbers.next_u64()) * u128::from(rows);
             *index = window.start + (scaled >> 64) as u64;

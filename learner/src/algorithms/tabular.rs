@@ -7,6 +7,7 @@ use shoal_common::space::EnvironmentSpec;
 use shoal_common::transition::Transition;
 
 use super::algorithm::{Algorithm, Losses, Method, RunSizes, SavedState, Section, SectionError};
+use crate::networks::product::Products;
 use crate::replay::{Replay, are_finite};
 
 /// Which value of s' an update bootstraps from.
@@ -35,6 +36,10 @@ impl Method for QLearning<'_> {
         &Tabular::WEIGHTS
     }
 
+    fn products(&self, _: &EnvironmentSpec) -> Products {
+        Products::default()
+    }
+
     fn state_numbers(&self, spec: &EnvironmentSpec, sizes: RunSizes) -> usize {
         state_numbers(self.0, spec, sizes)
     }
@@ -47,6 +52,10 @@ impl Method for Sarsa<'_> {
 
     fn weights(&self) -> &'static [&'static str] {
         &Tabular::WEIGHTS
+    }
+
+    fn products(&self, _: &EnvironmentSpec) -> Products {
+        Products::default()
     }
 
     fn state_numbers(&self, spec: &EnvironmentSpec, sizes: RunSizes) -> usize {

@@ -33,11 +33,33 @@ impl Adam {
         }
     }
 
-    /// Takes step number `t` (from 1) of `parameters` θ against `gradient`; then `target` ← τ θ + (1 − τ) `target`
-    /// (equation 3.31). All slices have the length of the network's parameters. The threads share the work.
+    /// Takes step number `t` (from 1) of `parameters` θ against `gradient`. Both have the length of the network's
+    /// parameters. The threads share the work.
     ///
     /// Bias correction as in PyTorch: θ ← θ − α / (1 − β₁ᵗ) · m / (√v / √(1 − β₂ᵗ) + ε).
-    pub fn step(
+    pub fn step(&mut self, threads: &Threads, t: u64, gradient: &[f32], parameters: &mut [f32]) {
+        let bias = self.bias(t);
+        let cut = cut(threads, parameters.len());
+        let part = |gradient: &[f32], m: &mut [f32], v: &mut [f32], parameters: &mut [f32]| {
+            let moments = m.iter_mut().zip(v);
+            Arch::new().dispatch(|| {
+                for ((g, (m, v)), weight) in gradient.iter().zip(moments).zip(parameters) {
+                    *weight -= bias.step(*g, m, v);
+                }
+            });
+        };
+        let gradient = gradient.split_at(cut);
+        let m = self.first_moment.split_at_mut(cut);
+        let v = self.second_moment.split_at_mut(cut);
+        let parameters = parameters.split_at_mut(cut);
+        threads.both(
+            || part(gradient.0, m.0, v.0, parameters.0),
+            || part(gradient.1, m.1, v.1, parameters.1),
+        );
+    }
+
+    /// As [`step`](Self::step); then `target` ← τ θ + (1 − τ) `target` (equation 3.31), in the same sweep.
+    pub fn step_and_follow(
         &mut self,
         threads: &Threads,
         t: u64,
@@ -47,7 +69,7 @@ impl Adam {
         target: &mut [f32],
     ) {
         let bias = self.bias(t);
-        let cut = (threads.first_share(parameters.len().div_ceil(PAGE)) * PAGE).min(parameters.len());
+        let cut = cut(threads, parameters.len());
         let part = |gradient: &[f32], m: &mut [f32], v: &mut [f32], parameters: &mut [f32], target: &mut [f32]| {
             let moments = m.iter_mut().zip(v);
             let weights = parameters.iter_mut().zip(target);
@@ -69,21 +91,17 @@ impl Adam {
         );
     }
 
-    /// As [`step`](Self::step), for a network without a target.
-    pub fn step_without_target(&mut self, t: u64, gradient: &[f32], parameters: &mut [f32]) {
-        let bias = self.bias(t);
-        let moments = self.first_moment.iter_mut().zip(self.second_moment.iter_mut());
-        for ((g, (m, v)), weight) in gradient.iter().zip(moments).zip(parameters) {
-            *weight -= bias.step(*g, m, v);
-        }
-    }
-
     fn bias(&self, t: u64) -> Bias {
         Bias {
             step_size: (self.learning_rate / (1.0 - BETA_1.powf(t as f64))) as f32,
             correction: (1.0 / (1.0 - BETA_2.powf(t as f64)).sqrt()) as f32,
         }
     }
+}
+
+/// How many of the parameters the first thread takes: whole pages.
+fn cut(threads: &Threads, parameters: usize) -> usize {
+    (threads.first_share(parameters.div_ceil(PAGE)) * PAGE).min(parameters)
 }
 
 /// The bias correction of learning rate and moments, which depends on a step's number.
@@ -146,7 +164,7 @@ mod tests {
             let gradient: Vec<f32> = (0..count)
                 .map(|i| ((t as f32 * 0.37 + i as f32).sin() + 0.2) * 10f32.powi(i as i32 % 9 - 6))
                 .collect();
-            adam.step(&Threads::ALONE, t, &gradient, &mut weights, 0.01, &mut targets);
+            adam.step_and_follow(&Threads::ALONE, t, &gradient, &mut weights, 0.01, &mut targets);
             for i in 0..count {
                 expected[i] = references[i].step(1e-3, gradient[i].into(), expected[i]);
                 expected_targets[i] = 0.01 * expected[i] + 0.99 * expected_targets[i];
@@ -168,8 +186,8 @@ mod tests {
         let (mut weights, mut same, mut target) = ([0.5_f32; 3], [0.5_f32; 3], [0.0_f32; 3]);
         for t in 1..=20 {
             let gradient = [0.3, -0.1 * t as f32, 0.0];
-            without.step_without_target(t, &gradient, &mut weights);
-            with.step(&Threads::ALONE, t, &gradient, &mut same, 0.1, &mut target);
+            without.step(&Threads::ALONE, t, &gradient, &mut weights);
+            with.step_and_follow(&Threads::ALONE, t, &gradient, &mut same, 0.1, &mut target);
         }
         assert_eq!(weights, same);
         assert_ne!(weights[..2], [0.5; 2]);
@@ -179,9 +197,9 @@ mod tests {
     fn moments_without_gradient_end_at_zero_and_are_never_denormal() {
         let mut adam = Adam::new(1e-3, 20);
         let (mut weights, mut targets) = (vec![0.0; 20], vec![0.0; 20]);
-        adam.step(&Threads::ALONE, 1, &[1e-9; 20], &mut weights, 0.01, &mut targets);
+        adam.step_and_follow(&Threads::ALONE, 1, &[1e-9; 20], &mut weights, 0.01, &mut targets);
         for t in 2..=30_000 {
-            adam.step(
+            adam.step_and_follow(
                 &Threads::ALONE,
                 t,
                 &[if t < 500 { 1e-22 } else { 0.0 }; 20],

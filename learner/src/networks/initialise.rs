@@ -13,15 +13,27 @@ const OUTPUT_BOUND: f32 = 3e-3;
 ///
 /// `index` distinguishes the networks of one run.
 pub fn initialise(layout: &NetworkLayout, seed: u64, index: u64) -> Vec<f32> {
-    let mut stream = stream(seed, Purpose::Initialisation, index, 0);
     let output_layer = layout.hidden().layers.len();
-    let mut parameters = Vec::with_capacity(layout.parameters());
-    for (layer, (inputs, outputs)) in layout.layer_sizes().enumerate() {
-        let bound = if layer == output_layer {
+    uniform(layout, seed, index, |layer, inputs| {
+        if layer == output_layer {
             OUTPUT_BOUND
         } else {
             fan_in_bound(inputs)
-        };
+        }
+    })
+}
+
+/// As [`initialise`], but the output layer is uniform within ±1/√fan-in too, as is the default of PyTorch's layers.
+pub fn fan_in(layout: &NetworkLayout, seed: u64, index: u64) -> Vec<f32> {
+    uniform(layout, seed, index, |_, inputs| fan_in_bound(inputs))
+}
+
+/// Weights and biases uniform within a layer's bound, which follows from the layer's number and its inputs.
+fn uniform(layout: &NetworkLayout, seed: u64, index: u64, bound: impl Fn(usize, usize) -> f32) -> Vec<f32> {
+    let mut stream = stream(seed, Purpose::Initialisation, index, 0);
+    let mut parameters = Vec::with_capacity(layout.parameters());
+    for (layer, (inputs, outputs)) in layout.layer_sizes().enumerate() {
+        let bound = bound(layer, inputs);
         parameters.extend((0..(inputs + 1) * outputs).map(|_| (2.0 * stream.random::<f32>() - 1.0) * bound));
     }
     parameters

@@ -39,63 +39,74 @@ pub struct Product {
 }
 
 impl Product {
+    fn new(m: usize, k: usize, n: usize, transposed: Transposed) -> Self {
+        Self { m, k, n, transposed }
+    }
+
     /// Floating-point operations: a multiplication and an addition for each term.
     pub fn flop(&self) -> u64 {
         2 * (self.m * self.k * self.n) as u64
     }
 }
 
-/// Every matrix product of one DDPG gradient step, in the order in which they run.
-///
-/// With the thesis's networks, three observations and a batch of 64 they take 140 million operations, nearly all of
-/// them in nine products of size 300 × 400 × 64.
-pub fn products_of_update(actor: &NetworkLayout, critic: &NetworkLayout, batch: usize) -> Vec<Product> {
-    let product = |m, k, n, transposed| Product { m, k, n, transposed };
-    let forward = |net: &NetworkLayout| -> Vec<Product> {
-        let sizes = net.layer_sizes();
-        sizes.map(|(i, o)| product(o, i, batch, Transposed::Neither)).collect()
-    };
-    // The gradient that a layer passes down to the units below it.
-    let down = |net: &NetworkLayout, layer: usize| {
-        let units = net.hidden().layers[layer - 1];
-        product(units, net.layer_size(layer).1, batch, Transposed::Left)
-    };
-    let output_layer = |net: &NetworkLayout| net.hidden().layers.len();
-    let backward = |net: &NetworkLayout| -> Vec<Product> {
-        let of_layer = |layer| {
-            let (inputs, outputs) = net.layer_size(layer);
-            let weights = product(outputs, batch, inputs, Transposed::Right);
-            [weights].into_iter().chain((layer > 0).then(|| down(net, layer)))
-        };
-        (0..=output_layer(net)).rev().flat_map(of_layer).collect()
-    };
-    let action_gradient: Vec<Product> = critic.late_layer().map_or_else(Vec::new, |late| {
-        let above = (late + 1..=output_layer(critic)).rev();
-        let units = critic.layer_size(late).1;
-        let actions = product(critic.late_inputs(), units, batch, Transposed::Left);
-        above.map(|layer| down(critic, layer)).chain([actions]).collect()
-    });
-    let target = [forward(actor), forward(critic)];
-    let ascent = [forward(actor), forward(critic)];
-    (target.into_iter().flatten())
-        .chain(forward(critic))
-        .chain(backward(critic))
-        .chain(ascent.into_iter().flatten())
-        .chain(action_gradient)
-        .chain(backward(actor))
-        .collect()
+/// The products of a forward pass of `batch` samples.
+pub fn forward(network: &NetworkLayout, batch: usize) -> impl Iterator<Item = Product> {
+    network
+        .layer_sizes()
+        .map(move |(inputs, outputs)| Product::new(outputs, inputs, batch, Transposed::Neither))
 }
 
-/// Floating-point operations of the matrix products of one DDPG gradient step: 140 million for Pendulum at batch 64.
-pub fn flop_per_update(actor: &NetworkLayout, critic: &NetworkLayout, batch: usize) -> u64 {
-    products_of_update(actor, critic, batch).iter().map(Product::flop).sum()
+/// The products of a backward pass for the gradient of all weights.
+pub fn backward(network: &NetworkLayout, batch: usize) -> impl Iterator<Item = Product> {
+    (0..=output_layer(network)).rev().flat_map(move |layer| {
+        let (inputs, outputs) = network.layer_size(layer);
+        let weights = Product::new(outputs, batch, inputs, Transposed::Right);
+        [weights]
+            .into_iter()
+            .chain((layer > 0).then(|| down(network, layer, batch)))
+    })
+}
+
+/// The products of a backward pass to the late inputs of a critic.
+pub fn backward_to_late_inputs(critic: &NetworkLayout, batch: usize) -> impl Iterator<Item = Product> {
+    critic.late_layer().into_iter().flat_map(move |late| {
+        let above = (late + 1..=output_layer(critic)).rev();
+        let units = critic.layer_size(late).1;
+        let inputs = Product::new(critic.late_inputs(), units, batch, Transposed::Left);
+        above.map(move |layer| down(critic, layer, batch)).chain([inputs])
+    })
+}
+
+/// The gradient that a layer passes down to the units below it.
+fn down(network: &NetworkLayout, layer: usize, batch: usize) -> Product {
+    let units = network.hidden().layers[layer - 1];
+    Product::new(units, network.layer_size(layer).1, batch, Transposed::Left)
+}
+
+fn output_layer(network: &NetworkLayout) -> usize {
+    network.hidden().layers.len()
+}
+
+/// Every matrix product of a number of updates, in the order in which they run.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Products {
+    /// Updates that these are the products of.
+    pub updates: u64,
+    /// The products.
+    pub products: Vec<Product>,
+}
+
+impl Products {
+    /// Floating-point operations of an update, on average.
+    pub fn flop_per_update(&self) -> u64 {
+        self.products.iter().map(Product::flop).sum::<u64>() / self.updates.max(1)
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use faer::Mat;
-    use shoal_common::network::Hidden;
 
     #[test]
     fn gradients_are_the_transposed_products() {
@@ -109,16 +120,5 @@ mod tests {
         let mut dx = Mat::full(3, 5, f32::NAN);
         input_gradient(w.as_ref(), d.as_ref(), dx.as_mut());
         assert_eq!(dx, Mat::from_fn(3, 5, |i, j| sum(&|k| w[(k, i)] * d[(k, j)], 4)));
-    }
-
-    #[test]
-    fn a_gradient_step_of_the_thesis_takes_140_million_operations() {
-        let (actor, critic) = (
-            NetworkLayout::policy(3, Hidden::relu([400, 300]), 1),
-            NetworkLayout::critic(3, Hidden::relu([400, 300]), 1),
-        );
-        let products = products_of_update(&actor, &critic, 64);
-        assert_eq!(products.iter().filter(|p| p.flop() > 15_000_000).count(), 9);
-        assert_eq!((flop_per_update(&actor, &critic, 64) as f64 / 1e6).round(), 140.0);
     }
 }

@@ -20,9 +20,10 @@ const BATCH: &str = "batch";
 
 /// The bytes of the model.
 ///
-/// - DDPG: `observation` (batch × n) to `action` (batch × m, in the environment's units).
+/// - DDPG, TD3 and SAC: `observation` (batch × n) to `action` (batch × m, in the environment's units).
 /// - REINFORCE: `observation` to `logits`, `probabilities` (batch × actions) and `action` (batch, the most probable
 ///   one).
+/// - DQN: `observation` to `action_values` (batch × actions) and `action` (batch, the one of highest value).
 /// - Tables: `state` (batch, 64-bit) to `action_values` (batch × actions) and `action` (batch, the one of highest
 ///   value).
 ///
@@ -60,6 +61,14 @@ pub(super) fn model(policy: &Portable) -> Vec<u8> {
             let actions = network.layers.last().map_or(0, |last| last.biases.len());
             graph.add_output("logits", FLOAT, &[actions]);
             graph.add_output("probabilities", FLOAT, &[actions]);
+            graph.add_output("action", INT64, &[]);
+        }
+        Body::Values { network } => {
+            graph.add_input("observation", FLOAT, &[network.layers[0].inputs]);
+            graph.add_network(network, "action_values");
+            graph.add_arg_max("action_values", policy.starts.action);
+            let actions = network.layers.last().map_or(0, |last| last.biases.len());
+            graph.add_output("action_values", FLOAT, &[actions]);
             graph.add_output("action", INT64, &[]);
         }
         Body::Table {

@@ -10,7 +10,9 @@ use super::{Body, Dense, Portable};
 /// the rest.
 pub(super) fn file(policy: &Portable) -> anyhow::Result<Vec<u8>> {
     let tensors = match &policy.body {
-        Body::Actions { network, .. } | Body::Probabilities { network } => of_layers(&network.layers),
+        Body::Actions { network, .. } | Body::Probabilities { network } | Body::Values { network } => {
+            of_layers(&network.layers)
+        }
         Body::Table {
             states,
             actions,

@@ -207,7 +207,7 @@ mod tests {
     fn by_definition(layout: &NetworkLayout, parameters: &[f32], input: &[f32], late: &[f32]) -> Vec<f64> {
         let mut x: Vec<f64> = input.iter().map(|&x| x.into()).collect();
         for (number, layer) in layout.layers(parameters).enumerate() {
-            if number == if layout.hidden().layers.len() == 1 { 0 } else { 1 } {
+            if Some(number) == layout.late_layer() {
                 x.extend(late.iter().map(|&a| f64::from(a)));
             }
             let outputs = layer.biases.len();
@@ -237,6 +237,8 @@ mod tests {
             (NetworkLayout::critic(6, Hidden::tanh([41, 29]), 2), 5),
             (NetworkLayout::critic(6, Hidden::relu([41]), 2), 1),
             (NetworkLayout::critic(6, Hidden::tanh([41]), 2), 5),
+            (NetworkLayout::joined_critic(6, Hidden::relu([41, 29]), 2), 5),
+            (NetworkLayout::joined_critic(3, Hidden::tanh([20, 41, 13]), 2), 1),
             (NetworkLayout::policy(6, Hidden::tanh([41]), 2), 1),
             (NetworkLayout::policy(3, Hidden::tanh([20, 41, 13]), 2), 1),
             (NetworkLayout::critic(3, Hidden::relu([20, 41, 13]), 2), 33),

@@ -11,6 +11,8 @@ pub struct NetworkLayout {
     pub(super) inputs: usize,
     pub(super) hidden: Hidden,
     pub(super) late_inputs: usize,
+    /// The layer that the late inputs enter, counted from 0. 0 if there are none.
+    late_layer: usize,
     pub(super) outputs: usize,
 }
 
@@ -30,16 +32,27 @@ impl NetworkLayout {
             inputs: observation,
             hidden,
             late_inputs: 0,
+            late_layer: 0,
             outputs: action,
         }
     }
 
-    /// An action-value function Q: from observations, and actions as late inputs, to one value.
+    /// An action-value function Q: from observations, and actions as late inputs, to one value. The actions enter at
+    /// the second hidden layer, or at the only one.
     pub fn critic(observation: usize, hidden: Hidden, action: usize) -> Self {
+        Self {
+            late_layer: hidden.layers.len().min(2) - 1,
+            ..Self::joined_critic(observation, hidden, action)
+        }
+    }
+
+    /// As [`critic`](Self::critic), but the actions enter at the first layer: its input is (s, a).
+    pub fn joined_critic(observation: usize, hidden: Hidden, action: usize) -> Self {
         Self {
             inputs: observation,
             hidden,
             late_inputs: action,
+            late_layer: 0,
             outputs: 1,
         }
     }
@@ -64,11 +77,9 @@ impl NetworkLayout {
         self.outputs
     }
 
-    /// The layer that the late inputs enter, counted from 0: the second hidden layer, or the only one. `None` if there
-    /// are no late inputs.
+    /// The layer that the late inputs enter, counted from 0. `None` if there are no late inputs.
     pub fn late_layer(&self) -> Option<usize> {
-        let second = self.hidden.layers.len().min(2) - 1;
-        (self.late_inputs > 0).then_some(second)
+        (self.late_inputs > 0).then_some(self.late_layer)
     }
 
     /// The `(inputs, outputs)` of a layer, counted from 0. The output layer comes after the hidden layers. The inputs
@@ -128,17 +139,20 @@ impl NetworkLayout {
     /// The fingerprint: two layouts have the same one only if they read parameters alike (FNV-1a over the sizes).
     ///
     /// With two ReLU layers it is that of files from before other networks existed. For any other list the length and
-    /// the activation are appended, so that no two layouts hash the same numbers.
+    /// the activation are appended, and a 1 if late inputs enter at the first of several layers, so that no two layouts
+    /// hash the same numbers.
     pub fn fingerprint(&self) -> u64 {
         let Hidden { layers, activation } = self.hidden;
+        let joined = (layers.len() > 1 && self.late_layer() == Some(0)).then_some(1);
         let marks = match (layers.len(), activation) {
-            (2, Activation::Relu) => None,
+            (2, Activation::Relu) if joined.is_none() => None,
             (count, Activation::Relu) => Some([count, 0]),
             (count, Activation::Tanh) => Some([count, 1]),
         };
         let sizes = [self.inputs].into_iter().chain(layers.iter().copied());
         let sizes = sizes.chain([self.late_inputs, self.outputs]);
-        let bytes = (sizes.chain(marks.into_iter().flatten())).flat_map(|size| (size as u64).to_le_bytes());
+        let bytes =
+            (sizes.chain(marks.into_iter().flatten()).chain(joined)).flat_map(|size| (size as u64).to_le_bytes());
         bytes.fold(0xcbf2_9ce4_8422_2325, |hash, byte| {
             (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3)
         })
@@ -156,12 +170,19 @@ mod tests {
 
     #[test]
     fn the_ranges_cover_the_parameters_without_gaps_or_overlaps() {
-        for (hidden, expected) in [
-            (Hidden::relu([5]), (3 + 2) * 5 + 5 + 5 + 1),
-            (Hidden::relu([5, 4]), 3 * 5 + 5 + (5 + 2) * 4 + 4 + 4 + 1),
-            (Hidden::tanh([5, 4, 6]), 3 * 5 + 5 + (5 + 2) * 4 + 4 + 4 * 6 + 6 + 6 + 1),
+        let critic = |hidden| NetworkLayout::critic(3, hidden, 2);
+        for (layout, expected) in [
+            (critic(Hidden::relu([5])), (3 + 2) * 5 + 5 + 5 + 1),
+            (critic(Hidden::relu([5, 4])), 3 * 5 + 5 + (5 + 2) * 4 + 4 + 4 + 1),
+            (
+                critic(Hidden::tanh([5, 4, 6])),
+                3 * 5 + 5 + (5 + 2) * 4 + 4 + 4 * 6 + 6 + 6 + 1,
+            ),
+            (
+                NetworkLayout::joined_critic(3, Hidden::relu([5, 4]), 2),
+                (3 + 2) * 5 + 5 + 5 * 4 + 4 + 4 + 1,
+            ),
         ] {
-            let layout = NetworkLayout::critic(3, hidden, 2);
             let mut end = 0;
             for (number, range) in layout.layer_ranges().enumerate() {
                 assert_eq!(range, layout.layer_range(number));
@@ -190,6 +211,8 @@ mod tests {
             NetworkLayout::critic(3, Hidden::relu([400, 300]), 2),
             NetworkLayout::critic(3, Hidden::tanh([400, 300]), 2),
             NetworkLayout::critic(3, Hidden::relu([400, 300, 2]), 1),
+            NetworkLayout::joined_critic(3, Hidden::relu([400, 300]), 1),
+            NetworkLayout::joined_critic(3, Hidden::tanh([400, 300]), 1),
         ];
         let fingerprints: std::collections::HashSet<u64> = layouts.iter().map(NetworkLayout::fingerprint).collect();
         assert_eq!(fingerprints.len(), layouts.len());

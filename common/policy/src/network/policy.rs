@@ -90,6 +90,12 @@ impl ActionRange {
         a.clamp(self.action(element, -1.0), self.action(element, 1.0))
     }
 
+    /// The inverse of [`action`](Self::action): element `element` of an action in units of half its range, from the
+    /// middle.
+    pub fn scaled(&self, element: usize, a: f32) -> f32 {
+        (a - self.centre[element]) / self.half[element]
+    }
+
     /// The value of element `element` of an action for the tanh output `t`. It is within the space's bounds,
     /// whatever the rounding.
     pub fn action(&self, element: usize, t: f32) -> f32 {
@@ -166,6 +172,7 @@ mod tests {
             }
         }
         assert!(range.action(0, f32::NAN).is_nan(), "what diverges is not hidden");
+        assert!((range.scaled(1, range.action(1, 0.25)) - 0.25).abs() < 1e-6);
     }
 
     #[test]

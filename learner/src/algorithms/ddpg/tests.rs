@@ -1,10 +1,11 @@
 use rand::RngExt;
-use shoal_common::network::{Activation, Hidden, Layers, PolicyNetwork};
+use shoal_common::network::{Hidden, Layers, PolicyNetwork};
 use shoal_common::space::Space;
-use shoal_common::stream::{Purpose, Stream, stream};
-use shoal_common::transition::{RowLayout, Transition};
+use shoal_common::stream::{Purpose, stream};
+use shoal_common::transition::RowLayout;
 
 use super::*;
+use crate::algorithms::testing::{self, assert_is_gradient_of, network, wide};
 
 const BATCH: usize = 5;
 
@@ -57,6 +58,7 @@ fn learner_of(hidden: Hidden, seed: u64) -> Ddpg {
     let mut numbers = stream(seed, Purpose::Sampling, 0, 0);
     for network in [&mut ddpg.actor, &mut ddpg.critic] {
         network
+            .online
             .parameters
             .iter_mut()
             .for_each(|x| *x = numbers.random_range(-bound..bound));
@@ -68,59 +70,12 @@ fn learner_of(hidden: Hidden, seed: u64) -> Ddpg {
     ddpg
 }
 
-fn random(numbers: &mut Stream, count: usize) -> Vec<f32> {
-    (0..count).map(|_| numbers.random_range(-2.0..2.0)).collect()
-}
-
 fn minibatch(seed: u64) -> Minibatch {
-    let mut numbers = stream(seed, Purpose::Environment, 0, 0);
-    let mut batch = Minibatch::new(RowLayout::new(3, 2), BATCH);
-    for column in 0..BATCH {
-        let [s, a, s_next] = [3, 2, 3].map(|count| random(&mut numbers, count));
-        let (r, discount) = (numbers.random_range(-1.0..1.0), [0.99, 0.9, 0.0, 1.0, 0.97][column]);
-        batch.set(
-            column,
-            &Transition {
-                s: &s,
-                a: &a,
-                r,
-                discount,
-                s_next: &s_next,
-                last: false,
-            },
-        );
-    }
-    batch
-}
-
-/// A network's output for one sample by the definition, with parameters in `f64`.
-fn network(layout: &NetworkLayout, parameters: &[f64], x: &[f64], late: &[f64]) -> Vec<f64> {
-    let mut x = x.to_vec();
-    let Hidden { layers, activation } = layout.hidden();
-    let enters = if layers.len() == 1 { 0 } else { 1 };
-    for (number, range) in layout.layer_ranges().enumerate() {
-        if number == enters {
-            x.extend(late);
-        }
-        let (w, b) = (&parameters[range.weights], &parameters[range.biases]);
-        let z = |i: usize| b[i] + x.iter().enumerate().map(|(j, x)| w[j * b.len() + i] * x).sum::<f64>();
-        x = (0..b.len())
-            .map(|i| match activation {
-                _ if number == layers.len() => z(i),
-                Activation::Relu => z(i).max(0.0),
-                Activation::Tanh => z(i).tanh(),
-            })
-            .collect();
-    }
-    x
-}
-
-fn wide(numbers: &[f32]) -> Vec<f64> {
-    numbers.iter().map(|&x| x.into()).collect()
+    testing::minibatch(seed, RowLayout::new(3, 2), BATCH)
 }
 
 fn policy(ddpg: &Ddpg, parameters: &[f64], s: &[f64]) -> Vec<f64> {
-    let z = network(ddpg.policy_layout(), parameters, s, &[]);
+    let z = network(ddpg.layouts().0, parameters, s, &[]);
     let [centre, half] = [[1.0, 0.0], [2.0, 2.0]];
     z.iter()
         .enumerate()
@@ -133,42 +88,20 @@ fn critic_loss(ddpg: &Ddpg, theta: &[f64], batch: &Minibatch) -> f64 {
     let square = |i: usize| {
         let [s, a, s_next] = [&batch.s, &batch.a, &batch.s_next].map(|m| wide(m.column(i).as_slice()));
         let a_next = policy(ddpg, &target_actor, &s_next);
-        let q_next = network(ddpg.critic_layout(), &target_critic, &s_next, &a_next)[0];
+        let q_next = network(ddpg.layouts().1, &target_critic, &s_next, &a_next)[0];
         let y = f64::from(batch.r[i]) + f64::from(batch.discount[i]) * q_next;
-        (y - network(ddpg.critic_layout(), theta, &s, &a)[0]).powi(2)
+        (y - network(ddpg.layouts().1, theta, &s, &a)[0]).powi(2)
     };
     (0..BATCH).map(square).sum::<f64>() / BATCH as f64
 }
 
 fn actor_loss(ddpg: &Ddpg, theta: &[f64], batch: &Minibatch) -> f64 {
-    let critic = wide(&ddpg.critic.parameters);
+    let critic = wide(&ddpg.critic.online.parameters);
     let value = |i: usize| {
         let s = wide(batch.s.column(i).as_slice());
-        network(ddpg.critic_layout(), &critic, &s, &policy(ddpg, theta, &s))[0]
+        network(ddpg.layouts().1, &critic, &s, &policy(ddpg, theta, &s))[0]
     };
     -(0..BATCH).map(value).sum::<f64>() / BATCH as f64
-}
-
-/// Compares `gradient` with central differences of `loss`. They are in `f64`, so that the step can be small enough to
-/// rarely cross a ReLU's corner. Returns the share of the gradient that is not nearly zero.
-fn assert_is_gradient_of(loss: impl Fn(&[f64]) -> f64, gradient: &[f32], parameters: &[f32]) -> f64 {
-    const STEP: f64 = 1e-6;
-    let mut theta = wide(parameters);
-    for (i, &found) in gradient.iter().enumerate() {
-        let middle = theta[i];
-        let mut at = |x: f64| {
-            theta[i] = x;
-            loss(&theta)
-        };
-        let expected = (at(middle + STEP) - at(middle - STEP)) / (2.0 * STEP);
-        theta[i] = middle;
-        let tolerance = 2e-6 + 2e-5 * expected.abs();
-        assert!(
-            (f64::from(found) - expected).abs() < tolerance,
-            "parameter {i}: {found} for {expected}"
-        );
-    }
-    gradient.iter().filter(|g| g.abs() > 1e-3).count() as f64 / gradient.len() as f64
 }
 
 /// Asserts that enough of the gradient was not nearly zero. With many ReLU layers, some samples do not affect the
@@ -186,10 +119,14 @@ fn the_critics_gradient_is_that_of_its_loss() {
             let (mut ddpg, batch) = (learner_of(hidden, seed), minibatch(seed));
             ddpg.evaluate(&batch);
             let (loss, _) = ddpg.critic_gradient(&batch);
-            let theta = &ddpg.critic.parameters;
+            let theta = &ddpg.critic.online.parameters;
             let expected = critic_loss(&ddpg, &wide(theta), &batch);
             assert!((f64::from(loss) - expected).abs() < 1e-5 * (1.0 + expected));
-            assert_is_gradient_of(|theta| critic_loss(&ddpg, theta, &batch), &ddpg.critic.gradient, theta)
+            assert_is_gradient_of(
+                |theta| critic_loss(&ddpg, theta, &batch),
+                &ddpg.critic.online.gradient,
+                theta,
+            )
         });
         assert_enough(hidden, &shares.collect::<Vec<_>>());
     }
@@ -202,10 +139,14 @@ fn the_actors_gradient_is_that_of_its_loss() {
             let (mut ddpg, batch) = (learner_of(hidden, seed), minibatch(seed));
             ddpg.evaluate(&batch);
             let loss = ddpg.actor_gradient(&batch.s);
-            let theta = &ddpg.actor.parameters;
+            let theta = &ddpg.actor.online.parameters;
             let expected = actor_loss(&ddpg, &wide(theta), &batch);
             assert!((f64::from(loss) - expected).abs() < 1e-5 * (1.0 + expected.abs()));
-            assert_is_gradient_of(|theta| actor_loss(&ddpg, theta, &batch), &ddpg.actor.gradient, theta)
+            assert_is_gradient_of(
+                |theta| actor_loss(&ddpg, theta, &batch),
+                &ddpg.actor.online.gradient,
+                theta,
+            )
         });
         assert_enough(hidden, &shares.collect::<Vec<_>>());
     }
@@ -294,12 +235,12 @@ fn two_threads_compute_the_same_bits_as_one() {
 #[test]
 fn targets_start_as_copies_and_follow_their_networks() {
     let mut ddpg = Ddpg::new(&spec(), &settings(), 1).unwrap();
-    assert_eq!(*ddpg.actor.parameters, *ddpg.actor.target);
-    assert_eq!(*ddpg.critic.parameters, *ddpg.critic.target);
+    assert_eq!(*ddpg.actor.online.parameters, *ddpg.actor.target);
+    assert_eq!(*ddpg.critic.online.parameters, *ddpg.critic.target);
     let before = ddpg.critic.clone();
     ddpg.update(&minibatch(1));
     for i in 0..before.target.len() {
-        let expected = 0.01 * ddpg.critic.parameters[i] + 0.99 * before.target[i];
+        let expected = 0.01 * ddpg.critic.online.parameters[i] + 0.99 * before.target[i];
         assert!((ddpg.critic.target[i] - expected).abs() < 1e-7);
     }
 }
@@ -310,25 +251,11 @@ fn a_restored_learner_continues_with_the_same_bits() {
     for t in 0..3 {
         ddpg.update(&minibatch(t));
     }
-    let kept: Vec<Vec<f32>> = ddpg.state().parts.map(<[f32]>::to_vec).into();
-    let parts = std::array::from_fn(|part| kept[part].as_slice());
     let mut restored = Ddpg::new(&spec(), &settings(), 99).unwrap();
-    restored.restore(&DdpgState { updates: 3, parts }).unwrap();
+    testing::copy_state(&ddpg, &mut restored);
     assert_eq!(restored.state(), ddpg.state());
     assert_eq!(restored.update(&minibatch(7)), ddpg.update(&minibatch(7)));
     assert_eq!(restored.state(), ddpg.state());
-
-    let mut short = parts;
-    short[5] = &short[5][1..];
-    let error = restored
-        .restore(&DdpgState {
-            updates: 3,
-            parts: short,
-        })
-        .unwrap_err();
-    let found = "`actor's second moment` has 121 numbers instead of 122";
-    assert!(error.to_string().contains(found), "{error}");
-    assert_eq!(restored.state(), ddpg.state(), "an error changes nothing");
 }
 
 #[test]
@@ -343,7 +270,7 @@ fn actors_compute_the_same_bits_as_the_learner() {
         act(
             &mut ddpg.mu,
             &ddpg.range,
-            &ddpg.actor.parameters,
+            &ddpg.actor.online.parameters,
             batch.s.as_slice(),
             &mut ddpg.actions,
         );
@@ -362,4 +289,15 @@ fn discrete_actions_are_refused() {
         error.to_string().contains("the action space is discrete (4 actions)"),
         "{error}"
     );
+}
+
+#[test]
+fn a_gradient_step_of_the_thesis_takes_140_million_operations() {
+    let pendulum = EnvironmentSpec {
+        action: Space::boxed(&[(-2.0, 2.0)]),
+        ..spec()
+    };
+    let products = (&config::DdpgConfig::default()).products(&pendulum);
+    assert_eq!(products.products.iter().filter(|p| p.flop() > 15_000_000).count(), 9);
+    assert_eq!((products.flop_per_update() as f64 / 1e6).round(), 140.0);
 }

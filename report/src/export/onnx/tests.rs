@@ -1,6 +1,6 @@
 use rten::{Model, Value};
 use shoal_common::config::Config;
-use shoal_common::policy::{PolicyLayout, Scores, softmax, table};
+use shoal_common::policy::{PolicyLayout, Scores, action_values, softmax, table};
 use shoal_common::policy_file::PolicyFile;
 
 use super::super::tests_support::{policies, some_observations, with_starts};
@@ -40,6 +40,9 @@ fn scores(config: &Config, policy: &PolicyFile, observations: &[f32], batch: usi
         shoal_common::config::Algorithm::Reinforce(reinforce) => {
             softmax("reinforce", reinforce.hidden_layers(), &config.spec, batch).unwrap()
         }
+        shoal_common::config::Algorithm::Dqn(dqn) => {
+            action_values("dqn", dqn.hidden_layers(), dqn.dueling, &config.spec, batch).unwrap()
+        }
         _ => table("q-learning", &config.spec, batch).unwrap(),
     };
     scores.of(&policy.parameters, observations).flatten().copied().collect()
@@ -56,7 +59,7 @@ fn another_runtime_computes_the_same_outputs_for_any_batch_size() {
             let mut actions = vec![0.0; batch * config.spec.action.width()];
             let mut ours = config.algorithm.policy(&config.spec, batch).unwrap();
             ours.act(&policy.parameters, &observations, &mut actions);
-            if let PolicyLayout::Deterministic(_) = layout {
+            if let PolicyLayout::Deterministic(_) | PolicyLayout::Gaussian(_) = layout {
                 let (shape, found) = computed_floats(&model, &config, &observations, "action");
                 assert_eq!(shape, [batch, config.spec.action.width()]);
                 assert_close(&found, &actions);

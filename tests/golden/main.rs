@@ -1,28 +1,19 @@
 //! Compares the program with data recorded from Gymnasium and PyTorch: every file in `tests/golden`, or in the
 //! directory that `SHOAL_GOLDEN_DIR` names.
 
-#[path = "support/value_iteration.rs"]
+mod updates;
+#[path = "../support/value_iteration.rs"]
 mod value_iteration;
 
 use std::path::{Path, PathBuf};
 
 use serde_json::Value;
-use shoal_common::{
-    config,
-    network::NetworkLayout,
-    space::{EnvironmentSpec, Space},
-    stream::{Purpose, stream},
-    transition::{RowLayout, Transition},
-};
+use shoal_common::stream::{Purpose, stream};
 use shoal_env_server::environment::{
     Environment,
     cart_pole::{self, CartPole},
     frozen_lake,
     pendulum::{self, Pendulum},
-};
-use shoal_learner::algorithms::{
-    ddpg::{Ddpg, DdpgState},
-    minibatch::Minibatch,
 };
 
 /// The largest difference allowed from a recorded number.
@@ -79,11 +70,14 @@ fn golden_files_of_unknown_kind_or_wrong_content_fail() {
 /// Returns one line for each file that disagrees, or one line if the directory holds no files.
 fn check_directory(directory: &Path) -> Vec<Failure> {
     let entries = std::fs::read_dir(directory).into_iter().flatten().flatten();
-    // The scripts that generate the data are in the same directory.
-    let is_generator = |path: &PathBuf| path.extension().is_some_and(|extension| extension == "py");
+    // The scripts that generate the data, and this test, are in the same directory.
+    let is_source = |path: &PathBuf| {
+        path.extension()
+            .is_some_and(|extension| extension == "py" || extension == "rs")
+    };
     let files: Vec<PathBuf> = entries
         .map(|entry| entry.path())
-        .filter(|path| !is_generator(path))
+        .filter(|path| !is_source(path))
         .collect();
     if files.is_empty() {
         return vec![format!("{} holds no golden files", directory.display())];
@@ -111,7 +105,7 @@ fn check_text(text: &str) -> Result<(), Failure> {
             rollout(&Rollout::read(&file)?, cart_pole, |_| None)
         }
         Some("frozen_lake") => frozen_lake(&file),
-        None if file.get("hidden").is_some() && file.get("batches").is_some() => ddpg_update(&file),
+        None if file.get("hidden").is_some() && file.get("batches").is_some() => updates::check(&file),
         kind => Err(format!("unknown kind of file: env is {kind:?}")),
     }
 }
@@ -242,128 +236,4 @@ fn same_outcome(ours: &frozen_lake::LakeTransition, recorded: &Value) -> bool {
         && recorded["next"].as_u64() == Some(ours.next as u64)
         && recorded["reward"].as_f64() == Some(ours.reward)
         && recorded["terminated"].as_bool() == Some(ours.terminated)
-}
-
-/// Repeats DDPG gradient steps of PyTorch's autograd and Adam: from the `initial` networks, one step for each of
-/// `batches`. After each step the losses and networks must be those in `expected`.
-fn ddpg_update(file: &Value) -> Result<(), Failure> {
-    if file["adam"] != serde_json::json!({"beta1": 0.9, "beta2": 0.999, "eps": 1e-8}) {
-        return Err(format!("Adam's constants are not the learner's: {}", file["adam"]));
-    }
-    let layout = RowLayout::new(
-        read(file, "obs_dim", serde_json::from_value)?,
-        read(file, "act_dim", serde_json::from_value)?,
-    );
-    let spec = EnvironmentSpec {
-        observation: Space::boxed(&vec![(f32::NEG_INFINITY, f32::INFINITY); layout.observation_width()]),
-        action: Space::Box {
-            low: read(file, "action_low", serde_json::from_value)?,
-            high: read(file, "action_high", serde_json::from_value)?,
-        },
-        time_limit: 1,
-        state_width: 0,
-    };
-    let gamma = read(file, "gamma", serde_json::from_value)?;
-    let batches = read(file, "batches", VALUES)?;
-    let batches: Vec<_> = batches
-        .iter()
-        .map(|batch| minibatch(batch, layout, gamma))
-        .collect::<Result<_, _>>()?;
-    let expected = read(file, "expected", VALUES)?;
-    if batches.is_empty() || expected.len() != batches.len() {
-        return Err(format!(
-            "{} batches, {} expected results",
-            batches.len(),
-            expected.len()
-        ));
-    }
-    let settings = config::DdpgConfig {
-        tau: read(file, "tau", serde_json::from_value)?,
-        actor_learning_rate: read(file, "actor_lr", serde_json::from_value)?,
-        critic_learning_rate: read(file, "critic_lr", serde_json::from_value)?,
-        hidden: read(file, "hidden", serde_json::from_value)?,
-        batch: batches[0].size(),
-        ..config::DdpgConfig::default()
-    };
-    let mut ddpg = Ddpg::new(&spec, &settings, 0).map_err(|e| e.to_string())?;
-    let initial = networks(&file["initial"], &ddpg)?;
-    ddpg.restart_from(initial.each_ref().map(Vec::as_slice))
-        .map_err(|e| e.to_string())?;
-
-    for (i, (batch, expected)) in batches.iter().zip(&expected).enumerate() {
-        let losses = ddpg.update(batch);
-        for (name, ours) in [("critic_loss", losses.critic_loss), ("actor_loss", losses.actor_loss)] {
-            let recorded = read(expected, name, serde_json::from_value)?;
-            close(&[ours.into()], &[recorded]).map_err(|e| format!("update {i}: {name} {e}"))?;
-        }
-        let recorded = networks(expected, &ddpg)?;
-        for ((name, ours), recorded) in DdpgState::PARTS.into_iter().zip(ddpg.state().parts).zip(&recorded) {
-            for (at, (a, b)) in ours.iter().zip(recorded).enumerate() {
-                close(&[f64::from(*a)], &[f64::from(*b)])
-                    .map_err(|e| format!("update {i}: {name}, parameter {at} {e}"))?;
-            }
-        }
-    }
-    Ok(())
-}
-
-/// Actor, critic, target actor and target critic, with their parameters in the learner's order.
-fn networks(recorded: &Value, ddpg: &Ddpg) -> Result<[Vec<f32>; 4], Failure> {
-    let (mu, q) = (ddpg.policy_layout(), ddpg.critic_layout());
-    let network = |name: &str, layout| flat(&recorded[name], layout).map_err(|e| format!("{name}: {e}"));
-    Ok([
-        network("actor", mu)?,
-        network("critic", q)?,
-        network("target_actor", mu)?,
-        network("target_critic", q)?,
-    ])
-}
-
-/// A recorded network's parameters in the learner's order. The recorded weights are lists of rows, one row per output.
-fn flat(network: &Value, layout: &NetworkLayout) -> Result<Vec<f32>, Failure> {
-    let mut parameters = Vec::with_capacity(layout.parameters());
-    for ((inputs, outputs), [w, b]) in layout.layer_sizes().zip([["w1", "b1"], ["w2", "b2"], ["w3", "b3"]]) {
-        let weights: Vec<Vec<f32>> = read(network, w, serde_json::from_value)?;
-        let biases: Vec<f32> = read(network, b, serde_json::from_value)?;
-        if weights.len() != outputs || biases.len() != outputs || weights.iter().any(|row| row.len() != inputs) {
-            return Err(format!("{w} and {b} are not {outputs} × {inputs}"));
-        }
-        parameters.extend((0..inputs).flat_map(|column| weights.iter().map(move |row| row[column])));
-        parameters.extend(biases);
-    }
-    Ok(parameters)
-}
-
-fn minibatch(batch: &Value, layout: RowLayout, gamma: f32) -> Result<Minibatch, Failure> {
-    let [s, a, s_next]: [Vec<Vec<f32>>; 3] = [
-        read(batch, "s", serde_json::from_value)?,
-        read(batch, "a", serde_json::from_value)?,
-        read(batch, "s2", serde_json::from_value)?,
-    ];
-    let r: Vec<f32> = read(batch, "r", serde_json::from_value)?;
-    let terminated = read(batch, "terminated", FLAGS)?;
-    let fits = |rows: &[Vec<f32>], width| rows.len() == r.len() && rows.iter().all(|row| row.len() == width);
-    let (observation, action) = (layout.observation_width(), layout.action_width());
-    if !(fits(&s, observation) && fits(&a, action) && fits(&s_next, observation)) || terminated.len() != r.len() {
-        return Err(format!(
-            "a batch does not hold {} transitions of {observation} observed and {action} action numbers",
-            r.len()
-        ));
-    }
-    let mut minibatch = Minibatch::new(layout, r.len());
-    for i in 0..r.len() {
-        let (last, discount) = (terminated[i], if terminated[i] { 0.0 } else { gamma });
-        minibatch.set(
-            i,
-            &Transition {
-                s: &s[i],
-                a: &a[i],
-                r: r[i],
-                discount,
-                s_next: &s_next[i],
-                last,
-            },
-        );
-    }
-    Ok(minibatch)
 }

@@ -1,0 +1,97 @@
+//! `[dqn]`: deep Q-network.
+
+use shoal_base::section;
+use shoal_base::section::{OutOfRange, above, from};
+use shoal_base::space::EnvironmentSpec;
+use shoal_policy::PolicyError;
+use shoal_policy::network::{Activation, Hidden, Layers, NetworkLayout};
+
+use super::algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Learned, Shape};
+use super::behaviour::{Behaviour, Epsilon};
+
+/// DQN.
+pub(super) const SPEC: AlgorithmSpec = AlgorithmSpec {
+    name: "dqn",
+    off_policy: true,
+    experience: Experience::Minibatches,
+};
+
+section! {
+    /// Mnih et al. 2015, with the double estimate of van Hasselt et al. 2016.
+    pub struct DqnConfig {
+        /// Units of each hidden layer: a list of 1 to 8 layers.
+        hidden: Layers = Layers::from([256, 256]), bounds: from(1, 8_192), unit: "units", source: "ours";
+        /// The activation function of the hidden layers.
+        activation: Activation = Activation::Relu, unit: "–", source: "Mnih et al. 2015";
+        /// γ, the discount of one step.
+        gamma: f64 = 0.99, bounds: from(0.0, 1.0), unit: "–", source: "Mnih et al. 2015";
+        /// Adam's step size.
+        learning_rate: f64 = 5e-4, bounds: above(0.0, 1.0), unit: "–", source: "ours";
+        /// N, transitions in a minibatch.
+        batch: usize = 64, bounds: from(1, 65_536), unit: "transitions", source: "ours";
+        /// The target network becomes a copy of the network after every so many updates.
+        target_every: u64 = 1_000, bounds: from(1, 1_000_000_000), unit: "updates", source: "ours";
+        /// Whether the action in s' is chosen by the network and valued by the target network. Otherwise the target
+        /// network does both.
+        double: bool = true, unit: "–", source: "van Hasselt et al. 2016";
+        /// Whether the network's last layer has separate heads for the value of a state and the advantages of the
+        /// actions.
+        dueling: bool = false, unit: "–", source: "Wang et al. 2016";
+        /// δ: errors beyond it count linearly instead of quadratically (Huber's loss).
+        huber_delta: f64 = 1.0, bounds: above(0.0, 1e6), unit: "–", source: "Mnih et al. 2015";
+        /// ε at the beginning: the probability that an actor takes a random action.
+        epsilon_start: f64 = 1.0, bounds: from(0.0, 1.0), unit: "share of the steps", source: "Mnih et al. 2015";
+        /// ε at the end.
+        epsilon_end: f64 = 0.05, bounds: from(0.0, 1.0), unit: "share of the steps", source: "ours";
+        /// Environment steps of all actors in which ε falls linearly from the first to the second value. 0 becomes a
+        /// tenth of `run.steps` when the run is created.
+        epsilon_steps: u64 = 0, unit: "environment steps", source: "ours";
+    }
+}
+
+impl DqnConfig {
+    /// The hidden layers.
+    pub fn hidden_layers(&self) -> Hidden {
+        Hidden {
+            layers: self.hidden,
+            activation: self.activation,
+        }
+    }
+}
+
+impl AlgorithmSettings for DqnConfig {
+    fn check(&self, section: &str) -> Result<(), OutOfRange> {
+        self.check_bounds(section)
+    }
+
+    fn gamma(&self) -> f64 {
+        self.gamma
+    }
+
+    fn behaviour(&self, name: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError> {
+        let values = shoal_policy::action_values(name, self.hidden_layers(), self.dueling, spec, batch)?;
+        let epsilon = Epsilon {
+            start: self.epsilon_start,
+            end: self.epsilon_end,
+            steps: self.epsilon_steps,
+        };
+        Ok(Behaviour::EpsilonGreedy(values, epsilon))
+    }
+
+    fn exploration_state_width(&self, _: &EnvironmentSpec) -> usize {
+        0
+    }
+
+    fn least_capacity(&self) -> u64 {
+        self.batch as u64
+    }
+
+    fn learned(&self, spec: &EnvironmentSpec) -> Learned {
+        let outputs = spec.action.size() + usize::from(self.dueling);
+        let values = NetworkLayout::policy(spec.observation.width(), self.hidden_layers(), outputs);
+        Learned {
+            policy: ("action-values", Shape::Network(values)),
+            others: Vec::new(),
+        }
+    }
+}

@@ -1,0 +1,90 @@
+//! `[sac]`: soft actor-critic.
+
+use shoal_base::section;
+use shoal_base::section::{OutOfRange, above, from};
+use shoal_base::space::EnvironmentSpec;
+use shoal_policy::PolicyError;
+use shoal_policy::network::{Activation, Hidden, Layers, NetworkLayout};
+
+use super::algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Learned, Shape};
+use super::behaviour::Behaviour;
+
+/// SAC.
+pub(super) const SPEC: AlgorithmSpec = AlgorithmSpec {
+    name: "sac",
+    off_policy: true,
+    experience: Experience::Minibatches,
+};
+
+section! {
+    /// Haarnoja et al. 2018b: a squashed Gaussian policy, two critics, and a learned temperature.
+    pub struct SacConfig {
+        /// Units of each hidden layer, for actor and critics: a list of 1 to 8 layers.
+        hidden: Layers = Layers::from([256, 256]), bounds: from(1, 8_192), unit: "units", source: "Haarnoja et al. 2018b";
+        /// The activation function of the hidden layers.
+        activation: Activation = Activation::Relu, unit: "–", source: "Haarnoja et al. 2018b";
+        /// γ, the discount of one step.
+        gamma: f64 = 0.99, bounds: from(0.0, 1.0), unit: "–", source: "Haarnoja et al. 2018b";
+        /// τ, the share by which the critics' target networks move in one update.
+        tau: f64 = 0.005, bounds: above(0.0, 1.0), unit: "–", source: "Haarnoja et al. 2018b";
+        /// Adam's step size for the actor.
+        actor_learning_rate: f64 = 3e-4, bounds: above(0.0, 1.0), unit: "–", source: "Haarnoja et al. 2018b";
+        /// Adam's step size for the critics.
+        critic_learning_rate: f64 = 3e-4, bounds: above(0.0, 1.0), unit: "–", source: "Haarnoja et al. 2018b";
+        /// Adam's step size for log α. With 0 the temperature stays at its initial value.
+        temperature_learning_rate: f64 = 3e-4, bounds: from(0.0, 1.0), unit: "–", source: "Haarnoja et al. 2018b";
+        /// α, the weight of the policy's entropy, at the beginning.
+        initial_temperature: f64 = 1.0, bounds: above(0.0, 1_000.0), unit: "–", source: "the authors' program";
+        /// H̄, the entropy that the temperature aims at, for each element of the action.
+        target_entropy_per_element: f64 = -1.0, bounds: from(-100.0, 100.0), unit: "nats per action element",
+            source: "Haarnoja et al. 2018b";
+        /// N, transitions in a minibatch.
+        batch: usize = 256, bounds: from(1, 65_536), unit: "transitions", source: "Haarnoja et al. 2018b";
+    }
+}
+
+impl SacConfig {
+    /// The hidden layers of actor and critics.
+    pub fn hidden_layers(&self) -> Hidden {
+        Hidden {
+            layers: self.hidden,
+            activation: self.activation,
+        }
+    }
+}
+
+impl AlgorithmSettings for SacConfig {
+    fn check(&self, section: &str) -> Result<(), OutOfRange> {
+        self.check_bounds(section)
+    }
+
+    fn gamma(&self) -> f64 {
+        self.gamma
+    }
+
+    fn behaviour(&self, _: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError> {
+        Ok(Behaviour::Gaussian(shoal_policy::gaussian(
+            self.hidden_layers(),
+            spec,
+            batch,
+        )?))
+    }
+
+    fn exploration_state_width(&self, _: &EnvironmentSpec) -> usize {
+        0
+    }
+
+    fn least_capacity(&self) -> u64 {
+        self.batch as u64
+    }
+
+    fn learned(&self, spec: &EnvironmentSpec) -> Learned {
+        let (observation, action) = (spec.observation.width(), spec.action.width());
+        let actor = NetworkLayout::policy(observation, self.hidden_layers(), 2 * action);
+        let critic = Shape::Network(NetworkLayout::joined_critic(observation, self.hidden_layers(), action));
+        Learned {
+            policy: ("actor", Shape::Network(actor)),
+            others: vec![("critic 1", critic), ("critic 2", critic)],
+        }
+    }
+}

@@ -1,0 +1,254 @@
+//! Twin delayed deep deterministic policy gradient: algorithm 1 of Fujimoto et al. 2018.
+//!
+//! Symbols as there: policy π with parameters φ, critics Q₁ and Q₂, their targets with a prime, noise ε ~
+//! clip(N(0, σ̃), −c, c), delay d. Actions within an update are scaled to [−1, 1].
+
+use nalgebra::{DMatrix, DVector};
+use rand::RngExt;
+use rand_distr::StandardNormal;
+use shoal_common::algorithms::AlgorithmSettings;
+use shoal_common::config;
+use shoal_common::network::{ActionRange, NetworkLayout};
+use shoal_common::policy::{PolicyError, PolicyLayout};
+use shoal_common::space::EnvironmentSpec;
+use shoal_common::stream::{Purpose, Stream, seek, stream};
+
+use super::algorithm::{Algorithm, Losses, Method, RunSizes, Section, SectionMut};
+use super::minibatch::Minibatch;
+use super::replayed::{MinibatchLearner, Replayed, mean};
+use super::twin_critics::{self, CriticLosses, CriticPart, TwinCritics};
+use crate::networks::initialise::fan_in;
+use crate::networks::pass::{Pass, Samples};
+use crate::networks::product::{self, Products};
+use crate::networks::threads::Threads;
+use crate::networks::trained::{Targeted, threads_for};
+
+/// The names of the actor's numbers in a checkpoint: parameters, target, moments.
+const ACTOR: [&str; 4] = ["actor", "target actor", "actor's first moment", "actor's second moment"];
+
+/// What is learned, as opposed to the state of the optimisers.
+const WEIGHTS: [&str; 6] = [
+    "actor",
+    "target actor",
+    "critic 1",
+    "target critic 1",
+    "critic 2",
+    "target critic 2",
+];
+
+/// The learner of TD3.
+#[derive(Clone, Debug)]
+pub struct Td3 {
+    settings: config::Td3Config,
+    range: ActionRange,
+    threads: Threads,
+    updates: u64,
+    actor: Targeted,
+    critics: TwinCritics,
+    /// Part `u` of this stream has the noise of update number `u`.
+    stream: Stream,
+    /// The loss of the newest step of the actor, for the reports.
+    actor_loss: f32,
+    // Buffers.
+    mu: Pass,
+    target_mu: Pass,
+    /// Standard normal numbers, one for each element of a target action.
+    noise: DMatrix<f32>,
+    a_next: DMatrix<f32>,
+    no_bonus: DVector<f32>,
+    d_mu: DMatrix<f32>,
+}
+
+impl Td3 {
+    /// New networks, drawn from `seed`. The settings are those of a checked configuration.
+    ///
+    /// # Errors
+    /// When the environment's actions are not real numbers in finite ranges.
+    pub fn new(spec: &EnvironmentSpec, settings: &config::Td3Config, seed: u64) -> Result<Self, PolicyError> {
+        let range = ActionRange::new(&spec.action)?;
+        let (observation, action, batch) = (spec.observation.width(), range.width(), settings.batch);
+        let mu = NetworkLayout::policy(observation, settings.hidden_layers(), action);
+        let q = NetworkLayout::joined_critic(observation, settings.hidden_layers(), action);
+        Ok(Self {
+            threads: Threads::ALONE,
+            updates: 0,
+            actor: Targeted::new(mu, settings.actor_learning_rate, &fan_in(&mu, seed, 0)),
+            critics: TwinCritics::new(q, settings.critic_learning_rate, batch, seed),
+            stream: stream(seed, Purpose::Update, 0, 0),
+            actor_loss: 0.0,
+            mu: Pass::new(mu, batch),
+            target_mu: Pass::new(mu, batch),
+            noise: DMatrix::zeros(action, batch),
+            a_next: DMatrix::zeros(action, batch),
+            no_bonus: DVector::zeros(batch),
+            d_mu: DMatrix::zeros(action, batch),
+            settings: settings.clone(),
+            range,
+        })
+    }
+
+    /// Takes a gradient step with these standard normal numbers, a column for each sample. Returns the sum of the
+    /// critics' losses, the loss of the actor's newest step, and the mean of Q₁(s, a) before its step.
+    pub fn update(&mut self, batch: &Minibatch, noise: &DMatrix<f32>) -> Losses {
+        let t = self.updates + 1;
+        let delayed = t.is_multiple_of(self.settings.policy_delay);
+        let tau = self.settings.tau as f32;
+        self.choose_next_actions(batch, noise);
+        let CriticLosses { loss, q_mean } = self.critics.step(
+            &self.threads,
+            t,
+            // The targets are not read again in this update.
+            delayed.then_some(tau),
+            batch,
+            &self.range,
+            (&self.a_next, &self.no_bonus),
+        );
+        if delayed {
+            self.actor_loss = self.actor_gradient(&batch.s);
+            let step = t / self.settings.policy_delay;
+            self.actor.descend_and_follow(&self.threads, step, tau);
+        }
+        self.updates = t;
+        Losses {
+            critic_loss: loss,
+            actor_loss: self.actor_loss,
+            q_mean,
+        }
+    }
+
+    /// a' = clip(π'(s') + clip(σ̃ ε, −c, c), −1, 1). The threads share the samples.
+    fn choose_next_actions(&mut self, batch: &Minibatch, noise: &DMatrix<f32>) {
+        let (sigma, clip) = (
+            self.settings.target_noise as f32,
+            self.settings.target_noise_clip as f32,
+        );
+        let (width, target) = (self.range.width(), &self.actor.target);
+        let cut = self.threads.first_share(batch.size());
+        let part = |mut mu: Samples<'_>, s: &[f32], noise: &[f32], a: &mut [f32]| {
+            mu.forward(target, s, &[]);
+            for ((a, z), normal) in a.iter_mut().zip(&*mu.output).zip(noise) {
+                let epsilon = (sigma * normal).clamp(-clip, clip);
+                *a = (z.tanh() + epsilon).clamp(-1.0, 1.0);
+            }
+        };
+        let s = batch.s_next.as_slice().split_at(cut * batch.s_next.nrows());
+        let noise = noise.as_slice().split_at(cut * width);
+        let a = self.a_next.as_mut_slice().split_at_mut(cut * width);
+        let mu = self.target_mu.samples().split_at(cut);
+        self.threads
+            .both(|| part(mu.0, s.0, noise.0, a.0), || part(mu.1, s.1, noise.1, a.1));
+    }
+
+    /// The gradient of the loss −1/N Σ Q₁(s, π(s)), with Q₁ after its step. Returns the loss. Up to the gradients of φ
+    /// the samples are independent, and the threads share them.
+    fn actor_gradient(&mut self, s: &DMatrix<f32>) -> f32 {
+        let (width, size) = (self.range.width(), s.ncols());
+        let actor = &mut self.actor.online;
+        let phi = &*actor.parameters;
+        let cut = self.threads.first_share(size);
+        let part = |mut mu: Samples<'_>, mut critic: CriticPart<'_>, s: &[f32], d_mu: &mut [f32]| {
+            mu.forward(phi, s, &[]);
+            mu.output.iter_mut().for_each(|z| *z = z.tanh());
+            critic.forward(s, mu.output);
+            critic.d_q.fill(-1.0 / size as f32);
+            critic.backward();
+            for ((d, d_a), a) in d_mu.iter_mut().zip(&*critic.d_a).zip(&*mu.output) {
+                *d = d_a * (1.0 - a * a);
+            }
+            mu.backward(phi, d_mu, 1);
+        };
+        let observations = s.as_slice().split_at(cut * s.nrows());
+        let d_mu = self.d_mu.as_mut_slice().split_at_mut(cut * width);
+        let first = &mut self.critics.critics[0];
+        let (mu, critic) = (self.mu.samples().split_at(cut), first.split_at(cut));
+        self.threads.both(
+            || part(mu.0, critic.0, observations.0, d_mu.0),
+            || part(mu.1, critic.1, observations.1, d_mu.1),
+        );
+        self.mu
+            .gradients(&self.threads, phi, s.as_slice(), &self.d_mu, &mut actor.gradient);
+        -mean(first.q.output.iter().copied())
+    }
+}
+
+impl MinibatchLearner for Td3 {
+    fn policy(&self) -> &[f32] {
+        &self.actor.online.parameters
+    }
+
+    fn layout(&self) -> PolicyLayout {
+        PolicyLayout::Deterministic(self.actor.online.layout)
+    }
+
+    fn updates(&self) -> u64 {
+        self.updates
+    }
+
+    fn set_threads(&mut self, threads: Threads) {
+        self.threads = threads_for(self.critics.layout(), self.settings.batch, threads);
+    }
+
+    fn learn(&mut self, batch: &Minibatch) -> Losses {
+        let mut noise = std::mem::replace(&mut self.noise, DMatrix::zeros(0, 0));
+        let stream = seek(&mut self.stream, self.updates);
+        noise
+            .iter_mut()
+            .for_each(|normal| *normal = stream.sample(StandardNormal));
+        let losses = self.update(batch, &noise);
+        self.noise = noise;
+        losses
+    }
+
+    fn state(&self) -> Vec<Section<'_>> {
+        let Targeted { online, target } = &self.actor;
+        let (m, v) = (&online.adam.first_moment, &online.adam.second_moment);
+        let actor: [&[f32]; 4] = [&online.parameters, target, m, v];
+        let names = ACTOR.into_iter().chain(twin_critics::SECTIONS.into_iter().flatten());
+        let numbers = actor.into_iter().chain(self.critics.numbers().into_iter().flatten());
+        names.zip(numbers).collect()
+    }
+
+    fn state_mut(&mut self, updates: u64) -> Vec<SectionMut<'_>> {
+        self.updates = updates;
+        let Targeted { online, target } = &mut self.actor;
+        let (m, v) = (&mut online.adam.first_moment, &mut online.adam.second_moment);
+        let actor: [&mut [f32]; 4] = [&mut online.parameters, target, m, v];
+        let names = ACTOR.into_iter().chain(twin_critics::SECTIONS.into_iter().flatten());
+        let numbers = actor
+            .into_iter()
+            .chain(self.critics.numbers_mut().into_iter().flatten());
+        names.zip(numbers).collect()
+    }
+}
+
+impl Method for &config::Td3Config {
+    fn start(&self, spec: &EnvironmentSpec, seed: u64, sizes: RunSizes) -> Result<Box<dyn Algorithm>, PolicyError> {
+        let td3 = Td3::new(spec, self, seed)?;
+        Ok(Box::new(Replayed::new(td3, spec, self.batch, seed, sizes)))
+    }
+
+    fn weights(&self) -> &'static [&'static str] {
+        &WEIGHTS
+    }
+
+    fn products(&self, spec: &EnvironmentSpec) -> Products {
+        let (observation, action) = (spec.observation.width(), spec.action.width());
+        let mu = &NetworkLayout::policy(observation, self.hidden_layers(), action);
+        let q = &NetworkLayout::joined_critic(observation, self.hidden_layers(), action);
+        let batch = self.batch;
+        let of_critics = || product::forward(mu, batch).chain(twin_critics::products(q, batch));
+        let of_actor = (product::forward(mu, batch).chain(product::forward(q, batch)))
+            .chain(product::backward_to_late_inputs(q, batch))
+            .chain(product::backward(mu, batch));
+        let delay = self.policy_delay;
+        Products {
+            updates: delay,
+            products: (0..delay).flat_map(|_| of_critics()).chain(of_actor).collect(),
+        }
+    }
+
+    fn state_numbers(&self, spec: &EnvironmentSpec, _: RunSizes) -> usize {
+        // Each network with its target and two moments.
+        4 * self.learned(spec).parameters()
+    }
+}

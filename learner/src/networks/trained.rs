@@ -1,0 +1,91 @@
+//! A network with its gradient and its optimiser, and a network with the target network that follows it.
+
+use shoal_common::network::NetworkLayout;
+
+use super::adam::Adam;
+use super::aligned::Aligned;
+use super::threads::Threads;
+
+/// Two threads are used only if there are at least this many samples, and units in each hidden layer but the last (or
+/// in the only one). If a dimension is 1 or the product is small, faer adds the terms of a transposed product in
+/// another order, and the bits must not depend on the number of threads.
+const MIN_SPLIT: usize = 4;
+/// As [`MIN_SPLIT`], for samples times units of each hidden layer but the first (or of the only one).
+const MIN_WORK: usize = 8_192;
+
+/// The threads, if two of them can share the work for `batch` samples of a network without another result; otherwise
+/// the calling thread alone.
+pub fn threads_for(layout: &NetworkLayout, batch: usize, threads: Threads) -> Threads {
+    let layers = layout.hidden().layers;
+    let others = layers.len() - 1;
+    let (all_but_last, all_but_first) = (&layers[..others.max(1)], &layers[others.min(1)..]);
+    let enough = batch >= MIN_SPLIT
+        && all_but_last.iter().all(|units| *units >= MIN_SPLIT)
+        && all_but_first.iter().all(|units| units * batch >= MIN_WORK);
+    if enough { threads } else { Threads::ALONE }
+}
+
+/// A network that learns.
+#[derive(Clone, Debug)]
+pub struct Trained {
+    /// The layout of the parameters.
+    pub layout: NetworkLayout,
+    /// θ.
+    pub parameters: Aligned,
+    /// ∂L/∂θ.
+    pub gradient: Aligned,
+    /// The optimiser.
+    pub adam: Adam,
+}
+
+impl Trained {
+    /// A network with these parameters, before its first step.
+    pub fn new(layout: NetworkLayout, learning_rate: f64, parameters: &[f32]) -> Self {
+        Self {
+            layout,
+            parameters: Aligned::from_slice(parameters, 0),
+            gradient: Aligned::zeros(parameters.len(), 2),
+            adam: Adam::new(learning_rate, parameters.len()),
+        }
+    }
+
+    /// Takes step number `t` (from 1) of Adam against the gradient.
+    pub fn descend(&mut self, threads: &Threads, t: u64) {
+        self.adam.step(threads, t, &self.gradient, &mut self.parameters);
+    }
+}
+
+/// A network that learns, and its target network.
+#[derive(Clone, Debug)]
+pub struct Targeted {
+    /// The network, θ.
+    pub online: Trained,
+    /// The target network's parameters, θ'.
+    pub target: Aligned,
+}
+
+impl Targeted {
+    /// A network with these parameters, before its first step; θ' ← θ.
+    pub fn new(layout: NetworkLayout, learning_rate: f64, parameters: &[f32]) -> Self {
+        Self {
+            online: Trained::new(layout, learning_rate, parameters),
+            target: Aligned::from_slice(parameters, 1),
+        }
+    }
+
+    /// Takes step number `t` (from 1) of Adam against the gradient; then θ' ← τ θ + (1 − τ) θ'.
+    pub fn descend_and_follow(&mut self, threads: &Threads, t: u64, tau: f32) {
+        let Trained {
+            parameters,
+            gradient,
+            adam,
+            ..
+        } = &mut self.online;
+        adam.step_and_follow(threads, t, gradient, parameters, tau, &mut self.target);
+    }
+
+    /// θ' ← θ.
+    pub fn copy_to_target(&mut self) {
+        self.target.copy_from_slice(&self.online.parameters);
+    }
+}

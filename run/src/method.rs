@@ -1,0 +1,132 @@
+//! The method of a new run: the one that was asked for, or the one that suits the environment; and its defaults.
+
+use anyhow::{Context, bail};
+use shoal_common::algorithms::Experience;
+use shoal_common::config::Algorithm;
+use shoal_common::space::{EnvironmentSpec, Space};
+use toml::{Table, Value};
+
+/// The defaults of each method: its section, and the keys of other sections that go with it.
+const DEFAULTS: [(&str, &str); 7] = [
+    ("ddpg", include_str!("../../presets/method/ddpg.toml")),
+    ("td3", include_str!("../../presets/method/td3.toml")),
+    ("sac", include_str!("../../presets/method/sac.toml")),
+    ("dqn", include_str!("../../presets/method/dqn.toml")),
+    ("reinforce", include_str!("../../presets/method/reinforce.toml")),
+    ("q-learning", include_str!("../../presets/method/q-learning.toml")),
+    ("sarsa", include_str!("../../presets/method/sarsa.toml")),
+];
+
+/// Settings for single Gymnasium environments, `[ID.METHOD]`, which replace the method's defaults.
+const OF_ENVIRONMENTS: &str = include_str!("../../presets/method/environments.toml");
+
+/// The methods' names.
+pub fn names() -> impl Iterator<Item = &'static str> {
+    DEFAULTS.iter().map(|(name, _)| *name)
+}
+
+/// The method that the user asks for: by its name, or by a key of its section.
+///
+/// # Errors
+/// When there is no such method, or two are asked for.
+pub(crate) fn asked_for(method: Option<&str>, set: &[String]) -> anyhow::Result<Option<&'static str>> {
+    let known = |name: &str| names().find(|known| *known == name);
+    let by_name = match method {
+        None => None,
+        Some(name) => Some(known(name).with_context(|| {
+            format!(
+                "--method {name}: there is no such method; choose {}",
+                names().collect::<Vec<_>>().join(", ")
+            )
+        })?),
+    };
+    let sections = set.iter().filter_map(|assignment| assignment.split('.').next());
+    let mut asked = by_name;
+    for section in sections.filter_map(known) {
+        if let Some(other) = asked.filter(|other| *other != section) {
+            bail!("{other} and {section} are two methods, and a run has one: leave out what belongs to the other");
+        }
+        asked = Some(section);
+    }
+    Ok(asked)
+}
+
+/// The method whose section is in the table. Without one, the noise of DDPG's actors names DDPG.
+pub(crate) fn named_in(table: &Table) -> Option<&'static str> {
+    names()
+        .find(|name| table.contains_key(*name))
+        .or_else(|| table.contains_key("exploration").then_some("ddpg"))
+}
+
+/// Makes a preset for another method. What the preset says about learning was chosen for its own method, so only the
+/// environment, the run's length and the evaluation are kept.
+pub(crate) fn replace(preset: &mut Table, method: &'static str) -> anyhow::Result<()> {
+    preset.retain(|section, _| ["run", "environment", "evaluation"].contains(&section));
+    if let Some(Value::Table(run)) = preset.get_mut("run") {
+        run.remove("mode");
+        // The steps alone would be a limit that this preset's episodes were expected to reach first.
+        if run.contains_key("episodes") {
+            run.remove("steps");
+        }
+    }
+    let mut defaults = defaults(method)?;
+    // The preset's own length and evaluation suit its task.
+    defaults.remove("evaluation");
+    if preset.get("run").and_then(|run| run.get("steps")).is_some()
+        && let Some(Value::Table(run)) = defaults.get_mut("run")
+    {
+        run.remove("steps");
+    }
+    add(preset, defaults);
+    Ok(())
+}
+
+/// The method that suits a Gymnasium environment's spaces.
+pub(crate) fn suitable(spec: &EnvironmentSpec) -> &'static str {
+    match (&spec.observation, &spec.action) {
+        (_, Space::Box { .. }) => "sac",
+        (Space::Box { .. }, Space::Discrete { .. }) => "dqn",
+        (Space::Discrete { .. }, Space::Discrete { .. }) => "q-learning",
+    }
+}
+
+/// Adds the defaults of a method, and those for the environment `name`, to a table. Existing settings are kept.
+pub(crate) fn add_defaults(table: &mut Table, name: &str, method: &'static str) -> anyhow::Result<()> {
+    let of_environments: Table = OF_ENVIRONMENTS.parse()?;
+    let own = of_environments.get(name).and_then(|methods| methods.get(method));
+    if let Some(Value::Table(own)) = own {
+        add(table, own.clone());
+    }
+    add(table, defaults(method)?);
+    Ok(())
+}
+
+/// Fills in what follows from the environment's spaces for this method, if it is not set.
+pub(crate) fn fit(table: &mut Table, spec: &EnvironmentSpec) {
+    let Some(method) = named_in(table) else { return };
+    let is_of_episodes =
+        |algorithm: &Algorithm| algorithm.name() == method && algorithm.spec().experience == Experience::Episodes;
+    if Algorithm::all().iter().any(is_of_episodes) {
+        // A chunk holds a whole episode.
+        let chunk = Table::from_iter([("chunk_steps".to_owned(), Value::from(spec.time_limit))]);
+        add(table, Table::from_iter([("actors".to_owned(), chunk.into())]));
+    }
+}
+
+fn defaults(method: &str) -> anyhow::Result<Table> {
+    let text = DEFAULTS.iter().find(|(name, _)| *name == method);
+    let (_, text) = text.with_context(|| format!("there is no method {method}"))?;
+    Ok(text.parse()?)
+}
+
+/// Adds the keys of `defaults` that the table does not have.
+fn add(table: &mut Table, defaults: Table) {
+    for (section, values) in defaults {
+        let there = table.entry(section).or_insert_with(|| Table::new().into());
+        if let (Value::Table(there), Value::Table(values)) = (there, values) {
+            values.into_iter().for_each(|(key, value)| {
+                there.entry(key).or_insert(value);
+            });
+        }
+    }
+}
