@@ -153,7 +153,7 @@ fn an_evaluator_killed_while_a_new_learner_repeats_rounds_does_not_block_the_run
             .map(|row| row.unwrap()[3].parse().unwrap());
         versions.collect::<Vec<u64>>()
     };
-    until("the policies of two periods are evaluated", || evaluated().len() == 2);
+    until("the policies of two periods are evaluated", || evaluated().len() >= 2);
     let before = evaluated()[1];
     until("the evaluator is evaluating the next one", || {
         place.role("killed", "evaluator-0")["policy_version"].as_u64() > Some(before)
@@ -162,7 +162,7 @@ fn an_evaluator_killed_while_a_new_learner_repeats_rounds_does_not_block_the_run
     running.stop_role("evaluator-0");
     assert_eq!(evaluated().len(), 2, "the third evaluation must not have ended yet");
     running.kill("learner-0");
-    until("there is a new learner", || running.pids("learner-0").len() == 2);
+    until("there is a new learner", || running.pids("learner-0").len() >= 2);
     until("it is working", || {
         place.role("killed", "learner-0")["state"] == "working"
     });
@@ -170,7 +170,7 @@ fn an_evaluator_killed_while_a_new_learner_repeats_rounds_does_not_block_the_run
     running.continue_role("evaluator-0");
     until("the policy is evaluated", || evaluated().len() == 3);
     running.kill("evaluator-0");
-    until("there is a new evaluator", || running.pids("evaluator-0").len() == 2);
+    until("there is a new evaluator", || running.pids("evaluator-0").len() >= 2);
     running.continue_role("learner-0");
     assert_eq!(final_result(running), undisturbed);
 }

@@ -11,10 +11,13 @@ mod twin;
 mod value_iteration;
 
 use rustix::process::Signal;
-use shoal_common::config::Config;
+use shoal_common::config::{Algorithm, Config};
 use shoal_common::policy::{PolicyLayout, highest};
 use shoal_common::policy_file::PolicyFile;
 use shoal_env_server::environment::frozen_lake::{ACTIONS, STATES};
+use shoal_learner::algorithms::dqn::Dqn;
+use shoal_learner::algorithms::sac::Sac;
+use shoal_learner::algorithms::td3::Td3;
 use support::{Running, Workplace, error_line, final_result, json, parse, until, wait_for_rows};
 
 /// Rare evaluations of few episodes.
@@ -143,6 +146,77 @@ fn reinforce_gives_the_bits_of_algorithm_3_in_a_single_process() {
     }
 }
 
+/// A short lockstep run of one actor whose chunks are single steps. Returns its configuration and its result.
+fn step_by_step(place: &Workplace, preset: &str, method: &str, set: &[&str]) -> (Config, serde_json::Value) {
+    let head = ["--method", method, "--lockstep", "--actors", "1", "--envs", "1"];
+    let head = [&[preset][..], &head, &["--steps", "900", "--seed", "11"]].concat();
+    let set = [&["actors.chunk_steps=1", "replay.warmup=300"], set].concat();
+    let set = set.into_iter().flat_map(|assignment| ["--set", assignment]);
+    let result = train(place, &head.into_iter().chain(set).collect::<Vec<_>>());
+    let config = Config::load(&place.path().join("run/config.toml")).unwrap();
+    (config, result)
+}
+
+#[test]
+fn td3_gives_the_bits_of_its_algorithm_in_a_single_process() {
+    for threads in ["learner.threads=1", "learner.threads=2"] {
+        let place = Workplace::new();
+        // Large enough to be split between two threads.
+        let set = ["td3.hidden=[64, 128]", "td3.batch=64", threads];
+        let (config, result) = step_by_step(&place, "pendulum", "td3", &set);
+        let Algorithm::Td3(settings) = &config.algorithm else {
+            panic!("{:?}", config.algorithm)
+        };
+        let learner = Td3::new(&config.spec, settings, 11).unwrap();
+        assert_eq!(
+            result["weights_sha256"],
+            twin::of_minibatches(&config, learner),
+            "{threads}"
+        );
+    }
+}
+
+#[test]
+fn sac_gives_the_bits_of_its_algorithm_in_a_single_process() {
+    for threads in ["learner.threads=1", "learner.threads=2"] {
+        let place = Workplace::new();
+        let set = ["sac.hidden=[64, 128]", "sac.batch=64", threads];
+        let (config, result) = step_by_step(&place, "point-mass-r3", "sac", &set);
+        let Algorithm::Sac(settings) = &config.algorithm else {
+            panic!("{:?}", config.algorithm)
+        };
+        let learner = Sac::new(&config.spec, settings, 11).unwrap();
+        assert_eq!(
+            result["weights_sha256"],
+            twin::of_minibatches(&config, learner),
+            "{threads}"
+        );
+    }
+}
+
+#[test]
+fn dqn_gives_the_bits_of_its_algorithm_in_a_single_process() {
+    for dueling in ["dqn.dueling=false", "dqn.dueling=true"] {
+        let place = Workplace::new();
+        let set = [
+            "dqn.hidden=[24, 16]",
+            "dqn.target_every=20",
+            "dqn.epsilon_steps=700",
+            dueling,
+        ];
+        let (config, result) = step_by_step(&place, "cart-pole", "dqn", &set);
+        let Algorithm::Dqn(settings) = &config.algorithm else {
+            panic!("{:?}", config.algorithm)
+        };
+        let learner = Dqn::new(&config.spec, settings, 11).unwrap();
+        assert_eq!(
+            result["weights_sha256"],
+            twin::of_minibatches(&config, learner),
+            "{dueling}"
+        );
+    }
+}
+
 const CART_POLE: [&str; 9] = [
     "cart-pole",
     "--actors",
@@ -174,6 +248,35 @@ const SARSA: [&str; 17] = [
     "--set",
     "checkpoint.every_updates=1500",
 ];
+
+/// Two actors of two environments each, with `method` and small networks.
+fn small(preset: &'static str, method: &'static str, hidden: &'static str) -> Vec<&'static str> {
+    let head = ["--method", method, "--lockstep", "--actors", "2", "--envs", "2"];
+    let set = [
+        "actors.chunk_steps=4",
+        "replay.warmup=300",
+        "checkpoint.every_updates=1500",
+        hidden,
+    ];
+    let set = set.into_iter().flat_map(|assignment| ["--set", assignment]);
+    let head = [&[preset][..], &head, &["--steps", "12000", "--episodes", "100000"]].concat();
+    head.into_iter().chain(set).collect()
+}
+
+#[test]
+fn td3_with_killed_roles_ends_with_the_bits_of_an_undisturbed_run() {
+    kills_do_not_change_the_bits(&small("pendulum", "td3", "td3.hidden=[8, 8]"));
+}
+
+#[test]
+fn sac_with_killed_roles_ends_with_the_bits_of_an_undisturbed_run() {
+    kills_do_not_change_the_bits(&small("pendulum", "sac", "sac.hidden=[8, 8]"));
+}
+
+#[test]
+fn dqn_with_killed_roles_ends_with_the_bits_of_an_undisturbed_run() {
+    kills_do_not_change_the_bits(&small("cart-pole", "dqn", "dqn.hidden=[8, 8]"));
+}
 
 #[test]
 fn reinforce_with_killed_roles_ends_with_the_bits_of_an_undisturbed_run() {

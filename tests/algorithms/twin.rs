@@ -1,4 +1,4 @@
-//! Algorithms 1, 2 and 3 as plain single-process programs, with one environment and the same random streams.
+//! The methods other than DDPG as plain single-process programs, with one environment and the same random streams.
 
 use shoal_actor::exploration::{Exploration, Progress};
 use shoal_common::channel::environment::ResponseLayout;
@@ -7,7 +7,10 @@ use shoal_common::stream::{Purpose, stream};
 use shoal_common::transition::Transition;
 use shoal_env_server::environment::frozen_lake::{ACTIONS, STATES};
 use shoal_env_server::vector::{Start, VectorEnvironment};
+use shoal_learner::algorithms::minibatch::Minibatch;
 use shoal_learner::algorithms::registry;
+use shoal_learner::algorithms::replayed::MinibatchLearner;
+use shoal_learner::algorithms::sampling::Sampler;
 use shoal_learner::networks::digest::sha256;
 use shoal_learner::replay::{ChunkMark, Replay, ReplayLayout};
 
@@ -22,10 +25,12 @@ struct World {
     s: Vec<f32>,
 }
 
+type Act = fn(&mut Exploration, &[f32], &[f32], Progress, &mut [f32]);
+
 /// The result of an action.
 struct Step {
     s: Vec<f32>,
-    a: f32,
+    a: Vec<f32>,
     r: f32,
     s_next: Vec<f32>,
     terminated: bool,
@@ -49,24 +54,31 @@ impl World {
 
     fn choose(&mut self, parameters: &[f32]) -> f32 {
         let mut a = [f32::NAN];
+        self.choose_all(Exploration::act, parameters, &mut a);
+        a[0]
+    }
+
+    /// Chooses every element of an action.
+    fn choose_all(&mut self, act: Act, parameters: &[f32], a: &mut [f32]) {
         let progress = Progress {
             step: self.t,
             env_steps: self.t,
         };
-        self.exploration.act(parameters, &self.s, progress, &mut a);
+        act(&mut self.exploration, parameters, &self.s, progress, a);
         self.t += 1;
-        a[0]
     }
 
     fn step(&mut self, a: f32) -> Step {
+        self.step_all(&[a])
+    }
+
+    fn step_all(&mut self, a: &[f32]) -> Step {
         let layout = ResponseLayout::new(1, self.s.len());
-        self.environment
-            .step(&[a], layout.split_mut(&mut self.response))
-            .unwrap();
+        self.environment.step(a, layout.split_mut(&mut self.response)).unwrap();
         let after = layout.split_mut(&mut self.response);
         let step = Step {
             s: self.s.clone(),
-            a,
+            a: a.to_vec(),
             r: after.rewards[0],
             s_next: after.next_observations.to_vec(),
             terminated: after.terminated[0] != 0.0,
@@ -149,7 +161,7 @@ pub(crate) fn reinforce(config: &Config) -> String {
             };
             let transition = Transition {
                 s: &step.s,
-                a: &[step.a],
+                a: &step.a,
                 r: step.r,
                 discount,
                 s_next: &step.s_next,
@@ -164,6 +176,57 @@ pub(crate) fn reinforce(config: &Config) -> String {
         };
         replay.append_and_commit(0, mark, &episode).unwrap();
         learner.update(&replay, replay.head());
+    }
+    let weights = registry::weights(&config.algorithm);
+    let state = learner.state();
+    let learned = state.iter().filter(|(name, _)| weights.contains(name));
+    sha256(&learned.map(|(_, numbers)| *numbers).collect::<Vec<_>>())
+}
+
+/// A method that learns from minibatches: a step, then the updates that it allows. Returns the SHA-256 of the final
+/// weights.
+pub(crate) fn of_minibatches<L: MinibatchLearner>(config: &Config, mut learner: L) -> String {
+    let row = config.row_layout();
+    let size = config.algorithm.settings().least_capacity() as usize;
+    let (sampler, mut batch, mut indices) = (Sampler::new(config.run.seed), Minibatch::new(row, size), vec![0; size]);
+    let mut rows: Vec<Vec<f32>> = Vec::new();
+    let mut world = World::new(config);
+    let mut a = vec![f32::NAN; row.action_width()];
+    for t in 1..=config.run.steps {
+        let act: Act = if learner.updates() == 0 {
+            Exploration::warm_up
+        } else {
+            Exploration::act
+        };
+        world.choose_all(act, learner.policy(), &mut a);
+        let step = world.step_all(&a);
+        let transition = Transition {
+            s: &step.s,
+            a: &step.a,
+            r: step.r,
+            discount: if step.terminated {
+                0.0
+            } else {
+                config.algorithm.gamma() as f32
+            },
+            s_next: &step.s_next,
+            last: step.terminated || step.truncated,
+        };
+        let mut stored = vec![0.0; row.width()];
+        row.write(&transition, &mut stored);
+        rows.push(stored);
+        if transition.last {
+            world.exploration.begin_episode(0);
+        }
+        let allowed = (t.saturating_sub(config.replay.warmup) as f64 * config.replay.updates_per_step).floor() as u64;
+        while learner.updates() < allowed {
+            let window = t.saturating_sub(config.replay.capacity)..t;
+            sampler.indices(learner.updates(), window, &mut indices);
+            for (column, index) in indices.iter().enumerate() {
+                batch.set(column, &row.read(&rows[*index as usize]));
+            }
+            learner.learn(&batch);
+        }
     }
     let weights = registry::weights(&config.algorithm);
     let state = learner.state();

@@ -88,7 +88,7 @@ fn a_gymnasium_pendulum_is_trained_while_its_servers_are_killed() {
     for who in ["env-server-0", "env-server-16"] {
         running.wait_for_learning();
         running.kill(who);
-        until("it is replaced", || running.pids(who).len() == 2);
+        until("it is replaced", || running.pids(who).len() >= 2);
     }
     running.wait_for_learning();
     let (code, printed, leftovers) = running.wait();
@@ -321,7 +321,7 @@ fn a_child_process_of_an_environment_blocks_nothing() {
         let running = place.start_in(&run, &format!("{OURS}Parent-v0"), &arguments);
         running.wait_for_learning();
         running.kill("env-server-0");
-        until("it is replaced", || running.pids("env-server-0").len() == 2);
+        until("it is replaced", || running.pids("env-server-0").len() >= 2);
         running.wait_for_learning();
         assert!(place.output(&["stop", &run]).status.success());
         assert_eq!(running.wait().0, Some(0), "{}", place.stderr());

@@ -230,3 +230,6 @@ impl Method for &config::DqnConfig {
         4 * self.learned(spec).parameters()
     }
 }
+
+#[cfg(test)]
+mod tests;

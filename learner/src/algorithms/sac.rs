@@ -421,3 +421,6 @@ impl Method for &config::SacConfig {
         4 * learned.parameters() - actor.parameters() + 3
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -252,3 +252,6 @@ impl Method for &config::Td3Config {
         4 * self.learned(spec).parameters()
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -7,6 +7,8 @@ use shoal_common::transition::{RowLayout, Transition};
 
 use super::minibatch::Minibatch;
 use super::replayed::MinibatchLearner;
+use crate::networks::digest::sha256;
+use crate::networks::threads::Threads;
 
 fn random(numbers: &mut Stream, count: usize) -> Vec<f32> {
     (0..count).map(|_| numbers.random_range(-2.0..2.0)).collect()
@@ -61,8 +63,14 @@ pub(super) fn wide(numbers: &[f32]) -> Vec<f64> {
 }
 
 /// Compares `gradient` with central differences of `loss`. They are in `f64`, so that the step can be small enough to
-/// rarely cross a ReLU's corner. Returns the share of the gradient that is not nearly zero.
-pub(super) fn assert_is_gradient_of(loss: impl Fn(&[f64]) -> f64, gradient: &[f32], parameters: &[f32]) -> f64 {
+/// rarely cross a ReLU's corner. `scale` is the size of the numbers that the gradient is computed from, and so of its
+/// rounding errors. Returns the share of the gradient that is not nearly zero.
+pub(super) fn assert_is_gradient_of(
+    loss: impl Fn(&[f64]) -> f64,
+    gradient: &[f32],
+    parameters: &[f32],
+    scale: f64,
+) -> f64 {
     const STEP: f64 = 1e-6;
     let mut theta = wide(parameters);
     for (i, &found) in gradient.iter().enumerate() {
@@ -73,7 +81,7 @@ pub(super) fn assert_is_gradient_of(loss: impl Fn(&[f64]) -> f64, gradient: &[f3
         };
         let expected = (at(middle + STEP) - at(middle - STEP)) / (2.0 * STEP);
         theta[i] = middle;
-        let tolerance = 2e-6 + 2e-5 * expected.abs();
+        let tolerance = 2e-6 * scale + 2e-5 * expected.abs();
         assert!(
             (f64::from(found) - expected).abs() < tolerance,
             "parameter {i}: {found} for {expected}"
@@ -90,4 +98,27 @@ pub(super) fn copy_state<L: MinibatchLearner>(from: &L, to: &mut L) {
     for ((_, to), (_, from)) in sections.into_iter().zip(from.state()) {
         to.copy_from_slice(from);
     }
+}
+
+/// Asserts that a learner, made anew by `new`, ends with the same numbers on two threads as on one.
+pub(super) fn assert_threads_do_not_change_the_bits<L: MinibatchLearner>(
+    new: impl Fn() -> L + Sync,
+    row: RowLayout,
+    size: usize,
+    what: &str,
+) {
+    let run = |threads: Threads| {
+        let mut learner = new();
+        learner.set_threads(threads);
+        for seed in 0..6 {
+            learner.learn(&minibatch(seed, row, size));
+        }
+        let state = learner.state().into_iter();
+        state
+            .map(|(name, numbers)| (name, sha256(&[numbers])))
+            .collect::<Vec<_>>()
+    };
+    // A thread can start a second one only once.
+    let shared = std::thread::scope(|scope| scope.spawn(|| run(Threads::two().unwrap())).join().unwrap());
+    assert_eq!(shared, run(Threads::ALONE), "{what}");
 }

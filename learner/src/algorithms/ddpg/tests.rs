@@ -126,6 +126,7 @@ fn the_critics_gradient_is_that_of_its_loss() {
                 |theta| critic_loss(&ddpg, theta, &batch),
                 &ddpg.critic.online.gradient,
                 theta,
+                1.0,
             )
         });
         assert_enough(hidden, &shares.collect::<Vec<_>>());
@@ -146,6 +147,7 @@ fn the_actors_gradient_is_that_of_its_loss() {
                 |theta| actor_loss(&ddpg, theta, &batch),
                 &ddpg.actor.online.gradient,
                 theta,
+                1.0,
             )
         });
         assert_enough(hidden, &shares.collect::<Vec<_>>());
