@@ -62,10 +62,11 @@ fn actor_loss(sac: &Sac, phi: &[f64], batch: &Minibatch) -> f64 {
         for (k, (mu, log_sigma)) in mu.iter().zip(log_sigma).enumerate() {
             let epsilon = f64::from(sac.now.noise[(k, i)]);
             let sigma = log_sigma.clamp(-20.0, 2.0).exp();
-            let action = (mu + sigma * epsilon).tanh();
+            let u = mu + sigma * epsilon;
             let density = (-0.5 * epsilon * epsilon).exp() / (sigma * (2.0 * std::f64::consts::PI).sqrt());
-            log_pi += (density / (1.0 - action * action)).ln();
-            a.push(action);
+            // 1 − tanh² u = 1 / cosh² u.
+            log_pi += density.ln() + 2.0 * u.cosh().ln();
+            a.push(u.tanh());
         }
         let value = |critic: usize| {
             let online = &sac.critics.critics[critic].network.online;
