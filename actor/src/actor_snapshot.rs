@@ -16,6 +16,8 @@ pub(crate) struct ActorSnapshot {
     pub(crate) returns: Vec<f64>,
     /// Their lengths.
     pub(crate) lengths: Vec<u32>,
+    /// The state of [`NStep`](crate::n_step::NStep).
+    pub(crate) n_step: Vec<u64>,
 }
 
 impl ActorSnapshot {
@@ -30,25 +32,29 @@ impl ActorSnapshot {
             .chain(step)
             .chain(own)
             .chain(lengths)
+            .chain(self.n_step.iter().copied())
             .collect()
     }
 
-    /// Reads the words of an actor with `envs` environments and `noise` numbers of noise; `None` if their count is not
-    /// that of `layout`.
-    pub(crate) fn read(words: &[u64], layout: &ChunkLayout, envs: usize, noise: usize) -> Option<Self> {
-        let environments = layout.actor_snapshot_words.checked_sub(1 + noise + 2 * envs)?;
+    /// Reads the words of an actor with `envs` environments, `noise` numbers of noise and `n_step` words of transitions
+    /// of several steps; `None` if their count is not that of `layout`.
+    pub(crate) fn read(words: &[u64], layout: &ChunkLayout, envs: usize, noise: usize, n_step: usize) -> Option<Self> {
+        let own = 1 + noise + 2 * envs + n_step;
+        let environments = layout.actor_snapshot_words.checked_sub(own)?;
         let (environments, rest) = words.split_at_checked(environments)?;
         let (step, rest) = rest.split_first()?;
         let (noise, rest) = rest.split_at_checked(noise)?;
-        let (returns, lengths) = rest.split_at_checked(envs)?;
+        let (returns, rest) = rest.split_at_checked(envs)?;
+        let (lengths, rest) = rest.split_at_checked(envs)?;
         let numbers = |words: &[u64]| words.iter().map(|bits| f64::from_bits(*bits)).collect();
-        (lengths.len() == envs).then(|| Self {
+        (rest.len() == n_step).then(|| Self {
             environments: environments.into(),
             step: *step,
             noise: numbers(noise),
             returns: numbers(returns),
             // Every length was written from a `u32`.
             lengths: lengths.iter().map(|length| *length as u32).collect(),
+            n_step: rest.into(),
         })
     }
 }
@@ -64,7 +70,7 @@ mod tests {
         let layout = ChunkLayout {
             row: RowLayout::new(3, 2),
             rows: 4,
-            actor_snapshot_words: 10 + 1 + 2 * (2 + 2),
+            actor_snapshot_words: 10 + 1 + 2 * (2 + 2) + 3,
         };
         let snapshot = ActorSnapshot {
             environments: (0..10).collect(),
@@ -72,15 +78,16 @@ mod tests {
             noise: vec![0.5, -0.0, f64::MIN_POSITIVE, 3.0],
             returns: vec![-1200.5, 0.0],
             lengths: vec![199, 0],
+            n_step: vec![7, 8, 9],
         };
         let words = snapshot.words();
-        assert_eq!(ActorSnapshot::read(&words, &layout, 2, 4), Some(snapshot));
-        assert_eq!(ActorSnapshot::read(&words[1..], &layout, 2, 4), None);
-        assert_eq!(ActorSnapshot::read(&[], &layout, 2, 4), None);
+        assert_eq!(ActorSnapshot::read(&words, &layout, 2, 4, 3), Some(snapshot));
+        assert_eq!(ActorSnapshot::read(&words[1..], &layout, 2, 4, 3), None);
+        assert_eq!(ActorSnapshot::read(&[], &layout, 2, 4, 3), None);
         let free = ChunkLayout {
             actor_snapshot_words: 0,
             ..layout
         };
-        assert_eq!(ActorSnapshot::read(&words, &free, 2, 4), None);
+        assert_eq!(ActorSnapshot::read(&words, &free, 2, 4, 3), None);
     }
 }

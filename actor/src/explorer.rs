@@ -33,6 +33,7 @@ use shoal_common::transition::{ChunkLayout, Transition};
 use crate::actor_snapshot::ActorSnapshot;
 use crate::error::ActorError;
 use crate::exploration::{Exploration, Progress};
+use crate::n_step::NStep;
 
 /// What the line about an invalid answer of an environment server ends with; the launcher looks for it.
 pub const GIVEN_UP: &str = "its episodes are given up";
@@ -56,6 +57,8 @@ pub struct ExplorerSettings {
     pub spec: EnvironmentSpec,
     /// Environments stepped at once.
     pub envs: usize,
+    /// Steps of a transition.
+    pub n_step: usize,
     /// The layout of a chunk.
     pub chunk: ChunkLayout,
     /// How many chunks may be sent and not yet committed.
@@ -75,6 +78,7 @@ impl ExplorerSettings {
             mode: config.run.mode,
             spec: config.spec.clone(),
             envs: config.actors.envs as usize,
+            n_step: config.replay.n_step as usize,
             chunk: config.chunk_layout(),
             window: config.actors.window,
             algorithm: config.algorithm.clone(),
@@ -107,6 +111,8 @@ struct Explorer<'a> {
     policy: PolicyReader,
     exploration: Exploration,
     sender: ChunkSender,
+    /// What is not in a chunk yet, if a transition has several steps.
+    n_step: NStep,
     /// The chunk that is being filled.
     chunk: Chunk,
     /// Version of the policy that its last row was collected with. While it is empty, that of the previous chunk.
@@ -158,7 +164,14 @@ impl<'a> Explorer<'a> {
         );
         let snapshot = if settings.mode == Mode::Lockstep && sender.sent() > 0 {
             let words = commits.actor_snapshot(index as usize);
-            ActorSnapshot::read(&words, &settings.chunk, settings.envs, exploration.state().len())
+            let n_step = row.n_step_words(settings.n_step, settings.envs);
+            ActorSnapshot::read(
+                &words,
+                &settings.chunk,
+                settings.envs,
+                exploration.state().len(),
+                n_step,
+            )
         } else {
             None
         };
@@ -173,6 +186,7 @@ impl<'a> Explorer<'a> {
             snapshot,
             ending_since: None,
             ended: Vec::new(),
+            n_step: NStep::new(settings.n_step, settings.envs, row),
             chunk: sender.begin()?,
             policy_version: 0,
             sender,
@@ -203,6 +217,7 @@ impl<'a> Explorer<'a> {
     /// Drops the current episodes and begins new ones. In lockstep, continues those of the last chunk's snapshot, if
     /// there is one.
     fn begin(&mut self) -> Result<Observed, Exit<ActorError>> {
+        self.n_step.clear();
         if self.settings.mode == Mode::Free {
             (0..self.settings.envs).for_each(|environment| self.begin_episode(environment));
             return self.reset(Begin::Next);
@@ -212,6 +227,7 @@ impl<'a> Explorer<'a> {
         if let Some(snapshot) = &self.snapshot {
             self.step = snapshot.step;
             self.exploration.restore(&snapshot.noise);
+            self.n_step.restore(&snapshot.n_step);
             self.returns.clone_from(&snapshot.returns);
             self.lengths.clone_from(&snapshot.lengths);
             let idle = || self.heartbeat.beat(Activity::WaitingForServer);
@@ -233,7 +249,9 @@ impl<'a> Explorer<'a> {
 
     fn run_until_server_lost(&mut self) -> Result<(), Exit<ActorError>> {
         let mut current = self.begin()?;
-        loop {
+        // A snapshot may hold transitions that are complete.
+        let mut connected = self.send_complete_chunks()?;
+        while connected {
             let policy = self.await_policy().map_err(Exit::widen)?;
             self.heartbeat.begin_work();
             self.act(&policy, &current);
@@ -249,16 +267,27 @@ impl<'a> Explorer<'a> {
             self.step += 1;
             self.heartbeat.count(self.settings.envs as u64);
             self.heartbeat.beat(Activity::Working);
-            if self.chunk_is_complete() {
-                if !self.append_snapshot()? {
-                    return Ok(());
-                }
-                self.await_capacity().map_err(Exit::widen)?;
-                self.send()?;
-            }
+            connected = self.send_complete_chunks()?;
             if self.stop.requested() {
                 return Err(Exit::Stopped);
             }
+        }
+        Ok(())
+    }
+
+    /// Sends the chunk if it is complete, and others that complete transitions fill. Returns false if the environment
+    /// server was lost.
+    fn send_complete_chunks(&mut self) -> Result<bool, Exit<ActorError>> {
+        loop {
+            self.n_step.move_into(&mut self.chunk);
+            if !self.chunk_is_complete() {
+                return Ok(true);
+            }
+            if !self.append_snapshot()? {
+                return Ok(false);
+            }
+            self.await_capacity().map_err(Exit::widen)?;
+            self.send()?;
         }
     }
 
@@ -337,7 +366,11 @@ impl<'a> Explorer<'a> {
                 s_next: next.next_observation(e),
                 last: terminated || truncated,
             };
-            self.chunk.push(&transition);
+            if self.settings.n_step == 1 {
+                self.chunk.push(&transition);
+            } else {
+                self.n_step.add(e, &transition);
+            }
             self.returns[e] += f64::from(transition.r);
             self.lengths[e] += 1;
             if transition.last {
@@ -377,6 +410,7 @@ impl<'a> Explorer<'a> {
             noise: self.exploration.state().into(),
             returns: self.returns.clone(),
             lengths: self.lengths.clone(),
+            n_step: self.n_step.words(),
         };
         self.chunk.set_actor_snapshot(&snapshot.words());
         self.snapshot = Some(snapshot);

@@ -6,4 +6,5 @@ pub mod error;
 pub mod evaluator;
 pub mod exploration;
 pub mod explorer;
+pub mod n_step;
 pub mod noise;

@@ -1,4 +1,4 @@
-//! Real transitions to move and to learn from: Pendulums under random actions.
+//! Real transitions to move and to learn from: a preset's environments under random actions.
 
 use rand::RngExt;
 use shoal_common::channel::environment::{ResponseLayout, StepBlocks};
@@ -18,7 +18,9 @@ pub(super) struct Rows {
     row: RowLayout,
     gamma: f32,
     random: Stream,
+    /// The range of each element of an action; whole numbers only if the actions are discrete.
     bounds: Vec<(f32, f32)>,
+    is_discrete: bool,
     observations: Vec<f32>,
     actions: Vec<f32>,
     response: Vec<f32>,
@@ -43,6 +45,7 @@ impl Rows {
             gamma: config.algorithm.gamma() as f32,
             random: stream(config.run.seed, Purpose::Exploration, 0, 0),
             bounds,
+            is_discrete: matches!(config.spec.action, Space::Discrete { .. }),
             observations,
             actions: vec![0.0; ENVIRONMENTS * row.action_width()],
             response: vec![0.0; layout.len()],
@@ -58,7 +61,8 @@ impl Rows {
     pub(super) fn fill(&mut self, out: &mut [f32]) -> anyhow::Result<()> {
         for action in self.actions.chunks_exact_mut(self.bounds.len()) {
             for (number, (low, high)) in action.iter_mut().zip(&self.bounds) {
-                *number = low + (high - low) * self.random.random::<f32>();
+                let drawn = low + (high - low) * self.random.random::<f32>();
+                *number = if self.is_discrete { drawn.round() } else { drawn };
             }
         }
         let blocks = self.layout.split_mut(&mut self.response);

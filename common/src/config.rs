@@ -164,11 +164,12 @@ impl Config {
         let envs = self.actors.envs as usize;
         match (self.run.mode, self.spec.snapshot_words(envs)) {
             (Mode::Free, _) | (_, 0) => 0,
-            // The actor's step, and for each environment the state of its exploration and its episode's return and
-            // length.
+            // The actor's step; for each environment the state of its exploration and its episode's return and length;
+            // and what is not in a chunk yet.
             (Mode::Lockstep, snapshot) => {
                 let exploration = self.algorithm.settings().exploration_state_width(&self.spec);
-                snapshot + 1 + envs * (exploration + 2)
+                let n_step = self.row_layout().n_step_words(self.replay.n_step as usize, envs);
+                snapshot + 1 + envs * (exploration + 2) + n_step
             }
         }
     }

@@ -196,13 +196,13 @@ fn sac_gives_the_bits_of_its_algorithm_in_a_single_process() {
 
 #[test]
 fn dqn_gives_the_bits_of_its_algorithm_in_a_single_process() {
-    for dueling in ["dqn.dueling=false", "dqn.dueling=true"] {
+    for variant in ["dqn.dueling=false", "dqn.dueling=true", "replay.n_step=3"] {
         let place = Workplace::new();
         let set = [
             "dqn.hidden=[24, 16]",
             "dqn.target_every=20",
             "dqn.epsilon_steps=700",
-            dueling,
+            variant,
         ];
         let (config, result) = step_by_step(&place, "cart-pole", "dqn", &set);
         let Algorithm::Dqn(settings) = &config.algorithm else {
@@ -212,7 +212,7 @@ fn dqn_gives_the_bits_of_its_algorithm_in_a_single_process() {
         assert_eq!(
             result["weights_sha256"],
             twin::of_minibatches(&config, learner),
-            "{dueling}"
+            "{variant}"
         );
     }
 }
@@ -276,6 +276,12 @@ fn sac_with_killed_roles_ends_with_the_bits_of_an_undisturbed_run() {
 #[test]
 fn dqn_with_killed_roles_ends_with_the_bits_of_an_undisturbed_run() {
     kills_do_not_change_the_bits(&small("cart-pole", "dqn", "dqn.hidden=[8, 8]"));
+}
+
+#[test]
+fn transitions_of_several_steps_survive_kills_bit_for_bit() {
+    let set = ["--set", "replay.n_step=5", "--set", "actors.chunk_steps=1"];
+    kills_do_not_change_the_bits(&[&small("cart-pole", "dqn", "dqn.hidden=[8, 8]")[..], &set].concat());
 }
 
 #[test]

@@ -54,15 +54,15 @@ impl World {
 
     fn choose(&mut self, parameters: &[f32]) -> f32 {
         let mut a = [f32::NAN];
-        self.choose_all(Exploration::act, parameters, &mut a);
+        self.choose_all(Exploration::act, self.t, parameters, &mut a);
         a[0]
     }
 
-    /// Chooses every element of an action.
-    fn choose_all(&mut self, act: Act, parameters: &[f32], a: &mut [f32]) {
+    /// Chooses every element of an action by a policy that was learned from `env_steps` steps.
+    fn choose_all(&mut self, act: Act, env_steps: u64, parameters: &[f32], a: &mut [f32]) {
         let progress = Progress {
             step: self.t,
-            env_steps: self.t,
+            env_steps,
         };
         act(&mut self.exploration, parameters, &self.s, progress, a);
         self.t += 1;
@@ -192,44 +192,64 @@ pub(crate) fn of_minibatches<L: MinibatchLearner>(config: &Config, mut learner: 
     let mut rows: Vec<Vec<f32>> = Vec::new();
     let mut world = World::new(config);
     let mut a = vec![f32::NAN; row.action_width()];
-    for t in 1..=config.run.steps {
+    // The steps of the current episode, and how many of them have a row.
+    let (mut episode, mut begun) = (Vec::new(), 0);
+    let n = config.replay.n_step as usize;
+    while (rows.len() as u64) < config.run.steps {
         let act: Act = if learner.updates() == 0 {
             Exploration::warm_up
         } else {
             Exploration::act
         };
-        world.choose_all(act, learner.policy(), &mut a);
-        let step = world.step_all(&a);
-        let transition = Transition {
-            s: &step.s,
-            a: &step.a,
-            r: step.r,
-            discount: if step.terminated {
-                0.0
-            } else {
-                config.algorithm.gamma() as f32
-            },
-            s_next: &step.s_next,
-            last: step.terminated || step.truncated,
-        };
-        let mut stored = vec![0.0; row.width()];
-        row.write(&transition, &mut stored);
-        rows.push(stored);
-        if transition.last {
-            world.exploration.begin_episode(0);
-        }
-        let allowed = (t.saturating_sub(config.replay.warmup) as f64 * config.replay.updates_per_step).floor() as u64;
-        while learner.updates() < allowed {
-            let window = t.saturating_sub(config.replay.capacity)..t;
-            sampler.indices(learner.updates(), window, &mut indices);
-            for (column, index) in indices.iter().enumerate() {
-                batch.set(column, &row.read(&rows[*index as usize]));
+        world.choose_all(act, rows.len() as u64, learner.policy(), &mut a);
+        episode.push(world.step_all(&a));
+        let over = episode.last().is_some_and(|step| step.terminated || step.truncated);
+        // A row follows as soon as n steps are known, or the episode is over.
+        while begun < episode.len() && (episode.len() - begun >= n || over) {
+            rows.push(row_of(config, &episode[begun..]));
+            begun += 1;
+            let t = rows.len() as u64;
+            let beyond_warmup = t.saturating_sub(config.replay.warmup);
+            let allowed = (beyond_warmup as f64 * config.replay.updates_per_step).floor() as u64;
+            while learner.updates() < allowed {
+                let window = t.saturating_sub(config.replay.capacity)..t;
+                sampler.indices(learner.updates(), window, &mut indices);
+                for (column, index) in indices.iter().enumerate() {
+                    batch.set(column, &row.read(&rows[*index as usize]));
+                }
+                learner.learn(&batch);
             }
-            learner.learn(&batch);
+        }
+        if over {
+            world.exploration.begin_episode(0);
+            (episode, begun) = (Vec::new(), 0);
         }
     }
     let weights = registry::weights(&config.algorithm);
     let state = learner.state();
     let learned = state.iter().filter(|(name, _)| weights.contains(name));
     sha256(&learned.map(|(_, numbers)| *numbers).collect::<Vec<_>>())
+}
+
+/// The transition over these steps.
+fn row_of(config: &Config, steps: &[Step]) -> Vec<f32> {
+    let (first, end) = (&steps[0], &steps[steps.len() - 1]);
+    let gamma = config.algorithm.gamma() as f32;
+    let (mut r, mut discount) = (0.0, 1.0);
+    for step in steps {
+        r += discount * step.r;
+        discount *= if step.terminated { 0.0 } else { gamma };
+    }
+    let transition = Transition {
+        s: &first.s,
+        a: &first.a,
+        r,
+        discount,
+        s_next: &end.s_next,
+        last: first.terminated || first.truncated,
+    };
+    let layout = config.row_layout();
+    let mut row = vec![0.0; layout.width()];
+    layout.write(&transition, &mut row);
+    row
 }

@@ -58,6 +58,15 @@ impl RowLayout {
         2 * self.observation + self.action + 3
     }
 
+    /// Words (`u64`) of what an actor with `envs` environments has not put into a chunk yet, if a transition has `n`
+    /// steps: counts of rows, and at most `n` rows for each environment. 0 if `n` is 1.
+    pub fn n_step_words(&self, n: usize, envs: usize) -> usize {
+        match n {
+            1 => 0,
+            n => 1 + envs + envs * n * self.width(),
+        }
+    }
+
     /// Reads a row of `width()` numbers.
     #[inline]
     pub fn read<'a>(&self, row: &'a [f32]) -> Transition<'a> {

@@ -78,6 +78,10 @@ fn text(config: &Config) -> String {
         "row",
         &format!("s {observation}, a {action}, r 1, discount 1, s' {observation}, last 1"),
     );
+    // What follows is named only if it differs from what every run had before there was a choice.
+    if config.replay.n_step != 1 {
+        line("steps of a row", &config.replay.n_step.to_string());
+    }
     text
 }
 

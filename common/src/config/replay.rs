@@ -19,6 +19,8 @@ section! {
         /// once. The thesis has 1.
         updates_per_step: f64 = 1.0, bounds: from(0.0, 1_000.0),
             unit: "updates per environment step", source: "Algorithm 4";
+        /// n, steps of a transition: the rewards of n steps are added, and the value of the observation after them counts.
+        n_step: u32 = 1, bounds: from(1, 100), unit: "steps", source: "Sutton and Barto 2018, chapter 7";
         /// Environment steps that the actors may be ahead of that ratio before the learner stops taking transitions.
         tolerance: u64 = 512, bounds: from(1, MAX_ROWS), unit: "environment steps", source: "ours";
     }
@@ -35,6 +37,7 @@ impl ReplayConfig {
             capacity,
             warmup,
             updates_per_step,
+            n_step,
             ..
         } = self;
         match algorithm.spec().experience {
@@ -54,6 +57,9 @@ impl ReplayConfig {
                 };
                 if *warmup != 0 {
                     return Err(only("replay.warmup", warmup.to_string(), "0"));
+                }
+                if *n_step != 1 {
+                    return Err(only("replay.n_step", n_step.to_string(), "1"));
                 }
                 if *updates_per_step != 1.0 {
                     return Err(only("replay.updates_per_step", updates_per_step.to_string(), "1"));
