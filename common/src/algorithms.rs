@@ -6,6 +6,7 @@ mod behaviour;
 mod ddpg;
 mod dqn;
 mod exploration;
+mod preparation;
 mod reinforce;
 mod sac;
 mod tabular;
@@ -16,6 +17,7 @@ pub use behaviour::{Behaviour, Epsilon};
 pub use ddpg::DdpgConfig;
 pub use dqn::DqnConfig;
 pub use exploration::{ExplorationConfig, Warmup};
+pub use preparation::{ObservationConfig, Preparation, RewardConfig};
 pub use reinforce::{ReinforceConfig, Weight};
 pub use sac::SacConfig;
 use serde::Serialize;
@@ -49,6 +51,13 @@ macro_rules! registry {
 
             /// Its settings, without the type of the algorithm.
             pub fn settings(&self) -> &dyn AlgorithmSettings {
+                match self {
+                    $(Self::$variant(settings) => settings),*
+                }
+            }
+
+            /// As [`settings`](Self::settings).
+            pub fn settings_mut(&mut self) -> &mut dyn AlgorithmSettings {
                 match self {
                     $(Self::$variant(settings) => settings),*
                 }

@@ -31,8 +31,8 @@ use shoal_policy::PolicyError;
 
 use crate::algorithms::Experience;
 pub use crate::algorithms::{
-    Algorithm, DdpgConfig, DqnConfig, ExplorationConfig, ReinforceConfig, SacConfig, TabularConfig, Td3Config, Warmup,
-    Weight,
+    Algorithm, DdpgConfig, DqnConfig, ExplorationConfig, ObservationConfig, Preparation, ReinforceConfig, RewardConfig,
+    SacConfig, TabularConfig, Td3Config, Warmup, Weight,
 };
 
 /// The complete configuration of a run.

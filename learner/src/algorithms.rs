@@ -4,6 +4,7 @@ pub mod algorithm;
 pub mod ddpg;
 pub mod dqn;
 pub mod minibatch;
+mod normaliser;
 pub mod registry;
 pub mod reinforce;
 pub mod replayed;

@@ -6,7 +6,7 @@ mod tensors;
 use std::collections::BTreeMap;
 
 use shoal_common::config::Config;
-use shoal_common::network::{ActionRange, Activation, NetworkLayout};
+use shoal_common::network::{ActionRange, Activation, CLIP, NetworkLayout};
 use shoal_common::policy::{PolicyLayout, combine_heads};
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::space::Space;
@@ -49,6 +49,8 @@ struct Starts {
 /// A sequence of layers, with the activation between them.
 #[derive(Clone, Debug)]
 struct Network {
+    /// The mean and the factor of each observed number, if they are normalised first.
+    normalisation: Option<(Vec<f32>, Vec<f32>)>,
     activation: Activation,
     layers: Vec<Dense>,
 }
@@ -136,7 +138,9 @@ impl Network {
                 .collect(),
             biases: layer.biases.to_vec(),
         });
+        let normalisation = layout.normalisation(parameters);
         Self {
+            normalisation: normalisation.map(|(mean, factor)| (mean.to_vec(), factor.to_vec())),
             activation: layout.hidden().activation,
             layers: dense.collect(),
         }
@@ -202,6 +206,9 @@ fn metadata(config: &Config, file: &PolicyFile, which: &str, body: &Body) -> any
             Activation::Tanh => "tanh",
         };
         insert("hidden_activation", activation.into());
+        if network.normalisation.is_some() {
+            insert("observation_clip", CLIP.to_string());
+        }
     }
     match body {
         Body::Actions { .. } => {
@@ -260,6 +267,8 @@ mod tests_support {
              [reinforce]\n[replay]\nwarmup = 0\n",
             "[environment]\nname = \"point-mass\"\n[td3]\nhidden = [9, 8]\n",
             "[environment]\nname = \"point-mass\"\n[sac]\nhidden = [9, 8]\n",
+            "[environment]\nname = \"point-mass\"\n[sac]\nhidden = [9]\n[observation]\nnormalise = true\n",
+            "[environment]\nname = \"pendulum\"\n[ddpg]\nhidden = [9]\n[observation]\nnormalise = true\n",
             "[environment]\nname = \"cart-pole\"\n[dqn]\nhidden = [9, 8]\n",
             "[environment]\nname = \"cart-pole\"\n[dqn]\nhidden = [9]\nactivation = \"tanh\"\ndueling = true\n",
             "[environment]\nname = \"frozen-lake\"\n[q-learning]\n[replay]\nwarmup = 0\n",

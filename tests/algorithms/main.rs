@@ -285,6 +285,12 @@ fn transitions_of_several_steps_survive_kills_bit_for_bit() {
 }
 
 #[test]
+fn each_observation_counts_once_however_often_roles_are_killed() {
+    let set = ["--set", "observation.normalise=true", "--set", "reward.scale=0.1"];
+    kills_do_not_change_the_bits(&[&small("pendulum", "sac", "sac.hidden=[8, 8]")[..], &set].concat());
+}
+
+#[test]
 fn reinforce_with_killed_roles_ends_with_the_bits_of_an_undisturbed_run() {
     kills_do_not_change_the_bits(&CART_POLE);
 }

@@ -150,7 +150,7 @@ pub(crate) fn reinforce(config: &Config) -> String {
     for number in 0..config.run.episodes.unwrap() {
         let (mut episode, mut over) = (Vec::new(), false);
         while !over {
-            let a = world.choose(learner.policy());
+            let a = world.choose(&learner.policy());
             let step = world.step(a);
             over = step.terminated || step.truncated;
             let mut row = vec![0.0; chunk.row.width()];

@@ -20,6 +20,7 @@ mod forward;
 mod gaussian;
 mod hidden;
 mod layout;
+mod normalise;
 mod policy;
 
 pub use acting::Network;
@@ -27,4 +28,5 @@ pub use forward::{Activations, Layer, matrix, matrix_mut};
 pub use gaussian::{GaussianPolicy, LOG_STD_RANGE};
 pub use hidden::{Activation, Hidden, Layers, LayersError};
 pub use layout::{LayerRange, NetworkLayout};
+pub use normalise::{CLIP, normalise};
 pub use policy::{ActionRange, ActionRangeError, PolicyNetwork};

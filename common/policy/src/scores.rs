@@ -61,6 +61,17 @@ impl Scores {
         }
     }
 
+    /// The same scores, of normalised observations or not. A table has no observations that could be.
+    pub fn normalising(self, normalised: bool) -> Self {
+        let source = match self.source {
+            Source::Logits(network) => Source::Logits(network.normalising(normalised)),
+            Source::Values(network) => Source::Values(network.normalising(normalised)),
+            Source::Dueling(network) => Source::Dueling(network.normalising(normalised)),
+            table @ Source::Table { .. } => table,
+        };
+        Self { source, ..self }
+    }
+
     /// The layout of the parameters of [`of`](Self::of).
     pub fn layout(&self) -> PolicyLayout {
         match &self.source {

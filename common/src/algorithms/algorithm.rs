@@ -8,6 +8,7 @@ use shoal_policy::PolicyError;
 use shoal_policy::network::{Activation, Hidden, NetworkLayout};
 
 use super::behaviour::Behaviour;
+use super::preparation::Preparation;
 
 /// The fixed properties of an algorithm, which do not depend on its settings.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -41,6 +42,12 @@ pub trait AlgorithmSettings {
 
     /// γ, the discount of one step.
     fn gamma(&self) -> f64;
+
+    /// How observations and rewards are prepared for its networks; `None` if it learns from them as they are.
+    fn preparation(&self) -> Option<&Preparation>;
+
+    /// As [`preparation`](Self::preparation).
+    fn preparation_mut(&mut self) -> Option<&mut Preparation>;
 
     /// Its policy in an environment like `spec`, for at most `batch` observations a call, and how actors explore with
     /// it. `name` is the name of the algorithm.
@@ -119,11 +126,14 @@ impl Display for Shape {
                     (late, Some(0)) if layers.len() > 1 => write!(to, " joined {late}")?,
                     (late, Some(_)) => write!(to, " late {late}")?,
                 }
-                match activation {
-                    // Not named, as in runs from before there were other activations.
-                    Activation::Relu => Ok(()),
-                    Activation::Tanh => write!(to, " tanh"),
+                // Not named, as in runs from before there was a choice.
+                if activation == Activation::Tanh {
+                    write!(to, " tanh")?;
                 }
+                if network.normalises() {
+                    write!(to, " normalised")?;
+                }
+                Ok(())
             }
             Self::Table { states, actions } => write!(to, "table {states} {actions}"),
         }

@@ -9,6 +9,7 @@ use shoal_policy::network::{Activation, Hidden, Layers, NetworkLayout};
 use super::algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Learned, Shape};
 use super::behaviour::Behaviour;
 use super::exploration::ExplorationConfig;
+use super::preparation::Preparation;
 
 /// DDPG.
 pub(super) const SPEC: AlgorithmSpec = AlgorithmSpec {
@@ -39,6 +40,10 @@ section! {
         #[serde(skip)]
         #[schemars(skip)]
         exploration: ExplorationConfig = ExplorationConfig::default();
+        /// How observations and rewards are prepared. They have their own sections, `[observation]` and `[reward]`.
+        #[serde(skip)]
+        #[schemars(skip)]
+        preparation: Preparation = Preparation::default();
     }
 }
 
@@ -55,6 +60,7 @@ impl DdpgConfig {
 impl AlgorithmSettings for DdpgConfig {
     fn check(&self, section: &str) -> Result<(), OutOfRange> {
         self.exploration.check_bounds("exploration")?;
+        self.preparation.check()?;
         self.check_bounds(section)
     }
 
@@ -62,8 +68,17 @@ impl AlgorithmSettings for DdpgConfig {
         self.gamma
     }
 
+    fn preparation(&self) -> Option<&Preparation> {
+        Some(&self.preparation)
+    }
+
+    fn preparation_mut(&mut self) -> Option<&mut Preparation> {
+        Some(&mut self.preparation)
+    }
+
     fn behaviour(&self, _: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError> {
         let network = shoal_policy::deterministic(self.hidden_layers(), spec, batch)?;
+        let network = network.normalising(self.preparation.observation.normalise);
         Ok(Behaviour::Noise(network, self.exploration.clone()))
     }
 
@@ -77,7 +92,8 @@ impl AlgorithmSettings for DdpgConfig {
 
     fn learned(&self, spec: &EnvironmentSpec) -> Learned {
         let (observation, action) = (spec.observation.width(), spec.action.width());
-        let actor = NetworkLayout::policy(observation, self.hidden_layers(), action);
+        let actor = NetworkLayout::policy(observation, self.hidden_layers(), action)
+            .normalising(self.preparation.observation.normalise);
         let critic = NetworkLayout::critic(observation, self.hidden_layers(), action);
         Learned {
             policy: ("actor", Shape::Network(actor)),

@@ -8,6 +8,7 @@ use shoal_policy::network::{Activation, Hidden, Layers, NetworkLayout};
 
 use super::algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Learned, Shape};
 use super::behaviour::{Behaviour, Epsilon};
+use super::preparation::Preparation;
 
 /// DQN.
 pub(super) const SPEC: AlgorithmSpec = AlgorithmSpec {
@@ -46,6 +47,10 @@ section! {
         /// Environment steps of all actors in which ε falls linearly from the first to the second value. 0 becomes a
         /// tenth of `run.steps` when the run is created.
         epsilon_steps: u64 = 0, unit: "environment steps", source: "ours";
+        /// How observations and rewards are prepared. They have their own sections, `[observation]` and `[reward]`.
+        #[serde(skip)]
+        #[schemars(skip)]
+        preparation: Preparation = Preparation::default();
     }
 }
 
@@ -61,6 +66,7 @@ impl DqnConfig {
 
 impl AlgorithmSettings for DqnConfig {
     fn check(&self, section: &str) -> Result<(), OutOfRange> {
+        self.preparation.check()?;
         self.check_bounds(section)
     }
 
@@ -68,8 +74,17 @@ impl AlgorithmSettings for DqnConfig {
         self.gamma
     }
 
+    fn preparation(&self) -> Option<&Preparation> {
+        Some(&self.preparation)
+    }
+
+    fn preparation_mut(&mut self) -> Option<&mut Preparation> {
+        Some(&mut self.preparation)
+    }
+
     fn behaviour(&self, name: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError> {
-        let values = shoal_policy::action_values(name, self.hidden_layers(), self.dueling, spec, batch)?;
+        let values = shoal_policy::action_values(name, self.hidden_layers(), self.dueling, spec, batch)?
+            .normalising(self.preparation.observation.normalise);
         let epsilon = Epsilon {
             start: self.epsilon_start,
             end: self.epsilon_end,
@@ -88,7 +103,8 @@ impl AlgorithmSettings for DqnConfig {
 
     fn learned(&self, spec: &EnvironmentSpec) -> Learned {
         let outputs = spec.action.size() + usize::from(self.dueling);
-        let values = NetworkLayout::policy(spec.observation.width(), self.hidden_layers(), outputs);
+        let values = NetworkLayout::policy(spec.observation.width(), self.hidden_layers(), outputs)
+            .normalising(self.preparation.observation.normalise);
         Learned {
             policy: ("action-values", Shape::Network(values)),
             others: Vec::new(),

@@ -10,6 +10,7 @@ use shoal_policy::network::{Activation, Hidden, Layers, NetworkLayout};
 
 use super::algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Learned, Shape};
 use super::behaviour::Behaviour;
+use super::preparation::Preparation;
 
 /// REINFORCE.
 pub(super) const SPEC: AlgorithmSpec = AlgorithmSpec {
@@ -80,6 +81,14 @@ impl AlgorithmSettings for ReinforceConfig {
 
     fn gamma(&self) -> f64 {
         self.gamma
+    }
+
+    fn preparation(&self) -> Option<&Preparation> {
+        None
+    }
+
+    fn preparation_mut(&mut self) -> Option<&mut Preparation> {
+        None
     }
 
     fn behaviour(&self, name: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError> {

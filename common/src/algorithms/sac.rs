@@ -8,6 +8,7 @@ use shoal_policy::network::{Activation, Hidden, Layers, NetworkLayout};
 
 use super::algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Learned, Shape};
 use super::behaviour::Behaviour;
+use super::preparation::Preparation;
 
 /// SAC.
 pub(super) const SPEC: AlgorithmSpec = AlgorithmSpec {
@@ -40,6 +41,10 @@ section! {
             source: "Haarnoja et al. 2018b";
         /// N, transitions in a minibatch.
         batch: usize = 256, bounds: from(1, 65_536), unit: "transitions", source: "Haarnoja et al. 2018b";
+        /// How observations and rewards are prepared. They have their own sections, `[observation]` and `[reward]`.
+        #[serde(skip)]
+        #[schemars(skip)]
+        preparation: Preparation = Preparation::default();
     }
 }
 
@@ -55,6 +60,7 @@ impl SacConfig {
 
 impl AlgorithmSettings for SacConfig {
     fn check(&self, section: &str) -> Result<(), OutOfRange> {
+        self.preparation.check()?;
         self.check_bounds(section)
     }
 
@@ -62,12 +68,19 @@ impl AlgorithmSettings for SacConfig {
         self.gamma
     }
 
+    fn preparation(&self) -> Option<&Preparation> {
+        Some(&self.preparation)
+    }
+
+    fn preparation_mut(&mut self) -> Option<&mut Preparation> {
+        Some(&mut self.preparation)
+    }
+
     fn behaviour(&self, _: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError> {
-        Ok(Behaviour::Gaussian(shoal_policy::gaussian(
-            self.hidden_layers(),
-            spec,
-            batch,
-        )?))
+        let policy = shoal_policy::gaussian(self.hidden_layers(), spec, batch)?;
+        Ok(Behaviour::Gaussian(
+            policy.normalising(self.preparation.observation.normalise),
+        ))
     }
 
     fn exploration_state_width(&self, _: &EnvironmentSpec) -> usize {
@@ -80,7 +93,8 @@ impl AlgorithmSettings for SacConfig {
 
     fn learned(&self, spec: &EnvironmentSpec) -> Learned {
         let (observation, action) = (spec.observation.width(), spec.action.width());
-        let actor = NetworkLayout::policy(observation, self.hidden_layers(), 2 * action);
+        let actor = NetworkLayout::policy(observation, self.hidden_layers(), 2 * action)
+            .normalising(self.preparation.observation.normalise);
         let critic = Shape::Network(NetworkLayout::joined_critic(observation, self.hidden_layers(), action));
         Learned {
             policy: ("actor", Shape::Network(actor)),

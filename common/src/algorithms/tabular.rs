@@ -7,6 +7,7 @@ use shoal_policy::PolicyError;
 
 use super::algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Learned, Shape};
 use super::behaviour::{Behaviour, Epsilon};
+use super::preparation::Preparation;
 
 /// Q-learning.
 pub(super) const Q_LEARNING: AlgorithmSpec = AlgorithmSpec {
@@ -41,6 +42,14 @@ impl AlgorithmSettings for TabularConfig {
 
     fn gamma(&self) -> f64 {
         self.gamma
+    }
+
+    fn preparation(&self) -> Option<&Preparation> {
+        None
+    }
+
+    fn preparation_mut(&mut self) -> Option<&mut Preparation> {
+        None
     }
 
     fn behaviour(&self, name: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError> {

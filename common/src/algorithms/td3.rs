@@ -9,6 +9,7 @@ use shoal_policy::network::{Activation, Hidden, Layers, NetworkLayout};
 use super::algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Learned, Shape};
 use super::behaviour::Behaviour;
 use super::exploration::{ExplorationConfig, Warmup};
+use super::preparation::Preparation;
 
 /// TD3.
 pub(super) const SPEC: AlgorithmSpec = AlgorithmSpec {
@@ -45,6 +46,10 @@ section! {
         /// actions uniformly.
         exploration_noise: f64 = 0.1, bounds: from(0.0, 10.0), unit: "half action ranges",
             source: "Fujimoto et al. 2018";
+        /// How observations and rewards are prepared. They have their own sections, `[observation]` and `[reward]`.
+        #[serde(skip)]
+        #[schemars(skip)]
+        preparation: Preparation = Preparation::default();
     }
 }
 
@@ -60,6 +65,7 @@ impl Td3Config {
 
 impl AlgorithmSettings for Td3Config {
     fn check(&self, section: &str) -> Result<(), OutOfRange> {
+        self.preparation.check()?;
         self.check_bounds(section)
     }
 
@@ -67,8 +73,17 @@ impl AlgorithmSettings for Td3Config {
         self.gamma
     }
 
+    fn preparation(&self) -> Option<&Preparation> {
+        Some(&self.preparation)
+    }
+
+    fn preparation_mut(&mut self) -> Option<&mut Preparation> {
+        Some(&mut self.preparation)
+    }
+
     fn behaviour(&self, _: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError> {
         let network = shoal_policy::deterministic(self.hidden_layers(), spec, batch)?;
+        let network = network.normalising(self.preparation.observation.normalise);
         // With θ = 1 the noise of a step does not depend on the previous one: it is N(0, σ²).
         let noise = ExplorationConfig {
             theta: 1.0,
@@ -88,7 +103,8 @@ impl AlgorithmSettings for Td3Config {
 
     fn learned(&self, spec: &EnvironmentSpec) -> Learned {
         let (observation, action) = (spec.observation.width(), spec.action.width());
-        let actor = NetworkLayout::policy(observation, self.hidden_layers(), action);
+        let actor = NetworkLayout::policy(observation, self.hidden_layers(), action)
+            .normalising(self.preparation.observation.normalise);
         let critic = Shape::Network(NetworkLayout::joined_critic(observation, self.hidden_layers(), action));
         Learned {
             policy: ("actor", Shape::Network(actor)),

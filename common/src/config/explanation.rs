@@ -10,7 +10,7 @@ use super::evaluation::EvaluationConfig;
 use super::learner::LearnerConfig;
 use super::replay::ReplayConfig;
 use super::run::RunConfig;
-use crate::algorithms::{Algorithm, ExplorationConfig};
+use crate::algorithms::{Algorithm, ExplorationConfig, ObservationConfig, RewardConfig};
 
 /// Every section that the user may write, including those of all algorithms, but without an environment's own
 /// parameters.
@@ -28,6 +28,8 @@ pub fn sections() -> Vec<Section> {
     all.extend(Algorithm::sections());
     all.extend([
         describe::<ExplorationConfig>("exploration"),
+        describe::<ObservationConfig>("observation"),
+        describe::<RewardConfig>("reward"),
         describe::<LearnerConfig>("learner"),
         describe::<ReplayConfig>("replay"),
         describe::<EvaluationConfig>("evaluation"),

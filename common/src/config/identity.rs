@@ -82,6 +82,13 @@ fn text(config: &Config) -> String {
     if config.replay.n_step != 1 {
         line("steps of a row", &config.replay.n_step.to_string());
     }
+    let reward_scale = algorithm
+        .settings()
+        .preparation()
+        .map(|preparation| preparation.reward.scale);
+    if let Some(scale) = reward_scale.filter(|scale| *scale != 1.0) {
+        line("reward scale", &scale.to_string());
+    }
     text
 }
 

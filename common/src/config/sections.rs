@@ -6,7 +6,7 @@ use toml::{Table, Value};
 
 use super::{
     ActorsConfig, Algorithm, CheckpointConfig, Config, EnvironmentConfig, EvaluationConfig, ExplorationConfig,
-    LearnerConfig, ReplayConfig, RunConfig, explanation,
+    LearnerConfig, ObservationConfig, Preparation, ReplayConfig, RewardConfig, RunConfig, explanation,
 };
 
 /// The sections as they are read.
@@ -18,6 +18,8 @@ struct Sections {
     #[serde(default)]
     actors: ActorsConfig,
     exploration: Option<ExplorationConfig>,
+    observation: Option<ObservationConfig>,
+    reward: Option<RewardConfig>,
     #[serde(default)]
     learner: LearnerConfig,
     #[serde(default)]
@@ -40,6 +42,10 @@ struct Written<'a> {
     actors: &'a ActorsConfig,
     #[serde(skip_serializing_if = "Option::is_none")]
     exploration: Option<&'a ExplorationConfig>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    observation: Option<&'a ObservationConfig>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    reward: Option<&'a RewardConfig>,
     /// A section with the algorithm's name.
     #[serde(flatten)]
     algorithm: &'a Algorithm,
@@ -69,6 +75,21 @@ impl TryFrom<Sections> for Config {
                 ));
             };
             ddpg.exploration = exploration;
+        }
+        let preparation = Preparation {
+            observation: sections.observation.unwrap_or_default(),
+            reward: sections.reward.unwrap_or_default(),
+        };
+        let name = algorithm.name();
+        match algorithm.settings_mut().preparation_mut() {
+            Some(own) => *own = preparation,
+            None if preparation == Preparation::default() => {}
+            None => {
+                return Err(format!(
+                    "[observation] and [reward] are for methods that learn from minibatches, but this configuration is \
+                     for {name}"
+                ));
+            }
         }
         Ok(Self {
             run: sections.run,
@@ -110,12 +131,15 @@ fn one_algorithm(mut sections: Table) -> Result<Algorithm, String> {
 
 impl Serialize for Config {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let preparation = self.algorithm.settings().preparation();
         Written {
             run: &self.run,
             environment: &self.environment,
             spec: &self.spec,
             actors: &self.actors,
             exploration: self.algorithm.ddpg().map(|ddpg| &ddpg.exploration),
+            observation: preparation.map(|preparation| &preparation.observation),
+            reward: preparation.map(|preparation| &preparation.reward),
             algorithm: &self.algorithm,
             learner: &self.learner,
             replay: &self.replay,

@@ -1,5 +1,7 @@
 //! The interface between a learning method and the learner's process.
 
+use std::borrow::Cow;
+
 use shoal_common::config::Config;
 use shoal_common::policy::{PolicyError, PolicyLayout};
 use shoal_common::space::EnvironmentSpec;
@@ -30,7 +32,7 @@ pub trait Method {
 /// A running learner: its updates from rows of the replay, its policy for the actors, and its state for checkpoints.
 pub trait Algorithm {
     /// The policy's parameters.
-    fn policy(&self) -> &[f32];
+    fn policy(&self) -> Cow<'_, [f32]>;
 
     /// The layout of the policy's parameters.
     fn layout(&self) -> PolicyLayout;

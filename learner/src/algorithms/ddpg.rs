@@ -8,12 +8,12 @@ use nalgebra::{DMatrix, DVector};
 use shoal_common::algorithms::AlgorithmSettings;
 use shoal_common::config;
 use shoal_common::network::{ActionRange, NetworkLayout};
-use shoal_common::policy::{PolicyError, PolicyLayout};
+use shoal_common::policy::PolicyError;
 use shoal_common::space::EnvironmentSpec;
 
 use super::algorithm::{Algorithm, Losses, Method, RunSizes, Section, SectionMut};
 use super::minibatch::Minibatch;
-use super::replayed::{MinibatchLearner, Replayed, mean, targets};
+use super::replayed::{self, MinibatchLearner, Replayed, mean, targets};
 use crate::networks::digest::sha256;
 use crate::networks::initialise::initialise;
 use crate::networks::pass::{Pass, Samples};
@@ -208,10 +208,6 @@ impl MinibatchLearner for Ddpg {
         &self.actor.online.parameters
     }
 
-    fn layout(&self) -> PolicyLayout {
-        PolicyLayout::Deterministic(self.actor.online.layout)
-    }
-
     fn updates(&self) -> u64 {
         self.updates
     }
@@ -248,7 +244,8 @@ impl MinibatchLearner for Ddpg {
 impl Method for &config::DdpgConfig {
     fn start(&self, spec: &EnvironmentSpec, seed: u64, sizes: RunSizes) -> Result<Box<dyn Algorithm>, PolicyError> {
         let ddpg = Ddpg::new(spec, self, seed)?;
-        Ok(Box::new(Replayed::new(ddpg, spec, self.batch, seed, sizes)))
+        let layout = self.behaviour("ddpg", spec, 0)?.into_policy().layout();
+        Ok(Box::new(Replayed::new(ddpg, *self, layout, spec, (seed, sizes))))
     }
 
     fn weights(&self) -> &'static [&'static str] {
@@ -277,7 +274,7 @@ impl Method for &config::DdpgConfig {
 
     fn state_numbers(&self, spec: &EnvironmentSpec, _: RunSizes) -> usize {
         // Each network with its target and two moments.
-        4 * self.learned(spec).parameters()
+        4 * replayed::learned_parameters(*self, spec) + replayed::state_numbers(*self, spec)
     }
 }
 

@@ -7,12 +7,12 @@ use nalgebra::{DMatrix, DVector};
 use shoal_common::algorithms::AlgorithmSettings;
 use shoal_common::config;
 use shoal_common::network::NetworkLayout;
-use shoal_common::policy::{self, PolicyError, PolicyLayout, highest};
+use shoal_common::policy::{self, PolicyError, highest};
 use shoal_common::space::EnvironmentSpec;
 
 use super::algorithm::{Algorithm, Losses, Method, RunSizes, Section, SectionMut};
 use super::minibatch::Minibatch;
-use super::replayed::{MinibatchLearner, Replayed, targets};
+use super::replayed::{self, MinibatchLearner, Replayed, targets};
 use crate::networks::initialise::fan_in;
 use crate::networks::pass::Pass;
 use crate::networks::product::{self, Products};
@@ -31,7 +31,6 @@ const PARTS: [&str; 4] = [
 #[derive(Clone, Debug)]
 pub struct Dqn {
     settings: config::DqnConfig,
-    layout: PolicyLayout,
     threads: Threads,
     updates: u64,
     network: Targeted,
@@ -57,7 +56,6 @@ impl Dqn {
         let outputs = scores.actions() + usize::from(settings.dueling);
         let layout = NetworkLayout::policy(observation, settings.hidden_layers(), outputs);
         Ok(Self {
-            layout: scores.layout(),
             threads: Threads::ALONE,
             updates: 0,
             network: Targeted::new(layout, settings.learning_rate, &fan_in(&layout, seed, 0)),
@@ -172,10 +170,6 @@ impl MinibatchLearner for Dqn {
         &self.network.online.parameters
     }
 
-    fn layout(&self) -> PolicyLayout {
-        self.layout
-    }
-
     fn updates(&self) -> u64 {
         self.updates
     }
@@ -207,7 +201,8 @@ impl MinibatchLearner for Dqn {
 impl Method for &config::DqnConfig {
     fn start(&self, spec: &EnvironmentSpec, seed: u64, sizes: RunSizes) -> Result<Box<dyn Algorithm>, PolicyError> {
         let dqn = Dqn::new(spec, self, seed)?;
-        Ok(Box::new(Replayed::new(dqn, spec, self.batch, seed, sizes)))
+        let layout = self.behaviour("dqn", spec, 0)?.into_policy().layout();
+        Ok(Box::new(Replayed::new(dqn, *self, layout, spec, (seed, sizes))))
     }
 
     fn weights(&self) -> &'static [&'static str] {
@@ -227,7 +222,7 @@ impl Method for &config::DqnConfig {
 
     fn state_numbers(&self, spec: &EnvironmentSpec, _: RunSizes) -> usize {
         // The network with its target and two moments.
-        4 * self.learned(spec).parameters()
+        4 * replayed::learned_parameters(*self, spec) + replayed::state_numbers(*self, spec)
     }
 }
 

@@ -69,6 +69,16 @@ mod tests {
                 real,
                 "discrete.n = 3",
             ),
+            (
+                "[ddpg]\n[observation]\nnormalise = true\n[spec]\ntime_limit = 8",
+                real,
+                real,
+            ),
+            (
+                "[sac]\n[observation]\nnormalise = true\n[spec]\ntime_limit = 8",
+                real,
+                real,
+            ),
             (&format!("[reinforce]\n{in_order}"), real, "discrete.n = 3"),
             (
                 &format!("[reinforce]\nweight = \"baseline\"\n{in_order}"),

@@ -7,6 +7,8 @@
 //! a round has an episode of each, and the step follows their mean. `docs/REPRODUCTION.md` describes the effect of
 //! other choices.
 
+use std::borrow::Cow;
+
 use nalgebra::DMatrix;
 use shoal_common::algorithms::AlgorithmSettings;
 use shoal_common::config::{self, Weight};
@@ -246,8 +248,8 @@ impl Method for &config::ReinforceConfig {
 }
 
 impl Algorithm for Reinforce {
-    fn policy(&self) -> &[f32] {
-        &self.policy.parameters
+    fn policy(&self) -> Cow<'_, [f32]> {
+        Cow::Borrowed(&self.policy.parameters)
     }
 
     fn layout(&self) -> PolicyLayout {

@@ -1,23 +1,24 @@
 //! Learning from the replay: minibatches drawn at random from its newest rows (line 11 of Algorithm 4).
 
+use std::borrow::Cow;
+
 use nalgebra::DVector;
+use shoal_common::algorithms::AlgorithmSettings;
 use shoal_common::policy::PolicyLayout;
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::transition::RowLayout;
 
 use super::algorithm::{Algorithm, Losses, RunSizes, SavedState, Section, SectionError, SectionMut};
 use super::minibatch::Minibatch;
+use super::normaliser::Normaliser;
 use super::sampling::Sampler;
 use crate::networks::threads::Threads;
 use crate::replay::Replay;
 
 /// A learner that takes gradient steps with minibatches, wherever those come from.
 pub trait MinibatchLearner {
-    /// The policy's parameters.
+    /// The policy's parameters, without those that normalise observations.
     fn policy(&self) -> &[f32];
-
-    /// The layout of the policy's parameters.
-    fn layout(&self) -> PolicyLayout;
 
     /// Gradient steps taken.
     fn updates(&self) -> u64;
@@ -45,29 +46,71 @@ pub struct Replayed<L> {
     batch: Minibatch,
     indices: Vec<u64>,
     capacity: u64,
+    layout: PolicyLayout,
+    normaliser: Option<Normaliser>,
+    reward_scale: f32,
 }
 
 impl<L: MinibatchLearner> Replayed<L> {
-    /// Samples minibatches of `batch` transitions in environments like `spec` for `learner`.
-    pub fn new(learner: L, spec: &EnvironmentSpec, batch: usize, seed: u64, sizes: RunSizes) -> Self {
-        let row = RowLayout::new(spec.observation.width(), spec.action.width());
+    /// Samples minibatches for `learner`, whose method has these settings and, in environments like `spec`, a policy of
+    /// this layout.
+    pub fn new(
+        learner: L,
+        settings: &dyn AlgorithmSettings,
+        layout: PolicyLayout,
+        spec: &EnvironmentSpec,
+        (seed, sizes): (u64, RunSizes),
+    ) -> Self {
+        let (observation, batch) = (spec.observation.width(), settings.least_capacity() as usize);
+        let row = RowLayout::new(observation, spec.action.width());
+        let preparation = settings.preparation().cloned().unwrap_or_default();
         Self {
             learner,
             sampler: Sampler::new(seed),
             batch: Minibatch::new(row, batch),
             indices: vec![0; batch],
             capacity: sizes.capacity,
+            layout,
+            normaliser: normalises(settings).then(|| Normaliser::new(observation)),
+            reward_scale: preparation.reward.scale as f32,
         }
     }
 }
 
+fn normalises(settings: &dyn AlgorithmSettings) -> bool {
+    let preparation = settings.preparation();
+    preparation.is_some_and(|preparation| preparation.observation.normalise)
+}
+
+/// The number of parameters of all that is learned, without those that normalise observations.
+pub(super) fn learned_parameters(settings: &dyn AlgorithmSettings, spec: &EnvironmentSpec) -> usize {
+    let all = settings.learned(spec).parameters();
+    all - if normalises(settings) {
+        2 * spec.observation.width()
+    } else {
+        0
+    }
+}
+
+/// The length of the state that a [`Replayed`] adds to its learner's.
+pub(super) fn state_numbers(settings: &dyn AlgorithmSettings, spec: &EnvironmentSpec) -> usize {
+    if normalises(settings) {
+        Normaliser::state_numbers(spec.observation.width())
+    } else {
+        0
+    }
+}
+
 impl<L: MinibatchLearner> Algorithm for Replayed<L> {
-    fn policy(&self) -> &[f32] {
-        self.learner.policy()
+    fn policy(&self) -> Cow<'_, [f32]> {
+        match &self.normaliser {
+            None => self.learner.policy().into(),
+            Some(normaliser) => [self.learner.policy(), normaliser.published()].concat().into(),
+        }
     }
 
     fn layout(&self) -> PolicyLayout {
-        self.learner.layout()
+        self.layout
     }
 
     fn updates(&self) -> u64 {
@@ -79,6 +122,13 @@ impl<L: MinibatchLearner> Algorithm for Replayed<L> {
         self.sampler
             .indices(self.learner.updates(), window.clone(), &mut self.indices);
         self.batch.gather(replay, &self.indices, &window);
+        if let Some(normaliser) = &mut self.normaliser {
+            normaliser.count(replay, rows);
+            normaliser.apply(&mut self.batch);
+        }
+        if self.reward_scale != 1.0 {
+            self.batch.r *= self.reward_scale;
+        }
         self.learner.learn(&self.batch)
     }
 
@@ -87,12 +137,19 @@ impl<L: MinibatchLearner> Algorithm for Replayed<L> {
     }
 
     fn state(&self) -> Vec<Section<'_>> {
-        self.learner.state()
+        let mut sections = self.learner.state();
+        sections.extend(self.normaliser.as_ref().map(Normaliser::state));
+        sections
     }
 
     fn restore(&mut self, updates: u64, saved: &mut SavedState) -> Result<(), SectionError> {
-        for (name, numbers) in self.learner.state_mut(updates) {
+        let mut sections = self.learner.state_mut(updates);
+        sections.extend(self.normaliser.as_mut().map(Normaliser::state_mut));
+        for (name, numbers) in sections {
             numbers.copy_from_slice(&saved.take(name, numbers.len())?);
+        }
+        if let Some(normaliser) = &mut self.normaliser {
+            normaliser.restored();
         }
         Ok(())
     }

@@ -12,13 +12,13 @@ use rand_distr::StandardNormal;
 use shoal_common::algorithms::AlgorithmSettings;
 use shoal_common::config;
 use shoal_common::network::{ActionRange, LOG_STD_RANGE, NetworkLayout};
-use shoal_common::policy::{PolicyError, PolicyLayout};
+use shoal_common::policy::PolicyError;
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::stream::{Purpose, Stream, seek, stream};
 
 use super::algorithm::{Algorithm, Losses, Method, RunSizes, Section, SectionMut};
 use super::minibatch::Minibatch;
-use super::replayed::{MinibatchLearner, Replayed, mean};
+use super::replayed::{self, MinibatchLearner, Replayed, mean};
 use super::twin_critics::{self, CriticLosses, CriticPart, TwinCritics};
 use crate::networks::adam::Adam;
 use crate::networks::initialise::fan_in;
@@ -337,10 +337,6 @@ impl MinibatchLearner for Sac {
         &self.actor.parameters
     }
 
-    fn layout(&self) -> PolicyLayout {
-        PolicyLayout::Gaussian(self.actor.layout)
-    }
-
     fn updates(&self) -> u64 {
         self.updates
     }
@@ -390,7 +386,8 @@ fn names() -> impl Iterator<Item = &'static str> {
 impl Method for &config::SacConfig {
     fn start(&self, spec: &EnvironmentSpec, seed: u64, sizes: RunSizes) -> Result<Box<dyn Algorithm>, PolicyError> {
         let sac = Sac::new(spec, self, seed)?;
-        Ok(Box::new(Replayed::new(sac, spec, self.batch, seed, sizes)))
+        let layout = self.behaviour("sac", spec, 0)?.into_policy().layout();
+        Ok(Box::new(Replayed::new(sac, *self, layout, spec, (seed, sizes))))
     }
 
     fn weights(&self) -> &'static [&'static str] {
@@ -415,10 +412,11 @@ impl Method for &config::SacConfig {
     }
 
     fn state_numbers(&self, spec: &EnvironmentSpec, _: RunSizes) -> usize {
-        let learned = self.learned(spec);
-        let (_, actor) = learned.policy;
+        let (observation, action) = (spec.observation.width(), spec.action.width());
+        let pi = NetworkLayout::policy(observation, self.hidden_layers(), 2 * action);
         // Each network with two moments, the critics also with a target; ln α with two moments.
-        4 * learned.parameters() - actor.parameters() + 3
+        let networks = 4 * replayed::learned_parameters(*self, spec) - pi.parameters();
+        networks + 3 + replayed::state_numbers(*self, spec)
     }
 }
 

@@ -1,5 +1,7 @@
 //! Tabular temporal-difference control: SARSA (Algorithm 1) and Q-learning (Algorithm 2), section 3.3.2.
 
+use std::borrow::Cow;
+
 use shoal_common::algorithms::AlgorithmSettings;
 use shoal_common::config;
 use shoal_common::policy::{self, PolicyError, PolicyLayout};
@@ -223,8 +225,8 @@ impl Tabular {
 }
 
 impl Algorithm for Tabular {
-    fn policy(&self) -> &[f32] {
-        &self.q
+    fn policy(&self) -> Cow<'_, [f32]> {
+        Cow::Borrowed(&self.q)
     }
 
     fn layout(&self) -> PolicyLayout {

@@ -9,13 +9,13 @@ use rand_distr::StandardNormal;
 use shoal_common::algorithms::AlgorithmSettings;
 use shoal_common::config;
 use shoal_common::network::{ActionRange, NetworkLayout};
-use shoal_common::policy::{PolicyError, PolicyLayout};
+use shoal_common::policy::PolicyError;
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::stream::{Purpose, Stream, seek, stream};
 
 use super::algorithm::{Algorithm, Losses, Method, RunSizes, Section, SectionMut};
 use super::minibatch::Minibatch;
-use super::replayed::{MinibatchLearner, Replayed, mean};
+use super::replayed::{self, MinibatchLearner, Replayed, mean};
 use super::twin_critics::{self, CriticLosses, CriticPart, TwinCritics};
 use crate::networks::initialise::fan_in;
 use crate::networks::pass::{Pass, Samples};
@@ -176,10 +176,6 @@ impl MinibatchLearner for Td3 {
         &self.actor.online.parameters
     }
 
-    fn layout(&self) -> PolicyLayout {
-        PolicyLayout::Deterministic(self.actor.online.layout)
-    }
-
     fn updates(&self) -> u64 {
         self.updates
     }
@@ -224,7 +220,8 @@ impl MinibatchLearner for Td3 {
 impl Method for &config::Td3Config {
     fn start(&self, spec: &EnvironmentSpec, seed: u64, sizes: RunSizes) -> Result<Box<dyn Algorithm>, PolicyError> {
         let td3 = Td3::new(spec, self, seed)?;
-        Ok(Box::new(Replayed::new(td3, spec, self.batch, seed, sizes)))
+        let layout = self.behaviour("td3", spec, 0)?.into_policy().layout();
+        Ok(Box::new(Replayed::new(td3, *self, layout, spec, (seed, sizes))))
     }
 
     fn weights(&self) -> &'static [&'static str] {
@@ -249,7 +246,7 @@ impl Method for &config::Td3Config {
 
     fn state_numbers(&self, spec: &EnvironmentSpec, _: RunSizes) -> usize {
         // Each network with its target and two moments.
-        4 * self.learned(spec).parameters()
+        4 * replayed::learned_parameters(*self, spec) + replayed::state_numbers(*self, spec)
     }
 }
 

@@ -186,7 +186,7 @@ impl<'a> Learner<'a> {
             updates: self.algorithm.updates(),
             fingerprint: self.algorithm.layout().fingerprint(),
         };
-        Ok(self.publisher.publish(self.algorithm.policy(), header)?)
+        Ok(self.publisher.publish(&self.algorithm.policy(), header)?)
     }
 
     /// Opens receivers for new actors: a run can be scaled while it is running.
@@ -302,7 +302,7 @@ impl<'a> Learner<'a> {
             return_mean: f64::NAN,
             return_std: f64::NAN,
             episodes: 0,
-            parameters: self.algorithm.policy().to_vec(),
+            parameters: self.algorithm.policy().into_owned(),
         }
         .write(&self.settings.run.last_policy())?;
         self.send_report();

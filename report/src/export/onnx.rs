@@ -8,7 +8,7 @@ use message::{
 };
 use prost::Message;
 
-use super::{Activation, Body, Network, Portable};
+use super::{Activation, Body, CLIP, Network, Portable};
 
 /// The versions of the file format and of the operator set. They are old enough for every runtime, and new enough for
 /// `ArgMax` to have `select_last_index`, which decides between equal values.
@@ -27,7 +27,7 @@ const BATCH: &str = "batch";
 /// - Tables: `state` (batch, 64-bit) to `action_values` (batch × actions) and `action` (batch, the one of highest
 ///   value).
 ///
-/// Discrete states and actions have the environment's own numbers, which begin at their spaces' starts.
+/// Observations are normalised in the model if the policy does so. Discrete states and actions have the environment's own numbers, which begin at their spaces' starts.
 pub(super) fn model(policy: &Portable) -> Vec<u8> {
     let mut graph = Graph {
         name: "policy".into(),
@@ -110,12 +110,32 @@ pub(super) fn model(policy: &Portable) -> Vec<u8> {
 impl Graph {
     /// Adds the layers with the activation between them. The output of the last one is named `output`.
     fn add_network(&mut self, network: &Network, output: &str) {
-        let Network { activation, layers } = network;
+        let Network {
+            normalisation,
+            activation,
+            layers,
+        } = network;
         let activation = match activation {
             Activation::Relu => "Relu",
             Activation::Tanh => "Tanh",
         };
         let mut x = "observation".to_owned();
+        if let Some((mean, factor)) = normalisation {
+            self.add_tensor("observation_mean", &[mean.len()], mean);
+            self.add_node("Sub", &["observation", "observation_mean"], "centred", vec![]);
+            self.add_tensor("observation_factor", &[factor.len()], factor);
+            self.add_node(
+                "Mul",
+                &["centred", "observation_factor"],
+                "unclipped_observation",
+                vec![],
+            );
+            self.add_tensor("observation_least", &[], &[-CLIP]);
+            self.add_tensor("observation_most", &[], &[CLIP]);
+            let clip = ["unclipped_observation", "observation_least", "observation_most"];
+            self.add_node("Clip", &clip, "normalised_observation", vec![]);
+            x = "normalised_observation".into();
+        }
         for (number, layer) in layers.iter().enumerate() {
             let [weight, bias] = ["weight", "bias"].map(|what| format!("layers.{number}.{what}"));
             self.add_tensor(&weight, &[layer.biases.len(), layer.inputs], &layer.weights);

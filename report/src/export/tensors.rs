@@ -3,15 +3,16 @@
 use safetensors::Dtype;
 use safetensors::tensor::TensorView;
 
-use super::{Body, Dense, Portable};
+use super::{Body, Network, Portable};
 
 /// The bytes of the file. A network has `layers.<i>.weight` (outputs × inputs, row-major) and `layers.<i>.bias` for
-/// each layer i from 0, the output layer last. A table has `action_values` (states × actions). The metadata describes
+/// each layer i from 0, the output layer last. If observations are normalised, `observation.mean` and
+/// `observation.factor` say how: x ← (x − mean) · factor, clipped to ±`observation_clip` of the metadata. A table has `action_values` (states × actions). The metadata describes
 /// the rest.
 pub(super) fn file(policy: &Portable) -> anyhow::Result<Vec<u8>> {
     let tensors = match &policy.body {
         Body::Actions { network, .. } | Body::Probabilities { network } | Body::Values { network } => {
-            of_layers(&network.layers)
+            of_network(network)
         }
         Body::Table {
             states,
@@ -32,8 +33,12 @@ pub(super) fn file(policy: &Portable) -> anyhow::Result<Vec<u8>> {
 
 type Named<'a> = (String, Vec<usize>, &'a [f32]);
 
-fn of_layers(layers: &[Dense]) -> Vec<Named<'_>> {
-    let each = layers.iter().enumerate().flat_map(|(number, layer)| {
+fn of_network(network: &Network) -> Vec<Named<'_>> {
+    let normalisation = network.normalisation.iter().flat_map(|(mean, factor)| {
+        [("observation.mean", mean), ("observation.factor", factor)]
+            .map(|(name, numbers)| (name.to_owned(), vec![numbers.len()], numbers.as_slice()))
+    });
+    let each = network.layers.iter().enumerate().flat_map(|(number, layer)| {
         let outputs = layer.biases.len();
         [
             (
@@ -44,7 +49,7 @@ fn of_layers(layers: &[Dense]) -> Vec<Named<'_>> {
             (format!("layers.{number}.bias"), vec![outputs], layer.biases.as_slice()),
         ]
     });
-    each.collect()
+    normalisation.chain(each).collect()
 }
 
 #[cfg(test)]
@@ -99,12 +104,21 @@ mod tests {
                     continue;
                 }
                 let mut x = observation.to_vec();
+                if let Some(clip) = metadata.get("observation_clip") {
+                    let clip: f32 = clip.parse().unwrap();
+                    let [mean, factor] =
+                        ["observation.mean", "observation.factor"].map(|name| numbers(&tensors, name).1);
+                    for (x, (mean, factor)) in x.iter_mut().zip(mean.into_iter().zip(factor)) {
+                        *x = ((*x - mean) * factor).clamp(-clip, clip);
+                    }
+                }
                 let activation: fn(f32) -> f32 = match metadata["hidden_activation"].as_str() {
                     "relu" => |z| z.max(0.0),
                     "tanh" => f32::tanh,
                     other => panic!("unknown activation {other}"),
                 };
-                let last = tensors.len() / 2 - 1;
+                let layers = tensors.names().iter().filter(|name| name.ends_with(".weight")).count();
+                let last = layers - 1;
                 for layer in 0..last {
                     x = linear(&tensors, layer, &x).into_iter().map(activation).collect();
                 }

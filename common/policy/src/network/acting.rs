@@ -1,13 +1,16 @@
 //! The forward pass of a policy's network, as actors and evaluator use it.
 
-use super::{Activations, NetworkLayout};
+use super::{Activations, NetworkLayout, normalise};
 
 /// A network without late inputs, with buffers for a batch. It does not own its parameters: each call borrows them.
 #[derive(Clone, Debug)]
 pub struct Network {
     layout: NetworkLayout,
+    batch: usize,
     /// A buffer for the outputs of each hidden layer.
     hidden: Vec<Vec<f32>>,
+    /// A buffer for the normalised inputs; empty if they are not normalised.
+    normalised: Vec<f32>,
 }
 
 impl Network {
@@ -16,8 +19,22 @@ impl Network {
         let units = layout.hidden().layers;
         Self {
             layout,
+            batch,
+            normalised: Vec::new(),
             hidden: units.iter().map(|units| vec![0.0; units * batch]).collect(),
         }
+    }
+
+    /// The same network, which normalises its inputs or not.
+    pub fn normalising(mut self, normalised: bool) -> Self {
+        self.layout = self.layout.normalising(normalised);
+        let inputs = if normalised {
+            self.layout.inputs() * self.batch
+        } else {
+            0
+        };
+        self.normalised = vec![0.0; inputs];
+        self
     }
 
     /// The layout of the parameters of [`forward`](Self::forward).
@@ -31,6 +48,15 @@ impl Network {
     /// If the slices do not match the layout, or have more inputs than the batch.
     pub fn forward(&mut self, parameters: &[f32], inputs: &[f32], output: &mut [f32]) {
         let batch = inputs.len() / self.layout.inputs();
+        let inputs = match self.layout.normalisation(parameters) {
+            None => inputs,
+            Some(normalisation) => {
+                let normalised = &mut self.normalised[..inputs.len()];
+                normalised.copy_from_slice(inputs);
+                normalise(normalised, normalisation);
+                normalised
+            }
+        };
         let units = self.layout.hidden().layers;
         let buffers = self.hidden.iter_mut().zip(units.iter());
         let to = Activations {

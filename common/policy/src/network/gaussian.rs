@@ -28,6 +28,14 @@ impl GaussianPolicy {
         }
     }
 
+    /// The same policy, which normalises its observations or not.
+    pub fn normalising(self, normalised: bool) -> Self {
+        Self {
+            network: self.network.normalising(normalised),
+            ..self
+        }
+    }
+
     /// The layout of the parameters.
     pub fn layout(&self) -> &NetworkLayout {
         self.network.layout()

@@ -14,6 +14,7 @@ pub struct NetworkLayout {
     /// The layer that the late inputs enter, counted from 0. 0 if there are none.
     late_layer: usize,
     pub(super) outputs: usize,
+    normalised: bool,
 }
 
 /// A layer's place in the parameter slice.
@@ -34,6 +35,7 @@ impl NetworkLayout {
             late_inputs: 0,
             late_layer: 0,
             outputs: action,
+            normalised: false,
         }
     }
 
@@ -54,7 +56,19 @@ impl NetworkLayout {
             late_inputs: action,
             late_layer: 0,
             outputs: 1,
+            normalised: false,
         }
+    }
+
+    /// The same network, which normalises its inputs or not. If it does, a mean and a factor for each input follow the
+    /// layers in the parameter slice ([`normalise`](super::normalise)).
+    pub fn normalising(self, normalised: bool) -> Self {
+        Self { normalised, ..self }
+    }
+
+    /// Whether it normalises its inputs.
+    pub fn normalises(&self) -> bool {
+        self.normalised
     }
 
     /// Numbers in an input vector, without late inputs.
@@ -123,7 +137,14 @@ impl NetworkLayout {
 
     /// The number of parameters: the length of the slice.
     pub fn parameters(&self) -> usize {
-        self.layer_sizes().map(parameters).sum()
+        let layers: usize = self.layer_sizes().map(parameters).sum();
+        layers + if self.normalised { 2 * self.inputs } else { 0 }
+    }
+
+    /// The mean and the factor of each input, if it normalises them, of a slice of `parameters()` numbers.
+    pub fn normalisation<'a>(&self, parameters: &'a [f32]) -> Option<(&'a [f32], &'a [f32])> {
+        let layers = self.parameters() - if self.normalised { 2 * self.inputs } else { 0 };
+        self.normalised.then(|| parameters[layers..].split_at(self.inputs))
     }
 
     /// All layers of a slice of `parameters()` numbers.
@@ -139,20 +160,22 @@ impl NetworkLayout {
     /// The fingerprint: two layouts have the same one only if they read parameters alike (FNV-1a over the sizes).
     ///
     /// With two ReLU layers it is that of files from before other networks existed. For any other list the length and
-    /// the activation are appended, and a 1 if late inputs enter at the first of several layers, so that no two layouts
-    /// hash the same numbers.
+    /// the activation are appended, and a 1 if late inputs enter at the first of several layers, or a 2 if the inputs are
+    /// normalised, so that no two layouts hash the same numbers.
     pub fn fingerprint(&self) -> u64 {
         let Hidden { layers, activation } = self.hidden;
         let joined = (layers.len() > 1 && self.late_layer() == Some(0)).then_some(1);
+        let normalised = self.normalised.then_some(2);
+        let others = joined.into_iter().chain(normalised);
         let marks = match (layers.len(), activation) {
-            (2, Activation::Relu) if joined.is_none() => None,
+            (2, Activation::Relu) if others.clone().next().is_none() => None,
             (count, Activation::Relu) => Some([count, 0]),
             (count, Activation::Tanh) => Some([count, 1]),
         };
         let sizes = [self.inputs].into_iter().chain(layers.iter().copied());
         let sizes = sizes.chain([self.late_inputs, self.outputs]);
         let bytes =
-            (sizes.chain(marks.into_iter().flatten()).chain(joined)).flat_map(|size| (size as u64).to_le_bytes());
+            (sizes.chain(marks.into_iter().flatten()).chain(others)).flat_map(|size| (size as u64).to_le_bytes());
         bytes.fold(0xcbf2_9ce4_8422_2325, |hash, byte| {
             (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3)
         })
@@ -211,6 +234,7 @@ mod tests {
             NetworkLayout::critic(3, Hidden::relu([400, 300]), 2),
             NetworkLayout::critic(3, Hidden::tanh([400, 300]), 2),
             NetworkLayout::critic(3, Hidden::relu([400, 300, 2]), 1),
+            NetworkLayout::policy(3, Hidden::relu([400, 300]), 1).normalising(true),
             NetworkLayout::joined_critic(3, Hidden::relu([400, 300]), 1),
             NetworkLayout::joined_critic(3, Hidden::tanh([400, 300]), 1),
         ];

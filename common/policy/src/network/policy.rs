@@ -120,6 +120,14 @@ impl PolicyNetwork {
         }
     }
 
+    /// The same policy, which normalises its observations or not.
+    pub fn normalising(self, normalised: bool) -> Self {
+        Self {
+            network: self.network.normalising(normalised),
+            ..self
+        }
+    }
+
     /// The layout of the parameters of [`forward`](Self::forward).
     pub fn layout(&self) -> &NetworkLayout {
         self.network.layout()
