@@ -26,11 +26,11 @@ use shoal_run::outcome::{RunOutcome, RunState};
 use shoal_run::process::wait_for_any;
 use shoal_run::recorder::Recorder;
 use shoal_run::signals::Signals;
-use shoal_run::{preflight, status};
+use shoal_run::{preflight, signals, status};
 
 pub(crate) use self::cleaner::work as clean_up;
 use self::log::Log;
-pub(crate) use self::log::{ALL_ENDED, FAILED};
+pub(crate) use self::log::{ALL_ENDED, FAILED, note};
 use self::progress::Progress;
 use self::stall::Stalls;
 use self::supervisor::Supervisor;
@@ -264,6 +264,8 @@ impl<'a> Launcher<'a> {
         self.supervisor.start_all(self.domain)?;
         loop {
             if let Some(signal) = self.signals.received() {
+                self.log
+                    .note("launcher", &format!("{} ends the run", signals::describe(signal)));
                 return Ok(Ending::Interrupted(signal));
             }
             self.read_reports()?;
@@ -325,6 +327,7 @@ impl<'a> Launcher<'a> {
             initial,
             ending,
             stop_requested,
+            log,
             ..
         } = self;
         control.answer_questions(run.key()?, run.path(), |question| -> anyhow::Result<Option<Answer>> {
@@ -338,6 +341,9 @@ impl<'a> Launcher<'a> {
                 Question::Scale { .. } if *ending => Ok(Some(Answer::Refused("the run is ending".into()))),
                 Question::Scale { actors } => requests::scale(config, run, supervisor, actors).map(Some),
                 Question::Stop => {
+                    if stop_requested.is_none() {
+                        log.note("launcher", "`shoal stop` ends the run");
+                    }
                     stop_requested.get_or_insert_with(Instant::now);
                     Ok(None)
                 }

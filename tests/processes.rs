@@ -57,12 +57,40 @@ fn ctrl_c_and_sigterm_end_a_run_and_save_its_state() {
         let run = running.run.clone();
         let (exit, printed, leftovers) = running.wait();
         assert_eq!(exit, Some(code));
+        let said = format!("signal {} (", code - 128);
+        assert!(std::fs::read_to_string(run.join("shoal.log")).unwrap().contains(&said));
         assert!(parse(&printed)["env_steps"].as_u64().unwrap() > 0);
         assert!(run.join("checkpoints/latest.ckpt").exists());
         assert!(run.join("checkpoints/last.policy").exists());
         assert!(leftovers.processes().is_empty());
         assert!(leftovers.files().is_empty(), "{:?}", leftovers.files());
     }
+}
+
+#[test]
+fn signals_that_were_ignored_at_the_start_stay_ignored() {
+    let place = Workplace::new();
+    let arguments = [
+        &["train", "pendulum", "--run", "run", "--json"],
+        &ENDLESS[..],
+        &support::QUICK,
+    ]
+    .concat();
+    let running = place.launch_command("run", &mut place.shoal_ignoring("HUP INT", &arguments));
+    for signal in [Signal::HUP, Signal::INT] {
+        running.signal(signal);
+        running.wait_for_learning();
+    }
+    running.signal(Signal::TERM);
+    let run = running.run.clone();
+    let (code, _, leftovers) = running.wait();
+    assert_eq!(code, Some(143), "{}", place.stderr());
+    assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
+    let log = std::fs::read_to_string(run.join("shoal.log")).unwrap();
+    assert!(
+        log.contains("signal 15 (SIGTERM) ends the run") && !log.contains("SIGINT") && !log.contains("SIGHUP"),
+        "{log}"
+    );
 }
 
 #[test]

@@ -9,6 +9,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::SystemTime;
 
 use anyhow::Context;
+use shoal_common::run_dir::RunDir;
 
 /// Number of lines kept per process, for the message when it is given up.
 const KEPT: usize = 5;
@@ -18,6 +19,13 @@ pub(crate) const ALL_ENDED: &str = "every role has ended";
 
 /// The start of the launcher's last line if the run ended with an error.
 pub(crate) const FAILED: &str = "the run failed: ";
+
+/// Writes a line of the launcher into the log of a run whose roles have ended. A log that cannot be written is no error.
+pub(crate) fn note(run: &RunDir, line: &str) {
+    if let Ok(log) = Log::open(&run.log()) {
+        log.note("launcher", line);
+    }
+}
 
 /// The log of a run; clones write to the same file.
 #[derive(Clone, Debug)]

@@ -22,8 +22,8 @@ const END_PATIENCE: Duration = Duration::from_secs(15);
 /// How long a process whose state does not matter may take to end.
 const SHUT_DOWN_PATIENCE: Duration = Duration::from_secs(2);
 
-/// Exit code of a launcher that Ctrl-C has ended in order.
-const INTERRUPTED: i32 = 130;
+/// Exit code of a launcher that SIGTERM has ended in order.
+const TERMINATED: i32 = 143;
 
 /// A process that ends when its standard input closes, and therefore also when this process is gone.
 #[derive(Debug)]
@@ -141,12 +141,13 @@ impl Peer {
         }
     }
 
-    /// Ends a launcher with SIGINT and waits for it. A launcher does not watch its standard input.
+    /// Ends a launcher with SIGTERM and waits for it. A launcher does not watch its standard input, and ignores SIGINT if
+    /// this process was started in the background of a script.
     pub fn interrupt(mut self, patience: Duration) -> anyhow::Result<()> {
-        self.signal(Signal::INT)?;
+        self.signal(Signal::TERM)?;
         let status = self.await_end(patience)?;
         match status.code() {
-            Some(0 | INTERRUPTED) => Ok(()),
+            Some(0 | TERMINATED) => Ok(()),
             _ => self.ended_early(status),
         }
     }
