@@ -58,11 +58,18 @@ struct Summary {
 pub(crate) fn run_training(
     config: Config,
     run: &RunDir,
-    _lock: RunLock,
+    lock: &RunLock,
     output: &OutputMode,
 ) -> anyhow::Result<ExitCode> {
+    let trained = train_and_report(config, run, lock, output);
+    // Whatever else has failed follows from it.
+    lock.check(run)?;
+    trained
+}
+
+fn train_and_report(config: Config, run: &RunDir, lock: &RunLock, output: &OutputMode) -> anyhow::Result<ExitCode> {
     let signals = Signals::register()?;
-    let outcome = launcher::run(config.clone(), run, &signals, output.quiet)?;
+    let outcome = launcher::run(config.clone(), (run, lock), &signals, output.quiet)?;
     let mut evaluated = Vec::new();
     let RunStatus {
         env_steps, episodes, ..
@@ -73,6 +80,7 @@ pub(crate) fn run_training(
         match final_evaluation(&config, run, env_steps, &interrupt, output.quiet) {
             Ok(policies) => evaluated = policies,
             Err(error) => {
+                lock.check(run)?;
                 let why = match interrupt.signal() {
                     Some(signal) => format!("the final evaluation was ended by {}", describe(signal)),
                     None => format!("the final evaluation failed: {error:#}").replace('\n', " "),
@@ -88,6 +96,7 @@ pub(crate) fn run_training(
         }
     }
     if let Err(error) = plots::draw(run, &config, run.path()) {
+        lock.check(run)?;
         let why = format!("{error:#}").replace('\n', " ");
         say(&format!("the figures could not be drawn: {why}"));
     }

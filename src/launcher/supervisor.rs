@@ -45,6 +45,8 @@ pub(super) enum Situation {
     LearnerDone,
     /// Dead processes occupy shared memory that cannot be freed.
     SharedMemoryOccupied,
+    /// Another program has removed files with which the processes find each other.
+    FilesRemoved,
 }
 
 /// All processes of a run.
@@ -310,10 +312,16 @@ impl Supervisor {
     /// Handles collected ends, restarts processes that are due, and starts or retires actors.
     pub(super) fn maintain(&mut self, domain: &Domain) -> anyhow::Result<Situation> {
         let mut state = Situation::AtWork;
-        if self.children.iter().any(|child| child.ended.is_some()) {
+        let ended = self.children.iter().any(|child| child.ended.is_some());
+        // Before anything is cleaned up or started: both would find the files of another run, or none.
+        if (ended || self.is_cleaning_due()) && !self.learner_has_finished() && !domain.is_intact(self.services.count())
+        {
+            return Ok(Situation::FilesRemoved);
+        }
+        if ended {
             // Frees their shared memory for their successors.
             state = self.clean(domain)?;
-        } else if self.cleaned.elapsed() >= self.occupied.map_or(CLEANING, |_| CLEANING_AGAIN) {
+        } else if self.is_cleaning_due() {
             self.cleaned = Instant::now();
             if domain.has_dead_nodes() || self.services.ports_of_dead_processes() > 0 {
                 state = self.clean(domain)?;
@@ -327,6 +335,19 @@ impl Supervisor {
         self.retire_surplus();
         self.start_missing(domain)?;
         Ok(state)
+    }
+
+    fn is_cleaning_due(&self) -> bool {
+        self.cleaned.elapsed() >= self.occupied.map_or(CLEANING, |_| CLEANING_AGAIN)
+    }
+
+    /// Whether the learner's end has been observed, and it was the planned one.
+    fn learner_has_finished(&self) -> bool {
+        let mut learners = self
+            .children
+            .iter()
+            .filter(|child| child.identity.role == Role::Learner);
+        learners.any(|learner| learner.ended.is_some_and(|status| status.success()))
     }
 
     fn maintain_one(&mut self, i: usize) -> anyhow::Result<Situation> {

@@ -244,12 +244,19 @@ impl Running {
     }
 
     /// Waits until the launcher has ended. Returns its exit code, its standard output and the run's leftovers.
-    pub(crate) fn wait(mut self) -> (Option<i32>, String, Leftovers) {
+    pub(crate) fn wait(self) -> (Option<i32>, String, Leftovers) {
+        let run = self.run.clone();
+        let (code, printed) = self.wait_for_launcher();
+        (code, printed, Leftovers::of(&run))
+    }
+
+    /// Waits until the launcher has ended. Returns its exit code and its standard output.
+    pub(crate) fn wait_for_launcher(mut self) -> (Option<i32>, String) {
         until("the launcher has ended", || self.child.try_wait().unwrap().is_some());
         let code = self.child.wait().unwrap().code();
         let mut printed = String::new();
         std::io::Read::read_to_string(self.child.stdout.as_mut().unwrap(), &mut printed).unwrap();
-        (code, printed, Leftovers::of(&self.run))
+        (code, printed)
     }
 
     /// Processes and shared memory of this run.
