@@ -61,7 +61,7 @@ pub(crate) fn run(role: Role, args: &RoleArgs) -> anyhow::Result<ExitCode> {
 }
 
 /// The level in the environment variable `SHOAL_LOG`, by default `info`; `debug` logs every chunk that is sent.
-fn log_level() -> LevelFilter {
+pub(crate) fn log_level() -> LevelFilter {
     let level = std::env::var("SHOAL_LOG").ok().and_then(|level| level.parse().ok());
     level.unwrap_or(LevelFilter::INFO)
 }

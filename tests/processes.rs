@@ -152,9 +152,11 @@ fn a_run_whose_files_in_tmp_are_removed_loses_nothing_and_continues() {
     assert!(place.status("run")["env_steps"].as_u64().unwrap() > 0);
 
     // Only files, as a program does that tidies up by age; and a role that must be replaced.
+    running.signal(Signal::STOP);
     let files = Command::new("find").arg(&root).args(["-type", "f", "-delete"]).status();
     assert!(files.unwrap().success());
     running.kill("actor-0");
+    running.signal(Signal::CONT);
     until("the launcher notices again", || noticed() == 2);
     running.wait_for_learning();
     let stopped = place.output(&["stop", "run"]);

@@ -15,7 +15,9 @@ use shoal_common::config::Config;
 use shoal_common::durable::write_atomically;
 use shoal_common::report::{Activity, Heartbeat, Identity, Role};
 use shoal_common::run_dir::RunDir;
+use shoal_run::process::Writer;
 use shoal_run::recorder::{Incident, IncidentKind};
+use tracing_subscriber::filter::LevelFilter;
 
 use super::child::{Child, Consequence};
 use super::cleaner;
@@ -23,6 +25,7 @@ use super::incarnations::{last_committed, read_counter};
 use super::log::{ALL_ENDED, Log};
 use super::process::{Process, name};
 use super::stall::Stalls;
+use crate::role::log_level;
 
 /// How often to look for dead processes whose end the launcher does not observe, such as `shoal status`.
 const CLEANING: Duration = Duration::from_secs(2);
@@ -68,6 +71,8 @@ pub(super) struct Supervisor {
     /// Incidents since the last [`Supervisor::take_incidents`].
     incidents: Vec<Incident>,
     run: PathBuf,
+    /// Who writes what the environment servers write. With `SHOAL_LOG=debug` all of it is logged.
+    server_output: Writer,
     /// The file with the number of processes ever started. It lasts over resumes: incarnations are never used twice.
     counter: PathBuf,
     started: u64,
@@ -116,6 +121,11 @@ impl Supervisor {
             log,
             incidents: Vec::new(),
             run: run.path().into(),
+            server_output: match log_level() {
+                LevelFilter::DEBUG | LevelFilter::TRACE => Writer::Shoal,
+                _ if config.environment.server.is_empty() => Writer::Shoal,
+                _ => Writer::Program,
+            },
             counter,
             started,
             faults: 0,
@@ -185,7 +195,11 @@ impl Supervisor {
             .with_context(|| format!("cannot write {}", self.counter.display()))?;
         let child = &mut self.children[i];
         child.identity.incarnation = self.started;
-        let process = Process::start(child.identity, &self.run, &self.log)?;
+        let writer = match child.identity.role {
+            Role::EnvServer => self.server_output,
+            _ => Writer::Shoal,
+        };
+        let process = Process::start(child.identity, &self.run, &self.log, writer)?;
         self.log
             .note(&name(child.identity), &format!("started as process {}", process.pid()));
         child.begin(process);
@@ -229,6 +243,7 @@ impl Supervisor {
             let last = last
                 .or_else(|| self.log.last_lines(&name(server.identity)).pop())
                 .unwrap_or_default();
+            self.log.write_left_out(&name(server.identity));
             let last = last.strip_prefix("error: ").unwrap_or(&last);
             self.last_fault = format!("{}: {last}", name(server.identity));
             self.incidents
@@ -369,6 +384,7 @@ impl Supervisor {
     fn handle_end(&mut self, i: usize, status: ExitStatus) -> anyhow::Result<Situation> {
         let child = &mut self.children[i];
         let name = name(child.identity);
+        self.log.write_left_out(&name);
         if child.identity.role == Role::Learner && status.success() {
             child.process = None;
             self.learner_done = true;

@@ -13,8 +13,7 @@ use rustix::thread::{CpuSet, sched_setaffinity};
 use shoal_common::report::{Identity, Role};
 use shoal_common::run_dir::RunDir;
 
-use crate::process::ChildGroup;
-use crate::process::ChildOutput;
+use crate::process::{ChildGroup, ChildOutput, Line, Writer};
 
 /// How long a process may take to end in order. A learner writes its replay to the disk.
 const END_PATIENCE: Duration = Duration::from_secs(15);
@@ -77,13 +76,14 @@ impl Peer {
             what,
         };
         let last_line = Arc::clone(&peer.last_line);
-        let keep = move |line: &str| {
-            if !line.trim().is_empty() {
-                *last_line.lock().unwrap_or_else(PoisonError::into_inner) = Some(line.trim().into());
+        let keep = move |line: Line<'_>| match line {
+            Line::Kept(text) | Line::TooMuch(text) if !text.trim().is_empty() => {
+                *last_line.lock().unwrap_or_else(PoisonError::into_inner) = Some(text.trim().into());
             }
+            _ => {}
         };
         peer.output = stderr
-            .map(|stderr| ChildOutput::read("peer", stderr, keep))
+            .map(|stderr| ChildOutput::read("peer", stderr, Writer::Program, keep))
             .transpose()?;
         Ok(peer)
     }
