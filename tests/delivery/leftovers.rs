@@ -83,6 +83,8 @@ fn a_living_run_whose_directory_is_removed_keeps_its_shared_memory() {
     let processes = one_of_each(&run);
     let directory = domain.directory().unwrap();
     assert!(domain.is_intact(5) && !domain.is_intact(1000));
+    let above = std::fs::File::open(directory.parent().unwrap()).unwrap();
+    assert!(above.try_lock().is_err(), "a program that tidies up skips it");
     std::fs::remove_dir_all(&directory).unwrap();
     assert!(!domain.is_intact(0));
     let before = run.leftovers();
