@@ -211,6 +211,10 @@ mod tests {
             log.write_left_out("env-server-0");
             assert_eq!(text().matches("too hot").count(), 1);
         }
+        log.line("env-server-1", Line::TooMuch("too much at once"), Writer::Program);
+        assert!(!text().contains("too much at once"));
+        log.write_left_out("env-server-1");
+        assert!(text().contains("too much at once"));
         // A launcher that goes on has a little left.
         let (log, text) = log_in(directory.path());
         log.line("env-server-0", Line::Kept("again"), Writer::Program);

@@ -18,7 +18,7 @@ use shoal_common::config::Config;
 use shoal_common::space::Space;
 use shoal_learner::replay::{Replay, ReplayLayout, are_finite};
 use suite::{PYTHON, test};
-use support::{QUICK, Workplace, error_line, final_result, output_of, parse, until, wait_for_rows};
+use support::{Workplace, error_line, final_result, output_of, parse, until, wait_for_rows};
 
 fn main() -> ExitCode {
     suite::run(vec![
@@ -50,7 +50,6 @@ fn main() -> ExitCode {
             an_evaluator_killed_while_it_confirms_a_policy_repeats_nothing_it_reported,
             PYTHON
         ),
-        test!(a_flood_hides_neither_why_its_program_ends_nor_grows_without_end, PYTHON),
         test!(a_module_sees_no_arguments_and_no_input_and_prints_to_the_log, PYTHON),
         test!(a_slow_environment_is_not_replaced, PYTHON),
         test!(a_run_remembers_where_its_server_is_started_and_with_what, PYTHON),
@@ -559,31 +558,6 @@ fn an_evaluator_killed_while_it_confirms_a_policy_repeats_nothing_it_reported() 
         .collect();
     assert_eq!(periods, (0..=5).collect::<Vec<_>>(), "each period once");
     assert!(rows.iter().all(|row| column("best", row, &headers) == "1"), "{rows:?}");
-}
-
-fn a_flood_hides_neither_why_its_program_ends_nor_grows_without_end() {
-    let place = place();
-    let environment = format!("{OURS}Talks-v0");
-    let arguments = [
-        "train",
-        &environment,
-        "--run",
-        "run",
-        "--steps",
-        "100000",
-        "--set",
-        "environment.how=flood-and-fail",
-    ];
-    let output = place.output(&[&arguments[..], &SHORT, &QUICK].concat());
-    let said = String::from_utf8_lossy(&output.stderr);
-    assert_eq!(output.status.code(), Some(1), "{said}");
-    assert!(
-        said.contains("env-server") && said.contains("RuntimeError: drowned"),
-        "{said}"
-    );
-    let log = std::fs::read_to_string(place.path().join("run/shoal.log")).unwrap();
-    assert!(log.contains("RuntimeError: drowned") && log.contains("lines left out"));
-    assert!(log.len() < 20_000_000, "{} bytes of log", log.len());
 }
 
 fn a_module_sees_no_arguments_and_no_input_and_prints_to_the_log() {

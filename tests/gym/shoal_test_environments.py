@@ -78,10 +78,6 @@ class Talks(Ends):
     def step(self, action):
         if self.how == "flood":
             os.write(2, b"x" * 1_000_000)
-        elif self.how == "flood-and-fail":
-            os.write(2, (b"x" * 3999 + b"\n") * 2000)
-            if self.steps == 3:
-                raise RuntimeError("drowned")
         else:
             os.write(2, b"\x1b]0;owned\x07\n")
         return super().step(action)
