@@ -142,6 +142,8 @@ fn a_run_whose_files_in_tmp_are_removed_loses_nothing_and_continues() {
         before.len(),
         after.len()
     );
+    let said = support::error_line(&place.output(&["status", "run"]));
+    assert!(said.contains("another program has removed files"), "{said}");
     running.signal(Signal::CONT);
     let noticed = || {
         running

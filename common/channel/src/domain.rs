@@ -191,6 +191,11 @@ impl Domain {
         same && details.exists() && listed >= services
     }
 
+    /// Whether a process of the run is alive, this one not counted if it is a visitor. It may be where iceoryx2 finds none.
+    pub fn has_members(&self) -> bool {
+        matches!(presence::claim(&self.run_id), Ok(Claim::Held))
+    }
+
     /// Leaves the run. The last process to leave removes all files of the run from shared memory, also when the
     /// launcher was killed.
     ///
@@ -221,7 +226,7 @@ impl Domain {
         loop {
             let (mut left, is_free) = {
                 let _lock = lock(&root.join(run_id))?;
-                let is_free = matches!(claim(run_id)?, Claim::Free(_));
+                let is_free = matches!(claim(run_id)?, Claim::Free { .. });
                 (living_processes(&root, run_id)?, is_free)
             };
             if left.is_empty() && is_free {
@@ -259,7 +264,7 @@ impl Domain {
         // Those whose directory another program has removed.
         let runs = presence::runs().map_err(io_error("list", Path::new(SHARED_MEMORY)))?;
         for run_id in runs.iter().filter(|run_id| !root.join(run_id).exists()) {
-            if matches!(claim(run_id)?, Claim::Free(_)) {
+            if matches!(claim(run_id)?, Claim::Free { .. }) {
                 let _lock = make_and_lock(&root.join(run_id))?;
                 remove_if_dead(&root, run_id)?;
             }

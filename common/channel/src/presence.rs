@@ -24,8 +24,8 @@ pub(super) struct Presence(Option<File>);
 /// The right to remove a run's files, or who has them.
 #[derive(Debug)]
 pub(super) enum Claim {
-    /// No member is alive, and none can join before this is dropped.
-    Free(#[expect(dead_code, reason = "held, not read")] Option<File>),
+    /// No member is alive, and none can join before this is dropped: it holds the lock.
+    Free { _lock: Option<File> },
     /// Processes of the run are alive.
     Held,
 }
@@ -65,10 +65,10 @@ impl Presence {
 pub(super) fn claim(run_id: &str) -> io::Result<Claim> {
     loop {
         let Some(file) = open(run_id, false)? else {
-            return Ok(Claim::Free(None));
+            return Ok(Claim::Free { _lock: None });
         };
         match file.try_lock() {
-            Ok(()) if is_current(run_id, &file) => return Ok(Claim::Free(Some(file))),
+            Ok(()) if is_current(run_id, &file) => return Ok(Claim::Free { _lock: Some(file) }),
             Ok(()) => {}
             Err(TryLockError::WouldBlock) => return Ok(Claim::Held),
             Err(TryLockError::Error(cause)) => return Err(cause),
@@ -148,14 +148,14 @@ mod tests {
     #[test]
     fn a_run_is_free_once_all_its_members_have_left() {
         let run_id = format!("pr{:x}", std::process::id());
-        assert!(matches!(claim(&run_id).unwrap(), Claim::Free(None)));
+        assert!(matches!(claim(&run_id).unwrap(), Claim::Free { _lock: None }));
         let (first, second) = (Presence::enter(&run_id).unwrap(), Presence::enter(&run_id).unwrap());
         assert!(runs().unwrap().contains(&run_id) && is_presence(&path(&run_id).to_string_lossy()));
         assert!(members(&run_id).contains(&(std::process::id() as i32)));
         first.leave();
         assert!(matches!(claim(&run_id).unwrap(), Claim::Held));
         second.leave();
-        let Claim::Free(Some(claimed)) = claim(&run_id).unwrap() else {
+        let Claim::Free { _lock: Some(claimed) } = claim(&run_id).unwrap() else {
             panic!("nobody has it");
         };
         std::fs::remove_file(path(&run_id)).unwrap();
