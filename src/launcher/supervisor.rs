@@ -25,7 +25,7 @@ use super::incarnations::{last_committed, read_counter};
 use super::log::{ALL_ENDED, Log};
 use super::process::{Process, name};
 use super::stall::Stalls;
-use crate::role::log_level;
+use crate::log_level::log_level;
 
 /// How often to look for dead processes whose end the launcher does not observe, such as `shoal status`.
 const CLEANING: Duration = Duration::from_secs(2);
