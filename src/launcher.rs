@@ -19,18 +19,18 @@ use shoal_common::channel::reports::{Report, Reports};
 use shoal_common::channel::{Domain, DomainError};
 use shoal_common::config::Config;
 use shoal_common::report::{EpisodeReport, EvaluationReport, Heartbeat, LearnerReport, Role};
-use shoal_common::run_dir::RunDir;
+use shoal_common::run_dir::{RunDir, RunLock};
 use shoal_common::stop::GRACE;
 use shoal_run::external_environment::server_iceoryx2_config;
 use shoal_run::outcome::{RunOutcome, RunState};
 use shoal_run::process::wait_for_any;
 use shoal_run::recorder::Recorder;
 use shoal_run::signals::Signals;
-use shoal_run::{preflight, status};
+use shoal_run::{preflight, signals, status};
 
 pub(crate) use self::cleaner::work as clean_up;
 use self::log::Log;
-pub(crate) use self::log::{ALL_ENDED, FAILED};
+pub(crate) use self::log::{ALL_ENDED, FAILED, note};
 use self::progress::Progress;
 use self::stall::Stalls;
 use self::supervisor::Supervisor;
@@ -69,7 +69,8 @@ pub(crate) enum Ending {
     Stopped,
     /// This signal ended it; the learner saved its state.
     Interrupted(i32),
-    /// Dead processes occupy shared memory that cannot be freed: the run continues in new shared memory.
+    /// Dead processes occupy shared memory that cannot be freed, or another program has removed files of the run: it
+    /// continues in new shared memory.
     Renewed,
 }
 
@@ -84,10 +85,15 @@ pub(crate) struct TrainingOutcome {
 }
 
 /// Runs all roles until the learner is done, a signal arrives, or `shoal stop` asks for the end.
-pub(crate) fn run(mut config: Config, run: &RunDir, signals: &Signals, quiet: bool) -> anyhow::Result<TrainingOutcome> {
+pub(crate) fn run(
+    mut config: Config,
+    (run, lock): (&RunDir, &RunLock),
+    signals: &Signals,
+    quiet: bool,
+) -> anyhow::Result<TrainingOutcome> {
     let (mut renewals, mut before, mut wall) = (Vec::new(), None, Duration::ZERO);
     loop {
-        let outcome = run_once(config, run, signals, quiet)?;
+        let outcome = run_once(config, (run, lock), signals, quiet)?;
         wall += outcome.wall;
         let before = before.get_or_insert(outcome.before.clone());
         if outcome.ending != Ending::Renewed {
@@ -108,12 +114,17 @@ pub(crate) fn run(mut config: Config, run: &RunDir, signals: &Signals, quiet: bo
     }
 }
 
-fn run_once(config: Config, run: &RunDir, signals: &Signals, quiet: bool) -> anyhow::Result<TrainingOutcome> {
+fn run_once(
+    config: Config,
+    (run, lock): (&RunDir, &RunLock),
+    signals: &Signals,
+    quiet: bool,
+) -> anyhow::Result<TrainingOutcome> {
     Domain::wait_for_earlier_processes(&config.run.id, PREDECESSORS_END).map_err(|error| explain(error, run))?;
     Domain::remove_abandoned()?;
     let domain = Domain::join(&config.run.id, config.actors.max)?;
     let outcome = preflight::reserve(&config, run, &domain)
-        .and_then(|()| Launcher::new(config, run, &domain, signals, quiet))
+        .and_then(|()| Launcher::new(config, (run, lock), &domain, signals, quiet))
         .and_then(Launcher::run);
     // Also after an error: no role is left by now.
     let left = domain.leave();
@@ -150,6 +161,7 @@ fn explain(error: DomainError, run: &RunDir) -> anyhow::Error {
 struct Launcher<'a> {
     config: Config,
     run: &'a RunDir,
+    lock: &'a RunLock,
     domain: &'a Domain,
     control: ControlPort,
     /// The run's status when this launcher started.
@@ -175,7 +187,7 @@ struct Launcher<'a> {
 impl<'a> Launcher<'a> {
     fn new(
         config: Config,
-        run: &'a RunDir,
+        (run, lock): (&'a RunDir, &'a RunLock),
         domain: &'a Domain,
         signals: &'a Signals,
         quiet: bool,
@@ -197,6 +209,7 @@ impl<'a> Launcher<'a> {
             stop_requested: None,
             ending: false,
             run,
+            lock,
             domain,
             heartbeats: Reports::open(domain)?,
             episode_reports: Reports::open(domain)?,
@@ -216,6 +229,10 @@ impl<'a> Launcher<'a> {
 
     fn run(mut self) -> anyhow::Result<TrainingOutcome> {
         let ending = self.watch();
+        if self.lock.check(self.run).is_err() {
+            // They have nowhere to save anything. Another run may be at this path by now, whose files are not theirs.
+            self.supervisor.kill(|_| true);
+        }
         // The roles are ended in every case, also after an error.
         self.progress.set_message("ending");
         let ended = self.end_all();
@@ -224,6 +241,10 @@ impl<'a> Launcher<'a> {
             Ok(()) => Answer::Accepted,
             Err(error) => Answer::Refused(format!("{error:#}")),
         });
+        // Whatever else has failed follows from it, and nothing may be written there. The log is still the run's own.
+        self.lock
+            .check(self.run)
+            .inspect_err(|gone| self.log.note("launcher", &format!("{FAILED}{gone}")))?;
         let renewed = matches!(ending, Ok(Ending::Renewed));
         let failure = ending.as_ref().err().or(ended.as_ref().err().filter(|_| !renewed));
         if let Some(error) = failure {
@@ -264,8 +285,11 @@ impl<'a> Launcher<'a> {
         self.supervisor.start_all(self.domain)?;
         loop {
             if let Some(signal) = self.signals.received() {
+                self.log
+                    .note("launcher", &format!("{} ends the run", signals::describe(signal)));
                 return Ok(Ending::Interrupted(signal));
             }
+            self.lock.check(self.run)?;
             self.read_reports()?;
             self.answer_requests()?;
             match self.supervisor.maintain(self.domain)? {
@@ -274,12 +298,18 @@ impl<'a> Launcher<'a> {
                     self.await_last_evaluation()?;
                     return Ok(Ending::Finished);
                 }
-                supervisor::Situation::SharedMemoryOccupied if self.stop_requested.is_some() => {}
+                supervisor::Situation::SharedMemoryOccupied | supervisor::Situation::FilesRemoved
+                    if self.stop_requested.is_some() => {}
                 supervisor::Situation::SharedMemoryOccupied => {
-                    let why = "dead processes occupy shared memory for good: the run continues in new shared memory";
-                    self.log.note("launcher", why);
-                    self.progress.print(why);
-                    return Ok(Ending::Renewed);
+                    return Ok(self.renew("dead processes occupy shared memory for good"));
+                }
+                supervisor::Situation::FilesRemoved => {
+                    let directory = self.domain.directory()?;
+                    let what = format!(
+                        "another program has removed files of this run in {}",
+                        directory.display()
+                    );
+                    return Ok(self.renew(&what));
                 }
             }
             for stalled in self.supervisor.replace_stalled(&mut self.stalls) {
@@ -300,6 +330,14 @@ impl<'a> Launcher<'a> {
             self.progress.draw(&self.supervisor);
             self.sleep(self.tick.min(self.supervisor.idle_for()));
         }
+    }
+
+    /// Says why the run continues in new shared memory.
+    fn renew(&self, why: &str) -> Ending {
+        let why = format!("{why}: the run continues in new shared memory");
+        self.log.note("launcher", &why);
+        self.progress.print(&why);
+        Ending::Renewed
     }
 
     /// Sleeps at most `most`, until a process ends, a signal arrives or a request comes.
@@ -325,6 +363,7 @@ impl<'a> Launcher<'a> {
             initial,
             ending,
             stop_requested,
+            log,
             ..
         } = self;
         control.answer_questions(run.key()?, run.path(), |question| -> anyhow::Result<Option<Answer>> {
@@ -338,6 +377,9 @@ impl<'a> Launcher<'a> {
                 Question::Scale { .. } if *ending => Ok(Some(Answer::Refused("the run is ending".into()))),
                 Question::Scale { actors } => requests::scale(config, run, supervisor, actors).map(Some),
                 Question::Stop => {
+                    if stop_requested.is_none() {
+                        log.note("launcher", "`shoal stop` ends the run");
+                    }
                     stop_requested.get_or_insert_with(Instant::now);
                     Ok(None)
                 }

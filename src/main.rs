@@ -5,6 +5,7 @@ mod command;
 mod completion;
 mod launcher;
 mod listing;
+mod log_level;
 mod role;
 mod top;
 

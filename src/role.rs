@@ -17,9 +17,9 @@ use shoal_learner::process;
 use shoal_run::external_environment::{self, LaunchSpec, server_iceoryx2_config};
 use shoal_run::server_location::Surroundings;
 use shoal_run::status::evaluated_period;
-use tracing_subscriber::filter::LevelFilter;
 
 use crate::cli::RoleArgs;
+use crate::log_level::log_level;
 
 /// Runs a role until it is done or its standard input closes.
 pub(crate) fn run(role: Role, args: &RoleArgs) -> anyhow::Result<ExitCode> {
@@ -58,12 +58,6 @@ pub(crate) fn run(role: Role, args: &RoleArgs) -> anyhow::Result<ExitCode> {
         let _ = writeln!(std::io::stderr(), "{error}");
     }
     Ok(ExitCode::SUCCESS)
-}
-
-/// The level in the environment variable `SHOAL_LOG`, by default `info`; `debug` logs every chunk that is sent.
-fn log_level() -> LevelFilter {
-    let level = std::env::var("SHOAL_LOG").ok().and_then(|level| level.parse().ok());
-    level.unwrap_or(LevelFilter::INFO)
 }
 
 fn work(domain: &Domain, config: &Config, run: &RunDir, identity: Identity, stop: &Stop) -> anyhow::Result<()> {

@@ -70,12 +70,42 @@ fn kill_and_scale(place: &Workplace, running: &Running, rng: &mut Stream, length
     (kills, scalings)
 }
 
+/// The seconds since 1970 of a time in the log, such as `2026-11-28T04:12:57.123456Z`.
+fn seconds(time: &str) -> Option<f64> {
+    let (date, time) = time.strip_suffix('Z')?.split_once('T')?;
+    let numbers = |text: &str, sign| {
+        text.split(sign)
+            .map(|part| part.parse::<f64>().ok())
+            .collect::<Option<Vec<_>>>()
+    };
+    let (date, time) = (numbers(date, '-')?, numbers(time, ':')?);
+    let (&[year, month, day], &[hours, minutes, seconds]) = (&date[..], &time[..]) else {
+        return None;
+    };
+    // The year begins in March here, so that the leap day is its last.
+    let (year, month) = if month > 2.0 {
+        (year, month - 3.0)
+    } else {
+        (year - 1.0, month + 9.0)
+    };
+    let leap_days = (year / 4.0).floor() - (year / 100.0).floor() + (year / 400.0).floor();
+    let days = 365.0 * year + leap_days + ((153.0 * month + 2.0) / 5.0).floor() + day - 1.0 - 719_468.0;
+    Some(((days * 24.0 + hours) * 60.0 + minutes) * 60.0 + seconds)
+}
+
+#[test]
+fn times_in_the_log_are_read() {
+    assert_eq!(seconds("1970-01-01T00:00:00.000000Z"), Some(0.0));
+    assert_eq!(seconds("2024-02-29T12:00:01.500000Z"), Some(1_709_208_001.5));
+    assert_eq!(seconds("ready"), None);
+}
+
 /// The launcher's log lines about a role, with their times.
 fn notes(log: &str, who: &str) -> Vec<(f64, String)> {
     let of = |line: &str| {
         let (name, rest) = line.split_once(' ')?;
         let (time, message) = rest.trim_start().split_once(' ')?;
-        Some((time.parse().ok()?, message.to_owned())).filter(|_| name == who)
+        Some((seconds(time)?, message.to_owned())).filter(|_| name == who)
     };
     log.lines().filter_map(of).collect()
 }

@@ -5,8 +5,10 @@
 mod support;
 
 use std::path::PathBuf;
+use std::process::Command;
 
 use rustix::process::Signal;
+use shoal_common::channel::Domain;
 use support::{Workplace, parse, until};
 
 const ENDLESS: [&str; 2] = ["--steps", "100000000"];
@@ -57,12 +59,40 @@ fn ctrl_c_and_sigterm_end_a_run_and_save_its_state() {
         let run = running.run.clone();
         let (exit, printed, leftovers) = running.wait();
         assert_eq!(exit, Some(code));
+        let said = format!("signal {} (", code - 128);
+        assert!(std::fs::read_to_string(run.join("shoal.log")).unwrap().contains(&said));
         assert!(parse(&printed)["env_steps"].as_u64().unwrap() > 0);
         assert!(run.join("checkpoints/latest.ckpt").exists());
         assert!(run.join("checkpoints/last.policy").exists());
         assert!(leftovers.processes().is_empty());
         assert!(leftovers.files().is_empty(), "{:?}", leftovers.files());
     }
+}
+
+#[test]
+fn signals_that_were_ignored_at_the_start_stay_ignored() {
+    let place = Workplace::new();
+    let arguments = [
+        &["train", "pendulum", "--run", "run", "--json"],
+        &ENDLESS[..],
+        &support::QUICK,
+    ]
+    .concat();
+    let running = place.launch_command("run", &mut place.shoal_ignoring("HUP INT", &arguments));
+    for signal in [Signal::HUP, Signal::INT] {
+        running.signal(signal);
+        running.wait_for_learning();
+    }
+    running.signal(Signal::TERM);
+    let run = running.run.clone();
+    let (code, _, leftovers) = running.wait();
+    assert_eq!(code, Some(143), "{}", place.stderr());
+    assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
+    let log = std::fs::read_to_string(run.join("shoal.log")).unwrap();
+    assert!(
+        log.contains("signal 15 (SIGTERM) ends the run") && !log.contains("SIGINT") && !log.contains("SIGHUP"),
+        "{log}"
+    );
 }
 
 #[test]
@@ -90,6 +120,88 @@ fn the_next_start_removes_what_a_killed_run_left_in_shared_memory() {
     running.kill_all();
     place.start("next", &["--steps", "100"]).wait();
     assert!(leftovers.files().is_empty(), "{:?}", leftovers.files());
+}
+
+#[test]
+fn a_run_whose_files_in_tmp_are_removed_loses_nothing_and_continues() {
+    let place = Workplace::new();
+    let running = place.start("run", &ENDLESS);
+    running.wait_for_learning();
+    let root = Domain::directory_of(running.leftovers().run_id()).unwrap();
+    // So that it does not notice before the other run has started.
+    running.signal(Signal::STOP);
+    let before = running.leftovers().files();
+    std::fs::remove_dir_all(&root).unwrap();
+    // As a terminal that asks makes it again, or a program that tidies up leaves it.
+    std::fs::create_dir(&root).unwrap();
+    place.start("next", &["--steps", "100"]).wait();
+    let after = running.leftovers().files();
+    assert!(
+        !before.is_empty() && before.iter().all(|file| after.contains(file)),
+        "{} files, then {}",
+        before.len(),
+        after.len()
+    );
+    let said = support::error_line(&place.output(&["status", "run"]));
+    assert!(said.contains("another program has removed files"), "{said}");
+    running.signal(Signal::CONT);
+    let noticed = || {
+        running
+            .log()
+            .matches("another program has removed files of this run")
+            .count()
+    };
+    until("the launcher notices", || noticed() == 1);
+    running.wait_for_learning();
+    assert!(place.status("run")["env_steps"].as_u64().unwrap() > 0);
+
+    // Only files, as a program does that tidies up by age; and a role that must be replaced.
+    running.signal(Signal::STOP);
+    // It complains if a file is gone before it gets there.
+    let find = Command::new("find").arg(&root).args(["-type", "f", "-delete"]).output();
+    assert!(find.is_ok(), "{find:?}");
+    running.kill("actor-0");
+    running.signal(Signal::CONT);
+    until("the launcher notices again", || noticed() == 2);
+    running.wait_for_learning();
+    let stopped = place.output(&["stop", "run"]);
+    assert!(stopped.status.success(), "{}", String::from_utf8_lossy(&stopped.stderr));
+    let (code, _, leftovers) = running.wait();
+    assert_eq!(code, Some(0), "{}", place.stderr());
+    assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
+}
+
+#[test]
+fn a_run_whose_directory_is_removed_or_replaced_ends_with_one_line() {
+    for replaced in [false, true] {
+        let place = Workplace::new();
+        let running = place.start("run", &ENDLESS);
+        running.wait_for_learning();
+        let (leftovers, gone) = (running.leftovers(), place.path().join("gone"));
+        std::fs::rename(&running.run, &gone).unwrap();
+        if replaced {
+            std::fs::create_dir(&running.run).unwrap();
+            std::fs::write(running.run.join("config.toml"), "").unwrap();
+        }
+        let (run, log) = (running.run.clone(), gone.join("shoal.log"));
+        let (code, printed) = running.wait_for_launcher();
+        let said = place.stderr();
+        let last = said.lines().last().unwrap();
+        assert_eq!((code, printed.as_str()), (Some(1), ""), "{said}");
+        assert!(
+            last.starts_with("error: the run directory") && last.contains("removed or renamed"),
+            "{said}"
+        );
+        assert!(!said.contains("resume"), "{said}");
+        assert!(std::fs::read_to_string(log).unwrap().contains("removed or renamed"));
+        assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
+        let there = std::fs::read_dir(&run).map_or(0, Iterator::count);
+        assert_eq!(
+            there,
+            usize::from(replaced),
+            "nothing is written into another directory"
+        );
+    }
 }
 
 #[test]

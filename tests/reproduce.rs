@@ -8,7 +8,7 @@ mod support;
 use std::fs::File;
 use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
-use std::process::{Child, ExitStatus, Stdio};
+use std::process::{Child, Command, ExitStatus, Stdio};
 
 use flate2::Compression;
 use flate2::read::GzDecoder;
@@ -21,8 +21,11 @@ struct Reproduction(Child);
 
 impl Reproduction {
     fn start(place: &Workplace, arguments: &[&str]) -> Self {
+        Self::start_command(place, &mut place.shoal(arguments))
+    }
+
+    fn start_command(place: &Workplace, command: &mut Command) -> Self {
         let stderr = std::fs::File::create(place.path().join("stderr")).unwrap();
-        let mut command = place.shoal(arguments);
         Self(command.stdout(Stdio::null()).stderr(stderr).spawn().unwrap())
     }
 
@@ -101,13 +104,21 @@ fn an_interrupted_reproduction_continues_and_repeats_no_training() {
     let results = place.path().join("kept/pendulum.jsonl.gz");
     let seeds = |seeds: &[u64]| seeds.iter().map(|seed| (*seed, String::new())).collect::<Vec<_>>();
 
-    let reproduction = Reproduction::start(&place, &PENDULUM);
+    // As with `nohup`: neither it nor its trainings may end with their terminal.
+    let reproduction = Reproduction::start_command(&place, &mut place.shoal_ignoring("HUP", &PENDULUM));
+    until("the first seed trains", || starts(&first) == 1);
+    reproduction.signal(Signal::HUP);
     until("the second seed trains", || starts(&second) == 1);
     let meanwhile = error_line(&place.output(&PENDULUM));
     assert!(meanwhile.contains("another `shoal reproduce`"), "{meanwhile}");
     reproduction.signal(Signal::INT);
     assert_eq!(reproduction.wait().code(), Some(130), "{}", place.stderr());
     assert_eq!(seeds_and_stages(&results), seeds(&[1]));
+    assert!(
+        log(&second).contains("signal 2 (SIGINT) ends the run"),
+        "{}",
+        log(&second)
+    );
     Leftovers::of(&second).wait_until_gone();
     let report = || std::fs::read_to_string(place.path().join("kept/REPORT.md")).unwrap();
     assert!(report().contains("seeds 1; missing: 2"), "{}", report());

@@ -30,6 +30,12 @@ pub enum RunDirError {
     /// Another launcher is running the run.
     #[error("the run in {0} is already running: a launcher holds its lock; end that one first")]
     Busy(PathBuf),
+    /// Somebody has removed or renamed it.
+    #[error(
+        "the run directory {0} was removed or renamed while the run was running; the run has ended, and what it had not \
+         written is lost"
+    )]
+    Gone(PathBuf),
     /// The system refused.
     #[error("cannot {action} {path}: {cause}")]
     Io {
@@ -45,7 +51,22 @@ pub enum RunDirError {
 /// The lock of a run. The launcher holds it while the run is running; the system releases it when the launcher dies.
 #[derive(Debug)]
 pub struct RunLock {
-    _file: File,
+    directory: File,
+}
+
+impl RunLock {
+    /// Checks that the run is still where it was when it was locked.
+    ///
+    /// # Errors
+    /// When its directory was removed or renamed, even if there is another one now.
+    pub fn check(&self, run: &RunDir) -> Result<(), RunDirError> {
+        let number = |metadata: io::Result<std::fs::Metadata>| metadata.map(|it| (it.dev(), it.ino())).ok();
+        let same = number(self.directory.metadata()) == number(std::fs::metadata(&run.path));
+        match same && run.config_file().is_file() {
+            true => Ok(()),
+            false => Err(RunDirError::Gone(run.path.clone())),
+        }
+    }
 }
 
 impl RunDir {
@@ -131,7 +152,7 @@ impl RunDir {
         let file = File::open(&self.path).map_err(io)?;
         // A process that only checks whether the run is running holds the lock for a moment.
         match file_lock::lock(&file, Duration::from_millis(200)).map_err(io)? {
-            true => Ok(RunLock { _file: file }),
+            true => Ok(RunLock { directory: file }),
             false => Err(RunDirError::Busy(self.path.clone())),
         }
     }
@@ -324,6 +345,13 @@ mod tests {
 
         let lock = first.lock().unwrap();
         assert!(matches!(first.lock(), Err(RunDirError::Busy(_))));
+        std::fs::write(first.config_file(), "").unwrap();
+        lock.check(&first).unwrap();
+        std::fs::remove_dir_all(first.path()).unwrap();
+        assert!(matches!(lock.check(&first), Err(RunDirError::Gone(_))));
+        let first = RunDir::create(first.path()).unwrap();
+        std::fs::write(first.config_file(), "").unwrap();
+        assert!(lock.check(&first).is_err(), "this is another one");
         drop(lock);
         first.lock().unwrap();
     }

@@ -20,6 +20,9 @@ SLEEP = 0.05
 BEAT = 0.5
 """Seconds between heartbeats."""
 
+PROVEN = 1000
+"""A server that has taken this many environment steps is able to work: one that fails later is started again and again."""
+
 PATIENCE = 10.0
 """Seconds for which a port may be refused: a predecessor that was killed has it until the launcher has cleaned up."""
 
@@ -149,10 +152,11 @@ class Port:
             self.beat(Activity.WORKING)
 
     def count(self, steps: int) -> None:
-        """Counts so many environment steps more. The first are told at once: this process is able to work."""
+        """Counts so many environment steps more. The first are told at once, and those that prove it able to work: a fast
+        one may fail before its next heartbeat."""
         if steps == 0:
             return
-        if self._heartbeat.steps == 0:
+        if self._heartbeat.steps == 0 or self._heartbeat.steps < PROVEN <= self._heartbeat.steps + steps:
             self._beaten = -BEAT
         self._heartbeat.steps += steps
         self.beat(Activity.WORKING)

@@ -12,7 +12,7 @@ from typing import Any
 import iceoryx2 as iox2
 
 from shoal_gym import port
-from shoal_gym.protocol import RequestHeader, ResponseHeader
+from shoal_gym.protocol import Heartbeat, RequestHeader, ResponseHeader
 
 
 class Claim(unittest.TestCase):
@@ -84,6 +84,26 @@ class Claim(unittest.TestCase):
         with self.assertRaises(ValueError):
             port.claim(fail, self._pause)
         self.assertEqual(self._pauses, 0)
+
+
+class Heartbeats(unittest.TestCase):
+    def test_a_server_says_at_once_that_it_works_and_that_it_is_proven(self) -> None:
+        told: list[int] = []
+
+        class Sink:
+            def update_connections(self) -> None:
+                pass
+
+            def send_copy(self, heartbeat: Any) -> None:
+                told.append(heartbeat.steps)
+
+        served = port.Port.__new__(port.Port)
+        served._heartbeat = Heartbeat()
+        served._heartbeat_port, served._beaten = Sink(), -port.BEAT
+        for _ in range(300):
+            served.count(4)
+        self.assertEqual(told, [4, port.PROVEN])
+
 
 
 if __name__ == "__main__":

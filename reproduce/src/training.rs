@@ -114,10 +114,12 @@ fn run_child(command: &mut Command, interrupted: Interrupted<'_>) -> anyhow::Res
         if let Some(status) = training.wait(SIGNAL_INTERVAL) {
             break status;
         }
-        if interrupted().is_some() && !terminated {
+        if let Some(signal) = interrupted().filter(|_| !terminated) {
             terminated = true;
+            // The same signal: the training ignores those that this process was started to ignore.
+            let signal = Signal::from_named_raw(signal).unwrap_or(Signal::TERM);
             // This fails only if the training has ended.
-            let _ = training.signal(Signal::TERM);
+            let _ = training.signal(signal);
         }
     };
     if interrupted().is_some() {

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::bail;
 use shoal_common::channel::control::{self, Answer, ControlError, Question, RunStatus};
-use shoal_common::channel::{Domain, Sweeper};
+use shoal_common::channel::{ChannelErrorKind, Domain, Sweeper};
 use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
 
@@ -55,8 +55,26 @@ impl Remote {
             }
             Ok(answer) => Ok(Some(answer)),
             Err(ControlError::Gone) => Ok(None),
+            Err(ControlError::Channel(error)) if error.kind == ChannelErrorKind::Missing => {
+                bail!("{}", self.why_missing(domain)?)
+            }
             Err(error) => Err(error.into()),
         }
+    }
+
+    /// Why there is a launcher that cannot be asked.
+    fn why_missing(&self, domain: &Domain) -> anyhow::Result<String> {
+        let here = self.run.path().display();
+        Ok(if domain.has_members() {
+            let directory = domain.directory()?;
+            format!(
+                "another program has removed files of {here} in {}; its launcher repairs that within seconds, unless it \
+                 is stopped",
+                directory.display()
+            )
+        } else {
+            format!("{here} is starting or in its final evaluation; ask again later")
+        })
     }
 
     /// The run's status; `None` if it is not running.

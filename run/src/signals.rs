@@ -26,7 +26,8 @@ impl Interrupt {
     }
 }
 
-/// Receives SIGINT, SIGTERM and SIGHUP. Once this is dropped, they end the process again.
+/// Receives SIGINT, SIGTERM and SIGHUP. Once this is dropped, they end the process again. A signal that whoever started
+/// this process made it ignore stays ignored, as SIGHUP under `nohup`.
 #[derive(Debug)]
 pub struct Signals {
     last: Arc<AtomicUsize>,
@@ -45,7 +46,11 @@ impl Signals {
             let (last, over) = (Arc::default(), Arc::new(AtomicBool::new(false)));
             let (wake, write) = UnixStream::pair()?;
             wake.set_nonblocking(true)?;
+            let ignored = ignored_signals();
             for signal in [SIGINT, SIGTERM, SIGHUP] {
+                if is_in(ignored, signal) {
+                    continue;
+                }
                 // In this order, so that a thread that is woken finds the number.
                 signal_hook::flag::register_conditional_default(signal, Arc::clone(&over))?;
                 signal_hook::flag::register_usize(signal, Arc::clone(&last), signal as usize)?;
@@ -89,6 +94,27 @@ impl Drop for Signals {
     }
 }
 
+/// The signals that this process ignores, a bit for each; none where the system does not say.
+fn ignored_signals() -> u64 {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
+    mask.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok())
+        .unwrap_or(0)
+}
+
+fn is_in(mask: u64, signal: i32) -> bool {
+    // Signals count from 1, bits from 0.
+    mask >> (signal - 1) & 1 == 1
+}
+
+/// The signal's number and name, as in `signal 15 (SIGTERM)`.
+pub fn describe(signal: i32) -> String {
+    match signal_hook::low_level::signal_name(signal) {
+        Some(name) => format!("signal {signal} ({name})"),
+        None => format!("signal {signal}"),
+    }
+}
+
 /// The exit code with which a shell reports that a signal ended a process.
 pub fn exit_code(signal: i32) -> std::process::ExitCode {
     std::process::ExitCode::from(128 + signal as u8)
@@ -100,15 +126,26 @@ mod tests {
     use rustix::event::PollFlags;
 
     #[test]
+    fn the_mask_of_ignored_signals_is_read_bit_by_bit() {
+        let mask = 1 << (SIGHUP - 1) | 1 << (SIGINT - 1);
+        assert_eq!(
+            [SIGHUP, SIGINT, SIGTERM].map(|signal| is_in(mask, signal)),
+            [true, true, false]
+        );
+        // The runtime of every Rust program ignores this one.
+        assert!(is_in(ignored_signals(), signal_hook::consts::SIGPIPE));
+    }
+
+    #[test]
     fn a_signal_wakes_a_waiting_thread_and_is_remembered() {
         let signals = Signals::register().unwrap();
         assert_eq!(signals.received(), None);
         assert_eq!(signals.wait(Duration::from_millis(1)), None);
         std::thread::scope(|scope| {
-            scope.spawn(|| signal_hook::low_level::raise(SIGHUP).unwrap());
-            assert_eq!(signals.wait(Duration::from_secs(60)), Some(SIGHUP));
+            scope.spawn(|| signal_hook::low_level::raise(SIGTERM).unwrap());
+            assert_eq!(signals.wait(Duration::from_secs(60)), Some(SIGTERM));
         });
-        assert_eq!(signals.received(), Some(SIGHUP));
+        assert_eq!(signals.received(), Some(SIGTERM));
         // It has been received, so it does not wake a poll again.
         let mut ready = [rustix::event::PollFd::new(&signals, PollFlags::IN)];
         assert_eq!(rustix::event::poll(&mut ready, Some(&Default::default())), Ok(0));

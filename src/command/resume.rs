@@ -53,5 +53,5 @@ pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
         config.check()?;
         run.write_config(&config)?;
     }
-    run_training(config, &run, lock, &args.output)
+    run_training(config, &run, &lock, &args.output)
 }

@@ -102,9 +102,10 @@ pub(crate) fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
         .as_deref()
         .context("name a preset, a gym: environment or a configuration file to train")?;
     let Plan { config, run, lock } = Plan::new(what, &args.overrides.overrides())?;
-    run_training(config, &run, lock, &args.output).inspect_err(|_| {
+    run_training(config, &run, &lock, &args.output).inspect_err(|_| {
         // Where no process was started there is nothing to resume or to read, and it would be in the way of the next try.
-        if !run.incarnations().exists() {
+        // What is at this path by now may be somebody else's.
+        if lock.check(&run).is_ok() && !run.incarnations().exists() {
             let _ = std::fs::remove_dir_all(run.path());
         }
     })

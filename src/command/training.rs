@@ -20,7 +20,7 @@ use shoal_run::evaluation::{EvaluationSummary, WhichPolicy, evaluate_until};
 use shoal_run::final_evaluation::{FinalEvaluation, FinalPolicy, FinallyEvaluated};
 use shoal_run::numbers::thousands;
 use shoal_run::outcome::{RunOutcome, RunState};
-use shoal_run::signals::{Interrupt, Signals, exit_code};
+use shoal_run::signals::{Interrupt, Signals, describe, exit_code};
 
 use crate::launcher::{self, Ending, TrainingOutcome};
 
@@ -58,11 +58,18 @@ struct Summary {
 pub(crate) fn run_training(
     config: Config,
     run: &RunDir,
-    _lock: RunLock,
+    lock: &RunLock,
     output: &OutputMode,
 ) -> anyhow::Result<ExitCode> {
+    let trained = train_and_report(config, run, lock, output);
+    // Whatever else has failed follows from it.
+    lock.check(run)?;
+    trained
+}
+
+fn train_and_report(config: Config, run: &RunDir, lock: &RunLock, output: &OutputMode) -> anyhow::Result<ExitCode> {
     let signals = Signals::register()?;
-    let outcome = launcher::run(config.clone(), run, &signals, output.quiet)?;
+    let outcome = launcher::run(config.clone(), (run, lock), &signals, output.quiet)?;
     let mut evaluated = Vec::new();
     let RunStatus {
         env_steps, episodes, ..
@@ -73,30 +80,33 @@ pub(crate) fn run_training(
         match final_evaluation(&config, run, env_steps, &interrupt, output.quiet) {
             Ok(policies) => evaluated = policies,
             Err(error) => {
+                lock.check(run)?;
                 let why = match interrupt.signal() {
-                    Some(signal) => format!("the final evaluation was ended by signal {signal}"),
+                    Some(signal) => format!("the final evaluation was ended by {}", describe(signal)),
                     None => format!("the final evaluation failed: {error:#}").replace('\n', " "),
                 };
                 let here = run.path().display();
-                writeln!(
-                    std::io::stderr(),
+                launcher::note(run, &why);
+                say(&format!(
                     "{why}; the training is finished; to evaluate it: shoal eval {here}"
-                )?;
+                ));
                 finished = finished.with_reason(why);
                 keep_some_policy(&config, run)?;
             }
         }
     }
     if let Err(error) = plots::draw(run, &config, run.path()) {
+        lock.check(run)?;
         let why = format!("{error:#}").replace('\n', " ");
-        writeln!(std::io::stderr(), "the figures could not be drawn: {why}")?;
+        say(&format!("the figures could not be drawn: {why}"));
     }
     if outcome.ending == Ending::Finished {
         finished.write(run)?;
     }
     let summary = Summary::new(&config, run, &outcome, evaluated.first().map(|(_, summary)| summary))?;
     if !output.quiet {
-        write_summary(&mut std::io::stderr().lock(), run, &outcome, &summary, &evaluated)?;
+        // As in `say`.
+        let _ = write_summary(&mut std::io::stderr().lock(), run, &outcome, &summary, &evaluated);
     }
     if output.json {
         writeln!(std::io::stdout().lock(), "{}", serde_json::to_string(&summary)?)?;
@@ -108,6 +118,11 @@ pub(crate) fn run_training(
         // As a shell reports a process that was ended by the signal.
         Ending::Interrupted(signal) => exit_code(signal),
     })
+}
+
+/// Writes a line to standard error. A terminal that is gone, as after `nohup`, must not make the run a failure.
+fn say(line: &str) {
+    let _ = writeln!(std::io::stderr(), "{line}");
 }
 
 /// The final evaluation: first of the policy with the best evaluation, then of the last one. Afterwards `best.policy` is

@@ -1,4 +1,4 @@
-//! `shoal.log`: the output of all processes of the run. Only the launcher writes it.
+//! `shoal.log`: the output of all processes of the run, each line with its time in UTC. Only the launcher writes it.
 
 use std::collections::{HashMap, VecDeque};
 use std::fs::{File, OpenOptions};
@@ -6,18 +6,33 @@ use std::io::Write;
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::SystemTime;
 
 use anyhow::Context;
+use shoal_common::run_dir::RunDir;
+use shoal_run::process::{Line, Writer};
+use tracing_subscriber::fmt::format;
+use tracing_subscriber::fmt::time::{FormatTime, SystemTime};
 
 /// Number of lines kept per process, for the message when it is given up.
 const KEPT: usize = 5;
+
+/// Bytes of the log that are for the lines of other programs: what is left of this when a launcher starts, and at least
+/// the other number. Shoal's own lines have no limit.
+const FOR_PROGRAMS: u64 = 16 * 1024 * 1024;
+const LEAST_FOR_PROGRAMS: u64 = 1024 * 1024;
 
 /// The launcher's line after all roles have ended.
 pub(crate) const ALL_ENDED: &str = "every role has ended";
 
 /// The start of the launcher's last line if the run ended with an error.
 pub(crate) const FAILED: &str = "the run failed: ";
+
+/// Writes a line of the launcher into the log of a run whose roles have ended. A log that cannot be written is no error.
+pub(crate) fn note(run: &RunDir, line: &str) {
+    if let Ok(log) = Log::open(&run.log()) {
+        log.note("launcher", line);
+    }
+}
 
 /// The log of a run; clones write to the same file.
 #[derive(Clone, Debug)]
@@ -26,7 +41,16 @@ pub(super) struct Log(Arc<Mutex<Inner>>);
 #[derive(Debug)]
 struct Inner {
     file: File,
-    last: HashMap<String, VecDeque<String>>,
+    last: HashMap<String, VecDeque<Said>>,
+    /// Bytes that other programs may still write.
+    for_programs: u64,
+}
+
+/// A line that a process has written.
+#[derive(Debug)]
+struct Said {
+    text: String,
+    is_in_log: bool,
 }
 
 impl Log {
@@ -37,46 +61,163 @@ impl Log {
             .mode(0o600)
             .open(path)
             .with_context(|| format!("cannot write {}", path.display()))?;
+        let length = file.metadata().map_or(0, |metadata| metadata.len());
         Ok(Self(Arc::new(Mutex::new(Inner {
             file,
             last: HashMap::new(),
+            for_programs: FOR_PROGRAMS.saturating_sub(length).max(LEAST_FOR_PROGRAMS),
         }))))
     }
 
-    /// Writes a line of the launcher about `who`, with the time.
+    /// Writes a line of the launcher about `who`.
     pub(super) fn note(&self, who: &str, line: &str) {
-        let seconds = SystemTime::UNIX_EPOCH
-            .elapsed()
-            .map_or(0.0, |since| since.as_secs_f64());
-        self.write(who, &format!("{seconds:.3} {line}"));
+        self.lock().write(who, line);
     }
 
-    /// Writes a line of output of `who`, which has its own time.
-    pub(super) fn line(&self, who: &str, line: &str) {
-        self.write(who, line);
+    /// Writes a line of output of `who`, if it may be in the log.
+    pub(super) fn line(&self, who: &str, line: Line<'_>, writer: Writer) {
         let mut inner = self.lock();
-        let last = inner.last.entry(who.into()).or_default();
-        if last.len() == KEPT {
-            last.pop_front();
+        match line {
+            Line::Kept(text) => {
+                let is_in_log = writer == Writer::Shoal || inner.takes(text);
+                if is_in_log {
+                    inner.write(who, text);
+                }
+                inner.remember(who, text, is_in_log);
+            }
+            Line::TooMuch(text) => inner.remember(who, text, false),
+            // Nothing more is said once the programs' lines are left out altogether.
+            Line::LeftOut(_) if inner.for_programs == 0 => {}
+            Line::LeftOut(count) => inner.write(who, &format!("… ({count} lines left out: too many at once)")),
         }
-        last.push_back(line.into());
+    }
+
+    /// Writes those of the last lines of `who` that were left out, because they matter: they say why it has failed.
+    pub(super) fn write_left_out(&self, who: &str) {
+        let mut inner = self.lock();
+        for said in inner.last.remove(who).unwrap_or_default() {
+            if !said.is_in_log {
+                inner.write(who, &said.text);
+            }
+            inner.remember(who, &said.text, true);
+        }
     }
 
     /// The last lines that `who` wrote.
     pub(super) fn last_lines(&self, who: &str) -> Vec<String> {
-        self.lock()
-            .last
-            .get(who)
-            .map(|lines| lines.iter().cloned().collect())
-            .unwrap_or_default()
-    }
-
-    fn write(&self, who: &str, line: &str) {
-        // A log that cannot be written must not end the run.
-        let _ = writeln!(self.lock().file, "{who:<14} {line}");
+        let inner = self.lock();
+        let last = inner.last.get(who).into_iter().flatten();
+        last.map(|said| said.text.clone()).collect()
     }
 
     fn lock(&self) -> MutexGuard<'_, Inner> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Inner {
+    /// Whether the log still takes this line of another program. Says so once it does not.
+    fn takes(&mut self, line: &str) -> bool {
+        let length = line.len() as u64 + 1;
+        if self.for_programs > 0 && self.for_programs < length {
+            let what = "this log takes no more of what other programs write to standard error (SHOAL_LOG=debug logs everything)";
+            self.write("launcher", what);
+            self.for_programs = 0;
+        }
+        self.for_programs = self.for_programs.saturating_sub(length);
+        self.for_programs > 0
+    }
+
+    fn remember(&mut self, who: &str, text: &str, is_in_log: bool) {
+        let last = self.last.entry(who.into()).or_default();
+        if last.len() == KEPT {
+            last.pop_front();
+        }
+        last.push_back(Said {
+            text: text.into(),
+            is_in_log,
+        });
+    }
+
+    /// Writes a line, with the time if it has none of its own.
+    fn write(&mut self, who: &str, line: &str) {
+        let time = if has_time(line) { String::new() } else { now() };
+        // A log that cannot be written must not end the run.
+        let _ = writeln!(self.file, "{who:<14} {time}{line}");
+    }
+}
+
+/// The time in UTC with a space behind it, as the roles write it: `2026-11-28T04:12:57.123456Z `.
+fn now() -> String {
+    let mut text = String::new();
+    // Writing into a string does not fail.
+    let _ = SystemTime.format_time(&mut format::Writer::new(&mut text));
+    text + " "
+}
+
+/// Whether the line begins with such a time.
+fn has_time(line: &str) -> bool {
+    let form = "0000-00-00T00:00:00";
+    let fits = |(found, wanted): (u8, u8)| found == wanted || (wanted == b'0' && found.is_ascii_digit());
+    line.len() > form.len() && line.bytes().zip(form.bytes()).all(fits)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn log_in(directory: &Path) -> (Log, impl Fn() -> String) {
+        let path = directory.join("shoal.log");
+        (Log::open(&path).unwrap(), move || {
+            std::fs::read_to_string(&path).unwrap()
+        })
+    }
+
+    #[test]
+    fn each_line_has_one_readable_time() {
+        let directory = tempfile::tempdir().unwrap();
+        let (log, text) = log_in(directory.path());
+        log.note("launcher", "every role is ready");
+        let own = "2026-11-28T04:12:57.123456Z DEBUG sent a chunk rows=8";
+        log.line("actor-0", Line::Kept(own), Writer::Shoal);
+        log.line("actor-0", Line::Kept("error: no"), Writer::Shoal);
+        let (text, year) = (text(), &now()[..5]);
+        let lines: Vec<_> = text.lines().collect();
+        assert!(lines[0].starts_with(&format!("launcher       {year}")) && lines[0].ends_with("Z every role is ready"));
+        assert_eq!(lines[1], format!("actor-0        {own}"));
+        assert!(
+            has_time(&lines[2][15..]) && lines[2].ends_with("Z error: no"),
+            "{}",
+            lines[2]
+        );
+        assert_eq!(log.last_lines("actor-0"), [own, "error: no"]);
+    }
+
+    #[test]
+    fn the_lines_of_other_programs_have_a_limit_and_the_last_ones_do_not_get_lost() {
+        let directory = tempfile::tempdir().unwrap();
+        let (log, text) = log_in(directory.path());
+        let line = "x".repeat(4000);
+        for _ in 0..10_000 {
+            log.line("env-server-0", Line::Kept(&line), Writer::Program);
+        }
+        log.line("env-server-0", Line::Kept("ValueError: too hot"), Writer::Program);
+        log.line("learner-0", Line::Kept("mine"), Writer::Shoal);
+        assert!((FOR_PROGRAMS - 5000..FOR_PROGRAMS + 500_000).contains(&(text().len() as u64)));
+        assert!(!text().contains("too hot") && text().contains("mine"));
+        assert_eq!(text().matches("this log takes no more").count(), 1);
+        assert_eq!(log.last_lines("env-server-0").pop().unwrap(), "ValueError: too hot");
+        for _ in 0..2 {
+            log.write_left_out("env-server-0");
+            assert_eq!(text().matches("too hot").count(), 1);
+        }
+        log.line("env-server-1", Line::TooMuch("too much at once"), Writer::Program);
+        assert!(!text().contains("too much at once"));
+        log.write_left_out("env-server-1");
+        assert!(text().contains("too much at once"));
+        // A launcher that goes on has a little left.
+        let (log, text) = log_in(directory.path());
+        log.line("env-server-0", Line::Kept("again"), Writer::Program);
+        assert!(text().contains("again"));
     }
 }

@@ -8,8 +8,7 @@ use std::process::{ChildStdin, Command, ExitStatus};
 
 use anyhow::Context;
 use shoal_common::report::Identity;
-use shoal_run::process::ChildGroup;
-use shoal_run::process::ChildOutput;
+use shoal_run::process::{ChildGroup, ChildOutput, Writer};
 
 use super::log::Log;
 
@@ -22,8 +21,8 @@ pub(super) struct Process {
 }
 
 impl Process {
-    /// Starts this program as a role.
-    pub(super) fn start(identity: Identity, run: &Path, log: &Log) -> anyhow::Result<Self> {
+    /// Starts this program as a role. `writer` is who writes to its standard error.
+    pub(super) fn start(identity: Identity, run: &Path, log: &Log, writer: Writer) -> anyhow::Result<Self> {
         let Identity {
             role,
             index,
@@ -35,7 +34,8 @@ impl Process {
         let (group, stdin, stderr) =
             ChildGroup::start(&mut command).with_context(|| format!("cannot start {} {index}", role.name()))?;
         let (who, log) = (name(identity), log.clone());
-        let read = stderr.map(|stderr| ChildOutput::read(&who.clone(), stderr, move |line| log.line(&who, line)));
+        let read = stderr
+            .map(|stderr| ChildOutput::read(&who.clone(), stderr, writer, move |line| log.line(&who, line, writer)));
         let output = read.transpose().context("cannot read the output of a role")?;
         Ok(Self { group, stdin, output })
     }

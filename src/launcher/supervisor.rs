@@ -15,7 +15,9 @@ use shoal_common::config::Config;
 use shoal_common::durable::write_atomically;
 use shoal_common::report::{Activity, Heartbeat, Identity, Role};
 use shoal_common::run_dir::RunDir;
+use shoal_run::process::Writer;
 use shoal_run::recorder::{Incident, IncidentKind};
+use tracing_subscriber::filter::LevelFilter;
 
 use super::child::{Child, Consequence};
 use super::cleaner;
@@ -23,6 +25,7 @@ use super::incarnations::{last_committed, read_counter};
 use super::log::{ALL_ENDED, Log};
 use super::process::{Process, name};
 use super::stall::Stalls;
+use crate::log_level::log_level;
 
 /// How often to look for dead processes whose end the launcher does not observe, such as `shoal status`.
 const CLEANING: Duration = Duration::from_secs(2);
@@ -45,6 +48,8 @@ pub(super) enum Situation {
     LearnerDone,
     /// Dead processes occupy shared memory that cannot be freed.
     SharedMemoryOccupied,
+    /// Another program has removed files with which the processes find each other.
+    FilesRemoved,
 }
 
 /// All processes of a run.
@@ -66,6 +71,8 @@ pub(super) struct Supervisor {
     /// Incidents since the last [`Supervisor::take_incidents`].
     incidents: Vec<Incident>,
     run: PathBuf,
+    /// Who writes what the environment servers write. With `SHOAL_LOG=debug` all of it is logged.
+    server_output: Writer,
     /// The file with the number of processes ever started. It lasts over resumes: incarnations are never used twice.
     counter: PathBuf,
     started: u64,
@@ -114,6 +121,11 @@ impl Supervisor {
             log,
             incidents: Vec::new(),
             run: run.path().into(),
+            server_output: match log_level() {
+                LevelFilter::DEBUG | LevelFilter::TRACE => Writer::Shoal,
+                _ if config.environment.server.is_empty() => Writer::Shoal,
+                _ => Writer::Program,
+            },
             counter,
             started,
             faults: 0,
@@ -183,7 +195,11 @@ impl Supervisor {
             .with_context(|| format!("cannot write {}", self.counter.display()))?;
         let child = &mut self.children[i];
         child.identity.incarnation = self.started;
-        let process = Process::start(child.identity, &self.run, &self.log)?;
+        let writer = match child.identity.role {
+            Role::EnvServer => self.server_output,
+            _ => Writer::Shoal,
+        };
+        let process = Process::start(child.identity, &self.run, &self.log, writer)?;
         self.log
             .note(&name(child.identity), &format!("started as process {}", process.pid()));
         child.begin(process);
@@ -227,6 +243,7 @@ impl Supervisor {
             let last = last
                 .or_else(|| self.log.last_lines(&name(server.identity)).pop())
                 .unwrap_or_default();
+            self.log.write_left_out(&name(server.identity));
             let last = last.strip_prefix("error: ").unwrap_or(&last);
             self.last_fault = format!("{}: {last}", name(server.identity));
             self.incidents
@@ -310,10 +327,16 @@ impl Supervisor {
     /// Handles collected ends, restarts processes that are due, and starts or retires actors.
     pub(super) fn maintain(&mut self, domain: &Domain) -> anyhow::Result<Situation> {
         let mut state = Situation::AtWork;
-        if self.children.iter().any(|child| child.ended.is_some()) {
+        let ended = self.children.iter().any(|child| child.ended.is_some());
+        // Before anything is cleaned up or started: both would find the files of another run, or none.
+        if (ended || self.is_cleaning_due()) && !self.learner_has_finished() && !domain.is_intact(self.services.count())
+        {
+            return Ok(Situation::FilesRemoved);
+        }
+        if ended {
             // Frees their shared memory for their successors.
             state = self.clean(domain)?;
-        } else if self.cleaned.elapsed() >= self.occupied.map_or(CLEANING, |_| CLEANING_AGAIN) {
+        } else if self.is_cleaning_due() {
             self.cleaned = Instant::now();
             if domain.has_dead_nodes() || self.services.ports_of_dead_processes() > 0 {
                 state = self.clean(domain)?;
@@ -327,6 +350,19 @@ impl Supervisor {
         self.retire_surplus();
         self.start_missing(domain)?;
         Ok(state)
+    }
+
+    fn is_cleaning_due(&self) -> bool {
+        self.cleaned.elapsed() >= self.occupied.map_or(CLEANING, |_| CLEANING_AGAIN)
+    }
+
+    /// Whether the learner's end has been observed, and it was the planned one.
+    fn learner_has_finished(&self) -> bool {
+        let mut learners = self
+            .children
+            .iter()
+            .filter(|child| child.identity.role == Role::Learner);
+        learners.any(|learner| learner.ended.is_some_and(|status| status.success()))
     }
 
     fn maintain_one(&mut self, i: usize) -> anyhow::Result<Situation> {
@@ -348,6 +384,7 @@ impl Supervisor {
     fn handle_end(&mut self, i: usize, status: ExitStatus) -> anyhow::Result<Situation> {
         let child = &mut self.children[i];
         let name = name(child.identity);
+        self.log.write_left_out(&name);
         if child.identity.role == Role::Learner && status.success() {
             child.process = None;
             self.learner_done = true;

@@ -75,3 +75,35 @@ fn an_abandoned_run_is_removed_and_a_running_one_continues() {
         commits.committed(1).sequence == 20 && commits.committed(0).sequence == 100
     });
 }
+
+#[test]
+fn a_living_run_whose_directory_is_removed_keeps_its_shared_memory() {
+    let run = Run::new();
+    let domain = run.join();
+    let processes = one_of_each(&run);
+    let directory = domain.directory().unwrap();
+    assert!(domain.is_intact(5) && !domain.is_intact(1000));
+    let above = std::fs::File::open(directory.parent().unwrap()).unwrap();
+    assert!(above.try_lock().is_err(), "a program that tidies up skips it");
+    std::fs::remove_dir_all(&directory).unwrap();
+    assert!(!domain.is_intact(0));
+    let before = run.leftovers();
+    assert!(before.len() > 5, "this test finds the run's files");
+    // As another run at its start, a terminal that asks, and a process that is started again.
+    Domain::remove_abandoned().unwrap();
+    Domain::visit(domain.run_id(), 1).unwrap().leave().unwrap();
+    run.join().leave().unwrap();
+    Domain::remove_abandoned().unwrap();
+    let after = run.leftovers();
+    assert!(before.iter().all(|file| after.contains(file)), "{before:?}; {after:?}");
+    let wait = Domain::wait_for_earlier_processes(domain.run_id(), Duration::from_millis(50));
+    let said = wait.unwrap_err().to_string();
+    assert!(said.contains(&std::process::id().to_string()), "{said}");
+
+    let id = domain.run_id().to_owned();
+    processes.into_iter().for_each(Process::end);
+    domain.leave().unwrap();
+    run.end_host();
+    assert!(run.leftovers().is_empty(), "{:?}", run.leftovers());
+    Domain::wait_for_earlier_processes(&id, Duration::ZERO).unwrap();
+}

@@ -3,6 +3,7 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
 
+mod answers;
 #[path = "../support/suite.rs"]
 mod suite;
 #[path = "../support/mod.rs"]
@@ -11,6 +12,7 @@ mod support;
 use std::path::Path;
 use std::process::{Command, ExitCode};
 
+use answers::arbitrary_answers_are_survived_or_named_in_one_line;
 use rustix::process::{Pid, Signal, kill_process};
 use shoal_common::config::Config;
 use shoal_common::space::Space;
@@ -43,6 +45,11 @@ fn main() -> ExitCode {
         test!(an_invalid_answer_ends_its_episodes_and_is_counted_and_named, PYTHON),
         test!(too_many_invalid_answers_end_a_run_that_can_be_resumed, PYTHON),
         test!(a_server_with_any_answers_is_survived_or_named_in_one_line, PYTHON),
+        test!(arbitrary_answers_are_survived_or_named_in_one_line, PYTHON),
+        test!(
+            an_evaluator_killed_while_it_confirms_a_policy_repeats_nothing_it_reported,
+            PYTHON
+        ),
         test!(a_module_sees_no_arguments_and_no_input_and_prints_to_the_log, PYTHON),
         test!(a_slow_environment_is_not_replaced, PYTHON),
         test!(a_run_remembers_where_its_server_is_started_and_with_what, PYTHON),
@@ -506,6 +513,51 @@ fn a_server_with_any_answers_is_survived_or_named_in_one_line() {
             assert!(replay.rows().all(|row| are_finite(replay.row(row))), "{how}");
         }
     }
+}
+
+/// `environment.server` as a function of `shoal_test_environments.py`, which is called with this Python expression.
+fn server_of(function: &str, argument: &str) -> String {
+    let program = format!("from shoal_test_environments import {function}; raise SystemExit({function}({argument}))");
+    let program = serde_json::to_string(&["python3", "-c", &program]).unwrap();
+    format!("environment.server={program}")
+}
+
+fn an_evaluator_killed_while_it_confirms_a_policy_repeats_nothing_it_reported() {
+    let place = place();
+    let server = server_of("holding_server", "2");
+    let arguments = [
+        "--lockstep",
+        "--steps",
+        "1000",
+        "--envs",
+        "2",
+        "--set",
+        "evaluation.every=200",
+    ];
+    let running = place.start_in(
+        "run",
+        &format!("{OURS}Grows-v0"),
+        &[&arguments[..], &["--set", &server]].concat(),
+    );
+    until("a policy is being confirmed", || place.path().join("held").exists());
+    running.kill("evaluator-0");
+    std::fs::write(place.path().join("go"), "").unwrap();
+    let run = running.run.clone();
+    let (code, _, leftovers) = running.wait();
+    assert_eq!(code, Some(0), "{}", place.stderr());
+    assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
+    let mut evaluations = csv::Reader::from_path(run.join("evaluations.csv")).unwrap();
+    let column = |name: &str, row: &csv::StringRecord, headers: &csv::StringRecord| {
+        row[headers.iter().position(|header| header == name).unwrap()].to_owned()
+    };
+    let headers = evaluations.headers().unwrap().clone();
+    let rows: Vec<_> = evaluations.records().map(Result::unwrap).collect();
+    let periods: Vec<u64> = rows
+        .iter()
+        .map(|row| column("env_steps", row, &headers).parse::<u64>().unwrap() / 200)
+        .collect();
+    assert_eq!(periods, (0..=5).collect::<Vec<_>>(), "each period once");
+    assert!(rows.iter().all(|row| column("best", row, &headers) == "1"), "{rows:?}");
 }
 
 fn a_module_sees_no_arguments_and_no_input_and_prints_to_the_log() {

@@ -1,7 +1,9 @@
 """Environments for the tests, some of which fail or cannot be served."""
 
+import json
 import os
 import subprocess
+import sys
 import time
 
 import gymnasium as gym
@@ -186,6 +188,23 @@ class Finale(Ends):
         return super().step(action)
 
 
+class Grows(Ends):
+    """Every episode has a greater return than those before."""
+
+    def __init__(self):
+        super().__init__(after=0)
+        self.resets = 0
+
+    def reset(self, *, seed=None, options=None):
+        self.resets += 1
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action):
+        observation, _, *rest = super().step(action)
+        return observation, float(self.resets), *rest
+
+
+gym.register("Grows-v0", entry_point=Grows, max_episode_steps=5)
 gym.register("Finale-v0", entry_point=Finale, max_episode_steps=5)
 gym.register("Ends-v0", entry_point=Ends, max_episode_steps=5)
 gym.register("Endless-v0", entry_point=Ends)
@@ -255,6 +274,101 @@ def hostile_server(how):
         server.Server._loan_blocks = another_length
     if how == "twice":
         server.Server.answer = twice
+    from shoal_gym.__main__ import main
+
+    return main()
+
+
+def holding_server(episodes):
+    """An environment server that creates the file ``held`` and waits for the file ``go`` when it is first asked for other
+    evaluation episodes than the first ``episodes``."""
+    from shoal_gym import environments
+
+    begin = environments.Environments.begin_evaluation
+
+    def begin_evaluation(self, first, count, blocks):
+        if first >= episodes and not os.path.exists("held"):
+            open("held", "w").close()
+            while not os.path.exists("go"):
+                time.sleep(0.01)
+        begin(self, first, count, blocks)
+
+    environments.Environments.begin_evaluation = begin_evaluation
+    from shoal_gym.__main__ import main
+
+    return main()
+
+
+def scripted_server(plan):
+    """An environment server that spoils its answers to one client by a plan, and does not check them.
+
+    Each deed is done with its chance, and at most ``times`` times by all servers in this directory together.
+    """
+    from shoal_gym import server
+
+    plan = json.loads(plan)
+    luck = np.random.default_rng(plan["seed"])
+    if not sys.argv[sys.argv.index("--client") + 1].startswith(plan["client"]):
+        plan["deeds"] = []
+
+    def is_due(deed):
+        if luck.random() >= deed["chance"]:
+            return False
+        for time_of in range(deed["times"]):
+            try:
+                os.close(os.open(f"{deed['what']}-{time_of}", os.O_CREAT | os.O_EXCL))
+                return True
+            except FileExistsError:
+                pass
+        return False
+
+    def due(*kinds):
+        return [deed for deed in plan["deeds"] if deed["what"] in kinds and is_due(deed)]
+
+    send, loan_blocks, answer = server.Server._send, server.Server._loan_blocks, server.Server.answer
+    header = server.ResponseHeader
+
+    def spoiled(self, response, verdict):
+        numbers = server._numbers(response.payload())
+        for deed in due("number", "numbers", "verdict"):
+            match deed["what"]:
+                case "number" if len(numbers) > 0:
+                    numbers[luck.integers(len(numbers))] = deed["number"]
+                case "numbers":
+                    numbers[:] = deed["number"]
+                case "verdict":
+                    verdict = deed["count"]
+        send(self, response, verdict)
+
+    def another_length(self, request):
+        response, blocks = loan_blocks(self, request)
+        for deed in due("length"):
+            return self._loan(request, deed["count"]), blocks
+        return response, blocks
+
+    def another_header(**fields):
+        for deed in due("header"):
+            fields[list(fields)[1 + deed["count"] % 7]] = deed["count"]
+        return header(**fields)
+
+    def answered(self, request):
+        for deed in due("none", "late", "exit", "refused"):
+            match deed["what"]:
+                case "none":
+                    return
+                case "late":
+                    time.sleep(deed["count"] / 10)
+                case "exit":
+                    os._exit(deed["count"])
+                case "refused":
+                    self._refuse(request, "it does not like it")
+                    return
+        answer(self, request)
+        for deed in due("twice"):
+            self._send(self._loan(request, deed["count"]), server.Verdict.ANSWERED)
+
+    server.Server._send, server.Server._loan_blocks, server.Server.answer = spoiled, another_length, answered
+    server.ResponseHeader = another_header
     from shoal_gym.__main__ import main
 
     return main()

@@ -100,14 +100,27 @@ impl Workplace {
         self.launch(name, &[&["resume", name], arguments].concat())
     }
 
+    /// The program, started with these signals ignored.
+    pub(crate) fn shoal_ignoring(&self, signals: &str, arguments: &[&str]) -> Command {
+        let mut shell = Command::new("sh");
+        shell.args(["-c", &format!("trap '' {signals}; exec \"$@\""), "sh"]);
+        shell.arg(env!("CARGO_BIN_EXE_shoal")).args(arguments);
+        shell.current_dir(self.path()).stdin(Stdio::null());
+        shell
+    }
+
     /// Starts a command that trains in the run directory `name`, and waits until every role is ready.
     pub(crate) fn launch(&self, name: &str, arguments: &[&str]) -> Running {
+        self.launch_command(name, &mut self.shoal(&[arguments, &["--json"]].concat()))
+    }
+
+    /// The same for a command with all its arguments.
+    pub(crate) fn launch_command(&self, name: &str, command: &mut Command) -> Running {
         let run = self.path().join(name);
         let log = || std::fs::read_to_string(run.join("shoal.log")).unwrap_or_default();
         let ready = || log().matches("every role is ready").count();
         let before = ready();
-        let child = self
-            .shoal(&[arguments, &["--json"]].concat())
+        let child = command
             .stdout(Stdio::piped())
             .stderr(std::fs::File::create(self.path().join("stderr")).unwrap())
             .env("SHOAL_LOG", self.log)
@@ -231,12 +244,19 @@ impl Running {
     }
 
     /// Waits until the launcher has ended. Returns its exit code, its standard output and the run's leftovers.
-    pub(crate) fn wait(mut self) -> (Option<i32>, String, Leftovers) {
+    pub(crate) fn wait(self) -> (Option<i32>, String, Leftovers) {
+        let run = self.run.clone();
+        let (code, printed) = self.wait_for_launcher();
+        (code, printed, Leftovers::of(&run))
+    }
+
+    /// Waits until the launcher has ended. Returns its exit code and its standard output.
+    pub(crate) fn wait_for_launcher(mut self) -> (Option<i32>, String) {
         until("the launcher has ended", || self.child.try_wait().unwrap().is_some());
         let code = self.child.wait().unwrap().code();
         let mut printed = String::new();
         std::io::Read::read_to_string(self.child.stdout.as_mut().unwrap(), &mut printed).unwrap();
-        (code, printed, Leftovers::of(&self.run))
+        (code, printed)
     }
 
     /// Processes and shared memory of this run.

@@ -24,6 +24,7 @@ use super::domain::{Domain, DomainError, io_error, iox_config, user_root};
 use super::error::ChannelError;
 use super::files::{SHARED_MEMORY, files_of};
 use super::memory::is_promise;
+use super::presence::is_presence;
 
 /// Interval between two sweeps: the longest time that a half-made file of a dead process delays other processes.
 const SWEEP_INTERVAL: Duration = Duration::from_millis(250);
@@ -107,8 +108,8 @@ pub(super) fn remove_unfinished(run_id: &str) -> io::Result<bool> {
 /// Whether iceoryx2 has not finished the file: it has no size, or is not readable.
 fn is_unfinished(path: &Path, metadata: &Metadata) -> bool {
     let name = path.file_name().map(|name| name.to_string_lossy());
-    let is_promise = name.is_some_and(|name| is_promise(&name));
-    metadata.is_file() && !is_promise && (metadata.len() == 0 || metadata.mode() & 0o400 == 0)
+    let is_ours = name.is_some_and(|name| is_promise(&name) || is_presence(&name));
+    metadata.is_file() && !is_ours && (metadata.len() == 0 || metadata.mode() & 0o400 == 0)
 }
 
 fn is_recent(metadata: &Metadata) -> bool {
@@ -230,12 +231,13 @@ mod tests {
         );
         let (whole, _) = Leftover::new("1.data", 0o600, b"whole");
         let (promise, _) = Leftover::new("promise_4096", 0o600, b"");
+        let (members, _) = Leftover::new("members", 0o600, b"");
         std::thread::sleep(2 * MIN_AGE);
         assert!(!remove_unfinished(&run_id()).unwrap());
         assert!(empty.0.exists() && closed.0.exists(), "their maker is alive");
         drop((making, filling));
         assert!(remove_unfinished(&run_id()).unwrap());
         assert!(!empty.0.exists() && !closed.0.exists());
-        assert!(whole.0.exists() && promise.0.exists());
+        assert!(whole.0.exists() && promise.0.exists() && members.0.exists());
     }
 }

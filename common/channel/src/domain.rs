@@ -16,6 +16,7 @@ use shoal_base::file_lock;
 
 use super::files::{SHARED_MEMORY, files_of, prefix};
 use super::memory;
+use super::presence::{self, Claim, Presence};
 
 /// How long to wait for a run's lock. Each process holds it for some milliseconds.
 const LOCK_PATIENCE: Duration = Duration::from_secs(10);
@@ -27,6 +28,12 @@ const VISITOR: &str = "visitor";
 #[derive(Debug)]
 pub struct Domain {
     node: Node<ipc::Service>,
+    /// `None` for visitors.
+    presence: Option<Presence>,
+    /// The user's directory, with a shared lock: systemd tidies no directory up that somebody has locked.
+    _user_root: Option<File>,
+    /// The run's directory in it, as it was when this process joined.
+    root: (u64, u64),
     run_id: String,
     max_actors: usize,
 }
@@ -52,7 +59,8 @@ pub enum DomainError {
     Locked(PathBuf),
     /// Processes of the run's previous launcher are still alive.
     #[error(
-        "run {run_id} cannot continue: some of its processes are still alive and do not end (stopped?): kill -9 {}",
+        "run {run_id} cannot continue: some of its processes are still alive and do not end (stopped?){}{}",
+        if pids.is_empty() { "" } else { ": kill -9 " },
         pids.iter().map(i32::to_string).collect::<Vec<_>>().join(" ")
     )]
     StillAlive {
@@ -91,7 +99,12 @@ impl Domain {
     fn enter(run_id: &str, max_actors: u32, name: &str) -> Result<Self, DomainError> {
         let root = user_root()?;
         // Held until the node exists, so that a process that removes abandoned runs does not remove this one.
-        let _lock = make_and_lock(&root.join(run_id))?;
+        let lock = make_and_lock(&root.join(run_id))?;
+        let user_root = File::open(&root).map_err(io_error("open", &root))?;
+        let presence = match name {
+            VISITOR => None,
+            _ => Some(Presence::enter(run_id).map_err(io_error("lock a file in", Path::new(SHARED_MEMORY)))?),
+        };
         let failed = |cause: String| DomainError::Join {
             run_id: run_id.into(),
             cause,
@@ -105,8 +118,13 @@ impl Domain {
             .create::<ipc::Service>()
             .map_err(|cause| failed(format!("{cause:?}")))?;
         close_to_others(run_id)?;
+        let root = lock.metadata().map_err(io_error("inspect", &root))?;
         Ok(Self {
             node,
+            presence,
+            // Somebody who holds it alone would be the program that tidies up, in this moment.
+            _user_root: user_root.try_lock_shared().is_ok().then_some(user_root),
+            root: (root.dev(), root.ino()),
             run_id: run_id.into(),
             max_actors: max_actors as usize,
         })
@@ -160,20 +178,41 @@ impl Domain {
         &self.node
     }
 
+    /// Whether the run's files outside `/dev/shm` are still there, with those of `services` services. If not, processes of
+    /// the run do not find each other any more.
+    pub fn is_intact(&self, services: usize) -> bool {
+        let Ok(directory) = self.directory() else {
+            return false;
+        };
+        let node = directory.join("nodes").join(self.node.id().value().to_string());
+        let details = node.join(format!("{}node.details", prefix(&self.run_id)));
+        let listed = std::fs::read_dir(directory.join("services")).map_or(0, Iterator::count);
+        let same = std::fs::metadata(&directory).is_ok_and(|now| (now.dev(), now.ino()) == self.root);
+        same && details.exists() && listed >= services
+    }
+
+    /// Whether a process of the run is alive, this one not counted if it is a visitor. It may be where iceoryx2 finds none.
+    pub fn has_members(&self) -> bool {
+        matches!(presence::claim(&self.run_id), Ok(Claim::Held))
+    }
+
     /// Leaves the run. The last process to leave removes all files of the run from shared memory, also when the
     /// launcher was killed.
     ///
     /// # Errors
     /// When files cannot be removed.
     pub fn leave(self) -> Result<(), DomainError> {
-        let run_id = self.run_id.clone();
-        drop(self);
-        let root = user_root()?;
-        // No directory: another process was the last, and removed the files before the directory.
-        match lock(&root.join(&run_id))? {
-            Some(_lock) => remove_if_dead(&root, &run_id),
-            None => Ok(()),
+        let Self {
+            node, presence, run_id, ..
+        } = self;
+        drop(node);
+        if let Some(presence) = presence {
+            presence.leave();
         }
+        let root = user_root()?;
+        // Made anew if it is gone: another program may have removed it before the files in shared memory.
+        let _lock = make_and_lock(&root.join(&run_id))?;
+        remove_if_dead(&root, &run_id)
     }
 
     /// Waits until the processes of an earlier, killed launcher have left the run `run_id`: they end by themselves. The
@@ -185,14 +224,18 @@ impl Domain {
         let root = user_root()?;
         let deadline = Instant::now() + patience;
         loop {
-            let left = {
+            let (mut left, is_free) = {
                 let _lock = lock(&root.join(run_id))?;
-                living_processes(&root, run_id)?
+                let is_free = matches!(claim(run_id)?, Claim::Free { .. });
+                (living_processes(&root, run_id)?, is_free)
             };
-            if left.is_empty() {
+            if left.is_empty() && is_free {
                 return Ok(());
             }
             if Instant::now() >= deadline {
+                if left.is_empty() {
+                    left = presence::members(run_id);
+                }
                 return Err(DomainError::StillAlive {
                     run_id: run_id.into(),
                     pids: left,
@@ -218,8 +261,20 @@ impl Domain {
                 remove_if_dead(&root, run_id)?;
             }
         }
+        // Those whose directory another program has removed.
+        let runs = presence::runs().map_err(io_error("list", Path::new(SHARED_MEMORY)))?;
+        for run_id in runs.iter().filter(|run_id| !root.join(run_id).exists()) {
+            if matches!(claim(run_id)?, Claim::Free { .. }) {
+                let _lock = make_and_lock(&root.join(run_id))?;
+                remove_if_dead(&root, run_id)?;
+            }
+        }
         Ok(())
     }
+}
+
+fn claim(run_id: &str) -> Result<Claim, DomainError> {
+    presence::claim(run_id).map_err(io_error("lock a file in", Path::new(SHARED_MEMORY)))
 }
 
 /// Makes the file that counts the run's nodes private: iceoryx2 makes it accessible to everybody, whatever the umask.
@@ -279,6 +334,11 @@ fn living_processes(root: &Path, run_id: &str) -> Result<Vec<i32>, DomainError> 
 
 fn remove_if_dead(root: &Path, run_id: &str) -> Result<(), DomainError> {
     if !living_processes(root, run_id)?.is_empty() {
+        return Ok(());
+    }
+    // Where another program has removed files of the run, its processes are not listed, but they are still its members.
+    let claim = claim(run_id)?;
+    if matches!(claim, Claim::Held) {
         return Ok(());
     }
     // The files are unused: no process of the run is left, and no other run has its name. iceoryx2 itself never removes

@@ -111,9 +111,9 @@ pub enum ChannelErrorKind {
 /// The other side of a channel violates the protocol, or sends something that cannot be used.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum PeerError {
-    /// A description lacks some of its numbers.
-    #[error("the answer is too short")]
-    ShortAnswer,
+    /// A description has another number of bounds than its spaces need.
+    #[error("the environment server's description has another number of bounds than its spaces need")]
+    DescriptionLength,
     /// A snapshot is of another environment, or of another number of environments.
     #[error("the snapshot has {found} words instead of {expected}")]
     SnapshotLength {

@@ -13,6 +13,7 @@ mod files;
 mod heartbeat;
 mod memory;
 pub mod policy;
+mod presence;
 pub mod reports;
 mod service;
 mod services;

@@ -94,6 +94,11 @@ impl Services {
         Ok(())
     }
 
+    /// How many services are held.
+    pub fn count(&self) -> usize {
+        self.held.len()
+    }
+
     /// Restores missing port tags of dead processes. Without its tag iceoryx2 never frees a port, so call this before a
     /// clean-up.
     ///

@@ -1,21 +1,42 @@
-//! Reads a child process's standard error on a thread. Any output takes bounded memory and bounded space in the log,
-//! and is harmless to a terminal that shows it.
+//! Reads a child process's standard error on a thread. Any output of another program takes bounded memory, and only as
+//! much of it is for the log as the rate allows. All output is harmless to a terminal that shows it.
 
 use std::fmt::Write as _;
 use std::io::{self, Read};
 use std::sync::mpsc::{self, Receiver, Sender};
 use std::time::{Duration, Instant};
 
-/// Bytes kept of a line.
+/// Bytes kept of a line of another program, and of Shoal itself, which writes no such lines.
 const LINE: usize = 4096;
+const OWN_LINE: usize = 1024 * 1024;
 
-/// Bytes that a child may write in a burst, and bytes per second that it may write permanently.
+/// Bytes that another program may write in a burst, and bytes per second that it may write permanently.
 const BURST: f64 = 4.0 * 1024.0 * 1024.0;
 const RATE: f64 = 256.0 * 1024.0;
 
 /// How long to wait for the last output of a process that has ended. It arrives at once unless another process keeps
 /// the pipe open.
 const LAST_OUTPUT: Duration = Duration::from_millis(200);
+
+/// Whose output it is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Writer {
+    /// Shoal itself: there is no limit.
+    Shoal,
+    /// Another program, such as the server of an environment.
+    Program,
+}
+
+/// A line of output.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Line<'a> {
+    /// A line for the log.
+    Kept(&'a str),
+    /// A line beyond the rate. It is not for the log, but may be the last one, which says why a program has ended.
+    TooMuch(&'a str),
+    /// How many lines were too much since the last one that was kept.
+    LeftOut(u64),
+}
 
 /// The thread that reads a child's output.
 #[derive(Debug)]
@@ -31,12 +52,13 @@ impl ChildOutput {
     pub fn read(
         name: &str,
         from: impl Read + Send + 'static,
-        take: impl FnMut(&str) + Send + 'static,
+        writer: Writer,
+        take: impl FnMut(Line<'_>) + Send + 'static,
     ) -> io::Result<Self> {
         let (sender, all_read) = mpsc::channel();
         std::thread::Builder::new()
             .name(name.into())
-            .spawn(move || forward(from, take, &sender))?;
+            .spawn(move || forward(from, Lines::new(writer), take, &sender))?;
         Ok(Self { all_read })
     }
 
@@ -47,8 +69,7 @@ impl ChildOutput {
     }
 }
 
-fn forward(mut from: impl Read, mut take: impl FnMut(&str), _all_read: &Sender<()>) {
-    let mut lines = Lines::default();
+fn forward(mut from: impl Read, mut lines: Lines, mut take: impl FnMut(Line<'_>), _all_read: &Sender<()>) {
     let mut bytes = [0; 8192];
     loop {
         match from.read(&mut bytes) {
@@ -63,6 +84,7 @@ fn forward(mut from: impl Read, mut take: impl FnMut(&str), _all_read: &Sender<(
 
 /// Splits bytes into lines and applies the limits.
 struct Lines {
+    writer: Writer,
     line: Vec<u8>,
     /// Bytes dropped from the current line.
     cut: usize,
@@ -72,9 +94,10 @@ struct Lines {
     left_out: u64,
 }
 
-impl Default for Lines {
-    fn default() -> Self {
+impl Lines {
+    fn new(writer: Writer) -> Self {
         Self {
+            writer,
             line: Vec::new(),
             cut: 0,
             allowance: BURST,
@@ -82,15 +105,17 @@ impl Default for Lines {
             left_out: 0,
         }
     }
-}
 
-impl Lines {
-    fn add(&mut self, bytes: &[u8], now: Instant, take: &mut impl FnMut(&str)) {
+    fn add(&mut self, bytes: &[u8], now: Instant, take: &mut impl FnMut(Line<'_>)) {
+        let longest = match self.writer {
+            Writer::Shoal => OWN_LINE,
+            Writer::Program => LINE,
+        };
         let since = self.counted.replace(now).map_or(Duration::ZERO, |then| now - then);
         self.allowance = BURST.min(self.allowance + RATE * since.as_secs_f64());
         let mut pieces = bytes.split(|byte| *byte == b'\n').peekable();
         while let Some(piece) = pieces.next() {
-            let kept = piece.len().min(LINE.saturating_sub(self.line.len()));
+            let kept = piece.len().min(longest.saturating_sub(self.line.len()));
             self.line.extend_from_slice(&piece[..kept]);
             self.cut += piece.len() - kept;
             if pieces.peek().is_some() {
@@ -99,31 +124,32 @@ impl Lines {
         }
     }
 
-    fn take_line(&mut self, take: &mut impl FnMut(&str)) {
+    fn take_line(&mut self, take: &mut impl FnMut(Line<'_>)) {
         let length = self.line.len() as f64;
-        if self.allowance < length {
+        let mut text = harmless(&String::from_utf8_lossy(&self.line));
+        if self.cut > 0 {
+            text += &format!(" … ({} more bytes)", self.cut);
+        }
+        if self.writer == Writer::Program && self.allowance < length {
             self.left_out += 1;
+            take(Line::TooMuch(&text));
         } else {
             self.allowance -= length;
             self.report_left_out(take);
-            let mut text = harmless(&String::from_utf8_lossy(&self.line));
-            if self.cut > 0 {
-                text += &format!(" … ({} more bytes)", self.cut);
-            }
-            take(&text);
+            take(Line::Kept(&text));
         }
         self.line.clear();
         self.cut = 0;
     }
 
-    fn report_left_out(&mut self, take: &mut impl FnMut(&str)) {
+    fn report_left_out(&mut self, take: &mut impl FnMut(Line<'_>)) {
         if self.left_out > 0 {
-            take(&format!("… ({} lines left out: too many at once)", self.left_out));
+            take(Line::LeftOut(self.left_out));
             self.left_out = 0;
         }
     }
 
-    fn end(&mut self, take: &mut impl FnMut(&str)) {
+    fn end(&mut self, take: &mut impl FnMut(Line<'_>)) {
         if !self.line.is_empty() {
             self.take_line(take);
         }
@@ -150,10 +176,17 @@ pub fn harmless(text: &str) -> String {
 mod tests {
     use super::*;
 
+    fn kept(line: Line<'_>) -> String {
+        let Line::Kept(text) = line else {
+            panic!("{line:?} was not kept");
+        };
+        text.to_owned()
+    }
+
     fn lines_of(pieces: &[&[u8]]) -> Vec<String> {
-        let (mut lines, mut taken) = (Lines::default(), Vec::new());
+        let (mut lines, mut taken) = (Lines::new(Writer::Program), Vec::new());
         let now = Instant::now();
-        let mut take = |line: &str| taken.push(line.to_owned());
+        let mut take = |line: Line<'_>| taken.push(kept(line));
         for piece in pieces {
             lines.add(piece, now, &mut take);
         }
@@ -169,9 +202,9 @@ mod tests {
 
     #[test]
     fn an_endless_line_is_cut_and_takes_bounded_memory() {
-        let mut lines = Lines::default();
+        let mut lines = Lines::new(Writer::Program);
         let (now, mut taken) = (Instant::now(), Vec::new());
-        let mut take = |line: &str| taken.push(line.to_owned());
+        let mut take = |line: Line<'_>| taken.push(kept(line));
         for _ in 0..1000 {
             lines.add(&[b'x'; 8192], now, &mut take);
             assert!(lines.line.capacity() <= 2 * LINE);
@@ -187,18 +220,47 @@ mod tests {
 
     #[test]
     fn a_flood_is_cut_and_later_lines_are_kept() {
-        let (mut lines, mut taken) = (Lines::default(), 0);
-        let (now, mut last) = (Instant::now(), String::new());
-        let line = [[b'x'; 99].as_slice(), b"\n"].concat();
-        for _ in 0..1_000_000 {
-            lines.add(&line, now, &mut |_: &str| taken += 1);
-        }
-        assert!(taken < 50_000, "{taken}");
-        lines.add(b"later\n", now + Duration::from_secs(1), &mut |line: &str| {
-            taken += 1;
-            last = line.to_owned();
-        });
+        let flood = |writer: Writer| {
+            let mut lines = Lines::new(writer);
+            let (now, mut taken, mut last, mut left_out) = (Instant::now(), 0, String::new(), 0);
+            let mut take = |line: Line<'_>| match line {
+                Line::Kept(text) => {
+                    taken += 1;
+                    last = text.to_owned();
+                }
+                Line::TooMuch(text) => last = text.to_owned(),
+                Line::LeftOut(count) => left_out += count,
+            };
+            for i in 0..200_000 {
+                lines.add(format!("{i:099}\n").as_bytes(), now, &mut take);
+            }
+            lines.add(b"why it ends\n", now, &mut take);
+            lines.add(b"later\n", now + Duration::from_secs(1), &mut take);
+            lines.end(&mut take);
+            (taken, last, left_out)
+        };
+        let (taken, last, left_out) = flood(Writer::Program);
+        assert!(taken < 50_000 && taken + left_out == 200_002, "{taken} {left_out}");
         assert_eq!(last, "later");
+        assert_eq!(
+            flood(Writer::Shoal),
+            (200_002, "later".into(), 0),
+            "its own lines are all kept"
+        );
+    }
+
+    #[test]
+    fn the_last_line_of_a_flood_is_passed_on() {
+        let (mut lines, mut last) = (Lines::new(Writer::Program), String::new());
+        let mut take = |line: Line<'_>| {
+            if let Line::TooMuch(text) = line {
+                last = text.to_owned();
+            }
+        };
+        lines.add(&b"noise\n".repeat(1_000_000), Instant::now(), &mut take);
+        lines.add(b"why it ends", Instant::now(), &mut take);
+        lines.end(&mut take);
+        assert_eq!(last, "why it ends");
     }
 
     #[test]

@@ -13,8 +13,7 @@ use rustix::thread::{CpuSet, sched_setaffinity};
 use shoal_common::report::{Identity, Role};
 use shoal_common::run_dir::RunDir;
 
-use crate::process::ChildGroup;
-use crate::process::ChildOutput;
+use crate::process::{ChildGroup, ChildOutput, Line, Writer};
 
 /// How long a process may take to end in order. A learner writes its replay to the disk.
 const END_PATIENCE: Duration = Duration::from_secs(15);
@@ -22,8 +21,8 @@ const END_PATIENCE: Duration = Duration::from_secs(15);
 /// How long a process whose state does not matter may take to end.
 const SHUT_DOWN_PATIENCE: Duration = Duration::from_secs(2);
 
-/// Exit code of a launcher that Ctrl-C has ended in order.
-const INTERRUPTED: i32 = 130;
+/// Exit code of a launcher that SIGTERM has ended in order.
+const TERMINATED: i32 = 143;
 
 /// A process that ends when its standard input closes, and therefore also when this process is gone.
 #[derive(Debug)]
@@ -77,13 +76,14 @@ impl Peer {
             what,
         };
         let last_line = Arc::clone(&peer.last_line);
-        let keep = move |line: &str| {
-            if !line.trim().is_empty() {
-                *last_line.lock().unwrap_or_else(PoisonError::into_inner) = Some(line.trim().into());
+        let keep = move |line: Line<'_>| match line {
+            Line::Kept(text) | Line::TooMuch(text) if !text.trim().is_empty() => {
+                *last_line.lock().unwrap_or_else(PoisonError::into_inner) = Some(text.trim().into());
             }
+            _ => {}
         };
         peer.output = stderr
-            .map(|stderr| ChildOutput::read("peer", stderr, keep))
+            .map(|stderr| ChildOutput::read("peer", stderr, Writer::Program, keep))
             .transpose()?;
         Ok(peer)
     }
@@ -141,12 +141,13 @@ impl Peer {
         }
     }
 
-    /// Ends a launcher with SIGINT and waits for it. A launcher does not watch its standard input.
+    /// Ends a launcher with SIGTERM and waits for it. A launcher does not watch its standard input, and ignores SIGINT if
+    /// this process was started in the background of a script.
     pub fn interrupt(mut self, patience: Duration) -> anyhow::Result<()> {
-        self.signal(Signal::INT)?;
+        self.signal(Signal::TERM)?;
         let status = self.await_end(patience)?;
         match status.code() {
-            Some(0 | INTERRUPTED) => Ok(()),
+            Some(0 | TERMINATED) => Ok(()),
             _ => self.ended_early(status),
         }
     }

@@ -186,16 +186,16 @@ impl EnvironmentClient {
     /// Asks the server for its spaces and the number of its environments.
     ///
     /// # Errors
-    /// When a stop is requested, the channel fails, or the answer is too short.
+    /// When a stop is requested, the channel fails, the server refuses, or its answer fits no spaces.
     pub fn describe(
         &self,
         listener: &Listener,
         mut idle: impl FnMut(),
     ) -> Result<(EnvironmentSpec, usize), Exit<ChannelError>> {
         let response = self.ask_until_answered(listener, RequestHeader::new(Ask::Describe, 0, 0), &[], &mut idle)?;
-        let (header, payload) = (response.user_header(), response.payload());
+        let (header, payload) = (response.user_header(), self.answered(&response)?);
         let described = header.described(payload);
-        described.ok_or_else(|| ChannelError::new(&self.channel, "describe", PeerError::ShortAnswer).into())
+        described.ok_or_else(|| ChannelError::new(&self.channel, "describe", PeerError::DescriptionLength).into())
     }
 
     /// Every environment begins an episode.
