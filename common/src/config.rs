@@ -24,6 +24,7 @@ pub use identity_format::IdentityFormat;
 pub use learner::LearnerConfig;
 pub use replay::ReplayConfig;
 pub use run::{Mode, RunConfig};
+use shoal_base::section;
 pub use shoal_base::section::OutOfRange;
 use shoal_base::space::EnvironmentSpec;
 use shoal_base::transition::{ChunkLayout, RowLayout};
@@ -74,6 +75,12 @@ pub enum ConfigError {
         /// What is wrong with it, on one line.
         message: String,
     },
+    /// The text is not TOML.
+    #[error("{message}")]
+    Syntax {
+        /// Where it is wrong and why, on one line.
+        message: String,
+    },
     /// A value is out of range.
     #[error(transparent)]
     OutOfRange(#[from] OutOfRange),
@@ -99,7 +106,9 @@ impl Config {
             path: path.to_owned(),
             cause,
         })?;
-        let table = text.parse().map_err(|error| malformed(path.display(), &error))?;
+        let table = text.parse::<toml::Table>().map_err(|error| ConfigError::Syntax {
+            message: section::malformed(path.display(), &text, &error),
+        })?;
         Self::from_table(table, path.display())
     }
 
@@ -108,7 +117,10 @@ impl Config {
     /// # Errors
     /// When a key is unknown, of the wrong type, or out of range.
     pub fn from_table(table: toml::Table, origin: impl Display) -> Result<Self, ConfigError> {
-        let config: Self = table.try_into().map_err(|error| malformed(origin, &error))?;
+        let config: Self = table.clone().try_into().map_err(|error| ConfigError::Malformed {
+            origin: origin.to_string(),
+            message: sections::at_fault(&table).unwrap_or_else(|| one_line(&error)),
+        })?;
         config.check()?;
         Ok(config)
     }
@@ -219,11 +231,8 @@ impl Config {
     }
 }
 
-fn malformed(origin: impl Display, error: &toml::de::Error) -> ConfigError {
-    ConfigError::Malformed {
-        origin: origin.to_string(),
-        message: error.message().replace('\n', " "),
-    }
+fn one_line(error: &toml::de::Error) -> String {
+    error.message().replace('\n', " ")
 }
 
 #[cfg(test)]

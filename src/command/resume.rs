@@ -1,11 +1,14 @@
 //! `shoal resume`: continues a run that was stopped or killed.
 
+use std::io::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::{Context, bail};
 use clap::Args;
 use shoal_common::run_dir::RunDir;
+use shoal_run::numbers::count;
+use shoal_run::plan::warning;
 use shoal_run::server_location::ServerLocation;
 use shoal_run::status;
 
@@ -17,10 +20,10 @@ pub(crate) struct ResumeArgs {
     /// Run directory.
     pub(crate) run: PathBuf,
     /// Environment steps of all actors together, including those already taken [default: as before].
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = count)]
     pub(crate) steps: Option<u64>,
     /// Episodes of all actors together, including those already finished [default: as before].
-    #[arg(long, value_name = "M")]
+    #[arg(long, value_name = "M", value_parser = count)]
     pub(crate) episodes: Option<u64>,
     #[command(flatten)]
     pub(crate) output: OutputMode,
@@ -52,6 +55,9 @@ pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
         (config.run.steps, config.run.episodes) = (steps, episodes);
         config.check()?;
         run.write_config(&config)?;
+    }
+    if let Some(warning) = warning(&config) {
+        writeln!(std::io::stderr(), "warning: {warning}")?;
     }
     run_training(config, &run, lock, &args.output)
 }
