@@ -271,6 +271,31 @@ mod tests {
     }
 
     #[test]
+    fn a_discrete_space_has_at_most_as_many_indices_as_a_float_counts_exactly() {
+        let sized = |n: u64| parse(&MINIMAL.replace("discrete.n = 16", &format!("discrete.n = {n}")));
+        assert!(sized(1 << 24).is_ok());
+        assert_eq!(
+            sized((1 << 24) + 1).unwrap_err().to_string(),
+            "spec.observation = 16777217 indices: must be at most 16777216 (2^24) indices: choose an environment with fewer"
+        );
+    }
+
+    #[test]
+    fn a_key_of_the_wrong_type_is_named() {
+        for (text, part) in [
+            ("[actors]\nenvs = true\n", "test: actors.envs = true: invalid type"),
+            ("[replay]\nwarmup = -1\n", "test: replay.warmup = -1: invalid value"),
+            (
+                "[learner]\nthread = 1\n",
+                "test: learner.thread = 1: unknown field `thread`",
+            ),
+        ] {
+            let message = parse(&format!("{MINIMAL}{text}")).unwrap_err().to_string();
+            assert!(message.starts_with(part) && !message.contains('\n'), "{message}");
+        }
+    }
+
+    #[test]
     fn the_fingerprint_depends_on_the_environment_but_not_on_the_length_of_the_run() {
         let base = parse(MINIMAL).unwrap();
         let mut other = base.clone();

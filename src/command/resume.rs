@@ -6,10 +6,13 @@ use std::process::ExitCode;
 
 use anyhow::{Context, bail};
 use clap::Args;
+use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
+use shoal_run::earlier_best::{EvaluatedAnew, evaluate_anew};
 use shoal_run::numbers::count;
 use shoal_run::plan::warning;
 use shoal_run::server_location::ServerLocation;
+use shoal_run::signals::{Signals, exit_code};
 use shoal_run::status;
 
 use super::training::OutputMode;
@@ -56,8 +59,39 @@ pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
         config.check()?;
         run.write_config(&config)?;
     }
+    if let Some(signal) = evaluate_best_anew(&run, &config)? {
+        return Ok(exit_code(signal));
+    }
     if let Some(warning) = warning(&config) {
         writeln!(std::io::stderr(), "warning: {warning}")?;
     }
     run_training(config, &run, lock, &args.output)
+}
+
+/// Evaluates the best policy again if an earlier version did that from other starts. Returns the signal that ended it, if
+/// one did.
+fn evaluate_best_anew(run: &RunDir, config: &Config) -> anyhow::Result<Option<i32>> {
+    let signals = Signals::register()?;
+    let interrupt = signals.interrupt();
+    let here = run.path().display();
+    match (evaluate_anew(run, config, &interrupt), interrupt.signal()) {
+        (Err(_), Some(signal)) => {
+            writeln!(
+                std::io::stderr(),
+                "ended by signal {signal}; nothing has changed in {here}"
+            )?;
+            Ok(Some(signal))
+        }
+        (evaluated, _) => {
+            let evaluated = evaluated.with_context(|| format!("cannot resume {here}: its best policy"))?;
+            if let Some(EvaluatedAnew { before, now }) = evaluated {
+                writeln!(
+                    std::io::stderr(),
+                    "the best policy is evaluated anew, for an earlier version used other starts: {:.2} instead of {before:.2}",
+                    now.return_mean
+                )?;
+            }
+            Ok(None)
+        }
+    }
 }
