@@ -81,15 +81,26 @@ impl Remote {
             (_, None | Some(RunState::Running)) => STARTING,
             _ => "starting or ending",
         };
-        Ok(Some(RunStatus {
+        self.saved(waiting).map(Some)
+    }
+
+    fn saved(&self, waiting: &str) -> anyhow::Result<RunStatus> {
+        Ok(RunStatus {
             waiting: Some(waiting.into()),
             ..saved_status(&self.run.config()?, &self.run)?
-        }))
+        })
     }
 
     /// The run's status; `None` if it is not running.
     pub fn status(&self) -> anyhow::Result<Option<RunStatus>> {
-        match self.ask(Question::Status, PATIENCE)? {
+        // A launcher that leaves its start may remove the shared memory in which it was asked.
+        let outcome = RunOutcome::read(&self.run)?;
+        let starts = outcome.and_then(|outcome| outcome.reason).as_deref() == Some(STARTING);
+        let answer = match self.ask(Question::Status, PATIENCE) {
+            Err(_) if starts => Some(Answer::Status(self.saved(STARTING)?)),
+            answer => answer?,
+        };
+        match answer {
             None => Ok(None),
             Some(Answer::Status(status)) => Ok(Some(status)),
             Some(other) => bail!("the launcher gave an unexpected answer: {other:?}"),

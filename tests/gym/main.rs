@@ -546,7 +546,14 @@ fn too_many_invalid_answers_end_a_run_that_can_be_resumed() {
     let place = place();
     let environment = format!("{OURS}Invalid-v0");
     let always = ["--set", "environment.what=shape", "--set", "environment.always=true"];
-    let few = ["--steps", "2000", "--set", "environment.faults=7"];
+    let few = [
+        "--steps",
+        "2000",
+        "--set",
+        "environment.faults=7",
+        "--set",
+        "replay.warmup=64",
+    ];
     let command = [&["train", &environment, "--run", "run"][..], &SHORT, &always, &few].concat();
     let output = place.output(&command);
     assert_eq!(output.status.code(), Some(1));
