@@ -22,7 +22,7 @@ use shoal_common::report::{EpisodeReport, EvaluationReport, Heartbeat, LearnerRe
 use shoal_common::run_dir::{RunDir, RunLock};
 use shoal_common::stop::GRACE;
 use shoal_run::external_environment::server_iceoryx2_config;
-use shoal_run::outcome::{RunOutcome, RunState};
+use shoal_run::outcome::{RunOutcome, RunState, STARTING};
 use shoal_run::process::wait_for_any;
 use shoal_run::recorder::Recorder;
 use shoal_run::signals::Signals;
@@ -120,6 +120,9 @@ fn run_once(
     signals: &Signals,
     quiet: bool,
 ) -> anyhow::Result<TrainingOutcome> {
+    let saved = status::saved_status(&config, run)?;
+    let starts = RunOutcome::new(RunState::Running, saved.env_steps, saved.episodes).with_reason(STARTING);
+    starts.write(run)?;
     Domain::wait_for_earlier_processes(&config.run.id, PREDECESSORS_END).map_err(|error| explain(error, run))?;
     Domain::remove_abandoned()?;
     let domain = Domain::join(&config.run.id, config.actors.max)?;

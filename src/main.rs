@@ -13,11 +13,16 @@ use std::io::Write;
 use std::process::ExitCode;
 use std::sync::Arc;
 
+use clap::error::ErrorKind;
 use clap::{CommandFactory, Parser};
 use iceoryx2::prelude::{LogLevel, set_log_level};
 use shoal_common::report::Role;
+use shoal_run::plan::UsageError;
 
 use crate::cli::{Cli, Command};
+
+/// The exit code for arguments that the program cannot use.
+const WRONG_USAGE: u8 = 2;
 
 fn main() -> ExitCode {
     completion::answer(Cli::command);
@@ -27,16 +32,33 @@ fn main() -> ExitCode {
     set_log_level(LogLevel::Fatal);
     // A file-size limit must be an error of the write that exceeds it, not the end of the process.
     let registered = signal_hook::flag::register(signal_hook::consts::SIGXFSZ, Arc::default());
-    let result = registered
-        .map_err(anyhow::Error::from)
-        .and_then(|_| run(&Cli::parse().command));
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        Err(error) => return wrong_usage(&error),
+    };
+    let result = registered.map_err(anyhow::Error::from).and_then(|_| run(&cli.command));
     result.unwrap_or_else(|error| {
         // After a broken pipe nobody reads the message.
         if !is_broken_pipe(&error) {
             let _ = writeln!(std::io::stderr(), "error: {}", in_one_line(&error));
         }
-        ExitCode::FAILURE
+        if error.is::<UsageError>() {
+            WRONG_USAGE.into()
+        } else {
+            ExitCode::FAILURE
+        }
     })
+}
+
+/// Prints what is wrong with the arguments, or what `--help` and `--version` ask for. A value that is refused needs no
+/// more than its line.
+fn wrong_usage(error: &clap::Error) -> ExitCode {
+    if error.kind() != ErrorKind::ValueValidation {
+        error.exit();
+    }
+    let text = error.to_string();
+    let _ = writeln!(std::io::stderr(), "{}", text.lines().next().unwrap_or_default());
+    WRONG_USAGE.into()
 }
 
 fn run(command: &Command) -> anyhow::Result<ExitCode> {
@@ -46,7 +68,7 @@ fn run(command: &Command) -> anyhow::Result<ExitCode> {
         Command::Status(args) => command::status::run(args),
         Command::Scale(args) => command::scale::run(args).map(done),
         Command::Stop(args) => command::stop::run(args).map(done),
-        Command::Eval(args) => command::eval::run(args).map(done),
+        Command::Eval(args) => command::eval::run(args),
         Command::Plot(args) => command::plot::run(args).map(done),
         Command::Report(args) => command::report::run(args).map(done),
         Command::Export(args) => command::export::run(args).map(done),

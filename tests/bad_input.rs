@@ -15,17 +15,70 @@ fn invalid_training_arguments_are_refused_before_anything_is_created() {
         "[environment]\nname = \"pendulum\"\n[lerner]\n",
     )
     .unwrap();
+    for (name, text) in [
+        (
+            "late",
+            "[environment]\nname = \"pendulum\"\n[replay]\ncapacity = 1e4\nwarmup = 1.5\n",
+        ),
+        ("typed", "[environment]\nname = \"pendulum\"\n[run]\nmode = 3\n"),
+        ("parameter", "[environment]\nname = \"pendulum\"\n\nstart_sped = 1\n"),
+    ] {
+        std::fs::write(place.path().join(format!("{name}.toml")), text).unwrap();
+    }
     for (arguments, part) in [
         (
             &["pendulums"][..],
-            "there is no preset `pendulums`: choose pendulum, point-mass-r1",
+            "there is no preset `pendulums`; did you mean pendulum? Otherwise choose pendulum, point-mass-r1",
         ),
+        (
+            &["walker"],
+            "there is no preset `walker`: choose pendulum, point-mass-r1",
+        ),
+        (&["Pendulum-v1"], "did you mean gym:Pendulum-v1?"),
         (&["missing.toml"], "cannot read missing.toml"),
-        (&["broken.toml"], "broken.toml"),
-        (&["strange.toml"], "strange.toml: unknown field `lerner`"),
+        (&["broken.toml"], "broken.toml, line 1 (`[run`): "),
+        (&["strange.toml"], "strange.toml, line 3: unknown field `lerner`"),
+        (&["strange.toml"], "; did you mean `learner`?"),
+        (
+            &["late.toml"],
+            "late.toml, line 5: replay.warmup = 1.5: must be a whole number",
+        ),
+        (&["typed.toml"], "typed.toml, line 4: run.mode = 3: "),
+        (
+            &["parameter.toml"],
+            "parameter.toml, line 4: environment pendulum: unknown field `start_sped`",
+        ),
         (
             &["pendulum", "--set", "ddpg.gama=0.9"],
-            "unknown field `gama`, expected one of",
+            "ddpg.gama = 0.9: unknown field `gama`, expected one of",
+        ),
+        (&["pendulum", "--set", "ddpg.gama=0.9"], "; did you mean `gamma`?"),
+        (
+            &["pendulum", "--set", "dpg.gamma=0.9"],
+            "error: unknown field `dpg`, expected",
+        ),
+        (
+            &["pendulum", "--set", "environment.name=Ant-v5"],
+            "did you mean gym:Ant-v5?",
+        ),
+        (&["pendulum", "--steps", "1.5"], "1.5 is not a whole number"),
+        (&["pendulum", "--episodes", "1e-3"], "1e-3 is not a whole number"),
+        (&["pendulum", "--actors", "1e10"], "1e10 is too large"),
+        (
+            &["pendulum", "--set", "replay.capacity=1.5k2"],
+            "must be a whole number, such as 1000, 1e5 or 30k",
+        ),
+        (
+            &["pendulum", "--set", "run.episodes=1e-3"],
+            "run.episodes = 0.001: must be a whole number",
+        ),
+        (
+            &["pendulum", "--set", "replay.capacity=500"],
+            "error: replay.capacity = 500: does not go with replay.warmup = 1000 (the default), which must be from 1 to 500",
+        ),
+        (
+            &["pendulum", "--actors", "300"],
+            "error: --actors: actors.count = 300: must be from 1 to 256",
         ),
         (
             &["pendulum", "--set", "ddpg.gamma=1.1"],
@@ -121,13 +174,74 @@ fn invalid_training_arguments_are_refused_before_anything_is_created() {
         (&["cart-pole", "--episodes", "0"], "run.episodes = 0: must be from 1"),
         (&["pendulum", "--steps", "0"], "run.steps = 0"),
     ] {
-        let message = error_line(&place.output(&[&["train"], arguments].concat()));
+        let output = place.output(&[&["train"], arguments].concat());
+        let message = error_line(&output);
+        // A file is no part of the command line.
+        let expected = if arguments[0].ends_with(".toml") { 1 } else { 2 };
+        assert_eq!(output.status.code(), Some(expected), "{arguments:?}: {message}");
         assert!(
             message.starts_with("error: ") && message.contains(part),
             "{arguments:?}: {message}"
         );
     }
     assert!(!place.path().join("runs").exists(), "nothing was created");
+}
+
+#[test]
+fn a_mistyped_command_is_wrong_usage_with_a_suggestion() {
+    let output = Workplace::new().output(&["trian", "pendulum"]);
+    assert_eq!(output.status.code(), Some(2));
+    let message = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(message.contains("similar") && message.contains("'train'"), "{message}");
+}
+
+#[test]
+fn counts_are_taken_as_people_write_them_and_a_run_without_learning_is_warned_of() {
+    let place = Workplace::new();
+    let counted = [
+        "pendulum",
+        "--steps",
+        "0.4k",
+        "--run",
+        "run",
+        "--set",
+        "replay.capacity=2e3",
+    ];
+    assert_eq!(place.train(&counted)["env_steps"], 400);
+    let config = std::fs::read_to_string(place.path().join("run/config.toml")).unwrap();
+    assert!(
+        config.contains("steps = 400\n") && config.contains("capacity = 2000\n"),
+        "{config}"
+    );
+
+    let output = place.output(&[&["resume", "run", "--steps", "5e2"][..], &["--json"]].concat());
+    assert_eq!(support::json(&output)["env_steps"], 500);
+    let warned = |warmup: &str| {
+        let warmup = format!("replay.warmup={warmup}");
+        let output = place.output(&["train", "pendulum", "--steps", "300", "--quiet", "--set", &warmup]);
+        assert!(output.status.success());
+        String::from_utf8_lossy(&output.stderr).into_owned()
+    };
+    assert!(!warned("200").contains("warning"), "it learns");
+    let warning = warned("300");
+    assert!(
+        warning.starts_with("warning: nothing will be learned") && warning.contains("warm-up of 300 steps"),
+        "{warning}"
+    );
+}
+
+#[test]
+fn what_a_method_fixes_need_not_be_in_a_file() {
+    let place = Workplace::new();
+    let table = "[environment]\nname = \"frozen-lake\"\n[sarsa]\nalpha = 0.5\n";
+    std::fs::write(place.path().join("table.toml"), table).unwrap();
+    let episodes = "[environment]\nname = \"cart-pole\"\ntime_limit = 50\n[reinforce]\nhidden = [8]\n";
+    std::fs::write(place.path().join("episodes.toml"), episodes).unwrap();
+    for file in ["table.toml", "episodes.toml"] {
+        let output = place.output(&["train", file, "--steps", "200", "--json"]);
+        let steps = support::json(&output)["env_steps"].as_u64();
+        assert!(steps >= Some(200), "{file}");
+    }
 }
 
 #[test]
@@ -146,6 +260,11 @@ fn a_path_that_is_not_a_run_directory_is_refused() {
     for command in ["eval", "plot"] {
         let message = error_line(&place.output(&[command, "nowhere"]));
         assert!(message.contains("nowhere is not a run directory"), "{message}");
+        std::fs::create_dir_all(place.path().join("runs/nowhere")).unwrap();
+        std::fs::write(place.path().join("runs/nowhere/config.toml"), "").unwrap();
+        let message = error_line(&place.output(&[command, "nowhere"]));
+        assert!(message.contains("did you mean runs/nowhere?"), "{message}");
+        std::fs::remove_dir_all(place.path().join("runs")).unwrap();
     }
 }
 

@@ -245,6 +245,8 @@ fn a_stopped_run_resumes_where_it_stopped() {
         (&["resume", "nowhere"], "nowhere is not a run directory"),
         (&["status", "nowhere"], "nowhere is not a run directory"),
         (&["scale", "run", "--actors", "2"], "nothing runs"),
+        (&["scale", "run", "--actors", "2"], "it is finished; `shoal resume"),
+        (&["stop", "run"], &format!("--steps N` with N above {steps}")),
     ] {
         let output = place.output(arguments);
         assert_eq!(output.status.code(), Some(1));

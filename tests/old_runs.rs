@@ -93,6 +93,9 @@ fn check(name: &str, ended: Ended, playable: bool) {
         is_read(&place, playable);
         if playable {
             is_resumed(&place, ended);
+            if name == "gym-stopped" {
+                its_best_policy_is_not_evaluated_anew_again(&place);
+            }
             // Now its records have rows of both versions.
             is_listed_as(&place, "finished");
             is_read(&place, playable);
@@ -200,6 +203,15 @@ fn is_evaluated_as_before(place: &Workplace) {
     assert!((now - then).abs() <= 1e-3 * then.abs().max(1.0), "{now} and {then}");
 }
 
+fn its_best_policy_is_not_evaluated_anew_again(place: &Workplace) {
+    let steps = json(&place.output(&["status", "run", "--json"]))["steps"]
+        .as_u64()
+        .unwrap();
+    let output = place.output(&["resume", "run", "--json", "--steps", &(steps + 500).to_string()]);
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.success() && !said.contains("evaluated anew"), "{said}");
+}
+
 /// Resumes a stopped run to its planned end, or a finished one to a later end. It keeps what it learned and collected.
 fn is_resumed(place: &Workplace, ended: Ended) {
     let before = support::json(&place.output(&["status", "run", "--json"]));
@@ -217,6 +229,12 @@ fn is_resumed(place: &Workplace, ended: Ended) {
 
     let output = place.output(&resume);
     let run = place.path().join("run");
+    // Earlier versions evaluated in Gymnasium's environments from other starts.
+    let config = Config::load(&run.join("config.toml")).unwrap();
+    let is_served = config.environment.name.starts_with("gym:");
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(said.contains("the best policy is evaluated anew"), is_served, "{said}");
+    assert_eq!(run.join("server.json").exists(), is_served);
     let log = std::fs::read_to_string(run.join("shoal.log")).unwrap();
     let message = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(0), "{message}\n{log}");

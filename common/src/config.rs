@@ -24,6 +24,7 @@ pub use identity_format::IdentityFormat;
 pub use learner::LearnerConfig;
 pub use replay::ReplayConfig;
 pub use run::{Mode, RunConfig};
+use shoal_base::section;
 pub use shoal_base::section::OutOfRange;
 use shoal_base::space::EnvironmentSpec;
 use shoal_base::transition::{ChunkLayout, RowLayout};
@@ -77,6 +78,12 @@ pub enum ConfigError {
         /// What is wrong with it, on one line.
         message: String,
     },
+    /// The text is not TOML.
+    #[error("{message}")]
+    Syntax {
+        /// Where it is wrong and why, on one line.
+        message: String,
+    },
     /// A value is out of range.
     #[error(transparent)]
     OutOfRange(#[from] OutOfRange),
@@ -104,7 +111,9 @@ impl Config {
             path: path.to_owned(),
             cause,
         })?;
-        let table = text.parse().map_err(|error| malformed(path.display(), &error))?;
+        let table = text.parse::<toml::Table>().map_err(|error| ConfigError::Syntax {
+            message: section::malformed(path.display(), &text, &error),
+        })?;
         Self::from_table(table, path.display())
     }
 
@@ -113,7 +122,10 @@ impl Config {
     /// # Errors
     /// When a key is unknown, of the wrong type, or out of range.
     pub fn from_table(table: toml::Table, origin: impl Display) -> Result<Self, ConfigError> {
-        let config: Self = table.try_into().map_err(|error| malformed(origin, &error))?;
+        let config: Self = table.clone().try_into().map_err(|error| ConfigError::Malformed {
+            origin: origin.to_string(),
+            message: sections::at_fault(&table).unwrap_or_else(|| one_line(&error)),
+        })?;
         config.check()?;
         Ok(config)
     }
@@ -238,11 +250,8 @@ impl Config {
     }
 }
 
-fn malformed(origin: impl Display, error: &toml::de::Error) -> ConfigError {
-    ConfigError::Malformed {
-        origin: origin.to_string(),
-        message: error.message().replace('\n', " "),
-    }
+fn one_line(error: &toml::de::Error) -> String {
+    error.message().replace('\n', " ")
 }
 
 #[cfg(test)]
@@ -278,6 +287,31 @@ mod tests {
         assert_eq!(range, "ddpg.gamma = 1.5: must be from 0 to 1");
         let nan = parse(&format!("{MINIMAL}[ddpg]\ntau = nan\n")).unwrap_err().to_string();
         assert!(nan.contains("ddpg.tau = NaN"), "{nan}");
+    }
+
+    #[test]
+    fn a_discrete_space_has_at_most_as_many_indices_as_a_float_counts_exactly() {
+        let sized = |n: u64| parse(&MINIMAL.replace("discrete.n = 16", &format!("discrete.n = {n}")));
+        assert!(sized(1 << 24).is_ok());
+        assert_eq!(
+            sized((1 << 24) + 1).unwrap_err().to_string(),
+            "spec.observation = 16777217 indices: must be at most 16777216 (2^24) indices: choose an environment with fewer"
+        );
+    }
+
+    #[test]
+    fn a_key_of_the_wrong_type_is_named() {
+        for (text, part) in [
+            ("[actors]\nenvs = true\n", "test: actors.envs = true: invalid type"),
+            ("[replay]\nwarmup = -1\n", "test: replay.warmup = -1: invalid value"),
+            (
+                "[learner]\nthread = 1\n",
+                "test: learner.thread = 1: unknown field `thread`",
+            ),
+        ] {
+            let message = parse(&format!("{MINIMAL}{text}")).unwrap_err().to_string();
+            assert!(message.starts_with(part) && !message.contains('\n'), "{message}");
+        }
     }
 
     #[test]

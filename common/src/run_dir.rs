@@ -25,7 +25,7 @@ pub enum RunDirError {
     #[error("{0} exists already; choose another directory with --run, or remove it")]
     Exists(PathBuf),
     /// There is no run in this directory.
-    #[error("{0} is not a run directory: it has no config.toml")]
+    #[error("{0} is not a run directory: it has no config.toml{hint}", hint = did_you_mean(.0))]
     NotARun(PathBuf),
     /// Another launcher is running the run.
     #[error("the run in {0} is already running: a launcher holds its lock; end that one first")]
@@ -46,6 +46,16 @@ pub enum RunDirError {
         /// The system's reason.
         cause: io::Error,
     },
+}
+
+/// The directory in which `shoal train` makes its runs, if the path is a bare name that is a run there.
+fn did_you_mean(path: &Path) -> String {
+    let there = Path::new("runs").join(path);
+    if path.components().count() == 1 && there.join("config.toml").is_file() {
+        format!("; did you mean {}?", there.display())
+    } else {
+        String::new()
+    }
 }
 
 /// The lock of a run. The launcher holds it while the run is running; the system releases it when the launcher dies.

@@ -54,24 +54,8 @@ pub fn evaluate(config: &Config, parameters: &[f32], episodes: u32, seed: u64) -
     evaluate_by(Rollout::new(config, parameters)?, config, episodes, seed, |_| ())
 }
 
-/// The same for this run: an environment that another program serves is served as in training.
-pub fn evaluate_run(
-    run: &RunDir,
-    config: &Config,
-    parameters: &[f32],
-    episodes: u32,
-    seed: u64,
-) -> anyhow::Result<EvaluationSummary> {
-    evaluate_by(
-        Rollout::of_run(run, config, parameters)?,
-        config,
-        episodes,
-        seed,
-        |_| (),
-    )
-}
-
-/// The same as [`evaluate_run`], but a signal ends it with an error. It calls `progress` with the number of finished
+/// The same for this run: an environment that another program serves is served as in training. A signal ends it with an
+/// error. It calls `progress` with the number of finished
 /// episodes.
 ///
 /// # Errors

@@ -3,6 +3,7 @@
 
 pub mod analysis;
 pub mod description;
+pub mod earlier_best;
 pub mod evaluation;
 pub mod external_environment;
 pub mod final_evaluation;

@@ -1,10 +1,10 @@
 //! The method of a new run: the one that was asked for, or the one that suits the environment; and its defaults.
 
-use anyhow::{Context, bail};
-use shoal_common::algorithms::Experience;
-use shoal_common::config::Algorithm;
+use anyhow::Context;
 use shoal_common::space::{EnvironmentSpec, Space};
 use toml::{Table, Value};
+
+use crate::plan::UsageError;
 
 /// The defaults of each method: its section, and the keys of other sections that go with it.
 const DEFAULTS: [(&str, &str); 7] = [
@@ -33,18 +33,20 @@ pub(crate) fn asked_for(method: Option<&str>, set: &[String]) -> anyhow::Result<
     let known = |name: &str| names().find(|known| *known == name);
     let by_name = match method {
         None => None,
-        Some(name) => Some(known(name).with_context(|| {
-            format!(
+        Some(name) => Some(known(name).ok_or_else(|| {
+            let names: Vec<&str> = names().collect();
+            UsageError(format!(
                 "--method {name}: there is no such method; choose {}",
-                names().collect::<Vec<_>>().join(", ")
-            )
+                names.join(", ")
+            ))
         })?),
     };
     let sections = set.iter().filter_map(|assignment| assignment.split('.').next());
     let mut asked = by_name;
     for section in sections.filter_map(known) {
         if let Some(other) = asked.filter(|other| *other != section) {
-            bail!("{other} and {section} are two methods, and a run has one: leave out what belongs to the other");
+            let two = format!("{other} and {section} are two methods, and a run has one: leave out one of them");
+            return Err(UsageError(two).into());
         }
         asked = Some(section);
     }
@@ -99,18 +101,6 @@ pub(crate) fn add_defaults(table: &mut Table, name: &str, method: &'static str) 
     }
     add(table, defaults(method)?);
     Ok(())
-}
-
-/// Fills in what follows from the environment's spaces for this method, if it is not set.
-pub(crate) fn fit(table: &mut Table, spec: &EnvironmentSpec) {
-    let Some(method) = named_in(table) else { return };
-    let is_of_episodes =
-        |algorithm: &Algorithm| algorithm.name() == method && algorithm.spec().experience == Experience::Episodes;
-    if Algorithm::all().iter().any(is_of_episodes) {
-        // A chunk holds a whole episode.
-        let chunk = Table::from_iter([("chunk_steps".to_owned(), Value::from(spec.time_limit))]);
-        add(table, Table::from_iter([("actors".to_owned(), chunk.into())]));
-    }
 }
 
 fn defaults(method: &str) -> anyhow::Result<Table> {

@@ -10,6 +10,12 @@ use shoal_common::run_dir::RunDir;
 /// The number of the file's format.
 const FORMAT: u32 = 1;
 
+/// The reason in the outcome of a run whose launcher answers no questions yet. Its state is `Running`.
+pub const STARTING: &str = "starting";
+
+/// The reason in the outcome of a run that evaluates its policies once more. Its state is still `Running`.
+pub const FINAL_EVALUATION: &str = "final evaluation";
+
 /// How a run ended.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RunOutcome {

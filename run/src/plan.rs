@@ -1,17 +1,27 @@
 //! The configuration of a new run: presets, files and overrides become one resolved configuration. No later code reads
 //! command-line options.
 
+mod source;
+mod suggestion;
+
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 use serde::de::DeserializeOwned;
+use shoal_common::algorithms::Experience;
+use shoal_common::config::explanation::{self, Key};
 use shoal_common::config::{ActorsConfig, Algorithm, Config, EnvironmentConfig, IdentityFormat, Mode, RunConfig};
 use shoal_common::run_dir::{RunDir, RunLock};
-use shoal_env_server::environment;
+use shoal_common::section;
+use shoal_env_server::environment::{self, EnvironmentError};
 use toml::{Table, Value};
+
+pub use self::source::{Source, Sources, UsageError};
+use self::suggestion::{nearest, with_suggestion};
 
 use crate::external_environment::{self, ExternalEnvironment, GYMNASIUM};
 use crate::method;
+use crate::numbers::count;
 use crate::preflight;
 use crate::server_location::{ServerLocation, Surroundings, hash_seed};
 use crate::signals::Interrupt;
@@ -56,6 +66,9 @@ const PRESETS: [(&str, &str); 15] = [
     ),
 ];
 
+/// The upper bound of `actors.max`.
+const MOST_ACTORS: i64 = 256;
+
 /// The keys that the program sets itself.
 pub const FILLED_IN: [&str; 2] = ["run.id", "run.identity_format"];
 
@@ -67,6 +80,23 @@ pub fn preset_names() -> impl Iterator<Item = &'static str> {
 /// The resolved configuration of a preset or a file, without overrides.
 pub fn resolved(what: &str) -> anyhow::Result<Config> {
     decide(what, &RunOverrides::default()).map(|(_, config)| config)
+}
+
+/// The resolved configuration of a preset or a file with these overrides, and where each value comes from.
+pub fn resolved_with_sources(what: &str, overrides: &RunOverrides) -> anyhow::Result<(Config, Sources)> {
+    let (_, table, sources) = for_method(what, overrides)?;
+    resolve(table, sources, overrides, what)
+}
+
+/// What is worth a warning before a run of this configuration starts.
+pub fn warning(config: &Config) -> Option<String> {
+    let (steps, warmup) = (config.run.steps, config.replay.warmup);
+    (steps <= warmup && config.replay.updates_per_step > 0.0).then(|| {
+        format!(
+            "nothing will be learned: the first update comes after the warm-up of {warmup} steps, and the run has {steps}; \
+             give it more with --steps, or lower replay.warmup"
+        )
+    })
 }
 
 /// Changes to a preset or a file for one run.
@@ -138,107 +168,113 @@ fn fill(run: &RunDir, config: &Config) -> anyhow::Result<Config> {
 
 /// The configuration of a preset or a file with these overrides, and the default name of its run. Creates nothing.
 pub fn decide(what: &str, overrides: &RunOverrides) -> anyhow::Result<(String, Config)> {
-    let (mut name, mut table) = sections(what)?;
-    if let Some(method) = method::asked_for(overrides.method.as_deref(), &overrides.set)? {
-        let named = method::named_in(&table);
-        if let Some((own, text)) = preset(&format!("{what}-{method}")) {
-            (name, table) = (own.into(), text.parse().with_context(|| format!("preset {own}"))?);
-        } else if preset(what).is_some() {
-            if named.unwrap_or(Algorithm::default().name()) != method {
-                method::replace(&mut table, method)?;
-                name = format!("{name}-{method}");
-            }
-        } else if let Some(other) = named.filter(|named| *named != method) {
-            bail!("{what} is for {other}, but {method} is asked for: remove what belongs to {other} from the file");
-        } else {
-            let environment = table.get("environment").and_then(|section| section.get("name"));
-            let environment = environment.and_then(Value::as_str).unwrap_or_default().to_owned();
-            method::add_defaults(&mut table, &environment, method)?;
-        }
-        table.entry(method).or_insert_with(|| Table::new().into());
-    }
-    Ok((name, resolve(table, overrides, what)?))
+    let (name, table, sources) = for_method(what, overrides)?;
+    let (config, _) = resolve(table, sources, overrides, what)?;
+    Ok((name, config))
 }
 
 fn preset(name: &str) -> Option<(&'static str, &'static str)> {
     PRESETS.into_iter().find(|(known, _)| *known == name)
 }
 
-/// The sections of a preset or a file, and the default name of its run.
-fn sections(what: &str) -> anyhow::Result<(String, Table)> {
+/// As [`sections`], for the method that is asked for.
+fn for_method(what: &str, overrides: &RunOverrides) -> anyhow::Result<(String, Table, Sources)> {
+    let (mut name, mut table, mut sources) = sections(what)?;
+    let Some(method) = method::asked_for(overrides.method.as_deref(), &overrides.set)? else {
+        return Ok((name, table, sources));
+    };
+    let named = method::named_in(&table);
+    if let Some((own, _)) = preset(&format!("{what}-{method}")) {
+        return sections(own);
+    }
+    let defaults = Source::Method(method);
+    if preset(what).is_some() {
+        if named.unwrap_or(Algorithm::default().name()) != method {
+            method::replace(&mut table, method)?;
+            name = format!("{name}-{method}");
+        }
+    } else if let Some(other) = named.filter(|named| *named != method) {
+        bail!("{what} is for {other}, but {method} is asked for: remove what belongs to {other} from the file");
+    } else {
+        let environment = table.get("environment").and_then(|section| section.get("name"));
+        let environment = environment.and_then(Value::as_str).unwrap_or_default().to_owned();
+        method::add_defaults(&mut table, &environment, method)?;
+    }
+    table.entry(method).or_insert_with(|| Table::new().into());
+    sources.add(&table, &defaults);
+    Ok((name, table, sources))
+}
+
+/// The default name of a run of a preset or a file, its sections, and where their values come from.
+fn sections(what: &str) -> anyhow::Result<(String, Table, Sources)> {
     if let Some((name, text)) = preset(what) {
-        return Ok((name.into(), text.parse().with_context(|| format!("preset {name}"))?));
+        let table = text.parse().with_context(|| format!("preset {name}"))?;
+        let sources = Sources::of_preset(name, &table);
+        return Ok((name.into(), table, sources));
     }
     if let Some(id) = what.strip_prefix(GYMNASIUM) {
         let mut table = Table::new();
         put(&mut table, &["environment", "name"], what.into())?;
         let is_plain = |c: char| c.is_ascii_alphanumeric() || "-._".contains(c);
-        return Ok((format!("gym-{}", id.replace(|c| !is_plain(c), "-")), table));
+        let name = format!("gym-{}", id.replace(|c| !is_plain(c), "-"));
+        return Ok((name, table, Sources::default()));
     }
     let path = PathBuf::from(what);
     if path.extension().is_none_or(|extension| extension != "toml") {
-        let known: Vec<&str> = preset_names().collect();
-        bail!(
-            "there is no preset `{what}`: choose {}, a file that ends in .toml, or gym: with a Gymnasium environment",
-            known.join(", ")
-        );
+        return Err(UsageError(no_preset(what)).into());
     }
     let text = std::fs::read_to_string(&path).with_context(|| format!("cannot read {what}"))?;
     let table = text
         .parse::<Table>()
-        .map_err(|error| anyhow::anyhow!("{what}: {}", one_line(&error)))?;
+        .map_err(|error| anyhow::anyhow!("{}", section::malformed(what, &text, &error)))?;
     let name = path
         .file_stem()
         .map_or_else(|| "run".into(), |stem| stem.to_string_lossy().into_owned());
-    Ok((name, table))
+    let sources = Sources::of_file(what, &text);
+    Ok((name, table, sources))
 }
 
-fn resolve(mut table: Table, overrides: &RunOverrides, origin: &str) -> anyhow::Result<Config> {
-    let mut set = |section: &str, key: &str, value: Value| put(&mut table, &[section, key], value);
-    if let Some(seed) = overrides.seed {
-        let seed = i64::try_from(seed).context("--seed: must be below 2^63")?;
-        set("run", "seed", seed.into())?;
+/// The error for a name that is neither a preset nor a file.
+fn no_preset(what: &str) -> String {
+    let known: Vec<&str> = preset_names().collect();
+    let all = format!(
+        "choose {}, a file that ends in .toml, or gym: with a Gymnasium environment",
+        known.join(", ")
+    );
+    if is_gymnasium(what) {
+        return format!("there is no preset `{what}`; did you mean {GYMNASIUM}{what}? Otherwise {all}");
     }
-    if let Some(steps) = overrides.steps {
-        set(
-            "run",
-            "steps",
-            i64::try_from(steps).context("--steps: must be below 2^63")?.into(),
-        )?;
+    match nearest(what, known) {
+        Some(near) => format!("there is no preset `{what}`; did you mean {near}? Otherwise {all}"),
+        None => format!("there is no preset `{what}`: {all}"),
     }
-    if let Some(actors) = overrides.actors {
-        set("actors", "count", i64::from(actors).into())?;
-    }
-    if let Some(envs) = overrides.envs {
-        set("actors", "envs", i64::from(envs).into())?;
-    }
-    if let Some(episodes) = overrides.episodes {
-        let episodes = i64::try_from(episodes).context("--episodes: must be below 2^63")?;
-        set("run", "episodes", episodes.into())?;
-    }
-    if overrides.lockstep {
-        set("run", "mode", "lockstep".into())?;
-    }
+}
+
+/// Whether this looks like the name of a Gymnasium environment, which ends in a version: `Pendulum-v1`.
+fn is_gymnasium(name: &str) -> bool {
+    let version = name.rsplit_once("-v").map(|(_, version)| version);
+    version.is_some_and(|version| !version.is_empty() && version.bytes().all(|byte| byte.is_ascii_digit()))
+}
+
+fn resolve(
+    mut table: Table,
+    mut sources: Sources,
+    overrides: &RunOverrides,
+    origin: &str,
+) -> anyhow::Result<(Config, Sources)> {
+    set_options(&mut table, &mut sources, overrides)?;
     for assignment in &overrides.set {
-        let (key, value) = assignment
-            .split_once('=')
-            .filter(|(key, _)| key.contains('.'))
-            .with_context(|| format!("--set {assignment}: must look like SECTION.KEY=VALUE"))?;
-        let path: Vec<&str> = key.split('.').collect();
-        if path[0] == "spec" || FILLED_IN.contains(&key) {
-            bail!("--set {assignment}: {key} cannot be set: the program sets it");
-        }
-        put(&mut table, &path, value_of(value)).with_context(|| format!("--set {assignment}"))?;
+        set_key(&mut table, &mut sources, assignment)?;
     }
-    // For more actors than the default of `actors.max`, raise it.
-    if let Some(count) = table
-        .get("actors")
-        .and_then(|actors| actors.get("count"))
-        .and_then(Value::as_integer)
+    let mistaken = |error: UsageError, sources: &Sources, table: &Table| sources.explain(error.0, origin, table);
+    read_counts(&mut table).map_err(|error| mistaken(error, &sources, &table))?;
+    // For more actors than the default of `actors.max`, raise it, but not beyond its bounds.
+    if let Some(count) = integer(&table, "actors", "count")
         && count > i64::from(ActorsConfig::default().max)
         && table.get("actors").is_some_and(|actors| actors.get("max").is_none())
     {
-        put(&mut table, &["actors", "max"], count.into())?;
+        put(&mut table, &["actors", "max"], count.min(MOST_ACTORS).into())?;
+        sources.set("actors.max".into(), Source::Follows("actors.count".into()));
     }
     // Random and independent of the seed: the run's name in shared memory must be unique.
     put(
@@ -248,16 +284,166 @@ fn resolve(mut table: Table, overrides: &RunOverrides, origin: &str) -> anyhow::
     )?;
     let format = i64::from(u32::from(IdentityFormat::NEWEST));
     put(&mut table, &["run", "identity_format"], format.into())?;
-    describe_environment(&mut table)?;
-    let mut config = Config::from_table(table, origin)?;
+    let chosen = table.clone();
+    describe_environment(&mut table).map_err(|error| about_environment(error, &sources))?;
+    // What is added are a method's settings for a Gymnasium environment, and the environment's own defaults.
+    sources.add_new(&chosen, &table, &Source::Gymnasium);
+    follow_method(&mut table, &mut sources)?;
+    let mut config = Config::from_table(table.clone(), "").map_err(|error| {
+        let message = error.to_string();
+        let message = message.strip_prefix(": ").unwrap_or(&message);
+        sources.explain(message.into(), origin, &table)
+    })?;
     // A short run must end with an evaluation too.
-    config.evaluation.every = config.evaluation.every.min(config.run.steps);
+    if config.run.steps < config.evaluation.every {
+        config.evaluation.every = config.run.steps;
+        sources.set("evaluation.every".into(), Source::Follows("run.steps".into()));
+    }
     if let Algorithm::Dqn(dqn) = &mut config.algorithm
         && dqn.epsilon_steps == 0
     {
         dqn.epsilon_steps = (config.run.steps / 10).max(1);
+        sources.set("dqn.epsilon_steps".into(), Source::Follows("run.steps".into()));
     }
-    Ok(config)
+    Ok((config, sources))
+}
+
+/// Sets the keys that have options of their own.
+fn set_options(table: &mut Table, sources: &mut Sources, overrides: &RunOverrides) -> anyhow::Result<()> {
+    let whole = |option: &str, number: Option<u64>| -> anyhow::Result<Option<Value>> {
+        let number = number.map(i64::try_from).transpose();
+        Ok(number
+            .with_context(|| format!("{option}: must be below 2^63"))?
+            .map(Value::from))
+    };
+    let small = |number: Option<u32>| number.map(|number| Value::from(i64::from(number)));
+    for (option, section, key, value) in [
+        ("--seed", "run", "seed", whole("--seed", overrides.seed)?),
+        ("--steps", "run", "steps", whole("--steps", overrides.steps)?),
+        ("--actors", "actors", "count", small(overrides.actors)),
+        ("--envs", "actors", "envs", small(overrides.envs)),
+        (
+            "--episodes",
+            "run",
+            "episodes",
+            whole("--episodes", overrides.episodes)?,
+        ),
+        (
+            "--lockstep",
+            "run",
+            "mode",
+            overrides.lockstep.then(|| "lockstep".into()),
+        ),
+    ] {
+        if let Some(value) = value {
+            put(table, &[section, key], value)?;
+            sources.set(format!("{section}.{key}"), Source::Option(option));
+        }
+    }
+    Ok(())
+}
+
+/// Sets a key as `--set` says.
+fn set_key(table: &mut Table, sources: &mut Sources, assignment: &str) -> anyhow::Result<()> {
+    let wrong = |why: String| UsageError(format!("--set {assignment}: {why}"));
+    let (key, value) = assignment
+        .split_once('=')
+        .filter(|(key, _)| key.contains('.'))
+        .ok_or_else(|| wrong("must look like SECTION.KEY=VALUE".into()))?;
+    let path: Vec<&str> = key.split('.').collect();
+    if path[0] == "spec" || FILLED_IN.contains(&key) {
+        return Err(wrong(format!("{key} cannot be set: the program sets it")).into());
+    }
+    put(table, &path, value_of(value)).map_err(|error| wrong(error.to_string()))?;
+    sources.set(path.iter().take(2).copied().collect::<Vec<_>>().join("."), Source::Set);
+    Ok(())
+}
+
+fn integer(table: &Table, section: &str, key: &str) -> Option<i64> {
+    table.get(section)?.get(key)?.as_integer()
+}
+
+/// Makes whole numbers of `1e5` and `30k` where a key takes whole numbers.
+fn read_counts(table: &mut Table) -> Result<(), UsageError> {
+    let mut keys: Vec<(&str, Key)> = Vec::new();
+    for section in explanation::sections() {
+        keys.extend(section.keys.into_iter().map(|key| (section.name, key)));
+    }
+    let name = table.get("environment").and_then(|section| section.get("name"));
+    if let Some(own) = name
+        .and_then(Value::as_str)
+        .and_then(|name| environment::explain(name).ok())
+    {
+        keys.extend(own.into_iter().map(|key| ("environment", key)));
+    }
+    for (section, key) in keys.into_iter().filter(|(_, key)| key.whole) {
+        let Some(value) = table.get_mut(section).and_then(|values| values.get_mut(&key.name)) else {
+            continue;
+        };
+        let text = match value {
+            Value::Float(number) => number.to_string(),
+            Value::String(text) => text.clone(),
+            _ => continue,
+        };
+        let read = count(&text).ok().and_then(|number| i64::try_from(number).ok());
+        let refused = || {
+            format!(
+                "{section}.{} = {value}: must be a whole number, such as 1000, 1e5 or 30k",
+                key.name
+            )
+        };
+        *value = read.ok_or_else(|| UsageError(refused()))?.into();
+    }
+    Ok(())
+}
+
+/// The error about an environment's own parameters, with the place where the user has set the one at fault.
+fn about_environment(error: anyhow::Error, sources: &Sources) -> anyhow::Error {
+    let Some(of_environment) = error.downcast_ref::<EnvironmentError>() else {
+        return error;
+    };
+    let (key, text) = match of_environment {
+        EnvironmentError::UnknownName { name, .. } => {
+            let near = nearest(name, environment::names()).map(str::to_owned);
+            let near = Some(format!("{GYMNASIUM}{name}"))
+                .filter(|_| is_gymnasium(name))
+                .or(near);
+            let hint = near.map_or_else(String::new, |near| format!("; did you mean {near}?"));
+            ("name", format!("{of_environment}{hint}"))
+        }
+        EnvironmentError::Parameters { reason, .. } => {
+            let key = reason.split('`').nth(1).unwrap_or_default();
+            (key, with_suggestion(of_environment.to_string()))
+        }
+    };
+    sources.blame(&format!("environment.{key}"), &text)
+}
+
+/// Sets what the method fixes, unless the user has set it.
+fn follow_method(table: &mut Table, sources: &mut Sources) -> anyhow::Result<()> {
+    let limit = integer(table, "spec", "time_limit");
+    let algorithms = Algorithm::all();
+    let Some(method) = algorithms.iter().find(|one| table.contains_key(one.name())) else {
+        return Ok(());
+    };
+    let spec = method.spec();
+    let once = spec.experience != Experience::Minibatches;
+    let episodes = spec.experience == Experience::Episodes;
+    for (section, key, value) in [
+        ("run", "mode", (!spec.off_policy).then(|| Value::from("lockstep"))),
+        ("replay", "warmup", once.then(|| 0.into())),
+        ("replay", "updates_per_step", once.then(|| 1.0.into())),
+        ("actors", "chunk_steps", limit.filter(|_| episodes).map(Value::from)),
+    ] {
+        let name = format!("{section}.{key}");
+        let now = table.get(section).and_then(|values| values.get(key));
+        let Some(value) = value.filter(|value| now != Some(value) && !sources.of(&name).is_users()) else {
+            continue;
+        };
+        put(table, &[section, key], value)?;
+        sources.set(name, Source::Follows(method.name().into()));
+    }
+    Ok(())
 }
 
 /// Fills in `[spec]` from the environment. Adds every parameter of a built-in environment, and for a Gymnasium
@@ -309,7 +495,6 @@ fn describe_environment(table: &mut Table) -> anyhow::Result<()> {
         let method = named.unwrap_or_else(|| method::suitable(&spec));
         method::add_defaults(table, &environment.name, method)?;
     }
-    method::fit(table, &spec);
     table.insert("environment".into(), Value::try_from(environment)?);
     table.insert("spec".into(), Value::try_from(spec)?);
     Ok(())

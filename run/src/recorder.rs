@@ -101,8 +101,10 @@ pub struct Recorder {
     warmup: u64,
     /// Running time of earlier launchers in seconds.
     earlier: f64,
-    /// Environment steps by the newest report.
+    /// Environment steps of the last row of `learner.csv`.
     env_steps: u64,
+    /// Environment steps of the last row of `episodes.csv`.
+    episode_steps: u64,
     /// Environment steps of the newest policy whose evaluation is recorded.
     evaluated: Option<u64>,
     previous: Option<(Duration, LearnerReport)>,
@@ -120,9 +122,15 @@ impl Recorder {
             .iter()
             .map(|row| row.env_steps)
             .max();
-        let last = table::last::<LearnerRecord>(&run.learner_log())?;
-        let (earlier, env_steps) = last.as_ref().map_or((0.0, 0), |row| (row.wall_seconds, row.env_steps));
-        let events = EventFile::create(&run.tensorboard()).map_err(|cause| RecordError::Write {
+        let learned = read_learner(&run.learner_log())?;
+        let earlier = learned.last().map_or(0.0, |row| row.wall_seconds);
+        // Not the last rows: in records of earlier versions the steps may have fallen.
+        let env_steps = learned.iter().map(|row| row.env_steps).max().unwrap_or(0);
+        let explored = read_episodes(&run.episodes())?;
+        let episode_steps = explored.iter().map(|row| row.env_steps).max().unwrap_or(0);
+        let newest = env_steps.max(episode_steps).max(evaluated.unwrap_or(0));
+        let continues = (!learned.is_empty()).then_some(newest + 1);
+        let events = EventFile::create(&run.tensorboard(), continues).map_err(|cause| RecordError::Write {
             path: run.tensorboard(),
             cause,
         })?;
@@ -137,22 +145,26 @@ impl Recorder {
             warmup,
             earlier,
             env_steps,
+            episode_steps,
             evaluated,
             previous: None,
             flushed,
         };
-        if last.is_some() {
+        if continues.is_some() {
             let resumed = Incident::of_launcher(IncidentKind::Resumed, String::new());
             recorder.incident(&resumed, Duration::ZERO)?;
         }
         Ok(recorder)
     }
 
-    /// Records an exploration episode that ended `wall` after this launcher's start.
+    /// Records an exploration episode that ended `wall` after this launcher's start. Its steps are those of all actors by
+    /// then. Reports of several actors may arrive in another order, and a replay may have lost rows; still the recorded
+    /// steps never fall.
     pub fn episode(&mut self, report: &EpisodeReport, wall: Duration) -> Result<(), RecordError> {
+        self.episode_steps = self.episode_steps.max(report.env_steps);
         self.episodes.write(&EpisodeRecord {
             wall_seconds: self.seconds(wall),
-            env_steps: report.env_steps,
+            env_steps: self.episode_steps,
             actor: report.actor,
             environment: report.environment,
             steps: report.steps,
@@ -164,7 +176,7 @@ impl Recorder {
             ("episode/return", report.episode_return),
             ("episode/steps", report.steps.into()),
         ];
-        self.scalars(report.env_steps, &scalars)?;
+        self.scalars(self.episode_steps, &scalars)?;
         if self.flushed.elapsed() >= MAX_UNFLUSHED {
             self.flush()
         } else {
@@ -201,8 +213,12 @@ impl Recorder {
         self.flush()
     }
 
-    /// Records the learner's progress and flushes all records. Reports come twice a second.
+    /// Records the learner's progress and flushes all records. Reports come twice a second. A learner that continues from
+    /// an older checkpoint repeats steps: they are not recorded again.
     pub fn learner(&mut self, report: &LearnerReport, wall: Duration) -> Result<(), RecordError> {
+        if report.env_steps < self.env_steps {
+            return self.flush();
+        }
         let averaged = |mean: f64| (report.averaged > 0).then_some(mean);
         let rate = |count: fn(&LearnerReport) -> u64| {
             let (before, previous) = self.previous.as_ref()?;

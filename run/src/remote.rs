@@ -9,6 +9,9 @@ use shoal_common::channel::{ChannelErrorKind, Domain, Sweeper};
 use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
 
+use crate::outcome::{FINAL_EVALUATION, RunOutcome, RunState, STARTING};
+use crate::status::saved_status;
+
 /// How long a launcher may take to answer. One that is starting does not answer at once.
 const PATIENCE: Duration = Duration::from_secs(5);
 
@@ -55,6 +58,12 @@ impl Remote {
             }
             Ok(answer) => Ok(Some(answer)),
             Err(ControlError::Gone) => Ok(None),
+            Err(error @ (ControlError::Missing | ControlError::Silence)) if question == Question::Status => {
+                match self.without_roles(&error)? {
+                    Some(status) => Ok(Some(Answer::Status(status))),
+                    None => Err(error.into()),
+                }
+            }
             Err(ControlError::Channel(error)) if error.kind == ChannelErrorKind::Missing => {
                 bail!("{}", self.why_missing(domain)?)
             }
@@ -77,9 +86,39 @@ impl Remote {
         })
     }
 
+    /// The status, by the run's files, of a run whose launcher has no roles yet, or none any more. `None` if the
+    /// launcher has roles and should have answered.
+    fn without_roles(&self, error: &ControlError) -> anyhow::Result<Option<RunStatus>> {
+        let outcome = RunOutcome::read(&self.run)?;
+        let reason = outcome.as_ref().and_then(|outcome| outcome.reason.as_deref());
+        let state = outcome.as_ref().map(|outcome| outcome.state);
+        let waiting = match (reason, state) {
+            (Some(FINAL_EVALUATION), _) => FINAL_EVALUATION,
+            (Some(STARTING), _) => STARTING,
+            _ if matches!(error, ControlError::Silence) => return Ok(None),
+            (_, None | Some(RunState::Running)) => STARTING,
+            _ => "starting or ending",
+        };
+        self.saved(waiting).map(Some)
+    }
+
+    fn saved(&self, waiting: &str) -> anyhow::Result<RunStatus> {
+        Ok(RunStatus {
+            waiting: Some(waiting.into()),
+            ..saved_status(&self.run.config()?, &self.run)?
+        })
+    }
+
     /// The run's status; `None` if it is not running.
     pub fn status(&self) -> anyhow::Result<Option<RunStatus>> {
-        match self.ask(Question::Status, PATIENCE)? {
+        // A launcher that leaves its start may remove the shared memory in which it was asked.
+        let outcome = RunOutcome::read(&self.run)?;
+        let starts = outcome.and_then(|outcome| outcome.reason).as_deref() == Some(STARTING);
+        let answer = match self.ask(Question::Status, PATIENCE) {
+            Err(_) if starts => Some(Answer::Status(self.saved(STARTING)?)),
+            answer => answer?,
+        };
+        match answer {
             None => Ok(None),
             Some(Answer::Status(status)) => Ok(Some(status)),
             Some(other) => bail!("the launcher gave an unexpected answer: {other:?}"),
@@ -97,8 +136,14 @@ impl Remote {
     /// Ends the run, and waits until it has ended.
     pub fn stop(&self) -> anyhow::Result<()> {
         // A launcher that does not answer at all is noticed sooner this way.
-        if self.status()?.is_none() {
-            bail!("{}", self.not_running());
+        match self.status()? {
+            None => bail!("{}", self.not_running()),
+            Some(status) if status.waiting.as_deref() == Some(FINAL_EVALUATION) => bail!(
+                "the training in {} is finished, and its {FINAL_EVALUATION} is under way; Ctrl-C in its terminal or \
+                 SIGTERM ends that",
+                self.run.path().display()
+            ),
+            Some(_) => {}
         }
         let answer = self.ask(Question::Stop, STOP_PATIENCE)?;
         let asked = Instant::now();
@@ -112,9 +157,21 @@ impl Remote {
         answer.map_or(Ok(()), accepted)
     }
 
+    /// Why nothing can be asked, and what continues the run. A finished run needs a new limit.
     fn not_running(&self) -> String {
         let here = self.run.path().display();
-        format!("nothing runs in {here}; `shoal resume {here}` continues it")
+        let status = self.run.config().ok().map(|config| saved_status(&config, &self.run));
+        match status.and_then(Result::ok) {
+            Some(status) if status.finished => {
+                let episodes = status.episodes_limit.filter(|limit| status.episodes >= *limit);
+                let (unit, limit) = episodes.map_or(("steps", status.steps), |limit| ("episodes", limit));
+                format!(
+                    "nothing runs in {here}: it is finished; `shoal resume {here} --{unit} N` with N above {limit} \
+                     continues it"
+                )
+            }
+            _ => format!("nothing runs in {here}; `shoal resume {here}` continues it"),
+        }
     }
 }
 

@@ -2,6 +2,7 @@
 
 use std::io::Write;
 use std::path::PathBuf;
+use std::process::ExitCode;
 
 use clap::Args;
 use comfy_table::Table;
@@ -10,7 +11,9 @@ use shoal_common::policy_file::PolicyFile;
 use shoal_common::run_dir::RunDir;
 use shoal_env_server::environment::Goal;
 use shoal_run::description::Description;
-use shoal_run::evaluation::{EvaluationSummary, WhichPolicy, evaluate_run};
+use shoal_run::evaluation::{EvaluationSummary, WhichPolicy, evaluate_until};
+use shoal_run::numbers::from_one;
+use shoal_run::signals::{Signals, exit_code};
 
 #[derive(Args, Clone, Debug)]
 pub(crate) struct EvalArgs {
@@ -20,7 +23,7 @@ pub(crate) struct EvalArgs {
     #[arg(long, value_enum, default_value_t)]
     pub(crate) policy: WhichPolicy,
     /// Number of episodes. Their start states are the same every time.
-    #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..))]
+    #[arg(long, default_value_t = 100, value_parser = from_one)]
     pub(crate) episodes: u32,
     /// Seed of the start states [default: the run's seed].
     #[arg(long)]
@@ -30,13 +33,24 @@ pub(crate) struct EvalArgs {
     pub(crate) json: bool,
 }
 
-/// Evaluates a policy and prints the result as a table or as JSON.
-pub(crate) fn run(args: &EvalArgs) -> anyhow::Result<()> {
+/// Evaluates a policy and prints the result as a table or as JSON. A signal ends it in order.
+pub(crate) fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
     let run = RunDir::open(&args.run)?;
     let config = run.config()?;
     let policy = args.policy.read(&run, &config)?;
     let seed = args.seed.unwrap_or(config.run.seed);
-    let summary = evaluate_run(&run, &config, &policy.parameters, args.episodes, seed)?;
+    let signals = Signals::register()?;
+    let interrupt = signals.interrupt();
+    let amount = (args.episodes, seed);
+    let evaluated = evaluate_until(&run, &config, &policy.parameters, amount, &interrupt, |_| ());
+    if let (Err(_), Some(signal)) = (&evaluated, interrupt.signal()) {
+        writeln!(
+            std::io::stderr(),
+            "the evaluation was ended by signal {signal}; nothing of it is kept"
+        )?;
+        return Ok(exit_code(signal));
+    }
+    let summary = evaluated?;
     let goal = Description::of(&config)?.goal;
     let table = table(&summary, &policy, seed, goal.as_ref());
     if args.json {
@@ -45,7 +59,7 @@ pub(crate) fn run(args: &EvalArgs) -> anyhow::Result<()> {
     } else {
         writeln!(std::io::stdout().lock(), "{table}")?;
     }
-    Ok(())
+    Ok(ExitCode::SUCCESS)
 }
 
 fn table(summary: &EvaluationSummary, policy: &PolicyFile, seed: u64, goal: Option<&Goal>) -> Table {

@@ -6,12 +6,12 @@ use std::io::Write as _;
 use shoal_common::config::Config;
 use shoal_common::config::explanation::{Key, sections};
 use shoal_env_server::environment;
-use shoal_run::plan::{FILLED_IN, preset_names, resolved};
+use shoal_run::plan::{FILLED_IN, RunOverrides, Source, preset_names, resolved, resolved_with_sources};
 use toml::{Table, Value};
 
-/// Explains the keys of one preset or file, or all keys if none is named.
-pub(crate) fn explain(what: Option<&str>) -> anyhow::Result<()> {
-    let text = what.map_or_else(explain_all, explain_one)?;
+/// Explains the keys of one preset or file with these overrides, or all keys if none is named.
+pub(crate) fn explain(what: Option<&str>, overrides: &RunOverrides) -> anyhow::Result<()> {
+    let text = what.map_or_else(explain_all, |what| explain_one(what, overrides))?;
     std::io::stdout().lock().write_all(text.as_bytes())?;
     Ok(())
 }
@@ -69,7 +69,7 @@ fn explain_all() -> anyhow::Result<String> {
     for (title, entries) in entries()? {
         let _ = writeln!(text, "\n{title}");
         for entry in entries {
-            write_key(&mut text, &entry.key, entry.default.as_ref());
+            write_key(&mut text, &entry.key, entry.default.as_ref(), None);
             let of_environment = title.strip_prefix("[environment] of ");
             for (value, names) in differing(&presets, &entry, of_environment) {
                 let _ = writeln!(text, "      {value} in {}", names.join(", "));
@@ -116,30 +116,35 @@ fn differing<'a>(
     differing
 }
 
-fn explain_one(what: &str) -> anyhow::Result<String> {
-    let config = resolved(what)?;
+fn explain_one(what: &str, overrides: &RunOverrides) -> anyhow::Result<String> {
+    let (config, sources) = resolved_with_sources(what, overrides)?;
     let table = table(&config)?;
-    let mut text = format!("{HEAD}\n{what} is a configuration for {}.\n", config.algorithm.name());
+    let mut text = format!(
+        "{HEAD}After the brackets: where the value comes from.\n\n{what} is a configuration for {}.\n",
+        config.algorithm.name()
+    );
     let environment = format!("[environment] of {}", config.environment.name);
     for (title, entries) in entries()? {
         let chosen = entries.iter().filter_map(|entry| {
             let value = table.get(&entry.section)?.as_table()?.get(&entry.key.name)?;
             // A key that the program sets has no value to show.
-            Some((&entry.key, (!is_filled_in(&entry.section, &entry.key)).then_some(value)))
+            let shown = (!is_filled_in(&entry.section, &entry.key)).then_some(value);
+            let source = sources.of(&format!("{}.{}", entry.section, entry.key.name));
+            Some((&entry.key, shown, shown.map(|_| source)))
         });
         let chosen: Vec<_> = chosen.collect();
         if chosen.is_empty() || (title.contains(" of ") && title != environment) {
             continue;
         }
         let _ = writeln!(text, "\n{title}");
-        for (key, value) in chosen {
-            write_key(&mut text, key, value);
+        for (key, value, source) in chosen {
+            write_key(&mut text, key, value, source.as_ref());
         }
     }
     Ok(text)
 }
 
-fn write_key(text: &mut String, key: &Key, value: Option<&Value>) {
+fn write_key(text: &mut String, key: &Key, value: Option<&Value>, source_of_value: Option<&Source>) {
     let Key {
         name,
         meaning,
@@ -147,13 +152,15 @@ fn write_key(text: &mut String, key: &Key, value: Option<&Value>) {
         source,
         choices,
         bounds,
+        whole: _,
     } = key;
     let value = match value {
         Some(Value::String(word)) if word.is_empty() => String::new(),
         Some(value) => format!(" = {value}"),
         None => String::new(),
     };
-    let _ = writeln!(text, "  {name}{value}  [{unit}; {source}]");
+    let from = source_of_value.map_or_else(String::new, |source| format!("  {source}"));
+    let _ = writeln!(text, "  {name}{value}  [{unit}; {source}]{from}");
     let _ = writeln!(text, "      {meaning}");
     if !choices.is_empty() {
         let _ = writeln!(text, "      One of {}.", choices.join(", "));
@@ -217,8 +224,43 @@ mod tests {
         let text = explain_all().unwrap();
         assert!(text.contains("steps = 120000  [environment steps;"), "{text}");
         assert!(text.contains("800000 in point-mass-r1"), "{text}");
-        let lake = explain_one("frozen-lake").unwrap();
+        let lake = explain_one("frozen-lake", &RunOverrides::default()).unwrap();
         assert!(lake.contains("alpha = 0.03") && !lake.contains("tau"), "{lake}");
         assert!(lake.contains("warmup = 0 "), "{lake}");
+    }
+
+    #[test]
+    fn each_value_of_a_configuration_names_its_source() {
+        let parent = tempfile::tempdir().unwrap();
+        let file = parent.path().join("mine.toml");
+        std::fs::write(
+            &file,
+            "[environment]\nname = \"frozen-lake\"\n[q-learning]\nalpha = 0.5\n",
+        )
+        .unwrap();
+        let file = file.display().to_string();
+        let overrides = RunOverrides {
+            actors: Some(20),
+            set: vec!["q-learning.gamma=0.5".into()],
+            ..RunOverrides::default()
+        };
+        let text = explain_one(&file, &overrides).unwrap();
+        for (key, source) in [
+            ("alpha = 0.5", format!("{file}, line 4")),
+            ("gamma = 0.5", "--set".into()),
+            ("count = 20", "--actors".into()),
+            ("max = 20", "follows from actors.count".into()),
+            ("warmup = 0", "follows from q-learning".into()),
+            ("epsilon = 0.4", "the default".into()),
+        ] {
+            let line = text.lines().find(|line| line.trim_start().starts_with(key));
+            assert!(
+                line.is_some_and(|line| line.ends_with(&format!("]  {source}"))),
+                "{key}: {line:?}"
+            );
+        }
+        let preset = explain_one("pendulum", &RunOverrides::default()).unwrap();
+        let line = preset.lines().find(|line| line.contains("steps = 120000")).unwrap();
+        assert!(line.ends_with("]  preset pendulum"), "{line}");
     }
 }

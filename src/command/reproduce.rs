@@ -9,6 +9,7 @@ use clap::Args;
 use clap::builder::PossibleValuesParser;
 use shoal_report::figure::CAN_RASTERISE;
 use shoal_reproduce::{BatchEnding, Effort, Request};
+use shoal_run::numbers::from_one;
 use shoal_run::signals::exit_code;
 
 /// Repeating an interrupted command continues it. Finished trainings are not run again.
@@ -18,7 +19,7 @@ pub(crate) struct ReproduceArgs {
     #[arg(value_name = "EXPERIMENT", value_parser = PossibleValuesParser::new(choices()))]
     pub(crate) experiments: Vec<String>,
     /// Run seeds 1 to N of each experiment [default: 5; 10 to 30 for frozen-lake and cart-pole; 2 with --quick].
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    #[arg(long, value_name = "N", value_parser = from_one)]
     pub(crate) seeds: Option<u32>,
     /// Number of trainings at a time [default: half the cores, because each training keeps about two busy].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]

@@ -1,12 +1,18 @@
 //! `shoal resume`: continues a run that was stopped or killed.
 
+use std::io::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::{Context, bail};
 use clap::Args;
+use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
+use shoal_run::earlier_best::{EvaluatedAnew, evaluate_anew};
+use shoal_run::numbers::count;
+use shoal_run::plan::warning;
 use shoal_run::server_location::ServerLocation;
+use shoal_run::signals::{Signals, exit_code};
 use shoal_run::status;
 
 use super::training::OutputMode;
@@ -17,10 +23,10 @@ pub(crate) struct ResumeArgs {
     /// Run directory.
     pub(crate) run: PathBuf,
     /// Environment steps of all actors together, including those already taken [default: as before].
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = count)]
     pub(crate) steps: Option<u64>,
     /// Episodes of all actors together, including those already finished [default: as before].
-    #[arg(long, value_name = "M")]
+    #[arg(long, value_name = "M", value_parser = count)]
     pub(crate) episodes: Option<u64>,
     #[command(flatten)]
     pub(crate) output: OutputMode,
@@ -53,5 +59,39 @@ pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
         config.check()?;
         run.write_config(&config)?;
     }
+    if let Some(signal) = evaluate_best_anew(&run, &config)? {
+        return Ok(exit_code(signal));
+    }
+    if let Some(warning) = warning(&config) {
+        writeln!(std::io::stderr(), "warning: {warning}")?;
+    }
     run_training(config, &run, &lock, &args.output)
+}
+
+/// Evaluates the best policy again if an earlier version did that from other starts. Returns the signal that ended it, if
+/// one did.
+fn evaluate_best_anew(run: &RunDir, config: &Config) -> anyhow::Result<Option<i32>> {
+    let signals = Signals::register()?;
+    let interrupt = signals.interrupt();
+    let here = run.path().display();
+    match (evaluate_anew(run, config, &interrupt), interrupt.signal()) {
+        (Err(_), Some(signal)) => {
+            writeln!(
+                std::io::stderr(),
+                "ended by signal {signal}; nothing has changed in {here}"
+            )?;
+            Ok(Some(signal))
+        }
+        (evaluated, _) => {
+            let evaluated = evaluated.with_context(|| format!("cannot resume {here}: its best policy"))?;
+            if let Some(EvaluatedAnew { before, now }) = evaluated {
+                writeln!(
+                    std::io::stderr(),
+                    "the best policy is evaluated anew, for an earlier version used other starts: {:.2} instead of {before:.2}",
+                    now.return_mean
+                )?;
+            }
+            Ok(None)
+        }
+    }
 }

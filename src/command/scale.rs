@@ -8,6 +8,7 @@ use anyhow::bail;
 use clap::Args;
 use shoal_common::channel::control::{RoleState, RunStatus};
 use shoal_common::report::Role;
+use shoal_run::numbers::small_count;
 use shoal_run::remote::Remote;
 
 #[derive(Args, Clone, Debug)]
@@ -15,7 +16,7 @@ pub(crate) struct ScaleArgs {
     /// Run directory.
     pub(crate) run: PathBuf,
     /// New number of actor processes.
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = small_count)]
     pub(crate) actors: u32,
 }
 

@@ -154,7 +154,8 @@ fn table(status: &RunStatus) -> String {
     let evaluated = status
         .eval_return_mean
         .map_or_else(String::new, |mean| format!(", eval {mean:.2}"));
-    let waiting = waiting(status);
+    let starts = status.roles.iter().any(|role| role.state == RoleState::Starting);
+    let waiting = if starts { "starting" } else { waiting(status) };
     format!(
         "{}, {} rows{evaluated}\n{:.0} updates/s, {:.0} steps/s, ratio {:.2} of {:.2}; {waiting}\n\n{table}",
         progress(status),

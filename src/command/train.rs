@@ -1,5 +1,6 @@
 //! `shoal train`: a new run, from its configuration to its result.
 
+use std::io::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -7,7 +8,8 @@ use anyhow::Context;
 use clap::Args;
 use clap::builder::PossibleValuesParser;
 use clap_complete::engine::ArgValueCompleter;
-use shoal_run::plan::{Plan, RunOverrides};
+use shoal_run::numbers::{count, small_count};
+use shoal_run::plan::{Plan, RunOverrides, warning};
 
 use super::help_config;
 use super::training::OutputMode;
@@ -45,16 +47,16 @@ pub(crate) struct RunArgs {
     #[arg(long)]
     pub(crate) seed: Option<u64>,
     /// Actor processes.
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = small_count)]
     pub(crate) actors: Option<u32>,
     /// Environments of each actor.
-    #[arg(long, value_name = "E")]
+    #[arg(long, value_name = "E", value_parser = small_count)]
     pub(crate) envs: Option<u32>,
     /// Environment steps of all actors together.
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = count)]
     pub(crate) steps: Option<u64>,
     /// Episodes of all actors together; the run ends at this limit or at its steps, whichever comes first.
-    #[arg(long, value_name = "M")]
+    #[arg(long, value_name = "M", value_parser = count)]
     pub(crate) episodes: Option<u64>,
     /// Lockstep: actors and learner take turns, and the same seed and number of actors give the same bits.
     #[arg(long)]
@@ -94,7 +96,7 @@ impl RunArgs {
 /// Creates a run and trains it, or explains the configuration.
 pub(crate) fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
     if args.help_config {
-        help_config::explain(args.what.as_deref())?;
+        help_config::explain(args.what.as_deref(), &args.overrides.overrides())?;
         return Ok(ExitCode::SUCCESS);
     }
     let what = args
@@ -102,6 +104,9 @@ pub(crate) fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
         .as_deref()
         .context("name a preset, a gym: environment or a configuration file to train")?;
     let Plan { config, run, lock } = Plan::new(what, &args.overrides.overrides())?;
+    if let Some(warning) = warning(&config) {
+        writeln!(std::io::stderr(), "warning: {warning}")?;
+    }
     run_training(config, &run, &lock, &args.output).inspect_err(|_| {
         // Where no process was started there is nothing to resume or to read, and it would be in the way of the next try.
         // What is at this path by now may be somebody else's.

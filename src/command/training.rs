@@ -19,7 +19,7 @@ use shoal_report::plots;
 use shoal_run::evaluation::{EvaluationSummary, WhichPolicy, evaluate_until};
 use shoal_run::final_evaluation::{FinalEvaluation, FinalPolicy, FinallyEvaluated};
 use shoal_run::numbers::thousands;
-use shoal_run::outcome::{RunOutcome, RunState};
+use shoal_run::outcome::{FINAL_EVALUATION, RunOutcome, RunState};
 use shoal_run::signals::{Interrupt, Signals, describe, exit_code};
 
 use crate::launcher::{self, Ending, TrainingOutcome};
@@ -77,6 +77,8 @@ fn train_and_report(config: Config, run: &RunDir, lock: &RunLock, output: &Outpu
     let mut finished = RunOutcome::new(RunState::Finished, env_steps, episodes);
     if outcome.ending == Ending::Finished {
         let interrupt = signals.interrupt();
+        let under_way = RunOutcome::new(RunState::Running, env_steps, episodes);
+        under_way.with_reason(FINAL_EVALUATION).write(run)?;
         match final_evaluation(&config, run, env_steps, &interrupt, output.quiet) {
             Ok(policies) => evaluated = policies,
             Err(error) => {

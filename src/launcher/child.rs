@@ -313,6 +313,7 @@ impl Child {
 
     fn state(&self) -> RoleState {
         match (&self.process, self.last_heartbeat) {
+            (None, _) if self.ends => RoleState::Done,
             (None, _) => RoleState::Restarting,
             (_, Some((then, _))) if then.elapsed() >= SILENT => RoleState::Silent,
             _ if self.retires => RoleState::Retiring,

@@ -10,7 +10,7 @@ mod suite;
 mod support;
 
 use std::path::Path;
-use std::process::{Command, ExitCode};
+use std::process::{Command, ExitCode, Stdio};
 
 use answers::arbitrary_answers_are_survived_or_named_in_one_line;
 use rustix::process::{Pid, Signal, kill_process};
@@ -18,7 +18,7 @@ use shoal_common::config::Config;
 use shoal_common::space::Space;
 use shoal_learner::replay::{Replay, ReplayLayout, are_finite};
 use suite::{PYTHON, test};
-use support::{Workplace, error_line, final_result, output_of, parse, until, wait_for_rows};
+use support::{Leftovers, QUICK, Workplace, error_line, final_result, output_of, parse, until, wait_for_rows};
 
 fn main() -> ExitCode {
     suite::run(vec![
@@ -40,6 +40,7 @@ fn main() -> ExitCode {
             PYTHON
         ),
         test!(a_stuck_server_ends_with_its_launcher, PYTHON),
+        test!(the_status_of_a_run_that_starts_says_so, PYTHON),
         test!(a_killed_start_leaves_no_process_and_no_file, PYTHON),
         test!(a_server_that_ignores_requests_is_replaced, PYTHON),
         test!(an_invalid_answer_ends_its_episodes_and_is_counted_and_named, PYTHON),
@@ -56,6 +57,7 @@ fn main() -> ExitCode {
         test!(a_run_with_another_program_may_lie_at_any_path, PYTHON),
         test!(a_failure_in_the_final_evaluation_costs_an_episode_or_a_line, PYTHON),
         test!(a_signal_ends_the_final_evaluation_in_order, PYTHON),
+        test!(a_signal_ends_shoal_eval_in_order, PYTHON),
     ])
 }
 
@@ -260,20 +262,73 @@ fn a_failure_in_the_final_evaluation_costs_an_episode_or_a_line() {
 }
 
 fn a_signal_ends_the_final_evaluation_in_order() {
-    let place = place();
-    let environment = format!("{OURS}Finale-v0");
-    let running = place.start_in("run", &environment, &with_a_finale("environment.how=sleeps"));
-    until("the final evaluation is asleep", || place.path().join("final").exists());
-    running.signal(Signal::TERM);
-    let (code, printed, leftovers) = running.wait();
-    assert_eq!(code, Some(143), "{}", place.stderr());
-    assert_eq!(parse(&printed)["env_steps"], 200);
-    assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
-    assert!(processes_of(&place, "shoal_gym").is_empty());
-    let outcome = outcome_of(&place);
-    assert_eq!(outcome["state"], "finished");
-    assert!(outcome["reason"].to_string().contains("signal 15"), "{outcome}");
-    assert!(place.path().join("run/checkpoints/best.policy").exists());
+    for (signal, code) in [(Signal::TERM, 143), (Signal::INT, 130)] {
+        let place = place();
+        let environment = format!("{OURS}Finale-v0");
+        let train = ["train", &environment, "--run", "run", "--json"];
+        // Not `start_in`: so short a run may end before its evaluator was ready.
+        let mut running = place
+            .shoal(&[&train[..], &with_a_finale("environment.how=sleeps"), &QUICK].concat())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap();
+        until("the final evaluation is asleep", || place.path().join("final").exists());
+        assert_eq!(place.status("run")["waiting"], "final evaluation");
+        let refused = error_line(&place.output(&["stop", "run"]));
+        assert!(refused.contains("its final evaluation is under way"), "{refused}");
+        kill_process(Pid::from_child(&running), signal).unwrap();
+        until("it has ended", || running.try_wait().unwrap().is_some());
+        let output = running.wait_with_output().unwrap();
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(code), "{said}");
+        assert_eq!(support::json(&output)["env_steps"], 200);
+        let leftovers = Leftovers::of(&place.path().join("run"));
+        assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
+        assert!(processes_of(&place, "shoal_gym").is_empty());
+        let outcome = outcome_of(&place);
+        assert_eq!(outcome["state"], "finished");
+        let why = format!("signal {}", code - 128);
+        assert!(outcome["reason"].to_string().contains(&why), "{outcome}");
+        assert!(place.path().join("run/checkpoints/best.policy").exists());
+    }
+}
+
+fn a_signal_ends_shoal_eval_in_order() {
+    for (signal, code) in [(Signal::TERM, 143), (Signal::INT, 130)] {
+        let place = place();
+        let environment = format!("{OURS}Sleeps-v0");
+        let arguments = [&SHORT[..], &["--steps", "200"]].concat();
+        let (trained, _, leftovers) = place.start_in("run", &environment, &arguments).wait();
+        assert_eq!(trained, Some(0), "{}", place.stderr());
+        std::fs::write(place.path().join("sleep"), "").unwrap();
+        let temporary = place.path().join("temporary");
+        std::fs::create_dir(&temporary).unwrap();
+        let files = || std::fs::read_dir("/dev/shm").unwrap().count();
+        let mut evaluation = place
+            .shoal(&["eval", "run", "--json"])
+            .env("TMPDIR", &temporary)
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap();
+        until("it is asleep", || place.path().join("asleep").exists());
+        assert!(files() > 0);
+        kill_process(Pid::from_child(&evaluation), signal).unwrap();
+        until("it has ended", || evaluation.try_wait().unwrap().is_some());
+        let output = evaluation.wait_with_output().unwrap();
+        assert_eq!(output.status.code(), Some(code));
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(said.lines().count() == 1 && said.contains("signal"), "{said}");
+        assert!(output.stdout.is_empty());
+        assert!(processes_of(&place, "shoal_gym").is_empty(), "its server has ended");
+        assert_eq!(
+            std::fs::read_dir(&temporary).unwrap().count(),
+            0,
+            "nothing of it is left"
+        );
+        assert!(leftovers.files().is_empty());
+    }
 }
 
 fn servers_end_with_their_launcher_and_the_run_can_be_resumed() {
@@ -377,6 +432,30 @@ fn a_stuck_server_ends_with_its_launcher() {
     });
 }
 
+/// The next launcher waits for the processes of the one before it, here for a stuck server, and answers no questions yet.
+fn the_status_of_a_run_that_starts_says_so() {
+    let place = place();
+    let arguments = [&SHORT[..], &["--steps", "100000000"]].concat();
+    let running = place.start_in("run", &format!("{OURS}Sleeps-v0"), &arguments);
+    running.wait_for_learning();
+    std::fs::write(place.path().join("sleep"), "").unwrap();
+    until("a server is asleep in a step", || place.path().join("asleep").exists());
+    running.signal(Signal::KILL);
+    std::fs::remove_file(place.path().join("sleep")).unwrap();
+    let mut resume = place.shoal(&["resume", "run", "--quiet"]).spawn().unwrap();
+    until("the status says that the run starts", || {
+        let status = place.output(&["status", "run", "--json"]);
+        status.status.code() == Some(0) && support::json(&status)["waiting"] == "starting"
+    });
+    until("its learner works", || {
+        let roles = place.status("run")["roles"].clone();
+        roles.as_array().unwrap().iter().any(|role| role["role"] == "learner")
+    });
+    let stopped = place.output(&["stop", "run"]);
+    assert!(stopped.status.success(), "{}", String::from_utf8_lossy(&stopped.stderr));
+    until("the launcher has ended", || resume.try_wait().unwrap().is_some());
+}
+
 fn a_killed_start_leaves_no_process_and_no_file() {
     let place = place();
     let asleep = format!("{OURS}Sleeps-v0");
@@ -474,7 +553,14 @@ fn too_many_invalid_answers_end_a_run_that_can_be_resumed() {
     let place = place();
     let environment = format!("{OURS}Invalid-v0");
     let always = ["--set", "environment.what=shape", "--set", "environment.always=true"];
-    let few = ["--steps", "2000", "--set", "environment.faults=7"];
+    let few = [
+        "--steps",
+        "2000",
+        "--set",
+        "environment.faults=7",
+        "--set",
+        "replay.warmup=64",
+    ];
     let command = [&["train", &environment, "--run", "run"][..], &SHORT, &always, &few].concat();
     let output = place.output(&command);
     assert_eq!(output.status.code(), Some(1));

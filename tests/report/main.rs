@@ -118,6 +118,7 @@ fn a_report_works_in_a_browser() {
         "requests only itself"
     );
 
+    check_final_evaluations(&mut browser, &place, &runs);
     let names = browser.value("document.querySelector('.legend').innerText");
     assert!(names.as_str().unwrap().contains("median of 2 runs of ddpg"), "{names}");
 
@@ -145,6 +146,32 @@ fn a_report_works_in_a_browser() {
     check_readout_and_zoom(&mut browser);
     assert_eq!(browser.problems(), [""; 0]);
     check_narrow_and_dark(&mut browser, &page);
+}
+
+/// The row of the final evaluation has each run's, and none for the stopped one.
+fn check_final_evaluations(browser: &mut Browser, place: &Workplace, runs: &[&str]) {
+    let row =
+        "[...document.querySelectorAll('tr')].find((row) => row.querySelector('th')?.innerText === 'final evaluation')";
+    let cells = browser.value(&format!(
+        "[...{row}.querySelectorAll('td')].map((cell) => cell.innerText)"
+    ));
+    let cells = cells.as_array().unwrap();
+    assert_eq!(cells.len(), runs.len());
+    for (run, cell) in runs.iter().zip(cells) {
+        let cell = cell.as_str().unwrap();
+        let file = place.path().join(run).join("final-evaluation.json");
+        match std::fs::read_to_string(file) {
+            Ok(text) => {
+                let found: Value = serde_json::from_str(&text).unwrap();
+                let episodes = &found["policies"][0]["episodes"];
+                assert!(
+                    cell.contains(&format!("({episodes} episodes, 95 % interval")),
+                    "{run}: {cell}"
+                );
+            }
+            Err(_) => assert_eq!((*run, cell), ("again", "none")),
+        }
+    }
 }
 
 /// Plays an episode with the slider, with the keyboard and automatically.

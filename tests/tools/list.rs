@@ -20,7 +20,7 @@ fn every_run_is_listed_with_its_state() {
     assert_eq!(String::from_utf8_lossy(&empty.stdout), "no runs in runs\n");
 
     let length = ["--steps", "400", "--lockstep", "--set", "evaluation.every=100"];
-    place.train(&[&["pendulum", "--run", "runs/finished"][..], &length].concat());
+    let trained = place.train(&[&["pendulum", "--run", "runs/finished"][..], &length].concat());
     let endless = ["--steps", "100000000"];
     let killed = place.start("runs/killed", &endless);
     killed.wait_for_learning();
@@ -52,6 +52,9 @@ fn every_run_is_listed_with_its_state() {
     returns.sort_by(f64::total_cmp);
     assert!(returns.first() < returns.last(), "more than one: {returns:?}");
     assert_eq!(finished["best_return"].as_f64(), returns.last().copied());
+    assert!(finished["final_return"].is_f64());
+    assert_eq!(finished["final_return"], trained["eval_return_mean"]);
+    assert!(listed(&list, "stopped")["final_return"].is_null());
     assert!(
         listed(&list, "damaged")["reason"]
             .as_str()
@@ -66,6 +69,13 @@ fn every_run_is_listed_with_its_state() {
     let last = table.lines().last().unwrap();
     assert!(last.starts_with("damaged: ") && last.contains("config.toml"), "{table}");
     assert!(table.contains("best return") && table.contains("400"), "{table}");
+    let finally = format!("{:.2}", finished["final_return"].as_f64().unwrap());
+    assert!(
+        table.lines().next().unwrap().trim_end().ends_with("final return"),
+        "{table}"
+    );
+    let row = table.lines().find(|line| line.contains(" finished ")).unwrap();
+    assert!(row.trim_end().ends_with(&finally), "{table}");
 }
 
 #[test]

@@ -7,6 +7,8 @@ mod explanation;
 pub use bounds::{Bounded, Bounds, OutOfRange, above, from, in_words};
 pub use explanation::{Key, Section, describe, keys};
 
+use std::fmt::Display;
+
 use serde::de::{DeserializeOwned, Error};
 use toml::{Table, Value};
 
@@ -26,6 +28,30 @@ pub fn read<T: DeserializeOwned>(name: &str, section: Value) -> Result<T, toml::
         let mut keys = section.as_table().into_iter().flatten();
         keys.find_map(alone).unwrap_or(error)
     })
+}
+
+/// What is wrong with a TOML text, on one line: where the text came from, the number and the text of the line, and the
+/// reason.
+pub fn malformed(origin: impl Display, text: &str, error: &toml::de::Error) -> String {
+    let reason = error.message().replace('\n', " ");
+    let Some(start) = error.span().map(|span| span.start.min(text.len())) else {
+        return format!("{origin}: {reason}");
+    };
+    let number = line_at(text, start);
+    let line: String = text
+        .lines()
+        .nth(number - 1)
+        .unwrap_or_default()
+        .trim()
+        .chars()
+        .take(60)
+        .collect();
+    format!("{origin}, line {number} (`{line}`): {reason}")
+}
+
+/// The number of the line, from 1, of a byte of the text.
+pub fn line_at(text: &str, byte: usize) -> usize {
+    1 + text.bytes().take(byte).filter(|byte| *byte == b'\n').count()
 }
 
 /// Declares the struct of a section. A key is written as

@@ -46,6 +46,9 @@ const ANSWER_PER_ROLE: usize = 96;
 /// idle.
 const POLL_INTERVAL: Duration = Duration::from_millis(5);
 
+/// How long a question about the status waits for a launcher without a service.
+const MISSING_PATIENCE: Duration = Duration::from_secs(1);
+
 /// How often the client checks that the launcher is still alive.
 const LIVENESS_INTERVAL: Duration = Duration::from_millis(100);
 
@@ -73,6 +76,9 @@ pub enum ControlError {
     /// The channel does not work.
     #[error(transparent)]
     Channel(#[from] ChannelError),
+    /// The launcher lives and has no service for questions: it is starting, or the roles have ended already.
+    #[error("the run is starting, or ending; try again")]
+    Missing,
     /// The launcher has ended.
     #[error("the launcher has ended")]
     Gone,
@@ -182,7 +188,13 @@ pub fn ask(
     patience: Duration,
     is_alive: impl Fn() -> bool,
 ) -> Result<Answer, ControlError> {
-    let deadline = Instant::now() + patience;
+    let asked = Instant::now();
+    let deadline = asked + patience;
+    // Who only wants to know how the run is need not wait until it is able to answer.
+    let missing_until = match question {
+        Question::Status => deadline.min(asked + MISSING_PATIENCE),
+        Question::Scale { .. } | Question::Stop => deadline,
+    };
     let make_client = || {
         service(domain, Entry::Open)?
             .client_builder()
@@ -195,6 +207,9 @@ pub fn ask(
         match make_client() {
             Ok(client) => break client,
             Err(_) if !is_alive() => return Err(ControlError::Gone),
+            Err(error) if error.kind == ChannelErrorKind::Missing && Instant::now() >= missing_until => {
+                return Err(ControlError::Missing);
+            }
             Err(error) if is_permanent(&error) || Instant::now() >= deadline => return Err(error.into()),
             Err(_) => std::thread::sleep(POLL_INTERVAL),
         }

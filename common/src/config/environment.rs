@@ -11,6 +11,9 @@ use shoal_base::space::{EnvironmentSpec, Space};
 /// computed from them overflows.
 const MAX_WIDTH: usize = 4_096;
 
+/// Most indices of a discrete space: a 32-bit float has every whole number up to this one.
+const MAX_INDICES: u64 = 1 << 24;
+
 /// The environment: its name and its parameters.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct EnvironmentConfig {
@@ -96,6 +99,11 @@ pub(super) fn check_spec(spec: &EnvironmentSpec) -> Result<(), OutOfRange> {
 fn check_size(key: &str, space: &Space) -> Result<(), OutOfRange> {
     let (value, expected) = match space {
         Space::Discrete { n: 0, .. } => ("no index".into(), "one index or more".into()),
+        // Rows and requests have the numbers of states and actions as 32-bit floats.
+        Space::Discrete { n, .. } if u64::from(*n) > MAX_INDICES => (
+            format!("{n} indices"),
+            format!("at most {MAX_INDICES} (2^24) indices: choose an environment with fewer"),
+        ),
         Space::Box { low, high } if low.len() != high.len() || !(1..=MAX_WIDTH).contains(&low.len()) => (
             format!("{} lower and {} upper bounds", low.len(), high.len()),
             format!("equally many of both, from 1 to {MAX_WIDTH}"),

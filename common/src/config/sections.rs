@@ -1,6 +1,8 @@
 //! The sections of the configuration's text. At most one of the algorithms' sections may be present.
 
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Deserializer, Serialize, Serializer, de};
+use shoal_base::section;
 use shoal_base::space::EnvironmentSpec;
 use toml::{Table, Value};
 
@@ -103,6 +105,28 @@ impl TryFrom<Sections> for Config {
             checkpoint: sections.checkpoint,
         })
     }
+}
+
+/// What is wrong with the first section that cannot be read, beginning with the key and its value: serde's own error does
+/// not name the key. The sections of algorithms, whose errors do, are not among these.
+pub(super) fn at_fault(sections: &Table) -> Option<String> {
+    fn fault<T: DeserializeOwned>(sections: &Table, name: &str) -> Option<String> {
+        let error = section::read::<T>(name, sections.get(name)?.clone()).err()?;
+        let message = error.message().replace('\n', " ");
+        let is_named = message.starts_with(&format!("{name}."));
+        Some(if is_named {
+            message
+        } else {
+            format!("[{name}]: {message}")
+        })
+    }
+    fault::<RunConfig>(sections, "run")
+        .or_else(|| fault::<ActorsConfig>(sections, "actors"))
+        .or_else(|| fault::<ExplorationConfig>(sections, "exploration"))
+        .or_else(|| fault::<LearnerConfig>(sections, "learner"))
+        .or_else(|| fault::<ReplayConfig>(sections, "replay"))
+        .or_else(|| fault::<EvaluationConfig>(sections, "evaluation"))
+        .or_else(|| fault::<CheckpointConfig>(sections, "checkpoint"))
 }
 
 /// The algorithm that has a section, or the default algorithm if none has one.

@@ -205,6 +205,11 @@ impl Rates {
         for i in too_short {
             (rows[i].env_steps_per_second, rows[i].updates_per_second) = (None, None);
         }
+        if last_is_incomplete(&rows)
+            && let Some(last) = rows.last_mut()
+        {
+            (last.env_steps_per_second, last.updates_per_second) = (None, None);
+        }
         let shown: Vec<&[LearnerRecord]> = parts(rows.len(), points).map(|part| &rows[part]).collect();
         let last = |part: &&[LearnerRecord]| part.last().cloned().unwrap_or_default();
         let column = |of: fn(&LearnerRecord) -> Option<f64>| -> Vec<f64> {
@@ -221,6 +226,18 @@ impl Rates {
             q_mean: column(|row| row.q_mean),
         }
     }
+}
+
+/// Whether the last row was recorded earlier than usual after the one before, at the end of the run. Its rates are those
+/// of a run that ends.
+fn last_is_incomplete(rows: &[LearnerRecord]) -> bool {
+    let mut spans: Vec<f64> = rows
+        .windows(2)
+        .map(|pair| pair[1].wall_seconds - pair[0].wall_seconds)
+        .collect();
+    let Some(last) = spans.pop() else { return false };
+    spans.sort_by(f64::total_cmp);
+    spans.get(spans.len() / 2).is_some_and(|usual| last < 0.9 * usual)
 }
 
 impl Incidents {
@@ -271,4 +288,31 @@ pub(super) fn names(runs: &[RunDir]) -> Vec<String> {
         }
     };
     runs.iter().zip(&short).map(name).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_rates_of_an_incomplete_last_window_are_left_out() {
+        let rates = |last: f64| {
+            let times = [0.5, 1.0, 1.5, 2.0, last];
+            let row = |wall_seconds: f64| {
+                let mut row = LearnerRecord::default();
+                (row.wall_seconds, row.ratio) = (wall_seconds, Some(1.0));
+                (row.env_steps_per_second, row.updates_per_second) = (Some(500.0), Some(500.0));
+                row
+            };
+            Rates::of(times.map(row).into(), 10)
+        };
+        let complete = rates(2.5);
+        assert_eq!(
+            (complete.env_steps_per_second[4], complete.updates_per_second[4]),
+            (500.0, 500.0)
+        );
+        let incomplete = rates(2.3);
+        assert!(incomplete.env_steps_per_second[4].is_nan() && incomplete.updates_per_second[4].is_nan());
+        assert_eq!((incomplete.env_steps_per_second[3], incomplete.ratio[4]), (500.0, 1.0));
+    }
 }

@@ -1,7 +1,7 @@
 //! A CSV file of rows of one type, opened for appending.
 
 use std::fs::{File, OpenOptions};
-use std::io::{self, BufRead, BufReader, Read, Seek, SeekFrom};
+use std::io::{self, BufRead, BufReader, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
@@ -44,7 +44,7 @@ pub(super) struct Table {
 }
 
 impl Table {
-    /// Opens the table at `path`, or creates it. Removes a last line that a crash cut short. A file with another header
+    /// Opens the table at `path`, or creates it with its header. Removes a last line that a crash cut short. A file with another header
     /// is refused and left unchanged.
     pub(super) fn open<Row: Serialize + Default>(path: &Path) -> Result<Self, RecordError> {
         let write = |cause| RecordError::Write {
@@ -58,7 +58,7 @@ impl Table {
             .truncate(false)
             .open(path)
             .map_err(write)?;
-        let (end, lines) = whole_lines(&file).map_err(write)?;
+        let end = whole_lines(&file).map_err(write)?;
         let expected = header_of::<Row>(path)?;
         let found = first_line(&file, expected.len()).map_err(write)?;
         if (end > 0 && found != expected) || !expected.starts_with(&found) {
@@ -72,12 +72,15 @@ impl Table {
         file.set_len(end)
             .and_then(|()| file.seek(SeekFrom::End(0)))
             .map_err(write)?;
-        Ok(Self::onto(path, file, lines))
+        if end == 0 {
+            file.write_all(&expected).map_err(write)?;
+        }
+        Ok(Self::onto(path, file))
     }
 
-    /// Appends to a file that has `lines` complete lines, including its header.
-    pub(super) fn onto(path: &Path, file: File, lines: u64) -> Self {
-        let rows = csv::WriterBuilder::new().has_headers(lines == 0).from_writer(file);
+    /// Appends to a file that has its header.
+    pub(super) fn onto(path: &Path, file: File) -> Self {
+        let rows = csv::WriterBuilder::new().has_headers(false).from_writer(file);
         Self {
             path: path.to_owned(),
             rows,
@@ -121,18 +124,17 @@ pub(super) fn last<Row: DeserializeOwned>(path: &Path) -> Result<Option<Row>, Re
     rows(path).map(|mut rows: Vec<Row>| rows.pop())
 }
 
-/// The length in bytes of the complete lines, and their number.
-fn whole_lines(file: &File) -> io::Result<(u64, u64)> {
-    let (mut end, mut lines, mut line) = (0, 0, Vec::new());
+/// The length in bytes of the complete lines.
+fn whole_lines(file: &File) -> io::Result<u64> {
+    let (mut end, mut line) = (0, Vec::new());
     let mut reader = BufReader::with_capacity(1 << 16, file);
     loop {
         line.clear();
         let read = reader.read_until(b'\n', &mut line)?;
         if line.last() != Some(&b'\n') {
-            return Ok((end, lines));
+            return Ok(end);
         }
         end += read as u64;
-        lines += 1;
     }
 }
 

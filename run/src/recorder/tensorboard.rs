@@ -20,7 +20,18 @@ struct Event {
     file_version: Option<String>,
     #[prost(message, optional, tag = "5")]
     summary: Option<Summary>,
+    #[prost(message, optional, tag = "7")]
+    session_log: Option<SessionLog>,
 }
+
+#[derive(Clone, PartialEq, Message)]
+struct SessionLog {
+    #[prost(int32, tag = "1")]
+    status: i32,
+}
+
+/// `SessionLog.START`: what was recorded at this step or later is not valid.
+const START: i32 = 1;
 
 #[derive(Clone, PartialEq, Message)]
 struct Summary {
@@ -45,7 +56,9 @@ pub(crate) struct EventFile {
 
 impl EventFile {
     /// Creates a new file in `directory`, and the directory if necessary. TensorBoard reads all files there as one run.
-    pub(crate) fn create(directory: &Path) -> io::Result<Self> {
+    /// The file of a resumed run begins at step `continues`: later ones in earlier files, which the run's tables do not
+    /// have, are not shown.
+    pub(crate) fn create(directory: &Path, continues: Option<u64>) -> io::Result<Self> {
         std::fs::create_dir_all(directory)?;
         let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         // TensorBoard reads the files in the order of their names.
@@ -62,6 +75,13 @@ impl EventFile {
             file_version: Some("brain.Event:2".into()),
             ..Event::default()
         })?;
+        if let Some(step) = continues {
+            events.write(&Event {
+                step: step as i64,
+                session_log: Some(SessionLog { status: START }),
+                ..Event::default()
+            })?;
+        }
         Ok(events)
     }
 
@@ -139,7 +159,7 @@ mod tests {
     #[test]
     fn scalars_are_read_back_with_valid_checksums() {
         let dir = tempfile::tempdir().unwrap();
-        let mut events = EventFile::create(&dir.path().join("tensorboard")).unwrap();
+        let mut events = EventFile::create(&dir.path().join("tensorboard"), None).unwrap();
         events.scalars(0, &[("episode/return", 0.0)]).unwrap();
         let loss = [
             ("learner/critic_loss", 1.5),
@@ -173,6 +193,21 @@ mod tests {
     }
 
     #[test]
+    fn the_file_of_a_resumed_run_begins_with_a_start() {
+        let dir = tempfile::tempdir().unwrap();
+        drop(EventFile::create(dir.path(), Some(2_001)).unwrap());
+        let bytes = std::fs::read(std::fs::read_dir(dir.path()).unwrap().next().unwrap().unwrap().path()).unwrap();
+        let events = read_back(dir.path());
+        assert_eq!(events.len(), 2);
+        assert_eq!(
+            (events[1].step, events[1].session_log.clone()),
+            (2_001, Some(SessionLog { status: START }))
+        );
+        // As protoc encodes `session_log { status: START }`: field 7 with two bytes, field 1 with 1.
+        assert!(bytes.windows(4).any(|bytes| bytes == [0x3a, 2, 0x08, 1]));
+    }
+
+    #[test]
     fn the_checksum_is_that_of_tensorflow() {
         // CRC-32C of "123456789" is 0xe3069283 (RFC 3720's polynomial); masked as in tsl/lib/hash/crc32c.h.
         assert_eq!(crc32c::crc32c(b"123456789"), 0xe306_9283);
@@ -183,7 +218,7 @@ mod tests {
     fn every_launcher_writes_its_own_file() {
         let dir = tempfile::tempdir().unwrap();
         for _ in 0..3 {
-            EventFile::create(dir.path()).unwrap();
+            EventFile::create(dir.path(), None).unwrap();
         }
         assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 3);
     }

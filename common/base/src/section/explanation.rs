@@ -21,6 +21,8 @@ pub struct Key {
     pub choices: Vec<String>,
     /// The bounds of its numbers, such as `from 0 to 1`; empty if none are declared.
     pub bounds: String,
+    /// Whether it takes whole numbers.
+    pub whole: bool,
 }
 
 /// A section of `config.toml`, without an environment's own parameters.
@@ -56,8 +58,15 @@ pub fn keys<T: JsonSchema>() -> Vec<Key> {
         source: text(property, "source"),
         choices: choices(&schema, property),
         bounds: text(property, "bounds"),
+        whole: is_whole(&property["type"]),
     });
     key.collect()
+}
+
+/// Whether a value of this type is a whole number, or may be one.
+fn is_whole(of_type: &Value) -> bool {
+    let any = of_type.as_array().into_iter().flatten();
+    std::iter::once(of_type).chain(any).any(|name| name == "integer")
 }
 
 /// The possible values of a property, if it is a word.

@@ -1,0 +1,56 @@
+//! The best policy of a run that an earlier version made: it may have been evaluated from other starts than its successors
+//! will be.
+
+use shoal_common::config::Config;
+use shoal_common::policy_file::PolicyFile;
+use shoal_common::run_dir::RunDir;
+
+use crate::evaluation::{EvaluationSummary, WhichPolicy, evaluate_until};
+use crate::external_environment::GYMNASIUM;
+use crate::server_location::ServerLocation;
+use crate::signals::Interrupt;
+
+/// The best policy's mean return by an earlier version, and the one from today's starts.
+#[derive(Clone, Debug, PartialEq)]
+pub struct EvaluatedAnew {
+    /// What `best.policy` said.
+    pub before: f64,
+    /// What it says now.
+    pub now: EvaluationSummary,
+}
+
+/// Evaluates the best policy of a Gymnasium run of an earlier version anew, once. The seeds of its episodes were not below
+/// 2³¹ then, so half of its starts were others, and it may have been better or worse by luck alone.
+///
+/// Such a run has no `server.json`, which came with the same version as the new seeds. This writes it, as the sign that
+/// nothing is left to do.
+///
+/// # Errors
+/// When the policy cannot be read or written, the environment fails, or a signal has arrived.
+pub fn evaluate_anew(run: &RunDir, config: &Config, interrupt: &Interrupt) -> anyhow::Result<Option<EvaluatedAnew>> {
+    if !config.environment.name.starts_with(GYMNASIUM) || run.server_file().exists() {
+        return Ok(None);
+    }
+    let evaluated = if run.best_policy().exists() {
+        let best = WhichPolicy::Best.read(run, config)?;
+        let amount = (config.evaluation.episodes, config.run.seed);
+        let now = evaluate_until(run, config, &best.parameters, amount, interrupt, |_| ())?;
+        let anew = PolicyFile {
+            return_mean: now.return_mean,
+            return_std: now.return_std,
+            episodes: now.episodes.into(),
+            ..best.clone()
+        };
+        anew.write(&run.best_policy())?;
+        Some(EvaluatedAnew {
+            before: best.return_mean,
+            now,
+        })
+    } else {
+        None
+    };
+    if let Some(location) = ServerLocation::here(&config.environment.server)? {
+        location.write(run)?;
+    }
+    Ok(evaluated)
+}

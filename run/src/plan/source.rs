@@ -1,0 +1,233 @@
+//! Where each value of a configuration comes from.
+
+use std::collections::BTreeMap;
+use std::fmt::{self, Display, Formatter};
+
+use shoal_common::section::line_at;
+use toml::de::{DeTable, DeValue};
+use toml::{Table, Value};
+
+use super::suggestion::with_suggestion;
+
+/// Where the value of a key comes from.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub enum Source {
+    /// No one has set the key.
+    #[default]
+    Default,
+    /// The preset of this name.
+    Preset(String),
+    /// A line of this file.
+    File(String, usize),
+    /// The defaults for a Gymnasium environment.
+    Gymnasium,
+    /// The defaults for this method, which was asked for.
+    Method(&'static str),
+    /// This option of the command line.
+    Option(&'static str),
+    /// `--set`.
+    Set,
+    /// The value of something else, which this names.
+    Follows(String),
+}
+
+impl Source {
+    /// Whether the user has chosen the value.
+    pub(super) fn is_users(&self) -> bool {
+        matches!(self, Self::File(..) | Self::Option(_) | Self::Set)
+    }
+}
+
+impl Display for Source {
+    fn fmt(&self, to: &mut Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Default => write!(to, "the default"),
+            Self::Preset(name) => write!(to, "preset {name}"),
+            Self::File(name, line) => write!(to, "{name}, line {line}"),
+            Self::Gymnasium => write!(to, "the default for gym: environments"),
+            Self::Method(name) => write!(to, "the default for {name}"),
+            Self::Option(option) => write!(to, "{option}"),
+            Self::Set => write!(to, "--set"),
+            Self::Follows(what) => write!(to, "follows from {what}"),
+        }
+    }
+}
+
+/// Wrong usage of the command line: the program ends with the code for that.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub struct UsageError(pub String);
+
+/// The sources of all keys, by `section.key`. A key that is not there has its default.
+#[derive(Clone, Debug, Default)]
+pub struct Sources(BTreeMap<String, Source>);
+
+/// Keys whose values must go together: if the first is refused and only the second is the user's, the user must read of
+/// the second.
+const TOGETHER: [(&str, &str); 7] = [
+    ("replay.warmup", "replay.capacity"),
+    ("replay.capacity", "ddpg.batch"),
+    ("replay.capacity", "td3.batch"),
+    ("replay.capacity", "sac.batch"),
+    ("replay.capacity", "dqn.batch"),
+    ("actors.count", "actors.max"),
+    ("actors.chunk_steps", "environment.time_limit"),
+];
+
+impl Sources {
+    /// All keys of `table` come from this preset.
+    pub(super) fn of_preset(name: &str, table: &Table) -> Self {
+        let mut sources = Self::default();
+        sources.add(table, &Source::Preset(name.into()));
+        sources
+    }
+
+    /// The keys of a file of this name with their lines.
+    pub(super) fn of_file(name: &str, text: &str) -> Self {
+        let mut sources = Self::default();
+        let Ok(document) = DeTable::parse(text) else {
+            return sources;
+        };
+        for (section, value) in document.get_ref() {
+            let at = |byte| Source::File(name.into(), line_at(text, byte));
+            let section_name = section.get_ref();
+            sources.0.insert(format!("[{section_name}]"), at(section.span().start));
+            if let DeValue::Table(keys) = value.get_ref() {
+                for key in keys.keys() {
+                    sources.set(format!("{section_name}.{}", key.get_ref()), at(key.span().start));
+                }
+            }
+        }
+        sources
+    }
+
+    /// Adds the keys of `now` that `before` does not have, except those of the environment.
+    pub(super) fn add_new(&mut self, before: &Table, now: &Table, source: &Source) {
+        for (section, keys) in now
+            .iter()
+            .filter(|(section, _)| !["environment", "spec"].contains(&section.as_str()))
+        {
+            for key in keys.as_table().into_iter().flat_map(Table::keys) {
+                if before.get(section).and_then(|keys| keys.get(key)).is_none() {
+                    self.set(format!("{section}.{key}"), source.clone());
+                }
+            }
+        }
+    }
+
+    /// Adds the keys of `table` that have no source yet.
+    pub(super) fn add(&mut self, table: &Table, source: &Source) {
+        for (section, keys) in table {
+            for key in keys.as_table().into_iter().flat_map(Table::keys) {
+                self.0
+                    .entry(format!("{section}.{key}"))
+                    .or_insert_with(|| source.clone());
+            }
+        }
+    }
+
+    pub(super) fn set(&mut self, key: String, source: Source) {
+        if let (Source::Set, Some((section, _))) = (&source, key.split_once('.')) {
+            self.0.entry(format!("[{section}]")).or_insert(Source::Set);
+        }
+        self.0.insert(key, source);
+    }
+
+    /// The source of a key.
+    pub fn of(&self, key: &str) -> Source {
+        self.0.get(key).cloned().unwrap_or_default()
+    }
+
+    /// The error for a refused configuration, whose message begins with the key at fault. It names what the user has
+    /// set, and where.
+    pub(super) fn explain(&self, message: String, origin: &str, table: &Table) -> anyhow::Error {
+        let message = with_suggestion(message);
+        let named = message.split_once(" = ").map_or("", |(key, _)| key);
+        let key = named.split('[').next().filter(|key| !key.is_empty()).unwrap_or(named);
+        if let Some(of_environment) = message.strip_prefix("spec.") {
+            return anyhow::anyhow!("{origin}: the environment's {of_environment}");
+        }
+        if self.of(key).is_users() {
+            return self.blame(key, &message);
+        }
+        self.explain_other(key, &message, origin, table)
+    }
+
+    /// The error for a key that the user may have set: names the option, or the file and the line.
+    pub(super) fn blame(&self, key: &str, message: &str) -> anyhow::Error {
+        match self.of(key) {
+            Source::Option(option) => UsageError(format!("{option}: {message}")).into(),
+            Source::Set => UsageError(message.into()).into(),
+            Source::File(name, line) => anyhow::anyhow!("{name}, line {line}: {message}"),
+            Source::Default | Source::Preset(_) | Source::Gymnasium | Source::Method(_) | Source::Follows(_) => {
+                anyhow::anyhow!("{message}")
+            }
+        }
+    }
+
+    /// The same for a key that the user has not set, or that the message does not name.
+    fn explain_other(&self, key: &str, message: &str, origin: &str, table: &Table) -> anyhow::Error {
+        let is_users = |(first, other): &&(&str, &str)| *first == key && self.of(other).is_users();
+        let Some((_, other)) = TOGETHER.iter().find(is_users) else {
+            return self.explain_section(message, origin);
+        };
+        let value = other
+            .split_once('.')
+            .and_then(|(section, key)| table.get(section)?.get(key));
+        let value = value.map_or_else(String::new, Value::to_string);
+        let (stated, expected) = message.split_once(": ").unwrap_or((message, ""));
+        let text = format!(
+            "{other} = {value}: does not go with {stated} ({}), which {expected}; set {key} too",
+            self.of(key)
+        );
+        self.blame(other, &text)
+    }
+
+    /// The same for a message about whole sections.
+    fn explain_section(&self, message: &str, origin: &str) -> anyhow::Error {
+        let words: Vec<&str> = message.split(['`', '[', ']']).skip(1).step_by(2).collect();
+        let of_preset = words.iter().find_map(|word| match self.first_of(word) {
+            Some(Source::Preset(name)) => Some((name, word)),
+            _ => None,
+        });
+        let hint = match of_preset.filter(|_| message.contains("two algorithms")) {
+            Some((name, word)) => format!("; the preset {name} has [{word}]: for another method use a file"),
+            None => String::new(),
+        };
+        let mut places = words.iter().map(|word| self.of(&format!("[{word}]")));
+        match places.find(|place| *place != Source::Default) {
+            Some(Source::File(name, line)) => anyhow::anyhow!("{name}, line {line}: {message}"),
+            Some(_) => UsageError(format!("{message}{hint}")).into(),
+            None if self.0.values().any(|source| *source == Source::Set) => {
+                UsageError(format!("{origin}: {message}")).into()
+            }
+            None => anyhow::anyhow!("{origin}: {message}"),
+        }
+    }
+
+    /// The source of the first key of a section.
+    fn first_of(&self, section: &str) -> Option<&Source> {
+        let mut all = self.0.iter();
+        all.find_map(|(key, source)| key.strip_prefix(section)?.starts_with('.').then_some(source))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_keys_of_a_file_have_their_lines() {
+        let text = "# a file\n[environment]\nname = \"pendulum\"\n\n[ddpg]\ntau = 0.5\nhidden = [\n1]\ngamma = 1\n";
+        let sources = Sources::of_file("a.toml", text);
+        for (key, line) in [
+            ("environment.name", 3),
+            ("ddpg.tau", 6),
+            ("ddpg.hidden", 7),
+            ("ddpg.gamma", 9),
+        ] {
+            assert_eq!(sources.of(key), Source::File("a.toml".into(), line), "{key}");
+        }
+        assert_eq!(sources.of("run.steps"), Source::Default);
+    }
+}
