@@ -123,8 +123,8 @@ mod tests {
 
     #[test]
     fn presets_and_keys_are_completed() {
-        let presets = values(what_to_train(OsStr::new("point-mass")));
-        assert_eq!(presets, ["point-mass-r1", "point-mass-r2", "point-mass-r3"]);
+        let presets = values(what_to_train(OsStr::new("point-mass-r3")));
+        assert_eq!(presets, ["point-mass-r3", "point-mass-r3-sac", "point-mass-r3-td3"]);
         assert_eq!(values(what_to_train(OsStr::new("gy"))), ["gym:"]);
         assert_eq!(values(settings(OsStr::new("ddpg.ta"))), ["ddpg.tau="]);
         assert_eq!(

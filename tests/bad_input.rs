@@ -144,11 +144,27 @@ fn invalid_training_arguments_are_refused_before_anything_is_created() {
         ),
         (
             &["frozen-lake", "--set", "ddpg.tau=1"],
-            "sections for two algorithms, [ddpg] and [q-learning]: keep one",
+            "ddpg cannot control frozen-lake: the action space is discrete (4 actions)",
         ),
         (
-            &["frozen-lake", "--set", "reinforce.gamma=0.9"],
-            "sections for two algorithms, [reinforce] and [q-learning]: keep one",
+            &["frozen-lake", "--method", "reinforce"],
+            "but these are indices of 16 states; choose one of q-learning, sarsa, or another environment",
+        ),
+        (
+            &["pendulum", "--method", "sac", "--set", "td3.tau=0.01"],
+            "sac and td3 are two methods, and a run has one",
+        ),
+        (
+            &["pendulum", "--method", "dqn"],
+            "choose one of ddpg, td3, sac, or another environment",
+        ),
+        (
+            &["frozen-lake", "--set", "replay.n_step=2"],
+            "replay.n_step = 2: must be 1: q-learning learns from each step once",
+        ),
+        (
+            &["frozen-lake", "--set", "observation.normalise=true"],
+            "[observation] and [reward] are for methods that learn from minibatches",
         ),
         (
             &["frozen-lake", "--set", "exploration.sigma=0.1"],

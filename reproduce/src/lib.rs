@@ -9,6 +9,7 @@ mod experiment;
 mod family;
 mod folder;
 mod frozen_lake;
+mod methods;
 mod pendulum;
 mod point_mass;
 mod progress;
@@ -34,11 +35,13 @@ pub use self::request::{BatchEnding, Request};
 use self::settings::RunSettings;
 
 /// Every family, in the report's order.
-const FAMILIES: [Entry; 4] = [
+const FAMILIES: [Entry; 6] = [
     entry::<frozen_lake::FrozenLake>(),
     entry::<cart_pole::CartPole>(),
     entry::<pendulum::Pendulum>(),
     entry::<point_mass::PointMass>(),
+    entry::<methods::PendulumMethods>(),
+    entry::<methods::PointMassMethods>(),
 ];
 
 /// The names of the experiments on the command line.

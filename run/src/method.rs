@@ -120,3 +120,38 @@ fn add(table: &mut Table, defaults: Table) {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_environment_may_have_numbers_of_its_own() {
+        let mut table: Table = "[dqn]\nbatch = 32".parse().unwrap();
+        add_defaults(&mut table, "gym:CartPole-v1", "dqn").unwrap();
+        assert_eq!(table["dqn"]["batch"].as_integer(), Some(32), "what is set is kept");
+        assert_eq!(table["dqn"]["epsilon_steps"].as_integer(), Some(8_000));
+        assert_eq!(table["run"]["steps"].as_integer(), Some(50_000));
+        let mut other = Table::new();
+        add_defaults(&mut other, "gym:Other-v0", "dqn").unwrap();
+        assert_eq!(other["run"]["steps"].as_integer(), Some(500_000));
+    }
+
+    #[test]
+    fn every_method_has_defaults_that_are_read_and_environments_name_methods() {
+        let all: Vec<_> = shoal_common::config::Algorithm::all();
+        assert_eq!(
+            names().collect::<Vec<_>>(),
+            all.iter().map(|one| one.name()).collect::<Vec<_>>()
+        );
+        for name in names() {
+            assert!(defaults(name).unwrap().contains_key(name), "{name}");
+        }
+        let of_environments: Table = OF_ENVIRONMENTS.parse().unwrap();
+        for (environment, methods) in of_environments {
+            for method in methods.as_table().unwrap().keys() {
+                assert!(names().any(|name| name == method), "{environment}: {method}");
+            }
+        }
+    }
+}

@@ -195,7 +195,7 @@ fn for_method(what: &str, overrides: &RunOverrides) -> anyhow::Result<(String, T
         }
     } else if let Some(other) = named.filter(|named| *named != method) {
         bail!("{what} is for {other}, but {method} is asked for: remove what belongs to {other} from the file");
-    } else {
+    } else if named.is_none() && method != Algorithm::default().name() {
         let environment = table.get("environment").and_then(|section| section.get("name"));
         let environment = environment.and_then(Value::as_str).unwrap_or_default().to_owned();
         method::add_defaults(&mut table, &environment, method)?;
@@ -628,6 +628,36 @@ mod tests {
         assert_eq!(config.environment.parameters["reward"].as_str(), Some("r2"));
         assert_eq!(config.environment.parameters["friction"].as_float(), Some(0.03));
         assert_eq!(*config.algorithm.ddpg().unwrap().hidden, [20, 10]);
+    }
+
+    #[test]
+    fn a_method_has_its_preset_for_the_task_or_its_own_defaults() {
+        let with = |what: &str, method: &str, set: &[&str]| {
+            let overrides = RunOverrides {
+                method: (!method.is_empty()).then(|| method.into()),
+                set: set.iter().map(|assignment| (*assignment).into()).collect(),
+                ..RunOverrides::default()
+            };
+            decide(what, &overrides).unwrap()
+        };
+        let (name, own) = with("pendulum", "sac", &[]);
+        assert_eq!((name.as_str(), own.run.steps), ("pendulum-sac", 20_000));
+        assert_eq!(with("pendulum", "", &["sac.tau=0.01"]).1.replay, own.replay);
+        assert_eq!(
+            with("pendulum", "ddpg", &[]).1.algorithm,
+            resolved("pendulum").unwrap().algorithm
+        );
+        // There is no preset for the pole with DQN: the task's length and evaluation, and the method's defaults.
+        let (name, dqn) = with("cart-pole", "dqn", &["run.steps=40_000"]);
+        assert_eq!(name, "cart-pole-dqn");
+        assert_eq!((dqn.run.mode, dqn.replay.updates_per_step), (Mode::Free, 0.25));
+        assert_eq!((dqn.run.episodes, dqn.actors.chunk_steps), (Some(5_000), 8));
+        let Algorithm::Dqn(settings) = dqn.algorithm else {
+            panic!("{:?}", dqn.algorithm)
+        };
+        assert_eq!(settings.epsilon_steps, 4_000, "a tenth of the run");
+        let (_, lake) = with("frozen-lake", "sarsa", &[]);
+        assert_eq!((lake.algorithm.name(), lake.run.mode), ("sarsa", Mode::Lockstep));
     }
 
     #[test]

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::bail;
 use shoal_common::channel::control::{self, Answer, ControlError, Question, RunStatus};
-use shoal_common::channel::{ChannelErrorKind, Domain, Sweeper};
+use shoal_common::channel::{Domain, Sweeper};
 use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
 
@@ -58,46 +58,47 @@ impl Remote {
             }
             Ok(answer) => Ok(Some(answer)),
             Err(ControlError::Gone) => Ok(None),
+            Err(ControlError::Missing) if domain.has_members() && self.reason_for_no_roles()?.is_none() => {
+                bail!("{}", self.files_removed(domain)?)
+            }
             Err(error @ (ControlError::Missing | ControlError::Silence)) if question == Question::Status => {
                 match self.without_roles(&error)? {
                     Some(status) => Ok(Some(Answer::Status(status))),
                     None => Err(error.into()),
                 }
             }
-            Err(ControlError::Channel(error)) if error.kind == ChannelErrorKind::Missing => {
-                bail!("{}", self.why_missing(domain)?)
-            }
             Err(error) => Err(error.into()),
         }
     }
 
-    /// Why there is a launcher that cannot be asked.
-    fn why_missing(&self, domain: &Domain) -> anyhow::Result<String> {
-        let here = self.run.path().display();
-        Ok(if domain.has_members() {
-            let directory = domain.directory()?;
-            format!(
-                "another program has removed files of {here} in {}; its launcher repairs that within seconds, unless it \
-                 is stopped",
-                directory.display()
-            )
-        } else {
-            format!("{here} is starting or in its final evaluation; ask again later")
-        })
+    /// Why a launcher that has processes in shared memory cannot be asked there.
+    fn files_removed(&self, domain: &Domain) -> anyhow::Result<String> {
+        Ok(format!(
+            "another program has removed files of {} in {}; its launcher repairs that within seconds, unless it is stopped",
+            self.run.path().display(),
+            domain.directory()?.display()
+        ))
+    }
+
+    /// Why the launcher has no roles, as the run's outcome tells: it is starting, or in its final evaluation.
+    fn reason_for_no_roles(&self) -> anyhow::Result<Option<&'static str>> {
+        let outcome = RunOutcome::read(&self.run)?;
+        let reason = outcome.and_then(|outcome| outcome.reason);
+        Ok([STARTING, FINAL_EVALUATION]
+            .into_iter()
+            .find(|known| reason.as_deref() == Some(known)))
     }
 
     /// The status, by the run's files, of a run whose launcher has no roles yet, or none any more. `None` if the
     /// launcher has roles and should have answered.
     fn without_roles(&self, error: &ControlError) -> anyhow::Result<Option<RunStatus>> {
-        let outcome = RunOutcome::read(&self.run)?;
-        let reason = outcome.as_ref().and_then(|outcome| outcome.reason.as_deref());
-        let state = outcome.as_ref().map(|outcome| outcome.state);
-        let waiting = match (reason, state) {
-            (Some(FINAL_EVALUATION), _) => FINAL_EVALUATION,
-            (Some(STARTING), _) => STARTING,
-            _ if matches!(error, ControlError::Silence) => return Ok(None),
-            (_, None | Some(RunState::Running)) => STARTING,
-            _ => "starting or ending",
+        let waiting = match self.reason_for_no_roles()? {
+            Some(reason) => reason,
+            None if matches!(error, ControlError::Silence) => return Ok(None),
+            None => match RunOutcome::read(&self.run)?.map(|outcome| outcome.state) {
+                None | Some(RunState::Running) => STARTING,
+                Some(_) => "starting or ending",
+            },
         };
         self.saved(waiting).map(Some)
     }
@@ -112,8 +113,7 @@ impl Remote {
     /// The run's status; `None` if it is not running.
     pub fn status(&self) -> anyhow::Result<Option<RunStatus>> {
         // A launcher that leaves its start may remove the shared memory in which it was asked.
-        let outcome = RunOutcome::read(&self.run)?;
-        let starts = outcome.and_then(|outcome| outcome.reason).as_deref() == Some(STARTING);
+        let starts = self.reason_for_no_roles()? == Some(STARTING);
         let answer = match self.ask(Question::Status, PATIENCE) {
             Err(_) if starts => Some(Answer::Status(self.saved(STARTING)?)),
             answer => answer?,

@@ -1,4 +1,4 @@
-"""Writes the reference updates of PyTorch that `tests/golden.rs` compares our DDPG with.
+"""Writes the reference updates of PyTorch that `tests/golden/updates.rs` compares our DDPG with.
 
     pip install torch==2.15.0 numpy==2.4.6
     python tests/golden/make_ddpg_golden.py DIRECTORY

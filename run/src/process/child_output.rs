@@ -257,8 +257,9 @@ mod tests {
                 last = text.to_owned();
             }
         };
-        lines.add(&b"noise\n".repeat(1_000_000), Instant::now(), &mut take);
-        lines.add(b"why it ends", Instant::now(), &mut take);
+        let now = Instant::now();
+        lines.add(&b"noise\n".repeat(1_000_000), now, &mut take);
+        lines.add(b"why it ends", now, &mut take);
         lines.end(&mut take);
         assert_eq!(last, "why it ends");
     }

@@ -1,0 +1,101 @@
+//! The pendulum with SAC and TD3.
+
+use serde::{Deserialize, Serialize};
+use shoal_report::figure;
+use shoal_run::analysis::pendulum::{Measures, SwingUp};
+use shoal_run::rollout::Rollout;
+
+use super::super::claim::{Claim, Scope, spread};
+use super::super::experiment::{Experiment, Stage};
+use super::super::family::{Family, Policies, Results};
+use super::super::result::SeedResult;
+use super::super::section::{FigureWriter, Section};
+use super::{experiment, stage};
+
+/// The final evaluation is over a thousand starts.
+const STARTS: &[&str] = &["evaluation.final_episodes=1000"];
+
+const EXPERIMENTS: [Experiment; 2] = [
+    experiment(
+        "pendulum-sac",
+        5,
+        (
+            STARTS,
+            &[
+                "sac.hidden=[16, 16]",
+                "evaluation.every=400",
+                "evaluation.final_episodes=10",
+            ],
+        ),
+        &[stage(20_000)],
+    ),
+    experiment(
+        "pendulum-td3",
+        5,
+        (
+            STARTS,
+            &[
+                "td3.hidden=[16, 16]",
+                "evaluation.every=400",
+                "evaluation.final_episodes=10",
+            ],
+        ),
+        &[stage(20_000)],
+    ),
+];
+
+/// The least mean return that is asked of every seed.
+const BAR: f64 = -165.0;
+
+/// The swing-up from rest at the bottom with the best policy.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(in super::super) struct Tests {
+    best: Measures,
+}
+
+/// SAC and TD3 on the pendulum.
+pub(in super::super) struct PendulumMethods;
+
+impl Family for PendulumMethods {
+    type Tests = Tests;
+    const EXPERIMENTS: &'static [Experiment] = &EXPERIMENTS;
+
+    fn test(policies: &Policies, _: &Stage) -> anyhow::Result<Tests> {
+        let best = SwingUp::run(&mut Rollout::new(&policies.config, &policies.best.parameters)?)?;
+        Ok(Tests { best: best.measures() })
+    }
+
+    fn sections(results: &Results<Tests>, writer: &FigureWriter) -> anyhow::Result<Vec<Section>> {
+        let [sac, td3] = ["pendulum-sac", "pendulum-td3"].map(|name| results.of(name, ""));
+        let mut figures = Vec::new();
+        for (name, seeds) in [("pendulum-sac", sac), ("pendulum-td3", td3)] {
+            let curves: Vec<_> = seeds.iter().map(SeedResult::curve).collect();
+            if !curves.is_empty() {
+                let caption = "Mean return of the evaluations during training, every seed";
+                figures.push(writer.add(&format!("{name}-learning-curve"), caption, |path| {
+                    figure::learning_curves(name, &curves, None, path)
+                })?);
+            }
+        }
+        Ok(vec![Section {
+            title: "The pendulum with SAC and TD3 (not in the thesis)",
+            from: vec![("pendulum-sac", ""), ("pendulum-td3", "")],
+            remark: "A sixth of the steps of section 4.3. The final evaluation is over 1,000 starts.".into(),
+            claims: [("SAC swings it up", sac), ("TD3 swings it up", td3)]
+                .map(|(what, seeds)| claim(what, seeds))
+                .into(),
+            figures,
+        }])
+    }
+}
+
+fn claim(what: &'static str, seeds: &[SeedResult<Tests>]) -> Claim {
+    let mean = |seed: &SeedResult<Tests>| seed.best.evaluation.return_mean;
+    Claim {
+        thesis: what,
+        criterion: "mean return of the best policy at least −165",
+        ours: spread(seeds.iter().map(mean), 1),
+        scope: Scope::EachSeed,
+        held: seeds.iter().map(|seed| mean(seed) >= BAR).collect(),
+    }
+}
