@@ -198,7 +198,7 @@ mod tests {
             panic!("one section")
         };
         assert_eq!(section.claims[0].held, [true, false, true]);
-        assert_eq!(section.claims[4].held[2], false, "{}", section.claims[4].ours);
+        assert!(!section.claims[4].held[2], "{}", section.claims[4].ours);
         assert!(section.claims[1].held.is_empty());
         assert!(section.remark.contains("| 3 | 100.0 | 12 |"), "{}", section.remark);
         assert_eq!(section.figures.len(), 1);
