@@ -49,12 +49,12 @@ const BAR: f64 = -165.0;
 
 /// The swing-up from rest at the bottom with the best policy.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(in super::super) struct Tests {
+pub(crate) struct Tests {
     best: Measures,
 }
 
 /// SAC and TD3 on the pendulum.
-pub(in super::super) struct PendulumMethods;
+pub(crate) struct PendulumMethods;
 
 impl Family for PendulumMethods {
     type Tests = Tests;

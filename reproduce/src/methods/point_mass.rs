@@ -50,7 +50,7 @@ turns less than 0.02 rad a step at rest; below 0.118 N the static friction holds
 
 /// Test runs of the best policy from all twelve starts.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(in super::super) struct Tests {
+pub(crate) struct Tests {
     best: Vec<Measures>,
 }
 
@@ -74,7 +74,7 @@ impl Tests {
 }
 
 /// SAC and TD3 on the point mass.
-pub(in super::super) struct PointMassMethods;
+pub(crate) struct PointMassMethods;
 
 impl Family for PointMassMethods {
     type Tests = Tests;

@@ -186,29 +186,19 @@ impl Sources {
     /// The same for a message about whole sections.
     fn explain_section(&self, message: &str, origin: &str) -> anyhow::Error {
         let words: Vec<&str> = message.split(['`', '[', ']']).skip(1).step_by(2).collect();
-        let of_preset = words.iter().find_map(|word| match self.first_of(word) {
-            Some(Source::Preset(name)) => Some((name, word)),
-            _ => None,
-        });
-        let hint = match of_preset.filter(|_| message.contains("two algorithms")) {
-            Some((name, word)) => format!("; the preset {name} has [{word}]: for another method use a file"),
-            None => String::new(),
-        };
         let mut places = words.iter().map(|word| self.of(&format!("[{word}]")));
         match places.find(|place| *place != Source::Default) {
             Some(Source::File(name, line)) => anyhow::anyhow!("{name}, line {line}: {message}"),
-            Some(_) => UsageError(format!("{message}{hint}")).into(),
-            None if self.0.values().any(|source| *source == Source::Set) => {
+            Some(_) => UsageError(message.into()).into(),
+            None if self
+                .0
+                .values()
+                .any(|source| matches!(source, Source::Set | Source::Method(_))) =>
+            {
                 UsageError(format!("{origin}: {message}")).into()
             }
             None => anyhow::anyhow!("{origin}: {message}"),
         }
-    }
-
-    /// The source of the first key of a section.
-    fn first_of(&self, section: &str) -> Option<&Source> {
-        let mut all = self.0.iter();
-        all.find_map(|(key, source)| key.strip_prefix(section)?.starts_with('.').then_some(source))
     }
 }
 
