@@ -227,7 +227,9 @@ impl<'a> Explorer<'a> {
         if let Some(snapshot) = &self.snapshot {
             self.step = snapshot.step;
             self.exploration.restore(&snapshot.noise);
-            self.n_step.restore(&snapshot.n_step);
+            if !self.n_step.restore(&snapshot.n_step) {
+                return Err(Exit::Failed(ActorError::Snapshot));
+            }
             self.returns.clone_from(&snapshot.returns);
             self.lengths.clone_from(&snapshot.lengths);
             let idle = || self.heartbeat.beat(Activity::WaitingForServer);
@@ -237,7 +239,9 @@ impl<'a> Explorer<'a> {
         (0..self.settings.envs).for_each(|environment| self.begin_episode(environment));
         // Without a snapshot, only the first episodes of the run can be repeated with the same bits.
         let sent = self.sender.sent();
-        self.step = sent * (self.settings.chunk.rows / self.settings.envs) as u64;
+        // A row of n steps is sent n − 1 steps after its first.
+        let sent_steps = sent * (self.settings.chunk.rows / self.settings.envs) as u64;
+        self.step = sent_steps + if sent == 0 { 0 } else { self.settings.n_step as u64 - 1 };
         let begin = if sent == 0 { Begin::Training(0) } else { Begin::Next };
         self.reset(begin)
     }
@@ -462,11 +466,15 @@ impl<'a> Explorer<'a> {
     /// a short time if the whole run ends. In lockstep incomplete chunks are dropped, because a round is complete or
     /// does not count.
     fn hand_over(&mut self) -> Result<(), ActorError> {
-        if self.settings.mode == Mode::Free
-            && !self.chunk.is_empty()
-            && self.await_commits(u64::from(self.settings.window) - 1)?
-        {
-            self.send()?;
+        if self.settings.mode == Mode::Free {
+            self.n_step.complete_all();
+            loop {
+                self.n_step.move_into(&mut self.chunk);
+                if self.chunk.is_empty() || !self.await_commits(u64::from(self.settings.window) - 1)? {
+                    break;
+                }
+                self.send()?;
+            }
         }
         self.await_commits(0)?;
         self.heartbeat.beat_now(Activity::Done);

@@ -45,6 +45,16 @@ impl NStep {
         }
     }
 
+    /// Completes what is pending with the steps that there are, although the episodes are not over.
+    pub fn complete_all(&mut self) {
+        for steps in &mut self.pending {
+            while !steps.is_empty() {
+                self.complete.push_back(of_several(self.row, steps));
+                steps.pop_front();
+            }
+        }
+    }
+
     /// Moves complete transitions into the chunk until it is full.
     pub fn move_into(&mut self, chunk: &mut Chunk) {
         while !chunk.is_full()
@@ -66,7 +76,7 @@ impl NStep {
 
     /// Everything that it holds, in [`RowLayout::n_step_words`] words.
     pub fn words(&self) -> Vec<u64> {
-        let mut words = Vec::with_capacity(self.state_words());
+        let mut words = Vec::new();
         if self.n == 1 {
             return words;
         }
@@ -74,12 +84,13 @@ impl NStep {
         words.push(self.complete.len() as u64);
         let rows = self.pending.iter().flatten().chain(&self.complete);
         words.extend(rows.flatten().map(|number| u64::from(number.to_bits())));
-        words.resize(words.capacity(), 0);
+        words.resize(self.state_words(), 0);
         words
     }
 
     /// Restores what [`words`](Self::words) returned for the same n, environments and row. Returns false, and holds
     /// nothing, if it is something else.
+    #[must_use]
     pub fn restore(&mut self, words: &[u64]) -> bool {
         self.clear();
         let restored = self.read(words);
@@ -239,6 +250,11 @@ mod tests {
         assert_eq!(of(0).map(|it| it.last).collect::<Vec<_>>(), [false, false, false, true]);
         assert_eq!(of(1).map(|it| it.s[0]).collect::<Vec<_>>(), [10.0, 11.0]);
         n_step.complete.clear();
+        let mut ended = n_step.clone();
+        ended.complete_all();
+        let rows = ended.complete.iter().map(|found| row().read(found));
+        let rows: Vec<_> = rows.map(|it| (it.s[0], it.r, it.s_next[0], it.last)).collect();
+        assert_eq!(rows, [(12.0, 3.8, 14.0, false), (13.0, 2.0, 14.0, false)]);
         assert_eq!(n_step.words().len(), row().n_step_words(3, 2));
         n_step.clear();
         assert_eq!(n_step, NStep::new(3, 2, row()));

@@ -23,7 +23,7 @@ pub(super) struct TemporaryRun {
     directory: TempDir,
 }
 
-/// The settings of DDPG, the only algorithm that is measured.
+/// The settings of DDPG, which every stage but `learner` measures.
 pub(super) fn ddpg(config: &Config) -> anyhow::Result<&DdpgConfig> {
     config.algorithm.ddpg().context("only DDPG is measured")
 }

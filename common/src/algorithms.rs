@@ -186,6 +186,8 @@ mod tests {
         let (yes, no) = (true, false);
         // DDPG, TD3, SAC, DQN, REINFORCE, Q-learning, SARSA.
         assert_eq!(takes(real, real), [yes, yes, yes, no, no, no, no]);
+        // DDPG's networks take an index as a quantity, as they did before there was a choice.
+        assert_eq!(takes(counted, real), [yes, no, no, no, no, no, no]);
         assert_eq!(takes(real, counted), [no, no, no, yes, yes, no, no]);
         assert_eq!(takes(counted, counted), [no, no, no, no, no, yes, yes]);
     }

@@ -61,8 +61,8 @@ pub(crate) fn named_in(table: &Table) -> Option<&'static str> {
 }
 
 /// Makes a preset for another method. What the preset says about learning was chosen for its own method, so only the
-/// environment, the run's length and the evaluation are kept.
-pub(crate) fn replace(preset: &mut Table, method: &'static str) -> anyhow::Result<()> {
+/// environment, the run's length and the evaluation are kept. Returns what is kept.
+pub(crate) fn replace(preset: &mut Table, method: &'static str) -> anyhow::Result<Table> {
     preset.retain(|section, _| ["run", "environment", "evaluation"].contains(&section));
     if let Some(Value::Table(run)) = preset.get_mut("run") {
         run.remove("mode");
@@ -79,14 +79,16 @@ pub(crate) fn replace(preset: &mut Table, method: &'static str) -> anyhow::Resul
     {
         run.remove("steps");
     }
+    let kept = preset.clone();
     add(preset, defaults);
-    Ok(())
+    Ok(kept)
 }
 
 /// The method that suits a Gymnasium environment's spaces.
 pub(crate) fn suitable(spec: &EnvironmentSpec) -> &'static str {
     match (&spec.observation, &spec.action) {
-        (_, Space::Box { .. }) => "sac",
+        (Space::Box { .. }, Space::Box { .. }) => "sac",
+        (Space::Discrete { .. }, Space::Box { .. }) => "ddpg",
         (Space::Box { .. }, Space::Discrete { .. }) => "dqn",
         (Space::Discrete { .. }, Space::Discrete { .. }) => "q-learning",
     }

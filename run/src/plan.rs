@@ -184,18 +184,27 @@ fn for_method(what: &str, overrides: &RunOverrides) -> anyhow::Result<(String, T
         return Ok((name, table, sources));
     };
     let named = method::named_in(&table);
-    if let Some((own, _)) = preset(&format!("{what}-{method}")) {
+    // A preset for another method than its task's first one ends with that method's name.
+    let task = named
+        .and_then(|named| what.strip_suffix(named)?.strip_suffix('-'))
+        .unwrap_or(what);
+    if let Some((own, _)) = preset(&format!("{task}-{method}")) {
         return sections(own);
+    }
+    let default = Algorithm::default().name();
+    if task != what && method == default && preset(task).is_some() {
+        return sections(task);
     }
     let defaults = Source::Method(method);
     if preset(what).is_some() {
-        if named.unwrap_or(Algorithm::default().name()) != method {
-            method::replace(&mut table, method)?;
+        if named.unwrap_or(default) != method {
+            let before = method::replace(&mut table, method)?;
+            sources = Sources::of_preset(&name, &before);
             name = format!("{name}-{method}");
         }
     } else if let Some(other) = named.filter(|named| *named != method) {
         bail!("{what} is for {other}, but {method} is asked for: remove what belongs to {other} from the file");
-    } else if named.is_none() && method != Algorithm::default().name() {
+    } else if named.is_none() && method != default {
         let environment = table.get("environment").and_then(|section| section.get("name"));
         let environment = environment.and_then(Value::as_str).unwrap_or_default().to_owned();
         method::add_defaults(&mut table, &environment, method)?;
@@ -643,6 +652,8 @@ mod tests {
         let (name, own) = with("pendulum", "sac", &[]);
         assert_eq!((name.as_str(), own.run.steps), ("pendulum-sac", 20_000));
         assert_eq!(with("pendulum", "", &["sac.tau=0.01"]).1.replay, own.replay);
+        assert_eq!(with("pendulum-sac", "td3", &[]).0, "pendulum-td3");
+        assert_eq!(with("pendulum-sac", "ddpg", &[]).0, "pendulum");
         assert_eq!(
             with("pendulum", "ddpg", &[]).1.algorithm,
             resolved("pendulum").unwrap().algorithm

@@ -47,7 +47,10 @@ fn check_shared_memory(config: &Config) -> anyhow::Result<()> {
     });
     let advice = match fits {
         Some(max) => format!("allow at most {max} actors (--set actors.max={max})"),
-        None => "choose smaller networks (ddpg.hidden) or chunks (actors.chunk_steps)".into(),
+        None => format!(
+            "choose smaller networks ({}.hidden), chunks (actors.chunk_steps), or fewer environments of an actor (actors.envs)",
+            config.algorithm.name()
+        ),
     };
     bail!(
         "the run needs {} of /dev/shm for up to {} actors, and {} are free: {advice}, end other runs, or enlarge it \

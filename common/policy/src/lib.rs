@@ -137,12 +137,18 @@ pub fn deterministic(hidden: Hidden, spec: &EnvironmentSpec, batch: usize) -> Re
 }
 
 /// A squashed Gaussian policy with these hidden layers in an environment like `spec`, for at most `batch` observations
-/// a call.
+/// a call. `algorithm` is named in errors.
 ///
 /// # Errors
-/// When the actions are not real numbers in finite ranges.
-pub fn gaussian(hidden: Hidden, spec: &EnvironmentSpec, batch: usize) -> Result<GaussianPolicy, PolicyError> {
+/// When the observations are not real numbers, or the actions are not real numbers in finite ranges.
+pub fn gaussian(
+    algorithm: &'static str,
+    hidden: Hidden,
+    spec: &EnvironmentSpec,
+    batch: usize,
+) -> Result<GaussianPolicy, PolicyError> {
     let range = ActionRange::new(&spec.action)?;
+    real_observations(algorithm, spec)?;
     Ok(GaussianPolicy::new(spec.observation.width(), hidden, range, batch))
 }
 
@@ -187,9 +193,17 @@ pub fn action_values(
 /// The numbers in an observation, which must be real, and the number of actions, which must be discrete.
 fn real_to_counted(algorithm: &'static str, spec: &EnvironmentSpec) -> Result<(usize, usize), PolicyError> {
     let actions = counted_actions(algorithm, spec)?;
+    Ok((real_observations(algorithm, spec)?, actions))
+}
+
+/// The numbers in an observation. `algorithm` is named in errors.
+///
+/// # Errors
+/// When the observations are not real numbers.
+pub fn real_observations(algorithm: &'static str, spec: &EnvironmentSpec) -> Result<usize, PolicyError> {
     match spec.observation {
         Space::Discrete { n, .. } => Err(PolicyError::RealStates { algorithm, n }),
-        Space::Box { .. } => Ok((spec.observation.width(), actions)),
+        Space::Box { .. } => Ok(spec.observation.width()),
     }
 }
 

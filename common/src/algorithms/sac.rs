@@ -76,8 +76,8 @@ impl AlgorithmSettings for SacConfig {
         Some(&mut self.preparation)
     }
 
-    fn behaviour(&self, _: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError> {
-        let policy = shoal_policy::gaussian(self.hidden_layers(), spec, batch)?;
+    fn behaviour(&self, name: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError> {
+        let policy = shoal_policy::gaussian(name, self.hidden_layers(), spec, batch)?;
         Ok(Behaviour::Gaussian(
             policy.normalising(self.preparation.observation.normalise),
         ))

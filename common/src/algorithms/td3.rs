@@ -22,7 +22,7 @@ section! {
     /// Fujimoto et al. 2018, with their numbers.
     pub struct Td3Config {
         /// Units of each hidden layer, for actor and critics: a list of 1 to 8 layers.
-        hidden: Layers = Layers::from([256, 256]), bounds: from(1, 8_192), unit: "units", source: "Fujimoto et al. 2018";
+        hidden: Layers = Layers::from([256, 256]), bounds: from(1, 8_192), unit: "units", source: "the authors' program";
         /// The activation function of the hidden layers.
         activation: Activation = Activation::Relu, unit: "–", source: "Fujimoto et al. 2018";
         /// γ, the discount of one step.
@@ -81,7 +81,8 @@ impl AlgorithmSettings for Td3Config {
         Some(&mut self.preparation)
     }
 
-    fn behaviour(&self, _: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError> {
+    fn behaviour(&self, name: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError> {
+        shoal_policy::real_observations(name, spec)?;
         let network = shoal_policy::deterministic(self.hidden_layers(), spec, batch)?;
         let network = network.normalising(self.preparation.observation.normalise);
         // With θ = 1 the noise of a step does not depend on the previous one: it is N(0, σ²).

@@ -123,6 +123,8 @@ pub(super) fn at_fault(sections: &Table) -> Option<String> {
     fault::<RunConfig>(sections, "run")
         .or_else(|| fault::<ActorsConfig>(sections, "actors"))
         .or_else(|| fault::<ExplorationConfig>(sections, "exploration"))
+        .or_else(|| fault::<ObservationConfig>(sections, "observation"))
+        .or_else(|| fault::<RewardConfig>(sections, "reward"))
         .or_else(|| fault::<LearnerConfig>(sections, "learner"))
         .or_else(|| fault::<ReplayConfig>(sections, "replay"))
         .or_else(|| fault::<EvaluationConfig>(sections, "evaluation"))

@@ -1,5 +1,5 @@
-//! Deep Q-network: Mnih et al. 2015, with the double estimate of van Hasselt et al. 2016 and, as a setting, the dueling
-//! heads of Wang et al. 2016.
+//! Deep Q-network: Mnih et al. 2015, with the double estimate of van Hasselt et al. 2016 and, as a setting, dueling heads
+//! after Wang et al. 2016, but on hidden layers that they share.
 //!
 //! Symbols as there: action-values Q with parameters θ, target network Q' with θ⁻, target y.
 
@@ -38,7 +38,7 @@ pub struct Dqn {
     q: Pass,
     next_q: Pass,
     target_q: Pass,
-    /// max Q' of s', by either estimate.
+    /// The value of s'.
     next_value: DVector<f32>,
     y: DVector<f32>,
     d_q: DMatrix<f32>,

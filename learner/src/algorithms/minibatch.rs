@@ -16,7 +16,7 @@ pub struct Minibatch {
     pub a: DMatrix<f32>,
     /// Rewards r.
     pub r: DVector<f32>,
-    /// The factor of the value of s': γ, or 0 if s' is terminal.
+    /// The factor of the value of s': γ, or γᵏ after k steps, or 0 if s' is terminal.
     pub discount: DVector<f32>,
     /// Observations s' after the step.
     pub s_next: DMatrix<f32>,

@@ -32,7 +32,7 @@ impl Normaliser {
         2 * (2 + 2 * width)
     }
 
-    /// Before the first observation of `width` numbers: nothing is changed by it.
+    /// Before the first observation of `width` numbers: numbers are only clipped.
     pub(super) fn new(width: usize) -> Self {
         let mut new = Self {
             width,
@@ -118,6 +118,7 @@ impl Normaliser {
 #[cfg(test)]
 mod tests {
     use rand::RngExt;
+    use shoal_common::network::CLIP;
     use shoal_common::stream::{Purpose, stream};
     use shoal_common::transition::{RowLayout, Transition};
 
@@ -206,15 +207,15 @@ mod tests {
     }
 
     #[test]
-    fn a_minibatch_is_normalised_and_before_the_first_row_unchanged() {
+    fn a_minibatch_is_normalised_and_before_the_first_row_only_clipped() {
         let (_directory, replay, _) = filled(500, 1_000);
         let mut batch = Minibatch::new(RowLayout::new(WIDTH, 1), 500);
         batch.gather(&replay, &(0..500).collect::<Vec<_>>(), &replay.rows());
         let before = batch.clone();
         let mut normaliser = Normaliser::new(WIDTH);
         normaliser.apply(&mut batch);
-        // No number is beyond the clip.
         assert_eq!(batch.s.row(1), before.s.row(1));
+        assert!(batch.s.row(0).iter().all(|x| *x == CLIP), "all are near 100");
         batch = before.clone();
         normaliser.count(&replay, 500);
         normaliser.apply(&mut batch);

@@ -3,7 +3,7 @@
 
 use super::{ActionRange, Hidden, Network, NetworkLayout};
 
-/// The range that log σ is clamped to (Haarnoja et al. 2018b, appendix C of the first version).
+/// The range that log σ is clamped to, as in the program of Haarnoja et al. 2018b.
 pub const LOG_STD_RANGE: (f32, f32) = (-20.0, 2.0);
 
 /// A policy π(a|s) with buffers for a batch of observations. The network has two outputs for each action element: all

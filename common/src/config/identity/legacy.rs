@@ -4,13 +4,19 @@
 use toml::{Table, Value};
 
 use super::sorted;
-use crate::algorithms::{Algorithm, DdpgConfig, ExplorationConfig, ReinforceConfig, TabularConfig, Warmup, Weight};
+use crate::algorithms::{
+    Algorithm, DdpgConfig, ExplorationConfig, Preparation, ReinforceConfig, TabularConfig, Warmup, Weight,
+};
 use crate::config::{Config, Mode};
 use shoal_policy::network::Activation;
 
-/// The text; `None` for an algorithm or a network that did not exist then.
+/// The text; `None` for an algorithm, a network or rows that did not exist then.
 pub(super) fn text(config: &Config) -> Option<String> {
     let Config { run, environment, .. } = config;
+    let preparation = config.algorithm.settings().preparation().cloned();
+    if config.replay.n_step != 1 || preparation.is_some_and(|of| of != Preparation::default()) {
+        return None;
+    }
     let mode = match run.mode {
         Mode::Free => "Free",
         Mode::Lockstep => "Lockstep",
