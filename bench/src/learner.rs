@@ -2,9 +2,8 @@
 
 use std::time::Duration;
 
-use anyhow::{Context, bail};
+use anyhow::Context;
 use serde::Serialize;
-use shoal_common::algorithms::Experience;
 use shoal_common::commit::ChunkMark;
 use shoal_common::config::Config;
 use shoal_common::stream::{Purpose, stream};
@@ -83,7 +82,7 @@ struct TwoThreads {
     updates: Windows,
 }
 
-/// Measures a method, by default DDPG.
+/// Measures one of [`METHODS`](super::METHODS), by default DDPG.
 pub(super) fn measure(method: Option<&str>, budget: &Budget) -> anyhow::Result<LearnerFigures> {
     let temporary = TemporaryRun::with_method(method)?;
     let replay = Replay::create(&temporary.run.replay_file(), &temporary.replay_layout())?;
@@ -91,7 +90,7 @@ pub(super) fn measure(method: Option<&str>, budget: &Budget) -> anyhow::Result<L
     let config = temporary.remove_directory()?;
     let replay = filled(&config, replay, budget)?;
 
-    let batch = batch(&config)?;
+    let batch = config.algorithm.settings().least_capacity() as usize;
     let mut configured = Case::new(&config, batch)?;
     let mut large = (batch != LARGE_BATCH)
         .then(|| Case::new(&config, LARGE_BATCH))
@@ -125,15 +124,6 @@ pub(super) fn measure(method: Option<&str>, budget: &Budget) -> anyhow::Result<L
         large_batch: large.map(Case::figure),
         replay_rows: replay.head(),
     })
-}
-
-/// Transitions in a minibatch.
-fn batch(config: &Config) -> anyhow::Result<usize> {
-    let name = config.algorithm.name();
-    if config.algorithm.spec().experience != Experience::Minibatches {
-        bail!("{name} does not learn from minibatches: measure ddpg, td3, sac or dqn");
-    }
-    Ok(config.algorithm.settings().least_capacity() as usize)
 }
 
 /// The configuration with minibatches of this size.

@@ -23,9 +23,12 @@ mod transitions;
 mod whole_run;
 mod window;
 
-use anyhow::bail;
+use shoal_run::plan::UsageError;
 
 use self::measurement::{Budget, print};
+
+/// The methods that [`Stage::Learner`] can measure: those that learn from minibatches.
+pub const METHODS: [&str; 4] = ["ddpg", "td3", "sac", "dqn"];
 
 /// A stage to measure.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -58,10 +61,10 @@ pub enum Stage {
 pub fn run(stage: Stage, actors: Option<&str>, method: Option<&str>, json: bool) -> anyhow::Result<()> {
     let budget = Budget::new()?;
     if actors.is_some() && stage != Stage::Actors {
-        bail!("--actors is only for `shoal bench actors`");
+        return Err(UsageError("--actors is only for `shoal bench actors`".into()).into());
     }
     if method.is_some() && stage != Stage::Learner {
-        bail!("--method is only for `shoal bench learner`");
+        return Err(UsageError("--method is only for `shoal bench learner`".into()).into());
     }
     match stage {
         Stage::Learner => learner::measure(method, &budget).and_then(|it| print(&it, json)),

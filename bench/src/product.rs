@@ -20,18 +20,20 @@ use super::window;
 /// Length of an attempt. It is shorter than a time slice, so that most attempts are undisturbed.
 const ATTEMPT: Duration = Duration::from_millis(2);
 
+/// With a dimension of at most this, nalgebra 0.35 does not use matrixmultiply but `axcpy`. For a vector with a stride,
+/// that takes the length of its storage for the vector's, and writes beyond the result.
+const TINY: usize = 5;
+
 /// An implementation of matrix products.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Kernel {
     /// faer's `matmul`.
     Faer,
-    /// nalgebra's `gemm`, which is `matrixmultiply::sgemm` unless a dimension is tiny.
+    /// nalgebra's `gemm`, which is `matrixmultiply::sgemm`. Not for a [tiny](TINY) dimension.
     Nalgebra,
 }
 
 impl Kernel {
-    pub(super) const ALL: [Self; 2] = [Self::Faer, Self::Nalgebra];
-
     pub(super) fn name(self) -> &'static str {
         match self {
             Self::Faer => "faer",
@@ -68,10 +70,20 @@ impl Multiplication {
         }
     }
 
+    /// The kernels that can compute it.
+    fn kernels(&self) -> &'static [Kernel] {
+        let Product { m, k, n, .. } = self.product;
+        if m.min(k).min(n) > TINY {
+            &[Kernel::Faer, Kernel::Nalgebra]
+        } else {
+            &[Kernel::Faer]
+        }
+    }
+
     /// Tries every kernel briefly and keeps the fastest so far.
     pub(super) fn try_kernels(&mut self) {
         let mut chosen = self.kernel;
-        for kernel in Kernel::ALL {
+        for &kernel in self.kernels() {
             self.kernel = kernel;
             let rate = self.gflops(ATTEMPT);
             if rate > self.best {
@@ -132,22 +144,45 @@ mod tests {
     use super::*;
     use shoal_common::stream::{Purpose, stream};
 
+    /// The product by its definition, in `f64`, column by column.
+    fn by_definition(multiplication: &Multiplication) -> Vec<f64> {
+        let Product { m, k, n, transposed } = multiplication.product;
+        let a = |i: usize, j: usize| match transposed {
+            Transposed::Left => multiplication.a[i * k + j],
+            _ => multiplication.a[j * m + i],
+        };
+        let b = |i: usize, j: usize| match transposed {
+            Transposed::Right => multiplication.b[i * n + j],
+            _ => multiplication.b[j * k + i],
+        };
+        let term = |i, j, l| f64::from(a(i, l)) * f64::from(b(l, j));
+        let element = |at: usize| (0..k).map(|l| term(at % m, at / m, l)).sum();
+        (0..m * n).map(element).collect()
+    }
+
     #[test]
-    fn every_kernel_computes_the_same_product() {
+    fn every_kernel_computes_the_product() {
         let mut random = stream(1, Purpose::Exploration, 0, 0);
+        let mut kernels = 0;
         for transposed in [Transposed::Neither, Transposed::Left, Transposed::Right] {
-            for (m, k, n) in [(12, 7, 9), (1, 8, 6), (10, 3, 4)] {
+            for (m, k, n) in [(12, 7, 9), (1, 8, 6), (10, 3, 4), (64, 2, 32)] {
                 let mut multiplication = Multiplication::new(Product { m, k, n, transposed }, &mut random);
-                let results = Kernel::ALL.map(|kernel| {
+                let expected = by_definition(&multiplication);
+                for &kernel in multiplication.kernels() {
                     multiplication.kernel = kernel;
                     multiplication.c.fill(f32::NAN);
                     multiplication.multiply();
-                    multiplication.c.to_vec()
-                });
-                for (x, y) in results[0].iter().zip(&results[1]) {
-                    assert!((x - y).abs() < 1e-5, "{transposed:?} {m} {k} {n}: {x} and {y}");
+                    for (found, expected) in multiplication.c.iter().zip(&expected) {
+                        let distance = (f64::from(*found) - expected).abs();
+                        assert!(
+                            distance < 1e-5,
+                            "{kernel:?}, {transposed:?} {m} {k} {n}: {found} for {expected}"
+                        );
+                    }
+                    kernels += 1;
                 }
             }
         }
+        assert_eq!(kernels, 15, "both for the first size");
     }
 }

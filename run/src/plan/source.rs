@@ -185,7 +185,10 @@ impl Sources {
 
     /// The same for a message about whole sections.
     fn explain_section(&self, message: &str, origin: &str) -> anyhow::Error {
-        let words: Vec<&str> = message.split(['`', '[', ']']).skip(1).step_by(2).collect();
+        let mut words: Vec<&str> = message.split(['`', '[', ']']).skip(1).step_by(2).collect();
+        if let Some((method, _)) = message.split_once(" cannot control ") {
+            words = vec![method];
+        }
         let mut places = words.iter().map(|word| self.of(&format!("[{word}]")));
         match places.find(|place| *place != Source::Default) {
             Some(Source::File(name, line)) => anyhow::anyhow!("{name}, line {line}: {message}"),
