@@ -183,7 +183,7 @@ checked once.",
             let _ = write!(text, "\n{}\n", section.remark);
         }
         if !section.claims.is_empty() {
-            text += "\n| claim of the thesis | our result | criterion | verdict |\n| --- | --- | --- | --- |\n";
+            text += "\n| claim | our result | criterion | verdict |\n| --- | --- | --- | --- |\n";
         }
         for claim in &section.claims {
             let Claim {
