@@ -17,6 +17,10 @@ use shoal_learner::process;
 use shoal_run::external_environment::{self, LaunchSpec, server_iceoryx2_config};
 use shoal_run::server_location::Surroundings;
 use shoal_run::status::evaluated_period;
+use tracing_subscriber::Layer;
+use tracing_subscriber::filter::{LevelFilter, Targets};
+use tracing_subscriber::layer::SubscriberExt;
+use tracing_subscriber::util::SubscriberInitExt;
 
 use crate::cli::RoleArgs;
 use crate::log_level::log_level;
@@ -24,12 +28,21 @@ use crate::log_level::log_level;
 /// Runs a role until it is done or its standard input closes.
 pub(crate) fn run(role: Role, args: &RoleArgs) -> anyhow::Result<ExitCode> {
     // The log goes to the launcher through standard error. If the launcher is gone, losing it is not an error.
-    tracing_subscriber::fmt()
+    let to_launcher = tracing_subscriber::fmt::layer()
         .with_writer(std::io::stderr)
-        .with_max_level(log_level())
         .with_ansi(false)
         .with_target(false)
-        .log_internal_errors(false)
+        .log_internal_errors(false);
+    // What the network engine notes about itself helps nobody who reads a run's log.
+    let level = log_level();
+    let of_network = if level == LevelFilter::TRACE {
+        level
+    } else {
+        LevelFilter::ERROR
+    };
+    let targets = Targets::new().with_default(level).with_target("zenoh", of_network);
+    tracing_subscriber::registry()
+        .with(to_launcher.with_filter(targets))
         .init();
 
     // For `ps` and `top`, which would otherwise show `exe`. The kernel keeps 15 bytes.
@@ -80,6 +93,28 @@ fn work(domain: &Domain, config: &Config, run: &RunDir, identity: Identity, stop
             };
             Ok(process::learn(domain, &settings, stop)?)
         }
+        #[cfg(feature = "remote")]
+        Role::Gate => {
+            let settings = shoal_remote::gate::GateSettings {
+                identity,
+                config: config.clone(),
+                run: run.clone(),
+                endpoint: shoal_remote::files::JoinFile::read(run.path())?.endpoint,
+            };
+            Ok(shoal_remote::gate::serve(domain, &settings, stop)?)
+        }
+        #[cfg(feature = "remote")]
+        Role::Relay => {
+            let settings = shoal_remote::relay::RelaySettings {
+                identity,
+                config: config.clone(),
+                run: run.clone(),
+                host: shoal_remote::files::HostFile::read(run)?,
+            };
+            Ok(shoal_remote::relay::relay(domain, &settings, stop)?)
+        }
+        #[cfg(not(feature = "remote"))]
+        Role::Gate | Role::Relay => anyhow::bail!(crate::command::join::NOT_BUILT),
     }
 }
 

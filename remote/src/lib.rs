@@ -4,8 +4,22 @@
 //!
 //! A chunk is committed exactly once, whatever the network loses, repeats or reorders, and whichever process dies:
 //! [`unconfirmed`] is the sending half of the protocol, [`forwarding`] the receiving half, and [`wire`] the bytes between
-//! them.
+//! them. These need no network. Gate and relay themselves are built with the feature `network`.
 
+pub mod bucket;
+pub mod endpoint;
+pub mod files;
 pub mod forwarding;
 pub mod unconfirmed;
 pub mod wire;
+
+#[cfg(feature = "network")]
+pub mod gate;
+#[cfg(feature = "network")]
+pub mod join;
+#[cfg(feature = "network")]
+mod network;
+#[cfg(feature = "network")]
+pub mod relay;
+#[cfg(feature = "network")]
+mod requests;

@@ -4,13 +4,12 @@
 //! all bytes before it. Chunks and policies are a header and `f32` numbers as they stand in memory. All other messages
 //! are encoded by bincode.
 
-use bytemuck::{Pod, Zeroable};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use shoal_common::channel::policy::PolicyHeader;
 use shoal_common::channel::transitions::ChunkHeader;
 use shoal_common::commit::ChunkMark;
-use shoal_common::report::EpisodeReport;
+use shoal_common::report::{Activity, EpisodeReport, Heartbeat, Identity, Role};
 
 /// The version of this format. Increase it with every change.
 pub const VERSION: u32 = 1;
@@ -50,29 +49,14 @@ enum Kind {
     Admission = 4,
     Marks = 5,
     HostReport = 6,
+    PolicyQuestion = 7,
 }
 
-/// The first word of a message: the letters "sh" and the kind, then the version.
-#[derive(Clone, Copy, Pod, Zeroable)]
-#[repr(C)]
-struct Start {
-    kind: u32,
-    version: u32,
-}
-
+/// The first word of a message has these letters in its upper half and the kind in its lower; the second is the version.
 const LETTERS: u32 = (b's' as u32) << 16 | (b'h' as u32) << 24;
 
-/// The header of a chunk.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Pod, Zeroable)]
-#[repr(C)]
-struct ChunkStart {
-    host: u64,
-    incarnation: u64,
-    sequence: u64,
-    policy_version: u64,
-    actor: u32,
-    rows: u32,
-}
+/// Bytes of the first two words.
+const START: usize = 2 * size_of::<u32>();
 
 /// A chunk as it travels: the numbers of its rows, and after them those of the actor's snapshot if there is one.
 #[derive(Clone, Debug, PartialEq)]
@@ -93,18 +77,17 @@ impl WireChunk {
 
     /// The bytes of a chunk.
     pub fn encode(host: u64, header: &ChunkHeader, rows: &[f32], snapshot: &[f32]) -> Vec<u8> {
-        let start = ChunkStart {
+        let start = [
             host,
-            incarnation: header.incarnation,
-            sequence: header.sequence,
-            policy_version: header.policy_version,
-            actor: header.actor,
-            rows: header.rows,
-        };
+            header.incarnation,
+            header.sequence,
+            header.policy_version,
+            u64::from(header.rows) << 32 | u64::from(header.actor),
+        ];
         sealed(
             Kind::Chunk,
             &[
-                bytemuck::bytes_of(&start),
+                &words(&start),
                 bytemuck::cast_slice(rows),
                 bytemuck::cast_slice(snapshot),
             ],
@@ -117,19 +100,15 @@ impl WireChunk {
     /// When the bytes are not a whole chunk of this version.
     pub fn decode(bytes: &[u8]) -> Result<Self, WireError> {
         let body = opened(Kind::Chunk, bytes)?;
-        let (start, numbers) = split::<ChunkStart>(body, bytes.len())?;
+        let ([host, incarnation, sequence, policy_version, rows_and_actor], numbers) = split(body, bytes.len())?;
         let header = ChunkHeader {
-            incarnation: start.incarnation,
-            sequence: start.sequence,
-            policy_version: start.policy_version,
-            rows: start.rows,
-            actor: start.actor,
+            incarnation,
+            sequence,
+            policy_version,
+            rows: (rows_and_actor >> 32) as u32,
+            actor: rows_and_actor as u32,
         };
-        Ok(Self {
-            host: start.host,
-            header,
-            numbers,
-        })
+        Ok(Self { host, header, numbers })
     }
 }
 
@@ -139,16 +118,6 @@ pub fn mark_of(header: &ChunkHeader) -> ChunkMark {
         incarnation: header.incarnation,
         sequence: header.sequence,
     }
-}
-
-#[derive(Clone, Copy, Pod, Zeroable)]
-#[repr(C)]
-struct PolicyStart {
-    incarnation: u64,
-    version: u64,
-    env_steps: u64,
-    updates: u64,
-    fingerprint: u64,
 }
 
 /// A policy as it travels.
@@ -163,17 +132,14 @@ pub struct WirePolicy {
 impl WirePolicy {
     /// The bytes of a policy.
     pub fn encode(header: &PolicyHeader, parameters: &[f32]) -> Vec<u8> {
-        let start = PolicyStart {
-            incarnation: header.incarnation,
-            version: header.version,
-            env_steps: header.env_steps,
-            updates: header.updates,
-            fingerprint: header.fingerprint,
-        };
-        sealed(
-            Kind::Policy,
-            &[bytemuck::bytes_of(&start), bytemuck::cast_slice(parameters)],
-        )
+        let start = [
+            header.incarnation,
+            header.version,
+            header.env_steps,
+            header.updates,
+            header.fingerprint,
+        ];
+        sealed(Kind::Policy, &[&words(&start), bytemuck::cast_slice(parameters)])
     }
 
     /// Reads a policy.
@@ -182,16 +148,25 @@ impl WirePolicy {
     /// When the bytes are not a whole policy of this version.
     pub fn decode(bytes: &[u8]) -> Result<Self, WireError> {
         let body = opened(Kind::Policy, bytes)?;
-        let (start, parameters) = split::<PolicyStart>(body, bytes.len())?;
+        let ([incarnation, version, env_steps, updates, fingerprint], parameters) = split(body, bytes.len())?;
         let header = PolicyHeader {
-            incarnation: start.incarnation,
-            version: start.version,
-            env_steps: start.env_steps,
-            updates: start.updates,
-            fingerprint: start.fingerprint,
+            incarnation,
+            version,
+            env_steps,
+            updates,
+            fingerprint,
         };
         Ok(Self { header, parameters })
     }
+}
+
+/// A host's question for a policy that it does not have. The gate answers when there is one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct PolicyQuestion {
+    /// The host.
+    pub host: u64,
+    /// The policy that it has: the learner's incarnation, and the version.
+    pub have: Option<(u64, u64)>,
 }
 
 /// What a host says to be admitted to a run.
@@ -283,6 +258,8 @@ pub struct HostReport {
     pub number: u64,
     /// Microseconds between an earlier report and marks that confirmed it; `None` before the first.
     pub round_trip_us: Option<u64>,
+    /// Whether the host is leaving the run, and sends nothing more.
+    pub leaving: bool,
     /// Chunks sent more than once.
     pub resent: u64,
     /// Version of the newest policy that it has.
@@ -296,12 +273,12 @@ pub struct HostReport {
 /// The last heartbeat of a process on another host.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RemoteRole {
-    /// The number of its role in a heartbeat.
-    pub role: u32,
+    /// Its role.
+    pub role: Role,
     /// Its index.
     pub index: u32,
-    /// The number of its activity in a heartbeat.
-    pub activity: u32,
+    /// What it is doing.
+    pub activity: Activity,
     /// Invalid answers of its environments.
     pub faults: u32,
     /// Its incarnation.
@@ -310,6 +287,35 @@ pub struct RemoteRole {
     pub steps: u64,
     /// The policy that it uses.
     pub policy_version: u64,
+}
+
+impl RemoteRole {
+    /// That of a heartbeat; `None` if this build does not know its role or activity.
+    pub fn of(heartbeat: &Heartbeat) -> Option<Self> {
+        Some(Self {
+            role: heartbeat.role()?,
+            index: heartbeat.index,
+            activity: heartbeat.activity()?,
+            faults: heartbeat.faults,
+            incarnation: heartbeat.incarnation,
+            steps: heartbeat.steps,
+            policy_version: heartbeat.policy_version,
+        })
+    }
+
+    /// The heartbeat.
+    pub fn heartbeat(&self) -> Heartbeat {
+        let mut heartbeat = Heartbeat::new(Identity {
+            role: self.role,
+            index: self.index,
+            incarnation: self.incarnation,
+        });
+        heartbeat.set_activity(self.activity);
+        heartbeat.faults = self.faults;
+        heartbeat.steps = self.steps;
+        heartbeat.policy_version = self.policy_version;
+        heartbeat
+    }
 }
 
 /// An episode that has ended on another host.
@@ -388,6 +394,10 @@ pub trait Message: Serialize + DeserializeOwned {
     }
 }
 
+impl Message for PolicyQuestion {
+    const KIND: u32 = Kind::PolicyQuestion as u32;
+}
+
 impl Message for Hello {
     const KIND: u32 = Kind::Hello as u32;
 }
@@ -414,13 +424,10 @@ fn sealed(kind: Kind, parts: &[&[u8]]) -> Vec<u8> {
 }
 
 fn sealed_as(kind: u32, parts: &[&[u8]]) -> Vec<u8> {
-    let start = Start {
-        kind: LETTERS | kind,
-        version: VERSION,
-    };
-    let length = size_of::<Start>() + parts.iter().map(|part| part.len()).sum::<usize>() + CHECKSUM;
+    let length = START + parts.iter().map(|part| part.len()).sum::<usize>() + CHECKSUM;
     let mut bytes = Vec::with_capacity(length);
-    bytes.extend_from_slice(bytemuck::bytes_of(&start));
+    bytes.extend((LETTERS | kind).to_le_bytes());
+    bytes.extend(VERSION.to_le_bytes());
     parts.iter().for_each(|part| bytes.extend_from_slice(part));
     let checksum = crc32fast::hash(&bytes);
     bytes.extend_from_slice(&checksum.to_le_bytes());
@@ -437,37 +444,45 @@ fn opened_as(kind: u32, bytes: &[u8]) -> Result<&[u8], WireError> {
     if bytes.len() > LONGEST {
         return length;
     }
-    let Some((start, _)) = bytes.split_at_checked(size_of::<Start>()) else {
+    let word = |at: usize| Some(u32::from_le_bytes(*bytes.get(at..)?.first_chunk()?));
+    let (Some(found), Some(version)) = (word(0), word(size_of::<u32>())) else {
         return length;
     };
-    let start: Start = bytemuck::pod_read_unaligned(start);
-    if start.kind != LETTERS | kind {
+    if found != LETTERS | kind {
         return Err(WireError::Kind);
     }
-    if start.version != VERSION {
-        return Err(WireError::Version(start.version));
+    if version != VERSION {
+        return Err(WireError::Version(version));
     }
     let Some((sealed, checksum)) = bytes.split_last_chunk::<CHECKSUM>() else {
         return length;
     };
-    if sealed.len() < size_of::<Start>() {
+    if sealed.len() < START {
         return length;
     }
     if crc32fast::hash(sealed) != u32::from_le_bytes(*checksum) {
         return Err(WireError::Checksum);
     }
-    Ok(&sealed[size_of::<Start>()..])
+    Ok(&sealed[START..])
 }
 
-/// A header and the numbers after it.
-fn split<H: Pod>(body: &[u8], length: usize) -> Result<(H, Vec<f32>), WireError> {
+/// The words of a header and the numbers after it.
+fn split<const N: usize>(body: &[u8], length: usize) -> Result<([u64; N], Vec<f32>), WireError> {
     let wrong = WireError::Length(length);
-    let (header, numbers) = body.split_at_checked(size_of::<H>()).ok_or(wrong.clone())?;
-    if !numbers.len().is_multiple_of(size_of::<f32>()) {
+    let (header, numbers) = body.split_at_checked(N * size_of::<u64>()).ok_or(wrong.clone())?;
+    let (words, _) = header.as_chunks::<{ size_of::<u64>() }>();
+    let (numbers, rest) = numbers.as_chunks::<{ size_of::<f32>() }>();
+    if !rest.is_empty() {
         return Err(wrong);
     }
+    let words = std::array::from_fn(|i| u64::from_le_bytes(words[i]));
     Ok((
-        bytemuck::pod_read_unaligned(header),
-        bytemuck::pod_collect_to_vec(numbers),
+        words,
+        numbers.iter().map(|number| f32::from_le_bytes(*number)).collect(),
     ))
+}
+
+/// The bytes of a header's words.
+fn words(header: &[u64]) -> Vec<u8> {
+    header.iter().flat_map(|word| word.to_le_bytes()).collect()
 }

@@ -2,6 +2,8 @@
 //! any moment, and the learner's host loses power. Whatever happens, the learner never sees a gap, and commits each chunk
 //! at most once and in order; once the network is good, all chunks are committed that no killed actor took with it.
 
+#![allow(clippy::expect_used, reason = "a test that panics has failed")]
+
 use std::collections::VecDeque;
 use std::time::Duration;
 

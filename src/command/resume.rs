@@ -15,6 +15,7 @@ use shoal_run::server_location::ServerLocation;
 use shoal_run::signals::{Signals, exit_code};
 use shoal_run::status;
 
+use super::listen::ListenArgs;
 use super::training::OutputMode;
 use super::training::run_training;
 
@@ -30,6 +31,8 @@ pub(crate) struct ResumeArgs {
     pub(crate) episodes: Option<u64>,
     #[command(flatten)]
     pub(crate) output: OutputMode,
+    #[command(flatten)]
+    pub(crate) listen: ListenArgs,
 }
 
 /// Continues with the run's replay, counters and noise, until its old or new number of steps or episodes.
@@ -65,7 +68,7 @@ pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
     if let Some(warning) = warning(&config) {
         writeln!(std::io::stderr(), "warning: {warning}")?;
     }
-    run_training(config, &run, &lock, &args.output)
+    run_training(config, &run, &lock, &args.output, &args.listen)
 }
 
 /// Evaluates the best policy again if an earlier version did that from other starts. Returns the signal that ended it, if

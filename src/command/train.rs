@@ -12,6 +12,7 @@ use shoal_run::numbers::{count, small_count};
 use shoal_run::plan::{Plan, RunOverrides, warning};
 
 use super::help_config;
+use super::listen::ListenArgs;
 use super::training::OutputMode;
 use super::training::run_training;
 use crate::completion;
@@ -31,6 +32,8 @@ pub(crate) struct TrainArgs {
     pub(crate) overrides: RunArgs,
     #[command(flatten)]
     pub(crate) output: OutputMode,
+    #[command(flatten)]
+    pub(crate) listen: ListenArgs,
 }
 
 /// The settings of a run that have options of their own, and `--set`.
@@ -99,6 +102,7 @@ pub(crate) fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
         help_config::explain(args.what.as_deref(), &args.overrides.overrides())?;
         return Ok(ExitCode::SUCCESS);
     }
+    args.listen.check()?;
     let what = args
         .what
         .as_deref()
@@ -107,7 +111,7 @@ pub(crate) fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
     if let Some(warning) = warning(&config) {
         writeln!(std::io::stderr(), "warning: {warning}")?;
     }
-    run_training(config, &run, &lock, &args.output).inspect_err(|_| {
+    run_training(config, &run, &lock, &args.output, &args.listen).inspect_err(|_| {
         // Where no process was started there is nothing to resume or to read, and it would be in the way of the next try.
         // What is at this path by now may be somebody else's.
         if lock.check(&run).is_ok() && !run.incarnations().exists() {

@@ -204,6 +204,14 @@ impl Running {
         self.signal_role(who, Signal::KILL);
     }
 
+    /// Kills the newest process of a role, if it is alive.
+    pub(crate) fn kill_if_alive(&self, who: &str) {
+        if let Some(pid) = self.pids(who).last().copied().filter(|pid| is_ours(*pid)) {
+            // It may end in between.
+            let _ = kill_process(Pid::from_raw(pid).unwrap(), Signal::KILL);
+        }
+    }
+
     /// Stops the running process of a role with SIGSTOP.
     pub(crate) fn stop_role(&self, who: &str) {
         self.signal_role(who, Signal::STOP);
