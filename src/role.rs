@@ -2,6 +2,8 @@
 
 use std::ffi::CString;
 use std::io::Write;
+#[cfg(feature = "remote")]
+use std::path::Path;
 use std::process::ExitCode;
 
 use anyhow::Context;
@@ -14,6 +16,11 @@ use shoal_common::run_dir::RunDir;
 use shoal_common::stop::Stop;
 use shoal_env_server::vector::VectorEnvironment;
 use shoal_learner::process;
+#[cfg(feature = "remote")]
+use shoal_remote::{
+    endpoint::Endpoint,
+    files::{HostFile, JoinFile, KeyFile},
+};
 use shoal_run::external_environment::{self, LaunchSpec, server_iceoryx2_config};
 use shoal_run::server_location::Surroundings;
 use shoal_run::status::evaluated_period;
@@ -41,9 +48,10 @@ pub(crate) fn run(role: Role, args: &RoleArgs) -> anyhow::Result<ExitCode> {
         LevelFilter::ERROR
     };
     let targets = Targets::new().with_default(level).with_target("zenoh", of_network);
-    tracing_subscriber::registry()
-        .with(to_launcher.with_filter(targets))
-        .init();
+    let registry = tracing_subscriber::registry().with(to_launcher.with_filter(targets));
+    #[cfg(feature = "remote")]
+    let registry = registry.with(shoal_remote::refused::layer());
+    registry.init();
 
     // For `ps` and `top`, which would otherwise show `exe`. The kernel keeps 15 bytes.
     if let Ok(name) = CString::new(format!("shoal-{}-{}", role.name(), args.index)) {
@@ -95,27 +103,37 @@ fn work(domain: &Domain, config: &Config, run: &RunDir, identity: Identity, stop
         }
         #[cfg(feature = "remote")]
         Role::Gate => {
+            let endpoint = JoinFile::read(run.path())?.listen;
             let settings = shoal_remote::gate::GateSettings {
                 identity,
                 config: config.clone(),
                 run: run.clone(),
-                endpoint: shoal_remote::files::JoinFile::read(run.path())?.endpoint,
+                key: key(&endpoint, &run.path().join(KeyFile::GATE))?,
+                endpoint,
             };
             Ok(shoal_remote::gate::serve(domain, &settings, stop)?)
         }
         #[cfg(feature = "remote")]
         Role::Relay => {
+            let host = HostFile::read(run)?;
             let settings = shoal_remote::relay::RelaySettings {
                 identity,
                 config: config.clone(),
                 run: run.clone(),
-                host: shoal_remote::files::HostFile::read(run)?,
+                key: key(&host.endpoint, &run.path().join(KeyFile::JOIN))?,
+                host,
             };
             Ok(shoal_remote::relay::relay(domain, &settings, stop)?)
         }
         #[cfg(not(feature = "remote"))]
         Role::Gate | Role::Relay => anyhow::bail!(crate::command::join::NOT_BUILT),
     }
+}
+
+/// The key for an endpoint; `None` if that needs none.
+#[cfg(feature = "remote")]
+fn key(endpoint: &Endpoint, path: &Path) -> anyhow::Result<Option<KeyFile>> {
+    Ok(endpoint.is_encrypted().then(|| KeyFile::read(path)).transpose()?)
 }
 
 /// The arguments of an environment server.

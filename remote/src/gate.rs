@@ -26,8 +26,10 @@ use zenoh::{Session, Wait};
 
 use crate::bucket::Bucket;
 use crate::endpoint::Endpoint;
+use crate::files::KeyFile;
 use crate::forwarding::{Forwarding, Offer};
 use crate::network::{self, NetworkError, failed};
+use crate::refused;
 use crate::requests::Requests;
 use crate::wire::{
     ActorMarks, Admission, Hello, HostReport, Lease, Marks, Message, Phase, PolicyQuestion, WireChunk, WireError,
@@ -57,7 +59,7 @@ const POLICY_PATIENCE: Duration = Duration::from_secs(8);
 /// How long the hosts may take to hand over what they have when the run is over.
 const HAND_OVER: Duration = Duration::from_secs(5);
 
-/// How often a host that sends wrong chunks is named.
+/// How often a host that sends wrong chunks, or a connection that was refused, is named.
 const WARN_AGAIN: Duration = Duration::from_secs(10);
 
 /// Bytes a second that policies may take, for all hosts together.
@@ -74,6 +76,8 @@ pub struct GateSettings {
     pub run: RunDir,
     /// Where to listen.
     pub endpoint: Endpoint,
+    /// The gate's key, unless the endpoint is not encrypted.
+    pub key: Option<KeyFile>,
 }
 
 /// Why the gate ended.
@@ -175,6 +179,8 @@ struct Gate<'a> {
     heartbeats: Reporter<Heartbeat>,
     episodes: Reporter<EpisodeReport>,
     marks: u64,
+    /// When a refused connection was last named.
+    warned: Option<Instant>,
     over: Option<Instant>,
     refreshed: Instant,
     told: Option<Instant>,
@@ -208,7 +214,7 @@ impl<'a> Gate<'a> {
         let layout = config.algorithm.policy_layout(&config.spec)?;
         let policy = PolicyReader::open(domain, layout.fingerprint(), layout.parameters())?;
         let requests = Requests::start(&config.run.id, config.actors.max, run.key()?)?;
-        let session = network::listen(settings.endpoint)?;
+        let session = network::listen(&settings.endpoint, settings.key.as_ref())?;
         let (sender, arrivals) = channel();
         declare(&session, &config.run.id, &sender)?;
         heartbeat.beat_now(Activity::WaitingForPeer);
@@ -233,6 +239,7 @@ impl<'a> Gate<'a> {
             heartbeats: Reporter::open(domain)?,
             episodes: Reporter::open(domain)?,
             marks: 0,
+            warned: None,
             over: None,
             refreshed: Instant::now(),
             told: None,
@@ -380,7 +387,8 @@ impl<'a> Gate<'a> {
             actors: hello.actors,
             held: hello.held.clone(),
         };
-        self.requests.ask(Question::Admit(request), Matter::Join(Box::new(query), hello));
+        self.requests
+            .ask(Question::Admit(request), Matter::Join(Box::new(query), hello));
         Ok(())
     }
 
@@ -612,6 +620,12 @@ impl<'a> Gate<'a> {
             return Ok(());
         }
         self.refreshed = Instant::now();
+        if self.warned.is_none_or(|warned| warned.elapsed() >= WARN_AGAIN)
+            && let Some(why) = refused::take()
+        {
+            self.warned = Some(Instant::now());
+            tracing::warn!("a connection was refused: {why}; only who has the run's join.key is let in");
+        }
         self.heartbeats.refresh_connections();
         self.episodes.refresh_connections();
         let waits = self.actors.values().any(|actor| actor.forwarding.is_waiting());

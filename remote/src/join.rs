@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 use zenoh::{Session, Wait};
 
 use crate::endpoint::Endpoint;
+use crate::files::KeyFile;
 use crate::network::{self, NetworkError, failed};
 use crate::wire::{Admission, Hello, Message, WireError};
 
@@ -24,8 +25,23 @@ pub enum JoinError {
     #[error(transparent)]
     Wire(#[from] WireError),
     /// There was no answer.
-    #[error("nobody answers at {0}; is the run running there, with --listen?")]
-    Silence(String),
+    #[error(
+        "nobody answers at {endpoint}: is the run running there, with --listen{}?",
+        also(endpoint)
+    )]
+    Silence {
+        /// Where the question was sent.
+        endpoint: String,
+    },
+}
+
+/// What else may be wrong where there are keys.
+fn also(endpoint: &str) -> &'static str {
+    if endpoint.starts_with("tls") {
+        ", and is this its key"
+    } else {
+        ""
+    }
 }
 
 /// Asks the gate at this endpoint, whichever run it belongs to, until it answers, `patience` is over, or `stop` returns
@@ -34,17 +50,22 @@ pub enum JoinError {
 /// # Errors
 /// When there is no answer, or it cannot be read.
 pub fn join(
-    endpoint: Endpoint,
+    endpoint: &Endpoint,
+    key: Option<&KeyFile>,
     hello: &Hello,
     patience: Duration,
     stop: impl Fn() -> bool,
 ) -> Result<Admission, JoinError> {
-    let session = network::connect(endpoint)?;
+    let session = network::connect(endpoint, key)?;
     let begun = Instant::now();
     loop {
-        match ask_to_join(&session, "*", hello) {
-            Err(JoinError::Silence(_)) if begun.elapsed() < patience && !stop() => std::thread::sleep(PAUSE),
-            Err(JoinError::Silence(_)) => return Err(JoinError::Silence(endpoint.to_string())),
+        // Without a key nobody knows which run it is, and only one can be there.
+        match ask_to_join(&session, key.map_or("*", |key| &key.run_id), hello) {
+            Err(JoinError::Silence { .. }) if begun.elapsed() < patience && !stop() => std::thread::sleep(PAUSE),
+            Err(JoinError::Silence { .. }) => {
+                let endpoint = endpoint.to_string();
+                return Err(JoinError::Silence { endpoint });
+            }
             answer => {
                 session.close().wait().map_err(failed("close"))?;
                 return answer;
@@ -64,6 +85,8 @@ pub(crate) fn ask_to_join(session: &Session, run_id: &str, hello: &Hello) -> Res
     let reply = replies.recv().ok();
     match reply.as_ref().and_then(|reply| reply.result().ok()) {
         Some(sample) => Ok(Admission::decode(&sample.payload().to_bytes())?),
-        None => Err(JoinError::Silence(run_id.into())),
+        None => Err(JoinError::Silence {
+            endpoint: run_id.into(),
+        }),
     }
 }

@@ -18,7 +18,11 @@ pub mod gate;
 #[cfg(feature = "network")]
 pub mod join;
 #[cfg(feature = "network")]
-mod network;
+pub mod keys;
+#[cfg(feature = "network")]
+pub mod network;
+#[cfg(feature = "network")]
+pub mod refused;
 #[cfg(feature = "network")]
 pub mod relay;
 #[cfg(feature = "network")]

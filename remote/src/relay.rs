@@ -23,7 +23,7 @@ use zenoh::pubsub::Publisher;
 use zenoh::qos::{CongestionControl, Priority};
 use zenoh::{Session, Wait};
 
-use crate::files::{FileError, HostFile};
+use crate::files::{FileError, HostFile, KeyFile};
 use crate::join::ask_to_join;
 use crate::network::{self, NetworkError, failed};
 use crate::requests::Requests;
@@ -73,6 +73,8 @@ pub struct RelaySettings {
     pub run: RunDir,
     /// What `shoal join` has been given.
     pub host: HostFile,
+    /// The run's key, unless the endpoint is not encrypted.
+    pub key: Option<KeyFile>,
 }
 
 /// Why the relay ended.
@@ -206,7 +208,7 @@ impl<'a> Relay<'a> {
             };
             sources.insert(*actor, source);
         }
-        let session = network::connect(host.endpoint)?;
+        let session = network::connect(&host.endpoint, settings.key.as_ref())?;
         let (sender, arrivals) = channel();
         let event = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK).map_err(std::io::Error::from)?;
         let wake = Wake {

@@ -13,9 +13,12 @@ pub(crate) const NOT_BUILT: &str = "this program was built without remote actors
 
 #[derive(Args, Clone, Debug)]
 pub(crate) struct JoinArgs {
-    /// Where the run listens, as `train --listen` prints it (tcp/127.0.0.1:7447); or the run's directory.
+    /// Where the run listens, as `train --listen` prints it (tls/learner-7:7447); or the run's directory.
     #[arg(value_name = "ENDPOINT|RUN_DIR")]
     pub(crate) run: String,
+    /// The run's key, the file join.key in its directory; - reads it from standard input [default: that of the directory].
+    #[arg(long, value_name = "FILE")]
+    pub(crate) key: Option<PathBuf>,
     /// Actor processes on this host, each with its environment server.
     #[arg(long, value_name = "N", value_parser = small_count)]
     pub(crate) actors: u32,
@@ -60,8 +63,8 @@ mod with_network {
 
     use anyhow::{Context, bail};
     use shoal_remote::endpoint::Endpoint;
-    use shoal_remote::files::{HostFile, JoinFile};
-    use shoal_remote::join::join;
+    use shoal_remote::files::{HostFile, JoinFile, KeyFile};
+    use shoal_remote::join::{JoinError, join};
     use shoal_remote::wire::{Admission, Hello, Lease};
     use shoal_run::joining::make_host_directory;
     use shoal_run::plan::UsageError;
@@ -75,7 +78,7 @@ mod with_network {
 
     /// Joins the run, and works for it until it is over.
     pub(crate) fn run(args: &JoinArgs) -> anyhow::Result<ExitCode> {
-        let endpoint = endpoint(&args.run)?;
+        let (endpoint, key) = endpoint(args)?;
         let signals = Signals::register()?;
         let interrupt = signals.interrupt();
         let host = host_number()?;
@@ -90,14 +93,16 @@ mod with_network {
             actors: args.actors,
             held: Vec::new(),
         };
-        let admission = join(endpoint, &hello, args.give_up, || interrupt.signal().is_some());
+        let admission = join(&endpoint, key.as_ref(), &hello, args.give_up, || {
+            interrupt.signal().is_some()
+        });
         if let Some(signal) = interrupt.signal() {
             return Ok(exit_code(signal));
         }
         let lease = match admission {
             Ok(Admission::Admitted(lease)) => lease,
             Ok(Admission::Refused(why)) => bail!("{endpoint} does not admit this host: {why}"),
-            Err(error @ shoal_remote::join::JoinError::Silence(_)) => {
+            Err(error @ JoinError::Silence { .. }) => {
                 say(&format!("error: {error}"));
                 return Ok(GAVE_UP.into());
             }
@@ -105,7 +110,7 @@ mod with_network {
         };
         let temporary = std::env::temp_dir().join(format!("shoal-join-{host:016x}"));
         let path = args.local.as_deref().unwrap_or(&temporary);
-        let worked = work(args, (endpoint, host, name), lease, path, &signals);
+        let worked = work(args, (endpoint, key, host, name), lease, path, &signals);
         if args.local.is_none() {
             match &worked {
                 Ok(_) => drop(std::fs::remove_dir_all(path)),
@@ -117,7 +122,7 @@ mod with_network {
 
     fn work(
         args: &JoinArgs,
-        (endpoint, host, name): (Endpoint, u64, String),
+        (endpoint, key, host, name): (Endpoint, Option<KeyFile>, u64, String),
         lease: Lease,
         path: &Path,
         signals: &Signals,
@@ -126,7 +131,10 @@ mod with_network {
         let (config, run, lock) = make_host_directory(path, &lease.config, lease.first_incarnation, interrupt)?;
         // The name of the run in its messages is that of its own configuration.
         let run_id = joined_run_id(&lease.config)?;
-        HostFile::new(endpoint, run_id, (host, name), &lease).write(&run)?;
+        if let Some(key) = key {
+            key.write(&run.path().join(KeyFile::JOIN))?;
+        }
+        HostFile::new(endpoint.clone(), run_id, (host, name), &lease).write(&run)?;
         let actors = lease.actors.clone();
         say(&format!("joined {endpoint} with {} actors: {actors:?}", actors.len()));
         let ending = joined::run(config, (&run, &lock), signals, actors, args.give_up)?;
@@ -152,13 +160,30 @@ mod with_network {
         let _ = writeln!(std::io::stderr(), "{line}");
     }
 
-    fn endpoint(run: &str) -> anyhow::Result<Endpoint> {
-        if Path::new(run).is_dir() {
-            return Ok(JoinFile::read(Path::new(run))
-                .with_context(|| format!("nobody can join {run}: was it started with --listen?"))?
-                .endpoint);
-        }
-        Ok(run.parse::<Endpoint>().map_err(|error| UsageError(error.to_string()))?)
+    /// Where to connect to, and with which key.
+    fn endpoint(args: &JoinArgs) -> anyhow::Result<(Endpoint, Option<KeyFile>)> {
+        let directory = Path::new(&args.run);
+        let (endpoint, key) = if directory.is_dir() {
+            let file = JoinFile::read(directory)
+                .with_context(|| format!("nobody can join {}: was it started with --listen?", args.run))?;
+            (
+                file.endpoint,
+                args.key.clone().unwrap_or_else(|| directory.join(KeyFile::JOIN)),
+            )
+        } else {
+            let endpoint = args.run.parse::<Endpoint>();
+            let endpoint = endpoint.map_err(|error| UsageError(error.to_string()))?;
+            let key = match &args.key {
+                None if endpoint.is_encrypted() => {
+                    let why = format!("{endpoint} needs the run's key: --key FILE, the join.key in its directory");
+                    return Err(UsageError(why).into());
+                }
+                key => key.clone().unwrap_or_default(),
+            };
+            (endpoint, key)
+        };
+        let key = endpoint.is_encrypted().then(|| KeyFile::read(&key)).transpose()?;
+        Ok((endpoint, key))
     }
 
     fn joined_run_id(config: &str) -> anyhow::Result<String> {

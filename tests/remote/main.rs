@@ -27,7 +27,9 @@ struct Run {
 impl Run {
     fn start(arguments: &[&str]) -> Self {
         let place = Workplace::logging_chunks();
-        let running = place.start("run", &[&["--listen", "--steps", ENDLESS], arguments].concat());
+        let listens = arguments.contains(&"--listen");
+        let listen: &[&str] = if listens { &[] } else { &["--listen", "tcp/127.0.0.1:0"] };
+        let running = place.start("run", &[listen, &["--steps", ENDLESS], arguments].concat());
         Self { place, running }
     }
 
@@ -252,6 +254,48 @@ fn a_host_that_is_ended_hands_over_what_it_has_and_frees_its_actors() {
 }
 
 #[test]
+fn only_the_key_of_the_run_opens_an_encrypted_endpoint() {
+    let run = Run::start(&["--actors", "1", "--listen", "tls/127.0.0.1:0"]);
+    let other = Run::start(&["--actors", "1", "--listen", "tls/127.0.0.1:0"]);
+    let key = |run: &Run| run.running.run.join("join.key").display().to_string();
+    let (own, foreign, endpoint) = (key(&run), key(&other), run.endpoint());
+    let mode = std::fs::metadata(&own).unwrap().permissions();
+    assert_eq!(std::os::unix::fs::PermissionsExt::mode(&mode) & 0o777, 0o600);
+    // None.
+    let none = run.place.output(&["join", &endpoint, "--actors", "1"]);
+    assert_eq!(none.status.code(), Some(2));
+    assert!(error_line(&none).contains("needs the run's key"));
+    // That of another run.
+    let begun = Instant::now();
+    let wrong = ["join", &endpoint, "--actors", "1", "--key", &foreign, "--give-up", "2s"];
+    let wrong = run.place.output(&wrong);
+    assert_eq!(wrong.status.code(), Some(4));
+    assert!(error_line(&wrong).contains("is this its key"));
+    assert!(begun.elapsed() < Duration::from_secs(60));
+    until("the gate names the refusal", || {
+        run.running.log().contains("a connection was refused")
+    });
+    // No encryption at all.
+    let plain = endpoint.replace("tls/", "tcp/");
+    let plain = run.place.output(&["join", &plain, "--actors", "1", "--give-up", "1s"]);
+    assert_eq!(plain.status.code(), Some(4));
+    // A file that is no key.
+    let config = run.running.run.join("config.toml").display().to_string();
+    let no_key = run
+        .place
+        .output(&["join", &endpoint, "--actors", "1", "--key", &config]);
+    assert!(error_line(&no_key).contains("is damaged"));
+    // The right one.
+    let host = Host::join(&run, &["--actors", "1", "--key", &own]);
+    wait_for_actors(&run, &[1]);
+    stop(other);
+    let path = stop(run);
+    let sent = host.sent(&[1]);
+    host.ends_with(0);
+    assert_eq!(in_replay(&path, &[1]), sent);
+}
+
+#[test]
 fn what_cannot_be_joined_is_refused_in_one_line() {
     let place = Workplace::new();
     let output = |arguments: &[&str]| place.output(arguments);
@@ -270,7 +314,15 @@ fn what_cannot_be_joined_is_refused_in_one_line() {
         assert!(error_line(&output(&train)).contains(why));
         assert!(!place.path().join("none").exists());
     }
-    let lockstep = ["train", "pendulum", "--run", "none", "--lockstep", "--listen"];
+    let lockstep = [
+        "train",
+        "pendulum",
+        "--run",
+        "none",
+        "--lockstep",
+        "--listen",
+        "tcp/127.0.0.1:0",
+    ];
     assert!(error_line(&output(&lockstep)).contains("lockstep"));
     assert!(!place.path().join("none").exists());
     // A run that nobody can join, and one that has no more actors.
