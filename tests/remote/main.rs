@@ -12,8 +12,9 @@ use std::time::{Duration, Instant};
 use rand::seq::IndexedRandom;
 use rand::{RngExt, SeedableRng};
 use rustix::process::Signal;
+use shoal_common::config::Config;
 use shoal_common::stream::Stream;
-use support::{Running, Workplace, committed, error_line, sent, until, wait_for_rows};
+use support::{QUICK, Running, Workplace, check_stored_rows, committed, error_line, sent, until, wait_for_rows};
 
 /// Steps that no test reaches.
 const ENDLESS: &str = "100000000";
@@ -29,7 +30,8 @@ impl Run {
         let place = Workplace::logging_chunks();
         let listens = arguments.contains(&"--listen");
         let listen: &[&str] = if listens { &[] } else { &["--listen", "tcp/127.0.0.1:0"] };
-        let running = place.start("run", &[listen, &["--steps", ENDLESS], arguments].concat());
+        let train = ["train", "pendulum", "--run", "run", "--steps", ENDLESS];
+        let running = place.launch("run", &[&train[..], listen, &QUICK, arguments].concat());
         Self { place, running }
     }
 
@@ -136,7 +138,14 @@ fn a_host_that_joins_sends_rows_is_shown_and_ends_with_the_run() {
 
 #[test]
 fn every_row_of_a_living_host_is_committed_once_whatever_is_killed() {
-    let run = Run::start(&["--actors", "1", "--set", "replay.updates_per_step=0.2"]);
+    let run = Run::start(&[
+        "--actors",
+        "1",
+        "--set",
+        "replay.updates_per_step=0.2",
+        "--set",
+        "replay.capacity=500000",
+    ]);
     let host = Host::join(&run, &["--actors", "2"]);
     let mut rng = Stream::seed_from_u64(3);
     let at_learner = ["gate-0", "learner-0", "evaluator-0", "actor-0", "env-server-0"];
@@ -157,6 +166,7 @@ fn every_row_of_a_living_host_is_committed_once_whatever_is_killed() {
     host.ends_with(0);
     assert!(sent > 0);
     assert_eq!(in_replay(&path, &[1, 2]), sent, "after {kills} kills");
+    check_stored_rows(&path, &Config::load(&path.join("config.toml")).unwrap());
 }
 
 #[test]
