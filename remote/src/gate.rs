@@ -14,7 +14,7 @@ use shoal_common::channel::reports::Reporter;
 use shoal_common::channel::transitions::ChunkForwarder;
 use shoal_common::channel::{ChannelError, Domain, EventName, HeartbeatSender, Notifier};
 use shoal_common::commit::{CommitReader, OpenError};
-use shoal_common::config::Config;
+use shoal_common::config::{Config, Mode};
 use shoal_common::policy::PolicyError;
 use shoal_common::report::{Activity, EpisodeReport, Heartbeat, Identity, Role};
 use shoal_common::run_dir::{RunDir, RunDirError};
@@ -31,6 +31,7 @@ use crate::forwarding::{Forwarding, Offer};
 use crate::network::{self, NetworkError, failed};
 use crate::refused;
 use crate::requests::Requests;
+use crate::wire::vector_instructions;
 use crate::wire::{
     ActorMarks, Admission, Hello, HostReport, Lease, Marks, Message, Phase, PolicyQuestion, WireChunk, WireError,
     WirePolicy,
@@ -146,7 +147,8 @@ type PolicyId = Option<(u64, u64)>;
 /// An actor of another host.
 struct RemoteActor {
     host: u64,
-    forwarder: ChunkForwarder,
+    /// `None` while the actor that the learner's host had before is ending.
+    forwarder: Option<ChunkForwarder>,
     forwarding: Forwarding,
 }
 
@@ -317,8 +319,13 @@ impl<'a> Gate<'a> {
         };
         // A host that was admitted again still has processes that an earlier launcher has given incarnations to.
         let ours = chunk.header.incarnation < host.lease.limit;
-        let parts = actor.forwarder.parts(&chunk.header, &chunk.numbers);
-        let Some((rows, _)) = parts.filter(|(rows, _)| ours && rows.iter().all(|number| number.is_finite())) else {
+        // Until there is a way to the learner, the host sends it again.
+        let Some(forwarder) = &actor.forwarder else {
+            return Ok(0);
+        };
+        let parts = forwarder.parts(&chunk.header, &chunk.numbers);
+        let finite = |rows: &[f32]| rows.iter().all(|number| number.is_finite());
+        if !(ours && parts.is_some_and(|(rows, _)| finite(rows))) {
             // The host repeats it again and again.
             if host.warned.is_none_or(|warned| warned.elapsed() >= WARN_AGAIN) {
                 host.warned = Some(Instant::now());
@@ -329,12 +336,11 @@ impl<'a> Gate<'a> {
                 );
             }
             return Ok(0);
-        };
+        }
         if actor.forwarding.offer(chunk.mark()) != Offer::Next {
             return Ok(0);
         }
-        debug_assert!(rows.len() <= chunk.numbers.len());
-        actor.forwarder.send(chunk.header, &chunk.numbers)?;
+        forwarder.send(chunk.header, &chunk.numbers)?;
         host.rows += u64::from(chunk.header.rows);
         host.due = true;
         Ok(chunk.header.rows.into())
@@ -377,6 +383,15 @@ impl<'a> Gate<'a> {
                 "this host has version {} of the program, the learner's host {}",
                 hello.program,
                 env!("CARGO_PKG_VERSION")
+            );
+            tracing::warn!("host {} is refused: {why}", hello.name);
+            return answer_join(&query, &Admission::Refused(why));
+        }
+        let (theirs, ours) = (&hello.instructions, vector_instructions());
+        if self.settings.config.run.mode == Mode::Lockstep && *theirs != ours {
+            let why = format!(
+                "this host's processor has other vector instructions ({theirs}) than the learner's ({ours}): a lockstep run \
+                 would not have the same bits"
             );
             tracing::warn!("host {} is refused: {why}", hello.name);
             return answer_join(&query, &Admission::Refused(why));
@@ -462,7 +477,7 @@ impl<'a> Gate<'a> {
             let committed = self.replay.committed(*actor as usize);
             let remote = RemoteActor {
                 host: lease.host,
-                forwarder: ChunkForwarder::open(self.domain, *actor, config.chunk_layout(), config.actors.window)?,
+                forwarder: None,
                 forwarding: Forwarding::new(committed, config.actors.window),
             };
             self.actors.insert(*actor, remote);
@@ -486,6 +501,18 @@ impl<'a> Gate<'a> {
             lease,
         };
         self.hosts.insert(host.lease.host, host);
+        self.open_forwarders()
+    }
+
+    /// Opens the ways to the learner that are free.
+    fn open_forwarders(&mut self) -> Result<(), GateError> {
+        let config = &self.settings.config;
+        let (layout, window) = (config.chunk_layout(), config.actors.window);
+        for (index, actor) in &mut self.actors {
+            if actor.forwarder.is_none() {
+                actor.forwarder = ChunkForwarder::try_open(self.domain, *index, layout, window)?;
+            }
+        }
         Ok(())
     }
 
@@ -510,13 +537,23 @@ impl<'a> Gate<'a> {
     fn send_marks(&mut self) -> Result<(), GateError> {
         let Some(epoch) = self.epoch else { return Ok(()) };
         let rows = self.replay.rows();
+        // Marks and snapshots must belong together.
+        let has_snapshots = self.replay.layout().actor_snapshot_words > 0;
+        let record = if has_snapshots { self.replay.snapshot() } else { None };
+        if has_snapshots && record.is_none() {
+            return Ok(());
+        }
         for host in self.hosts.values_mut() {
             let since = host.marked.elapsed();
             if since < MARKS_APART {
                 continue;
             }
             let of = |actor: &u32| {
-                let commit = self.replay.actor(*actor as usize);
+                let index = *actor as usize;
+                let (commit, snapshot) = match &record {
+                    Some(record) => (record.actor(index), record.actor_snapshot(index).to_vec()),
+                    None => (self.replay.actor(index), Vec::new()),
+                };
                 let got = self
                     .actors
                     .get(actor)
@@ -526,6 +563,7 @@ impl<'a> Gate<'a> {
                     committed: (commit.mark.incarnation, commit.mark.sequence),
                     got: (got.incarnation, got.sequence),
                     rows: commit.rows,
+                    snapshot,
                 }
             };
             let actors: Vec<ActorMarks> = host.lease.actors.iter().map(of).collect();
@@ -629,15 +667,16 @@ impl<'a> Gate<'a> {
         self.heartbeats.refresh_connections();
         self.episodes.refresh_connections();
         let waits = self.actors.values().any(|actor| actor.forwarding.is_waiting());
-        self.heartbeat.beat(if waits {
-            Activity::WaitingForRatio
-        } else {
-            Activity::WaitingForPeer
+        let cut_off = |host: &Host| host.heard.elapsed() >= CUT_OFF;
+        self.heartbeat.beat(match waits {
+            // While a host is away, no other process is to blame that all wait.
+            _ if self.hosts.values().any(cut_off) => Activity::Working,
+            true => Activity::WaitingForRatio,
+            false => Activity::WaitingForPeer,
         });
-        self.actors
-            .values()
-            .try_for_each(|actor| actor.forwarder.refresh_connections())?;
-        Ok(())
+        let mut forwarders = self.actors.values().filter_map(|actor| actor.forwarder.as_ref());
+        forwarders.try_for_each(ChunkForwarder::refresh_connections)?;
+        self.open_forwarders()
     }
 
     /// The learner wakes nobody but actors, so the gate looks at the commit record: often while chunks are being

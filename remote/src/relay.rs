@@ -28,6 +28,7 @@ use crate::join::ask_to_join;
 use crate::network::{self, NetworkError, failed};
 use crate::requests::Requests;
 use crate::unconfirmed::{Consequence, Unconfirmed};
+use crate::wire::vector_instructions;
 use crate::wire::{
     Admission, Hello, HostReport, Marks, Message, Phase, PolicyQuestion, RemoteEpisode, RemoteRole, WireChunk,
     WireError, WirePolicy, mark_of,
@@ -359,7 +360,11 @@ impl<'a> Relay<'a> {
             follow(&self.requests, marks.actor, consequence);
         }
         if other_gate || !changed.is_empty() {
-            let commits = self.sources.iter().map(|(actor, source)| (*actor, source.commit));
+            let of_host = marks.actors.iter();
+            let commits = of_host.filter_map(|marks| {
+                let source = self.sources.get(&marks.actor)?;
+                Some((marks.actor, source.commit, &marks.snapshot[..]))
+            });
             self.mirror.publish(marks.rows, commits);
             changed.iter().for_each(|actor| self.sources[actor].notifier.notify());
         }
@@ -380,6 +385,7 @@ impl<'a> Relay<'a> {
             program: env!("CARGO_PKG_VERSION").into(),
             host: host.host,
             name: host.name.clone(),
+            instructions: vector_instructions(),
             actors: host.actors.len() as u32,
             held: host.actors.clone(),
         };

@@ -178,10 +178,32 @@ pub struct Hello {
     pub host: u64,
     /// The host's name, for people.
     pub name: String,
+    /// The vector instructions of its processor. Bits of policies depend on them.
+    pub instructions: String,
     /// The number of actors that it offers.
     pub actors: u32,
     /// The actors that it has already, if it was admitted before.
     pub held: Vec<u32>,
+}
+
+/// The vector instructions of this processor that the program may use.
+pub fn vector_instructions() -> String {
+    let mut found = Vec::new();
+    #[cfg(target_arch = "x86_64")]
+    {
+        for (name, present) in [
+            ("avx2", std::is_x86_feature_detected!("avx2")),
+            ("fma", std::is_x86_feature_detected!("fma")),
+            ("avx512f", std::is_x86_feature_detected!("avx512f")),
+            ("avx512vl", std::is_x86_feature_detected!("avx512vl")),
+            ("avx512dq", std::is_x86_feature_detected!("avx512dq")),
+        ] {
+            if present {
+                found.push(name);
+            }
+        }
+    }
+    format!("{} {}", std::env::consts::ARCH, found.join(" "))
 }
 
 /// The answer to a [`Hello`].
@@ -237,7 +259,7 @@ pub struct Marks {
 }
 
 /// What has become of an actor's chunks.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ActorMarks {
     /// The actor.
     pub actor: u32,
@@ -247,6 +269,8 @@ pub struct ActorMarks {
     pub got: (u64, u64),
     /// Rows of all its committed chunks.
     pub rows: u64,
+    /// The actor's snapshot after its last committed chunk, in runs that have snapshots.
+    pub snapshot: Vec<u64>,
 }
 
 /// What a host tells the gate a few times a second. Some may be lost.

@@ -65,7 +65,7 @@ mod with_network {
     use shoal_remote::endpoint::Endpoint;
     use shoal_remote::files::{HostFile, JoinFile, KeyFile};
     use shoal_remote::join::{JoinError, join};
-    use shoal_remote::wire::{Admission, Hello, Lease};
+    use shoal_remote::wire::{Admission, Hello, Lease, vector_instructions};
     use shoal_run::joining::make_host_directory;
     use shoal_run::plan::UsageError;
     use shoal_run::signals::{Signals, exit_code};
@@ -90,6 +90,7 @@ mod with_network {
             program: env!("CARGO_PKG_VERSION").into(),
             host,
             name: name.clone(),
+            instructions: vector_instructions(),
             actors: args.actors,
             held: Vec::new(),
         };

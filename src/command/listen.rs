@@ -4,7 +4,7 @@ use std::io::Write;
 use std::path::PathBuf;
 
 use clap::Args;
-use shoal_common::config::{Config, Mode};
+use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
 use shoal_remote::endpoint::Endpoint;
 use shoal_remote::files::JoinFile;
@@ -60,9 +60,6 @@ impl ListenArgs {
         self.check()?;
         let Some(endpoint) = &self.listen else { return Ok(false) };
         let mut endpoint = endpoint.parse::<Endpoint>()?;
-        if config.run.mode == Mode::Lockstep {
-            anyhow::bail!("other hosts cannot join a lockstep run yet: leave out --listen or --lockstep");
-        }
         // A resumed run listens where the hosts of before are trying to reach it.
         if endpoint.to_string() == Endpoint::DEFAULT
             && let Ok(before) = JoinFile::read(run.path())

@@ -11,7 +11,7 @@ use shoal_actor::explorer::GIVEN_UP;
 use shoal_common::channel::control::{Answer, HostLease, HostRequest, HostStatus, RoleStatus};
 use shoal_common::channel::environment::Fault;
 use shoal_common::channel::{Domain, Services};
-use shoal_common::config::Config;
+use shoal_common::config::{Config, Mode};
 use shoal_common::durable::write_atomically;
 use shoal_common::report::{Activity, Heartbeat, Identity, Role};
 use shoal_common::run_dir::RunDir;
@@ -83,6 +83,8 @@ pub(super) struct Supervisor {
     /// The wanted actors of this host, in order; and the most that the run may have on all hosts.
     actors: Vec<u32>,
     max_actors: u32,
+    /// The number of actors of a lockstep run, on all hosts together. It never changes.
+    lockstep_actors: Option<u32>,
     hosts: Hosts,
     log: Log,
     /// Incidents since the last [`Supervisor::take_incidents`].
@@ -126,6 +128,8 @@ impl Supervisor {
         let mut services = Services::new(domain)?;
         services.create_common(domain)?;
         let server = config.evaluation_server();
+        let lockstep = config.run.mode == Mode::Lockstep;
+        let mut lockstep_actors = None;
         let (children, actors) = match members {
             Members::Learner { gate } => {
                 services.create_environment(domain, server)?;
@@ -135,6 +139,7 @@ impl Supervisor {
                     Child::new(Role::Evaluator, 0).with_server(server),
                 ];
                 children.extend(gate.then(|| Child::new(Role::Gate, 0)));
+                lockstep_actors = lockstep.then_some(config.actors.count);
                 (children, (0..config.actors.count).collect())
             }
             Members::Host { actors } => (vec![Child::new(Role::Relay, 0)], actors),
@@ -149,6 +154,7 @@ impl Supervisor {
             actors,
             hosts: Hosts::new(started),
             max_actors: config.actors.max,
+            lockstep_actors,
             log,
             incidents: Vec::new(),
             run: run.path().into(),
@@ -225,14 +231,26 @@ impl Supervisor {
         if let Some(lease) = self.hosts.lease(host) {
             return Ok(Answer::Admitted(lease.clone()));
         }
-        // The services of a retiring actor are in use.
-        let exists = |index: u32| self.children.iter().any(|child| child.is(Role::Actor, index));
-        let free: Vec<u32> = self.free_actors().filter(|index| !exists(*index)).collect();
-        let actors = if !held.is_empty() && held.iter().all(|index| free.contains(index)) {
+        let free: Vec<u32> = match self.lockstep_actors {
+            // The host takes over actors of this one, which end; theirs continue from the same snapshots.
+            Some(_) => self.actors.iter().rev().copied().collect(),
+            // The services of a retiring actor are in use.
+            None => {
+                let exists = |index: u32| self.children.iter().any(|child| child.is(Role::Actor, index));
+                self.free_actors().filter(|index| !exists(*index)).collect()
+            }
+        };
+        let mut actors = if !held.is_empty() && held.iter().all(|index| free.contains(index)) {
             held
         } else if free.len() >= count as usize {
             free[..count as usize].to_vec()
         } else {
+            if let Some(count) = self.lockstep_actors {
+                return Ok(Answer::Refused(format!(
+                    "this lockstep run has {count} actors, of which other hosts have {}",
+                    count as usize - free.len()
+                )));
+            }
             return Ok(Answer::Refused(format!(
                 "the run may have {} actors on all hosts together (actors.max, fixed when it was created), of which {} \
                  are free",
@@ -240,6 +258,7 @@ impl Supervisor {
                 free.len()
             )));
         };
+        actors.sort_unstable();
         let first_incarnation = self.started + 1;
         self.started += INCARNATIONS;
         self.write_counter()?;
@@ -256,6 +275,7 @@ impl Supervisor {
             limit: self.started + 1,
         };
         self.hosts.admit(lease.clone());
+        self.share_lockstep_actors();
         Ok(Answer::Admitted(lease))
     }
 
@@ -264,9 +284,17 @@ impl Supervisor {
         for message in self.hosts.update(statuses) {
             self.log.note("launcher", &message);
         }
+        self.share_lockstep_actors();
         Answer::Leases {
             epoch: self.hosts.epoch(),
             leases: self.hosts.leases(),
+        }
+    }
+
+    /// In a lockstep run this host has all actors that no other has.
+    fn share_lockstep_actors(&mut self) {
+        if let Some(count) = self.lockstep_actors {
+            self.actors = (0..count).filter(|index| !self.hosts.has(*index)).collect();
         }
     }
 
@@ -297,7 +325,7 @@ impl Supervisor {
 
     /// Creates the services of all wanted actors.
     fn create_wanted_services(&mut self, domain: &Domain) -> anyhow::Result<()> {
-        let end = self.actors.last().map_or(0, |last| last + 1);
+        let end = self.actors.iter().max().map_or(0, |last| last + 1);
         self.create_services(domain, end)
     }
 

@@ -14,7 +14,9 @@ use rand::{RngExt, SeedableRng};
 use rustix::process::Signal;
 use shoal_common::config::Config;
 use shoal_common::stream::Stream;
-use support::{QUICK, Running, Workplace, check_stored_rows, committed, error_line, sent, until, wait_for_rows};
+use support::{
+    QUICK, Running, Workplace, check_stored_rows, committed, error_line, final_result, sent, until, wait_for_rows,
+};
 
 /// Steps that no test reaches.
 const ENDLESS: &str = "100000000";
@@ -263,6 +265,58 @@ fn a_host_that_is_ended_hands_over_what_it_has_and_frees_its_actors() {
     assert_eq!(in_replay(&path, &[1, 2]), sent + more);
 }
 
+/// The weights and evaluations of a lockstep run with three actors, of which another host takes over two, if `joined`.
+fn lockstep(joined: bool) -> (serde_json::Value, Vec<String>) {
+    let place = Workplace::new();
+    let train = [
+        "train",
+        "pendulum",
+        "--run",
+        "run",
+        "--lockstep",
+        "--actors",
+        "3",
+        "--steps",
+        "6000",
+    ];
+    let more = ["--listen", "tcp/127.0.0.1:0", "--set", "checkpoint.every_updates=500"];
+    let running = place.launch("run", &[&train[..], &more, &QUICK].concat());
+    let run = Run { place, running };
+    if joined {
+        let host = Host::join(&run, &["--actors", "2"]);
+        wait_for_actors(&run, &[1, 2]);
+        for (at_host, role) in [
+            (true, "actor-1"),
+            (true, "relay-0"),
+            (false, "gate-0"),
+            (true, "env-server-2"),
+            (false, "learner-0"),
+        ] {
+            let running = if at_host { &host.running } else { &run.running };
+            running.kill_if_alive(role);
+            wait_for_rows(&run.running, 96);
+        }
+        // It gives its actors back, and another one takes one of them over.
+        host.running.signal(Signal::TERM);
+        host.ends_with(128 + 15);
+        wait_for_rows(&run.running, 96);
+        let host = Host::join(&run, &["--actors", "1"]);
+        let too_many = run.place.output(&["join", &run.endpoint(), "--actors", "3"]);
+        assert!(error_line(&too_many).contains("this lockstep run has 3 actors, of which other hosts have 1"));
+        let result = final_result(run.running);
+        host.ends_with(0);
+        return result;
+    }
+    final_result(run.running)
+}
+
+#[test]
+fn a_lockstep_run_has_the_same_bits_wherever_its_actors_are() {
+    let (here, elsewhere) = (lockstep(false), lockstep(true));
+    assert!(here.0.is_string());
+    assert_eq!(here, elsewhere);
+}
+
 #[test]
 fn only_the_key_of_the_run_opens_an_encrypted_endpoint() {
     let run = Run::start(&["--actors", "1", "--listen", "tls/127.0.0.1:0"]);
@@ -324,17 +378,6 @@ fn what_cannot_be_joined_is_refused_in_one_line() {
         assert!(error_line(&output(&train)).contains(why));
         assert!(!place.path().join("none").exists());
     }
-    let lockstep = [
-        "train",
-        "pendulum",
-        "--run",
-        "none",
-        "--lockstep",
-        "--listen",
-        "tcp/127.0.0.1:0",
-    ];
-    assert!(error_line(&output(&lockstep)).contains("lockstep"));
-    assert!(!place.path().join("none").exists());
     // A run that nobody can join, and one that has no more actors.
     place.train(&["pendulum", "--run", "closed", "--steps", "200"]);
     assert!(error_line(&output(&["join", "closed", "--actors", "1"])).contains("was it started with --listen?"));

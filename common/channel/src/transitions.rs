@@ -235,18 +235,28 @@ impl ChunkSender {
 }
 
 impl ChunkForwarder {
-    /// Opens the sending end of `actor`, whose chunks have this layout. At most `window` of them may be uncommitted.
+    /// Opens the sending end of `actor`, whose chunks have this layout. At most `window` of them may be uncommitted. `None`
+    /// if another process sends for this actor at the moment: try again later.
     ///
     /// # Errors
-    /// When shared memory is unavailable, or another process sends for this actor.
-    pub fn open(domain: &Domain, actor: u32, layout: ChunkLayout, window: u32) -> Result<Self, ChannelError> {
+    /// When shared memory is unavailable.
+    pub fn try_open(
+        domain: &Domain,
+        actor: u32,
+        layout: ChunkLayout,
+        window: u32,
+    ) -> Result<Option<Self>, ChannelError> {
         let channel = name(actor);
-        let publisher = claim(|| publisher(&service(domain, &channel, window, Entry::Open)?, &channel, &layout))?;
-        Ok(Self {
-            publisher,
-            channel,
-            layout,
-        })
+        let opened = service(domain, &channel, window, Entry::Open);
+        match opened.and_then(|service| publisher(&service, &channel, &layout)) {
+            Ok(publisher) => Ok(Some(Self {
+                publisher,
+                channel,
+                layout,
+            })),
+            Err(error) if error.is_transient() => Ok(None),
+            Err(error) => Err(error),
+        }
     }
 
     /// The rows of a chunk with this header, and after them the numbers of the actor's snapshot. `None` if `numbers` are

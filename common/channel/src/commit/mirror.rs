@@ -74,14 +74,18 @@ impl CommitMirror {
         self.record.actor(actor)
     }
 
-    /// Publishes what is committed of some actors, and how many rows the replay has. Readers see all of it or nothing.
-    /// Actors that the layout does not have are ignored.
-    pub fn publish(&mut self, rows: u64, actors: impl IntoIterator<Item = (u32, ActorCommit)>) {
+    /// Publishes what is committed of some actors, with their snapshots, and how many rows the replay has. Readers see all
+    /// of it or nothing. Actors that the layout does not have are ignored, and so are snapshots of another length.
+    pub fn publish<'a>(&mut self, rows: u64, actors: impl IntoIterator<Item = (u32, ActorCommit, &'a [u64])>) {
         let count = self.record.actors();
         let mut rows = rows;
-        for (actor, commit) in actors {
-            if (actor as usize) < count {
-                self.record.set_actor(actor as usize, commit);
+        for (actor, commit, snapshot) in actors {
+            let actor = actor as usize;
+            if actor < count {
+                self.record.set_actor(actor, commit);
+                if self.record.actor_snapshot(actor).len() == snapshot.len() {
+                    self.record.set_actor_snapshot(actor, snapshot);
+                }
                 rows = rows.max(commit.rows);
             }
         }
@@ -107,7 +111,7 @@ mod tests {
             row: RowLayout::new(3, 1),
             ring: 1_000_000,
             actors: 4,
-            actor_snapshot_words: 0,
+            actor_snapshot_words: 2,
             fingerprint: 17,
         }
     }
@@ -126,13 +130,14 @@ mod tests {
         let mut mirror = CommitMirror::open(&path, &layout()).unwrap();
         let reader = CommitReader::open(&path).unwrap();
         assert_eq!((reader.rows(), reader.committed(2)), (0, ChunkMark::default()));
-        mirror.publish(640, [(2, commit(7, 5, 320)), (9, commit(1, 1, 1))]);
+        mirror.publish(640, [(2, commit(7, 5, 320), &[3, 4][..]), (9, commit(1, 1, 1), &[])]);
         assert_eq!((reader.rows(), reader.actor(2)), (640, commit(7, 5, 320)));
         assert!(reader.snapshot().is_some());
+        assert_eq!(reader.actor_snapshot(2), [3, 4]);
         drop(mirror);
         let mut mirror = CommitMirror::open(&path, &layout()).unwrap();
         assert_eq!(mirror.actor(2), commit(7, 5, 320));
-        mirror.publish(600, [(2, commit(7, 4, 280))]);
+        mirror.publish(600, [(2, commit(7, 4, 280), &[][..])]);
         assert_eq!((reader.rows(), reader.actor(2)), (600, commit(7, 4, 280)));
         use std::os::unix::fs::MetadataExt;
         let taken = std::fs::metadata(&path).unwrap().blocks() * 512;
@@ -145,7 +150,7 @@ mod tests {
         let path = directory.path().join("replay.bin");
         CommitMirror::open(&path, &layout())
             .unwrap()
-            .publish(9, [(0, commit(1, 1, 9))]);
+            .publish(9, [(0, commit(1, 1, 9), &[][..])]);
         let other = ReplayLayout {
             fingerprint: 18,
             ..layout()
