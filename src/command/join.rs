@@ -1,10 +1,11 @@
 //! `shoal join`: works for a run of another host.
 
+use std::io::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use clap::Args;
+use clap::{Args, ValueEnum};
 use shoal_run::numbers::small_count;
 
 /// The message of a program without the network.
@@ -14,14 +15,14 @@ pub(crate) const NOT_BUILT: &str = "this program was built without remote actors
 #[derive(Args, Clone, Debug)]
 pub(crate) struct JoinArgs {
     /// Where the run listens, as `train --listen` prints it (tls/learner-7:7447); or the run's directory.
-    #[arg(value_name = "ENDPOINT|RUN_DIR")]
-    pub(crate) run: String,
+    #[arg(value_name = "ENDPOINT|RUN_DIR", required_unless_present = "template")]
+    pub(crate) run: Option<String>,
     /// The run's key, the file join.key in its directory; - reads it from standard input [default: that of the directory].
     #[arg(long, value_name = "FILE")]
     pub(crate) key: Option<PathBuf>,
     /// Actor processes on this host, each with its environment server.
-    #[arg(long, value_name = "N", value_parser = small_count)]
-    pub(crate) actors: u32,
+    #[arg(long, value_name = "N", value_parser = small_count, required_unless_present = "template")]
+    pub(crate) actors: Option<u32>,
     /// End, with exit code 4, if the run cannot be reached for this long, as in 90s, 10min or 2h.
     #[arg(long, value_name = "TIME", default_value = "10min", value_parser = time)]
     pub(crate) give_up: Duration,
@@ -31,6 +32,42 @@ pub(crate) struct JoinArgs {
     /// Directory for this host's log and other files; it is kept [default: a temporary one].
     #[arg(long, value_name = "DIR")]
     pub(crate) local: Option<PathBuf>,
+    /// Print a script or manifest that starts hosts, to be edited, and join nothing.
+    #[arg(long, value_name = "FOR", exclusive = true)]
+    pub(crate) template: Option<Template>,
+}
+
+/// What starts processes on other hosts.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Template {
+    /// A batch script for Slurm.
+    Slurm,
+    /// A manifest for Kubernetes.
+    Kubernetes,
+    /// A script that uses ssh.
+    Ssh,
+}
+
+impl Template {
+    fn text(self) -> &'static str {
+        match self {
+            Self::Slurm => include_str!("join/slurm.sh"),
+            Self::Kubernetes => include_str!("join/kubernetes.yaml"),
+            Self::Ssh => include_str!("join/ssh.sh"),
+        }
+    }
+}
+
+/// Joins a run, or prints a template.
+pub(crate) fn run(args: &JoinArgs) -> anyhow::Result<ExitCode> {
+    if let Some(template) = args.template {
+        std::io::stdout().lock().write_all(template.text().as_bytes())?;
+        return Ok(ExitCode::SUCCESS);
+    }
+    let (Some(run), Some(actors)) = (&args.run, args.actors) else {
+        anyhow::bail!("name a run to join, and a number of actors");
+    };
+    join(args, run, actors)
 }
 
 /// Reads a time such as `90s`, `10min` or `2h`.
@@ -49,24 +86,25 @@ fn time(text: &str) -> Result<Duration, String> {
 }
 
 #[cfg(not(feature = "remote"))]
-pub(crate) fn run(_args: &JoinArgs) -> anyhow::Result<ExitCode> {
+fn join(_args: &JoinArgs, _run: &str, _actors: u32) -> anyhow::Result<ExitCode> {
     anyhow::bail!(NOT_BUILT)
 }
 
 #[cfg(feature = "remote")]
-pub(crate) use with_network::run;
+use with_network::join;
 
 #[cfg(feature = "remote")]
 mod with_network {
-    use std::io::Write;
     use std::path::Path;
 
     use anyhow::{Context, bail};
+    use shoal_common::run_dir::RunDir;
     use shoal_remote::endpoint::Endpoint;
     use shoal_remote::files::{HostFile, JoinFile, KeyFile};
-    use shoal_remote::join::{JoinError, join};
+    use shoal_remote::join::{JoinError, join as ask};
     use shoal_remote::wire::{Admission, Hello, Lease, vector_instructions};
     use shoal_run::joining::make_host_directory;
+    use shoal_run::outcome::{RunOutcome, RunState};
     use shoal_run::plan::UsageError;
     use shoal_run::signals::{Signals, exit_code};
 
@@ -77,8 +115,8 @@ mod with_network {
     const GAVE_UP: u8 = 4;
 
     /// Joins the run, and works for it until it is over.
-    pub(crate) fn run(args: &JoinArgs) -> anyhow::Result<ExitCode> {
-        let (endpoint, key) = endpoint(args)?;
+    pub(super) fn join(args: &JoinArgs, run: &str, actors: u32) -> anyhow::Result<ExitCode> {
+        let (endpoint, key) = endpoint(args, run)?;
         let signals = Signals::register()?;
         let interrupt = signals.interrupt();
         let host = host_number()?;
@@ -91,18 +129,21 @@ mod with_network {
             host,
             name: name.clone(),
             instructions: vector_instructions(),
-            actors: args.actors,
+            actors,
             held: Vec::new(),
         };
-        let admission = join(&endpoint, key.as_ref(), &hello, args.give_up, || {
-            interrupt.signal().is_some()
-        });
+        let ends = || interrupt.signal().is_some() || is_finished(run);
+        let admission = ask(&endpoint, key.as_ref(), &hello, args.give_up, ends);
         if let Some(signal) = interrupt.signal() {
             return Ok(exit_code(signal));
         }
         let lease = match admission {
             Ok(Admission::Admitted(lease)) => lease,
             Ok(Admission::Refused(why)) => bail!("{endpoint} does not admit this host: {why}"),
+            Err(JoinError::Silence { .. }) if is_finished(run) => {
+                say("the run is over");
+                return Ok(ExitCode::SUCCESS);
+            }
             Err(error @ JoinError::Silence { .. }) => {
                 say(&format!("error: {error}"));
                 return Ok(GAVE_UP.into());
@@ -161,18 +202,24 @@ mod with_network {
         let _ = writeln!(std::io::stderr(), "{line}");
     }
 
+    /// Whether this is the directory of a run that has done everything: a host that comes late has nothing to wait for.
+    fn is_finished(run: &str) -> bool {
+        let outcome = RunDir::open(Path::new(run)).map(|run| RunOutcome::read(&run));
+        matches!(outcome, Ok(Ok(Some(outcome))) if outcome.state == RunState::Finished)
+    }
+
     /// Where to connect to, and with which key.
-    fn endpoint(args: &JoinArgs) -> anyhow::Result<(Endpoint, Option<KeyFile>)> {
-        let directory = Path::new(&args.run);
+    fn endpoint(args: &JoinArgs, run: &str) -> anyhow::Result<(Endpoint, Option<KeyFile>)> {
+        let directory = Path::new(run);
         let (endpoint, key) = if directory.is_dir() {
             let file = JoinFile::read(directory)
-                .with_context(|| format!("nobody can join {}: was it started with --listen?", args.run))?;
+                .with_context(|| format!("nobody can join {run}: was it started with --listen?"))?;
             (
                 file.endpoint,
                 args.key.clone().unwrap_or_else(|| directory.join(KeyFile::JOIN)),
             )
         } else {
-            let endpoint = args.run.parse::<Endpoint>();
+            let endpoint = run.parse::<Endpoint>();
             let endpoint = endpoint.map_err(|error| UsageError(error.to_string()))?;
             let key = match &args.key {
                 None if endpoint.is_encrypted() => {
