@@ -374,7 +374,7 @@ fn template(place: &Workplace, name: &str, replaced: (&str, &str)) -> std::path:
 fn the_script_for_slurm_trains_joins_and_resumes() {
     let place = Workplace::new();
     let quick = place.path().join("quick.toml");
-    let text = "[environment]\nname = \"pendulum\"\n[run]\nsteps = 40000\n[ddpg]\nhidden = [24, 16]\n\
+    let text = "[environment]\nname = \"pendulum\"\n[run]\nsteps = 300000\n[ddpg]\nhidden = [24, 16]\n\
                 [replay]\nwarmup = 64\ncapacity = 5000\n[evaluation]\nepisodes = 2\nfinal_episodes = 3\n";
     std::fs::write(&quick, text).unwrap();
     let script = template(&place, "slurm", ("what=pendulum", &format!("what={}", quick.display())));
