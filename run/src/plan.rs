@@ -1,6 +1,7 @@
 //! The configuration of a new run: presets, files and overrides become one resolved configuration. No later code reads
 //! command-line options.
 
+mod revision;
 mod source;
 mod suggestion;
 
@@ -16,6 +17,7 @@ use shoal_common::section;
 use shoal_env_server::environment::{self, EnvironmentError};
 use toml::{Table, Value};
 
+pub use self::revision::{Asked, Revision, edited, store_actors};
 pub use self::source::{Source, Sources, UsageError};
 use self::suggestion::{nearest, with_suggestion};
 
@@ -68,9 +70,6 @@ const PRESETS: [(&str, &str); 15] = [
 
 /// The upper bound of `actors.max`.
 const MOST_ACTORS: i64 = 256;
-
-/// The keys that the program sets itself.
-pub const FILLED_IN: [&str; 2] = ["run.id", "run.identity_format"];
 
 /// The presets' names.
 pub fn preset_names() -> impl Iterator<Item = &'static str> {
@@ -163,7 +162,9 @@ fn fill(run: &RunDir, config: &Config) -> anyhow::Result<Config> {
         location.write(run)?;
     }
     run.write_config(config)?;
-    Ok(run.config()?)
+    let config = run.config()?;
+    run.write_used_config(&config)?;
+    Ok(config)
 }
 
 /// The configuration of a preset or a file with these overrides, and the default name of its run. Creates nothing.
@@ -308,13 +309,18 @@ fn resolve(
         config.evaluation.every = config.run.steps;
         sources.set("evaluation.every".into(), Source::Follows("run.steps".into()));
     }
+    set_what_follows(&mut config, &mut sources);
+    Ok((config, sources))
+}
+
+/// Sets what follows from the run's length if it is left open.
+fn set_what_follows(config: &mut Config, sources: &mut Sources) {
     if let Algorithm::Dqn(dqn) = &mut config.algorithm
         && dqn.epsilon_steps == 0
     {
         dqn.epsilon_steps = (config.run.steps / 10).max(1);
         sources.set("dqn.epsilon_steps".into(), Source::Follows("run.steps".into()));
     }
-    Ok((config, sources))
 }
 
 /// Sets the keys that have options of their own.
@@ -360,7 +366,7 @@ fn set_key(table: &mut Table, sources: &mut Sources, assignment: &str) -> anyhow
         .filter(|(key, _)| key.contains('.'))
         .ok_or_else(|| wrong("must look like SECTION.KEY=VALUE".into()))?;
     let path: Vec<&str> = key.split('.').collect();
-    if path[0] == "spec" || FILLED_IN.contains(&key) {
+    if path[0] == "spec" || explanation::set_by_program().iter().any(|own| own == key) {
         return Err(wrong(format!("{key} cannot be set: the program sets it")).into());
     }
     put(table, &path, value_of(value)).map_err(|error| wrong(error.to_string()))?;

@@ -11,6 +11,8 @@ use shoal_common::channel::{Domain, free_shared_memory};
 use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
 
+use crate::numbers::mebibytes;
+
 /// Checks that the machine has the resources for this run. The run directory need not exist; nothing is created.
 /// Removes what this user's killed runs left in shared memory, and raises this process's limit on open files to its
 /// maximum.
@@ -109,9 +111,4 @@ fn existing(path: &Path) -> PathBuf {
         .filter(|path| !path.as_os_str().is_empty())
         .unwrap_or(Path::new("."))
         .into()
-}
-
-/// In MiB, with one decimal.
-fn mebibytes(bytes: u64) -> String {
-    format!("{:.1} MiB", bytes as f64 / f64::from(1 << 20))
 }

@@ -7,8 +7,8 @@ use shoal_run::evaluation::WhichPolicy;
 use shoal_run::final_evaluation::{FinalEvaluation, FinallyEvaluated};
 use shoal_run::outcome::{RunOutcome, RunState};
 use shoal_run::recorder::{
-    EpisodeRecord, EvaluationRecord, IncidentRow, LearnerRecord, read_episodes, read_evaluations, read_incidents,
-    read_learner,
+    ChangeRecord, EpisodeRecord, EvaluationRecord, IncidentRow, LearnerRecord, read_changes, read_episodes,
+    read_evaluations, read_incidents, read_learner,
 };
 
 use super::Limits;
@@ -45,6 +45,8 @@ pub(super) struct Run {
     exploration: Curve,
     learner: Rates,
     incidents: Option<Incidents>,
+    /// The changes of its configuration after its start.
+    changes: Vec<ChangeRecord>,
     pub(super) played: Played,
     /// Every record, for medians.
     #[serde(skip)]
@@ -151,6 +153,7 @@ impl Run {
             exploration: Curve::of_episodes(&explored, limits.points),
             learner: Rates::of(learner, limits.points),
             incidents: read_incidents(&run.incidents())?.map(Incidents::of),
+            changes: read_changes(&run.changes())?,
             played: Played::of(run, &config, limits.episodes),
             evaluation_records,
         })
