@@ -11,6 +11,7 @@ pub(crate) mod plot;
 pub(crate) mod report;
 pub(crate) mod reproduce;
 pub(crate) mod resume;
+pub(crate) mod rm;
 pub(crate) mod scale;
 pub(crate) mod status;
 pub(crate) mod stop;
