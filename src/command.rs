@@ -15,6 +15,7 @@ pub(crate) mod rm;
 pub(crate) mod scale;
 pub(crate) mod status;
 pub(crate) mod stop;
+mod suite;
 pub(crate) mod top;
 pub(crate) mod train;
 mod training;

@@ -213,7 +213,10 @@ fn an_edited_file_is_compared_key_by_key() {
             "ddpg.tau = 7: must be above 0",
         ),
         (&original.replace("tau = 0.001", "tau = \"x\""), "ddpg.tau = \"x\""),
-        (&original.replace("[ddpg]", "[sac]"), "activation"),
+        (
+            &original.replace("[ddpg]", "[sac]"),
+            "[exploration] is the noise of ddpg",
+        ),
         (&original.replace("seed = 1", "seed = 2"), "run.seed = 2: cannot change"),
         (
             &original.replace("time_limit = 200", "time_limit = 100"),

@@ -346,6 +346,11 @@ impl RunDir {
         self.path.join("incarnations")
     }
 
+    /// `origin.json`: the run whose networks this one began with.
+    pub fn origin(&self) -> PathBuf {
+        self.path.join("origin.json")
+    }
+
     /// `outcome.json`: how the run ended.
     pub fn outcome(&self) -> PathBuf {
         self.path.join("outcome.json")

@@ -36,6 +36,16 @@ pub fn reserve(config: &Config, run: &RunDir, domain: &Domain) -> anyhow::Result
     check(config, run)
 }
 
+/// How many runs of this configuration the free shared memory allows side by side.
+///
+/// # Errors
+/// When the amount cannot be found out.
+pub fn side_by_side(config: &Config) -> anyhow::Result<usize> {
+    let need = needs::shared_memory(config).max(1);
+    let free = free_shared_memory(&config.run.id).context("cannot find out how much of /dev/shm is free")?;
+    Ok(free.map_or(usize::MAX, |free| (free / need) as usize))
+}
+
 fn check_shared_memory(config: &Config) -> anyhow::Result<()> {
     let need = needs::shared_memory(config);
     let free = free_shared_memory(&config.run.id).context("cannot find out how much of /dev/shm is free")?;

@@ -10,19 +10,22 @@ use clap_complete::engine::ArgValueCompleter;
 use shoal_common::run_dir::RunDir;
 use shoal_run::earlier_best::{EvaluatedAnew, evaluate_anew, evaluate_best};
 use shoal_run::numbers::count;
-use shoal_run::plan::{Asked, Revision, warning};
+use shoal_run::origin::Origin;
+use shoal_run::plan::{Asked, Revision, UsageError, warning};
 use shoal_run::recorder::{ChangeRecord, Moment};
 use shoal_run::server_location::ServerLocation;
 use shoal_run::signals::{Signals, exit_code};
 use shoal_run::status;
+use shoal_run::suite::Suite;
 
+use super::suite;
 use super::training::OutputMode;
 use super::training::run_training;
 use crate::{completion, launcher};
 
 #[derive(Args, Clone, Debug)]
 pub(crate) struct ResumeArgs {
-    /// Run directory.
+    /// Run directory, or the directory of a suite.
     pub(crate) run: PathBuf,
     /// Environment steps of all actors together, including those already taken [default: as before].
     #[arg(long, value_name = "N", value_parser = count)]
@@ -33,6 +36,9 @@ pub(crate) struct ResumeArgs {
     /// Change a key that may change in a run, as in --set ddpg.tau=0.005. May be repeated.
     #[arg(long, value_name = "SECTION.KEY=VALUE", add = ArgValueCompleter::new(completion::settings))]
     pub(crate) set: Vec<String>,
+    /// Runs of a suite at a time [default: what cores and /dev/shm allow].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
+    pub(crate) jobs: Option<u16>,
     #[command(flatten)]
     pub(crate) output: OutputMode,
 }
@@ -40,6 +46,12 @@ pub(crate) struct ResumeArgs {
 /// Continues with the run's replay, counters and noise, until its old or new number of steps or episodes, and with what
 /// was changed in its configuration.
 pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
+    if let Some(suite) = Suite::read(&args.run)? {
+        return resume_suite(&suite, args);
+    }
+    if args.jobs.is_some() {
+        return Err(UsageError("--jobs: is for suites, and this is one run".into()).into());
+    }
     let run = RunDir::open(&args.run)?;
     // Only the holder of the lock may change the configuration.
     let lock = run.lock()?;
@@ -48,8 +60,11 @@ pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
     if run.replay_removed().exists() && !run.replay_file().exists() {
         bail!(
             "cannot resume {here}: `shoal rm --replay` has removed its replay, from which it would learn; eval, report \
-             and export still work"
+             and export still work, and `shoal train … --from {here}` begins a new run with its networks"
         );
+    }
+    if used.run.from.is_some() && Origin::read(&run)?.is_none() {
+        bail!("the start of {here} was interrupted before it had its networks: remove it and train again");
     }
     let saved = status::saved_status(&used, &run).with_context(|| format!("cannot resume {here}"))?;
     let asked = Asked {
@@ -97,6 +112,18 @@ pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
         writeln!(std::io::stderr(), "warning: {warning}")?;
     }
     run_training(revision.config, &run, &lock, &args.output)
+}
+
+fn resume_suite(suite: &Suite, args: &ResumeArgs) -> anyhow::Result<ExitCode> {
+    if args.steps.is_some() || args.episodes.is_some() || !args.set.is_empty() {
+        let why = "a suite goes on as it was made: change its runs one by one, or train another one";
+        return Err(UsageError(why.into()).into());
+    }
+    let manner = suite::Manner {
+        jobs: args.jobs,
+        output: &args.output,
+    };
+    suite::resume(suite, &args.run, manner)
 }
 
 /// Evaluates the best policy again if an earlier version did that from other starts, or if later policies are evaluated

@@ -63,6 +63,7 @@ mod tests {
         assert_eq!(
             set_by_program(),
             [
+                "run.from",
                 "run.id",
                 "run.identity_format",
                 "replay.ratio_since",

@@ -53,6 +53,7 @@ function overview() {
     ["final evaluation", (run) => finalEvaluation(run.final_evaluation)],
     ["processes", incidents],
   ];
+  if (runs.some((run) => run.origin)) facts.splice(3, 0, ["beginning", (run) => run.origin ?? "networks of its own"]);
   section(
     "At a glance",
     table("The runs at a glance", facts.map(([name, of]) => [name, runs.map(of)])),
@@ -149,6 +150,20 @@ function time() {
   section("Over time", ...parts, aside("The diagrams of this section are zoomed together. Vertical lines mark incidents and changes of the configuration. A horizontal dashed line is the configured ratio."));
 }
 
+/** Which settings are best, where settings were repeated with several seeds. */
+function ranking() {
+  if (!report.rankings.length) return;
+  const percent = (share) => (share === null ? "–" : `${Math.round(100 * share)} %`);
+  const columns = ["setting", "runs", "interquartile mean", "95 % interval", "best in"];
+  const parts = report.rankings.map(({ environment, places }) => {
+    const row = (place) => [place.label, `${whole(place.runs)}${place.unfinished ? ` (${whole(place.unfinished)} not finished)` : ""}`, text(place.mean), place.interval ? `${text(place.interval[0])} … ${text(place.interval[1])}` : "–", percent(place.best)];
+    const head = html("tr", {}, columns.map((name) => html("th", { scope: "col" }, name)));
+    const body = places.map((place) => html("tr", {}, row(place).map((value) => html("td", {}, value))));
+    return html("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": `Settings of ${environment}, the best first` }, html("table", {}, html("caption", {}, environment), html("thead", {}, head), html("tbody", {}, body)));
+  });
+  section("Ranking", ...parts, aside("The results are the mean returns of the final evaluations, or of the last evaluation of a run that has not finished. The interquartile mean leaves out the best and the worst quarter of the seeds, if there are at least four. Intervals and shares are of 5,000 resamples of the seeds (bootstrap)."));
+}
+
 /** The changes of the configuration, if there were any. */
 function changes() {
   const rows = runs.flatMap((run) => run.changes.map((change) => ({ ...change, run: run.name })));
@@ -184,4 +199,4 @@ function settings() {
 document.getElementById("made").textContent =
   `Made ${new Date(report.made * 1000).toISOString().slice(0, 16).replace("T", " ")} UTC by shoal ${report.version}` +
   (runs.some((run) => run.state === "training") ? "; training was still running." : ".");
-for (const part of [overview, learning, episodes, time, changes, settings]) part();
+for (const part of [overview, ranking, learning, episodes, time, changes, settings]) part();

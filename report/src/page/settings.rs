@@ -8,13 +8,16 @@ pub(super) type Setting = (String, String);
 /// Settings in which repetitions may differ.
 const NOT_COMPARED: [&str; 3] = ["run.seed", "run.steps", "run.episodes"];
 
-/// All settings in the order of `config.toml`, except those that the program fills in.
+/// Set by the program, and still a setting that distinguishes runs.
+const ORIGIN: &str = "run.from";
+
+/// All settings in the order of `config.toml`, except most of those that the program fills in.
 pub(super) fn of(config: &Config) -> anyhow::Result<Vec<Setting>> {
     let table: toml::Table = config.to_toml()?.parse()?;
     let mut settings = Vec::new();
     flatten("", &table, &mut settings);
     let of_program = explanation::set_by_program();
-    settings.retain(|(key, _)| !of_program.contains(key));
+    settings.retain(|(key, _)| !of_program.contains(key) || key == ORIGIN);
     Ok(settings)
 }
 

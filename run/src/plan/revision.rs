@@ -199,7 +199,7 @@ pub fn edited(run: &RunDir, used: &Config) -> Option<String> {
 }
 
 /// As it is in `config.toml`: without what only `config/used.toml` has.
-fn as_written(config: &Config) -> Config {
+pub(super) fn as_written(config: &Config) -> Config {
     let mut config = config.clone();
     (config.replay.ratio_since, config.replay.updates_before) = (0, 0);
     config
