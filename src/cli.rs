@@ -9,6 +9,7 @@ use crate::command::bench::BenchArgs;
 use crate::command::completions::CompletionsArgs;
 use crate::command::eval::EvalArgs;
 use crate::command::export::ExportArgs;
+use crate::command::join::JoinArgs;
 use crate::command::list::ListArgs;
 use crate::command::man::ManArgs;
 use crate::command::plot::PlotArgs;
@@ -36,6 +37,8 @@ pub(crate) enum Command {
     Train(TrainArgs),
     /// Continue a run that was stopped or killed.
     Resume(ResumeArgs),
+    /// Work for a run of another host: start actors and environment servers here.
+    Join(JoinArgs),
     /// Show the status of a run: its progress, every process with its rate and restarts, and who waits for whom.
     Status(StatusArgs),
     /// Change the number of actors during training.
@@ -72,6 +75,10 @@ pub(crate) enum Command {
     Evaluator(RoleArgs),
     #[command(hide = true)]
     Learner(RoleArgs),
+    #[command(hide = true)]
+    Gate(RoleArgs),
+    #[command(hide = true)]
+    Relay(RoleArgs),
     #[command(hide = true)]
     CleanUp(CleanUpArgs),
     #[command(hide = true)]

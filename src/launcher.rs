@@ -2,7 +2,13 @@
 
 mod child;
 mod cleaner;
+mod hosts;
 mod incarnations;
+#[cfg_attr(
+    not(feature = "remote"),
+    expect(dead_code, reason = "only `join` uses it, which is not built")
+)]
+pub(crate) mod joined;
 mod log;
 mod process;
 mod progress;
@@ -33,7 +39,7 @@ use self::log::Log;
 pub(crate) use self::log::{ALL_ENDED, FAILED, note};
 use self::progress::Progress;
 use self::stall::Stalls;
-use self::supervisor::Supervisor;
+use self::supervisor::{Members, Supervisor};
 
 /// How often the launcher reads reports and checks its children if nothing wakes it. Ticks start short and become
 /// longer while reports arrive slowly: a full buffer loses its oldest reports.
@@ -52,6 +58,9 @@ const LEARNER_RESTART: Duration = Duration::from_secs(5);
 /// How long actors may take to hand over their last chunks, and the other roles to end. The learner saves its state.
 const ACTORS_END: Duration = Duration::from_secs(3);
 const OTHERS_END: Duration = Duration::from_secs(15);
+
+/// How long the gate may take to let the other hosts hand over their last chunks.
+const GATE_END: Duration = Duration::from_secs(8);
 
 /// How long the roles of a killed launcher may take to end. One that is stuck ends after [`GRACE`].
 const PREDECESSORS_END: Duration = GRACE.saturating_add(Duration::from_secs(5));
@@ -84,16 +93,25 @@ pub(crate) struct TrainingOutcome {
     pub(crate) after: RunStatus,
 }
 
+/// How a launcher shows what it does, and whether other hosts may join its run.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Manner {
+    /// No live line.
+    pub(crate) quiet: bool,
+    /// There is a gate, at the endpoint in `join.toml`.
+    pub(crate) gate: bool,
+}
+
 /// Runs all roles until the learner is done, a signal arrives, or `shoal stop` asks for the end.
 pub(crate) fn run(
     mut config: Config,
     (run, lock): (&RunDir, &RunLock),
     signals: &Signals,
-    quiet: bool,
+    manner: Manner,
 ) -> anyhow::Result<TrainingOutcome> {
     let (mut renewals, mut before, mut wall) = (Vec::new(), None, Duration::ZERO);
     loop {
-        let outcome = run_once(config, (run, lock), signals, quiet)?;
+        let outcome = run_once(config, (run, lock), signals, manner)?;
         wall += outcome.wall;
         let before = before.get_or_insert(outcome.before.clone());
         if outcome.ending != Ending::Renewed {
@@ -118,7 +136,7 @@ fn run_once(
     config: Config,
     (run, lock): (&RunDir, &RunLock),
     signals: &Signals,
-    quiet: bool,
+    manner: Manner,
 ) -> anyhow::Result<TrainingOutcome> {
     let saved = status::saved_status(&config, run)?;
     let starts = RunOutcome::new(RunState::Running, saved.env_steps, saved.episodes).with_reason(STARTING);
@@ -127,7 +145,7 @@ fn run_once(
     Domain::remove_abandoned()?;
     let domain = Domain::join(&config.run.id, config.actors.max)?;
     let outcome = preflight::reserve(&config, run, &domain)
-        .and_then(|()| Launcher::new(config, (run, lock), &domain, signals, quiet))
+        .and_then(|()| Launcher::new(config, (run, lock), &domain, signals, manner))
         .and_then(Launcher::run);
     // Also after an error: no role is left by now.
     let left = domain.leave();
@@ -142,7 +160,7 @@ fn explain(error: DomainError, run: &RunDir) -> anyhow::Error {
         return error.into();
     };
     // Only roles name their directory in a fixed place: their arguments are role, run directory and two numbers.
-    let roles = [Role::EnvServer, Role::Actor, Role::Evaluator, Role::Learner].map(Role::name);
+    let roles = [Role::EnvServer, Role::Actor, Role::Evaluator, Role::Learner, Role::Gate].map(Role::name);
     let directory = |pid: &i32| {
         let arguments = std::fs::read(format!("/proc/{pid}/cmdline")).ok()?;
         let arguments = String::from_utf8_lossy(&arguments);
@@ -193,7 +211,7 @@ impl<'a> Launcher<'a> {
         (run, lock): (&'a RunDir, &'a RunLock),
         domain: &'a Domain,
         signals: &'a Signals,
-        quiet: bool,
+        Manner { quiet, gate }: Manner,
     ) -> anyhow::Result<Self> {
         let log = Log::open(&run.log())?;
         write_iox_config(domain, run)?;
@@ -205,7 +223,7 @@ impl<'a> Launcher<'a> {
         let initial = status::saved_status(&config, run)?;
         RunOutcome::new(RunState::Running, initial.env_steps, initial.episodes).write(run)?;
         // Creates the services that are opened below.
-        let supervisor = Supervisor::new(&config, run, domain, log.clone())?;
+        let supervisor = Supervisor::new(&config, run, domain, log.clone(), Members::Learner { gate })?;
         Ok(Self {
             control: ControlPort::open(domain)?,
             initial,
@@ -368,6 +386,7 @@ impl<'a> Launcher<'a> {
             ending,
             stop_requested,
             log,
+            domain,
             ..
         } = self;
         control.answer_questions(run.key()?, run.path(), |question| -> anyhow::Result<Option<Answer>> {
@@ -380,6 +399,12 @@ impl<'a> Launcher<'a> {
                 )),
                 Question::Scale { .. } if *ending => Ok(Some(Answer::Refused("the run is ending".into()))),
                 Question::Scale { actors } => requests::scale(config, run, supervisor, actors, now).map(Some),
+                Question::Admit(_) if *ending || stop_requested.is_some() => {
+                    Ok(Some(Answer::Refused("the run is ending".into())))
+                }
+                Question::Admit(request) => supervisor.admit(domain, request).map(Some),
+                Question::Hosts(statuses) => Ok(Some(supervisor.update_hosts(statuses))),
+                Question::Replace { .. } => Ok(Some(Answer::Refused("this is the learner's host".into()))),
                 Question::Stop => {
                     if stop_requested.is_none() {
                         log.note("launcher", "`shoal stop` ends the run");
@@ -411,14 +436,22 @@ impl<'a> Launcher<'a> {
     fn end_all(&mut self) -> anyhow::Result<()> {
         self.ending = true;
         self.end(|role| role == Role::Actor, ACTORS_END);
+        // The gate tells the other hosts, which hand over what they have while the learner is still there.
+        self.supervisor.ask_to_retire(Role::Gate);
+        self.await_end(|role| role == Role::Gate, GATE_END);
         self.end(|_| true, OTHERS_END);
         self.read_reports()?;
         self.supervisor.check_saved()
     }
 
     fn end(&mut self, which: impl Fn(Role) -> bool + Copy, patience: Duration) {
-        let deadline = Instant::now() + patience;
         self.supervisor.ask_to_end(which);
+        self.await_end(which, patience);
+    }
+
+    /// Waits until processes have ended that were asked to, and kills them after a while.
+    fn await_end(&mut self, which: impl Fn(Role) -> bool + Copy, patience: Duration) {
+        let deadline = Instant::now() + patience;
         while !self.supervisor.have_ended(which) {
             if Instant::now() >= deadline {
                 self.supervisor.kill(which);

@@ -65,6 +65,7 @@ fn run(command: &Command) -> anyhow::Result<ExitCode> {
     match command {
         Command::Train(args) => command::train::run(args),
         Command::Resume(args) => command::resume::run(args),
+        Command::Join(args) => command::join::run(args),
         Command::Status(args) => command::status::run(args),
         Command::Scale(args) => command::scale::run(args).map(done),
         Command::Stop(args) => command::stop::run(args).map(done),
@@ -83,6 +84,8 @@ fn run(command: &Command) -> anyhow::Result<ExitCode> {
         Command::Actor(args) => role::run(Role::Actor, args),
         Command::Evaluator(args) => role::run(Role::Evaluator, args),
         Command::Learner(args) => role::run(Role::Learner, args),
+        Command::Gate(args) => role::run(Role::Gate, args),
+        Command::Relay(args) => role::run(Role::Relay, args),
         Command::Tied(args) => shoal_run::external_environment::exec_tied(args.parent, &args.program),
         Command::CleanUp(args) => launcher::clean_up(&args.run_id),
     }

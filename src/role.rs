@@ -2,6 +2,8 @@
 
 use std::ffi::CString;
 use std::io::Write;
+#[cfg(feature = "remote")]
+use std::path::Path;
 use std::process::ExitCode;
 
 use anyhow::Context;
@@ -14,9 +16,18 @@ use shoal_common::run_dir::RunDir;
 use shoal_common::stop::Stop;
 use shoal_env_server::vector::VectorEnvironment;
 use shoal_learner::process;
+#[cfg(feature = "remote")]
+use shoal_remote::{
+    endpoint::Endpoint,
+    files::{HostFile, JoinFile, KeyFile},
+};
 use shoal_run::external_environment::{self, LaunchSpec, server_iceoryx2_config};
 use shoal_run::server_location::Surroundings;
 use shoal_run::status::evaluated_period;
+use tracing_subscriber::Layer;
+use tracing_subscriber::filter::{LevelFilter, Targets};
+use tracing_subscriber::layer::SubscriberExt;
+use tracing_subscriber::util::SubscriberInitExt;
 
 use crate::cli::RoleArgs;
 use crate::log_level::log_level;
@@ -24,13 +35,23 @@ use crate::log_level::log_level;
 /// Runs a role until it is done or its standard input closes.
 pub(crate) fn run(role: Role, args: &RoleArgs) -> anyhow::Result<ExitCode> {
     // The log goes to the launcher through standard error. If the launcher is gone, losing it is not an error.
-    tracing_subscriber::fmt()
+    let to_launcher = tracing_subscriber::fmt::layer()
         .with_writer(std::io::stderr)
-        .with_max_level(log_level())
         .with_ansi(false)
         .with_target(false)
-        .log_internal_errors(false)
-        .init();
+        .log_internal_errors(false);
+    // What the network engine notes about itself helps nobody who reads a run's log.
+    let level = log_level();
+    let of_network = if level == LevelFilter::TRACE {
+        level
+    } else {
+        LevelFilter::ERROR
+    };
+    let targets = Targets::new().with_default(level).with_target("zenoh", of_network);
+    let registry = tracing_subscriber::registry().with(to_launcher.with_filter(targets));
+    #[cfg(feature = "remote")]
+    let registry = registry.with(shoal_remote::refused::layer());
+    registry.init();
 
     // For `ps` and `top`, which would otherwise show `exe`. The kernel keeps 15 bytes.
     if let Ok(name) = CString::new(format!("shoal-{}-{}", role.name(), args.index)) {
@@ -80,7 +101,39 @@ fn work(domain: &Domain, config: &Config, run: &RunDir, identity: Identity, stop
             };
             Ok(process::learn(domain, &settings, stop)?)
         }
+        #[cfg(feature = "remote")]
+        Role::Gate => {
+            let endpoint = JoinFile::read(run.path())?.listen;
+            let settings = shoal_remote::gate::GateSettings {
+                identity,
+                config: config.clone(),
+                run: run.clone(),
+                key: key(&endpoint, &run.path().join(KeyFile::GATE))?,
+                endpoint,
+            };
+            Ok(shoal_remote::gate::serve(domain, &settings, stop)?)
+        }
+        #[cfg(feature = "remote")]
+        Role::Relay => {
+            let host = HostFile::read(run)?;
+            let settings = shoal_remote::relay::RelaySettings {
+                identity,
+                config: config.clone(),
+                run: run.clone(),
+                key: key(&host.endpoint, &run.path().join(KeyFile::JOIN))?,
+                host,
+            };
+            Ok(shoal_remote::relay::relay(domain, &settings, stop)?)
+        }
+        #[cfg(not(feature = "remote"))]
+        Role::Gate | Role::Relay => anyhow::bail!(crate::command::join::NOT_BUILT),
     }
+}
+
+/// The key for an endpoint; `None` if that needs none.
+#[cfg(feature = "remote")]
+fn key(endpoint: &Endpoint, path: &Path) -> anyhow::Result<Option<KeyFile>> {
+    Ok(endpoint.is_encrypted().then(|| KeyFile::read(path)).transpose()?)
 }
 
 /// The arguments of an environment server.

@@ -5,7 +5,6 @@
 
 mod support;
 
-use std::collections::HashSet;
 use std::path::Path;
 use std::time::{Duration, Instant, SystemTime};
 
@@ -14,8 +13,7 @@ use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 use shoal_common::config::Config;
 use shoal_common::stream::Stream;
-use shoal_learner::replay::{Replay, ReplayLayout};
-use support::{Running, Workplace, committed, parse, sent};
+use support::{Running, Workplace, check_stored_rows, committed, parse, sent};
 
 const MAX_ACTORS: u32 = 4;
 
@@ -163,32 +161,6 @@ fn check_sent_rows(run: &Path, config: &Config, kills: &[Kill]) -> (u64, u64) {
     (rows, lost)
 }
 
-/// Checks that every row of the replay is whole and unique. None may be terminal: the pendulum never terminates.
-fn check_stored_rows(run: &Path, config: &Config, rows: u64) {
-    let layout = ReplayLayout {
-        row: config.row_layout(),
-        ring: config.replay.capacity,
-        actors: config.actors.max as usize,
-        actor_snapshot_words: 0,
-        fingerprint: config.fingerprint(),
-    };
-    let replay = Replay::open(&run.join("replay.bin"), &layout).unwrap();
-    assert_eq!(replay.warnings(), [] as [String; 0]);
-    assert_eq!(replay.head(), rows, "rows of all actors");
-    let mut seen = HashSet::new();
-    for index in replay.rows() {
-        let row = replay.row(index);
-        let transition = layout.row.read(row);
-        assert_eq!(transition.discount, config.algorithm.gamma() as f32);
-        // A pendulum that spins at full speed under full torque may return to exactly the same state.
-        if transition.a[0].abs() < 2.0 {
-            let bits: Vec<u32> = row.iter().map(|x| x.to_bits()).collect();
-            assert!(seen.insert(bits), "row {index} is there twice");
-        }
-    }
-    assert!(seen.len() > 1000);
-}
-
 /// Checks that the learner is never ahead of the ratio, and takes nothing in while the actors are ahead by more than
 /// the tolerance. Returns the longest time between two reports, in seconds.
 fn ratio_is_kept(run: &Path, config: &Config) -> f64 {
@@ -245,7 +217,7 @@ fn chaos(seed: u64, length: Duration, arguments: &[&str], steps: u64) -> (Figure
     assert!(leftovers.files().is_empty(), "{:?}", leftovers.files());
     let config = Config::load(&run.join("config.toml")).unwrap();
     let (rows, rows_lost) = check_sent_rows(&run, &config, &kills);
-    check_stored_rows(&run, &config, rows);
+    assert_eq!(check_stored_rows(&run, &config), rows, "rows of all actors");
     let silence = ratio_is_kept(&run, &config);
 
     let steps = steps.max(rows + 1000).to_string();

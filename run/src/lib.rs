@@ -8,6 +8,7 @@ pub mod earlier_best;
 pub mod evaluation;
 pub mod external_environment;
 pub mod final_evaluation;
+pub mod joining;
 pub mod method;
 pub mod numbers;
 pub mod origin;

@@ -46,6 +46,17 @@ pub fn side_by_side(config: &Config) -> anyhow::Result<usize> {
     Ok(free.map_or(usize::MAX, |free| (free / need) as usize))
 }
 
+/// Like [`reserve`], for a host that joins a run: it has no replay.
+///
+/// # Errors
+/// When shared memory or open files are short.
+pub fn reserve_for_host(config: &Config, domain: &Domain) -> anyhow::Result<()> {
+    domain.promise(needs::shared_memory(config))?;
+    Domain::remove_abandoned()?;
+    check_open_files(config)?;
+    check_shared_memory(config)
+}
+
 fn check_shared_memory(config: &Config) -> anyhow::Result<()> {
     let need = needs::shared_memory(config);
     let free = free_shared_memory(&config.run.id).context("cannot find out how much of /dev/shm is free")?;

@@ -51,6 +51,7 @@ impl Remote {
     fn ask_in(&self, domain: &Domain, question: Question, patience: Duration) -> anyhow::Result<Option<Answer>> {
         let _sweeper = Sweeper::start(domain)?;
         let lives = || self.run.is_running().unwrap_or(true);
+        let is_about_status = question == Question::Status;
         match control::ask(domain, self.run.key()?, question, patience, lives) {
             Ok(Answer::AnotherRun(there)) => {
                 let here = self.run.path().display();
@@ -61,7 +62,7 @@ impl Remote {
             Err(ControlError::Missing) if domain.has_members() && self.reason_for_no_roles()?.is_none() => {
                 bail!("{}", self.files_removed(domain)?)
             }
-            Err(error @ (ControlError::Missing | ControlError::Silence)) if question == Question::Status => {
+            Err(error @ (ControlError::Missing | ControlError::Silence)) if is_about_status => {
                 match self.without_roles(&error)? {
                     Some(status) => Ok(Some(Answer::Status(status))),
                     None => Err(error.into()),
@@ -179,8 +180,6 @@ fn accepted(answer: Answer) -> anyhow::Result<()> {
     match answer {
         Answer::Accepted => Ok(()),
         Answer::Refused(reason) => bail!("{reason}"),
-        other @ (Answer::Status(_) | Answer::AnotherRun(_)) => {
-            bail!("the launcher gave an unexpected answer: {other:?}")
-        }
+        other => bail!("the launcher gave an unexpected answer: {other:?}"),
     }
 }

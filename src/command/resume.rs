@@ -18,6 +18,7 @@ use shoal_run::signals::{Signals, exit_code};
 use shoal_run::status;
 use shoal_run::suite::Suite;
 
+use super::listen::ListenArgs;
 use super::suite;
 use super::training::OutputMode;
 use super::training::run_training;
@@ -41,6 +42,8 @@ pub(crate) struct ResumeArgs {
     pub(crate) jobs: Option<u16>,
     #[command(flatten)]
     pub(crate) output: OutputMode,
+    #[command(flatten)]
+    pub(crate) listen: ListenArgs,
 }
 
 /// Continues with the run's replay, counters and noise, until its old or new number of steps or episodes, and with what
@@ -111,7 +114,7 @@ pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
     if let Some(warning) = warning(config) {
         writeln!(std::io::stderr(), "warning: {warning}")?;
     }
-    run_training(revision.config, &run, &lock, &args.output)
+    run_training(revision.config, &run, &lock, &args.output, &args.listen)
 }
 
 fn resume_suite(suite: &Suite, args: &ResumeArgs) -> anyhow::Result<ExitCode> {

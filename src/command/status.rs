@@ -10,7 +10,7 @@ use comfy_table::presets::NOTHING;
 use comfy_table::{CellAlignment, Table};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
-use shoal_common::channel::control::{RoleState, RunStatus};
+use shoal_common::channel::control::{HostState, HostStatus, RoleState, RunStatus};
 use shoal_run::numbers::thousands;
 use shoal_run::remote::Remote;
 use shoal_run::status::saved_status;
@@ -151,13 +151,17 @@ fn table(status: &RunStatus) -> String {
             column.set_cell_alignment(CellAlignment::Right);
         }
     }
+    let hosts = match &status.hosts[..] {
+        [] => String::new(),
+        hosts => format!("\n\n{}", table_of_hosts(hosts)),
+    };
     let evaluated = status
         .eval_return_mean
         .map_or_else(String::new, |mean| format!(", eval {mean:.2}"));
     let starts = status.roles.iter().any(|role| role.state == RoleState::Starting);
     let waiting = if starts { "starting" } else { waiting(status) };
     format!(
-        "{}, {} rows{evaluated}\n{:.0} updates/s, {:.0} steps/s, ratio {:.2} of {:.2}; {waiting}\n\n{table}",
+        "{}, {} rows{evaluated}\n{:.0} updates/s, {:.0} steps/s, ratio {:.2} of {:.2}; {waiting}\n\n{table}{hosts}",
         progress(status),
         thousands(status.replay_rows),
         status.updates_per_second,
@@ -165,6 +169,35 @@ fn table(status: &RunStatus) -> String {
         status.ratio,
         status.updates_per_step,
     )
+}
+
+fn table_of_hosts(hosts: &[HostStatus]) -> Table {
+    let mut table = Table::new();
+    table.load_style(NOTHING);
+    table.set_header(["host", "state", "actors", "rate", "resent", "round trip", "lag"]);
+    for host in hosts {
+        let state = match host.state {
+            HostState::Connected => "connected".into(),
+            HostState::CutOff => format!("cut off for {:.0} s", host.silent_seconds),
+            HostState::Left => "has left".into(),
+        };
+        table.add_row([
+            host.name.clone(),
+            state,
+            host.actors.to_string(),
+            format!("{:.0}/s", host.rows_per_second),
+            thousands(host.resent_chunks),
+            host.round_trip_us
+                .map_or_else(String::new, |time| format!("{:.1} ms", time as f64 / 1e3)),
+            thousands(host.policy_lag),
+        ]);
+    }
+    for column in 2..7 {
+        if let Some(column) = table.column_mut(column) {
+            column.set_cell_alignment(CellAlignment::Right);
+        }
+    }
+    table
 }
 
 /// Who waits for whom, in words.

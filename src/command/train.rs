@@ -13,6 +13,7 @@ use shoal_run::plan::{Plan, RunOverrides, UsageError};
 use shoal_run::suite;
 
 use super::help_config;
+use super::listen::ListenArgs;
 use super::training::OutputMode;
 use super::training::run_training;
 use crate::{completion, launcher};
@@ -41,6 +42,8 @@ pub(crate) struct TrainArgs {
     pub(crate) jobs: Option<u16>,
     #[command(flatten)]
     pub(crate) output: OutputMode,
+    #[command(flatten)]
+    pub(crate) listen: ListenArgs,
 }
 
 /// The seeds of a suite.
@@ -127,6 +130,7 @@ pub(crate) fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
         help_config::explain(args.what.as_deref(), &args.overrides.overrides())?;
         return Ok(ExitCode::SUCCESS);
     }
+    args.listen.check()?;
     let what = args
         .what
         .as_deref()
@@ -154,7 +158,7 @@ pub(crate) fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
             writeln!(std::io::stderr(), "{line}")?;
         }
     }
-    run_training(config, &run, &lock, &args.output).inspect_err(|_| {
+    run_training(config, &run, &lock, &args.output, &args.listen).inspect_err(|_| {
         // Where no process was started there is nothing to resume or to read, and it would be in the way of the next try.
         // What is at this path by now may be somebody else's.
         if lock.check(&run).is_ok() && !run.incarnations().exists() {

@@ -22,7 +22,8 @@ use shoal_run::numbers::thousands;
 use shoal_run::outcome::{FINAL_EVALUATION, RunOutcome, RunState};
 use shoal_run::signals::{Interrupt, Signals, describe, exit_code};
 
-use crate::launcher::{self, Ending, TrainingOutcome};
+use super::listen::ListenArgs;
+use crate::launcher::{self, Ending, Manner, TrainingOutcome};
 
 /// The output options of a training.
 #[derive(Args, Clone, Debug, Default)]
@@ -60,16 +61,28 @@ pub(crate) fn run_training(
     run: &RunDir,
     lock: &RunLock,
     output: &OutputMode,
+    listen: &ListenArgs,
 ) -> anyhow::Result<ExitCode> {
-    let trained = train_and_report(config, run, lock, output);
+    let gate = listen.prepare(&config, run)?;
+    let manner = Manner {
+        quiet: output.quiet,
+        gate,
+    };
+    let trained = train_and_report(config, run, lock, output, manner);
     // Whatever else has failed follows from it.
     lock.check(run)?;
     trained
 }
 
-fn train_and_report(config: Config, run: &RunDir, lock: &RunLock, output: &OutputMode) -> anyhow::Result<ExitCode> {
+fn train_and_report(
+    config: Config,
+    run: &RunDir,
+    lock: &RunLock,
+    output: &OutputMode,
+    manner: Manner,
+) -> anyhow::Result<ExitCode> {
     let signals = Signals::register()?;
-    let outcome = launcher::run(config.clone(), (run, lock), &signals, output.quiet)?;
+    let outcome = launcher::run(config.clone(), (run, lock), &signals, manner)?;
     let mut evaluated = Vec::new();
     let RunStatus {
         env_steps, episodes, ..

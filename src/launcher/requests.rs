@@ -36,6 +36,7 @@ pub(super) fn status(
         status.eval_return_mean = Some(report.return_mean);
     }
     status.roles = supervisor.status(status.policy_version);
+    status.hosts = supervisor.hosts();
     status.waiting = waiting(supervisor).map(|who| {
         let (ratio, agreed) = (status.ratio, status.updates_per_step);
         format!("{who}: ratio {ratio:.2} of {agreed:.2}")
@@ -55,9 +56,17 @@ pub(super) fn scale(
         let reason = "the number of actors of a lockstep run cannot change: its results depend on it";
         return Ok(Answer::Refused(reason.into()));
     }
-    let max = config.actors.max;
-    if !(1..=max).contains(&actors) {
-        let reason = format!("this run can have 1 to {max} actors (actors.max, fixed when it was created)");
+    let (max, most) = (config.actors.max, supervisor.most_actors());
+    if !(1..=most).contains(&actors) {
+        let reason = if most == max {
+            format!("this run can have 1 to {max} actors (actors.max, fixed when it was created)")
+        } else {
+            format!(
+                "this host can have 1 to {most} actors: the run may have {max} (actors.max, fixed when it was created), \
+                 and other hosts have {}",
+                max - most
+            )
+        };
         return Ok(Answer::Refused(reason));
     }
     // Before the actors start, so that a learner that is started now reads the new number.

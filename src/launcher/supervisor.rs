@@ -8,10 +8,10 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use shoal_actor::explorer::GIVEN_UP;
-use shoal_common::channel::control::RoleStatus;
+use shoal_common::channel::control::{Answer, HostLease, HostRequest, HostStatus, RoleStatus};
 use shoal_common::channel::environment::Fault;
 use shoal_common::channel::{Domain, Services};
-use shoal_common::config::Config;
+use shoal_common::config::{Config, Mode};
 use shoal_common::durable::write_atomically;
 use shoal_common::report::{Activity, Heartbeat, Identity, Role};
 use shoal_common::run_dir::RunDir;
@@ -21,6 +21,7 @@ use tracing_subscriber::filter::LevelFilter;
 
 use super::child::{Child, Consequence};
 use super::cleaner;
+use super::hosts::{Hosts, INCARNATIONS};
 use super::incarnations::{last_committed, read_counter};
 use super::log::{ALL_ENDED, Log};
 use super::process::{Process, name};
@@ -52,7 +53,22 @@ pub(super) enum Situation {
     FilesRemoved,
 }
 
-/// All processes of a run.
+/// Which processes there are.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) enum Members {
+    /// Those of the learner's host, with a gate if other hosts may join.
+    Learner {
+        /// Whether there is a gate.
+        gate: bool,
+    },
+    /// Those of another host: a relay, and these actors with their environment servers.
+    Host {
+        /// The actors.
+        actors: Vec<u32>,
+    },
+}
+
+/// All processes of a run on one host.
 #[derive(Debug)]
 pub(super) struct Supervisor {
     children: Vec<Child>,
@@ -64,9 +80,12 @@ pub(super) struct Supervisor {
     occupied: Option<Instant>,
     /// Time spent on clean-ups since the last search for stalls.
     busy: Duration,
-    /// The wanted number of actors, and its maximum.
-    actors: u32,
+    /// The wanted actors of this host, in order; and the most that the run may have on all hosts.
+    actors: Vec<u32>,
     max_actors: u32,
+    /// The number of actors of a lockstep run, on all hosts together. It never changes.
+    lockstep_actors: Option<u32>,
+    hosts: Hosts,
     log: Log,
     /// Incidents since the last [`Supervisor::take_incidents`].
     incidents: Vec<Incident>,
@@ -88,7 +107,13 @@ pub(super) struct Supervisor {
 }
 
 impl Supervisor {
-    pub(super) fn new(config: &Config, run: &RunDir, domain: &Domain, log: Log) -> anyhow::Result<Self> {
+    pub(super) fn new(
+        config: &Config,
+        run: &RunDir,
+        domain: &Domain,
+        log: Log,
+        members: Members,
+    ) -> anyhow::Result<Self> {
         let counter = run.incarnations();
         let mut started = read_counter(&counter)?;
         let committed = last_committed(run)?;
@@ -102,13 +127,23 @@ impl Supervisor {
         }
         let mut services = Services::new(domain)?;
         services.create_common(domain)?;
-        services.create_environment(domain, config.evaluation_server())?;
         let server = config.evaluation_server();
-        let children = vec![
-            Child::new(Role::Learner, 0),
-            Child::new(Role::EnvServer, server),
-            Child::new(Role::Evaluator, 0).with_server(server),
-        ];
+        let lockstep = config.run.mode == Mode::Lockstep;
+        let mut lockstep_actors = None;
+        let (children, actors) = match members {
+            Members::Learner { gate } => {
+                services.create_environment(domain, server)?;
+                let mut children = vec![
+                    Child::new(Role::Learner, 0),
+                    Child::new(Role::EnvServer, server),
+                    Child::new(Role::Evaluator, 0).with_server(server),
+                ];
+                children.extend(gate.then(|| Child::new(Role::Gate, 0)));
+                lockstep_actors = lockstep.then_some(config.actors.count);
+                (children, (0..config.actors.count).collect())
+            }
+            Members::Host { actors } => (vec![Child::new(Role::Relay, 0)], actors),
+        };
         Ok(Self {
             children,
             services,
@@ -116,8 +151,10 @@ impl Supervisor {
             window: config.actors.window,
             occupied: None,
             busy: Duration::ZERO,
-            actors: config.actors.count,
+            actors,
+            hosts: Hosts::new(started),
             max_actors: config.actors.max,
+            lockstep_actors,
             log,
             incidents: Vec::new(),
             run: run.path().into(),
@@ -140,7 +177,7 @@ impl Supervisor {
 
     /// Starts all processes.
     pub(super) fn start_all(&mut self, domain: &Domain) -> anyhow::Result<()> {
-        self.create_services(domain)?;
+        self.create_wanted_services(domain)?;
         (0..self.children.len()).try_for_each(|i| self.start(i))?;
         self.start_missing(domain)
     }
@@ -152,21 +189,133 @@ impl Supervisor {
 
     /// Changes the wanted number of actors. [`maintain`](Self::maintain) starts or retires them.
     pub(super) fn scale(&mut self, actors: u32) {
+        let before = self.actors.len();
         self.log
-            .note("launcher", &format!("scaled from {} to {actors} actors", self.actors));
-        let detail = format!("{} to {actors} actors", self.actors);
+            .note("launcher", &format!("scaled from {before} to {actors} actors"));
+        let detail = format!("{before} to {actors} actors");
         self.incidents.push(Incident::of_launcher(IncidentKind::Scaled, detail));
-        self.actors = actors;
+        self.actors.truncate(actors as usize);
+        let missing = actors as usize - self.actors.len();
+        let more: Vec<u32> = self.free_actors().take(missing).collect();
+        self.actors.extend(more);
+        self.actors.sort_unstable();
     }
 
-    /// The wanted number of actors.
+    /// The wanted number of actors on this host.
     pub(super) fn actors(&self) -> u32 {
-        self.actors
+        self.actors.len() as u32
     }
 
-    /// Creates the services of all wanted actors.
-    fn create_services(&mut self, domain: &Domain) -> anyhow::Result<()> {
-        while self.actors_with_services < self.actors {
+    /// The most actors that this host may have now.
+    pub(super) fn most_actors(&self) -> u32 {
+        self.actors() + self.free_actors().count() as u32
+    }
+
+    /// Indices that neither this host nor another has.
+    fn free_actors(&self) -> impl Iterator<Item = u32> {
+        (0..self.max_actors).filter(|index| !self.actors.contains(index) && !self.hosts.has(*index))
+    }
+
+    /// Gives actors and incarnations to another host. One that an earlier launcher has given actors gets them again, if
+    /// they are still free.
+    ///
+    /// # Errors
+    /// When services cannot be created, or the counter cannot be written.
+    pub(super) fn admit(&mut self, domain: &Domain, request: HostRequest) -> anyhow::Result<Answer> {
+        let HostRequest {
+            host,
+            name,
+            actors: count,
+            held,
+        } = request;
+        if let Some(lease) = self.hosts.lease(host) {
+            return Ok(Answer::Admitted(lease.clone()));
+        }
+        let free: Vec<u32> = match self.lockstep_actors {
+            // The host takes over actors of this one, which end; theirs continue from the same snapshots.
+            Some(_) => self.actors.iter().rev().copied().collect(),
+            // The services of a retiring actor are in use.
+            None => {
+                let exists = |index: u32| self.children.iter().any(|child| child.is(Role::Actor, index));
+                self.free_actors().filter(|index| !exists(*index)).collect()
+            }
+        };
+        let mut actors = if !held.is_empty() && held.iter().all(|index| free.contains(index)) {
+            held
+        } else if free.len() >= count as usize {
+            free[..count as usize].to_vec()
+        } else {
+            if let Some(count) = self.lockstep_actors {
+                return Ok(Answer::Refused(format!(
+                    "this lockstep run has {count} actors, of which other hosts have {}",
+                    count as usize - free.len()
+                )));
+            }
+            return Ok(Answer::Refused(format!(
+                "the run may have {} actors on all hosts together (actors.max, fixed when it was created), of which {} \
+                 are free",
+                self.max_actors,
+                free.len()
+            )));
+        };
+        actors.sort_unstable();
+        let first_incarnation = self.started + 1;
+        self.started += INCARNATIONS;
+        self.write_counter()?;
+        let highest = actors.iter().max().map_or(0, |highest| highest + 1);
+        self.create_services(domain, highest)?;
+        self.log
+            .note("launcher", &format!("host {name} is admitted with actors {actors:?}"));
+        let lease = HostLease {
+            host,
+            name,
+            epoch: self.hosts.epoch(),
+            actors,
+            first_incarnation,
+            limit: self.started + 1,
+        };
+        self.hosts.admit(lease.clone());
+        self.share_lockstep_actors();
+        Ok(Answer::Admitted(lease))
+    }
+
+    /// Takes note of how the other hosts are. The answer tells which of them are admitted.
+    pub(super) fn update_hosts(&mut self, statuses: Vec<HostStatus>) -> Answer {
+        for message in self.hosts.update(statuses) {
+            self.log.note("launcher", &message);
+        }
+        self.share_lockstep_actors();
+        Answer::Leases {
+            epoch: self.hosts.epoch(),
+            leases: self.hosts.leases(),
+        }
+    }
+
+    /// In a lockstep run this host has all actors that no other has.
+    fn share_lockstep_actors(&mut self) {
+        if let Some(count) = self.lockstep_actors {
+            self.actors = (0..count).filter(|index| !self.hosts.has(*index)).collect();
+        }
+    }
+
+    /// The status of the other hosts.
+    pub(super) fn hosts(&self) -> Vec<HostStatus> {
+        self.hosts.statuses()
+    }
+
+    /// Kills an actor of this incarnation or an earlier one, so that it is started again.
+    pub(super) fn replace_actor(&mut self, index: u32, incarnation: u64) {
+        let actor = self.children.iter_mut().find(|child| child.is(Role::Actor, index));
+        if let Some(actor) = actor.filter(|actor| actor.identity.incarnation <= incarnation)
+            && let Some(process) = &mut actor.process
+        {
+            process.kill();
+        }
+    }
+
+    /// Creates the services of all actors below `end`.
+    fn create_services(&mut self, domain: &Domain, end: u32) -> anyhow::Result<()> {
+        while self.actors_with_services < end {
             self.services
                 .create_actor(domain, self.actors_with_services, self.window)?;
             self.actors_with_services += 1;
@@ -174,10 +323,22 @@ impl Supervisor {
         Ok(())
     }
 
+    /// Creates the services of all wanted actors.
+    fn create_wanted_services(&mut self, domain: &Domain) -> anyhow::Result<()> {
+        let end = self.actors.iter().max().map_or(0, |last| last + 1);
+        self.create_services(domain, end)
+    }
+
+    fn write_counter(&self) -> anyhow::Result<()> {
+        let text = self.started.to_string();
+        write_atomically(&self.counter, |file| std::io::Write::write_all(file, text.as_bytes()))
+            .with_context(|| format!("cannot write {}", self.counter.display()))
+    }
+
     /// Adds and starts the wanted actors that do not exist, each with its environment server.
     fn start_missing(&mut self, domain: &Domain) -> anyhow::Result<()> {
-        self.create_services(domain)?;
-        for index in 0..self.actors {
+        self.create_wanted_services(domain)?;
+        for index in self.actors.clone() {
             for role in [Role::EnvServer, Role::Actor] {
                 if !self.children.iter().any(|child| child.is(role, index)) {
                     self.children.push(Child::new(role, index));
@@ -190,9 +351,7 @@ impl Supervisor {
 
     fn start(&mut self, i: usize) -> anyhow::Result<()> {
         self.started += 1;
-        let text = self.started.to_string();
-        write_atomically(&self.counter, |file| std::io::Write::write_all(file, text.as_bytes()))
-            .with_context(|| format!("cannot write {}", self.counter.display()))?;
+        self.write_counter()?;
         let child = &mut self.children[i];
         child.identity.incarnation = self.started;
         let writer = match child.identity.role {
@@ -523,7 +682,7 @@ impl Supervisor {
     fn is_wanted(&self, child: &Child) -> bool {
         let Identity { role, index, .. } = child.identity;
         // The index of the evaluator's server is the maximum number of actors.
-        !matches!(role, Role::Actor | Role::EnvServer) || !(self.actors..self.max_actors).contains(&index)
+        !matches!(role, Role::Actor | Role::EnvServer) || index >= self.max_actors || self.actors.contains(&index)
     }
 
     fn give_up(&self, name: &str, starts: u32, status: ExitStatus) -> anyhow::Result<Situation> {
@@ -541,6 +700,16 @@ impl Supervisor {
             ending(status),
             self.run.display()
         );
+    }
+
+    /// Asks the processes of a role to hand over what they have and then to end.
+    pub(super) fn ask_to_retire(&mut self, role: Role) {
+        for child in self.children.iter_mut().filter(|child| child.identity.role == role) {
+            if let Some(process) = &mut child.process {
+                child.ends = true;
+                process.ask_to_retire();
+            }
+        }
     }
 
     /// Asks the processes of some roles to end.

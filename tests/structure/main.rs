@@ -16,7 +16,7 @@ use cycles::{cycles, fault, text};
 use scan::Sources;
 
 /// The crates of the workspace that each crate may import. No crate imports `shoal`.
-const MAY_IMPORT: [(&str, &[&str]); 12] = [
+const MAY_IMPORT: [(&str, &[&str]); 13] = [
     ("shoal-base", &[]),
     ("shoal-channel", &["shoal-base"]),
     ("shoal-policy", &["shoal-base"]),
@@ -25,6 +25,7 @@ const MAY_IMPORT: [(&str, &[&str]); 12] = [
     ("shoal-env-server", &["shoal-base", "shoal-channel"]),
     ("shoal-actor", &["shoal-common"]),
     ("shoal-learner", &["shoal-common"]),
+    ("shoal-remote", &["shoal-common"]),
     ("shoal-run", &CORE),
     ("shoal-report", &RUN_AND_CORE),
     ("shoal-bench", &RUN_AND_CORE),
@@ -48,11 +49,12 @@ const REPORT_RUN_AND_CORE: [&str; 6] = [
     "shoal-actor",
     "shoal-learner",
 ];
-const EVERYTHING: [&str; 8] = [
+const EVERYTHING: [&str; 9] = [
     "shoal-bench",
     "shoal-reproduce",
     "shoal-report",
     "shoal-run",
+    "shoal-remote",
     "shoal-common",
     "shoal-env-server",
     "shoal-actor",

@@ -2,6 +2,7 @@
 
 #![allow(dead_code, reason = "every suite uses a different part of this file")]
 
+use std::collections::HashSet;
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
@@ -9,6 +10,9 @@ use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process, test_kill_process};
 use shoal_common::channel::Domain;
+use shoal_common::config::Config;
+use shoal_learner::process::replay_layout;
+use shoal_learner::replay::Replay;
 
 /// A wait that takes longer has failed, even on a slow machine.
 const TIMEOUT: Duration = Duration::from_secs(120);
@@ -204,6 +208,14 @@ impl Running {
         self.signal_role(who, Signal::KILL);
     }
 
+    /// Kills the newest process of a role, if it is alive.
+    pub(crate) fn kill_if_alive(&self, who: &str) {
+        if let Some(pid) = self.pids(who).last().copied().filter(|pid| is_ours(*pid)) {
+            // It may end in between.
+            let _ = kill_process(Pid::from_raw(pid).unwrap(), Signal::KILL);
+        }
+    }
+
     /// Stops the running process of a role with SIGSTOP.
     pub(crate) fn stop_role(&self, who: &str) {
         self.signal_role(who, Signal::STOP);
@@ -354,6 +366,27 @@ pub(crate) fn sent(run: &Path, actor: u32) -> u64 {
 pub(crate) fn committed(run: &Path, actor: usize) -> u64 {
     let commits = shoal_common::commit::CommitReader::open(&run.join("replay.bin")).unwrap();
     commits.actor(actor).rows
+}
+
+/// Checks that every row in a pendulum run's replay is whole and unique, and returns how many were ever committed. None may
+/// be terminal: the pendulum never terminates.
+pub(crate) fn check_stored_rows(run: &Path, config: &Config) -> u64 {
+    let replay = Replay::open(&run.join("replay.bin"), &replay_layout(config)).unwrap();
+    assert_eq!(replay.warnings(), [] as [String; 0]);
+    let layout = replay.layout().row;
+    let mut seen = HashSet::new();
+    for index in replay.rows() {
+        let row = replay.row(index);
+        let transition = layout.read(row);
+        assert_eq!(transition.discount, config.algorithm.gamma() as f32);
+        // A pendulum that spins at full speed under full torque may return to exactly the same state.
+        if transition.a[0].abs() < 2.0 {
+            let bits: Vec<u32> = row.iter().map(|x| x.to_bits()).collect();
+            assert!(seen.insert(bits), "row {index} is there twice");
+        }
+    }
+    assert!(seen.len() > 1000);
+    replay.head()
 }
 
 /// Waits until a run has ended successfully. Returns its final weights and its evaluations without their times.

@@ -4,7 +4,7 @@ use iceoryx2::prelude::ZeroCopySend;
 use serde::{Deserialize, Serialize};
 
 /// What a process of a run is for.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[repr(u32)]
 pub enum Role {
     /// Steps environments.
@@ -15,6 +15,10 @@ pub enum Role {
     Evaluator,
     /// Learns.
     Learner,
+    /// Stands in for the actors of other hosts on the learner's host.
+    Gate,
+    /// Stands in for the learner on another host.
+    Relay,
 }
 
 impl Role {
@@ -25,14 +29,22 @@ impl Role {
             Self::Actor => "actor",
             Self::Evaluator => "evaluator",
             Self::Learner => "learner",
+            Self::Gate => "gate",
+            Self::Relay => "relay",
         }
     }
 
     /// The role with this number in a message.
     fn from_code(code: u32) -> Option<Self> {
-        [Self::EnvServer, Self::Actor, Self::Evaluator, Self::Learner]
-            .into_iter()
-            .find(|role| *role as u32 == code)
+        let all = [
+            Self::EnvServer,
+            Self::Actor,
+            Self::Evaluator,
+            Self::Learner,
+            Self::Gate,
+            Self::Relay,
+        ];
+        all.into_iter().find(|role| *role as u32 == code)
     }
 }
 
@@ -62,7 +74,7 @@ pub struct Identity {
 }
 
 /// What a role is doing.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[repr(u32)]
 pub enum Activity {
     /// Doing its work.

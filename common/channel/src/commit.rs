@@ -5,11 +5,13 @@
 //! format.
 
 mod layout;
+mod mirror;
 mod reader;
 mod record;
 mod words;
 
 pub use layout::{IdentityFault, Places, ReplayLayout, SLOTS, SYNCED};
+pub use mirror::CommitMirror;
 pub use reader::{CommitReader, OpenError};
 pub use record::{ActorCommit, ChunkMark, MAX_INCARNATION, Record};
 pub use words::{Words, WritableWords};

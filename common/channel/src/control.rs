@@ -13,7 +13,9 @@ use iceoryx2::service::header::request_response::{
 use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::request_response::PortFactory;
 
-pub use self::message::{Answer, Question, RoleState, RoleStatus, RunKey, RunStatus};
+pub use self::message::{
+    Answer, HostLease, HostRequest, HostState, HostStatus, Question, RoleState, RoleStatus, RunKey, RunStatus,
+};
 use self::message::{Asked, VERSION, decode, encode};
 use super::domain::Domain;
 use super::error::{Cause, ChannelError, ChannelErrorKind};
@@ -33,7 +35,7 @@ const NODES: usize = 2 * CLIENTS;
 
 const ACTIVE_REQUESTS: usize = 2;
 
-/// Most bytes of a question.
+/// Most bytes of a question from a terminal.
 const QUESTION: usize = 64;
 
 /// Most bytes of an answer without its roles.
@@ -41,6 +43,9 @@ const ANSWER: usize = 1024;
 
 /// Most bytes of one role in an answer.
 const ANSWER_PER_ROLE: usize = 96;
+
+/// Most bytes of another host in an answer, without its roles. Each has at least one actor.
+const ANSWER_PER_HOST: usize = 192;
 
 /// How long the client sleeps between checks for an answer. It notifies the launcher, which answers at once if it is
 /// idle.
@@ -193,12 +198,13 @@ pub fn ask(
     // Who only wants to know how the run is need not wait until it is able to answer.
     let missing_until = match question {
         Question::Status => deadline.min(asked + MISSING_PATIENCE),
-        Question::Scale { .. } | Question::Stop => deadline,
+        _ => deadline,
     };
+    let question = encode(&Asked { run, question }).map_err(cannot_ask)?;
     let make_client = || {
         service(domain, Entry::Open)?
             .client_builder()
-            .initial_max_slice_len(QUESTION)
+            .initial_max_slice_len(question.len().max(QUESTION))
             .create()
             .map_err(cannot_ask)
     };
@@ -220,7 +226,6 @@ pub fn ask(
         request.user_header_mut().version = VERSION;
         request.send().map_err(cannot_ask)
     };
-    let question = encode(&Asked { run, question }).map_err(cannot_ask)?;
     let launcher = Notifier::to_launcher(domain);
     let notify = || launcher.iter().for_each(Notifier::notify);
     let mut pending = ask(&question)?;
@@ -275,9 +280,10 @@ pub fn reserved(max_actors: usize) -> u64 {
         + CLIENTS as u64 * memory::connection(2 * ACTIVE_REQUESTS, 1, 1, CLIENTS * answers)
 }
 
-/// Most bytes of an answer. Its roles are the learner, the evaluator with its server, and each actor with its server.
+/// Most bytes of an answer. Its roles are the learner, the evaluator with its server, the gate, and each actor with its server.
 fn answer_length(max_actors: usize) -> usize {
-    ANSWER + ANSWER_PER_ROLE * (2 * max_actors + 3)
+    // Each actor has a server, and may be the only one of its host.
+    ANSWER + ANSWER_PER_ROLE * (2 * max_actors + 4) + ANSWER_PER_HOST * max_actors
 }
 
 /// Creates the service.

@@ -71,6 +71,15 @@ pub struct ChunkSender {
 #[derive(Debug)]
 pub struct Handshake(ChunkSender);
 
+/// The end of the process that passes on what an actor of another host has sent. It is to the learner what the actor
+/// would be: its headers are the actor's own, and its history is the actor's.
+#[derive(Debug)]
+pub struct ChunkForwarder {
+    publisher: Publisher<ipc::Service, [f32], ChunkHeader>,
+    channel: String,
+    layout: ChunkLayout,
+}
+
 /// A chunk being filled, in the shared memory that it is sent in.
 #[derive(Debug)]
 pub struct Chunk {
@@ -140,12 +149,7 @@ impl ChunkSender {
         let channel = name(actor);
         let (service, publisher) = claim(|| {
             let service = service(domain, &channel, window, Entry::Open)?;
-            let publisher = service
-                .publisher_builder()
-                .initial_max_slice_len(layout.len())
-                .max_loaned_samples(LOANED)
-                .create()
-                .map_err(|cause| ChannelError::new(&channel, "send", cause))?;
+            let publisher = publisher(&service, &channel, &layout)?;
             Ok((service, publisher))
         })?;
         let sender = Self {
@@ -217,6 +221,79 @@ impl ChunkSender {
     /// Whether a learner is connected. A killed learner counts until the launcher has cleaned up after it.
     pub fn has_receiver(&self) -> bool {
         self.service.dynamic_config().number_of_subscribers() > 0
+    }
+
+    /// Connects to a new learner, which then receives the chunks in the history. Call this while waiting.
+    ///
+    /// # Errors
+    /// When the connection fails.
+    pub fn refresh_connections(&self) -> Result<(), ChannelError> {
+        self.publisher
+            .update_connections()
+            .map_err(|cause| ChannelError::new(&self.channel, "reconnect", cause))
+    }
+}
+
+impl ChunkForwarder {
+    /// Opens the sending end of `actor`, whose chunks have this layout. At most `window` of them may be uncommitted. `None`
+    /// if another process sends for this actor at the moment: try again later.
+    ///
+    /// # Errors
+    /// When shared memory is unavailable.
+    pub fn try_open(
+        domain: &Domain,
+        actor: u32,
+        layout: ChunkLayout,
+        window: u32,
+    ) -> Result<Option<Self>, ChannelError> {
+        let channel = name(actor);
+        let opened = service(domain, &channel, window, Entry::Open);
+        match opened.and_then(|service| publisher(&service, &channel, &layout)) {
+            Ok(publisher) => Ok(Some(Self {
+                publisher,
+                channel,
+                layout,
+            })),
+            Err(error) if error.is_transient() => Ok(None),
+            Err(error) => Err(error),
+        }
+    }
+
+    /// The rows of a chunk with this header, and after them the numbers of the actor's snapshot. `None` if `numbers` are
+    /// not those of such a chunk: a handshake has neither rows nor a snapshot.
+    pub fn parts<'a>(&self, header: &ChunkHeader, numbers: &'a [f32]) -> Option<(&'a [f32], &'a [f32])> {
+        let rows = header.rows as usize;
+        let snapshot = self.layout.len() - self.layout.numbers_of_rows();
+        let (most_rows, snapshot) = match header.sequence {
+            0 => (0, 0),
+            _ => (self.layout.rows, snapshot),
+        };
+        let split = numbers.split_at_checked(rows.checked_mul(self.layout.row.width())?)?;
+        (rows <= most_rows && split.1.len() == snapshot).then_some(split)
+    }
+
+    /// Sends a chunk with this header, of which `numbers` are the [`parts`](Self::parts).
+    ///
+    /// # Errors
+    /// When they are not, or the connection to the learner fails.
+    pub fn send(&self, header: ChunkHeader, numbers: &[f32]) -> Result<(), ChannelError> {
+        let Some((rows, snapshot)) = self.parts(&header, numbers) else {
+            let cause = PeerError::ChunkLength {
+                numbers: numbers.len(),
+                rows: header.rows as usize,
+            };
+            return Err(ChannelError::new(&self.channel, "send", cause));
+        };
+        let failed = |cause| ChannelError::new(&self.channel, "send", cause);
+        let mut sample = self
+            .publisher
+            .loan_slice(self.layout.len())
+            .map_err(|cause| ChannelError::new(&self.channel, "begin a chunk", cause))?;
+        *sample.user_header_mut() = header;
+        sample.payload_mut()[..rows.len()].copy_from_slice(rows);
+        let end = self.layout.numbers_of_rows();
+        sample.payload_mut()[end..][..snapshot.len()].copy_from_slice(snapshot);
+        sample.send().map(drop).map_err(failed)
     }
 
     /// Connects to a new learner, which then receives the chunks in the history. Call this while waiting.
@@ -345,6 +422,13 @@ impl ReceivedChunk {
         &self.sample.payload()[..self.header().rows as usize * self.layout.row.width()]
     }
 
+    /// Its rows, and the numbers of the actor's snapshot after them; no numbers for a handshake, and if the layout has no
+    /// snapshots.
+    pub fn parts(&self) -> (&[f32], &[f32]) {
+        let snapshot = &self.sample.payload()[self.layout.numbers_of_rows()..];
+        (self.rows(), if self.is_handshake() { &[] } else { snapshot })
+    }
+
     /// The actor's snapshot after it; `None` for a handshake, and if the layout has no snapshots.
     pub fn actor_snapshot(&self) -> Option<Vec<u64>> {
         let rows = self.layout.numbers_of_rows();
@@ -377,6 +461,19 @@ pub(super) fn create(domain: &Domain, actor: u32, window: u32) -> Result<Held, C
         ports.list_publishers(|port| visit(port.node_id, port.publisher_id.value()));
         ports.list_subscribers(|port| visit(port.node_id, port.subscriber_id.value()));
     }))
+}
+
+fn publisher(
+    service: &ChunkService,
+    channel: &str,
+    layout: &ChunkLayout,
+) -> Result<Publisher<ipc::Service, [f32], ChunkHeader>, ChannelError> {
+    service
+        .publisher_builder()
+        .initial_max_slice_len(layout.len())
+        .max_loaned_samples(LOANED)
+        .create()
+        .map_err(|cause| ChannelError::new(channel, "send", cause))
 }
 
 type ChunkService = PortFactory<ipc::Service, [f32], ChunkHeader>;

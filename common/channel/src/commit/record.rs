@@ -117,6 +117,23 @@ impl Record {
         self.words[HEAD] += rows;
     }
 
+    /// Sets what is committed of an actor, in a record that mirrors another one.
+    ///
+    /// # Panics
+    /// If `actor` is not less than `actors()`.
+    pub(super) fn set_actor(&mut self, actor: usize, commit: ActorCommit) {
+        let at = ACTORS + self.stride * actor;
+        self.words[at] = commit.mark.incarnation;
+        self.words[at + 1] = commit.mark.sequence;
+        self.words[at + 2] = commit.rows;
+    }
+
+    /// Sets the number of rows committed, in a record that mirrors another one.
+    pub(super) fn set_head(&mut self, rows: u64) {
+        self.words[HEAD] = rows;
+        self.words[TAIL] = self.words[TAIL].min(rows);
+    }
+
     /// An actor's snapshot after its last chunk; zeros before the first.
     ///
     /// # Panics

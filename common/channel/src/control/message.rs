@@ -6,10 +6,10 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 /// The format version of the messages. Increase it with every change: launcher and client may be of different builds.
-pub(super) const VERSION: u32 = 3;
+pub(super) const VERSION: u32 = 4;
 
 /// A request to a launcher.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub enum Question {
     /// Report the status of the run.
     Status,
@@ -20,11 +20,89 @@ pub enum Question {
     },
     /// End the run in an orderly way.
     Stop,
+    /// From the gate: admit another host.
+    Admit(HostRequest),
+    /// From the gate, a few times a second: how the other hosts are. The answer is which hosts are admitted.
+    Hosts(Vec<HostStatus>),
+    /// From a relay: end this actor if it is of this incarnation or an earlier one, and start it again.
+    Replace {
+        /// The actor.
+        actor: u32,
+        /// Its incarnation.
+        incarnation: u64,
+    },
+}
+
+/// What another host asks for.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct HostRequest {
+    /// A number that the host has drawn.
+    pub host: u64,
+    /// Its name.
+    pub name: String,
+    /// The number of actors that it offers.
+    pub actors: u32,
+    /// The actors that an earlier launcher of the run has given it.
+    pub held: Vec<u32>,
+}
+
+/// What a host is given: actors, and the incarnations that its processes may have.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct HostLease {
+    /// The host.
+    pub host: u64,
+    /// Its name.
+    pub name: String,
+    /// Grows with every start of the launcher.
+    pub epoch: u64,
+    /// The indices of its actors.
+    pub actors: Vec<u32>,
+    /// Its processes have incarnations from this one on …
+    pub first_incarnation: u64,
+    /// … and below this one.
+    pub limit: u64,
+}
+
+/// The state of another host.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum HostState {
+    /// It sends reports.
+    Connected,
+    /// It has sent none for seconds. It may come back with all that its actors have collected.
+    CutOff,
+    /// It has left the run.
+    Left,
+}
+
+/// The status of another host.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct HostStatus {
+    /// Its number.
+    pub host: u64,
+    /// Its name.
+    pub name: String,
+    /// Its state.
+    pub state: HostState,
+    /// The number of its actors.
+    pub actors: u32,
+    /// Rows a second that arrive from it.
+    pub rows_per_second: f64,
+    /// Chunks that it had to send more than once.
+    pub resent_chunks: u64,
+    /// Time from a report of the host to the answer, in microseconds.
+    pub round_trip_us: Option<u64>,
+    /// How many versions its newest policy is behind the learner's.
+    pub policy_lag: u64,
+    /// Seconds since it was last heard of.
+    pub silent_seconds: f64,
+    /// Its actors and environment servers.
+    pub roles: Vec<RoleStatus>,
 }
 
 /// A question and the run that it is about. The run is checked because a copy of a run directory has the same name in
 /// shared memory: a question about the copy reaches the launcher of the original.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Asked {
     pub(super) run: RunKey,
     pub(super) question: Question,
@@ -48,6 +126,15 @@ pub enum Answer {
     Accepted,
     /// The request is refused, with the reason.
     Refused(String),
+    /// The host is admitted.
+    Admitted(HostLease),
+    /// The hosts that are admitted.
+    Leases {
+        /// Grows with every start of the launcher.
+        epoch: u64,
+        /// What each has.
+        leases: Vec<HostLease>,
+    },
     /// The launcher runs this other directory; the one that was asked about is a copy of it.
     AnotherRun(String),
 }
@@ -87,6 +174,8 @@ pub struct RunStatus {
     pub waiting: Option<String>,
     /// Whether all environment steps, updates and evaluations are done.
     pub finished: bool,
+    /// The other hosts of the run.
+    pub hosts: Vec<HostStatus>,
 }
 
 /// The status of a process of a run.
@@ -178,6 +267,18 @@ mod tests {
                 policy_lag: None,
             }],
             waiting: Some("actors wait".into()),
+            hosts: vec![HostStatus {
+                host: 17,
+                name: "node-2".into(),
+                state: HostState::CutOff,
+                actors: 4,
+                rows_per_second: 1.5,
+                resent_chunks: 3,
+                round_trip_us: Some(250),
+                policy_lag: 2,
+                silent_seconds: 4.5,
+                roles: Vec::new(),
+            }],
             eval_return_mean: Some(-140.0),
             ..Default::default()
         }

@@ -325,10 +325,11 @@ impl EnvironmentClient {
         payload: &[f32],
         idle: &mut dyn FnMut(),
     ) -> Result<Option<Answer>, Exit<ChannelError>> {
-        if self.server() != self.episodes.get() {
+        let server = self.server();
+        if server != self.episodes.get() {
             return Ok(None);
         }
-        let sent = self.send(RequestHeader::new(ask, 0, 0), payload)?;
+        let sent = self.send(server, RequestHeader::new(ask, 0, 0), payload)?;
         let Some(response) = self.answer(listener, &sent, idle)? else {
             return Ok(None);
         };
@@ -351,7 +352,7 @@ impl EnvironmentClient {
     ) -> Result<Answer, Exit<ChannelError>> {
         let mut unreachable = None;
         loop {
-            let sent = self.send(question, payload)?;
+            let sent = self.send(self.server(), question, payload)?;
             if let Some(response) = self.answer(listener, &sent, idle)? {
                 return Ok(response);
             }
@@ -363,10 +364,14 @@ impl EnvironmentClient {
         }
     }
 
-    fn send(&self, question: RequestHeader, payload: &[f32]) -> Result<Sent, ChannelError> {
-        // Look up the server before sending. If another server takes its place in between, the request counts as lost
-        // and is sent again. In the other order, a lost request could count as delivered.
-        let server = self.server();
+    /// Sends a request to `server`, which was looked up before. If another server takes its place in between, the request
+    /// counts as lost and is sent again. In the other order, a lost request could count as delivered.
+    fn send(
+        &self,
+        server: Option<UniqueServerId>,
+        question: RequestHeader,
+        payload: &[f32],
+    ) -> Result<Sent, ChannelError> {
         let mut request = self
             .client
             .loan_slice_uninit(payload.len())

@@ -1,0 +1,830 @@
+//! The gate, a role on the learner's host. To the learner it is each actor of the other hosts: it passes on their chunks,
+//! each exactly once and in order. To the hosts it tells what has become of the chunks, and gives them the newest policy.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, Sender, channel};
+use std::time::{Duration, Instant};
+
+use shoal_common::channel::control::{
+    Answer, HostLease, HostRequest, HostState, HostStatus, Question, RoleState, RoleStatus,
+};
+use shoal_common::channel::policy::{Policy, PolicyReader};
+use shoal_common::channel::reports::Reporter;
+use shoal_common::channel::transitions::ChunkForwarder;
+use shoal_common::channel::{ChannelError, Domain, EventName, HeartbeatSender, Notifier};
+use shoal_common::commit::{CommitReader, OpenError};
+use shoal_common::config::{Config, Mode};
+use shoal_common::policy::PolicyError;
+use shoal_common::report::{Activity, EpisodeReport, Heartbeat, Identity, Role};
+use shoal_common::run_dir::{RunDir, RunDirError};
+use shoal_common::stop::Stop;
+use zenoh::pubsub::Publisher;
+use zenoh::qos::{CongestionControl, Priority};
+use zenoh::query::Query;
+use zenoh::{Session, Wait};
+
+use crate::bucket::Bucket;
+use crate::endpoint::Endpoint;
+use crate::files::KeyFile;
+use crate::forwarding::{Forwarding, Offer};
+use crate::network::{self, NetworkError, failed};
+use crate::refused;
+use crate::requests::Requests;
+use crate::wire::vector_instructions;
+use crate::wire::{
+    ActorMarks, Admission, Hello, HostReport, Lease, Marks, Message, Phase, PolicyQuestion, WireChunk, WireError,
+    WirePolicy,
+};
+
+/// Marks follow each other after at least the first time, and at most the second.
+const MARKS_APART: Duration = Duration::from_millis(1);
+const MARKS_WITHIN: Duration = Duration::from_millis(100);
+
+/// How long to sleep while chunks wait to be committed: at first, and at most while nothing is committed.
+const SHORTEST_SLEEP: Duration = Duration::from_micros(200);
+const LONGEST_SLEEP: Duration = Duration::from_millis(20);
+
+/// How often to refresh connections, which a restarted learner needs.
+const REFRESH: Duration = Duration::from_millis(50);
+
+/// How often the launcher is told how the hosts are.
+const STATUS: Duration = Duration::from_millis(500);
+
+/// A host that is silent for this long is cut off, or gone.
+const CUT_OFF: Duration = Duration::from_secs(3);
+
+/// How long a query for a policy is kept before the host has to ask again.
+const POLICY_PATIENCE: Duration = Duration::from_secs(8);
+
+/// How long the hosts may take to hand over what they have when the run is over.
+const HAND_OVER: Duration = Duration::from_secs(5);
+
+/// How often a host that sends wrong chunks, or a connection that was refused, is named.
+const WARN_AGAIN: Duration = Duration::from_secs(10);
+
+/// Bytes a second that policies may take, for all hosts together.
+const POLICY_BANDWIDTH: f64 = 30e6;
+
+/// What the gate needs.
+#[derive(Clone, Debug)]
+pub struct GateSettings {
+    /// Which process this is.
+    pub identity: Identity,
+    /// The run's configuration.
+    pub config: Config,
+    /// The run's directory.
+    pub run: RunDir,
+    /// Where to listen.
+    pub endpoint: Endpoint,
+    /// The gate's key, unless the endpoint is not encrypted.
+    pub key: Option<KeyFile>,
+}
+
+/// Why the gate ended.
+#[derive(Debug, thiserror::Error)]
+pub enum GateError {
+    /// A channel of this host failed.
+    #[error(transparent)]
+    Channel(#[from] ChannelError),
+    /// The network failed.
+    #[error(transparent)]
+    Network(#[from] NetworkError),
+    /// The replay cannot be read.
+    #[error(transparent)]
+    Replay(#[from] OpenError),
+    /// The run's directory cannot be used.
+    #[error(transparent)]
+    Run(#[from] RunDirError),
+    /// The policy of the run is impossible.
+    #[error(transparent)]
+    Policy(#[from] PolicyError),
+    /// A message cannot be encoded.
+    #[error(transparent)]
+    Wire(#[from] WireError),
+    /// The configuration cannot be written.
+    #[error("cannot write the configuration: {0}")]
+    Config(String),
+    /// A thread cannot be started.
+    #[error("cannot start a thread: {0}")]
+    Thread(#[from] std::io::Error),
+}
+
+/// Something that has come from a host.
+enum Arrival {
+    Chunk(Vec<u8>),
+    Report(Vec<u8>),
+    Join(Query),
+    Policy(Query),
+}
+
+/// A host that is admitted.
+struct Host {
+    lease: HostLease,
+    marks: Publisher<'static>,
+    last_marks: Vec<ActorMarks>,
+    marked: Instant,
+    /// Marks are sent soon, whether they have changed or not.
+    due: bool,
+    heard: Instant,
+    report: u64,
+    left: bool,
+    newest: Option<HostReport>,
+    warned: Option<Instant>,
+    /// Rows that were passed on, and the same with the time of the last status.
+    rows: u64,
+    counted: (Instant, u64),
+    rate: f64,
+    /// The steps of its processes at the last status.
+    steps: HashMap<(Role, u32), (u64, u64)>,
+    /// A query for a policy, and the one that the host has.
+    wants: Option<(Query, PolicyId, Instant)>,
+}
+
+/// The learner's incarnation and the version of a policy, if there is one.
+type PolicyId = Option<(u64, u64)>;
+
+/// An actor of another host.
+struct RemoteActor {
+    host: u64,
+    /// `None` while the actor that the learner's host had before is ending.
+    forwarder: Option<ChunkForwarder>,
+    forwarding: Forwarding,
+}
+
+/// What a question to the launcher was about.
+enum Matter {
+    Join(Box<Query>, Hello),
+    Hosts,
+}
+
+struct Gate<'a> {
+    settings: &'a GateSettings,
+    domain: &'a Domain,
+    stop: &'a Stop,
+    session: Session,
+    arrivals: Receiver<Arrival>,
+    requests: Requests<Matter>,
+    /// Of the launcher; `None` before its first answer.
+    epoch: Option<u64>,
+    hosts: HashMap<u64, Host>,
+    actors: HashMap<u32, RemoteActor>,
+    replay: CommitReader,
+    policy: PolicyReader,
+    /// The policy that was sent last, as bytes.
+    encoded: Option<(PolicyId, Arc<Vec<u8>>)>,
+    bucket: Bucket,
+    /// Version of the learner's newest policy, as far as it was looked at.
+    policy_version: u64,
+    learner: Notifier,
+    heartbeat: HeartbeatSender,
+    heartbeats: Reporter<Heartbeat>,
+    episodes: Reporter<EpisodeReport>,
+    marks: u64,
+    /// When a refused connection was last named.
+    warned: Option<Instant>,
+    over: Option<Instant>,
+    refreshed: Instant,
+    told: Option<Instant>,
+    sleep: Duration,
+}
+
+/// Serves the other hosts of the run until `stop`.
+///
+/// # Errors
+/// When a channel fails, or the endpoint cannot be used.
+pub fn serve(domain: &Domain, settings: &GateSettings, stop: &Stop) -> Result<(), GateError> {
+    let Some(mut gate) = Gate::new(domain, settings, stop)? else {
+        return Ok(());
+    };
+    gate.run()
+}
+
+impl<'a> Gate<'a> {
+    /// `None` if it was asked to end before there was a replay.
+    fn new(domain: &'a Domain, settings: &'a GateSettings, stop: &'a Stop) -> Result<Option<Self>, GateError> {
+        let (config, run) = (&settings.config, &settings.run);
+        let mut heartbeat = HeartbeatSender::new(domain, settings.identity)?;
+        let replay = loop {
+            match CommitReader::open(&run.replay_file()) {
+                Ok(replay) => break replay,
+                Err(OpenError::NotYet { .. }) if stop.requested() => return Ok(None),
+                Err(OpenError::NotYet { .. }) => std::thread::sleep(LONGEST_SLEEP),
+                Err(error) => return Err(error.into()),
+            }
+        };
+        let layout = config.algorithm.policy_layout(&config.spec)?;
+        let policy = PolicyReader::open(domain, layout.fingerprint(), layout.parameters())?;
+        let requests = Requests::start(&config.run.id, config.actors.max, run.key()?)?;
+        let session = network::listen(&settings.endpoint, settings.key.as_ref())?;
+        let (sender, arrivals) = channel();
+        declare(&session, &config.run.id, &sender)?;
+        heartbeat.beat_now(Activity::WaitingForPeer);
+        tracing::info!("listening on {}", settings.endpoint);
+        Ok(Some(Self {
+            settings,
+            domain,
+            stop,
+            session,
+            arrivals,
+            requests,
+            epoch: None,
+            hosts: HashMap::new(),
+            actors: HashMap::new(),
+            replay,
+            policy,
+            encoded: None,
+            bucket: Bucket::new(POLICY_BANDWIDTH, Instant::now()),
+            policy_version: 0,
+            learner: Notifier::new(domain, EventName(Role::Learner, 0))?,
+            heartbeat,
+            heartbeats: Reporter::open(domain)?,
+            episodes: Reporter::open(domain)?,
+            marks: 0,
+            warned: None,
+            over: None,
+            refreshed: Instant::now(),
+            told: None,
+            sleep: LONGEST_SLEEP,
+        }))
+    }
+
+    fn run(&mut self) -> Result<(), GateError> {
+        loop {
+            // The senders stay as long as the session, which is ours.
+            let first = self.arrivals.recv_timeout(self.sleep).ok();
+            let more: Vec<Arrival> = self.arrivals.try_iter().collect();
+            let mut passed_on = 0;
+            for arrival in first.into_iter().chain(more) {
+                passed_on += self.take(arrival)?;
+            }
+            if passed_on > 0 {
+                self.learner.notify();
+                self.heartbeat.count(passed_on);
+            }
+            self.take_answers()?;
+            let progress = self.look_at_commits();
+            self.send_marks()?;
+            self.send_policies()?;
+            self.tell_launcher();
+            self.refresh_connections()?;
+            self.choose_sleep(passed_on > 0 || progress);
+            if self.is_done() {
+                return Ok(());
+            }
+        }
+    }
+
+    /// Whether to end now. When the run is over, the hosts are told and hand over what they have. If the launcher has
+    /// died, they wait for its successor.
+    fn is_done(&mut self) -> bool {
+        if !self.stop.requested() {
+            return false;
+        }
+        if self.stop.at_once() {
+            return true;
+        }
+        let since = *self.over.get_or_insert_with(Instant::now);
+        let gone = |host: &Host| host.left || host.heard.elapsed() >= CUT_OFF;
+        since.elapsed() >= HAND_OVER || self.hosts.values().all(gone)
+    }
+
+    /// Handles what a host has sent. Returns the rows that were passed on to the learner.
+    fn take(&mut self, arrival: Arrival) -> Result<u64, GateError> {
+        match arrival {
+            Arrival::Chunk(bytes) => return self.take_chunk(&bytes),
+            Arrival::Report(bytes) => match HostReport::decode(&bytes) {
+                Ok(report) => self.take_report(report)?,
+                Err(error) => tracing::warn!("a host sent a report that is not read: {error}"),
+            },
+            Arrival::Join(query) => self.take_join(query)?,
+            Arrival::Policy(query) => self.take_policy_query(query),
+        }
+        Ok(0)
+    }
+
+    fn take_chunk(&mut self, bytes: &[u8]) -> Result<u64, GateError> {
+        let chunk = match WireChunk::decode(bytes) {
+            Ok(chunk) => chunk,
+            Err(error) => {
+                tracing::warn!("a host sent a chunk that is not read: {error}");
+                return Ok(0);
+            }
+        };
+        let Some(actor) = self.actors.get_mut(&chunk.header.actor) else {
+            return Ok(0);
+        };
+        let Some(host) = self.hosts.get_mut(&chunk.host).filter(|_| actor.host == chunk.host) else {
+            return Ok(0);
+        };
+        // A host that was admitted again still has processes that an earlier launcher has given incarnations to.
+        let ours = chunk.header.incarnation < host.lease.limit;
+        // Until there is a way to the learner, the host sends it again.
+        let Some(forwarder) = &actor.forwarder else {
+            return Ok(0);
+        };
+        let parts = forwarder.parts(&chunk.header, &chunk.numbers);
+        let finite = |rows: &[f32]| rows.iter().all(|number| number.is_finite());
+        if !(ours && parts.is_some_and(|(rows, _)| finite(rows))) {
+            // The host repeats it again and again.
+            if host.warned.is_none_or(|warned| warned.elapsed() >= WARN_AGAIN) {
+                host.warned = Some(Instant::now());
+                tracing::warn!(
+                    "host {} sent a chunk of actor {} that no actor of this run sends; it is ignored",
+                    host.lease.name,
+                    chunk.header.actor
+                );
+            }
+            return Ok(0);
+        }
+        if actor.forwarding.offer(chunk.mark()) != Offer::Next {
+            return Ok(0);
+        }
+        forwarder.send(chunk.header, &chunk.numbers)?;
+        host.rows += u64::from(chunk.header.rows);
+        host.due = true;
+        Ok(chunk.header.rows.into())
+    }
+
+    fn take_report(&mut self, report: HostReport) -> Result<(), GateError> {
+        let Some(host) = self.hosts.get_mut(&report.host) else {
+            // It learns that it must ask to be admitted.
+            return self.send_empty_marks(report.host);
+        };
+        host.heard = Instant::now();
+        if report.number <= host.report {
+            return Ok(());
+        }
+        host.report = report.number;
+        host.due = true;
+        host.left = report.leaving;
+        for role in &report.roles {
+            if role.role == Role::Actor && host.lease.actors.contains(&role.index) {
+                self.heartbeats.send(role.heartbeat());
+            }
+        }
+        for episode in &report.episodes {
+            if host.lease.actors.contains(&episode.actor) {
+                self.episodes.send((*episode).into());
+            }
+        }
+        host.newest = Some(report);
+        Ok(())
+    }
+
+    fn take_join(&mut self, query: Query) -> Result<(), GateError> {
+        let bytes = query.payload().map(|payload| payload.to_bytes().into_owned());
+        let hello = match Hello::decode(&bytes.unwrap_or_default()) {
+            Ok(hello) => hello,
+            Err(error) => return answer_join(&query, &Admission::Refused(error.to_string())),
+        };
+        if hello.program != env!("CARGO_PKG_VERSION") {
+            let why = format!(
+                "this host has version {} of the program, the learner's host {}",
+                hello.program,
+                env!("CARGO_PKG_VERSION")
+            );
+            tracing::warn!("host {} is refused: {why}", hello.name);
+            return answer_join(&query, &Admission::Refused(why));
+        }
+        let (theirs, ours) = (&hello.instructions, vector_instructions());
+        if self.settings.config.run.mode == Mode::Lockstep && *theirs != ours {
+            let why = format!(
+                "this host's processor has other vector instructions ({theirs}) than the learner's ({ours}): a lockstep run \
+                 would not have the same bits"
+            );
+            tracing::warn!("host {} is refused: {why}", hello.name);
+            return answer_join(&query, &Admission::Refused(why));
+        }
+        let request = HostRequest {
+            host: hello.host,
+            name: hello.name.clone(),
+            actors: hello.actors,
+            held: hello.held.clone(),
+        };
+        self.requests
+            .ask(Question::Admit(request), Matter::Join(Box::new(query), hello));
+        Ok(())
+    }
+
+    fn take_policy_query(&mut self, query: Query) {
+        let bytes = query.payload().map(|payload| payload.to_bytes().into_owned());
+        match PolicyQuestion::decode(&bytes.unwrap_or_default()) {
+            Ok(question) => {
+                if let Some(host) = self.hosts.get_mut(&question.host) {
+                    host.wants = Some((query, question.have, Instant::now()));
+                }
+            }
+            Err(error) => tracing::warn!("a host sent a question that is not read: {error}"),
+        }
+    }
+
+    /// Takes what the launcher has answered.
+    fn take_answers(&mut self) -> Result<(), GateError> {
+        while let Some((answer, matter)) = self.requests.answer() {
+            match (answer, matter) {
+                (Ok(Answer::Admitted(lease)), Matter::Join(query, hello)) => {
+                    tracing::info!(
+                        "host {} is admitted with {} actors: {:?}",
+                        hello.name,
+                        lease.actors.len(),
+                        lease.actors
+                    );
+                    let config = self.settings.config.to_toml();
+                    let answer = Lease {
+                        epoch: lease.epoch,
+                        config: config.map_err(|error| GateError::Config(error.to_string()))?,
+                        actors: lease.actors.clone(),
+                        first_incarnation: lease.first_incarnation,
+                        limit: lease.limit,
+                    };
+                    self.epoch = Some(lease.epoch);
+                    self.admit(lease)?;
+                    answer_join(&query, &Admission::Admitted(answer))?;
+                }
+                (answer, Matter::Join(query, hello)) => {
+                    let why = match answer {
+                        Ok(Answer::Refused(why)) | Err(why) => why,
+                        Ok(other) => format!("the launcher gave an unexpected answer: {other:?}"),
+                    };
+                    tracing::warn!("host {} is refused: {why}", hello.name);
+                    answer_join(&query, &Admission::Refused(why))?;
+                }
+                (Ok(Answer::Leases { epoch, leases }), Matter::Hosts) => {
+                    self.epoch = Some(epoch);
+                    let released = |host: &u64| !leases.iter().any(|lease| lease.host == *host);
+                    let gone: Vec<u64> = self.hosts.keys().copied().filter(released).collect();
+                    gone.iter().for_each(|host| self.release(*host));
+                    leases.into_iter().try_for_each(|lease| self.admit(lease))?;
+                }
+                (answer, Matter::Hosts) => {
+                    tracing::debug!("the launcher did not say which hosts are admitted: {answer:?}")
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Takes in a host, or what it has been given anew.
+    fn admit(&mut self, lease: HostLease) -> Result<(), GateError> {
+        if self.hosts.get(&lease.host).is_some_and(|host| host.lease == lease) {
+            return Ok(());
+        }
+        let report = self.hosts.get(&lease.host).map_or(0, |host| host.report);
+        self.release(lease.host);
+        let config = &self.settings.config;
+        for actor in &lease.actors {
+            let committed = self.replay.committed(*actor as usize);
+            let remote = RemoteActor {
+                host: lease.host,
+                forwarder: None,
+                forwarding: Forwarding::new(committed, config.actors.window),
+            };
+            self.actors.insert(*actor, remote);
+        }
+        let now = Instant::now();
+        let host = Host {
+            marks: marks_publisher(&self.session, &config.run.id, lease.host)?,
+            last_marks: Vec::new(),
+            marked: now,
+            due: true,
+            heard: now,
+            report,
+            left: false,
+            newest: None,
+            warned: None,
+            rows: 0,
+            counted: (now, 0),
+            rate: 0.0,
+            steps: HashMap::new(),
+            wants: None,
+            lease,
+        };
+        self.hosts.insert(host.lease.host, host);
+        self.open_forwarders()
+    }
+
+    /// Opens the ways to the learner that are free.
+    fn open_forwarders(&mut self) -> Result<(), GateError> {
+        let config = &self.settings.config;
+        let (layout, window) = (config.chunk_layout(), config.actors.window);
+        for (index, actor) in &mut self.actors {
+            if actor.forwarder.is_none() {
+                actor.forwarder = ChunkForwarder::try_open(self.domain, *index, layout, window)?;
+            }
+        }
+        Ok(())
+    }
+
+    fn release(&mut self, host: u64) {
+        self.hosts.remove(&host);
+        self.actors.retain(|_, actor| actor.host != host);
+    }
+
+    /// Reads what the learner has committed. Returns whether it is news.
+    fn look_at_commits(&mut self) -> bool {
+        let mut news = false;
+        for (index, actor) in &mut self.actors {
+            let committed = self.replay.committed(*index as usize);
+            if committed != actor.forwarding.committed() {
+                actor.forwarding.commit(committed);
+                news = true;
+            }
+        }
+        news
+    }
+
+    fn send_marks(&mut self) -> Result<(), GateError> {
+        let Some(epoch) = self.epoch else { return Ok(()) };
+        let rows = self.replay.rows();
+        // Marks and snapshots must belong together.
+        let has_snapshots = self.replay.layout().actor_snapshot_words > 0;
+        let record = if has_snapshots { self.replay.snapshot() } else { None };
+        if has_snapshots && record.is_none() {
+            return Ok(());
+        }
+        for host in self.hosts.values_mut() {
+            let since = host.marked.elapsed();
+            if since < MARKS_APART {
+                continue;
+            }
+            let of = |actor: &u32| {
+                let index = *actor as usize;
+                let (commit, snapshot) = match &record {
+                    Some(record) => (record.actor(index), record.actor_snapshot(index).to_vec()),
+                    None => (self.replay.actor(index), Vec::new()),
+                };
+                let got = self
+                    .actors
+                    .get(actor)
+                    .map_or(commit.mark, |actor| actor.forwarding.got());
+                ActorMarks {
+                    actor: *actor,
+                    committed: (commit.mark.incarnation, commit.mark.sequence),
+                    got: (got.incarnation, got.sequence),
+                    rows: commit.rows,
+                    snapshot,
+                }
+            };
+            let actors: Vec<ActorMarks> = host.lease.actors.iter().map(of).collect();
+            if !host.due && since < MARKS_WITHIN && actors == host.last_marks {
+                continue;
+            }
+            self.marks += 1;
+            let marks = Marks {
+                epoch,
+                gate: self.settings.identity.incarnation,
+                number: self.marks,
+                phase: if self.over.is_some() {
+                    Phase::Over
+                } else {
+                    Phase::Running
+                },
+                rows,
+                report: host.report,
+                actors,
+            };
+            host.marks.put(marks.encode()?).wait().map_err(failed("send marks"))?;
+            host.last_marks = marks.actors;
+            (host.marked, host.due) = (Instant::now(), false);
+        }
+        Ok(())
+    }
+
+    /// Marks for a host that is not admitted, which have no actors.
+    fn send_empty_marks(&mut self, host: u64) -> Result<(), GateError> {
+        let Some(epoch) = self.epoch else { return Ok(()) };
+        self.marks += 1;
+        let marks = Marks {
+            epoch,
+            gate: self.settings.identity.incarnation,
+            number: self.marks,
+            phase: if self.over.is_some() {
+                Phase::Over
+            } else {
+                Phase::Running
+            },
+            rows: self.replay.rows(),
+            report: 0,
+            actors: Vec::new(),
+        };
+        let publisher = marks_publisher(&self.session, &self.settings.config.run.id, host)?;
+        publisher.put(marks.encode()?).wait().map_err(failed("send marks"))?;
+        Ok(())
+    }
+
+    /// Answers the queries for a policy that is there, as far as the bandwidth allows.
+    fn send_policies(&mut self) -> Result<(), GateError> {
+        self.hosts
+            .values_mut()
+            .for_each(|host| drop(host.wants.take_if(|(.., since)| since.elapsed() >= POLICY_PATIENCE)));
+        if self.hosts.values().all(|host| host.wants.is_none()) {
+            return Ok(());
+        }
+        let Some(newest) = self.policy.latest()? else {
+            return Ok(());
+        };
+        self.policy_version = newest.header().version;
+        let id = Some((newest.header().incarnation, newest.header().version));
+        for host in self.hosts.values_mut() {
+            if host.wants.as_ref().is_none_or(|(_, have, _)| id == *have) {
+                continue;
+            }
+            let bytes = encoded(&mut self.encoded, &newest);
+            if !self.bucket.take(bytes.len() as f64, Instant::now()) {
+                break;
+            }
+            if let Some((query, ..)) = host.wants.take() {
+                answer_policy(query, bytes)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Tells the launcher how the hosts are, and asks which are admitted.
+    fn tell_launcher(&mut self) {
+        if self.told.is_some_and(|told| told.elapsed() < STATUS) {
+            return;
+        }
+        self.told = Some(Instant::now());
+        let newest = self.policy_version;
+        let statuses = self.hosts.values_mut().map(|host| host.status(newest)).collect();
+        self.requests.ask(Question::Hosts(statuses), Matter::Hosts);
+        self.heartbeat.set_policy_version(newest);
+    }
+
+    fn refresh_connections(&mut self) -> Result<(), GateError> {
+        if self.refreshed.elapsed() < REFRESH {
+            return Ok(());
+        }
+        self.refreshed = Instant::now();
+        if self.warned.is_none_or(|warned| warned.elapsed() >= WARN_AGAIN)
+            && let Some(why) = refused::take()
+        {
+            self.warned = Some(Instant::now());
+            tracing::warn!("a connection was refused: {why}; only who has the run's join.key is let in");
+        }
+        self.heartbeats.refresh_connections();
+        self.episodes.refresh_connections();
+        let waits = self.actors.values().any(|actor| actor.forwarding.is_waiting());
+        let cut_off = |host: &Host| host.heard.elapsed() >= CUT_OFF;
+        self.heartbeat.beat(match waits {
+            // While a host is away, no other process is to blame that all wait.
+            _ if self.hosts.values().any(cut_off) => Activity::Working,
+            true => Activity::WaitingForRatio,
+            false => Activity::WaitingForPeer,
+        });
+        let mut forwarders = self.actors.values().filter_map(|actor| actor.forwarder.as_ref());
+        forwarders.try_for_each(ChunkForwarder::refresh_connections)?;
+        self.open_forwarders()
+    }
+
+    /// The learner wakes nobody but actors, so the gate looks at the commit record: often while chunks are being
+    /// committed, less often while the learner is busy with its updates.
+    fn choose_sleep(&mut self, progress: bool) {
+        let waits = self.actors.values().any(|actor| actor.forwarding.is_waiting());
+        self.sleep = match (waits, progress) {
+            (true, true) => SHORTEST_SLEEP,
+            (true, false) => (2 * self.sleep).min(LONGEST_SLEEP),
+            (false, _) => LONGEST_SLEEP,
+        };
+    }
+}
+
+impl Host {
+    fn status(&mut self, newest: u64) -> HostStatus {
+        let (then, rows) = self.counted;
+        let seconds = then.elapsed().as_secs_f64();
+        if seconds > 0.0 {
+            self.rate = (self.rows - rows) as f64 / seconds;
+        }
+        self.counted = (Instant::now(), self.rows);
+        let silent = self.heard.elapsed();
+        let cut_off = silent >= CUT_OFF;
+        let mut roles = Vec::new();
+        for role in self.newest.iter().flat_map(|report| &report.roles) {
+            let key = (role.role, role.index);
+            let before = self.steps.insert(key, (role.incarnation, role.steps));
+            let taken = before
+                .filter(|(incarnation, _)| *incarnation == role.incarnation)
+                .map_or(0, |(_, steps)| role.steps.saturating_sub(steps));
+            roles.push(RoleStatus {
+                role: role.role.name().into(),
+                index: role.index,
+                pid: None,
+                state: if cut_off {
+                    RoleState::Silent
+                } else {
+                    state(role.activity)
+                },
+                restarts: 0,
+                rate: if seconds > 0.0 { taken as f64 / seconds } else { 0.0 },
+                policy_version: (role.role == Role::Actor).then_some(role.policy_version),
+                policy_lag: (role.role == Role::Actor).then(|| newest.saturating_sub(role.policy_version)),
+            });
+        }
+        let report = self.newest.as_ref();
+        HostStatus {
+            host: self.lease.host,
+            name: self.lease.name.clone(),
+            state: match (self.left, cut_off) {
+                (true, _) => HostState::Left,
+                (false, true) => HostState::CutOff,
+                (false, false) => HostState::Connected,
+            },
+            actors: self.lease.actors.len() as u32,
+            rows_per_second: self.rate,
+            resent_chunks: report.map_or(0, |report| report.resent),
+            round_trip_us: report.and_then(|report| report.round_trip_us),
+            policy_lag: report.map_or(0, |report| newest.saturating_sub(report.policy_version)),
+            silent_seconds: silent.as_secs_f64(),
+            roles,
+        }
+    }
+}
+
+fn state(activity: Activity) -> RoleState {
+    match activity {
+        Activity::Working => RoleState::Working,
+        Activity::WaitingForPeer | Activity::WaitingForServer => RoleState::WaitingForPeer,
+        Activity::WaitingForRatio => RoleState::WaitingForRatio,
+        Activity::Done => RoleState::Done,
+    }
+}
+
+/// Declares what the gate receives. The session keeps the declarations.
+fn declare(session: &Session, run_id: &str, arrivals: &Sender<Arrival>) -> Result<(), NetworkError> {
+    // A callback fails only while the gate ends.
+    let to = |arrivals: &Sender<Arrival>| arrivals.clone();
+    let sender = to(arrivals);
+    session
+        .declare_subscriber(network::chunks(run_id, "*"))
+        .callback(move |sample| drop(sender.send(Arrival::Chunk(sample.payload().to_bytes().into_owned()))))
+        .background()
+        .wait()
+        .map_err(failed("receive chunks"))?;
+    let sender = to(arrivals);
+    session
+        .declare_subscriber(network::reports(run_id, "*"))
+        .callback(move |sample| drop(sender.send(Arrival::Report(sample.payload().to_bytes().into_owned()))))
+        .background()
+        .wait()
+        .map_err(failed("receive reports"))?;
+    let sender = to(arrivals);
+    session
+        .declare_queryable(network::join(run_id))
+        .callback(move |query| drop(sender.send(Arrival::Join(query))))
+        .background()
+        .wait()
+        .map_err(failed("be asked"))?;
+    let sender = to(arrivals);
+    session
+        .declare_queryable(network::policy(run_id))
+        .callback(move |query| drop(sender.send(Arrival::Policy(query))))
+        .background()
+        .wait()
+        .map_err(failed("be asked"))
+}
+
+/// Only the newest marks count, and they are repeated, so they may be dropped where the network is busy.
+fn marks_publisher(session: &Session, run_id: &str, host: u64) -> Result<Publisher<'static>, NetworkError> {
+    session
+        .declare_publisher(network::marks(run_id, host))
+        .congestion_control(CongestionControl::Drop)
+        .priority(Priority::InteractiveHigh)
+        .express(true)
+        .wait()
+        .map_err(failed("send marks"))
+}
+
+fn answer_join(query: &Query, admission: &Admission) -> Result<(), GateError> {
+    let sent = query.reply(query.key_expr().clone(), admission.encode()?).wait();
+    if let Err(cause) = sent {
+        tracing::debug!("a host did not get its answer: {cause}");
+    }
+    Ok(())
+}
+
+/// Sends a policy from a thread of its own: a host with a slow connection must not delay the others. A host has one query
+/// at a time, so there is at most one thread for each.
+fn answer_policy(query: Query, bytes: Arc<Vec<u8>>) -> Result<(), GateError> {
+    let send = move || {
+        let key = query.key_expr().clone();
+        let sent = query.reply(key, bytes.as_slice()).wait();
+        if let Err(cause) = sent {
+            tracing::debug!("a policy did not arrive: {cause}");
+        }
+    };
+    std::thread::Builder::new().name("policy".into()).spawn(send)?;
+    Ok(())
+}
+
+fn encoded(cache: &mut Option<(PolicyId, Arc<Vec<u8>>)>, newest: &Policy) -> Arc<Vec<u8>> {
+    let id = Some((newest.header().incarnation, newest.header().version));
+    if let Some((_, bytes)) = cache.as_ref().filter(|(cached, _)| *cached == id) {
+        return bytes.clone();
+    }
+    let bytes = Arc::new(WirePolicy::encode(newest.header(), newest.parameters()));
+    *cache = Some((id, bytes.clone()));
+    bytes
+}

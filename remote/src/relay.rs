@@ -1,0 +1,634 @@
+//! The relay, a role on each other host. To the actors there it is the learner: it receives their chunks, publishes the
+//! policy, and writes the commit record that they wait for. What it knows of the learner comes from the gate.
+
+use std::collections::BTreeMap;
+use std::os::fd::{AsFd, OwnedFd};
+use std::sync::mpsc::{Receiver, Sender, SyncSender, TrySendError, channel, sync_channel};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
+use shoal_common::channel::control::Question;
+use shoal_common::channel::policy::PolicyPublisher;
+use shoal_common::channel::reports::Reports;
+use shoal_common::channel::transitions::ChunkReceiver;
+use shoal_common::channel::{ChannelError, Domain, EventName, HeartbeatSender, Listener, Notifier};
+use shoal_common::commit::{ActorCommit, ChunkMark, CommitMirror, ReplayLayout};
+use shoal_common::config::Config;
+use shoal_common::report::{Activity, EpisodeReport, Heartbeat, Identity, Role};
+use shoal_common::run_dir::{RunDir, RunDirError};
+use shoal_common::stop::Stop;
+use zenoh::bytes::ZBytes;
+use zenoh::pubsub::Publisher;
+use zenoh::qos::{CongestionControl, Priority};
+use zenoh::{Session, Wait};
+
+use crate::files::{FileError, HostFile, KeyFile};
+use crate::join::ask_to_join;
+use crate::network::{self, NetworkError, failed};
+use crate::requests::Requests;
+use crate::unconfirmed::{Consequence, Unconfirmed};
+use crate::wire::vector_instructions;
+use crate::wire::{
+    Admission, Hello, HostReport, Marks, Message, Phase, PolicyQuestion, RemoteEpisode, RemoteRole, WireChunk,
+    WireError, WirePolicy, mark_of,
+};
+
+/// The gate is away if it has sent no marks for this long.
+const CUT_OFF: Duration = Duration::from_secs(3);
+
+/// Chunks are sent again if the gate has got none for this long; or for some round trips, if that is longer.
+const PATIENCE: Duration = Duration::from_millis(200);
+const ROUND_TRIPS: u32 = 4;
+
+/// Time between two reports.
+const REPORTS: Duration = Duration::from_millis(250);
+
+/// How long to wait for news before looking at everything again.
+const SLEEP: Duration = Duration::from_millis(20);
+
+/// How often to refresh connections.
+const REFRESH: Duration = Duration::from_millis(50);
+
+/// Chunks on their way to the thread that sends them.
+const SENDING: usize = 64;
+
+/// Episodes kept for the next report; more are dropped while the gate is away.
+const EPISODES: usize = 10_000;
+
+/// How long a query for a policy may take, and the pause after one without an answer.
+const POLICY_QUERY: Duration = Duration::from_secs(10);
+const POLICY_PAUSE: Duration = Duration::from_millis(50);
+
+/// How long to wait before asking again to be admitted.
+const JOIN_AGAIN: Duration = Duration::from_secs(1);
+
+/// What the relay needs.
+#[derive(Clone, Debug)]
+pub struct RelaySettings {
+    /// Which process this is.
+    pub identity: Identity,
+    /// The run's configuration, as on this host.
+    pub config: Config,
+    /// The host's directory.
+    pub run: RunDir,
+    /// What `shoal join` has been given.
+    pub host: HostFile,
+    /// The run's key, unless the endpoint is not encrypted.
+    pub key: Option<KeyFile>,
+}
+
+/// Why the relay ended.
+#[derive(Debug, thiserror::Error)]
+pub enum RelayError {
+    /// A channel of this host failed.
+    #[error(transparent)]
+    Channel(#[from] ChannelError),
+    /// The network failed.
+    #[error(transparent)]
+    Network(#[from] NetworkError),
+    /// The host's directory cannot be used.
+    #[error(transparent)]
+    Run(#[from] RunDirError),
+    /// A file of the host cannot be used.
+    #[error(transparent)]
+    File(#[from] FileError),
+    /// Its actors belong to others now.
+    #[error("the run has given the actors of this host to others: join again")]
+    OtherActors,
+    /// A message cannot be encoded.
+    #[error(transparent)]
+    Wire(#[from] WireError),
+    /// The copy of the commit record cannot be written.
+    #[error("cannot write the copy of the commit record: {0}")]
+    Mirror(std::io::Error),
+    /// The system refused.
+    #[error("the system refuses: {0}")]
+    System(#[from] std::io::Error),
+}
+
+/// Something that has come from the gate.
+enum Arrival {
+    Marks(Vec<u8>),
+    Policy(Vec<u8>),
+    /// The answer to the question whether this host is still admitted.
+    Admission(Result<Admission, String>),
+}
+
+/// Wakes the relay's loop after an arrival.
+#[derive(Clone)]
+struct Wake {
+    arrivals: Sender<Arrival>,
+    event: Arc<OwnedFd>,
+}
+
+impl Wake {
+    fn send(&self, arrival: Arrival) {
+        // Both fail only while the relay ends, or if it has been woken a great many times already.
+        let _ = self.arrivals.send(arrival);
+        let _ = rustix::io::write(&self.event, &1_u64.to_ne_bytes());
+    }
+}
+
+/// An actor of this host.
+struct Source {
+    receiver: ChunkReceiver,
+    unconfirmed: Unconfirmed<ZBytes>,
+    notifier: Notifier,
+    commit: ActorCommit,
+}
+
+struct Relay<'a> {
+    settings: &'a RelaySettings,
+    domain: &'a Domain,
+    stop: &'a Stop,
+    session: Session,
+    listener: Listener,
+    wake: Wake,
+    arrivals: Receiver<Arrival>,
+    requests: Requests<()>,
+    sender: SyncSender<ZBytes>,
+    reports: Publisher<'static>,
+    mirror: CommitMirror,
+    sources: BTreeMap<u32, Source>,
+    publisher: Option<PolicyPublisher>,
+    /// The newest policy, for the thread that asks for the next one.
+    newest: Newest,
+    heartbeat: HeartbeatSender,
+    heartbeats: Reports<Heartbeat>,
+    episode_reports: Reports<EpisodeReport>,
+    roles: BTreeMap<(Role, u32), RemoteRole>,
+    episodes: Vec<RemoteEpisode>,
+    epoch: u64,
+    /// Gate and number of the newest marks.
+    marks: (u64, u64),
+    heard: Option<Instant>,
+    begun: Instant,
+    /// Number and time of the last report.
+    report: (u64, Instant),
+    /// A report that no marks have confirmed yet.
+    echo: Option<(u64, Instant)>,
+    round_trip: Option<Duration>,
+    refreshed: Instant,
+    /// When this host last asked to be admitted again, and whether an answer is still to come.
+    asked: Option<(Instant, bool)>,
+    over: bool,
+}
+
+/// Stands in for the learner until `stop`.
+///
+/// # Errors
+/// When a channel fails, or this host is no longer admitted.
+pub fn relay(domain: &Domain, settings: &RelaySettings, stop: &Stop) -> Result<(), RelayError> {
+    Relay::new(domain, settings, stop)?.run()
+}
+
+impl<'a> Relay<'a> {
+    fn new(domain: &'a Domain, settings: &'a RelaySettings, stop: &'a Stop) -> Result<Self, RelayError> {
+        let RelaySettings { config, run, host, .. } = settings;
+        let heartbeat = HeartbeatSender::new(domain, settings.identity)?;
+        let listener = Listener::bind(domain, EventName(Role::Learner, 0))?;
+        let chunk = config.chunk_layout();
+        let layout = ReplayLayout {
+            row: chunk.row,
+            // There are no rows in a copy.
+            ring: 1,
+            actors: config.actors.max as usize,
+            actor_snapshot_words: chunk.actor_snapshot_words,
+            fingerprint: config.fingerprint(),
+        };
+        let mirror = CommitMirror::open(&run.replay_file(), &layout).map_err(RelayError::Mirror)?;
+        let mut sources = BTreeMap::new();
+        for actor in &host.actors {
+            let commit = mirror.actor(*actor as usize);
+            let source = Source {
+                receiver: ChunkReceiver::open(domain, *actor, chunk, config.actors.window)?,
+                unconfirmed: Unconfirmed::new(commit.mark),
+                notifier: Notifier::new(domain, EventName(Role::Actor, *actor))?,
+                commit,
+            };
+            sources.insert(*actor, source);
+        }
+        let session = network::connect(&host.endpoint, settings.key.as_ref())?;
+        let (sender, arrivals) = channel();
+        let event = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK).map_err(std::io::Error::from)?;
+        let wake = Wake {
+            arrivals: sender,
+            event: Arc::new(event),
+        };
+        let to = wake.clone();
+        session
+            .declare_subscriber(network::marks(&host.run_id, host.host))
+            .callback(move |sample| to.send(Arrival::Marks(sample.payload().to_bytes().into_owned())))
+            .background()
+            .wait()
+            .map_err(failed("receive marks"))?;
+        let reports = session
+            .declare_publisher(network::reports(&host.run_id, &host.host.to_string()))
+            .congestion_control(CongestionControl::Drop)
+            .express(true)
+            .wait()
+            .map_err(failed("send reports"))?;
+        let newest = Newest::default();
+        start_asking_for_policies(&session, host, wake.clone(), newest.clone())?;
+        let now = Instant::now();
+        Ok(Self {
+            sender: start_sending(&session, host)?,
+            requests: Requests::start(&config.run.id, config.actors.max, run.key()?)?,
+            heartbeats: Reports::open(domain)?,
+            episode_reports: Reports::open(domain)?,
+            settings,
+            domain,
+            stop,
+            session,
+            listener,
+            wake,
+            arrivals,
+            reports,
+            mirror,
+            sources,
+            publisher: None,
+            newest,
+            heartbeat,
+            roles: BTreeMap::new(),
+            episodes: Vec::new(),
+            epoch: host.epoch,
+            marks: (0, 0),
+            heard: None,
+            begun: now,
+            report: (0, now),
+            echo: None,
+            round_trip: None,
+            refreshed: now,
+            asked: None,
+            over: false,
+        })
+    }
+
+    fn run(&mut self) -> Result<(), RelayError> {
+        self.heartbeat.beat_now(Activity::WaitingForPeer);
+        loop {
+            let arrivals: Vec<Arrival> = self.arrivals.try_iter().collect();
+            for arrival in arrivals {
+                self.take(arrival)?;
+            }
+            self.take_chunks()?;
+            self.send_chunks();
+            self.read_reports()?;
+            if self.report.1.elapsed() >= REPORTS {
+                self.send_report(false)?;
+            }
+            self.refresh_connections()?;
+            while self.requests.answer().is_some() {}
+            if self.stop.requested() {
+                return self.send_report(true);
+            }
+            self.sleep()?;
+        }
+    }
+
+    fn is_cut_off(&self) -> bool {
+        self.heard.is_none_or(|heard| heard.elapsed() >= CUT_OFF)
+    }
+
+    fn now(&self) -> Duration {
+        self.begun.elapsed()
+    }
+
+    fn take(&mut self, arrival: Arrival) -> Result<(), RelayError> {
+        match arrival {
+            Arrival::Marks(bytes) => match Marks::decode(&bytes) {
+                Ok(marks) => self.take_marks(&marks),
+                Err(error) => {
+                    tracing::warn!("the gate sent marks that are not read: {error}");
+                    Ok(())
+                }
+            },
+            Arrival::Policy(bytes) => match WirePolicy::decode(&bytes) {
+                Ok(policy) => self.publish(&policy),
+                Err(error) => {
+                    tracing::warn!("the gate sent a policy that is not read: {error}");
+                    Ok(())
+                }
+            },
+            Arrival::Admission(answer) => self.take_admission(answer),
+        }
+    }
+
+    fn take_marks(&mut self, marks: &Marks) -> Result<(), RelayError> {
+        if (marks.gate, marks.number) <= self.marks {
+            return Ok(());
+        }
+        let other_gate = marks.gate != self.marks.0;
+        self.marks = (marks.gate, marks.number);
+        if self.is_cut_off() {
+            tracing::info!("connected to the gate");
+        }
+        self.heard = Some(Instant::now());
+        if marks.phase == Phase::Over && !self.over {
+            tracing::info!("the run is over");
+            self.over = true;
+        }
+        if let Some((_, sent)) = self.echo.take_if(|(number, _)| *number <= marks.report) {
+            self.round_trip = Some(sent.elapsed());
+        }
+        let covered = |actor: &u32| marks.actors.iter().any(|marks| marks.actor == *actor);
+        if marks.epoch != self.epoch || !self.settings.host.actors.iter().all(covered) {
+            self.ask_again();
+            return Ok(());
+        }
+        let now = self.now();
+        let mut changed = Vec::new();
+        for marks in &marks.actors {
+            let Some(source) = self.sources.get_mut(&marks.actor) else {
+                continue;
+            };
+            let mark = |(incarnation, sequence)| ChunkMark { incarnation, sequence };
+            let commit = ActorCommit {
+                mark: mark(marks.committed),
+                rows: marks.rows,
+            };
+            let limit = self.settings.host.limit;
+            let consequence = source.unconfirmed.confirm(mark(marks.got), commit.mark, limit, now);
+            if other_gate {
+                source.unconfirmed.go_back(now);
+            }
+            if commit != source.commit {
+                source.commit = commit;
+                changed.push(marks.actor);
+            }
+            follow(&self.requests, marks.actor, consequence);
+        }
+        if other_gate || !changed.is_empty() {
+            let of_host = marks.actors.iter();
+            let commits = of_host.filter_map(|marks| {
+                let source = self.sources.get(&marks.actor)?;
+                Some((marks.actor, source.commit, &marks.snapshot[..]))
+            });
+            self.mirror.publish(marks.rows, commits);
+            changed.iter().for_each(|actor| self.sources[actor].notifier.notify());
+        }
+        Ok(())
+    }
+
+    /// Asks whether this host is still admitted: the launcher of the run is another process, or has given its actors away.
+    fn ask_again(&mut self) {
+        let waits = self
+            .asked
+            .is_some_and(|(then, open)| open || then.elapsed() < JOIN_AGAIN);
+        if waits {
+            return;
+        }
+        self.asked = Some((Instant::now(), true));
+        let host = &self.settings.host;
+        let hello = Hello {
+            program: env!("CARGO_PKG_VERSION").into(),
+            host: host.host,
+            name: host.name.clone(),
+            instructions: vector_instructions(),
+            actors: host.actors.len() as u32,
+            held: host.actors.clone(),
+        };
+        let (session, wake, run_id) = (self.session.clone(), self.wake.clone(), host.run_id.clone());
+        let ask = move || {
+            let answer = ask_to_join(&session, &run_id, &hello).map_err(|error| error.to_string());
+            wake.send(Arrival::Admission(answer));
+        };
+        if let Err(cause) = std::thread::Builder::new().name("join".into()).spawn(ask) {
+            tracing::warn!("cannot ask to be admitted again: {cause}");
+            self.asked = Some((Instant::now(), false));
+        }
+    }
+
+    fn take_admission(&mut self, answer: Result<Admission, String>) -> Result<(), RelayError> {
+        self.asked = Some((Instant::now(), false));
+        let host = &self.settings.host;
+        match answer {
+            Ok(Admission::Admitted(lease)) if lease.actors == host.actors => {
+                tracing::info!("admitted again");
+                self.epoch = lease.epoch;
+                let mut host = host.clone();
+                host.epoch = lease.epoch;
+                host.write(&self.settings.run)?;
+            }
+            Ok(Admission::Admitted(_)) => return Err(RelayError::OtherActors),
+            Ok(Admission::Refused(why)) => tracing::warn!("not admitted again: {why}"),
+            Err(why) => tracing::debug!("no answer: {why}"),
+        }
+        Ok(())
+    }
+
+    fn publish(&mut self, policy: &WirePolicy) -> Result<(), RelayError> {
+        let publisher = match &self.publisher {
+            Some(publisher) => publisher,
+            None => self
+                .publisher
+                .insert(PolicyPublisher::open(self.domain, policy.parameters.len())?),
+        };
+        publisher.publish(&policy.parameters, policy.header)?;
+        self.newest.set(policy.header.incarnation, policy.header.version);
+        self.heartbeat.set_policy_version(policy.header.version);
+        self.sources.values().for_each(|source| source.notifier.notify());
+        Ok(())
+    }
+
+    /// Takes the chunks of the actors.
+    fn take_chunks(&mut self) -> Result<(), RelayError> {
+        // Before the first marks nobody knows what is committed.
+        if self.heard.is_none() {
+            return Ok(());
+        }
+        let now = self.now();
+        for (actor, source) in &mut self.sources {
+            while let Some(chunk) = source.receiver.receive()? {
+                let (rows, snapshot) = chunk.parts();
+                let bytes = WireChunk::encode(self.settings.host.host, chunk.header(), rows, snapshot);
+                let consequence = source.unconfirmed.add(mark_of(chunk.header()), bytes.into(), now);
+                follow(&self.requests, *actor, consequence);
+                self.heartbeat.count(chunk.header().rows.into());
+            }
+        }
+        Ok(())
+    }
+
+    /// Hands chunks to the thread that sends them, as many as it takes. While the gate is away they stay here.
+    fn send_chunks(&mut self) {
+        let (now, cut_off) = (self.now(), self.is_cut_off());
+        let patience = PATIENCE.max(ROUND_TRIPS * self.round_trip.unwrap_or_default());
+        for source in self.sources.values_mut() {
+            if cut_off {
+                continue;
+            }
+            source.unconfirmed.go_back_if_overdue(now, patience);
+            while let Some(kept) = source.unconfirmed.next() {
+                match self.sender.try_send(kept.chunk.clone()) {
+                    Ok(()) => source.unconfirmed.sent(),
+                    Err(TrySendError::Full(_) | TrySendError::Disconnected(_)) => return,
+                }
+            }
+        }
+    }
+
+    fn read_reports(&mut self) -> Result<(), RelayError> {
+        while let Some(heartbeat) = self.heartbeats.receive()? {
+            if let Some(role) = RemoteRole::of(&heartbeat).filter(|role| role.role != Role::Relay) {
+                self.roles.insert((role.role, role.index), role);
+            }
+        }
+        while let Some(episode) = self.episode_reports.receive()? {
+            if self.episodes.len() < EPISODES {
+                self.episodes.push(episode.into());
+            }
+        }
+        Ok(())
+    }
+
+    fn send_report(&mut self, leaving: bool) -> Result<(), RelayError> {
+        let now = Instant::now();
+        self.report = (self.report.0 + 1, now);
+        self.echo.get_or_insert(self.report);
+        // What is sent while the gate is away is lost.
+        let episodes = if self.is_cut_off() {
+            Vec::new()
+        } else {
+            std::mem::take(&mut self.episodes)
+        };
+        let report = HostReport {
+            host: self.settings.host.host,
+            number: self.number(),
+            round_trip_us: self.round_trip.map(|trip| trip.as_micros() as u64),
+            leaving,
+            resent: self.sources.values().map(|source| source.unconfirmed.resent()).sum(),
+            policy_version: self.newest.get().map_or(0, |(_, version)| version),
+            roles: self.roles.values().copied().collect(),
+            episodes,
+        };
+        self.reports
+            .put(report.encode()?)
+            .wait()
+            .map_err(failed("send a report"))?;
+        if leaving {
+            // The process ends next, and with it what has not left it.
+            self.session.close().wait().map_err(failed("close"))?;
+        }
+        Ok(())
+    }
+
+    /// The number of this report. It grows over restarts of the relay, whose incarnations grow.
+    fn number(&self) -> u64 {
+        (self.settings.identity.incarnation << 32) + self.report.0
+    }
+
+    fn refresh_connections(&mut self) -> Result<(), RelayError> {
+        if self.refreshed.elapsed() < REFRESH {
+            return Ok(());
+        }
+        self.refreshed = Instant::now();
+        if let Some(publisher) = &self.publisher {
+            publisher.refresh_connections()?;
+        }
+        let activity = match (self.over, self.is_cut_off()) {
+            (true, _) => Activity::Done,
+            (false, true) => Activity::WaitingForPeer,
+            (false, false) => Activity::Working,
+        };
+        self.heartbeat.beat(activity);
+        Ok(())
+    }
+
+    /// Waits for an actor or the gate, for a while.
+    fn sleep(&self) -> Result<(), RelayError> {
+        let patience = Timespec::try_from(SLEEP).ok();
+        let mut ready = [
+            PollFd::from_borrowed_fd(self.listener.as_fd(), PollFlags::IN),
+            PollFd::from_borrowed_fd(self.wake.event.as_fd(), PollFlags::IN),
+        ];
+        match poll(&mut ready, patience.as_ref()) {
+            Ok(_) | Err(rustix::io::Errno::INTR) => {}
+            Err(errno) => return Err(std::io::Error::from(errno).into()),
+        }
+        let mut count = [0; 8];
+        // It fails if there was no arrival.
+        let _ = rustix::io::read(&self.wake.event, &mut count);
+        self.listener.wait(Duration::ZERO)?;
+        Ok(())
+    }
+}
+
+fn follow(requests: &Requests<()>, actor: u32, consequence: Consequence) {
+    match consequence {
+        Consequence::Continue => {}
+        Consequence::StartAgain(incarnation) => {
+            tracing::warn!("the replay has lost chunks of actor {actor}; the actor is started again");
+            requests.ask(Question::Replace { actor, incarnation }, ());
+        }
+        // The gate's next marks no longer name the actor.
+        Consequence::TakenOver => tracing::warn!("actor {actor} now belongs to another host"),
+    }
+}
+
+/// Starts the thread that sends chunks. It may block for seconds while the connection is down.
+fn start_sending(session: &Session, host: &HostFile) -> Result<SyncSender<ZBytes>, RelayError> {
+    let publisher = session
+        .declare_publisher(network::chunks(&host.run_id, &host.host.to_string()))
+        .congestion_control(CongestionControl::Block)
+        .priority(Priority::DataHigh)
+        .wait()
+        .map_err(failed("send chunks"))?;
+    let (sender, chunks) = sync_channel::<ZBytes>(SENDING);
+    std::thread::Builder::new().name("sender".into()).spawn(move || {
+        for chunk in chunks {
+            if let Err(cause) = publisher.put(chunk).wait() {
+                tracing::debug!("a chunk was not sent: {cause}");
+            }
+        }
+    })?;
+    Ok(sender)
+}
+
+/// Learner's incarnation and version of the newest policy of this host; `None` before the first.
+#[derive(Clone, Debug, Default)]
+struct Newest(Arc<Mutex<Option<(u64, u64)>>>);
+
+impl Newest {
+    fn get(&self) -> Option<(u64, u64)> {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn set(&self, incarnation: u64, version: u64) {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = Some((incarnation, version));
+    }
+}
+
+/// Starts the thread that always asks for a policy other than the last one.
+fn start_asking_for_policies(session: &Session, host: &HostFile, wake: Wake, newest: Newest) -> Result<(), RelayError> {
+    let (session, key, host) = (session.clone(), network::policy(&host.run_id), host.host);
+    let ask = move || {
+        while !session.is_closed() {
+            let have = newest.get();
+            let Ok(question) = (PolicyQuestion { host, have }).encode() else {
+                return;
+            };
+            let replies = session
+                .get(&key)
+                .payload(question)
+                .timeout(POLICY_QUERY)
+                // The policy has the congestion control of the question: `Drop` would never deliver a large one.
+                .congestion_control(CongestionControl::Block)
+                .wait();
+            let reply = replies.ok().and_then(|replies| replies.recv().ok());
+            let Some(sample) = reply.as_ref().and_then(|reply| reply.result().ok()) else {
+                std::thread::sleep(POLICY_PAUSE);
+                continue;
+            };
+            wake.send(Arrival::Policy(sample.payload().to_bytes().into_owned()));
+            // The next question names this policy, so it waits until it is published here.
+            let asked = Instant::now();
+            while newest.get() == have && asked.elapsed() < POLICY_QUERY {
+                std::thread::sleep(Duration::from_millis(1));
+            }
+        }
+    };
+    std::thread::Builder::new().name("policies".into()).spawn(ask)?;
+    Ok(())
+}

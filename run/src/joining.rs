@@ -1,0 +1,59 @@
+//! The directory of a host that has joined a run of another host.
+
+use std::path::Path;
+
+use anyhow::{Context, bail};
+use shoal_common::config::Config;
+use shoal_common::run_dir::{RunDir, RunLock};
+
+use crate::external_environment::ExternalEnvironment;
+use crate::server_location::{ServerLocation, Surroundings};
+use crate::signals::Interrupt;
+
+/// Makes the directory at `path` from the run's configuration. The run's processes on this host find each other under a name
+/// of their own, so a host may join a run of the same machine. `first_incarnation` is the first that they may have.
+///
+/// # Errors
+/// When the directory exists, the configuration cannot be used here, or an environment that another program serves has other
+/// spaces here.
+pub fn make_host_directory(
+    path: &Path,
+    configuration: &str,
+    first_incarnation: u64,
+    interrupt: Interrupt,
+) -> anyhow::Result<(Config, RunDir, RunLock)> {
+    let run = RunDir::create(path)?;
+    let lock = run.lock()?;
+    let made = fill(&run, configuration, first_incarnation, interrupt);
+    match made {
+        Ok(config) => Ok((config, run, lock)),
+        Err(error) => {
+            let _ = std::fs::remove_dir_all(run.path());
+            Err(error)
+        }
+    }
+}
+
+fn fill(run: &RunDir, configuration: &str, first_incarnation: u64, interrupt: Interrupt) -> anyhow::Result<Config> {
+    std::fs::write(run.config_file(), configuration).context("cannot write the configuration")?;
+    let mut config = run
+        .config()
+        .context("the run's configuration cannot be used on this host")?;
+    config.run.id = format!("{:08x}", rand::random::<u32>());
+    run.write_config(&config)?;
+    std::fs::write(run.incarnations(), (first_incarnation - 1).to_string()).context("cannot write a counter")?;
+    if let Some(location) = ServerLocation::here(&config.environment.server)? {
+        location.write(run)?;
+        let surroundings = Surroundings::of_run(run, &config)?;
+        let environment = ExternalEnvironment::begin_in(&config.environment, 1, 0, surroundings, interrupt)?;
+        let found = environment.spec();
+        if !found.is(&config.spec) {
+            bail!(
+                "the environment {} has other spaces on this host: {found:?} instead of {:?}",
+                config.environment.name,
+                config.spec
+            );
+        }
+    }
+    Ok(config)
+}

@@ -1,0 +1,221 @@
+//! `shoal join`: works for a run of another host.
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::time::Duration;
+
+use clap::Args;
+use shoal_run::numbers::small_count;
+
+/// The message of a program without the network.
+pub(crate) const NOT_BUILT: &str = "this program was built without remote actors: build it with `cargo build --release \
+                                    --features remote`";
+
+#[derive(Args, Clone, Debug)]
+pub(crate) struct JoinArgs {
+    /// Where the run listens, as `train --listen` prints it (tls/learner-7:7447); or the run's directory.
+    #[arg(value_name = "ENDPOINT|RUN_DIR")]
+    pub(crate) run: String,
+    /// The run's key, the file join.key in its directory; - reads it from standard input [default: that of the directory].
+    #[arg(long, value_name = "FILE")]
+    pub(crate) key: Option<PathBuf>,
+    /// Actor processes on this host, each with its environment server.
+    #[arg(long, value_name = "N", value_parser = small_count)]
+    pub(crate) actors: u32,
+    /// End, with exit code 4, if the run cannot be reached for this long, as in 90s, 10min or 2h.
+    #[arg(long, value_name = "TIME", default_value = "10min", value_parser = time)]
+    pub(crate) give_up: Duration,
+    /// The host's name in `status` [default: the machine's].
+    #[arg(long, value_name = "NAME")]
+    pub(crate) name: Option<String>,
+    /// Directory for this host's log and other files; it is kept [default: a temporary one].
+    #[arg(long, value_name = "DIR")]
+    pub(crate) local: Option<PathBuf>,
+}
+
+/// Reads a time such as `90s`, `10min` or `2h`.
+fn time(text: &str) -> Result<Duration, String> {
+    let digits = text.find(|c: char| !c.is_ascii_digit()).unwrap_or(text.len());
+    let (number, unit) = text.split_at(digits);
+    let seconds = match unit {
+        "s" => Some(1),
+        "min" => Some(60),
+        "h" => Some(3600),
+        _ => None,
+    };
+    let time = number.parse::<u32>().ok().zip(seconds);
+    time.map(|(number, seconds)| Duration::from_secs(u64::from(number) * seconds))
+        .ok_or_else(|| "write a number and a unit: 90s, 10min or 2h".into())
+}
+
+#[cfg(not(feature = "remote"))]
+pub(crate) fn run(_args: &JoinArgs) -> anyhow::Result<ExitCode> {
+    anyhow::bail!(NOT_BUILT)
+}
+
+#[cfg(feature = "remote")]
+pub(crate) use with_network::run;
+
+#[cfg(feature = "remote")]
+mod with_network {
+    use std::io::Write;
+    use std::path::Path;
+
+    use anyhow::{Context, bail};
+    use shoal_remote::endpoint::Endpoint;
+    use shoal_remote::files::{HostFile, JoinFile, KeyFile};
+    use shoal_remote::join::{JoinError, join};
+    use shoal_remote::wire::{Admission, Hello, Lease, vector_instructions};
+    use shoal_run::joining::make_host_directory;
+    use shoal_run::plan::UsageError;
+    use shoal_run::signals::{Signals, exit_code};
+
+    use super::*;
+    use crate::launcher::joined::{self, Ending};
+
+    /// The exit code if the run could not be reached for too long.
+    const GAVE_UP: u8 = 4;
+
+    /// Joins the run, and works for it until it is over.
+    pub(crate) fn run(args: &JoinArgs) -> anyhow::Result<ExitCode> {
+        let (endpoint, key) = endpoint(args)?;
+        let signals = Signals::register()?;
+        let interrupt = signals.interrupt();
+        let host = host_number()?;
+        let name = match &args.name {
+            Some(name) => name.clone(),
+            None => rustix::system::uname().nodename().to_string_lossy().into_owned(),
+        };
+        let hello = Hello {
+            program: env!("CARGO_PKG_VERSION").into(),
+            host,
+            name: name.clone(),
+            instructions: vector_instructions(),
+            actors: args.actors,
+            held: Vec::new(),
+        };
+        let admission = join(&endpoint, key.as_ref(), &hello, args.give_up, || {
+            interrupt.signal().is_some()
+        });
+        if let Some(signal) = interrupt.signal() {
+            return Ok(exit_code(signal));
+        }
+        let lease = match admission {
+            Ok(Admission::Admitted(lease)) => lease,
+            Ok(Admission::Refused(why)) => bail!("{endpoint} does not admit this host: {why}"),
+            Err(error @ JoinError::Silence { .. }) => {
+                say(&format!("error: {error}"));
+                return Ok(GAVE_UP.into());
+            }
+            Err(error) => return Err(error.into()),
+        };
+        let temporary = std::env::temp_dir().join(format!("shoal-join-{host:016x}"));
+        let path = args.local.as_deref().unwrap_or(&temporary);
+        let worked = work(args, (endpoint, key, host, name), lease, path, &signals);
+        if args.local.is_none() {
+            match &worked {
+                Ok(_) => drop(std::fs::remove_dir_all(path)),
+                Err(_) => say(&format!("the log of this host is {}", path.join("shoal.log").display())),
+            }
+        }
+        worked
+    }
+
+    fn work(
+        args: &JoinArgs,
+        (endpoint, key, host, name): (Endpoint, Option<KeyFile>, u64, String),
+        lease: Lease,
+        path: &Path,
+        signals: &Signals,
+    ) -> anyhow::Result<ExitCode> {
+        let interrupt = signals.interrupt();
+        let (config, run, lock) = make_host_directory(path, &lease.config, lease.first_incarnation, interrupt)?;
+        // The name of the run in its messages is that of its own configuration.
+        let run_id = joined_run_id(&lease.config)?;
+        if let Some(key) = key {
+            key.write(&run.path().join(KeyFile::JOIN))?;
+        }
+        HostFile::new(endpoint.clone(), run_id, (host, name), &lease).write(&run)?;
+        let actors = lease.actors.clone();
+        say(&format!("joined {endpoint} with {} actors: {actors:?}", actors.len()));
+        let ending = joined::run(config, (&run, &lock), signals, actors, args.give_up)?;
+        Ok(match ending {
+            Ending::Over => {
+                say("the run is over");
+                ExitCode::SUCCESS
+            }
+            Ending::Stopped => ExitCode::SUCCESS,
+            Ending::Interrupted(signal) => exit_code(signal),
+            Ending::GaveUp => {
+                say(&format!(
+                    "error: {endpoint} could not be reached for {} s",
+                    args.give_up.as_secs()
+                ));
+                GAVE_UP.into()
+            }
+        })
+    }
+
+    fn say(line: &str) {
+        // A terminal that is gone must not make the work a failure.
+        let _ = writeln!(std::io::stderr(), "{line}");
+    }
+
+    /// Where to connect to, and with which key.
+    fn endpoint(args: &JoinArgs) -> anyhow::Result<(Endpoint, Option<KeyFile>)> {
+        let directory = Path::new(&args.run);
+        let (endpoint, key) = if directory.is_dir() {
+            let file = JoinFile::read(directory)
+                .with_context(|| format!("nobody can join {}: was it started with --listen?", args.run))?;
+            (
+                file.endpoint,
+                args.key.clone().unwrap_or_else(|| directory.join(KeyFile::JOIN)),
+            )
+        } else {
+            let endpoint = args.run.parse::<Endpoint>();
+            let endpoint = endpoint.map_err(|error| UsageError(error.to_string()))?;
+            let key = match &args.key {
+                None if endpoint.is_encrypted() => {
+                    let why = format!("{endpoint} needs the run's key: --key FILE, the join.key in its directory");
+                    return Err(UsageError(why).into());
+                }
+                key => key.clone().unwrap_or_default(),
+            };
+            (endpoint, key)
+        };
+        let key = endpoint.is_encrypted().then(|| KeyFile::read(&key)).transpose()?;
+        Ok((endpoint, key))
+    }
+
+    fn joined_run_id(config: &str) -> anyhow::Result<String> {
+        let table: toml::Table = config.parse().context("the run's configuration is damaged")?;
+        let id = table
+            .get("run")
+            .and_then(|run| run.get("id"))
+            .and_then(toml::Value::as_str);
+        Ok(id.context("the run's configuration has no run.id")?.to_owned())
+    }
+
+    /// A number that no other host draws.
+    fn host_number() -> anyhow::Result<u64> {
+        let mut bytes = [0; 8];
+        let mut file = std::fs::File::open("/dev/urandom").context("cannot draw a number")?;
+        std::io::Read::read_exact(&mut file, &mut bytes).context("cannot draw a number")?;
+        Ok(u64::from_le_bytes(bytes))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_time_has_a_number_and_a_unit() {
+        assert_eq!(time("90s"), Ok(Duration::from_secs(90)));
+        assert_eq!(time("10min"), Ok(Duration::from_secs(600)));
+        assert_eq!(time("2h"), Ok(Duration::from_secs(7200)));
+        for wrong in ["", "10", "s", "-1s", "1.5h", "1d", "99999999999s"] {
+            assert!(time(wrong).is_err(), "{wrong}");
+        }
+    }
+}

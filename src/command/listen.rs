@@ -1,0 +1,82 @@
+//! `--listen`, of `train` and `resume`: other hosts may join the run.
+
+use std::io::Write;
+use std::path::PathBuf;
+
+use clap::Args;
+use shoal_common::config::Config;
+use shoal_common::run_dir::RunDir;
+use shoal_remote::endpoint::Endpoint;
+use shoal_remote::files::JoinFile;
+use shoal_run::plan::UsageError;
+
+use super::join::NOT_BUILT;
+
+/// Makes the keys of the run, unless it has them from an earlier start. Returns the path of the hosts' key.
+#[cfg(feature = "remote")]
+fn make_keys(config: &Config, run: &RunDir) -> anyhow::Result<PathBuf> {
+    use std::time::SystemTime;
+
+    use shoal_remote::files::KeyFile;
+    use shoal_remote::keys::{self, VALID};
+
+    let (gate, join) = (run.path().join(KeyFile::GATE), run.path().join(KeyFile::JOIN));
+    if !(gate.exists() && join.exists()) {
+        let keys = keys::make(&config.run.id, SystemTime::now() + VALID)?;
+        keys.gate.write(&gate)?;
+        keys.join.write(&join)?;
+    }
+    Ok(join)
+}
+
+#[cfg(not(feature = "remote"))]
+fn make_keys(_config: &Config, _run: &RunDir) -> anyhow::Result<PathBuf> {
+    anyhow::bail!(NOT_BUILT)
+}
+
+#[derive(Args, Clone, Debug, Default)]
+pub(crate) struct ListenArgs {
+    /// Let other hosts join the run with `shoal join`, at this address of this machine (tls/10.0.0.1:7447) [default: all
+    /// addresses and a free port, or those of before].
+    #[arg(long, value_name = "ENDPOINT", num_args = 0..=1, default_missing_value = Endpoint::DEFAULT)]
+    pub(crate) listen: Option<String>,
+}
+
+impl ListenArgs {
+    /// Refuses what cannot be, before a run is made.
+    pub(crate) fn check(&self) -> anyhow::Result<()> {
+        let Some(endpoint) = &self.listen else { return Ok(()) };
+        if !cfg!(feature = "remote") {
+            anyhow::bail!(NOT_BUILT);
+        }
+        endpoint
+            .parse::<Endpoint>()
+            .map_err(|error| UsageError(error.to_string()))?;
+        Ok(())
+    }
+
+    /// Writes `join.toml` and says how to join, if other hosts may. Returns whether they may.
+    pub(crate) fn prepare(&self, config: &Config, run: &RunDir) -> anyhow::Result<bool> {
+        self.check()?;
+        let Some(endpoint) = &self.listen else { return Ok(false) };
+        let mut endpoint = endpoint.parse::<Endpoint>()?;
+        // A resumed run listens where the hosts of before are trying to reach it.
+        if endpoint.to_string() == Endpoint::DEFAULT
+            && let Ok(before) = JoinFile::read(run.path())
+        {
+            endpoint = before.listen;
+        }
+        let listen = endpoint.with_port()?;
+        let machine = rustix::system::uname().nodename().to_string_lossy().into_owned();
+        let endpoint = listen.seen_from_elsewhere(&machine);
+        JoinFile::new(endpoint.clone(), listen).write(run)?;
+        let mut line = format!("listening on {endpoint}; on other hosts: shoal join {endpoint}");
+        if endpoint.is_encrypted() {
+            let key = make_keys(config, run)?;
+            line += &format!(" --key {}", key.display());
+        }
+        // As everywhere, a terminal that is gone must not make the run a failure.
+        let _ = writeln!(std::io::stderr(), "{line} --actors N");
+        Ok(true)
+    }
+}

@@ -1,0 +1,110 @@
+//! The other hosts of a run: which actors and incarnations each has.
+
+use std::time::{Duration, Instant};
+
+use shoal_common::channel::control::{HostLease, HostState, HostStatus};
+
+/// Incarnations that a host gets at once: more than it will ever need.
+pub(super) const INCARNATIONS: u64 = 1 << 20;
+
+/// A host that is silent for this long loses its actors, so that another host may have them.
+const LOST: Duration = Duration::from_secs(60);
+
+/// The admitted hosts.
+#[derive(Debug)]
+pub(super) struct Hosts {
+    epoch: u64,
+    admitted: Vec<Admitted>,
+}
+
+#[derive(Debug)]
+struct Admitted {
+    lease: HostLease,
+    heard: Instant,
+    status: Option<HostStatus>,
+}
+
+impl Hosts {
+    /// No hosts. `epoch` is the number of this start of the launcher.
+    pub(super) fn new(epoch: u64) -> Self {
+        Self {
+            epoch,
+            admitted: Vec::new(),
+        }
+    }
+
+    pub(super) fn epoch(&self) -> u64 {
+        self.epoch
+    }
+
+    /// What each host has.
+    pub(super) fn leases(&self) -> Vec<HostLease> {
+        self.admitted.iter().map(|admitted| admitted.lease.clone()).collect()
+    }
+
+    pub(super) fn lease(&self, host: u64) -> Option<&HostLease> {
+        let mut leases = self.admitted.iter().map(|admitted| &admitted.lease);
+        leases.find(|lease| lease.host == host)
+    }
+
+    /// The last status of each host.
+    pub(super) fn statuses(&self) -> Vec<HostStatus> {
+        self.admitted
+            .iter()
+            .filter_map(|admitted| admitted.status.clone())
+            .collect()
+    }
+
+    /// Whether a host has this actor.
+    pub(super) fn has(&self, actor: u32) -> bool {
+        self.admitted
+            .iter()
+            .any(|admitted| admitted.lease.actors.contains(&actor))
+    }
+
+    /// Admits a host, or gives it something else.
+    pub(super) fn admit(&mut self, lease: HostLease) {
+        self.admitted.retain(|admitted| admitted.lease.host != lease.host);
+        self.admitted.push(Admitted {
+            lease,
+            heard: Instant::now(),
+            status: None,
+        });
+    }
+
+    /// Takes note of how the hosts are. Returns a message for each that has left or is given up.
+    pub(super) fn update(&mut self, statuses: Vec<HostStatus>) -> Vec<String> {
+        for status in statuses {
+            if let Some(admitted) = self
+                .admitted
+                .iter_mut()
+                .find(|admitted| admitted.lease.host == status.host)
+            {
+                if status.state == HostState::Connected {
+                    admitted.heard = Instant::now();
+                }
+                admitted.status = Some(status);
+            }
+        }
+        let mut messages = Vec::new();
+        self.admitted.retain(|admitted| {
+            let left = admitted
+                .status
+                .as_ref()
+                .is_some_and(|status| status.state == HostState::Left);
+            let name = &admitted.lease.name;
+            if left {
+                messages.push(format!("host {name} has left"));
+            } else if admitted.heard.elapsed() >= LOST {
+                messages.push(format!(
+                    "host {name} was silent for {} s: its actors are free",
+                    LOST.as_secs()
+                ));
+            } else {
+                return true;
+            }
+            false
+        });
+        messages
+    }
+}

@@ -1,0 +1,228 @@
+//! The launcher of a host that has joined a run: starts a relay, actors and environment servers, and watches them.
+
+use std::os::fd::AsFd;
+use std::time::{Duration, Instant};
+
+use anyhow::bail;
+use shoal_common::channel::Domain;
+use shoal_common::channel::control::{Answer, ControlPort, Question, RunStatus};
+use shoal_common::channel::reports::Reports;
+use shoal_common::config::Config;
+use shoal_common::report::{Activity, Heartbeat, Role};
+use shoal_common::run_dir::{RunDir, RunLock};
+use shoal_run::preflight;
+use shoal_run::process::wait_for_any;
+use shoal_run::signals::{self, Signals};
+
+use super::log::Log;
+use super::stall::Stalls;
+use super::supervisor::{Members, Situation, Supervisor};
+use super::{OTHERS_END, write_iox_config};
+
+/// How often heartbeats are read if nothing wakes the launcher.
+const TICK: Duration = Duration::from_millis(100);
+
+/// How long actors may take to hand over what they have.
+const HAND_OVER: Duration = Duration::from_secs(6);
+
+/// How the work for another host's run ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Ending {
+    /// The run is over.
+    Over,
+    /// The run could not be reached for too long.
+    GaveUp,
+    /// `shoal stop` ended it.
+    Stopped,
+    /// This signal ended it.
+    Interrupted(i32),
+}
+
+/// Works for the run until one of these endings. `config` and `run` are those of this host.
+pub(crate) fn run(
+    config: Config,
+    (run, lock): (&RunDir, &RunLock),
+    signals: &Signals,
+    actors: Vec<u32>,
+    give_up: Duration,
+) -> anyhow::Result<Ending> {
+    Domain::remove_abandoned()?;
+    let domain = Domain::join(&config.run.id, config.actors.max)?;
+    let ending = preflight::reserve_for_host(&config, &domain)
+        .and_then(|()| Host::new(config, (run, lock), &domain, signals, actors))
+        .and_then(|host| host.run(give_up));
+    // Also after an error: no role is left by now.
+    let left = domain.leave();
+    let ending = ending?;
+    left?;
+    Ok(ending)
+}
+
+struct Host<'a> {
+    config: Config,
+    run: &'a RunDir,
+    lock: &'a RunLock,
+    domain: &'a Domain,
+    control: ControlPort,
+    supervisor: Supervisor,
+    signals: &'a Signals,
+    stalls: Stalls,
+    log: Log,
+    heartbeats: Reports<Heartbeat>,
+    stop_requested: bool,
+    /// Since when the relay has had no connection.
+    cut_off: Option<Instant>,
+}
+
+impl<'a> Host<'a> {
+    fn new(
+        config: Config,
+        (run, lock): (&'a RunDir, &'a RunLock),
+        domain: &'a Domain,
+        signals: &'a Signals,
+        actors: Vec<u32>,
+    ) -> anyhow::Result<Self> {
+        let log = Log::open(&run.log())?;
+        write_iox_config(domain, run)?;
+        // Creates the services that are opened below.
+        let supervisor = Supervisor::new(&config, run, domain, log.clone(), Members::Host { actors })?;
+        Ok(Self {
+            control: ControlPort::open(domain)?,
+            heartbeats: Reports::open(domain)?,
+            stalls: Stalls::new(Duration::from_secs(config.run.stall_seconds)),
+            supervisor,
+            run,
+            lock,
+            domain,
+            signals,
+            log,
+            config,
+            stop_requested: false,
+            cut_off: None,
+        })
+    }
+
+    fn run(mut self, give_up: Duration) -> anyhow::Result<Ending> {
+        let ending = self.watch(give_up);
+        // The roles are ended in every case, also after an error. The relay stays while actors hand over what they have. If
+        // the run is over, they try that only for a moment: its learner takes no more than it needs.
+        match ending {
+            Ok(Ending::Over | Ending::GaveUp) => self.supervisor.ask_to_end(|role| role == Role::Actor),
+            _ => self.supervisor.ask_to_retire(Role::Actor),
+        }
+        self.await_end(|role| role == Role::Actor, HAND_OVER);
+        self.supervisor.ask_to_end(|_| true);
+        self.await_end(|_| true, OTHERS_END);
+        self.control.answer_waiting(&Answer::Accepted);
+        if let Err(error) = &ending {
+            self.log.note("launcher", &format!("{error:#}").replace('\n', " "));
+        }
+        ending
+    }
+
+    fn watch(&mut self, give_up: Duration) -> anyhow::Result<Ending> {
+        self.supervisor.start_all(self.domain)?;
+        loop {
+            if let Some(signal) = self.signals.received() {
+                let what = format!("{} ends the work for the run", signals::describe(signal));
+                self.log.note("launcher", &what);
+                return Ok(Ending::Interrupted(signal));
+            }
+            self.lock.check(self.run)?;
+            self.read_heartbeats()?;
+            self.answer_questions()?;
+            match self.supervisor.maintain(self.domain)? {
+                Situation::AtWork => {}
+                Situation::LearnerDone => bail!("a learner has ended on a host that has none"),
+                Situation::SharedMemoryOccupied => bail!("dead processes occupy shared memory for good: join again"),
+                Situation::FilesRemoved => bail!(
+                    "another program has removed files of this host in {}: join again",
+                    self.domain.directory()?.display()
+                ),
+            }
+            let start_limit =
+                (!self.config.environment.server.is_empty()).then(|| self.config.environment.start_limit());
+            for slow in self.supervisor.report_slow(&self.stalls, start_limit) {
+                self.log.note("launcher", &slow);
+            }
+            if self.stop_requested {
+                return Ok(Ending::Stopped);
+            }
+            match self.supervisor.activity(Role::Relay) {
+                Some(Activity::Done) => return Ok(Ending::Over),
+                Some(Activity::Working) => self.cut_off = None,
+                _ => {
+                    let since = self.cut_off.get_or_insert_with(Instant::now);
+                    if since.elapsed() >= give_up {
+                        return Ok(Ending::GaveUp);
+                    }
+                }
+            }
+            self.sleep(TICK.min(self.supervisor.idle_for()));
+        }
+    }
+
+    fn read_heartbeats(&mut self) -> anyhow::Result<()> {
+        while let Some(heartbeat) = self.heartbeats.receive()? {
+            self.supervisor.record(&heartbeat);
+        }
+        // The learner's host keeps the records.
+        self.supervisor.take_incidents();
+        self.supervisor.check_faults()
+    }
+
+    fn answer_questions(&mut self) -> anyhow::Result<()> {
+        let Self {
+            control,
+            run,
+            supervisor,
+            stop_requested,
+            config,
+            ..
+        } = self;
+        control.answer_questions(run.key()?, run.path(), |question| {
+            Ok::<_, anyhow::Error>(match question {
+                Question::Status => Some(Answer::Status(RunStatus {
+                    roles: supervisor.status(0),
+                    actors: supervisor.actors(),
+                    steps: config.run.steps,
+                    ..RunStatus::default()
+                })),
+                Question::Stop => {
+                    *stop_requested = true;
+                    None
+                }
+                Question::Replace { actor, incarnation } => {
+                    supervisor.replace_actor(actor, incarnation);
+                    Some(Answer::Accepted)
+                }
+                Question::Scale { .. } | Question::Admit(_) | Question::Hosts(_) => {
+                    let why = "this is a host that has joined a run: ask on the learner's host";
+                    Some(Answer::Refused(why.into()))
+                }
+            })
+        })
+    }
+
+    fn await_end(&mut self, which: impl Fn(Role) -> bool + Copy, patience: Duration) {
+        let deadline = Instant::now() + patience;
+        while !self.supervisor.have_ended(which) {
+            if Instant::now() >= deadline {
+                self.supervisor.kill(which);
+            }
+            // An error here must not prevent the end.
+            let _ = self.answer_questions();
+            self.sleep(deadline.saturating_duration_since(Instant::now()).min(TICK));
+        }
+    }
+
+    /// Sleeps at most `most`, until a process ends, a signal arrives or a request comes.
+    fn sleep(&mut self, most: Duration) {
+        let mut wakers: Vec<_> = self.supervisor.exit_descriptors().collect();
+        wakers.extend([self.signals.as_fd(), self.control.as_fd()]);
+        wait_for_any(&wakers, most);
+        // So that the same events do not wake it again.
+        self.signals.received();
+        self.supervisor.collect_exits();
+    }
+}

@@ -1,0 +1,404 @@
+//! Two hosts on one machine: a run that others may join, and hosts that join it. Processes of both are killed and stopped at
+//! any moment. Everything that the actors of a living host have sent is in the replay, once.
+
+#![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
+
+#[path = "../support/mod.rs"]
+mod support;
+
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use rand::seq::IndexedRandom;
+use rand::{RngExt, SeedableRng};
+use rustix::process::Signal;
+use shoal_common::config::Config;
+use shoal_common::stream::Stream;
+use support::{
+    QUICK, Running, Workplace, check_stored_rows, committed, error_line, final_result, sent, until, wait_for_rows,
+};
+
+/// Steps that no test reaches.
+const ENDLESS: &str = "100000000";
+
+/// A learner's host and its run, which others may join.
+struct Run {
+    place: Workplace,
+    running: Running,
+}
+
+impl Run {
+    fn start(arguments: &[&str]) -> Self {
+        let place = Workplace::logging_chunks();
+        let listens = arguments.contains(&"--listen");
+        let listen: &[&str] = if listens { &[] } else { &["--listen", "tcp/127.0.0.1:0"] };
+        let train = ["train", "pendulum", "--run", "run", "--steps", ENDLESS];
+        let running = place.launch("run", &[&train[..], listen, &QUICK, arguments].concat());
+        Self { place, running }
+    }
+
+    fn endpoint(&self) -> String {
+        let file = std::fs::read_to_string(self.running.run.join("join.toml")).unwrap();
+        let table: toml::Table = file.parse().unwrap();
+        table["endpoint"].as_str().unwrap().to_owned()
+    }
+
+    /// What `status` says of the other hosts.
+    fn hosts(&self) -> Vec<serde_json::Value> {
+        self.place.status("run")["hosts"].as_array().unwrap().clone()
+    }
+}
+
+/// Another host, which has joined a run.
+struct Host {
+    place: Workplace,
+    running: Running,
+}
+
+impl Host {
+    /// Joins with this number of actors, and waits until all roles of the host are ready.
+    fn join(run: &Run, arguments: &[&str]) -> Self {
+        let place = Workplace::logging_chunks();
+        let endpoint = run.endpoint();
+        let arguments = [&["join", &endpoint, "--local", "host"], arguments].concat();
+        let running = place.launch_command("host", &mut place.shoal(&arguments));
+        Self { place, running }
+    }
+
+    /// Rows that its actors have sent.
+    fn sent(&self, actors: &[u32]) -> u64 {
+        actors.iter().map(|actor| sent(&self.running.run, *actor)).sum()
+    }
+
+    /// Waits until the host has ended with this exit code and has left nothing.
+    fn ends_with(self, code: i32) {
+        let (ended, _, leftovers) = self.running.wait();
+        assert_eq!(ended, Some(code), "{}", self.place.stderr());
+        assert!(leftovers.processes().is_empty(), "{:?}", leftovers.processes());
+        assert!(leftovers.files().is_empty(), "{:?}", leftovers.files());
+    }
+}
+
+fn stop(run: Run) -> std::path::PathBuf {
+    let output = run.place.output(&["stop", "run"]);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let path = run.running.run.clone();
+    let (code, _, leftovers) = run.running.wait();
+    assert_eq!(code, Some(0), "{}", run.place.stderr());
+    assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
+    // The run's directory must outlive its workplace.
+    std::mem::forget(run.place);
+    path
+}
+
+/// Rows of these actors in the replay.
+fn in_replay(run: &std::path::Path, actors: &[u32]) -> u64 {
+    actors.iter().map(|actor| committed(run, *actor as usize)).sum()
+}
+
+/// Waits until the replay has more rows of each of these actors.
+fn wait_for_actors(run: &Run, actors: &[u32]) {
+    let rows = |actor: u32| committed(&run.running.run, actor as usize);
+    let before: Vec<u64> = actors.iter().map(|actor| rows(*actor)).collect();
+    until("every remote actor has more rows in the replay", || {
+        actors.iter().zip(&before).all(|(actor, before)| rows(*actor) > *before)
+    });
+}
+
+#[test]
+fn a_host_that_joins_sends_rows_is_shown_and_ends_with_the_run() {
+    let run = Run::start(&["--actors", "1"]);
+    let host = Host::join(&run, &["--actors", "2", "--name", "node-2"]);
+    wait_for_actors(&run, &[1, 2]);
+    until("the host is shown", || run.hosts().len() == 1);
+    let hosts = run.hosts();
+    assert_eq!(
+        (&hosts[0]["name"], &hosts[0]["state"]),
+        (&"node-2".into(), &"connected".into())
+    );
+    assert_eq!(hosts[0]["actors"], 2);
+    until("its roles are shown", || {
+        run.hosts()[0]["roles"].as_array().is_some_and(|roles| roles.len() == 4)
+    });
+    // Remote and local actors have their own indices.
+    let refused = run.place.output(&["scale", "run", "--actors", "15"]);
+    assert!(error_line(&refused).contains("other hosts have 2"));
+    let scaled = run.place.output(&["scale", "run", "--actors", "2"]);
+    assert!(scaled.status.success());
+    until("a second local actor works", || run.running.pids("actor-3").len() == 1);
+    until("episodes of remote actors are recorded", || {
+        let episodes = std::fs::read_to_string(run.running.run.join("episodes.csv")).unwrap_or_default();
+        let mut rows = csv::Reader::from_reader(episodes.as_bytes());
+        let actor = rows.headers().unwrap().iter().position(|name| name == "actor").unwrap();
+        rows.records().flatten().any(|row| &row[actor] == "2")
+    });
+    let path = stop(run);
+    let sent = host.sent(&[1, 2]);
+    host.ends_with(0);
+    assert_eq!(in_replay(&path, &[1, 2]), sent);
+}
+
+#[test]
+fn every_row_of_a_living_host_is_committed_once_whatever_is_killed() {
+    let run = Run::start(&[
+        "--actors",
+        "1",
+        "--set",
+        "replay.updates_per_step=0.2",
+        "--set",
+        "replay.capacity=500000",
+    ]);
+    let host = Host::join(&run, &["--actors", "2"]);
+    let mut rng = Stream::seed_from_u64(3);
+    let at_learner = ["gate-0", "learner-0", "evaluator-0", "actor-0", "env-server-0"];
+    // An actor that is killed may take a chunk with it that it has not logged.
+    let at_host = ["relay-0", "env-server-1", "env-server-2"];
+    let (begun, mut kills) = (Instant::now(), 0);
+    while begun.elapsed() < Duration::from_secs(12) || kills < 20 {
+        std::thread::sleep(Duration::from_millis(rng.random_range(50..600)));
+        match rng.random_bool(0.6) {
+            true => run.running.kill_if_alive(at_learner.choose(&mut rng).unwrap()),
+            false => host.running.kill_if_alive(at_host.choose(&mut rng).unwrap()),
+        }
+        kills += 1;
+    }
+    wait_for_actors(&run, &[1, 2]);
+    let path = stop(run);
+    let sent = host.sent(&[1, 2]);
+    host.ends_with(0);
+    assert!(sent > 0);
+    assert_eq!(in_replay(&path, &[1, 2]), sent, "after {kills} kills");
+    check_stored_rows(&path, &Config::load(&path.join("config.toml")).unwrap());
+}
+
+#[test]
+fn actors_are_replaced_and_lose_at_most_what_they_have_not_sent() {
+    let run = Run::start(&["--actors", "1"]);
+    let host = Host::join(&run, &["--actors", "1"]);
+    let mut kills = 0;
+    for pause in [0, 120, 40, 300, 10, 200] {
+        wait_for_actors(&run, &[1]);
+        std::thread::sleep(Duration::from_millis(pause));
+        host.running.kill("actor-1");
+        kills += 1;
+        let successor = || host.running.pids("actor-1").len() == kills + 1;
+        until("the actor is replaced", successor);
+    }
+    wait_for_actors(&run, &[1]);
+    let chunk = 8;
+    let path = stop(run);
+    let sent = host.sent(&[1]);
+    host.ends_with(0);
+    let committed = in_replay(&path, &[1]);
+    // It may be killed between sending a chunk and logging that.
+    assert!(
+        (sent..=sent + chunk * kills as u64).contains(&committed),
+        "{sent} rows sent, {committed} committed"
+    );
+}
+
+#[test]
+fn a_stopped_gate_or_relay_delays_only_its_hosts() {
+    let run = Run::start(&["--actors", "1"]);
+    let host = Host::join(&run, &["--actors", "1"]);
+    wait_for_actors(&run, &[1]);
+    host.running.stop_role("relay-0");
+    until("the host is shown as cut off", || run.hosts()[0]["state"] == "cut-off");
+    // The others go on.
+    wait_for_rows(&run.running, 100);
+    host.running.continue_role("relay-0");
+    wait_for_actors(&run, &[1]);
+    until("the host is shown as connected", || {
+        run.hosts()[0]["state"] == "connected"
+    });
+    run.running.stop_role("gate-0");
+    std::thread::sleep(Duration::from_secs(4));
+    wait_for_rows(&run.running, 100);
+    run.running.continue_role("gate-0");
+    wait_for_actors(&run, &[1]);
+    let path = stop(run);
+    let sent = host.sent(&[1]);
+    host.ends_with(0);
+    assert_eq!(in_replay(&path, &[1]), sent);
+}
+
+#[test]
+fn hosts_wait_for_a_killed_launcher_and_continue_with_its_successor() {
+    let run = Run::start(&["--actors", "1"]);
+    let host = Host::join(&run, &["--actors", "2"]);
+    wait_for_actors(&run, &[1, 2]);
+    let endpoint = run.endpoint();
+    run.running.signal(Signal::KILL);
+    run.running.leftovers().wait_until_gone();
+    let Run { place, running } = run;
+    let (code, ..) = running.wait();
+    assert_eq!(code, None);
+    let running = place.resume("run", &["--listen", &endpoint]);
+    let run = Run { place, running };
+    wait_for_actors(&run, &[1, 2]);
+    assert!(
+        host.running.pids("actor-1").len() == 1,
+        "the host's actors need no restart"
+    );
+    let path = stop(run);
+    let sent = host.sent(&[1, 2]);
+    host.ends_with(0);
+    assert_eq!(in_replay(&path, &[1, 2]), sent);
+}
+
+#[test]
+fn a_host_that_is_ended_hands_over_what_it_has_and_frees_its_actors() {
+    let run = Run::start(&["--actors", "1"]);
+    let host = Host::join(&run, &["--actors", "2"]);
+    wait_for_actors(&run, &[1, 2]);
+    host.running.signal(Signal::TERM);
+    until("the host has left", || run.hosts().is_empty());
+    let sent = host.sent(&[1, 2]);
+    host.ends_with(128 + 15);
+    assert_eq!(in_replay(&run.running.run, &[1, 2]), sent);
+    // Another host may have them, and continues their sequence numbers.
+    let host = Host::join(&run, &["--actors", "2"]);
+    wait_for_actors(&run, &[1, 2]);
+    let path = stop(run);
+    let more = host.sent(&[1, 2]);
+    host.ends_with(0);
+    assert_eq!(in_replay(&path, &[1, 2]), sent + more);
+}
+
+/// The weights and evaluations of a lockstep run with three actors, of which another host takes over two, if `joined`.
+fn lockstep(joined: bool) -> (serde_json::Value, Vec<String>) {
+    let place = Workplace::new();
+    let train = [
+        "train",
+        "pendulum",
+        "--run",
+        "run",
+        "--lockstep",
+        "--actors",
+        "3",
+        "--steps",
+        "6000",
+    ];
+    let more = ["--listen", "tcp/127.0.0.1:0", "--set", "checkpoint.every_updates=500"];
+    let running = place.launch("run", &[&train[..], &more, &QUICK].concat());
+    let run = Run { place, running };
+    if joined {
+        let host = Host::join(&run, &["--actors", "2"]);
+        wait_for_actors(&run, &[1, 2]);
+        for (at_host, role) in [
+            (true, "actor-1"),
+            (true, "relay-0"),
+            (false, "gate-0"),
+            (true, "env-server-2"),
+            (false, "learner-0"),
+        ] {
+            let running = if at_host { &host.running } else { &run.running };
+            running.kill_if_alive(role);
+            wait_for_rows(&run.running, 96);
+        }
+        // It gives its actors back, and another one takes one of them over.
+        host.running.signal(Signal::TERM);
+        host.ends_with(128 + 15);
+        wait_for_rows(&run.running, 96);
+        let host = Host::join(&run, &["--actors", "1"]);
+        let too_many = run.place.output(&["join", &run.endpoint(), "--actors", "3"]);
+        assert!(error_line(&too_many).contains("this lockstep run has 3 actors, of which other hosts have 1"));
+        let result = final_result(run.running);
+        host.ends_with(0);
+        return result;
+    }
+    final_result(run.running)
+}
+
+#[test]
+fn a_lockstep_run_has_the_same_bits_wherever_its_actors_are() {
+    let (here, elsewhere) = (lockstep(false), lockstep(true));
+    assert!(here.0.is_string());
+    assert_eq!(here, elsewhere);
+}
+
+#[test]
+fn only_the_key_of_the_run_opens_an_encrypted_endpoint() {
+    let run = Run::start(&["--actors", "1", "--listen", "tls/127.0.0.1:0"]);
+    let other = Run::start(&["--actors", "1", "--listen", "tls/127.0.0.1:0"]);
+    let key = |run: &Run| run.running.run.join("join.key").display().to_string();
+    let (own, foreign, endpoint) = (key(&run), key(&other), run.endpoint());
+    let mode = std::fs::metadata(&own).unwrap().permissions();
+    assert_eq!(std::os::unix::fs::PermissionsExt::mode(&mode) & 0o777, 0o600);
+    // None.
+    let none = run.place.output(&["join", &endpoint, "--actors", "1"]);
+    assert_eq!(none.status.code(), Some(2));
+    assert!(error_line(&none).contains("needs the run's key"));
+    // That of another run.
+    let begun = Instant::now();
+    let wrong = ["join", &endpoint, "--actors", "1", "--key", &foreign, "--give-up", "2s"];
+    let wrong = run.place.output(&wrong);
+    assert_eq!(wrong.status.code(), Some(4));
+    assert!(error_line(&wrong).contains("is this its key"));
+    assert!(begun.elapsed() < Duration::from_secs(60));
+    until("the gate names the refusal", || {
+        run.running.log().contains("a connection was refused")
+    });
+    // No encryption at all.
+    let plain = endpoint.replace("tls/", "tcp/");
+    let plain = run.place.output(&["join", &plain, "--actors", "1", "--give-up", "1s"]);
+    assert_eq!(plain.status.code(), Some(4));
+    // A file that is no key.
+    let config = run.running.run.join("config.toml").display().to_string();
+    let no_key = run
+        .place
+        .output(&["join", &endpoint, "--actors", "1", "--key", &config]);
+    assert!(error_line(&no_key).contains("is damaged"));
+    // The right one.
+    let host = Host::join(&run, &["--actors", "1", "--key", &own]);
+    wait_for_actors(&run, &[1]);
+    stop(other);
+    let path = stop(run);
+    let sent = host.sent(&[1]);
+    host.ends_with(0);
+    assert_eq!(in_replay(&path, &[1]), sent);
+}
+
+#[test]
+fn what_cannot_be_joined_is_refused_in_one_line() {
+    let place = Workplace::new();
+    let output = |arguments: &[&str]| place.output(arguments);
+    let code = |arguments: &[&str]| output(arguments).status.code();
+    // Nobody is there.
+    let nobody = ["join", "tcp/127.0.0.1:9", "--actors", "1", "--give-up", "1s"];
+    assert_eq!(code(&nobody), Some(4));
+    assert!(error_line(&output(&nobody)).contains("nobody answers at tcp/127.0.0.1:9"));
+    // No endpoints.
+    for (endpoint, why) in [("here", "is no endpoint"), ("tcp/10.1.2.3:7447", "without encryption")] {
+        let join = ["join", endpoint, "--actors", "1"];
+        assert_eq!(code(&join), Some(2));
+        assert!(error_line(&output(&join)).contains(why));
+        let train = ["train", "pendulum", "--run", "none", "--listen", endpoint];
+        assert_eq!(code(&train), Some(2));
+        assert!(error_line(&output(&train)).contains(why));
+        assert!(!place.path().join("none").exists());
+    }
+    // A run that nobody can join, and one that has no more actors.
+    place.train(&["pendulum", "--run", "closed", "--steps", "200"]);
+    assert!(error_line(&output(&["join", "closed", "--actors", "1"])).contains("was it started with --listen?"));
+    let run = Run::start(&["--actors", "1", "--set", "actors.max=2"]);
+    let endpoint = run.endpoint();
+    let too_many = output(&["join", &endpoint, "--actors", "2"]);
+    assert!(error_line(&too_many).contains("2 actors on all hosts together"));
+    let output = Command::new("sh")
+        .args([
+            "-c",
+            &format!(
+                "ls -d {}/shoal-join-* 2>/dev/null | wc -l",
+                std::env::temp_dir().display()
+            ),
+        ])
+        .output()
+        .unwrap();
+    assert_eq!(
+        String::from_utf8_lossy(&output.stdout).trim(),
+        "0",
+        "a refused host leaves nothing"
+    );
+    stop(run);
+}
