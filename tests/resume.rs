@@ -221,11 +221,14 @@ fn files_that_do_not_belong_to_the_run_are_refused_and_left_unchanged() {
     let config = std::fs::read_to_string(run.join("config.toml")).unwrap();
     let replay = std::fs::read(run.join("replay.bin")).unwrap();
 
-    // Another configuration.
+    // Another configuration, and nothing that tells what the run was last used with.
+    let used = run.join("config/used.toml");
+    std::fs::remove_file(&used).unwrap();
     std::fs::write(run.join("config.toml"), config.replace("gamma = 0.99", "gamma = 0.9")).unwrap();
     let message = error_line(&place.output(&["resume", "run"]));
     assert!(message.contains("another configuration"), "{message}");
     std::fs::write(run.join("config.toml"), &config).unwrap();
+    assert!(!used.exists(), "a run that is refused is left as it was");
 
     // A replay of another version: the second word of the file.
     let file = std::fs::File::options()
@@ -252,6 +255,7 @@ fn files_that_do_not_belong_to_the_run_are_refused_and_left_unchanged() {
         "{message}"
     );
     std::fs::write(run.join("config.toml"), &config).unwrap();
+    std::fs::remove_file(&used).unwrap();
 
     assert_eq!(std::fs::read(run.join("replay.bin")).unwrap(), replay);
     resume_to_the_end(&place, 500);
@@ -390,4 +394,23 @@ fn stopping_a_waiting_copy_does_not_stop_the_original() {
     until("the copy's launcher gives up", || waiting.try_wait().unwrap().is_some());
     running.wait_for_learning();
     assert_eq!(place.status("run")["actors"], 2);
+}
+
+#[test]
+fn a_signal_ends_a_resumed_run_in_order() {
+    let place = Workplace::new();
+    killed(&place, &[]);
+    let resumed = place.resume("run", &[]);
+    resumed.wait_for_learning();
+    resumed.signal(Signal::TERM);
+    let log = resumed.run.join("shoal.log");
+    let (code, _, leftovers) = resumed.wait();
+    assert_eq!(code, Some(143), "{}", place.stderr());
+    assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
+    let log = std::fs::read_to_string(log).unwrap();
+    assert!(log.contains("signal 15 (SIGTERM) ends the run"), "{log}");
+    assert_eq!(
+        support::json(&place.output(&["list", ".", "--json"]))["runs"][0]["state"],
+        "stopped"
+    );
 }

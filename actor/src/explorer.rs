@@ -65,6 +65,8 @@ pub struct ExplorerSettings {
     pub window: u32,
     /// The algorithm, which determines the exploration.
     pub algorithm: Algorithm,
+    /// Whether the policy has learned before the run's first update, in another run.
+    pub has_learned: bool,
     /// The replay file; its commit record shows which chunks have arrived.
     pub replay: PathBuf,
 }
@@ -82,6 +84,7 @@ impl ExplorerSettings {
             chunk: config.chunk_layout(),
             window: config.actors.window,
             algorithm: config.algorithm.clone(),
+            has_learned: config.run.from.is_some(),
             replay: run.replay_file(),
         }
     }
@@ -339,7 +342,7 @@ impl<'a> Explorer<'a> {
     /// Chooses an action for every environment.
     fn act(&mut self, policy: &Policy, current: &Observed) {
         let act = match policy.header().updates {
-            0 => Exploration::warm_up,
+            0 if !self.settings.has_learned => Exploration::warm_up,
             _ => Exploration::act,
         };
         let progress = Progress {

@@ -6,6 +6,7 @@
 //! the layout, the invariants and what survives a power loss.
 
 mod append;
+mod begin;
 mod check;
 mod error;
 mod file;

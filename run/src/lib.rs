@@ -2,6 +2,7 @@
 //! the evaluation of its policies.
 
 pub mod analysis;
+pub mod batch;
 pub mod description;
 pub mod earlier_best;
 pub mod evaluation;
@@ -10,6 +11,7 @@ pub mod final_evaluation;
 pub mod joining;
 pub mod method;
 pub mod numbers;
+pub mod origin;
 pub mod outcome;
 pub mod plan;
 pub mod preflight;
@@ -21,5 +23,6 @@ pub mod rollout;
 pub mod server_location;
 pub mod signals;
 pub mod status;
+pub mod suite;
 #[cfg(any(test, feature = "testing"))]
 pub mod testing;

@@ -1,14 +1,14 @@
 //! `[observation]` and `[reward]`: how numbers of the environment are prepared for networks that learn from minibatches.
 
 use shoal_base::section;
-use shoal_base::section::{OutOfRange, above};
+use shoal_base::section::{Change, OutOfRange, above, never};
 
 section! {
     /// What networks see of an observation. The replay holds it as it is.
     pub struct ObservationConfig {
         /// Whether each number is normalised by the mean and standard deviation of all observations so far. The learner
         /// keeps them and publishes them with the policy; they are part of checkpoints and exports.
-        normalise: bool = false, unit: "–", source: "ours";
+        normalise: bool = false, unit: "–", source: "ours", change: Change::Shape;
     }
 }
 
@@ -16,7 +16,8 @@ section! {
     /// What is learned of a reward. The replay, curves and evaluations have it as it is.
     pub struct RewardConfig {
         /// The factor of every reward in a minibatch.
-        scale: f64 = 1.0, bounds: above(0.0, 1e6), unit: "–", source: "ours";
+        scale: f64 = 1.0, bounds: above(0.0, 1e6), unit: "–", source: "ours",
+            change: never("the critics have learned with it");
     }
 }
 

@@ -12,7 +12,13 @@ use crate::replay::Replay;
 const VARIANCE_FLOOR: f64 = 1e-8;
 
 /// The name of its numbers in a checkpoint.
-const SECTION: &str = "observations";
+pub(super) const SECTION: &str = "observations";
+
+/// Sets the number of rows looked at in a state that was saved: those of another replay do not count.
+pub(super) fn set_rows(state: &mut [f32], rows: u64) {
+    let halves: [f32; 2] = bytemuck::cast(rows as f64);
+    state.iter_mut().zip(halves).for_each(|(number, half)| *number = half);
+}
 
 /// Mean and variance of the observations in the rows of a replay. Each row is counted once: those up to a number that is
 /// part of the state.

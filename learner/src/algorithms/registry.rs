@@ -3,8 +3,8 @@
 use shoal_common::config::{self, Config};
 use shoal_common::policy::PolicyError;
 
-use super::algorithm::{Algorithm, Method, RunSizes};
-use super::tabular;
+use super::algorithm::{Algorithm, Method, RunSizes, SavedState, SectionError};
+use super::{normaliser, tabular};
 use crate::networks::product::Products;
 
 /// The method for the settings of a configuration.
@@ -31,6 +31,31 @@ pub fn new(config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
 /// Names of the sections of a checkpoint that hold what was learned, as opposed to the state of the optimiser.
 pub fn weights(algorithm: &config::Algorithm) -> &'static [&'static str] {
     method(algorithm).weights()
+}
+
+/// The state of a learner that is `fresh`, except that it has the weights (by their names) of another one's state `saved`,
+/// and its normalisation of observations. The optimisers begin anew. `rows` rows of its own replay are part of that
+/// normalisation already.
+///
+/// # Errors
+/// When the other state lacks a part, or has it in another shape.
+pub fn inherited(
+    fresh: &dyn Algorithm,
+    weights: &[&str],
+    mut saved: SavedState,
+    rows: u64,
+) -> Result<Vec<(&'static str, Vec<f32>)>, SectionError> {
+    let section = |(name, numbers): (&'static str, &[f32])| {
+        if !weights.contains(&name) && name != normaliser::SECTION {
+            return Ok((name, numbers.to_vec()));
+        }
+        let mut inherited = saved.take(name, numbers.len())?;
+        if name == normaliser::SECTION {
+            normaliser::set_rows(&mut inherited, rows);
+        }
+        Ok((name, inherited))
+    };
+    fresh.state().into_iter().map(section).collect()
 }
 
 /// The matrix products of one or a few updates of that learner; none if its method has no networks, or if its updates
@@ -99,6 +124,19 @@ mod tests {
             assert_eq!(state_numbers(&config), numbers, "{rest}");
             let named = |name: &&str| state.iter().any(|(section, _)| section == name);
             let weights = weights(&config.algorithm);
+            // A learner inherits its weights, and nothing of the optimiser.
+            let other: Vec<(String, Vec<f32>)> = state
+                .iter()
+                .map(|(name, numbers)| ((*name).to_owned(), vec![0.5; numbers.len()]))
+                .collect();
+            let begun = inherited(&*learner, weights, SavedState::from(other), 3).unwrap();
+            for ((name, numbers), (_, fresh)) in begun.iter().zip(&state) {
+                match *name {
+                    name if weights.contains(&name) => assert!(numbers.iter().all(|it| *it == 0.5), "{name}"),
+                    normaliser::SECTION => assert_eq!(numbers[..2], bytemuck::cast::<f64, [f32; 2]>(3.0)),
+                    name => assert_eq!(numbers, fresh, "{name}"),
+                }
+            }
             // Only some learners have a baseline.
             assert!(weights.iter().filter(|name| **name != "baseline").all(named), "{rest}");
         }

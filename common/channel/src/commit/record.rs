@@ -112,6 +112,11 @@ impl Record {
         self.words[HEAD] += rows;
     }
 
+    /// Adds rows that belong to no actor: those of another replay.
+    pub fn add_rows_of_nobody(&mut self, rows: u64) {
+        self.words[HEAD] += rows;
+    }
+
     /// Sets what is committed of an actor, in a record that mirrors another one.
     ///
     /// # Panics
