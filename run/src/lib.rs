@@ -2,6 +2,8 @@
 //! the evaluation of its policies.
 
 pub mod analysis;
+pub mod client;
+pub mod client;
 pub mod description;
 pub mod earlier_best;
 pub mod evaluation;
@@ -15,7 +17,6 @@ pub mod preflight;
 pub mod process;
 pub mod rate;
 pub mod recorder;
-pub mod remote;
 pub mod rollout;
 pub mod server_location;
 pub mod signals;

@@ -1,7 +1,7 @@
 //! `[observation]` and `[reward]`: how numbers of the environment are prepared for networks that learn from minibatches.
 
 use shoal_base::section;
-use shoal_base::section::{OutOfRange, above};
+use shoal_base::section::above;
 
 section! {
     /// What networks see of an observation. The replay holds it as it is.
@@ -17,25 +17,5 @@ section! {
     pub struct RewardConfig {
         /// The factor of every reward in a minibatch.
         scale: f64 = 1.0, bounds: above(0.0, 1e6), unit: "–", source: "ours";
-    }
-}
-
-/// Both sections.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Preparation {
-    /// `[observation]`.
-    pub observation: ObservationConfig,
-    /// `[reward]`.
-    pub reward: RewardConfig,
-}
-
-impl Preparation {
-    /// Checks every number.
-    ///
-    /// # Errors
-    /// For the first invalid number.
-    pub fn check(&self) -> Result<(), OutOfRange> {
-        self.observation.check_bounds("observation")?;
-        self.reward.check_bounds("reward")
     }
 }

@@ -42,7 +42,7 @@ impl ReplayConfig {
         } = self;
         match algorithm.spec().experience {
             Experience::Minibatches => {
-                let least = algorithm.settings().least_capacity();
+                let least = algorithm.settings().batch() as u64;
                 from(least, MAX_ROWS).check("replay.capacity", capacity)?;
                 from(1, *capacity).check("replay.warmup", warmup)
             }

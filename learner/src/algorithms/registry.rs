@@ -4,6 +4,7 @@ use shoal_common::config::{self, Config};
 use shoal_common::policy::PolicyError;
 
 use super::algorithm::{Algorithm, Method, RunSizes};
+use super::normaliser::Normaliser;
 use super::tabular;
 use crate::networks::product::Products;
 
@@ -25,12 +26,14 @@ fn method(algorithm: &config::Algorithm) -> Box<dyn Method + '_> {
 /// # Errors
 /// When the method cannot control the environment.
 pub fn new(config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
-    method(&config.algorithm).start(&config.spec, config.run.seed, RunSizes::from(config))
+    method(&config.algorithm).start(config)
 }
 
 /// Names of the sections of a checkpoint that hold what was learned, as opposed to the state of the optimiser.
-pub fn weights(algorithm: &config::Algorithm) -> &'static [&'static str] {
-    method(algorithm).weights()
+pub fn weights(config: &Config) -> Vec<&'static str> {
+    let statistics = config.observation.normalise.then_some(Normaliser::SECTION);
+    let learned = method(&config.algorithm).weights().iter().copied();
+    learned.chain(statistics).collect()
 }
 
 /// The matrix products of one or a few updates of that learner; none if its method has no networks, or if its updates
@@ -41,7 +44,12 @@ pub fn products(config: &Config) -> Products {
 
 /// The total length of that learner's state, computed without creating the learner.
 pub fn state_numbers(config: &Config) -> usize {
-    method(&config.algorithm).state_numbers(&config.spec, RunSizes::from(config))
+    let statistics = if config.observation.normalise {
+        Normaliser::state_numbers(config.spec.observation.width())
+    } else {
+        0
+    };
+    method(&config.algorithm).state_numbers(&config.spec, RunSizes::from(config)) + statistics
 }
 
 #[cfg(test)]
@@ -98,7 +106,12 @@ mod tests {
             let numbers: usize = state.iter().map(|(_, numbers)| numbers.len()).sum();
             assert_eq!(state_numbers(&config), numbers, "{rest}");
             let named = |name: &&str| state.iter().any(|(section, _)| section == name);
-            let weights = weights(&config.algorithm);
+            let weights = weights(&config);
+            assert_eq!(
+                weights.contains(&"observations"),
+                rest.contains("normalise = true"),
+                "{rest}"
+            );
             // Only some learners have a baseline.
             assert!(weights.iter().filter(|name| **name != "baseline").all(named), "{rest}");
         }
