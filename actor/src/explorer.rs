@@ -517,8 +517,8 @@ pub(crate) fn connect(
     Ok(client)
 }
 
-/// Takes note of an answer that no environment may give; the next thing is to begin new episodes. The pause keeps an
-/// environment that always answers so from filling the log before the launcher ends the run for it.
+/// Logs an invalid answer of an environment server and pauses; the caller must then begin new episodes. Without the pause,
+/// an environment that always answers like this would fill the log before the launcher ends the run.
 pub(crate) fn after_fault(
     error: &ChannelError,
     heartbeat: &mut HeartbeatSender,

@@ -3,7 +3,6 @@
 
 pub mod analysis;
 pub mod client;
-pub mod client;
 pub mod description;
 pub mod earlier_best;
 pub mod evaluation;

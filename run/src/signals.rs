@@ -26,8 +26,8 @@ impl Interrupt {
     }
 }
 
-/// Receives SIGINT, SIGTERM and SIGHUP. Once this is dropped, they end the process again. A signal that whoever started
-/// this process made it ignore stays ignored, as SIGHUP under `nohup`.
+/// Receives SIGINT, SIGTERM and SIGHUP. Once this is dropped, they end the process again. A signal that was ignored when
+/// this process started stays ignored, such as SIGHUP under `nohup`.
 #[derive(Debug)]
 pub struct Signals {
     last: Arc<AtomicUsize>,
