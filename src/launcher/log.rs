@@ -41,14 +41,14 @@ pub(super) struct Log(Arc<Mutex<Inner>>);
 #[derive(Debug)]
 struct Inner {
     file: File,
-    last: HashMap<String, VecDeque<Said>>,
+    last: HashMap<String, VecDeque<KeptLine>>,
     /// Bytes that other programs may still write.
     for_programs: u64,
 }
 
 /// A line that a process has written.
 #[derive(Debug)]
-struct Said {
+struct KeptLine {
     text: String,
     is_in_log: bool,
 }
@@ -95,11 +95,11 @@ impl Log {
     /// Writes those of the last lines of `who` that were left out: they say why it has failed.
     pub(super) fn write_left_out(&self, who: &str) {
         let mut inner = self.lock();
-        for said in inner.last.remove(who).unwrap_or_default() {
-            if !said.is_in_log {
-                inner.write(who, &said.text);
+        for kept in inner.last.remove(who).unwrap_or_default() {
+            if !kept.is_in_log {
+                inner.write(who, &kept.text);
             }
-            inner.remember(who, &said.text, true);
+            inner.remember(who, &kept.text, true);
         }
     }
 
@@ -107,7 +107,7 @@ impl Log {
     pub(super) fn last_lines(&self, who: &str) -> Vec<String> {
         let inner = self.lock();
         let last = inner.last.get(who).into_iter().flatten();
-        last.map(|said| said.text.clone()).collect()
+        last.map(|kept| kept.text.clone()).collect()
     }
 
     fn lock(&self) -> MutexGuard<'_, Inner> {
@@ -133,7 +133,7 @@ impl Inner {
         if last.len() == KEPT {
             last.pop_front();
         }
-        last.push_back(Said {
+        last.push_back(KeptLine {
             text: text.into(),
             is_in_log,
         });

@@ -4,7 +4,7 @@ use shoal_base::section;
 use shoal_base::section::above;
 
 section! {
-    /// What networks see of an observation. The replay holds it as it is.
+    /// How observations are prepared for networks. The replay holds the environment's.
     pub struct ObservationConfig {
         /// Whether each number is normalised by the mean and standard deviation of all observations so far. The learner
         /// keeps them and publishes them with the policy; they are part of checkpoints and exports.
@@ -13,7 +13,7 @@ section! {
 }
 
 section! {
-    /// What is learned of a reward. The replay, curves and evaluations have it as it is.
+    /// How rewards are prepared for learning. The replay, curves and evaluations have the environment's.
     pub struct RewardConfig {
         /// The factor of every reward in a minibatch.
         scale: f64 = 1.0, bounds: above(0.0, 1e6), unit: "–", source: "ours";

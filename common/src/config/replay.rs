@@ -19,7 +19,7 @@ section! {
         /// once. The thesis has 1.
         updates_per_step: f64 = 1.0, bounds: from(0.0, 1_000.0),
             unit: "updates per environment step", source: "Algorithm 4";
-        /// n, steps of a transition: the rewards of n steps are added, and the value of the observation after them counts.
+        /// n, steps of a transition: the sum of n discounted rewards, and the observation after the last of them.
         n_step: u32 = 1, bounds: from(1, 100), unit: "steps", source: "Sutton and Barto 2018, chapter 7";
         /// Environment steps that the actors may be ahead of that ratio before the learner stops taking transitions.
         tolerance: u64 = 512, bounds: from(1, MAX_ROWS), unit: "environment steps", source: "ours";

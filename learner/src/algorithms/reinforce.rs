@@ -187,7 +187,7 @@ impl Reinforce {
         episode
             .last()
             .is_some_and(|end| end.last && (self.settings.learn_at_limit || end.discount == 0.0))
-            // Those of a learner that did not check what it committed may not be.
+            // Learners of earlier versions did not check their rows.
             && episode.iter().all(is_finite)
     }
 

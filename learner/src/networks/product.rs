@@ -90,7 +90,7 @@ fn output_layer(network: &NetworkLayout) -> usize {
 /// Every matrix product of a number of updates, in the order in which they run.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Products {
-    /// Updates that these are the products of.
+    /// The number of updates.
     pub updates: u64,
     /// The products.
     pub products: Vec<Product>,
