@@ -15,6 +15,7 @@ use crate::command::plot::PlotArgs;
 use crate::command::report::ReportArgs;
 use crate::command::reproduce::ReproduceArgs;
 use crate::command::resume::ResumeArgs;
+use crate::command::rm::RmArgs;
 use crate::command::scale::ScaleArgs;
 use crate::command::status::StatusArgs;
 use crate::command::stop::StopArgs;
@@ -49,6 +50,8 @@ pub(crate) enum Command {
     Report(ReportArgs),
     /// Write a run's policy into a file for other programs.
     Export(ExportArgs),
+    /// Remove runs, or their replays alone.
+    Rm(RmArgs),
     /// List the runs in a directory with their state, progress and best return.
     List(ListArgs),
     /// Run the thesis's experiments with several seeds, draw its figures, and report which of its claims hold.

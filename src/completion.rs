@@ -5,10 +5,10 @@ use std::ffi::OsStr;
 use clap::Command;
 use clap_complete::CompleteEnv;
 use clap_complete::engine::{CompletionCandidate, PathCompleter, ValueCompleter};
-use shoal_common::config::explanation::{Key, sections};
+use shoal_common::config::explanation::{Key, sections, set_by_program};
 use shoal_env_server::environment;
 use shoal_run::external_environment::GYMNASIUM;
-use shoal_run::plan::{FILLED_IN, preset_names};
+use shoal_run::plan::preset_names;
 use toml::{Table, Value};
 
 /// The variable that a shell sets when it asks for completions. (Other programs may use plain `COMPLETE`.)
@@ -79,7 +79,8 @@ fn all_settings() -> Vec<Setting> {
         let keys = environment::explain(name).unwrap_or_default();
         settings.extend(keys.iter().map(|key| setting("environment", key, &defaults)));
     }
-    settings.retain(|setting| !FILLED_IN.contains(&setting.key.as_str()));
+    let of_program = set_by_program();
+    settings.retain(|setting| !of_program.contains(&setting.key));
     if let Some(name) = settings.iter_mut().find(|setting| setting.key == "environment.name") {
         name.values = environment::names().map(str::to_owned).collect();
     }

@@ -201,7 +201,7 @@ impl<'a> Launcher<'a> {
         if config.evaluation.keep_policies {
             std::fs::create_dir_all(run.policies()).context("cannot create the directory for policies")?;
         }
-        let recorder = Recorder::open(run, config.replay.warmup)?;
+        let recorder = Recorder::open(run, &config.replay)?;
         let initial = status::saved_status(&config, run)?;
         RunOutcome::new(RunState::Running, initial.env_steps, initial.episodes).write(run)?;
         // Creates the services that are opened below.
@@ -358,6 +358,7 @@ impl<'a> Launcher<'a> {
 
     /// Answers requests from other terminals. A request to stop is answered when the run has ended.
     fn answer_requests(&mut self) -> anyhow::Result<()> {
+        let now = self.recorder.moment(self.begun.elapsed());
         let Self {
             config,
             run,
@@ -379,7 +380,7 @@ impl<'a> Launcher<'a> {
                     },
                 )),
                 Question::Scale { .. } if *ending => Ok(Some(Answer::Refused("the run is ending".into()))),
-                Question::Scale { actors } => requests::scale(config, run, supervisor, actors).map(Some),
+                Question::Scale { actors } => requests::scale(config, run, supervisor, actors, now).map(Some),
                 Question::Stop => {
                     if stop_requested.is_none() {
                         log.note("launcher", "`shoal stop` ends the run");
@@ -443,7 +444,9 @@ impl<'a> Launcher<'a> {
                 Ok(self.recorder.episode(&report, wall)?)
             })?,
             each(&self.evaluation_reports, |report| {
-                self.progress.set_evaluation(&report);
+                // A restarted evaluator reports some again.
+                let is_new = self.recorder.evaluated() < Some(report.env_steps);
+                self.progress.set_evaluation(&report, is_new);
                 Ok(self.recorder.evaluation(&report, wall)?)
             })?,
             each(&self.learner_reports, |report| {

@@ -12,6 +12,7 @@ use shoal_run::client::RunClient;
 use shoal_run::evaluation::WhichPolicy;
 use shoal_run::final_evaluation::FinalEvaluation;
 use shoal_run::outcome::{RunOutcome, RunState};
+use shoal_run::plan;
 use shoal_run::recorder::read_evaluations;
 use shoal_run::status::saved_status;
 
@@ -64,7 +65,7 @@ pub(crate) struct Listed {
     pub(crate) name: String,
     pub(crate) path: PathBuf,
     pub(crate) state: ListedState,
-    /// Why the run is damaged or silent.
+    /// Why the run is damaged or silent, or what in `config.toml` differs from what the run was last used with.
     pub(crate) reason: Option<String>,
     pub(crate) environment: String,
     pub(crate) algorithm: String,
@@ -118,7 +119,8 @@ impl Listed {
                 self.set_progress(&status);
             }
             Ok(None) => {
-                let status = saved_status(&run.config()?, run)?;
+                let used = run.config()?;
+                let status = saved_status(&used, run)?;
                 self.state = if status.finished {
                     ListedState::Finished
                 } else {
@@ -127,6 +129,7 @@ impl Listed {
                 let evaluation = FinalEvaluation::read(run, status.env_steps)?;
                 self.final_return = evaluation.and_then(|it| it.of(WhichPolicy::Best)?.return_mean);
                 self.set_progress(&status);
+                self.reason = plan::edited(run, &used);
             }
             Err(error) => {
                 self.state = ListedState::Silent;

@@ -221,11 +221,14 @@ fn files_that_do_not_belong_to_the_run_are_refused_and_left_unchanged() {
     let config = std::fs::read_to_string(run.join("config.toml")).unwrap();
     let replay = std::fs::read(run.join("replay.bin")).unwrap();
 
-    // Another configuration.
+    // Another configuration, and nothing that tells what the run was last used with.
+    let used = run.join("config/used.toml");
+    std::fs::remove_file(&used).unwrap();
     std::fs::write(run.join("config.toml"), config.replace("gamma = 0.99", "gamma = 0.9")).unwrap();
     let message = error_line(&place.output(&["resume", "run"]));
     assert!(message.contains("another configuration"), "{message}");
     std::fs::write(run.join("config.toml"), &config).unwrap();
+    assert!(!used.exists(), "a run that is refused is left as it was");
 
     // A replay of another version: the second word of the file.
     let file = std::fs::File::options()
@@ -252,6 +255,7 @@ fn files_that_do_not_belong_to_the_run_are_refused_and_left_unchanged() {
         "{message}"
     );
     std::fs::write(run.join("config.toml"), &config).unwrap();
+    std::fs::remove_file(&used).unwrap();
 
     assert_eq!(std::fs::read(run.join("replay.bin")).unwrap(), replay);
     resume_to_the_end(&place, 500);

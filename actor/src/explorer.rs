@@ -57,6 +57,8 @@ pub struct ExplorerSettings {
     pub n_step: usize,
     /// The layout of a chunk.
     pub chunk: ChunkLayout,
+    /// Whether the policy has learned before the run's first update, in another run.
+    pub has_learned: bool,
     /// The replay file; its commit record shows which chunks have arrived.
     pub replay: PathBuf,
 }
@@ -70,6 +72,7 @@ impl ExplorerSettings {
             envs: config.actors.envs as usize,
             n_step: config.replay.n_step as usize,
             chunk: config.chunk_layout(),
+            has_learned: config.run.from.is_some(),
             replay: run.replay_file(),
         }
     }
@@ -334,7 +337,7 @@ impl<'a> Explorer<'a> {
     /// Chooses an action for every environment.
     fn act(&mut self, policy: &Policy, current: &Observed) {
         let act = match policy.header().updates {
-            0 => Exploration::warm_up,
+            0 if !self.settings.has_learned => Exploration::warm_up,
             _ => Exploration::act,
         };
         let progress = Progress {

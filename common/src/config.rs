@@ -3,6 +3,7 @@
 
 mod actors;
 mod checkpoint;
+mod difference;
 mod environment;
 mod evaluation;
 pub mod explanation;
@@ -18,6 +19,7 @@ use std::path::{Path, PathBuf};
 
 pub use actors::ActorsConfig;
 pub use checkpoint::CheckpointConfig;
+pub use difference::Difference;
 pub use environment::EnvironmentConfig;
 pub use evaluation::EvaluationConfig;
 pub use identity_format::IdentityFormat;
@@ -25,7 +27,7 @@ pub use learner::LearnerConfig;
 pub use replay::ReplayConfig;
 pub use run::{Mode, RunConfig};
 use shoal_base::section;
-pub use shoal_base::section::OutOfRange;
+pub use shoal_base::section::{Change, OutOfRange};
 use shoal_base::space::EnvironmentSpec;
 use shoal_base::transition::{ChunkLayout, RowLayout};
 use shoal_policy::{Policy, PolicyError, PolicyLayout};

@@ -58,6 +58,20 @@ fn did_you_mean(path: &Path) -> String {
     }
 }
 
+/// The first line of `config/used.toml`.
+const USED: &str = "# What this run was last used with. To change it, edit config.toml or use `shoal resume --set`.\n";
+
+/// Writes a configuration after these first lines, atomically.
+fn write(path: &Path, head: &str, config: &Config) -> Result<(), RunDirError> {
+    let io = |cause| RunDirError::Io {
+        action: "write",
+        path: path.to_owned(),
+        cause,
+    };
+    let text = config.to_toml().map_err(|error| io(io::Error::other(error)))?;
+    write_atomically(path, |file| write!(file, "{head}{text}")).map_err(io)
+}
+
 /// The lock of a run. The launcher holds it while the run is running; the system releases it when the launcher dies.
 #[derive(Debug)]
 pub struct RunLock {
@@ -197,26 +211,42 @@ impl RunDir {
         })
     }
 
-    /// The resolved configuration.
+    /// The resolved configuration that the run was last used with, which its files belong to. `config.toml` may have been
+    /// edited since; such an edit takes effect when the run is resumed.
     ///
     /// # Errors
     /// When it is missing or invalid.
     pub fn config(&self) -> Result<Config, ConfigError> {
-        Config::load(&self.config_file())
+        let used = self.used_config_file();
+        if used.exists() {
+            Config::load(&used)
+        } else {
+            // A run of an earlier version, or one that has just been made.
+            Config::load(&self.config_file())
+        }
     }
 
-    /// Writes the configuration atomically. Only the launcher calls this.
+    /// Writes `config.toml` atomically. Only the launcher calls this.
     ///
     /// # Errors
     /// When it cannot be written.
     pub fn write_config(&self, config: &Config) -> Result<(), RunDirError> {
-        let io = |cause| RunDirError::Io {
-            action: "write",
-            path: self.config_file(),
+        write(&self.config_file(), "", config)
+    }
+
+    /// Writes the configuration that the run is used with from now on. Only the launcher calls this.
+    ///
+    /// # Errors
+    /// When it cannot be written.
+    pub fn write_used_config(&self, config: &Config) -> Result<(), RunDirError> {
+        let path = self.used_config_file();
+        let made = path.parent().map_or(Ok(()), std::fs::create_dir_all);
+        made.map_err(|cause| RunDirError::Io {
+            action: "create the directory of",
+            path: path.clone(),
             cause,
-        };
-        let text = config.to_toml().map_err(|error| io(io::Error::other(error)))?;
-        write_atomically(&self.config_file(), |file| file.write_all(text.as_bytes())).map_err(io)
+        })?;
+        write(&path, USED, config)
     }
 
     /// The directory itself.
@@ -231,14 +261,29 @@ impl RunDir {
             .map_or_else(|| "run".into(), |name| name.to_string_lossy().into_owned())
     }
 
-    /// `config.toml`: the resolved configuration.
+    /// `config.toml`: the resolved configuration, which the user may edit.
     pub fn config_file(&self) -> PathBuf {
         self.path.join("config.toml")
+    }
+
+    /// `config/used.toml`: the configuration that the run was last used with.
+    pub fn used_config_file(&self) -> PathBuf {
+        self.path.join("config/used.toml")
+    }
+
+    /// `changes.csv`: every change of the configuration since the run was created.
+    pub fn changes(&self) -> PathBuf {
+        self.path.join("changes.csv")
     }
 
     /// `replay.bin`: the mapped ring of transitions.
     pub fn replay_file(&self) -> PathBuf {
         self.path.join("replay.bin")
+    }
+
+    /// `replay.removed`: exists if `shoal rm --replay` has removed the replay.
+    pub fn replay_removed(&self) -> PathBuf {
+        self.path.join("replay.removed")
     }
 
     /// `checkpoints/`: the learner's state.
@@ -299,6 +344,11 @@ impl RunDir {
     /// `incarnations`: the number of processes started for the run so far, written before each start.
     pub fn incarnations(&self) -> PathBuf {
         self.path.join("incarnations")
+    }
+
+    /// `origin.json`: the run whose networks this one began with.
+    pub fn origin(&self) -> PathBuf {
+        self.path.join("origin.json")
     }
 
     /// `outcome.json`: how the run ended.

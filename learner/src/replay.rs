@@ -30,6 +30,7 @@
 //! ```
 
 mod append;
+mod begin;
 mod check;
 mod error;
 mod file;

@@ -4,6 +4,7 @@
 mod comparison;
 mod numbers;
 mod played;
+mod ranking;
 mod run;
 mod settings;
 mod signals;
@@ -14,6 +15,8 @@ use serde::Serialize;
 use shoal_common::run_dir::RunDir;
 
 use self::comparison::Comparison;
+use self::numbers::Limits;
+use self::ranking::Ranking;
 use self::run::Run;
 
 /// The first bytes of every report. They distinguish a report from other files.
@@ -32,15 +35,6 @@ const SCRIPTS: [&str; 7] = [
     include_str!("page/page.js"),
 ];
 
-/// Points in a curve of a single run. Several runs share a total, so that the page stays small.
-const POINTS: usize = 800;
-const POINTS_TOGETHER: usize = 4_000;
-const FEWEST_POINTS: usize = 60;
-
-/// Playable episodes of a single run. Several runs share a total.
-const EPISODES: usize = 6;
-const EPISODES_TOGETHER: usize = 24;
-
 /// Everything the page shows.
 #[derive(Clone, Debug, Serialize)]
 pub struct Report {
@@ -49,26 +43,7 @@ pub struct Report {
     made: u64,
     runs: Vec<Run>,
     comparisons: Vec<Comparison>,
-}
-
-/// How much of one run the page may contain.
-#[derive(Clone, Copy, Debug)]
-struct Limits {
-    points: usize,
-    episodes: usize,
-}
-
-impl Limits {
-    /// For run `number`, counted from 0, of `runs` in the report.
-    fn of(number: usize, runs: usize) -> Self {
-        Self {
-            points: (POINTS_TOGETHER / runs).clamp(FEWEST_POINTS, POINTS),
-            episodes: match EPISODES_TOGETHER / runs {
-                0 => usize::from(number < EPISODES_TOGETHER),
-                share => share.min(EPISODES),
-            },
-        }
-    }
+    rankings: Vec<Ranking>,
 }
 
 /// Reads what the runs have recorded so far. There must be at least one. A run may still be training, or have just
@@ -80,13 +55,33 @@ pub fn gather(runs: &[RunDir]) -> anyhow::Result<Report> {
         let limits = Limits::of(number, runs.len());
         gathered.push(Run::read(run, name, limits)?);
     }
+    let comparisons = comparison::compare(&gathered);
     let since = SystemTime::UNIX_EPOCH.elapsed();
     Ok(Report {
         version: env!("CARGO_PKG_VERSION"),
         made: since.map_or(0, |since| since.as_secs()),
-        comparisons: comparison::compare(&gathered),
+        rankings: rankings(&comparisons, &gathered),
+        comparisons,
         runs: gathered,
     })
+}
+
+fn rankings(comparisons: &[Comparison], runs: &[Run]) -> Vec<Ranking> {
+    let of = |it: &Comparison| ranking::rank(&it.environment, &it.sets, runs);
+    comparisons.iter().filter_map(of).collect()
+}
+
+/// What the runs' repetitions say about their settings: a line for each, the best first, and how certain that is. Nothing if
+/// nothing was repeated.
+///
+/// # Errors
+/// When a run cannot be read.
+pub fn ranking(runs: &[RunDir]) -> anyhow::Result<Vec<String>> {
+    let named = runs.iter().zip(run::names(runs));
+    let read = named.map(|(run, name)| Run::read(run, name, Limits::NONE));
+    let read = read.collect::<anyhow::Result<Vec<_>>>()?;
+    let found = rankings(&comparison::compare(&read), &read);
+    Ok(found.iter().flat_map(|it| it.lines().chain(it.verdict())).collect())
 }
 
 impl Report {

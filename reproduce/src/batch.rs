@@ -1,10 +1,10 @@
 //! Runs the seeds that have no result yet, several at a time, until all have finished or a signal arrives.
 
 use std::collections::{BTreeMap, VecDeque};
-use std::sync::{Mutex, PoisonError, mpsc};
-use std::time::Duration;
+use std::sync::mpsc;
 
 use anyhow::bail;
+use shoal_run::batch::work_off;
 use shoal_run::signals::Signals;
 
 use super::experiment::{Effort, Length};
@@ -13,9 +13,6 @@ use super::progress::Progress;
 use super::request::{BatchEnding, Job, Name};
 use super::settings::RunSettings;
 use super::training::{Ending, RunState, train};
-
-/// Interval at which the live line is drawn.
-const DRAW_INTERVAL: Duration = Duration::from_secs(1);
 
 /// The seeds to run, and where.
 pub(super) struct Batch<'a> {
@@ -46,38 +43,29 @@ impl Batch<'_> {
         let signals = Signals::register()?;
         let due: VecDeque<Job> = self.jobs.iter().copied().filter(|job| self.is_due(job)).collect();
         let mut progress = Progress::new(self.folder, self.effort, self.jobs.len(), &due)?;
-        let queue = Mutex::new(due);
         let mut failures = BTreeMap::new();
-        std::thread::scope(|scope| {
-            let (events, receiver) = mpsc::channel();
-            for _ in 0..parallel {
-                let (events, queue, signals) = (events.clone(), &queue, &signals);
-                scope.spawn(move || self.work(queue, signals, &events));
-            }
-            drop(events);
-            loop {
-                match receiver.recv_timeout(DRAW_INTERVAL) {
-                    Ok(Event::Started(job)) => progress.started(job),
-                    Ok(Event::Finished(job)) => progress.finished(&job),
-                    Ok(Event::Stored(job, length)) => {
-                        progress.stored(&job, length);
-                        // Writing is tried again at the end. An error is reported then.
-                        if self.effort == Effort::Full {
-                            let _ = write(&failures);
-                        }
+        let work = |job: Job, events: &mpsc::Sender<Event>| self.work(job, &signals, events);
+        work_off(due, parallel, &signals, work, |event| {
+            match event {
+                None => {}
+                Some(Event::Started(job)) => progress.started(job),
+                Some(Event::Finished(job)) => progress.finished(&job),
+                Some(Event::Stored(job, length)) => {
+                    progress.stored(&job, length);
+                    // Writing is tried again at the end. An error is reported then.
+                    if self.effort == Effort::Full {
+                        let _ = write(&failures);
                     }
-                    Ok(Event::Failed(job, error)) => {
-                        // Paths in the report are relative to the folder, because the report may be read elsewhere.
-                        let prefix = format!("{}/", self.folder.path().display());
-                        let message = format!("{error:#}").replace(&prefix, "");
-                        progress.failed(&job, &message);
-                        failures.insert(job.name(), message);
-                    }
-                    Err(mpsc::RecvTimeoutError::Timeout) => {}
-                    Err(mpsc::RecvTimeoutError::Disconnected) => break,
                 }
-                progress.draw();
+                Some(Event::Failed(job, error)) => {
+                    // Paths in the report are relative to the folder, because the report may be read elsewhere.
+                    let prefix = format!("{}/", self.folder.path().display());
+                    let message = format!("{error:#}").replace(&prefix, "");
+                    progress.failed(&job, &message);
+                    failures.insert(job.name(), message);
+                }
             }
+            progress.draw();
         });
         progress.clear();
         write(&failures)?;
@@ -93,20 +81,13 @@ impl Batch<'_> {
         stages.any(|stage| !self.folder.has(job.experiment, stage, job.seed))
     }
 
-    /// Runs one job after another until none is left or a signal has arrived.
-    fn work(&self, queue: &Mutex<VecDeque<Job>>, signals: &Signals, events: &mpsc::Sender<Event>) {
-        let next = || {
-            let mut queue = queue.lock().unwrap_or_else(PoisonError::into_inner);
-            queue.pop_front().filter(|_| signals.received().is_none())
-        };
-        while let Some(job) = next() {
-            // A closed channel is no reason to stop: the results are still stored.
-            let _ = events.send(Event::Started(job));
-            match self.run_stages(job, signals, events) {
-                Ok(Ending::Finished) => _ = events.send(Event::Finished(job)),
-                Ok(Ending::Interrupted) => return,
-                Err(error) => _ = events.send(Event::Failed(job, error)),
-            }
+    fn work(&self, job: Job, signals: &Signals, events: &mpsc::Sender<Event>) {
+        // A closed channel is no reason to stop: the results are still stored.
+        let _ = events.send(Event::Started(job));
+        match self.run_stages(job, signals, events) {
+            Ok(Ending::Finished) => _ = events.send(Event::Finished(job)),
+            Ok(Ending::Interrupted) => {}
+            Err(error) => _ = events.send(Event::Failed(job, error)),
         }
     }
 

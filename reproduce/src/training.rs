@@ -3,33 +3,20 @@
 use std::os::unix::process::CommandExt;
 use std::path::Path;
 use std::process::Command;
-use std::time::Duration;
 
-use anyhow::{Context, bail};
-use rustix::process::Signal;
 use shoal_common::run_dir::{RunDir, RunDirError};
+pub(super) use shoal_run::batch::Ending;
+use shoal_run::batch::run_training;
 use shoal_run::evaluation::WhichPolicy;
-use shoal_run::process::Peer;
 use shoal_run::status;
 
 use super::experiment::{Effort, Experiment, Length, Progress};
-
-/// Interval at which a received signal is checked.
-const SIGNAL_INTERVAL: Duration = Duration::from_millis(100);
 
 /// The state of a run directory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum RunState {
     Absent,
     Started(Progress),
-}
-
-/// How a training ended.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Ending {
-    Finished,
-    /// By a signal; its state is saved.
-    Interrupted,
 }
 
 impl RunState {
@@ -91,7 +78,7 @@ pub(super) fn train(
         }
     }
     command.args(length.arguments()).arg("--quiet");
-    run_child(&mut command, interrupted)
+    run_training(&mut command, interrupted)
 }
 
 /// Whether a run has reached this length and ended normally there, which leaves its last policy.
@@ -107,64 +94,9 @@ fn has_ended(run: &Path, length: Length, progress: Progress) -> anyhow::Result<b
     })
 }
 
-fn run_child(command: &mut Command, interrupted: Interrupted<'_>) -> anyhow::Result<Ending> {
-    let mut training = Peer::start(command, "training".into()).context("cannot start a training")?;
-    let mut terminated = false;
-    let status = loop {
-        if let Some(status) = training.wait(SIGNAL_INTERVAL) {
-            break status;
-        }
-        if let Some(signal) = interrupted().filter(|_| !terminated) {
-            terminated = true;
-            // The same signal: the training ignores those that this process was started to ignore.
-            let signal = Signal::from_named_raw(signal).unwrap_or(Signal::TERM);
-            // This fails only if the training has ended.
-            let _ = training.signal(signal);
-        }
-    };
-    if interrupted().is_some() {
-        return Ok(Ending::Interrupted);
-    }
-    if !status.success() {
-        bail!(
-            "{}",
-            training
-                .last_error_line()
-                .unwrap_or_else(|| format!("a training ended with {status}"))
-        );
-    }
-    Ok(Ending::Finished)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    fn shell(script: &str, signal: Option<i32>) -> anyhow::Result<Ending> {
-        run_child(Command::new("sh").args(["-c", script]), &|| signal)
-    }
-
-    #[test]
-    fn the_error_of_a_failed_training_is_its_last_line() {
-        assert_eq!(shell("exit 0", None).unwrap(), Ending::Finished);
-        let error = shell(
-            "echo 'warning: hot' >&2; echo 'error: no room' >&2; echo >&2; exit 1",
-            None,
-        )
-        .unwrap_err();
-        assert_eq!(error.to_string(), "no room");
-        assert!(shell("exit 3", None).unwrap_err().to_string().contains("3"));
-    }
-
-    #[test]
-    fn a_signal_terminates_the_training() {
-        let start = std::time::Instant::now();
-        assert_eq!(
-            shell("sleep 60 & trap 'kill $!; exit 143' TERM; wait", Some(15)).unwrap(),
-            Ending::Interrupted
-        );
-        assert!(start.elapsed() < Duration::from_secs(30));
-    }
 
     #[test]
     fn an_empty_directory_is_not_a_run() {

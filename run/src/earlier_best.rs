@@ -1,5 +1,4 @@
-//! The best policy of a run that an earlier version made: it may have been evaluated from other starts than its successors
-//! will be.
+//! The best policy of a run, evaluated anew where its successors are evaluated in another way than it was.
 
 use shoal_common::config::Config;
 use shoal_common::policy_file::PolicyFile;
@@ -10,7 +9,7 @@ use crate::external_environment::GYMNASIUM;
 use crate::server_location::ServerLocation;
 use crate::signals::Interrupt;
 
-/// The best policy's mean return by an earlier version, and the one from today's starts.
+/// The best policy's mean return before, and the one now.
 #[derive(Clone, Debug, PartialEq)]
 pub struct EvaluatedAnew {
     /// The one stored in `best.policy` before.
@@ -31,26 +30,33 @@ pub fn evaluate_anew(run: &RunDir, config: &Config, interrupt: &Interrupt) -> an
     if !config.environment.name.starts_with(GYMNASIUM) || run.server_file().exists() {
         return Ok(None);
     }
-    let evaluated = if run.best_policy().exists() {
-        let best = WhichPolicy::Best.read(run, config)?;
-        let amount = (config.evaluation.episodes, config.run.seed);
-        let now = evaluate_until(run, config, &best.parameters, amount, interrupt, |_| ())?;
-        let anew = PolicyFile {
-            return_mean: now.return_mean,
-            return_std: now.return_std,
-            episodes: now.episodes.into(),
-            ..best.clone()
-        };
-        anew.write(&run.best_policy())?;
-        Some(EvaluatedAnew {
-            before: best.return_mean,
-            now,
-        })
-    } else {
-        None
-    };
+    let evaluated = evaluate_best(run, config, interrupt)?;
     if let Some(location) = ServerLocation::here(&config.environment.server)? {
         location.write(run)?;
     }
     Ok(evaluated)
+}
+
+/// Evaluates the best policy with the episodes that later policies will have; `None` if there is none yet.
+///
+/// # Errors
+/// When the policy cannot be read or written, the environment fails, or a signal has arrived.
+pub fn evaluate_best(run: &RunDir, config: &Config, interrupt: &Interrupt) -> anyhow::Result<Option<EvaluatedAnew>> {
+    if !run.best_policy().exists() {
+        return Ok(None);
+    }
+    let best = WhichPolicy::Best.read(run, config)?;
+    let amount = (config.evaluation.episodes, config.run.seed);
+    let now = evaluate_until(run, config, &best.parameters, amount, interrupt, |_| ())?;
+    let anew = PolicyFile {
+        return_mean: now.return_mean,
+        return_std: now.return_std,
+        episodes: now.episodes.into(),
+        ..best.clone()
+    };
+    anew.write(&run.best_policy())?;
+    Ok(Some(EvaluatedAnew {
+        before: best.return_mean,
+        now,
+    }))
 }

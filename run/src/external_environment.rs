@@ -118,7 +118,7 @@ pub const TIED_COMMAND: &str = "tied";
 ///
 /// # Errors
 /// When there is no such program.
-fn tied(program: &Command) -> anyhow::Result<Command> {
+pub fn tied(program: &Command) -> anyhow::Result<Command> {
     let name = Path::new(program.get_program());
     let in_path = || {
         let path = std::env::var_os("PATH").unwrap_or_default();

@@ -2,6 +2,7 @@
 //! the evaluation of its policies.
 
 pub mod analysis;
+pub mod batch;
 pub mod client;
 pub mod description;
 pub mod earlier_best;
@@ -10,6 +11,7 @@ pub mod external_environment;
 pub mod final_evaluation;
 pub mod method;
 pub mod numbers;
+pub mod origin;
 pub mod outcome;
 pub mod plan;
 pub mod preflight;
@@ -20,5 +22,6 @@ pub mod rollout;
 pub mod server_location;
 pub mod signals;
 pub mod status;
+pub mod suite;
 #[cfg(any(test, feature = "testing"))]
 pub mod testing;

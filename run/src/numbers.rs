@@ -5,6 +5,11 @@ pub fn thousands(number: u64) -> String {
     indicatif::HumanCount(number).to_string()
 }
 
+/// An amount of memory in MiB, with one decimal.
+pub fn mebibytes(bytes: u64) -> String {
+    format!("{:.1} MiB", bytes as f64 / f64::from(1 << 20))
+}
+
 /// The largest whole number below which a 64-bit float has every whole number.
 const EXACT: f64 = 9_007_199_254_740_992.0;
 

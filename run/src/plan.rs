@@ -1,6 +1,7 @@
 //! The configuration of a new run: presets, files and overrides become one resolved configuration. No later code reads
 //! command-line options.
 
+mod revision;
 mod source;
 mod suggestion;
 
@@ -16,12 +17,15 @@ use shoal_common::section;
 use shoal_env_server::environment::{self, EnvironmentError};
 use toml::{Table, Value};
 
+use self::revision::as_written;
+pub use self::revision::{Asked, Revision, edited, store_actors};
 pub use self::source::{Source, Sources, UsageError};
 use self::suggestion::{nearest, with_suggestion};
 
 use crate::external_environment::{self, ExternalEnvironment, GYMNASIUM};
 use crate::method;
 use crate::numbers::count;
+use crate::origin::{Origin, Predecessor, shapes};
 use crate::preflight;
 use crate::server_location::{ServerLocation, Surroundings, hash_seed};
 use crate::signals::Interrupt;
@@ -69,9 +73,6 @@ const PRESETS: [(&str, &str); 15] = [
 /// The upper bound of `actors.max`.
 const MOST_ACTORS: i64 = 256;
 
-/// The keys that the program sets itself.
-pub const FILLED_IN: [&str; 2] = ["run.id", "run.identity_format"];
-
 /// The presets' names.
 pub fn preset_names() -> impl Iterator<Item = &'static str> {
     PRESETS.iter().map(|(name, _)| *name)
@@ -88,7 +89,7 @@ pub fn resolved_with_sources(what: &str, overrides: &RunOverrides) -> anyhow::Re
     resolve(table, sources, overrides, what)
 }
 
-/// What is worth a warning before a run of this configuration starts.
+/// What is worth a warning before a run of this configuration starts or goes on.
 pub fn warning(config: &Config) -> Option<String> {
     let (steps, warmup) = (config.run.steps, config.replay.warmup);
     (steps <= warmup && config.replay.updates_per_step > 0.0).then(|| {
@@ -120,6 +121,10 @@ pub struct RunOverrides {
     pub lockstep: bool,
     /// Any key, as `SECTION.KEY=VALUE`.
     pub set: Vec<String>,
+    /// A run whose networks this one begins with.
+    pub from: Option<PathBuf>,
+    /// Whether it also begins with that run's replay.
+    pub with_replay: bool,
 }
 
 /// A run that is ready to start.
@@ -131,6 +136,10 @@ pub struct Plan {
     pub run: RunDir,
     /// Held for as long as this process owns the run.
     pub lock: RunLock,
+    /// What it begins with, if that is not its own.
+    pub origin: Option<Origin>,
+    /// What is worth a warning before it starts.
+    pub warnings: Vec<String>,
 }
 
 impl Plan {
@@ -140,7 +149,14 @@ impl Plan {
     /// When the configuration is invalid, the machine lacks resources, or the directory cannot be created. No run
     /// directory remains.
     pub fn new(what: &str, overrides: &RunOverrides) -> anyhow::Result<Self> {
-        let (name, config) = decide(what, overrides)?;
+        let (name, mut config) = decide(what, overrides)?;
+        let from = overrides.from.as_deref();
+        let from = from
+            .map(|from| Predecessor::open(from, overrides.with_replay))
+            .transpose()?;
+        if let Some(predecessor) = &from {
+            predecessor.prepare(&mut config)?;
+        }
         let place = overrides.run.clone().unwrap_or_else(|| Path::new("runs").join(&name));
         preflight::check(&config, &RunDir::planned(&place))?;
         let run = match &overrides.run {
@@ -148,11 +164,23 @@ impl Plan {
             None => RunDir::create_next(Path::new("runs"), &name)?,
         };
         let lock = run.lock()?;
-        let config = fill(&run, &config).inspect_err(|_| {
+        let begin = || {
+            let config = fill(&run, &config)?;
+            let origin = from.as_ref().map(|predecessor| predecessor.begin(&run, &config));
+            Ok((config, origin.transpose()?))
+        };
+        let (config, origin) = begin().inspect_err(|_: &anyhow::Error| {
             // The directory would block the next attempt.
             let _ = std::fs::remove_dir_all(run.path());
         })?;
-        Ok(Self { config, run, lock })
+        let of_rows = from.and_then(|predecessor| predecessor.warning(&config));
+        Ok(Self {
+            warnings: warning(&config).into_iter().chain(of_rows).collect(),
+            config,
+            run,
+            lock,
+            origin,
+        })
     }
 }
 
@@ -162,8 +190,11 @@ fn fill(run: &RunDir, config: &Config) -> anyhow::Result<Config> {
     if let Some(location) = ServerLocation::here(&config.environment.server)? {
         location.write(run)?;
     }
-    run.write_config(config)?;
-    Ok(run.config()?)
+    run.write_config(&as_written(config))?;
+    let mut read = run.config()?;
+    (read.replay.ratio_since, read.replay.updates_before) = (config.replay.ratio_since, config.replay.updates_before);
+    run.write_used_config(&read)?;
+    Ok(read)
 }
 
 /// The configuration of a preset or a file with these overrides, and the default name of its run. Creates nothing.
@@ -180,7 +211,9 @@ fn preset(name: &str) -> Option<(&'static str, &'static str)> {
 /// As [`sections`], for the method that is asked for.
 fn for_method(what: &str, overrides: &RunOverrides) -> anyhow::Result<(String, Table, Sources)> {
     let (mut name, mut table, mut sources) = sections(what)?;
-    let Some(method) = method::asked_for(overrides.method.as_deref(), &overrides.set)? else {
+    let asked = method::asked_for(overrides.method.as_deref(), &overrides.set)?;
+    let of_networks = predecessor(overrides)?.map(|(_, config)| config.algorithm.name());
+    let Some(method) = asked.or(of_networks) else {
         return Ok((name, table, sources));
     };
     let named = method::named_in(&table);
@@ -285,6 +318,14 @@ fn resolve(
         put(&mut table, &["actors", "max"], count.min(MOST_ACTORS).into())?;
         sources.set("actors.max".into(), Source::Follows("actors.count".into()));
     }
+    // A file may be the configuration of another run.
+    for key in explanation::set_by_program() {
+        if let Some((section, key)) = key.split_once('.')
+            && let Some(Value::Table(values)) = table.get_mut(section)
+        {
+            values.remove(key);
+        }
+    }
     // Random and independent of the seed: the run's name in shared memory must be unique.
     put(
         &mut table,
@@ -298,6 +339,7 @@ fn resolve(
     // What is added are a method's settings for a Gymnasium environment, and the environment's own defaults.
     sources.add_new(&chosen, &table, &Source::Gymnasium);
     follow_method(&mut table, &mut sources)?;
+    follow_networks(&mut table, &mut sources, overrides)?;
     let mut config = Config::from_table(table.clone(), "").map_err(|error| {
         let message = error.to_string();
         let message = message.strip_prefix(": ").unwrap_or(&message);
@@ -308,13 +350,18 @@ fn resolve(
         config.evaluation.every = config.run.steps;
         sources.set("evaluation.every".into(), Source::Follows("run.steps".into()));
     }
+    set_what_follows(&mut config, &mut sources);
+    Ok((config, sources))
+}
+
+/// Sets what follows from the run's length if it is left open.
+fn set_what_follows(config: &mut Config, sources: &mut Sources) {
     if let Algorithm::Dqn(dqn) = &mut config.algorithm
         && dqn.epsilon_steps == 0
     {
         dqn.epsilon_steps = (config.run.steps / 10).max(1);
         sources.set("dqn.epsilon_steps".into(), Source::Follows("run.steps".into()));
     }
-    Ok((config, sources))
 }
 
 /// Sets the keys that have options of their own.
@@ -360,7 +407,7 @@ fn set_key(table: &mut Table, sources: &mut Sources, assignment: &str) -> anyhow
         .filter(|(key, _)| key.contains('.'))
         .ok_or_else(|| wrong("must look like SECTION.KEY=VALUE".into()))?;
     let path: Vec<&str> = key.split('.').collect();
-    if path[0] == "spec" || FILLED_IN.contains(&key) {
+    if path[0] == "spec" || explanation::set_by_program().iter().any(|own| own == key) {
         return Err(wrong(format!("{key} cannot be set: the program sets it")).into());
     }
     put(table, &path, value_of(value)).map_err(|error| wrong(error.to_string()))?;
@@ -426,6 +473,33 @@ fn about_environment(error: anyhow::Error, sources: &Sources) -> anyhow::Error {
         }
     };
     sources.blame(&format!("environment.{key}"), &text)
+}
+
+/// Directory and configuration of the run whose networks the new one begins with.
+fn predecessor(overrides: &RunOverrides) -> anyhow::Result<Option<(PathBuf, Config)>> {
+    let Some(from) = &overrides.from else { return Ok(None) };
+    let run = RunDir::open(from)?;
+    Ok(Some((run.path().to_owned(), run.config()?)))
+}
+
+/// Sets the shapes of the networks that a run begins with, unless the user has set others.
+fn follow_networks(table: &mut Table, sources: &mut Sources, overrides: &RunOverrides) -> anyhow::Result<()> {
+    let Some((path, config)) = predecessor(overrides)? else {
+        return Ok(());
+    };
+    put(table, &["run", "from"], path.display().to_string().into())?;
+    if !table.contains_key(config.algorithm.name()) {
+        // Networks of another method, which are refused later.
+        return Ok(());
+    }
+    for (section, key, value) in shapes(&config)? {
+        let name = format!("{section}.{key}");
+        if !sources.of(&name).is_users() {
+            put(table, &[section, &key], value)?;
+            sources.set(name, Source::Follows("--from".into()));
+        }
+    }
+    Ok(())
 }
 
 /// Sets what the method fixes, unless the user has set it.

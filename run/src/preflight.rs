@@ -11,6 +11,8 @@ use shoal_common::channel::{Domain, free_shared_memory};
 use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
 
+use crate::numbers::mebibytes;
+
 /// Checks that the machine has the resources for this run. The run directory need not exist; nothing is created.
 /// Removes what this user's killed runs left in shared memory, and raises this process's limit on open files to its
 /// maximum.
@@ -32,6 +34,16 @@ pub fn check(config: &Config, run: &RunDir) -> anyhow::Result<()> {
 pub fn reserve(config: &Config, run: &RunDir, domain: &Domain) -> anyhow::Result<()> {
     domain.promise(needs::shared_memory(config))?;
     check(config, run)
+}
+
+/// How many runs of this configuration the free shared memory allows side by side.
+///
+/// # Errors
+/// When the amount cannot be found out.
+pub fn side_by_side(config: &Config) -> anyhow::Result<usize> {
+    let need = needs::shared_memory(config).max(1);
+    let free = free_shared_memory(&config.run.id).context("cannot find out how much of /dev/shm is free")?;
+    Ok(free.map_or(usize::MAX, |free| (free / need) as usize))
 }
 
 fn check_shared_memory(config: &Config) -> anyhow::Result<()> {
@@ -109,9 +121,4 @@ fn existing(path: &Path) -> PathBuf {
         .filter(|path| !path.as_os_str().is_empty())
         .unwrap_or(Path::new("."))
         .into()
-}
-
-/// In MiB, with one decimal.
-fn mebibytes(bytes: u64) -> String {
-    format!("{:.1} MiB", bytes as f64 / f64::from(1 << 20))
 }

@@ -1,4 +1,4 @@
-//! Rates, and the ratio of updates to environment steps: shared by the live line, the records and the status.
+//! Rates, for the live line, the records and the status.
 
 use std::time::Duration;
 
@@ -8,12 +8,6 @@ pub fn per_second((then, earlier): (Duration, u64), (now, count): (Duration, u64
     let seconds = now.checked_sub(then)?.as_secs_f64();
     let made = count.checked_sub(earlier)?;
     (seconds > 0.0).then_some(made as f64 / seconds)
-}
-
-/// Updates per environment step after the warm-up; `None` during the warm-up.
-pub fn updates_per_step(updates: u64, env_steps: u64, warmup: u64) -> Option<f64> {
-    let steps = env_steps.saturating_sub(warmup);
-    (steps > 0).then(|| updates as f64 / steps as f64)
 }
 
 #[cfg(test)]
@@ -28,12 +22,5 @@ mod tests {
         assert_eq!(per_second((at(2), 100), (at(2), 150)), None);
         assert_eq!(per_second((at(2), 100), (at(4), 99)), None, "a restart");
         assert_eq!(per_second((at(4), 100), (at(2), 150)), None);
-    }
-
-    #[test]
-    fn the_ratio_is_undefined_during_the_warm_up() {
-        assert_eq!(updates_per_step(0, 100, 100), None);
-        assert_eq!(updates_per_step(0, 50, 100), None);
-        assert_eq!(updates_per_step(30, 120, 100), Some(1.5));
     }
 }

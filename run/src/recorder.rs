@@ -1,5 +1,6 @@
-//! The run's records: four tables, three of them also as TensorBoard scalars.
+//! The run's records: five tables, three of them also as TensorBoard scalars.
 
+mod change;
 mod incident;
 mod table;
 mod tensorboard;
@@ -7,15 +8,17 @@ mod tensorboard;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
+pub use change::{ChangeRecord, Moment, read_changes, record_changes};
 pub use incident::{Incident, IncidentKind, IncidentRow};
 use serde::{Deserialize, Serialize};
+use shoal_common::config::ReplayConfig;
 use shoal_common::report::{EpisodeReport, EvaluationReport, LearnerReport};
 use shoal_common::run_dir::RunDir;
 pub use table::RecordError;
 use table::Table;
 
 use self::tensorboard::EventFile;
-use crate::rate::{per_second, updates_per_step};
+use crate::rate::per_second;
 
 /// The longest time that rows stay unflushed. A `kill -9` of the launcher loses at most these.
 const MAX_UNFLUSHED: Duration = Duration::from_millis(500);
@@ -98,7 +101,7 @@ pub struct Recorder {
     incidents: Table,
     events: EventFile,
     events_path: std::path::PathBuf,
-    warmup: u64,
+    ratio: ReplayConfig,
     /// Running time of earlier launchers in seconds.
     earlier: f64,
     /// Environment steps of the last row of `learner.csv`.
@@ -112,12 +115,13 @@ pub struct Recorder {
 }
 
 impl Recorder {
-    /// Opens the records of `run`, whose learner starts after `warmup` environment steps.
-    pub fn open(run: &RunDir, warmup: u64) -> Result<Self, RecordError> {
+    /// Opens the records of `run`, whose ratio of updates to environment steps is that of `ratio`.
+    pub fn open(run: &RunDir, ratio: &ReplayConfig) -> Result<Self, RecordError> {
         let episodes = Table::open::<EpisodeRecord>(&run.episodes())?;
         let evaluations = Table::open::<EvaluationRecord>(&run.evaluations())?;
         let learner = Table::open::<LearnerRecord>(&run.learner_log())?;
         let incidents = Table::open::<IncidentRow>(&run.incidents())?;
+        change::create(run)?;
         let evaluated = read_evaluations(&run.evaluations())?
             .iter()
             .map(|row| row.env_steps)
@@ -142,7 +146,7 @@ impl Recorder {
             incidents,
             events,
             events_path,
-            warmup,
+            ratio: ratio.clone(),
             earlier,
             env_steps,
             episode_steps,
@@ -234,7 +238,7 @@ impl Recorder {
             q_mean: averaged(report.q_mean),
             updates_per_second: rate(|report| report.updates),
             env_steps_per_second: rate(|report| report.env_steps),
-            ratio: updates_per_step(report.updates, report.env_steps, self.warmup),
+            ratio: self.ratio.ratio(report.updates, report.env_steps),
         };
         self.env_steps = report.env_steps;
         self.previous = Some((wall, *report));
@@ -287,6 +291,14 @@ impl Recorder {
                 path: path.clone(),
                 cause,
             })
+    }
+
+    /// The moment `wall` after this launcher's start.
+    pub fn moment(&self, wall: Duration) -> Moment {
+        Moment {
+            wall_seconds: self.seconds(wall),
+            env_steps: self.env_steps,
+        }
     }
 
     /// Running time of the run so far in seconds, rounded to milliseconds.

@@ -9,7 +9,6 @@ use shoal_learner::process::checkpoint::Checkpoints;
 use shoal_learner::process::ratio::Ratio;
 
 use crate::outcome::{RunOutcome, RunState};
-use crate::rate::updates_per_step;
 use crate::recorder::read_evaluations;
 
 /// The status that a learner would continue from, by the run's files.
@@ -36,7 +35,7 @@ pub fn saved_status(config: &Config, run: &RunDir) -> anyhow::Result<RunStatus> 
             .map(|last| last.return_mean),
         ..Default::default()
     };
-    status.ratio = updates_per_step(status.updates, status.env_steps, config.replay.warmup).unwrap_or(0.0);
+    status.ratio = config.replay.ratio(status.updates, status.env_steps).unwrap_or(0.0);
     status.finished = is_finished(config, run, &status)?;
     Ok(status)
 }

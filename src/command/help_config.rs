@@ -4,9 +4,9 @@ use std::fmt::Write as _;
 use std::io::Write as _;
 
 use shoal_common::config::Config;
-use shoal_common::config::explanation::{Key, sections};
+use shoal_common::config::explanation::{Change, Key, sections};
 use shoal_env_server::environment;
-use shoal_run::plan::{FILLED_IN, RunOverrides, Source, preset_names, resolved, resolved_with_sources};
+use shoal_run::plan::{RunOverrides, Source, preset_names, resolved, resolved_with_sources};
 use toml::{Table, Value};
 
 /// Explains the keys of one preset or file with these overrides, or all keys if none is named.
@@ -80,8 +80,8 @@ fn explain_all() -> anyhow::Result<String> {
 }
 
 /// Whether the program sets the key itself for each run.
-fn is_filled_in(section: &str, key: &Key) -> bool {
-    FILLED_IN.contains(&format!("{section}.{}", key.name).as_str())
+fn is_filled_in(key: &Key) -> bool {
+    key.change == Some(Change::ByProgram)
 }
 
 /// The values that differ from the default, each with the presets that have it.
@@ -91,7 +91,7 @@ fn differing<'a>(
     environment: Option<&str>,
 ) -> Vec<(String, Vec<&'a str>)> {
     let mut differing: Vec<(String, Vec<&str>)> = Vec::new();
-    if is_filled_in(&entry.section, &entry.key) {
+    if is_filled_in(&entry.key) {
         return differing;
     }
     for (name, table) in presets {
@@ -128,7 +128,7 @@ fn explain_one(what: &str, overrides: &RunOverrides) -> anyhow::Result<String> {
         let chosen = entries.iter().filter_map(|entry| {
             let value = table.get(&entry.section)?.as_table()?.get(&entry.key.name)?;
             // A key that the program sets has no value to show.
-            let shown = (!is_filled_in(&entry.section, &entry.key)).then_some(value);
+            let shown = (!is_filled_in(&entry.key)).then_some(value);
             let source = sources.of(&format!("{}.{}", entry.section, entry.key.name));
             Some((&entry.key, shown, shown.map(|_| source)))
         });
@@ -153,6 +153,7 @@ fn write_key(text: &mut String, key: &Key, value: Option<&Value>, source_of_valu
         choices,
         bounds,
         whole: _,
+        change,
     } = key;
     let value = match value {
         Some(Value::String(word)) if word.is_empty() => String::new(),
@@ -167,6 +168,9 @@ fn write_key(text: &mut String, key: &Key, value: Option<&Value>, source_of_valu
     }
     if !bounds.is_empty() {
         let _ = writeln!(text, "      A number {bounds}.");
+    }
+    if let Some(change) = change {
+        let _ = writeln!(text, "      {}", change.in_words());
     }
 }
 

@@ -8,13 +8,14 @@ use clap::Args;
 use shoal_common::durable::write_atomically;
 use shoal_common::run_dir::RunDir;
 use shoal_report::page::{self, MARK};
+use shoal_run::suite::Suite;
 
 #[derive(Args, Clone, Debug)]
 pub(crate) struct ReportArgs {
-    /// Run directories. Runs in the same environment are compared.
+    /// Run directories, or those of suites. Runs in the same environment are compared.
     #[arg(value_name = "RUN", required = true)]
     pub(crate) runs: Vec<PathBuf>,
-    /// The file to write [default: report.html in the run directory; for several runs, in the working directory].
+    /// The file to write [default: report.html in that directory; for several, in the working directory].
     #[arg(long, value_name = "FILE")]
     pub(crate) out: Option<PathBuf>,
 }
@@ -25,9 +26,12 @@ const NAME: &str = "report.html";
 /// Collects the data of the runs, writes the page, and prints its path.
 pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<()> {
     let runs = open(&args.runs)?;
-    let out = match (&args.out, &runs[..]) {
+    let out = match (&args.out, &args.runs[..]) {
         (Some(out), _) => out.clone(),
-        (None, [run]) => run.path().join(NAME),
+        // A suite has a directory of its own too.
+        (None, [one]) => std::fs::canonicalize(one)
+            .with_context(|| format!("cannot resolve {}", one.display()))?
+            .join(NAME),
         (None, _) => NAME.into(),
     };
     check_replaceable(&out)?;
@@ -46,14 +50,20 @@ pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Opens the runs. Each may be named only once.
+/// Opens the runs, and those of suites. Each may be named only once.
 fn open(paths: &[PathBuf]) -> anyhow::Result<Vec<RunDir>> {
     let mut runs: Vec<RunDir> = Vec::new();
     for path in paths {
-        let run = RunDir::open(path)?;
-        let twice = runs.contains(&run);
-        ensure!(!twice, "{} is named twice: name each run once", path.display());
-        runs.push(run);
+        let of_suite = Suite::read(path)?.map(|suite| suite.runs(path));
+        if of_suite.as_ref().is_some_and(Vec::is_empty) {
+            bail!("no run of the suite in {} has begun yet", path.display());
+        }
+        for path in of_suite.unwrap_or_else(|| vec![path.clone()]) {
+            let run = RunDir::open(&path)?;
+            let twice = runs.contains(&run);
+            ensure!(!twice, "{} is named twice: name each run once", path.display());
+            runs.push(run);
+        }
     }
     Ok(runs)
 }

@@ -6,21 +6,26 @@ use std::process::ExitCode;
 
 use anyhow::{Context, bail};
 use clap::Args;
-use shoal_common::config::Config;
+use clap_complete::engine::ArgValueCompleter;
 use shoal_common::run_dir::RunDir;
-use shoal_run::earlier_best::{EvaluatedAnew, evaluate_anew};
+use shoal_run::earlier_best::{EvaluatedAnew, evaluate_anew, evaluate_best};
 use shoal_run::numbers::count;
-use shoal_run::plan::warning;
+use shoal_run::origin::Origin;
+use shoal_run::plan::{Asked, Revision, UsageError, warning};
+use shoal_run::recorder::{ChangeRecord, Moment};
 use shoal_run::server_location::ServerLocation;
 use shoal_run::signals::{Signals, exit_code};
 use shoal_run::status;
+use shoal_run::suite::Suite;
 
+use super::suite;
 use super::training::OutputMode;
 use super::training::run_training;
+use crate::{completion, launcher};
 
 #[derive(Args, Clone, Debug)]
 pub(crate) struct ResumeArgs {
-    /// Run directory.
+    /// Run directory, or the directory of a suite.
     pub(crate) run: PathBuf,
     /// Environment steps of all actors together, including those already taken [default: as before].
     #[arg(long, value_name = "N", value_parser = count)]
@@ -28,23 +33,51 @@ pub(crate) struct ResumeArgs {
     /// Episodes of all actors together, including those already finished [default: as before].
     #[arg(long, value_name = "M", value_parser = count)]
     pub(crate) episodes: Option<u64>,
+    /// Change a key that may change in a run, as in --set ddpg.tau=0.005. May be repeated.
+    #[arg(long, value_name = "SECTION.KEY=VALUE", add = ArgValueCompleter::new(completion::settings))]
+    pub(crate) set: Vec<String>,
+    /// Runs of a suite at a time [default: what cores and /dev/shm allow].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
+    pub(crate) jobs: Option<u16>,
     #[command(flatten)]
     pub(crate) output: OutputMode,
 }
 
-/// Continues with the run's replay, counters and noise, until its old or new number of steps or episodes.
+/// Continues with the run's replay, counters and noise, until its old or new number of steps or episodes, and with what
+/// was changed in its configuration.
 pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
+    if let Some(suite) = Suite::read(&args.run)? {
+        return resume_suite(&suite, args);
+    }
+    if args.jobs.is_some() {
+        return Err(UsageError("--jobs: is for suites, and this is one run".into()).into());
+    }
     let run = RunDir::open(&args.run)?;
-    let mut config = run.config()?;
     // Only the holder of the lock may change the configuration.
     let lock = run.lock()?;
+    let used = run.config()?;
     let here = args.run.display();
-    let saved = status::saved_status(&config, &run).with_context(|| format!("cannot resume {here}"))?;
+    if run.replay_removed().exists() && !run.replay_file().exists() {
+        bail!(
+            "cannot resume {here}: `shoal rm --replay` has removed its replay, from which it would learn; eval, report \
+             and export still work, and `shoal train … --from {here}` begins a new run with its networks"
+        );
+    }
+    if used.run.from.is_some() && Origin::read(&run)?.is_none() {
+        bail!("the start of {here} was interrupted before it had its networks: remove it and train again");
+    }
+    let saved = status::saved_status(&used, &run).with_context(|| format!("cannot resume {here}"))?;
+    let asked = Asked {
+        steps: args.steps,
+        episodes: args.episodes,
+        set: args.set.clone(),
+    };
+    let revision = Revision::new(&run, &used, &asked)?;
+    let config = &revision.config;
     let (steps_taken, episodes_ended) = (saved.env_steps, saved.episodes);
-    let steps = args.steps.unwrap_or(config.run.steps);
-    let episodes = args.episodes.or(config.run.episodes);
+    let (steps, episodes) = (config.run.steps, config.run.episodes);
     // A run with all its steps may still lack updates or the last evaluation.
-    if saved.finished || (steps, episodes) != (config.run.steps, config.run.episodes) {
+    if saved.finished || (steps, episodes) != (used.run.steps, used.run.episodes) {
         if steps_taken >= steps {
             bail!("{here} has taken {steps_taken} of {steps} steps already: give it more with --steps");
         }
@@ -54,27 +87,64 @@ pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
     }
     // Found now, and not by roles that fail one after the other.
     ServerLocation::of_run(&run).with_context(|| format!("cannot resume {here}"))?;
-    if (steps, episodes) != (config.run.steps, config.run.episodes) {
-        (config.run.steps, config.run.episodes) = (steps, episodes);
-        config.check()?;
-        run.write_config(&config)?;
-    }
-    if let Some(signal) = evaluate_best_anew(&run, &config)? {
+    if let Some(signal) = evaluate_best_anew(&run, &revision)? {
         return Ok(exit_code(signal));
     }
-    if let Some(warning) = warning(&config) {
+    // A learner that was killed has reported more steps than it has saved.
+    let mut now = Moment::of_records(&run)?;
+    now.env_steps = now.env_steps.max(steps_taken);
+    for change in revision.apply(&run, now)? {
+        let ChangeRecord {
+            key,
+            before,
+            after,
+            source,
+            env_steps,
+            ..
+        } = change;
+        let line = format!("{key} changes from {before} to {after} at step {env_steps} ({source})");
+        launcher::note(&run, &line);
+        if !args.output.quiet {
+            writeln!(std::io::stderr(), "{line}")?;
+        }
+    }
+    if let Some(warning) = warning(config) {
         writeln!(std::io::stderr(), "warning: {warning}")?;
     }
-    run_training(config, &run, &lock, &args.output)
+    run_training(revision.config, &run, &lock, &args.output)
 }
 
-/// Evaluates the best policy again if an earlier version did that from other starts. Returns the signal that ended it, if
-/// one did.
-fn evaluate_best_anew(run: &RunDir, config: &Config) -> anyhow::Result<Option<i32>> {
+fn resume_suite(suite: &Suite, args: &ResumeArgs) -> anyhow::Result<ExitCode> {
+    if args.steps.is_some() || args.episodes.is_some() || !args.set.is_empty() {
+        let why = "a suite goes on as it was made: change its runs one by one, or train another one";
+        return Err(UsageError(why.into()).into());
+    }
+    let manner = suite::Manner {
+        jobs: args.jobs,
+        output: &args.output,
+    };
+    suite::resume(suite, &args.run, manner)
+}
+
+/// Evaluates the best policy again if an earlier version did that from other starts, or if later policies are evaluated
+/// with another number of episodes. Returns the signal that ended it, if one did.
+fn evaluate_best_anew(run: &RunDir, revision: &Revision) -> anyhow::Result<Option<i32>> {
     let signals = Signals::register()?;
     let interrupt = signals.interrupt();
     let here = run.path().display();
-    match (evaluate_anew(run, config, &interrupt), interrupt.signal()) {
+    let config = &revision.config;
+    let (evaluated, why) = if revision.changes("evaluation.episodes") {
+        (
+            evaluate_best(run, config, &interrupt),
+            "it has another number of episodes now",
+        )
+    } else {
+        (
+            evaluate_anew(run, config, &interrupt),
+            "an earlier version used other starts",
+        )
+    };
+    match (evaluated, interrupt.signal()) {
         (Err(_), Some(signal)) => {
             writeln!(
                 std::io::stderr(),
@@ -87,7 +157,7 @@ fn evaluate_best_anew(run: &RunDir, config: &Config) -> anyhow::Result<Option<i3
             if let Some(EvaluatedAnew { before, now }) = evaluated {
                 writeln!(
                     std::io::stderr(),
-                    "the best policy is evaluated anew, for an earlier version used other starts: {:.2} instead of {before:.2}",
+                    "the best policy is evaluated anew, for {why}: {:.2} instead of {before:.2}",
                     now.return_mean
                 )?;
             }

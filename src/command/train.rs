@@ -9,12 +9,13 @@ use clap::Args;
 use clap::builder::PossibleValuesParser;
 use clap_complete::engine::ArgValueCompleter;
 use shoal_run::numbers::{count, small_count};
-use shoal_run::plan::{Plan, RunOverrides, warning};
+use shoal_run::plan::{Plan, RunOverrides, UsageError};
+use shoal_run::suite;
 
 use super::help_config;
 use super::training::OutputMode;
 use super::training::run_training;
-use crate::completion;
+use crate::{completion, launcher};
 
 #[derive(Args, Clone, Debug)]
 pub(crate) struct TrainArgs {
@@ -29,8 +30,25 @@ pub(crate) struct TrainArgs {
     pub(crate) help_config: bool,
     #[command(flatten)]
     pub(crate) overrides: RunArgs,
+    /// Train a suite: a run for each of these seeds, as in 1..5 (five seeds) or 1,4,7.
+    #[arg(long, value_name = "A..B", value_parser = seeds, conflicts_with = "seed")]
+    pub(crate) seeds: Option<Seeds>,
+    /// Train a suite: a run for each of these values, as in --sweep ddpg.tau=0.001,0.005. Repeated: for each combination.
+    #[arg(long, value_name = "SECTION.KEY=A,B,C", add = ArgValueCompleter::new(completion::settings))]
+    pub(crate) sweep: Vec<String>,
+    /// Runs of a suite at a time [default: what cores and /dev/shm allow].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
+    pub(crate) jobs: Option<u16>,
     #[command(flatten)]
     pub(crate) output: OutputMode,
+}
+
+/// The seeds of a suite.
+#[derive(Clone, Debug)]
+pub(crate) struct Seeds(pub(crate) Vec<u64>);
+
+fn seeds(text: &str) -> Result<Seeds, String> {
+    suite::seeds(text).map(Seeds)
 }
 
 /// The settings of a run that have options of their own, and `--set`.
@@ -64,6 +82,12 @@ pub(crate) struct RunArgs {
     /// Set a key of the configuration, as in --set ddpg.tau=0.005. May be repeated.
     #[arg(long, value_name = "SECTION.KEY=VALUE", add = ArgValueCompleter::new(completion::settings))]
     pub(crate) set: Vec<String>,
+    /// Begin with the networks of this run, whose method and shapes it then has.
+    #[arg(long, value_name = "RUN")]
+    pub(crate) from: Option<PathBuf>,
+    /// Begin with the replay of that run too. The new run's steps are counted from its rows on.
+    #[arg(long, requires = "from")]
+    pub(crate) with_replay: bool,
 }
 
 impl RunArgs {
@@ -78,6 +102,8 @@ impl RunArgs {
             episodes,
             lockstep,
             set,
+            from,
+            with_replay,
         } = self.clone();
         RunOverrides {
             run,
@@ -89,6 +115,8 @@ impl RunArgs {
             episodes,
             lockstep,
             set,
+            from,
+            with_replay,
         }
     }
 }
@@ -103,9 +131,28 @@ pub(crate) fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
         .what
         .as_deref()
         .context("name a preset, a gym: environment or a configuration file to train")?;
-    let Plan { config, run, lock } = Plan::new(what, &args.overrides.overrides())?;
-    if let Some(warning) = warning(&config) {
+    if args.seeds.is_some() || !args.sweep.is_empty() {
+        return super::suite::train(args, what, &args.overrides.overrides());
+    }
+    if args.jobs.is_some() {
+        return Err(UsageError("--jobs: is for several runs, with --seeds or --sweep".into()).into());
+    }
+    let Plan {
+        config,
+        run,
+        lock,
+        origin,
+        warnings,
+    } = Plan::new(what, &args.overrides.overrides())?;
+    for warning in warnings {
         writeln!(std::io::stderr(), "warning: {warning}")?;
+    }
+    if let Some(origin) = origin {
+        let line = format!("{} {}", run.name(), origin.in_words());
+        launcher::note(&run, &line);
+        if !args.output.quiet {
+            writeln!(std::io::stderr(), "{line}")?;
+        }
     }
     run_training(config, &run, &lock, &args.output).inspect_err(|_| {
         // Where no process was started there is nothing to resume or to read, and it would be in the way of the next try.

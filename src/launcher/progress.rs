@@ -1,13 +1,14 @@
-//! The live line.
+//! The live line; or, where standard error is no terminal, a plain line for each evaluation.
 
+use std::io::{IsTerminal, Write};
 use std::time::{Duration, Instant};
 
 use indicatif::{HumanDuration, ProgressBar, ProgressDrawTarget, ProgressStyle};
-use shoal_common::config::Config;
+use shoal_common::config::{Config, ReplayConfig};
 use shoal_common::report::{EvaluationReport, LearnerReport};
 use shoal_common::run_dir::RunDir;
 use shoal_run::numbers::thousands;
-use shoal_run::rate::{per_second, updates_per_step};
+use shoal_run::rate::per_second;
 
 use super::requests::waiting;
 use super::supervisor::Supervisor;
@@ -15,14 +16,19 @@ use super::supervisor::Supervisor;
 /// The time over which rates are averaged.
 const SPAN: Duration = Duration::from_secs(5);
 
-/// Shows the progress of a run on standard error, if that is a terminal.
+/// A ratio below this share of the agreed one is explained: until the run is long, the lead that the actors may have
+/// counts.
+const NEARLY: f64 = 0.98;
+
+/// Shows the progress of a run on standard error.
 #[derive(Debug)]
 pub(super) struct Progress {
     bar: ProgressBar,
+    /// Whether plain lines are printed instead of the bar.
+    plain: bool,
     /// Whether the bar counts episodes rather than steps.
     counts_episodes: bool,
-    warmup: u64,
-    updates_per_step: f64,
+    replay: ReplayConfig,
     learner: Option<LearnerReport>,
     /// Reports of the last [`SPAN`].
     recent: std::collections::VecDeque<(Duration, LearnerReport)>,
@@ -48,9 +54,9 @@ impl Progress {
         bar.set_message("starting");
         Self {
             bar,
+            plain: !quiet && !std::io::stderr().is_terminal(),
             counts_episodes: config.run.episodes.is_some(),
-            warmup: config.replay.warmup,
-            updates_per_step: config.replay.updates_per_step,
+            replay: config.replay.clone(),
             learner: None,
             recent: [].into(),
             evaluated: None,
@@ -78,17 +84,42 @@ impl Progress {
         }
     }
 
-    pub(super) fn set_evaluation(&mut self, report: &EvaluationReport) {
+    /// Takes a report of the evaluator. One that `is_new` is printed where there is no live line.
+    pub(super) fn set_evaluation(&mut self, report: &EvaluationReport, is_new: bool) {
         self.evaluated = Some(*report);
+        if self.plain && is_new {
+            say(&self.evaluation_line(report));
+        }
+    }
+
+    fn evaluation_line(&self, report: &EvaluationReport) -> String {
+        let steps = thousands(report.env_steps);
+        let place = match self.learner.filter(|_| self.counts_episodes) {
+            Some(learner) => {
+                let (done, all) = (thousands(learner.episodes), thousands(self.bar.length().unwrap_or(0)));
+                format!("step {steps} ({done} of {all} episodes)")
+            }
+            None => format!("step {steps} of {}", thousands(self.bar.length().unwrap_or(0))),
+        };
+        let mut parts = vec![format!("return {:.2} ± {:.2}", report.return_mean, report.return_std)];
+        if let Some((updates, env_steps)) = self.rates() {
+            parts.push(format!("{updates:.0} updates/s, {env_steps:.0} steps/s"));
+        }
+        parts.extend(self.learner.and_then(|learner| self.time_left(&learner)));
+        format!("{}: {place}, {}", self.bar.prefix(), parts.join(", "))
     }
 
     pub(super) fn set_message(&self, message: &'static str) {
         self.bar.set_message(message);
     }
 
-    /// Prints a line above the bar, if it is shown.
+    /// Prints a line, above the bar if that is shown.
     pub(super) fn print(&self, text: &str) {
-        self.bar.println(text);
+        if self.plain {
+            say(text);
+        } else {
+            self.bar.println(text);
+        }
     }
 
     pub(super) fn clear(&self) {
@@ -111,10 +142,7 @@ impl Progress {
         let (done, all) = (self.done(learner), self.bar.length().unwrap_or(0));
         let unit = if self.counts_episodes { "episodes" } else { "steps" };
         let mut distance = vec![format!("{}/{} {unit}", thousands(done), thousands(all))];
-        if let Some(pace) = self.pace(|report| self.done(report)).filter(|pace| *pace > 0.0) {
-            let left = all.saturating_sub(done) as f64 / pace;
-            distance.push(format!("{} left", HumanDuration(Duration::from_secs_f64(left))));
-        }
+        distance.extend(self.time_left(learner));
         let mut pace = Vec::new();
         if let Some(evaluated) = &self.evaluated {
             pace.push(format!("eval {:.2}", evaluated.return_mean));
@@ -124,14 +152,23 @@ impl Progress {
             Some((rate, env_steps)) => pace.push(format!("{updates} updates, {rate:.0}/s · {env_steps:.0} steps/s")),
             None => pace.push(format!("{updates} updates")),
         }
-        let ratio = updates_per_step(learner.updates, learner.env_steps, self.warmup).unwrap_or(0.0);
         let waits = waiting(supervisor).map(|who| format!(", {who}")).unwrap_or_default();
-        let ratio = format!("ratio {ratio:.2} of {:.2}{waits}", self.updates_per_step);
+        let ratio = format!(
+            "{}{waits}",
+            ratio_in_words(&self.replay, learner.updates, learner.env_steps)
+        );
         let mut lines = vec![distance.join(" · "), pace.join(" · "), ratio];
         if supervisor.restarts() > 0 {
             lines.push(format!("{} restarts; see shoal.log", supervisor.restarts()));
         }
         lines.join("\n  ")
+    }
+
+    /// How long the rest takes at the present pace.
+    fn time_left(&self, learner: &LearnerReport) -> Option<String> {
+        let pace = self.pace(|report| self.done(report)).filter(|pace| *pace > 0.0)?;
+        let left = self.bar.length().unwrap_or(0).saturating_sub(self.done(learner)) as f64 / pace;
+        Some(format!("{} left", HumanDuration(Duration::from_secs_f64(left))))
     }
 
     /// Episodes so far, if the run has a limit of episodes; otherwise steps.
@@ -157,5 +194,48 @@ impl Progress {
         }
         let ((then, old), (now, new)) = (self.recent.front()?, self.recent.back()?);
         per_second((*then, count(old)), (*now, count(new)))
+    }
+}
+
+/// The ratio of updates to environment steps beside the agreed one, and why it is lower at first.
+fn ratio_in_words(replay: &ReplayConfig, updates: u64, env_steps: u64) -> String {
+    let agreed = replay.updates_per_step;
+    let Some(ratio) = replay.ratio(updates, env_steps) else {
+        let (steps, warmup) = (thousands(env_steps), thousands(replay.ratio_start()));
+        return format!("warm-up: {steps} of {warmup} steps, then ratio {agreed:.2}");
+    };
+    let stated = format!("ratio {ratio:.2} of {agreed:.2}");
+    if ratio >= NEARLY * agreed {
+        return stated;
+    }
+    format!(
+        "{stated} (rising: actors may be {} steps ahead)",
+        thousands(replay.tolerance)
+    )
+}
+
+/// Writes a line to standard error. One that is closed must not end the run.
+fn say(line: &str) {
+    let _ = writeln!(std::io::stderr(), "{line}");
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_ratio_that_is_still_low_is_explained() {
+        let replay = ReplayConfig {
+            warmup: 100,
+            updates_per_step: 0.5,
+            ..ReplayConfig::default()
+        };
+        let words = |updates, steps| ratio_in_words(&replay, updates, steps);
+        assert_eq!(words(0, 64), "warm-up: 64 of 100 steps, then ratio 0.50");
+        assert_eq!(
+            words(90, 500),
+            "ratio 0.23 of 0.50 (rising: actors may be 512 steps ahead)"
+        );
+        assert_eq!(words(196, 500), "ratio 0.49 of 0.50");
     }
 }

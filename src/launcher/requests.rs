@@ -5,8 +5,8 @@ use shoal_common::commit::OpenError;
 use shoal_common::config::{Config, Mode};
 use shoal_common::report::{Activity, Role};
 use shoal_common::run_dir::RunDir;
-use shoal_run::rate::updates_per_step;
-use shoal_run::status;
+use shoal_run::recorder::Moment;
+use shoal_run::{plan, status};
 
 use super::progress::Progress;
 use super::supervisor::Supervisor;
@@ -29,8 +29,7 @@ pub(super) fn status(
         status.episodes = learner.episodes;
         status.updates = learner.updates;
         status.policy_version = learner.policy_version;
-        let ratio = updates_per_step(status.updates, status.env_steps, config.replay.warmup);
-        status.ratio = ratio.unwrap_or(0.0);
+        status.ratio = config.replay.ratio(status.updates, status.env_steps).unwrap_or(0.0);
     }
     (status.updates_per_second, status.env_steps_per_second) = progress.rates().unwrap_or_default();
     if let Some(report) = progress.evaluated() {
@@ -44,12 +43,13 @@ pub(super) fn status(
     Ok(status)
 }
 
-/// Changes the number of actors, now and for when the run is resumed.
+/// Changes the number of actors, `now` and for when the run is resumed.
 pub(super) fn scale(
     config: &mut Config,
     run: &RunDir,
     supervisor: &mut Supervisor,
     actors: u32,
+    now: Moment,
 ) -> anyhow::Result<Answer> {
     if config.run.mode == Mode::Lockstep {
         let reason = "the number of actors of a lockstep run cannot change: its results depend on it";
@@ -60,13 +60,11 @@ pub(super) fn scale(
         let reason = format!("this run can have 1 to {max} actors (actors.max, fixed when it was created)");
         return Ok(Answer::Refused(reason));
     }
-    let mut scaled = config.clone();
-    scaled.actors.count = actors;
     // Before the actors start, so that a learner that is started now reads the new number.
-    if let Err(error) = run.write_config(&scaled) {
-        return Ok(Answer::Refused(error.to_string()));
+    match plan::store_actors(run, config, actors, now) {
+        Ok(scaled) => *config = scaled,
+        Err(error) => return Ok(Answer::Refused(format!("{error:#}"))),
     }
-    *config = scaled;
     supervisor.scale(actors);
     Ok(Answer::Accepted)
 }

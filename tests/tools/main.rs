@@ -5,6 +5,7 @@
 mod export;
 mod list;
 mod networks;
+mod rm;
 mod shell;
 #[path = "../support/mod.rs"]
 mod support;

@@ -124,7 +124,12 @@ fn a_run_can_be_resumed_only_with_its_own_networks() {
         assert_ne!(changed, config, "{written}");
         std::fs::write(&path, changed).unwrap();
         let message = error_line(&place.output(&["resume", "run", "--steps", "400"]));
-        assert!(message.contains("another configuration"), "{other}: {message}");
+        let (key, value) = other.split_once(" = ").unwrap();
+        let refused = format!("ddpg.{key} = {}: cannot change", value.trim_matches('"'));
+        assert!(
+            message.contains(&refused) && message.contains("config.toml, line "),
+            "{other}: {message}"
+        );
     }
     // A configuration of a version without this key.
     std::fs::write(&path, config.replace("activation = \"relu\"\n", "")).unwrap();

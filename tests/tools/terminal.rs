@@ -203,8 +203,33 @@ fn no_color_also_applies_to_help_and_errors() {
 }
 
 #[test]
-fn without_a_terminal_there_is_no_live_line() {
+fn without_a_terminal_there_is_a_line_for_each_evaluation_instead_of_the_live_line() {
     let place = Workplace::new();
+    let said = |more: &[&str]| {
+        let output = place.output(
+            &[
+                &SHORT[..],
+                &QUICK[..],
+                &["--lockstep", "--set", "evaluation.every=200"],
+                more,
+            ]
+            .concat(),
+        );
+        assert!(output.status.success());
+        String::from_utf8(output.stderr).unwrap()
+    };
+    let lines = said(&[]);
+    let evaluated: Vec<&str> = lines.lines().filter(|line| line.contains("of 600, return ")).collect();
+    assert!(
+        evaluated.len() == 4 && evaluated.iter().all(|line| line.starts_with("pendulum-1: step ")),
+        "{lines}"
+    );
+    assert!(
+        evaluated[0].starts_with("pendulum-1: step 0 of 600, return -"),
+        "{lines}"
+    );
+    assert_eq!(said(&["--quiet"]), "");
+
     let output = place.output(&[&SHORT[..], &QUICK[..]].concat());
     let message = String::from_utf8(output.stderr).unwrap();
     assert!(

@@ -1,10 +1,13 @@
-//! Sections of the configuration. Each key is declared once: its name, type, default, bounds, unit and meaning, and the
-//! source of the default. Reading, validation, `--help-config` and completions all follow from that declaration.
+//! Sections of the configuration. Each key is declared once: its name, type, default, bounds, unit and meaning, the source
+//! of the default, and whether it may change after the start of a run. Reading, validation, `resume --set`,
+//! `--help-config` and completions all follow from that declaration.
 
 mod bounds;
+mod change;
 mod explanation;
 
 pub use bounds::{Bounded, Bounds, OutOfRange, above, from, in_words};
+pub use change::{Change, EXPLORATION, in_free_runs, never};
 pub use explanation::{Key, Section, describe, keys};
 
 use std::fmt::Display;
@@ -58,7 +61,7 @@ pub fn line_at(text: &str, byte: usize) -> usize {
 ///
 /// ```text
 /// /// What it means: whole sentences.
-/// gamma: f64 = 0.99, bounds: from(0.0, 1.0), unit: "–", source: "section 4.3.1";
+/// gamma: f64 = 0.99, bounds: from(0.0, 1.0), unit: "–", source: "section 4.3.1", change: never("rows have it");
 /// ```
 ///
 /// Leave out `bounds` for values that are not numbers, and where a bound is the value of another key; the section's
@@ -80,7 +83,7 @@ macro_rules! section {
                 $(#[$of_field:meta])*
                 $field:ident: $type:ty = $default:expr
                 $(, bounds: $bounds:expr)?
-                $(, unit: $unit:literal, source: $source:literal)?
+                $(, unit: $unit:literal, source: $source:literal, change: $change:expr)?
                 $(, section: $section:literal)?;
             )*
         }
@@ -91,7 +94,7 @@ macro_rules! section {
         pub struct $name {
             $(
                 $(#[$of_field])*
-                $(#[schemars(extend("unit" = $unit, "source" = $source))])?
+                $(#[schemars(extend("unit" = $unit, "source" = $source, "change" = $change))])?
                 $(#[schemars(extend("bounds" = $crate::section::in_words::<$type>(&$bounds)))])?
                 $(
                     #[doc = concat!("\n\nThis is the section `[", $section, "]`.")]

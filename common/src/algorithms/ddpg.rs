@@ -1,7 +1,7 @@
 //! `[ddpg]`: deep deterministic policy gradient.
 
 use shoal_base::section;
-use shoal_base::section::{above, from};
+use shoal_base::section::{Change, above, from, never};
 use shoal_base::space::EnvironmentSpec;
 use shoal_policy::PolicyError;
 use shoal_policy::network::{Activation, Hidden, Layers, NetworkLayout};
@@ -22,19 +22,25 @@ section! {
     pub struct DdpgConfig {
         /// Units of each hidden layer, for actor and critic: a list of 1 to 8 layers. The action enters the critic at
         /// the second hidden layer, or at the only one.
-        hidden: Layers = Layers::from([400, 300]), bounds: from(1, 8_192), unit: "units", source: "section 4.3.1";
+        hidden: Layers = Layers::from([400, 300]), bounds: from(1, 8_192), unit: "units", source: "section 4.3.1",
+            change: Change::Shape;
         /// The activation function of the hidden layers.
-        activation: Activation = Activation::Relu, unit: "–", source: "section 4.3.1";
+        activation: Activation = Activation::Relu, unit: "–", source: "section 4.3.1", change: Change::Shape;
         /// γ, the discount of one step.
-        gamma: f64 = 0.99, bounds: from(0.0, 1.0), unit: "–", source: "section 4.3.1";
+        gamma: f64 = 0.99, bounds: from(0.0, 1.0), unit: "–", source: "section 4.3.1",
+            change: never("the rows in the replay have it");
         /// τ, the share by which the target networks move in one gradient step (equation 3.31).
-        tau: f64 = 0.001, bounds: above(0.0, 1.0), unit: "–", source: "equation 3.31, section 4.3.1";
+        tau: f64 = 0.001, bounds: above(0.0, 1.0), unit: "–", source: "equation 3.31, section 4.3.1",
+            change: Change::Learning;
         /// Adam's step size for the actor, α_μ.
-        actor_learning_rate: f64 = 1e-4, bounds: above(0.0, 1.0), unit: "–", source: "section 4.3.1";
+        actor_learning_rate: f64 = 1e-4, bounds: above(0.0, 1.0), unit: "–", source: "section 4.3.1",
+            change: Change::Learning;
         /// Adam's step size for the critic, α_Q.
-        critic_learning_rate: f64 = 1e-3, bounds: above(0.0, 1.0), unit: "–", source: "section 4.3.1";
+        critic_learning_rate: f64 = 1e-3, bounds: above(0.0, 1.0), unit: "–", source: "section 4.3.1",
+            change: Change::Learning;
         /// N, transitions in a minibatch.
-        batch: usize = 64, bounds: from(1, 65_536), unit: "transitions", source: "Algorithm 4, section 4.3.1";
+        batch: usize = 64, bounds: from(1, 65_536), unit: "transitions", source: "Algorithm 4, section 4.3.1",
+            change: Change::Learning;
         /// The noise of its actors.
         exploration: ExplorationConfig = ExplorationConfig::default(), section: "exploration";
     }

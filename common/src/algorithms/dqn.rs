@@ -1,7 +1,7 @@
 //! `[dqn]`: deep Q-network.
 
 use shoal_base::section;
-use shoal_base::section::{above, from};
+use shoal_base::section::{Change, EXPLORATION, above, from, never};
 use shoal_base::space::EnvironmentSpec;
 use shoal_policy::PolicyError;
 use shoal_policy::network::{Activation, Hidden, Layers, NetworkLayout};
@@ -20,32 +20,38 @@ section! {
     /// Mnih et al. 2015, with the double estimate of van Hasselt et al. 2016.
     pub struct DqnConfig {
         /// Units of each hidden layer: a list of 1 to 8 layers.
-        hidden: Layers = Layers::from([256, 256]), bounds: from(1, 8_192), unit: "units", source: "ours";
+        hidden: Layers = Layers::from([256, 256]), bounds: from(1, 8_192), unit: "units", source: "ours",
+            change: Change::Shape;
         /// The activation function of the hidden layers.
-        activation: Activation = Activation::Relu, unit: "–", source: "Mnih et al. 2015";
+        activation: Activation = Activation::Relu, unit: "–", source: "Mnih et al. 2015", change: Change::Shape;
         /// γ, the discount of one step.
-        gamma: f64 = 0.99, bounds: from(0.0, 1.0), unit: "–", source: "Mnih et al. 2015";
+        gamma: f64 = 0.99, bounds: from(0.0, 1.0), unit: "–", source: "Mnih et al. 2015",
+            change: never("the rows in the replay have it");
         /// Adam's step size.
-        learning_rate: f64 = 5e-4, bounds: above(0.0, 1.0), unit: "–", source: "ours";
+        learning_rate: f64 = 5e-4, bounds: above(0.0, 1.0), unit: "–", source: "ours", change: Change::Learning;
         /// N, transitions in a minibatch.
-        batch: usize = 64, bounds: from(1, 65_536), unit: "transitions", source: "ours";
+        batch: usize = 64, bounds: from(1, 65_536), unit: "transitions", source: "ours", change: Change::Learning;
         /// The target network becomes a copy of the network after every so many updates.
-        target_every: u64 = 1_000, bounds: from(1, 1_000_000_000), unit: "updates", source: "ours";
+        target_every: u64 = 1_000, bounds: from(1, 1_000_000_000), unit: "updates", source: "ours",
+            change: Change::Learning;
         /// Whether the action in s' is chosen by the network and valued by the target network. Otherwise the target
         /// network does both.
-        double: bool = true, unit: "–", source: "van Hasselt et al. 2016";
+        double: bool = true, unit: "–", source: "van Hasselt et al. 2016", change: Change::Learning;
         /// Whether the network's last layer has separate heads for the value of a state and the advantages of the
         /// actions.
-        dueling: bool = false, unit: "–", source: "Wang et al. 2016";
+        dueling: bool = false, unit: "–", source: "Wang et al. 2016", change: Change::Shape;
         /// δ: errors beyond it count linearly instead of quadratically (Huber's loss).
-        huber_delta: f64 = 1.0, bounds: above(0.0, 1e6), unit: "–", source: "Mnih et al. 2015";
+        huber_delta: f64 = 1.0, bounds: above(0.0, 1e6), unit: "–", source: "Mnih et al. 2015",
+            change: Change::Learning;
         /// ε at the beginning: the probability that an actor takes a random action.
-        epsilon_start: f64 = 1.0, bounds: from(0.0, 1.0), unit: "share of the steps", source: "Mnih et al. 2015";
+        epsilon_start: f64 = 1.0, bounds: from(0.0, 1.0), unit: "share of the steps", source: "Mnih et al. 2015",
+            change: EXPLORATION;
         /// ε at the end.
-        epsilon_end: f64 = 0.05, bounds: from(0.0, 1.0), unit: "share of the steps", source: "ours";
+        epsilon_end: f64 = 0.05, bounds: from(0.0, 1.0), unit: "share of the steps", source: "ours",
+            change: EXPLORATION;
         /// Environment steps of all actors in which ε falls linearly from the first to the second value. 0 becomes a
         /// tenth of `run.steps` when the run is created.
-        epsilon_steps: u64 = 0, unit: "environment steps", source: "ours";
+        epsilon_steps: u64 = 0, unit: "environment steps", source: "ours", change: EXPLORATION;
     }
 }
 

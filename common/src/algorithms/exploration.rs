@@ -3,18 +3,19 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use shoal_base::section;
-use shoal_base::section::from;
+use shoal_base::section::{EXPLORATION, from};
 
 section! {
     /// Ornstein-Uhlenbeck noise: x ← x − θ x + σ N(0, 1) at each step. It is added to the action in units of half the
     /// range.
     pub struct ExplorationConfig {
         /// θ, the pull towards zero.
-        theta: f64 = 0.15, bounds: from(0.0, 1.0), unit: "1 / step", source: "section 4.3.1";
+        theta: f64 = 0.15, bounds: from(0.0, 1.0), unit: "1 / step", source: "section 4.3.1", change: EXPLORATION;
         /// σ, the size of each step's impulse.
-        sigma: f64 = 0.2, bounds: from(0.0, 10.0), unit: "half action ranges", source: "section 4.3.1";
+        sigma: f64 = 0.2, bounds: from(0.0, 10.0), unit: "half action ranges", source: "section 4.3.1",
+            change: EXPLORATION;
         /// How actors act until the learner's first update, while `replay.warmup` transitions are collected.
-        warmup: Warmup = Warmup::Policy, unit: "–", source: "ours";
+        warmup: Warmup = Warmup::Policy, unit: "–", source: "ours", change: EXPLORATION;
     }
 }
 

@@ -3,7 +3,7 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use shoal_base::section;
-use shoal_base::section::from;
+use shoal_base::section::{Change, from, never};
 use shoal_base::space::EnvironmentSpec;
 use shoal_policy::PolicyError;
 use shoal_policy::network::{Activation, Hidden, Layers, NetworkLayout};
@@ -22,24 +22,28 @@ section! {
     /// Algorithm 3 with the numbers of section 4.2.1, and its variants of section 4.2.2.
     pub struct ReinforceConfig {
         /// Units of each of the policy's hidden layers: a list of 1 to 8 layers.
-        hidden: Layers = Layers::from([10, 2]), bounds: from(1, 8_192), unit: "units", source: "section 4.2.1";
+        hidden: Layers = Layers::from([10, 2]), bounds: from(1, 8_192), unit: "units", source: "section 4.2.1",
+            change: Change::Shape;
         /// The activation function of the hidden layers, for policy and baseline.
-        activation: Activation = Activation::Relu, unit: "–", source: "section 4.2.1";
+        activation: Activation = Activation::Relu, unit: "–", source: "section 4.2.1", change: Change::Shape;
         /// γ, the discount of one step.
-        gamma: f64 = 0.95, bounds: from(0.0, 1.0), unit: "–", source: "section 4.2.1";
+        gamma: f64 = 0.95, bounds: from(0.0, 1.0), unit: "–", source: "section 4.2.1",
+            change: never("the rows in the replay have it");
         /// Adam's step size for the policy, α.
-        learning_rate: f64 = 0.01, bounds: from(0.0, 1.0), unit: "–", source: "section 4.2.1";
+        learning_rate: f64 = 0.01, bounds: from(0.0, 1.0), unit: "–", source: "section 4.2.1", change: Change::Learning;
         /// What a step's ∇ ln π is multiplied by.
-        weight: Weight = Weight::Normalised, unit: "–", source: "section 4.2.2";
+        weight: Weight = Weight::Normalised, unit: "–", source: "section 4.2.2",
+            change: never("a baseline is a network of its own");
         /// Whether the product is also multiplied by γᵗ, as in line 6 of Algorithm 3.
-        discount_steps: bool = false, unit: "–", source: "Algorithm 3";
+        discount_steps: bool = false, unit: "–", source: "Algorithm 3", change: Change::Learning;
         /// Whether an episode that the time limit ended is learned from.
-        learn_at_limit: bool = true, unit: "–", source: "section 4.2.2";
+        learn_at_limit: bool = true, unit: "–", source: "section 4.2.2", change: Change::Learning;
         /// Units of each of the baseline's hidden layers: a list of 1 to 8 layers. Used only with `weight =
         /// "baseline"`.
-        baseline_hidden: Layers = Layers::from([32, 32]), bounds: from(1, 8_192), unit: "units", source: "ours";
+        baseline_hidden: Layers = Layers::from([32, 32]), bounds: from(1, 8_192), unit: "units", source: "ours",
+            change: Change::Shape;
         /// Adam's step size for the baseline.
-        baseline_learning_rate: f64 = 0.01, bounds: from(0.0, 1.0), unit: "–", source: "ours";
+        baseline_learning_rate: f64 = 0.01, bounds: from(0.0, 1.0), unit: "–", source: "ours", change: Change::Learning;
     }
 }
 

@@ -1,7 +1,7 @@
 //! `[q-learning]` and `[sarsa]`: tabular temporal-difference control. Both have the same keys.
 
 use shoal_base::section;
-use shoal_base::section::from;
+use shoal_base::section::{Change, EXPLORATION, from, never};
 use shoal_base::space::EnvironmentSpec;
 use shoal_policy::PolicyError;
 
@@ -26,11 +26,13 @@ section! {
     /// Algorithms 1 and 2 with the numbers of section 4.1.
     pub struct TabularConfig {
         /// γ, the discount of one step.
-        gamma: f64 = 0.999, bounds: from(0.0, 1.0), unit: "–", source: "section 4.1";
+        gamma: f64 = 0.999, bounds: from(0.0, 1.0), unit: "–", source: "section 4.1",
+            change: never("the rows in the replay have it");
         /// α, the step size.
-        alpha: f64 = 0.03, bounds: from(0.0, 1.0), unit: "–", source: "section 4.1";
+        alpha: f64 = 0.03, bounds: from(0.0, 1.0), unit: "–", source: "section 4.1", change: Change::Learning;
         /// ε, the probability that an actor takes a random action instead of the best.
-        epsilon: f64 = 0.4, bounds: from(0.0, 1.0), unit: "share of the steps", source: "section 4.1";
+        epsilon: f64 = 0.4, bounds: from(0.0, 1.0), unit: "share of the steps", source: "section 4.1",
+            change: EXPLORATION;
     }
 }
 

@@ -1,22 +1,25 @@
 //! `[actors]`.
 
 use shoal_base::section;
-use shoal_base::section::{OutOfRange, from};
+use shoal_base::section::{Change, OutOfRange, from, in_free_runs, never};
 
 section! {
     /// The actors, and the size of their chunks.
     #[derive(Eq)]
     pub struct ActorsConfig {
         /// Actor processes, each with its own environment server; at most `actors.max`.
-        count: u32 = 2, unit: "processes", source: "ours";
+        count: u32 = 2, unit: "processes", source: "ours", change: in_free_runs("its results depend on it");
         /// Environments that an actor steps at once.
-        envs: u32 = 1, bounds: from(1, 4_096), unit: "environments", source: "ours";
+        envs: u32 = 1, bounds: from(1, 4_096), unit: "environments", source: "ours",
+            change: in_free_runs("the snapshots of its actors have it");
         /// Steps of every environment that are sent in one chunk. A chunk has `chunk_steps · envs` rows.
-        chunk_steps: u32 = 8, bounds: from(1, 4_096), unit: "steps", source: "ours";
+        chunk_steps: u32 = 8, bounds: from(1, 4_096), unit: "steps", source: "ours",
+            change: in_free_runs("its rounds have it");
         /// Chunks that an actor may have sent and the learner has not committed yet.
-        window: u32 = 8, bounds: from(1, 64), unit: "chunks", source: "ours";
+        window: u32 = 8, bounds: from(1, 64), unit: "chunks", source: "ours", change: Change::Anytime;
         /// The most actors that the run can be scaled to.
-        max: u32 = 16, bounds: from(1, 256), unit: "processes", source: "ours";
+        max: u32 = 16, bounds: from(1, 256), unit: "processes", source: "ours",
+            change: never("the replay has a place for each of them");
     }
 }
 

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use shoal_base::section::{OutOfRange, from};
+use shoal_base::section::{Change, OutOfRange, from, never};
 use shoal_base::space::{EnvironmentSpec, Space};
 
 /// Most numbers in an observation or an action: many more than any environment has, and few enough that no size
@@ -14,24 +14,30 @@ const MAX_WIDTH: usize = 4_096;
 /// Most indices of a discrete space: a 32-bit float has every whole number up to this one.
 const MAX_INDICES: u64 = 1 << 24;
 
+/// Why the environment of a run and its parameters never change.
+pub(super) const ITS_ROWS: &str = "the rows in the replay come from this environment";
+
+/// Why the command of an environment's server never changes.
+const ITS_SERVER: &str = "the rows in the replay come from it; if its program has moved, edit server.json";
+
 /// The environment: its name and its parameters.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct EnvironmentConfig {
     /// The name of a built-in environment, or a name for an external server, such as `gym:Pendulum-v1`.
-    #[schemars(extend("unit" = "–", "source" = "chapters 4 and 5"))]
+    #[schemars(extend("unit" = "–", "source" = "chapters 4 and 5", "change" = never(ITS_ROWS)))]
     pub name: String,
     /// The command that starts the external environment server (`docs/PROTOCOL.md`); empty for built-in environments.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    #[schemars(extend("unit" = "–", "source" = "ours"))]
+    #[schemars(extend("unit" = "–", "source" = "ours", "change" = never(ITS_SERVER)))]
     pub server: Vec<String>,
     /// Invalid answers, such as an infinite reward, after which the run ends. Each one ends the episodes of its server,
     /// and new ones begin.
     #[serde(default = "default_faults", skip_serializing_if = "is_default_faults")]
-    #[schemars(extend("unit" = "answers", "source" = "ours"))]
+    #[schemars(extend("unit" = "answers", "source" = "ours", "change" = Change::Anytime))]
     pub faults: u32,
     /// How long the server may take to start. After 10 s the terminal shows which server the run waits for.
     #[serde(default = "default_start_seconds", skip_serializing_if = "is_default_start_seconds")]
-    #[schemars(extend("unit" = "s", "source" = "ours"))]
+    #[schemars(extend("unit" = "s", "source" = "ours", "change" = Change::Anytime))]
     pub start_seconds: u32,
     /// The environment's own parameters.
     #[serde(flatten)]

@@ -1,7 +1,7 @@
 //! Every section that the user may write, with its keys.
 
 use shoal_base::section::describe;
-pub use shoal_base::section::{Key, Section, keys};
+pub use shoal_base::section::{Change, Key, Section, keys};
 
 use super::actors::ActorsConfig;
 use super::checkpoint::CheckpointConfig;
@@ -38,10 +38,39 @@ pub fn sections() -> Vec<Section> {
     all
 }
 
+/// The keys that the program sets itself, each with its section.
+pub fn set_by_program() -> Vec<String> {
+    let sections = sections().into_iter();
+    let keys = sections.flat_map(|section| section.keys.into_iter().map(move |key| (section.name, key)));
+    let of_program = keys.filter(|(_, key)| key.change == Some(Change::ByProgram));
+    of_program
+        .map(|(section, key)| format!("{section}.{}", key.name))
+        .collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::config::{DdpgConfig, ReinforceConfig};
+
+    #[test]
+    fn every_key_says_whether_it_may_change() {
+        for section in sections() {
+            for key in section.keys {
+                assert!(key.change.is_some(), "{}.{}", section.name, key.name);
+            }
+        }
+        assert_eq!(
+            set_by_program(),
+            [
+                "run.from",
+                "run.id",
+                "run.identity_format",
+                "replay.ratio_since",
+                "replay.updates_before"
+            ]
+        );
+    }
 
     #[test]
     fn the_explanation_of_a_key_comes_from_its_declaration() {

@@ -1,32 +1,70 @@
 //! `[replay]`.
 
 use shoal_base::section;
-use shoal_base::section::{OutOfRange, from};
+use shoal_base::section::{Change, OutOfRange, from, in_free_runs, never};
 
 use crate::algorithms::{Algorithm, Experience};
 
 /// Most transitions in a replay.
 const MAX_ROWS: u64 = 1_000_000_000;
 
+/// More environment steps and updates than any run has.
+const MAX_COUNT: u64 = 1 << 60;
+
 section! {
     /// The replay, and the ratio of updates to environment steps.
     pub struct ReplayConfig {
         /// Minibatches are sampled from this many newest transitions.
-        capacity: u64 = 1_000_000, bounds: from(1, MAX_ROWS), unit: "transitions", source: "section 4.3.1";
+        capacity: u64 = 1_000_000, bounds: from(1, MAX_ROWS), unit: "transitions", source: "section 4.3.1",
+            change: never("the file of the replay has this size");
         /// Transitions collected before the first update.
-        warmup: u64 = 1_000, bounds: from(0, MAX_ROWS), unit: "transitions", source: "ours";
+        warmup: u64 = 1_000, bounds: from(0, MAX_ROWS), unit: "transitions", source: "ours",
+            change: in_free_runs("its rounds so far have had the updates that it allows");
         /// Updates for each environment step beyond the warm-up: gradient steps, or rows for methods that use each row
         /// once. The thesis has 1.
         updates_per_step: f64 = 1.0, bounds: from(0.0, 1_000.0),
-            unit: "updates per environment step", source: "Algorithm 4";
+            unit: "updates per environment step", source: "Algorithm 4",
+            change: in_free_runs("its replay is as large as it requires");
         /// n, steps of a transition: the sum of n discounted rewards, and the observation after the last of them.
-        n_step: u32 = 1, bounds: from(1, 100), unit: "steps", source: "Sutton and Barto 2018, chapter 7";
+        n_step: u32 = 1, bounds: from(1, 100), unit: "steps", source: "Sutton and Barto 2018, chapter 7",
+            change: never("the rows in the replay have it");
         /// Environment steps that the actors may be ahead of that ratio before the learner stops taking transitions.
-        tolerance: u64 = 512, bounds: from(1, MAX_ROWS), unit: "environment steps", source: "ours";
+        tolerance: u64 = 512, bounds: from(1, MAX_ROWS), unit: "environment steps", source: "ours",
+            change: Change::Anytime;
+        /// The environment step from which the ratio counts, if that is later than the warm-up: the ratio was changed
+        /// there.
+        #[serde(skip_serializing_if = "is_zero")]
+        ratio_since: u64 = 0, bounds: from(0, MAX_COUNT), unit: "environment steps", source: "ours",
+            change: Change::ByProgram;
+        /// Updates that were agreed until then.
+        #[serde(skip_serializing_if = "is_zero")]
+        updates_before: u64 = 0, bounds: from(0, MAX_COUNT), unit: "updates", source: "ours", change: Change::ByProgram;
     }
 }
 
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde requires this signature")]
+fn is_zero(number: &u64) -> bool {
+    *number == 0
+}
+
 impl ReplayConfig {
+    /// The environment step after which the ratio counts.
+    pub fn ratio_start(&self) -> u64 {
+        self.warmup.max(self.ratio_since)
+    }
+
+    /// How many updates are agreed in total after `rows` environment steps.
+    pub fn agreed_updates(&self, rows: u64) -> u64 {
+        let counted = rows.saturating_sub(self.ratio_start());
+        self.updates_before + (counted as f64 * self.updates_per_step) as u64
+    }
+
+    /// Updates per environment step, both since the ratio counts; `None` before.
+    pub fn ratio(&self, updates: u64, env_steps: u64) -> Option<f64> {
+        let steps = env_steps.saturating_sub(self.ratio_start());
+        (steps > 0).then(|| updates.saturating_sub(self.updates_before) as f64 / steps as f64)
+    }
+
     /// Checks every number for this algorithm.
     ///
     /// # Errors
@@ -67,5 +105,41 @@ impl ReplayConfig {
                 Ok(())
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_new_ratio_counts_from_where_it_was_agreed() {
+        let before = ReplayConfig {
+            warmup: 100,
+            ..ReplayConfig::default()
+        };
+        let after = ReplayConfig {
+            updates_per_step: 0.5,
+            ratio_since: 1_100,
+            updates_before: before.agreed_updates(1_100),
+            ..before.clone()
+        };
+        assert_eq!((before.agreed_updates(100), before.agreed_updates(1_100)), (0, 1_000));
+        assert_eq!(
+            [1_000, 1_100, 1_102, 2_100].map(|rows| after.agreed_updates(rows)),
+            [1_000, 1_000, 1_001, 1_500]
+        );
+        assert_eq!((before.ratio(500, 1_100), before.ratio(0, 100)), (Some(0.5), None));
+        assert_eq!(after.ratio(1_050, 1_200), Some(0.5), "of the updates since then");
+        assert_eq!(
+            after.ratio(990, 1_200),
+            Some(0.0),
+            "the learner has some of the earlier ones to make"
+        );
+        let written = toml::to_string(&before).unwrap();
+        assert!(
+            !written.contains("ratio_since") && !written.contains("updates_before"),
+            "{written}"
+        );
     }
 }

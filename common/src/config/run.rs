@@ -3,7 +3,7 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use shoal_base::section;
-use shoal_base::section::{OutOfRange, from};
+use shoal_base::section::{Change, OutOfRange, from, never};
 
 use super::identity_format::IdentityFormat;
 
@@ -11,25 +11,32 @@ section! {
     /// Identity and length of the run.
     pub struct RunConfig {
         /// Names the run's services and shared memory. Chosen by the program when the run directory is created.
-        id: String = String::new(), unit: "–", source: "ours";
+        id: String = String::new(), unit: "–", source: "ours", change: Change::ByProgram;
         /// The seed of every random stream.
-        seed: u64 = 1, bounds: from(0, i64::MAX as u64), unit: "–", source: "ours";
+        seed: u64 = 1, bounds: from(0, i64::MAX as u64), unit: "–", source: "ours",
+            change: never("every random stream of the run has it");
         /// Whether results may depend on timing (free) or not (lockstep).
-        mode: Mode = Mode::Free, unit: "–", source: "ours";
+        mode: Mode = Mode::Free, unit: "–", source: "ours",
+            change: never("the replay and its actors' snapshots are made for it");
         /// Environment steps of all actors after which training ends.
         steps: u64 = 120_000, bounds: from(1, 1_000_000_000_000),
-            unit: "environment steps", source: "sections 4.1 to 5.3, each task its own";
+            unit: "environment steps", source: "sections 4.1 to 5.3, each task its own", change: Change::Anytime;
         /// Episodes of all actors after which training ends, if that is earlier.
         #[serde(skip_serializing_if = "Option::is_none")]
-        episodes: Option<u64> = None, bounds: from(1, 1_000_000_000), unit: "episodes", source: "sections 4.1 and 4.2";
+        episodes: Option<u64> = None, bounds: from(1, 1_000_000_000), unit: "episodes", source: "sections 4.1 and 4.2",
+            change: Change::Anytime;
         /// A process is replaced after this time without progress if the processes that it waits for are alive and wait
         /// too. Stopped processes and environments with long steps are not replaced.
-        stall_seconds: u64 = 10, bounds: from(1, 86_400), unit: "s", source: "ours";
+        stall_seconds: u64 = 10, bounds: from(1, 86_400), unit: "s", source: "ours", change: Change::Anytime;
+        /// The run whose networks this one began with, from `--from`.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        from: Option<String> = None, unit: "–", source: "ours", change: Change::ByProgram;
         /// The format of the text that identifies the run's files. Chosen by the program when the run directory is
         /// created.
         #[serde(skip_serializing_if = "IdentityFormat::is_unnumbered")]
         #[schemars(with = "u32")]
-        identity_format: IdentityFormat = IdentityFormat::Unnumbered, unit: "–", source: "ours";
+        identity_format: IdentityFormat = IdentityFormat::Unnumbered, unit: "–", source: "ours",
+            change: Change::ByProgram;
     }
 }
 

@@ -3,8 +3,8 @@
 use shoal_common::config::{self, Config};
 use shoal_common::policy::PolicyError;
 
-use super::algorithm::{Algorithm, Method, RunSizes};
-use super::normaliser::Normaliser;
+use super::algorithm::{Algorithm, Method, RunSizes, SavedState, SectionError};
+use super::normaliser::{self, Normaliser};
 use super::tabular;
 use crate::networks::product::Products;
 
@@ -34,6 +34,30 @@ pub fn weights(config: &Config) -> Vec<&'static str> {
     let statistics = config.observation.normalise.then_some(Normaliser::SECTION);
     let learned = method(&config.algorithm).weights().iter().copied();
     learned.chain(statistics).collect()
+}
+
+/// The state of a learner that is `fresh`, except that it has the sections `weights` of another one's state `saved`. The
+/// optimisers begin anew. `rows` rows of its own replay are part of the statistics of observations already.
+///
+/// # Errors
+/// When the other state lacks a part, or has it in another shape.
+pub fn inherited(
+    fresh: &dyn Algorithm,
+    weights: &[&str],
+    mut saved: SavedState,
+    rows: u64,
+) -> Result<Vec<(&'static str, Vec<f32>)>, SectionError> {
+    let section = |(name, numbers): (&'static str, &[f32])| {
+        if !weights.contains(&name) {
+            return Ok((name, numbers.to_vec()));
+        }
+        let mut inherited = saved.take(name, numbers.len())?;
+        if name == Normaliser::SECTION {
+            normaliser::set_rows(&mut inherited, rows);
+        }
+        Ok((name, inherited))
+    };
+    fresh.state().into_iter().map(section).collect()
 }
 
 /// The matrix products of one or a few updates of that learner; none if its method has no networks, or if its updates
@@ -112,6 +136,21 @@ mod tests {
                 rest.contains("normalise = true"),
                 "{rest}"
             );
+            // A learner inherits its weights, and nothing of the optimiser.
+            let other: Vec<(String, Vec<f32>)> = state
+                .iter()
+                .map(|(name, numbers)| ((*name).to_owned(), vec![0.5; numbers.len()]))
+                .collect();
+            let begun = inherited(&*learner, &weights, SavedState::from(other), 3).unwrap();
+            for ((name, numbers), (_, fresh)) in begun.iter().zip(&state) {
+                match *name {
+                    name if weights.contains(&name) && name != Normaliser::SECTION => {
+                        assert!(numbers.iter().all(|it| *it == 0.5), "{name}")
+                    }
+                    Normaliser::SECTION => assert_eq!(numbers[..2], bytemuck::cast::<f64, [f32; 2]>(3.0)),
+                    name => assert_eq!(numbers, fresh, "{name}"),
+                }
+            }
             // Only some learners have a baseline.
             assert!(weights.iter().filter(|name| **name != "baseline").all(named), "{rest}");
         }

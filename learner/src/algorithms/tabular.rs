@@ -264,7 +264,10 @@ impl Algorithm for Tabular {
 
     fn restore(&mut self, updates: u64, saved: &mut SavedState) -> Result<(), SectionError> {
         self.q = saved.take(Self::WEIGHTS[0], self.q.len())?;
-        self.pending = saved.take(Self::PENDING, self.pending.len())?;
+        // Q-learning has none, and the number of its actors may have changed.
+        if self.bootstrap == Bootstrap::NextAction {
+            self.pending = saved.take(Self::PENDING, self.pending.len())?;
+        }
         self.rows = updates;
         Ok(())
     }

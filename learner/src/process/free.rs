@@ -53,7 +53,7 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
             learner.notify_all();
             return EvaluationWait::new(learner)?.wait(learner, Some(LAST_EVALUATION));
         } else {
-            let activity = if learner.rows < ratio.warmup {
+            let activity = if learner.rows < ratio.start() {
                 Activity::WaitingForPeer
             } else {
                 Activity::WaitingForRatio

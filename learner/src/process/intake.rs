@@ -131,7 +131,8 @@ impl Intake {
         let Some(chunk) = source.receiver.receive()? else {
             return Ok(None);
         };
-        let accepted = (self.limit - replay.head()).min(chunk.header().rows.into()) as usize * self.chunk.row.width();
+        let accepted =
+            self.limit.saturating_sub(replay.head()).min(chunk.header().rows.into()) as usize * self.chunk.row.width();
         let appended = append(replay, actor, &chunk, accepted)?;
         drop(chunk);
         source.notifier.notify();

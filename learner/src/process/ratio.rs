@@ -4,35 +4,30 @@ use shoal_common::config;
 
 /// How many updates the environment steps collected so far allow. An update is a gradient step or, for methods that use
 /// each row once, a row.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Ratio {
-    /// Environment steps before the first update.
-    pub warmup: u64,
-    /// Updates for each environment step after the warm-up.
-    pub updates_per_step: f64,
-    /// Environment steps by which the actors may be ahead.
-    pub tolerance: u64,
-}
+#[derive(Clone, Debug, PartialEq)]
+pub struct Ratio(config::ReplayConfig);
 
 impl From<&config::ReplayConfig> for Ratio {
     fn from(replay: &config::ReplayConfig) -> Self {
-        Self {
-            warmup: replay.warmup,
-            updates_per_step: replay.updates_per_step,
-            tolerance: replay.tolerance,
-        }
+        Self(replay.clone())
     }
 }
 
 impl Ratio {
     /// How many updates are allowed in total after `rows` environment steps.
     pub fn allowed(&self, rows: u64) -> u64 {
-        (rows.saturating_sub(self.warmup) as f64 * self.updates_per_step) as u64
+        self.0.agreed_updates(rows)
     }
 
     /// Whether the learner is behind by more than the tolerance, so that it should take no more rows.
     pub fn is_behind(&self, rows: u64, updates: u64) -> bool {
-        rows.saturating_sub(self.tolerance) > self.warmup && self.allowed(rows - self.tolerance) > updates
+        let rows = rows.saturating_sub(self.0.tolerance);
+        rows > self.0.ratio_start() && self.allowed(rows) > updates
+    }
+
+    /// The environment step after which the ratio counts.
+    pub fn start(&self) -> u64 {
+        self.0.ratio_start()
     }
 }
 
@@ -42,11 +37,12 @@ mod tests {
 
     #[test]
     fn neither_side_gets_ahead_by_more_than_the_tolerance() {
-        let ratio = Ratio {
+        let ratio = Ratio(config::ReplayConfig {
             warmup: 100,
             updates_per_step: 0.5,
             tolerance: 10,
-        };
+            ..config::ReplayConfig::default()
+        });
         assert_eq!((ratio.allowed(100), ratio.allowed(101), ratio.allowed(102)), (0, 0, 1));
         assert!(!ratio.is_behind(111, 0), "the tolerance is not used up");
         assert!(ratio.is_behind(112, 0));

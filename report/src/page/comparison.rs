@@ -98,16 +98,25 @@ fn label(sets: &[Set], i: usize, runs: &[Run]) -> String {
         return first(set).name.clone();
     }
     let mut label = format!("{} runs of {}", set.runs.len(), first(set).algorithm);
+    for setting in own_settings(sets, i, runs) {
+        label += &format!(", {setting}");
+    }
+    label
+}
+
+/// The settings in which a set differs from the others, but no more than a few.
+pub(super) fn own_settings(sets: &[Set], i: usize, runs: &[Run]) -> Vec<String> {
+    let first = |set: &Set| &runs[set.runs[0]];
     let differs = |(key, value): &&Setting| {
         sets.iter().any(|other| {
             let there = first(other).settings.iter().find(|(name, _)| name == key);
             there.is_none_or(|(_, there)| there != value)
         })
     };
-    for (key, value) in in_common(&first(set).settings).filter(differs).take(LABEL_SETTINGS) {
-        label += &format!(", {key} = {value}");
-    }
-    label
+    let own = in_common(&first(&sets[i]).settings)
+        .filter(differs)
+        .take(LABEL_SETTINGS);
+    own.map(|(key, value)| format!("{key} = {value}")).collect()
 }
 
 /// (x, mean return), sorted by x.

@@ -1,6 +1,41 @@
-//! Rounds and thins out numbers for the page's diagrams.
+//! Rounds and thins out numbers for the page's diagrams, and how many there may be.
 
 use std::ops::Range;
+
+/// Points in a curve of a single run. Several runs share a total, so that the page stays small.
+pub(super) const POINTS: usize = 800;
+const POINTS_TOGETHER: usize = 4_000;
+const FEWEST_POINTS: usize = 60;
+
+/// Playable episodes of a single run. Several runs share a total.
+const EPISODES: usize = 6;
+const EPISODES_TOGETHER: usize = 24;
+
+/// How much of one run the page may contain.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Limits {
+    pub(super) points: usize,
+    pub(super) episodes: usize,
+}
+
+impl Limits {
+    /// For what shows neither curves nor episodes.
+    pub(super) const NONE: Self = Self {
+        points: FEWEST_POINTS,
+        episodes: 0,
+    };
+
+    /// For run `number`, counted from 0, of `runs` in the report.
+    pub(super) fn of(number: usize, runs: usize) -> Self {
+        Self {
+            points: (POINTS_TOGETHER / runs).clamp(FEWEST_POINTS, POINTS),
+            episodes: match EPISODES_TOGETHER / runs {
+                0 => usize::from(number < EPISODES_TOGETHER),
+                share => share.min(EPISODES),
+            },
+        }
+    }
+}
 
 /// Rounds to five significant digits, which is finer than any screen.
 pub(super) fn short(value: f64) -> f64 {

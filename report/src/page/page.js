@@ -53,6 +53,7 @@ function overview() {
     ["final evaluation", (run) => finalEvaluation(run.final_evaluation)],
     ["processes", incidents],
   ];
+  if (runs.some((run) => run.origin)) facts.splice(3, 0, ["beginning", (run) => run.origin ?? "networks of its own"]);
   section(
     "At a glance",
     table("The runs at a glance", facts.map(([name, of]) => [name, runs.map(of)])),
@@ -86,8 +87,12 @@ function returns(comparison, axis) {
       series.push({ name: `median of ${set.label}`, colour: own ? "ink" : at % COLOURS, x: spread.x, y: median, low, high, band, look: "thick" });
     }
   });
-  return new Chart({ title: `Evaluation return, ${comparison.environment}`, unit: "", axis, link: new Link(), series, height: 340 });
+  const marks = all.length <= COLOURS ? all.flatMap((i) => named(runs[i], changesOf(runs[i], axis))) : [];
+  return new Chart({ title: `Evaluation return, ${comparison.environment}`, unit: "", axis, link: new Link(), series, marks, height: 340 });
 }
+
+/** Marks of a run, which say whose they are where there are several runs. */
+const named = (run, marks) => marks.map((mark) => ({ ...mark, text: several ? `${run.name}: ${mark.text}` : mark.text }));
 
 function learning() {
   const place = html("div", {});
@@ -101,6 +106,7 @@ function learning() {
     "Learning curves",
     html("fieldset", {}, html("legend", {}, "over"), choice("environment steps", STEPS, true), choice("time", TIME, false)),
     place,
+    ...(runs.some((run) => run.changes.length) ? [aside("Vertical lines mark changes of the configuration.")] : []),
     aside("Drag over a diagram to zoom in and double-click it to see everything. A click on a name in the legend hides or shows its curve."),
   );
   draw(STEPS);
@@ -129,7 +135,7 @@ function time() {
   const parts = runs.filter((run) => run.incidents?.rows.length).map((run) => new Timeline(run, link, several).element);
   parts.push(...remarks((run) => (run.incidents ? null : "This run was made by an older version, which recorded no incidents.")));
   parts.push(...remarks((run) => (run.incidents?.rows.length === 0 ? "No incidents were recorded." : null)));
-  const marks = runs.length <= COLOURS ? runs.flatMap((run) => marksOf(run).map((mark) => ({ ...mark, text: several ? `${run.name}: ${mark.text}` : mark.text }))) : [];
+  const marks = runs.length <= COLOURS ? runs.flatMap((run) => named(run, [...marksOf(run), ...changesOf(run, TIME)])) : [];
   const chart = (title, key, more = {}) => {
     const series = perRun(({ learner }) => ({ x: learner.time, y: learner[key] }));
     if (series.length) parts.push(new Chart({ title, axis: TIME, link, series, marks, height: 220, unit: "", ...more }).element);
@@ -141,7 +147,39 @@ function time() {
   chart("Loss of the critic", "critic_loss");
   chart("Loss of the actor", "actor_loss");
   chart("Mean value of the sampled actions (Q)", "q_mean");
-  section("Over time", ...parts, aside("The diagrams of this section are zoomed together. Vertical lines mark incidents. A horizontal dashed line is the configured ratio."));
+  section("Over time", ...parts, aside("The diagrams of this section are zoomed together. Vertical lines mark incidents and changes of the configuration. A horizontal dashed line is the configured ratio."));
+}
+
+/** Which settings are best, where settings were repeated with several seeds. */
+function ranking() {
+  if (!report.rankings.length) return;
+  const percent = (share) => (share === null ? "–" : `${Math.round(100 * share)} %`);
+  const columns = ["setting", "runs", "interquartile mean", "95 % interval", "best in"];
+  const parts = report.rankings.map(({ environment, places }) => {
+    const row = (place) => [place.label, `${whole(place.runs)}${place.unfinished ? ` (${whole(place.unfinished)} not finished)` : ""}`, text(place.mean), place.interval ? `${text(place.interval[0])} … ${text(place.interval[1])}` : "–", percent(place.best)];
+    const head = html("tr", {}, columns.map((name) => html("th", { scope: "col" }, name)));
+    const body = places.map((place) => html("tr", {}, row(place).map((value) => html("td", {}, value))));
+    return html("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": `Settings of ${environment}, the best first` }, html("table", {}, html("caption", {}, environment), html("thead", {}, head), html("tbody", {}, body)));
+  });
+  section("Ranking", ...parts, aside("The results are the mean returns of the final evaluations, or of the last evaluation of a run that has not finished. The interquartile mean leaves out the best and the worst quarter of the seeds, if there are at least four. Intervals and shares are of 5,000 resamples of the seeds (bootstrap)."));
+}
+
+/** The changes of the configuration, if there were any. */
+function changes() {
+  const rows = runs.flatMap((run) => run.changes.map((change) => ({ ...change, run: run.name })));
+  if (!rows.length) return;
+  const columns = [
+    ...(several ? [["run", (row) => row.run]] : []),
+    ["step", (row) => whole(row.env_steps)],
+    ["time", (row) => duration(row.wall_seconds)],
+    ["key", (row) => row.key],
+    ["before", (row) => row.before || "none"],
+    ["after", (row) => row.after || "none"],
+    ["by", (row) => row.source],
+  ];
+  const head = html("tr", {}, columns.map(([name]) => html("th", { scope: "col" }, name)));
+  const body = rows.map((row) => html("tr", {}, columns.map(([, of]) => html("td", {}, of(row)))));
+  section("Changes", html("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "Changes of the configuration" }, html("table", {}, html("thead", {}, head), html("tbody", {}, body))), aside("The settings below are those after the last change."));
 }
 
 function settings() {
@@ -161,4 +199,4 @@ function settings() {
 document.getElementById("made").textContent =
   `Made ${new Date(report.made * 1000).toISOString().slice(0, 16).replace("T", " ")} UTC by shoal ${report.version}` +
   (runs.some((run) => run.state === "training") ? "; training was still running." : ".");
-for (const part of [overview, learning, episodes, time, settings]) part();
+for (const part of [overview, ranking, learning, episodes, time, changes, settings]) part();

@@ -5,14 +5,14 @@ use shoal_common::config::{Config, Mode};
 use shoal_common::run_dir::RunDir;
 use shoal_run::evaluation::WhichPolicy;
 use shoal_run::final_evaluation::{FinalEvaluation, FinallyEvaluated};
+use shoal_run::origin::Origin;
 use shoal_run::outcome::{RunOutcome, RunState};
 use shoal_run::recorder::{
-    EpisodeRecord, EvaluationRecord, IncidentRow, LearnerRecord, read_episodes, read_evaluations, read_incidents,
-    read_learner,
+    ChangeRecord, EpisodeRecord, EvaluationRecord, IncidentRow, LearnerRecord, read_changes, read_episodes,
+    read_evaluations, read_incidents, read_learner,
 };
 
-use super::Limits;
-use super::numbers::{downsample, mean, parts, short};
+use super::numbers::{Limits, downsample, mean, parts, short};
 use super::played::Played;
 use super::settings::{self, Setting};
 
@@ -45,6 +45,10 @@ pub(super) struct Run {
     exploration: Curve,
     learner: Rates,
     incidents: Option<Incidents>,
+    /// What it began with, in words.
+    origin: Option<String>,
+    /// The changes of its configuration after its start.
+    changes: Vec<ChangeRecord>,
     pub(super) played: Played,
     /// Every record, for medians.
     #[serde(skip)]
@@ -151,9 +155,22 @@ impl Run {
             exploration: Curve::of_episodes(&explored, limits.points),
             learner: Rates::of(learner, limits.points),
             incidents: read_incidents(&run.incidents())?.map(Incidents::of),
+            origin: Origin::read(run)?.map(|origin| origin.in_words()),
+            changes: read_changes(&run.changes())?,
             played: Played::of(run, &config, limits.episodes),
             evaluation_records,
         })
+    }
+}
+
+impl Run {
+    /// The run's result, and whether it has finished: the mean return of its final evaluation, or of its last evaluation if
+    /// there is none.
+    pub(super) fn result(&self) -> Option<(f64, bool)> {
+        let finally = self.final_evaluation.as_ref().and_then(|it| it.return_mean);
+        let last = || self.evaluation_records.last().map(|row| row.return_mean);
+        let mean = finally.or_else(last).filter(|mean| mean.is_finite())?;
+        Some((mean, self.state == PageState::Finished))
     }
 }
 

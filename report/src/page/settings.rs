@@ -1,6 +1,6 @@
 //! A run's settings as lines of a table.
 
-use shoal_common::config::Config;
+use shoal_common::config::{Config, explanation};
 
 /// A key with its sections, as `--set` takes it, and its value.
 pub(super) type Setting = (String, String);
@@ -8,15 +8,16 @@ pub(super) type Setting = (String, String);
 /// Settings in which repetitions may differ.
 const NOT_COMPARED: [&str; 3] = ["run.seed", "run.steps", "run.episodes"];
 
-/// Settings that the program fills in: the run's name in shared memory, and the format of its identity.
-const FILLED_IN: [&str; 2] = ["run.id", "run.identity_format"];
+/// Set by the program, and still a setting that distinguishes runs.
+const ORIGIN: &str = "run.from";
 
-/// All settings in the order of `config.toml`, except those that the program fills in.
+/// All settings in the order of `config.toml`, except most of those that the program fills in.
 pub(super) fn of(config: &Config) -> anyhow::Result<Vec<Setting>> {
     let table: toml::Table = config.to_toml()?.parse()?;
     let mut settings = Vec::new();
     flatten("", &table, &mut settings);
-    settings.retain(|(key, _)| !FILLED_IN.contains(&key.as_str()));
+    let of_program = explanation::set_by_program();
+    settings.retain(|(key, _)| !of_program.contains(key) || key == ORIGIN);
     Ok(settings)
 }
 

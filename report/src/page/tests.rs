@@ -4,6 +4,7 @@ use shoal_env_server::environment::{make, names};
 use shoal_run::rollout::policy_layout;
 use shoal_run::testing::small;
 
+use super::numbers::POINTS;
 use super::*;
 
 /// A run directory as the launcher makes it, with a best policy if `parameters` are given.

@@ -27,6 +27,13 @@ function describe(row) {
   return `${who} ${row.detail.startsWith(words) ? row.detail : [words, row.detail].filter(Boolean).join(": ")}`;
 }
 
+const describeChange = (change) => `${change.key} ${change.before || "none"} → ${change.after || "none"}`;
+
+/** The changes of the configuration as marks for other diagrams, over steps or time. */
+function changesOf(run, axis) {
+  return run.changes.map((change) => ({ x: axis === STEPS ? change.env_steps : change.wall_seconds, kind: "calm", text: describeChange(change) }));
+}
+
 /** The incidents as marks for other diagrams, without restarts, which follow immediately, and retirements. */
 function marksOf(run) {
   const rows = run.incidents?.rows ?? [];

@@ -10,6 +10,13 @@ fn run() -> (tempfile::TempDir, RunDir) {
     (parent, run)
 }
 
+fn without_warmup() -> ReplayConfig {
+    ReplayConfig {
+        warmup: 0,
+        ..ReplayConfig::default()
+    }
+}
+
 fn episode(env_steps: u64) -> EpisodeReport {
     EpisodeReport {
         actor: 1,
@@ -59,7 +66,7 @@ fn text(path: &Path) -> String {
 #[test]
 fn every_report_becomes_a_row() {
     let (_parent, run) = run();
-    let mut recorder = Recorder::open(&run, 1_000).unwrap();
+    let mut recorder = Recorder::open(&run, &ReplayConfig::default()).unwrap();
     recorder.episode(&episode(200), seconds(0.25)).unwrap();
     recorder
         .evaluation(&evaluation(2_000, -1_500.25), seconds(1.0))
@@ -92,7 +99,7 @@ fn every_report_becomes_a_row() {
 fn a_resumed_run_continues_the_same_tables() {
     let (_parent, run) = run();
     for session in 0..3 {
-        let mut recorder = Recorder::open(&run, 0).unwrap();
+        let mut recorder = Recorder::open(&run, &without_warmup()).unwrap();
         recorder
             .evaluation(&evaluation(1_000 * session, -100.0), seconds(1.0))
             .unwrap();
@@ -120,7 +127,7 @@ fn a_resumed_run_continues_the_same_tables() {
 #[test]
 fn a_line_cut_short_by_a_crash_is_removed() {
     let (_parent, run) = run();
-    let mut recorder = Recorder::open(&run, 0).unwrap();
+    let mut recorder = Recorder::open(&run, &without_warmup()).unwrap();
     recorder.evaluation(&evaluation(1_000, -100.0), seconds(1.0)).unwrap();
     drop(recorder);
     let mut file = std::fs::OpenOptions::new()
@@ -129,7 +136,7 @@ fn a_line_cut_short_by_a_crash_is_removed() {
         .unwrap();
     file.write_all(b"2.0,2000,10").unwrap();
     assert_eq!(read_evaluations(&run.evaluations()).unwrap().len(), 1);
-    let mut recorder = Recorder::open(&run, 0).unwrap();
+    let mut recorder = Recorder::open(&run, &without_warmup()).unwrap();
     recorder.evaluation(&evaluation(3_000, -90.0), seconds(3.0)).unwrap();
     let evaluations = read_evaluations(&run.evaluations()).unwrap();
     assert_eq!(
@@ -152,14 +159,14 @@ fn incidents_are_written_at_once_with_their_time_and_steps() {
         what: IncidentKind::Killed,
         detail: "killed by signal 9".into(),
     };
-    let mut recorder = Recorder::open(&run, 0).unwrap();
+    let mut recorder = Recorder::open(&run, &without_warmup()).unwrap();
     recorder.learner(&learner(2_000, 500, 1), seconds(1.0)).unwrap();
     recorder.incident(&killed, seconds(1.5)).unwrap();
     let first = "wall_seconds,env_steps,role,index,what,detail\n1.5,2000,actor,3,killed,killed by signal 9\n";
     assert_eq!(text(&run.incidents()), first);
     drop(recorder);
 
-    let mut recorder = Recorder::open(&run, 0).unwrap();
+    let mut recorder = Recorder::open(&run, &without_warmup()).unwrap();
     recorder.incident(&killed, seconds(0.5)).unwrap();
     let second = "1.0,2000,launcher,0,resumed,\n1.5,2000,actor,3,killed,killed by signal 9\n";
     assert_eq!(text(&run.incidents()), format!("{first}{second}"));
@@ -169,7 +176,7 @@ fn incidents_are_written_at_once_with_their_time_and_steps() {
 #[test]
 fn a_learner_that_fell_back_to_a_checkpoint_has_no_update_rate() {
     let (_parent, run) = run();
-    let mut recorder = Recorder::open(&run, 0).unwrap();
+    let mut recorder = Recorder::open(&run, &without_warmup()).unwrap();
     recorder.learner(&learner(2_000, 500, 1), seconds(1.0)).unwrap();
     recorder.learner(&learner(2_500, 400, 1), seconds(2.0)).unwrap();
     let rows: Vec<LearnerRecord> = table::rows(&run.learner_log()).unwrap();
@@ -182,7 +189,7 @@ fn a_learner_that_fell_back_to_a_checkpoint_has_no_update_rate() {
 #[test]
 fn recorded_steps_never_fall_after_a_learners_restart_or_a_resume() {
     let (_parent, run) = run();
-    let mut recorder = Recorder::open(&run, 0).unwrap();
+    let mut recorder = Recorder::open(&run, &without_warmup()).unwrap();
     for steps in [1_000, 2_000, 1_200, 1_900, 2_000, 2_300] {
         recorder
             .learner(&learner(steps, steps / 2, 1), seconds(steps as f64 / 1e3))
@@ -191,7 +198,7 @@ fn recorded_steps_never_fall_after_a_learners_restart_or_a_resume() {
     }
     drop(recorder);
     // A new launcher, whose learner begins at an older checkpoint.
-    let mut recorder = Recorder::open(&run, 0).unwrap();
+    let mut recorder = Recorder::open(&run, &without_warmup()).unwrap();
     for steps in [1_500, 2_299, 2_600] {
         recorder.learner(&learner(steps, steps / 2, 1), seconds(1.0)).unwrap();
         recorder.episode(&episode(steps), seconds(1.0)).unwrap();
@@ -216,7 +223,7 @@ fn every_table_has_its_header_from_the_start() {
     let (_parent, run) = run();
     let header = "wall_seconds,env_steps,role,index,what,detail\n";
     for _ in 0..2 {
-        let recorder = Recorder::open(&run, 0).unwrap();
+        let recorder = Recorder::open(&run, &without_warmup()).unwrap();
         assert_eq!(text(&run.incidents()), header);
         drop(recorder);
     }
@@ -230,7 +237,7 @@ fn every_table_has_its_header_from_the_start() {
 fn a_foreign_file_and_a_full_disk_are_one_line_errors() {
     let (_parent, run) = run();
     std::fs::write(run.evaluations(), "a,b\n1,2\n").unwrap();
-    let message = Recorder::open(&run, 0).unwrap_err().to_string();
+    let message = Recorder::open(&run, &without_warmup()).unwrap_err().to_string();
     assert!(
         message.contains("its first line is \"a,b\", not \"wall_seconds,") && !message.contains('\n'),
         "{message}"
@@ -245,12 +252,12 @@ fn a_foreign_file_and_a_full_disk_are_one_line_errors() {
         "wall_seconds,env_steps\n1",
     ] {
         std::fs::write(run.evaluations(), foreign).unwrap();
-        assert!(Recorder::open(&run, 0).is_err(), "{foreign:?}");
+        assert!(Recorder::open(&run, &without_warmup()).is_err(), "{foreign:?}");
         assert_eq!(text(&run.evaluations()), foreign);
     }
     // A header that was cut short is replaced.
     std::fs::write(run.evaluations(), "wall_seconds,env_").unwrap();
-    Recorder::open(&run, 0).unwrap();
+    Recorder::open(&run, &without_warmup()).unwrap();
 
     let full = std::fs::OpenOptions::new().write(true).open("/dev/full").unwrap();
     let mut full = Table::onto(Path::new("/dev/full"), full);
@@ -268,7 +275,7 @@ fn a_foreign_file_and_a_full_disk_are_one_line_errors() {
 fn a_run_without_evaluations_is_valid() {
     let (_parent, run) = run();
     assert_eq!(read_evaluations(&run.evaluations()).unwrap(), []);
-    Recorder::open(&run, 0).unwrap();
+    Recorder::open(&run, &without_warmup()).unwrap();
     assert_eq!(read_evaluations(&run.evaluations()).unwrap(), []);
 }
 

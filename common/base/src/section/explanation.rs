@@ -6,6 +6,8 @@ use serde::Serialize;
 use serde_json::Value;
 use toml::Table;
 
+use super::change::Change;
+
 /// The explanation of a key.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Key {
@@ -23,6 +25,8 @@ pub struct Key {
     pub bounds: String,
     /// Whether it takes whole numbers.
     pub whole: bool,
+    /// Whether it may change when a run is resumed; `None` for an environment's own parameters, which may not.
+    pub change: Option<Change>,
 }
 
 /// A section of `config.toml`, without an environment's own parameters.
@@ -59,6 +63,7 @@ pub fn keys<T: JsonSchema>() -> Vec<Key> {
         choices: choices(&schema, property),
         bounds: text(property, "bounds"),
         whole: is_whole(&property["type"]),
+        change: serde_json::from_value(property["change"].clone()).ok(),
     });
     key.collect()
 }

@@ -112,6 +112,11 @@ impl Record {
         self.words[HEAD] += rows;
     }
 
+    /// Adds rows that belong to no actor: those of another replay.
+    pub fn add_rows_of_nobody(&mut self, rows: u64) {
+        self.words[HEAD] += rows;
+    }
+
     /// An actor's snapshot after its last chunk; zeros before the first.
     ///
     /// # Panics

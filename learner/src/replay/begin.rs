@@ -1,0 +1,97 @@
+//! Beginning with the rows of another replay.
+
+use std::sync::atomic::{Ordering, fence};
+
+use super::error::ReplayError;
+use super::store::Replay;
+
+/// Rows that are copied at once.
+const AT_ONCE: u64 = 4_096;
+
+impl Replay {
+    /// Fills this empty replay with the newest rows of another one, at most `most` and at most a ring, and syncs them.
+    /// They belong to no actor. Returns their number.
+    ///
+    /// # Errors
+    /// When the file cannot be synced.
+    ///
+    /// # Panics
+    /// If this replay is not empty, or its rows have another layout.
+    pub fn begin_with(&mut self, other: &Self, most: u64) -> Result<u64, ReplayError> {
+        assert_eq!(self.head(), 0, "only an empty replay begins with other rows");
+        assert_eq!(self.layout.row, other.layout.row, "rows of another layout");
+        let rows = other.rows();
+        let first = rows.end.saturating_sub(most.min(self.layout.ring)).max(rows.start);
+        let count = rows.end - first;
+        // As for a chunk: recovery after a kill must know that these places may have been written.
+        self.words.store(self.places.write_horizon, count);
+        let mut numbers = Vec::new();
+        let mut next = first;
+        while next < rows.end {
+            let end = (next + AT_ONCE).min(rows.end);
+            numbers.clear();
+            (next..end).for_each(|index| numbers.extend_from_slice(other.row(index)));
+            self.ring.put(next - first, &numbers, |_| ());
+            next = end;
+        }
+        // The rows are in the file before a record names them.
+        fence(Ordering::Release);
+        self.record.add_rows_of_nobody(count);
+        self.publish(self.record.generation() + 1);
+        self.flush()?;
+        Ok(count)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use shoal_common::transition::RowLayout;
+
+    use super::super::{ChunkMark, ReplayLayout};
+    use super::*;
+
+    fn layout(ring: u64) -> ReplayLayout {
+        ReplayLayout {
+            row: RowLayout::new(2, 1),
+            ring,
+            actors: 2,
+            actor_snapshot_words: 0,
+            fingerprint: 7,
+        }
+    }
+
+    #[test]
+    fn the_newest_rows_of_another_replay_are_the_first_of_this_one() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = |name: &str| directory.path().join(name);
+        let mut old = Replay::create(&path("old"), &layout(6)).unwrap();
+        let width = layout(6).row.width();
+        for sequence in 1..=5_u64 {
+            let rows: Vec<f32> = (0..2 * width).map(|i| (sequence * 100) as f32 + i as f32).collect();
+            let mark = ChunkMark {
+                incarnation: 0,
+                sequence,
+            };
+            old.append_and_commit(0, mark, &rows).unwrap();
+        }
+        for (ring, most, expected) in [(20, 20, 6), (20, 4, 4), (3, 20, 3)] {
+            let name = path(&format!("{ring}-{most}"));
+            let mut new = Replay::create(&name, &layout(ring)).unwrap();
+            assert_eq!(new.begin_with(&old, most).unwrap(), expected);
+            drop(new);
+            let mut new = Replay::open(&name, &layout(ring)).unwrap();
+            assert!(new.warnings().is_empty(), "{:?}", new.warnings());
+            assert_eq!(new.rows(), 0..expected);
+            for index in 0..expected {
+                assert_eq!(new.row(index), old.row(10 - expected + index), "row {index}");
+            }
+            // The first chunk of an actor is still its first one.
+            let mark = ChunkMark {
+                incarnation: 0,
+                sequence: 1,
+            };
+            new.append_and_commit(1, mark, &vec![1.0; width]).unwrap();
+            assert_eq!((new.head(), new.committed(1).rows), (expected + 1, 1));
+        }
+    }
+}

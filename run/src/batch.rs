@@ -1,0 +1,136 @@
+//! Several trainings, each a child process, some of them at a time.
+
+use std::collections::VecDeque;
+use std::process::Command;
+use std::sync::{Mutex, PoisonError, mpsc};
+use std::time::Duration;
+
+use anyhow::{Context, bail};
+use rustix::process::Signal;
+
+use crate::process::Peer;
+use crate::signals::Signals;
+
+/// How often `observe` is called without an event.
+const PAUSE: Duration = Duration::from_secs(1);
+
+/// Interval at which a received signal is checked.
+const SIGNAL_INTERVAL: Duration = Duration::from_millis(100);
+
+/// How a training ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Ending {
+    /// In order.
+    Finished,
+    /// By a signal; its state is saved.
+    Interrupted,
+}
+
+/// Works off the queue with `parallel` threads until it is empty or a signal has arrived. `work` may send events, which
+/// this thread passes to `observe`; that is also called once a second without an event.
+pub fn work_off<Job: Send, Event: Send>(
+    queue: VecDeque<Job>,
+    parallel: usize,
+    signals: &Signals,
+    work: impl Fn(Job, &mpsc::Sender<Event>) + Sync,
+    mut observe: impl FnMut(Option<Event>),
+) {
+    let queue = Mutex::new(queue);
+    let next = || {
+        let mut queue = queue.lock().unwrap_or_else(PoisonError::into_inner);
+        queue.pop_front().filter(|_| signals.received().is_none())
+    };
+    std::thread::scope(|scope| {
+        let (events, receiver) = mpsc::channel();
+        for _ in 0..parallel {
+            let (events, next, work) = (events.clone(), &next, &work);
+            scope.spawn(move || {
+                while let Some(job) = next() {
+                    work(job, &events);
+                }
+            });
+        }
+        drop(events);
+        loop {
+            match receiver.recv_timeout(PAUSE) {
+                Ok(event) => observe(Some(event)),
+                Err(mpsc::RecvTimeoutError::Timeout) => observe(None),
+                Err(mpsc::RecvTimeoutError::Disconnected) => break,
+            }
+        }
+    });
+}
+
+/// Runs a training to its end. A signal that `interrupted` returns is passed on to it.
+///
+/// # Errors
+/// When it cannot be started, or fails: its last line.
+pub fn run_training(command: &mut Command, interrupted: &dyn Fn() -> Option<i32>) -> anyhow::Result<Ending> {
+    let mut training = Peer::start(command, "training".into()).context("cannot start a training")?;
+    let mut terminated = false;
+    let status = loop {
+        if let Some(status) = training.wait(SIGNAL_INTERVAL) {
+            break status;
+        }
+        if let Some(signal) = interrupted().filter(|_| !terminated) {
+            terminated = true;
+            // The same signal: the training ignores those that this process was started to ignore.
+            let signal = Signal::from_named_raw(signal).unwrap_or(Signal::TERM);
+            // This fails only if the training has ended.
+            let _ = training.signal(signal);
+        }
+    };
+    if interrupted().is_some() {
+        return Ok(Ending::Interrupted);
+    }
+    if !status.success() {
+        bail!(
+            "{}",
+            training
+                .last_error_line()
+                .unwrap_or_else(|| format!("a training ended with {status}"))
+        );
+    }
+    Ok(Ending::Finished)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn shell(script: &str, signal: Option<i32>) -> anyhow::Result<Ending> {
+        run_training(Command::new("sh").args(["-c", script]), &|| signal)
+    }
+
+    #[test]
+    fn the_error_of_a_failed_training_is_its_last_line() {
+        assert_eq!(shell("exit 0", None).unwrap(), Ending::Finished);
+        let error = shell(
+            "echo 'warning: hot' >&2; echo 'error: no room' >&2; echo >&2; exit 1",
+            None,
+        )
+        .unwrap_err();
+        assert_eq!(error.to_string(), "no room");
+        assert!(shell("exit 3", None).unwrap_err().to_string().contains("3"));
+    }
+
+    #[test]
+    fn a_signal_terminates_the_training() {
+        let start = std::time::Instant::now();
+        assert_eq!(
+            shell("sleep 60 & trap 'kill $!; exit 143' TERM; wait", Some(15)).unwrap(),
+            Ending::Interrupted
+        );
+        assert!(start.elapsed() < Duration::from_secs(30));
+    }
+
+    #[test]
+    fn every_job_is_done_once_by_several_threads() {
+        let signals = Signals::register().unwrap();
+        let mut done = Vec::new();
+        let work = |job: u32, events: &mpsc::Sender<u32>| events.send(job * 2).unwrap();
+        work_off((0..50).collect(), 3, &signals, work, |event| done.extend(event));
+        done.sort_unstable();
+        assert_eq!(done, (0..50).map(|job| job * 2).collect::<Vec<_>>());
+    }
+}

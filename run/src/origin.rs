@@ -1,0 +1,298 @@
+//! The run whose networks a new run begins with, and whose replay if that is asked for.
+//!
+//! `origin.json` in the new run's directory is written last: without it the run's beginning was interrupted.
+
+use std::io::{ErrorKind, Write};
+use std::path::Path;
+
+use anyhow::{Context, bail};
+use serde::{Deserialize, Serialize};
+use shoal_common::algorithms::Experience;
+use shoal_common::config::{Config, explanation};
+use shoal_common::durable::write_atomically;
+use shoal_common::run_dir::{RunDir, RunDirError, RunLock};
+use shoal_common::section::Change;
+use shoal_learner::algorithms::algorithm::SavedState;
+use shoal_learner::algorithms::registry;
+use shoal_learner::networks::digest;
+use shoal_learner::process::checkpoint::{Checkpoint, Checkpoints, Counters};
+use shoal_learner::process::replay_layout;
+use shoal_learner::replay::Replay;
+
+use crate::plan::UsageError;
+
+/// The number of the file's format.
+const FORMAT: u32 = 1;
+
+/// What a run began with: `origin.json`.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Origin {
+    format: u32,
+    /// The directory of the other run.
+    pub run: String,
+    /// Environment steps that its networks had learned from.
+    pub env_steps: u64,
+    /// Updates that they had.
+    pub updates: u64,
+    /// SHA-256 of their weights, as `weights_sha256` of `train --json`.
+    pub weights_sha256: String,
+    /// Rows of its replay that this run began with.
+    pub rows: u64,
+}
+
+impl Origin {
+    /// What a run began with; `None` if it began with networks of its own.
+    ///
+    /// # Errors
+    /// When the file cannot be read, or has another format.
+    pub fn read(run: &RunDir) -> anyhow::Result<Option<Self>> {
+        let path = run.origin();
+        let here = path.display();
+        let text = match std::fs::read(&path) {
+            Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
+            text => text.with_context(|| format!("cannot read {here}"))?,
+        };
+        let origin: Self = serde_json::from_slice(&text).with_context(|| format!("{here} is damaged"))?;
+        if origin.format != FORMAT {
+            bail!(
+                "{here} has format {}, and this program reads format {FORMAT}",
+                origin.format
+            );
+        }
+        Ok(Some(origin))
+    }
+
+    fn write(&self, run: &RunDir) -> anyhow::Result<()> {
+        let path = run.origin();
+        let text = serde_json::to_string(self)?;
+        write_atomically(&path, |file| writeln!(file, "{text}"))
+            .with_context(|| format!("cannot write {}", path.display()))
+    }
+
+    /// In words: `begins with …`.
+    pub fn in_words(&self) -> String {
+        let rows = if self.rows > 0 {
+            format!(" and with {} rows of its replay", self.rows)
+        } else {
+            String::new()
+        };
+        format!(
+            "begins with the networks of {} after {} updates{rows}",
+            self.run, self.updates
+        )
+    }
+}
+
+/// A run to begin with.
+#[derive(Debug)]
+pub(crate) struct Predecessor {
+    run: RunDir,
+    config: Config,
+    checkpoint: Checkpoint,
+    /// Its replay, with the lock that keeps its own learner away.
+    replay: Option<(Replay, RunLock)>,
+}
+
+impl Predecessor {
+    /// Opens the run in this directory. It may be running, unless its replay is asked for.
+    ///
+    /// # Errors
+    /// When it has learned nothing yet, or its files cannot be read.
+    pub(crate) fn open(path: &Path, with_replay: bool) -> anyhow::Result<Self> {
+        let run = RunDir::open(path)?;
+        let config = run.config()?;
+        let here = path.display();
+        let lock = with_replay
+            .then(|| run.lock())
+            .transpose()
+            .map_err(|error| match error {
+                RunDirError::Busy(_) => anyhow::anyhow!(
+                    "{here} is running, and its replay with it: end it first, with `shoal stop {here}`, or leave out \
+                 --with-replay"
+                ),
+                other => other.into(),
+            })?;
+        let loaded = Checkpoints::new(&run.checkpoints(), config.fingerprint()).load_newest()?;
+        let Some(loaded) = loaded else {
+            bail!("{here} has no checkpoint, so it has no networks to begin with");
+        };
+        let replay = lock.map(|lock| -> anyhow::Result<_> {
+            if !run.replay_file().exists() {
+                bail!("{here} has no replay: leave out --with-replay");
+            }
+            Ok((Replay::open(&run.replay_file(), &replay_layout(&config))?, lock))
+        });
+        Ok(Self {
+            replay: replay.transpose()?,
+            checkpoint: loaded.checkpoint,
+            run,
+            config,
+        })
+    }
+
+    /// Checks that a run with this configuration can begin with it. Counts the rows that it takes along into the run's
+    /// steps.
+    ///
+    /// # Errors
+    /// When networks or rows do not fit. The message says what differs.
+    pub(crate) fn prepare(&self, config: &mut Config) -> anyhow::Result<()> {
+        self.check_networks(config)?;
+        let Some((replay, _)) = &self.replay else { return Ok(()) };
+        self.check_rows(config)?;
+        let rows = self.rows(replay, config);
+        config.run.steps = config.run.steps.saturating_add(rows);
+        // The rows' own updates were made by the other run.
+        (config.replay.ratio_since, config.replay.updates_before) = (rows, 0);
+        Ok(config.check()?)
+    }
+
+    fn rows(&self, replay: &Replay, config: &Config) -> u64 {
+        let rows = replay.rows();
+        (rows.end - rows.start).min(config.replay.capacity)
+    }
+
+    fn check_networks(&self, config: &Config) -> Result<(), UsageError> {
+        let there = self.run.path().display();
+        let (old, new) = (&self.config, config);
+        let methods = [old, new].map(|config| config.algorithm.name());
+        let refused = |what: String| Err(UsageError(format!("--from {there}: {what}")));
+        if methods[0] != methods[1] {
+            return refused(format!(
+                "it has networks of {}, and this run learns with {}",
+                methods[0], methods[1]
+            ));
+        }
+        let learned = |config: &Config| config.algorithm.settings().learned(&config.spec);
+        if learned(old) == learned(new) {
+            return Ok(());
+        }
+        for (what, [old, new]) in [
+            ("observations", [&old.spec.observation, &new.spec.observation]),
+            ("actions", [&old.spec.action, &new.spec.action]),
+        ] {
+            if (old.width(), old.size()) != (new.width(), new.size()) {
+                return refused(format!("its networks are for other {what}, {old:?} instead of {new:?}"));
+            }
+        }
+        let shapes = old.differences(new).into_iter().filter(|it| it.change == Change::Shape);
+        let differing: Vec<String> = shapes.map(|it| format!("{} = {}", it.key, it.before)).collect();
+        refused(format!("its networks have another shape: {}", differing.join(", ")))
+    }
+
+    fn check_rows(&self, config: &Config) -> Result<(), UsageError> {
+        let there = self.run.path().display();
+        let refused = |what: String| Err(UsageError(format!("--with-replay: {what}; leave out --with-replay")));
+        let (old, new) = (&self.config, config);
+        if config.algorithm.spec().experience != Experience::Minibatches {
+            return refused(format!(
+                "{} learns from each step once, as it happens",
+                config.algorithm.name()
+            ));
+        }
+        for (what, old, new) in [
+            (
+                "γ",
+                old.algorithm.gamma().to_string(),
+                new.algorithm.gamma().to_string(),
+            ),
+            (
+                "replay.n_step",
+                old.replay.n_step.to_string(),
+                new.replay.n_step.to_string(),
+            ),
+            (
+                "the space of observations",
+                format!("{:?}", old.spec.observation),
+                format!("{:?}", new.spec.observation),
+            ),
+            (
+                "the space of actions",
+                format!("{:?}", old.spec.action),
+                format!("{:?}", new.spec.action),
+            ),
+        ] {
+            if old != new {
+                return refused(format!(
+                    "{what} is {old} in {there} and {new} here, and the rows have it"
+                ));
+            }
+        }
+        Ok(())
+    }
+
+    /// Writes the first files of the new run in this directory. Its configuration has been [prepared](Self::prepare).
+    ///
+    /// # Errors
+    /// When a file cannot be written.
+    pub(crate) fn begin(&self, run: &RunDir, config: &Config) -> anyhow::Result<Origin> {
+        std::fs::create_dir_all(run.checkpoints()).context("cannot create the directory for checkpoints")?;
+        let rows = match &self.replay {
+            None => 0,
+            Some((old, _)) => {
+                let mut new = Replay::create(&run.replay_file(), &replay_layout(config))?;
+                new.begin_with(old, self.rows(old, config))?
+            }
+        };
+        let Checkpoint { counters, sections } = &self.checkpoint;
+        let weights = registry::weights(config);
+        let fresh = registry::new(config)?;
+        let state = registry::inherited(&*fresh, &weights, SavedState::from(sections.clone()), rows)?;
+        let borrowed: Vec<(&str, &[f32])> = state
+            .iter()
+            .map(|(name, numbers)| (*name, numbers.as_slice()))
+            .collect();
+        let begun = Counters {
+            rows,
+            ..Counters::default()
+        };
+        Checkpoints::new(&run.checkpoints(), config.fingerprint()).save(&begun, &borrowed)?;
+        let of_weights = |name: &&str| sections.iter().find(|(found, _)| found == name);
+        let numbers: Vec<&[f32]> = weights
+            .iter()
+            .filter_map(of_weights)
+            .map(|it| it.1.as_slice())
+            .collect();
+        let origin = Origin {
+            format: FORMAT,
+            run: self.run.path().display().to_string(),
+            env_steps: counters.rows,
+            updates: counters.updates,
+            weights_sha256: digest::sha256(&numbers),
+            rows,
+        };
+        origin.write(run)?;
+        Ok(origin)
+    }
+
+    /// What is worth a warning before a run of this configuration takes the rows along.
+    pub(crate) fn warning(&self, config: &Config) -> Option<String> {
+        self.replay.as_ref()?;
+        let own = |key: &str| key.starts_with("environment.") && key != "environment.server";
+        let differences = self.config.differences(config).into_iter();
+        let differing: Vec<String> = differences
+            .filter(|it| own(&it.key))
+            .map(|it| format!("{} = {} instead of {}", it.key, it.before, it.after))
+            .collect();
+        (!differing.is_empty()).then(|| {
+            format!(
+                "the rows of {} come from another environment: {}",
+                self.run.path().display(),
+                differing.join(", ")
+            )
+        })
+    }
+}
+
+/// The keys that are part of the shapes of networks, with their values in this configuration.
+pub(crate) fn shapes(config: &Config) -> anyhow::Result<Vec<(&'static str, String, toml::Value)>> {
+    let table = toml::Table::try_from(config)?;
+    let mut shapes = Vec::new();
+    for section in explanation::sections() {
+        let of_shape = section.keys.into_iter().filter(|key| key.change == Some(Change::Shape));
+        for key in of_shape {
+            let value = table.get(section.name).and_then(|values| values.get(&key.name));
+            shapes.extend(value.map(|value| (section.name, key.name, value.clone())));
+        }
+    }
+    Ok(shapes)
+}

@@ -1,0 +1,295 @@
+//! The configuration of a run that is resumed: what `config.toml` and the command line ask for, compared key by key with
+//! what the run was last used with.
+//!
+//! Three files take part, and are written in this order: `config.toml`, `changes.csv`, `config/used.toml`. After a kill
+//! between two of them the next resume finds the same difference again and does what is left.
+
+use std::collections::BTreeSet;
+
+use anyhow::{Context, bail};
+use shoal_common::commit::{CommitReader, OpenError};
+use shoal_common::config::{Change, Config, Difference, Mode};
+use shoal_common::run_dir::RunDir;
+use shoal_common::section;
+use shoal_learner::process::replay_layout;
+use toml::Table;
+
+use super::source::{Source, Sources, UsageError};
+use super::{RunOverrides, read_counts, set_key, set_options, set_what_follows};
+use crate::method;
+use crate::recorder::{ChangeRecord, Moment, read_changes, record_changes};
+use crate::status::{replay_rows, saved_status};
+
+/// What the command line asks a resumed run to change.
+#[derive(Clone, Debug, Default)]
+pub struct Asked {
+    /// `run.steps`.
+    pub steps: Option<u64>,
+    /// `run.episodes`.
+    pub episodes: Option<u64>,
+    /// Any key, as `SECTION.KEY=VALUE`.
+    pub set: Vec<String>,
+}
+
+/// A checked configuration for a run that is resumed.
+#[derive(Clone, Debug)]
+pub struct Revision {
+    /// The configuration from now on.
+    pub config: Config,
+    /// Where it differs from what the run was last used with, each with who has changed it.
+    changes: Vec<(Difference, String)>,
+    /// Whether `config.toml` says something else.
+    rewrite: bool,
+}
+
+impl Revision {
+    /// Compares `config.toml` and what is asked for with `used`, the configuration that the run was last used with.
+    /// Changes nothing.
+    ///
+    /// # Errors
+    /// When a key cannot change, or a value is invalid. The message names the key and where it was set.
+    pub fn new(run: &RunDir, used: &Config, asked: &Asked) -> anyhow::Result<Self> {
+        let path = run.config_file();
+        let origin = path.display().to_string();
+        let text = std::fs::read_to_string(&path).with_context(|| format!("cannot read {origin}"))?;
+        let malformed = |error| anyhow::anyhow!("{}", section::malformed(&origin, &text, &error));
+        let mut table: Table = text.parse().map_err(malformed)?;
+        let edited = Config::from_table(table.clone(), &origin).ok();
+        let mut sources = Sources::of_file(&origin, &text);
+        let options = RunOverrides {
+            steps: asked.steps,
+            episodes: asked.episodes,
+            ..RunOverrides::default()
+        };
+        set_options(&mut table, &mut sources, &options)?;
+        for assignment in &asked.set {
+            check_method(assignment, used)?;
+            set_key(&mut table, &mut sources, assignment)?;
+        }
+        let explain = |message: String, table: &Table| sources.explain(message, &origin, table);
+        read_counts(&mut table).map_err(|error| explain(error.0, &table))?;
+        let mut config = Config::from_table(table.clone(), "").map_err(|error| {
+            let message = error.to_string();
+            explain(message.strip_prefix(": ").unwrap_or(&message).into(), &table)
+        })?;
+        set_what_follows(&mut config, &mut Sources::default());
+        let (since, before) = (config.replay.ratio_since, config.replay.updates_before);
+        // These two are in the other file alone, because `config.toml` is written before a change is final.
+        (config.replay.ratio_since, config.replay.updates_before) = if (since, before) == (0, 0) {
+            (used.replay.ratio_since, used.replay.updates_before)
+        } else {
+            (since, before)
+        };
+        let differences = used.differences(&config);
+        refuse(&differences, used, &sources)?;
+        check_files(run, used, &config, &differences)?;
+        let has = |key: &str| differences.iter().any(|it| it.key == key);
+        if has("replay.updates_per_step") || has("replay.warmup") {
+            let rows = replay_rows(run)?;
+            (config.replay.ratio_since, config.replay.updates_before) = (rows, used.replay.agreed_updates(rows));
+        }
+        let who = |key: &str| match sources.of(key) {
+            Source::Option(option) => option.into(),
+            Source::Set => "--set".into(),
+            _ => "config.toml".into(),
+        };
+        Ok(Self {
+            rewrite: edited.as_ref() != Some(&as_written(&config)),
+            changes: differences
+                .into_iter()
+                .map(|it| (who(&it.key), it))
+                .map(|(who, it)| (it, who))
+                .collect(),
+            config,
+        })
+    }
+
+    /// Whether it changes this key.
+    pub fn changes(&self, key: &str) -> bool {
+        self.changes.iter().any(|(change, _)| change.key == key)
+    }
+
+    /// Writes the run's files, so that the run is used with this configuration from now on. Returns the rows that are new
+    /// in `changes.csv`.
+    ///
+    /// # Errors
+    /// When a file cannot be read or written.
+    pub fn apply(&self, run: &RunDir, now: Moment) -> anyhow::Result<Vec<ChangeRecord>> {
+        if self.rewrite {
+            run.write_config(&as_written(&self.config))?;
+        }
+        let rows = self.unrecorded(&read_changes(&run.changes())?, now);
+        if !rows.is_empty() {
+            record_changes(run, &rows)?;
+        }
+        if !self.changes.is_empty() || !run.used_config_file().exists() {
+            run.write_used_config(&self.config)?;
+        }
+        Ok(rows)
+    }
+
+    /// The rows that `changes.csv` lacks. A launcher may have been killed after it recorded a change and before the change
+    /// was final; the change may now be made, or be withdrawn.
+    fn unrecorded(&self, recorded: &[ChangeRecord], now: Moment) -> Vec<ChangeRecord> {
+        let values = self.config.values();
+        let changed = self.changes.iter().map(|(change, _)| &change.key);
+        let keys: BTreeSet<&String> = changed.chain(recorded.iter().map(|row| &row.key)).collect();
+        let row = |key: &String| {
+            let change = self.changes.iter().find(|(change, _)| change.key == *key);
+            let last = recorded.iter().rev().find(|row| row.key == *key);
+            let before = last.map_or_else(
+                || change.map(|(it, _)| it.before.clone()),
+                |row| Some(row.after.clone()),
+            );
+            let (before, after) = (before.unwrap_or_default(), values.get(key).cloned().unwrap_or_default());
+            (before != after).then(|| ChangeRecord {
+                wall_seconds: now.wall_seconds,
+                env_steps: now.env_steps,
+                key: key.clone(),
+                before,
+                after,
+                source: change.map_or_else(|| "config.toml".into(), |(_, who)| who.clone()),
+            })
+        };
+        keys.into_iter().filter_map(row).collect()
+    }
+}
+
+/// Changes the number of actors of a running run in its files. What else was edited in `config.toml` stays there until the
+/// run is resumed.
+///
+/// # Errors
+/// When a file cannot be written.
+pub fn store_actors(run: &RunDir, used: &Config, actors: u32, now: Moment) -> anyhow::Result<Config> {
+    let mut config = used.clone();
+    config.actors.count = actors;
+    let edited = Config::load(&run.config_file()).ok();
+    if edited.as_ref() == Some(&as_written(used)) {
+        run.write_config(&as_written(&config))?;
+    } else if let Some(mut edited) = edited {
+        edited.actors.count = actors;
+        run.write_config(&edited)?;
+    }
+    let changed = used.actors.count != actors;
+    if changed {
+        let row = ChangeRecord {
+            wall_seconds: now.wall_seconds,
+            env_steps: now.env_steps,
+            key: "actors.count".into(),
+            before: used.actors.count.to_string(),
+            after: actors.to_string(),
+            source: "scale".into(),
+        };
+        record_changes(run, &[row])?;
+    }
+    run.write_used_config(&config)?;
+    Ok(config)
+}
+
+/// What `config.toml` asks a run for that is not running, in words; `None` if it is what the run was last used with.
+pub fn edited(run: &RunDir, used: &Config) -> Option<String> {
+    match Revision::new(run, used, &Asked::default()) {
+        Err(error) => Some(format!("it cannot be resumed: {error:#}")),
+        Ok(revision) => {
+            let change = |(it, _): &(Difference, String)| format!("{} = {} instead of {}", it.key, it.after, it.before);
+            let all: Vec<String> = revision.changes.iter().map(change).collect();
+            (!all.is_empty()).then(|| format!("config.toml was edited, for the next resume: {}", all.join(", ")))
+        }
+    }
+}
+
+/// As it is in `config.toml`: without what only `config/used.toml` has.
+pub(super) fn as_written(config: &Config) -> Config {
+    let mut config = config.clone();
+    (config.replay.ratio_since, config.replay.updates_before) = (0, 0);
+    config
+}
+
+/// Checks that a `--set` is not for another method.
+fn check_method(assignment: &str, used: &Config) -> Result<(), UsageError> {
+    let section = assignment.split('.').next().unwrap_or_default();
+    let own = used.algorithm.name();
+    if section != own && method::names().any(|name| name == section) {
+        return Err(UsageError(format!(
+            "--set {assignment}: this run learns with {own}, and the method of a run cannot change"
+        )));
+    }
+    Ok(())
+}
+
+/// Refuses the first key that cannot change.
+fn refuse(differences: &[Difference], used: &Config, sources: &Sources) -> anyhow::Result<()> {
+    let lockstep = used.run.mode == Mode::Lockstep;
+    for Difference {
+        key,
+        before,
+        after,
+        change,
+    } in differences
+    {
+        let Some(why) = change.refusal(lockstep) else { continue };
+        let place = if matches!(change, Change::InFreeRuns(_)) {
+            "in a lockstep run"
+        } else {
+            "in this run"
+        };
+        let stated = if after.is_empty() { "nothing" } else { after };
+        let text = format!("{key} = {stated}: cannot change {place}, which has {before}: {why}");
+        return Err(sources.blame(key, &text));
+    }
+    Ok(())
+}
+
+/// Checks that the run's files still belong to the configuration, and that a lockstep run can begin with it at a definite
+/// round.
+fn check_files(run: &RunDir, used: &Config, config: &Config, differences: &[Difference]) -> anyhow::Result<()> {
+    if differences.is_empty() {
+        return Ok(());
+    }
+    let names: Vec<&str> = differences.iter().map(|it| it.key.as_str()).collect();
+    let names = names.join(", ");
+    if config.fingerprint() != used.fingerprint() {
+        bail!(
+            "{names}: cannot change in this run: an early version of the program made it, whose files are identified by \
+             such keys"
+        );
+    }
+    if run.replay_file().exists() && replay_layout(config) != replay_layout(used) {
+        bail!("{names}: cannot change in this run: its replay.bin was made for other sizes");
+    }
+    if used.run.mode == Mode::Free {
+        return Ok(());
+    }
+    let saved = saved_status(used, run)?;
+    let here = run.path().display();
+    let learning = differences.iter().find(|it| it.change == Change::Learning);
+    if let Some(first) = learning
+        && newest_round(used, run)? > saved.policy_version + 1
+    {
+        bail!(
+            "{}: cannot change now: this lockstep run was killed, and the learner repeats updates on rounds that were \
+             collected already; `shoal resume {here}` and then `shoal stop {here}` bring it to a definite step",
+            first.key
+        );
+    }
+    if config.run.steps != used.run.steps && saved.replay_rows > saved.env_steps && saved.replay_rows >= used.run.steps
+    {
+        bail!(
+            "run.steps: cannot change now: this lockstep run was interrupted in its last round; `shoal resume {here}` \
+             finishes it first"
+        );
+    }
+    Ok(())
+}
+
+/// The number of the newest round of which a part is in the replay; 0 without a replay.
+fn newest_round(config: &Config, run: &RunDir) -> anyhow::Result<u64> {
+    match CommitReader::open(&run.replay_file()) {
+        Ok(reader) => {
+            let actors = 0..config.actors.max as usize;
+            Ok(actors.map(|actor| reader.actor(actor).mark.sequence).max().unwrap_or(0))
+        }
+        Err(OpenError::NotYet { .. }) => Ok(0),
+        Err(error) => Err(error.into()),
+    }
+}

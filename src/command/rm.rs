@@ -1,0 +1,151 @@
+//! `shoal rm`: removes runs, or their replays alone.
+
+use std::io::{BufRead, ErrorKind, IsTerminal, Write};
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+use anyhow::{Context, bail};
+use clap::Args;
+use shoal_common::channel::Domain;
+use shoal_common::durable::write_atomically;
+use shoal_common::run_dir::{RunDir, RunDirError, RunLock};
+use shoal_run::numbers::mebibytes;
+use shoal_run::plan::UsageError;
+
+use crate::launcher;
+
+#[derive(Args, Clone, Debug)]
+pub(crate) struct RmArgs {
+    /// Run directories.
+    #[arg(value_name = "RUN", required = true)]
+    pub(crate) runs: Vec<PathBuf>,
+    /// Remove only the replays. The runs can still be evaluated and exported, but not resumed.
+    #[arg(long)]
+    pub(crate) replay: bool,
+    /// Do not ask.
+    #[arg(long)]
+    pub(crate) yes: bool,
+}
+
+/// A run to be removed. The lock keeps it from being started meanwhile.
+struct Condemned {
+    run: RunDir,
+    lock: RunLock,
+    bytes: u64,
+}
+
+/// Removes the runs after asking. Nothing is removed if one of them cannot be.
+pub(crate) fn run(args: &RmArgs) -> anyhow::Result<ExitCode> {
+    let mut runs: Vec<Condemned> = Vec::new();
+    for path in &args.runs {
+        let run = RunDir::open(path)?;
+        if runs.iter().any(|other| other.run == run) {
+            bail!("{} is named twice: name each run once", path.display());
+        }
+        runs.push(condemn(run, args.replay)?);
+    }
+    if !args.yes && !confirmed(&runs, args.replay)? {
+        writeln!(std::io::stderr(), "nothing is removed")?;
+        return Ok(ExitCode::FAILURE);
+    }
+    for Condemned { run, lock, bytes: size } in &runs {
+        lock.check(run)?;
+        let here = run.path().display();
+        if args.replay {
+            remove_replay(run)?;
+            writeln!(std::io::stdout(), "removed the replay of {here} ({})", mebibytes(*size))?;
+        } else {
+            remove(run.path()).with_context(|| format!("cannot remove {here}"))?;
+            writeln!(std::io::stdout(), "removed {here} ({})", mebibytes(*size))?;
+        }
+    }
+    // What the runs may have left in shared memory when they were killed.
+    Domain::remove_abandoned()?;
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Checks that this can be removed.
+fn condemn(run: RunDir, replay: bool) -> anyhow::Result<Condemned> {
+    let here = run.path().display();
+    let lock = run.lock().map_err(|error| match error {
+        RunDirError::Busy(_) => anyhow::anyhow!("{here} is running: end it first, with `shoal stop {here}`"),
+        other => other.into(),
+    })?;
+    // A `config.toml` alone may be anything.
+    if let Err(error) = run.config() {
+        bail!("{here} may not be a run, and is left as it is: {error}; to remove it nevertheless: rm -r {here}");
+    }
+    let bytes = if replay {
+        match std::fs::metadata(run.replay_file()) {
+            Ok(file) => file.len(),
+            Err(error) if error.kind() == ErrorKind::NotFound => bail!("{here} has no replay"),
+            Err(error) => return Err(error).with_context(|| format!("cannot read the replay of {here}")),
+        }
+    } else {
+        size(run.path()).with_context(|| format!("cannot read {here}"))?
+    };
+    Ok(Condemned { run, lock, bytes })
+}
+
+/// Asks on the terminal whether to go on.
+fn confirmed(runs: &[Condemned], replay: bool) -> anyhow::Result<bool> {
+    if !std::io::stdin().is_terminal() {
+        return Err(UsageError("there is no terminal to ask on: add --yes".into()).into());
+    }
+    let mut stderr = std::io::stderr().lock();
+    let what = if replay { "the replay of " } else { "" };
+    for Condemned { run, bytes: size, .. } in runs {
+        writeln!(stderr, "{what}{} ({})", run.path().display(), mebibytes(*size))?;
+    }
+    write!(stderr, "Remove {}? [y/N] ", if runs.len() == 1 { "it" } else { "them" })?;
+    stderr.flush()?;
+    let mut answer = String::new();
+    std::io::stdin().lock().read_line(&mut answer)?;
+    Ok(["y", "yes"].contains(&answer.trim().to_lowercase().as_str()))
+}
+
+/// Removes a replay. The mark comes first: a replay that is missing without it is collected again.
+fn remove_replay(run: &RunDir) -> anyhow::Result<()> {
+    let path = run.replay_file();
+    let mark = run.replay_removed();
+    write_atomically(&mark, |file| {
+        writeln!(file, "`shoal rm --replay` has removed replay.bin.")
+    })
+    .with_context(|| format!("cannot write {}", mark.display()))?;
+    std::fs::remove_file(&path).with_context(|| format!("cannot remove {}", path.display()))?;
+    launcher::note(run, "`shoal rm --replay` has removed the replay");
+    Ok(())
+}
+
+/// Removes a run directory, `config.toml` last: if this is interrupted, the rest is still a run that can be removed.
+fn remove(directory: &Path) -> std::io::Result<()> {
+    let config = directory.join("config.toml");
+    for entry in std::fs::read_dir(directory)? {
+        let entry = entry?;
+        if entry.path() == config {
+            continue;
+        }
+        if entry.file_type()?.is_dir() {
+            std::fs::remove_dir_all(entry.path())?;
+        } else {
+            std::fs::remove_file(entry.path())?;
+        }
+    }
+    std::fs::remove_file(config)?;
+    std::fs::remove_dir(directory)
+}
+
+/// Bytes of all files below the directory.
+fn size(directory: &Path) -> std::io::Result<u64> {
+    let mut sum = 0;
+    for entry in std::fs::read_dir(directory)? {
+        let entry = entry?;
+        let metadata = entry.metadata()?;
+        sum += if metadata.is_dir() {
+            size(&entry.path())?
+        } else {
+            metadata.len()
+        };
+    }
+    Ok(sum)
+}

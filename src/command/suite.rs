@@ -1,0 +1,483 @@
+//! Suites of runs: `shoal train --seeds` and `--sweep`, and `shoal resume SUITE`, which continues one.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::io::{IsTerminal, Write};
+use std::path::{Path, PathBuf};
+use std::process::{Command, ExitCode};
+use std::sync::mpsc::Sender;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, bail};
+use indicatif::{HumanDuration, ProgressBar, ProgressDrawTarget, ProgressStyle};
+use serde::Serialize;
+use shoal_common::config::Config;
+use shoal_common::run_dir::RunDir;
+use shoal_report::page;
+use shoal_run::batch::{Ending, run_training, work_off};
+use shoal_run::evaluation::WhichPolicy;
+use shoal_run::external_environment::tied;
+use shoal_run::final_evaluation::FinalEvaluation;
+use shoal_run::numbers::thousands;
+use shoal_run::plan::{self, RunOverrides, UsageError};
+use shoal_run::preflight;
+use shoal_run::recorder::recorded;
+use shoal_run::signals::{Signals, exit_code};
+use shoal_run::status::saved_status;
+use shoal_run::suite::{self, Suite, Sweep, Trial};
+
+use super::train::TrainArgs;
+use super::training::OutputMode;
+
+/// How many runs at a time, and what is printed.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Manner<'a> {
+    pub(crate) jobs: Option<u16>,
+    pub(crate) output: &'a OutputMode,
+}
+
+/// The output of `--json`.
+#[derive(Serialize)]
+struct Printed<'a> {
+    suite: String,
+    runs: Vec<PrintedRun<'a>>,
+}
+
+#[derive(Serialize)]
+struct PrintedRun<'a> {
+    run: &'a str,
+    finished: bool,
+    env_steps: u64,
+    eval_return_mean: Option<f64>,
+}
+
+/// Creates the suite that is asked for and trains its runs. The same command with `--run` continues it.
+pub(crate) fn train(args: &TrainArgs, what: &str, overrides: &RunOverrides) -> anyhow::Result<ExitCode> {
+    let sweeps = args
+        .sweep
+        .iter()
+        .map(|text| Sweep::parse(text))
+        .collect::<Result<Vec<_>, _>>();
+    let sweeps = sweeps.map_err(UsageError)?;
+    let seeds: Vec<u64> = match (&args.seeds, overrides.seed) {
+        (Some(seeds), _) => seeds.0.clone(),
+        (None, seed) => seed.into_iter().collect(),
+    };
+    // The suite may be continued from another directory.
+    let absolute =
+        |path: &Path| std::path::absolute(path).with_context(|| format!("cannot resolve {}", path.display()));
+    let what = if Path::new(what).extension().is_some_and(|extension| extension == "toml") {
+        absolute(Path::new(what))?.display().to_string()
+    } else {
+        what.to_owned()
+    };
+    let common = RunOverrides {
+        from: overrides.from.as_deref().map(absolute).transpose()?,
+        ..overrides.clone()
+    };
+    let suite = Suite::new(what, arguments(&common), &sweeps, &seeds)?;
+    let manner = Manner {
+        // Each takes the lock of the run whose replay it copies.
+        jobs: if common.with_replay { Some(1) } else { args.jobs },
+        output: &args.output,
+    };
+    if let Some(directory) = &overrides.run
+        && directory.exists()
+    {
+        let here = directory.display();
+        return match Suite::read(directory)? {
+            Some(found) if found == suite => run(&suite, directory, &common, manner),
+            Some(_) => bail!(
+                "{here} is a suite of other runs: continue it with `shoal resume {here}`, or choose another directory with --run"
+            ),
+            None => bail!("{here} exists already; choose another directory with --run, or remove it"),
+        };
+    }
+    // Before anything is made: is each of them a configuration?
+    let name = check(&suite, &common)?;
+    let directory = match &overrides.run {
+        Some(path) => RunDir::create(path)?,
+        None => RunDir::create_next(Path::new("runs"), &format!("{name}-suite"))?,
+    };
+    suite.write(directory.path())?;
+    run(&suite, directory.path(), &common, manner)
+}
+
+/// Continues the suite in this directory.
+pub(crate) fn resume(suite: &Suite, directory: &Path, manner: Manner<'_>) -> anyhow::Result<ExitCode> {
+    run(suite, directory, &RunOverrides::default(), manner)
+}
+
+/// The arguments of `train` for these overrides, except directory and seed.
+fn arguments(overrides: &RunOverrides) -> Vec<String> {
+    let RunOverrides {
+        run: _,
+        method,
+        seed: _,
+        actors,
+        envs,
+        steps,
+        episodes,
+        lockstep,
+        set,
+        from,
+        with_replay,
+    } = overrides;
+    let mut arguments = Vec::new();
+    let mut option = |name: &str, value: Option<String>| {
+        arguments.extend(value.into_iter().flat_map(|value| [name.to_owned(), value]));
+    };
+    option("--method", method.clone());
+    option("--actors", actors.map(|number| number.to_string()));
+    option("--envs", envs.map(|number| number.to_string()));
+    option("--steps", steps.map(|number| number.to_string()));
+    option("--episodes", episodes.map(|number| number.to_string()));
+    option("--from", from.as_ref().map(|path| path.display().to_string()));
+    set.iter()
+        .for_each(|assignment| option("--set", Some(assignment.clone())));
+    arguments.extend(lockstep.then(|| "--lockstep".into()));
+    arguments.extend(with_replay.then(|| "--with-replay".into()));
+    arguments
+}
+
+/// Checks the configuration of each combination of values. Returns the usual name of a run of this kind.
+fn check(suite: &Suite, common: &RunOverrides) -> anyhow::Result<String> {
+    let mut checked: Vec<&[String]> = Vec::new();
+    let mut name = String::new();
+    for trial in &suite.trials {
+        if checked.contains(&trial.set.as_slice()) {
+            continue;
+        }
+        checked.push(&trial.set);
+        (name, _) = plan::decide(&suite.what, &overrides_of(trial, common))?;
+    }
+    Ok(name)
+}
+
+fn overrides_of(trial: &Trial, common: &RunOverrides) -> RunOverrides {
+    RunOverrides {
+        run: None,
+        seed: trial.seed,
+        set: common.set.iter().chain(&trial.set).cloned().collect(),
+        ..common.clone()
+    }
+}
+
+/// A message from a worker: the number of the trial, and what has happened to it.
+enum Event {
+    Started(usize),
+    Finished(usize),
+    Interrupted(usize),
+    Failed(usize, String),
+}
+
+/// Trains all runs of the suite that have not finished.
+fn run(suite: &Suite, directory: &Path, common: &RunOverrides, manner: Manner<'_>) -> anyhow::Result<ExitCode> {
+    let directory =
+        &std::fs::canonicalize(directory).with_context(|| format!("cannot resolve {}", directory.display()))?;
+    let _lock = suite::lock(directory)?;
+    let signals = Signals::register()?;
+    let mut due = VecDeque::new();
+    for (number, trial) in suite.trials.iter().enumerate() {
+        if !is_finished(&directory.join(&trial.name))? {
+            due.push_back(number);
+        }
+    }
+    let jobs = match (manner.jobs, due.front()) {
+        (Some(jobs), _) => jobs.into(),
+        (None, None) => 1,
+        (None, Some(first)) => usual_jobs(suite, directory, *first, common),
+    };
+    let mut progress = Progress::new(suite, directory, &due, manner.output.quiet);
+    let work = |number: usize, events: &Sender<Event>| {
+        // A closed channel is no reason to stop.
+        let _ = events.send(Event::Started(number));
+        let trained = train_one(suite, &suite.trials[number], directory, &signals);
+        let _ = events.send(match trained {
+            Ok(Ending::Finished) => Event::Finished(number),
+            Ok(Ending::Interrupted) => Event::Interrupted(number),
+            Err(error) => Event::Failed(number, format!("{error:#}").replace('\n', " ")),
+        });
+    };
+    work_off(due, jobs, &signals, work, |event| progress.observe(event));
+    let failed = progress.end();
+    report(suite, directory, manner.output)?;
+    let here = directory.display();
+    let mut stderr = std::io::stderr().lock();
+    match (signals.received(), failed) {
+        (None, 0) => Ok(ExitCode::SUCCESS),
+        (None, failed) => bail!("{failed} of the runs failed; to continue with them: shoal resume {here}"),
+        (Some(signal), _) => {
+            writeln!(
+                stderr,
+                "interrupted; every run is saved; to continue: shoal resume {here}"
+            )?;
+            Ok(exit_code(signal))
+        }
+    }
+}
+
+/// What cores and shared memory allow; each run keeps about two cores busy.
+fn usual_jobs(suite: &Suite, directory: &Path, first: usize, common: &RunOverrides) -> usize {
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    let trial = &suite.trials[first];
+    let stored = RunDir::open(&directory.join(&trial.name))
+        .ok()
+        .and_then(|run| run.config().ok());
+    let config = stored.or_else(|| Some(plan::decide(&suite.what, &overrides_of(trial, common)).ok()?.1));
+    // Where it cannot be found out, each run still checks for itself.
+    let fit = config
+        .and_then(|config| preflight::side_by_side(&config).ok())
+        .unwrap_or(1);
+    (cores / 2).clamp(1, fit.max(1))
+}
+
+/// Whether nothing is left to do in this run directory.
+fn is_finished(run: &Path) -> anyhow::Result<bool> {
+    // A training that was killed before it wrote anything leaves an empty directory. Only such a directory is removed.
+    let _ = std::fs::remove_dir(run);
+    if !run.exists() {
+        return Ok(false);
+    }
+    let run = RunDir::open(run)?;
+    if run.is_running()? {
+        let here = run.path().display();
+        bail!("{here} is running: end it first, with `shoal stop {here}`");
+    }
+    Ok(saved_status(&run.config()?, &run)?.finished)
+}
+
+/// Trains or resumes a run as a process of its own.
+fn train_one(suite: &Suite, trial: &Trial, directory: &Path, signals: &Signals) -> anyhow::Result<Ending> {
+    let run = directory.join(&trial.name);
+    let mut command = Command::new("/proc/self/exe");
+    if run.exists() {
+        command.arg("resume").arg(&run);
+    } else {
+        command.arg("train").arg(&suite.what);
+        // One learner thread unless something else is asked for, because other runs use the other cores.
+        command.args(["--set", "learner.threads=1"]).args(&suite.arguments);
+        for assignment in &trial.set {
+            command.args(["--set", assignment]);
+        }
+        if let Some(seed) = trial.seed {
+            command.args(["--seed", &seed.to_string()]);
+        }
+        command.arg("--run").arg(&run);
+    }
+    command.arg("--quiet");
+    // Tied to this process: if that is killed, the run ends and can be resumed with the suite.
+    run_training(&mut tied(&command)?, &|| signals.received())
+}
+
+/// Prints what came out: a line for each setting, and which is best; with `--json` an object about the runs.
+fn report(suite: &Suite, directory: &Path, output: &OutputMode) -> anyhow::Result<()> {
+    let here = directory.display();
+    if !output.quiet {
+        let runs = suite
+            .runs(directory)
+            .iter()
+            .map(|run| RunDir::open(run))
+            .collect::<Result<Vec<_>, _>>()?;
+        let mut stderr = std::io::stderr().lock();
+        for line in page::ranking(&runs)? {
+            writeln!(stderr, "{line}")?;
+        }
+        writeln!(stderr, "{here}\n  compare the runs: shoal report {here}")?;
+    }
+    if output.json {
+        let mut runs = Vec::new();
+        for trial in &suite.trials {
+            runs.push(printed(&trial.name, &directory.join(&trial.name))?);
+        }
+        let printed = Printed {
+            suite: here.to_string(),
+            runs,
+        };
+        writeln!(std::io::stdout().lock(), "{}", serde_json::to_string(&printed)?)?;
+    }
+    Ok(())
+}
+
+fn printed<'a>(name: &'a str, path: &Path) -> anyhow::Result<PrintedRun<'a>> {
+    let mut printed = PrintedRun {
+        run: name,
+        finished: false,
+        env_steps: 0,
+        eval_return_mean: None,
+    };
+    if let Ok(run) = RunDir::open(path) {
+        let status = saved_status(&run.config()?, &run)?;
+        let evaluation = FinalEvaluation::read(&run, status.env_steps)?;
+        (printed.finished, printed.env_steps) = (status.finished, status.env_steps);
+        printed.eval_return_mean = evaluation.and_then(|it| it.of(WhichPolicy::Best)?.return_mean);
+    }
+    Ok(printed)
+}
+
+/// The live line, or a line for each event where standard error is no terminal.
+struct Progress<'a> {
+    suite: &'a Suite,
+    directory: &'a Path,
+    bar: ProgressBar,
+    live: bool,
+    quiet: bool,
+    /// By the number of its trial: each run that had not finished at the beginning, with what it had done by then.
+    due: BTreeMap<usize, u64>,
+    running: Vec<usize>,
+    done: Vec<usize>,
+    failed: usize,
+    begun: Instant,
+}
+
+/// How far a run is, and how far it goes: in episodes if they limit it, otherwise in environment steps.
+fn distance(run: &Path) -> Option<(u64, u64)> {
+    let run = RunDir::open(run).ok()?;
+    let config: Config = run.config().ok()?;
+    let (steps, episodes) = recorded(&run).ok()?.unwrap_or_default();
+    Some(match config.run.episodes {
+        Some(limit) => (episodes, limit),
+        None => (steps, config.run.steps),
+    })
+}
+
+impl<'a> Progress<'a> {
+    fn new(suite: &'a Suite, directory: &'a Path, due: &VecDeque<usize>, quiet: bool) -> Self {
+        let live = !quiet && std::io::stderr().is_terminal();
+        let target = if live {
+            ProgressDrawTarget::stderr()
+        } else {
+            ProgressDrawTarget::hidden()
+        };
+        let bar = ProgressBar::with_draw_target(Some(suite.trials.len() as u64), target);
+        if let Ok(style) = ProgressStyle::with_template("{bar:16.cyan/dim} {msg}") {
+            bar.set_style(style.progress_chars("━━─"));
+        }
+        let begun = |number: &usize| {
+            let run = directory.join(&suite.trials[*number].name);
+            (*number, distance(&run).map_or(0, |(done, _)| done))
+        };
+        let progress = Self {
+            suite,
+            directory,
+            bar,
+            live,
+            quiet,
+            due: due.iter().map(begun).collect(),
+            running: Vec::new(),
+            done: Vec::new(),
+            failed: 0,
+            begun: Instant::now(),
+        };
+        progress.print(&format!("{} of {} runs to train", due.len(), suite.trials.len()));
+        progress
+    }
+
+    fn observe(&mut self, event: Option<Event>) {
+        match event {
+            None => {}
+            Some(Event::Started(number)) => {
+                self.running.push(number);
+                if !self.live {
+                    self.print(&format!("{}: started", self.suite.trials[number].name));
+                }
+            }
+            Some(Event::Finished(number)) => {
+                self.ended(number);
+                let left = self
+                    .time_left()
+                    .map_or_else(String::new, |left| format!(", about {left} left"));
+                let result = self
+                    .result(number)
+                    .map_or_else(String::new, |mean| format!(", return {mean:.2}"));
+                self.print(&format!(
+                    "{}: done{result}, {}{left}",
+                    self.suite.trials[number].name,
+                    self.count()
+                ));
+            }
+            Some(Event::Interrupted(number)) => self.running.retain(|other| *other != number),
+            Some(Event::Failed(number, why)) => {
+                self.ended(number);
+                self.failed += 1;
+                self.print(&format!("{}: failed: {why}", self.suite.trials[number].name));
+            }
+        }
+        self.draw();
+    }
+
+    fn ended(&mut self, number: usize) {
+        self.running.retain(|other| *other != number);
+        self.done.push(number);
+    }
+
+    fn run(&self, number: usize) -> PathBuf {
+        self.directory.join(&self.suite.trials[number].name)
+    }
+
+    fn result(&self, number: usize) -> Option<f64> {
+        let run = RunDir::open(&self.run(number)).ok()?;
+        FinalEvaluation::read(&run, 0).ok()??.of(WhichPolicy::Best)?.return_mean
+    }
+
+    fn count(&self) -> String {
+        let all = self.suite.trials.len();
+        format!("{} of {all} runs", all - self.due.len() + self.done.len())
+    }
+
+    /// The time that the rest takes at the rate of this suite so far. A run that has not begun is as long as the others are on
+    /// average.
+    fn time_left(&self) -> Option<String> {
+        let (mut made, mut known, mut total) = (0, 0, 0);
+        let mut waiting = 0;
+        let mut left = 0;
+        for (number, begin) in &self.due {
+            match distance(&self.run(*number)) {
+                Some((done, all)) => {
+                    let done = if self.done.contains(number) { all } else { done };
+                    made += done.saturating_sub(*begin);
+                    left += all.saturating_sub(done);
+                    (known, total) = (known + 1, total + all);
+                }
+                None if self.done.contains(number) => {}
+                None => waiting += 1,
+            }
+        }
+        left += waiting * total.checked_div(known)?;
+        let seconds = self.begun.elapsed().as_secs_f64() * left as f64 / made as f64;
+        (made > 0 && left > 0).then(|| format!("{:#}", HumanDuration(Duration::from_secs(seconds as u64))))
+    }
+
+    fn draw(&self) {
+        if !self.live {
+            return;
+        }
+        let mut lines = vec![self.count()];
+        if let Some(left) = self.time_left() {
+            lines[0] += &format!(" · {left} left");
+        }
+        for number in &self.running {
+            if let Some((done, all)) = distance(&self.run(*number)) {
+                let name: String = self.suite.trials[*number].name.chars().take(50).collect();
+                lines.push(format!("{name}: {} of {}", thousands(done), thousands(all)));
+            }
+        }
+        self.bar
+            .set_position((self.suite.trials.len() - self.due.len() + self.done.len()) as u64);
+        self.bar.set_message(lines.join("\n  "));
+    }
+
+    /// Ends the live line. Returns how many runs have failed.
+    fn end(self) -> usize {
+        self.bar.finish_and_clear();
+        self.failed
+    }
+
+    fn print(&self, line: &str) {
+        if !self.quiet {
+            self.bar.suspend(|| {
+                // A closed standard error is no reason to fail.
+                let _ = writeln!(std::io::stderr(), "{line}");
+            });
+        }
+    }
+}

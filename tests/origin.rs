@@ -1,0 +1,237 @@
+//! A new run begins with the networks of another one, and with its replay: `train --from RUN --with-replay`.
+
+#![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
+
+mod support;
+
+use std::path::Path;
+
+use serde_json::Value;
+use shoal_common::config::Config;
+use support::{Workplace, error_line, json};
+
+/// A short lockstep run in `old`. Returns its result.
+fn old(place: &Workplace, more: &[&str]) -> Value {
+    place.train(&[&["pendulum", "--run", "old", "--steps", "300", "--lockstep"], more].concat())
+}
+
+/// Trains `what` in `new` with these arguments and the shortest evaluations. Returns its result and what it said.
+fn begin(place: &Workplace, what: &str, arguments: &[&str]) -> (Value, String) {
+    let short = [
+        "--set",
+        "evaluation.episodes=2",
+        "--set",
+        "evaluation.final_episodes=2",
+        "--json",
+    ];
+    let output = place.output(&[&["train", what, "--from", "old"], arguments, &short].concat());
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.success(), "{arguments:?}: {said}");
+    (json(&output), said)
+}
+
+fn config(run: &Path) -> Config {
+    Config::load(&run.join("config/used.toml")).unwrap()
+}
+
+#[test]
+fn a_run_begins_with_the_weights_of_another_one_and_takes_their_shapes() {
+    let place = Workplace::new();
+    let before = old(&place, &[]);
+    // No update is due before the end.
+    let idle = [
+        "--run",
+        "new",
+        "--steps",
+        "200",
+        "--set",
+        "environment.start_speed=1",
+        "--set",
+        "ddpg.gamma=0.9",
+    ];
+    let (result, said) = begin(&place, "pendulum", &idle);
+    assert_eq!(result["weights_sha256"], before["weights_sha256"]);
+    assert_eq!((&result["updates"], &result["env_steps"]), (&0.into(), &200.into()));
+    let run = place.path().join("new");
+    let origin: Value = serde_json::from_str(&std::fs::read_to_string(run.join("origin.json")).unwrap()).unwrap();
+    let there = place.path().join("old").canonicalize().unwrap();
+    assert_eq!(origin["run"], there.to_str().unwrap());
+    assert_eq!((&origin["updates"], &origin["env_steps"]), (&236.into(), &300.into()));
+    assert_eq!(
+        (&origin["weights_sha256"], &origin["rows"]),
+        (&before["weights_sha256"], &0.into())
+    );
+    let expected = format!("new begins with the networks of {} after 236 updates", there.display());
+    assert!(said.contains(&expected), "{said}");
+    assert!(
+        std::fs::read_to_string(run.join("shoal.log"))
+            .unwrap()
+            .contains(&expected)
+    );
+    let config = config(&run);
+    assert_eq!(*config.algorithm.ddpg().unwrap().hidden, [24, 16]);
+    assert_eq!(
+        (config.algorithm.gamma(), config.run.from.as_deref()),
+        (0.9, there.to_str())
+    );
+    assert!(place.output(&["report", "new", "--out", "page.html"]).status.success());
+    assert!(
+        std::fs::read_to_string(place.path().join("page.html"))
+            .unwrap()
+            .contains("after 236 updates")
+    );
+
+    // Other seeds and lengths learn on from there.
+    let (result, _) = begin(
+        &place,
+        "pendulum",
+        &["--run", "later", "--steps", "400", "--set", "replay.warmup=100"],
+    );
+    assert_eq!(result["updates"], 300);
+    assert_ne!(result["weights_sha256"], before["weights_sha256"]);
+
+    std::fs::remove_file(run.join("origin.json")).unwrap();
+    let message = error_line(&place.output(&["resume", "new", "--steps", "300"]));
+    assert!(message.contains("the start of new was interrupted"), "{message}");
+}
+
+#[test]
+fn a_policy_that_has_learned_acts_in_the_warm_up_too() {
+    let place = Workplace::new();
+    old(&place, &[]);
+    let returns = |run: &str, warmup: &str| {
+        let set = ["--run", run, "--steps", "400", "--lockstep", "--set", warmup];
+        begin(&place, "pendulum", &set);
+        let text = std::fs::read_to_string(place.path().join(run).join("episodes.csv")).unwrap();
+        let returns = text.lines().map(|line| line.split(',').nth(6).unwrap().to_owned());
+        let mut returns: Vec<String> = returns.collect();
+        returns.sort();
+        returns
+    };
+    let by_policy = returns("policy", "exploration.warmup=policy");
+    assert!(by_policy.len() > 1, "{by_policy:?}");
+    assert_eq!(returns("uniform", "exploration.warmup=uniform"), by_policy);
+}
+
+#[test]
+fn a_run_takes_the_replay_along_and_counts_its_steps_from_there() {
+    let place = Workplace::new();
+    old(&place, &[]);
+    let arguments = [
+        "--with-replay",
+        "--steps",
+        "200",
+        "--set",
+        "replay.warmup=64",
+        "--set",
+        "replay.capacity=1000",
+    ];
+    let mut weights = Vec::new();
+    for run in ["new", "again"] {
+        let (result, said) = begin(
+            &place,
+            "pendulum",
+            &[&arguments[..], &["--run", run, "--lockstep"]].concat(),
+        );
+        assert_eq!((&result["env_steps"], &result["updates"]), (&500.into(), &200.into()));
+        assert!(
+            said.contains("and with 300 rows of its replay") && !said.contains("warning"),
+            "{said}"
+        );
+        weights.push(result["weights_sha256"].clone());
+    }
+    assert_eq!(
+        weights[0], weights[1],
+        "in lockstep the same beginning has the same end"
+    );
+    let (free, _) = begin(&place, "pendulum", &[&arguments[..], &["--run", "free"]].concat());
+    assert_eq!((&free["env_steps"], &free["updates"]), (&500.into(), &200.into()));
+
+    // The old rows are the first ones.
+    let width = 4 * config(&place.path().join("new")).row_layout().width();
+    let rows = |run: &str| {
+        let config = config(&place.path().join(run));
+        let bytes = std::fs::read(place.path().join(run).join("replay.bin")).unwrap();
+        let ring = shoal_learner::process::replay_layout(&config).ring as usize * width;
+        bytes[bytes.len() - ring.next_multiple_of(4096)..][..300 * width].to_vec()
+    };
+    assert_eq!(rows("new"), rows("old"));
+
+    let output = place.output(&["resume", "new", "--steps", "600", "--json"]);
+    assert_eq!(
+        json(&output)["updates"],
+        300,
+        "{}",
+        String::from_utf8_lossy(&output.stderr)
+    );
+
+    let other = [
+        &arguments[..],
+        &["--run", "faster", "--set", "environment.start_speed=1"],
+    ]
+    .concat();
+    let (_, said) = begin(&place, "pendulum", &other);
+    assert!(
+        said.contains("warning: the rows of") && said.contains("environment.start_speed = "),
+        "{said}"
+    );
+}
+
+#[test]
+fn what_does_not_fit_is_refused_and_leaves_no_run() {
+    let place = Workplace::new();
+    old(&place, &[]);
+    let refused = |arguments: &[&str]| {
+        let output = place.output(&[&["train"], arguments, &["--run", "new"]].concat());
+        let message = error_line(&output);
+        assert!(!place.path().join("new").exists(), "{message}");
+        (message, output.status.code())
+    };
+    for (arguments, part) in [
+        (&["pendulum", "--from", "nowhere"][..], "nowhere is not a run directory"),
+        (
+            &["pendulum", "--method", "sac", "--from", "old"],
+            "it has networks of ddpg, and this run learns with sac",
+        ),
+        (
+            &["pendulum-sac", "--set", "sac.tau=0.1", "--from", "old"],
+            "it has networks of ddpg",
+        ),
+        (
+            &["pendulum", "--from", "old", "--set", "ddpg.hidden=[8]"],
+            "its networks have another shape: ddpg.hidden = [24, 16]",
+        ),
+        (
+            &["point-mass-r1", "--from", "old"],
+            "its networks are for other observations",
+        ),
+        (
+            &["pendulum", "--from", "old", "--set", "run.from=there"],
+            "run.from cannot be set",
+        ),
+        (
+            &["pendulum", "--from", "old", "--with-replay", "--set", "ddpg.gamma=0.9"],
+            "γ is 0.99 in",
+        ),
+        (
+            &["pendulum", "--from", "old", "--with-replay", "--set", "replay.n_step=3"],
+            "replay.n_step is 1 in",
+        ),
+    ] {
+        let (message, code) = refused(arguments);
+        assert!(message.contains(part), "{arguments:?}: {message}");
+        assert!(
+            code == Some(2) || part.starts_with("nowhere"),
+            "{arguments:?}: {message}"
+        );
+    }
+    assert!(place.output(&["rm", "old", "--replay", "--yes"]).status.success());
+    let (message, _) = refused(&["pendulum", "--from", "old", "--with-replay"]);
+    assert!(message.contains("has no replay: leave out --with-replay"), "{message}");
+    begin(&place, "pendulum", &["--run", "without", "--steps", "100"]);
+
+    let running = place.start("running", &["--steps", "100000000"]);
+    running.wait_for_learning();
+    let (message, _) = refused(&["pendulum", "--from", "running", "--with-replay"]);
+    assert!(message.contains("is running, and its replay with it"), "{message}");
+}

@@ -1,0 +1,233 @@
+//! Suites of runs: `shoal train --seeds` and `--sweep`, their continuation and their report.
+
+#![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
+
+mod support;
+
+use std::path::Path;
+use std::process::{Child, Stdio};
+
+use rustix::process::{Pid, Signal, kill_process};
+use serde_json::Value;
+use shoal_common::channel::Domain;
+use support::{QUICK, Workplace, error_line, json, until};
+
+/// Trains the suite `suite` of the pendulum and returns what it printed and said.
+fn train(place: &Workplace, arguments: &[&str]) -> (Value, String) {
+    let output = place.output(
+        &[
+            &["train", "pendulum", "--run", "suite", "--json"],
+            arguments,
+            &QUICK[..],
+        ]
+        .concat(),
+    );
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.success(), "{arguments:?}: {said}");
+    (json(&output), said)
+}
+
+#[test]
+fn a_suite_trains_each_combination_with_each_seed_and_is_compared() {
+    let place = Workplace::new();
+    let arguments = [
+        "--seeds",
+        "1..2",
+        "--sweep",
+        "ddpg.tau=0.001,0.01",
+        "--steps",
+        "200",
+        "--jobs",
+        "2",
+    ];
+    let (printed, said) = train(&place, &arguments);
+    let names = [
+        "tau=0.001,seed=1",
+        "tau=0.001,seed=2",
+        "tau=0.01,seed=1",
+        "tau=0.01,seed=2",
+    ];
+    let runs = printed["runs"].as_array().unwrap();
+    assert_eq!(
+        runs.iter().map(|run| run["run"].as_str().unwrap()).collect::<Vec<_>>(),
+        names
+    );
+    for run in runs {
+        assert!(
+            run["finished"] == true && run["env_steps"] == 200 && run["eval_return_mean"].is_f64(),
+            "{printed}"
+        );
+    }
+    assert_ne!(
+        runs[0]["eval_return_mean"], runs[1]["eval_return_mean"],
+        "the seeds differ"
+    );
+    for (name, seed, tau) in [(names[1], 2, 0.001), (names[2], 1, 0.01)] {
+        let path = place.path().join("suite").join(name).join("config.toml");
+        let config = shoal_common::config::Config::load(&path).unwrap();
+        assert_eq!((config.run.seed, config.algorithm.ddpg().unwrap().tau), (seed, tau));
+        assert_eq!(config.learner.threads, 1);
+    }
+    assert!(
+        said.contains("4 of 4 runs to train") && said.contains("tau=0.01,seed=2: done, return -"),
+        "{said}"
+    );
+    assert!(said.contains("ddpg.tau = 0.001: -"), "a line for each setting: {said}");
+    assert!(said.contains("of the resamples"), "and how certain the best is: {said}");
+
+    // The same command has nothing left to do; another one is refused.
+    let (again, said) = train(&place, &arguments);
+    assert!(again == printed && said.contains("0 of 4 runs to train"), "{said}");
+    let other = ["train", "pendulum", "--run", "suite", "--seeds", "1..3"];
+    let message = error_line(&place.output(&other));
+    assert!(message.contains("suite is a suite of other runs"), "{message}");
+
+    let listed = json(&place.output(&["list", "suite", "--json"]));
+    assert_eq!(listed["runs"].as_array().unwrap().len(), 4);
+    let report = place.output(&["report", "suite"]);
+    assert!(report.status.success(), "{}", String::from_utf8_lossy(&report.stderr));
+    let page = std::fs::read_to_string(place.path().join("suite/report.html")).unwrap();
+    let shown = page
+        .split_once("id=\"data\">")
+        .unwrap()
+        .1
+        .split_once("</script>")
+        .unwrap()
+        .0;
+    let shown: Value = serde_json::from_str(shown).unwrap();
+    let places = shown["rankings"][0]["places"].as_array().unwrap();
+    assert_eq!(places.len(), 2, "{places:?}");
+    assert!(places[0]["mean"].as_f64() >= places[1]["mean"].as_f64());
+    let shares: f64 = places.iter().map(|place| place["best"].as_f64().unwrap()).sum();
+    assert!(
+        (shares - 1.0).abs() < 1e-9 && places[0]["interval"][0].is_f64(),
+        "{places:?}"
+    );
+}
+
+fn start(place: &Workplace, arguments: &[&str]) -> Child {
+    let mut command = place.shoal(arguments);
+    command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap()
+}
+
+/// Updates that the run has recorded.
+fn learned(run: &Path) -> usize {
+    std::fs::read_to_string(run.join("learner.csv")).map_or(0, |text| text.lines().count())
+}
+
+#[test]
+fn an_interrupted_or_killed_suite_continues_where_it_was() {
+    let place = Workplace::new();
+    let slow = [
+        "--set",
+        "ddpg.hidden=[300, 300]",
+        "--set",
+        "ddpg.batch=256",
+        "--set",
+        "replay.tolerance=64",
+    ];
+    let suite = [
+        "train", "pendulum", "--run", "suite", "--seeds", "3,1", "--steps", "2000", "--jobs", "1",
+    ];
+    let arguments = [&suite[..], &QUICK, &slow].concat();
+    let first = place.path().join("suite/seed=3");
+    let mut suite = start(&place, &arguments);
+    until("the first run learns", || learned(&first) > 2);
+    kill_process(Pid::from_child(&suite), Signal::INT).unwrap();
+    assert_eq!(suite.wait().unwrap().code(), Some(130));
+    let rows = || {
+        json(&place.output(&["status", first.to_str().unwrap(), "--json"]))["replay_rows"]
+            .as_u64()
+            .unwrap()
+    };
+    let before = rows();
+    assert!((1..2_000).contains(&before), "{before}");
+    assert!(!place.path().join("suite/seed=1").exists());
+
+    let mut suite = start(&place, &["resume", "suite"]);
+    until("it goes on", || rows() > before);
+    let message = error_line(&place.output(&["resume", "suite"]));
+    assert!(message.contains("another process works on the suite"), "{message}");
+    kill_process(Pid::from_child(&suite), Signal::KILL).unwrap();
+    suite.wait().unwrap();
+    until("its training has ended", || {
+        !shoal_common::run_dir::RunDir::open(&first)
+            .unwrap()
+            .is_running()
+            .unwrap()
+    });
+
+    let output = place.output(&["resume", "suite", "--json"]);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let runs = json(&output)["runs"].clone();
+    assert_eq!(
+        (&runs[0]["env_steps"], &runs[1]["env_steps"]),
+        (&2_000.into(), &2_000.into()),
+        "{runs}"
+    );
+    for refused in [&["--steps", "1"][..], &["--set", "ddpg.tau=0.1"]] {
+        let message = error_line(&place.output(&[&["resume", "suite"], refused].concat()));
+        assert!(message.contains("a suite goes on as it was made"), "{message}");
+    }
+    let _ = Domain::remove_abandoned();
+}
+
+#[test]
+fn a_failed_run_does_not_stop_the_others() {
+    let place = Workplace::new();
+    // The learner of the first diverges.
+    let sweep = [
+        "--sweep",
+        "reward.scale=1e6,1",
+        "--set",
+        "ddpg.critic_learning_rate=1",
+        "--steps",
+        "600",
+    ];
+    let output = place.output(
+        &[
+            &["train", "pendulum", "--run", "suite", "--jobs", "1"],
+            &sweep[..],
+            &QUICK,
+        ]
+        .concat(),
+    );
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    if output.status.code() == Some(1) {
+        assert!(
+            said.contains("of the runs failed; to continue with them: shoal resume"),
+            "{said}"
+        );
+    }
+    assert!(
+        said.contains("scale=1: done") || said.contains("scale=1: failed"),
+        "{said}"
+    );
+}
+
+#[test]
+fn what_is_no_suite_is_refused_before_anything_is_made() {
+    let place = Workplace::new();
+    for (arguments, part) in [
+        (&["--seeds", "5..1"][..], "must look like 1..5"),
+        (&["--seeds", "1,1"], "names a seed twice"),
+        (&["--sweep", "tau=1,2"], "must look like SECTION.KEY=A,B,C"),
+        (&["--sweep", "ddpg.tau=0.1,0.1"], "names a value twice"),
+        (&["--sweep", "run.seed=1,2"], "use --seeds"),
+        (&["--sweep", "ddpg.tau=0.1,2"], "ddpg.tau = 2: must be above 0"),
+        (&["--sweep", "ddpg.ta=0.1,0.2"], "unknown field `ta`"),
+        (
+            &["--sweep", "ddpg.tau=0.1", "--sweep", "ddpg.tau=0.2"],
+            "is given twice",
+        ),
+        (&["--jobs", "2"], "--jobs: is for several runs"),
+    ] {
+        let output = place.output(&[&["train", "pendulum", "--run", "suite"], arguments].concat());
+        let message = error_line(&output);
+        assert!(message.contains(part), "{arguments:?}: {message}");
+        assert!(!place.path().join("suite").exists(), "{arguments:?}");
+    }
+    std::fs::create_dir(place.path().join("mine")).unwrap();
+    let message = error_line(&place.output(&["train", "pendulum", "--run", "mine", "--seeds", "1..2"]));
+    assert!(message.contains("mine exists already"), "{message}");
+}
