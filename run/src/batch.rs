@@ -126,7 +126,8 @@ mod tests {
 
     #[test]
     fn every_job_is_done_once_by_several_threads() {
-        let signals = Signals::register().unwrap();
+        // Not dropped: a signal would then end this process, and another test sends it one.
+        let signals = std::mem::ManuallyDrop::new(Signals::register().unwrap());
         let mut done = Vec::new();
         let work = |job: u32, events: &mpsc::Sender<u32>| events.send(job * 2).unwrap();
         work_off((0..50).collect(), 3, &signals, work, |event| done.extend(event));
