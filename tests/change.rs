@@ -151,6 +151,14 @@ fn what_cannot_change_is_refused_by_the_name_of_its_key() {
             "observation.normalise=true",
             "observation.normalise = true: cannot change",
         ),
+        (
+            "ddpg.batch=3000",
+            "ddpg.batch = 3000: does not go with replay.capacity = 2000 (the run's own), which must be from 3000 to",
+        ),
+        (
+            "environment.server=[\"x\"]",
+            "environment.server = [\"x\"]: cannot change in this run, which has nothing",
+        ),
         ("ddpg.tau=nan", "ddpg.tau = NaN: must be above 0 and at most 1"),
         ("ddpg.tau=-1", "ddpg.tau = -1: must be above 0"),
         ("ddpg.tau=quickly", "ddpg.tau = \"quickly\": invalid type"),

@@ -81,7 +81,10 @@ pub fn ranking(runs: &[RunDir]) -> anyhow::Result<Vec<String>> {
     let read = named.map(|(run, name)| Run::read(run, name, Limits::NONE));
     let read = read.collect::<anyhow::Result<Vec<_>>>()?;
     let found = rankings(&comparison::compare(&read), &read);
-    Ok(found.iter().flat_map(|it| it.lines().chain(it.verdict())).collect())
+    Ok(found
+        .iter()
+        .flat_map(|it| it.lines().chain(it.verdict.clone()))
+        .collect())
 }
 
 impl Report {

@@ -421,7 +421,7 @@ impl<'a> Progress<'a> {
 
     fn count(&self) -> String {
         let all = self.suite.trials.len();
-        format!("{} of {all} runs", all - self.due.len() + self.done.len())
+        format!("{} of {all} runs", all - self.due.len() + self.done.len() - self.failed)
     }
 
     /// The time that the rest takes at the rate of this suite so far. A run that has not begun is as long as the others are on

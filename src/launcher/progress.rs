@@ -94,12 +94,11 @@ impl Progress {
 
     fn evaluation_line(&self, report: &EvaluationReport) -> String {
         let steps = thousands(report.env_steps);
-        let place = match self.learner.filter(|_| self.counts_episodes) {
-            Some(learner) => {
-                let (done, all) = (thousands(learner.episodes), thousands(self.bar.length().unwrap_or(0)));
-                format!("step {steps} ({done} of {all} episodes)")
-            }
-            None => format!("step {steps} of {}", thousands(self.bar.length().unwrap_or(0))),
+        let all = thousands(self.bar.length().unwrap_or(0));
+        let place = match (self.counts_episodes, self.learner) {
+            (false, _) => format!("step {steps} of {all}"),
+            (true, None) => format!("step {steps}"),
+            (true, Some(learner)) => format!("step {steps} ({} of {all} episodes)", thousands(learner.episodes)),
         };
         let mut parts = vec![format!("return {:.2} ± {:.2}", report.return_mean, report.return_std)];
         if let Some((updates, env_steps)) = self.rates() {

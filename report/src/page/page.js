@@ -155,11 +155,12 @@ function ranking() {
   if (!report.rankings.length) return;
   const percent = (share) => (share === null ? "–" : `${Math.round(100 * share)} %`);
   const columns = ["setting", "runs", "interquartile mean", "95 % interval", "best in"];
-  const parts = report.rankings.map(({ environment, places }) => {
+  const parts = report.rankings.flatMap(({ environment, places, verdict }) => {
     const row = (place) => [place.label, `${whole(place.runs)}${place.unfinished ? ` (${whole(place.unfinished)} not finished)` : ""}`, text(place.mean), place.interval ? `${text(place.interval[0])} … ${text(place.interval[1])}` : "–", percent(place.best)];
     const head = html("tr", {}, columns.map((name) => html("th", { scope: "col" }, name)));
     const body = places.map((place) => html("tr", {}, row(place).map((value) => html("td", {}, value))));
-    return html("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": `Settings of ${environment}, the best first` }, html("table", {}, html("caption", {}, environment), html("thead", {}, head), html("tbody", {}, body)));
+    const list = html("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": `Settings of ${environment}, the best first` }, html("table", {}, html("caption", {}, environment), html("thead", {}, head), html("tbody", {}, body)));
+    return verdict ? [html("p", {}, `${verdict}.`), list] : [list];
   });
   section("Ranking", ...parts, aside("The results are the mean returns of the final evaluations, or of the last evaluation of a run that has not finished. The interquartile mean leaves out the best and the worst quarter of the seeds, if there are at least four. Intervals and shares are of 5,000 resamples of the seeds (bootstrap)."));
 }

@@ -24,6 +24,8 @@ const TAIL: f64 = 0.025;
 pub(super) struct Ranking {
     pub(super) environment: String,
     pub(super) places: Vec<Place>,
+    /// Which setting is best and how certain that is, in a sentence; `None` for a single one.
+    pub(super) verdict: Option<String>,
 }
 
 /// The result of one setting.
@@ -78,40 +80,35 @@ pub(super) fn rank(environment: &str, sets: &[Set], runs: &[Run]) -> Option<Rank
     places.sort_by(|a, b| b.mean.total_cmp(&a.mean));
     Some(Ranking {
         environment: environment.into(),
+        verdict: verdict(&places),
         places,
     })
 }
 
-impl Ranking {
-    /// Which setting is best and how certain that is, in a sentence; `None` for a single one.
-    pub(super) fn verdict(&self) -> Option<String> {
-        let [best, second, ..] = self.places.as_slice() else {
-            return None;
-        };
-        let share = best.best?;
-        let certainty = match share {
-            0.975.. => "almost certainly the best",
-            0.9.. => "probably the best",
-            0.6.. => "perhaps the best",
-            _ => "the best so far, but that may be chance",
-        };
-        let few = match self.places.iter().map(|place| place.runs).min() {
-            Some(runs) if runs < FEW => format!("; {runs} runs are few, so train more seeds to be sure"),
-            _ => String::new(),
-        };
-        let others = if self.places.len() > 2 {
-            "all others"
-        } else {
-            &second.label
-        };
-        Some(format!(
-            "{}: {} is {certainty}, ahead of {others} in {:.0} % of the resamples{few}",
-            self.environment,
-            best.label,
-            100.0 * share
-        ))
-    }
+fn verdict(places: &[Place]) -> Option<String> {
+    let [best, second, ..] = places else {
+        return None;
+    };
+    let share = best.best?;
+    let certainty = match share {
+        0.975.. => "almost certainly the best",
+        0.9.. => "probably the best",
+        0.6.. => "perhaps the best",
+        _ => "the best so far, but that may be chance",
+    };
+    let few = match places.iter().map(|place| place.runs).min() {
+        Some(runs) if runs < FEW => format!("; {runs} runs are few, so train more seeds to be sure"),
+        _ => String::new(),
+    };
+    let others = if places.len() > 2 { "all others" } else { &second.label };
+    Some(format!(
+        "{} is {certainty}, ahead of {others} in {:.0} % of the resamples{few}",
+        best.label,
+        100.0 * share
+    ))
+}
 
+impl Ranking {
     /// A line for each setting.
     pub(super) fn lines(&self) -> impl Iterator<Item = String> {
         self.places.iter().map(|place| {
@@ -205,6 +202,17 @@ mod tests {
         assert!((from - 1.33).abs() < 0.35 && (to - 4.67).abs() < 0.35, "{from} {to}");
         let same = bootstrap(&[&low, &low]);
         assert!((same[0].1.unwrap() - 0.5).abs() < 0.03, "{same:?}");
+        let place = |label: &str, mean, best| Place {
+            label: label.into(),
+            runs: 5,
+            unfinished: 0,
+            mean,
+            interval: None,
+            best,
+        };
+        let told = verdict(&[place("b", 13.0, found[1].1), place("a", 3.0, found[0].1)]);
+        let expected = "b is almost certainly the best, ahead of a in 100 % of the resamples";
+        assert_eq!(told.as_deref(), Some(expected));
         let single = bootstrap(&[&[1.0], &low]);
         assert_eq!((single[0], single[1].1), ((None, None), None));
     }

@@ -56,6 +56,12 @@ impl Revision {
         let mut table: Table = text.parse().map_err(malformed)?;
         let edited = Config::from_table(table.clone(), &origin).ok();
         let mut sources = Sources::of_file(&origin, &text);
+        if let Some(edited) = &edited {
+            // Nobody has set what is as before.
+            let differing: Vec<String> = used.differences(edited).into_iter().map(|it| it.key).collect();
+            let same = edited.values().into_keys().filter(|key| !differing.contains(key));
+            same.for_each(|key| sources.set(key, Source::Run));
+        }
         let options = RunOverrides {
             steps: asked.steps,
             episodes: asked.episodes,
@@ -233,8 +239,8 @@ fn refuse(differences: &[Difference], used: &Config, sources: &Sources) -> anyho
         } else {
             "in this run"
         };
-        let stated = if after.is_empty() { "nothing" } else { after };
-        let text = format!("{key} = {stated}: cannot change {place}, which has {before}: {why}");
+        let [before, after] = [before, after].map(|value| if value.is_empty() { "nothing" } else { value });
+        let text = format!("{key} = {after}: cannot change {place}, which has {before}: {why}");
         return Err(sources.blame(key, &text));
     }
     Ok(())
@@ -249,9 +255,15 @@ fn check_files(run: &RunDir, used: &Config, config: &Config, differences: &[Diff
     let names: Vec<&str> = differences.iter().map(|it| it.key.as_str()).collect();
     let names = names.join(", ");
     if config.fingerprint() != used.fingerprint() {
+        let of_method = [used.algorithm.name(), "exploration"];
+        let names = differences.iter().map(|it| it.key.as_str());
+        let names: Vec<&str> = names
+            .filter(|key| of_method.iter().any(|section| key.starts_with(&format!("{section}."))))
+            .collect();
         bail!(
-            "{names}: cannot change in this run: an early version of the program made it, whose files are identified by \
-             such keys"
+            "{}: cannot change in this run: an early version of the program made it, whose files are identified by \
+             such keys",
+            names.join(", ")
         );
     }
     if run.replay_file().exists() && replay_layout(config) != replay_layout(used) {

@@ -30,6 +30,8 @@ pub enum Source {
     Set,
     /// The value of something else, which this names.
     Follows(String),
+    /// The run that is resumed has it.
+    Run,
 }
 
 impl Source {
@@ -50,6 +52,7 @@ impl Display for Source {
             Self::Option(option) => write!(to, "{option}"),
             Self::Set => write!(to, "--set"),
             Self::Follows(what) => write!(to, "follows from {what}"),
+            Self::Run => write!(to, "the run's own"),
         }
     }
 }
@@ -162,7 +165,12 @@ impl Sources {
             Source::Option(option) => UsageError(format!("{option}: {message}")).into(),
             Source::Set => UsageError(message.into()).into(),
             Source::File(name, line) => anyhow::anyhow!("{name}, line {line}: {message}"),
-            Source::Default | Source::Preset(_) | Source::Gymnasium | Source::Method(_) | Source::Follows(_) => {
+            Source::Default
+            | Source::Preset(_)
+            | Source::Gymnasium
+            | Source::Method(_)
+            | Source::Follows(_)
+            | Source::Run => {
                 anyhow::anyhow!("{message}")
             }
         }
@@ -178,8 +186,12 @@ impl Sources {
             .and_then(|(section, key)| table.get(section)?.get(key));
         let value = value.map_or_else(String::new, Value::to_string);
         let (stated, expected) = message.split_once(": ").unwrap_or((message, ""));
+        let advice = match self.of(key) {
+            Source::Run => String::new(),
+            _ => format!("; set {key} too"),
+        };
         let text = format!(
-            "{other} = {value}: does not go with {stated} ({}), which {expected}; set {key} too",
+            "{other} = {value}: does not go with {stated} ({}), which {expected}{advice}",
             self.of(key)
         );
         self.blame(&other, &text)
