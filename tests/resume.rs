@@ -395,3 +395,22 @@ fn stopping_a_waiting_copy_does_not_stop_the_original() {
     running.wait_for_learning();
     assert_eq!(place.status("run")["actors"], 2);
 }
+
+#[test]
+fn a_signal_ends_a_resumed_run_in_order() {
+    let place = Workplace::new();
+    killed(&place, &[]);
+    let resumed = place.resume("run", &[]);
+    resumed.wait_for_learning();
+    resumed.signal(Signal::TERM);
+    let log = resumed.run.join("shoal.log");
+    let (code, _, leftovers) = resumed.wait();
+    assert_eq!(code, Some(143), "{}", place.stderr());
+    assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
+    let log = std::fs::read_to_string(log).unwrap();
+    assert!(log.contains("signal 15 (SIGTERM) ends the run"), "{log}");
+    assert_eq!(
+        support::json(&place.output(&["list", ".", "--json"]))["runs"][0]["state"],
+        "stopped"
+    );
+}

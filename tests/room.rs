@@ -208,7 +208,7 @@ fn a_disk_that_fills_up_ends_the_run_with_one_line() {
     let place = Workplace::new();
     fs::create_dir(place.path().join("small")).unwrap();
     let script = "mount -t tmpfs -o size=32m tmpfs small
-        $SHOAL train pendulum --steps 100000000 --run small/run $QUICK --json & run=$!
+        $SHOAL train pendulum --steps 100000000 --run small/run $QUICK --quiet --json & run=$!
         timeout 60 sh -c 'until test -s small/run/checkpoints/latest.ckpt; do sleep 0.05; done'
         cat /dev/zero > small/filler 2>/dev/null || true
         timeout 60 tail --pid=$run -f /dev/null

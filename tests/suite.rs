@@ -84,6 +84,13 @@ fn a_suite_trains_each_combination_with_each_seed_and_is_compared() {
 
     let listed = json(&place.output(&["list", "suite", "--json"]));
     assert_eq!(listed["runs"].as_array().unwrap().len(), 4);
+    let above = json(&place.output(&["list", ".", "--json"]));
+    let found = &above["suites"][0];
+    assert_eq!(
+        (&found["path"], &found["runs"], &found["begun"]),
+        (&"./suite".into(), &4.into(), &4.into()),
+        "{above}"
+    );
     let report = place.output(&["report", "suite"]);
     assert!(report.status.success(), "{}", String::from_utf8_lossy(&report.stderr));
     let page = std::fs::read_to_string(place.path().join("suite/report.html")).unwrap();
@@ -103,6 +110,18 @@ fn a_suite_trains_each_combination_with_each_seed_and_is_compared() {
         (shares - 1.0).abs() < 1e-9 && places[0]["interval"][0].is_f64(),
         "{places:?}"
     );
+
+    let replays = || {
+        let there = |name: &&&str| place.path().join("suite").join(name).join("replay.bin").exists();
+        names.iter().filter(there).count()
+    };
+    assert!(place.output(&["rm", "suite", "--replay", "--yes"]).status.success());
+    assert_eq!(replays(), 0);
+    std::fs::write(place.path().join("suite/notes.txt"), "mine").unwrap();
+    assert!(place.output(&["rm", "suite", "--yes"]).status.success());
+    let left = std::fs::read_dir(place.path().join("suite")).unwrap();
+    let left: Vec<_> = left.map(|entry| entry.unwrap().file_name()).collect();
+    assert_eq!(left, ["notes.txt"], "what the suite did not make stays");
 }
 
 fn start(place: &Workplace, arguments: &[&str]) -> Child {

@@ -126,8 +126,7 @@ mod tests {
 
     #[test]
     fn every_job_is_done_once_by_several_threads() {
-        // Not dropped: a signal would then end this process, and another test sends it one.
-        let signals = std::mem::ManuallyDrop::new(Signals::register().unwrap());
+        let signals = Signals::register().unwrap();
         let mut done = Vec::new();
         let work = |job: u32, events: &mpsc::Sender<u32>| events.send(job * 2).unwrap();
         work_off((0..50).collect(), 3, &signals, work, |event| done.extend(event));

@@ -3,8 +3,8 @@
 use std::io::{self, Read};
 use std::os::fd::{AsFd, BorrowedFd};
 use std::os::unix::net::UnixStream;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::{Arc, LazyLock, Mutex, PoisonError};
 use std::time::Duration;
 
 use anyhow::Context;
@@ -26,12 +26,24 @@ impl Interrupt {
     }
 }
 
-/// Receives SIGINT, SIGTERM and SIGHUP. Once this is dropped, they end the process again. A signal that was ignored when
-/// this process started stays ignored, such as SIGHUP under `nohup`.
+/// How many `Signals` there are in this process. While there is one, none of the signals ends the process.
+static RECEIVERS: Mutex<usize> = Mutex::new(0);
+
+/// Whether there is none.
+static NOBODY: LazyLock<Arc<AtomicBool>> = LazyLock::new(Arc::default);
+
+/// Counts one receiver more or less.
+fn count(change: impl FnOnce(usize) -> usize) {
+    let mut receivers = RECEIVERS.lock().unwrap_or_else(PoisonError::into_inner);
+    *receivers = change(*receivers);
+    NOBODY.store(*receivers == 0, Ordering::Relaxed);
+}
+
+/// Receives SIGINT, SIGTERM and SIGHUP. Once all `Signals` are dropped, these signals end the process again. A signal that
+/// was ignored when this process started stays ignored, such as SIGHUP under `nohup`.
 #[derive(Debug)]
 pub struct Signals {
     last: Arc<AtomicUsize>,
-    over: Arc<AtomicBool>,
     /// Readable if a signal has arrived since the last call of `received`.
     wake: UnixStream,
 }
@@ -43,7 +55,7 @@ impl Signals {
     /// When a handler cannot be registered.
     pub fn register() -> anyhow::Result<Self> {
         let registered = || -> io::Result<Self> {
-            let (last, over) = (Arc::default(), Arc::new(AtomicBool::new(false)));
+            let last = Arc::default();
             let (wake, write) = UnixStream::pair()?;
             wake.set_nonblocking(true)?;
             let ignored = ignored_signals();
@@ -52,13 +64,16 @@ impl Signals {
                     continue;
                 }
                 // In this order, so that a thread that is woken finds the number.
-                signal_hook::flag::register_conditional_default(signal, Arc::clone(&over))?;
+                signal_hook::flag::register_conditional_default(signal, Arc::clone(&NOBODY))?;
                 signal_hook::flag::register_usize(signal, Arc::clone(&last), signal as usize)?;
                 signal_hook::low_level::pipe::register(signal, write.try_clone()?)?;
             }
-            Ok(Self { last, over, wake })
+            Ok(Self { last, wake })
         };
-        registered().context("cannot watch for signals")
+        // Before the first handler: one that an earlier receiver has left must not end the process either.
+        count(|receivers| receivers + 1);
+        let signals = registered().inspect_err(|_| count(|receivers| receivers - 1));
+        signals.context("cannot watch for signals")
     }
 
     /// The last signal that has arrived.
@@ -90,7 +105,7 @@ impl AsFd for Signals {
 
 impl Drop for Signals {
     fn drop(&mut self) {
-        self.over.store(true, Ordering::Relaxed);
+        count(|receivers| receivers - 1);
     }
 }
 
@@ -138,7 +153,10 @@ mod tests {
 
     #[test]
     fn a_signal_wakes_a_waiting_thread_and_is_remembered() {
+        // An earlier receiver and another one at the same time, which are gone by then, do not count.
+        drop(Signals::register().unwrap());
         let signals = Signals::register().unwrap();
+        drop(Signals::register().unwrap());
         assert_eq!(signals.received(), None);
         assert_eq!(signals.wait(Duration::from_millis(1)), None);
         std::thread::scope(|scope| {

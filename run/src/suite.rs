@@ -3,7 +3,7 @@
 
 use std::collections::BTreeSet;
 use std::fs::File;
-use std::io::Write;
+use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -241,6 +241,22 @@ pub fn lock(directory: &Path) -> anyhow::Result<File> {
         bail!("another process works on the suite in {here}: wait for it, or end it");
     }
     Ok(file)
+}
+
+/// Removes what is left of a suite whose runs have been removed: its file and its report, and the directory if that is all
+/// that it has.
+///
+/// # Errors
+/// When a file cannot be removed.
+pub fn remove(directory: &Path) -> std::io::Result<()> {
+    let missing = |error: &std::io::Error| error.kind() == ErrorKind::NotFound;
+    for file in [directory.join("report.html"), file(directory)] {
+        std::fs::remove_file(file).or_else(|error| if missing(&error) { Ok(()) } else { Err(error) })?;
+    }
+    match std::fs::remove_dir(directory) {
+        Err(error) if error.kind() == ErrorKind::DirectoryNotEmpty => Ok(()),
+        removed => removed,
+    }
 }
 
 fn file(directory: &Path) -> PathBuf {

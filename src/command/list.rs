@@ -9,6 +9,7 @@ use comfy_table::presets::NOTHING;
 use comfy_table::{CellAlignment, Table};
 use serde::Serialize;
 use shoal_run::numbers::thousands;
+use shoal_run::suite::Suite;
 
 use crate::listing::{Listed, runs_in};
 
@@ -27,6 +28,16 @@ pub(crate) struct ListArgs {
 struct Printed<'a> {
     directory: &'a Path,
     runs: &'a [Listed],
+    suites: &'a [ListedSuite],
+}
+
+/// A suite in the directory.
+#[derive(Serialize)]
+struct ListedSuite {
+    path: PathBuf,
+    /// The number of its runs, and of those that have begun.
+    runs: usize,
+    begun: usize,
 }
 
 /// Lists the runs directly in the directory.
@@ -41,11 +52,18 @@ pub(crate) fn run(args: &ListArgs) -> anyhow::Result<()> {
     let runs: Vec<PathBuf> =
         runs_in(directory).with_context(|| format!("cannot read the directory {}", directory.display()))?;
     let runs: Vec<Listed> = runs.iter().map(|run| Listed::new(run)).collect();
+    let suites = suites_in(directory).with_context(|| format!("cannot read the directory {}", directory.display()))?;
     let mut stdout = std::io::stdout().lock();
     if args.json {
-        let printed = Printed { directory, runs: &runs };
+        let printed = Printed {
+            directory,
+            runs: &runs,
+            suites: &suites,
+        };
         writeln!(stdout, "{}", serde_json::to_string(&printed)?)?;
-    } else if runs.is_empty() {
+        return Ok(());
+    }
+    if runs.is_empty() {
         writeln!(stdout, "no runs in {}", directory.display())?;
     } else {
         writeln!(stdout, "{}", table(&runs))?;
@@ -55,7 +73,31 @@ pub(crate) fn run(args: &ListArgs) -> anyhow::Result<()> {
             }
         }
     }
+    for ListedSuite { path, runs, begun } in &suites {
+        let here = path.display();
+        writeln!(
+            stdout,
+            "{here}: a suite of {runs} runs, {begun} of them begun; to list them: shoal list {here}"
+        )?;
+    }
     Ok(())
+}
+
+/// The suites in a directory, by name. One that cannot be read is left out.
+fn suites_in(directory: &Path) -> std::io::Result<Vec<ListedSuite>> {
+    let mut suites = Vec::new();
+    for entry in std::fs::read_dir(directory)? {
+        let path = entry?.path();
+        if let Ok(Some(suite)) = Suite::read(&path) {
+            suites.push(ListedSuite {
+                runs: suite.trials.len(),
+                begun: suite.runs(&path).len(),
+                path,
+            });
+        }
+    }
+    suites.sort_by(|a, b| a.path.cmp(&b.path));
+    Ok(suites)
 }
 
 fn table(runs: &[Listed]) -> Table {

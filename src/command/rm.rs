@@ -1,5 +1,6 @@
 //! `shoal rm`: removes runs, or their replays alone.
 
+use std::fs::File;
 use std::io::{BufRead, ErrorKind, IsTerminal, Write};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -11,13 +12,14 @@ use shoal_common::durable::write_atomically;
 use shoal_common::run_dir::{RunDir, RunDirError, RunLock};
 use shoal_run::numbers::mebibytes;
 use shoal_run::plan::UsageError;
+use shoal_run::suite::{self, Suite};
 
 use crate::launcher;
 
 #[derive(Args, Clone, Debug)]
 pub(crate) struct RmArgs {
-    /// Run directories.
-    #[arg(value_name = "RUN", required = true)]
+    /// Run directories, or those of suites.
+    #[arg(value_name = "RUN|SUITE", required = true)]
     pub(crate) runs: Vec<PathBuf>,
     /// Remove only the replays. The runs can still be evaluated and exported, but not resumed.
     #[arg(long)]
@@ -36,13 +38,20 @@ struct Condemned {
 
 /// Removes the runs after asking. Nothing is removed if one of them cannot be.
 pub(crate) fn run(args: &RmArgs) -> anyhow::Result<ExitCode> {
-    let mut runs: Vec<Condemned> = Vec::new();
+    let (mut runs, mut suites): (Vec<Condemned>, Vec<(&PathBuf, File)>) = (Vec::new(), Vec::new());
     for path in &args.runs {
-        let run = RunDir::open(path)?;
-        if runs.iter().any(|other| other.run == run) {
-            bail!("{} is named twice: name each run once", path.display());
+        let mut paths = vec![path.clone()];
+        if let Some(suite) = Suite::read(path)? {
+            suites.push((path, suite::lock(path)?));
+            paths = suite.runs(path);
         }
-        runs.push(condemn(run, args.replay)?);
+        for path in paths {
+            let run = RunDir::open(&path)?;
+            if runs.iter().any(|other| other.run == run) {
+                bail!("{} is named twice: name each run once", path.display());
+            }
+            runs.push(condemn(run, args.replay)?);
+        }
     }
     if !args.yes && !confirmed(&runs, args.replay)? {
         writeln!(std::io::stderr(), "nothing is removed")?;
@@ -57,6 +66,11 @@ pub(crate) fn run(args: &RmArgs) -> anyhow::Result<ExitCode> {
         } else {
             remove(run.path()).with_context(|| format!("cannot remove {here}"))?;
             writeln!(std::io::stdout(), "removed {here} ({})", mebibytes(*size))?;
+        }
+    }
+    if !args.replay {
+        for (path, _lock) in &suites {
+            suite::remove(path).with_context(|| format!("cannot remove the suite {}", path.display()))?;
         }
     }
     // What the runs may have left in shared memory when they were killed.
