@@ -154,7 +154,7 @@ fn run_once(
     Ok(outcome)
 }
 
-/// Adds to the error which run the processes belong to that prevent the start.
+/// Adds to the error to which run the processes belong that are still alive.
 fn explain(error: DomainError, run: &RunDir) -> anyhow::Error {
     let DomainError::StillAlive { pids, .. } = &error else {
         return error.into();
@@ -251,7 +251,7 @@ impl<'a> Launcher<'a> {
     fn run(mut self) -> anyhow::Result<TrainingOutcome> {
         let ending = self.watch();
         if self.lock.check(self.run).is_err() {
-            // They have nowhere to save anything. Another run may be at this path by now, whose files are not theirs.
+            // The run's directory is gone, so the roles cannot save anything. By now, another run may be at this path.
             self.supervisor.kill(|_| true);
         }
         // The roles are ended in every case, also after an error.
@@ -262,7 +262,8 @@ impl<'a> Launcher<'a> {
             Ok(()) => Answer::Accepted,
             Err(error) => Answer::Refused(format!("{error:#}")),
         });
-        // Whatever else has failed follows from it, and nothing may be written there. The log is still the run's own.
+        // If the directory is gone, all other errors follow from that, and nothing may be written at its path. The open
+        // log is still the run's own.
         self.lock
             .check(self.run)
             .inspect_err(|gone| self.log.note("launcher", &format!("{FAILED}{gone}")))?;

@@ -8,12 +8,12 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 use shoal_common::channel::control::RunStatus;
 use shoal_common::run_dir::RunDir;
+use shoal_run::client::RunClient;
 use shoal_run::evaluation::WhichPolicy;
 use shoal_run::final_evaluation::FinalEvaluation;
 use shoal_run::outcome::{RunOutcome, RunState};
 use shoal_run::plan;
 use shoal_run::recorder::read_evaluations;
-use shoal_run::remote::Remote;
 use shoal_run::status::saved_status;
 
 use crate::launcher::{ALL_ENDED, FAILED};
@@ -104,8 +104,8 @@ impl Listed {
     }
 
     fn read(&mut self) -> anyhow::Result<()> {
-        let remote = Remote::open(&self.path)?;
-        let Remote { run, config } = &remote;
+        let client = RunClient::open(&self.path)?;
+        let RunClient { run, config } = &client;
         self.environment.clone_from(&config.environment.name);
         config.algorithm.name().clone_into(&mut self.algorithm);
         (self.steps, self.episodes_limit) = (Some(config.run.steps), config.run.episodes);
@@ -113,7 +113,7 @@ impl Listed {
             .into_iter()
             .map(|row| row.return_mean);
         self.best_return = returns.reduce(f64::max);
-        match remote.status() {
+        match client.status() {
             Ok(Some(status)) => {
                 self.state = ListedState::Running;
                 self.set_progress(&status);

@@ -10,7 +10,7 @@ use shoal_actor::noise::OrnsteinUhlenbeck;
 use shoal_common::channel::environment::ResponseLayout;
 use shoal_common::commit::CommitReader;
 use shoal_common::config::{Algorithm, Config, Warmup};
-use shoal_common::network::{ActionRange, PolicyNetwork};
+use shoal_common::network::{ActionRange, DeterministicPolicy};
 use shoal_common::stream::{Purpose, seek, stream};
 use shoal_common::transition::Transition;
 use shoal_env_server::vector::{Start, VectorEnvironment};
@@ -300,7 +300,7 @@ fn twin(config: &Config) -> String {
     let mut indices = vec![0; ddpg.batch];
 
     let range = ActionRange::new(&config.spec.action).unwrap();
-    let mut mu = PolicyNetwork::new(row.observation_width(), ddpg.hidden_layers(), range, 1);
+    let mut mu = DeterministicPolicy::new(ddpg.networks(&config.spec).actor, range, 1);
     let mut uniform = stream(seed, Purpose::Exploration, 0, 0);
     let mut noise = OrnsteinUhlenbeck::new(exploration, 1, row.action_width(), uniform.clone());
 

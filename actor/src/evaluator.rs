@@ -7,14 +7,13 @@ use shoal_common::channel::environment::{Begin, EnvironmentClient, Stepped};
 use shoal_common::channel::policy::{self, PolicyHeader, PolicyReader};
 use shoal_common::channel::reports::Reporter;
 use shoal_common::channel::{ChannelError, Domain, EventName, HeartbeatSender, Listener, Notifier, wait_for};
-use shoal_common::config::{Algorithm, Config, EvaluationConfig};
+use shoal_common::config::Config;
 use shoal_common::evaluator_state::EvaluatorState;
 use shoal_common::exit::Exit;
 use shoal_common::policy::Policy;
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::report::{Activity, EvaluatedReport, EvaluationReport, Identity, Role};
 use shoal_common::run_dir::RunDir;
-use shoal_common::space::EnvironmentSpec;
 use shoal_common::stop::Stop;
 
 use crate::error::ActorError;
@@ -25,16 +24,12 @@ use crate::explorer::{after_fault, connect};
 pub struct EvaluatorSettings {
     /// Which process this is.
     pub identity: Identity,
-    /// What the environment server is expected to serve.
-    pub spec: EnvironmentSpec,
+    /// The run's configuration.
+    pub config: Config,
     /// The environment server's index.
     pub server: u32,
     /// The number of environments that it steps at once.
     pub envs: usize,
-    /// How often to evaluate, and for how many episodes.
-    pub evaluation: EvaluationConfig,
-    /// The algorithm, which determines the kind of policy.
-    pub algorithm: Algorithm,
     /// The run directory, where the best policy is written, and all evaluated ones if configured.
     pub run: RunDir,
     /// The period of the policy that a previous evaluator evaluated last.
@@ -47,11 +42,9 @@ impl EvaluatorSettings {
     pub fn new(config: &Config, run: &RunDir, identity: Identity, evaluated_period: Option<u64>) -> Self {
         Self {
             identity,
-            spec: config.spec.clone(),
+            config: config.clone(),
             server: config.evaluation_server(),
             envs: config.evaluation_envs() as usize,
-            evaluation: config.evaluation.clone(),
-            algorithm: config.algorithm.clone(),
             run: run.clone(),
             evaluated_period,
         }
@@ -151,11 +144,18 @@ struct Best {
 
 impl<'a> Evaluator<'a> {
     fn new(domain: &Domain, settings: &'a EvaluatorSettings, stop: &'a Stop) -> Result<Self, Exit<ActorError>> {
-        let policy = settings.algorithm.policy(&settings.spec, settings.envs)?;
+        let policy = settings.config.policy(settings.envs)?;
         let layout = policy.layout();
         let listener = Listener::bind(domain, EventName(Role::Evaluator, settings.identity.index))?;
         let mut heartbeat = HeartbeatSender::new(domain, settings.identity)?;
-        let client = connect(domain, &listener, settings.server, &settings.spec, settings.envs, stop)?;
+        let client = connect(
+            domain,
+            &listener,
+            settings.server,
+            &settings.config.spec,
+            settings.envs,
+            stop,
+        )?;
         let reader = PolicyReader::open(domain, layout.fingerprint(), layout.parameters())?;
         let best = if settings.run.best_policy().exists() {
             let best = PolicyFile::read(&settings.run.best_policy(), &layout)?;
@@ -188,7 +188,7 @@ impl<'a> Evaluator<'a> {
             evaluated_reports,
             state,
             heartbeat,
-            actions: vec![0.0; settings.envs * settings.spec.action.width()],
+            actions: vec![0.0; settings.envs * settings.config.spec.action.width()],
             policy,
             listener,
             evaluated_period: settings.evaluated_period,
@@ -199,17 +199,17 @@ impl<'a> Evaluator<'a> {
     fn evaluate_next(&mut self) -> Result<(), Exit<ActorError>> {
         let published = self.await_due_policy().map_err(Exit::widen)?;
         let header = published.header();
-        let returns = self.returns(published.parameters(), 0, self.settings.evaluation.episodes)?;
+        let returns = self.returns(published.parameters(), 0, self.settings.config.evaluation.episodes)?;
         let (return_mean, return_std) = mean_and_std(&returns);
         let best = self.becomes_best(&published, return_mean)?;
         if best {
             self.write_policy(&published, return_mean, return_std, &self.settings.run.best_policy())?;
         }
-        if self.settings.evaluation.keep_policies {
+        if self.settings.config.evaluation.keep_policies {
             let path = self.settings.run.evaluated_policy(header.env_steps);
             self.write_policy(&published, return_mean, return_std, &path)?;
         }
-        let period = self.settings.evaluation.period(header.env_steps);
+        let period = self.settings.config.evaluation.period(header.env_steps);
         self.evaluated_period = Some(period);
         let evaluation = EvaluationReport {
             policy_version: header.version,
@@ -217,7 +217,7 @@ impl<'a> Evaluator<'a> {
             updates: header.updates,
             return_mean,
             return_std,
-            episodes: self.settings.evaluation.episodes,
+            episodes: self.settings.config.evaluation.episodes,
             best: best.into(),
         };
         // Before the report: if this process dies in between, its successor sends the report.
@@ -238,7 +238,7 @@ impl<'a> Evaluator<'a> {
             parameters: published.parameters().to_vec(),
             confirmed: None,
         };
-        let evaluation = &self.settings.evaluation;
+        let evaluation = &self.settings.config.evaluation;
         let first = evaluation.episodes;
         let episodes = first.saturating_mul(evaluation.confirm);
         let best = self.best.take();
@@ -284,8 +284,9 @@ impl<'a> Evaluator<'a> {
             evaluated_reports,
             ..
         } = self;
-        let due =
-            |header: &PolicyHeader| evaluated_period.is_none_or(|j| settings.evaluation.period(header.env_steps) > j);
+        let due = |header: &PolicyHeader| {
+            evaluated_period.is_none_or(|j| settings.config.evaluation.period(header.env_steps) > j)
+        };
         let published = wait_for(
             listener,
             stop,
@@ -365,7 +366,7 @@ impl<'a> Evaluator<'a> {
             env_steps: header.env_steps,
             return_mean,
             return_std,
-            episodes: self.settings.evaluation.episodes.into(),
+            episodes: self.settings.config.evaluation.episodes.into(),
             parameters: published.parameters().to_vec(),
         };
         Ok(file.write(path)?)

@@ -3,7 +3,7 @@
 use rand::RngExt;
 use rand_distr::StandardNormal;
 use shoal_common::algorithms::{Behaviour, Epsilon, Warmup};
-use shoal_common::network::{ActionRange, GaussianPolicy, PolicyNetwork};
+use shoal_common::network::{ActionRange, DeterministicPolicy, GaussianPolicy};
 use shoal_common::policy::{PolicyLayout, Scores, highest};
 use shoal_common::stream::{Stream, seek};
 
@@ -14,7 +14,7 @@ use crate::noise::OrnsteinUhlenbeck;
 #[derive(Clone, Debug)]
 pub enum Exploration {
     /// DDPG and TD3: the policy's action and noise (line 8 of Algorithm 4).
-    Noise(PolicyNetwork, OrnsteinUhlenbeck),
+    Noise(DeterministicPolicy, OrnsteinUhlenbeck),
     /// SAC: an action drawn from π(·|s).
     Gaussian(GaussianPolicy, Stream),
     /// REINFORCE: an action drawn from π(·|s), the softmax of the scores (line 3 of Algorithm 3).

@@ -21,7 +21,7 @@ use shoal_common::channel::reports::Reporter;
 use shoal_common::channel::transitions::{Chunk, ChunkSender};
 use shoal_common::channel::{ChannelError, Domain, EventName, HeartbeatSender, Listener, Notifier, wait_for};
 use shoal_common::commit::{CommitReader, OpenError};
-use shoal_common::config::{Algorithm, Config, Mode};
+use shoal_common::config::{Config, Mode};
 use shoal_common::exit::Exit;
 use shoal_common::report::{Activity, EpisodeReport, Identity, Role};
 use shoal_common::run_dir::RunDir;
@@ -49,22 +49,14 @@ const LAST_COMMIT_TIMEOUT: Duration = Duration::from_secs(1);
 pub struct ExplorerSettings {
     /// Which process this is.
     pub identity: Identity,
-    /// The run's seed.
-    pub seed: u64,
-    /// Free or lockstep. In lockstep, the actor waits for the policy of each round.
-    pub mode: Mode,
-    /// What the environment server is expected to serve.
-    pub spec: EnvironmentSpec,
+    /// The run's configuration. In lockstep, the actor waits for the policy of each round.
+    pub config: Config,
     /// Environments stepped at once.
     pub envs: usize,
     /// Steps of a transition.
     pub n_step: usize,
     /// The layout of a chunk.
     pub chunk: ChunkLayout,
-    /// How many chunks may be sent and not yet committed.
-    pub window: u32,
-    /// The algorithm, which determines the exploration.
-    pub algorithm: Algorithm,
     /// Whether the policy has learned before the run's first update, in another run.
     pub has_learned: bool,
     /// The replay file; its commit record shows which chunks have arrived.
@@ -76,14 +68,10 @@ impl ExplorerSettings {
     pub fn new(config: &Config, run: &RunDir, identity: Identity) -> Self {
         Self {
             identity,
-            seed: config.run.seed,
-            mode: config.run.mode,
-            spec: config.spec.clone(),
+            config: config.clone(),
             envs: config.actors.envs as usize,
             n_step: config.replay.n_step as usize,
             chunk: config.chunk_layout(),
-            window: config.actors.window,
-            algorithm: config.algorithm.clone(),
             has_learned: config.run.from.is_some(),
             replay: run.replay_file(),
         }
@@ -140,32 +128,39 @@ impl<'a> Explorer<'a> {
     fn new(domain: &Domain, settings: &'a ExplorerSettings, stop: &'a Stop) -> Result<Self, Exit<ActorError>> {
         let Identity { index, incarnation, .. } = settings.identity;
         let row = settings.chunk.row;
-        let layout = settings.algorithm.policy_layout(&settings.spec)?;
+        let layout = settings.config.policy_layout()?;
         let listener = Listener::bind(domain, EventName(Role::Actor, index))?;
         let mut heartbeat = HeartbeatSender::new(domain, settings.identity)?;
-        let client = connect(domain, &listener, index, &settings.spec, settings.envs, stop)?;
+        let client = connect(domain, &listener, index, &settings.config.spec, settings.envs, stop)?;
         let policy = PolicyReader::open(domain, layout.fingerprint(), layout.parameters())?;
         heartbeat.beat(Activity::WaitingForPeer);
 
         let commits = wait_for_replay(settings, &listener, stop, &mut heartbeat)?;
-        let handshake = ChunkSender::open(domain, index, incarnation, settings.chunk, settings.window)?;
+        let handshake = ChunkSender::open(
+            domain,
+            index,
+            incarnation,
+            settings.chunk,
+            settings.config.actors.window,
+        )?;
         let learner = Notifier::new(domain, EventName(Role::Learner, 0))?;
         learner.notify();
         let sender = handshake
             .wait(&commits, &listener, stop, || heartbeat.beat(Activity::WaitingForPeer))
             .map_err(Exit::widen)?;
         // In lockstep the bits must not depend on how often an actor was started: it continues after its last chunk.
-        let incarnation = match settings.mode {
+        let incarnation = match settings.config.run.mode {
             Mode::Lockstep => 0,
             Mode::Free => incarnation,
         };
-        let stream = stream(settings.seed, Purpose::Exploration, index.into(), incarnation);
-        let exploration = Exploration::new(
-            settings.algorithm.behaviour(&settings.spec, settings.envs)?,
-            settings.envs,
-            stream,
+        let stream = stream(
+            settings.config.run.seed,
+            Purpose::Exploration,
+            index.into(),
+            incarnation,
         );
-        let snapshot = if settings.mode == Mode::Lockstep && sender.sent() > 0 {
+        let exploration = Exploration::new(settings.config.behaviour(settings.envs)?, settings.envs, stream);
+        let snapshot = if settings.config.run.mode == Mode::Lockstep && sender.sent() > 0 {
             let words = commits.actor_snapshot(index as usize);
             let n_step = row.n_step_words(settings.n_step, settings.envs);
             ActorSnapshot::read(
@@ -221,7 +216,7 @@ impl<'a> Explorer<'a> {
     /// there is one.
     fn begin(&mut self) -> Result<Observed, Exit<ActorError>> {
         self.n_step.clear();
-        if self.settings.mode == Mode::Free {
+        if self.settings.config.run.mode == Mode::Free {
             (0..self.settings.envs).for_each(|environment| self.begin_episode(environment));
             return self.reset(Begin::Next);
         }
@@ -301,13 +296,13 @@ impl<'a> Explorer<'a> {
     /// Whether the chunk is full or, if a chunk is one episode, the episode is over.
     fn chunk_is_complete(&self) -> bool {
         let episode_is_over =
-            self.settings.algorithm.spec().experience == Experience::Episodes && !self.ended.is_empty();
+            self.settings.config.algorithm.spec().experience == Experience::Episodes && !self.ended.is_empty();
         self.chunk.is_full() || episode_is_over
     }
 
     /// Waits for the policy to act with: the newest, or in lockstep the one after the last round.
     fn await_policy(&mut self) -> Result<Rc<Policy>, Exit<ChannelError>> {
-        let wanted = match self.settings.mode {
+        let wanted = match self.settings.config.run.mode {
             Mode::Free => 0,
             Mode::Lockstep => self.sender.sent(),
         };
@@ -361,7 +356,7 @@ impl<'a> Explorer<'a> {
     /// Adds the transition of every environment to the chunk (line 10 of Algorithm 4).
     fn store(&mut self, current: &Observed, next: &Observed, version: u64) {
         let width = self.settings.chunk.row.action_width();
-        let gamma = self.settings.algorithm.gamma() as f32;
+        let gamma = self.settings.config.algorithm.gamma() as f32;
         self.policy_version = version;
         for e in 0..self.settings.envs {
             let (terminated, truncated) = (next.terminated(e), next.truncated(e));
@@ -437,7 +432,7 @@ impl<'a> Explorer<'a> {
         } = self;
         let has_capacity = || {
             let committed = commits.committed(settings.identity.index as usize);
-            (sender.in_flight(committed) < u64::from(settings.window)).then_some(())
+            (sender.in_flight(committed) < u64::from(settings.config.actors.window)).then_some(())
         };
         if has_capacity().is_some() {
             return Ok(());
@@ -469,11 +464,11 @@ impl<'a> Explorer<'a> {
     /// a short time if the whole run ends. In lockstep incomplete chunks are dropped, because a round is complete or
     /// does not count.
     fn hand_over(&mut self) -> Result<(), ActorError> {
-        if self.settings.mode == Mode::Free {
+        if self.settings.config.run.mode == Mode::Free {
             self.n_step.complete_all();
             loop {
                 self.n_step.move_into(&mut self.chunk);
-                if self.chunk.is_empty() || !self.await_commits(u64::from(self.settings.window) - 1)? {
+                if self.chunk.is_empty() || !self.await_commits(u64::from(self.settings.config.actors.window) - 1)? {
                     break;
                 }
                 self.send()?;
@@ -513,7 +508,7 @@ pub(crate) fn connect(
 ) -> Result<EnvironmentClient, Exit<ActorError>> {
     let client = EnvironmentClient::open(domain, index, spec, envs, stop.clone())?;
     let (served, served_envs) = client.describe(listener, || ()).map_err(Exit::widen)?;
-    if !served.is(spec) || served_envs != envs {
+    if !served.matches(spec) || served_envs != envs {
         let served = format!("{served_envs} times {served:?}");
         let configured = format!("{envs} times {spec:?}");
         return Err(Exit::Failed(ActorError::Server {
@@ -525,8 +520,8 @@ pub(crate) fn connect(
     Ok(client)
 }
 
-/// Takes note of an answer that no environment may give; the next thing is to begin new episodes. The pause keeps an
-/// environment that always answers so from filling the log before the launcher ends the run for it.
+/// Logs an invalid answer of an environment server and pauses; the caller must then begin new episodes. Without the pause,
+/// an environment that always answers like this would fill the log before the launcher ends the run.
 pub(crate) fn after_fault(
     error: &ChannelError,
     heartbeat: &mut HeartbeatSender,

@@ -45,7 +45,7 @@ impl NStep {
         }
     }
 
-    /// Completes what is pending with the steps that there are, although the episodes are not over.
+    /// Completes all pending transitions with the steps they have, although the episodes are not over.
     pub fn complete_all(&mut self) {
         for steps in &mut self.pending {
             while !steps.is_empty() {
@@ -88,8 +88,8 @@ impl NStep {
         words
     }
 
-    /// Restores what [`words`](Self::words) returned for the same n, environments and row. Returns false, and holds
-    /// nothing, if it is something else.
+    /// Restores what [`words`](Self::words) returned for the same n, environments and row. Other words are refused: it
+    /// returns false and holds nothing.
     #[must_use]
     pub fn restore(&mut self, words: &[u64]) -> bool {
         self.clear();

@@ -10,7 +10,7 @@ use shoal_common::channel::transitions::ChunkSender;
 use shoal_common::channel::{Domain, EventName, Listener, Notifier};
 use shoal_common::commit::CommitReader;
 use shoal_common::config::Config;
-use shoal_common::network::{ActionRange, PolicyNetwork};
+use shoal_common::network::{ActionRange, DeterministicPolicy};
 use shoal_common::report::Role;
 use shoal_common::stream::{Purpose, stream};
 use shoal_env_server::vector::{Start, VectorEnvironment};
@@ -49,7 +49,7 @@ pub(super) struct Costs {
 
 /// The policy's forward pass for one step of all environments, as in an actor.
 pub(super) struct Inference {
-    policy: PolicyNetwork,
+    policy: DeterministicPolicy,
     parameters: Vec<f32>,
     observations: Vec<f32>,
     actions: Vec<f32>,
@@ -59,8 +59,8 @@ impl Inference {
     pub(super) fn new(config: &Config) -> anyhow::Result<Self> {
         let range = ActionRange::new(&config.spec.action)?;
         let actions = vec![0.0; ENVIRONMENTS * range.width()];
-        let width = config.spec.observation.width();
-        let policy = PolicyNetwork::new(width, ddpg(config)?.hidden_layers(), range, ENVIRONMENTS);
+        let network = ddpg(config)?.networks(&config.spec).actor;
+        let policy = DeterministicPolicy::new(network, range, ENVIRONMENTS);
         Ok(Self {
             parameters: initialise(policy.layout(), config.run.seed, 0),
             observations: Rows::new(config)?.observations().to_vec(),
@@ -87,11 +87,7 @@ pub(super) fn measure(length: Duration, budget: &Budget) -> anyhow::Result<Costs
     let inference_us = microseconds(each, budget, || inference.step())?;
 
     let stream = stream(config.run.seed, Purpose::Exploration, 0, 0);
-    let mut exploration = Exploration::new(
-        config.algorithm.behaviour(&config.spec, ENVIRONMENTS)?,
-        ENVIRONMENTS,
-        stream,
-    );
+    let mut exploration = Exploration::new(config.behaviour(ENVIRONMENTS)?, ENVIRONMENTS, stream);
     let mut step = 0;
     let acting_us = microseconds(each, budget, || {
         let Inference {

@@ -82,7 +82,7 @@ struct TwoThreads {
     updates: Windows,
 }
 
-/// Measures one of [`METHODS`](super::METHODS), by default DDPG.
+/// Measures one of the [methods](super::methods), by default DDPG.
 pub(super) fn measure(method: Option<&str>, budget: &Budget) -> anyhow::Result<LearnerFigures> {
     let temporary = TemporaryRun::with_method(method)?;
     let replay = Replay::create(&temporary.run.replay_file(), &temporary.replay_layout())?;
@@ -90,7 +90,7 @@ pub(super) fn measure(method: Option<&str>, budget: &Budget) -> anyhow::Result<L
     let config = temporary.remove_directory()?;
     let replay = filled(&config, replay, budget)?;
 
-    let batch = config.algorithm.settings().least_capacity() as usize;
+    let batch = config.algorithm.settings().batch();
     let mut configured = Case::new(&config, batch)?;
     let mut large = (batch != LARGE_BATCH)
         .then(|| Case::new(&config, LARGE_BATCH))
@@ -167,7 +167,7 @@ struct Case {
     learner: Box<dyn Algorithm>,
     batch: usize,
     flop_per_update: u64,
-    /// Updates that the list has the products of.
+    /// The number of updates whose products are in the list.
     updates_of_list: f64,
     list: List,
     fastest: Multiplication,

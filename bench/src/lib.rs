@@ -23,12 +23,15 @@ mod transitions;
 mod whole_run;
 mod window;
 
+use shoal_common::algorithms::Algorithm;
 use shoal_run::plan::UsageError;
 
 use self::measurement::{Budget, print};
 
 /// The methods that [`Stage::Learner`] can measure: those that learn from minibatches.
-pub const METHODS: [&str; 4] = ["ddpg", "td3", "sac", "dqn"];
+pub fn methods() -> impl Iterator<Item = &'static str> {
+    Algorithm::of_minibatches().map(|algorithm| algorithm.name())
+}
 
 /// A stage to measure.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use pulp::Arch;
 use serde::Serialize;
-use shoal_common::network::{ActionRange, NetworkLayout, PolicyNetwork};
+use shoal_common::network::{ActionRange, DeterministicPolicy, NetworkLayout};
 use shoal_common::stream::{Purpose, stream};
 use shoal_learner::networks::initialise::initialise;
 use shoal_learner::networks::product::{Product, Transposed};
@@ -53,7 +53,8 @@ pub(super) fn measure(budget: &Budget) -> anyhow::Result<PolicyFigures> {
     let range = ActionRange::new(&config.spec.action)?;
     let width = config.spec.observation.width();
     let mut actions = vec![0.0; ENVIRONMENTS * range.width()];
-    let mut policy = PolicyNetwork::new(width, ddpg(&config)?.hidden_layers(), range, ENVIRONMENTS);
+    let network = ddpg(&config)?.networks(&config.spec).actor;
+    let mut policy = DeterministicPolicy::new(network, range, ENVIRONMENTS);
     let layout = *policy.layout();
     let parameters = initialise(&layout, config.run.seed, 0);
     let rows = Rows::new(&config)?;

@@ -105,7 +105,7 @@ pub(super) fn open_commits(run: &RunDir) -> anyhow::Result<Option<CommitReader>>
 
 /// Opens a reader of the run's policies. The service allows one reader besides the roles.
 pub(super) fn policy_reader(config: &Config, domain: &Domain) -> anyhow::Result<PolicyReader> {
-    let layout = config.algorithm.policy_layout(&config.spec)?;
+    let layout = config.policy_layout()?;
     Ok(PolicyReader::open(domain, layout.fingerprint(), layout.parameters())?)
 }
 

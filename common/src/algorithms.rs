@@ -12,18 +12,18 @@ mod sac;
 mod tabular;
 mod td3;
 
-pub use algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Learned, Shape};
+pub use algorithm::{ActorCritic, AlgorithmSettings, AlgorithmSpec, Experience, Learned, Shape};
 pub use behaviour::{Behaviour, Epsilon};
 pub use ddpg::DdpgConfig;
 pub use dqn::DqnConfig;
 pub use exploration::{ExplorationConfig, Warmup};
-pub use preparation::{ObservationConfig, Preparation, RewardConfig};
-pub use reinforce::{ReinforceConfig, Weight};
+pub use preparation::{ObservationConfig, RewardConfig};
+pub use reinforce::{ReinforceConfig, ReinforceNetworks, Weight};
 pub use sac::SacConfig;
 use serde::Serialize;
 use shoal_base::section::{self, OutOfRange, Section, describe};
 use shoal_base::space::EnvironmentSpec;
-use shoal_policy::{Policy, PolicyError, PolicyLayout};
+use shoal_policy::PolicyError;
 pub use tabular::TabularConfig;
 pub use td3::Td3Config;
 
@@ -56,10 +56,20 @@ macro_rules! registry {
                 }
             }
 
-            /// As [`settings`](Self::settings).
-            pub fn settings_mut(&mut self) -> &mut dyn AlgorithmSettings {
+            /// γ, the discount of one step.
+            pub fn gamma(&self) -> f64 {
                 match self {
-                    $(Self::$variant(settings) => settings),*
+                    $(Self::$variant(settings) => settings.gamma),*
+                }
+            }
+
+            /// Checks every number of its sections.
+            ///
+            /// # Errors
+            /// For the first invalid number.
+            pub fn check(&self) -> Result<(), OutOfRange> {
+                match self {
+                    $(Self::$variant(settings) => settings.check_bounds($spec.name)),*
                 }
             }
 
@@ -109,14 +119,15 @@ impl Default for Algorithm {
 }
 
 impl Algorithm {
+    /// Each algorithm that learns from minibatches, with its default settings.
+    pub fn of_minibatches() -> impl Iterator<Item = Self> {
+        let all = Self::all().into_iter();
+        all.filter(|algorithm| algorithm.spec().experience == Experience::Minibatches)
+    }
+
     /// Its name, which is its section's.
     pub fn name(&self) -> &'static str {
         self.spec().name
-    }
-
-    /// γ, the discount of one step.
-    pub fn gamma(&self) -> f64 {
-        self.settings().gamma()
     }
 
     /// The settings of DDPG, if this is DDPG.
@@ -127,15 +138,7 @@ impl Algorithm {
         }
     }
 
-    /// Checks every number of its sections.
-    ///
-    /// # Errors
-    /// For the first invalid number.
-    pub fn check(&self) -> Result<(), OutOfRange> {
-        self.settings().check(self.name())
-    }
-
-    /// How its actors act in `batch` environments like `spec`.
+    /// How its actors act in `batch` environments like `spec`, if observations are not normalised.
     ///
     /// # Errors
     /// When it cannot control such environments.
@@ -143,20 +146,12 @@ impl Algorithm {
         self.settings().behaviour(self.name(), spec, batch)
     }
 
-    /// Its policy in an environment like `spec`, for at most `batch` observations a call.
+    /// Checks that it can control environments like `spec`.
     ///
     /// # Errors
-    /// When it cannot control that environment.
-    pub fn policy(&self, spec: &EnvironmentSpec, batch: usize) -> Result<Policy, PolicyError> {
-        Ok(self.behaviour(spec, batch)?.into_policy())
-    }
-
-    /// The layout of that policy's parameters.
-    ///
-    /// # Errors
-    /// When it cannot control that environment.
-    pub fn policy_layout(&self, spec: &EnvironmentSpec) -> Result<PolicyLayout, PolicyError> {
-        Ok(self.policy(spec, 0)?.layout())
+    /// When it cannot.
+    pub fn check_spaces(&self, spec: &EnvironmentSpec) -> Result<(), PolicyError> {
+        self.behaviour(spec, 0).map(drop)
     }
 }
 
@@ -181,7 +176,7 @@ mod tests {
         let takes = |observation: fn() -> Space, action: fn() -> Space| -> Vec<bool> {
             let spec = spec(observation(), action());
             let all = Algorithm::all().into_iter();
-            all.map(|algorithm| algorithm.policy_layout(&spec).is_ok()).collect()
+            all.map(|algorithm| algorithm.check_spaces(&spec).is_ok()).collect()
         };
         let (yes, no) = (true, false);
         // DDPG, TD3, SAC, DQN, REINFORCE, Q-learning, SARSA.
@@ -214,10 +209,13 @@ mod tests {
         for algorithm in Algorithm::all() {
             let fits = specs
                 .iter()
-                .find_map(|spec| Some((spec, algorithm.policy_layout(spec).ok()?)));
-            let (spec, layout) = fits.unwrap();
-            let (_, policy) = algorithm.settings().learned(spec).policy;
-            assert_eq!(policy.parameters(), layout.parameters(), "{}", algorithm.name());
+                .find_map(|spec| Some((spec, algorithm.behaviour(spec, 0).ok()?)));
+            let (spec, behaviour) = fits.unwrap();
+            for normalised in [false, true] {
+                let layout = behaviour.clone().normalising(normalised).into_policy().layout();
+                let (_, policy) = algorithm.settings().learned(spec).normalising(normalised).policy;
+                assert_eq!(policy.parameters(), layout.parameters(), "{}", algorithm.name());
+            }
         }
     }
 }

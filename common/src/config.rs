@@ -30,13 +30,13 @@ use shoal_base::section;
 pub use shoal_base::section::{Change, OutOfRange};
 use shoal_base::space::EnvironmentSpec;
 use shoal_base::transition::{ChunkLayout, RowLayout};
-use shoal_policy::PolicyError;
+use shoal_policy::{Policy, PolicyError, PolicyLayout};
 
-use crate::algorithms::Experience;
 pub use crate::algorithms::{
-    Algorithm, DdpgConfig, DqnConfig, ExplorationConfig, ObservationConfig, Preparation, ReinforceConfig, RewardConfig,
-    SacConfig, TabularConfig, Td3Config, Warmup, Weight,
+    Algorithm, DdpgConfig, DqnConfig, ExplorationConfig, ObservationConfig, ReinforceConfig, RewardConfig, SacConfig,
+    TabularConfig, Td3Config, Warmup, Weight,
 };
+use crate::algorithms::{Behaviour, Experience, Learned};
 
 /// The complete configuration of a run.
 #[derive(Clone, Debug, PartialEq)]
@@ -51,6 +51,10 @@ pub struct Config {
     pub actors: ActorsConfig,
     /// The algorithm and its settings.
     pub algorithm: Algorithm,
+    /// How observations are prepared for networks. Only methods that learn from minibatches have a choice.
+    pub observation: ObservationConfig,
+    /// How rewards are prepared. Only methods that learn from minibatches have a choice.
+    pub reward: RewardConfig,
     /// The learner's threads.
     pub learner: LearnerConfig,
     /// The replay, and the ratio of updates to environment steps.
@@ -143,6 +147,37 @@ impl Config {
         })
     }
 
+    /// How actors act in `batch` environments.
+    ///
+    /// # Errors
+    /// When the algorithm cannot control the environment; a checked configuration has no such algorithm.
+    pub fn behaviour(&self, batch: usize) -> Result<Behaviour, PolicyError> {
+        let behaviour = self.algorithm.behaviour(&self.spec, batch)?;
+        Ok(behaviour.normalising(self.observation.normalise))
+    }
+
+    /// The policy without exploration, for at most `batch` observations a call.
+    ///
+    /// # Errors
+    /// As [`behaviour`](Self::behaviour).
+    pub fn policy(&self, batch: usize) -> Result<Policy, PolicyError> {
+        Ok(self.behaviour(batch)?.into_policy())
+    }
+
+    /// The layout of the policy's parameters.
+    ///
+    /// # Errors
+    /// As [`behaviour`](Self::behaviour).
+    pub fn policy_layout(&self) -> Result<PolicyLayout, PolicyError> {
+        Ok(self.policy(0)?.layout())
+    }
+
+    /// The networks or tables that are learned.
+    pub fn learned(&self) -> Learned {
+        let learned = self.algorithm.settings().learned(&self.spec);
+        learned.normalising(self.observation.normalise)
+    }
+
     /// Rows in a full chunk.
     pub fn chunk_rows(&self) -> usize {
         (self.actors.chunk_steps * self.actors.envs) as usize
@@ -181,7 +216,8 @@ impl Config {
             // The actor's step; for each environment the state of its exploration and its episode's return and length;
             // and what is not in a chunk yet.
             (Mode::Lockstep, snapshot) => {
-                let exploration = self.algorithm.settings().exploration_state_width(&self.spec);
+                // An algorithm that cannot control the environment is refused before there is a snapshot.
+                let exploration = self.behaviour(0).map_or(0, |behaviour| behaviour.state_width());
                 let n_step = self.row_layout().n_step_words(self.replay.n_step as usize, envs);
                 snapshot + 1 + envs * (exploration + 2) + n_step
             }
@@ -199,13 +235,15 @@ impl Config {
         self.actors.check()?;
         self.algorithm.check()?;
         self.algorithm
-            .policy_layout(&self.spec)
+            .check_spaces(&self.spec)
             .map_err(|cause| ConfigError::Control {
                 algorithm: self.algorithm.name(),
                 environment: self.environment.name.clone(),
                 cause,
                 fitting: self.fitting(),
             })?;
+        self.observation.check_bounds("observation")?;
+        self.reward.check_bounds("reward")?;
         self.replay.check(&self.algorithm)?;
         self.check_collection()?;
         self.learner.check_bounds("learner")?;
@@ -216,7 +254,7 @@ impl Config {
     /// The names of the algorithms that can control the environment.
     fn fitting(&self) -> String {
         let all = Algorithm::all().into_iter();
-        let fitting = all.filter(|algorithm| algorithm.policy_layout(&self.spec).is_ok());
+        let fitting = all.filter(|algorithm| algorithm.check_spaces(&self.spec).is_ok());
         let names: Vec<&str> = fitting.map(|algorithm| algorithm.name()).collect();
         if names.is_empty() {
             "another environment".into()

@@ -48,7 +48,7 @@ pub enum RunDirError {
     },
 }
 
-/// The directory in which `shoal train` makes its runs, if the path is a bare name that is a run there.
+/// A hint for a bare name that is a run in `runs`, where `shoal train` makes its runs; otherwise empty.
 fn did_you_mean(path: &Path) -> String {
     let there = Path::new("runs").join(path);
     if path.components().count() == 1 && there.join("config.toml").is_file() {
@@ -118,7 +118,7 @@ impl RunDir {
                 })
         };
         make().inspect_err(|_| {
-            // Directories that another process uses meanwhile are not empty, and stay.
+            // A directory that another process has begun to use is not empty, so it stays.
             for above in missing {
                 let _ = std::fs::remove_dir(above);
             }

@@ -15,8 +15,8 @@ const EPISODE_BITS: u32 = 40;
 /// `count` environments of one kind, each in its own episode.
 ///
 /// All random numbers of training episode k of environment e come from stream (e, k) of `stream(seed, Environment,
-/// server, incarnation)`, those of evaluation episode k from `stream(seed, Evaluation, k, 0)`: these numbers alone
-/// determine an episode, not what was run before it.
+/// server, incarnation)`, those of evaluation episode k from `stream(seed, Evaluation, k, 0)`. So an episode does not
+/// depend on what was run before it.
 pub struct VectorEnvironment {
     spec: EnvironmentSpec,
     training: Stream,
@@ -41,7 +41,7 @@ struct Running {
 #[derive(Clone, Copy)]
 struct Evaluation {
     seed: u64,
-    /// The first number that is none of them.
+    /// The number after the last one.
     end: Option<u64>,
 }
 
@@ -52,15 +52,15 @@ pub enum Start<'a> {
     Next,
     /// Environment e in training episode `episodes[e]`, below 2⁴⁰; its later episodes are counted from there.
     Episodes(&'a [u64]),
-    /// Environment e in evaluation episode `first` + e. Of E environments, each continues with the episode E later, so
-    /// that together they run every episode from `first` on exactly once.
+    /// Environment e in evaluation episode `first` + e. The next episode of each is the one E later, where E is the
+    /// number of environments: together they run every episode from `first` on exactly once.
     Evaluation {
         /// Seed of the evaluation, not necessarily the run's.
         seed: u64,
         /// Number of the first episode.
         first: u64,
-        /// How many episodes there are; an environment whose next one is none of them stays as it is at its end, whatever it
-        /// is asked to do. `None`: no limit.
+        /// The number of episodes; `None` if there is no limit. An environment that has no further episode stays in its
+        /// last state, whatever the actions.
         episodes: Option<u32>,
     },
     /// Environment e in state e of E concatenated physical states. Training episodes follow.

@@ -4,6 +4,30 @@
 //! replay in three steps that cannot be taken out of order: [`Replay::begin`], [`Reserved::fill`], [`Filled::commit`].
 //! A process that is killed between any two instructions leaves the last committed state. `docs/REPLAY_FORMAT.md` has
 //! the layout, the invariants and what survives a power loss.
+//!
+//! ```
+//! use shoal_common::transition::{RowLayout, Transition};
+//! use shoal_learner::replay::{Appended, ChunkMark, Replay, ReplayLayout};
+//!
+//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! let row = RowLayout::new(2, 1); // two numbers of an observation, one of an action
+//! let layout = ReplayLayout { row, ring: 100, actors: 1, actor_snapshot_words: 0, fingerprint: 0 };
+//! let directory = tempfile::tempdir()?;
+//! let mut replay = Replay::create(&directory.path().join("replay.bin"), &layout)?;
+//!
+//! let (s, a, s_next) = ([0.0, 1.0], [0.5], [0.1, 0.9]);
+//! let transition = Transition { s: &s, a: &a, r: -1.0, discount: 0.99, s_next: &s_next, last: false };
+//! let mut chunk = vec![0.0; row.width()]; // of one row
+//! row.write(&transition, &mut chunk);
+//! let mark = ChunkMark { incarnation: 0, sequence: 1 };
+//! assert_eq!(replay.append_and_commit(0, mark, &chunk)?, Appended::Accepted);
+//! // After a crash a chunk may arrive again.
+//! assert_eq!(replay.append_and_commit(0, mark, &chunk)?, Appended::Duplicate);
+//! assert_eq!(replay.rows(), 0..1);
+//! assert_eq!(row.read(replay.row(0)).r, -1.0);
+//! # Ok(())
+//! # }
+//! ```
 
 mod append;
 mod begin;

@@ -213,7 +213,7 @@ impl<'a> Gate<'a> {
                 Err(error) => return Err(error.into()),
             }
         };
-        let layout = config.algorithm.policy_layout(&config.spec)?;
+        let layout = config.policy_layout()?;
         let policy = PolicyReader::open(domain, layout.fingerprint(), layout.parameters())?;
         let requests = Requests::start(&config.run.id, config.actors.max, run.key()?)?;
         let session = network::listen(&settings.endpoint, settings.key.as_ref())?;

@@ -6,7 +6,7 @@ mod tensors;
 use std::collections::BTreeMap;
 
 use shoal_common::config::Config;
-use shoal_common::network::{ActionRange, Activation, CLIP, NetworkLayout};
+use shoal_common::network::{ActionRange, Activation, NetworkLayout, OBSERVATION_CLIP};
 use shoal_common::policy::{PolicyLayout, combine_heads};
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::space::Space;
@@ -207,7 +207,7 @@ fn metadata(config: &Config, file: &PolicyFile, which: &str, body: &Body) -> any
         };
         insert("hidden_activation", activation.into());
         if network.normalisation.is_some() {
-            insert("observation_clip", CLIP.to_string());
+            insert("observation_clip", OBSERVATION_CLIP.to_string());
         }
     }
     match body {
@@ -236,7 +236,7 @@ mod tests {
 
     #[test]
     fn weights_are_exported_in_row_major_order() {
-        let layout = NetworkLayout::policy(3, Hidden::relu([2, 1]), 1);
+        let layout = NetworkLayout::new(3, Hidden::relu([2, 1]), 1);
         let parameters: Vec<f32> = (0..layout.parameters()).map(|i| i as f32).collect();
         let first = &Network::new(&layout, &parameters).layers[0];
         assert_eq!(first.weights, [0.0, 2.0, 4.0, 1.0, 3.0, 5.0]);

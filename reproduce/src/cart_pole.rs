@@ -213,7 +213,7 @@ observation, and nothing more is learned. Such seeds are counted like the others
 /// Whether the last policy has the same scores for many random states within the bounds of an episode.
 fn is_dead(policies: &Policies) -> anyhow::Result<bool> {
     const STATES: usize = 200;
-    let Policy::Scored(mut scores) = policies.config.algorithm.policy(&policies.config.spec, STATES)? else {
+    let Policy::Scored(mut scores) = policies.config.policy(STATES)? else {
         return Ok(false);
     };
     let mut numbers = stream(policies.config.run.seed, Purpose::Sampling, 0, 0);

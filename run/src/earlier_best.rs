@@ -12,17 +12,17 @@ use crate::signals::Interrupt;
 /// The best policy's mean return before, and the one now.
 #[derive(Clone, Debug, PartialEq)]
 pub struct EvaluatedAnew {
-    /// What `best.policy` said.
+    /// The one stored in `best.policy` before.
     pub before: f64,
-    /// What it says now.
+    /// The one stored now.
     pub now: EvaluationSummary,
 }
 
-/// Evaluates the best policy of a Gymnasium run of an earlier version anew, once. The seeds of its episodes were not below
-/// 2³¹ then, so half of its starts were others, and it may have been better or worse by luck alone.
+/// Evaluates the best policy of a Gymnasium run of an earlier version again, once. In that version the seeds of episodes
+/// could be above 2³¹, so half of the starts differ from today's. By luck alone, the policy may have looked better or worse.
 ///
-/// Such a run has no `server.json`, which came with the same version as the new seeds. This writes it, as the sign that
-/// nothing is left to do.
+/// Such a run has no `server.json`, which came with the same version as the new seeds. This function writes that file, so
+/// the next call finds nothing to do.
 ///
 /// # Errors
 /// When the policy cannot be read or written, the environment fails, or a signal has arrived.

@@ -54,9 +54,8 @@ pub fn evaluate(config: &Config, parameters: &[f32], episodes: u32, seed: u64) -
     evaluate_by(Rollout::new(config, parameters)?, config, episodes, seed, |_| ())
 }
 
-/// The same for this run: an environment that another program serves is served as in training. A signal ends it with an
-/// error. It calls `progress` with the number of finished
-/// episodes.
+/// As [`evaluate`], for a run: an environment that another program serves is started as in training. Calls `progress`
+/// with the number of finished episodes.
 ///
 /// # Errors
 /// When the environment fails, or a signal has arrived.

@@ -34,7 +34,7 @@ use crate::signals::Interrupt;
 /// The prefix of the names of Gymnasium environments.
 pub const GYMNASIUM: &str = "gym:";
 
-/// How long a program may take to end that has left shared memory.
+/// How long a program may take to end after it has left shared memory.
 const LAST_WORDS: Duration = Duration::from_secs(2);
 
 /// A start that takes longer is reported to the user.
@@ -46,7 +46,7 @@ pub fn default_command(name: &str) -> Option<Vec<String>> {
     name.starts_with(GYMNASIUM).then(gymnasium)
 }
 
-/// The file with which other programs find the run `run_id` in shared memory. It goes with the run's files there.
+/// The file with which other programs find the run `run_id` in shared memory. It is removed with the run's files there.
 ///
 /// # Errors
 /// When the user's directory cannot be used.
@@ -269,7 +269,8 @@ impl ExternalEnvironment {
         )
     }
 
-    /// The same in these surroundings. A signal ends this and every later wait for an answer.
+    /// As [`begin`](Self::begin), but with this location and environment variables. A signal ends this and every later
+    /// wait for an answer.
     ///
     /// # Errors
     /// As for [`begin`](Self::begin), and when a signal has arrived.
@@ -465,14 +466,14 @@ fn stop_when_it_ends(program: &Peer, has_answered: Stop, environment: &Environme
     Ok(stop)
 }
 
-/// The result, where the end of the program takes precedence as the error; `None` if it has not answered within its limit.
+/// The result; `None` if the program has not answered within its limit. If the program has ended, that is the error.
 fn checked<T>(result: Result<T, Exit<ChannelError>>, program: &mut Peer) -> anyhow::Result<Option<T>> {
     result.map(Some).or_else(|exit| {
         program.check()?;
         match exit {
             Exit::Stopped => Ok(None),
             Exit::Failed(error) => match (error.fault(), program.last_line()) {
-                // What it was stands there.
+                // Its last line describes the fault.
                 (Some(Fault::Reported), Some(line)) => bail!("{line}"),
                 _ => Err(error.into()),
             },

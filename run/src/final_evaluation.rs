@@ -9,7 +9,7 @@ use shoal_common::run_dir::RunDir;
 
 use crate::evaluation::{EvaluationSummary, WhichPolicy};
 
-/// The number of the file's format.
+/// The version of the file's format.
 const FORMAT: u32 = 1;
 
 /// What the final evaluation of a run found.
@@ -18,11 +18,11 @@ pub struct FinalEvaluation {
     format: u32,
     /// The seed of the start states.
     pub seed: u64,
-    /// The run's environment steps at the time. A run that has more now was resumed since.
+    /// The run's environment steps at that time. A run that has more now has been resumed.
     pub env_steps: u64,
     /// The evaluated policies.
     pub policies: Vec<FinallyEvaluated>,
-    /// The better policy by this evaluation. It is `best.policy` since.
+    /// The better policy by this evaluation, which then became `best.policy`.
     pub kept: FinalPolicy,
 }
 
@@ -39,7 +39,7 @@ pub enum FinalPolicy {
 /// A policy's result in the final evaluation. A number that is not finite is `None`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct FinallyEvaluated {
-    /// Which policy it was when it was evaluated.
+    /// Whether it was the best or the last policy when it was evaluated.
     pub policy: FinalPolicy,
     /// Its version.
     pub version: u64,

@@ -47,7 +47,7 @@ fn fill(run: &RunDir, configuration: &str, first_incarnation: u64, interrupt: In
         let surroundings = Surroundings::of_run(run, &config)?;
         let environment = ExternalEnvironment::begin_in(&config.environment, 1, 0, surroundings, interrupt)?;
         let found = environment.spec();
-        if !found.is(&config.spec) {
+        if !found.matches(&config.spec) {
             bail!(
                 "the environment {} has other spaces on this host: {found:?} instead of {:?}",
                 config.environment.name,

@@ -3,6 +3,7 @@
 
 pub mod analysis;
 pub mod batch;
+pub mod client;
 pub mod description;
 pub mod earlier_best;
 pub mod evaluation;
@@ -18,7 +19,6 @@ pub mod preflight;
 pub mod process;
 pub mod rate;
 pub mod recorder;
-pub mod remote;
 pub mod rollout;
 pub mod server_location;
 pub mod signals;

@@ -53,7 +53,7 @@ pub(crate) fn asked_for(method: Option<&str>, set: &[String]) -> anyhow::Result<
     Ok(asked)
 }
 
-/// The method whose section is in the table. Without one, the noise of DDPG's actors names DDPG.
+/// The method whose section is in the table; DDPG if there is only `[exploration]`, the noise of its actors.
 pub(crate) fn named_in(table: &Table) -> Option<&'static str> {
     names()
         .find(|name| table.contains_key(*name))
@@ -66,7 +66,7 @@ pub(crate) fn replace(preset: &mut Table, method: &'static str) -> anyhow::Resul
     preset.retain(|section, _| ["run", "environment", "evaluation"].contains(&section));
     if let Some(Value::Table(run)) = preset.get_mut("run") {
         run.remove("mode");
-        // The steps alone would be a limit that this preset's episodes were expected to reach first.
+        // A preset that ends by episodes has steps only as an upper bound. The method's own steps replace them.
         if run.contains_key("episodes") {
             run.remove("steps");
         }

@@ -234,9 +234,9 @@ impl Predecessor {
             }
         };
         let Checkpoint { counters, sections } = &self.checkpoint;
-        let weights = registry::weights(&config.algorithm);
+        let weights = registry::weights(config);
         let fresh = registry::new(config)?;
-        let state = registry::inherited(&*fresh, weights, SavedState::from(sections.clone()), rows)?;
+        let state = registry::inherited(&*fresh, &weights, SavedState::from(sections.clone()), rows)?;
         let borrowed: Vec<(&str, &[f32])> = state
             .iter()
             .map(|(name, numbers)| (*name, numbers.as_slice()))

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use shoal_common::durable::write_atomically;
 use shoal_common::run_dir::RunDir;
 
-/// The number of the file's format.
+/// The version of the file's format.
 const FORMAT: u32 = 1;
 
 /// The reason in the outcome of a run whose launcher answers no questions yet. Its state is `Running`.

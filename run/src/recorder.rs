@@ -50,7 +50,7 @@ pub struct EvaluationRecord {
     pub wall_seconds: f64,
     /// Environment steps the policy was learned from.
     pub env_steps: u64,
-    /// Updates the policy results from: gradient steps, or consumed rows for methods that use each row once.
+    /// Updates that made the policy: gradient steps, or consumed rows for methods that use each row once.
     pub updates: u64,
     /// Version of the policy.
     pub policy_version: u64,
@@ -162,8 +162,7 @@ impl Recorder {
     }
 
     /// Records an exploration episode that ended `wall` after this launcher's start. Its steps are those of all actors by
-    /// then. Reports of several actors may arrive in another order, and a replay may have lost rows; still the recorded
-    /// steps never fall.
+    /// then. They never fall, even if reports arrive out of order or a replay has lost rows.
     pub fn episode(&mut self, report: &EpisodeReport, wall: Duration) -> Result<(), RecordError> {
         self.episode_steps = self.episode_steps.max(report.env_steps);
         self.episodes.write(&EpisodeRecord {
@@ -272,7 +271,7 @@ impl Recorder {
         self.incidents.flush()
     }
 
-    /// Hands everything to the kernel; it then survives the death of this process.
+    /// Writes everything to the files, so that it survives the death of this process.
     pub fn flush(&mut self) -> Result<(), RecordError> {
         self.flushed = Instant::now();
         for table in [&mut self.episodes, &mut self.evaluations, &mut self.learner] {

@@ -105,7 +105,7 @@ impl<'a> Rollout<'a> {
         })
     }
 
-    /// The same for this run: an environment that another program serves is served as in training.
+    /// As [`new`](Self::new), for a run: an environment that another program serves is started as in training.
     pub fn of_run(run: &RunDir, config: &'a Config, parameters: &'a [f32]) -> anyhow::Result<Self> {
         Ok(Self {
             surroundings: Surroundings::of_run(run, config)?,
@@ -271,7 +271,7 @@ impl Host {
 fn check_spec(config: &Config, found: &EnvironmentSpec) -> anyhow::Result<()> {
     let name = &config.environment.name;
     ensure!(
-        found.is(&config.spec),
+        found.matches(&config.spec),
         "config.toml: [spec] does not match the environment {name}"
     );
     Ok(())
@@ -279,17 +279,11 @@ fn check_spec(config: &Config, found: &EnvironmentSpec) -> anyhow::Result<()> {
 
 /// The layout that a policy file of this run must have.
 pub fn policy_layout(config: &Config) -> anyhow::Result<PolicyLayout> {
-    config
-        .algorithm
-        .policy_layout(&config.spec)
-        .with_context(|| config.environment.name.clone())
+    config.policy_layout().with_context(|| config.environment.name.clone())
 }
 
 fn policy_of(config: &Config) -> anyhow::Result<Policy> {
-    config
-        .algorithm
-        .policy(&config.spec, 1)
-        .with_context(|| config.environment.name.clone())
+    config.policy(1).with_context(|| config.environment.name.clone())
 }
 
 #[cfg(test)]

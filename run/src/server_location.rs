@@ -14,7 +14,7 @@ use shoal_common::config::{Config, Mode};
 use shoal_common::durable::write_atomically;
 use shoal_common::run_dir::RunDir;
 
-/// The number of the file's form.
+/// The version of the file's format.
 const FORMAT: u32 = 1;
 
 /// A directory and a program, both absolute. Symbolic links are kept: Python finds its virtual environment by them.
@@ -28,7 +28,7 @@ pub struct ServerLocation {
     file: Option<PathBuf>,
 }
 
-/// A path as JSON has it: a text, or the bytes of one that is not UTF-8.
+/// A path in JSON: text, or a list of bytes if it is not UTF-8.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(untagged)]
 enum PathText {
@@ -53,8 +53,7 @@ impl PathText {
 }
 
 impl ServerLocation {
-    /// Where this command would be started now: in the current directory, its program found as a shell finds it. `None` for
-    /// an empty command.
+    /// The current directory, and the program of this command as a shell would find it. `None` for an empty command.
     ///
     /// # Errors
     /// When there is no such program.
@@ -75,10 +74,11 @@ impl ServerLocation {
         }))
     }
 
-    /// That of the run; `None` where the environment is one of ours, or the run is of a version before this file.
+    /// The location of the run's server; `None` if the environment is built in, or the run is older than this file.
     ///
     /// # Errors
-    /// When the file cannot be read, or is damaged or of another form; when the directory or the program is no more.
+    /// When the file cannot be read, is damaged or has another format, or when the directory or the program no longer
+    /// exists.
     pub fn of_run(run: &RunDir) -> anyhow::Result<Option<Self>> {
         let file = run.server_file();
         let text = match std::fs::read(&file) {
@@ -100,7 +100,7 @@ impl ServerLocation {
         Ok(Some(location))
     }
 
-    /// Writes it, whole or not at all.
+    /// Writes the file atomically.
     ///
     /// # Errors
     /// When it cannot be written.
@@ -151,17 +151,17 @@ fn is_program(path: &Path) -> bool {
     std::fs::metadata(path).is_ok_and(|metadata| metadata.is_file() && metadata.permissions().mode() & 0o111 != 0)
 }
 
-/// What surrounds an environment server that is another program, besides its arguments.
+/// Where an environment server that is another program is started, and with which environment variables.
 #[derive(Clone, Debug, Default)]
 pub struct Surroundings {
-    /// Where it is started. `None`: in the current directory, and `PATH` decides.
+    /// Its directory and program. `None`: the current directory, and the program that `PATH` leads to.
     pub location: Option<ServerLocation>,
-    /// What orders Python's sets: the environment variable `PYTHONHASHSEED`. `None`: as it is.
+    /// The environment variable `PYTHONHASHSEED`, which decides the order of Python's sets. `None`: unchanged.
     pub hash_seed: Option<u32>,
 }
 
 impl Surroundings {
-    /// Those of a run.
+    /// The surroundings of a run's server.
     ///
     /// # Errors
     /// As for [`ServerLocation::of_run`].
@@ -175,7 +175,7 @@ impl Surroundings {
 
 /// In lockstep the order of Python's sets follows from the run's seed.
 pub fn hash_seed(mode: Mode, seed: u64) -> Option<u32> {
-    // Of the seed's 64 bits, as many as Python takes.
+    // Python takes 32 of the seed's 64 bits.
     (mode == Mode::Lockstep).then_some(seed as u32)
 }
 

@@ -13,7 +13,7 @@ pub(crate) struct BenchArgs {
     #[arg(long, value_name = "N,N,…", allow_hyphen_values = true)]
     pub(crate) actors: Option<String>,
     /// With `learner`: the method to measure [default: ddpg].
-    #[arg(long, value_parser = PossibleValuesParser::new(shoal_bench::METHODS))]
+    #[arg(long, value_parser = PossibleValuesParser::new(shoal_bench::methods()))]
     pub(crate) method: Option<String>,
     /// Print one JSON object on standard output.
     #[arg(long)]

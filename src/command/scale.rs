@@ -8,8 +8,8 @@ use anyhow::bail;
 use clap::Args;
 use shoal_common::channel::control::{RoleState, RunStatus};
 use shoal_common::report::Role;
+use shoal_run::client::RunClient;
 use shoal_run::numbers::small_count;
-use shoal_run::remote::Remote;
 
 #[derive(Args, Clone, Debug)]
 pub(crate) struct ScaleArgs {
@@ -25,11 +25,11 @@ const PATIENCE: Duration = Duration::from_secs(60);
 
 /// Requests this number of actors, and waits until all of them are at work.
 pub(crate) fn run(args: &ScaleArgs) -> anyhow::Result<()> {
-    let remote = Remote::open(&args.run)?;
-    remote.scale(args.actors)?;
+    let client = RunClient::open(&args.run)?;
+    client.scale(args.actors)?;
     let (asked, here) = (Instant::now(), args.run.display());
     loop {
-        match remote.status()? {
+        match client.status()? {
             None => bail!("{here} has ended meanwhile"),
             Some(status) if status.actors != args.actors => {
                 bail!("another command scaled {here} to {} actors", status.actors)

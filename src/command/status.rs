@@ -11,8 +11,8 @@ use comfy_table::{CellAlignment, Table};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
 use shoal_common::channel::control::{HostState, HostStatus, RoleState, RunStatus};
+use shoal_run::client::RunClient;
 use shoal_run::numbers::thousands;
-use shoal_run::remote::Remote;
 use shoal_run::status::saved_status;
 
 #[derive(Args, Clone, Debug)]
@@ -43,9 +43,9 @@ struct Printed<'a> {
 
 /// Shows the run's status, once or until it ends.
 pub(crate) fn run(args: &StatusArgs) -> anyhow::Result<ExitCode> {
-    let remote = Remote::open(&args.run)?;
-    let Some(mut status) = remote.status()? else {
-        return show_saved(&args.run, args.json, &remote);
+    let client = RunClient::open(&args.run)?;
+    let Some(mut status) = client.status()? else {
+        return show_saved(&args.run, args.json, &client);
     };
     if !args.watch {
         show(args, &status, &mut std::io::stdout().lock())?;
@@ -59,20 +59,20 @@ pub(crate) fn run(args: &StatusArgs) -> anyhow::Result<ExitCode> {
             screen.set_message(table(&status));
         }
         std::thread::sleep(INTERVAL);
-        match remote.status()? {
+        match client.status()? {
             Some(newer) => status = newer,
             None => break,
         }
     }
     screen.finish_and_clear();
-    show_saved(&args.run, args.json, &remote)?;
+    show_saved(&args.run, args.json, &client)?;
     Ok(ExitCode::SUCCESS)
 }
 
 /// Shows the status of a run that is not running, by its files.
-pub(super) fn show_saved(run: &Path, json: bool, remote: &Remote) -> anyhow::Result<ExitCode> {
+pub(super) fn show_saved(run: &Path, json: bool, client: &RunClient) -> anyhow::Result<ExitCode> {
     // The configuration is read again: the run may have been scaled or extended since it was opened.
-    let status = saved_status(&remote.run.config()?, &remote.run)?;
+    let status = saved_status(&client.run.config()?, &client.run)?;
     let mut stdout = std::io::stdout().lock();
     let here = run.display();
     if json {

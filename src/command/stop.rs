@@ -4,7 +4,7 @@ use std::io::Write;
 use std::path::PathBuf;
 
 use clap::Args;
-use shoal_run::remote::Remote;
+use shoal_run::client::RunClient;
 
 #[derive(Args, Clone, Debug)]
 pub(crate) struct StopArgs {
@@ -14,7 +14,7 @@ pub(crate) struct StopArgs {
 
 /// Asks the launcher to end the run, and waits until it has ended.
 pub(crate) fn run(args: &StopArgs) -> anyhow::Result<()> {
-    Remote::open(&args.run)?.stop()?;
+    RunClient::open(&args.run)?.stop()?;
     writeln!(
         std::io::stdout(),
         "stopped; to continue: shoal resume {}",

@@ -14,7 +14,7 @@ use ratatui::crossterm::event::{self, Event, KeyCode, KeyEvent, KeyEventKind, Ke
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
 use shoal_common::config::{Config, Mode};
-use shoal_run::remote::Remote;
+use shoal_run::client::RunClient;
 use shoal_run::signals::{Signals, exit_code};
 use signal_hook::consts::SIGHUP;
 
@@ -35,20 +35,20 @@ const END_PATIENCE: Duration = Duration::from_secs(3);
 
 /// Shows the run until `q` or a signal, and then restores the terminal.
 pub(crate) fn run(args: &TopArgs) -> anyhow::Result<ExitCode> {
-    let remote = Remote::open(&args.run)?;
+    let client = RunClient::open(&args.run)?;
     if !(std::io::stdout().is_terminal() && std::io::stdin().is_terminal()) {
         bail!(
             "shoal top draws on a terminal, and this is not one; use `shoal status {} --watch`",
             args.run.display()
         );
     }
-    if remote.status()?.is_none() {
-        return show_saved(&args.run, false, &remote);
+    if client.status()?.is_none() {
+        return show_saved(&args.run, false, &client);
     }
     let signal = watched_signals()?;
     let here = args.run.display().to_string();
-    let mut screen = Screen::new(here, task(&remote.config), colours());
-    let link = Link::new(remote)?;
+    let mut screen = Screen::new(here, task(&client.config), colours());
+    let link = Link::new(client)?;
     let restore = RestoreOnDrop;
     let mut terminal = ratatui::try_init().context("cannot draw on this terminal")?;
     let shown = show(&mut terminal, &mut screen, &link, &signal);

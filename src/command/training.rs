@@ -252,12 +252,13 @@ impl Summary {
     }
 }
 
-/// SHA-256 of the learned weights in the newest checkpoint; for DDPG: actor, critic and both targets.
+/// SHA-256 of the learned weights in the newest checkpoint; for DDPG: actor, critic and both targets. If observations are
+/// normalised, their statistics are included.
 fn weights_sha256(config: &Config, run: &RunDir) -> anyhow::Result<Option<String>> {
     let loaded = Checkpoints::new(&run.checkpoints(), config.fingerprint()).load_newest()?;
     Ok(loaded.map(|loaded| {
         let section = |name| loaded.checkpoint.sections.iter().find(|(found, _)| found == name);
-        let weights = registry::weights(&config.algorithm).iter().filter_map(section);
+        let weights = registry::weights(config).into_iter().filter_map(section);
         digest::sha256(&weights.map(|(_, numbers)| numbers.as_slice()).collect::<Vec<_>>())
     }))
 }

@@ -13,11 +13,11 @@ use shoal_run::process::{Line, Writer};
 use tracing_subscriber::fmt::format;
 use tracing_subscriber::fmt::time::{FormatTime, SystemTime};
 
-/// Number of lines kept per process, for the message when it is given up.
+/// Last lines kept of each process: they are logged when it ends, and the last one is shown when it is given up.
 const KEPT: usize = 5;
 
-/// Bytes of the log that are for the lines of other programs: what is left of this when a launcher starts, and at least
-/// the other number. Shoal's own lines have no limit.
+/// Size of the log, in bytes, above which lines of other programs are left out. Each launcher accepts at least the second
+/// number of bytes from them. Shoal's own lines have no limit.
 const FOR_PROGRAMS: u64 = 16 * 1024 * 1024;
 const LEAST_FOR_PROGRAMS: u64 = 1024 * 1024;
 
@@ -27,7 +27,7 @@ pub(crate) const ALL_ENDED: &str = "every role has ended";
 /// The start of the launcher's last line if the run ended with an error.
 pub(crate) const FAILED: &str = "the run failed: ";
 
-/// Writes a line of the launcher into the log of a run whose roles have ended. A log that cannot be written is no error.
+/// Writes a line of the launcher into the log of a run whose roles have ended, if the log can be written.
 pub(crate) fn note(run: &RunDir, line: &str) {
     if let Ok(log) = Log::open(&run.log()) {
         log.note("launcher", line);
@@ -41,14 +41,14 @@ pub(super) struct Log(Arc<Mutex<Inner>>);
 #[derive(Debug)]
 struct Inner {
     file: File,
-    last: HashMap<String, VecDeque<Said>>,
+    last: HashMap<String, VecDeque<KeptLine>>,
     /// Bytes that other programs may still write.
     for_programs: u64,
 }
 
 /// A line that a process has written.
 #[derive(Debug)]
-struct Said {
+struct KeptLine {
     text: String,
     is_in_log: bool,
 }
@@ -74,7 +74,7 @@ impl Log {
         self.lock().write(who, line);
     }
 
-    /// Writes a line of output of `who`, if it may be in the log.
+    /// Writes a line of output of `who`, unless it exceeds a limit.
     pub(super) fn line(&self, who: &str, line: Line<'_>, writer: Writer) {
         let mut inner = self.lock();
         match line {
@@ -86,20 +86,20 @@ impl Log {
                 inner.remember(who, text, is_in_log);
             }
             Line::TooMuch(text) => inner.remember(who, text, false),
-            // Nothing more is said once the programs' lines are left out altogether.
+            // The log already says that it takes no more lines of programs.
             Line::LeftOut(_) if inner.for_programs == 0 => {}
             Line::LeftOut(count) => inner.write(who, &format!("… ({count} lines left out: too many at once)")),
         }
     }
 
-    /// Writes those of the last lines of `who` that were left out, because they matter: they say why it has failed.
+    /// Writes those of the last lines of `who` that were left out: they say why it has failed.
     pub(super) fn write_left_out(&self, who: &str) {
         let mut inner = self.lock();
-        for said in inner.last.remove(who).unwrap_or_default() {
-            if !said.is_in_log {
-                inner.write(who, &said.text);
+        for kept in inner.last.remove(who).unwrap_or_default() {
+            if !kept.is_in_log {
+                inner.write(who, &kept.text);
             }
-            inner.remember(who, &said.text, true);
+            inner.remember(who, &kept.text, true);
         }
     }
 
@@ -107,7 +107,7 @@ impl Log {
     pub(super) fn last_lines(&self, who: &str) -> Vec<String> {
         let inner = self.lock();
         let last = inner.last.get(who).into_iter().flatten();
-        last.map(|said| said.text.clone()).collect()
+        last.map(|kept| kept.text.clone()).collect()
     }
 
     fn lock(&self) -> MutexGuard<'_, Inner> {
@@ -133,7 +133,7 @@ impl Inner {
         if last.len() == KEPT {
             last.pop_front();
         }
-        last.push_back(Said {
+        last.push_back(KeptLine {
             text: text.into(),
             is_in_log,
         });
@@ -215,7 +215,7 @@ mod tests {
         assert!(!text().contains("too much at once"));
         log.write_left_out("env-server-1");
         assert!(text().contains("too much at once"));
-        // A launcher that goes on has a little left.
+        // A launcher that continues the run has a little left.
         let (log, text) = log_in(directory.path());
         log.line("env-server-0", Line::Kept("again"), Writer::Program);
         assert!(text().contains("again"));

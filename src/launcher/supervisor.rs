@@ -685,18 +685,17 @@ impl Supervisor {
         !matches!(role, Role::Actor | Role::EnvServer) || index >= self.max_actors || self.actors.contains(&index)
     }
 
+    /// One line: what happened to whom, its last message, and what to do. The log has its earlier messages.
     fn give_up(&self, name: &str, starts: u32, status: ExitStatus) -> anyhow::Result<Situation> {
-        let mut lines = self.log.last_lines(name);
-        lines.dedup();
-        let output = match lines.split_last() {
-            None if status.signal().is_some() => "it wrote no message before it was killed; is memory short?".into(),
-            None => "it wrote no message".into(),
-            Some((last, [])) => last.strip_prefix("error: ").unwrap_or(last).to_owned(),
-            Some(_) => format!("its last messages:\n  {}", lines.join("\n  ")),
+        let lines = self.log.last_lines(name);
+        let message = match lines.last() {
+            None if status.signal().is_some() => "it wrote no message; is memory short?",
+            None => "it wrote no message",
+            Some(last) => last.strip_prefix("error: ").unwrap_or(last),
         };
         bail!(
-            "{name} failed {starts} times and is given up ({}); fix the cause, then resume with `shoal resume {}`; \
-             {output}",
+            "{name} failed {starts} times and is given up ({}): {message}; see shoal.log in the run's directory, fix \
+             the cause, then `shoal resume {}` continues the run",
             ending(status),
             self.run.display()
         );

@@ -6,8 +6,8 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use shoal_common::channel::control::RunStatus;
+use shoal_run::client::RunClient;
 use shoal_run::recorder::read_evaluations;
-use shoal_run::remote::Remote;
 use shoal_run::status::saved_status;
 
 /// Time between two polls.
@@ -49,12 +49,12 @@ impl Link {
     ///
     /// # Errors
     /// When the thread cannot be started.
-    pub(crate) fn new(remote: Remote) -> anyhow::Result<Self> {
+    pub(crate) fn new(client: RunClient) -> anyhow::Result<Self> {
         let (requests, incoming) = channel();
         let (outgoing, events) = channel();
         let thread = thread::Builder::new()
             .name("poll".into())
-            .spawn(move || poll_until_closed(&remote, &incoming, &outgoing))
+            .spawn(move || poll_until_closed(&client, &incoming, &outgoing))
             .context("cannot start a thread")?;
         Ok(Self {
             requests: Some(requests),
@@ -92,10 +92,10 @@ impl Link {
     }
 }
 
-fn poll_until_closed(remote: &Remote, requests: &Receiver<Request>, events: &Sender<RunEvent>) {
+fn poll_until_closed(client: &RunClient, requests: &Receiver<Request>, events: &Sender<RunEvent>) {
     let mut ended = false;
     loop {
-        let event = poll(remote, ended);
+        let event = poll(client, ended);
         ended = matches!(event, Some(RunEvent::Ended(..))) || (ended && event.is_none());
         if event.is_some_and(|event| events.send(event).is_err()) {
             return;
@@ -104,7 +104,7 @@ fn poll_until_closed(remote: &Remote, requests: &Receiver<Request>, events: &Sen
             Err(RecvTimeoutError::Disconnected) => return,
             Err(RecvTimeoutError::Timeout) => {}
             Ok(request) => {
-                if events.send(RunEvent::Answered(carry_out(remote, request))).is_err() {
+                if events.send(RunEvent::Answered(carry_out(client, request))).is_err() {
                     return;
                 }
             }
@@ -113,30 +113,30 @@ fn poll_until_closed(remote: &Remote, requests: &Receiver<Request>, events: &Sen
 }
 
 /// The state of the run; `None` if it was already known to have `ended` and has not been resumed.
-fn poll(remote: &Remote, ended: bool) -> Option<RunEvent> {
+fn poll(client: &RunClient, ended: bool) -> Option<RunEvent> {
     let polled = || -> anyhow::Result<Option<RunEvent>> {
-        if let Some(status) = remote.status()? {
-            return Ok(Some(RunEvent::Running(Box::new(status), evaluations(remote)?)));
+        if let Some(status) = client.status()? {
+            return Ok(Some(RunEvent::Running(Box::new(status), evaluations(client)?)));
         }
         if ended {
             return Ok(None);
         }
-        let status = saved_status(&remote.run.config()?, &remote.run)?;
-        Ok(Some(RunEvent::Ended(Box::new(status), evaluations(remote)?)))
+        let status = saved_status(&client.run.config()?, &client.run)?;
+        Ok(Some(RunEvent::Ended(Box::new(status), evaluations(client)?)))
     };
     polled().unwrap_or_else(|error| Some(RunEvent::Silent(format!("{error:#}"))))
 }
 
-fn evaluations(remote: &Remote) -> anyhow::Result<Vec<(f64, f64)>> {
-    let evaluations = read_evaluations(&remote.run.evaluations())?;
+fn evaluations(client: &RunClient) -> anyhow::Result<Vec<(f64, f64)>> {
+    let evaluations = read_evaluations(&client.run.evaluations())?;
     let points = evaluations.iter().map(|row| (row.env_steps as f64, row.return_mean));
     Ok(points.collect())
 }
 
-fn carry_out(remote: &Remote, request: Request) -> String {
+fn carry_out(client: &RunClient, request: Request) -> String {
     let (result, success) = match request {
-        Request::Scale(actors) => (remote.scale(actors), format!("scaled to {actors} actors")),
-        Request::Stop => (remote.stop(), "stopped; the state is saved".into()),
+        Request::Scale(actors) => (client.scale(actors), format!("scaled to {actors} actors")),
+        Request::Stop => (client.stop(), "stopped; the state is saved".into()),
     };
     result.map_or_else(|error| format!("{error:#}"), |()| success)
 }

@@ -16,8 +16,11 @@ use shoal_common::policy::{PolicyLayout, highest};
 use shoal_common::policy_file::PolicyFile;
 use shoal_env_server::environment::frozen_lake::{ACTIONS, STATES};
 use shoal_learner::algorithms::dqn::Dqn;
+use shoal_learner::algorithms::registry;
 use shoal_learner::algorithms::sac::Sac;
 use shoal_learner::algorithms::td3::Td3;
+use shoal_learner::networks::digest::sha256;
+use shoal_learner::process::checkpoint::Checkpoints;
 use support::{Running, Workplace, error_line, final_result, json, parse, until, wait_for_rows};
 
 /// Rare evaluations of few episodes.
@@ -288,6 +291,31 @@ fn transitions_of_several_steps_survive_kills_bit_for_bit() {
 fn each_observation_counts_once_however_often_roles_are_killed() {
     let set = ["--set", "observation.normalise=true", "--set", "reward.scale=0.1"];
     kills_do_not_change_the_bits(&[&small("pendulum", "sac", "sac.hidden=[8, 8]")[..], &set].concat());
+}
+
+/// A normalised policy is not determined by its network alone.
+#[test]
+fn the_digest_of_the_weights_includes_the_statistics_of_normalised_observations() {
+    let place = Workplace::new();
+    let set = ["sac.hidden=[8, 8]", "replay.warmup=300", "observation.normalise=true"];
+    let set = set.into_iter().flat_map(|assignment| ["--set", assignment]);
+    let arguments = ["pendulum", "--method", "sac", "--lockstep", "--steps", "1500"];
+    let result = train(&place, &arguments.into_iter().chain(set).collect::<Vec<_>>());
+    let run = place.path().join("run");
+    let config = Config::load(&run.join("config.toml")).unwrap();
+    let loaded = Checkpoints::new(&run.join("checkpoints"), config.fingerprint()).load_newest();
+    let sections = loaded.unwrap().unwrap().checkpoint.sections;
+    let digest = |names: &[&str]| {
+        let learned = names
+            .iter()
+            .map(|name| sections.iter().find(|(found, _)| found == name));
+        sha256(&learned.map(|section| section.unwrap().1.as_slice()).collect::<Vec<_>>())
+    };
+    let weights = registry::weights(&config);
+    let (statistics, network) = weights.split_last().unwrap();
+    assert_eq!(*statistics, "observations");
+    assert_eq!(result["weights_sha256"], digest(&weights));
+    assert_ne!(result["weights_sha256"], digest(network));
 }
 
 #[test]

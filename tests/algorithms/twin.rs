@@ -43,7 +43,7 @@ impl World {
         let streams = stream(seed, Purpose::Exploration, 0, 0);
         let mut world = Self {
             environment: VectorEnvironment::new(&environment.name, &environment.parameters, 1, seed, 0, 0).unwrap(),
-            exploration: Exploration::new(config.algorithm.behaviour(spec, 1).unwrap(), 1, streams),
+            exploration: Exploration::new(config.behaviour(1).unwrap(), 1, streams),
             response: vec![0.0; ResponseLayout::new(1, spec.observation.width()).len()],
             t: 0,
             s: vec![0.0; spec.observation.width()],
@@ -177,7 +177,7 @@ pub(crate) fn reinforce(config: &Config) -> String {
         replay.append_and_commit(0, mark, &episode).unwrap();
         learner.update(&replay, replay.head());
     }
-    let weights = registry::weights(&config.algorithm);
+    let weights = registry::weights(config);
     let state = learner.state();
     let learned = state.iter().filter(|(name, _)| weights.contains(name));
     sha256(&learned.map(|(_, numbers)| *numbers).collect::<Vec<_>>())
@@ -187,7 +187,7 @@ pub(crate) fn reinforce(config: &Config) -> String {
 /// weights.
 pub(crate) fn of_minibatches<L: MinibatchLearner>(config: &Config, mut learner: L) -> String {
     let row = config.row_layout();
-    let size = config.algorithm.settings().least_capacity() as usize;
+    let size = config.algorithm.settings().batch();
     let (sampler, mut batch, mut indices) = (Sampler::new(config.run.seed), Minibatch::new(row, size), vec![0; size]);
     let mut rows: Vec<Vec<f32>> = Vec::new();
     let mut world = World::new(config);
@@ -225,7 +225,7 @@ pub(crate) fn of_minibatches<L: MinibatchLearner>(config: &Config, mut learner: 
             (episode, begun) = (Vec::new(), 0);
         }
     }
-    let weights = registry::weights(&config.algorithm);
+    let weights = registry::weights(config);
     let state = learner.state();
     let learned = state.iter().filter(|(name, _)| weights.contains(name));
     sha256(&learned.map(|(_, numbers)| *numbers).collect::<Vec<_>>())

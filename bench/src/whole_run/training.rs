@@ -12,8 +12,8 @@ use shoal_common::channel::policy::PolicyReader;
 use shoal_common::channel::reports::Reports;
 use shoal_common::report::{Heartbeat, Role};
 use shoal_common::run_dir::RunDir;
+use shoal_run::client::RunClient;
 use shoal_run::process::Peer;
-use shoal_run::remote::Remote;
 use tempfile::TempDir;
 
 use super::super::measurement::Budget;
@@ -37,7 +37,7 @@ pub(super) struct Training {
 
 /// Access to the run's configuration, status, heartbeats and policies.
 struct Observer {
-    remote: Remote,
+    client: RunClient,
     heartbeats: Reports<Heartbeat>,
     policies: PolicyReader,
     domain: Domain,
@@ -119,9 +119,9 @@ impl Training {
         let counter = run.incarnations();
         self.wait(budget, "no process", |_| Ok(counter.exists().then_some(())))?;
         let mut observer = Observer::open(&run)?;
-        let actors = observer.remote.config.actors.count;
+        let actors = observer.client.config.actors.count;
         let roles = 3 + 2 * actors as usize;
-        let warm_up_rows = observer.remote.config.replay.warmup;
+        let warm_up_rows = observer.client.config.replay.warmup;
 
         let (mut seen, mut commits) = (HashSet::new(), None);
         let (mut ready, mut first_row, mut warm, mut update) = (None, None, None, None);
@@ -168,7 +168,7 @@ impl Training {
 
     /// Role, index and process id of every process.
     pub(super) fn members(&self) -> anyhow::Result<Vec<(String, u32, u32)>> {
-        let status = self.observer()?.remote.status()?.context("the training has ended")?;
+        let status = self.observer()?.client.status()?.context("the training has ended")?;
         let members = status.roles.into_iter();
         Ok(members
             .filter_map(|role| Some((role.role, role.index, role.pid?)))
@@ -177,7 +177,7 @@ impl Training {
 
     /// The path of the replay file.
     pub(super) fn replay(&self) -> anyhow::Result<PathBuf> {
-        Ok(self.observer()?.remote.run.replay_file())
+        Ok(self.observer()?.client.run.replay_file())
     }
 
     /// Observes the run until the successor of the learner killed at `killed` has made gradient steps.
@@ -236,12 +236,12 @@ impl Training {
 
 impl Observer {
     fn open(run: &RunDir) -> anyhow::Result<Self> {
-        let remote = Remote::open(run.path())?;
-        let domain = Domain::join(&remote.config.run.id, remote.config.actors.max)?;
+        let client = RunClient::open(run.path())?;
+        let domain = Domain::join(&client.config.run.id, client.config.actors.max)?;
         Ok(Self {
             heartbeats: Reports::open(&domain)?,
-            policies: policy_reader(&remote.config, &domain)?,
-            remote,
+            policies: policy_reader(&client.config, &domain)?,
+            client,
             domain,
         })
     }

@@ -74,7 +74,7 @@ impl Drop for Prepared {
     }
 }
 
-/// Writes a file atomically: at any moment `path` is either the old file or the complete new one, also after a power
+/// Writes a file atomically: at any moment `path` is either the old file or the complete new one, even after a power
 /// loss.
 pub fn write_atomically<E: From<io::Error>>(
     path: &Path,

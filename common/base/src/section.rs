@@ -65,8 +65,15 @@ pub fn line_at(text: &str, byte: usize) -> usize {
 /// ```
 ///
 /// Leave out `bounds` for values that are not numbers, and where a bound is the value of another key; the section's
-/// `check` or `Config::check` then compares. The struct gets `Default`, the traits of serde and schemars, and
-/// `check_bounds`.
+/// `check` or `Config::check` then compares. A field that is a section of its own has only that section's name:
+///
+/// ```text
+/// /// What it means.
+/// exploration: ExplorationConfig = ExplorationConfig::default(), section: "exploration";
+/// ```
+///
+/// It is not a key: it is read and written elsewhere, but checked together with the keys. The struct gets `Default`, the
+/// traits of serde and schemars, and `check_bounds`.
 #[macro_export]
 macro_rules! section {
     (
@@ -76,7 +83,8 @@ macro_rules! section {
                 $(#[$of_field:meta])*
                 $field:ident: $type:ty = $default:expr
                 $(, bounds: $bounds:expr)?
-                $(, unit: $unit:literal, source: $source:literal, change: $change:expr)?;
+                $(, unit: $unit:literal, source: $source:literal, change: $change:expr)?
+                $(, section: $section:literal)?;
             )*
         }
     ) => {
@@ -88,6 +96,11 @@ macro_rules! section {
                 $(#[$of_field])*
                 $(#[schemars(extend("unit" = $unit, "source" = $source, "change" = $change))])?
                 $(#[schemars(extend("bounds" = $crate::section::in_words::<$type>(&$bounds)))])?
+                $(
+                    #[doc = concat!("\n\nThis is the section `[", $section, "]`.")]
+                    #[serde(skip)]
+                    #[schemars(skip)]
+                )?
                 pub $field: $type,
             )*
         }
@@ -105,7 +118,10 @@ macro_rules! section {
             /// # Errors
             /// For the first number that is not.
             pub fn check_bounds(&self, section: &str) -> Result<(), $crate::section::OutOfRange> {
-                $($($crate::section::Bounded::check(&self.$field, section, stringify!($field), &$bounds)?;)?)*
+                $(
+                    $($crate::section::Bounded::check(&self.$field, section, stringify!($field), &$bounds)?;)?
+                    $(self.$field.check_bounds($section)?;)?
+                )*
                 Ok(())
             }
         }

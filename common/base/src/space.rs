@@ -45,9 +45,9 @@ impl Space {
         }
     }
 
-    /// Whether this space is the `configured` one. Configurations of earlier versions have no `start`, so 0 matches
+    /// Whether this space matches the `configured` one. Configurations of earlier versions have no `start`, so 0 matches
     /// any.
-    fn is(&self, configured: &Self) -> bool {
+    fn matches(&self, configured: &Self) -> bool {
         match (self, configured) {
             (Self::Discrete { n, .. }, Self::Discrete { n: expected, start: 0 }) => n == expected,
             _ => self == configured,
@@ -92,9 +92,9 @@ fn is_zero(number: &i32) -> bool {
 
 impl EnvironmentSpec {
     /// Whether this description of an environment matches the `configured` one.
-    pub fn is(&self, configured: &Self) -> bool {
-        self.observation.is(&configured.observation)
-            && self.action.is(&configured.action)
+    pub fn matches(&self, configured: &Self) -> bool {
+        self.observation.matches(&configured.observation)
+            && self.action.matches(&configured.action)
             && (self.time_limit, self.state_width) == (configured.time_limit, configured.state_width)
     }
 

@@ -29,7 +29,8 @@ use super::presence::is_presence;
 /// Interval between two sweeps: the longest time that a half-made file of a dead process delays other processes.
 const SWEEP_INTERVAL: Duration = Duration::from_millis(250);
 
-/// A younger file may still be in creation, which takes some microseconds, even if no process is seen to have it open.
+/// The least age of a file that is removed. Its maker may still be creating it, which takes some microseconds, even if
+/// no process seems to have it open.
 const MIN_AGE: Duration = Duration::from_millis(50);
 
 /// How long a clean-up waits for half-made files whose makers may be alive.
@@ -198,6 +199,7 @@ mod tests {
     use std::os::unix::fs::PermissionsExt;
 
     use super::super::files::prefix;
+    use super::super::presence::Presence;
     use super::*;
 
     /// A file of this test's own run, removed on drop.
@@ -225,13 +227,15 @@ mod tests {
 
     #[test]
     fn only_half_made_files_of_dead_processes_are_removed() {
+        // Without a member of their run, another run that starts now would remove these files.
+        let (members, _) = Leftover::new("members", 0o600, b"");
+        let _presence = Presence::enter(&run_id()).unwrap();
         let ((empty, making), (closed, filling)) = (
             Leftover::new("1_2.connection", 0o200, b""),
             Leftover::new("1_3.connection", 0o200, b"half"),
         );
         let (whole, _) = Leftover::new("1.data", 0o600, b"whole");
         let (promise, _) = Leftover::new("promise_4096", 0o600, b"");
-        let (members, _) = Leftover::new("members", 0o600, b"");
         std::thread::sleep(2 * MIN_AGE);
         assert!(!remove_unfinished(&run_id()).unwrap());
         assert!(empty.0.exists() && closed.0.exists(), "their maker is alive");

@@ -30,7 +30,7 @@ pub struct Domain {
     node: Node<ipc::Service>,
     /// `None` for visitors.
     presence: Option<Presence>,
-    /// The user's directory, with a shared lock: systemd tidies no directory up that somebody has locked.
+    /// The user's directory, with a shared lock: systemd does not tidy up a locked directory.
     _user_root: Option<File>,
     /// The run's directory in it, as it was when this process joined.
     root: (u64, u64),
@@ -122,7 +122,7 @@ impl Domain {
         Ok(Self {
             node,
             presence,
-            // Somebody who holds it alone would be the program that tidies up, in this moment.
+            // Only the program that tidies up holds an exclusive lock, for a moment.
             _user_root: user_root.try_lock_shared().is_ok().then_some(user_root),
             root: (root.dev(), root.ino()),
             run_id: run_id.into(),
@@ -148,8 +148,9 @@ impl Domain {
         Self::directory_of(&self.run_id)
     }
 
-    /// The same of the run `run_id`, for who has not joined it. Its path is short plain text, wherever the run's own
-    /// directory is: iceoryx2 refuses to read a file whose path is longer than 255 bytes or has other than plain characters.
+    /// The same for the run `run_id`, for a process that has not joined it. Its path is short and has only plain
+    /// characters, wherever the run's own directory is: iceoryx2 refuses to read other paths, and those of more than 255
+    /// bytes.
     ///
     /// # Errors
     /// When the user's directory cannot be used.
@@ -178,8 +179,8 @@ impl Domain {
         &self.node
     }
 
-    /// Whether the run's files outside `/dev/shm` are still there, with those of `services` services. If not, processes of
-    /// the run do not find each other any more.
+    /// Whether the run's files outside `/dev/shm` still exist, including those of `services` services. Without them the
+    /// processes of the run no longer find each other.
     pub fn is_intact(&self, services: usize) -> bool {
         let Ok(directory) = self.directory() else {
             return false;
@@ -191,13 +192,13 @@ impl Domain {
         same && details.exists() && listed >= services
     }
 
-    /// Whether a process of the run is alive, this one not counted if it is a visitor. It may be where iceoryx2 finds none.
+    /// Whether a process of the run is alive, even one that iceoryx2 does not find. Visitors are not counted.
     pub fn has_members(&self) -> bool {
         matches!(presence::claim(&self.run_id), Ok(Claim::Held))
     }
 
-    /// Leaves the run. The last process to leave removes all files of the run from shared memory, also when the
-    /// launcher was killed.
+    /// Leaves the run. The last process to leave removes all files of the run from shared memory, even if the launcher
+    /// was killed.
     ///
     /// # Errors
     /// When files cannot be removed.
@@ -210,7 +211,7 @@ impl Domain {
             presence.leave();
         }
         let root = user_root()?;
-        // Made anew if it is gone: another program may have removed it before the files in shared memory.
+        // It is created again if it is gone: another program may have removed it, but not the files in shared memory.
         let _lock = make_and_lock(&root.join(&run_id))?;
         remove_if_dead(&root, &run_id)
     }
@@ -245,7 +246,7 @@ impl Domain {
         }
     }
 
-    /// Removes the files of this user's runs that have no living process any more.
+    /// Removes the files of those of this user's runs that no longer have a living process.
     ///
     /// # Errors
     /// When the user's directory cannot be read, or files cannot be removed.
@@ -261,7 +262,7 @@ impl Domain {
                 remove_if_dead(&root, run_id)?;
             }
         }
-        // Those whose directory another program has removed.
+        // Runs whose directory another program has removed.
         let runs = presence::runs().map_err(io_error("list", Path::new(SHARED_MEMORY)))?;
         for run_id in runs.iter().filter(|run_id| !root.join(run_id).exists()) {
             if matches!(claim(run_id)?, Claim::Free { .. }) {
@@ -302,7 +303,7 @@ pub(super) fn iox_config(root: &Path, run_id: &str) -> Result<Config, String> {
     Ok(config)
 }
 
-/// Process ids of the living processes of the run, with stopped ones but without visitors.
+/// Process ids of the living processes of the run, including stopped ones but not visitors.
 fn living_processes(root: &Path, run_id: &str) -> Result<Vec<i32>, DomainError> {
     let failed = |cause: String| DomainError::Join {
         run_id: run_id.into(),
@@ -336,7 +337,7 @@ fn remove_if_dead(root: &Path, run_id: &str) -> Result<(), DomainError> {
     if !living_processes(root, run_id)?.is_empty() {
         return Ok(());
     }
-    // Where another program has removed files of the run, its processes are not listed, but they are still its members.
+    // If another program has removed files of the run, iceoryx2 lists no processes, but they are still members.
     let claim = claim(run_id)?;
     if matches!(claim, Claim::Held) {
         return Ok(());

@@ -1,5 +1,33 @@
 //! The policy, from the learner to actors and evaluator; only the latest counts. Readers evaluate it in place, in the
 //! learner's memory, and can use it even after the learner has died.
+//!
+//! ```
+//! use shoal_channel::policy::{PolicyHeader, PolicyPublisher, PolicyReader};
+//! use shoal_channel::{Domain, Services};
+//!
+//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! let run_id = format!("example-{}", std::process::id());
+//! let domain = Domain::join(&run_id, 1)?; // a run of at most one actor
+//! let mut services = Services::new(&domain)?; // as the launcher does
+//! services.create_common(&domain)?;
+//!
+//! let fingerprint = 7; // of the parameters' layout
+//! let learner = PolicyPublisher::open(&domain, 3)?;
+//! let mut actor = PolicyReader::open(&domain, fingerprint, 3)?;
+//! assert!(actor.latest()?.is_none());
+//!
+//! let header = PolicyHeader { version: 1, fingerprint, ..PolicyHeader::default() };
+//! learner.publish(&[0.5, -1.0, 2.0], header)?;
+//! let policy = actor.latest()?.ok_or("no policy")?;
+//! assert_eq!(policy.header().version, 1);
+//! assert_eq!(policy.parameters(), [0.5, -1.0, 2.0]);
+//!
+//! drop((policy, actor, learner, services));
+//! domain.leave()?; // the last to leave removes the run from shared memory
+//! # assert!(std::fs::read_dir("/dev/shm")?.flatten().all(|file| !file.file_name().to_string_lossy().contains(&run_id)));
+//! # Ok(())
+//! # }
+//! ```
 
 use std::rc::Rc;
 

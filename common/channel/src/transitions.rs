@@ -7,7 +7,7 @@
 //! Chunks of a dead actor still arrive, before any chunk of its successor, if the learner was connected to it. A new
 //! actor cannot know which of them will. So it first sends an empty chunk, its [`Handshake`], and sends no rows until
 //! that one is committed. Then the replay has all it will ever have of the predecessor, and the sequence continues from
-//! there.
+//! there. The documentation of the crate `shoal_learner` has an example.
 
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;

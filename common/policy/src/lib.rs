@@ -7,7 +7,7 @@ mod scores;
 pub use scores::{Scores, combine_heads};
 use shoal_base::space::{EnvironmentSpec, Space};
 
-use crate::network::{ActionRange, ActionRangeError, GaussianPolicy, Hidden, NetworkLayout, PolicyNetwork};
+use crate::network::{ActionRange, ActionRangeError, DeterministicPolicy, GaussianPolicy, NetworkLayout};
 
 /// The layout of a policy's parameters, which all processes of a run must agree on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -87,10 +87,40 @@ impl PolicyLayout {
 
 /// A policy without exploration, with buffers for a batch of observations. It does not own its parameters: each call
 /// borrows them.
+///
+/// ```
+/// use shoal_base::space::{EnvironmentSpec, Space};
+/// use shoal_policy::network::{Hidden, NetworkLayout};
+/// use shoal_policy::{Policy, deterministic};
+///
+/// # fn main() -> Result<(), shoal_policy::PolicyError> {
+/// let spec = EnvironmentSpec {
+///     observation: Space::boxed(&[(-1.0, 1.0); 3]),
+///     action: Space::boxed(&[(-2.0, 2.0)]),
+///     time_limit: 200,
+///     state_width: 0,
+/// };
+/// let network = NetworkLayout::new(3, Hidden::relu([8]), 1);
+/// let mut policy = Policy::Deterministic(deterministic(network, &spec, 2)?);
+///
+/// let mut parameters = vec![0.0; policy.layout().parameters()];
+/// let observations = [0.1, 0.2, 0.3, -0.1, -0.2, -0.3]; // two of them
+/// let mut actions = [f32::NAN; 2];
+/// policy.act(&parameters, &observations, &mut actions);
+/// assert_eq!(actions, [0.0, 0.0]); // the middle of the range
+///
+/// // The last parameter is the bias of the output: tanh 100 is 1, the upper end of the range.
+/// let last = parameters.len() - 1;
+/// parameters[last] = 100.0;
+/// policy.act(&parameters, &observations, &mut actions);
+/// assert_eq!(actions, [2.0, 2.0]);
+/// # Ok(())
+/// # }
+/// ```
 #[derive(Clone, Debug)]
 pub enum Policy {
     /// A network whose output is the action.
-    Deterministic(PolicyNetwork),
+    Deterministic(DeterministicPolicy),
     /// A squashed normal distribution. The action of its mean is taken.
     Gaussian(GaussianPolicy),
     /// A score for every action, π(a|s) or Q(s, a). The action with the highest score is taken.
@@ -126,84 +156,80 @@ impl Policy {
     }
 }
 
-/// A deterministic policy with these hidden layers in an environment like `spec`, for at most `batch` observations a
-/// call.
+/// A deterministic policy with this network in an environment like `spec`, for at most `batch` observations a call.
 ///
 /// # Errors
 /// When the actions are not real numbers in finite ranges.
-pub fn deterministic(hidden: Hidden, spec: &EnvironmentSpec, batch: usize) -> Result<PolicyNetwork, PolicyError> {
+pub fn deterministic(
+    network: NetworkLayout,
+    spec: &EnvironmentSpec,
+    batch: usize,
+) -> Result<DeterministicPolicy, PolicyError> {
     let range = ActionRange::new(&spec.action)?;
-    Ok(PolicyNetwork::new(spec.observation.width(), hidden, range, batch))
+    Ok(DeterministicPolicy::new(network, range, batch))
 }
 
-/// A squashed Gaussian policy with these hidden layers in an environment like `spec`, for at most `batch` observations
-/// a call. `algorithm` is named in errors.
+/// A squashed Gaussian policy with this network in an environment like `spec`, for at most `batch` observations a call.
+/// `algorithm` is named in errors.
 ///
 /// # Errors
 /// When the observations are not real numbers, or the actions are not real numbers in finite ranges.
 pub fn gaussian(
     algorithm: &'static str,
-    hidden: Hidden,
+    network: NetworkLayout,
     spec: &EnvironmentSpec,
     batch: usize,
 ) -> Result<GaussianPolicy, PolicyError> {
     let range = ActionRange::new(&spec.action)?;
-    real_observations(algorithm, spec)?;
-    Ok(GaussianPolicy::new(spec.observation.width(), hidden, range, batch))
+    check_real_observations(algorithm, spec)?;
+    Ok(GaussianPolicy::new(network, range, batch))
 }
 
-/// A softmax policy with these hidden layers in an environment like `spec`, for at most `batch` observations a call.
+/// A softmax policy with this network in an environment like `spec`, for at most `batch` observations a call.
 /// `algorithm` is named in errors.
 ///
 /// # Errors
 /// When the actions are not discrete, or the observations are not real numbers.
 pub fn softmax(
     algorithm: &'static str,
-    hidden: Hidden,
+    network: NetworkLayout,
     spec: &EnvironmentSpec,
     batch: usize,
 ) -> Result<Scores, PolicyError> {
-    let (observation, actions) = real_to_counted(algorithm, spec)?;
-    Ok(Scores::softmax(
-        NetworkLayout::policy(observation, hidden, actions),
-        batch,
-    ))
+    counted_actions(algorithm, spec)?;
+    check_real_observations(algorithm, spec)?;
+    Ok(Scores::softmax(network, batch))
 }
 
-/// A network of action-values with these hidden layers, and with dueling heads if asked for, in an environment like
-/// `spec`, for at most `batch` observations a call. `algorithm` is named in errors.
+/// Action-values that this network computes, as dueling heads or directly, in an environment like `spec`, for at most
+/// `batch` observations a call. `algorithm` is named in errors.
 ///
 /// # Errors
 /// When the actions are not discrete, or the observations are not real numbers.
 pub fn action_values(
     algorithm: &'static str,
-    hidden: Hidden,
+    network: NetworkLayout,
     dueling: bool,
     spec: &EnvironmentSpec,
     batch: usize,
 ) -> Result<Scores, PolicyError> {
-    let (observation, actions) = real_to_counted(algorithm, spec)?;
+    counted_actions(algorithm, spec)?;
+    check_real_observations(algorithm, spec)?;
     Ok(if dueling {
-        Scores::dueling(NetworkLayout::policy(observation, hidden, actions + 1), batch)
+        Scores::dueling(network, batch)
     } else {
-        Scores::values(NetworkLayout::policy(observation, hidden, actions), batch)
+        Scores::values(network, batch)
     })
 }
 
-/// The numbers in an observation, which must be real, and the number of actions, which must be discrete.
-fn real_to_counted(algorithm: &'static str, spec: &EnvironmentSpec) -> Result<(usize, usize), PolicyError> {
-    let actions = counted_actions(algorithm, spec)?;
-    Ok((real_observations(algorithm, spec)?, actions))
-}
-
-/// The numbers in an observation. `algorithm` is named in errors.
+/// Checks that the observations are real numbers. `algorithm` is named in the error.
 ///
 /// # Errors
-/// When the observations are not real numbers.
-pub fn real_observations(algorithm: &'static str, spec: &EnvironmentSpec) -> Result<usize, PolicyError> {
+/// When they are indices.
+pub fn check_real_observations(algorithm: &'static str, spec: &EnvironmentSpec) -> Result<(), PolicyError> {
     match spec.observation {
         Space::Discrete { n, .. } => Err(PolicyError::RealStates { algorithm, n }),
-        Space::Box { .. } => Ok(spec.observation.width()),
+        Space::Box { .. } => Ok(()),
     }
 }
 
@@ -241,6 +267,7 @@ pub fn highest(scores: &[f32]) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::network::Hidden;
 
     fn spec(observation: Space, action: Space) -> EnvironmentSpec {
         EnvironmentSpec {
@@ -263,7 +290,7 @@ mod tests {
 
     #[test]
     fn different_kinds_of_policies_have_different_fingerprints() {
-        let network = NetworkLayout::policy(4, Hidden::relu([10, 2]), 2);
+        let network = NetworkLayout::new(4, Hidden::relu([10, 2]), 2);
         let kinds = [
             PolicyLayout::Deterministic(network),
             PolicyLayout::Gaussian(network),

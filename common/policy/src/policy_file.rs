@@ -143,7 +143,7 @@ mod tests {
     use super::*;
 
     fn layout() -> PolicyLayout {
-        PolicyLayout::Deterministic(NetworkLayout::policy(1, Hidden::relu([1, 1]), 1))
+        PolicyLayout::Deterministic(NetworkLayout::new(1, Hidden::relu([1, 1]), 1))
     }
 
     fn policy() -> PolicyFile {
@@ -187,7 +187,7 @@ mod tests {
         assert!(
             PolicyFile::read(
                 &path,
-                &PolicyLayout::Deterministic(NetworkLayout::policy(2, Hidden::relu([1, 1]), 1))
+                &PolicyLayout::Deterministic(NetworkLayout::new(2, Hidden::relu([1, 1]), 1))
             )
             .unwrap_err()
             .to_string()

@@ -2,13 +2,11 @@
 
 use std::fmt::{self, Display, Formatter};
 
-use shoal_base::section::OutOfRange;
 use shoal_base::space::EnvironmentSpec;
 use shoal_policy::PolicyError;
 use shoal_policy::network::{Activation, Hidden, NetworkLayout};
 
 use super::behaviour::Behaviour;
-use super::preparation::Preparation;
 
 /// The fixed properties of an algorithm, which do not depend on its settings.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -32,23 +30,9 @@ pub enum Experience {
     Episodes,
 }
 
-/// The settings of an algorithm: its section of the configuration, and everything derived from it.
+/// The settings of an algorithm: its section of the configuration, and everything derived from it. Observations are as
+/// the environment has them; `Config` adds their normalisation.
 pub trait AlgorithmSettings {
-    /// Checks every number. `section` is the section's name.
-    ///
-    /// # Errors
-    /// For the first invalid number.
-    fn check(&self, section: &str) -> Result<(), OutOfRange>;
-
-    /// γ, the discount of one step.
-    fn gamma(&self) -> f64;
-
-    /// How observations and rewards are prepared for its networks; `None` if it learns from them as they are.
-    fn preparation(&self) -> Option<&Preparation>;
-
-    /// As [`preparation`](Self::preparation).
-    fn preparation_mut(&mut self) -> Option<&mut Preparation>;
-
     /// Its policy in an environment like `spec`, for at most `batch` observations a call, and how actors explore with
     /// it. `name` is the name of the algorithm.
     ///
@@ -56,14 +40,31 @@ pub trait AlgorithmSettings {
     /// When it cannot control that environment.
     fn behaviour(&self, name: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError>;
 
-    /// Numbers of exploration state that one environment keeps from step to step; 0 if the steps are independent.
-    fn exploration_state_width(&self, spec: &EnvironmentSpec) -> usize;
-
-    /// The smallest capacity of the replay, in transitions: a minibatch, or 1.
-    fn least_capacity(&self) -> u64;
-
     /// The networks or tables that it learns in an environment like `spec`.
     fn learned(&self, spec: &EnvironmentSpec) -> Learned;
+
+    /// Transitions in a minibatch; 1 if it does not learn from minibatches.
+    fn batch(&self) -> usize;
+}
+
+/// The networks of an algorithm with an actor and a critic, or several critics of the same layout.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ActorCritic {
+    /// The policy.
+    pub actor: NetworkLayout,
+    /// The action-value function.
+    pub critic: NetworkLayout,
+}
+
+impl ActorCritic {
+    /// The actor and two critics.
+    pub(super) fn with_twin_critics(self) -> Learned {
+        let critic = Shape::Network(self.critic);
+        Learned {
+            policy: ("actor", Shape::Network(self.actor)),
+            others: vec![("critic 1", critic), ("critic 2", critic)],
+        }
+    }
 }
 
 /// The networks or tables that an algorithm learns, each with a name. Target networks and the state of the optimiser
@@ -80,6 +81,14 @@ impl Learned {
     /// All of them, the policy first.
     pub fn iter(&self) -> impl Iterator<Item = (&'static str, Shape)> {
         std::iter::once(self.policy).chain(self.others.iter().copied())
+    }
+
+    /// The same, with a policy that normalises its observations or not.
+    pub fn normalising(mut self, normalised: bool) -> Self {
+        if let (_, Shape::Network(policy)) = &mut self.policy {
+            *policy = policy.normalising(normalised);
+        }
+        self
     }
 
     /// The number of parameters in all of them.
@@ -121,7 +130,7 @@ impl Display for Shape {
                 write!(to, "network {}", network.inputs())?;
                 layers.iter().try_for_each(|units| write!(to, " {units}"))?;
                 write!(to, " {}", network.outputs())?;
-                match (network.late_inputs(), network.late_layer()) {
+                match (network.action_inputs(), network.action_layer()) {
                     (0, _) | (_, None) => {}
                     (late, Some(0)) if layers.len() > 1 => write!(to, " joined {late}")?,
                     (late, Some(_)) => write!(to, " late {late}")?,

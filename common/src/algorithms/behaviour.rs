@@ -1,6 +1,6 @@
 //! How an algorithm's actors act: its policy and their exploration.
 
-use shoal_policy::network::{GaussianPolicy, PolicyNetwork};
+use shoal_policy::network::{DeterministicPolicy, GaussianPolicy};
 use shoal_policy::{Policy, Scores};
 
 use super::exploration::ExplorationConfig;
@@ -9,7 +9,7 @@ use super::exploration::ExplorationConfig;
 #[derive(Clone, Debug)]
 pub enum Behaviour {
     /// The action of the policy, to which actors add noise.
-    Noise(PolicyNetwork, ExplorationConfig),
+    Noise(DeterministicPolicy, ExplorationConfig),
     /// An action drawn from the policy's distribution; uniformly from its range before the first update.
     Gaussian(GaussianPolicy),
     /// An action drawn from the policy's probabilities.
@@ -49,10 +49,29 @@ impl Epsilon {
 }
 
 impl Behaviour {
+    /// The same behaviour, whose policy normalises its observations or not. A table has no observations that could be
+    /// normalised.
+    pub fn normalising(self, normalised: bool) -> Self {
+        match self {
+            Self::Noise(policy, noise) => Self::Noise(policy.normalising(normalised), noise),
+            Self::Gaussian(policy) => Self::Gaussian(policy.normalising(normalised)),
+            Self::Sample(scores) => Self::Sample(scores.normalising(normalised)),
+            Self::EpsilonGreedy(scores, epsilon) => Self::EpsilonGreedy(scores.normalising(normalised), epsilon),
+        }
+    }
+
+    /// Numbers of exploration state that one environment keeps from step to step; 0 if the steps are independent.
+    pub fn state_width(&self) -> usize {
+        match self {
+            Self::Noise(policy, _) => policy.range().width(),
+            Self::Gaussian(_) | Self::Sample(_) | Self::EpsilonGreedy(..) => 0,
+        }
+    }
+
     /// The policy without exploration.
     pub fn into_policy(self) -> Policy {
         match self {
-            Self::Noise(network, _) => Policy::Deterministic(network),
+            Self::Noise(policy, _) => Policy::Deterministic(policy),
             Self::Gaussian(policy) => Policy::Gaussian(policy),
             Self::Sample(scores) | Self::EpsilonGreedy(scores, _) => Policy::Scored(scores),
         }

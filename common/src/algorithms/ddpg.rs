@@ -1,15 +1,14 @@
 //! `[ddpg]`: deep deterministic policy gradient.
 
 use shoal_base::section;
-use shoal_base::section::{Change, OutOfRange, above, from, never};
+use shoal_base::section::{Change, above, from, never};
 use shoal_base::space::EnvironmentSpec;
 use shoal_policy::PolicyError;
 use shoal_policy::network::{Activation, Hidden, Layers, NetworkLayout};
 
-use super::algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Learned, Shape};
+use super::algorithm::{ActorCritic, AlgorithmSettings, AlgorithmSpec, Experience, Learned, Shape};
 use super::behaviour::Behaviour;
 use super::exploration::ExplorationConfig;
-use super::preparation::Preparation;
 
 /// DDPG.
 pub(super) const SPEC: AlgorithmSpec = AlgorithmSpec {
@@ -42,68 +41,38 @@ section! {
         /// N, transitions in a minibatch.
         batch: usize = 64, bounds: from(1, 65_536), unit: "transitions", source: "Algorithm 4, section 4.3.1",
             change: Change::Learning;
-        /// The noise of its actors. It has its own section, `[exploration]`.
-        #[serde(skip)]
-        #[schemars(skip)]
-        exploration: ExplorationConfig = ExplorationConfig::default();
-        /// How observations and rewards are prepared. They have their own sections, `[observation]` and `[reward]`.
-        #[serde(skip)]
-        #[schemars(skip)]
-        preparation: Preparation = Preparation::default();
+        /// The noise of its actors.
+        exploration: ExplorationConfig = ExplorationConfig::default(), section: "exploration";
     }
 }
 
 impl DdpgConfig {
-    /// The hidden layers of actor and critic.
-    pub fn hidden_layers(&self) -> Hidden {
-        Hidden {
-            layers: self.hidden,
-            activation: self.activation,
+    /// Its networks in an environment like `spec`.
+    pub fn networks(&self, spec: &EnvironmentSpec) -> ActorCritic {
+        let (observation, action) = (spec.observation.width(), spec.action.width());
+        let hidden = Hidden::new(self.hidden, self.activation);
+        ActorCritic {
+            actor: NetworkLayout::new(observation, hidden, action),
+            critic: NetworkLayout::critic(observation, hidden, action),
         }
     }
 }
 
 impl AlgorithmSettings for DdpgConfig {
-    fn check(&self, section: &str) -> Result<(), OutOfRange> {
-        self.exploration.check_bounds("exploration")?;
-        self.preparation.check()?;
-        self.check_bounds(section)
-    }
-
-    fn gamma(&self) -> f64 {
-        self.gamma
-    }
-
-    fn preparation(&self) -> Option<&Preparation> {
-        Some(&self.preparation)
-    }
-
-    fn preparation_mut(&mut self) -> Option<&mut Preparation> {
-        Some(&mut self.preparation)
-    }
-
     fn behaviour(&self, _: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError> {
-        let network = shoal_policy::deterministic(self.hidden_layers(), spec, batch)?;
-        let network = network.normalising(self.preparation.observation.normalise);
-        Ok(Behaviour::Noise(network, self.exploration.clone()))
-    }
-
-    fn exploration_state_width(&self, spec: &EnvironmentSpec) -> usize {
-        spec.action.width()
-    }
-
-    fn least_capacity(&self) -> u64 {
-        self.batch as u64
+        let policy = shoal_policy::deterministic(self.networks(spec).actor, spec, batch)?;
+        Ok(Behaviour::Noise(policy, self.exploration.clone()))
     }
 
     fn learned(&self, spec: &EnvironmentSpec) -> Learned {
-        let (observation, action) = (spec.observation.width(), spec.action.width());
-        let actor = NetworkLayout::policy(observation, self.hidden_layers(), action)
-            .normalising(self.preparation.observation.normalise);
-        let critic = NetworkLayout::critic(observation, self.hidden_layers(), action);
+        let ActorCritic { actor, critic } = self.networks(spec);
         Learned {
             policy: ("actor", Shape::Network(actor)),
             others: vec![("critic", Shape::Network(critic))],
         }
+    }
+
+    fn batch(&self) -> usize {
+        self.batch
     }
 }

@@ -1,14 +1,13 @@
 //! `[dqn]`: deep Q-network.
 
 use shoal_base::section;
-use shoal_base::section::{Change, EXPLORATION, OutOfRange, above, from, never};
+use shoal_base::section::{Change, EXPLORATION, above, from, never};
 use shoal_base::space::EnvironmentSpec;
 use shoal_policy::PolicyError;
 use shoal_policy::network::{Activation, Hidden, Layers, NetworkLayout};
 
 use super::algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Learned, Shape};
 use super::behaviour::{Behaviour, Epsilon};
-use super::preparation::Preparation;
 
 /// DQN.
 pub(super) const SPEC: AlgorithmSpec = AlgorithmSpec {
@@ -53,44 +52,22 @@ section! {
         /// Environment steps of all actors in which ε falls linearly from the first to the second value. 0 becomes a
         /// tenth of `run.steps` when the run is created.
         epsilon_steps: u64 = 0, unit: "environment steps", source: "ours", change: EXPLORATION;
-        /// How observations and rewards are prepared. They have their own sections, `[observation]` and `[reward]`.
-        #[serde(skip)]
-        #[schemars(skip)]
-        preparation: Preparation = Preparation::default();
     }
 }
 
 impl DqnConfig {
-    /// The hidden layers.
-    pub fn hidden_layers(&self) -> Hidden {
-        Hidden {
-            layers: self.hidden,
-            activation: self.activation,
-        }
+    /// Its network in an environment like `spec`: an output for each action, after one for the value of the state if the
+    /// heads are dueling.
+    pub fn network(&self, spec: &EnvironmentSpec) -> NetworkLayout {
+        let outputs = spec.action.size() + usize::from(self.dueling);
+        let hidden = Hidden::new(self.hidden, self.activation);
+        NetworkLayout::new(spec.observation.width(), hidden, outputs)
     }
 }
 
 impl AlgorithmSettings for DqnConfig {
-    fn check(&self, section: &str) -> Result<(), OutOfRange> {
-        self.preparation.check()?;
-        self.check_bounds(section)
-    }
-
-    fn gamma(&self) -> f64 {
-        self.gamma
-    }
-
-    fn preparation(&self) -> Option<&Preparation> {
-        Some(&self.preparation)
-    }
-
-    fn preparation_mut(&mut self) -> Option<&mut Preparation> {
-        Some(&mut self.preparation)
-    }
-
     fn behaviour(&self, name: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError> {
-        let values = shoal_policy::action_values(name, self.hidden_layers(), self.dueling, spec, batch)?
-            .normalising(self.preparation.observation.normalise);
+        let values = shoal_policy::action_values(name, self.network(spec), self.dueling, spec, batch)?;
         let epsilon = Epsilon {
             start: self.epsilon_start,
             end: self.epsilon_end,
@@ -99,21 +76,14 @@ impl AlgorithmSettings for DqnConfig {
         Ok(Behaviour::EpsilonGreedy(values, epsilon))
     }
 
-    fn exploration_state_width(&self, _: &EnvironmentSpec) -> usize {
-        0
-    }
-
-    fn least_capacity(&self) -> u64 {
-        self.batch as u64
-    }
-
     fn learned(&self, spec: &EnvironmentSpec) -> Learned {
-        let outputs = spec.action.size() + usize::from(self.dueling);
-        let values = NetworkLayout::policy(spec.observation.width(), self.hidden_layers(), outputs)
-            .normalising(self.preparation.observation.normalise);
         Learned {
-            policy: ("action-values", Shape::Network(values)),
+            policy: ("action-values", Shape::Network(self.network(spec))),
             others: Vec::new(),
         }
+    }
+
+    fn batch(&self) -> usize {
+        self.batch
     }
 }

@@ -1,10 +1,10 @@
 //! `[observation]` and `[reward]`: how numbers of the environment are prepared for networks that learn from minibatches.
 
 use shoal_base::section;
-use shoal_base::section::{Change, OutOfRange, above, never};
+use shoal_base::section::{Change, above, never};
 
 section! {
-    /// What networks see of an observation. The replay holds it as it is.
+    /// How observations are prepared for networks. The replay holds the environment's.
     pub struct ObservationConfig {
         /// Whether each number is normalised by the mean and standard deviation of all observations so far. The learner
         /// keeps them and publishes them with the policy; they are part of checkpoints and exports.
@@ -13,30 +13,10 @@ section! {
 }
 
 section! {
-    /// What is learned of a reward. The replay, curves and evaluations have it as it is.
+    /// How rewards are prepared for learning. The replay, curves and evaluations have the environment's.
     pub struct RewardConfig {
         /// The factor of every reward in a minibatch.
         scale: f64 = 1.0, bounds: above(0.0, 1e6), unit: "–", source: "ours",
             change: never("the critics have learned with it");
-    }
-}
-
-/// Both sections.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Preparation {
-    /// `[observation]`.
-    pub observation: ObservationConfig,
-    /// `[reward]`.
-    pub reward: RewardConfig,
-}
-
-impl Preparation {
-    /// Checks every number.
-    ///
-    /// # Errors
-    /// For the first invalid number.
-    pub fn check(&self) -> Result<(), OutOfRange> {
-        self.observation.check_bounds("observation")?;
-        self.reward.check_bounds("reward")
     }
 }

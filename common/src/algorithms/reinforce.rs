@@ -3,14 +3,13 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use shoal_base::section;
-use shoal_base::section::{Change, OutOfRange, from, never};
+use shoal_base::section::{Change, from, never};
 use shoal_base::space::EnvironmentSpec;
 use shoal_policy::PolicyError;
 use shoal_policy::network::{Activation, Hidden, Layers, NetworkLayout};
 
 use super::algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Learned, Shape};
 use super::behaviour::Behaviour;
-use super::preparation::Preparation;
 
 /// REINFORCE.
 pub(super) const SPEC: AlgorithmSpec = AlgorithmSpec {
@@ -60,65 +59,45 @@ pub enum Weight {
     Baseline,
 }
 
-impl ReinforceConfig {
-    /// The policy's hidden layers.
-    pub fn hidden_layers(&self) -> Hidden {
-        Hidden {
-            layers: self.hidden,
-            activation: self.activation,
-        }
-    }
+/// The networks of REINFORCE.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ReinforceNetworks {
+    /// The policy: logits of the actions.
+    pub policy: NetworkLayout,
+    /// V, if there is a baseline.
+    pub baseline: Option<NetworkLayout>,
+}
 
-    /// The baseline's hidden layers.
-    pub fn baseline_hidden_layers(&self) -> Hidden {
-        Hidden {
-            layers: self.baseline_hidden,
-            activation: self.activation,
+impl ReinforceConfig {
+    /// Its networks in an environment like `spec`.
+    pub fn networks(&self, spec: &EnvironmentSpec) -> ReinforceNetworks {
+        let network = |layers, outputs| {
+            let hidden = Hidden::new(layers, self.activation);
+            NetworkLayout::new(spec.observation.width(), hidden, outputs)
+        };
+        ReinforceNetworks {
+            policy: network(self.hidden, spec.action.size()),
+            baseline: (self.weight == Weight::Baseline).then(|| network(self.baseline_hidden, 1)),
         }
     }
 }
 
 impl AlgorithmSettings for ReinforceConfig {
-    fn check(&self, section: &str) -> Result<(), OutOfRange> {
-        self.check_bounds(section)
-    }
-
-    fn gamma(&self) -> f64 {
-        self.gamma
-    }
-
-    fn preparation(&self) -> Option<&Preparation> {
-        None
-    }
-
-    fn preparation_mut(&mut self) -> Option<&mut Preparation> {
-        None
-    }
-
     fn behaviour(&self, name: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError> {
-        Ok(Behaviour::Sample(shoal_policy::softmax(
-            name,
-            self.hidden_layers(),
-            spec,
-            batch,
-        )?))
-    }
-
-    fn exploration_state_width(&self, _: &EnvironmentSpec) -> usize {
-        0
-    }
-
-    fn least_capacity(&self) -> u64 {
-        1
+        let policy = shoal_policy::softmax(name, self.networks(spec).policy, spec, batch)?;
+        Ok(Behaviour::Sample(policy))
     }
 
     fn learned(&self, spec: &EnvironmentSpec) -> Learned {
-        let observation = spec.observation.width();
-        let network = |hidden, outputs| Shape::Network(NetworkLayout::policy(observation, hidden, outputs));
-        let baseline = (self.weight == Weight::Baseline).then(|| network(self.baseline_hidden_layers(), 1));
+        let ReinforceNetworks { policy, baseline } = self.networks(spec);
+        let baseline = baseline.map(|network| ("baseline", Shape::Network(network)));
         Learned {
-            policy: ("policy", network(self.hidden_layers(), spec.action.size())),
-            others: baseline.map(|network| ("baseline", network)).into_iter().collect(),
+            policy: ("policy", Shape::Network(policy)),
+            others: baseline.into_iter().collect(),
         }
+    }
+
+    fn batch(&self) -> usize {
+        1
     }
 }

@@ -1,14 +1,13 @@
 //! `[sac]`: soft actor-critic.
 
 use shoal_base::section;
-use shoal_base::section::{Change, OutOfRange, above, from, never};
+use shoal_base::section::{Change, above, from, never};
 use shoal_base::space::EnvironmentSpec;
 use shoal_policy::PolicyError;
 use shoal_policy::network::{Activation, Hidden, Layers, NetworkLayout};
 
-use super::algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Learned, Shape};
+use super::algorithm::{ActorCritic, AlgorithmSettings, AlgorithmSpec, Experience, Learned};
 use super::behaviour::Behaviour;
-use super::preparation::Preparation;
 
 /// SAC.
 pub(super) const SPEC: AlgorithmSpec = AlgorithmSpec {
@@ -48,64 +47,33 @@ section! {
         /// N, transitions in a minibatch.
         batch: usize = 256, bounds: from(1, 65_536), unit: "transitions", source: "Haarnoja et al. 2018b",
             change: Change::Learning;
-        /// How observations and rewards are prepared. They have their own sections, `[observation]` and `[reward]`.
-        #[serde(skip)]
-        #[schemars(skip)]
-        preparation: Preparation = Preparation::default();
     }
 }
 
 impl SacConfig {
-    /// The hidden layers of actor and critics.
-    pub fn hidden_layers(&self) -> Hidden {
-        Hidden {
-            layers: self.hidden,
-            activation: self.activation,
+    /// Its networks in an environment like `spec`. Both critics have the same layout. The actor has two outputs for each
+    /// element of the action: all means, then all log standard deviations.
+    pub fn networks(&self, spec: &EnvironmentSpec) -> ActorCritic {
+        let (observation, action) = (spec.observation.width(), spec.action.width());
+        let hidden = Hidden::new(self.hidden, self.activation);
+        ActorCritic {
+            actor: NetworkLayout::new(observation, hidden, 2 * action),
+            critic: NetworkLayout::joined_critic(observation, hidden, action),
         }
     }
 }
 
 impl AlgorithmSettings for SacConfig {
-    fn check(&self, section: &str) -> Result<(), OutOfRange> {
-        self.preparation.check()?;
-        self.check_bounds(section)
-    }
-
-    fn gamma(&self) -> f64 {
-        self.gamma
-    }
-
-    fn preparation(&self) -> Option<&Preparation> {
-        Some(&self.preparation)
-    }
-
-    fn preparation_mut(&mut self) -> Option<&mut Preparation> {
-        Some(&mut self.preparation)
-    }
-
     fn behaviour(&self, name: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError> {
-        let policy = shoal_policy::gaussian(name, self.hidden_layers(), spec, batch)?;
-        Ok(Behaviour::Gaussian(
-            policy.normalising(self.preparation.observation.normalise),
-        ))
-    }
-
-    fn exploration_state_width(&self, _: &EnvironmentSpec) -> usize {
-        0
-    }
-
-    fn least_capacity(&self) -> u64 {
-        self.batch as u64
+        let policy = shoal_policy::gaussian(name, self.networks(spec).actor, spec, batch)?;
+        Ok(Behaviour::Gaussian(policy))
     }
 
     fn learned(&self, spec: &EnvironmentSpec) -> Learned {
-        let (observation, action) = (spec.observation.width(), spec.action.width());
-        let actor = NetworkLayout::policy(observation, self.hidden_layers(), 2 * action)
-            .normalising(self.preparation.observation.normalise);
-        let critic = Shape::Network(NetworkLayout::joined_critic(observation, self.hidden_layers(), action));
-        Learned {
-            policy: ("actor", Shape::Network(actor)),
-            others: vec![("critic 1", critic), ("critic 2", critic)],
-        }
+        self.networks(spec).with_twin_critics()
+    }
+
+    fn batch(&self) -> usize {
+        self.batch
     }
 }

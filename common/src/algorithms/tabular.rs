@@ -1,13 +1,12 @@
 //! `[q-learning]` and `[sarsa]`: tabular temporal-difference control. Both have the same keys.
 
 use shoal_base::section;
-use shoal_base::section::{Change, EXPLORATION, OutOfRange, from, never};
+use shoal_base::section::{Change, EXPLORATION, from, never};
 use shoal_base::space::EnvironmentSpec;
 use shoal_policy::PolicyError;
 
 use super::algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Learned, Shape};
 use super::behaviour::{Behaviour, Epsilon};
-use super::preparation::Preparation;
 
 /// Q-learning.
 pub(super) const Q_LEARNING: AlgorithmSpec = AlgorithmSpec {
@@ -38,33 +37,9 @@ section! {
 }
 
 impl AlgorithmSettings for TabularConfig {
-    fn check(&self, section: &str) -> Result<(), OutOfRange> {
-        self.check_bounds(section)
-    }
-
-    fn gamma(&self) -> f64 {
-        self.gamma
-    }
-
-    fn preparation(&self) -> Option<&Preparation> {
-        None
-    }
-
-    fn preparation_mut(&mut self) -> Option<&mut Preparation> {
-        None
-    }
-
     fn behaviour(&self, name: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError> {
         let values = shoal_policy::table(name, spec, batch)?;
         Ok(Behaviour::EpsilonGreedy(values, Epsilon::constant(self.epsilon)))
-    }
-
-    fn exploration_state_width(&self, _: &EnvironmentSpec) -> usize {
-        0
-    }
-
-    fn least_capacity(&self) -> u64 {
-        1
     }
 
     fn learned(&self, spec: &EnvironmentSpec) -> Learned {
@@ -73,5 +48,9 @@ impl AlgorithmSettings for TabularConfig {
             policy: ("action-values", Shape::Table { states, actions }),
             others: Vec::new(),
         }
+    }
+
+    fn batch(&self) -> usize {
+        1
     }
 }

@@ -1,15 +1,14 @@
 //! `[td3]`: twin delayed deep deterministic policy gradient.
 
 use shoal_base::section;
-use shoal_base::section::{Change, EXPLORATION, OutOfRange, above, from, never};
+use shoal_base::section::{Change, EXPLORATION, above, from, never};
 use shoal_base::space::EnvironmentSpec;
 use shoal_policy::PolicyError;
 use shoal_policy::network::{Activation, Hidden, Layers, NetworkLayout};
 
-use super::algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Learned, Shape};
+use super::algorithm::{ActorCritic, AlgorithmSettings, AlgorithmSpec, Experience, Learned};
 use super::behaviour::Behaviour;
 use super::exploration::{ExplorationConfig, Warmup};
-use super::preparation::Preparation;
 
 /// TD3.
 pub(super) const SPEC: AlgorithmSpec = AlgorithmSpec {
@@ -53,70 +52,39 @@ section! {
         /// actions uniformly.
         exploration_noise: f64 = 0.1, bounds: from(0.0, 10.0), unit: "half action ranges",
             source: "Fujimoto et al. 2018", change: EXPLORATION;
-        /// How observations and rewards are prepared. They have their own sections, `[observation]` and `[reward]`.
-        #[serde(skip)]
-        #[schemars(skip)]
-        preparation: Preparation = Preparation::default();
     }
 }
 
 impl Td3Config {
-    /// The hidden layers of actor and critics.
-    pub fn hidden_layers(&self) -> Hidden {
-        Hidden {
-            layers: self.hidden,
-            activation: self.activation,
+    /// Its networks in an environment like `spec`. Both critics have the same layout.
+    pub fn networks(&self, spec: &EnvironmentSpec) -> ActorCritic {
+        let (observation, action) = (spec.observation.width(), spec.action.width());
+        let hidden = Hidden::new(self.hidden, self.activation);
+        ActorCritic {
+            actor: NetworkLayout::new(observation, hidden, action),
+            critic: NetworkLayout::joined_critic(observation, hidden, action),
         }
     }
 }
 
 impl AlgorithmSettings for Td3Config {
-    fn check(&self, section: &str) -> Result<(), OutOfRange> {
-        self.preparation.check()?;
-        self.check_bounds(section)
-    }
-
-    fn gamma(&self) -> f64 {
-        self.gamma
-    }
-
-    fn preparation(&self) -> Option<&Preparation> {
-        Some(&self.preparation)
-    }
-
-    fn preparation_mut(&mut self) -> Option<&mut Preparation> {
-        Some(&mut self.preparation)
-    }
-
     fn behaviour(&self, name: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError> {
-        shoal_policy::real_observations(name, spec)?;
-        let network = shoal_policy::deterministic(self.hidden_layers(), spec, batch)?;
-        let network = network.normalising(self.preparation.observation.normalise);
+        shoal_policy::check_real_observations(name, spec)?;
+        let policy = shoal_policy::deterministic(self.networks(spec).actor, spec, batch)?;
         // With θ = 1 the noise of a step does not depend on the previous one: it is N(0, σ²).
         let noise = ExplorationConfig {
             theta: 1.0,
             sigma: self.exploration_noise,
             warmup: Warmup::Uniform,
         };
-        Ok(Behaviour::Noise(network, noise))
-    }
-
-    fn exploration_state_width(&self, spec: &EnvironmentSpec) -> usize {
-        spec.action.width()
-    }
-
-    fn least_capacity(&self) -> u64 {
-        self.batch as u64
+        Ok(Behaviour::Noise(policy, noise))
     }
 
     fn learned(&self, spec: &EnvironmentSpec) -> Learned {
-        let (observation, action) = (spec.observation.width(), spec.action.width());
-        let actor = NetworkLayout::policy(observation, self.hidden_layers(), action)
-            .normalising(self.preparation.observation.normalise);
-        let critic = Shape::Network(NetworkLayout::joined_critic(observation, self.hidden_layers(), action));
-        Learned {
-            policy: ("actor", Shape::Network(actor)),
-            others: vec![("critic 1", critic), ("critic 2", critic)],
-        }
+        self.networks(spec).with_twin_critics()
+    }
+
+    fn batch(&self) -> usize {
+        self.batch
     }
 }

@@ -15,7 +15,7 @@ section! {
         /// A policy that seems better than the best one must also be better on this many times `episodes` other episodes.
         /// 0: the first comparison decides.
         confirm: u32 = 2, bounds: from(0, 100), unit: "–", source: "ours", change: Change::Anytime;
-        /// Environments that the evaluator steps at once, and no more than an evaluation has episodes.
+        /// Environments that the evaluator steps at once; at most one for each episode of an evaluation.
         envs: u32 = 64, bounds: from(1, 64), unit: "environments", source: "ours", change: Change::Anytime;
         /// Episodes of the last evaluation. Their mean return is the run's result.
         final_episodes: u32 = 100, bounds: from(1, 100_000), unit: "episodes", source: "ours", change: Change::Anytime;

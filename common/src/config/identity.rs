@@ -60,7 +60,7 @@ fn text(config: &Config) -> String {
     line("action", &space(&spec.action));
     line("time limit", &spec.time_limit.to_string());
     line("algorithm", algorithm.name());
-    for (name, shape) in algorithm.settings().learned(spec).iter() {
+    for (name, shape) in config.learned().iter() {
         line(&format!("learned {name}"), &shape.to_string());
     }
     line("gamma", &algorithm.gamma().to_string());
@@ -82,12 +82,8 @@ fn text(config: &Config) -> String {
     if config.replay.n_step != 1 {
         line("steps of a row", &config.replay.n_step.to_string());
     }
-    let reward_scale = algorithm
-        .settings()
-        .preparation()
-        .map(|preparation| preparation.reward.scale);
-    if let Some(scale) = reward_scale.filter(|scale| *scale != 1.0) {
-        line("reward scale", &scale.to_string());
+    if config.reward.scale != 1.0 {
+        line("reward scale", &config.reward.scale.to_string());
     }
     text
 }

@@ -25,7 +25,7 @@ section! {
         updates_per_step: f64 = 1.0, bounds: from(0.0, 1_000.0),
             unit: "updates per environment step", source: "Algorithm 4",
             change: in_free_runs("its replay is as large as it requires");
-        /// n, steps of a transition: the rewards of n steps are added, and the value of the observation after them counts.
+        /// n, steps of a transition: the sum of n discounted rewards, and the observation after the last of them.
         n_step: u32 = 1, bounds: from(1, 100), unit: "steps", source: "Sutton and Barto 2018, chapter 7",
             change: never("the rows in the replay have it");
         /// Environment steps that the actors may be ahead of that ratio before the learner stops taking transitions.
@@ -80,7 +80,7 @@ impl ReplayConfig {
         } = self;
         match algorithm.spec().experience {
             Experience::Minibatches => {
-                let least = algorithm.settings().least_capacity();
+                let least = algorithm.settings().batch() as u64;
                 from(least, MAX_ROWS).check("replay.capacity", capacity)?;
                 from(1, *capacity).check("replay.warmup", warmup)
             }

@@ -8,8 +8,9 @@ use toml::{Table, Value};
 
 use super::{
     ActorsConfig, Algorithm, CheckpointConfig, Config, EnvironmentConfig, EvaluationConfig, ExplorationConfig,
-    LearnerConfig, ObservationConfig, Preparation, ReplayConfig, RewardConfig, RunConfig, explanation,
+    LearnerConfig, ObservationConfig, ReplayConfig, RewardConfig, RunConfig, explanation,
 };
+use crate::algorithms::Experience;
 
 /// The sections as they are read.
 #[derive(Deserialize)]
@@ -78,20 +79,17 @@ impl TryFrom<Sections> for Config {
             };
             ddpg.exploration = exploration;
         }
-        let preparation = Preparation {
-            observation: sections.observation.unwrap_or_default(),
-            reward: sections.reward.unwrap_or_default(),
-        };
-        let name = algorithm.name();
-        match algorithm.settings_mut().preparation_mut() {
-            Some(own) => *own = preparation,
-            None if preparation == Preparation::default() => {}
-            None => {
-                return Err(format!(
-                    "[observation] and [reward] are for methods that learn from minibatches, but this configuration is \
-                     for {name}"
-                ));
-            }
+        let (observation, reward) = (
+            sections.observation.unwrap_or_default(),
+            sections.reward.unwrap_or_default(),
+        );
+        let are_default = observation == ObservationConfig::default() && reward == RewardConfig::default();
+        if !are_default && algorithm.spec().experience != Experience::Minibatches {
+            return Err(format!(
+                "[observation] and [reward] are for methods that learn from minibatches, but this configuration is \
+                 for {}",
+                algorithm.name()
+            ));
         }
         Ok(Self {
             run: sections.run,
@@ -99,6 +97,8 @@ impl TryFrom<Sections> for Config {
             spec: sections.spec,
             actors: sections.actors,
             algorithm,
+            observation,
+            reward,
             learner: sections.learner,
             replay: sections.replay,
             evaluation: sections.evaluation,
@@ -157,15 +157,15 @@ fn one_algorithm(mut sections: Table) -> Result<Algorithm, String> {
 
 impl Serialize for Config {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        let preparation = self.algorithm.settings().preparation();
+        let has_minibatches = self.algorithm.spec().experience == Experience::Minibatches;
         Written {
             run: &self.run,
             environment: &self.environment,
             spec: &self.spec,
             actors: &self.actors,
             exploration: self.algorithm.ddpg().map(|ddpg| &ddpg.exploration),
-            observation: preparation.map(|preparation| &preparation.observation),
-            reward: preparation.map(|preparation| &preparation.reward),
+            observation: has_minibatches.then_some(&self.observation),
+            reward: has_minibatches.then_some(&self.reward),
             algorithm: &self.algorithm,
             learner: &self.learner,
             replay: &self.replay,

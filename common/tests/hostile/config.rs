@@ -3,7 +3,6 @@
 use proptest::prelude::*;
 use shoal_common::commit::ReplayLayout;
 use shoal_common::config::Config;
-use shoal_common::network::NetworkLayout;
 use toml::{Table, Value};
 
 const WHOLE: &str = r#"
@@ -95,10 +94,9 @@ fn assert_usable(config: &Config) {
         fingerprint: config.fingerprint(),
     };
     assert!(layout.places().is_some());
-    let (observation, action) = (row.observation_width(), row.action_width());
     if let Some(ddpg) = config.algorithm.ddpg() {
         let batch = ddpg.batch.max(config.actors.envs as usize);
-        let network = NetworkLayout::critic(observation, ddpg.hidden_layers(), action);
+        let network = ddpg.networks(&config.spec).critic;
         assert!(network.parameters().checked_mul(size_of::<f32>() * batch).is_some());
     }
     assert!(config.evaluation_server() < 257 && (1..=64).contains(&config.evaluation_envs()));

@@ -13,7 +13,7 @@ use tempfile::TempDir;
 use crate::bytes::{damage, extreme};
 
 fn layout() -> PolicyLayout {
-    PolicyLayout::Deterministic(NetworkLayout::policy(2, Hidden::relu([3, 2]), 1))
+    PolicyLayout::Deterministic(NetworkLayout::new(2, Hidden::relu([3, 2]), 1))
 }
 
 fn policy() -> PolicyFile {

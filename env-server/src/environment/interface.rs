@@ -10,6 +10,26 @@ use super::signal::{Goal, Picture, Signal};
 ///
 /// Its `spec` has a time limit, but the caller counts the steps and truncates the episode. Before the first `reset`,
 /// `reset_to` or `restore` the state is arbitrary but valid.
+///
+/// ```
+/// use shoal_base::stream::{Purpose, stream};
+/// use shoal_env_server::environment::Environment;
+/// use shoal_env_server::environment::pendulum::{Pendulum, PendulumParameters};
+///
+/// # fn main() -> Result<(), Box<dyn std::error::Error>> {
+/// let mut pendulum = Pendulum::new(PendulumParameters::default())?;
+/// let mut rng = stream(1, Purpose::Environment, 0, 0);
+/// pendulum.reset(&mut rng);
+/// let mut observation = vec![0.0; pendulum.spec().observation.width()];
+/// for _ in 0..pendulum.spec().time_limit {
+///     let step = pendulum.step(&[2.0], &mut rng);
+///     pendulum.observe(&mut observation); // cos θ, sin θ, angular velocity
+///     assert!(step.reward <= 0.0 && !step.terminated);
+///     assert!((observation[0].hypot(observation[1]) - 1.0).abs() < 1e-6);
+/// }
+/// # Ok(())
+/// # }
+/// ```
 pub trait Environment: Send {
     /// Spaces, time limit and the width of the state. They never change.
     fn spec(&self) -> EnvironmentSpec;

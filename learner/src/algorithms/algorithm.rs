@@ -12,20 +12,21 @@ use crate::replay::Replay;
 
 /// A learning method with its settings, before it learns.
 pub trait Method {
-    /// The learner for an environment with this `spec`, before its first update. `seed` determines the initial weights.
+    /// The learner of a run with this configuration, before its first update.
     ///
     /// # Errors
-    /// When the method cannot control that environment.
-    fn start(&self, spec: &EnvironmentSpec, seed: u64, sizes: RunSizes) -> Result<Box<dyn Algorithm>, PolicyError>;
+    /// When the method cannot control the environment.
+    fn start(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError>;
 
-    /// Names of the sections that hold what was learned, as opposed to the state of the optimiser.
+    /// Names of the sections that hold what was learned, as opposed to the state of the optimiser. The statistics of
+    /// normalised observations are not among them.
     fn weights(&self) -> &'static [&'static str];
 
     /// The matrix products of one or a few updates in an environment like `spec`; none if the method has no networks,
     /// or if its updates have no fixed size.
     fn products(&self, spec: &EnvironmentSpec) -> Products;
 
-    /// The total length of all sections of the learner's state.
+    /// The total length of all sections of the learner's state, without the statistics of normalised observations.
     fn state_numbers(&self, spec: &EnvironmentSpec, sizes: RunSizes) -> usize;
 }
 

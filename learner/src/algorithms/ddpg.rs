@@ -5,15 +5,15 @@
 //! actors and environment servers.
 
 use nalgebra::{DMatrix, DVector};
-use shoal_common::algorithms::AlgorithmSettings;
-use shoal_common::config;
+use shoal_common::algorithms::{ActorCritic, AlgorithmSettings};
+use shoal_common::config::{self, Config};
 use shoal_common::network::{ActionRange, NetworkLayout};
 use shoal_common::policy::PolicyError;
 use shoal_common::space::EnvironmentSpec;
 
 use super::algorithm::{Algorithm, Losses, Method, RunSizes, Section, SectionMut};
 use super::minibatch::Minibatch;
-use super::replayed::{self, MinibatchLearner, Replayed, mean, targets};
+use super::replayed::{MinibatchLearner, Replayed, mean, targets};
 use crate::networks::digest::sha256;
 use crate::networks::initialise::initialise;
 use crate::networks::pass::{Pass, Samples};
@@ -61,9 +61,8 @@ impl Ddpg {
     /// When the environment's actions are not real numbers in finite ranges.
     pub fn new(spec: &EnvironmentSpec, settings: &config::DdpgConfig, seed: u64) -> Result<Self, PolicyError> {
         let range = ActionRange::new(&spec.action)?;
-        let (observation, action, batch) = (spec.observation.width(), range.width(), settings.batch);
-        let mu = NetworkLayout::policy(observation, settings.hidden_layers(), action);
-        let q = NetworkLayout::critic(observation, settings.hidden_layers(), action);
+        let ActorCritic { actor: mu, critic: q } = settings.networks(spec);
+        let (action, batch) = (range.width(), settings.batch);
         Ok(Self {
             range,
             tau: settings.tau as f32,
@@ -148,7 +147,7 @@ impl Ddpg {
         let per_sample = |matrix: &DMatrix<f32>| cut * matrix.nrows();
         let part = |mut mu: Samples<'_>, mut q: Samples<'_>, s, actions, d_q, d_mu: &mut [f32]| {
             q.forward(&critic.parameters, s, actions);
-            q.backward_to_late_inputs(&critic.parameters, d_q, d_mu);
+            q.backward_to_actions(&critic.parameters, d_q, d_mu);
             // a = centre + half · tanh z, so ∂a/∂z = half · (1 − tanh² z)
             for (d, tanh) in d_mu
                 .chunks_exact_mut(half.len())
@@ -242,10 +241,9 @@ impl MinibatchLearner for Ddpg {
 }
 
 impl Method for &config::DdpgConfig {
-    fn start(&self, spec: &EnvironmentSpec, seed: u64, sizes: RunSizes) -> Result<Box<dyn Algorithm>, PolicyError> {
-        let ddpg = Ddpg::new(spec, self, seed)?;
-        let layout = self.behaviour("ddpg", spec, 0)?.into_policy().layout();
-        Ok(Box::new(Replayed::new(ddpg, *self, layout, spec, (seed, sizes))))
+    fn start(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
+        let ddpg = Ddpg::new(&config.spec, self, config.run.seed)?;
+        Ok(Box::new(Replayed::new(ddpg, config)?))
     }
 
     fn weights(&self) -> &'static [&'static str] {
@@ -255,16 +253,14 @@ impl Method for &config::DdpgConfig {
     /// With the thesis's networks, three observations and a batch of 64 they take 140 million operations, nearly all of
     /// them in nine products of size 300 × 400 × 64.
     fn products(&self, spec: &EnvironmentSpec) -> Products {
-        let (observation, action) = (spec.observation.width(), spec.action.width());
-        let mu = &NetworkLayout::policy(observation, self.hidden_layers(), action);
-        let q = &NetworkLayout::critic(observation, self.hidden_layers(), action);
+        let ActorCritic { actor: mu, critic: q } = &self.networks(spec);
         let batch = self.batch;
         let both = || product::forward(mu, batch).chain(product::forward(q, batch));
         let products = (both()
             .chain(product::forward(q, batch))
             .chain(product::backward(q, batch)))
         .chain(both())
-        .chain(product::backward_to_late_inputs(q, batch))
+        .chain(product::backward_to_actions(q, batch))
         .chain(product::backward(mu, batch));
         Products {
             updates: 1,
@@ -274,12 +270,12 @@ impl Method for &config::DdpgConfig {
 
     fn state_numbers(&self, spec: &EnvironmentSpec, _: RunSizes) -> usize {
         // Each network with its target and two moments.
-        4 * replayed::learned_parameters(*self, spec) + replayed::state_numbers(*self, spec)
+        4 * self.learned(spec).parameters()
     }
 }
 
 /// Fills `actions` with the policy's actions, in environment units, and leaves their tanh in `mu.output`. The bits are
-/// those of [`PolicyNetwork`](shoal_common::network::PolicyNetwork).
+/// those of [`DeterministicPolicy`](shoal_common::network::DeterministicPolicy).
 fn act(mu: &mut Pass, range: &ActionRange, parameters: &[f32], s: &[f32], actions: &mut DMatrix<f32>) {
     mu.forward(parameters, s, &[]);
     for (mut action, mut z) in actions.column_iter_mut().zip(mu.output.column_iter_mut()) {

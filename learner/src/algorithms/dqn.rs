@@ -4,15 +4,13 @@
 //! Symbols as there: action-values Q with parameters θ, target network Q' with θ⁻, target y.
 
 use nalgebra::{DMatrix, DVector};
-use shoal_common::algorithms::AlgorithmSettings;
-use shoal_common::config;
-use shoal_common::network::NetworkLayout;
+use shoal_common::config::{self, Config};
 use shoal_common::policy::{self, PolicyError, highest};
 use shoal_common::space::EnvironmentSpec;
 
 use super::algorithm::{Algorithm, Losses, Method, RunSizes, Section, SectionMut};
 use super::minibatch::Minibatch;
-use super::replayed::{self, MinibatchLearner, Replayed, targets};
+use super::replayed::{MinibatchLearner, Replayed, targets};
 use crate::networks::initialise::fan_in;
 use crate::networks::pass::Pass;
 use crate::networks::product::{self, Products};
@@ -51,10 +49,8 @@ impl Dqn {
     /// When the environment's actions are not discrete, or its observations are not real numbers.
     pub fn new(spec: &EnvironmentSpec, settings: &config::DqnConfig, seed: u64) -> Result<Self, PolicyError> {
         let batch = settings.batch;
-        let scores = policy::action_values("dqn", settings.hidden_layers(), settings.dueling, spec, 0)?;
-        let observation = spec.observation.width();
-        let outputs = scores.actions() + usize::from(settings.dueling);
-        let layout = NetworkLayout::policy(observation, settings.hidden_layers(), outputs);
+        let layout = settings.network(spec);
+        policy::action_values("dqn", layout, settings.dueling, spec, 0)?;
         Ok(Self {
             threads: Threads::ALONE,
             updates: 0,
@@ -64,7 +60,7 @@ impl Dqn {
             target_q: Pass::new(layout, batch),
             next_value: DVector::zeros(batch),
             y: DVector::zeros(batch),
-            d_q: DMatrix::zeros(outputs, batch),
+            d_q: DMatrix::zeros(layout.outputs(), batch),
             settings: settings.clone(),
         })
     }
@@ -199,10 +195,9 @@ impl MinibatchLearner for Dqn {
 }
 
 impl Method for &config::DqnConfig {
-    fn start(&self, spec: &EnvironmentSpec, seed: u64, sizes: RunSizes) -> Result<Box<dyn Algorithm>, PolicyError> {
-        let dqn = Dqn::new(spec, self, seed)?;
-        let layout = self.behaviour("dqn", spec, 0)?.into_policy().layout();
-        Ok(Box::new(Replayed::new(dqn, *self, layout, spec, (seed, sizes))))
+    fn start(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
+        let dqn = Dqn::new(&config.spec, self, config.run.seed)?;
+        Ok(Box::new(Replayed::new(dqn, config)?))
     }
 
     fn weights(&self) -> &'static [&'static str] {
@@ -210,8 +205,7 @@ impl Method for &config::DqnConfig {
     }
 
     fn products(&self, spec: &EnvironmentSpec) -> Products {
-        let outputs = spec.action.size() + usize::from(self.dueling);
-        let q = &NetworkLayout::policy(spec.observation.width(), self.hidden_layers(), outputs);
+        let q = &self.network(spec);
         let forward_passes = if self.double { 3 } else { 2 };
         let forward = (0..forward_passes).flat_map(|_| product::forward(q, self.batch));
         Products {
@@ -222,7 +216,7 @@ impl Method for &config::DqnConfig {
 
     fn state_numbers(&self, spec: &EnvironmentSpec, _: RunSizes) -> usize {
         // The network with its target and two moments.
-        4 * replayed::learned_parameters(*self, spec) + replayed::state_numbers(*self, spec)
+        4 * self.network(spec).parameters()
     }
 }
 

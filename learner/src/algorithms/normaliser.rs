@@ -11,9 +11,6 @@ use crate::replay::Replay;
 /// Added to a variance before its root is taken.
 const VARIANCE_FLOOR: f64 = 1e-8;
 
-/// The name of its numbers in a checkpoint.
-pub(super) const SECTION: &str = "observations";
-
 /// Sets the number of rows looked at in a state that was saved: those of another replay do not count.
 pub(super) fn set_rows(state: &mut [f32], rows: u64) {
     let halves: [f32; 2] = bytemuck::cast(rows as f64);
@@ -33,6 +30,9 @@ pub(super) struct Normaliser {
 }
 
 impl Normaliser {
+    /// The name of its numbers in a checkpoint.
+    pub(super) const SECTION: &'static str = "observations";
+
     /// `f32`s in a checkpoint, for observations of this width.
     pub(super) fn state_numbers(width: usize) -> usize {
         2 * (2 + 2 * width)
@@ -107,12 +107,12 @@ impl Normaliser {
 
     /// Its numbers, each `f64` as the two halves of its bits.
     pub(super) fn state(&self) -> Section<'_> {
-        (SECTION, bytemuck::cast_slice(&self.numbers))
+        (Self::SECTION, bytemuck::cast_slice(&self.numbers))
     }
 
     /// As [`state`](Self::state), to be overwritten; [`restored`](Self::restored) must follow.
     pub(super) fn state_mut(&mut self) -> SectionMut<'_> {
-        (SECTION, bytemuck::cast_slice_mut(&mut self.numbers))
+        (Self::SECTION, bytemuck::cast_slice_mut(&mut self.numbers))
     }
 
     /// Derives the rest from a restored state.
@@ -124,7 +124,7 @@ impl Normaliser {
 #[cfg(test)]
 mod tests {
     use rand::RngExt;
-    use shoal_common::network::CLIP;
+    use shoal_common::network::OBSERVATION_CLIP;
     use shoal_common::stream::{Purpose, stream};
     use shoal_common::transition::{RowLayout, Transition};
 
@@ -221,7 +221,10 @@ mod tests {
         let mut normaliser = Normaliser::new(WIDTH);
         normaliser.apply(&mut batch);
         assert_eq!(batch.s.row(1), before.s.row(1));
-        assert!(batch.s.row(0).iter().all(|x| *x == CLIP), "all are near 100");
+        assert!(
+            batch.s.row(0).iter().all(|x| *x == OBSERVATION_CLIP),
+            "all are near 100"
+        );
         batch = before.clone();
         normaliser.count(&replay, 500);
         normaliser.apply(&mut batch);

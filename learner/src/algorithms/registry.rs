@@ -4,7 +4,8 @@ use shoal_common::config::{self, Config};
 use shoal_common::policy::PolicyError;
 
 use super::algorithm::{Algorithm, Method, RunSizes, SavedState, SectionError};
-use super::{normaliser, tabular};
+use super::normaliser::{self, Normaliser};
+use super::tabular;
 use crate::networks::product::Products;
 
 /// The method for the settings of a configuration.
@@ -25,17 +26,18 @@ fn method(algorithm: &config::Algorithm) -> Box<dyn Method + '_> {
 /// # Errors
 /// When the method cannot control the environment.
 pub fn new(config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
-    method(&config.algorithm).start(&config.spec, config.run.seed, RunSizes::from(config))
+    method(&config.algorithm).start(config)
 }
 
 /// Names of the sections of a checkpoint that hold what was learned, as opposed to the state of the optimiser.
-pub fn weights(algorithm: &config::Algorithm) -> &'static [&'static str] {
-    method(algorithm).weights()
+pub fn weights(config: &Config) -> Vec<&'static str> {
+    let statistics = config.observation.normalise.then_some(Normaliser::SECTION);
+    let learned = method(&config.algorithm).weights().iter().copied();
+    learned.chain(statistics).collect()
 }
 
-/// The state of a learner that is `fresh`, except that it has the weights (by their names) of another one's state `saved`,
-/// and its normalisation of observations. The optimisers begin anew. `rows` rows of its own replay are part of that
-/// normalisation already.
+/// The state of a learner that is `fresh`, except that it has the sections `weights` of another one's state `saved`. The
+/// optimisers begin anew. `rows` rows of its own replay are part of the statistics of observations already.
 ///
 /// # Errors
 /// When the other state lacks a part, or has it in another shape.
@@ -46,11 +48,11 @@ pub fn inherited(
     rows: u64,
 ) -> Result<Vec<(&'static str, Vec<f32>)>, SectionError> {
     let section = |(name, numbers): (&'static str, &[f32])| {
-        if !weights.contains(&name) && name != normaliser::SECTION {
+        if !weights.contains(&name) {
             return Ok((name, numbers.to_vec()));
         }
         let mut inherited = saved.take(name, numbers.len())?;
-        if name == normaliser::SECTION {
+        if name == Normaliser::SECTION {
             normaliser::set_rows(&mut inherited, rows);
         }
         Ok((name, inherited))
@@ -66,7 +68,12 @@ pub fn products(config: &Config) -> Products {
 
 /// The total length of that learner's state, computed without creating the learner.
 pub fn state_numbers(config: &Config) -> usize {
-    method(&config.algorithm).state_numbers(&config.spec, RunSizes::from(config))
+    let statistics = if config.observation.normalise {
+        Normaliser::state_numbers(config.spec.observation.width())
+    } else {
+        0
+    };
+    method(&config.algorithm).state_numbers(&config.spec, RunSizes::from(config)) + statistics
 }
 
 #[cfg(test)]
@@ -123,17 +130,24 @@ mod tests {
             let numbers: usize = state.iter().map(|(_, numbers)| numbers.len()).sum();
             assert_eq!(state_numbers(&config), numbers, "{rest}");
             let named = |name: &&str| state.iter().any(|(section, _)| section == name);
-            let weights = weights(&config.algorithm);
+            let weights = weights(&config);
+            assert_eq!(
+                weights.contains(&"observations"),
+                rest.contains("normalise = true"),
+                "{rest}"
+            );
             // A learner inherits its weights, and nothing of the optimiser.
             let other: Vec<(String, Vec<f32>)> = state
                 .iter()
                 .map(|(name, numbers)| ((*name).to_owned(), vec![0.5; numbers.len()]))
                 .collect();
-            let begun = inherited(&*learner, weights, SavedState::from(other), 3).unwrap();
+            let begun = inherited(&*learner, &weights, SavedState::from(other), 3).unwrap();
             for ((name, numbers), (_, fresh)) in begun.iter().zip(&state) {
                 match *name {
-                    name if weights.contains(&name) => assert!(numbers.iter().all(|it| *it == 0.5), "{name}"),
-                    normaliser::SECTION => assert_eq!(numbers[..2], bytemuck::cast::<f64, [f32; 2]>(3.0)),
+                    name if weights.contains(&name) && name != Normaliser::SECTION => {
+                        assert!(numbers.iter().all(|it| *it == 0.5), "{name}")
+                    }
+                    Normaliser::SECTION => assert_eq!(numbers[..2], bytemuck::cast::<f64, [f32; 2]>(3.0)),
                     name => assert_eq!(numbers, fresh, "{name}"),
                 }
             }

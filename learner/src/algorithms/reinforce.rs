@@ -10,8 +10,8 @@
 use std::borrow::Cow;
 
 use nalgebra::DMatrix;
-use shoal_common::algorithms::AlgorithmSettings;
-use shoal_common::config::{self, Weight};
+use shoal_common::algorithms::{AlgorithmSettings, ReinforceNetworks};
+use shoal_common::config::{self, Config, Weight};
 use shoal_common::network::NetworkLayout;
 use shoal_common::policy::{self, PolicyError, PolicyLayout};
 use shoal_common::space::EnvironmentSpec;
@@ -106,21 +106,16 @@ impl Reinforce {
         seed: u64,
         sizes: RunSizes,
     ) -> Result<Self, PolicyError> {
-        let observation = spec.observation.width();
-        let actions = policy::softmax("reinforce", settings.hidden_layers(), spec, 0)?.actions();
+        let ReinforceNetworks { policy, baseline } = settings.networks(spec);
+        policy::softmax("reinforce", policy, spec, 0)?;
         let steps = sizes.chunk_rows * sizes.actors as usize;
-        let network = NetworkLayout::policy(observation, settings.hidden_layers(), actions);
-        let baseline = (settings.weight == Weight::Baseline).then(|| {
-            let network = NetworkLayout::policy(observation, settings.baseline_hidden_layers(), 1);
-            Learned::new(network, settings.baseline_learning_rate, seed, 1, steps)
-        });
         Ok(Self {
-            policy: Learned::new(network, settings.learning_rate, seed, 0, steps),
-            baseline,
+            policy: Learned::new(policy, settings.learning_rate, seed, 0, steps),
+            baseline: baseline.map(|network| Learned::new(network, settings.baseline_learning_rate, seed, 1, steps)),
             settings: settings.clone(),
             rows: 0,
             steps: [0.0],
-            s: DMatrix::zeros(observation, steps),
+            s: DMatrix::zeros(policy.inputs(), steps),
         })
     }
 
@@ -192,7 +187,7 @@ impl Reinforce {
         episode
             .last()
             .is_some_and(|end| end.last && (self.settings.learn_at_limit || end.discount == 0.0))
-            // Those of a learner that did not check what it committed may not be.
+            // Learners of earlier versions did not check their rows.
             && episode.iter().all(is_finite)
     }
 
@@ -229,8 +224,9 @@ fn ln_sum_exp(logits: &[f32]) -> f32 {
 }
 
 impl Method for &config::ReinforceConfig {
-    fn start(&self, spec: &EnvironmentSpec, seed: u64, sizes: RunSizes) -> Result<Box<dyn Algorithm>, PolicyError> {
-        Ok(Box::new(Reinforce::new(self, spec, seed, sizes)?))
+    fn start(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
+        let (spec, seed) = (&config.spec, config.run.seed);
+        Ok(Box::new(Reinforce::new(self, spec, seed, RunSizes::from(config))?))
     }
 
     fn weights(&self) -> &'static [&'static str] {

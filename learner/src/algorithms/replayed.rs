@@ -3,12 +3,10 @@
 use std::borrow::Cow;
 
 use nalgebra::DVector;
-use shoal_common::algorithms::AlgorithmSettings;
-use shoal_common::policy::PolicyLayout;
-use shoal_common::space::EnvironmentSpec;
-use shoal_common::transition::RowLayout;
+use shoal_common::config::Config;
+use shoal_common::policy::{PolicyError, PolicyLayout};
 
-use super::algorithm::{Algorithm, Losses, RunSizes, SavedState, Section, SectionError, SectionMut};
+use super::algorithm::{Algorithm, Losses, SavedState, Section, SectionError, SectionMut};
 use super::minibatch::Minibatch;
 use super::normaliser::Normaliser;
 use super::sampling::Sampler;
@@ -52,52 +50,23 @@ pub struct Replayed<L> {
 }
 
 impl<L: MinibatchLearner> Replayed<L> {
-    /// Samples minibatches for `learner`, whose method has these settings and, in environments like `spec`, a policy of
-    /// this layout.
-    pub fn new(
-        learner: L,
-        settings: &dyn AlgorithmSettings,
-        layout: PolicyLayout,
-        spec: &EnvironmentSpec,
-        (seed, sizes): (u64, RunSizes),
-    ) -> Self {
-        let (observation, batch) = (spec.observation.width(), settings.least_capacity() as usize);
-        let row = RowLayout::new(observation, spec.action.width());
-        let preparation = settings.preparation().cloned().unwrap_or_default();
-        Self {
+    /// Samples minibatches for the `learner` of a run with this configuration.
+    ///
+    /// # Errors
+    /// When the algorithm cannot control the environment.
+    pub fn new(learner: L, config: &Config) -> Result<Self, PolicyError> {
+        let (row, batch) = (config.row_layout(), config.algorithm.settings().batch());
+        let normalise = config.observation.normalise;
+        Ok(Self {
             learner,
-            sampler: Sampler::new(seed),
+            sampler: Sampler::new(config.run.seed),
             batch: Minibatch::new(row, batch),
             indices: vec![0; batch],
-            capacity: sizes.capacity,
-            layout,
-            normaliser: normalises(settings).then(|| Normaliser::new(observation)),
-            reward_scale: preparation.reward.scale as f32,
-        }
-    }
-}
-
-fn normalises(settings: &dyn AlgorithmSettings) -> bool {
-    let preparation = settings.preparation();
-    preparation.is_some_and(|preparation| preparation.observation.normalise)
-}
-
-/// The number of parameters of all that is learned, without those that normalise observations.
-pub(super) fn learned_parameters(settings: &dyn AlgorithmSettings, spec: &EnvironmentSpec) -> usize {
-    let all = settings.learned(spec).parameters();
-    all - if normalises(settings) {
-        2 * spec.observation.width()
-    } else {
-        0
-    }
-}
-
-/// The length of the state that a [`Replayed`] adds to its learner's.
-pub(super) fn state_numbers(settings: &dyn AlgorithmSettings, spec: &EnvironmentSpec) -> usize {
-    if normalises(settings) {
-        Normaliser::state_numbers(spec.observation.width())
-    } else {
-        0
+            capacity: config.replay.capacity,
+            layout: config.policy_layout()?,
+            normaliser: normalise.then(|| Normaliser::new(row.observation_width())),
+            reward_scale: config.reward.scale as f32,
+        })
     }
 }
 

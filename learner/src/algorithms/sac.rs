@@ -10,8 +10,8 @@ use std::f32::consts::{LN_2, PI};
 use nalgebra::{DMatrix, DVector};
 use rand::RngExt;
 use rand_distr::StandardNormal;
-use shoal_common::algorithms::AlgorithmSettings;
-use shoal_common::config;
+use shoal_common::algorithms::ActorCritic;
+use shoal_common::config::{self, Config};
 use shoal_common::network::{ActionRange, LOG_STD_RANGE, NetworkLayout};
 use shoal_common::policy::PolicyError;
 use shoal_common::space::EnvironmentSpec;
@@ -19,7 +19,7 @@ use shoal_common::stream::{Purpose, Stream, seek, stream};
 
 use super::algorithm::{Algorithm, Losses, Method, RunSizes, Section, SectionMut};
 use super::minibatch::Minibatch;
-use super::replayed::{self, MinibatchLearner, Replayed, mean};
+use super::replayed::{MinibatchLearner, Replayed, mean};
 use super::twin_critics::{self, CriticLosses, CriticPart, TwinCritics};
 use crate::networks::adam::Adam;
 use crate::networks::initialise::fan_in;
@@ -207,9 +207,8 @@ impl Sac {
     /// When the environment's actions are not real numbers in finite ranges.
     pub fn new(spec: &EnvironmentSpec, settings: &config::SacConfig, seed: u64) -> Result<Self, PolicyError> {
         let range = ActionRange::new(&spec.action)?;
-        let (observation, action, batch) = (spec.observation.width(), range.width(), settings.batch);
-        let pi = NetworkLayout::policy(observation, settings.hidden_layers(), 2 * action);
-        let q = NetworkLayout::joined_critic(observation, settings.hidden_layers(), action);
+        let ActorCritic { actor: pi, critic: q } = settings.networks(spec);
+        let (action, batch) = (range.width(), settings.batch);
         Ok(Self {
             range,
             tau: settings.tau as f32,
@@ -383,10 +382,9 @@ fn names() -> impl Iterator<Item = &'static str> {
 }
 
 impl Method for &config::SacConfig {
-    fn start(&self, spec: &EnvironmentSpec, seed: u64, sizes: RunSizes) -> Result<Box<dyn Algorithm>, PolicyError> {
-        let sac = Sac::new(spec, self, seed)?;
-        let layout = self.behaviour("sac", spec, 0)?.into_policy().layout();
-        Ok(Box::new(Replayed::new(sac, *self, layout, spec, (seed, sizes))))
+    fn start(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
+        let sac = Sac::new(&config.spec, self, config.run.seed)?;
+        Ok(Box::new(Replayed::new(sac, config)?))
     }
 
     fn weights(&self) -> &'static [&'static str] {
@@ -394,11 +392,9 @@ impl Method for &config::SacConfig {
     }
 
     fn products(&self, spec: &EnvironmentSpec) -> Products {
-        let (observation, action) = (spec.observation.width(), spec.action.width());
-        let pi = &NetworkLayout::policy(observation, self.hidden_layers(), 2 * action);
-        let q = &NetworkLayout::joined_critic(observation, self.hidden_layers(), action);
+        let ActorCritic { actor: pi, critic: q } = &self.networks(spec);
         let batch = self.batch;
-        let improve = || product::forward(q, batch).chain(product::backward_to_late_inputs(q, batch));
+        let improve = || product::forward(q, batch).chain(product::backward_to_actions(q, batch));
         let products = (product::forward(pi, batch).chain(product::forward(pi, batch)))
             .chain(twin_critics::products(q, batch))
             .chain(improve())
@@ -411,11 +407,9 @@ impl Method for &config::SacConfig {
     }
 
     fn state_numbers(&self, spec: &EnvironmentSpec, _: RunSizes) -> usize {
-        let (observation, action) = (spec.observation.width(), spec.action.width());
-        let pi = NetworkLayout::policy(observation, self.hidden_layers(), 2 * action);
-        // Each network with two moments, the critics also with a target; ln α with two moments.
-        let networks = 4 * replayed::learned_parameters(*self, spec) - pi.parameters();
-        networks + 3 + replayed::state_numbers(*self, spec)
+        let ActorCritic { actor, critic } = self.networks(spec);
+        // The actor with two moments, each critic with a target and two moments, ln α with two moments.
+        3 * actor.parameters() + 2 * 4 * critic.parameters() + 3
     }
 }
 

@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 
 use shoal_common::algorithms::AlgorithmSettings;
-use shoal_common::config;
+use shoal_common::config::{self, Config};
 use shoal_common::policy::{self, PolicyError, PolicyLayout};
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::transition::Transition;
@@ -30,8 +30,9 @@ pub struct QLearning<'a>(pub &'a config::TabularConfig);
 pub struct Sarsa<'a>(pub &'a config::TabularConfig);
 
 impl Method for QLearning<'_> {
-    fn start(&self, spec: &EnvironmentSpec, _: u64, sizes: RunSizes) -> Result<Box<dyn Algorithm>, PolicyError> {
-        Ok(Box::new(Tabular::new(Bootstrap::Max, self.0, spec, sizes)?))
+    fn start(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
+        let sizes = RunSizes::from(config);
+        Ok(Box::new(Tabular::new(Bootstrap::Max, self.0, &config.spec, sizes)?))
     }
 
     fn weights(&self) -> &'static [&'static str] {
@@ -48,8 +49,14 @@ impl Method for QLearning<'_> {
 }
 
 impl Method for Sarsa<'_> {
-    fn start(&self, spec: &EnvironmentSpec, _: u64, sizes: RunSizes) -> Result<Box<dyn Algorithm>, PolicyError> {
-        Ok(Box::new(Tabular::new(Bootstrap::NextAction, self.0, spec, sizes)?))
+    fn start(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
+        let sizes = RunSizes::from(config);
+        Ok(Box::new(Tabular::new(
+            Bootstrap::NextAction,
+            self.0,
+            &config.spec,
+            sizes,
+        )?))
     }
 
     fn weights(&self) -> &'static [&'static str] {
@@ -244,7 +251,7 @@ impl Algorithm for Tabular {
         let slot = self.slot(row);
         let numbers = replay.row(row);
         if !are_finite(numbers) {
-            // Of a learner that did not check what it committed. The step before has lost its successor.
+            // From a learner of an earlier version, which did not check its rows. The step before has lost its successor.
             self.take_pending(slot);
             return Losses::default();
         }

@@ -6,16 +6,16 @@
 use nalgebra::{DMatrix, DVector};
 use rand::RngExt;
 use rand_distr::StandardNormal;
-use shoal_common::algorithms::AlgorithmSettings;
-use shoal_common::config;
-use shoal_common::network::{ActionRange, NetworkLayout};
+use shoal_common::algorithms::{ActorCritic, AlgorithmSettings};
+use shoal_common::config::{self, Config};
+use shoal_common::network::ActionRange;
 use shoal_common::policy::PolicyError;
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::stream::{Purpose, Stream, seek, stream};
 
 use super::algorithm::{Algorithm, Losses, Method, RunSizes, Section, SectionMut};
 use super::minibatch::Minibatch;
-use super::replayed::{self, MinibatchLearner, Replayed, mean};
+use super::replayed::{MinibatchLearner, Replayed, mean};
 use super::twin_critics::{self, CriticLosses, CriticPart, TwinCritics};
 use crate::networks::initialise::fan_in;
 use crate::networks::pass::{Pass, Samples};
@@ -66,9 +66,8 @@ impl Td3 {
     /// When the environment's actions are not real numbers in finite ranges.
     pub fn new(spec: &EnvironmentSpec, settings: &config::Td3Config, seed: u64) -> Result<Self, PolicyError> {
         let range = ActionRange::new(&spec.action)?;
-        let (observation, action, batch) = (spec.observation.width(), range.width(), settings.batch);
-        let mu = NetworkLayout::policy(observation, settings.hidden_layers(), action);
-        let q = NetworkLayout::joined_critic(observation, settings.hidden_layers(), action);
+        let ActorCritic { actor: mu, critic: q } = settings.networks(spec);
+        let (action, batch) = (range.width(), settings.batch);
         Ok(Self {
             threads: Threads::ALONE,
             updates: 0,
@@ -218,10 +217,9 @@ impl MinibatchLearner for Td3 {
 }
 
 impl Method for &config::Td3Config {
-    fn start(&self, spec: &EnvironmentSpec, seed: u64, sizes: RunSizes) -> Result<Box<dyn Algorithm>, PolicyError> {
-        let td3 = Td3::new(spec, self, seed)?;
-        let layout = self.behaviour("td3", spec, 0)?.into_policy().layout();
-        Ok(Box::new(Replayed::new(td3, *self, layout, spec, (seed, sizes))))
+    fn start(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
+        let td3 = Td3::new(&config.spec, self, config.run.seed)?;
+        Ok(Box::new(Replayed::new(td3, config)?))
     }
 
     fn weights(&self) -> &'static [&'static str] {
@@ -229,13 +227,11 @@ impl Method for &config::Td3Config {
     }
 
     fn products(&self, spec: &EnvironmentSpec) -> Products {
-        let (observation, action) = (spec.observation.width(), spec.action.width());
-        let mu = &NetworkLayout::policy(observation, self.hidden_layers(), action);
-        let q = &NetworkLayout::joined_critic(observation, self.hidden_layers(), action);
+        let ActorCritic { actor: mu, critic: q } = &self.networks(spec);
         let batch = self.batch;
         let of_critics = || product::forward(mu, batch).chain(twin_critics::products(q, batch));
         let of_actor = (product::forward(mu, batch).chain(product::forward(q, batch)))
-            .chain(product::backward_to_late_inputs(q, batch))
+            .chain(product::backward_to_actions(q, batch))
             .chain(product::backward(mu, batch));
         let delay = self.policy_delay;
         Products {
@@ -246,7 +242,7 @@ impl Method for &config::Td3Config {
 
     fn state_numbers(&self, spec: &EnvironmentSpec, _: RunSizes) -> usize {
         // Each network with its target and two moments.
-        4 * replayed::learned_parameters(*self, spec) + replayed::state_numbers(*self, spec)
+        4 * self.learned(spec).parameters()
     }
 }
 

@@ -38,12 +38,12 @@ pub(super) fn minibatch(seed: u64, row: RowLayout, size: usize) -> Minibatch {
 }
 
 /// A network's output for one sample by the definition, with parameters in `f64`.
-pub(super) fn network(layout: &NetworkLayout, parameters: &[f64], x: &[f64], late: &[f64]) -> Vec<f64> {
+pub(super) fn network(layout: &NetworkLayout, parameters: &[f64], x: &[f64], actions: &[f64]) -> Vec<f64> {
     let mut x = x.to_vec();
     let Hidden { layers, activation } = layout.hidden();
     for (number, range) in layout.layer_ranges().enumerate() {
-        if Some(number) == layout.late_layer() {
-            x.extend(late);
+        if Some(number) == layout.action_layer() {
+            x.extend(actions);
         }
         let (w, b) = (&parameters[range.weights], &parameters[range.biases]);
         let z = |i: usize| b[i] + x.iter().enumerate().map(|(j, x)| w[j * b.len() + i] * x).sum::<f64>();

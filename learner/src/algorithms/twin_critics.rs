@@ -77,7 +77,7 @@ impl CriticPart<'_> {
 
     /// Computes `d_a` from `d_q`.
     pub(super) fn backward(&mut self) {
-        self.q.backward_to_late_inputs(self.theta, self.d_q, self.d_a);
+        self.q.backward_to_actions(self.theta, self.d_q, self.d_a);
     }
 }
 
@@ -102,7 +102,7 @@ pub(super) struct CriticLosses {
 impl TwinCritics {
     /// New critics, drawn from networks 1 and 2 of `seed`, for minibatches of `batch` transitions.
     pub(super) fn new(layout: NetworkLayout, learning_rate: f64, batch: usize, seed: u64) -> Self {
-        let action = layout.late_inputs();
+        let action = layout.action_inputs();
         let critic = |index| Critic {
             network: Targeted::new(layout, learning_rate, &fan_in(&layout, seed, index)),
             q: Pass::new(layout, batch),

@@ -8,7 +8,7 @@ use shoal_common::stream::{Purpose, stream};
 /// range (Lillicrap et al. 2015, section 7).
 const OUTPUT_BOUND: f32 = 3e-3;
 
-/// Seeded initial weights: hidden layers uniform within ±1/√fan-in (including late inputs), the output layer within
+/// Seeded initial weights: hidden layers uniform within ±1/√fan-in (including action inputs), the output layer within
 /// ±3e-3.
 ///
 /// `index` distinguishes the networks of one run.
@@ -66,7 +66,7 @@ mod tests {
 
     #[test]
     fn glorot_weights_fill_their_bounds_and_biases_are_zero() {
-        let layout = NetworkLayout::policy(4, Hidden::relu([60, 40]), 2);
+        let layout = NetworkLayout::new(4, Hidden::relu([60, 40]), 2);
         let parameters = glorot(&layout, 7, 0);
         let bounds = [6.0 / 64.0, 6.0 / 100.0, 6.0 / 42.0].map(f32::sqrt);
         for (range, bound) in layout.layer_ranges().zip(bounds) {
@@ -101,7 +101,7 @@ mod tests {
 
     #[test]
     fn seed_and_index_determine_the_weights() {
-        let layout = NetworkLayout::policy(3, Hidden::relu([8, 6]), 1);
+        let layout = NetworkLayout::new(3, Hidden::relu([8, 6]), 1);
         assert_eq!(initialise(&layout, 1, 0), initialise(&layout, 1, 0));
         assert_ne!(initialise(&layout, 1, 0), initialise(&layout, 2, 0));
         assert_ne!(initialise(&layout, 1, 0), initialise(&layout, 1, 1));

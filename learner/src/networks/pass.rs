@@ -15,9 +15,9 @@ use super::threads::Threads;
 #[derive(Clone, Debug)]
 pub struct Pass {
     layout: NetworkLayout,
-    /// The inputs with the late inputs below them, if these enter at the first layer; otherwise it has no rows.
+    /// The inputs with the action inputs below them, if these enter at the first layer; otherwise it has no rows.
     joined: DMatrix<f32>,
-    /// Each hidden layer's activations, with the late inputs below them if these enter at the next layer.
+    /// Each hidden layer's activations, with the action inputs below them if these enter at the next layer.
     h: Vec<DMatrix<f32>>,
     /// The output layer's values, linear.
     pub output: DMatrix<f32>,
@@ -40,9 +40,9 @@ impl Pass {
         }
     }
 
-    /// Computes `output` for inputs `x` and late inputs `late` (empty if the network has none).
-    pub fn forward(&mut self, parameters: &[f32], x: &[f32], late: &[f32]) {
-        self.samples().forward(parameters, x, late);
+    /// Computes `output` for inputs `x` and `actions` (empty if the network has none).
+    pub fn forward(&mut self, parameters: &[f32], x: &[f32], actions: &[f32]) {
+        self.samples().forward(parameters, x, actions);
     }
 
     /// Writes ∂L/∂θ, laid out as the parameters θ, into `gradient`, given `d` = ∂L/∂output. A forward pass with the
@@ -55,8 +55,7 @@ impl Pass {
         d: &DMatrix<f32>,
         gradient: &mut [f32],
     ) {
-        // Below the last hidden layer the products are large enough to be shared. With two hidden layers there are
-        // none.
+        // With three or more hidden layers, there are products below the last one that are large enough to share.
         if self.d.len() > 2 {
             let cut = threads.first_share(d.ncols());
             let d = d.as_slice().split_at(cut * d.nrows());
@@ -138,7 +137,7 @@ impl Pass {
         let (gradient_1, gradient_2) = rest.split_at_mut(g1.biases.end);
         let (w1, b1) = gradient_1.split_at_mut(g1.weights.len());
         let (w2, b2) = gradient_2.split_at_mut(g2.weights.len());
-        let x = if layout.late_layer() == Some(0) {
+        let x = if layout.action_layer() == Some(0) {
             joined.as_slice()
         } else {
             x
@@ -156,7 +155,7 @@ impl Pass {
                 d1.sum_into(b1);
                 weight_gradient(d1.as_mat(), matrix(x, inputs), to_w1);
             };
-        // The late inputs come last: the second thread has them, or the only one.
+        // The action inputs come last: the second thread has them, or the only one.
         let weights = matrix(&second.weights[..h1 * h2], h2).split_at_col(cut);
         let units = Columns::new(h[0].as_slice(), inputs_2);
         let units = (units.rows(0, cut), units.rows(cut, inputs_2 - cut));
@@ -173,9 +172,9 @@ impl Pass {
     }
 }
 
-/// Rows of `Pass::joined`: 0 if late inputs do not enter at the first layer.
+/// Rows of `Pass::joined`: 0 if action inputs do not enter at the first layer.
 fn rows_of_joined(layout: &NetworkLayout) -> usize {
-    match layout.late_layer() {
+    match layout.action_layer() {
         Some(0) => layout.layer_size(0).0,
         _ => 0,
     }
@@ -236,13 +235,13 @@ impl<'a> Samples<'a> {
     }
 
     /// As [`Pass::forward`], for these samples.
-    pub fn forward(&mut self, parameters: &[f32], x: &[f32], late: &[f32]) {
+    pub fn forward(&mut self, parameters: &[f32], x: &[f32], actions: &[f32]) {
         let to = Activations {
             joined: self.joined,
             hidden: self.h.iter_mut().map(|h| &mut **h),
             output: self.output,
         };
-        self.layout.forward(parameters, x, late, to);
+        self.layout.forward(parameters, x, actions, to);
     }
 
     /// Computes ∂L/∂z of the hidden layers, from the last one down to `lowest`, given `d` = ∂L/∂output of the forward
@@ -261,21 +260,21 @@ impl<'a> Samples<'a> {
         }
     }
 
-    /// Writes ∂L/∂late into `to`, given `d` = ∂L/∂output. It does not go below the layer where the late inputs enter,
+    /// Writes ∂L/∂action into `to`, given `d` = ∂L/∂output. It does not go below the layer where the action inputs enter,
     /// and does nothing if there are none.
-    pub fn backward_to_late_inputs(&mut self, parameters: &[f32], d: &[f32], to: &mut [f32]) {
+    pub fn backward_to_actions(&mut self, parameters: &[f32], d: &[f32], to: &mut [f32]) {
         let layout = self.layout;
-        let Some(layer) = layout.late_layer() else {
+        let Some(layer) = layout.action_layer() else {
             return;
         };
         self.backward(parameters, d, layer);
         let (inputs, units) = layout.layer_size(layer);
-        let own_inputs = inputs - layout.late_inputs();
-        let late = &layout.layer(layer, parameters).weights[own_inputs * units..];
+        let own_inputs = inputs - layout.action_inputs();
+        let weights = &layout.layer(layer, parameters).weights[own_inputs * units..];
         input_gradient(
-            matrix(late, units),
+            matrix(weights, units),
             matrix(self.d[layer], units),
-            matrix_mut(to, layout.late_inputs()),
+            matrix_mut(to, layout.action_inputs()),
         );
     }
 }

@@ -67,12 +67,12 @@ pub fn backward(network: &NetworkLayout, batch: usize) -> impl Iterator<Item = P
     })
 }
 
-/// The products of a backward pass to the late inputs of a critic.
-pub fn backward_to_late_inputs(critic: &NetworkLayout, batch: usize) -> impl Iterator<Item = Product> {
-    critic.late_layer().into_iter().flat_map(move |late| {
-        let above = (late + 1..=output_layer(critic)).rev();
-        let units = critic.layer_size(late).1;
-        let inputs = Product::new(critic.late_inputs(), units, batch, Transposed::Left);
+/// The products of a backward pass to the action inputs of a critic.
+pub fn backward_to_actions(critic: &NetworkLayout, batch: usize) -> impl Iterator<Item = Product> {
+    critic.action_layer().into_iter().flat_map(move |entry| {
+        let above = (entry + 1..=output_layer(critic)).rev();
+        let units = critic.layer_size(entry).1;
+        let inputs = Product::new(critic.action_inputs(), units, batch, Transposed::Left);
         above.map(move |layer| down(critic, layer, batch)).chain([inputs])
     })
 }
@@ -90,7 +90,7 @@ fn output_layer(network: &NetworkLayout) -> usize {
 /// Every matrix product of a number of updates, in the order in which they run.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Products {
-    /// Updates that these are the products of.
+    /// The number of updates.
     pub updates: u64,
     /// The products.
     pub products: Vec<Product>,

@@ -36,8 +36,7 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
         }
         learner.connect_new_actors()?;
         let updates = learner.updates();
-        // After a power loss the replay may have had many rows of which none is readable. Then new rows must come
-        // first.
+        // After a power loss the replay may have no readable row, although it had many. Then new rows must come first.
         let drained = learner.intake.drain(&mut learner.replay, CHUNKS_AT_ONCE, |replay| {
             !replay.rows().is_empty() && ratio.is_behind(replay.head(), updates)
         })?;

@@ -35,7 +35,7 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
         for actor in 0..learner.intake.actors() {
             rows = await_chunk(learner, actor, rows)?;
         }
-        // Only now, so that a round that is interrupted begins again.
+        // Only after all chunks have come: a round that is interrupted before begins again.
         learner.count_rows(rows);
         while learner.updates() < ratio.allowed(learner.rows) {
             learner.update()?;

@@ -102,7 +102,7 @@ pub fn disk_bytes(config: &Config, run: &RunDir) -> Result<u64, SizeError> {
         let places = replay_layout(config).places().ok_or(SizeError::Replay { capacity })?;
         places.end as u64
     };
-    let (_, policy) = config.algorithm.settings().learned(&config.spec).policy;
+    let (_, policy) = config.learned().policy;
     // Three checkpoints: the latest, the one before, and the next one while it is written. Three policies: the best,
     // the last, and one while it is written.
     let numbers = 3 * (registry::state_numbers(config) + policy.parameters()) as u64;

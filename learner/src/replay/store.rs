@@ -29,11 +29,11 @@ pub struct Replay {
     pub(super) synced_generation: u64,
     pub(super) warnings: Vec<String>,
     pub(super) hook: Option<Hook>,
-    /// Whether the log has been told of rows that are not learned from.
+    /// Whether it has been logged that some rows are not learned from.
     warned: AtomicBool,
 }
 
-/// Whether every number of these is finite. Without an early end, which is nearly never taken: this can be done in vectors.
+/// Whether all these numbers are finite. It does not stop at the first that is not, so that it can use vector instructions.
 pub fn are_finite(numbers: &[f32]) -> bool {
     numbers.iter().fold(true, |all, number| all & number.is_finite())
 }
@@ -138,8 +138,9 @@ impl Replay {
         self.ring.row(index)
     }
 
-    /// The row `index`, or the next one of `within` whose numbers are all finite; after the last the first follows. Learners
-    /// check chunks before they commit them, but those of earlier versions did not. The row itself if there is no finite one.
+    /// Row `index` if its numbers are all finite. Otherwise the next such row of `within`, where the first follows the last,
+    /// or row `index` if there is none. Only rows of earlier versions can have other numbers: learners now check chunks
+    /// before they commit them.
     ///
     /// # Panics
     /// As [`row`](Self::row).

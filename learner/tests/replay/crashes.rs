@@ -110,9 +110,10 @@ proptest! {
         let copy = directory.0.path().join("copy");
         let reopened = reopen(&copy, &image, ring).unwrap();
         let head = reopened.head();
-        prop_assert!(head >= synced, "{} of {} synced rows", head, synced);
-        states[&head].check(&reopened);
+        // Later rows may have replaced all synced ones. Then nothing is left to prove.
         let replaced = model.head().saturating_sub(ring);
+        prop_assert!(head >= synced || replaced >= synced, "{} of {} synced rows", head, synced);
+        states[&head].check(&reopened);
         let all = reopened.rows().start <= replaced || replaced >= synced;
         prop_assert!(all, "{:?} of {} synced rows", reopened.rows(), synced);
         drop(reopened);

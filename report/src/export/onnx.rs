@@ -8,7 +8,7 @@ use message::{
 };
 use prost::Message;
 
-use super::{Activation, Body, CLIP, Network, Portable};
+use super::{Activation, Body, Network, OBSERVATION_CLIP, Portable};
 
 /// The versions of the file format and of the operator set. They are old enough for every runtime, and new enough for
 /// `ArgMax` to have `select_last_index`, which decides between equal values.
@@ -27,7 +27,8 @@ const BATCH: &str = "batch";
 /// - Tables: `state` (batch, 64-bit) to `action_values` (batch × actions) and `action` (batch, the one of highest
 ///   value).
 ///
-/// Observations are normalised in the model if the policy does so. Discrete states and actions have the environment's own numbers, which begin at their spaces' starts.
+/// If the policy normalises observations, the model does so. Discrete states and actions have the environment's own
+/// numbers, which begin at the `start` of their space.
 pub(super) fn model(policy: &Portable) -> Vec<u8> {
     let mut graph = Graph {
         name: "policy".into(),
@@ -130,8 +131,8 @@ impl Graph {
                 "unclipped_observation",
                 vec![],
             );
-            self.add_tensor("observation_least", &[], &[-CLIP]);
-            self.add_tensor("observation_most", &[], &[CLIP]);
+            self.add_tensor("observation_least", &[], &[-OBSERVATION_CLIP]);
+            self.add_tensor("observation_most", &[], &[OBSERVATION_CLIP]);
             let clip = ["unclipped_observation", "observation_least", "observation_most"];
             self.add_node("Clip", &clip, "normalised_observation", vec![]);
             x = "normalised_observation".into();

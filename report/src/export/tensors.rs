@@ -92,7 +92,7 @@ mod tests {
             let metadata = header.metadata().clone().unwrap();
             assert_eq!(metadata["environment"], config.environment.name);
             let observations = some_observations(&config, 5);
-            let mut ours = config.algorithm.policy(&config.spec, 1).unwrap();
+            let mut ours = config.policy(1).unwrap();
             let width = config.spec.observation.width();
             for observation in observations.chunks_exact(width) {
                 let mut expected = vec![0.0; config.spec.action.width()];

@@ -114,7 +114,7 @@ struct Incidents {
 impl Run {
     pub(super) fn read(run: &RunDir, name: String, limits: Limits) -> anyhow::Result<Self> {
         let config = configuration(run)?;
-        // This comes first, so that the last records of a run that ends now are read below.
+        // Before the records: if the run ends now, its last records are read below.
         let is_training = run.is_running()?;
         let evaluation_records = read_evaluations(&run.evaluations())?;
         let learner = read_learner(&run.learner_log())?;
@@ -245,8 +245,7 @@ impl Rates {
     }
 }
 
-/// Whether the last row was recorded earlier than usual after the one before, at the end of the run. Its rates are those
-/// of a run that ends.
+/// Whether the last row came sooner after the one before than usual, because the run ended. Its rates would mislead.
 fn last_is_incomplete(rows: &[LearnerRecord]) -> bool {
     let mut spans: Vec<f64> = rows
         .windows(2)

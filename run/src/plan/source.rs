@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::fmt::{self, Display, Formatter};
 
+use shoal_common::algorithms::Algorithm;
 use shoal_common::section::line_at;
 use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
@@ -65,17 +66,19 @@ pub struct UsageError(pub String);
 #[derive(Clone, Debug, Default)]
 pub struct Sources(BTreeMap<String, Source>);
 
-/// Keys whose values must go together: if the first is refused and only the second is the user's, the user must read of
-/// the second.
-const TOGETHER: [(&str, &str); 7] = [
-    ("replay.warmup", "replay.capacity"),
-    ("replay.capacity", "ddpg.batch"),
-    ("replay.capacity", "td3.batch"),
-    ("replay.capacity", "sac.batch"),
-    ("replay.capacity", "dqn.batch"),
-    ("actors.count", "actors.max"),
-    ("actors.chunk_steps", "environment.time_limit"),
-];
+/// The keys that bound the value of `key`. If `key` is refused, and the user has set one of these instead, the error must
+/// name that one.
+fn bounding(key: &str) -> Vec<String> {
+    match key {
+        "replay.warmup" => vec!["replay.capacity".into()],
+        "replay.capacity" => Algorithm::of_minibatches()
+            .map(|of| format!("{}.batch", of.name()))
+            .collect(),
+        "actors.count" => vec!["actors.max".into()],
+        "actors.chunk_steps" => vec!["environment.time_limit".into()],
+        _ => Vec::new(),
+    }
+}
 
 impl Sources {
     /// All keys of `table` come from this preset.
@@ -175,8 +178,7 @@ impl Sources {
 
     /// The same for a key that the user has not set, or that the message does not name.
     fn explain_other(&self, key: &str, message: &str, origin: &str, table: &Table) -> anyhow::Error {
-        let is_users = |(first, other): &&(&str, &str)| *first == key && self.of(other).is_users();
-        let Some((_, other)) = TOGETHER.iter().find(is_users) else {
+        let Some(other) = bounding(key).into_iter().find(|other| self.of(other).is_users()) else {
             return self.explain_section(message, origin);
         };
         let value = other
@@ -192,7 +194,7 @@ impl Sources {
             "{other} = {value}: does not go with {stated} ({}), which {expected}{advice}",
             self.of(key)
         );
-        self.blame(other, &text)
+        self.blame(&other, &text)
     }
 
     /// The same for a message about whole sections.

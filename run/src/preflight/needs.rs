@@ -61,10 +61,7 @@ pub(super) fn disk(config: &Config, run: &RunDir) -> Result<u64, SizeError> {
 
 /// Parameters of the policy; 0 for an algorithm that cannot control the environment, which is refused elsewhere.
 fn parameters(config: &Config) -> usize {
-    config
-        .algorithm
-        .policy_layout(&config.spec)
-        .map_or(0, |layout| layout.parameters())
+    config.policy_layout().map_or(0, |layout| layout.parameters())
 }
 
 /// Files that any one process of the run may have open.

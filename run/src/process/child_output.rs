@@ -1,16 +1,16 @@
-//! Reads a child process's standard error on a thread. Any output of another program takes bounded memory, and only as
-//! much of it is for the log as the rate allows. All output is harmless to a terminal that shows it.
+//! Reads a child process's standard error on a thread. The output of another program takes bounded memory, and its rate
+//! in the log is limited. Control characters are escaped, so that a terminal can show the output safely.
 
 use std::fmt::Write as _;
 use std::io::{self, Read};
 use std::sync::mpsc::{self, Receiver, Sender};
 use std::time::{Duration, Instant};
 
-/// Bytes kept of a line of another program, and of Shoal itself, which writes no such lines.
+/// Bytes kept of a line of another program, and of a line of Shoal itself, which never writes longer ones.
 const LINE: usize = 4096;
 const OWN_LINE: usize = 1024 * 1024;
 
-/// Bytes that another program may write in a burst, and bytes per second that it may write permanently.
+/// Bytes that another program may write in a burst, and bytes per second that it may write for a long time.
 const BURST: f64 = 4.0 * 1024.0 * 1024.0;
 const RATE: f64 = 256.0 * 1024.0;
 
@@ -32,9 +32,9 @@ pub enum Writer {
 pub enum Line<'a> {
     /// A line for the log.
     Kept(&'a str),
-    /// A line beyond the rate. It is not for the log, but may be the last one, which says why a program has ended.
+    /// A line beyond the rate. It is not for the log, unless it turns out to be one of the last before the program failed.
     TooMuch(&'a str),
-    /// How many lines were too much since the last one that was kept.
+    /// The number of lines beyond the rate since the last one that was kept.
     LeftOut(u64),
 }
 

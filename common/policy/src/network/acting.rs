@@ -2,7 +2,7 @@
 
 use super::{Activations, NetworkLayout, normalise};
 
-/// A network without late inputs, with buffers for a batch. It does not own its parameters: each call borrows them.
+/// A network without action inputs, with buffers for a batch. It does not own its parameters: each call borrows them.
 #[derive(Clone, Debug)]
 pub struct Network {
     layout: NetworkLayout,
@@ -14,7 +14,7 @@ pub struct Network {
 }
 
 impl Network {
-    /// A network for at most `batch` inputs a call. `layout` must have no late inputs.
+    /// A network for at most `batch` inputs a call. `layout` must have no action inputs.
     pub fn new(layout: NetworkLayout, batch: usize) -> Self {
         let units = layout.hidden().layers;
         Self {

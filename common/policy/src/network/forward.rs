@@ -27,9 +27,9 @@ impl<'a> Layer<'a> {
 /// The buffers of a forward pass, one column for each sample.
 #[derive(Debug)]
 pub struct Activations<'a, H> {
-    /// The inputs, followed by the late inputs, if those enter at the first layer; otherwise empty.
+    /// The inputs, followed by the action inputs, if those enter at the first layer; otherwise empty.
     pub joined: &'a mut [f32],
-    /// The outputs of each hidden layer, followed by the late inputs if those enter at the next layer.
+    /// The outputs of each hidden layer, followed by the action inputs if those enter at the next layer.
     pub hidden: H,
     /// The linear outputs of the output layer.
     pub output: &'a mut [f32],
@@ -50,7 +50,7 @@ pub fn matrix_mut(slice: &mut [f32], rows: usize) -> MatMut<'_, f32> {
 }
 
 impl NetworkLayout {
-    /// Computes the network's output for a batch of `inputs` and `late_inputs` (empty if the layout has none).
+    /// Computes the network's output for a batch of `inputs` and of `actions` (empty if the layout has no action inputs).
     ///
     /// Every slice must have one column for each sample of the batch, and `to.hidden` must have a slice for each hidden
     /// layer. The same numbers give the same bits, whatever the alignment of the slices. Nothing is allocated.
@@ -58,18 +58,18 @@ impl NetworkLayout {
         &self,
         parameters: &[f32],
         inputs: &'a [f32],
-        late_inputs: &[f32],
+        actions: &[f32],
         to: Activations<'a, impl Iterator<Item = &'a mut [f32]>>,
     ) {
-        let late_layer = self.late_layer();
+        let action_layer = self.action_layer();
         let one = inputs.len() == self.inputs;
         let mut x = inputs;
-        if late_layer == Some(0) {
-            let rows = self.inputs + self.late_inputs;
+        if action_layer == Some(0) {
+            let rows = self.inputs + self.action_inputs;
             for (column, x) in to.joined.chunks_exact_mut(rows).zip(inputs.chunks_exact(self.inputs)) {
                 column[..self.inputs].copy_from_slice(x);
             }
-            self.join(to.joined, rows, late_inputs);
+            self.join(to.joined, rows, actions);
             x = to.joined;
         }
         for (number, (units, h)) in self.hidden.layers.iter().zip(to.hidden).enumerate() {
@@ -85,8 +85,8 @@ impl NetworkLayout {
                 Activation::Relu => add_bias_and_rectify(h, rows, layer.biases),
                 Activation::Tanh => add_bias_and_squash(h, rows, layer.biases),
             }
-            if late_layer == Some(number + 1) {
-                self.join(h, rows, late_inputs);
+            if action_layer == Some(number + 1) {
+                self.join(h, rows, actions);
             }
             x = h;
         }
@@ -105,11 +105,11 @@ impl NetworkLayout {
         }
     }
 
-    /// Writes the late inputs into the last of the `rows` numbers of every column of `x`.
-    fn join(&self, x: &mut [f32], rows: usize, late_inputs: &[f32]) {
-        let late = self.late_inputs;
-        for (column, late_inputs) in x.chunks_exact_mut(rows).zip(late_inputs.chunks_exact(late)) {
-            column[rows - late..].copy_from_slice(late_inputs);
+    /// Writes the action inputs into the last of the `rows` numbers of every column of `x`.
+    fn join(&self, x: &mut [f32], rows: usize, actions: &[f32]) {
+        let width = self.action_inputs;
+        for (column, action) in x.chunks_exact_mut(rows).zip(actions.chunks_exact(width)) {
+            column[rows - width..].copy_from_slice(action);
         }
     }
 }
@@ -184,9 +184,9 @@ mod tests {
             .collect()
     }
 
-    fn run(layout: &NetworkLayout, parameters: &[f32], inputs: &[f32], late: &[f32]) -> Vec<f32> {
+    fn run(layout: &NetworkLayout, parameters: &[f32], inputs: &[f32], actions: &[f32]) -> Vec<f32> {
         let batch = inputs.len() / layout.inputs();
-        let joined = if layout.late_layer() == Some(0) {
+        let joined = if layout.action_layer() == Some(0) {
             layout.layer_size(0).0
         } else {
             0
@@ -199,16 +199,16 @@ mod tests {
             hidden: hidden.iter_mut().map(Vec::as_mut_slice),
             output: &mut output,
         };
-        layout.forward(parameters, inputs, late, to);
+        layout.forward(parameters, inputs, actions, to);
         output
     }
 
     /// The output for one sample, computed in `f64` from the definition.
-    fn by_definition(layout: &NetworkLayout, parameters: &[f32], input: &[f32], late: &[f32]) -> Vec<f64> {
+    fn by_definition(layout: &NetworkLayout, parameters: &[f32], input: &[f32], actions: &[f32]) -> Vec<f64> {
         let mut x: Vec<f64> = input.iter().map(|&x| x.into()).collect();
         for (number, layer) in layout.layers(parameters).enumerate() {
-            if Some(number) == layout.late_layer() {
-                x.extend(late.iter().map(|&a| f64::from(a)));
+            if Some(number) == layout.action_layer() {
+                x.extend(actions.iter().map(|&a| f64::from(a)));
             }
             let outputs = layer.biases.len();
             x = (0..outputs)
@@ -231,28 +231,28 @@ mod tests {
     #[test]
     fn a_batch_agrees_with_the_definition_for_each_sample() {
         for (layout, batch) in [
-            (NetworkLayout::policy(3, Hidden::relu([40, 30]), 2), 1),
-            (NetworkLayout::policy(6, Hidden::relu([40, 30]), 1), 7),
+            (NetworkLayout::new(3, Hidden::relu([40, 30]), 2), 1),
+            (NetworkLayout::new(6, Hidden::relu([40, 30]), 1), 7),
             (NetworkLayout::critic(3, Hidden::relu([40, 30]), 1), 64),
             (NetworkLayout::critic(6, Hidden::tanh([41, 29]), 2), 5),
             (NetworkLayout::critic(6, Hidden::relu([41]), 2), 1),
             (NetworkLayout::critic(6, Hidden::tanh([41]), 2), 5),
             (NetworkLayout::joined_critic(6, Hidden::relu([41, 29]), 2), 5),
             (NetworkLayout::joined_critic(3, Hidden::tanh([20, 41, 13]), 2), 1),
-            (NetworkLayout::policy(6, Hidden::tanh([41]), 2), 1),
-            (NetworkLayout::policy(3, Hidden::tanh([20, 41, 13]), 2), 1),
+            (NetworkLayout::new(6, Hidden::tanh([41]), 2), 1),
+            (NetworkLayout::new(3, Hidden::tanh([20, 41, 13]), 2), 1),
             (NetworkLayout::critic(3, Hidden::relu([20, 41, 13]), 2), 33),
             (NetworkLayout::critic(3, Hidden::tanh([9, 8, 7, 6, 5, 6, 7, 8]), 2), 1),
             (NetworkLayout::critic(3, Hidden::tanh([9, 8, 7, 6, 5, 6, 7, 8]), 2), 6),
         ] {
             let parameters = numbers(layout.parameters(), 1);
             let inputs = numbers(layout.inputs() * batch, 2);
-            let late = numbers(layout.late_inputs() * batch, 3);
-            let output = run(&layout, &parameters, &inputs, &late);
+            let actions = numbers(layout.action_inputs() * batch, 3);
+            let output = run(&layout, &parameters, &inputs, &actions);
             for (sample, column) in output.chunks_exact(layout.outputs()).enumerate() {
                 let input = &inputs[sample * layout.inputs()..][..layout.inputs()];
-                let late = &late[sample * layout.late_inputs()..][..layout.late_inputs()];
-                for (found, expected) in column.iter().zip(by_definition(&layout, &parameters, input, late)) {
+                let actions = &actions[sample * layout.action_inputs()..][..layout.action_inputs()];
+                for (found, expected) in column.iter().zip(by_definition(&layout, &parameters, input, actions)) {
                     assert!(
                         (f64::from(*found) - expected).abs() < 1e-4,
                         "{found} instead of {expected}"
@@ -274,13 +274,13 @@ mod tests {
         }) {
             let layout = NetworkLayout::critic(3, hidden, 1);
             let parameters = numbers(layout.parameters(), 1);
-            let (inputs, late) = (numbers(3 * batch, 2), numbers(batch, 3));
-            let expected = run(&layout, &parameters, &inputs, &late);
+            let (inputs, actions) = (numbers(3 * batch, 2), numbers(batch, 3));
+            let expected = run(&layout, &parameters, &inputs, &actions);
             for shift in [1, 3, 8, 13] {
                 let mut moved = vec![0.0; shift];
                 moved.extend(&parameters);
                 assert_eq!(
-                    run(&layout, &moved[shift..], &inputs, &late),
+                    run(&layout, &moved[shift..], &inputs, &actions),
                     expected,
                     "{hidden:?}, batch {batch}, shift {shift}"
                 );
@@ -291,7 +291,7 @@ mod tests {
     #[test]
     fn nan_passes_through_the_activations() {
         for hidden in [Hidden::relu([2, 2]), Hidden::tanh([2, 2, 2])] {
-            let layout = NetworkLayout::policy(1, hidden, 1);
+            let layout = NetworkLayout::new(1, hidden, 1);
             let mut parameters = vec![1.0; layout.parameters()];
             parameters[0] = f32::NAN;
             assert!(run(&layout, &parameters, &[1.0], &[])[0].is_nan());

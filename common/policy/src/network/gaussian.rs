@@ -1,7 +1,7 @@
 //! SAC's policy: a normal distribution for each element of the action, squashed by tanh and scaled to the range of the
 //! actions.
 
-use super::{ActionRange, Hidden, Network, NetworkLayout};
+use super::{ActionRange, Network, NetworkLayout};
 
 /// The range that log σ is clamped to, as in the program of Haarnoja et al. 2018b.
 pub const LOG_STD_RANGE: (f32, f32) = (-20.0, 2.0);
@@ -18,9 +18,16 @@ pub struct GaussianPolicy {
 }
 
 impl GaussianPolicy {
-    /// A policy from `observation` numbers to actions in `range`, for at most `batch` observations a call.
-    pub fn new(observation: usize, hidden: Hidden, range: ActionRange, batch: usize) -> Self {
-        let layout = NetworkLayout::policy(observation, hidden, 2 * range.width());
+    /// A policy with actions in `range`, for at most `batch` observations a call.
+    ///
+    /// # Panics
+    /// If the network does not have two outputs for each element of an action.
+    pub fn new(layout: NetworkLayout, range: ActionRange, batch: usize) -> Self {
+        assert_eq!(
+            layout.outputs(),
+            2 * range.width(),
+            "μ and log σ for each element of an action"
+        );
         Self {
             outputs: vec![0.0; layout.outputs() * batch],
             network: Network::new(layout, batch),
@@ -98,13 +105,14 @@ impl GaussianPolicy {
 mod tests {
     use shoal_base::space::Space;
 
+    use super::super::Hidden;
     use super::*;
 
     /// A policy of one observed number whose outputs are its parameters: h = max(s, 0), μ = (1, 2) h and log σ =
     /// (−1, 50) h.
     fn policy(batch: usize) -> (GaussianPolicy, Vec<f32>) {
         let range = ActionRange::new(&Space::boxed(&[(-1.0, 3.0), (-2.0, 2.0)])).unwrap();
-        let policy = GaussianPolicy::new(1, Hidden::relu([1]), range, batch);
+        let policy = GaussianPolicy::new(NetworkLayout::new(1, Hidden::relu([1]), 4), range, batch);
         (policy, vec![1.0, 0.0, 1.0, 2.0, -1.0, 50.0, 0.0, 0.0, 0.0, 0.0])
     }
 

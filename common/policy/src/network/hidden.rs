@@ -100,20 +100,19 @@ pub struct Hidden {
 }
 
 impl Hidden {
+    /// Layers whose units all have this activation function.
+    pub fn new(layers: Layers, activation: Activation) -> Self {
+        Self { layers, activation }
+    }
+
     /// Layers of ReLU units, as in the thesis.
     pub fn relu(layers: impl Into<Layers>) -> Self {
-        Self {
-            layers: layers.into(),
-            activation: Activation::Relu,
-        }
+        Self::new(layers.into(), Activation::Relu)
     }
 
     /// Layers of tanh units.
     pub fn tanh(layers: impl Into<Layers>) -> Self {
-        Self {
-            layers: layers.into(),
-            activation: Activation::Tanh,
-        }
+        Self::new(layers.into(), Activation::Tanh)
     }
 }
 

@@ -10,9 +10,9 @@ use super::hidden::{Activation, Hidden};
 pub struct NetworkLayout {
     pub(super) inputs: usize,
     pub(super) hidden: Hidden,
-    pub(super) late_inputs: usize,
-    /// The layer that the late inputs enter, counted from 0. 0 if there are none.
-    late_layer: usize,
+    pub(super) action_inputs: usize,
+    /// The layer that the action inputs enter, counted from 0. 0 if there are none.
+    action_layer: usize,
     pub(super) outputs: usize,
     normalised: bool,
 }
@@ -27,23 +27,24 @@ pub struct LayerRange {
 }
 
 impl NetworkLayout {
-    /// A policy μ: from observations to actions.
-    pub fn policy(observation: usize, hidden: Hidden, action: usize) -> Self {
+    /// A network from `inputs` to `outputs` numbers, without action inputs: a policy, or the values of a state or of all
+    /// actions.
+    pub fn new(inputs: usize, hidden: Hidden, outputs: usize) -> Self {
         Self {
-            inputs: observation,
+            inputs,
             hidden,
-            late_inputs: 0,
-            late_layer: 0,
-            outputs: action,
+            action_inputs: 0,
+            action_layer: 0,
+            outputs,
             normalised: false,
         }
     }
 
-    /// An action-value function Q: from observations, and actions as late inputs, to one value. The actions enter at
-    /// the second hidden layer, or at the only one.
+    /// An action-value function Q(s, a): from observations and actions to one value. The actions enter at the second
+    /// hidden layer, or at the only one.
     pub fn critic(observation: usize, hidden: Hidden, action: usize) -> Self {
         Self {
-            late_layer: hidden.layers.len().min(2) - 1,
+            action_layer: hidden.layers.len().min(2) - 1,
             ..Self::joined_critic(observation, hidden, action)
         }
     }
@@ -53,8 +54,8 @@ impl NetworkLayout {
         Self {
             inputs: observation,
             hidden,
-            late_inputs: action,
-            late_layer: 0,
+            action_inputs: action,
+            action_layer: 0,
             outputs: 1,
             normalised: false,
         }
@@ -71,7 +72,7 @@ impl NetworkLayout {
         self.normalised
     }
 
-    /// Numbers in an input vector, without late inputs.
+    /// Numbers in an input vector, without action inputs.
     pub fn inputs(&self) -> usize {
         self.inputs
     }
@@ -81,9 +82,9 @@ impl NetworkLayout {
         self.hidden
     }
 
-    /// Numbers in a vector of late inputs.
-    pub fn late_inputs(&self) -> usize {
-        self.late_inputs
+    /// Numbers in an action; 0 if the network has no action inputs.
+    pub fn action_inputs(&self) -> usize {
+        self.action_inputs
     }
 
     /// Numbers in an output vector.
@@ -91,22 +92,22 @@ impl NetworkLayout {
         self.outputs
     }
 
-    /// The layer that the late inputs enter, counted from 0. `None` if there are no late inputs.
-    pub fn late_layer(&self) -> Option<usize> {
-        (self.late_inputs > 0).then_some(self.late_layer)
+    /// The layer that the action inputs enter, counted from 0. `None` if there are no action inputs.
+    pub fn action_layer(&self) -> Option<usize> {
+        (self.action_inputs > 0).then_some(self.action_layer)
     }
 
     /// The `(inputs, outputs)` of a layer, counted from 0. The output layer comes after the hidden layers. The inputs
-    /// include the late inputs if those enter at this layer.
+    /// include the action inputs if those enter at this layer.
     pub fn layer_size(&self, layer: usize) -> (usize, usize) {
         let units = &*self.hidden.layers;
         let below = layer.checked_sub(1).map_or(self.inputs, |below| units[below]);
-        let late = if self.late_layer() == Some(layer) {
-            self.late_inputs
+        let action = if self.action_layer() == Some(layer) {
+            self.action_inputs
         } else {
             0
         };
-        (below + late, units.get(layer).copied().unwrap_or(self.outputs))
+        (below + action, units.get(layer).copied().unwrap_or(self.outputs))
     }
 
     /// The `(inputs, outputs)` of every hidden layer and of the output layer.
@@ -160,11 +161,11 @@ impl NetworkLayout {
     /// The fingerprint: two layouts have the same one only if they read parameters alike (FNV-1a over the sizes).
     ///
     /// With two ReLU layers it is that of files from before other networks existed. For any other list the length and
-    /// the activation are appended, and a 1 if late inputs enter at the first of several layers, or a 2 if the inputs are
+    /// the activation are appended, and a 1 if action inputs enter at the first of several layers, or a 2 if the inputs are
     /// normalised, so that no two layouts hash the same numbers.
     pub fn fingerprint(&self) -> u64 {
         let Hidden { layers, activation } = self.hidden;
-        let joined = (layers.len() > 1 && self.late_layer() == Some(0)).then_some(1);
+        let joined = (layers.len() > 1 && self.action_layer() == Some(0)).then_some(1);
         let normalised = self.normalised.then_some(2);
         let others = joined.into_iter().chain(normalised);
         let marks = match (layers.len(), activation) {
@@ -173,7 +174,7 @@ impl NetworkLayout {
             (count, Activation::Tanh) => Some([count, 1]),
         };
         let sizes = [self.inputs].into_iter().chain(layers.iter().copied());
-        let sizes = sizes.chain([self.late_inputs, self.outputs]);
+        let sizes = sizes.chain([self.action_inputs, self.outputs]);
         let bytes =
             (sizes.chain(marks.into_iter().flatten()).chain(others)).flat_map(|size| (size as u64).to_le_bytes());
         bytes.fold(0xcbf2_9ce4_8422_2325, |hash, byte| {
@@ -221,20 +222,20 @@ mod tests {
     #[test]
     fn different_layouts_have_different_fingerprints() {
         let layouts = [
-            NetworkLayout::policy(3, Hidden::relu([400, 300]), 1),
-            NetworkLayout::policy(4, Hidden::relu([400, 300]), 1),
-            NetworkLayout::policy(3, Hidden::relu([300, 400]), 1),
-            NetworkLayout::policy(3, Hidden::relu([400, 300]), 2),
+            NetworkLayout::new(3, Hidden::relu([400, 300]), 1),
+            NetworkLayout::new(4, Hidden::relu([400, 300]), 1),
+            NetworkLayout::new(3, Hidden::relu([300, 400]), 1),
+            NetworkLayout::new(3, Hidden::relu([400, 300]), 2),
             NetworkLayout::critic(3, Hidden::relu([400, 300]), 1),
-            NetworkLayout::policy(3, Hidden::tanh([400, 300]), 1),
-            NetworkLayout::policy(3, Hidden::relu([400]), 1),
-            NetworkLayout::policy(3, Hidden::tanh([400]), 1),
-            NetworkLayout::policy(3, Hidden::relu([400, 300, 300]), 1),
+            NetworkLayout::new(3, Hidden::tanh([400, 300]), 1),
+            NetworkLayout::new(3, Hidden::relu([400]), 1),
+            NetworkLayout::new(3, Hidden::tanh([400]), 1),
+            NetworkLayout::new(3, Hidden::relu([400, 300, 300]), 1),
             // The same numbers in the same order as for a critic with two layers.
             NetworkLayout::critic(3, Hidden::relu([400, 300]), 2),
             NetworkLayout::critic(3, Hidden::tanh([400, 300]), 2),
             NetworkLayout::critic(3, Hidden::relu([400, 300, 2]), 1),
-            NetworkLayout::policy(3, Hidden::relu([400, 300]), 1).normalising(true),
+            NetworkLayout::new(3, Hidden::relu([400, 300]), 1).normalising(true),
             NetworkLayout::joined_critic(3, Hidden::relu([400, 300]), 1),
             NetworkLayout::joined_critic(3, Hidden::tanh([400, 300]), 1),
         ];

@@ -5,7 +5,8 @@ use toml::{Table, Value};
 
 use super::sorted;
 use crate::algorithms::{
-    Algorithm, DdpgConfig, ExplorationConfig, Preparation, ReinforceConfig, TabularConfig, Warmup, Weight,
+    Algorithm, DdpgConfig, ExplorationConfig, ObservationConfig, ReinforceConfig, RewardConfig, TabularConfig, Warmup,
+    Weight,
 };
 use crate::config::{Config, Mode};
 use shoal_policy::network::Activation;
@@ -13,8 +14,8 @@ use shoal_policy::network::Activation;
 /// The text; `None` for an algorithm, a network or rows that did not exist then.
 pub(super) fn text(config: &Config) -> Option<String> {
     let Config { run, environment, .. } = config;
-    let preparation = config.algorithm.settings().preparation().cloned();
-    if config.replay.n_step != 1 || preparation.is_some_and(|of| of != Preparation::default()) {
+    let is_plain = config.observation == ObservationConfig::default() && config.reward == RewardConfig::default();
+    if config.replay.n_step != 1 || !is_plain {
         return None;
     }
     let mode = match run.mode {

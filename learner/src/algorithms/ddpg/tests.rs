@@ -1,5 +1,5 @@
 use rand::RngExt;
-use shoal_common::network::{Hidden, Layers, PolicyNetwork};
+use shoal_common::network::{DeterministicPolicy, Hidden, Layers};
 use shoal_common::space::Space;
 use shoal_common::stream::{Purpose, stream};
 use shoal_common::transition::RowLayout;
@@ -42,7 +42,7 @@ fn lists() -> Vec<Hidden> {
 }
 
 fn learner(seed: u64) -> Ddpg {
-    learner_of(settings().hidden_layers(), seed)
+    learner_of(Hidden::relu([9, 7]), seed)
 }
 
 /// A learner whose output layers are as large as the others, so that every gradient is well above rounding errors.
@@ -266,7 +266,7 @@ fn actors_compute_the_same_bits_as_the_learner() {
         let mut ddpg = learner_of(hidden, 1);
         let batch = minibatch(1);
         let range = ActionRange::new(&spec().action).unwrap();
-        let mut network = PolicyNetwork::new(3, hidden, range, BATCH);
+        let mut network = DeterministicPolicy::new(*ddpg.layouts().0, range, BATCH);
         let mut actions = vec![0.0; 2 * BATCH];
         network.forward(ddpg.policy(), batch.s.as_slice(), &mut actions);
         act(

@@ -190,7 +190,7 @@ fn actors_compute_the_same_bits_as_the_learner() {
     for hidden in lists() {
         let (mut sac, batch) = (learner_of(hidden, 1), minibatch(1, row(), BATCH));
         sac.draw(&batch);
-        let mut policy = GaussianPolicy::new(ROW.0, hidden, sac.range.clone(), BATCH);
+        let mut policy = GaussianPolicy::new(sac.actor.layout, sac.range.clone(), BATCH);
         let mut actions = vec![0.0; ROW.1 * BATCH];
         let mut noise = sac.now.noise.iter().copied();
         policy.sample(sac.policy(), batch.s.as_slice(), || noise.next().unwrap(), &mut actions);

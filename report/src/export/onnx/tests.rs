@@ -1,6 +1,6 @@
 use rten::{Model, Value};
 use shoal_common::config::Config;
-use shoal_common::policy::{PolicyLayout, Scores, action_values, softmax, table};
+use shoal_common::policy::{Policy, PolicyLayout};
 use shoal_common::policy_file::PolicyFile;
 
 use super::super::tests_support::{policies, some_observations, with_starts};
@@ -36,14 +36,8 @@ fn assert_close(found: &[f32], expected: &[f32]) {
 }
 
 fn scores(config: &Config, policy: &PolicyFile, observations: &[f32], batch: usize) -> Vec<f32> {
-    let mut scores: Scores = match &config.algorithm {
-        shoal_common::config::Algorithm::Reinforce(reinforce) => {
-            softmax("reinforce", reinforce.hidden_layers(), &config.spec, batch).unwrap()
-        }
-        shoal_common::config::Algorithm::Dqn(dqn) => {
-            action_values("dqn", dqn.hidden_layers(), dqn.dueling, &config.spec, batch).unwrap()
-        }
-        _ => table("q-learning", &config.spec, batch).unwrap(),
+    let Policy::Scored(mut scores) = config.policy(batch).unwrap() else {
+        panic!("this policy has no scores");
     };
     scores.of(&policy.parameters, observations).flatten().copied().collect()
 }
@@ -53,11 +47,11 @@ fn another_runtime_computes_the_same_outputs_for_any_batch_size() {
     for (config, policy) in policies() {
         let bytes = Portable::new(&config, &policy, "best").unwrap().to_onnx();
         let model = Model::load(bytes).unwrap();
-        let layout = config.algorithm.policy_layout(&config.spec).unwrap();
+        let layout = config.policy_layout().unwrap();
         for batch in [1, 2, 33] {
             let observations = some_observations(&config, batch);
             let mut actions = vec![0.0; batch * config.spec.action.width()];
-            let mut ours = config.algorithm.policy(&config.spec, batch).unwrap();
+            let mut ours = config.policy(batch).unwrap();
             ours.act(&policy.parameters, &observations, &mut actions);
             if let PolicyLayout::Deterministic(_) | PolicyLayout::Gaussian(_) = layout {
                 let (shape, found) = computed_floats(&model, &config, &observations, "action");
@@ -99,7 +93,7 @@ fn states_and_actions_are_counted_as_the_environment_counts_them() {
     let indices = some_observations(&config, 33);
     let states: Vec<f32> = indices.iter().map(|index| index + 1.0).collect();
     let mut expected = vec![0.0; 33];
-    let mut ours = config.algorithm.policy(&config.spec, 33).unwrap();
+    let mut ours = config.policy(33).unwrap();
     ours.act(&policy.parameters, &indices, &mut expected);
     let chosen = computed(&model, &config, &states, "action");
     let (_, chosen) = chosen.into_shape_vec::<i32, 1>().unwrap();

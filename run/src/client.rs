@@ -1,4 +1,4 @@
-//! Access to a running run from another terminal.
+//! Requests from another terminal: asks the launcher of a run for its status, for more actors, or to stop.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -18,16 +18,16 @@ const PATIENCE: Duration = Duration::from_secs(5);
 /// How long a run may take to end. Its roles are given less.
 const STOP_PATIENCE: Duration = Duration::from_secs(60);
 
-/// A run, and access to its launcher if it has one.
+/// A run, whose launcher is asked if it has one.
 #[derive(Debug)]
-pub struct Remote {
+pub struct RunClient {
     /// The run's directory.
     pub run: RunDir,
     /// The contents of its `config.toml`.
     pub config: Config,
 }
 
-impl Remote {
+impl RunClient {
     /// Opens the run in this directory.
     pub fn open(path: &Path) -> anyhow::Result<Self> {
         let run = RunDir::open(path)?;
