@@ -87,9 +87,14 @@ fn access(run_id: &str) -> serde_json::Value {
     let questions = [join(run_id), policy(run_id)];
     let rule = |id: &str, flow: &str, messages: &[&str], keys: &[String]| json!({ "id": id, "permission": "allow", "flows": [flow], "messages": messages, "key_exprs": keys });
     let rules = [
-        rule("send", "ingress", &["put"], &[up.clone()]),
+        rule("send", "ingress", &["put"], std::slice::from_ref(&up)),
         rule("ask", "ingress", &["query"], &questions),
-        rule("listen", "ingress", &["declare_subscriber"], &[down.clone()]),
+        rule(
+            "listen",
+            "ingress",
+            &["declare_subscriber"],
+            std::slice::from_ref(&down),
+        ),
         rule("marks", "egress", &["put"], &[down]),
         rule("answers", "egress", &["reply"], &questions),
         rule("receive", "egress", &["declare_subscriber"], &[up]),

@@ -118,6 +118,9 @@ pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
 }
 
 fn resume_suite(suite: &Suite, args: &ResumeArgs) -> anyhow::Result<ExitCode> {
+    if args.listen.listen.is_some() {
+        return Err(UsageError("--listen: other hosts join a single run, and this is a suite".into()).into());
+    }
     if args.steps.is_some() || args.episodes.is_some() || !args.set.is_empty() {
         let why = "a suite goes on as it was made: change its runs one by one, or train another one";
         return Err(UsageError(why.into()).into());

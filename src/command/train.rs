@@ -136,6 +136,11 @@ pub(crate) fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
         .as_deref()
         .context("name a preset, a gym: environment or a configuration file to train")?;
     if args.seeds.is_some() || !args.sweep.is_empty() {
+        if args.listen.listen.is_some() {
+            return Err(
+                UsageError("--listen: other hosts join a single run, without --seeds and --sweep".into()).into(),
+            );
+        }
         return super::suite::train(args, what, &args.overrides.overrides());
     }
     if args.jobs.is_some() {
