@@ -1,4 +1,4 @@
-//! The commands of `shoal`, one file each.
+//! The commands of `shoal`, one file each, and what several of them share.
 
 pub(crate) mod bench;
 pub(crate) mod completions;

@@ -1,4 +1,4 @@
-//! Shoal, the only binary. Each command is a file in `command/`.
+//! Shoal, the only binary. Each command has a file in `command/`.
 
 mod cli;
 mod command;

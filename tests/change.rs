@@ -119,7 +119,7 @@ fn what_cannot_change_is_refused_by_the_name_of_its_key() {
     for (set, part) in [
         (
             "ddpg.gamma=0.9",
-            "ddpg.gamma = 0.9: cannot change in this run, which has 0.99: the rows in the replay have it",
+            "ddpg.gamma = 0.9: cannot change in this run, which has 0.99: the rows in the replay were made with it",
         ),
         (
             "ddpg.hidden=[8]",

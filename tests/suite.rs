@@ -241,9 +241,9 @@ fn what_is_no_suite_is_refused_before_anything_is_made() {
         (&["--sweep", "ddpg.ta=0.1,0.2"], "unknown field `ta`"),
         (
             &["--sweep", "ddpg.tau=0.1", "--sweep", "ddpg.tau=0.2"],
-            "is given twice",
+            "was given twice",
         ),
-        (&["--jobs", "2"], "--jobs: is for several runs"),
+        (&["--jobs", "2"], "--jobs: only for several runs"),
     ] {
         let output = place.output(&[&["train", "pendulum", "--run", "suite"], arguments].concat());
         let message = error_line(&output);

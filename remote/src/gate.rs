@@ -2,6 +2,7 @@
 //! each exactly once and in order. To the hosts it tells what has become of the chunks, and gives them the newest policy.
 
 use std::collections::HashMap;
+use std::fmt;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::time::{Duration, Instant};
@@ -37,7 +38,7 @@ use crate::wire::{
     WirePolicy,
 };
 
-/// Marks follow each other after at least the first time, and at most the second.
+/// The least and the greatest time between two messages of marks to a host.
 const MARKS_APART: Duration = Duration::from_millis(1);
 const MARKS_WITHIN: Duration = Duration::from_millis(100);
 
@@ -62,6 +63,9 @@ const HAND_OVER: Duration = Duration::from_secs(5);
 
 /// How often a host that sends wrong chunks, or a connection that was refused, is named.
 const WARN_AGAIN: Duration = Duration::from_secs(10);
+
+/// How long at least to say that the run is over.
+const LAST_WORDS: Duration = Duration::from_secs(1);
 
 /// Bytes a second that policies may take, for all hosts together.
 const POLICY_BANDWIDTH: f64 = 30e6;
@@ -181,11 +185,13 @@ struct Gate<'a> {
     heartbeats: Reporter<Heartbeat>,
     episodes: Reporter<EpisodeReport>,
     marks: u64,
-    /// When a refused connection was last named.
+    /// When something wrong was last named.
     warned: Option<Instant>,
     over: Option<Instant>,
     refreshed: Instant,
     told: Option<Instant>,
+    /// The launcher has not answered yet.
+    asking: bool,
     sleep: Duration,
 }
 
@@ -245,6 +251,7 @@ impl<'a> Gate<'a> {
             over: None,
             refreshed: Instant::now(),
             told: None,
+            asking: false,
             sleep: LONGEST_SLEEP,
         }))
     }
@@ -285,7 +292,9 @@ impl<'a> Gate<'a> {
             return true;
         }
         let since = *self.over.get_or_insert_with(Instant::now);
-        let gone = |host: &Host| host.left || host.heard.elapsed() >= CUT_OFF;
+        // A host that was away until now learns of the end too, if it is back.
+        let told = since.elapsed() >= LAST_WORDS;
+        let gone = |host: &Host| host.left || (told && host.heard.elapsed() >= CUT_OFF);
         since.elapsed() >= HAND_OVER || self.hosts.values().all(gone)
     }
 
@@ -295,7 +304,7 @@ impl<'a> Gate<'a> {
             Arrival::Chunk(bytes) => return self.take_chunk(&bytes),
             Arrival::Report(bytes) => match HostReport::decode(&bytes) {
                 Ok(report) => self.take_report(report)?,
-                Err(error) => tracing::warn!("a host sent a report that is not read: {error}"),
+                Err(error) => self.warn(format_args!("a host sent a report that is not read: {error}")),
             },
             Arrival::Join(query) => self.take_join(query)?,
             Arrival::Policy(query) => self.take_policy_query(query),
@@ -307,7 +316,7 @@ impl<'a> Gate<'a> {
         let chunk = match WireChunk::decode(bytes) {
             Ok(chunk) => chunk,
             Err(error) => {
-                tracing::warn!("a host sent a chunk that is not read: {error}");
+                self.warn(format_args!("a host sent a chunk that is not read: {error}"));
                 return Ok(0);
             }
         };
@@ -317,6 +326,7 @@ impl<'a> Gate<'a> {
         let Some(host) = self.hosts.get_mut(&chunk.host).filter(|_| actor.host == chunk.host) else {
             return Ok(0);
         };
+        host.heard = Instant::now();
         // A host that was admitted again still has processes that an earlier launcher has given incarnations to.
         let ours = chunk.header.incarnation < host.lease.limit;
         // Until there is a way to the learner, the host sends it again.
@@ -415,13 +425,22 @@ impl<'a> Gate<'a> {
                     host.wants = Some((query, question.have, Instant::now()));
                 }
             }
-            Err(error) => tracing::warn!("a host sent a question that is not read: {error}"),
+            Err(error) => self.warn(format_args!("a host sent a question that is not read: {error}")),
+        }
+    }
+
+    /// Warns once in a while: somebody may repeat what is wrong without end.
+    fn warn(&mut self, what: fmt::Arguments<'_>) {
+        if self.warned.is_none_or(|warned| warned.elapsed() >= WARN_AGAIN) {
+            self.warned = Some(Instant::now());
+            tracing::warn!("{what}");
         }
     }
 
     /// Takes what the launcher has answered.
     fn take_answers(&mut self) -> Result<(), GateError> {
         while let Some((answer, matter)) = self.requests.answer() {
+            self.asking &= !matches!(matter, Matter::Hosts);
             match (answer, matter) {
                 (Ok(Answer::Admitted(lease)), Matter::Join(query, hello)) => {
                     tracing::info!(
@@ -643,10 +662,10 @@ impl<'a> Gate<'a> {
 
     /// Tells the launcher how the hosts are, and asks which are admitted.
     fn tell_launcher(&mut self) {
-        if self.told.is_some_and(|told| told.elapsed() < STATUS) {
+        if self.asking || self.told.is_some_and(|told| told.elapsed() < STATUS) {
             return;
         }
-        self.told = Some(Instant::now());
+        (self.told, self.asking) = (Some(Instant::now()), true);
         let newest = self.policy_version;
         let statuses = self.hosts.values_mut().map(|host| host.status(newest)).collect();
         self.requests.ask(Question::Hosts(statuses), Matter::Hosts);
@@ -658,11 +677,10 @@ impl<'a> Gate<'a> {
             return Ok(());
         }
         self.refreshed = Instant::now();
-        if self.warned.is_none_or(|warned| warned.elapsed() >= WARN_AGAIN)
-            && let Some(why) = refused::take()
-        {
-            self.warned = Some(Instant::now());
-            tracing::warn!("a connection was refused: {why}; only who has the run's join.key is let in");
+        if let Some(why) = refused::take() {
+            self.warn(format_args!(
+                "a connection was refused: {why}; only who has the run's join.key is let in"
+            ));
         }
         self.heartbeats.refresh_connections();
         self.episodes.refresh_connections();

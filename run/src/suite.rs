@@ -123,7 +123,7 @@ pub fn seeds(text: &str) -> Result<Vec<u64>, String> {
     }
     let distinct: BTreeSet<u64> = seeds.iter().copied().collect();
     if distinct.len() < seeds.len() {
-        return Err(format!("{text}: names a seed twice"));
+        return Err(format!("{text} names a seed twice"));
     }
     Ok(seeds)
 }
@@ -137,7 +137,7 @@ impl Suite {
     pub fn new(what: String, arguments: Vec<String>, sweeps: &[Sweep], seeds: &[u64]) -> anyhow::Result<Self> {
         for (i, sweep) in sweeps.iter().enumerate() {
             if sweeps[..i].iter().any(|other| other.key == sweep.key) {
-                bail!("--sweep {}: is given twice: give all of its values in one", sweep.key);
+                bail!("--sweep {} was given twice: give all of its values in one", sweep.key);
             }
         }
         let all = sweeps

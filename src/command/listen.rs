@@ -43,7 +43,7 @@ pub(crate) struct ListenArgs {
 }
 
 impl ListenArgs {
-    /// Refuses what cannot be, before a run is made.
+    /// Checks the endpoint before the run is created.
     pub(crate) fn check(&self) -> anyhow::Result<()> {
         let Some(endpoint) = &self.listen else { return Ok(()) };
         if !cfg!(feature = "remote") {

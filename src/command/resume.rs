@@ -53,7 +53,7 @@ pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
         return resume_suite(&suite, args);
     }
     if args.jobs.is_some() {
-        return Err(UsageError("--jobs: is for suites, and this is one run".into()).into());
+        return Err(UsageError("--jobs: only for suites, and this is one run".into()).into());
     }
     let run = RunDir::open(&args.run)?;
     // Only the holder of the lock may change the configuration.

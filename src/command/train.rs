@@ -144,7 +144,7 @@ pub(crate) fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
         return super::suite::train(args, what, &args.overrides.overrides());
     }
     if args.jobs.is_some() {
-        return Err(UsageError("--jobs: is for several runs, with --seeds or --sweep".into()).into());
+        return Err(UsageError("--jobs: only for several runs, with --seeds or --sweep".into()).into());
     }
     let Plan {
         config,

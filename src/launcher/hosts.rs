@@ -72,7 +72,7 @@ impl Hosts {
         });
     }
 
-    /// Takes note of how the hosts are. Returns a message for each that has left or is given up.
+    /// Updates the status of each host. Returns a message for each that has left or is given up.
     pub(super) fn update(&mut self, statuses: Vec<HostStatus>) -> Vec<String> {
         for status in statuses {
             if let Some(admitted) = self

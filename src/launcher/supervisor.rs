@@ -279,7 +279,7 @@ impl Supervisor {
         Ok(Answer::Admitted(lease))
     }
 
-    /// Takes note of how the other hosts are. The answer tells which of them are admitted.
+    /// Updates the status of the other hosts. The answer tells which of them are admitted.
     pub(super) fn update_hosts(&mut self, statuses: Vec<HostStatus>) -> Answer {
         for message in self.hosts.update(statuses) {
             self.log.note("launcher", &message);

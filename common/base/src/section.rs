@@ -61,7 +61,7 @@ pub fn line_at(text: &str, byte: usize) -> usize {
 ///
 /// ```text
 /// /// What it means: whole sentences.
-/// gamma: f64 = 0.99, bounds: from(0.0, 1.0), unit: "–", source: "section 4.3.1", change: never("rows have it");
+/// gamma: f64 = 0.99, bounds: from(0.0, 1.0), unit: "–", source: "section 4.3.1", change: never("rows were made with it");
 /// ```
 ///
 /// Leave out `bounds` for values that are not numbers, and where a bound is the value of another key; the section's

@@ -28,7 +28,7 @@ section! {
         activation: Activation = Activation::Relu, unit: "–", source: "section 4.3.1", change: Change::Shape;
         /// γ, the discount of one step.
         gamma: f64 = 0.99, bounds: from(0.0, 1.0), unit: "–", source: "section 4.3.1",
-            change: never("the rows in the replay have it");
+            change: never("the rows in the replay were made with it");
         /// τ, the share by which the target networks move in one gradient step (equation 3.31).
         tau: f64 = 0.001, bounds: above(0.0, 1.0), unit: "–", source: "equation 3.31, section 4.3.1",
             change: Change::Learning;

@@ -26,7 +26,7 @@ section! {
         activation: Activation = Activation::Relu, unit: "–", source: "Mnih et al. 2015", change: Change::Shape;
         /// γ, the discount of one step.
         gamma: f64 = 0.99, bounds: from(0.0, 1.0), unit: "–", source: "Mnih et al. 2015",
-            change: never("the rows in the replay have it");
+            change: never("the rows in the replay were made with it");
         /// Adam's step size.
         learning_rate: f64 = 5e-4, bounds: above(0.0, 1.0), unit: "–", source: "ours", change: Change::Learning;
         /// N, transitions in a minibatch.

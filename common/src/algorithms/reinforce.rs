@@ -28,7 +28,7 @@ section! {
         activation: Activation = Activation::Relu, unit: "–", source: "section 4.2.1", change: Change::Shape;
         /// γ, the discount of one step.
         gamma: f64 = 0.95, bounds: from(0.0, 1.0), unit: "–", source: "section 4.2.1",
-            change: never("the rows in the replay have it");
+            change: never("the rows in the replay were made with it");
         /// Adam's step size for the policy, α.
         learning_rate: f64 = 0.01, bounds: from(0.0, 1.0), unit: "–", source: "section 4.2.1", change: Change::Learning;
         /// What a step's ∇ ln π is multiplied by.

@@ -26,7 +26,7 @@ section! {
         activation: Activation = Activation::Relu, unit: "–", source: "Haarnoja et al. 2018b", change: Change::Shape;
         /// γ, the discount of one step.
         gamma: f64 = 0.99, bounds: from(0.0, 1.0), unit: "–", source: "Haarnoja et al. 2018b",
-            change: never("the rows in the replay have it");
+            change: never("the rows in the replay were made with it");
         /// τ, the share by which the critics' target networks move in one update.
         tau: f64 = 0.005, bounds: above(0.0, 1.0), unit: "–", source: "Haarnoja et al. 2018b", change: Change::Learning;
         /// Adam's step size for the actor.

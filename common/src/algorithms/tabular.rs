@@ -27,7 +27,7 @@ section! {
     pub struct TabularConfig {
         /// γ, the discount of one step.
         gamma: f64 = 0.999, bounds: from(0.0, 1.0), unit: "–", source: "section 4.1",
-            change: never("the rows in the replay have it");
+            change: never("the rows in the replay were made with it");
         /// α, the step size.
         alpha: f64 = 0.03, bounds: from(0.0, 1.0), unit: "–", source: "section 4.1", change: Change::Learning;
         /// ε, the probability that an actor takes a random action instead of the best.

@@ -27,7 +27,7 @@ section! {
         activation: Activation = Activation::Relu, unit: "–", source: "Fujimoto et al. 2018", change: Change::Shape;
         /// γ, the discount of one step.
         gamma: f64 = 0.99, bounds: from(0.0, 1.0), unit: "–", source: "Fujimoto et al. 2018",
-            change: never("the rows in the replay have it");
+            change: never("the rows in the replay were made with it");
         /// τ, the share by which the target networks move at each update of the policy.
         tau: f64 = 0.005, bounds: above(0.0, 1.0), unit: "–", source: "Fujimoto et al. 2018", change: Change::Learning;
         /// Adam's step size for the actor.

@@ -11,10 +11,10 @@ section! {
         count: u32 = 2, unit: "processes", source: "ours", change: in_free_runs("its results depend on it");
         /// Environments that an actor steps at once.
         envs: u32 = 1, bounds: from(1, 4_096), unit: "environments", source: "ours",
-            change: in_free_runs("the snapshots of its actors have it");
+            change: in_free_runs("saved states of its actors depend on it");
         /// Steps of every environment that are sent in one chunk. A chunk has `chunk_steps · envs` rows.
         chunk_steps: u32 = 8, bounds: from(1, 4_096), unit: "steps", source: "ours",
-            change: in_free_runs("its rounds have it");
+            change: in_free_runs("the length of a round depends on it");
         /// Chunks that an actor may have sent and the learner has not committed yet.
         window: u32 = 8, bounds: from(1, 64), unit: "chunks", source: "ours", change: Change::Anytime;
         /// The most actors that the run can be scaled to.

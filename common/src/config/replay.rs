@@ -27,7 +27,7 @@ section! {
             change: in_free_runs("its replay is as large as it requires");
         /// n, steps of a transition: the sum of n discounted rewards, and the observation after the last of them.
         n_step: u32 = 1, bounds: from(1, 100), unit: "steps", source: "Sutton and Barto 2018, chapter 7",
-            change: never("the rows in the replay have it");
+            change: never("the rows in the replay were made with it");
         /// Environment steps that the actors may be ahead of that ratio before the learner stops taking transitions.
         tolerance: u64 = 512, bounds: from(1, MAX_ROWS), unit: "environment steps", source: "ours",
             change: Change::Anytime;

@@ -14,7 +14,7 @@ section! {
         id: String = String::new(), unit: "–", source: "ours", change: Change::ByProgram;
         /// The seed of every random stream.
         seed: u64 = 1, bounds: from(0, i64::MAX as u64), unit: "–", source: "ours",
-            change: never("every random stream of the run has it");
+            change: never("every random stream of the run depends on it");
         /// Whether results may depend on timing (free) or not (lockstep).
         mode: Mode = Mode::Free, unit: "–", source: "ours",
             change: never("the replay and its actors' snapshots are made for it");
