@@ -682,6 +682,10 @@ impl<'a> Gate<'a> {
                 "a connection was refused: {why}; only who has the run's join.key is let in"
             ));
         }
+        // Taken as often as an actor takes it, so that none is held long after its learner has died.
+        if let Some(newest) = self.policy.latest()? {
+            self.policy_version = newest.header().version;
+        }
         self.heartbeats.refresh_connections();
         self.episodes.refresh_connections();
         let waits = self.actors.values().any(|actor| actor.forwarding.is_waiting());

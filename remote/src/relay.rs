@@ -60,6 +60,9 @@ const EPISODES: usize = 10_000;
 const POLICY_QUERY: Duration = Duration::from_secs(10);
 const POLICY_PAUSE: Duration = Duration::from_millis(50);
 
+/// How long the gate may take to get the last chunks. It waits a little longer for its hosts.
+const HAND_OVER: Duration = Duration::from_secs(3);
+
 /// How long to wait before asking again to be admitted.
 const JOIN_AGAIN: Duration = Duration::from_secs(1);
 
@@ -173,6 +176,8 @@ struct Relay<'a> {
     /// When this host last asked to be admitted again, and whether an answer is still to come.
     asked: Option<(Instant, bool)>,
     over: bool,
+    /// When it was first seen that it should end.
+    ending: Option<Instant>,
 }
 
 /// Stands in for the learner until `stop`.
@@ -262,6 +267,7 @@ impl<'a> Relay<'a> {
             refreshed: now,
             asked: None,
             over: false,
+            ending: None,
         })
     }
 
@@ -280,11 +286,21 @@ impl<'a> Relay<'a> {
             }
             self.refresh_connections()?;
             while self.requests.answer().is_some() {}
-            if self.stop.requested() {
+            if self.may_leave() {
                 return self.send_report(true);
             }
             self.sleep()?;
         }
+    }
+
+    /// Whether to end now: once it was asked to, and the gate has got all chunks or cannot be reached.
+    fn may_leave(&mut self) -> bool {
+        if !self.stop.requested() {
+            return false;
+        }
+        let since = *self.ending.get_or_insert_with(Instant::now);
+        let handed_over = self.sources.values().all(|source| source.unconfirmed.all_got());
+        handed_over || self.is_cut_off() || since.elapsed() >= HAND_OVER
     }
 
     fn is_cut_off(&self) -> bool {

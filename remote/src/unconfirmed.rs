@@ -166,6 +166,11 @@ impl<C> Unconfirmed<C> {
         Consequence::Continue
     }
 
+    /// Whether the gate has got all chunks.
+    pub fn all_got(&self) -> bool {
+        self.chunks.back().is_none_or(|kept| kept.mark <= self.got)
+    }
+
     /// Goes back to the first chunk that the gate has not got, if it has got none for `patience` although some were sent.
     pub fn go_back_if_overdue(&mut self, now: Duration, patience: Duration) {
         let outstanding = self.next > 0 && self.chunks[self.next - 1].mark > self.got;
