@@ -554,8 +554,12 @@ impl<'a> Gate<'a> {
     }
 
     fn send_marks(&mut self) -> Result<(), GateError> {
-        let Some(epoch) = self.epoch else { return Ok(()) };
-        let rows = self.replay.rows();
+        let Some(without_actors) = self.marks_without_actors() else {
+            return Ok(());
+        };
+        if self.hosts.values().all(|host| host.marked.elapsed() < MARKS_APART) {
+            return Ok(());
+        }
         // Marks and snapshots must belong together.
         let has_snapshots = self.replay.layout().actor_snapshot_words > 0;
         let record = if has_snapshots { self.replay.snapshot() } else { None };
@@ -591,17 +595,10 @@ impl<'a> Gate<'a> {
             }
             self.marks += 1;
             let marks = Marks {
-                epoch,
-                gate: self.settings.identity.incarnation,
                 number: self.marks,
-                phase: if self.over.is_some() {
-                    Phase::Over
-                } else {
-                    Phase::Running
-                },
-                rows,
                 report: host.report,
                 actors,
+                ..without_actors.clone()
             };
             host.marks.put(marks.encode()?).wait().map_err(failed("send marks"))?;
             host.last_marks = marks.actors;
@@ -610,14 +607,12 @@ impl<'a> Gate<'a> {
         Ok(())
     }
 
-    /// Marks for a host that is not admitted, which have no actors.
-    fn send_empty_marks(&mut self, host: u64) -> Result<(), GateError> {
-        let Some(epoch) = self.epoch else { return Ok(()) };
-        self.marks += 1;
-        let marks = Marks {
-            epoch,
+    /// What the next marks have in common, whichever host they are for. `None` before the launcher has answered.
+    fn marks_without_actors(&self) -> Option<Marks> {
+        Some(Marks {
+            epoch: self.epoch?,
             gate: self.settings.identity.incarnation,
-            number: self.marks,
+            number: self.marks + 1,
             phase: if self.over.is_some() {
                 Phase::Over
             } else {
@@ -626,7 +621,15 @@ impl<'a> Gate<'a> {
             rows: self.replay.rows(),
             report: 0,
             actors: Vec::new(),
+        })
+    }
+
+    /// Marks for a host that is not admitted, which have no actors.
+    fn send_empty_marks(&mut self, host: u64) -> Result<(), GateError> {
+        let Some(marks) = self.marks_without_actors() else {
+            return Ok(());
         };
+        self.marks = marks.number;
         let publisher = marks_publisher(&self.session, &self.settings.config.run.id, host)?;
         publisher.put(marks.encode()?).wait().map_err(failed("send marks"))?;
         Ok(())

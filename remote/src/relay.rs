@@ -502,7 +502,8 @@ impl<'a> Relay<'a> {
     fn send_report(&mut self, leaving: bool) -> Result<(), RelayError> {
         let now = Instant::now();
         self.report = (self.report.0 + 1, now);
-        self.echo.get_or_insert(self.report);
+        let number = self.number();
+        self.echo.get_or_insert((number, now));
         // What is sent while the gate is away is lost.
         let episodes = if self.is_cut_off() {
             Vec::new()
@@ -511,7 +512,7 @@ impl<'a> Relay<'a> {
         };
         let report = HostReport {
             host: self.settings.host.host,
-            number: self.number(),
+            number,
             round_trip_us: self.round_trip.map(|trip| trip.as_micros() as u64),
             leaving,
             resent: self.sources.values().map(|source| source.unconfirmed.resent()).sum(),

@@ -40,9 +40,10 @@ pub enum WireError {
 }
 
 /// What a message is.
+#[doc(hidden)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u32)]
-enum Kind {
+pub enum Kind {
     Chunk = 1,
     Policy = 2,
     Hello = 3,
@@ -392,7 +393,7 @@ impl From<RemoteEpisode> for EpisodeReport {
 /// A message that bincode encodes.
 pub trait Message: Serialize + DeserializeOwned {
     #[doc(hidden)]
-    const KIND: u32;
+    const KIND: Kind;
 
     /// Its bytes.
     ///
@@ -401,7 +402,7 @@ pub trait Message: Serialize + DeserializeOwned {
     fn encode(&self) -> Result<Vec<u8>, WireError> {
         let body = bincode::serde::encode_to_vec(self, encoding());
         let body = body.map_err(|error| WireError::Contents(error.to_string()))?;
-        Ok(sealed_as(Self::KIND, &[&body]))
+        Ok(sealed(Self::KIND, &[&body]))
     }
 
     /// Reads a message.
@@ -409,7 +410,7 @@ pub trait Message: Serialize + DeserializeOwned {
     /// # Errors
     /// When the bytes are not a whole message of this kind and version.
     fn decode(bytes: &[u8]) -> Result<Self, WireError> {
-        let body = opened_as(Self::KIND, bytes)?;
+        let body = opened(Self::KIND, bytes)?;
         match bincode::serde::decode_from_slice(body, encoding()) {
             Ok((message, used)) if used == body.len() => Ok(message),
             Ok(_) => Err(WireError::Length(bytes.len())),
@@ -419,23 +420,23 @@ pub trait Message: Serialize + DeserializeOwned {
 }
 
 impl Message for PolicyQuestion {
-    const KIND: u32 = Kind::PolicyQuestion as u32;
+    const KIND: Kind = Kind::PolicyQuestion;
 }
 
 impl Message for Hello {
-    const KIND: u32 = Kind::Hello as u32;
+    const KIND: Kind = Kind::Hello;
 }
 
 impl Message for Admission {
-    const KIND: u32 = Kind::Admission as u32;
+    const KIND: Kind = Kind::Admission;
 }
 
 impl Message for Marks {
-    const KIND: u32 = Kind::Marks as u32;
+    const KIND: Kind = Kind::Marks;
 }
 
 impl Message for HostReport {
-    const KIND: u32 = Kind::HostReport as u32;
+    const KIND: Kind = Kind::HostReport;
 }
 
 /// The limit keeps a damaged length from allocating memory without bound.
@@ -444,13 +445,9 @@ fn encoding() -> impl bincode::config::Config {
 }
 
 fn sealed(kind: Kind, parts: &[&[u8]]) -> Vec<u8> {
-    sealed_as(kind as u32, parts)
-}
-
-fn sealed_as(kind: u32, parts: &[&[u8]]) -> Vec<u8> {
     let length = START + parts.iter().map(|part| part.len()).sum::<usize>() + CHECKSUM;
     let mut bytes = Vec::with_capacity(length);
-    bytes.extend((LETTERS | kind).to_le_bytes());
+    bytes.extend((LETTERS | kind as u32).to_le_bytes());
     bytes.extend(VERSION.to_le_bytes());
     parts.iter().for_each(|part| bytes.extend_from_slice(part));
     let checksum = crc32fast::hash(&bytes);
@@ -458,12 +455,8 @@ fn sealed_as(kind: u32, parts: &[&[u8]]) -> Vec<u8> {
     bytes
 }
 
-fn opened(kind: Kind, bytes: &[u8]) -> Result<&[u8], WireError> {
-    opened_as(kind as u32, bytes)
-}
-
 /// The bytes between the first words and the checksum.
-fn opened_as(kind: u32, bytes: &[u8]) -> Result<&[u8], WireError> {
+fn opened(kind: Kind, bytes: &[u8]) -> Result<&[u8], WireError> {
     let length = Err(WireError::Length(bytes.len()));
     if bytes.len() > LONGEST {
         return length;
@@ -472,7 +465,7 @@ fn opened_as(kind: u32, bytes: &[u8]) -> Result<&[u8], WireError> {
     let (Some(found), Some(version)) = (word(0), word(size_of::<u32>())) else {
         return length;
     };
-    if found != LETTERS | kind {
+    if found != LETTERS | kind as u32 {
         return Err(WireError::Kind);
     }
     if version != VERSION {

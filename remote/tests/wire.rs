@@ -7,8 +7,8 @@ use shoal_common::channel::policy::PolicyHeader;
 use shoal_common::channel::transitions::ChunkHeader;
 use shoal_common::report::{Activity, Role};
 use shoal_remote::wire::{
-    ActorMarks, Admission, Hello, HostReport, Lease, Marks, Message, Phase, RemoteEpisode, RemoteRole, VERSION,
-    WireChunk, WireError, WirePolicy,
+    ActorMarks, Admission, Hello, HostReport, Lease, Marks, Message, Phase, PolicyQuestion, RemoteEpisode, RemoteRole,
+    VERSION, WireChunk, WireError, WirePolicy,
 };
 
 fn header() -> ChunkHeader {
@@ -104,6 +104,13 @@ fn report() -> HostReport {
     }
 }
 
+fn question() -> PolicyQuestion {
+    PolicyQuestion {
+        host: 9,
+        have: Some((1, 2)),
+    }
+}
+
 fn all() -> Vec<Vec<u8>> {
     vec![
         chunk(),
@@ -112,11 +119,12 @@ fn all() -> Vec<Vec<u8>> {
         admission().encode().unwrap(),
         marks().encode().unwrap(),
         report().encode().unwrap(),
+        question().encode().unwrap(),
     ]
 }
 
 /// The first error, or none, of reading bytes as each kind of message.
-fn read(bytes: &[u8]) -> [Option<WireError>; 6] {
+fn read(bytes: &[u8]) -> [Option<WireError>; 7] {
     [
         WireChunk::decode(bytes).err(),
         WirePolicy::decode(bytes).err(),
@@ -124,6 +132,7 @@ fn read(bytes: &[u8]) -> [Option<WireError>; 6] {
         Admission::decode(bytes).err(),
         Marks::decode(bytes).err(),
         HostReport::decode(bytes).err(),
+        PolicyQuestion::decode(bytes).err(),
     ]
 }
 
@@ -137,6 +146,7 @@ fn every_message_arrives_unchanged_and_is_no_other() {
     assert_eq!(Admission::decode(&admission().encode().unwrap()), Ok(admission()));
     assert_eq!(Marks::decode(&marks().encode().unwrap()), Ok(marks()));
     assert_eq!(HostReport::decode(&report().encode().unwrap()), Ok(report()));
+    assert_eq!(PolicyQuestion::decode(&question().encode().unwrap()), Ok(question()));
     for (i, bytes) in all().iter().enumerate() {
         for (j, error) in read(bytes).into_iter().enumerate() {
             assert_eq!(error, (i != j).then_some(WireError::Kind), "message {i} read as {j}");
@@ -154,6 +164,7 @@ fn the_bytes_are_those_of_this_format() {
         "04007368010000000006065b72756e5d0a020102fbe803fbd007",
         "0500736801000000060803 00fb800202010107040705fb00010201fb2c01",
         "060073680100000009030196000103010101000007fb800203010100c80000000000009061c003fb8002",
+        "070073680100000009010102",
     ];
     for (bytes, recorded) in all().iter().zip(recorded) {
         let (body, checksum) = bytes.split_last_chunk::<4>().unwrap();
@@ -185,7 +196,7 @@ proptest! {
 
     #[test]
     fn changed_cut_and_longer_messages_are_refused(
-        which in 0..6_usize,
+        which in 0..7_usize,
         at in any::<prop::sample::Index>(),
         by in 1_u8..,
         more in prop::collection::vec(any::<u8>(), 1..9),
@@ -200,7 +211,7 @@ proptest! {
 
     #[test]
     fn a_wrong_body_with_a_right_checksum_does_no_harm(
-        which in 0..6_usize,
+        which in 0..7_usize,
         body in prop::collection::vec(any::<u8>(), 0..200),
     ) {
         let start = &all().swap_remove(which)[..8];
