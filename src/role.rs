@@ -34,6 +34,10 @@ use crate::log_level::log_level;
 
 /// Runs a role until it is done or its standard input closes.
 pub(crate) fn run(role: Role, args: &RoleArgs) -> anyhow::Result<ExitCode> {
+    #[cfg(feature = "remote")]
+    if matches!(role, Role::Gate | Role::Relay) {
+        shoal_remote::network::restart_with_one_thread()?;
+    }
     // The log goes to the launcher through standard error. If the launcher is gone, losing it is not an error.
     let to_launcher = tracing_subscriber::fmt::layer()
         .with_writer(std::io::stderr)

@@ -4,6 +4,9 @@
 //! whole messages when a connection breaks, and a `put` succeeds while nobody is connected. What makes chunks arrive
 //! exactly once is in [`crate::unconfirmed`] and [`crate::forwarding`].
 
+use std::os::unix::process::CommandExt;
+use std::process::Command;
+
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use serde_json::json;
@@ -12,6 +15,41 @@ use zenoh::{Config, Session, Wait};
 use crate::endpoint::Endpoint;
 use crate::files::KeyFile;
 use crate::keys::HOST;
+
+/// The environment variable with which Zenoh starts its threads, and the value for a single thread.
+///
+/// By default, Zenoh 1.10 reads a TLS connection in one thread and writes to it in another. rustls does not allow that, and
+/// memory is corrupted (<https://github.com/eclipse-zenoh/zenoh/issues/2557>). In one thread the two cannot coincide.
+const THREADS: (&str, &str) = (
+    "ZENOH_RUNTIME",
+    "(app: (worker_threads: 1), acc: (handover: app), tx: (handover: app), rx: (handover: app), net: (handover: app))",
+);
+
+fn has_one_thread() -> bool {
+    std::env::var(THREADS.0).is_ok_and(|value| value == THREADS.1)
+}
+
+/// Executes this program again, with the same arguments and in the same process, if Zenoh would otherwise use several
+/// threads: only an environment variable decides that. A session can be opened afterwards. Call this before anything else,
+/// because everything that the process has done is lost.
+///
+/// # Errors
+/// When the program cannot be executed.
+pub fn restart_with_one_thread() -> Result<(), NetworkError> {
+    if has_one_thread() {
+        return Ok(());
+    }
+    let mut arguments = std::env::args_os();
+    let mut command = Command::new("/proc/self/exe");
+    if let Some(name) = arguments.next() {
+        command.arg0(name);
+    }
+    let cause = command.args(arguments).env(THREADS.0, THREADS.1).exec();
+    Err(NetworkError {
+        action: "be started",
+        cause: cause.to_string(),
+    })
+}
 
 /// Zenoh could not do something.
 #[derive(Debug, thiserror::Error)]
@@ -142,6 +180,10 @@ pub fn connect(endpoint: &Endpoint, key: Option<&KeyFile>) -> Result<Session, Ne
 }
 
 fn open(ours: &[(&str, serde_json::Value)], action: &'static str) -> Result<Session, NetworkError> {
+    if !has_one_thread() {
+        let cause = format!("{} must be {}", THREADS.0, THREADS.1);
+        return Err(NetworkError { action, cause });
+    }
     let mut config = Config::default();
     let common = [
         // A client would not begin before it is connected.

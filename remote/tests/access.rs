@@ -3,14 +3,16 @@
 #![cfg(feature = "network")]
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
 
+use std::net::{Shutdown, TcpListener, TcpStream};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::thread::JoinHandle;
 use std::time::{Duration, Instant, SystemTime};
 
 use shoal_remote::endpoint::Endpoint;
 use shoal_remote::files::KeyFile;
 use shoal_remote::keys::{self, Keys, VALID};
-use shoal_remote::network::{connect, listen};
+use shoal_remote::network::{connect, listen, restart_with_one_thread};
 use zenoh::sample::Sample;
 use zenoh::{Session, Wait};
 
@@ -68,6 +70,7 @@ fn gets_through(gate: &KeyFile, host: &KeyFile, seconds: u64) -> bool {
 
 #[test]
 fn a_foreign_or_expired_key_or_that_of_the_gate_opens_nothing() {
+    restart_with_one_thread().unwrap();
     let keys = fresh();
     assert!(gets_through(&keys.gate, &keys.join, 60), "the right key");
     assert!(!gets_through(&keys.gate, &fresh().join, 2), "that of another run");
@@ -80,6 +83,7 @@ fn a_foreign_or_expired_key_or_that_of_the_gate_opens_nothing() {
 
 #[test]
 fn a_host_may_send_chunks_and_receive_marks_and_nothing_else() {
+    restart_with_one_thread().unwrap();
     let keys = fresh();
     let endpoint = endpoint();
     let gate = listen(&endpoint, Some(&keys.gate)).unwrap();
@@ -108,4 +112,55 @@ fn a_host_may_send_chunks_and_receive_marks_and_nothing_else() {
     assert_eq!(other_run.load(Ordering::Relaxed), 0, "chunks of another run arrive");
     let read = of_others.load(Ordering::Relaxed) + everything.load(Ordering::Relaxed);
     assert_eq!(read, 0, "a host reads what another sends");
+}
+
+/// Carries bytes between each connection and the gate, and breaks the connection after a moment.
+fn breaking_proxy(gate: &Endpoint) -> Endpoint {
+    let ours = endpoint();
+    let address = |endpoint: &Endpoint| endpoint.to_string().trim_start_matches("tls/").to_owned();
+    let (listener, gate) = (TcpListener::bind(address(&ours)).unwrap(), address(gate));
+    std::thread::spawn(move || {
+        for (number, host) in listener.incoming().flatten().enumerate() {
+            let gate = TcpStream::connect(&gate).unwrap();
+            let (up, down) = (copying(&host, &gate), copying(&gate, &host));
+            std::thread::sleep(Duration::from_millis(100 + number as u64 * 37 % 200));
+            for stream in [&host, &gate] {
+                let _ = stream.shutdown(Shutdown::Both);
+            }
+            drop((up.join(), down.join()));
+        }
+    });
+    ours
+}
+
+fn copying(from: &TcpStream, to: &TcpStream) -> JoinHandle<()> {
+    let (mut from, mut to) = (from.try_clone().unwrap(), to.try_clone().unwrap());
+    std::thread::spawn(move || drop(std::io::copy(&mut from, &mut to)))
+}
+
+/// Reading and writing at the same time corrupts the memory of a TLS connection.
+#[test]
+fn connections_that_break_under_traffic_in_both_directions_harm_nothing() {
+    restart_with_one_thread().unwrap();
+    let keys = fresh();
+    let endpoint = endpoint();
+    let gate = listen(&endpoint, Some(&keys.gate)).unwrap();
+    let payload: &'static str = "chunk".repeat(20_000).leak();
+    let up = counting(&gate, "shoal/1a2b/up/**", payload);
+    let host = connect(&breaking_proxy(&endpoint), Some(&keys.join)).unwrap();
+    let down = counting(&host, "shoal/1a2b/down/7/marks", payload);
+    for _ in 0..20 {
+        let before = [&up, &down].map(|count| count.load(Ordering::Relaxed));
+        let both = within(60, || {
+            for _ in 0..20 {
+                host.put("shoal/1a2b/up/7/chunks", payload).wait().unwrap();
+                gate.put("shoal/1a2b/down/7/marks", payload).wait().unwrap();
+            }
+            [&up, &down]
+                .iter()
+                .zip(before)
+                .all(|(count, before)| count.load(Ordering::Relaxed) > before + 100)
+        });
+        assert!(both, "messages no longer arrive");
+    }
 }

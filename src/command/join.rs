@@ -102,6 +102,7 @@ mod with_network {
     use shoal_remote::endpoint::Endpoint;
     use shoal_remote::files::{HostFile, JoinFile, KeyFile};
     use shoal_remote::join::{JoinError, join as ask};
+    use shoal_remote::network::restart_with_one_thread;
     use shoal_remote::wire::{Admission, Hello, Lease, vector_instructions};
     use shoal_run::joining::make_host_directory;
     use shoal_run::outcome::{RunOutcome, RunState};
@@ -116,6 +117,7 @@ mod with_network {
 
     /// Joins the run, and works for it until it is over.
     pub(super) fn join(args: &JoinArgs, run: &str, actors: u32) -> anyhow::Result<ExitCode> {
+        restart_with_one_thread()?;
         let (endpoint, key) = endpoint(args, run)?;
         let signals = Signals::register()?;
         let interrupt = signals.interrupt();

@@ -210,7 +210,7 @@ impl Running {
 
     /// Kills the newest process of a role, if it is alive.
     pub(crate) fn kill_if_alive(&self, who: &str) {
-        if let Some(pid) = self.pids(who).last().copied().filter(|pid| is_ours(*pid)) {
+        if let Some(pid) = self.pids(who).last().copied().filter(|pid| is_ours(*pid, &self.run)) {
             // It may end in between.
             let _ = kill_process(Pid::from_raw(pid).unwrap(), Signal::KILL);
         }
@@ -283,13 +283,13 @@ impl Drop for Running {
         let _ = self.child.wait();
         let processes = pids(&self.log());
         for (_, pid) in &processes {
-            if is_ours(*pid) {
+            if is_ours(*pid, &self.run) {
                 let _ = kill_process(Pid::from_raw(*pid).unwrap(), Signal::KILL);
             }
         }
         // Not `until`: a panic while another one unwinds would abort the suite.
         let begun = Instant::now();
-        while processes.iter().any(|(_, pid)| is_ours(*pid)) && begun.elapsed() < TIMEOUT {
+        while processes.iter().any(|(_, pid)| is_ours(*pid, &self.run)) && begun.elapsed() < TIMEOUT {
             std::thread::sleep(Duration::from_millis(10));
         }
     }
@@ -304,6 +304,7 @@ impl Drop for Workplace {
 
 /// Processes and shared memory of a run.
 pub(crate) struct Leftovers {
+    run: PathBuf,
     run_id: String,
     pids: Vec<i32>,
 }
@@ -314,6 +315,7 @@ impl Leftovers {
         let table: toml::Table = config.parse().unwrap();
         let log = std::fs::read_to_string(run.join("shoal.log")).unwrap();
         Self {
+            run: run.into(),
             run_id: table["run"]["id"].as_str().unwrap().into(),
             pids: pids(&log).into_iter().map(|(_, pid)| pid).collect(),
         }
@@ -321,7 +323,11 @@ impl Leftovers {
 
     /// Processes of the run that still exist.
     pub(crate) fn processes(&self) -> Vec<i32> {
-        self.pids.iter().copied().filter(|pid| is_ours(*pid)).collect()
+        self.pids
+            .iter()
+            .copied()
+            .filter(|pid| is_ours(*pid, &self.run))
+            .collect()
     }
 
     /// Files of the run that are still in shared memory.
@@ -489,10 +495,20 @@ fn pids(log: &str) -> Vec<(String, i32)> {
     log.lines().filter_map(started).collect()
 }
 
-/// Whether the process exists and is a role of Shoal. Its id may have been reused by another program.
-fn is_ours(pid: i32) -> bool {
+/// Whether the process exists and belongs to this run. Its id may have been reused, even by a role of another run.
+fn is_ours(pid: i32, run: &Path) -> bool {
     let alive = test_kill_process(Pid::from_raw(pid).unwrap()).is_ok();
     let command = std::fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
-    let serves = || command.windows(11).any(|part| part == b"--iceoryx2\0");
-    alive && (command.starts_with(b"shoal\0") || serves())
+    let names = |part: &[u8]| command.windows(part.len()).any(|window| window == part);
+    // The run itself may have been renamed.
+    let place = run.parent().unwrap();
+    let place = place.canonicalize().unwrap_or_else(|_| place.into());
+    let config = std::fs::read_to_string(run.join("config.toml")).unwrap_or_default();
+    let id = config
+        .parse::<toml::Table>()
+        .ok()
+        .and_then(|table| Some(table.get("run")?.get("id")?.as_str()?.to_owned()));
+    // A server of another program knows the run by its id alone.
+    let serves = id.is_some_and(|id| names(format!("--run\0{id}\0").as_bytes()));
+    alive && (names(place.as_os_str().as_encoded_bytes()) || serves)
 }
