@@ -27,8 +27,8 @@ pub(crate) trait Done {
 
 /// Gymnasium's environments, served by `python3`.
 pub(crate) static PYTHON: Need = Need::new(
-    "python3 has no shoal_gym: pip install ./python",
-    || succeeds(Command::new("python3").args(["-c", "import shoal_gym.server"])),
+    "python3 has no shoal_gym or shoal: pip install ./python",
+    || succeeds(Command::new("python3").args(["-c", "import shoal_gym.server, shoal"])),
     Some("SHOAL_REQUIRE_PYTHON"),
 );
 

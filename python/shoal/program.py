@@ -1,0 +1,199 @@
+"""The program ``shoal``: where it is, how it is called, and how a training is started."""
+
+from __future__ import annotations
+
+import collections
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from .errors import ShoalError
+
+if TYPE_CHECKING:
+    from .run import Run
+
+#: Seconds that a training may take until its directory exists. Environments of other programs are asked first.
+START_SECONDS = 150.0
+
+#: Lines of the program's messages that are kept for an error.
+KEPT_LINES = 20
+
+
+def program() -> str:
+    """The path of the program: ``$SHOAL``, else ``shoal`` in ``PATH``, else beside the Python interpreter."""
+    named = os.environ.get("SHOAL")
+    beside = Path(sys.executable).parent / "shoal"
+    found = named or shutil.which("shoal") or (str(beside) if beside.exists() else None)
+    if found is None:
+        raise ShoalError(
+            "there is no program `shoal` in PATH: install it with `cargo install --path .` in Shoal's directory, "
+            "or name it in the environment variable SHOAL"
+        )
+    return found
+
+
+def text_of(value: Any) -> str:
+    """A value of a setting as the option ``--set`` takes it."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return value
+    if isinstance(value, Mapping):
+        pairs = (f"{json.dumps(str(key))} = {toml_value(item)}" for key, item in value.items())
+        return "{" + ", ".join(pairs) + "}"
+    if isinstance(value, Sequence):
+        return "[" + ", ".join(toml_value(item) for item in value) + "]"
+    return str(value)
+
+
+def toml_value(value: Any) -> str:
+    return json.dumps(value) if isinstance(value, str) else text_of(value)
+
+
+def settings(values: Mapping[str, Any] | None) -> list[str]:
+    """The options ``--set`` for these keys and values."""
+    return [part for key, value in (values or {}).items() for part in ("--set", f"{key}={text_of(value)}")]
+
+
+#: The exit code of `shoal status` for a run that is not running.
+NOT_RUNNING = 3
+
+
+def call(arguments: Sequence[str | os.PathLike[str]], accepted: Sequence[int] = (0,)) -> str:
+    """Runs the program to its end and returns what it printed.
+
+    Raises :class:`ShoalError` with its message if its exit code is none of those ``accepted``.
+    """
+    command = [program(), *(os.fspath(argument) for argument in arguments)]
+    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True)
+    if done.returncode not in accepted:
+        raise failure(done.stderr, done.returncode)
+    return done.stdout
+
+
+def failure(messages: str, code: int) -> ShoalError:
+    """The error for a program that ended with ``code`` after these messages."""
+    lines = [line for line in messages.splitlines() if line.strip()]
+    errors = [line.removeprefix("error: ") for line in lines if line.startswith("error: ")]
+    message = errors[-1] if errors else lines[-1] if lines else f"shoal ended with exit code {code}"
+    return ShoalError(message, code)
+
+
+def follow(command: Sequence[str], quiet: bool) -> str:
+    """Runs a training to its end, shows its lines while it runs, and returns what it printed.
+
+    If this Python is interrupted, the training is too: it saves what it has, and then ``KeyboardInterrupt`` is raised.
+    """
+    last: collections.deque[str] = collections.deque(maxlen=KEPT_LINES)
+    with tempfile.TemporaryFile("w+") as printed:
+        child = subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=printed, stderr=subprocess.PIPE, text=True, start_new_session=True
+        )
+        assert child.stderr is not None
+        try:
+            for line in child.stderr:
+                last.append(line)
+                # An error becomes an exception.
+                if not quiet and not line.startswith("error: "):
+                    print(line, end="", file=sys.stderr, flush=True)
+            code = child.wait()
+        except BaseException:
+            child.terminate()
+            # Its last lines are read too: a full pipe would keep it from ending.
+            child.communicate()
+            raise
+        if code != 0:
+            raise failure("".join(last), code)
+        printed.seek(0)
+        return printed.read()
+
+
+def new_directory(what: str) -> Path:
+    """``runs/<what>-<n>`` with the first free n, as the program names runs."""
+    name = Path(what).stem if what.endswith(".toml") else what.removeprefix("gym:").replace("/", "-").replace(":", "-")
+    number = 1
+    while Path("runs", f"{name}-{number}").exists():
+        number += 1
+    return Path("runs", f"{name}-{number}").absolute()
+
+
+def train(
+    what: str,
+    *,
+    run: str | os.PathLike[str] | None = None,
+    steps: int | None = None,
+    episodes: int | None = None,
+    seed: int | None = None,
+    actors: int | None = None,
+    envs: int | None = None,
+    method: str | None = None,
+    lockstep: bool = False,
+    set: Mapping[str, Any] | None = None,
+    from_run: str | os.PathLike[str] | Run | None = None,
+    with_replay: bool = False,
+    wait: bool = True,
+    quiet: bool = False,
+) -> Run:
+    """Trains ``what``: a preset (``"pendulum"``), an environment (``"gym:Pendulum-v1"``) or a configuration file.
+
+    ``set`` has settings by their keys, as in ``{"ddpg.tau": 0.005}``; ``shoal train --help-config`` lists them. The
+    other arguments are those of ``shoal train``. ``run`` is the directory to create, by default ``runs/<what>-<n>``.
+
+    With ``wait``, this returns when the training has finished, and shows its lines unless ``quiet``. Without, it
+    returns as soon as the run exists. The training then continues even if this Python ends; :meth:`Run.stop` ends it.
+
+    Raises :class:`ShoalError` if the program refuses or fails.
+    """
+    from .run import Run
+
+    directory = Path(run).absolute() if run is not None else None
+    if directory is None and not wait:
+        directory = new_directory(what)
+    options: list[tuple[str, object]] = [
+        ("--run", directory),
+        ("--steps", steps),
+        ("--episodes", episodes),
+        ("--seed", seed),
+        ("--actors", actors),
+        ("--envs", envs),
+        ("--method", method),
+        ("--from", getattr(from_run, "path", from_run)),
+    ]
+    command = [program(), "train", what, "--json"]
+    command += [str(part) for option, value in options if value is not None for part in (option, value)]
+    command += ["--lockstep"] if lockstep else []
+    command += ["--with-replay"] if with_replay else []
+    command += settings(set)
+    if wait:
+        return Run(json.loads(follow(command, quiet))["run"])
+    assert directory is not None
+    return detached(command, directory)
+
+
+def detached(command: Sequence[str], directory: Path) -> Run:
+    """Starts a training in a session of its own, and returns when its run has a replay."""
+    from .run import Run
+
+    messages = tempfile.TemporaryFile("w+")
+    child = subprocess.Popen(
+        command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=messages, start_new_session=True
+    )
+    give_up = time.monotonic() + START_SECONDS
+    # The learner makes it when everything else is there.
+    replay = directory / "replay.bin"
+    while not replay.exists() and child.poll() is None:
+        if time.monotonic() > give_up:
+            child.terminate()
+            raise ShoalError(f"the training of {directory} did not begin within {START_SECONDS:.0f} s")
+        time.sleep(0.02)
+    if child.poll() not in (None, 0):
+        messages.seek(0)
+        raise failure(messages.read(), child.returncode)
+    return Run(directory, child=child, messages=messages)

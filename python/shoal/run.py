@@ -1,0 +1,150 @@
+"""A run: its files, and the commands for it."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+import numpy as np
+
+from . import program, tables
+from .errors import ShoalError
+from .policy import Policy
+from .transitions import Transitions
+
+if TYPE_CHECKING:
+    import pandas
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+
+class Run:
+    """A run in its directory, running or not.
+
+    Raises :class:`ShoalError` if the directory has no run.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        child: subprocess.Popen[Any] | None = None,
+        messages: IO[str] | None = None,
+    ) -> None:
+        self.path = Path(path).absolute()
+        self._child, self._messages = child, messages
+        if not (self.path / "config.toml").is_file():
+            raise ShoalError(f"{self.path} is not a run directory: it has no config.toml")
+
+    def __repr__(self) -> str:
+        return f"shoal.Run({str(self.path)!r})"
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The configuration that the run was last used with, by section and key."""
+        used = self.path / "config" / "used.toml"
+        # Runs of earlier versions have config.toml alone.
+        path = used if used.exists() else self.path / "config.toml"
+        try:
+            return tomllib.loads(path.read_text())
+        except (OSError, tomllib.TOMLDecodeError) as error:
+            raise ShoalError(f"{path} cannot be read: {error}") from error
+
+    @property
+    def evaluations(self) -> np.ndarray:
+        """The evaluations of its policies: a structured array with a field for each column of ``evaluations.csv``."""
+        return self.table("evaluations")
+
+    @property
+    def episodes(self) -> np.ndarray:
+        """The training episodes: a structured array with a field for each column of ``episodes.csv``."""
+        return self.table("episodes")
+
+    @property
+    def learner(self) -> np.ndarray:
+        """The learner's progress: a structured array with a field for each column of ``learner.csv``."""
+        return self.table("learner")
+
+    def table(self, name: str) -> np.ndarray:
+        """``<name>.csv`` of the run as a structured array: ``evaluations``, ``episodes``, ``learner``, ``incidents`` or
+        ``changes``."""
+        return tables.read(self.path / f"{name}.csv")
+
+    def frame(self, name: str = "evaluations") -> pandas.DataFrame:
+        """The same as a DataFrame; this needs pandas."""
+        try:
+            import pandas
+        except ImportError as error:
+            raise ShoalError("frame() needs pandas: pip install pandas") from error
+        return pandas.DataFrame(self.table(name))
+
+    @property
+    def result(self) -> dict[str, Any] | None:
+        """The final evaluation of a finished run (``final-evaluation.json``); ``None`` before."""
+        path = self.path / "final-evaluation.json"
+        return json.loads(path.read_text()) if path.exists() else None
+
+    def policy(self, which: str = "best") -> Policy:
+        """The ``"best"`` policy of the run's evaluations, or its ``"last"`` one. It can be called with observations."""
+        if which not in ("best", "last"):
+            raise ShoalError(f"there is no policy {which!r}; choose 'best' or 'last'")
+        return Policy(self.path / "checkpoints" / f"{which}.policy", self.config)
+
+    def transitions(self) -> Transitions:
+        """The run's replay, mapped read-only, even while the run continues."""
+        return Transitions(self.path / "replay.bin")
+
+    def status(self) -> dict[str, Any]:
+        """What ``shoal status --json`` says."""
+        return json.loads(program.call(["status", self.path, "--json"], accepted=(0, program.NOT_RUNNING)))
+
+    def scale(self, actors: int) -> None:
+        """Changes the number of actors while the run is running."""
+        program.call(["scale", self.path, "--actors", str(actors)])
+
+    def stop(self) -> None:
+        """Ends the run in order: all that was sent is committed and saved. :meth:`resume` continues it."""
+        program.call(["stop", self.path])
+        if self._child is not None:
+            self._child.wait()
+
+    def wait(self, timeout: float | None = None) -> Run:
+        """Waits until the run is no longer running, for at most ``timeout`` seconds. Returns the run.
+
+        Raises ``TimeoutError`` if it is still running, and :class:`ShoalError` if it failed and was started without
+        ``wait`` by this Python.
+        """
+        give_up = None if timeout is None else time.monotonic() + timeout
+        running = self._child_runs if self._child is not None else lambda: self.status()["running"]
+        while running():
+            if give_up is not None and time.monotonic() > give_up:
+                raise TimeoutError(f"{self.path} is still running after {timeout} s")
+            time.sleep(0.1 if self._child is not None else 0.5)
+        if self._child is not None and self._child.returncode != 0 and self._messages is not None:
+            self._messages.seek(0)
+            raise program.failure(self._messages.read(), self._child.returncode)
+        return self
+
+    def _child_runs(self) -> bool:
+        return self._child is not None and self._child.poll() is None
+
+    def resume(self, *, steps: int | None = None, set: Mapping[str, Any] | None = None, quiet: bool = False) -> Run:
+        """Continues the run to its end, or to a new number of ``steps``, with changed settings. Returns the run."""
+        command = [program.program(), "resume", str(self.path), "--json"]
+        command += ["--steps", str(steps)] if steps is not None else []
+        program.follow(command + program.settings(set), quiet)
+        return self
+
+    def evaluate(self, episodes: int | None = None) -> dict[str, Any]:
+        """Evaluates the best policy anew, as ``shoal eval --json`` does."""
+        options = ["--episodes", str(episodes)] if episodes is not None else []
+        return json.loads(program.call(["eval", self.path, "--json", *options]))
