@@ -152,14 +152,23 @@ fn rates_of_several_actors_are_measured_and_predicted() {
         assert_eq!(count["more_processes_than_cores"], processes > cores);
         for (way, updates) in [("collecting", false), ("learning", true)] {
             let [rate, one] = [&count[way], &counts[0][way]];
-            let rows = |rate| number(rate, "rows_per_second");
+            // In so short a time, other work may keep the actors from sending anything.
+            let rows = |rate: &Value| rate["rows_per_second"].as_f64().unwrap();
             let efficiency = rows(rate) / (actors * rows(one));
-            assert!((number(rate, "efficiency") - efficiency).abs() < 1e-9, "{figures}");
+            let found = rate["efficiency"].as_f64().unwrap_or(f64::NAN);
+            assert!(
+                rows(one) == 0.0 || (found - efficiency).abs() < 1e-9 * efficiency.max(1.0),
+                "{figures}"
+            );
             number(rate, "expected_rows_per_second");
             assert_eq!(rate["updates_per_second"].as_f64().unwrap() > 0.0, updates, "{figures}");
             assert_eq!(rate["expected_updates_per_second"].as_f64().unwrap() > 0.0, updates);
         }
     }
+    let collected = counts
+        .iter()
+        .map(|count| count["collecting"]["rows_per_second"].as_f64().unwrap());
+    assert!(collected.sum::<f64>() > 0.0, "{figures}");
     let one_core = &figures["one_core"];
     number(one_core, "pair_rows_per_second");
     number(one_core, "inference_rows_per_second");
