@@ -21,6 +21,7 @@ use crate::command::scale::ScaleArgs;
 use crate::command::status::StatusArgs;
 use crate::command::stop::StopArgs;
 use crate::command::top::TopArgs;
+use crate::command::track::TrackArgs;
 use crate::command::train::TrainArgs;
 
 /// Shared-memory off-policy actor-learner: distributed reinforcement learning on one machine.
@@ -53,6 +54,8 @@ pub(crate) enum Command {
     Report(ReportArgs),
     /// Write a run's policy into a file for other programs.
     Export(ExportArgs),
+    /// Copy what a run records to Weights & Biases or MLflow.
+    Track(TrackArgs),
     /// Remove runs, or their replays alone.
     Rm(RmArgs),
     /// List the runs in a directory with their state, progress and best return.

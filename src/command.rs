@@ -19,5 +19,6 @@ pub(crate) mod status;
 pub(crate) mod stop;
 mod suite;
 pub(crate) mod top;
+pub(crate) mod track;
 pub(crate) mod train;
 mod training;

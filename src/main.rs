@@ -73,6 +73,7 @@ fn run(command: &Command) -> anyhow::Result<ExitCode> {
         Command::Plot(args) => command::plot::run(args).map(done),
         Command::Report(args) => command::report::run(args).map(done),
         Command::Export(args) => command::export::run(args).map(done),
+        Command::Track(args) => command::track::run(args).map(done),
         Command::Rm(args) => command::rm::run(args),
         Command::List(args) => command::list::run(args).map(done),
         Command::Reproduce(args) => command::reproduce::run(args),

@@ -16,9 +16,12 @@ use shoal_common::policy::policy_file::PolicyFile;
 use shoal_common::run_dir::RunDir;
 use shoal_common::space::Space;
 use suite::{Need, PYTHON, test};
-use support::Workplace;
+use support::{Workplace, until};
 
 static MATPLOTLIB: Need = Need::new("python3 has no matplotlib", || python_has("matplotlib"), None);
+
+static MLFLOW: Need = Need::new("python3 has no mlflow", || python_has("mlflow"), None);
+static WANDB: Need = Need::new("python3 has no wandb", || python_has("wandb"), None);
 
 fn main() -> ExitCode {
     suite::run(vec![
@@ -26,6 +29,7 @@ fn main() -> ExitCode {
         test!(runs_are_started_read_changed_and_stopped_from_python, PYTHON),
         test!(the_tutorials_python_works, PYTHON),
         test!(the_notebook_works, PYTHON, MATPLOTLIB),
+        test!(a_run_is_tracked_while_it_runs, PYTHON, MLFLOW, WANDB),
     ])
 }
 
@@ -150,4 +154,32 @@ fn the_notebook_works() {
     let text: String = lines.map(|line| line.as_str().unwrap_or("\n")).collect();
     let checked = format!("{text}\nassert total > -700 and abs(torque).max() > 1.5, total");
     python(&Workplace::new(), &["-c", &checked]);
+}
+
+/// The trackers' own programs read what was stored.
+fn a_run_is_tracked_while_it_runs() {
+    let place = Workplace::new();
+    let running = place.start("run", &["--steps", "100000000", "--set", "evaluation.every=500"]);
+    let track = |to: &str| {
+        let mut command = place.shoal(&["track", "run", "--to", to]);
+        let store = format!("file://{}/mlruns", place.path().display());
+        command
+            .env("MLFLOW_TRACKING_URI", store)
+            .env("MLFLOW_ALLOW_FILE_STORE", "true");
+        command.env("WANDB_MODE", "offline").env("WANDB_SILENT", "true");
+        command.stderr(std::process::Stdio::piped()).spawn().unwrap()
+    };
+    let following = ["mlflow", "wandb"].map(track);
+    until("both have begun", || {
+        let begun = |to| place.path().join(format!("run/tracking-{to}.json")).exists();
+        begun("mlflow") && begun("wandb")
+    });
+    running.wait_for_learning();
+    assert!(place.output(&["stop", "run"]).status.success());
+    running.wait();
+    for follower in following {
+        let output = follower.wait_with_output().unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    }
+    python(&place, &[&script("tracked.py"), "run"]);
 }

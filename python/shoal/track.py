@@ -1,0 +1,293 @@
+"""Copies what a run records to a tracker, Weights & Biases or MLflow, while it runs and afterwards.
+
+``shoal track RUN --to mlflow`` calls this module. It needs the tracker's own Python package. It only reads the run, and
+writes ``tracking-<tracker>.json`` there: which run of the tracker it is, and how many lines of each file were sent. So
+it may be interrupted and repeated; at most the lines that were being sent are sent twice.
+"""
+
+from __future__ import annotations
+
+import argparse
+import fcntl
+import json
+import os
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from .errors import ShoalError
+from .run import Run
+
+#: The files that are followed, and what their metrics are called.
+FOLLOWED = {"evaluations": "evaluation", "learner": "learner", "episodes": "episode"}
+
+#: Columns that say when something was, or count instead of measure.
+NOT_METRICS = {"wall_seconds", "env_steps", "actor", "environment", "best", "terminated"}
+
+#: Lines that are sent together.
+TOGETHER = 500
+
+#: Files of a run that a tracker keeps.
+ARTIFACTS = ("config.toml", "config/used.toml", "learning-curve.svg", "swing-up.svg", "changes.csv", "report.html")
+
+#: Seconds between two looks at a run.
+PAUSE = 2.0
+
+
+class Tracker(Protocol):
+    """A run of a tracker."""
+
+    #: The tracker's own name for it.
+    id: str
+
+    def settings(self, settings: Mapping[str, Any]) -> None:
+        """Records the configuration: values by ``section.key``."""
+
+    def metrics(self, rows: Sequence[tuple[float, int, Mapping[str, float]]]) -> None:
+        """Records metrics: for each row its seconds since the start of the run, its step, and values by name."""
+
+    def result(self, values: Mapping[str, float]) -> None:
+        """Records the final result, by name."""
+
+    def files(self, run: Run, paths: Sequence[Path]) -> None:
+        """Keeps copies of these files of the run."""
+
+    def close(self, state: str) -> None:
+        """Ends the connection. The run is ``finished``, ``stopped`` or still ``running``."""
+
+
+class MLflow:
+    """A run of MLflow, in the store that ``MLFLOW_TRACKING_URI`` names, by default a local one."""
+
+    def __init__(self, run: Run, project: str, group: str | None, begun: float, known: str | None) -> None:
+        try:
+            from mlflow import MlflowClient
+            from mlflow.entities import Metric
+        except ImportError as error:
+            raise ShoalError("--to mlflow needs the package mlflow: pip install mlflow") from error
+        try:
+            self._client, self._metric = MlflowClient(), Metric
+        except Exception as error:
+            raise ShoalError(f"MLflow's store cannot be used: {error}") from error
+        experiment = self._client.get_experiment_by_name(project)
+        number = experiment.experiment_id if experiment else self._client.create_experiment(project)
+        if known is None:
+            tags = {"shoal.run": str(run.path), **({"shoal.suite": group} if group else {})}
+            known = self._client.create_run(number, run_name=run.path.name, tags=tags).info.run_id
+        else:
+            self._client.update_run(known, status="RUNNING")
+        self.id: str = known
+        self._begun = int(1000 * begun)
+
+    def settings(self, settings: Mapping[str, Any]) -> None:
+        existing = self._client.get_run(self.id).data.params
+        for key, value in settings.items():
+            # A parameter of MLflow cannot change; a changed one is a tag.
+            if key not in existing:
+                self._client.log_param(self.id, key, value)
+            elif existing[key] != str(value):
+                self._client.set_tag(self.id, f"changed.{key}", value)
+
+    def metrics(self, rows: Sequence[tuple[float, int, Mapping[str, float]]]) -> None:
+        metrics = [
+            self._metric(name, value, self._begun + int(1000 * seconds), step)
+            for seconds, step, values in rows
+            for name, value in values.items()
+        ]
+        for first in range(0, len(metrics), TOGETHER):
+            self._client.log_batch(self.id, metrics=metrics[first : first + TOGETHER])
+
+    def result(self, values: Mapping[str, float]) -> None:
+        for name, value in values.items():
+            self._client.log_metric(self.id, name, value)
+
+    def files(self, run: Run, paths: Sequence[Path]) -> None:
+        for path in paths:
+            self._client.log_artifact(self.id, str(path))
+
+    def close(self, state: str) -> None:
+        if state != "running":
+            self._client.set_terminated(self.id, "FINISHED" if state == "finished" else "KILLED")
+
+
+class WeightsAndBiases:
+    """A run of Weights & Biases, in the mode that ``WANDB_MODE`` names; ``offline`` needs no account."""
+
+    def __init__(self, run: Run, project: str, group: str | None, begun: float, known: str | None) -> None:
+        try:
+            import wandb
+        except ImportError as error:
+            raise ShoalError("--to wandb needs the package wandb: pip install wandb") from error
+        self._wandb = wandb
+        directory = os.environ.get("WANDB_DIR", str(run.path))
+        self._run = wandb.init(
+            project=project, name=run.path.name, group=group, id=known, resume="allow", dir=directory
+        )
+        self.id: str = self._run.id
+        self._run.define_metric("env_steps")
+        self._run.define_metric("*", step_metric="env_steps")
+
+    def settings(self, settings: Mapping[str, Any]) -> None:
+        self._run.config.update(dict(settings), allow_val_change=True)
+
+    def metrics(self, rows: Sequence[tuple[float, int, Mapping[str, float]]]) -> None:
+        for seconds, step, values in rows:
+            self._run.log({**values, "env_steps": step, "wall_seconds": seconds})
+
+    def result(self, values: Mapping[str, float]) -> None:
+        self._run.summary.update(dict(values))
+
+    def files(self, run: Run, paths: Sequence[Path]) -> None:
+        artifact = self._wandb.Artifact(f"shoal-{self.id}", type="run")
+        for path in paths:
+            artifact.add_file(str(path), name=str(path.relative_to(run.path)))
+        self._run.log_artifact(artifact)
+
+    def close(self, state: str) -> None:
+        self._run.finish(exit_code=0 if state != "stopped" else 1)
+
+
+TRACKERS: dict[str, type] = {"mlflow": MLflow, "wandb": WeightsAndBiases}
+
+
+def track(path: str | os.PathLike[str], to: str, *, project: str = "shoal", follow: bool = True) -> None:
+    """Copies a run, or each run of a suite, to the tracker ``"mlflow"`` or ``"wandb"``.
+
+    With ``follow``, this returns when no run is running any more; without, it copies what is there now. A run that a
+    suite has not begun yet is tracked as soon as it has.
+    """
+    if to not in TRACKERS:
+        raise ShoalError(f"there is no tracker {to!r}; choose one of {', '.join(TRACKERS)}")
+    path = Path(path).absolute()
+    group = path.name if (path / "suite.json").is_file() else None
+    tracked: dict[Path, Copy] = {}
+    try:
+        while True:
+            for run in runs(path):
+                if run.path not in tracked:
+                    tracked[run.path] = Copy(run, to, project, group)
+            # What a run wrote before it ended is copied after its end was seen.
+            continues = any(map(is_worked_on, [path, *tracked]))
+            for copy in tracked.values():
+                copy.update()
+            if not (follow and continues):
+                break
+            time.sleep(PAUSE)
+    finally:
+        for copy in tracked.values():
+            copy.close()
+
+
+def runs(path: Path) -> list[Run]:
+    """The run of this directory, or those of this suite that have begun."""
+    if not (path / "suite.json").is_file():
+        return [Run(path)]
+    return [Run(path / name) for name in trials(path) if (path / name / "config.toml").is_file()]
+
+
+def trials(suite: Path) -> list[str]:
+    try:
+        return [trial["name"] for trial in json.loads((suite / "suite.json").read_text())["trials"]]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ShoalError(f"{suite / 'suite.json'} cannot be read: {error}") from error
+
+
+def is_worked_on(directory: Path) -> bool:
+    """Whether a process holds the lock of this run or suite, as the launcher of a running run does."""
+    descriptor = os.open(directory, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(descriptor)
+    return False
+
+
+class Copy:
+    """A run and its copy in a tracker."""
+
+    def __init__(self, run: Run, to: str, project: str, group: str | None) -> None:
+        self.run = run
+        self._file = run.path / f"tracking-{to}.json"
+        state = json.loads(self._file.read_text()) if self._file.exists() else {}
+        # The file is written again when a setting changes.
+        self._begun: float = state.get("begun", (run.path / "config.toml").stat().st_mtime)
+        self._lines: dict[str, int] = state.get("lines", {})
+        self._result: dict[str, Any] | None = state.get("result")
+        self._tracker: Tracker = TRACKERS[to](run, project, group, self._begun, state.get("id"))
+
+    def update(self) -> None:
+        """Copies what was added since."""
+        self._tracker.settings(dict(flat(self.run.config)))
+        for name, prefix in FOLLOWED.items():
+            table = self.run.table(name)
+            done = self._lines.get(name, 0)
+            self._tracker.metrics(list(rows(table[done:], prefix)))
+            self._lines[name] = len(table)
+            self._save()
+
+    def close(self) -> None:
+        """Copies result and files, and ends the connection."""
+        result = self.run.result
+        if result is not None and result != self._result:
+            for policy in result["policies"]:
+                name = policy["policy"]
+                values = {f"final/{name}_{key}": policy[key] for key in ("return_mean", "return_std", "episodes")}
+                self._tracker.result({key: value for key, value in values.items() if value is not None})
+            self._result = result
+            self._save()
+        files = [self.run.path / name for name in ARTIFACTS]
+        self._tracker.files(self.run, [path for path in files if path.is_file()])
+        outcome = self.run.path / "outcome.json"
+        finished = outcome.is_file() and json.loads(outcome.read_text())["state"] == "finished"
+        running = is_worked_on(self.run.path)
+        self._tracker.close("running" if running else "finished" if finished else "stopped")
+
+    def _save(self) -> None:
+        state = {"id": self._tracker.id, "begun": self._begun, "lines": self._lines, "result": self._result}
+        new = self._file.with_suffix(".json.new")
+        new.write_text(json.dumps({"format": 1, **state}))
+        new.replace(self._file)
+
+
+def flat(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """The values of a nested table by their dotted keys; lists as text."""
+    for key, value in config.items():
+        if isinstance(value, Mapping):
+            yield from flat(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", json.dumps(value) if isinstance(value, list) else value
+
+
+def rows(table: np.ndarray, prefix: str) -> Iterator[tuple[float, int, dict[str, float]]]:
+    """The lines of a table with their metrics. Empty cells are left out."""
+    names = [name for name in table.dtype.names or () if name not in NOT_METRICS and table[name].dtype != object]
+    for row in table:
+        values = {f"{prefix}/{name}": float(row[name]) for name in names if np.isfinite(row[name])}
+        yield float(row["wall_seconds"]), int(row["env_steps"]), values
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="shoal track", description="Copies what a run or suite records to a tracker.")
+    parser.add_argument("run", help="the directory of a run or suite")
+    parser.add_argument("--to", choices=sorted(TRACKERS), required=True)
+    parser.add_argument("--project", default="shoal", help="project or experiment of the tracker [default: shoal]")
+    parser.add_argument("--once", action="store_true", help="copy what is there now, and do not wait for the end")
+    arguments = parser.parse_args()
+    try:
+        track(arguments.run, arguments.to, project=arguments.project, follow=not arguments.once)
+    except ShoalError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
