@@ -168,9 +168,25 @@ impl Workplace {
 
     /// Copies the run directory `from` in its current state, whether the run is running or not.
     pub(crate) fn copy(&self, from: &str, to: &str) {
-        let mut command = Command::new("cp");
-        let copied = command.args(["-r", from, to]).current_dir(self.path()).status();
-        assert!(copied.unwrap().success(), "{from} cannot be copied");
+        copy_directory(&self.path().join(from), &self.path().join(to));
+    }
+}
+
+/// A running run renames its temporary files meanwhile; those that are gone are left out.
+fn copy_directory(from: &Path, to: &Path) {
+    std::fs::create_dir(to).unwrap();
+    for entry in std::fs::read_dir(from).unwrap().map(Result::unwrap) {
+        let to = to.join(entry.file_name());
+        if entry.file_type().unwrap().is_dir() {
+            copy_directory(&entry.path(), &to);
+        } else if let Err(error) = std::fs::copy(entry.path(), to) {
+            assert_eq!(
+                error.kind(),
+                std::io::ErrorKind::NotFound,
+                "{}: {error}",
+                entry.path().display()
+            );
+        }
     }
 }
 
