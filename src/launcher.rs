@@ -219,7 +219,8 @@ impl<'a> Launcher<'a> {
         if config.evaluation.keep_policies {
             std::fs::create_dir_all(run.policies()).context("cannot create the directory for policies")?;
         }
-        let recorder = Recorder::open(run, &config.replay)?;
+        let mut recorder = Recorder::open(run, &config.replay)?;
+        recorder.settings(&config)?;
         let initial = status::saved_status(&config, run)?;
         RunOutcome::new(RunState::Running, initial.env_steps, initial.episodes).write(run)?;
         // Creates the services that are opened below.

@@ -11,13 +11,14 @@ use std::time::{Duration, Instant};
 pub use change::{ChangeRecord, Moment, read_changes, record_changes};
 pub use incident::{Incident, IncidentKind, IncidentRow};
 use serde::{Deserialize, Serialize};
-use shoal_common::config::ReplayConfig;
+use shoal_common::config::{Config, ReplayConfig};
 use shoal_common::report::{EpisodeReport, EvaluationReport, LearnerReport};
 use shoal_common::run_dir::RunDir;
 pub use table::RecordError;
 use table::Table;
 
 use self::tensorboard::EventFile;
+use crate::final_evaluation::{FinalEvaluation, FinalPolicy};
 use crate::rate::per_second;
 
 /// The longest time that rows stay unflushed. A `kill -9` of the launcher loses at most these.
@@ -114,6 +115,29 @@ pub struct Recorder {
     flushed: Instant,
 }
 
+/// Records the final evaluation for TensorBoard, as scalars named `final/…`.
+pub fn record_final(run: &RunDir, evaluation: &FinalEvaluation) -> Result<(), RecordError> {
+    let write = || {
+        let mut events = EventFile::create(&run.tensorboard(), None)?;
+        for policy in &evaluation.policies {
+            let name = match policy.policy {
+                FinalPolicy::Best => "best",
+                FinalPolicy::Last => "last",
+            };
+            let [mean, std] = ["mean", "std"].map(|which| format!("final/{name}_return_{which}"));
+            let scalars = [(&*mean, policy.return_mean), (&*std, policy.return_std)];
+            let scalars = scalars.map(|(tag, value)| (tag, value.unwrap_or(f64::NAN)));
+            events.scalars(evaluation.env_steps, &scalars)?;
+        }
+        events.finished()?;
+        events.flush()
+    };
+    write().map_err(|cause| RecordError::Write {
+        path: run.tensorboard(),
+        cause,
+    })
+}
+
 impl Recorder {
     /// Opens the records of `run`, whose ratio of updates to environment steps is that of `ratio`.
     pub fn open(run: &RunDir, ratio: &ReplayConfig) -> Result<Self, RecordError> {
@@ -159,6 +183,18 @@ impl Recorder {
             recorder.incident(&resumed, Duration::ZERO)?;
         }
         Ok(recorder)
+    }
+
+    /// Records the settings for TensorBoard.
+    pub fn settings(&mut self, config: &Config) -> Result<(), RecordError> {
+        let mut settings = config.values();
+        // The run's name and its environment's spaces are nobody's choice.
+        settings.retain(|key, _| key != "run.id" && !key.starts_with("spec."));
+        let written = self.events.hyperparameters(&settings);
+        written.map_err(|cause| RecordError::Write {
+            path: self.events_path.clone(),
+            cause,
+        })
     }
 
     /// Records an exploration episode that ended `wall` after this launcher's start. Its steps are those of all actors by

@@ -20,6 +20,7 @@ use shoal_run::evaluation::{EvaluationSummary, WhichPolicy, evaluate_until};
 use shoal_run::final_evaluation::{FinalEvaluation, FinalPolicy, FinallyEvaluated};
 use shoal_run::numbers::thousands;
 use shoal_run::outcome::{FINAL_EVALUATION, RunOutcome, RunState};
+use shoal_run::recorder::record_final;
 use shoal_run::signals::{Interrupt, Signals, describe, exit_code};
 
 use super::listen::ListenArgs;
@@ -199,7 +200,9 @@ fn final_evaluation(
     let entry = |(_, policy, file, summary): &(_, FinalPolicy, PolicyFile, _)| {
         FinallyEvaluated::new(*policy, (file.version, file.env_steps), summary)
     };
-    FinalEvaluation::new(seed, env_steps, evaluated.iter().map(entry).collect(), *kept_policy).write(run)?;
+    let result = FinalEvaluation::new(seed, env_steps, evaluated.iter().map(entry).collect(), *kept_policy);
+    result.write(run)?;
+    record_final(run, &result)?;
     let best = ("best policy", kept_summary.clone());
     let last = evaluated.iter().filter(|(_, policy, ..)| *policy == FinalPolicy::Last);
     let last = last.map(|(name, .., summary)| (*name, summary.clone()));

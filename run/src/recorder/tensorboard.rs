@@ -1,6 +1,7 @@
-//! TensorBoard event files, scalars only. Written here because the crates that do this need `protoc` or depend on
+//! TensorBoard event files: scalars, and the settings of the run for its tab HParams. Written here because the crates that do this need `protoc` or depend on
 //! outdated image crates.
 
+use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
@@ -46,6 +47,87 @@ struct Value {
     /// Optional, because a plain zero would not be written.
     #[prost(float, optional, tag = "2")]
     simple_value: Option<f32>,
+    #[prost(message, optional, tag = "9")]
+    metadata: Option<Metadata>,
+}
+
+/// `SummaryMetadata`: data of a plugin.
+#[derive(Clone, PartialEq, Message)]
+struct Metadata {
+    #[prost(message, optional, tag = "1")]
+    plugin_data: Option<PluginData>,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct PluginData {
+    #[prost(string, tag = "1")]
+    plugin_name: String,
+    #[prost(bytes = "vec", tag = "2")]
+    content: Vec<u8>,
+}
+
+/// `HParamsPluginData` of `plugins/hparams/plugin_data.proto`, as far as it is used here.
+#[derive(Clone, PartialEq, Message)]
+struct HyperparameterData {
+    #[prost(message, optional, tag = "3")]
+    session_start: Option<SessionStart>,
+    #[prost(message, optional, tag = "4")]
+    session_end: Option<SessionEnd>,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct SessionStart {
+    #[prost(btree_map = "string, message", tag = "1")]
+    hyperparameters: BTreeMap<String, Setting>,
+    /// Seconds since 1970.
+    #[prost(double, tag = "5")]
+    start_time: f64,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct SessionEnd {
+    #[prost(int32, tag = "1")]
+    status: i32,
+    /// Seconds since 1970.
+    #[prost(double, tag = "2")]
+    end_time: f64,
+}
+
+/// `Status.STATUS_SUCCESS`.
+const SUCCESS: i32 = 1;
+
+/// `google.protobuf.Value`.
+#[derive(Clone, PartialEq, Message)]
+struct Setting {
+    #[prost(oneof = "SettingKind", tags = "2, 3, 4")]
+    kind: Option<SettingKind>,
+}
+
+#[derive(Clone, PartialEq, prost::Oneof)]
+enum SettingKind {
+    #[prost(double, tag = "2")]
+    Number(f64),
+    #[prost(string, tag = "3")]
+    Text(String),
+    #[prost(bool, tag = "4")]
+    Truth(bool),
+}
+
+impl Setting {
+    /// A value as `--set` takes it.
+    fn read(text: &str) -> Self {
+        let kind = match (text.parse::<bool>(), text.parse::<f64>()) {
+            (Ok(truth), _) => SettingKind::Truth(truth),
+            (_, Ok(number)) => SettingKind::Number(number),
+            _ => SettingKind::Text(text.into()),
+        };
+        Self { kind: Some(kind) }
+    }
+}
+
+fn now() -> f64 {
+    let now = SystemTime::now().duration_since(UNIX_EPOCH);
+    now.unwrap_or_default().as_secs_f64()
 }
 
 /// An event file of this process.
@@ -91,11 +173,57 @@ impl EventFile {
         let value = finite.map(|(tag, value)| Value {
             tag: (*tag).into(),
             simple_value: Some(*value as f32),
+            metadata: None,
         });
         let summary = Some(Summary { value: value.collect() });
         self.write(&Event {
             step: step as i64,
             summary,
+            ..Event::default()
+        })
+    }
+
+    /// Writes the settings of the run: values as `--set` takes them, by key.
+    pub(crate) fn hyperparameters(&mut self, settings: &BTreeMap<String, String>) -> io::Result<()> {
+        let settings = settings.iter().map(|(key, value)| (key.clone(), Setting::read(value)));
+        self.plugin(
+            "_hparams_/session_start_info",
+            &HyperparameterData {
+                session_start: Some(SessionStart {
+                    hyperparameters: settings.collect(),
+                    start_time: now(),
+                }),
+                session_end: None,
+            },
+        )
+    }
+
+    /// Writes that the run with these settings is finished.
+    pub(crate) fn finished(&mut self) -> io::Result<()> {
+        self.plugin(
+            "_hparams_/session_end_info",
+            &HyperparameterData {
+                session_start: None,
+                session_end: Some(SessionEnd {
+                    status: SUCCESS,
+                    end_time: now(),
+                }),
+            },
+        )
+    }
+
+    fn plugin(&mut self, tag: &str, data: &HyperparameterData) -> io::Result<()> {
+        let plugin_data = Some(PluginData {
+            plugin_name: "hparams".into(),
+            content: data.encode_to_vec(),
+        });
+        let value = Value {
+            tag: tag.into(),
+            simple_value: None,
+            metadata: Some(Metadata { plugin_data }),
+        };
+        self.write(&Event {
+            summary: Some(Summary { value: vec![value] }),
             ..Event::default()
         })
     }
@@ -106,9 +234,8 @@ impl EventFile {
     }
 
     fn write(&mut self, event: &Event) -> io::Result<()> {
-        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         let data = Event {
-            wall_time: now.as_secs_f64(),
+            wall_time: now(),
             ..event.clone()
         }
         .encode_to_vec();
@@ -190,6 +317,42 @@ mod tests {
             [("learner/critic_loss".into(), 1.5), ("learner/ratio".into(), 1.0)]
         );
         assert!(events.iter().all(|event| event.wall_time > 1.7e9));
+    }
+
+    #[test]
+    fn settings_have_the_types_that_tensorboard_sorts_by() {
+        let dir = tempfile::tempdir().unwrap();
+        let mut events = EventFile::create(dir.path(), None).unwrap();
+        let settings = [
+            ("ddpg.tau", "0.005"),
+            ("ddpg.activation", "relu"),
+            ("observation.normalise", "false"),
+        ];
+        let settings = settings.map(|(key, value)| (key.to_owned(), value.to_owned()));
+        events.hyperparameters(&settings.into()).unwrap();
+        events.finished().unwrap();
+        events.flush().unwrap();
+        let events = read_back(dir.path());
+        let data = events[1..].iter().map(|event| {
+            let value = event.summary.clone().unwrap().value.remove(0);
+            let data = value.metadata.unwrap().plugin_data.unwrap();
+            assert_eq!(data.plugin_name, "hparams");
+            (value.tag, HyperparameterData::decode(&data.content[..]).unwrap())
+        });
+        let [(start, begun), (end, ended)] = data.collect::<Vec<_>>().try_into().unwrap();
+        assert_eq!(
+            [start, end],
+            ["_hparams_/session_start_info", "_hparams_/session_end_info"]
+        );
+        assert_eq!(ended.session_end.unwrap().status, SUCCESS);
+        let kinds = begun.session_start.unwrap().hyperparameters;
+        let kinds: Vec<_> = kinds.into_values().map(|setting| setting.kind.unwrap()).collect();
+        let expected = [
+            SettingKind::Text("relu".into()),
+            SettingKind::Number(0.005),
+            SettingKind::Truth(false),
+        ];
+        assert_eq!(kinds, expected);
     }
 
     #[test]
