@@ -44,7 +44,7 @@ pub(crate) enum Overlay {
 pub(crate) struct Screen {
     /// The run's directory, as given by the user.
     pub(crate) run: String,
-    /// Environment, method and mode.
+    /// Environment, algorithm and mode.
     pub(crate) task: String,
     pub(crate) launcher: LauncherState,
     pub(crate) status: RunStatus,

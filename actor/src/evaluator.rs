@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::rc::Rc;
 
-use shoal_common::channel::environment::{Begin, EnvironmentClient, Stepped};
+use shoal_common::channel::environment::{EnvironmentClient, ResetRequest, Stepped};
 use shoal_common::channel::policy::{self, PolicyHeader, PolicyReader};
 use shoal_common::channel::reports::Reporter;
 use shoal_common::channel::{ChannelError, Domain, EventName, HeartbeatSender, Listener, Notifier, wait_for};
@@ -12,18 +12,18 @@ use shoal_common::evaluator_state::EvaluatorState;
 use shoal_common::exit::Exit;
 use shoal_common::policy::Policy;
 use shoal_common::policy_file::PolicyFile;
-use shoal_common::report::{Activity, EvaluatedReport, EvaluationReport, Identity, Role};
+use shoal_common::report::{Activity, EvaluatedReport, EvaluationReport, Role, RoleInstance};
 use shoal_common::run_dir::RunDir;
 use shoal_common::stop::Stop;
 
+use crate::actor::{after_fault, connect};
 use crate::error::ActorError;
-use crate::explorer::{after_fault, connect};
 
 /// The settings of an evaluator.
 #[derive(Clone, Debug)]
 pub struct EvaluatorSettings {
     /// Which process this is.
-    pub identity: Identity,
+    pub instance: RoleInstance,
     /// The run's configuration.
     pub config: Config,
     /// The environment server's index.
@@ -39,9 +39,9 @@ pub struct EvaluatorSettings {
 impl EvaluatorSettings {
     /// The settings of this run's evaluator. `evaluated_period` is the period of the policy that a previous one
     /// evaluated last.
-    pub fn new(config: &Config, run: &RunDir, identity: Identity, evaluated_period: Option<u64>) -> Self {
+    pub fn new(config: &Config, run: &RunDir, instance: RoleInstance, evaluated_period: Option<u64>) -> Self {
         Self {
-            identity,
+            instance,
             config: config.clone(),
             server: config.evaluation_server(),
             envs: config.evaluation_envs() as usize,
@@ -146,8 +146,8 @@ impl<'a> Evaluator<'a> {
     fn new(domain: &Domain, settings: &'a EvaluatorSettings, stop: &'a Stop) -> Result<Self, Exit<ActorError>> {
         let policy = settings.config.policy(settings.envs)?;
         let layout = policy.layout();
-        let listener = Listener::bind(domain, EventName(Role::Evaluator, settings.identity.index))?;
-        let mut heartbeat = HeartbeatSender::new(domain, settings.identity)?;
+        let listener = Listener::bind(domain, EventName(Role::Evaluator, settings.instance.index))?;
+        let mut heartbeat = HeartbeatSender::new(domain, settings.instance)?;
         let client = connect(
             domain,
             &listener,
@@ -231,7 +231,7 @@ impl<'a> Evaluator<'a> {
     }
 
     /// Compares this policy with the best one and remembers the better one. Returns whether it is this policy.
-    fn becomes_best(&mut self, published: &policy::Policy, mean: f64) -> Result<bool, Exit<ActorError>> {
+    fn becomes_best(&mut self, published: &policy::PublishedPolicy, mean: f64) -> Result<bool, Exit<ActorError>> {
         let candidate = Best {
             version: published.header().version,
             mean,
@@ -272,7 +272,7 @@ impl<'a> Evaluator<'a> {
     }
 
     /// Waits for a policy of a period that has not been evaluated.
-    fn await_due_policy(&mut self) -> Result<Rc<policy::Policy>, Exit<ChannelError>> {
+    fn await_due_policy(&mut self) -> Result<Rc<policy::PublishedPolicy>, Exit<ChannelError>> {
         let Self {
             reader,
             evaluated_period,
@@ -320,11 +320,11 @@ impl<'a> Evaluator<'a> {
         } = self;
         // No environment is reset more often than an episode is needed.
         let episodes = left.min(self.settings.envs as u32);
-        let begin = Begin::Evaluation {
+        let request = ResetRequest::Evaluation {
             first: first.into(),
             episodes,
         };
-        let begun = client.reset(listener, begin, || {
+        let begun = client.reset(listener, request, || {
             heartbeat.beat(Activity::WaitingForServer);
         });
         let mut current = begun.map_err(Exit::widen)?;
@@ -354,7 +354,7 @@ impl<'a> Evaluator<'a> {
 
     fn write_policy(
         &self,
-        published: &policy::Policy,
+        published: &policy::PublishedPolicy,
         return_mean: f64,
         return_std: f64,
         path: &Path,

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use serde::Serialize;
-use shoal_common::commit::ChunkMark;
+use shoal_common::commit::ChunkId;
 use shoal_common::config::Config;
 use shoal_common::stream::{Purpose, stream};
 use shoal_learner::algorithms::algorithm::Algorithm;
@@ -14,17 +14,17 @@ use shoal_learner::networks::threads::Threads;
 use shoal_learner::replay::Replay;
 use toml::{Table, Value};
 
+use super::intervals::{self, IntervalResults};
 use super::measurement::{Budget, Figures};
 use super::product::Multiplication;
 use super::rows::{ENVIRONMENTS, Rows};
 use super::target::{Line, Target};
 use super::temporary_run::TemporaryRun;
-use super::window::{self, Windows};
 
-const WINDOW: Duration = Duration::from_millis(100);
+const INTERVAL: Duration = Duration::from_millis(100);
 
 /// Share of the time for each of seven measurements: for both minibatch sizes the gradient steps, the fastest product
-/// and all products; and gradient steps on two threads. A method whose minibatches are large has only four.
+/// and all products; and gradient steps on two threads. An algorithm whose minibatches are large has only four.
 const SHARE: f64 = 1.0 / 7.0;
 
 /// The second minibatch size, large enough that Adam takes little of the time.
@@ -39,7 +39,8 @@ const WARM_UP: f64 = 0.05;
 /// The fields of `bench learner --json`.
 #[derive(Serialize)]
 pub(super) struct LearnerFigures {
-    method: String,
+    #[serde(rename = "method")]
+    algorithm: String,
     #[serde(flatten)]
     configured: Figure,
     /// Missing if the configured minibatches have this size.
@@ -65,11 +66,11 @@ struct Figure {
     products_gflops: f64,
     share_of_products: f64,
     #[serde(skip)]
-    updates: Windows,
+    updates: IntervalResults,
     #[serde(skip)]
-    limit: Windows,
+    limit: IntervalResults,
     #[serde(skip)]
-    products: Windows,
+    products: IntervalResults,
 }
 
 /// The configured minibatch size, on two threads.
@@ -79,12 +80,12 @@ struct TwoThreads {
     /// Relative to one thread.
     speedup: f64,
     #[serde(skip)]
-    updates: Windows,
+    updates: IntervalResults,
 }
 
-/// Measures one of the [methods](super::methods), by default DDPG.
-pub(super) fn measure(method: Option<&str>, budget: &Budget) -> anyhow::Result<LearnerFigures> {
-    let temporary = TemporaryRun::with_method(method)?;
+/// Measures one of the [algorithms](super::algorithms), by default DDPG.
+pub(super) fn measure(algorithm: Option<&str>, budget: &Budget) -> anyhow::Result<LearnerFigures> {
+    let temporary = TemporaryRun::with_algorithm(algorithm)?;
     let replay = Replay::create(&temporary.run.replay_file(), &temporary.replay_layout())?;
     // The mapping outlives the file, so nothing is left behind even if this process is killed.
     let config = temporary.remove_directory()?;
@@ -97,24 +98,24 @@ pub(super) fn measure(method: Option<&str>, budget: &Budget) -> anyhow::Result<L
         .transpose()?;
     let mut shared = learner(&config, batch)?;
     shared.set_threads(Threads::two()?);
-    let mut updates_of_two = Windows::default();
+    let mut updates_of_two = IntervalResults::default();
     let cases = [&mut configured]
         .into_iter()
         .chain(&mut large)
         .map(|case| &mut case.learner);
     for learner in cases.chain([&mut shared]) {
-        window::rate(budget.length.mul_f64(WARM_UP), || update(learner, &replay));
+        intervals::rate(budget.length.mul_f64(WARM_UP), || update(learner, &replay));
     }
-    for _ in 0..window::count(budget.length, SHARE, WINDOW) {
+    for _ in 0..intervals::count(budget.length, SHARE, INTERVAL) {
         budget.check()?;
         configured.measure(&replay);
-        updates_of_two.add(window::rate(WINDOW, || update(&mut shared, &replay)));
+        updates_of_two.add(intervals::rate(INTERVAL, || update(&mut shared, &replay)));
         large.iter_mut().for_each(|large| large.measure(&replay));
     }
 
     let configured = configured.figure();
     Ok(LearnerFigures {
-        method: config.algorithm.name().into(),
+        algorithm: config.algorithm.name().into(),
         two_threads: TwoThreads {
             updates_per_second: updates_of_two.median(),
             speedup: updates_of_two.median() / configured.updates_per_second,
@@ -143,11 +144,11 @@ fn filled(config: &Config, mut replay: Replay, budget: &Budget) -> anyhow::Resul
     for sequence in 1..=config.replay.capacity / ENVIRONMENTS as u64 {
         budget.check()?;
         rows.fill(&mut chunk)?;
-        let mark = ChunkMark {
+        let id = ChunkId {
             incarnation: 0,
             sequence,
         };
-        replay.append_and_commit(0, mark, &chunk).context("the replay")?;
+        replay.append_and_commit(0, id, &chunk).context("the replay")?;
     }
     Ok(replay)
 }
@@ -171,9 +172,9 @@ struct Case {
     updates_of_list: f64,
     list: List,
     fastest: Multiplication,
-    updates: Windows,
-    limit: Windows,
-    products: Windows,
+    updates: IntervalResults,
+    limit: IntervalResults,
+    products: IntervalResults,
 }
 
 impl Case {
@@ -187,20 +188,20 @@ impl Case {
             updates_of_list: products.updates as f64,
             list,
             fastest,
-            updates: Windows::default(),
-            limit: Windows::default(),
-            products: Windows::default(),
+            updates: IntervalResults::default(),
+            limit: IntervalResults::default(),
+            products: IntervalResults::default(),
         })
     }
 
-    /// Adds one window to each measurement.
+    /// Adds the result of one interval to each measurement.
     fn measure(&mut self, replay: &Replay) {
         let flop_of_list = self.flop_per_update as f64 * self.updates_of_list;
         self.updates
-            .add(window::rate(WINDOW, || update(&mut self.learner, replay)));
-        self.limit.add(self.fastest.gflops(WINDOW));
+            .add(intervals::rate(INTERVAL, || update(&mut self.learner, replay)));
+        self.limit.add(self.fastest.gflops(INTERVAL));
         self.products
-            .add(window::rate(WINDOW, || self.list.multiply_all()) * flop_of_list / 1e9);
+            .add(intervals::rate(INTERVAL, || self.list.multiply_all()) * flop_of_list / 1e9);
     }
 
     fn figure(self) -> Figure {
@@ -307,7 +308,7 @@ impl Figures for LearnerFigures {
             self.configured.batch,
             two.speedup
         );
-        let mut lines = vec![("method", self.method.clone())];
+        let mut lines = vec![("algorithm", self.algorithm.clone())];
         lines.extend(self.configured.lines());
         lines.push(("updates a second", two));
         lines.extend(self.large_batch.iter().flat_map(Figure::lines));

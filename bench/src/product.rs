@@ -15,7 +15,7 @@ use shoal_common::stream::Stream;
 use shoal_learner::networks::aligned::Aligned;
 use shoal_learner::networks::product::{Product, Transposed};
 
-use super::window;
+use super::intervals;
 
 /// Length of an attempt. It is shorter than a time slice, so that most attempts are undisturbed.
 const ATTEMPT: Duration = Duration::from_millis(2);
@@ -95,7 +95,7 @@ impl Multiplication {
 
     /// The rate over `length`, in GFLOP/s.
     pub(super) fn gflops(&mut self, length: Duration) -> f64 {
-        window::rate(length, || self.multiply()) * self.product.flop() as f64 / 1e9
+        intervals::rate(length, || self.multiply()) * self.product.flop() as f64 / 1e9
     }
 
     pub(super) fn multiply(&mut self) {

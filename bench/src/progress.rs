@@ -21,13 +21,13 @@ const STARTUP_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// The counters of a run in which every actor sends rows.
 #[derive(Debug)]
-pub(super) struct Progress<'a> {
+pub(super) struct RunProgress<'a> {
     temporary: &'a TemporaryRun,
     commits: CommitReader,
     policies: PolicyReader,
 }
 
-impl<'a> Progress<'a> {
+impl<'a> RunProgress<'a> {
     /// Waits until rows of every actor are committed.
     pub(super) fn begin(
         temporary: &'a TemporaryRun,

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use anyhow::bail;
 use rustix::thread::sched_setaffinity;
 use serde::Serialize;
-use shoal_common::channel::environment::{Begin, EnvironmentClient, Stepped};
+use shoal_common::channel::environment::{EnvironmentClient, ResetRequest, Stepped};
 use shoal_common::channel::{ChannelError, Domain, EventName, Listener};
 use shoal_common::config::Config;
 use shoal_common::exit::Exit;
@@ -106,7 +106,7 @@ fn round_trips(
         Err(Exit::Failed(error)) => server.check().and(Err(error.into())),
     };
     ask(&|| client.describe(&listener, || ()).map(|_| ()))?;
-    ask(&|| client.reset(&listener, Begin::Next, || ()).map(|_| ()))?;
+    ask(&|| client.reset(&listener, ResetRequest::Next, || ()).map(|_| ()))?;
 
     let actions = vec![0.5; environments * config.spec.action.width()];
     let mut times = Vec::new();

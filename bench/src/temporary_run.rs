@@ -34,11 +34,15 @@ impl TemporaryRun {
         Self::of(1, 1, set)
     }
 
-    /// The preset for a method, or as it is, with one actor and one environment. For DQN it is `cart-pole`.
-    pub(super) fn with_method(method: Option<&str>) -> anyhow::Result<Self> {
-        let preset = if method == Some("dqn") { "cart-pole" } else { "pendulum" };
+    /// The preset for an algorithm, or as it is, with one actor and one environment. For DQN it is `cart-pole`.
+    pub(super) fn with_algorithm(algorithm: Option<&str>) -> anyhow::Result<Self> {
+        let preset = if algorithm == Some("dqn") {
+            "cart-pole"
+        } else {
+            "pendulum"
+        };
         let overrides = RunOverrides {
-            method: method.map(Into::into),
+            algorithm: algorithm.map(Into::into),
             actors: Some(1),
             envs: Some(1),
             ..RunOverrides::default()

@@ -2,10 +2,10 @@
 
 use shoal_base::report::Activity;
 use shoal_base::stop::Stop;
-use shoal_channel::environment::{Ask, EnvironmentPort};
+use shoal_channel::environment::{EnvironmentPort, RequestKind};
 use shoal_channel::{ChannelError, HeartbeatSender};
 
-use crate::vector::{Start, VectorEnvironment};
+use crate::vector::{Reset, VectorEnvironment};
 
 /// Answers requests until `stop`. `seed` determines the evaluation episodes.
 ///
@@ -25,26 +25,26 @@ pub fn serve(
             Ok(request) => request,
             Err(exit) => return exit.into_result(),
         };
-        let refused = match request.ask() {
-            Some(ask @ (Ask::Reset | Ask::ResetToTraining | Ask::ResetToEvaluation)) => {
+        let refused = match request.kind() {
+            Some(kind @ (RequestKind::Reset | RequestKind::ResetToTraining | RequestKind::ResetToEvaluation)) => {
                 let first = request.episode();
                 let episodes = vec![first; environments.count()];
-                let start = match ask {
-                    Ask::ResetToTraining => Start::Episodes(&episodes),
-                    Ask::ResetToEvaluation => Start::Evaluation {
+                let reset = match kind {
+                    RequestKind::ResetToTraining => Reset::Episodes(&episodes),
+                    RequestKind::ResetToEvaluation => Reset::Evaluation {
                         seed,
                         first,
                         episodes: request.episodes(),
                     },
-                    _ => Start::Next,
+                    _ => Reset::Next,
                 };
                 started = true;
                 heartbeat.begin_work();
                 request
-                    .answer(|_, blocks| environments.reset(start, blocks.observations))?
+                    .answer(|_, blocks| environments.reset(reset, blocks.observations))?
                     .err()
             }
-            Some(Ask::Step) if started => {
+            Some(RequestKind::Step) if started => {
                 heartbeat.begin_work();
                 let refused = request
                     .answer(|actions, blocks| environments.step(actions, blocks))?
@@ -53,12 +53,14 @@ pub fn serve(
                 heartbeat.beat(Activity::Working);
                 refused
             }
-            Some(Ask::Snapshot) if started => request.answer_snapshot(|words| environments.snapshot(words))?.err(),
-            Some(Ask::Step | Ask::Snapshot) => {
+            Some(RequestKind::Snapshot) if started => {
+                request.answer_snapshot(|words| environments.snapshot(words))?.err()
+            }
+            Some(RequestKind::Step | RequestKind::Snapshot) => {
                 request.not_started()?;
                 None
             }
-            Some(Ask::Restore) => {
+            Some(RequestKind::Restore) => {
                 let words = request.words();
                 let refused = request
                     .answer(|_, blocks| environments.restore(&words, blocks.observations))?

@@ -8,8 +8,8 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use shoal_common::channel::policy::PolicyHeader;
 use shoal_common::channel::transitions::ChunkHeader;
-use shoal_common::commit::ChunkMark;
-use shoal_common::report::{Activity, EpisodeReport, Heartbeat, Identity, Role};
+use shoal_common::commit::ChunkId;
+use shoal_common::report::{Activity, EpisodeReport, Heartbeat, Role, RoleInstance};
 
 /// The version of this format. Increase it with every change.
 pub const VERSION: u32 = 1;
@@ -48,9 +48,9 @@ pub enum Kind {
     Policy = 2,
     Hello = 3,
     Admission = 4,
-    Marks = 5,
+    Acknowledgement = 5,
     HostReport = 6,
-    PolicyQuestion = 7,
+    PolicyRequest = 7,
 }
 
 /// The first word of a message has these letters in its upper half and the kind in its lower; the second is the version.
@@ -72,8 +72,8 @@ pub struct WireChunk {
 
 impl WireChunk {
     /// Its own incarnation and sequence number.
-    pub fn mark(&self) -> ChunkMark {
-        mark_of(&self.header)
+    pub fn id(&self) -> ChunkId {
+        id_of(&self.header)
     }
 
     /// The bytes of a chunk.
@@ -114,8 +114,8 @@ impl WireChunk {
 }
 
 /// The numbers in a chunk's header that identify it; a handshake has sequence number 0.
-pub fn mark_of(header: &ChunkHeader) -> ChunkMark {
-    ChunkMark {
+pub fn id_of(header: &ChunkHeader) -> ChunkId {
+    ChunkId {
         incarnation: header.incarnation,
         sequence: header.sequence,
     }
@@ -161,9 +161,9 @@ impl WirePolicy {
     }
 }
 
-/// A host's question for a policy that it does not have. The gate answers when there is one.
+/// A host's request for a policy that it does not have. The gate answers when there is one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct PolicyQuestion {
+pub struct PolicyRequest {
     /// The host.
     pub host: u64,
     /// The policy that it has: the learner's incarnation, and the version.
@@ -240,14 +240,14 @@ pub enum Phase {
     Over,
 }
 
-/// What the gate tells a host: what is committed of its actors, and what has arrived. Only the newest marks count.
+/// What the gate tells a host: what is committed of its actors, and what it has forwarded. Only the newest one counts.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Marks {
+pub struct Acknowledgement {
     /// See [`Lease::epoch`].
     pub epoch: u64,
-    /// Incarnation of the gate. Marks of a later gate, and later marks of the same gate, are newer.
+    /// Incarnation of the gate. Those of a later gate, and later ones of the same gate, are newer.
     pub gate: u64,
-    /// The number of these marks among those of this gate.
+    /// Its number among those of this gate.
     pub number: u64,
     /// Whether the run continues.
     pub phase: Phase,
@@ -256,18 +256,18 @@ pub struct Marks {
     /// The number of the last report that the gate has received from this host.
     pub report: u64,
     /// For each actor of the host.
-    pub actors: Vec<ActorMarks>,
+    pub actors: Vec<ActorAcknowledgement>,
 }
 
 /// What has become of an actor's chunks.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct ActorMarks {
+pub struct ActorAcknowledgement {
     /// The actor.
     pub actor: u32,
     /// Incarnation and sequence number of its last committed chunk.
     pub committed: (u64, u64),
     /// Those of the last chunk that the gate has passed on to the learner.
-    pub got: (u64, u64),
+    pub forwarded: (u64, u64),
     /// Rows of all its committed chunks.
     pub rows: u64,
     /// The actor's snapshot after its last committed chunk, in runs that have snapshots.
@@ -281,7 +281,7 @@ pub struct HostReport {
     pub host: u64,
     /// The number of this report.
     pub number: u64,
-    /// Microseconds between an earlier report and marks that confirmed it; `None` before the first.
+    /// Microseconds between an earlier report and the acknowledgement that confirmed it; `None` before the first.
     pub round_trip_us: Option<u64>,
     /// Whether the host is leaving the run, and sends nothing more.
     pub leaving: bool,
@@ -330,7 +330,7 @@ impl RemoteRole {
 
     /// The heartbeat.
     pub fn heartbeat(&self) -> Heartbeat {
-        let mut heartbeat = Heartbeat::new(Identity {
+        let mut heartbeat = Heartbeat::new(RoleInstance {
             role: self.role,
             index: self.index,
             incarnation: self.incarnation,
@@ -419,8 +419,8 @@ pub trait Message: Serialize + DeserializeOwned {
     }
 }
 
-impl Message for PolicyQuestion {
-    const KIND: Kind = Kind::PolicyQuestion;
+impl Message for PolicyRequest {
+    const KIND: Kind = Kind::PolicyRequest;
 }
 
 impl Message for Hello {
@@ -431,8 +431,8 @@ impl Message for Admission {
     const KIND: Kind = Kind::Admission;
 }
 
-impl Message for Marks {
-    const KIND: Kind = Kind::Marks;
+impl Message for Acknowledgement {
+    const KIND: Kind = Kind::Acknowledgement;
 }
 
 impl Message for HostReport {

@@ -26,11 +26,14 @@ pub struct Portable {
 #[derive(Clone, Debug)]
 enum Body {
     /// μ of DDPG and TD3, or the mean of SAC's π: the network, tanh, and the scaling to the range of the actions.
-    Actions { network: Network, range: ActionRange },
+    Actions {
+        network: ExportedNetwork,
+        range: ActionRange,
+    },
     /// REINFORCE's π: the network, and softmax.
-    Probabilities { network: Network },
+    Probabilities { network: ExportedNetwork },
     /// DQN's action-values: the network.
-    Values { network: Network },
+    Values { network: ExportedNetwork },
     /// Action-values Q(s, a), state by state.
     Table {
         states: usize,
@@ -48,7 +51,7 @@ struct Starts {
 
 /// A sequence of layers, with the activation between them.
 #[derive(Clone, Debug)]
-struct Network {
+struct ExportedNetwork {
     /// The mean and the factor of each observed number, if they are normalised first.
     normalisation: Option<(Vec<f32>, Vec<f32>)>,
     activation: Activation,
@@ -69,24 +72,24 @@ impl Portable {
     pub fn new(config: &Config, file: &PolicyFile, which: &str) -> anyhow::Result<Self> {
         let body = match policy_layout(config)? {
             PolicyLayout::Deterministic(network) => Body::Actions {
-                network: Network::new(&network, &file.parameters),
+                network: ExportedNetwork::new(&network, &file.parameters),
                 range: ActionRange::new(&config.spec.action)?,
             },
             PolicyLayout::Gaussian(network) => {
                 let range = ActionRange::new(&config.spec.action)?;
                 Body::Actions {
-                    network: Network::new(&network, &file.parameters).with_first_outputs(range.width()),
+                    network: ExportedNetwork::new(&network, &file.parameters).with_first_outputs(range.width()),
                     range,
                 }
             }
             PolicyLayout::Softmax(network) => Body::Probabilities {
-                network: Network::new(&network, &file.parameters),
+                network: ExportedNetwork::new(&network, &file.parameters),
             },
             PolicyLayout::ActionValues(network) => Body::Values {
-                network: Network::new(&network, &file.parameters),
+                network: ExportedNetwork::new(&network, &file.parameters),
             },
             PolicyLayout::Dueling(network) => Body::Values {
-                network: Network::new(&network, &file.parameters).with_combined_heads(),
+                network: ExportedNetwork::new(&network, &file.parameters).with_combined_heads(),
             },
             PolicyLayout::Table { states, actions } => Body::Table {
                 states,
@@ -127,7 +130,7 @@ impl Portable {
     }
 }
 
-impl Network {
+impl ExportedNetwork {
     fn new(layout: &NetworkLayout, parameters: &[f32]) -> Self {
         let layers = layout.layers(parameters).zip(layout.layer_sizes());
         let dense = layers.map(|(layer, (inputs, outputs))| Dense {
@@ -238,7 +241,7 @@ mod tests {
     fn weights_are_exported_in_row_major_order() {
         let layout = NetworkLayout::new(3, Hidden::relu([2, 1]), 1);
         let parameters: Vec<f32> = (0..layout.parameters()).map(|i| i as f32).collect();
-        let first = &Network::new(&layout, &parameters).layers[0];
+        let first = &ExportedNetwork::new(&layout, &parameters).layers[0];
         assert_eq!(first.weights, [0.0, 2.0, 4.0, 1.0, 3.0, 5.0]);
         assert_eq!(first.biases, [6.0, 7.0]);
     }

@@ -9,8 +9,8 @@ use shoal_report::figure::{self, Frame, Setting};
 use super::claim::{Claim, Scope, median, percent, spread};
 use super::experiment::{Experiment, Length, Stage};
 use super::family::{Family, Policies, Results};
+use super::report_section::{FigureWriter, ReportSection};
 use super::result::SeedResult;
-use super::section::{FigureWriter, Section};
 
 /// Number of episodes in the moving average of figure 4.6.
 const SPAN: usize = 100;
@@ -147,7 +147,7 @@ impl Family for CartPole {
         Ok(Tests::of(&returns, is_dead(policies)?))
     }
 
-    fn sections(results: &Results<Tests>, writer: &FigureWriter) -> anyhow::Result<Vec<Section>> {
+    fn sections(results: &Results<Tests>, writer: &FigureWriter) -> anyhow::Result<Vec<ReportSection>> {
         let variants = VARIANTS.map(|(name, label)| (label, results.of(name, "")));
         let settings: Vec<Setting> = variants
             .iter()
@@ -179,7 +179,7 @@ impl Family for CartPole {
                 |path| figure::lines_by_setting(&frame, &settings, path),
             )?,
         ];
-        Ok(vec![Section {
+        Ok(vec![ReportSection {
             title: "CartPole with REINFORCE (section 4.2)",
             from: EXPERIMENTS.iter().map(|experiment| (experiment.name, "")).collect(),
             remark: REMARK.into(),

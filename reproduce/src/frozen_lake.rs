@@ -13,8 +13,8 @@ use shoal_run::rollout::policy_layout;
 
 use super::experiment::{Experiment, Length, Stage};
 use super::family::{Family, Policies, Results};
+use super::report_section::{Figure, FigureWriter, ReportSection};
 use super::result::{SeedResult, representative};
-use super::section::{Figure, FigureWriter, Section};
 
 /// γ of every experiment of this family.
 const GAMMA: f64 = 0.999;
@@ -172,7 +172,7 @@ impl Family for FrozenLake {
         })
     }
 
-    fn sections(results: &Results<Tests>, writer: &FigureWriter) -> anyhow::Result<Vec<Section>> {
+    fn sections(results: &Results<Tests>, writer: &FigureWriter) -> anyhow::Result<Vec<ReportSection>> {
         let good = results.of(GOOD, "");
         let q_star = optimal(GAMMA);
         let best: Vec<f32> = q_star.iter().flatten().map(|q| *q as f32).collect();
@@ -201,7 +201,7 @@ impl Family for FrozenLake {
             "The optimal policy and its action-values, by value iteration",
             |path| draw_table(&best, path),
         )?);
-        Ok(vec![Section {
+        Ok(vec![ReportSection {
             title: "FrozenLake with Q-learning (section 4.1)",
             from: EXPERIMENTS.iter().map(|experiment| (experiment.name, "")).collect(),
             remark: remark(walk.reached),

@@ -16,7 +16,7 @@ use super::request::{Job, Name};
 use super::training::RunState;
 
 /// The live line and its data.
-pub(super) struct Progress<'a> {
+pub(super) struct ProgressDisplay<'a> {
     folder: &'a Folder,
     bar: ProgressBar,
     live: bool,
@@ -48,7 +48,7 @@ impl Due {
     }
 }
 
-impl<'a> Progress<'a> {
+impl<'a> ProgressDisplay<'a> {
     pub(super) fn new<'j>(
         folder: &'a Folder,
         effort: Effort,

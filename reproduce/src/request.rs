@@ -26,7 +26,7 @@ pub struct Request {
 
 /// How a request ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum BatchEnding {
+pub enum ReproductionEnd {
     /// Every requested result exists.
     Complete,
     /// This many seeds failed.

@@ -4,7 +4,7 @@ use shoal_common::config::Config;
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::run_dir::RunDir;
 
-use crate::evaluation::{EvaluationSummary, WhichPolicy, evaluate_until};
+use crate::evaluation::{EvaluationSummary, SavedPolicy, evaluate_until};
 use crate::external_environment::GYMNASIUM;
 use crate::server_location::ServerLocation;
 use crate::signals::Interrupt;
@@ -45,7 +45,7 @@ pub fn evaluate_best(run: &RunDir, config: &Config, interrupt: &Interrupt) -> an
     if !run.best_policy().exists() {
         return Ok(None);
     }
-    let best = WhichPolicy::Best.read(run, config)?;
+    let best = SavedPolicy::Best.read(run, config)?;
     let amount = (config.evaluation.episodes, config.run.seed);
     let now = evaluate_until(run, config, &best.parameters, amount, interrupt, |_| ())?;
     let anew = PolicyFile {

@@ -19,7 +19,7 @@ use rustix::process::{
     Pid, PidfdFlags, Signal, getpgrp, getpid, getppid, kill_process, kill_process_group, pidfd_open,
     set_parent_process_death_signal,
 };
-use shoal_common::channel::environment::{Begin, EnvironmentClient, Fault, Observed, Stepped, describe};
+use shoal_common::channel::environment::{EnvironmentClient, Fault, Observed, ResetRequest, Stepped, describe};
 use shoal_common::channel::{ChannelError, Domain, EventName, Listener, Services};
 use shoal_common::config::EnvironmentConfig;
 use shoal_common::exit::Exit;
@@ -329,7 +329,7 @@ impl ExternalEnvironment {
         let asked = Instant::now();
         let begun = self.client.reset(
             &self.listener,
-            Begin::Evaluation {
+            ResetRequest::Evaluation {
                 first: number,
                 episodes: 1,
             },

@@ -50,7 +50,7 @@ pub struct EvaluationRecord {
     pub wall_seconds: f64,
     /// Environment steps the policy was learned from.
     pub env_steps: u64,
-    /// Updates that made the policy: gradient steps, or consumed rows for methods that use each row once.
+    /// Updates that made the policy: gradient steps, or consumed rows for algorithms that use each row once.
     pub updates: u64,
     /// Version of the policy.
     pub policy_version: u64,
@@ -75,7 +75,7 @@ pub struct LearnerRecord {
     /// Episodes ended; 0 in the records of earlier versions.
     #[serde(default)]
     pub episodes: u64,
-    /// Updates done: gradient steps, or consumed rows for methods that use each row once.
+    /// Updates done: gradient steps, or consumed rows for algorithms that use each row once.
     pub updates: u64,
     policy_version: u64,
     /// Mean loss of the value estimate since the previous row.

@@ -9,7 +9,7 @@ use clap::ValueEnum;
 use shoal_common::durable::write_atomically;
 use shoal_common::run_dir::RunDir;
 use shoal_report::export::Portable;
-use shoal_run::evaluation::WhichPolicy;
+use shoal_run::evaluation::SavedPolicy;
 use shoal_run::final_evaluation::FinalEvaluation;
 
 #[derive(Args, Clone, Debug)]
@@ -21,7 +21,7 @@ pub(crate) struct ExportArgs {
     pub(crate) format: Format,
     /// Which policy to write.
     #[arg(long, value_enum, default_value_t)]
-    pub(crate) policy: WhichPolicy,
+    pub(crate) policy: SavedPolicy,
     /// The file to write [default: <policy>.<format> in the run directory].
     #[arg(long, value_name = "FILE")]
     pub(crate) out: Option<PathBuf>,

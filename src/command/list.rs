@@ -107,7 +107,7 @@ fn table(runs: &[Listed]) -> Table {
         "run",
         "state",
         "environment",
-        "method",
+        "algorithm",
         "steps",
         "of",
         "best return",

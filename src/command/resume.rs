@@ -125,11 +125,11 @@ fn resume_suite(suite: &Suite, args: &ResumeArgs) -> anyhow::Result<ExitCode> {
         let why = "a suite goes on as it was made: change its runs one by one, or train another one";
         return Err(UsageError(why.into()).into());
     }
-    let manner = suite::Manner {
+    let options = suite::SuiteOptions {
         jobs: args.jobs,
         output: &args.output,
     };
-    suite::resume(suite, &args.run, manner)
+    suite::resume(suite, &args.run, options)
 }
 
 /// Evaluates the best policy again if an earlier version did that from other starts, or if later policies are evaluated

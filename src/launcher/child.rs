@@ -5,7 +5,7 @@ use std::process::ExitStatus;
 use std::time::{Duration, Instant};
 
 use shoal_common::channel::control::{RoleState, RoleStatus};
-use shoal_common::report::{Activity, Heartbeat, Identity, Role};
+use shoal_common::report::{Activity, Heartbeat, Role, RoleInstance};
 use shoal_run::rate::per_second;
 use signal_hook::consts::{SIGABRT, SIGBUS, SIGFPE, SIGILL, SIGSEGV};
 
@@ -36,7 +36,7 @@ const RATE_SPAN: Duration = Duration::from_millis(400);
 /// A role of the run, its current process, and the history of the earlier ones.
 #[derive(Debug)]
 pub(super) struct Child {
-    pub(super) identity: Identity,
+    pub(super) instance: RoleInstance,
     pub(super) process: Option<Process>,
     /// The exit status of a process whose end has been observed but not handled.
     pub(super) ended: Option<ExitStatus>,
@@ -83,7 +83,7 @@ impl Child {
     pub(super) fn new(role: Role, index: u32) -> Self {
         let now = Instant::now();
         Self {
-            identity: Identity {
+            instance: RoleInstance {
                 role,
                 index,
                 incarnation: 0,
@@ -123,7 +123,7 @@ impl Child {
     }
 
     pub(super) fn is(&self, role: Role, index: u32) -> bool {
-        (self.identity.role, self.identity.index) == (role, index)
+        (self.instance.role, self.instance.index) == (role, index)
     }
 
     /// Assigns the role to a new process.
@@ -194,7 +194,7 @@ impl Child {
         let was_killed = status.signal().is_some_and(|signal| !crash_signals.contains(&signal));
         let lived = now - self.begun;
         let steps = self.last_heartbeat.map_or(0, |(_, heartbeat)| heartbeat.steps);
-        let served = self.identity.role == Role::EnvServer && steps >= PROVEN_STEPS;
+        let served = self.instance.role == Role::EnvServer && steps >= PROVEN_STEPS;
         if self.is_ready() && (lived >= PROVEN || served) {
             (self.failures, self.failing_since) = (0, None);
             return Consequence::Restart(if was_killed { Duration::ZERO } else { FIRST_PAUSE });
@@ -293,7 +293,7 @@ impl Child {
 
     /// Its status. `newest` is the version of the learner's newest policy.
     pub(super) fn status(&self, newest: u64) -> RoleStatus {
-        let Identity { role, index, .. } = self.identity;
+        let RoleInstance { role, index, .. } = self.instance;
         let policy_version = self
             .last_heartbeat
             .filter(|_| role != Role::EnvServer)
@@ -374,7 +374,7 @@ mod tests {
         }
 
         fn heartbeat(&self, activity: Activity, steps: u64) -> Heartbeat {
-            let mut heartbeat = Heartbeat::new(self.child.identity);
+            let mut heartbeat = Heartbeat::new(self.child.instance);
             heartbeat.set_activity(activity);
             heartbeat.steps = steps;
             heartbeat

@@ -22,7 +22,7 @@ const NEARLY: f64 = 0.98;
 
 /// Shows the progress of a run on standard error.
 #[derive(Debug)]
-pub(super) struct Progress {
+pub(super) struct ProgressLine {
     bar: ProgressBar,
     /// Whether plain lines are printed instead of the bar.
     plain: bool,
@@ -38,7 +38,7 @@ pub(super) struct Progress {
     drawn: Instant,
 }
 
-impl Progress {
+impl ProgressLine {
     pub(super) fn new(config: &Config, run: &RunDir, quiet: bool) -> Self {
         let target = if quiet {
             ProgressDrawTarget::hidden()

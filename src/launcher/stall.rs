@@ -63,11 +63,11 @@ impl Stalls {
             clients.any(|client| client.is_responsive() && client.activity() == Some(Activity::WaitingForServer))
         };
         let servers = children.iter().enumerate().filter(|(_, child)| {
-            child.identity.role == Role::EnvServer && child.is_active() && child.is_ready() && !child.is_stopped()
+            child.instance.role == Role::EnvServer && child.is_active() && child.is_ready() && !child.is_stopped()
         });
         servers
             .map(|(i, server)| (i, server.silent_for()))
-            .filter(|(i, silent)| *silent >= self.patience && is_waited_for(children[*i].identity.index))
+            .filter(|(i, silent)| *silent >= self.patience && is_waited_for(children[*i].instance.index))
             .collect()
     }
 
@@ -77,11 +77,11 @@ impl Stalls {
         if !child.is_active() {
             return None;
         }
-        if child.identity.role == Role::EnvServer {
+        if child.instance.role == Role::EnvServer {
             // Only if replacing its client has not helped.
             let client = children
                 .iter()
-                .find(|client| client.server() == Some(child.identity.index))?;
+                .find(|client| client.server() == Some(child.instance.index))?;
             let both = client.stalls > 0 && self.waits_for_an_idle_server(children, client);
             return both.then_some("it does not receive the request that its client waits on");
         }
@@ -120,7 +120,7 @@ impl Stalls {
         } else {
             &[Role::Actor, Role::Evaluator]
         };
-        let chosen = |i: &usize| roles.contains(&children[*i].identity.role);
+        let chosen = |i: &usize| roles.contains(&children[*i].instance.role);
         (0..children.len())
             .filter(chosen)
             .map(|i| (i, "every process of the run waits for another"))

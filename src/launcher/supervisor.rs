@@ -7,13 +7,13 @@ use std::process::ExitStatus;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
-use shoal_actor::explorer::GIVEN_UP;
-use shoal_common::channel::control::{Answer, HostLease, HostRequest, HostStatus, RoleStatus};
+use shoal_actor::actor::GIVEN_UP;
+use shoal_common::channel::control::{ControlResponse, HostLease, HostRequest, HostStatus, RoleStatus};
 use shoal_common::channel::environment::Fault;
 use shoal_common::channel::{Domain, Services};
 use shoal_common::config::{Config, Mode};
 use shoal_common::durable::write_atomically;
-use shoal_common::report::{Activity, Heartbeat, Identity, Role};
+use shoal_common::report::{Activity, Heartbeat, Role, RoleInstance};
 use shoal_common::run_dir::RunDir;
 use shoal_run::process::Writer;
 use shoal_run::recorder::{Incident, IncidentKind};
@@ -221,7 +221,7 @@ impl Supervisor {
     ///
     /// # Errors
     /// When services cannot be created, or the counter cannot be written.
-    pub(super) fn admit(&mut self, domain: &Domain, request: HostRequest) -> anyhow::Result<Answer> {
+    pub(super) fn admit(&mut self, domain: &Domain, request: HostRequest) -> anyhow::Result<ControlResponse> {
         let HostRequest {
             host,
             name,
@@ -229,7 +229,7 @@ impl Supervisor {
             held,
         } = request;
         if let Some(lease) = self.hosts.lease(host) {
-            return Ok(Answer::Admitted(lease.clone()));
+            return Ok(ControlResponse::Admitted(lease.clone()));
         }
         let free: Vec<u32> = match self.lockstep_actors {
             // The host takes over actors of this one, which end; theirs continue from the same snapshots.
@@ -246,12 +246,12 @@ impl Supervisor {
             free[..count as usize].to_vec()
         } else {
             if let Some(count) = self.lockstep_actors {
-                return Ok(Answer::Refused(format!(
+                return Ok(ControlResponse::Refused(format!(
                     "this lockstep run has {count} actors, of which other hosts have {}",
                     count as usize - free.len()
                 )));
             }
-            return Ok(Answer::Refused(format!(
+            return Ok(ControlResponse::Refused(format!(
                 "the run may have {} actors on all hosts together (actors.max, fixed when it was created), of which {} \
                  are free",
                 self.max_actors,
@@ -276,16 +276,16 @@ impl Supervisor {
         };
         self.hosts.admit(lease.clone());
         self.share_lockstep_actors();
-        Ok(Answer::Admitted(lease))
+        Ok(ControlResponse::Admitted(lease))
     }
 
     /// Updates the status of the other hosts. The answer tells which of them are admitted.
-    pub(super) fn update_hosts(&mut self, statuses: Vec<HostStatus>) -> Answer {
+    pub(super) fn update_hosts(&mut self, statuses: Vec<HostStatus>) -> ControlResponse {
         for message in self.hosts.update(statuses) {
             self.log.note("launcher", &message);
         }
         self.share_lockstep_actors();
-        Answer::Leases {
+        ControlResponse::Leases {
             epoch: self.hosts.epoch(),
             leases: self.hosts.leases(),
         }
@@ -306,7 +306,7 @@ impl Supervisor {
     /// Kills an actor of this incarnation or an earlier one, so that it is started again.
     pub(super) fn replace_actor(&mut self, index: u32, incarnation: u64) {
         let actor = self.children.iter_mut().find(|child| child.is(Role::Actor, index));
-        if let Some(actor) = actor.filter(|actor| actor.identity.incarnation <= incarnation)
+        if let Some(actor) = actor.filter(|actor| actor.instance.incarnation <= incarnation)
             && let Some(process) = &mut actor.process
         {
             process.kill();
@@ -353,14 +353,14 @@ impl Supervisor {
         self.started += 1;
         self.write_counter()?;
         let child = &mut self.children[i];
-        child.identity.incarnation = self.started;
-        let writer = match child.identity.role {
+        child.instance.incarnation = self.started;
+        let writer = match child.instance.role {
             Role::EnvServer => self.server_output,
             _ => Writer::Shoal,
         };
-        let process = Process::start(child.identity, &self.run, &self.log, writer)?;
+        let process = Process::start(child.instance, &self.run, &self.log, writer)?;
         self.log
-            .note(&name(child.identity), &format!("started as process {}", process.pid()));
+            .note(&name(child.instance), &format!("started as process {}", process.pid()));
         child.begin(process);
         Ok(())
     }
@@ -368,19 +368,19 @@ impl Supervisor {
     /// Records a heartbeat.
     pub(super) fn record(&mut self, heartbeat: &Heartbeat) {
         let child = self.children.iter_mut().find(|child| {
-            let Identity {
+            let RoleInstance {
                 role,
                 index,
                 incarnation,
-            } = child.identity;
+            } = child.instance;
             (heartbeat.role(), heartbeat.index, heartbeat.incarnation) == (Some(role), index, incarnation)
         });
         let Some(child) = child else { return };
         let faults = heartbeat.faults.saturating_sub(child.faults());
-        let (client, server) = (name(child.identity), child.server());
+        let (client, server) = (name(child.instance), child.server());
         if let Some(after) = child.record(heartbeat) {
             self.log
-                .note(&name(child.identity), &format!("ready after {} ms", after.as_millis()));
+                .note(&name(child.instance), &format!("ready after {} ms", after.as_millis()));
         }
         if let Some(index) = server {
             // No process can make the launcher list more than the run may have.
@@ -400,13 +400,13 @@ impl Supervisor {
             let by_client = self.log.last_lines(client).pop().filter(|line| line.contains(GIVEN_UP));
             let last = by_client.filter(|line| !line.contains(&Fault::Reported.to_string()));
             let last = last
-                .or_else(|| self.log.last_lines(&name(server.identity)).pop())
+                .or_else(|| self.log.last_lines(&name(server.instance)).pop())
                 .unwrap_or_default();
-            self.log.write_left_out(&name(server.identity));
+            self.log.write_left_out(&name(server.instance));
             let last = last.strip_prefix("error: ").unwrap_or(&last);
-            self.last_fault = format!("{}: {last}", name(server.identity));
+            self.last_fault = format!("{}: {last}", name(server.instance));
             self.incidents
-                .push(Incident::of(server.identity, IncidentKind::Fault, last.into()));
+                .push(Incident::of(server.instance, IncidentKind::Fault, last.into()));
         }
     }
 
@@ -428,7 +428,7 @@ impl Supervisor {
 
     /// The activity of a role: that of its first process with a heartbeat.
     pub(super) fn activity(&self, role: Role) -> Option<Activity> {
-        let mut of_role = self.children.iter().filter(|child| child.identity.role == role);
+        let mut of_role = self.children.iter().filter(|child| child.instance.role == role);
         of_role.find_map(Child::activity)
     }
 
@@ -437,7 +437,7 @@ impl Supervisor {
         let mut learners = self
             .children
             .iter()
-            .filter(|child| child.identity.role == Role::Learner);
+            .filter(|child| child.instance.role == Role::Learner);
         learners.any(|learner| learner.process.is_some() && learner.is_ready())
     }
 
@@ -449,7 +449,7 @@ impl Supervisor {
     /// The status of all processes. `newest` is the version of the learner's newest policy.
     pub(super) fn status(&self, newest: u64) -> Vec<RoleStatus> {
         let mut children: Vec<_> = self.children.iter().collect();
-        children.sort_by_key(|child| (std::cmp::Reverse(child.identity.role), child.identity.index));
+        children.sort_by_key(|child| (std::cmp::Reverse(child.instance.role), child.instance.index));
         children.into_iter().map(|child| child.status(newest)).collect()
     }
 
@@ -520,7 +520,7 @@ impl Supervisor {
         let mut learners = self
             .children
             .iter()
-            .filter(|child| child.identity.role == Role::Learner);
+            .filter(|child| child.instance.role == Role::Learner);
         learners.any(|learner| learner.ended.is_some_and(|status| status.success()))
     }
 
@@ -542,9 +542,9 @@ impl Supervisor {
 
     fn handle_end(&mut self, i: usize, status: ExitStatus) -> anyhow::Result<Situation> {
         let child = &mut self.children[i];
-        let name = name(child.identity);
+        let name = name(child.instance);
         self.log.write_left_out(&name);
-        if child.identity.role == Role::Learner && status.success() {
+        if child.instance.role == Role::Learner && status.success() {
             child.process = None;
             self.learner_done = true;
             self.log.note(&name, "done");
@@ -586,7 +586,7 @@ impl Supervisor {
             let child = &mut self.children[i];
             messages.push(format!(
                 "{} makes no progress: {why}; it is replaced",
-                name(child.identity)
+                name(child.instance)
             ));
             if let Some(process) = &mut child.process {
                 process.kill();
@@ -603,7 +603,7 @@ impl Supervisor {
         for (i, silent) in stalls.slow_servers(&self.children) {
             let child = &mut self.children[i];
             if child.report_slow() {
-                let (name, seconds) = (name(child.identity), silent.as_secs());
+                let (name, seconds) = (name(child.instance), silent.as_secs());
                 said.push(format!(
                     "{name} has been over one step or reset of its environments for {seconds} s; it is left alone"
                 ));
@@ -611,14 +611,14 @@ impl Supervisor {
         }
         for child in &mut self.children {
             let Some(starting) = child.starting_for() else { continue };
-            let limit = start_limit.filter(|_| child.identity.role == Role::EnvServer);
+            let limit = start_limit.filter(|_| child.instance.role == Role::EnvServer);
             if limit.is_some_and(|limit| starting >= limit) {
                 let text = "is not ready within environment.start_seconds and is ended";
-                self.log.note(&name(child.identity), text);
+                self.log.note(&name(child.instance), text);
                 child.end_slow_start();
             } else if starting >= SLOW_START && child.report_slow() {
                 let limit = limit.map_or(String::new(), |limit| format!(", for at most {} s", limit.as_secs()));
-                said.push(format!("waiting for {} to start{limit}", name(child.identity)));
+                said.push(format!("waiting for {} to start{limit}", name(child.instance)));
             }
         }
         said
@@ -626,7 +626,7 @@ impl Supervisor {
 
     fn note_incident(&mut self, i: usize, what: IncidentKind, detail: String) {
         self.incidents
-            .push(Incident::of(self.children[i].identity, what, detail));
+            .push(Incident::of(self.children[i].instance, what, detail));
     }
 
     /// Frees shared memory that dead processes occupy.
@@ -652,14 +652,14 @@ impl Supervisor {
     /// Retires surplus actors and then their environment servers.
     fn retire_surplus(&mut self) {
         let has_no_client = |children: &[Child], child: &Child| {
-            child.identity.role == Role::EnvServer
-                && !children.iter().any(|actor| actor.is(Role::Actor, child.identity.index))
+            child.instance.role == Role::EnvServer
+                && !children.iter().any(|actor| actor.is(Role::Actor, child.instance.index))
         };
         let mut children = std::mem::take(&mut self.children);
         children.retain(|child| {
             let stays = child.process.is_some() || self.is_wanted(child);
             if !stays {
-                self.log.note(&name(child.identity), "no longer needed");
+                self.log.note(&name(child.instance), "no longer needed");
             }
             stays
         });
@@ -669,7 +669,7 @@ impl Supervisor {
                 continue;
             }
             let may_end =
-                self.children[i].identity.role == Role::Actor || has_no_client(&self.children, &self.children[i]);
+                self.children[i].instance.role == Role::Actor || has_no_client(&self.children, &self.children[i]);
             let child = &mut self.children[i];
             if let Some(process) = child.process.as_mut().filter(|_| may_end) {
                 child.retires = true;
@@ -680,7 +680,7 @@ impl Supervisor {
 
     /// Whether the child is not a surplus actor or the environment server of one.
     fn is_wanted(&self, child: &Child) -> bool {
-        let Identity { role, index, .. } = child.identity;
+        let RoleInstance { role, index, .. } = child.instance;
         // The index of the evaluator's server is the maximum number of actors.
         !matches!(role, Role::Actor | Role::EnvServer) || index >= self.max_actors || self.actors.contains(&index)
     }
@@ -703,7 +703,7 @@ impl Supervisor {
 
     /// Asks the processes of a role to hand over what they have and then to end.
     pub(super) fn ask_to_retire(&mut self, role: Role) {
-        for child in self.children.iter_mut().filter(|child| child.identity.role == role) {
+        for child in self.children.iter_mut().filter(|child| child.instance.role == role) {
             if let Some(process) = &mut child.process {
                 child.ends = true;
                 process.ask_to_retire();
@@ -713,13 +713,13 @@ impl Supervisor {
 
     /// Asks the processes of some roles to end.
     pub(super) fn ask_to_end(&mut self, which: impl Fn(Role) -> bool) {
-        for child in self.children.iter_mut().filter(|child| which(child.identity.role)) {
+        for child in self.children.iter_mut().filter(|child| which(child.instance.role)) {
             match &mut child.process {
                 Some(process) => {
                     child.ends = true;
                     process.ask_to_end();
                 }
-                None if child.identity.role == Role::Learner && !self.learner_done => {
+                None if child.instance.role == Role::Learner && !self.learner_done => {
                     self.unsaved = Some("it had died and was not restarted yet".into());
                 }
                 None => {}
@@ -730,12 +730,12 @@ impl Supervisor {
     /// Whether all processes of some roles have ended.
     pub(super) fn have_ended(&mut self, which: impl Fn(Role) -> bool) -> bool {
         let mut all = true;
-        for child in self.children.iter_mut().filter(|child| which(child.identity.role)) {
+        for child in self.children.iter_mut().filter(|child| which(child.instance.role)) {
             let Some(process) = &mut child.process else { continue };
             match process.exit_status() {
                 Some(status) => {
                     child.process = None;
-                    if child.identity.role == Role::Learner && !status.success() {
+                    if child.instance.role == Role::Learner && !status.success() {
                         self.unsaved = Some(ending(status));
                     }
                 }
@@ -747,14 +747,14 @@ impl Supervisor {
 
     /// Kills the processes of some roles that did not end when they were asked to.
     pub(super) fn kill(&mut self, which: impl Fn(Role) -> bool) {
-        for child in self.children.iter_mut().filter(|child| which(child.identity.role)) {
+        for child in self.children.iter_mut().filter(|child| which(child.instance.role)) {
             if child.process.take().is_some() {
-                let name = name(child.identity);
+                let name = name(child.instance);
                 self.log.note(&name, "did not end when asked to, and was killed");
                 let detail = "did not end when asked to".into();
                 self.incidents
-                    .push(Incident::of(child.identity, IncidentKind::Killed, detail));
-                if child.identity.role == Role::Learner {
+                    .push(Incident::of(child.instance, IncidentKind::Killed, detail));
+                if child.instance.role == Role::Learner {
                     self.unsaved = Some("it did not end when asked to, and was killed".into());
                 }
             }
@@ -768,7 +768,7 @@ impl Supervisor {
     pub(super) fn check_saved(&self) -> anyhow::Result<()> {
         self.log.note("launcher", ALL_ENDED);
         let Some(how) = &self.unsaved else { return Ok(()) };
-        let lines = self.log.last_lines(&name(Identity {
+        let lines = self.log.last_lines(&name(RoleInstance {
             role: Role::Learner,
             index: 0,
             incarnation: 0,

@@ -4,7 +4,7 @@ use std::sync::mpsc::{Receiver, Sender, channel};
 use std::time::Duration;
 
 use rustix::process::Signal;
-use shoal_common::channel::environment::{Begin, EnvironmentClient, Observed, Snapshot, Stepped};
+use shoal_common::channel::environment::{EnvironmentClient, Observed, ResetRequest, Snapshot, Stepped};
 use shoal_common::channel::{ChannelError, Domain, EventName, Listener};
 use shoal_common::exit::Exit;
 use shoal_common::report::Role;
@@ -40,7 +40,9 @@ impl TestClient {
 
     /// `idle` is called repeatedly during the wait.
     fn reset_while(&self, idle: impl FnMut()) -> Observed {
-        self.inner.reset(&self.listener, Begin::Next, idle).expect("no hang")
+        self.inner
+            .reset(&self.listener, ResetRequest::Next, idle)
+            .expect("no hang")
     }
 
     fn step(&self) -> Stepped {
@@ -289,10 +291,10 @@ fn a_training_episode_depends_only_on_its_number() {
         let observed = client.inner.reset(&client.listener, begin, || ()).expect("no hang");
         observed.observations().to_vec()
     };
-    let [first, second] = [begin(Begin::Next), begin(Begin::Next)];
+    let [first, second] = [begin(ResetRequest::Next), begin(ResetRequest::Next)];
     assert_ne!(first, second);
     client.steps(10);
-    assert_eq!(begin(Begin::Training(0)), first);
-    assert_eq!(begin(Begin::Next), second, "the count continues from there");
-    assert_eq!(begin(Begin::Training(1)), second);
+    assert_eq!(begin(ResetRequest::Training(0)), first);
+    assert_eq!(begin(ResetRequest::Next), second, "the count continues from there");
+    assert_eq!(begin(ResetRequest::Training(1)), second);
 }

@@ -10,8 +10,8 @@ mod reader;
 mod record;
 mod words;
 
-pub use layout::{IdentityFault, Places, ReplayLayout, SLOTS, SYNCED};
+pub use layout::{Places, PreambleError, ReplayLayout, SLOTS, SYNCED};
 pub use mirror::CommitMirror;
 pub use reader::{CommitReader, OpenError};
-pub use record::{ActorCommit, ChunkMark, MAX_INCARNATION, Record};
+pub use record::{ActorCommit, ChunkId, MAX_INCARNATION, Record};
 pub use words::{Words, WritableWords};

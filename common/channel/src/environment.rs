@@ -9,8 +9,8 @@ mod port;
 mod service;
 
 pub use check::Fault;
-pub use client::{Begin, EnvironmentClient, Observed, Snapshot, Stepped, describe};
-pub use message::{Ask, RequestHeader, ResponseHeader, ResponseLayout, StepBlocks};
+pub use client::{EnvironmentClient, Observed, ResetRequest, Snapshot, Stepped, describe};
+pub use message::{RequestHeader, RequestKind, ResponseHeader, ResponseLayout, StepBlocks};
 pub use port::{EnvironmentPort, Request};
 pub(super) use service::create;
 pub use service::reserved;

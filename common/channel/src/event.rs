@@ -178,7 +178,7 @@ impl Notifier {
         claim(|| Self::on(domain, &channel))
     }
 
-    /// Opens a notifier for the launcher, if that is possible at once. Otherwise the launcher finds the question when
+    /// Opens a notifier for the launcher, if that is possible at once. Otherwise the launcher finds the request when
     /// it next looks by itself.
     pub(super) fn to_launcher(domain: &Domain) -> Option<Self> {
         Self::on(domain, LAUNCHER).ok()

@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use shoal_base::report::{Activity, Heartbeat, Identity};
+use shoal_base::report::{Activity, Heartbeat, RoleInstance};
 
 use super::domain::Domain;
 use super::error::ChannelError;
@@ -24,10 +24,10 @@ impl HeartbeatSender {
     ///
     /// # Errors
     /// When shared memory is unavailable.
-    pub fn new(domain: &Domain, identity: Identity) -> Result<Self, ChannelError> {
+    pub fn new(domain: &Domain, instance: RoleInstance) -> Result<Self, ChannelError> {
         Ok(Self {
             reporter: Reporter::open(domain)?,
-            heartbeat: Heartbeat::new(identity),
+            heartbeat: Heartbeat::new(instance),
             last: None,
         })
     }

@@ -79,7 +79,7 @@ pub struct PolicyPublisher {
 #[derive(Debug)]
 pub struct PolicyReader {
     subscriber: Subscriber<ipc::Service, [f32], PolicyHeader>,
-    current: Option<Rc<Policy>>,
+    current: Option<Rc<PublishedPolicy>>,
     fingerprint: u64,
     parameters: usize,
 }
@@ -87,7 +87,7 @@ pub struct PolicyReader {
 /// A policy in the learner's memory. It stays valid and unchanged until this is dropped, even after the learner has
 /// ended.
 #[derive(Debug)]
-pub struct Policy {
+pub struct PublishedPolicy {
     sample: Sample<ipc::Service, [f32], PolicyHeader>,
 }
 
@@ -162,7 +162,7 @@ impl PolicyReader {
     ///
     /// # Errors
     /// When the learner's memory cannot be mapped, or its policy has another layout.
-    pub fn latest(&mut self) -> Result<Option<Rc<Policy>>, ChannelError> {
+    pub fn latest(&mut self) -> Result<Option<Rc<PublishedPolicy>>, ChannelError> {
         while let Some(sample) = self
             .subscriber
             .receive()
@@ -171,13 +171,13 @@ impl PolicyReader {
             if sample.user_header().fingerprint != self.fingerprint || sample.payload().len() != self.parameters {
                 return Err(ChannelError::new(CHANNEL, "read", PeerError::PolicyLayout));
             }
-            self.current = Some(Rc::new(Policy { sample }));
+            self.current = Some(Rc::new(PublishedPolicy { sample }));
         }
         Ok(self.current.clone())
     }
 }
 
-impl Policy {
+impl PublishedPolicy {
     /// The policy's header.
     pub fn header(&self) -> &PolicyHeader {
         self.sample.user_header()

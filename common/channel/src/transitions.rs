@@ -28,7 +28,7 @@ use super::error::{ChannelError, PeerError};
 use super::event::{Listener, wait_for};
 use super::memory;
 use super::service::{Entry, Held, claim, service_name};
-use crate::commit::{ChunkMark, CommitReader};
+use crate::commit::{ChunkId, CommitReader};
 
 /// Chunks that the learner holds at the same time.
 const BORROWED: usize = 2;
@@ -170,8 +170,8 @@ impl ChunkSender {
         self.sent
     }
 
-    /// Chunks sent but not committed. `committed` is the newest mark of this actor in the replay.
-    pub fn in_flight(&self, committed: ChunkMark) -> u64 {
+    /// Chunks sent but not committed. `committed` is the id of this actor's last chunk in the replay.
+    pub fn in_flight(&self, committed: ChunkId) -> u64 {
         self.sent.saturating_sub(committed.sequence)
     }
 
@@ -397,13 +397,13 @@ impl ReceivedChunk {
         self.sample.user_header()
     }
 
-    /// The chunk's mark. `committed` is the newest committed mark of its actor: a handshake keeps its sequence number,
+    /// The chunk's id. `committed` is the id of the last committed chunk of its actor: a handshake keeps its sequence number,
     /// and only announces the new incarnation.
-    pub fn mark(&self, committed: ChunkMark) -> ChunkMark {
+    pub fn id(&self, committed: ChunkId) -> ChunkId {
         let ChunkHeader {
             incarnation, sequence, ..
         } = *self.header();
-        ChunkMark {
+        ChunkId {
             incarnation,
             sequence: if self.is_handshake() {
                 committed.sequence

@@ -16,12 +16,12 @@ pub struct AlgorithmSpec {
     /// Whether it can learn from transitions of older policies. If not, it runs in lockstep only.
     pub off_policy: bool,
     /// How it uses transitions.
-    pub experience: Experience,
+    pub transition_use: TransitionUse,
 }
 
 /// How an algorithm uses the transitions that it learns from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Experience {
+pub enum TransitionUse {
     /// In minibatches drawn at random from the replay, each transition many times.
     Minibatches,
     /// Each transition once, in order.

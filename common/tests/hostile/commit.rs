@@ -42,8 +42,8 @@ fn sealed(bytes: &mut [u8], slot: usize, words: &[u64]) {
 /// A replay of six rows, all of actor 0.
 fn file() -> Vec<u8> {
     let mut bytes = vec![0; places().end];
-    for (i, of_identity) in layout().identity().into_iter().enumerate() {
-        word(&mut bytes, 8 * i, of_identity);
+    for (i, of_preamble) in layout().preamble().into_iter().enumerate() {
+        word(&mut bytes, 8 * i, of_preamble);
     }
     let mut words = [0; WORDS];
     words[..6].copy_from_slice(&[2, 6, 0, 1, 3, 6]);
@@ -70,7 +70,7 @@ fn read_all(path: &Path) -> Option<CommitReader> {
     if let Some(reader) = &reader {
         reader.rows();
         for actor in 0..reader.layout().actors {
-            assert_eq!(reader.actor(actor).mark, reader.committed(actor));
+            assert_eq!(reader.actor(actor).last_chunk, reader.committed(actor));
         }
         let record = reader.snapshot().unwrap();
         assert!(record.tail() <= record.head() && record.actors() == reader.layout().actors);
@@ -136,13 +136,13 @@ proptest! {
         sizes in any::<bool>(),
     ) {
         let [observation, action, row, ring, actors] = words;
-        let mut identity = layout().identity();
-        identity.truncate(8);
-        identity[2..7].copy_from_slice(&[observation, action, row, ring, actors]);
+        let mut preamble = layout().preamble();
+        preamble.truncate(8);
+        preamble[2..7].copy_from_slice(&[observation, action, row, ring, actors]);
         if width {
-            identity[4] = observation.wrapping_mul(2).wrapping_add(action).wrapping_add(3);
+            preamble[4] = observation.wrapping_mul(2).wrapping_add(action).wrapping_add(3);
         }
-        let bytes: Vec<u8> = identity.iter().flat_map(|word| word.to_le_bytes()).collect();
+        let bytes: Vec<u8> = preamble.iter().flat_map(|word| word.to_le_bytes()).collect();
         let (_directory, path) = written(&bytes);
         let file = File::options().write(true).open(&path).unwrap();
         file.write_all_at(&u64::from(crc32fast::hash(&bytes)).to_le_bytes(), 64).unwrap();
@@ -193,7 +193,7 @@ fn a_file_for_too_many_actors_is_refused() {
         actor_snapshot_words: 0,
         ..layout()
     };
-    let bytes: Vec<u8> = many.identity().iter().flat_map(|word| word.to_le_bytes()).collect();
+    let bytes: Vec<u8> = many.preamble().iter().flat_map(|word| word.to_le_bytes()).collect();
     let (_directory, path) = written(&bytes);
     // The length that such a layout would need: a sparse file of half a terabyte.
     let slot = (u64::from(u32::MAX) * 3 + 4) * 8;

@@ -71,7 +71,7 @@ fn copy_into_column(matrix: &mut DMatrix<f32>, column: usize, numbers: &[f32]) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::replay::{ChunkMark, ReplayLayout};
+    use crate::replay::{ChunkId, ReplayLayout};
 
     fn layout() -> ReplayLayout {
         ReplayLayout {
@@ -87,11 +87,11 @@ mod tests {
     fn replay_of(rows: &[f32]) -> (tempfile::TempDir, Replay) {
         let directory = tempfile::tempdir().unwrap();
         let mut replay = Replay::create(&directory.path().join("replay"), &layout()).unwrap();
-        let mark = ChunkMark {
+        let id = ChunkId {
             incarnation: 0,
             sequence: 1,
         };
-        replay.append_and_commit(0, mark, rows).unwrap();
+        replay.append_and_commit(0, id, rows).unwrap();
         (directory, replay)
     }
 

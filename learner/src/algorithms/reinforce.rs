@@ -11,13 +11,13 @@ use std::borrow::Cow;
 
 use nalgebra::DMatrix;
 use shoal_common::algorithms::{AlgorithmSettings, ReinforceNetworks};
-use shoal_common::config::{self, Config, Weight};
+use shoal_common::config::{self, Config, ReturnWeighting};
 use shoal_common::network::NetworkLayout;
 use shoal_common::policy::{self, PolicyError, PolicyLayout};
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::transition::Transition;
 
-use super::algorithm::{Algorithm, Losses, Method, RunSizes, SavedState, Section, SectionError};
+use super::algorithm::{Algorithm, AlgorithmFactory, Losses, RunSizes, SavedState, StateArray, StateArrayError};
 use crate::networks::adam::Adam;
 use crate::networks::aligned::Aligned;
 use crate::networks::initialise::glorot;
@@ -88,7 +88,7 @@ pub struct Reinforce {
 }
 
 impl Reinforce {
-    /// Names of the sections that hold what was learned.
+    /// Names of the arrays that hold what was learned.
     const WEIGHTS: [&'static str; 2] = ["policy", "baseline"];
     const MOMENTS: [[&'static str; 2]; 2] = [
         ["policy's first moment", "policy's second moment"],
@@ -145,7 +145,7 @@ impl Reinforce {
             let mut gamma_t = 1.0;
             for (step, g) in episode.iter().zip(&returns) {
                 let weight = match (self.settings.weight, &mut self.baseline) {
-                    (Weight::Normalised, _) => (g - mean) / (spread + SPREAD_FLOOR),
+                    (ReturnWeighting::Normalised, _) => (g - mean) / (spread + SPREAD_FLOOR),
                     (_, Some(baseline)) => {
                         // The gradient of ½ δ² (equation 3.22).
                         let delta = g - baseline.pass.output[column];
@@ -223,8 +223,8 @@ fn ln_sum_exp(logits: &[f32]) -> f32 {
     greatest + logits.iter().map(|logit| (logit - greatest).exp()).sum::<f32>().ln()
 }
 
-impl Method for &config::ReinforceConfig {
-    fn start(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
+impl AlgorithmFactory for &config::ReinforceConfig {
+    fn create(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
         let (spec, seed) = (&config.spec, config.run.seed);
         Ok(Box::new(Reinforce::new(self, spec, seed, RunSizes::from(config))?))
     }
@@ -263,7 +263,7 @@ impl Algorithm for Reinforce {
         self.learn(&round)
     }
 
-    fn state(&self) -> Vec<Section<'_>> {
+    fn state(&self) -> Vec<StateArray<'_>> {
         let names = Self::WEIGHTS.into_iter().zip(Self::MOMENTS);
         let networks = self
             .networks()
@@ -278,7 +278,7 @@ impl Algorithm for Reinforce {
         networks.chain([(Self::STEPS, self.steps.as_slice())]).collect()
     }
 
-    fn restore(&mut self, updates: u64, saved: &mut SavedState) -> Result<(), SectionError> {
+    fn restore(&mut self, updates: u64, saved: &mut SavedState) -> Result<(), StateArrayError> {
         let names = Self::WEIGHTS.into_iter().zip(Self::MOMENTS);
         for (network, (name, [first, second])) in std::iter::once(&mut self.policy).chain(&mut self.baseline).zip(names)
         {

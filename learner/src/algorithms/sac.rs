@@ -17,16 +17,16 @@ use shoal_common::policy::PolicyError;
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::stream::{Purpose, Stream, seek, stream};
 
-use super::algorithm::{Algorithm, Losses, Method, RunSizes, Section, SectionMut};
+use super::algorithm::{Algorithm, AlgorithmFactory, Losses, RunSizes, StateArray, StateArrayMut};
 use super::minibatch::Minibatch;
-use super::replayed::{MinibatchLearner, Replayed, mean};
+use super::minibatch_algorithm::{MinibatchAlgorithm, MinibatchLearner, mean};
 use super::twin_critics::{self, CriticLosses, CriticPart, TwinCritics};
 use crate::networks::adam::Adam;
 use crate::networks::initialise::fan_in;
 use crate::networks::pass::{Pass, Samples};
 use crate::networks::product::{self, Products};
 use crate::networks::threads::Threads;
-use crate::networks::trained::{Trained, threads_for};
+use crate::networks::trainable::{TrainableNetwork, threads_for};
 
 /// The names of the actor's numbers in a checkpoint: parameters, moments.
 const ACTOR: [&str; 3] = ["actor", "actor's first moment", "actor's second moment"];
@@ -186,7 +186,7 @@ pub struct Sac {
     tau: f32,
     threads: Threads,
     updates: u64,
-    actor: Trained,
+    actor: TrainableNetwork,
     critics: TwinCritics,
     temperature: Temperature,
     /// Part `u` of this stream has the noise of update number `u`.
@@ -214,7 +214,7 @@ impl Sac {
             tau: settings.tau as f32,
             threads: Threads::ALONE,
             updates: 0,
-            actor: Trained::new(pi, settings.actor_learning_rate, &fan_in(&pi, seed, 0)),
+            actor: TrainableNetwork::new(pi, settings.actor_learning_rate, &fan_in(&pi, seed, 0)),
             critics: TwinCritics::new(q, settings.critic_learning_rate, batch, seed),
             temperature: Temperature {
                 target_entropy: settings.target_entropy_per_element as f32 * action as f32,
@@ -353,8 +353,8 @@ impl MinibatchLearner for Sac {
         self.update_with_drawn_noise(batch)
     }
 
-    fn state(&self) -> Vec<Section<'_>> {
-        let Trained { parameters, adam, .. } = &self.actor;
+    fn state(&self) -> Vec<StateArray<'_>> {
+        let TrainableNetwork { parameters, adam, .. } = &self.actor;
         let actor: [&[f32]; 3] = [parameters, &adam.first_moment, &adam.second_moment];
         let Temperature { log_alpha, adam, .. } = &self.temperature;
         let temperature: [&[f32]; 3] = [log_alpha, &adam.first_moment, &adam.second_moment];
@@ -362,9 +362,9 @@ impl MinibatchLearner for Sac {
         names().zip(numbers.chain(temperature)).collect()
     }
 
-    fn state_mut(&mut self, updates: u64) -> Vec<SectionMut<'_>> {
+    fn state_mut(&mut self, updates: u64) -> Vec<StateArrayMut<'_>> {
         self.updates = updates;
-        let Trained { parameters, adam, .. } = &mut self.actor;
+        let TrainableNetwork { parameters, adam, .. } = &mut self.actor;
         let actor: [&mut [f32]; 3] = [parameters, &mut adam.first_moment, &mut adam.second_moment];
         let Temperature { log_alpha, adam, .. } = &mut self.temperature;
         let temperature: [&mut [f32]; 3] = [log_alpha, &mut adam.first_moment, &mut adam.second_moment];
@@ -377,14 +377,14 @@ impl MinibatchLearner for Sac {
 
 /// The names of all parts of the state.
 fn names() -> impl Iterator<Item = &'static str> {
-    let critics = twin_critics::SECTIONS.into_iter().flatten();
+    let critics = twin_critics::ARRAYS.into_iter().flatten();
     ACTOR.into_iter().chain(critics).chain(TEMPERATURE)
 }
 
-impl Method for &config::SacConfig {
-    fn start(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
+impl AlgorithmFactory for &config::SacConfig {
+    fn create(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
         let sac = Sac::new(&config.spec, self, config.run.seed)?;
-        Ok(Box::new(Replayed::new(sac, config)?))
+        Ok(Box::new(MinibatchAlgorithm::new(sac, config)?))
     }
 
     fn weights(&self) -> &'static [&'static str] {

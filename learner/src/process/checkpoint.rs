@@ -23,7 +23,7 @@ const PREVIOUS: &str = "previous.ckpt";
 /// A learner's progress.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Counters {
-    /// Gradient steps taken; for methods that use each row once, rows consumed.
+    /// Gradient steps taken; for algorithms that use each row once, rows consumed.
     pub updates: u64,
     /// Environment steps of all actors that count for the ratio of updates: rows of the replay.
     pub rows: u64,
@@ -39,7 +39,7 @@ pub struct Checkpoint {
     /// The learner's progress.
     pub counters: Counters,
     /// The learner's numbers by name, as they were given to `save`.
-    pub sections: Vec<(String, Vec<f32>)>,
+    pub arrays: Vec<(String, Vec<f32>)>,
 }
 
 /// Why a checkpoint was not written or read. The files on the disk have not changed.
@@ -114,8 +114,8 @@ pub struct Checkpoints {
 struct Header {
     fingerprint: u64,
     counters: Counters,
-    /// Name and length of each section, in the order of their numbers.
-    sections: Vec<(String, u64)>,
+    /// Name and length of each array, in the order of their numbers.
+    arrays: Vec<(String, u64)>,
 }
 
 /// The content of one of the two files.
@@ -186,8 +186,8 @@ impl Checkpoints {
     }
 
     /// Writes a checkpoint. When this returns it is on the disk: a power loss leaves it or a later one.
-    pub fn save(&mut self, counters: &Counters, sections: &[(&str, &[f32])]) -> Result<(), CheckpointError> {
-        let prepared = self.prepare(counters, sections)?;
+    pub fn save(&mut self, counters: &Counters, arrays: &[(&str, &[f32])]) -> Result<(), CheckpointError> {
+        let prepared = self.prepare(counters, arrays)?;
         (self.hook)(SaveStep::Prepared);
         self.keep_latest()?;
         (self.hook)(SaveStep::Kept);
@@ -196,12 +196,12 @@ impl Checkpoints {
         Ok(())
     }
 
-    fn prepare(&self, counters: &Counters, sections: &[(&str, &[f32])]) -> Result<Prepared, CheckpointError> {
+    fn prepare(&self, counters: &Counters, arrays: &[(&str, &[f32])]) -> Result<Prepared, CheckpointError> {
         let path = self.directory.join(LATEST);
         let header = Header {
             fingerprint: self.fingerprint,
             counters: *counters,
-            sections: sections
+            arrays: arrays
                 .iter()
                 .map(|(name, numbers)| ((*name).to_owned(), numbers.len() as u64))
                 .collect(),
@@ -209,7 +209,7 @@ impl Checkpoints {
         Prepared::write(&path, |file| {
             durable::seal(KIND, file, |body| {
                 body.write_all(&bincode::serde::encode_to_vec(&header, encoding()).map_err(io::Error::other)?)?;
-                sections
+                arrays
                     .iter()
                     .try_for_each(|(_, numbers)| body.write_all(bytemuck::cast_slice(numbers)))
             })
@@ -281,10 +281,10 @@ impl Checkpoints {
                 header.fingerprint, self.fingerprint
             )));
         }
-        let sections = header.sections.into_iter().map(|(name, _)| name).zip(numbers).collect();
+        let arrays = header.arrays.into_iter().map(|(name, _)| name).zip(numbers).collect();
         Ok(Found::Whole(Checkpoint {
             counters: header.counters,
-            sections,
+            arrays,
         }))
     }
 }
@@ -292,7 +292,7 @@ impl Checkpoints {
 /// No run reaches this many updates, rows, episodes or versions, and counting further from here does not overflow.
 const LIMIT: u64 = 1 << 60;
 
-/// Splits a body into its header and the numbers of each section; `None` unless the lengths add up to the body's and
+/// Splits a body into its header and the numbers of each array; `None` unless the lengths add up to the body's and
 /// all counters are below `LIMIT`.
 fn parse(body: &[u8]) -> Option<(Header, Vec<Vec<f32>>)> {
     let (header, read): (Header, usize) = bincode::serde::decode_from_slice(body, encoding()).ok()?;
@@ -306,13 +306,13 @@ fn parse(body: &[u8]) -> Option<(Header, Vec<Vec<f32>>)> {
     if updates.max(rows).max(episodes).max(policy_version) >= LIMIT {
         return None;
     }
-    let mut sections = Vec::with_capacity(header.sections.len());
-    for (_, length) in &header.sections {
+    let mut arrays = Vec::with_capacity(header.arrays.len());
+    for (_, length) in &header.arrays {
         let (numbers, after) = rest.split_at_checked(usize::try_from(*length).ok()?)?;
-        sections.push(numbers.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect());
+        arrays.push(numbers.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect());
         rest = after;
     }
-    (rest.is_empty() && odd.is_empty()).then_some((header, sections))
+    (rest.is_empty() && odd.is_empty()).then_some((header, arrays))
 }
 
 /// The limit keeps an absurd length from allocating memory.

@@ -1,4 +1,4 @@
-//! The learner that free and lockstep runs share, with its replay, method, channels and checkpoints.
+//! The learner that free and lockstep runs share, with its replay, algorithm, channels and checkpoints.
 
 use std::io;
 use std::thread::JoinHandle;
@@ -80,7 +80,7 @@ impl<'a> Learner<'a> {
             Some(loaded) => {
                 loaded.warnings.iter().for_each(|warning| tracing::warn!("{warning}"));
                 let counters = loaded.checkpoint.counters;
-                algorithm.restore(counters.updates, &mut SavedState::from(loaded.checkpoint.sections))?;
+                algorithm.restore(counters.updates, &mut SavedState::from(loaded.checkpoint.arrays))?;
                 tracing::info!(
                     "continuing after {} updates and {} of {} rows",
                     counters.updates,
@@ -99,7 +99,7 @@ impl<'a> Learner<'a> {
             }
         };
 
-        let mut heartbeat = HeartbeatSender::new(domain, settings.identity)?;
+        let mut heartbeat = HeartbeatSender::new(domain, settings.instance)?;
         let learner = Self {
             publisher: PolicyPublisher::open(domain, algorithm.policy().len())?,
             evaluator: Notifier::new(domain, EventName(Role::Evaluator, 0))?,
@@ -135,7 +135,7 @@ impl<'a> Learner<'a> {
         Ok(learner)
     }
 
-    /// Gradient steps taken; for methods that use each row once, rows consumed.
+    /// Gradient steps taken; for algorithms that use each row once, rows consumed.
     pub(crate) fn updates(&self) -> u64 {
         self.algorithm.updates()
     }
@@ -180,7 +180,7 @@ impl<'a> Learner<'a> {
 
     fn publish_current(&self) -> Result<(), LearnerError> {
         let header = PolicyHeader {
-            incarnation: self.settings.identity.incarnation,
+            incarnation: self.settings.instance.incarnation,
             version: self.policy_version,
             env_steps: self.rows,
             updates: self.algorithm.updates(),

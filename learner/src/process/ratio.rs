@@ -2,7 +2,7 @@
 
 use shoal_common::config;
 
-/// How many updates the environment steps collected so far allow. An update is a gradient step or, for methods that use
+/// How many updates the environment steps collected so far allow. An update is a gradient step or, for algorithms that use
 /// each row once, a row.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Ratio(config::ReplayConfig);

@@ -6,12 +6,12 @@ use shoal_common::channel::ChannelError;
 use shoal_common::config::{Config, Mode};
 use shoal_common::policy::PolicyError;
 use shoal_common::policy_file::PolicyFileError;
-use shoal_common::report::Identity;
+use shoal_common::report::RoleInstance;
 use shoal_common::run_dir::RunDir;
 
 use super::checkpoint::CheckpointError;
 use super::intake::IntakeError;
-use crate::algorithms::algorithm::SectionError;
+use crate::algorithms::algorithm::StateArrayError;
 use crate::algorithms::registry;
 use crate::networks::threads::ThreadsError;
 use crate::replay::{ReplayError, ReplayLayout};
@@ -20,7 +20,7 @@ use crate::replay::{ReplayError, ReplayLayout};
 #[derive(Clone, Debug)]
 pub struct LearnerSettings {
     /// Which process this is.
-    pub identity: Identity,
+    pub instance: RoleInstance,
     /// The run's configuration.
     pub config: Config,
     /// The run's directory, where the replay, the checkpoints and the last policy are.
@@ -46,7 +46,7 @@ pub enum LearnerError {
     Checkpoint(#[from] CheckpointError),
     /// A checkpoint was written by another version of the program.
     #[error(transparent)]
-    Section(#[from] SectionError),
+    StateArray(#[from] StateArrayError),
     /// The algorithm cannot control the environment.
     #[error(transparent)]
     Algorithm(#[from] PolicyError),
@@ -59,7 +59,7 @@ pub enum LearnerError {
     /// The losses are no longer finite.
     #[error("the losses are no longer finite after {updates} updates: lower the learning rates or the rewards' scale")]
     Diverged {
-        /// Gradient steps taken; for methods that use each row once, rows consumed.
+        /// Gradient steps taken; for algorithms that use each row once, rows consumed.
         updates: u64,
     },
     /// A lockstep run must repeat updates on rows that the ring no longer holds.

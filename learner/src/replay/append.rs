@@ -2,7 +2,7 @@
 
 use std::sync::atomic::{Ordering, compiler_fence, fence};
 
-use shoal_common::commit::ChunkMark;
+use shoal_common::commit::ChunkId;
 
 use super::error::ChunkError;
 use super::step::{WriteStep, observe};
@@ -23,7 +23,7 @@ pub enum Appended {
 pub struct Reserved<'a> {
     replay: &'a mut Replay,
     actor: usize,
-    mark: ChunkMark,
+    id: ChunkId,
 }
 
 /// A chunk whose rows are in the ring but not committed.
@@ -40,28 +40,28 @@ impl Replay {
     /// # Errors
     /// When the actor is unknown, or the chunk is not the next one. The next one has the same incarnation and the next
     /// sequence number, or it is the first of a later incarnation, which has no rows and keeps the sequence number.
-    pub fn begin(&mut self, actor: usize, mark: ChunkMark) -> Result<Option<Reserved<'_>>, ChunkError> {
+    pub fn begin(&mut self, actor: usize, id: ChunkId) -> Result<Option<Reserved<'_>>, ChunkError> {
         let actors = self.layout.actors;
         if actor >= actors {
             return Err(ChunkError::Actor { actor, actors });
         }
-        let committed = self.record.actor(actor).mark;
-        if mark <= committed {
+        let committed = self.record.actor(actor).last_chunk;
+        if id <= committed {
             return Ok(None);
         }
-        if !mark.is_next(committed) {
-            return Err(ChunkError::OutOfOrder { actor, mark, committed });
+        if !id.is_next(committed) {
+            return Err(ChunkError::OutOfOrder { actor, id, committed });
         }
         Ok(Some(Reserved {
             replay: self,
             actor,
-            mark,
+            id,
         }))
     }
 
     /// Starts, fills and commits a chunk in one call.
-    pub fn append_and_commit(&mut self, actor: usize, mark: ChunkMark, rows: &[f32]) -> Result<Appended, ChunkError> {
-        match self.begin(actor, mark)? {
+    pub fn append_and_commit(&mut self, actor: usize, id: ChunkId, rows: &[f32]) -> Result<Appended, ChunkError> {
+        match self.begin(actor, id)? {
             Some(chunk) => {
                 chunk.fill(rows)?.commit();
                 Ok(Appended::Accepted)
@@ -125,8 +125,8 @@ impl Filled<'_> {
 
     /// Makes the chunk part of the replay.
     pub fn commit(self) {
-        let Reserved { replay, actor, mark } = self.chunk;
-        replay.record.add(actor, mark, self.rows);
+        let Reserved { replay, actor, id } = self.chunk;
+        replay.record.add(actor, id, self.rows);
         replay.publish(replay.record.generation() + 1);
     }
 }

@@ -47,7 +47,7 @@ impl Replay {
 mod tests {
     use shoal_common::transition::RowLayout;
 
-    use super::super::{ChunkMark, ReplayLayout};
+    use super::super::{ChunkId, ReplayLayout};
     use super::*;
 
     fn layout(ring: u64) -> ReplayLayout {
@@ -68,11 +68,11 @@ mod tests {
         let width = layout(6).row.width();
         for sequence in 1..=5_u64 {
             let rows: Vec<f32> = (0..2 * width).map(|i| (sequence * 100) as f32 + i as f32).collect();
-            let mark = ChunkMark {
+            let id = ChunkId {
                 incarnation: 0,
                 sequence,
             };
-            old.append_and_commit(0, mark, &rows).unwrap();
+            old.append_and_commit(0, id, &rows).unwrap();
         }
         for (ring, most, expected) in [(20, 20, 6), (20, 4, 4), (3, 20, 3)] {
             let name = path(&format!("{ring}-{most}"));
@@ -86,11 +86,11 @@ mod tests {
                 assert_eq!(new.row(index), old.row(10 - expected + index), "row {index}");
             }
             // The first chunk of an actor is still its first one.
-            let mark = ChunkMark {
+            let id = ChunkId {
                 incarnation: 0,
                 sequence: 1,
             };
-            new.append_and_commit(1, mark, &vec![1.0; width]).unwrap();
+            new.append_and_commit(1, id, &vec![1.0; width]).unwrap();
             assert_eq!((new.head(), new.committed(1).rows), (expected + 1, 1));
         }
     }

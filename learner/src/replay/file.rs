@@ -43,7 +43,7 @@ pub(super) fn create(path: &Path, layout: &ReplayLayout) -> Result<(File, Places
     reserve(path, &file, places.end as u64)?;
 
     let mut words = WritableWords::map(&file, places.header).map_err(io(path, "map"))?;
-    for (i, word) in layout.identity().into_iter().enumerate() {
+    for (i, word) in layout.preamble().into_iter().enumerate() {
         words.store(i * size_of::<u64>(), word);
     }
     let mut record = Record::empty(layout);

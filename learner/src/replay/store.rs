@@ -169,7 +169,7 @@ impl Replay {
     /// The rows to draw a minibatch from, for a replay as it was after `logical_head` rows: the newest `capacity` rows
     /// before it. There are fewer if the replay had fewer, if rows were lost, or if the ring has overwritten some
     /// since. A caller that must rule out the last case compares the start with `logical_head - capacity`.
-    pub fn window(&self, logical_head: u64, capacity: u64) -> Range<u64> {
+    pub fn sampling_range(&self, logical_head: u64, capacity: u64) -> Range<u64> {
         let rows = self.rows();
         let end = logical_head.clamp(rows.start, rows.end);
         end.saturating_sub(capacity).max(rows.start)..end

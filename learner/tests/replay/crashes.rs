@@ -8,7 +8,7 @@ use proptest::prelude::*;
 use shoal_common::commit::{CommitReader, OpenError};
 use shoal_learner::replay::{Appended, Replay, WriteStep};
 
-use crate::model::{ACTORS, Directory, Model, WIDTH, chunk, filled, layout, mark, places, reopen};
+use crate::model::{ACTORS, Directory, Model, WIDTH, chunk, filled, id, layout, places, reopen};
 
 /// The content of the file after each step.
 type Images = Vec<(WriteStep, Vec<u8>)>;
@@ -31,11 +31,11 @@ proptest! {
 
         let mut before = Model::default();
         for (actor, rows, noise) in writes {
-            let mark = before.next(actor);
-            let numbers = chunk(actor, mark, rows);
-            replay.append_and_commit(actor, mark, &numbers).unwrap();
+            let id = before.next(actor);
+            let numbers = chunk(actor, id, rows);
+            replay.append_and_commit(actor, id, &numbers).unwrap();
             let mut after = before.clone();
-            after.add(actor, mark, &numbers);
+            after.add(actor, id, &numbers);
             after.check(&replay);
             if noise % 5 == 0 {
                 replay.flush().unwrap();
@@ -61,7 +61,7 @@ proptest! {
                 prop_assert!(reopened.rows().start <= intact, "after {:?}: {:?}", step, reopened.rows());
 
                 // The actor sends it again.
-                let again = reopened.append_and_commit(actor, mark, &numbers).unwrap();
+                let again = reopened.append_and_commit(actor, id, &numbers).unwrap();
                 prop_assert_eq!(again, if committed { Appended::Duplicate } else { Appended::Accepted });
                 after.check(&reopened);
                 drop(reopened);
@@ -91,10 +91,10 @@ proptest! {
                 replay.flush().unwrap();
                 images.push(fs::read(directory.replay()).unwrap());
             }
-            let mark = model.next(actor);
-            let numbers = chunk(actor, mark, rows);
-            replay.append_and_commit(actor, mark, &numbers).unwrap();
-            model.add(actor, mark, &numbers);
+            let id = model.next(actor);
+            let numbers = chunk(actor, id, rows);
+            replay.append_and_commit(actor, id, &numbers).unwrap();
+            model.add(actor, id, &numbers);
             states.insert(model.head(), model.clone());
             if number >= before.len() {
                 images.push(fs::read(directory.replay()).unwrap());
@@ -120,7 +120,7 @@ proptest! {
         states[&head].check(&Replay::open(&copy, &layout(ring)).unwrap());
     }
 
-    /// After damage anywhere behind the identity, the readable rows are still right.
+    /// After damage anywhere behind the preamble, the readable rows are still right.
     #[test]
     fn a_damaged_row_is_never_readable(
         writes in prop::collection::vec((0..ACTORS, 1_u64..9), 1..20),
@@ -133,8 +133,8 @@ proptest! {
         let mut partial = Model::default();
         states.insert(0, partial.clone());
         for &(actor, rows) in &writes {
-            let mark = partial.next(actor);
-            partial.add(actor, mark, &chunk(actor, mark, rows));
+            let id = partial.next(actor);
+            partial.add(actor, id, &chunk(actor, id, rows));
             states.insert(partial.head(), partial.clone());
         }
         let places = places(ring);
@@ -176,15 +176,10 @@ fn a_torn_newest_record_falls_back_to_the_previous_one_with_a_warning() {
         replay.warnings()
     );
     assert_eq!(
-        replay
-            .append_and_commit(0, mark(0, 2), &chunk(0, mark(0, 2), 4))
-            .unwrap(),
+        replay.append_and_commit(0, id(0, 2), &chunk(0, id(0, 2), 4)).unwrap(),
         Appended::Accepted
     );
-    assert_eq!(
-        CommitReader::open(&directory.replay()).unwrap().committed(0),
-        mark(0, 2)
-    );
+    assert_eq!(CommitReader::open(&directory.replay()).unwrap().committed(0), id(0, 2));
 
     for slot in places(100).slots {
         image[slot..slot + 104].fill(0);
@@ -214,8 +209,8 @@ fn a_sync_on_another_thread_counts_once_it_is_finished() {
     let (directory, mut model) = filled(100, &[(0, 30)]);
     let mut replay = Replay::open(&directory.replay(), &layout(100)).unwrap();
     let old = replay.start_sync().unwrap();
-    let numbers = chunk(0, mark(0, 2), 5);
-    replay.append_and_commit(0, mark(0, 2), &numbers).unwrap();
+    let numbers = chunk(0, id(0, 2), 5);
+    replay.append_and_commit(0, id(0, 2), &numbers).unwrap();
     let new = replay.start_sync().unwrap();
     let new = std::thread::spawn(|| new.run().unwrap()).join().unwrap();
     replay.finish_sync(new);
@@ -223,7 +218,7 @@ fn a_sync_on_another_thread_counts_once_it_is_finished() {
     let before = fs::read(directory.replay()).unwrap();
     replay.finish_sync(old.run().unwrap());
     assert_eq!(fs::read(directory.replay()).unwrap(), before);
-    model.add(0, mark(0, 2), &numbers);
+    model.add(0, id(0, 2), &numbers);
     drop(replay);
     let mut image = fs::read(directory.replay()).unwrap();
     for slot in &places(100).slots[..2] {
@@ -289,9 +284,7 @@ fn a_power_loss_among_unsynced_rows_goes_back_to_the_synced_ones() {
     let (directory, mut model) = filled(100, &[(0, 30)]);
     let mut replay = Replay::open(&directory.replay(), &layout(100)).unwrap();
     replay.flush().unwrap();
-    replay
-        .append_and_commit(1, mark(0, 1), &chunk(1, mark(0, 1), 60))
-        .unwrap();
+    replay.append_and_commit(1, id(0, 1), &chunk(1, id(0, 1), 60)).unwrap();
     drop(replay);
     let mut image = fs::read(directory.replay()).unwrap();
     let row = |index| places(100).rows.start + 4 * WIDTH * index;
@@ -304,9 +297,9 @@ fn a_power_loss_among_unsynced_rows_goes_back_to_the_synced_ones() {
         ["the newest 60 rows did not reach the disk; continuing from the 30 rows that did"]
     );
     // The lost rows do not come back under the numbers of the next rows.
-    let numbers = chunk(2, mark(0, 1), 5);
-    replay.append_and_commit(2, mark(0, 1), &numbers).unwrap();
-    model.add(2, mark(0, 1), &numbers);
+    let numbers = chunk(2, id(0, 1), 5);
+    replay.append_and_commit(2, id(0, 1), &numbers).unwrap();
+    model.add(2, id(0, 1), &numbers);
     drop(replay);
     let replay = Replay::open(&directory.replay(), &layout(100)).unwrap();
     model.check(&replay);

@@ -8,7 +8,7 @@ use message::{
 };
 use prost::Message;
 
-use super::{Activation, Body, Network, OBSERVATION_CLIP, Portable};
+use super::{Activation, Body, ExportedNetwork, OBSERVATION_CLIP, Portable};
 
 /// The versions of the file format and of the operator set. They are old enough for every runtime, and new enough for
 /// `ArgMax` to have `select_last_index`, which decides between equal values.
@@ -110,8 +110,8 @@ pub(super) fn model(policy: &Portable) -> Vec<u8> {
 
 impl Graph {
     /// Adds the layers with the activation between them. The output of the last one is named `output`.
-    fn add_network(&mut self, network: &Network, output: &str) {
-        let Network {
+    fn add_network(&mut self, network: &ExportedNetwork, output: &str) {
+        let ExportedNetwork {
             normalisation,
             activation,
             layers,

@@ -3,7 +3,7 @@
 use safetensors::Dtype;
 use safetensors::tensor::TensorView;
 
-use super::{Body, Network, Portable};
+use super::{Body, ExportedNetwork, Portable};
 
 /// The bytes of the file. A network has `layers.<i>.weight` (outputs × inputs, row-major) and `layers.<i>.bias` for
 /// each layer i from 0, the output layer last. If observations are normalised, `observation.mean` and
@@ -33,7 +33,7 @@ pub(super) fn file(policy: &Portable) -> anyhow::Result<Vec<u8>> {
 
 type Named<'a> = (String, Vec<usize>, &'a [f32]);
 
-fn of_network(network: &Network) -> Vec<Named<'_>> {
+fn of_network(network: &ExportedNetwork) -> Vec<Named<'_>> {
     let normalisation = network.normalisation.iter().flat_map(|(mean, factor)| {
         [("observation.mean", mean), ("observation.factor", factor)]
             .map(|(name, numbers)| (name.to_owned(), vec![numbers.len()], numbers.as_slice()))
@@ -100,7 +100,7 @@ mod tests {
                 if !metadata.contains_key("hidden_activation") {
                     let (shape, values) = numbers(&tensors, "action_values");
                     let row = &values[observation[0] as usize * shape[1]..][..shape[1]];
-                    assert_eq!(shoal_common::policy::highest(row) as f32, expected[0]);
+                    assert_eq!(shoal_common::policy::argmax(row) as f32, expected[0]);
                     continue;
                 }
                 let mut x = observation.to_vec();
@@ -124,7 +124,7 @@ mod tests {
                 }
                 let z = linear(&tensors, last, &x);
                 if ["reinforce", "dqn"].contains(&config.algorithm.name()) {
-                    assert_eq!(shoal_common::policy::highest(&z) as f32, expected[0]);
+                    assert_eq!(shoal_common::policy::argmax(&z) as f32, expected[0]);
                     continue;
                 }
                 let bound = |name: &str| -> Vec<f32> { serde_json::from_str(&metadata[name]).unwrap() };

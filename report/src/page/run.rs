@@ -3,7 +3,7 @@
 use serde::Serialize;
 use shoal_common::config::{Config, Mode};
 use shoal_common::run_dir::RunDir;
-use shoal_run::evaluation::WhichPolicy;
+use shoal_run::evaluation::SavedPolicy;
 use shoal_run::final_evaluation::{FinalEvaluation, FinallyEvaluated};
 use shoal_run::origin::Origin;
 use shoal_run::outcome::{RunOutcome, RunState};
@@ -150,7 +150,7 @@ impl Run {
                 .map(EvaluatedPolicy::of),
             last: evaluation_records.last().map(EvaluatedPolicy::of),
             final_evaluation: FinalEvaluation::read(run, now.env_steps)?
-                .and_then(|it| it.of(WhichPolicy::Best).cloned()),
+                .and_then(|it| it.of(SavedPolicy::Best).cloned()),
             evaluations: Curve::of_evaluations(&evaluation_records, limits.points),
             exploration: Curve::of_episodes(&explored, limits.points),
             learner: Rates::of(learner, limits.points),

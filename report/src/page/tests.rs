@@ -38,14 +38,16 @@ fn data(page: &str) -> serde_json::Value {
 
 /// A small configuration for an environment, with an algorithm that supports its spaces.
 fn configuration(name: &str) -> Config {
-    let method = match name {
+    let algorithm = match name {
         "cart-pole" => {
             "[run]\nid = \"1a\"\nmode = \"lockstep\"\n[actors]\nchunk_steps = 200\n[replay]\nwarmup = 0\n[reinforce]\nhidden = [4, 3]\n"
         }
         "frozen-lake" => "[run]\nid = \"1a\"\n[replay]\nwarmup = 0\n[q-learning]\n",
         _ => "[run]\nid = \"1a\"\n[ddpg]\nhidden = [4, 3]\n",
     };
-    let mut table: toml::Table = format!("{method}[environment]\nname = \"{name}\"\n").parse().unwrap();
+    let mut table: toml::Table = format!("{algorithm}[environment]\nname = \"{name}\"\n")
+        .parse()
+        .unwrap();
     let spec = make(name, &toml::Table::new()).unwrap().spec();
     table.insert("spec".into(), toml::Value::try_from(spec).unwrap());
     Config::from_table(table, "test").unwrap()

@@ -4,8 +4,8 @@ use std::ops::Range;
 
 use shoal_report::figure::{self, Agent};
 
+use super::super::report_section::{Figure, FigureWriter};
 use super::super::result::{SeedResult, representative};
-use super::super::section::{Figure, FigureWriter};
 use super::Tests;
 
 /// The figures of a reward.

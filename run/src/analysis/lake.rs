@@ -1,7 +1,7 @@
 //! The slippery lake: the exact value of a policy and the optimal values, computed from the transition table.
 
 use serde::{Deserialize, Serialize};
-use shoal_common::policy::highest;
+use shoal_common::policy::argmax;
 use shoal_env_server::environment::frozen_lake::{ACTIONS, STATES, transitions};
 
 /// Steps after which an evaluation episode ends.
@@ -63,7 +63,7 @@ impl Walk {
 
 /// The action with the highest value in each state; among equal ones the first.
 pub fn greedy(table: &[f32]) -> [usize; STATES] {
-    std::array::from_fn(|state| highest(&table[state * ACTIONS..][..ACTIONS]))
+    std::array::from_fn(|state| argmax(&table[state * ACTIONS..][..ACTIONS]))
 }
 
 /// q*, by value iteration.

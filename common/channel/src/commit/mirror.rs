@@ -53,7 +53,7 @@ impl CommitMirror {
             .open(&temporary)?;
         file.set_len(places.end as u64)?;
         let mut words = WritableWords::map(&file, places.header)?;
-        for (i, word) in layout.identity().into_iter().enumerate() {
+        for (i, word) in layout.preamble().into_iter().enumerate() {
             words.store(i * size_of::<u64>(), word);
         }
         let mut record = Record::empty(layout);
@@ -103,7 +103,7 @@ mod tests {
     use shoal_base::transition::RowLayout;
 
     use super::super::reader::CommitReader;
-    use super::super::record::ChunkMark;
+    use super::super::record::ChunkId;
     use super::*;
 
     fn layout() -> ReplayLayout {
@@ -118,7 +118,7 @@ mod tests {
 
     fn commit(incarnation: u64, sequence: u64, rows: u64) -> ActorCommit {
         ActorCommit {
-            mark: ChunkMark { incarnation, sequence },
+            last_chunk: ChunkId { incarnation, sequence },
             rows,
         }
     }
@@ -129,7 +129,7 @@ mod tests {
         let path = directory.path().join("replay.bin");
         let mut mirror = CommitMirror::open(&path, &layout()).unwrap();
         let reader = CommitReader::open(&path).unwrap();
-        assert_eq!((reader.rows(), reader.committed(2)), (0, ChunkMark::default()));
+        assert_eq!((reader.rows(), reader.committed(2)), (0, ChunkId::default()));
         mirror.publish(640, [(2, commit(7, 5, 320), &[3, 4][..]), (9, commit(1, 1, 1), &[])]);
         assert_eq!((reader.rows(), reader.actor(2)), (640, commit(7, 5, 320)));
         assert!(reader.snapshot().is_some());

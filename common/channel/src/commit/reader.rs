@@ -5,8 +5,8 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{Ordering, fence};
 
-use super::layout::{IDENTITY_BYTES, Places, ReplayLayout};
-use super::record::{self, ActorCommit, ChunkMark, Record};
+use super::layout::{PREAMBLE_BYTES, Places, ReplayLayout};
+use super::record::{self, ActorCommit, ChunkId, Record};
 use super::words::Words;
 
 /// Follows the commit record of a replay file that a learner may be writing. It never waits for the learner, alive or
@@ -67,11 +67,11 @@ impl CommitReader {
             file => file.map_err(io)?,
         };
         let length = file.metadata().map_err(io)?.len();
-        if length < IDENTITY_BYTES as u64 {
+        if length < PREAMBLE_BYTES as u64 {
             return Err(refused("the file is too short for a replay".into()));
         }
-        let identity = Words::map(&file, IDENTITY_BYTES).map_err(io)?;
-        let layout = ReplayLayout::read(&identity).map_err(|fault| refused(fault.to_string()))?;
+        let preamble = Words::map(&file, PREAMBLE_BYTES).map_err(io)?;
+        let layout = ReplayLayout::read(&preamble).map_err(|fault| refused(fault.to_string()))?;
         let places = layout
             .places()
             .ok_or_else(|| refused("its header has an impossible size".into()))?;
@@ -100,12 +100,12 @@ impl CommitReader {
         self.consistent(|slot| record::load_head(&self.words, slot))
     }
 
-    /// The mark of an actor's last committed chunk; the default mark before its first.
+    /// The id of an actor's last committed chunk; the default id before its first.
     ///
     /// # Panics
     /// If `actor` is not less than `layout().actors`.
-    pub fn committed(&self, actor: usize) -> ChunkMark {
-        self.actor(actor).mark
+    pub fn committed(&self, actor: usize) -> ChunkId {
+        self.actor(actor).last_chunk
     }
 
     /// What is committed of an actor.

@@ -15,8 +15,8 @@ use shoal_base::space::{EnvironmentSpec, Space};
 use shoal_base::stop::Stop;
 
 use super::check::{Fault, Part, find_fault};
-use super::message::{Ask, Block, RequestHeader, ResponseHeader, ResponseLayout, Verdict};
-use super::service::{EnvironmentService, name, question_length, service};
+use super::message::{Block, RequestHeader, RequestKind, ResponseHeader, ResponseLayout, ResponseStatus};
+use super::service::{EnvironmentService, name, request_length, service};
 use crate::domain::Domain;
 use crate::error::{ChannelError, PeerError};
 use crate::event::{EventName, Listener, Notifier, wait_for};
@@ -24,7 +24,7 @@ use crate::service::{CLAIM_PATIENCE, Entry, claim};
 
 /// Which episodes a reset begins.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Begin {
+pub enum ResetRequest {
     /// The next training episode of each environment.
     Next,
     /// The training episode with this number, of each environment's own stream.
@@ -159,7 +159,7 @@ impl EnvironmentClient {
     ) -> Result<Self, ChannelError> {
         let channel = name(index);
         let snapshot_words = spec.snapshot_words(environments);
-        let longest = question_length(spec, environments);
+        let longest = request_length(spec, environments);
         let (service, client) = claim(|| {
             let service = service(domain, &channel, Entry::Open)?;
             let client = service
@@ -192,7 +192,12 @@ impl EnvironmentClient {
         listener: &Listener,
         mut idle: impl FnMut(),
     ) -> Result<(EnvironmentSpec, usize), Exit<ChannelError>> {
-        let response = self.ask_until_answered(listener, RequestHeader::new(Ask::Describe, 0, 0), &[], &mut idle)?;
+        let response = self.request_until_answered(
+            listener,
+            RequestHeader::new(RequestKind::Describe, 0, 0),
+            &[],
+            &mut idle,
+        )?;
         let (header, payload) = (response.user_header(), self.answered(&response)?);
         let described = header.described(payload);
         described.ok_or_else(|| ChannelError::new(&self.channel, "describe", PeerError::DescriptionLength).into())
@@ -205,15 +210,17 @@ impl EnvironmentClient {
     pub fn reset(
         &self,
         listener: &Listener,
-        begin: Begin,
+        request: ResetRequest,
         mut idle: impl FnMut(),
     ) -> Result<Observed, Exit<ChannelError>> {
-        let question = match begin {
-            Begin::Next => RequestHeader::new(Ask::Reset, 0, 0),
-            Begin::Training(episode) => RequestHeader::new(Ask::ResetToTraining, episode, 0),
-            Begin::Evaluation { first, episodes } => RequestHeader::new(Ask::ResetToEvaluation, first, episodes),
+        let header = match request {
+            ResetRequest::Next => RequestHeader::new(RequestKind::Reset, 0, 0),
+            ResetRequest::Training(episode) => RequestHeader::new(RequestKind::ResetToTraining, episode, 0),
+            ResetRequest::Evaluation { first, episodes } => {
+                RequestHeader::new(RequestKind::ResetToEvaluation, first, episodes)
+            }
         };
-        self.begun(self.ask_until_answered(listener, question, &[], &mut idle)?)
+        self.begun(self.request_until_answered(listener, header, &[], &mut idle)?)
     }
 
     /// Every environment takes a step with its action.
@@ -227,7 +234,7 @@ impl EnvironmentClient {
         actions: &[f32],
         mut idle: impl FnMut(),
     ) -> Result<Stepped, Exit<ChannelError>> {
-        match self.ask_within_episodes(listener, Ask::Step, actions, &mut idle)? {
+        match self.request_within_episodes(listener, RequestKind::Step, actions, &mut idle)? {
             Some(response) => Ok(Stepped::Taken(self.observed(response, Part::Step)?)),
             None => Ok(Stepped::Lost),
         }
@@ -239,7 +246,7 @@ impl EnvironmentClient {
     /// When a stop is requested, the channel fails, or the server refuses because its environments cannot save their
     /// state or run evaluation episodes.
     pub fn snapshot(&self, listener: &Listener, mut idle: impl FnMut()) -> Result<Snapshot, Exit<ChannelError>> {
-        let Some(response) = self.ask_within_episodes(listener, Ask::Snapshot, &[], &mut idle)? else {
+        let Some(response) = self.request_within_episodes(listener, RequestKind::Snapshot, &[], &mut idle)? else {
             return Ok(Snapshot::Lost);
         };
         let words = words_of(self.answered(&response)?);
@@ -267,23 +274,23 @@ impl EnvironmentClient {
             };
             return Err(ChannelError::new(&self.channel, "restore", cause).into());
         }
-        self.begun(self.ask_until_answered(
+        self.begun(self.request_until_answered(
             listener,
-            RequestHeader::new(Ask::Restore, 0, 0),
+            RequestHeader::new(RequestKind::Restore, 0, 0),
             numbers_of(words),
             &mut idle,
         )?)
     }
 
     /// Takes the response to a reset or restore, and notes which server runs the new episodes.
-    fn begun(&self, response: Answer) -> Result<Observed, Exit<ChannelError>> {
+    fn begun(&self, response: ServerResponse) -> Result<Observed, Exit<ChannelError>> {
         let server = response.origin();
         let observed = self.observed(response, Part::Observations)?;
         self.episodes.set(Some(server));
         Ok(observed)
     }
 
-    fn observed(&self, response: Answer, part: Part) -> Result<Observed, ChannelError> {
+    fn observed(&self, response: ServerResponse, part: Part) -> Result<Observed, ChannelError> {
         let numbers = self.answered(&response)?;
         if numbers.len() != self.layout.len() {
             let fault = Fault::Length {
@@ -301,12 +308,12 @@ impl EnvironmentClient {
     }
 
     /// The payload of a response; an error if the server refused.
-    fn answered<'a>(&self, response: &'a Answer) -> Result<&'a [f32], ChannelError> {
-        let verdict = response.user_header().verdict;
-        if verdict == Verdict::Answered as u32 {
+    fn answered<'a>(&self, response: &'a ServerResponse) -> Result<&'a [f32], ChannelError> {
+        let status = response.user_header().status;
+        if status == ResponseStatus::Answered as u32 {
             return Ok(response.payload());
         }
-        if verdict == Verdict::Invalid as u32 {
+        if status == ResponseStatus::Invalid as u32 {
             let cause = PeerError::Invalid(Fault::Reported);
             return Err(ChannelError::new(&self.channel, "ask", cause));
         }
@@ -318,22 +325,22 @@ impl EnvironmentClient {
     }
 
     /// Asks once: for requests about the current episodes. `None` if the server that ran them is gone.
-    fn ask_within_episodes(
+    fn request_within_episodes(
         &self,
         listener: &Listener,
-        ask: Ask,
+        kind: RequestKind,
         payload: &[f32],
         idle: &mut dyn FnMut(),
-    ) -> Result<Option<Answer>, Exit<ChannelError>> {
+    ) -> Result<Option<ServerResponse>, Exit<ChannelError>> {
         let server = self.server();
         if server != self.episodes.get() {
             return Ok(None);
         }
-        let sent = self.send(server, RequestHeader::new(ask, 0, 0), payload)?;
+        let sent = self.send(server, RequestHeader::new(kind, 0, 0), payload)?;
         let Some(response) = self.answer(listener, &sent, idle)? else {
             return Ok(None);
         };
-        if response.user_header().verdict != Verdict::NotStarted as u32 {
+        if response.user_header().status != ResponseStatus::NotStarted as u32 {
             return Ok(Some(response));
         }
         if Some(response.origin()) == self.episodes.get() {
@@ -343,16 +350,16 @@ impl EnvironmentClient {
     }
 
     /// Asks until a server answers: for requests that may be sent twice.
-    fn ask_until_answered(
+    fn request_until_answered(
         &self,
         listener: &Listener,
-        question: RequestHeader,
+        header: RequestHeader,
         payload: &[f32],
         idle: &mut dyn FnMut(),
-    ) -> Result<Answer, Exit<ChannelError>> {
+    ) -> Result<ServerResponse, Exit<ChannelError>> {
         let mut unreachable = None;
         loop {
-            let sent = self.send(self.server(), question, payload)?;
+            let sent = self.send(self.server(), header, payload)?;
             if let Some(response) = self.answer(listener, &sent, idle)? {
                 return Ok(response);
             }
@@ -369,14 +376,14 @@ impl EnvironmentClient {
     fn send(
         &self,
         server: Option<UniqueServerId>,
-        question: RequestHeader,
+        header: RequestHeader,
         payload: &[f32],
     ) -> Result<Sent, ChannelError> {
         let mut request = self
             .client
             .loan_slice_uninit(payload.len())
             .map_err(|cause| ChannelError::new(&self.channel, "ask", cause))?;
-        *request.user_header_mut() = question;
+        *request.user_header_mut() = header;
         let pending = request
             .write_from_slice(payload)
             .send()
@@ -391,7 +398,7 @@ impl EnvironmentClient {
         listener: &Listener,
         sent: &Sent,
         idle: &mut dyn FnMut(),
-    ) -> Result<Option<Answer>, Exit<ChannelError>> {
+    ) -> Result<Option<ServerResponse>, Exit<ChannelError>> {
         let lost = Cell::new(false);
         let answer = wait_for(
             listener,
@@ -438,4 +445,4 @@ impl Sent {
 }
 
 type Pending = PendingResponse<ipc::Service, [f32], RequestHeader, [f32], ResponseHeader>;
-type Answer = Response<ipc::Service, [f32], ResponseHeader>;
+type ServerResponse = Response<ipc::Service, [f32], ResponseHeader>;

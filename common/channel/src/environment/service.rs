@@ -32,22 +32,22 @@ pub fn reserved(spec: &EnvironmentSpec, environments: usize) -> u64 {
     let requests = 2 * ACTIVE_REQUESTS + LOANED_REQUESTS;
     let of_a_request = RESPONSE_BUFFER + BORROWED_RESPONSES + LOANED_RESPONSES;
     let responses = 2 * ACTIVE_REQUESTS * of_a_request;
-    let (question, answer) = (question_length(spec, environments), answer_length(spec, environments));
+    let (request, response) = (request_length(spec, environments), response_length(spec, environments));
     memory::service(NODES)
-        + memory::segment::<IoxRequestHeader, RequestHeader>(requests, size_of::<f32>() * question)
-        + memory::segment::<IoxResponseHeader, ResponseHeader>(responses, size_of::<f32>() * answer)
+        + memory::segment::<IoxRequestHeader, RequestHeader>(requests, size_of::<f32>() * request)
+        + memory::segment::<IoxResponseHeader, ResponseHeader>(responses, size_of::<f32>() * response)
         + memory::connection(1, ACTIVE_REQUESTS, requests, requests)
         + memory::connection(2 * ACTIVE_REQUESTS, RESPONSE_BUFFER, BORROWED_RESPONSES, responses)
 }
 
 /// The most numbers in a request: the actions or a snapshot.
-pub(super) fn question_length(spec: &EnvironmentSpec, environments: usize) -> usize {
+pub(super) fn request_length(spec: &EnvironmentSpec, environments: usize) -> usize {
     let snapshot = NUMBERS_PER_WORD * spec.snapshot_words(environments);
     (environments * spec.action.width()).max(snapshot)
 }
 
 /// The most numbers in a response: the blocks of [`ResponseLayout`], a description or a snapshot.
-pub(super) fn answer_length(spec: &EnvironmentSpec, environments: usize) -> usize {
+pub(super) fn response_length(spec: &EnvironmentSpec, environments: usize) -> usize {
     let described = 2 * (spec.observation.width() + spec.action.width());
     let snapshot = NUMBERS_PER_WORD * spec.snapshot_words(environments);
     let blocks = ResponseLayout::new(environments, spec.observation.width()).len();

@@ -55,7 +55,7 @@ fn a_saved_checkpoint_is_loaded_bit_for_bit() {
     let Loaded { checkpoint, warnings } = load(&directory).unwrap().unwrap();
     assert!(warnings.is_empty());
     assert_eq!(checkpoint.counters, counters(2));
-    let mut saved = SavedState::from(checkpoint.sections);
+    let mut saved = SavedState::from(checkpoint.arrays);
     let actor = saved.take("actor", 5).unwrap();
     assert_eq!(actor.map_bits(), WEIGHTS.to_vec().map_bits());
     assert_eq!(saved.take("empty", 0).unwrap(), [0.0_f32; 0]);
@@ -208,7 +208,7 @@ proptest! {
 
     #[test]
     fn a_header_with_a_wrong_length_is_refused(length in any::<u64>(), numbers in 0_usize..20) {
-        let header = Header { fingerprint: 0, counters: Counters::default(), sections: vec![("a".into(), length)] };
+        let header = Header { fingerprint: 0, counters: Counters::default(), arrays: vec![("a".into(), length)] };
         let mut body = bincode::serde::encode_to_vec(&header, encoding()).unwrap();
         body.resize(body.len() + 4 * numbers, 0);
         prop_assert_eq!(parse(&body).is_some(), length == numbers as u64);

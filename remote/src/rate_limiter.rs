@@ -4,33 +4,33 @@ use std::time::{Duration, Instant};
 
 /// What may be taken now. It refills at a constant rate, up to what comes in half a second.
 #[derive(Clone, Copy, Debug)]
-pub struct Bucket {
+pub struct RateLimiter {
     rate: f64,
-    level: f64,
+    available: f64,
     at: Instant,
 }
 
-const DEPTH: Duration = Duration::from_millis(500);
+const BURST: Duration = Duration::from_millis(500);
 
-impl Bucket {
-    /// A full bucket that refills with `rate` a second.
+impl RateLimiter {
+    /// A full limiter that refills with `rate` a second.
     pub fn new(rate: f64, now: Instant) -> Self {
         Self {
             rate,
-            level: rate * DEPTH.as_secs_f64(),
+            available: rate * BURST.as_secs_f64(),
             at: now,
         }
     }
 
-    /// Takes an amount if the bucket is not empty, and returns whether it did. An amount may be larger than what is in the
-    /// bucket, which then takes longer to refill: otherwise an amount larger than the bucket could never be taken.
+    /// Takes an amount if the limiter is not empty, and returns whether it did. An amount may be larger than what is in the
+    /// limiter, which then takes longer to refill: otherwise an amount larger than the limiter could never be taken.
     pub fn take(&mut self, amount: f64, now: Instant) -> bool {
-        let refilled = self.level + self.rate * now.saturating_duration_since(self.at).as_secs_f64();
-        self.level = refilled.min(self.rate * DEPTH.as_secs_f64());
+        let refilled = self.available + self.rate * now.saturating_duration_since(self.at).as_secs_f64();
+        self.available = refilled.min(self.rate * BURST.as_secs_f64());
         self.at = now;
-        let may = self.level > 0.0;
+        let may = self.available > 0.0;
         if may {
-            self.level -= amount;
+            self.available -= amount;
         }
         may
     }
@@ -44,9 +44,9 @@ mod tests {
     fn in_the_long_run_no_more_is_taken_than_the_rate_allows() {
         let begin = Instant::now();
         for amount in [1.0, 700.0, 30_000.0] {
-            let mut bucket = Bucket::new(1000.0, begin);
+            let mut limiter = RateLimiter::new(1000.0, begin);
             let times = (0..100_000).map(|i| begin + Duration::from_millis(i));
-            let taken = times.filter(|now| bucket.take(amount, *now)).count() as f64 * amount;
+            let taken = times.filter(|now| limiter.take(amount, *now)).count() as f64 * amount;
             assert!(
                 (100_000.0..=100_000.0 + 500.0 + amount).contains(&taken),
                 "{taken} in pieces of {amount}"
