@@ -38,8 +38,8 @@ pub(crate) use self::cleaner::work as clean_up;
 use self::log::Log;
 pub(crate) use self::log::{ALL_ENDED, FAILED, note};
 use self::progress::ProgressLine;
-use self::stall::Stalls;
-use self::supervisor::{Members, Supervisor};
+use self::stall::StallDetector;
+use self::supervisor::{RolesOnHost, Supervisor};
 
 /// How often the launcher reads reports and checks its children if nothing wakes it. Ticks start short and become
 /// longer while reports arrive slowly: a full buffer loses its oldest reports.
@@ -196,7 +196,7 @@ struct Launcher<'a> {
     recorder: Recorder,
     progress: ProgressLine,
     signals: &'a Signals,
-    stalls: Stalls,
+    stalls: StallDetector,
     begun: Instant,
     tick: Duration,
     heartbeats: Reports<Heartbeat>,
@@ -223,7 +223,7 @@ impl<'a> Launcher<'a> {
         let initial = status::saved_status(&config, run)?;
         RunOutcome::new(RunState::Running, initial.env_steps, initial.episodes).write(run)?;
         // Creates the services that are opened below.
-        let supervisor = Supervisor::new(&config, run, domain, log.clone(), Members::Learner { gate })?;
+        let supervisor = Supervisor::new(&config, run, domain, log.clone(), RolesOnHost::Learner { gate })?;
         Ok(Self {
             control: ControlPort::open(domain)?,
             initial,
@@ -237,7 +237,7 @@ impl<'a> Launcher<'a> {
             evaluation_reports: Reports::open(domain)?,
             learner_reports: Reports::open(domain)?,
             supervisor,
-            stalls: Stalls::new(Duration::from_secs(config.run.stall_seconds)),
+            stalls: StallDetector::new(Duration::from_secs(config.run.stall_seconds)),
             log,
             recorder,
             progress: ProgressLine::new(&config, run, quiet),
@@ -315,17 +315,17 @@ impl<'a> Launcher<'a> {
             self.read_reports()?;
             self.answer_requests()?;
             match self.supervisor.maintain(self.domain)? {
-                supervisor::Situation::AtWork => {}
-                supervisor::Situation::LearnerDone => {
+                supervisor::RunCondition::AtWork => {}
+                supervisor::RunCondition::LearnerDone => {
                     self.await_last_evaluation()?;
                     return Ok(RunEnd::Finished);
                 }
-                supervisor::Situation::SharedMemoryOccupied | supervisor::Situation::FilesRemoved
+                supervisor::RunCondition::SharedMemoryOccupied | supervisor::RunCondition::FilesRemoved
                     if self.stop_requested.is_some() => {}
-                supervisor::Situation::SharedMemoryOccupied => {
+                supervisor::RunCondition::SharedMemoryOccupied => {
                     return Ok(self.renew("dead processes occupy shared memory for good"));
                 }
-                supervisor::Situation::FilesRemoved => {
+                supervisor::RunCondition::FilesRemoved => {
                     let directory = self.domain.directory()?;
                     let what = format!(
                         "another program has removed files of this run in {}",

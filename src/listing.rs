@@ -61,7 +61,7 @@ impl ListedState {
 
 /// A run in a list.
 #[derive(Clone, Debug, Serialize)]
-pub(crate) struct Listed {
+pub(crate) struct ListedRun {
     pub(crate) name: String,
     pub(crate) path: PathBuf,
     pub(crate) state: ListedState,
@@ -79,7 +79,7 @@ pub(crate) struct Listed {
     pub(crate) final_return: Option<f64>,
 }
 
-impl Listed {
+impl ListedRun {
     /// Reads the run in this directory. A failure becomes its state, so that the other runs are still listed.
     pub(crate) fn new(path: &Path) -> Self {
         let name = path.file_name().map(|name| name.to_string_lossy().into_owned());

@@ -22,7 +22,7 @@ use shoal_remote::{
     files::{HostFile, JoinFile, KeyFile},
 };
 use shoal_run::external_environment::{self, LaunchSpec, server_iceoryx2_config};
-use shoal_run::server_location::Surroundings;
+use shoal_run::server_location::ServerSurroundings;
 use shoal_run::status::evaluated_period;
 use tracing_subscriber::Layer;
 use tracing_subscriber::filter::{LevelFilter, Targets};
@@ -158,7 +158,7 @@ fn launch_spec<'a>(config: &'a Config, run: &RunDir, instance: RoleInstance) -> 
         } else {
             incarnation
         },
-        surroundings: Surroundings::of_run(run, config)?,
+        surroundings: ServerSurroundings::of_run(run, config)?,
     })
 }
 

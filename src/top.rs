@@ -5,7 +5,7 @@ mod view;
 
 use std::collections::VecDeque;
 
-pub(crate) use link::{Link, Request, RunEvent};
+pub(crate) use link::{LauncherLink, Request, RunEvent};
 use shoal_common::channel::control::RunStatus;
 pub(crate) use view::draw;
 

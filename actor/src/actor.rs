@@ -15,7 +15,9 @@ use std::rc::Rc;
 use std::time::{Duration, Instant};
 
 use shoal_common::algorithms::TransitionUse;
-use shoal_common::channel::environment::{EnvironmentClient, Observed, ResetRequest, Snapshot, Stepped};
+use shoal_common::channel::environment::{
+    EnvironmentClient, EnvironmentResponse, ResetRequest, SnapshotResult, StepResult,
+};
 use shoal_common::channel::policy::{PolicyReader, PublishedPolicy};
 use shoal_common::channel::reports::Reporter;
 use shoal_common::channel::transitions::{Chunk, ChunkSender};
@@ -147,7 +149,7 @@ impl<'a> Actor<'a> {
         learner.notify();
         let sender = handshake
             .wait(&commits, &listener, stop, || heartbeat.beat(Activity::WaitingForPeer))
-            .map_err(Exit::widen)?;
+            .map_err(Exit::convert)?;
         // In lockstep the bits must not depend on how often an actor was started: it continues after its last chunk.
         let incarnation = match settings.config.run.mode {
             Mode::Lockstep => 0,
@@ -204,7 +206,7 @@ impl<'a> Actor<'a> {
                 Ok(()) => tracing::warn!("the environment server was restarted"),
                 Err(Exit::Failed(ActorError::Channel(error))) if error.fault().is_some() => {
                     if let Err(exit) = after_fault(&error, &mut self.heartbeat, &self.listener, self.stop) {
-                        return exit.widen();
+                        return exit.convert();
                     }
                 }
                 Err(exit) => return exit,
@@ -214,7 +216,7 @@ impl<'a> Actor<'a> {
 
     /// Drops the current episodes and begins new ones. In lockstep, continues those of the last chunk's snapshot, if
     /// there is one.
-    fn begin(&mut self) -> Result<Observed, Exit<ActorError>> {
+    fn begin(&mut self) -> Result<EnvironmentResponse, Exit<ActorError>> {
         self.n_step.clear();
         if self.settings.config.run.mode == Mode::Free {
             (0..self.settings.envs).for_each(|environment| self.begin_episode(environment));
@@ -232,7 +234,7 @@ impl<'a> Actor<'a> {
             self.lengths.clone_from(&snapshot.lengths);
             let idle = || self.heartbeat.beat(Activity::WaitingForServer);
             let restored = self.client.restore(&self.listener, &snapshot.environments, idle);
-            return restored.map_err(Exit::widen);
+            return restored.map_err(Exit::convert);
         }
         (0..self.settings.envs).for_each(|environment| self.begin_episode(environment));
         // Without a snapshot, only the first episodes of the run can be repeated with the same bits.
@@ -248,9 +250,9 @@ impl<'a> Actor<'a> {
         self.reset(request)
     }
 
-    fn reset(&mut self, request: ResetRequest) -> Result<Observed, Exit<ActorError>> {
+    fn reset(&mut self, request: ResetRequest) -> Result<EnvironmentResponse, Exit<ActorError>> {
         let idle = || self.heartbeat.beat(Activity::WaitingForServer);
-        self.client.reset(&self.listener, request, idle).map_err(Exit::widen)
+        self.client.reset(&self.listener, request, idle).map_err(Exit::convert)
     }
 
     fn run_until_server_lost(&mut self) -> Result<(), Exit<ActorError>> {
@@ -258,17 +260,17 @@ impl<'a> Actor<'a> {
         // A snapshot may hold transitions that are complete.
         let mut connected = self.send_complete_chunks()?;
         while connected {
-            let policy = self.await_policy().map_err(Exit::widen)?;
+            let policy = self.await_policy().map_err(Exit::convert)?;
             self.heartbeat.begin_work();
             self.act(&policy, &current);
             let idle = || self.heartbeat.beat(Activity::WaitingForServer);
             let stepped = self.client.step(&self.listener, &self.actions, idle);
-            match stepped.map_err(Exit::widen)? {
-                Stepped::Taken(next) => {
+            match stepped.map_err(Exit::convert)? {
+                StepResult::Taken(next) => {
                     self.store(&current, &next, policy.header().version);
                     current = next;
                 }
-                Stepped::Lost => return Ok(()),
+                StepResult::Lost => return Ok(()),
             }
             self.step += 1;
             self.heartbeat.count(self.settings.envs as u64);
@@ -292,7 +294,7 @@ impl<'a> Actor<'a> {
             if !self.append_snapshot()? {
                 return Ok(false);
             }
-            self.await_capacity().map_err(Exit::widen)?;
+            self.await_capacity().map_err(Exit::convert)?;
             self.send()?;
         }
     }
@@ -339,7 +341,7 @@ impl<'a> Actor<'a> {
     }
 
     /// Chooses an action for every environment.
-    fn act(&mut self, policy: &PublishedPolicy, current: &Observed) {
+    fn act(&mut self, policy: &PublishedPolicy, current: &EnvironmentResponse) {
         let act = match policy.header().updates {
             0 if !self.settings.has_learned => Exploration::warm_up,
             _ => Exploration::act,
@@ -358,7 +360,7 @@ impl<'a> Actor<'a> {
     }
 
     /// Adds the transition of every environment to the chunk (line 10 of Algorithm 4).
-    fn store(&mut self, current: &Observed, next: &Observed, version: u64) {
+    fn store(&mut self, current: &EnvironmentResponse, next: &EnvironmentResponse, version: u64) {
         let width = self.settings.chunk.row.action_width();
         let gamma = self.settings.config.algorithm.gamma() as f32;
         self.policy_version = version;
@@ -406,8 +408,8 @@ impl<'a> Actor<'a> {
             return Ok(true);
         }
         let idle = || self.heartbeat.beat(Activity::WaitingForServer);
-        let environments = self.client.snapshot(&self.listener, idle).map_err(Exit::widen)?;
-        let Snapshot::Taken(environments) = environments else {
+        let environments = self.client.snapshot(&self.listener, idle).map_err(Exit::convert)?;
+        let SnapshotResult::Taken(environments) = environments else {
             return Ok(false);
         };
         let snapshot = ActorSnapshot {
@@ -511,7 +513,7 @@ pub(crate) fn connect(
     stop: &Stop,
 ) -> Result<EnvironmentClient, Exit<ActorError>> {
     let client = EnvironmentClient::open(domain, index, spec, envs, stop.clone())?;
-    let (served, served_envs) = client.describe(listener, || ()).map_err(Exit::widen)?;
+    let (served, served_envs) = client.describe(listener, || ()).map_err(Exit::convert)?;
     if !served.matches(spec) || served_envs != envs {
         let served = format!("{served_envs} times {served:?}");
         let configured = format!("{envs} times {spec:?}");

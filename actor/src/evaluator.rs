@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::rc::Rc;
 
-use shoal_common::channel::environment::{EnvironmentClient, ResetRequest, Stepped};
+use shoal_common::channel::environment::{EnvironmentClient, ResetRequest, StepResult};
 use shoal_common::channel::policy::{self, PolicyHeader, PolicyReader};
 use shoal_common::channel::reports::Reporter;
 use shoal_common::channel::{ChannelError, Domain, EventName, HeartbeatSender, Listener, Notifier, wait_for};
@@ -197,7 +197,7 @@ impl<'a> Evaluator<'a> {
     }
 
     fn evaluate_next(&mut self) -> Result<(), Exit<ActorError>> {
-        let published = self.await_due_policy().map_err(Exit::widen)?;
+        let published = self.await_due_policy().map_err(Exit::convert)?;
         let header = published.header();
         let returns = self.returns(published.parameters(), 0, self.settings.config.evaluation.episodes)?;
         let (return_mean, return_std) = mean_and_std(&returns);
@@ -262,7 +262,7 @@ impl<'a> Evaluator<'a> {
                 Ok(Some(more)) => returns.extend(more),
                 Ok(None) => {}
                 Err(Exit::Failed(ActorError::Channel(error))) if error.fault().is_some() => {
-                    after_fault(&error, &mut self.heartbeat, &self.listener, self.stop).map_err(Exit::widen)?;
+                    after_fault(&error, &mut self.heartbeat, &self.listener, self.stop).map_err(Exit::convert)?;
                 }
                 Err(exit) => return Err(exit),
             }
@@ -327,15 +327,15 @@ impl<'a> Evaluator<'a> {
         let begun = client.reset(listener, request, || {
             heartbeat.beat(Activity::WaitingForServer);
         });
-        let mut current = begun.map_err(Exit::widen)?;
+        let mut current = begun.map_err(Exit::convert)?;
         let mut returns = vec![0.0; self.settings.envs];
         let mut running: Vec<_> = (0..self.settings.envs).map(|e| (e as u32) < episodes).collect();
         while running.contains(&true) {
             policy.act(parameters, current.observations(), actions);
             let stepped = client.step(listener, actions, || heartbeat.beat(Activity::WaitingForServer));
-            match stepped.map_err(Exit::widen)? {
-                Stepped::Taken(next) => current = next,
-                Stepped::Lost => return Ok(None),
+            match stepped.map_err(Exit::convert)? {
+                StepResult::Taken(next) => current = next,
+                StepResult::Lost => return Ok(None),
             }
             for (e, (running, total)) in running.iter_mut().zip(&mut returns).enumerate() {
                 if *running {

@@ -9,7 +9,7 @@ use serde::Serialize;
 
 use super::costs::{self, Costs};
 use super::intervals::IntervalResults;
-use super::measurement::{Budget, Figures};
+use super::measurement::{Figures, TimeBudget};
 use super::model::{Bottleneck, Stages};
 use super::one_core::{self, OneCore};
 use super::processes::Processes;
@@ -104,7 +104,7 @@ fn counts(typed: Option<&str>, cores: u32) -> anyhow::Result<Vec<u32>> {
     Ok(counts)
 }
 
-pub(super) fn measure(typed: Option<&str>, budget: &Budget) -> anyhow::Result<ActorFigures> {
+pub(super) fn measure(typed: Option<&str>, budget: &TimeBudget) -> anyhow::Result<ActorFigures> {
     let cores = std::thread::available_parallelism().map_or(1, |cores| cores.get() as u32);
     let counts = counts(typed, cores)?;
     let [counting, alone, stages] = SHARES.map(|share| budget.length.mul_f64(share));
@@ -182,7 +182,7 @@ fn scaling(stages: &Stages, actors: u32, rows: f64) -> Scaling {
 }
 
 /// The rate of committed rows with `actors` actors in each interval, and the learner's gradient steps per second.
-fn count(actors: u32, updates: bool, length: Duration, budget: &Budget) -> anyhow::Result<(IntervalResults, f64)> {
+fn count(actors: u32, updates: bool, length: Duration, budget: &TimeBudget) -> anyhow::Result<(IntervalResults, f64)> {
     let temporary = TemporaryRun::of(actors, ENVIRONMENTS as u32, &settings_for_counting(actors, updates))?;
     temporary.with_processes(
         |_| None,
@@ -198,7 +198,7 @@ fn watch(
     progress: &mut RunProgress<'_>,
     length: Duration,
     processes: &mut Processes,
-    budget: &Budget,
+    budget: &TimeBudget,
 ) -> anyhow::Result<(IntervalResults, f64)> {
     let mut results = IntervalResults::default();
     let mut published: Vec<(Instant, u64)> = Vec::new();

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use anyhow::bail;
 use serde::Serialize;
 use shoal_actor::exploration::{Exploration, StepCounts};
-use shoal_common::channel::environment::{EnvironmentClient, ResetRequest, ResponseLayout, Stepped};
+use shoal_common::channel::environment::{EnvironmentClient, ResetRequest, ResponseLayout, StepResult};
 use shoal_common::channel::transitions::ChunkSender;
 use shoal_common::channel::{Domain, EventName, Listener, Notifier};
 use shoal_common::commit::CommitReader;
@@ -18,10 +18,10 @@ use shoal_learner::algorithms::registry;
 use shoal_learner::networks::initialise::initialise;
 use shoal_learner::process::intake::Intake;
 use shoal_learner::replay::Replay;
-use shoal_run::process::Peer;
+use shoal_run::process::ChildProcess;
 
 use super::intervals::{self, IntervalResults};
-use super::measurement::{Budget, interrupted};
+use super::measurement::{TimeBudget, interrupted};
 use super::rows::{ENVIRONMENTS, Rows};
 use super::temporary_run::{TemporaryRun, ddpg};
 
@@ -78,7 +78,7 @@ impl Inference {
 }
 
 /// Measures every stage, in about `length` altogether.
-pub(super) fn measure(length: Duration, budget: &Budget) -> anyhow::Result<Costs> {
+pub(super) fn measure(length: Duration, budget: &TimeBudget) -> anyhow::Result<Costs> {
     let temporary = TemporaryRun::of(1, ENVIRONMENTS as u32, &[])?;
     let config = &temporary.config;
     let each = length / 6;
@@ -127,7 +127,7 @@ pub(super) fn measure(length: Duration, budget: &Budget) -> anyhow::Result<Costs
 }
 
 /// The median time of `work` over several intervals, after a warm-up.
-fn microseconds(length: Duration, budget: &Budget, mut work: impl FnMut()) -> anyhow::Result<f64> {
+fn microseconds(length: Duration, budget: &TimeBudget, mut work: impl FnMut()) -> anyhow::Result<f64> {
     let part = length / (INTERVALS + 1);
     intervals::rate(part, &mut work);
     let mut results = IntervalResults::default();
@@ -138,7 +138,7 @@ fn microseconds(length: Duration, budget: &Budget, mut work: impl FnMut()) -> an
     Ok(results.median())
 }
 
-fn environment_step(config: &Config, length: Duration, budget: &Budget) -> anyhow::Result<f64> {
+fn environment_step(config: &Config, length: Duration, budget: &TimeBudget) -> anyhow::Result<f64> {
     let (name, parameters) = (&config.environment.name, &config.environment.parameters);
     let mut environments = VectorEnvironment::new(name, parameters, config.actors.envs, config.run.seed, 0, 0)?;
     let layout = ResponseLayout::new(ENVIRONMENTS, config.spec.observation.width());
@@ -161,10 +161,10 @@ fn environment_step(config: &Config, length: Duration, budget: &Budget) -> anyho
 fn round_trip(
     config: &Config,
     domain: &Domain,
-    server: &mut Peer,
+    server: &mut ChildProcess,
     inference: &mut Inference,
     length: Duration,
-    budget: &Budget,
+    budget: &TimeBudget,
 ) -> anyhow::Result<f64> {
     let listener = Listener::bind(domain, EventName(Role::Actor, 0))?;
     let client = EnvironmentClient::open(domain, 0, &config.spec, ENVIRONMENTS, budget.stop.clone())?;
@@ -182,7 +182,7 @@ fn round_trip(
         while asked == 0.0 || begun.elapsed() < part {
             inference.step();
             let before = Instant::now();
-            if let Stepped::Lost = client.step(&listener, &actions, || ()).map_err(interrupted)? {
+            if let StepResult::Lost = client.step(&listener, &actions, || ()).map_err(interrupted)? {
                 bail!("the environment server lost its episodes");
             }
             taken += before.elapsed();
@@ -203,7 +203,7 @@ fn chunks(
     domain: &Domain,
     replay: &mut Replay,
     length: Duration,
-    budget: &Budget,
+    budget: &TimeBudget,
 ) -> anyhow::Result<(f64, f64)> {
     let config = &temporary.config;
     let (row, window) = (config.row_layout(), config.actors.window);

@@ -15,8 +15,8 @@ use shoal_learner::replay::Replay;
 use toml::{Table, Value};
 
 use super::intervals::{self, IntervalResults};
-use super::measurement::{Budget, Figures};
-use super::product::Multiplication;
+use super::measurement::{Figures, TimeBudget};
+use super::product::TimedProduct;
 use super::rows::{ENVIRONMENTS, Rows};
 use super::target::{Line, Target};
 use super::temporary_run::TemporaryRun;
@@ -84,7 +84,7 @@ struct TwoThreads {
 }
 
 /// Measures one of the [algorithms](super::algorithms), by default DDPG.
-pub(super) fn measure(algorithm: Option<&str>, budget: &Budget) -> anyhow::Result<LearnerFigures> {
+pub(super) fn measure(algorithm: Option<&str>, budget: &TimeBudget) -> anyhow::Result<LearnerFigures> {
     let temporary = TemporaryRun::with_algorithm(algorithm)?;
     let replay = Replay::create(&temporary.run.replay_file(), &temporary.replay_layout())?;
     // The mapping outlives the file, so nothing is left behind even if this process is killed.
@@ -137,7 +137,7 @@ fn with_batch(config: &Config, size: usize) -> anyhow::Result<Config> {
 }
 
 /// Fills the replay to its capacity.
-fn filled(config: &Config, mut replay: Replay, budget: &Budget) -> anyhow::Result<Replay> {
+fn filled(config: &Config, mut replay: Replay, budget: &TimeBudget) -> anyhow::Result<Replay> {
     let row = config.row_layout();
     let mut rows = Rows::new(config)?;
     let mut chunk = vec![0.0; ENVIRONMENTS * row.width()];
@@ -171,7 +171,7 @@ struct Case {
     /// The number of updates whose products are in the list.
     updates_of_list: f64,
     list: List,
-    fastest: Multiplication,
+    fastest: TimedProduct,
     updates: IntervalResults,
     limit: IntervalResults,
     products: IntervalResults,
@@ -226,7 +226,7 @@ impl Case {
 
 /// An update's products in their order. A repeated shape uses the same matrices again.
 struct List {
-    distinct: Vec<Multiplication>,
+    distinct: Vec<TimedProduct>,
     order: Vec<usize>,
 }
 
@@ -239,19 +239,19 @@ impl List {
 }
 
 /// All products, each with its best kernel, and a copy of the fastest one.
-fn multiplications(config: &Config, products: &Products) -> (List, Multiplication) {
+fn multiplications(config: &Config, products: &Products) -> (List, TimedProduct) {
     let mut random = stream(config.run.seed, Purpose::Exploration, 1, 0);
-    let (mut distinct, mut order): (Vec<Multiplication>, Vec<usize>) = Default::default();
+    let (mut distinct, mut order): (Vec<TimedProduct>, Vec<usize>) = Default::default();
     for &product in &products.products {
         let known = distinct.iter().position(|known| known.product == product);
         order.push(known.unwrap_or(distinct.len()));
         if known.is_none() {
-            distinct.push(Multiplication::new(product, &mut random));
+            distinct.push(TimedProduct::new(product, &mut random));
         }
     }
     // In turn, so that a disturbance does not affect all attempts at one shape.
     for _ in 0..ATTEMPTS {
-        distinct.iter_mut().for_each(Multiplication::try_kernels);
+        distinct.iter_mut().for_each(TimedProduct::try_kernels);
     }
     let best = (0..distinct.len()).fold(0, |best, i| {
         if distinct[i].best > distinct[best].best {
@@ -260,7 +260,7 @@ fn multiplications(config: &Config, products: &Products) -> (List, Multiplicatio
             best
         }
     });
-    let mut fastest = Multiplication::new(distinct[best].product, &mut random);
+    let mut fastest = TimedProduct::new(distinct[best].product, &mut random);
     fastest.kernel = distinct[best].kernel;
     (List { distinct, order }, fastest)
 }

@@ -26,7 +26,7 @@ mod whole_run;
 use shoal_common::algorithms::AlgorithmConfig;
 use shoal_run::plan::UsageError;
 
-use self::measurement::{Budget, print};
+use self::measurement::{TimeBudget, print};
 
 /// The algorithms that [`Stage::Learner`] can measure: those that learn from minibatches.
 pub fn algorithms() -> impl Iterator<Item = &'static str> {
@@ -62,7 +62,7 @@ pub enum Stage {
 /// # Errors
 /// If a measured process fails, or the user interrupts.
 pub fn run(stage: Stage, actors: Option<&str>, algorithm: Option<&str>, json: bool) -> anyhow::Result<()> {
-    let budget = Budget::new()?;
+    let budget = TimeBudget::new()?;
     if actors.is_some() && stage != Stage::Actors {
         return Err(UsageError("--actors is only for `shoal bench actors`".into()).into());
     }

@@ -11,7 +11,7 @@ use shoal_common::report::Role;
 use super::cores::Cores;
 use super::costs::Inference;
 use super::intervals::{self, IntervalResults};
-use super::measurement::Budget;
+use super::measurement::TimeBudget;
 use super::processes::Processes;
 use super::progress::RunProgress;
 use super::rows::ENVIRONMENTS;
@@ -36,7 +36,7 @@ pub(super) struct OneCore {
 }
 
 /// Measures for about `length`.
-pub(super) fn measure(length: Duration, budget: &Budget) -> anyhow::Result<OneCore> {
+pub(super) fn measure(length: Duration, budget: &TimeBudget) -> anyhow::Result<OneCore> {
     let temporary = TemporaryRun::of(1, ENVIRONMENTS as u32, &settings_for_counting(1, false))?;
     let mut inference = Inference::new(&temporary.config)?;
     let cores = Cores::choose()?;
@@ -61,7 +61,7 @@ fn take_turns(
     turns: usize,
     turn: Duration,
     inference: &mut Inference,
-    budget: &Budget,
+    budget: &TimeBudget,
 ) -> anyhow::Result<OneCore> {
     let (mut pair, mut alone, mut shares) = (
         IntervalResults::default(),

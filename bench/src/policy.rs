@@ -10,8 +10,8 @@ use shoal_learner::networks::initialise::initialise;
 use shoal_learner::networks::product::{Product, Transposed};
 
 use super::intervals::{self, IntervalResults};
-use super::measurement::{Budget, Figures};
-use super::product::Multiplication;
+use super::measurement::{Figures, TimeBudget};
+use super::product::TimedProduct;
 use super::rows::{ENVIRONMENTS, Rows};
 use super::target::{Line, Target};
 use super::temporary_run::{TemporaryRun, ddpg};
@@ -47,7 +47,7 @@ pub(super) struct PolicyFigures {
     calls: [IntervalResults; 2],
 }
 
-pub(super) fn measure(budget: &Budget) -> anyhow::Result<PolicyFigures> {
+pub(super) fn measure(budget: &TimeBudget) -> anyhow::Result<PolicyFigures> {
     let temporary = TemporaryRun::new(&[])?;
     let config = temporary.remove_directory()?;
     let range = ActionRange::new(&config.spec.action)?;
@@ -102,7 +102,7 @@ pub(super) fn measure(budget: &Budget) -> anyhow::Result<PolicyFigures> {
 }
 
 /// The second layer's product for a batch of 64, with its fastest kernel. It is nearly the whole computation.
-fn widest_product(layout: &NetworkLayout, seed: u64) -> Multiplication {
+fn widest_product(layout: &NetworkLayout, seed: u64) -> TimedProduct {
     let (k, m) = layout.layer_size(1);
     let product = Product {
         m,
@@ -110,7 +110,7 @@ fn widest_product(layout: &NetworkLayout, seed: u64) -> Multiplication {
         n: ENVIRONMENTS,
         transposed: Transposed::Neither,
     };
-    let mut product = Multiplication::new(product, &mut stream(seed, Purpose::Exploration, 1, 0));
+    let mut product = TimedProduct::new(product, &mut stream(seed, Purpose::Exploration, 1, 0));
     (0..ATTEMPTS).for_each(|_| product.try_kernels());
     product
 }

@@ -4,11 +4,11 @@
 use rustix::thread::CpuSet;
 use shoal_common::report::{Role, RoleInstance};
 use shoal_common::run_dir::RunDir;
-use shoal_run::process::Peer;
+use shoal_run::process::ChildProcess;
 
 /// The running processes.
 #[derive(Debug)]
-pub(super) struct Processes(Vec<(Role, Peer)>);
+pub(super) struct Processes(Vec<(Role, ChildProcess)>);
 
 impl Processes {
     /// Starts a learner, and `actors` actors each with its environment server. `cores_for` returns the cores to bind a
@@ -22,7 +22,7 @@ impl Processes {
                 index,
                 incarnation,
             };
-            let peer = Peer::member(instance, run)?;
+            let peer = ChildProcess::member(instance, run)?;
             if let Some(cores) = cores_for(role) {
                 peer.pin(&cores)?;
             }

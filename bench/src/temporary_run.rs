@@ -10,7 +10,7 @@ use shoal_common::run_dir::RunDir;
 use shoal_run::plan::Plan;
 use shoal_run::plan::RunOverrides;
 use shoal_run::preflight;
-use shoal_run::process::Peer;
+use shoal_run::process::ChildProcess;
 use tempfile::TempDir;
 
 use super::processes::Processes;
@@ -98,10 +98,10 @@ impl TemporaryRun {
     pub(super) fn with_peer<T>(
         &self,
         role: Role,
-        act: impl FnOnce(&Domain, &mut Peer) -> anyhow::Result<T>,
+        act: impl FnOnce(&Domain, &mut ChildProcess) -> anyhow::Result<T>,
     ) -> anyhow::Result<T> {
         self.in_shared_memory(|domain| {
-            let mut peer = Peer::role(role, &self.run)?;
+            let mut peer = ChildProcess::role(role, &self.run)?;
             let acted = act(domain, &mut peer);
             let ended = peer.end();
             let acted = acted?;

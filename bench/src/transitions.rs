@@ -14,10 +14,10 @@ use shoal_common::run_dir::RunDir;
 use shoal_learner::algorithms::minibatch::Minibatch;
 use shoal_learner::algorithms::sampling::Sampler;
 use shoal_learner::replay::Replay;
-use shoal_run::process::Peer;
+use shoal_run::process::ChildProcess;
 
 use super::intervals::{self, IntervalResults};
-use super::measurement::{Budget, Figures};
+use super::measurement::{Figures, TimeBudget};
 use super::rows::{ENVIRONMENTS, Rows};
 use super::target::{Line, Target};
 use super::temporary_run::{TemporaryRun, ddpg};
@@ -48,7 +48,7 @@ pub(super) struct TransitionFigures {
     sampled: IntervalResults,
 }
 
-pub(super) fn measure(budget: &Budget) -> anyhow::Result<TransitionFigures> {
+pub(super) fn measure(budget: &TimeBudget) -> anyhow::Result<TransitionFigures> {
     let temporary = TemporaryRun::new(&[
         "actors.chunk_steps=64",
         "replay.updates_per_step=0",
@@ -79,8 +79,8 @@ fn move_rows(
     config: &Config,
     run: &RunDir,
     domain: &Domain,
-    learner: &mut Peer,
-    budget: &Budget,
+    learner: &mut ChildProcess,
+    budget: &TimeBudget,
 ) -> anyhow::Result<IntervalResults> {
     let row = config.row_layout();
     let mut rows = Rows::new(config)?;
@@ -150,8 +150,8 @@ fn move_rows(
 fn wait_for_replay(
     run: &RunDir,
     listener: &Listener,
-    learner: &mut Peer,
-    budget: &Budget,
+    learner: &mut ChildProcess,
+    budget: &TimeBudget,
 ) -> anyhow::Result<CommitReader> {
     loop {
         match CommitReader::open(&run.replay_file()) {
@@ -167,7 +167,7 @@ fn wait_for_replay(
 }
 
 /// The rates of rows drawn into minibatches, as the learner does it.
-fn sample(replay: &Replay, config: &Config, budget: &Budget) -> anyhow::Result<IntervalResults> {
+fn sample(replay: &Replay, config: &Config, budget: &TimeBudget) -> anyhow::Result<IntervalResults> {
     let sampler = Sampler::new(config.run.seed);
     let size = ddpg(config)?.batch;
     let mut batch = Minibatch::new(config.row_layout(), size);

@@ -10,7 +10,7 @@ use shoal_common::report::Role;
 
 use self::training::{Recovery, Startup, Training};
 use super::intervals::IntervalResults;
-use super::measurement::{Budget, Figures};
+use super::measurement::{Figures, TimeBudget};
 use super::memory::Memory;
 use super::target::{Line, Target};
 
@@ -65,7 +65,7 @@ struct RoleMemory {
     memory: Memory,
 }
 
-pub(super) fn measure(budget: &Budget) -> anyhow::Result<RunFigures> {
+pub(super) fn measure(budget: &TimeBudget) -> anyhow::Result<RunFigures> {
     let begun = Instant::now();
     let mut starts = Vec::new();
     loop {
@@ -90,7 +90,7 @@ pub(super) fn measure(budget: &Budget) -> anyhow::Result<RunFigures> {
 fn recoveries_and_memory(
     training: &mut Training,
     begun: Instant,
-    budget: &Budget,
+    budget: &TimeBudget,
 ) -> anyhow::Result<(Vec<Recovery>, Vec<RoleMemory>)> {
     let mut recoveries = Vec::new();
     let mut roles = Vec::new();

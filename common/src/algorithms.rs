@@ -12,7 +12,7 @@ mod sac;
 mod tabular;
 mod td3;
 
-pub use algorithm::{ActorCritic, AlgorithmSettings, AlgorithmSpec, Learned, Shape, TransitionUse};
+pub use algorithm::{ActorCritic, AlgorithmSettings, AlgorithmSpec, LearnedShapes, Shape, TransitionUse};
 pub use behaviour::{Behaviour, Epsilon};
 pub use ddpg::DdpgConfig;
 pub use dqn::DqnConfig;

@@ -36,7 +36,7 @@ pub use crate::algorithms::{
     AlgorithmConfig, DdpgConfig, DqnConfig, ExplorationConfig, ObservationConfig, ReinforceConfig, ReturnWeighting,
     RewardConfig, SacConfig, TabularConfig, Td3Config, Warmup,
 };
-use crate::algorithms::{Behaviour, Learned, TransitionUse};
+use crate::algorithms::{Behaviour, LearnedShapes, TransitionUse};
 
 /// The complete configuration of a run.
 #[derive(Clone, Debug, PartialEq)]
@@ -173,7 +173,7 @@ impl Config {
     }
 
     /// The networks or tables that are learned.
-    pub fn learned(&self) -> Learned {
+    pub fn learned(&self) -> LearnedShapes {
         let learned = self.algorithm.settings().learned(&self.spec);
         learned.normalising(self.observation.normalise)
     }

@@ -1,7 +1,7 @@
 //! The replay: a ring of rows in a mapped file. Only the learner writes it, and it samples rows in place.
 //!
 //! Rows are numbered in the order they are committed, from 0, for the life of the file. A chunk becomes part of the
-//! replay in three steps that cannot be taken out of order: [`Replay::begin`], [`Reserved::fill`], [`Filled::commit`].
+//! replay in three steps that cannot be taken out of order: [`Replay::begin`], [`ReservedChunk::fill`], [`FilledChunk::commit`].
 //! A process that is killed between any two instructions leaves the last committed state. `docs/REPLAY_FORMAT.md` has
 //! the layout, the invariants and what survives a power loss.
 //!
@@ -42,7 +42,7 @@ mod sync;
 
 pub use shoal_common::commit::{ActorCommit, ChunkId, ReplayLayout};
 
-pub use self::append::{Appended, Filled, Reserved};
+pub use self::append::{Appended, FilledChunk, ReservedChunk};
 pub use self::error::{ChunkError, ReplayError};
 pub use self::step::WriteStep;
 pub use self::store::{Replay, are_finite};

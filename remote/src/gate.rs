@@ -34,7 +34,7 @@ use crate::refused;
 use crate::requests::LauncherRequests;
 use crate::wire::vector_instructions;
 use crate::wire::{
-    Acknowledgement, ActorAcknowledgement, Admission, Hello, HostReport, Lease, Message, Phase, PolicyRequest,
+    Acknowledgement, ActorAcknowledgement, Admission, Hello, HostReport, Lease, Message, PolicyRequest, RunPhase,
     WireChunk, WireError, WirePolicy,
 };
 
@@ -628,9 +628,9 @@ impl<'a> Gate<'a> {
             gate: self.settings.instance.incarnation,
             number: self.acknowledgements_sent + 1,
             phase: if self.over_since.is_some() {
-                Phase::Over
+                RunPhase::Over
             } else {
-                Phase::Running
+                RunPhase::Running
             },
             rows: self.replay.rows(),
             report: 0,

@@ -30,8 +30,8 @@ use crate::requests::LauncherRequests;
 use crate::uncommitted::{Consequence, UncommittedChunks};
 use crate::wire::vector_instructions;
 use crate::wire::{
-    Acknowledgement, Admission, Hello, HostReport, Message, Phase, PolicyRequest, RemoteEpisode, RemoteRole, WireChunk,
-    WireError, WirePolicy, id_of,
+    Acknowledgement, Admission, Hello, HostReport, Message, PolicyRequest, RemoteEpisode, RemoteRole, RunPhase,
+    WireChunk, WireError, WirePolicy, id_of,
 };
 
 /// The gate is away if it has sent no acknowledgement for this long.
@@ -341,7 +341,7 @@ impl<'a> Relay<'a> {
             tracing::info!("connected to the gate");
         }
         self.heard_at = Some(Instant::now());
-        if acknowledgement.phase == Phase::Over && !self.run_is_over {
+        if acknowledgement.phase == RunPhase::Over && !self.run_is_over {
             tracing::info!("the run is over");
             self.run_is_over = true;
         }

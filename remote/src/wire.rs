@@ -24,7 +24,7 @@ const CHECKSUM: usize = size_of::<u32>();
 pub enum WireError {
     /// They do not begin as a message of this kind.
     #[error("the message is not what was expected")]
-    Kind,
+    MessageKind,
     /// They have another version of the format.
     #[error("the message has format {0}, this program uses format {VERSION}: use the same program on all hosts")]
     Version(u32),
@@ -43,7 +43,7 @@ pub enum WireError {
 #[doc(hidden)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u32)]
-pub enum Kind {
+pub enum MessageKind {
     Chunk = 1,
     Policy = 2,
     Hello = 3,
@@ -86,7 +86,7 @@ impl WireChunk {
             u64::from(header.rows) << 32 | u64::from(header.actor),
         ];
         sealed(
-            Kind::Chunk,
+            MessageKind::Chunk,
             &[
                 &words(&start),
                 bytemuck::cast_slice(rows),
@@ -100,7 +100,7 @@ impl WireChunk {
     /// # Errors
     /// When the bytes are not a whole chunk of this version.
     pub fn decode(bytes: &[u8]) -> Result<Self, WireError> {
-        let body = opened(Kind::Chunk, bytes)?;
+        let body = opened(MessageKind::Chunk, bytes)?;
         let ([host, incarnation, sequence, policy_version, rows_and_actor], numbers) = split(body, bytes.len())?;
         let header = ChunkHeader {
             incarnation,
@@ -140,7 +140,7 @@ impl WirePolicy {
             header.updates,
             header.fingerprint,
         ];
-        sealed(Kind::Policy, &[&words(&start), bytemuck::cast_slice(parameters)])
+        sealed(MessageKind::Policy, &[&words(&start), bytemuck::cast_slice(parameters)])
     }
 
     /// Reads a policy.
@@ -148,7 +148,7 @@ impl WirePolicy {
     /// # Errors
     /// When the bytes are not a whole policy of this version.
     pub fn decode(bytes: &[u8]) -> Result<Self, WireError> {
-        let body = opened(Kind::Policy, bytes)?;
+        let body = opened(MessageKind::Policy, bytes)?;
         let ([incarnation, version, env_steps, updates, fingerprint], parameters) = split(body, bytes.len())?;
         let header = PolicyHeader {
             incarnation,
@@ -233,7 +233,7 @@ pub struct Lease {
 
 /// Whether the run continues.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub enum Phase {
+pub enum RunPhase {
     /// The run continues.
     Running,
     /// It is over, because it is finished or was stopped: the host ends too.
@@ -250,7 +250,7 @@ pub struct Acknowledgement {
     /// Its number among those of this gate.
     pub number: u64,
     /// Whether the run continues.
-    pub phase: Phase,
+    pub phase: RunPhase,
     /// Rows in the replay.
     pub rows: u64,
     /// The number of the last report that the gate has received from this host.
@@ -393,7 +393,7 @@ impl From<RemoteEpisode> for EpisodeReport {
 /// A message that bincode encodes.
 pub trait Message: Serialize + DeserializeOwned {
     #[doc(hidden)]
-    const KIND: Kind;
+    const KIND: MessageKind;
 
     /// Its bytes.
     ///
@@ -420,23 +420,23 @@ pub trait Message: Serialize + DeserializeOwned {
 }
 
 impl Message for PolicyRequest {
-    const KIND: Kind = Kind::PolicyRequest;
+    const KIND: MessageKind = MessageKind::PolicyRequest;
 }
 
 impl Message for Hello {
-    const KIND: Kind = Kind::Hello;
+    const KIND: MessageKind = MessageKind::Hello;
 }
 
 impl Message for Admission {
-    const KIND: Kind = Kind::Admission;
+    const KIND: MessageKind = MessageKind::Admission;
 }
 
 impl Message for Acknowledgement {
-    const KIND: Kind = Kind::Acknowledgement;
+    const KIND: MessageKind = MessageKind::Acknowledgement;
 }
 
 impl Message for HostReport {
-    const KIND: Kind = Kind::HostReport;
+    const KIND: MessageKind = MessageKind::HostReport;
 }
 
 /// The limit keeps a damaged length from allocating memory without bound.
@@ -444,7 +444,7 @@ fn encoding() -> impl bincode::config::Config {
     bincode::config::standard().with_limit::<{ 4 << 20 }>()
 }
 
-fn sealed(kind: Kind, parts: &[&[u8]]) -> Vec<u8> {
+fn sealed(kind: MessageKind, parts: &[&[u8]]) -> Vec<u8> {
     let length = START + parts.iter().map(|part| part.len()).sum::<usize>() + CHECKSUM;
     let mut bytes = Vec::with_capacity(length);
     bytes.extend((LETTERS | kind as u32).to_le_bytes());
@@ -456,7 +456,7 @@ fn sealed(kind: Kind, parts: &[&[u8]]) -> Vec<u8> {
 }
 
 /// The bytes between the first words and the checksum.
-fn opened(kind: Kind, bytes: &[u8]) -> Result<&[u8], WireError> {
+fn opened(kind: MessageKind, bytes: &[u8]) -> Result<&[u8], WireError> {
     let length = Err(WireError::Length(bytes.len()));
     if bytes.len() > LONGEST {
         return length;
@@ -466,7 +466,7 @@ fn opened(kind: Kind, bytes: &[u8]) -> Result<&[u8], WireError> {
         return length;
     };
     if found != LETTERS | kind as u32 {
-        return Err(WireError::Kind);
+        return Err(WireError::MessageKind);
     }
     if version != VERSION {
         return Err(WireError::Version(version));

@@ -7,8 +7,8 @@ use shoal_common::channel::policy::PolicyHeader;
 use shoal_common::channel::transitions::ChunkHeader;
 use shoal_common::report::{Activity, Role};
 use shoal_remote::wire::{
-    Acknowledgement, ActorAcknowledgement, Admission, Hello, HostReport, Lease, Message, Phase, PolicyRequest,
-    RemoteEpisode, RemoteRole, VERSION, WireChunk, WireError, WirePolicy,
+    Acknowledgement, ActorAcknowledgement, Admission, Hello, HostReport, Lease, Message, PolicyRequest, RemoteEpisode,
+    RemoteRole, RunPhase, VERSION, WireChunk, WireError, WirePolicy,
 };
 
 fn header() -> ChunkHeader {
@@ -62,7 +62,7 @@ fn acknowledgement() -> Acknowledgement {
         epoch: 6,
         gate: 8,
         number: 3,
-        phase: Phase::Running,
+        phase: RunPhase::Running,
         rows: 640,
         report: 2,
         actors: vec![ActorAcknowledgement {
@@ -152,7 +152,11 @@ fn every_message_arrives_unchanged_and_is_no_other() {
     assert_eq!(PolicyRequest::decode(&request().encode().unwrap()), Ok(request()));
     for (i, bytes) in all().iter().enumerate() {
         for (j, error) in read(bytes).into_iter().enumerate() {
-            assert_eq!(error, (i != j).then_some(WireError::Kind), "message {i} read as {j}");
+            assert_eq!(
+                error,
+                (i != j).then_some(WireError::MessageKind),
+                "message {i} read as {j}"
+            );
         }
     }
 }

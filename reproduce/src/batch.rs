@@ -4,13 +4,13 @@ use std::collections::{BTreeMap, VecDeque};
 use std::sync::mpsc;
 
 use anyhow::bail;
-use shoal_run::batch::work_off;
+use shoal_run::batch::run_jobs;
 use shoal_run::signals::Signals;
 
 use super::experiment::{Effort, Length};
 use super::folder::Folder;
 use super::progress::ProgressDisplay;
-use super::request::{Job, Name, ReproductionEnd};
+use super::request::{Job, JobName, ReproductionEnd};
 use super::settings::RunSettings;
 use super::training::{RunState, TrainingEnd, train};
 
@@ -38,14 +38,14 @@ impl Batch<'_> {
     pub(super) fn run(
         &self,
         parallel: usize,
-        write: impl Fn(&BTreeMap<Name, String>) -> anyhow::Result<()>,
+        write: impl Fn(&BTreeMap<JobName, String>) -> anyhow::Result<()>,
     ) -> anyhow::Result<ReproductionEnd> {
         let signals = Signals::register()?;
         let due: VecDeque<Job> = self.jobs.iter().copied().filter(|job| self.is_due(job)).collect();
         let mut progress = ProgressDisplay::new(self.folder, self.effort, self.jobs.len(), &due)?;
         let mut failures = BTreeMap::new();
         let work = |job: Job, events: &mpsc::Sender<Event>| self.work(job, &signals, events);
-        work_off(due, parallel, &signals, work, |event| {
+        run_jobs(due, parallel, &signals, work, |event| {
             match event {
                 None => {}
                 Some(Event::Started(job)) => progress.started(job),

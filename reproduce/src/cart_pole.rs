@@ -4,7 +4,7 @@ use rand::RngExt;
 use serde::{Deserialize, Serialize};
 use shoal_common::policy::Policy;
 use shoal_common::stream::{Purpose, stream};
-use shoal_report::figure::{self, Frame, Setting};
+use shoal_report::figure::{self, CurvesOfSetting, Frame};
 
 use super::claim::{Claim, Scope, median, percent, spread};
 use super::experiment::{Experiment, Length, Stage};
@@ -149,11 +149,11 @@ impl Family for CartPole {
 
     fn sections(results: &Results<Tests>, writer: &FigureWriter) -> anyhow::Result<Vec<ReportSection>> {
         let variants = VARIANTS.map(|(name, label)| (label, results.of(name, "")));
-        let settings: Vec<Setting> = variants
+        let settings: Vec<CurvesOfSetting> = variants
             .iter()
             .map(|(label, seeds)| {
                 let runs: Vec<_> = seeds.iter().map(|seed| seed.tests.curve()).collect();
-                Setting {
+                CurvesOfSetting {
                     label: (*label).into(),
                     curve: figure::pointwise(&runs, median),
                     runs,

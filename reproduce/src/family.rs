@@ -79,7 +79,7 @@ impl<T> Results<T> {
 
 /// A [`Family`] without its type, so that a list can contain different families.
 #[derive(Debug)]
-pub(super) struct Entry {
+pub(super) struct FamilyEntry {
     pub(super) experiments: &'static [Experiment],
     /// Makes and stores the result of a run that has reached the end of a stage.
     pub(super) store_result: fn(&Folder, &'static Experiment, &Stage, u64, Length, &RunSettings) -> anyhow::Result<()>,
@@ -87,9 +87,9 @@ pub(super) struct Entry {
     pub(super) sections: fn(&Folder, &FigureWriter) -> anyhow::Result<Vec<ReportSection>>,
 }
 
-/// The [`Entry`] of a family.
-pub(super) const fn entry<F: Family>() -> Entry {
-    Entry {
+/// The [`FamilyEntry`] of a family.
+pub(super) const fn entry<F: Family>() -> FamilyEntry {
+    FamilyEntry {
         experiments: F::EXPERIMENTS,
         store_result: store_result::<F>,
         sections: sections::<F>,

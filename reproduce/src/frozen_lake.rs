@@ -6,7 +6,7 @@ use anyhow::Context;
 use serde::{Deserialize, Serialize};
 use shoal_common::policy_file::PolicyFile;
 use shoal_env_server::environment::frozen_lake::{ACTIONS, STATES};
-use shoal_report::figure::{self, Frame, Setting};
+use shoal_report::figure::{self, CurvesOfSetting, Frame};
 use shoal_run::analysis::lake::{LIMIT, Walk, greedy, optimal};
 use shoal_run::recorder::read_evaluations;
 use shoal_run::rollout::policy_layout;
@@ -243,10 +243,10 @@ fn of_sweep(
     number: &str,
     best: Walk,
 ) -> anyhow::Result<Vec<Figure>> {
-    let settings = |of: fn(&EvaluatedPolicy) -> f64| -> Vec<Setting> {
+    let settings = |of: fn(&EvaluatedPolicy) -> f64| -> Vec<CurvesOfSetting> {
         let curves = sweep.iter().map(|(label, seeds)| {
             let runs: Vec<_> = seeds.iter().map(|seed| seed.tests.on_grid(of)).collect();
-            Setting {
+            CurvesOfSetting {
                 label: (*label).into(),
                 curve: figure::pointwise(&runs, mean),
                 runs,

@@ -28,14 +28,14 @@ use anyhow::Context;
 use self::batch::Batch;
 pub use self::experiment::Effort;
 use self::experiment::Experiment;
-use self::family::{Entry, entry};
+use self::family::{FamilyEntry, entry};
 use self::folder::Folder;
 use self::request::Job;
 pub use self::request::{ReproductionEnd, Request};
 use self::settings::RunSettings;
 
 /// Every family, in the report's order.
-const FAMILIES: [Entry; 6] = [
+const FAMILIES: [FamilyEntry; 6] = [
     entry::<frozen_lake::FrozenLake>(),
     entry::<cart_pole::CartPole>(),
     entry::<pendulum::Pendulum>(),
@@ -86,8 +86,8 @@ pub fn run(request: &Request) -> anyhow::Result<ReproductionEnd> {
     batch.run(request.jobs, write)
 }
 
-fn experiments() -> impl Iterator<Item = (&'static Entry, &'static Experiment)> {
-    const ENTRIES: &[Entry] = &FAMILIES;
+fn experiments() -> impl Iterator<Item = (&'static FamilyEntry, &'static Experiment)> {
+    const ENTRIES: &[FamilyEntry] = &FAMILIES;
     ENTRIES
         .iter()
         .flat_map(|entry| entry.experiments.iter().map(move |experiment| (entry, experiment)))

@@ -10,18 +10,18 @@ use shoal_common::durable::write_atomically;
 
 use super::claim::{Claim, Verdict};
 use super::experiment::{Effort, Experiment, Stage};
-use super::family::Entry;
+use super::family::FamilyEntry;
 use super::folder::Folder;
 use super::report_section::{Figure, FigureWriter, ReportSection};
-use super::request::{Job, Name, Request};
+use super::request::{Job, JobName, Request};
 
 /// Writes the report from all results of the folder, and draws its figures.
 pub(super) fn write(
-    families: &[Entry],
+    families: &[FamilyEntry],
     folder: &Folder,
     request: &Request,
     jobs: &[Job],
-    failures: &BTreeMap<Name, String>,
+    failures: &BTreeMap<JobName, String>,
 ) -> anyhow::Result<()> {
     let figures = folder.path().join("figures");
     let writer = FigureWriter::in_directory(figures.clone(), request.png)?;
@@ -54,10 +54,10 @@ pub(super) fn write(
 
 /// The stages of a family, with their results and failures.
 struct Stages<'a> {
-    family: &'a Entry,
+    family: &'a FamilyEntry,
     folder: &'a Folder,
     jobs: &'a [Job],
-    failures: &'a BTreeMap<Name, String>,
+    failures: &'a BTreeMap<JobName, String>,
     effort: Effort,
 }
 

@@ -8,7 +8,7 @@ use std::time::Duration;
 use anyhow::{Context, bail};
 use rustix::process::Signal;
 
-use crate::process::Peer;
+use crate::process::ChildProcess;
 use crate::signals::Signals;
 
 /// How often `observe` is called without an event.
@@ -28,7 +28,7 @@ pub enum TrainingEnd {
 
 /// Works off the queue with `parallel` threads until it is empty or a signal has arrived. `work` may send events, which
 /// this thread passes to `observe`; that is also called once a second without an event.
-pub fn work_off<Job: Send, Event: Send>(
+pub fn run_jobs<Job: Send, Event: Send>(
     queue: VecDeque<Job>,
     parallel: usize,
     signals: &Signals,
@@ -66,7 +66,7 @@ pub fn work_off<Job: Send, Event: Send>(
 /// # Errors
 /// When it cannot be started, or fails: its last line.
 pub fn run_training(command: &mut Command, interrupted: &dyn Fn() -> Option<i32>) -> anyhow::Result<TrainingEnd> {
-    let mut training = Peer::start(command, "training".into()).context("cannot start a training")?;
+    let mut training = ChildProcess::start(command, "training".into()).context("cannot start a training")?;
     let mut terminated = false;
     let status = loop {
         if let Some(status) = training.wait(SIGNAL_INTERVAL) {
@@ -129,7 +129,7 @@ mod tests {
         let signals = Signals::register().unwrap();
         let mut done = Vec::new();
         let work = |job: u32, events: &mpsc::Sender<u32>| events.send(job * 2).unwrap();
-        work_off((0..50).collect(), 3, &signals, work, |event| done.extend(event));
+        run_jobs((0..50).collect(), 3, &signals, work, |event| done.extend(event));
         done.sort_unstable();
         assert_eq!(done, (0..50).map(|job| job * 2).collect::<Vec<_>>());
     }

@@ -21,14 +21,14 @@ pub struct FinalEvaluation {
     /// The run's environment steps at that time. A run that has more now has been resumed.
     pub env_steps: u64,
     /// The evaluated policies.
-    pub policies: Vec<FinallyEvaluated>,
+    pub policies: Vec<FinalPolicyResult>,
     /// The better policy by this evaluation, which then became `best.policy`.
     pub kept: SavedPolicy,
 }
 
 /// A policy's result in the final evaluation. A number that is not finite is `None`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct FinallyEvaluated {
+pub struct FinalPolicyResult {
     /// Whether it was the best or the last policy when it was evaluated.
     pub policy: SavedPolicy,
     /// Its version.
@@ -45,7 +45,7 @@ pub struct FinallyEvaluated {
     pub interval: Option<(f64, f64)>,
 }
 
-impl FinallyEvaluated {
+impl FinalPolicyResult {
     /// The entry of a policy of this version and number of environment steps.
     pub fn new(policy: SavedPolicy, (version, env_steps): (u64, u64), summary: &EvaluationSummary) -> Self {
         let finite = |number: f64| Some(number).filter(|number| number.is_finite());
@@ -63,7 +63,7 @@ impl FinallyEvaluated {
 
 impl FinalEvaluation {
     /// The final evaluation of a run with this number of environment steps.
-    pub fn new(seed: u64, env_steps: u64, policies: Vec<FinallyEvaluated>, kept: SavedPolicy) -> Self {
+    pub fn new(seed: u64, env_steps: u64, policies: Vec<FinalPolicyResult>, kept: SavedPolicy) -> Self {
         Self {
             format: FORMAT,
             seed,
@@ -74,7 +74,7 @@ impl FinalEvaluation {
     }
 
     /// The result of the policy that now has this name.
-    pub fn of(&self, which: SavedPolicy) -> Option<&FinallyEvaluated> {
+    pub fn of(&self, which: SavedPolicy) -> Option<&FinalPolicyResult> {
         let policy = match which {
             SavedPolicy::Best => self.kept,
             SavedPolicy::Last => SavedPolicy::Last,
@@ -170,8 +170,8 @@ mod tests {
         let run = RunDir::create(&parent.path().join("run")).unwrap();
         assert_eq!(FinalEvaluation::read(&run, 10).unwrap(), None);
         let policies = vec![
-            FinallyEvaluated::new(SavedPolicy::Best, (3, 5), &summary(f64::NAN, 0.0, 9)),
-            FinallyEvaluated::new(SavedPolicy::Last, (4, 10), &summary(-1.0, 0.5, 9)),
+            FinalPolicyResult::new(SavedPolicy::Best, (3, 5), &summary(f64::NAN, 0.0, 9)),
+            FinalPolicyResult::new(SavedPolicy::Last, (4, 10), &summary(-1.0, 0.5, 9)),
         ];
         let written = FinalEvaluation::new(1, 10, policies, SavedPolicy::Last);
         written.write(&run).unwrap();

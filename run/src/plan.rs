@@ -18,7 +18,7 @@ use shoal_env_server::environment::{self, EnvironmentError};
 use toml::{Table, Value};
 
 use self::revision::as_written;
-pub use self::revision::{Asked, Revision, edited, store_actors};
+pub use self::revision::{RequestedChanges, Revision, edited, store_actors};
 pub use self::source::{SettingSource, SettingSources, UsageError};
 use self::suggestion::{nearest, with_suggestion};
 
@@ -27,7 +27,7 @@ use crate::external_environment::{self, ExternalEnvironment, GYMNASIUM};
 use crate::numbers::count;
 use crate::origin::{Origin, Predecessor, shapes};
 use crate::preflight;
-use crate::server_location::{ServerLocation, Surroundings, hash_seed};
+use crate::server_location::{ServerLocation, ServerSurroundings, hash_seed};
 use crate::signals::Interrupt;
 
 const PRESETS: [(&str, &str); 15] = [
@@ -563,7 +563,7 @@ fn describe_environment(table: &mut Table) -> anyhow::Result<()> {
     };
     let (environment, spec) = if let Some(server) = server {
         let environment = configured(name, server, section.clone());
-        let surroundings = Surroundings {
+        let surroundings = ServerSurroundings {
             location: ServerLocation::here(&environment.server)?,
             hash_seed: hash_seed(mode, seed),
         };

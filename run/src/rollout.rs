@@ -12,7 +12,7 @@ use shoal_env_server::environment::angle::unwrapped;
 use shoal_env_server::vector::{Reset, VectorEnvironment};
 
 use crate::external_environment::ExternalEnvironment;
-use crate::server_location::Surroundings;
+use crate::server_location::ServerSurroundings;
 use crate::signals::Interrupt;
 
 /// How often an episode is begun if the environment's server fails in it, each time with a new server.
@@ -62,7 +62,7 @@ pub struct Rollout<'a> {
     host: Host,
     policy: Policy,
     parameters: &'a [f32],
-    surroundings: Surroundings,
+    surroundings: ServerSurroundings,
     interrupt: Interrupt,
 }
 
@@ -100,7 +100,7 @@ impl<'a> Rollout<'a> {
             host: Host::new(config)?,
             policy,
             parameters,
-            surroundings: Surroundings::default(),
+            surroundings: ServerSurroundings::default(),
             interrupt: Interrupt::default(),
         })
     }
@@ -108,7 +108,7 @@ impl<'a> Rollout<'a> {
     /// As [`new`](Self::new), for a run: an environment that another program serves is started as in training.
     pub fn of_run(run: &RunDir, config: &'a Config, parameters: &'a [f32]) -> anyhow::Result<Self> {
         Ok(Self {
-            surroundings: Surroundings::of_run(run, config)?,
+            surroundings: ServerSurroundings::of_run(run, config)?,
             ..Self::new(config, parameters)?
         })
     }
@@ -201,7 +201,7 @@ impl Host {
     fn begin(
         &mut self,
         config: &Config,
-        surroundings: &Surroundings,
+        surroundings: &ServerSurroundings,
         reset: Reset<'_>,
         interrupt: &Interrupt,
     ) -> anyhow::Result<Vec<f32>> {

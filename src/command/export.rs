@@ -8,7 +8,7 @@ use clap::Args;
 use clap::ValueEnum;
 use shoal_common::durable::write_atomically;
 use shoal_common::run_dir::RunDir;
-use shoal_report::export::Portable;
+use shoal_report::export::PortablePolicy;
 use shoal_run::evaluation::SavedPolicy;
 use shoal_run::final_evaluation::FinalEvaluation;
 
@@ -45,7 +45,7 @@ pub(crate) fn run(args: &ExportArgs) -> anyhow::Result<()> {
     };
     let which = name(args.policy.to_possible_value());
     let file = args.policy.read(&run, &config)?;
-    let mut policy = Portable::new(&config, &file, &which)?;
+    let mut policy = PortablePolicy::new(&config, &file, &which)?;
     // The version tells whether the evaluation was of this policy.
     let evaluation = FinalEvaluation::read(&run, 0)?;
     if let Some(evaluation) = evaluation

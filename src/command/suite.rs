@@ -13,7 +13,7 @@ use serde::Serialize;
 use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
 use shoal_report::page;
-use shoal_run::batch::{TrainingEnd, run_training, work_off};
+use shoal_run::batch::{TrainingEnd, run_jobs, run_training};
 use shoal_run::evaluation::SavedPolicy;
 use shoal_run::external_environment::tied;
 use shoal_run::final_evaluation::FinalEvaluation;
@@ -198,7 +198,7 @@ fn run(suite: &Suite, directory: &Path, common: &RunOverrides, options: SuiteOpt
             Err(error) => Event::Failed(number, format!("{error:#}").replace('\n', " ")),
         });
     };
-    work_off(due, jobs, &signals, work, |event| progress.observe(event));
+    run_jobs(due, jobs, &signals, work, |event| progress.observe(event));
     let failed = progress.end();
     report(suite, directory, options.output)?;
     let here = directory.display();

@@ -17,7 +17,7 @@ use shoal_learner::networks::digest;
 use shoal_learner::process::checkpoint::Checkpoints;
 use shoal_report::plots;
 use shoal_run::evaluation::{EvaluationSummary, SavedPolicy, evaluate_until};
-use shoal_run::final_evaluation::{FinalEvaluation, FinallyEvaluated};
+use shoal_run::final_evaluation::{FinalEvaluation, FinalPolicyResult};
 use shoal_run::numbers::thousands;
 use shoal_run::outcome::{FINAL_EVALUATION, RunOutcome, RunState};
 use shoal_run::signals::{Interrupt, Signals, describe, exit_code};
@@ -197,7 +197,7 @@ fn final_evaluation(
         best.write(&run.best_policy())?;
     }
     let entry = |(_, policy, file, summary): &(_, SavedPolicy, PolicyFile, _)| {
-        FinallyEvaluated::new(*policy, (file.version, file.env_steps), summary)
+        FinalPolicyResult::new(*policy, (file.version, file.env_steps), summary)
     };
     FinalEvaluation::new(seed, env_steps, evaluated.iter().map(entry).collect(), *kept_policy).write(run)?;
     let best = ("best policy", kept_summary.clone());

@@ -15,8 +15,8 @@ use shoal_run::process::wait_for_any;
 use shoal_run::signals::{self, Signals};
 
 use super::log::Log;
-use super::stall::Stalls;
-use super::supervisor::{Members, Situation, Supervisor};
+use super::stall::StallDetector;
+use super::supervisor::{RolesOnHost, RunCondition, Supervisor};
 use super::{OTHERS_END, write_iox_config};
 
 /// How often heartbeats are read if nothing wakes the launcher.
@@ -66,7 +66,7 @@ struct Host<'a> {
     control: ControlPort,
     supervisor: Supervisor,
     signals: &'a Signals,
-    stalls: Stalls,
+    stalls: StallDetector,
     log: Log,
     heartbeats: Reports<Heartbeat>,
     stop_requested: bool,
@@ -85,11 +85,11 @@ impl<'a> Host<'a> {
         let log = Log::open(&run.log())?;
         write_iox_config(domain, run)?;
         // Creates the services that are opened below.
-        let supervisor = Supervisor::new(&config, run, domain, log.clone(), Members::Host { actors })?;
+        let supervisor = Supervisor::new(&config, run, domain, log.clone(), RolesOnHost::Host { actors })?;
         Ok(Self {
             control: ControlPort::open(domain)?,
             heartbeats: Reports::open(domain)?,
-            stalls: Stalls::new(Duration::from_secs(config.run.stall_seconds)),
+            stalls: StallDetector::new(Duration::from_secs(config.run.stall_seconds)),
             supervisor,
             run,
             lock,
@@ -132,10 +132,10 @@ impl<'a> Host<'a> {
             self.read_heartbeats()?;
             self.answer_requests()?;
             match self.supervisor.maintain(self.domain)? {
-                Situation::AtWork => {}
-                Situation::LearnerDone => bail!("a learner has ended on a host that has none"),
-                Situation::SharedMemoryOccupied => bail!("dead processes occupy shared memory for good: join again"),
-                Situation::FilesRemoved => bail!(
+                RunCondition::AtWork => {}
+                RunCondition::LearnerDone => bail!("a learner has ended on a host that has none"),
+                RunCondition::SharedMemoryOccupied => bail!("dead processes occupy shared memory for good: join again"),
+                RunCondition::FilesRemoved => bail!(
                     "another program has removed files of this host in {}: join again",
                     self.domain.directory()?.display()
                 ),

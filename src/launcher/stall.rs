@@ -18,12 +18,12 @@ const WORK: u32 = 3;
 
 /// Looks for processes that make no progress.
 #[derive(Debug)]
-pub(super) struct Stalls {
+pub(super) struct StallDetector {
     patience: Duration,
     looked: Instant,
 }
 
-impl Stalls {
+impl StallDetector {
     /// `patience` is the longest time without progress.
     pub(super) fn new(patience: Duration) -> Self {
         Self {
@@ -99,7 +99,7 @@ impl Stalls {
         let server = client.server().and_then(|index| find(children, Role::EnvServer, index));
         let waits = match client.activity() {
             // It becomes ready when its server has described its environments.
-            None => client.is_active() && client.moved.elapsed() >= self.patience,
+            None => client.is_active() && client.progress_at.elapsed() >= self.patience,
             Some(activity) => activity == Activity::WaitingForServer && self.is_idle(client),
         };
         waits && server.is_some_and(|server| self.is_idle(server))
@@ -107,7 +107,7 @@ impl Stalls {
 
     /// Whether it has waited without progress for too long.
     fn is_idle(&self, child: &Child) -> bool {
-        child.is_active() && child.is_waiting() && child.moved.elapsed() >= self.patience
+        child.is_active() && child.is_waiting() && child.progress_at.elapsed() >= self.patience
     }
 
     /// If all processes wait: the actors and the evaluator, or, if replacing them has not helped, the learner.

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, bail};
 use shoal_actor::actor::GIVEN_UP;
 use shoal_common::channel::control::{ControlResponse, HostLease, HostRequest, HostStatus, RoleStatus};
-use shoal_common::channel::environment::Fault;
+use shoal_common::channel::environment::ResponseFault;
 use shoal_common::channel::{Domain, Services};
 use shoal_common::config::{Config, Mode};
 use shoal_common::durable::write_atomically;
@@ -19,13 +19,13 @@ use shoal_run::process::Writer;
 use shoal_run::recorder::{Incident, IncidentKind};
 use tracing_subscriber::filter::LevelFilter;
 
-use super::child::{Child, Consequence};
+use super::child::{Child, RestartDecision};
 use super::cleaner;
 use super::hosts::{Hosts, INCARNATIONS};
 use super::incarnations::{last_committed, read_counter};
 use super::log::{ALL_ENDED, Log};
 use super::process::{Process, name};
-use super::stall::Stalls;
+use super::stall::StallDetector;
 use crate::log_level::log_level;
 
 /// How often to look for dead processes whose end the launcher does not observe, such as `shoal status`.
@@ -44,7 +44,7 @@ const STARTS_WITHOUT_CHUNK: u64 = 100_000;
 
 /// The situation of the run's processes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Situation {
+pub(super) enum RunCondition {
     AtWork,
     LearnerDone,
     /// Dead processes occupy shared memory that cannot be freed.
@@ -55,7 +55,7 @@ pub(super) enum Situation {
 
 /// Which processes there are.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) enum Members {
+pub(super) enum RolesOnHost {
     /// Those of the learner's host, with a gate if other hosts may join.
     Learner {
         /// Whether there is a gate.
@@ -112,7 +112,7 @@ impl Supervisor {
         run: &RunDir,
         domain: &Domain,
         log: Log,
-        members: Members,
+        members: RolesOnHost,
     ) -> anyhow::Result<Self> {
         let counter = run.incarnations();
         let mut started = read_counter(&counter)?;
@@ -131,7 +131,7 @@ impl Supervisor {
         let lockstep = config.run.mode == Mode::Lockstep;
         let mut lockstep_actors = None;
         let (children, actors) = match members {
-            Members::Learner { gate } => {
+            RolesOnHost::Learner { gate } => {
                 services.create_environment(domain, server)?;
                 let mut children = vec![
                     Child::new(Role::Learner, 0),
@@ -142,7 +142,7 @@ impl Supervisor {
                 lockstep_actors = lockstep.then_some(config.actors.count);
                 (children, (0..config.actors.count).collect())
             }
-            Members::Host { actors } => (vec![Child::new(Role::Relay, 0)], actors),
+            RolesOnHost::Host { actors } => (vec![Child::new(Role::Relay, 0)], actors),
         };
         Ok(Self {
             children,
@@ -398,7 +398,7 @@ impl Supervisor {
         if let Some(server) = server {
             // The server has written what it was, unless it is one that does not check itself: then its client has.
             let by_client = self.log.last_lines(client).pop().filter(|line| line.contains(GIVEN_UP));
-            let last = by_client.filter(|line| !line.contains(&Fault::Reported.to_string()));
+            let last = by_client.filter(|line| !line.contains(&ResponseFault::Reported.to_string()));
             let last = last
                 .or_else(|| self.log.last_lines(&name(server.instance)).pop())
                 .unwrap_or_default();
@@ -484,13 +484,13 @@ impl Supervisor {
     }
 
     /// Handles collected ends, restarts processes that are due, and starts or retires actors.
-    pub(super) fn maintain(&mut self, domain: &Domain) -> anyhow::Result<Situation> {
-        let mut state = Situation::AtWork;
+    pub(super) fn maintain(&mut self, domain: &Domain) -> anyhow::Result<RunCondition> {
+        let mut state = RunCondition::AtWork;
         let ended = self.children.iter().any(|child| child.ended.is_some());
         // Before anything is cleaned up or started: both would find the files of another run, or none.
         if (ended || self.is_cleaning_due()) && !self.learner_has_finished() && !domain.is_intact(self.services.count())
         {
-            return Ok(Situation::FilesRemoved);
+            return Ok(RunCondition::FilesRemoved);
         }
         if ended {
             // Frees their shared memory for their successors.
@@ -502,8 +502,8 @@ impl Supervisor {
             }
         }
         for i in 0..self.children.len() {
-            if self.maintain_one(i)? == Situation::LearnerDone {
-                return Ok(Situation::LearnerDone);
+            if self.maintain_one(i)? == RunCondition::LearnerDone {
+                return Ok(RunCondition::LearnerDone);
             }
         }
         self.retire_surplus();
@@ -524,11 +524,11 @@ impl Supervisor {
         learners.any(|learner| learner.ended.is_some_and(|status| status.success()))
     }
 
-    fn maintain_one(&mut self, i: usize) -> anyhow::Result<Situation> {
+    fn maintain_one(&mut self, i: usize) -> anyhow::Result<RunCondition> {
         if let Some(status) = self.children[i].ended.take()
-            && self.handle_end(i, status)? == Situation::LearnerDone
+            && self.handle_end(i, status)? == RunCondition::LearnerDone
         {
-            return Ok(Situation::LearnerDone);
+            return Ok(RunCondition::LearnerDone);
         }
         let is_wanted = self.is_wanted(&self.children[i]);
         let child = &mut self.children[i];
@@ -537,10 +537,10 @@ impl Supervisor {
             self.start(i)?;
             self.note_incident(i, IncidentKind::StartedAgain, String::new());
         }
-        Ok(Situation::AtWork)
+        Ok(RunCondition::AtWork)
     }
 
-    fn handle_end(&mut self, i: usize, status: ExitStatus) -> anyhow::Result<Situation> {
+    fn handle_end(&mut self, i: usize, status: ExitStatus) -> anyhow::Result<RunCondition> {
         let child = &mut self.children[i];
         let name = name(child.instance);
         self.log.write_left_out(&name);
@@ -548,14 +548,14 @@ impl Supervisor {
             child.process = None;
             self.learner_done = true;
             self.log.note(&name, "done");
-            return Ok(Situation::LearnerDone);
+            return Ok(RunCondition::LearnerDone);
         }
-        if child.retires {
+        if child.is_retiring {
             child.process = None;
             child.restart_at = Instant::now();
             self.log.note(&name, &format!("retired: {}", ending(status)));
             self.note_incident(i, IncidentKind::Retired, String::new());
-            return Ok(Situation::AtWork);
+            return Ok(RunCondition::AtWork);
         }
         let consequence = child.has_ended(status);
         let what = if status.signal().is_some() {
@@ -565,13 +565,13 @@ impl Supervisor {
         };
         self.note_incident(i, what, ending(status));
         match consequence {
-            Consequence::Restart(pause) => {
+            RestartDecision::Restart(pause) => {
                 self.children[i].restart_at = Instant::now() + pause;
                 self.log
                     .note(&name, &format!("{}; restarting it in {pause:?}", ending(status)));
-                Ok(Situation::AtWork)
+                Ok(RunCondition::AtWork)
             }
-            Consequence::GiveUp(starts) => {
+            RestartDecision::GiveUp(starts) => {
                 self.note_incident(i, IncidentKind::GivenUp, String::new());
                 self.give_up(&name, starts, status)
             }
@@ -579,7 +579,7 @@ impl Supervisor {
     }
 
     /// Kills stalled processes, so that they are replaced. Returns a message for each.
-    pub(super) fn replace_stalled(&mut self, stalls: &mut Stalls) -> Vec<String> {
+    pub(super) fn replace_stalled(&mut self, stalls: &mut StallDetector) -> Vec<String> {
         let stalled = stalls.find(&mut self.children, std::mem::take(&mut self.busy));
         let mut messages = Vec::new();
         for (i, why) in stalled {
@@ -598,7 +598,7 @@ impl Supervisor {
 
     /// What is to be said of processes that are slow, each once: environment servers over one step or reset, and roles that
     /// are starting. An environment's program that is not ready within `start_limit` is ended, which counts as a failure.
-    pub(super) fn report_slow(&mut self, stalls: &Stalls, start_limit: Option<Duration>) -> Vec<String> {
+    pub(super) fn report_slow(&mut self, stalls: &StallDetector, start_limit: Option<Duration>) -> Vec<String> {
         let mut said = Vec::new();
         for (i, silent) in stalls.slow_servers(&self.children) {
             let child = &mut self.children[i];
@@ -630,7 +630,7 @@ impl Supervisor {
     }
 
     /// Frees shared memory that dead processes occupy.
-    fn clean(&mut self, domain: &Domain) -> anyhow::Result<Situation> {
+    fn clean(&mut self, domain: &Domain) -> anyhow::Result<RunCondition> {
         let begun = Instant::now();
         let cleaned = cleaner::clean_up(domain, &self.services);
         self.cleaned = Instant::now();
@@ -640,13 +640,13 @@ impl Supervisor {
         }
         if self.services.ports_of_dead_processes() == 0 {
             self.occupied = None;
-            return Ok(Situation::AtWork);
+            return Ok(RunCondition::AtWork);
         }
         let since = *self.occupied.get_or_insert(begun);
         if cleaned.is_ok() && since.elapsed() >= OCCUPIED_PATIENCE {
-            return Ok(Situation::SharedMemoryOccupied);
+            return Ok(RunCondition::SharedMemoryOccupied);
         }
-        Ok(Situation::AtWork)
+        Ok(RunCondition::AtWork)
     }
 
     /// Retires surplus actors and then their environment servers.
@@ -665,14 +665,14 @@ impl Supervisor {
         });
         self.children = children;
         for i in 0..self.children.len() {
-            if self.is_wanted(&self.children[i]) || self.children[i].retires {
+            if self.is_wanted(&self.children[i]) || self.children[i].is_retiring {
                 continue;
             }
             let may_end =
                 self.children[i].instance.role == Role::Actor || has_no_client(&self.children, &self.children[i]);
             let child = &mut self.children[i];
             if let Some(process) = child.process.as_mut().filter(|_| may_end) {
-                child.retires = true;
+                child.is_retiring = true;
                 process.ask_to_retire();
             }
         }
@@ -686,7 +686,7 @@ impl Supervisor {
     }
 
     /// One line: what happened to whom, its last message, and what to do. The log has its earlier messages.
-    fn give_up(&self, name: &str, starts: u32, status: ExitStatus) -> anyhow::Result<Situation> {
+    fn give_up(&self, name: &str, starts: u32, status: ExitStatus) -> anyhow::Result<RunCondition> {
         let lines = self.log.last_lines(name);
         let message = match lines.last() {
             None if status.signal().is_some() => "it wrote no message; is memory short?",
@@ -705,7 +705,7 @@ impl Supervisor {
     pub(super) fn ask_to_retire(&mut self, role: Role) {
         for child in self.children.iter_mut().filter(|child| child.instance.role == role) {
             if let Some(process) = &mut child.process {
-                child.ends = true;
+                child.is_asked_to_end = true;
                 process.ask_to_retire();
             }
         }
@@ -716,7 +716,7 @@ impl Supervisor {
         for child in self.children.iter_mut().filter(|child| which(child.instance.role)) {
             match &mut child.process {
                 Some(process) => {
-                    child.ends = true;
+                    child.is_asked_to_end = true;
                     process.ask_to_end();
                 }
                 None if child.instance.role == Role::Learner && !self.learner_done => {

@@ -4,7 +4,7 @@
 use nalgebra::DMatrix;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
-use shoal_common::algorithms::{AlgorithmSettings, Learned, Shape};
+use shoal_common::algorithms::{AlgorithmSettings, LearnedShapes, Shape};
 use shoal_common::config::{DdpgConfig, DqnConfig, SacConfig, Td3Config};
 use shoal_common::network::NetworkLayout;
 use shoal_common::space::{EnvironmentSpec, Space};
@@ -169,7 +169,7 @@ fn repeat<L: MinibatchLearner>(
     file: &Value,
     batches: &Batches,
     learner: &mut L,
-    learned: &Learned,
+    learned: &LearnedShapes,
     networks: &[Recorded],
     mut update: impl FnMut(&mut L, &Value, &Minibatch) -> Result<Vec<(&'static str, f32)>, Failure>,
 ) -> Result<(), Failure> {
@@ -207,7 +207,7 @@ fn repeat<L: MinibatchLearner>(
 /// Every network's parameters in the learner's order.
 fn parameters<'a>(
     recorded: &Value,
-    learned: &Learned,
+    learned: &LearnedShapes,
     networks: &'a [Recorded],
 ) -> Result<Vec<(&'a Recorded, Vec<f32>)>, Failure> {
     let of = |network: &'a Recorded| {

@@ -13,10 +13,10 @@ use shoal_common::channel::reports::Reports;
 use shoal_common::report::{Heartbeat, Role};
 use shoal_common::run_dir::RunDir;
 use shoal_run::client::RunClient;
-use shoal_run::process::Peer;
+use shoal_run::process::ChildProcess;
 use tempfile::TempDir;
 
-use super::super::measurement::Budget;
+use super::super::measurement::TimeBudget;
 use super::super::progress::{POLL_INTERVAL, newest, open_commits, policy_reader};
 
 /// How long a learner runs before it is killed, so that the launcher has received its heartbeat.
@@ -27,7 +27,7 @@ const TIMEOUT: Duration = Duration::from_secs(60);
 
 /// A running training process.
 pub(super) struct Training {
-    launcher: Peer,
+    launcher: ChildProcess,
     begun: Instant,
     /// Incarnation of the newest learner seen.
     incarnation: u64,
@@ -78,7 +78,7 @@ impl Training {
         command.args(["--set", "run.steps=1_000_000_000_000", "--run"]);
         command.arg(directory.path().join("run"));
         let begun = Instant::now();
-        let launcher = Peer::start(&mut command, "training".into()).context("cannot start a training")?;
+        let launcher = ChildProcess::start(&mut command, "training".into()).context("cannot start a training")?;
         Ok(Self {
             launcher,
             begun,
@@ -111,7 +111,7 @@ impl Training {
     }
 
     /// Observes the run until the first policy that gradient steps have changed.
-    pub(super) fn begin(&mut self, budget: &Budget) -> anyhow::Result<Startup> {
+    pub(super) fn begin(&mut self, budget: &TimeBudget) -> anyhow::Result<Startup> {
         let run = RunDir::planned(&self.directory.path().join("run"));
         let begun = self.begun;
         // Joining before the launcher would look like the remains of an earlier run. The launcher writes this file
@@ -159,7 +159,7 @@ impl Training {
     }
 
     /// Lets the run work for a while.
-    pub(super) fn settle(&mut self, budget: &Budget) -> anyhow::Result<()> {
+    pub(super) fn settle(&mut self, budget: &TimeBudget) -> anyhow::Result<()> {
         let begun = Instant::now();
         self.wait(budget, "no steady state", |_| {
             Ok((begun.elapsed() >= SETTLING_TIME).then_some(()))
@@ -181,7 +181,7 @@ impl Training {
     }
 
     /// Observes the run until the successor of the learner killed at `killed` has made gradient steps.
-    pub(super) fn recover(&mut self, killed: Instant, budget: &Budget) -> anyhow::Result<Recovery> {
+    pub(super) fn recover(&mut self, killed: Instant, budget: &TimeBudget) -> anyhow::Result<Recovery> {
         let mut observer = self.observer.take().context("the training is not being observed")?;
         let (mut ready, mut first, before) = (None, None, self.incarnation);
         let came = self.wait(budget, "no update of the learner's successor", |incarnation| {
@@ -215,7 +215,7 @@ impl Training {
     /// interrupts.
     fn wait<T>(
         &mut self,
-        budget: &Budget,
+        budget: &TimeBudget,
         missing: &str,
         mut look: impl FnMut(&mut u64) -> anyhow::Result<Option<T>>,
     ) -> anyhow::Result<T> {

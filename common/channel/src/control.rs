@@ -22,7 +22,7 @@ use super::domain::Domain;
 use super::error::{Cause, ChannelError, ChannelErrorKind};
 use super::event::{Listener, Notifier};
 use super::memory;
-use super::service::{Entry, Held, claim, service_name};
+use super::service::{HeldService, OpenMode, claim, service_name};
 
 mod message;
 
@@ -110,7 +110,7 @@ impl ControlPort {
     /// When shared memory is unavailable.
     pub fn open(domain: &Domain) -> Result<Self, ChannelError> {
         let server = claim(|| {
-            service(domain, Entry::Open)?
+            service(domain, OpenMode::Open)?
                 .server_builder()
                 .initial_max_slice_len(response_length(domain.max_actors()))
                 .create()
@@ -207,7 +207,7 @@ pub fn ask(
     };
     let request = encode(&AddressedRequest { run, request }).map_err(cannot_ask)?;
     let make_client = || {
-        service(domain, Entry::Open)?
+        service(domain, OpenMode::Open)?
             .client_builder()
             .initial_max_slice_len(request.len().max(REQUEST_BYTES))
             .create()
@@ -292,9 +292,9 @@ fn response_length(max_actors: usize) -> usize {
 }
 
 /// Creates the service.
-pub(super) fn create(domain: &Domain) -> Result<Held, ChannelError> {
-    let service = service(domain, Entry::Create)?;
-    Ok(Held::new(move |visit| {
+pub(super) fn create(domain: &Domain) -> Result<HeldService, ChannelError> {
+    let service = service(domain, OpenMode::Create)?;
+    Ok(HeldService::new(move |visit| {
         let ports = service.dynamic_config();
         ports.list_clients(|port| visit(port.node_id, port.client_id.value()));
         ports.list_servers(|port| visit(port.node_id, port.server_id.value()));
@@ -303,7 +303,7 @@ pub(super) fn create(domain: &Domain) -> Result<Held, ChannelError> {
 
 type ControlService = PortFactory<ipc::Service, [u8], ControlHeader, [u8], ControlHeader>;
 
-fn service(domain: &Domain, entry: Entry) -> Result<ControlService, ChannelError> {
+fn service(domain: &Domain, mode: OpenMode) -> Result<ControlService, ChannelError> {
     let builder = domain
         .node()
         .service_builder(&service_name(domain, CHANNEL)?)
@@ -316,7 +316,7 @@ fn service(domain: &Domain, entry: Entry) -> Result<ControlService, ChannelError
         .max_active_requests_per_client(ACTIVE_REQUESTS)
         .max_response_buffer_size(1)
         .max_borrowed_responses_per_pending_response(1);
-    entry.service(CHANNEL, builder, |b| b.create(), |b| b.open())
+    mode.service(CHANNEL, builder, |b| b.create(), |b| b.open())
 }
 
 #[cfg(test)]

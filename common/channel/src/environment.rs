@@ -8,8 +8,8 @@ mod message;
 mod port;
 mod service;
 
-pub use check::Fault;
-pub use client::{EnvironmentClient, Observed, ResetRequest, Snapshot, Stepped, describe};
+pub use check::ResponseFault;
+pub use client::{EnvironmentClient, EnvironmentResponse, ResetRequest, SnapshotResult, StepResult, describe};
 pub use message::{RequestHeader, RequestKind, ResponseHeader, ResponseLayout, StepBlocks};
 pub use port::{EnvironmentPort, Request};
 pub(super) use service::create;

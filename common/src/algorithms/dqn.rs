@@ -6,7 +6,7 @@ use shoal_base::space::EnvironmentSpec;
 use shoal_policy::PolicyError;
 use shoal_policy::network::{Activation, Hidden, Layers, NetworkLayout};
 
-use super::algorithm::{AlgorithmSettings, AlgorithmSpec, Learned, Shape, TransitionUse};
+use super::algorithm::{AlgorithmSettings, AlgorithmSpec, LearnedShapes, Shape, TransitionUse};
 use super::behaviour::{Behaviour, Epsilon};
 
 /// DQN.
@@ -76,8 +76,8 @@ impl AlgorithmSettings for DqnConfig {
         Ok(Behaviour::EpsilonGreedy(values, epsilon))
     }
 
-    fn learned(&self, spec: &EnvironmentSpec) -> Learned {
-        Learned {
+    fn learned(&self, spec: &EnvironmentSpec) -> LearnedShapes {
+        LearnedShapes {
             policy: ("action-values", Shape::Network(self.network(spec))),
             others: Vec::new(),
         }

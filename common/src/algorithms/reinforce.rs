@@ -8,7 +8,7 @@ use shoal_base::space::EnvironmentSpec;
 use shoal_policy::PolicyError;
 use shoal_policy::network::{Activation, Hidden, Layers, NetworkLayout};
 
-use super::algorithm::{AlgorithmSettings, AlgorithmSpec, Learned, Shape, TransitionUse};
+use super::algorithm::{AlgorithmSettings, AlgorithmSpec, LearnedShapes, Shape, TransitionUse};
 use super::behaviour::Behaviour;
 
 /// REINFORCE.
@@ -88,10 +88,10 @@ impl AlgorithmSettings for ReinforceConfig {
         Ok(Behaviour::Sample(policy))
     }
 
-    fn learned(&self, spec: &EnvironmentSpec) -> Learned {
+    fn learned(&self, spec: &EnvironmentSpec) -> LearnedShapes {
         let ReinforceNetworks { policy, baseline } = self.networks(spec);
         let baseline = baseline.map(|network| ("baseline", Shape::Network(network)));
-        Learned {
+        LearnedShapes {
             policy: ("policy", Shape::Network(policy)),
             others: baseline.into_iter().collect(),
         }

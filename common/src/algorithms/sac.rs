@@ -6,7 +6,7 @@ use shoal_base::space::EnvironmentSpec;
 use shoal_policy::PolicyError;
 use shoal_policy::network::{Activation, Hidden, Layers, NetworkLayout};
 
-use super::algorithm::{ActorCritic, AlgorithmSettings, AlgorithmSpec, Learned, TransitionUse};
+use super::algorithm::{ActorCritic, AlgorithmSettings, AlgorithmSpec, LearnedShapes, TransitionUse};
 use super::behaviour::Behaviour;
 
 /// SAC.
@@ -69,7 +69,7 @@ impl AlgorithmSettings for SacConfig {
         Ok(Behaviour::Gaussian(policy))
     }
 
-    fn learned(&self, spec: &EnvironmentSpec) -> Learned {
+    fn learned(&self, spec: &EnvironmentSpec) -> LearnedShapes {
         self.networks(spec).with_twin_critics()
     }
 

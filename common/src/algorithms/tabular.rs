@@ -5,7 +5,7 @@ use shoal_base::section::{Change, EXPLORATION, from, never};
 use shoal_base::space::EnvironmentSpec;
 use shoal_policy::PolicyError;
 
-use super::algorithm::{AlgorithmSettings, AlgorithmSpec, Learned, Shape, TransitionUse};
+use super::algorithm::{AlgorithmSettings, AlgorithmSpec, LearnedShapes, Shape, TransitionUse};
 use super::behaviour::{Behaviour, Epsilon};
 
 /// Q-learning.
@@ -42,9 +42,9 @@ impl AlgorithmSettings for TabularConfig {
         Ok(Behaviour::EpsilonGreedy(values, Epsilon::constant(self.epsilon)))
     }
 
-    fn learned(&self, spec: &EnvironmentSpec) -> Learned {
+    fn learned(&self, spec: &EnvironmentSpec) -> LearnedShapes {
         let (states, actions) = (spec.observation.size(), spec.action.size());
-        Learned {
+        LearnedShapes {
             policy: ("action-values", Shape::Table { states, actions }),
             others: Vec::new(),
         }

@@ -31,7 +31,7 @@ const SPREAD_FLOOR: f32 = 1e-8;
 
 /// A network without a target network, and the state of its optimiser.
 #[derive(Clone, Debug)]
-struct Learned {
+struct TrainableNetworkWithPass {
     layout: NetworkLayout,
     parameters: Aligned,
     gradient: Aligned,
@@ -41,7 +41,7 @@ struct Learned {
     d: DMatrix<f32>,
 }
 
-impl Learned {
+impl TrainableNetworkWithPass {
     fn new(layout: NetworkLayout, learning_rate: f64, seed: u64, index: u64, steps: usize) -> Self {
         let parameters = glorot(&layout, seed, index);
         Self {
@@ -77,8 +77,8 @@ impl Learned {
 #[derive(Clone, Debug)]
 pub struct Reinforce {
     settings: config::ReinforceConfig,
-    policy: Learned,
-    baseline: Option<Learned>,
+    policy: TrainableNetworkWithPass,
+    baseline: Option<TrainableNetworkWithPass>,
     /// Rows learned from.
     rows: u64,
     /// Steps taken by Adam, as stored in a checkpoint. The `f32` is exact up to 2²⁴, more episodes than any run has.
@@ -110,8 +110,9 @@ impl Reinforce {
         policy::softmax("reinforce", policy, spec, 0)?;
         let steps = sizes.chunk_rows * sizes.actors as usize;
         Ok(Self {
-            policy: Learned::new(policy, settings.learning_rate, seed, 0, steps),
-            baseline: baseline.map(|network| Learned::new(network, settings.baseline_learning_rate, seed, 1, steps)),
+            policy: TrainableNetworkWithPass::new(policy, settings.learning_rate, seed, 0, steps),
+            baseline: baseline
+                .map(|network| TrainableNetworkWithPass::new(network, settings.baseline_learning_rate, seed, 1, steps)),
             settings: settings.clone(),
             rows: 0,
             steps: [0.0],
@@ -191,7 +192,7 @@ impl Reinforce {
             && episode.iter().all(is_finite)
     }
 
-    fn networks(&self) -> impl Iterator<Item = &Learned> {
+    fn networks(&self) -> impl Iterator<Item = &TrainableNetworkWithPass> {
         std::iter::once(&self.policy).chain(&self.baseline)
     }
 }

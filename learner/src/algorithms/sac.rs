@@ -72,13 +72,13 @@ impl Draw {
     }
 
     /// The first `cut` samples, and the others.
-    fn split_at(&mut self, cut: usize) -> (Part<'_>, Part<'_>) {
+    fn split_at(&mut self, cut: usize) -> (MinibatchPart<'_>, MinibatchPart<'_>) {
         let width = self.a.nrows();
         let pi = self.pi.samples().split_at(cut);
         let noise = self.noise.as_slice().split_at(cut * width);
         let a = self.a.as_mut_slice().split_at_mut(cut * width);
         let log_pi = self.log_pi.as_mut_slice().split_at_mut(cut);
-        let part = |pi, noise, a, log_pi| Part {
+        let part = |pi, noise, a, log_pi| MinibatchPart {
             width,
             pi,
             noise,
@@ -90,7 +90,7 @@ impl Draw {
 }
 
 /// Some samples of a [`Draw`].
-struct Part<'a> {
+struct MinibatchPart<'a> {
     width: usize,
     pi: Samples<'a>,
     noise: &'a [f32],
@@ -98,7 +98,7 @@ struct Part<'a> {
     log_pi: &'a mut [f32],
 }
 
-impl Part<'_> {
+impl MinibatchPart<'_> {
     /// Draws a for each observation of `s` with the policy φ.
     fn draw(&mut self, phi: &[f32], s: &[f32]) {
         let width = self.width;
@@ -189,7 +189,7 @@ pub struct Sac {
     actor: TrainableNetwork,
     critics: TwinCritics,
     temperature: Temperature,
-    /// Part `u` of this stream has the noise of update number `u`.
+    /// MinibatchPart `u` of this stream has the noise of update number `u`.
     stream: Stream,
     // Buffers.
     now: Draw,
@@ -296,19 +296,20 @@ impl Sac {
         let actor = &mut self.actor;
         let phi = &*actor.parameters;
         let cut = self.threads.first_share(size);
-        let part = |mut draw: Part<'_>, [mut first, mut second]: [CriticPart<'_>; 2], s: &[f32], d_pi: &mut [f32]| {
-            first.forward(s, draw.a);
-            second.forward(s, draw.a);
-            for i in 0..draw.log_pi.len() {
-                let first_is_less = first.values()[i] <= second.values()[i];
-                let each = -1.0 / size as f32;
-                (first.d_q[i], second.d_q[i]) = if first_is_less { (each, 0.0) } else { (0.0, each) };
-            }
-            first.backward();
-            second.backward();
-            draw.backward(alpha / size as f32, [first.d_a, second.d_a], d_pi);
-            draw.pi.backward(phi, d_pi, 1);
-        };
+        let part =
+            |mut draw: MinibatchPart<'_>, [mut first, mut second]: [CriticPart<'_>; 2], s: &[f32], d_pi: &mut [f32]| {
+                first.forward(s, draw.a);
+                second.forward(s, draw.a);
+                for i in 0..draw.log_pi.len() {
+                    let first_is_less = first.values()[i] <= second.values()[i];
+                    let each = -1.0 / size as f32;
+                    (first.d_q[i], second.d_q[i]) = if first_is_less { (each, 0.0) } else { (0.0, each) };
+                }
+                first.backward();
+                second.backward();
+                draw.backward(alpha / size as f32, [first.d_a, second.d_a], d_pi);
+                draw.pi.backward(phi, d_pi, 1);
+            };
         let observations = s.as_slice().split_at(cut * s.nrows());
         let outputs = self.d_pi.nrows();
         let d_pi = self.d_pi.as_mut_slice().split_at_mut(cut * outputs);

@@ -10,9 +10,9 @@ use std::path::{Path, PathBuf};
 
 use bincode::config::{self, Config};
 use serde::{Deserialize, Serialize};
-use shoal_common::durable::{self, Kind, Prepared, SealError, sync_directory_of};
+use shoal_common::durable::{self, FileKind, PreparedFile, SealError, sync_directory_of};
 
-const KIND: Kind = Kind {
+const KIND: FileKind = FileKind {
     magic: *b"SHOALCKP",
     version: 2,
     name: "a checkpoint",
@@ -82,7 +82,7 @@ pub enum CheckpointError {
 
 /// What `load_newest` found.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Loaded {
+pub struct LoadedCheckpoint {
     /// The newest checkpoint that is whole.
     pub checkpoint: Checkpoint,
     /// What is wrong with newer ones, for the run's log.
@@ -119,7 +119,7 @@ struct Header {
 }
 
 /// The content of one of the two files.
-enum Found {
+enum CheckpointFile {
     Missing,
     Whole(Checkpoint),
     Damaged(String),
@@ -142,23 +142,23 @@ impl Checkpoints {
     }
 
     /// Reads the newest checkpoint that is whole; `None` if there is none at all.
-    pub fn load_newest(&mut self) -> Result<Option<Loaded>, CheckpointError> {
+    pub fn load_newest(&mut self) -> Result<Option<LoadedCheckpoint>, CheckpointError> {
         let latest = self.read(LATEST)?;
-        self.latest_is_sound = Some(matches!(latest, Found::Whole(_)));
+        self.latest_is_sound = Some(matches!(latest, CheckpointFile::Whole(_)));
         let latest_path = self.directory.join(LATEST);
         let mut warnings = match latest {
-            Found::Whole(checkpoint) => {
-                return Ok(Some(Loaded {
+            CheckpointFile::Whole(checkpoint) => {
+                return Ok(Some(LoadedCheckpoint {
                     checkpoint,
                     warnings: vec![],
                 }));
             }
-            Found::Missing => vec![],
-            Found::Damaged(reason) => vec![format!("{}: {reason}", latest_path.display())],
+            CheckpointFile::Missing => vec![],
+            CheckpointFile::Damaged(reason) => vec![format!("{}: {reason}", latest_path.display())],
         };
         let previous = self.directory.join(PREVIOUS);
         match self.read(PREVIOUS)? {
-            Found::Whole(checkpoint) => {
+            CheckpointFile::Whole(checkpoint) => {
                 if warnings.is_empty() {
                     warnings.push(format!(
                         "{}: missing, probably after a crash while it was being replaced",
@@ -171,10 +171,10 @@ impl Checkpoints {
                     checkpoint.counters.updates
                 );
                 warnings.push(used);
-                return Ok(Some(Loaded { checkpoint, warnings }));
+                return Ok(Some(LoadedCheckpoint { checkpoint, warnings }));
             }
-            Found::Missing => {}
-            Found::Damaged(reason) => warnings.push(format!("{}: {reason}", previous.display())),
+            CheckpointFile::Missing => {}
+            CheckpointFile::Damaged(reason) => warnings.push(format!("{}: {reason}", previous.display())),
         }
         if warnings.is_empty() {
             return Ok(None);
@@ -196,7 +196,7 @@ impl Checkpoints {
         Ok(())
     }
 
-    fn prepare(&self, counters: &Counters, arrays: &[(&str, &[f32])]) -> Result<Prepared, CheckpointError> {
+    fn prepare(&self, counters: &Counters, arrays: &[(&str, &[f32])]) -> Result<PreparedFile, CheckpointError> {
         let path = self.directory.join(LATEST);
         let header = Header {
             fingerprint: self.fingerprint,
@@ -206,7 +206,7 @@ impl Checkpoints {
                 .map(|(name, numbers)| ((*name).to_owned(), numbers.len() as u64))
                 .collect(),
         };
-        Prepared::write(&path, |file| {
+        PreparedFile::write(&path, |file| {
             durable::seal(KIND, file, |body| {
                 body.write_all(&bincode::serde::encode_to_vec(&header, encoding()).map_err(io::Error::other)?)?;
                 arrays
@@ -222,7 +222,7 @@ impl Checkpoints {
         let latest = self.directory.join(LATEST);
         let sound = match self.latest_is_sound {
             Some(sound) => sound,
-            None => matches!(self.read(LATEST)?, Found::Whole(_)),
+            None => matches!(self.read(LATEST)?, CheckpointFile::Whole(_)),
         };
         let kept = if sound {
             self.directory.join(PREVIOUS)
@@ -240,7 +240,7 @@ impl Checkpoints {
         }
     }
 
-    fn publish(&mut self, prepared: Prepared) -> Result<(), CheckpointError> {
+    fn publish(&mut self, prepared: PreparedFile) -> Result<(), CheckpointError> {
         prepared.publish().map_err(|source| CheckpointError::Write {
             path: self.directory.join(LATEST),
             source,
@@ -260,7 +260,7 @@ impl Checkpoints {
         }
     }
 
-    fn read(&self, name: &str) -> Result<Found, CheckpointError> {
+    fn read(&self, name: &str) -> Result<CheckpointFile, CheckpointError> {
         let path = self.directory.join(name);
         let refused = |reason| CheckpointError::Refused {
             path: path.clone(),
@@ -268,12 +268,12 @@ impl Checkpoints {
         };
         let body = match durable::read_sealed(KIND, &path) {
             Ok(body) => body,
-            Err(SealError::Io(error)) if error.kind() == io::ErrorKind::NotFound => return Ok(Found::Missing),
+            Err(SealError::Io(error)) if error.kind() == io::ErrorKind::NotFound => return Ok(CheckpointFile::Missing),
             Err(error @ SealError::Version { .. }) => return Err(refused(error.to_string())),
-            Err(error) => return Ok(Found::Damaged(error.to_string())),
+            Err(error) => return Ok(CheckpointFile::Damaged(error.to_string())),
         };
         let Some((header, numbers)) = parse(&body) else {
-            return Ok(Found::Damaged("its parts do not fit together".into()));
+            return Ok(CheckpointFile::Damaged("its parts do not fit together".into()));
         };
         if header.fingerprint != self.fingerprint {
             return Err(refused(format!(
@@ -282,7 +282,7 @@ impl Checkpoints {
             )));
         }
         let arrays = header.arrays.into_iter().map(|(name, _)| name).zip(numbers).collect();
-        Ok(Found::Whole(Checkpoint {
+        Ok(CheckpointFile::Whole(Checkpoint {
             counters: header.counters,
             arrays,
         }))

@@ -82,7 +82,7 @@ fn await_chunk(learner: &mut Learner<'_>, actor: usize, first: u64) -> Result<u6
                 publisher.refresh_connections()
             },
         );
-        taken.map_err(Exit::widen)??;
+        taken.map_err(Exit::convert)??;
         learner.report_activity(Activity::Working);
     }
 }

@@ -99,8 +99,8 @@ pub fn disk_bytes(config: &Config, run: &RunDir) -> Result<u64, SizeError> {
     let replay = if run.replay_file().exists() {
         0
     } else {
-        let places = replay_layout(config).places().ok_or(SizeError::Replay { capacity })?;
-        places.end as u64
+        let offsets = replay_layout(config).offsets().ok_or(SizeError::Replay { capacity })?;
+        offsets.end as u64
     };
     let (_, policy) = config.learned().policy;
     // Three checkpoints: the latest, the one before, and the next one while it is written. Three policies: the best,

@@ -23,8 +23,8 @@ impl Replay {
         let rows = other.rows();
         let first = rows.end.saturating_sub(most.min(self.layout.ring)).max(rows.start);
         let count = rows.end - first;
-        // As for a chunk: recovery after a kill must know that these places may have been written.
-        self.words.store(self.places.write_horizon, count);
+        // As for a chunk: recovery after a kill must know that these offsets may have been written.
+        self.words.store(self.offsets.write_horizon, count);
         let mut numbers = Vec::new();
         let mut next = first;
         while next < rows.end {
@@ -36,7 +36,7 @@ impl Replay {
         }
         // The rows are in the file before a record names them.
         fence(Ordering::Release);
-        self.record.add_rows_of_nobody(count);
+        self.record.add_inherited_rows(count);
         self.publish(self.record.generation() + 1);
         self.flush()?;
         Ok(count)

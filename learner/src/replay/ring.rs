@@ -5,12 +5,12 @@ use std::io;
 use std::ops::Range;
 
 use memmap2::{MmapMut, MmapOptions};
-use shoal_common::commit::{Places, ReplayLayout};
+use shoal_common::commit::{FileOffsets, ReplayLayout};
 
 use super::check;
 use super::step::WriteStep;
 
-/// The places of the ring. Row `index` is stored in place `index` mod `ring`.
+/// The offsets of the ring. Row `index` is stored in place `index` mod `ring`.
 pub(super) struct Ring {
     map: MmapMut,
     /// Where the rows begin in the mapping, in bytes; the checks begin at 0.
@@ -21,17 +21,17 @@ pub(super) struct Ring {
 
 impl Ring {
     /// Maps checks and rows of a file whose length has been compared with its layout.
-    pub(super) fn map(file: &File, layout: &ReplayLayout, places: &Places) -> io::Result<Self> {
+    pub(super) fn map(file: &File, layout: &ReplayLayout, offsets: &FileOffsets) -> io::Result<Self> {
         let mut options = MmapOptions::new();
         options
-            .offset(places.checks.start as u64)
-            .len(places.end - places.checks.start);
+            .offset(offsets.checks.start as u64)
+            .len(offsets.end - offsets.checks.start);
         // SAFETY: the bytes change under a mapping only if another process writes the file. Rows and checks are written
         // and read only by the process that holds the file's lock, which is this one, and only through this mapping.
         // Other processes map the header, which ends before it. The file is never shortened: its space was reserved
         // when it was created, and its length has been checked.
         let map = unsafe { options.map_mut(file)? };
-        let rows = places.rows.start - places.checks.start;
+        let rows = offsets.rows.start - offsets.checks.start;
         Ok(Self {
             map,
             rows,
@@ -58,9 +58,9 @@ impl Ring {
 
     /// Writes rows `first ..`, at most a ring of them, and then their checks.
     pub(super) fn put(&mut self, first: u64, numbers: &[f32], mut step: impl FnMut(WriteStep)) {
-        let (start, places, width) = (self.place(first), self.ring as usize, self.width);
+        let (start, offsets, width) = (self.place(first), self.ring as usize, self.width);
         let (checks, rows) = self.parts();
-        let (before, after) = numbers.split_at(numbers.len().min((places - start) * width));
+        let (before, after) = numbers.split_at(numbers.len().min((offsets - start) * width));
         rows[start * width..][..before.len()].copy_from_slice(before);
         step(WriteStep::RowsBeforeWrap);
         rows[..after.len()].copy_from_slice(after);
@@ -86,7 +86,7 @@ impl Ring {
         check != check::NONE && check == check::of_row(index, self.row(index))
     }
 
-    /// Empties the places outside `rows`. Otherwise a row that was never committed, or was given up after a power loss,
+    /// Empties the offsets outside `rows`. Otherwise a row that was never committed, or was given up after a power loss,
     /// could pass for the later row with its number. Returns true if a place was not empty.
     pub(super) fn clear_outside(&mut self, rows: Range<u64>) -> bool {
         let mut cleared = false;

@@ -8,8 +8,8 @@ use bincode::config;
 use proptest::prelude::*;
 use proptest::sample::Index;
 use rustix::process::{Resource, Rlimit, setrlimit};
-use shoal_common::durable::{self, Kind};
-use shoal_learner::process::checkpoint::{CheckpointError, Checkpoints, Counters, Loaded};
+use shoal_common::durable::{self, FileKind};
+use shoal_learner::process::checkpoint::{CheckpointError, Checkpoints, Counters, LoadedCheckpoint};
 use tempfile::TempDir;
 
 const NAMES: [&str; 2] = ["latest.ckpt", "previous.ckpt"];
@@ -42,7 +42,7 @@ fn save(directory: &Path, updates: u64) {
 }
 
 /// Loads, and asserts that the files have not changed.
-fn load(directory: &Path) -> Result<Option<Loaded>, CheckpointError> {
+fn load(directory: &Path) -> Result<Option<LoadedCheckpoint>, CheckpointError> {
     let read = || NAMES.map(|name| fs::read(directory.join(name)).ok());
     let before = read();
     let loaded = Checkpoints::new(directory, 7).load_newest();
@@ -97,7 +97,7 @@ fn damaged(mut bytes: Vec<u8>, damage: Vec<Damage>) -> Vec<u8> {
 }
 
 fn sealed(path: &Path, body: &[u8]) {
-    const KIND: Kind = Kind {
+    const KIND: FileKind = FileKind {
         magic: *b"SHOALCKP",
         version: 2,
         name: "a checkpoint",

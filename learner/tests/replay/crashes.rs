@@ -8,7 +8,7 @@ use proptest::prelude::*;
 use shoal_common::commit::{CommitReader, OpenError};
 use shoal_learner::replay::{Appended, Replay, WriteStep};
 
-use crate::model::{ACTORS, Directory, Model, WIDTH, chunk, filled, id, layout, places, reopen};
+use crate::model::{ACTORS, Directory, Model, WIDTH, chunk, filled, id, layout, offsets, reopen};
 
 /// The content of the file after each step.
 type Images = Vec<(WriteStep, Vec<u8>)>;
@@ -45,9 +45,9 @@ proptest! {
             for (step, mut image) in images.lock().unwrap().drain(..) {
                 committed |= step == WriteStep::Sealed;
                 if step == WriteStep::WriteHorizonSet {
-                    // If the kill comes while rows are copied, their places may hold anything.
+                    // If the kill comes while rows are copied, their offsets may hold anything.
                     for index in before.head()..after.head() {
-                        let place = places(ring).rows.start + (index % ring) as usize * 4 * WIDTH;
+                        let place = offsets(ring).rows.start + (index % ring) as usize * 4 * WIDTH;
                         if noise >> (index % 32) & 1 == 1 {
                             image[place + (noise % 24) as usize] ^= 0x55;
                         }
@@ -137,12 +137,12 @@ proptest! {
             partial.add(actor, id, &chunk(actor, id, rows));
             states.insert(partial.head(), partial.clone());
         }
-        let places = places(ring);
+        let offsets = offsets(ring);
         // The used parts of the file, so that the damage hits something.
-        let used: Vec<usize> = (places.published..places.published + 16)
-            .chain(places.slots.iter().flat_map(|&slot| slot..slot + 104))
-            .chain(places.checks.clone())
-            .chain(places.rows.clone())
+        let used: Vec<usize> = (offsets.published..offsets.published + 16)
+            .chain(offsets.slots.iter().flat_map(|&slot| slot..slot + 104))
+            .chain(offsets.checks.clone())
+            .chain(offsets.rows.clone())
             .collect();
         for (at, byte) in damage {
             image[*at.get(&used)] = byte;
@@ -158,8 +158,8 @@ proptest! {
 fn a_torn_newest_record_falls_back_to_the_previous_one_with_a_warning() {
     let (directory, _) = filled(100, &[(0, 3), (1, 2), (0, 4)]);
     let mut image = fs::read(directory.replay()).unwrap();
-    let newest = u64::from_le_bytes(image[places(100).published..][..8].try_into().unwrap());
-    let slot = places(100).slots[newest as usize % 2];
+    let newest = u64::from_le_bytes(image[offsets(100).published..][..8].try_into().unwrap());
+    let slot = offsets(100).slots[newest as usize % 2];
     image[slot + 16] ^= 1;
     // An actor that opens it first waits until the learner has repaired it.
     fs::write(directory.replay(), &image).unwrap();
@@ -181,7 +181,7 @@ fn a_torn_newest_record_falls_back_to_the_previous_one_with_a_warning() {
     );
     assert_eq!(CommitReader::open(&directory.replay()).unwrap().committed(0), id(0, 2));
 
-    for slot in places(100).slots {
+    for slot in offsets(100).slots {
         image[slot..slot + 104].fill(0);
     }
     drop(replay);
@@ -194,7 +194,7 @@ fn a_torn_newest_record_falls_back_to_the_previous_one_with_a_warning() {
 fn a_damaged_row_also_loses_the_rows_before_it() {
     let (directory, model) = filled(100, &[(0, 60), (1, 30)]);
     let mut image = fs::read(directory.replay()).unwrap();
-    image[places(100).rows.start + 20 * 4 * WIDTH] ^= 1;
+    image[offsets(100).rows.start + 20 * 4 * WIDTH] ^= 1;
     let replay = reopen(&directory.replay(), &image, 100).unwrap();
     model.check(&replay);
     assert_eq!(replay.rows(), 21..90);
@@ -221,7 +221,7 @@ fn a_sync_on_another_thread_counts_once_it_is_finished() {
     model.add(0, id(0, 2), &numbers);
     drop(replay);
     let mut image = fs::read(directory.replay()).unwrap();
-    for slot in &places(100).slots[..2] {
+    for slot in &offsets(100).slots[..2] {
         image[*slot] ^= 1;
     }
     model.check(&reopen(&directory.replay(), &image, 100).unwrap());
@@ -250,7 +250,7 @@ fn word(image: &[u8], at: usize) -> u64 {
 fn a_record_that_is_being_written_has_no_seal() {
     let (_directory, images) = images_of_a_commit();
     for (step, image) in images {
-        let other = places(100).slots[1 - (word(&image, places(100).published) % 2) as usize];
+        let other = offsets(100).slots[1 - (word(&image, offsets(100).published) % 2) as usize];
         let cleared = word(&image, other) == 0;
         assert_eq!(
             cleared,
@@ -264,7 +264,7 @@ fn a_record_that_is_being_written_has_no_seal() {
 fn opening_leaves_the_record_that_it_continues_from() {
     let (directory, images) = images_of_a_commit();
     for (step, image) in images {
-        let slots = places(100).slots;
+        let slots = offsets(100).slots;
         let newest = slots[..2]
             .iter()
             .max_by_key(|&&slot| (word(&image, slot) != 0, word(&image, slot + 8)));
@@ -287,7 +287,7 @@ fn a_power_loss_among_unsynced_rows_goes_back_to_the_synced_ones() {
     replay.append_and_commit(1, id(0, 1), &chunk(1, id(0, 1), 60)).unwrap();
     drop(replay);
     let mut image = fs::read(directory.replay()).unwrap();
-    let row = |index| places(100).rows.start + 4 * WIDTH * index;
+    let row = |index| offsets(100).rows.start + 4 * WIDTH * index;
     image[row(30)..row(40)].fill(0);
     let mut replay = reopen(&directory.replay(), &image, 100).unwrap();
     model.check(&replay);
@@ -306,6 +306,6 @@ fn a_power_loss_among_unsynced_rows_goes_back_to_the_synced_ones() {
     assert_eq!(replay.rows(), 0..35);
     drop(replay);
     let image = fs::read(directory.replay()).unwrap();
-    let checks = &image[places(100).checks.start..][..400];
+    let checks = &image[offsets(100).checks.start..][..400];
     assert!(checks[35 * 4..].iter().all(|&byte| byte == 0));
 }

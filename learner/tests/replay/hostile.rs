@@ -6,7 +6,7 @@ use proptest::prelude::*;
 use shoal_common::commit::{CommitReader, OpenError};
 use shoal_learner::replay::{Appended, ChunkId, Replay, ReplayError};
 
-use crate::model::{ACTORS, chunk, filled, id, layout, places, reopen};
+use crate::model::{ACTORS, chunk, filled, id, layout, offsets, reopen};
 
 const RING: u64 = 40;
 /// Words of a record: generation, head, tail, and three per actor.
@@ -93,14 +93,14 @@ proptest! {
         let (directory, _) = filled(RING, &writes);
         let mut image = fs::read(directory.replay()).unwrap();
         for (slot, word, value) in changes {
-            put(&mut image, places(RING).slots[slot] + 8 * (1 + word), value);
+            put(&mut image, offsets(RING).slots[slot] + 8 * (1 + word), value);
         }
-        for (slot, sealed) in places(RING).slots.into_iter().zip(sealed) {
+        for (slot, sealed) in offsets(RING).slots.into_iter().zip(sealed) {
             if sealed {
                 seal(&mut image, slot);
             }
         }
-        for (at, value) in [(places(RING).published, published), (places(RING).write_horizon, write_horizon)] {
+        for (at, value) in [(offsets(RING).published, published), (offsets(RING).write_horizon, write_horizon)] {
             if let Some(value) = value {
                 put(&mut image, at, value);
             }

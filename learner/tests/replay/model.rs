@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use shoal_common::commit::Places;
+use shoal_common::commit::FileOffsets;
 use shoal_common::transition::RowLayout;
 use shoal_learner::replay::{ActorCommit, ChunkId, Replay, ReplayError, ReplayLayout};
 use tempfile::TempDir;
@@ -22,8 +22,8 @@ pub(crate) fn layout(ring: u64) -> ReplayLayout {
     }
 }
 
-pub(crate) fn places(ring: u64) -> Places {
-    layout(ring).places().unwrap()
+pub(crate) fn offsets(ring: u64) -> FileOffsets {
+    layout(ring).offsets().unwrap()
 }
 
 pub(crate) fn id(incarnation: u64, sequence: u64) -> ChunkId {

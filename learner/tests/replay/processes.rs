@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use shoal_common::commit::{CommitReader, OpenError, Record};
+use shoal_common::commit::{CommitReader, CommitRecord, OpenError};
 use shoal_common::transition::RowLayout;
 use shoal_learner::process::checkpoint::{CheckpointError, Checkpoints, Counters};
 use shoal_learner::replay::{ChunkId, Replay, ReplayError, ReplayLayout};
@@ -91,7 +91,7 @@ fn child_appends_forever() {
 }
 
 /// Asserts that a record is of one moment: the actors' rows add up to its head, and the actors took turns.
-fn check_record(record: &Record) {
+fn check_record(record: &CommitRecord) {
     let actors = (0..ACTORS).map(|actor| record.actor(actor));
     assert_eq!(actors.map(|actor| actor.rows).sum::<u64>(), record.head());
     assert!(record.actor(0).last_chunk.sequence - record.actor(1).last_chunk.sequence <= 1);
@@ -226,7 +226,7 @@ fn under_limit(set_up: &str, test: &str, path: &Path) {
 fn child_creates_a_replay_that_is_too_large() {
     let path = path_of_child();
     let error = Replay::create(&path, &layout()).unwrap_err();
-    let bytes = layout().places().unwrap().end;
+    let bytes = layout().offsets().unwrap().end;
     assert!(matches!(error, ReplayError::NoSpace { .. }), "{error}");
     let line = error.to_string();
     assert!(

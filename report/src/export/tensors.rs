@@ -3,18 +3,18 @@
 use safetensors::Dtype;
 use safetensors::tensor::TensorView;
 
-use super::{Body, ExportedNetwork, Portable};
+use super::{ExportedNetwork, PolicyFunction, PortablePolicy};
 
 /// The bytes of the file. A network has `layers.<i>.weight` (outputs × inputs, row-major) and `layers.<i>.bias` for
 /// each layer i from 0, the output layer last. If observations are normalised, `observation.mean` and
 /// `observation.factor` say how: x ← (x − mean) · factor, clipped to ±`observation_clip` of the metadata. A table has `action_values` (states × actions). The metadata describes
 /// the rest.
-pub(super) fn file(policy: &Portable) -> anyhow::Result<Vec<u8>> {
+pub(super) fn file(policy: &PortablePolicy) -> anyhow::Result<Vec<u8>> {
     let tensors = match &policy.body {
-        Body::Actions { network, .. } | Body::Probabilities { network } | Body::Values { network } => {
-            of_network(network)
-        }
-        Body::Table {
+        PolicyFunction::Actions { network, .. }
+        | PolicyFunction::Probabilities { network }
+        | PolicyFunction::Values { network } => of_network(network),
+        PolicyFunction::Table {
             states,
             actions,
             values,
@@ -83,7 +83,7 @@ mod tests {
     #[test]
     fn tensors_and_metadata_suffice_to_compute_the_same_actions() {
         for (config, policy) in policies() {
-            let bytes = Portable::new(&config, &policy, "best")
+            let bytes = PortablePolicy::new(&config, &policy, "best")
                 .unwrap()
                 .to_safetensors()
                 .unwrap();

@@ -6,7 +6,7 @@ use plotters::style::text_anchor::HPos;
 use shoal_run::recorder::EvaluationRecord;
 
 use super::canvas::{BLUE, px, save, text};
-use super::panel::{Axis, Look, Panel, Series, range_of};
+use super::panel::{Axis, Panel, Series, SeriesStyle, range_of};
 
 const SIZE: (u32, u32) = (860, 470);
 
@@ -42,7 +42,7 @@ pub fn learning_curve(evaluations: &[EvaluationRecord], path: &Path) -> anyhow::
     let mut series = Vec::new();
     if raw.len() <= 100 {
         series.push(Series {
-            look: Look::Dots,
+            style: SeriesStyle::Dots,
             opacity: 0.6,
             width: 2.5,
             ..Series::line("", BLUE, raw.clone())

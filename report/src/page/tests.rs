@@ -176,11 +176,11 @@ fn the_page_of_a_long_run_is_small_and_shows_its_peak() {
 fn many_runs_share_the_points_and_episodes() {
     let sizes: Vec<_> = [1, 3, 5, 30, 500]
         .iter()
-        .map(|runs| Limits::of(29, *runs))
+        .map(|runs| PageLimits::of(29, *runs))
         .map(|r| (r.points, r.episodes))
         .collect();
     assert_eq!(sizes, [(800, 6), (800, 6), (800, 4), (133, 0), (60, 0)]);
-    assert_eq!(Limits::of(0, 500).episodes, 1);
+    assert_eq!(PageLimits::of(0, 500).episodes, 1);
 }
 
 #[test]

@@ -22,7 +22,7 @@ use crate::status::{replay_rows, saved_status};
 
 /// What the command line asks a resumed run to change.
 #[derive(Clone, Debug, Default)]
-pub struct Asked {
+pub struct RequestedChanges {
     /// `run.steps`.
     pub steps: Option<u64>,
     /// `run.episodes`.
@@ -48,7 +48,7 @@ impl Revision {
     ///
     /// # Errors
     /// When a key cannot change, or a value is invalid. The message names the key and where it was set.
-    pub fn new(run: &RunDir, used: &Config, asked: &Asked) -> anyhow::Result<Self> {
+    pub fn new(run: &RunDir, used: &Config, asked: &RequestedChanges) -> anyhow::Result<Self> {
         let path = run.config_file();
         let origin = path.display().to_string();
         let text = std::fs::read_to_string(&path).with_context(|| format!("cannot read {origin}"))?;
@@ -194,7 +194,7 @@ pub fn store_actors(run: &RunDir, used: &Config, actors: u32, now: Moment) -> an
 
 /// What `config.toml` asks a run for that is not running, in words; `None` if it is what the run was last used with.
 pub fn edited(run: &RunDir, used: &Config) -> Option<String> {
-    match Revision::new(run, used, &Asked::default()) {
+    match Revision::new(run, used, &RequestedChanges::default()) {
         Err(error) => Some(format!("it cannot be resumed: {error:#}")),
         Ok(revision) => {
             let change = |(it, _): &(Difference, String)| format!("{} = {} instead of {}", it.key, it.after, it.before);

@@ -56,7 +56,7 @@ pub struct ReplayLayout {
 
 /// The offsets of the parts of a replay file, in bytes.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Places {
+pub struct FileOffsets {
     /// The word with the published generation, which selects the active slot.
     pub published: usize,
     /// The word with the write horizon: the row number up to which the ring may have been written.
@@ -93,7 +93,7 @@ pub enum PreambleError {
 impl ReplayLayout {
     /// The offsets of all parts. `None` if there are no rows or no actors, if there are too many actors or snapshot
     /// words, or if the file would be larger than a file can be.
-    pub fn places(&self) -> Option<Places> {
+    pub fn offsets(&self) -> Option<FileOffsets> {
         if self.ring == 0
             || !(1..=MAX_ACTORS).contains(&self.actors)
             || self.actor_snapshot_words > MAX_ACTOR_SNAPSHOT_WORDS
@@ -118,7 +118,7 @@ impl ReplayLayout {
         let end = rows.end.checked_next_multiple_of(BLOCK)?;
         i64::try_from(end).ok()?;
         let slots = std::array::from_fn(|i| first + i * slot);
-        Some(Places {
+        Some(FileOffsets {
             published,
             write_horizon,
             slots,

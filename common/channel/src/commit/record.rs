@@ -43,7 +43,7 @@ pub struct ActorCommit {
 
 /// A commit record. Rows are numbered from 0 in the order they were committed, for the life of the file.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Record {
+pub struct CommitRecord {
     /// Exactly as in a slot: the three fields below, then for each actor three words and its snapshot.
     words: Vec<u64>,
     /// Words of an actor.
@@ -62,8 +62,8 @@ const OPEN: u64 = 0;
 /// More rows and records than any run will write.
 const LIMIT: u64 = 1 << 60;
 
-impl Record {
-    /// The record of an empty replay of this layout, which must have [`places`](ReplayLayout::places).
+impl CommitRecord {
+    /// The record of an empty replay of this layout, which must have [`offsets`](ReplayLayout::offsets).
     pub fn empty(layout: &ReplayLayout) -> Self {
         let stride = ACTOR_WORDS + layout.actor_snapshot_words;
         Self {
@@ -113,7 +113,7 @@ impl Record {
     }
 
     /// Adds rows that belong to no actor: those of another replay.
-    pub fn add_rows_of_nobody(&mut self, rows: u64) {
+    pub fn add_inherited_rows(&mut self, rows: u64) {
         self.words[HEAD] += rows;
     }
 

@@ -14,13 +14,13 @@ use shoal_base::report::Role;
 use shoal_base::space::{EnvironmentSpec, Space};
 use shoal_base::stop::Stop;
 
-use super::check::{Fault, Part, find_fault};
+use super::check::{ResponseFault, ResponsePart, find_fault};
 use super::message::{Block, RequestHeader, RequestKind, ResponseHeader, ResponseLayout, ResponseStatus};
 use super::service::{EnvironmentService, name, request_length, service};
 use crate::domain::Domain;
 use crate::error::{ChannelError, PeerError};
 use crate::event::{EventName, Listener, Notifier, wait_for};
-use crate::service::{CLAIM_PATIENCE, Entry, claim};
+use crate::service::{CLAIM_PATIENCE, OpenMode, claim};
 
 /// Which episodes a reset begins.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -41,16 +41,16 @@ pub enum ResetRequest {
 
 /// The result of a step.
 #[derive(Debug)]
-pub enum Stepped {
+pub enum StepResult {
     /// Every environment took the step.
-    Taken(Observed),
+    Taken(EnvironmentResponse),
     /// The server died and another one has taken its place: the current episodes are lost.
     Lost,
 }
 
 /// The result of a request for a snapshot.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Snapshot {
+pub enum SnapshotResult {
     /// The words to restore from; their number is
     /// [`EnvironmentSpec::snapshot_words`](shoal_base::space::EnvironmentSpec::snapshot_words).
     Taken(Vec<u64>),
@@ -60,7 +60,7 @@ pub enum Snapshot {
 
 /// A response in the server's memory.
 #[derive(Debug)]
-pub struct Observed {
+pub struct EnvironmentResponse {
     response: Response<ipc::Service, [f32], ResponseHeader>,
     layout: ResponseLayout,
 }
@@ -80,7 +80,7 @@ pub struct EnvironmentClient {
     stop: Stop,
 }
 
-impl Observed {
+impl EnvironmentResponse {
     fn block(&self, block: Block) -> &[f32] {
         self.layout.block(block, self.response.payload())
     }
@@ -161,7 +161,7 @@ impl EnvironmentClient {
         let snapshot_words = spec.snapshot_words(environments);
         let longest = request_length(spec, environments);
         let (service, client) = claim(|| {
-            let service = service(domain, &channel, Entry::Open)?;
+            let service = service(domain, &channel, OpenMode::Open)?;
             let client = service
                 .client_builder()
                 .initial_max_slice_len(longest)
@@ -212,7 +212,7 @@ impl EnvironmentClient {
         listener: &Listener,
         request: ResetRequest,
         mut idle: impl FnMut(),
-    ) -> Result<Observed, Exit<ChannelError>> {
+    ) -> Result<EnvironmentResponse, Exit<ChannelError>> {
         let header = match request {
             ResetRequest::Next => RequestHeader::new(RequestKind::Reset, 0, 0),
             ResetRequest::Training(episode) => RequestHeader::new(RequestKind::ResetToTraining, episode, 0),
@@ -233,10 +233,10 @@ impl EnvironmentClient {
         listener: &Listener,
         actions: &[f32],
         mut idle: impl FnMut(),
-    ) -> Result<Stepped, Exit<ChannelError>> {
+    ) -> Result<StepResult, Exit<ChannelError>> {
         match self.request_within_episodes(listener, RequestKind::Step, actions, &mut idle)? {
-            Some(response) => Ok(Stepped::Taken(self.observed(response, Part::Step)?)),
-            None => Ok(Stepped::Lost),
+            Some(response) => Ok(StepResult::Taken(self.observed(response, ResponsePart::Step)?)),
+            None => Ok(StepResult::Lost),
         }
     }
 
@@ -245,15 +245,15 @@ impl EnvironmentClient {
     /// # Errors
     /// When a stop is requested, the channel fails, or the server refuses because its environments cannot save their
     /// state or run evaluation episodes.
-    pub fn snapshot(&self, listener: &Listener, mut idle: impl FnMut()) -> Result<Snapshot, Exit<ChannelError>> {
+    pub fn snapshot(&self, listener: &Listener, mut idle: impl FnMut()) -> Result<SnapshotResult, Exit<ChannelError>> {
         let Some(response) = self.request_within_episodes(listener, RequestKind::Snapshot, &[], &mut idle)? else {
-            return Ok(Snapshot::Lost);
+            return Ok(SnapshotResult::Lost);
         };
         let words = words_of(self.answered(&response)?);
         if words.len() != self.snapshot_words {
             return Err(self.refused().into());
         }
-        Ok(Snapshot::Taken(words))
+        Ok(SnapshotResult::Taken(words))
     }
 
     /// Every environment continues its training episode from a snapshot. The result has the observations to act on
@@ -266,7 +266,7 @@ impl EnvironmentClient {
         listener: &Listener,
         words: &[u64],
         mut idle: impl FnMut(),
-    ) -> Result<Observed, Exit<ChannelError>> {
+    ) -> Result<EnvironmentResponse, Exit<ChannelError>> {
         if words.len() != self.snapshot_words {
             let cause = PeerError::SnapshotLength {
                 found: words.len(),
@@ -283,17 +283,17 @@ impl EnvironmentClient {
     }
 
     /// Takes the response to a reset or restore, and notes which server runs the new episodes.
-    fn begun(&self, response: ServerResponse) -> Result<Observed, Exit<ChannelError>> {
+    fn begun(&self, response: ServerResponse) -> Result<EnvironmentResponse, Exit<ChannelError>> {
         let server = response.origin();
-        let observed = self.observed(response, Part::Observations)?;
+        let observed = self.observed(response, ResponsePart::Observations)?;
         self.episodes.set(Some(server));
         Ok(observed)
     }
 
-    fn observed(&self, response: ServerResponse, part: Part) -> Result<Observed, ChannelError> {
+    fn observed(&self, response: ServerResponse, part: ResponsePart) -> Result<EnvironmentResponse, ChannelError> {
         let numbers = self.answered(&response)?;
         if numbers.len() != self.layout.len() {
-            let fault = Fault::Length {
+            let fault = ResponseFault::Length {
                 found: numbers.len(),
                 expected: self.layout.len(),
             };
@@ -301,7 +301,7 @@ impl EnvironmentClient {
         }
         find_fault(&self.spec, &self.layout, numbers, part)
             .map_err(|fault| ChannelError::new(&self.channel, "ask", PeerError::Invalid(fault)))?;
-        Ok(Observed {
+        Ok(EnvironmentResponse {
             response,
             layout: self.layout,
         })
@@ -314,7 +314,7 @@ impl EnvironmentClient {
             return Ok(response.payload());
         }
         if status == ResponseStatus::Invalid as u32 {
-            let cause = PeerError::Invalid(Fault::Reported);
+            let cause = PeerError::Invalid(ResponseFault::Reported);
             return Err(ChannelError::new(&self.channel, "ask", cause));
         }
         Err(self.refused())

@@ -14,7 +14,7 @@ use super::service::{LOANED_RESPONSES, name, response_length, service};
 use crate::domain::Domain;
 use crate::error::ChannelError;
 use crate::event::{EventName, Listener, Notifier, wait_for};
-use crate::service::{Entry, claim};
+use crate::service::{OpenMode, claim};
 
 /// The server's end.
 #[derive(Debug)]
@@ -50,7 +50,7 @@ impl EnvironmentPort {
         let layout = ResponseLayout::new(environments, spec.observation.width());
         let longest = response_length(&spec, environments);
         let server = claim(|| {
-            service(domain, &channel, Entry::Open)?
+            service(domain, &channel, OpenMode::Open)?
                 .server_builder()
                 .initial_max_slice_len(longest)
                 .max_loaned_responses_per_request(LOANED_RESPONSES)

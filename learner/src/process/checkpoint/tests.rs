@@ -36,7 +36,7 @@ fn two() -> (TempDir, PathBuf, PathBuf) {
     (directory, latest, previous)
 }
 
-fn load(directory: &TempDir) -> Result<Option<Loaded>, CheckpointError> {
+fn load(directory: &TempDir) -> Result<Option<LoadedCheckpoint>, CheckpointError> {
     Checkpoints::new(directory.path(), 7).load_newest()
 }
 
@@ -52,7 +52,7 @@ fn an_empty_directory_has_no_checkpoint() {
 #[test]
 fn a_saved_checkpoint_is_loaded_bit_for_bit() {
     let (directory, latest, previous) = two();
-    let Loaded { checkpoint, warnings } = load(&directory).unwrap().unwrap();
+    let LoadedCheckpoint { checkpoint, warnings } = load(&directory).unwrap().unwrap();
     assert!(warnings.is_empty());
     assert_eq!(checkpoint.counters, counters(2));
     let mut saved = SavedState::from(checkpoint.arrays);
@@ -182,7 +182,7 @@ fn a_checkpoint_of_another_configuration_is_refused_and_not_replaced() {
 fn a_checkpoint_of_another_version_is_refused() {
     let (directory, latest, _) = two();
     durable::write_atomically(&latest, |file| {
-        durable::seal(Kind { version: 1, ..KIND }, file, |_| Ok(()))
+        durable::seal(FileKind { version: 1, ..KIND }, file, |_| Ok(()))
     })
     .unwrap();
     let error = load(&directory).unwrap_err().to_string();

@@ -26,7 +26,7 @@ const TERMINATED: i32 = 143;
 
 /// A process that ends when its standard input closes, and therefore also when this process is gone.
 #[derive(Debug)]
-pub struct Peer {
+pub struct ChildProcess {
     group: ChildGroup,
     stdin: Option<ChildStdin>,
     /// Reads what the process writes.
@@ -35,13 +35,13 @@ pub struct Peer {
     what: String,
 }
 
-impl AsFd for Peer {
+impl AsFd for ChildProcess {
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.group.as_fd()
     }
 }
 
-impl Peer {
+impl ChildProcess {
     /// Starts this program again as `role` 0 of the run.
     pub fn role(role: Role, run: &RunDir) -> anyhow::Result<Self> {
         let first = RoleInstance {
@@ -109,7 +109,7 @@ impl Peer {
         sched_setaffinity(Some(self.pid()), cores).with_context(|| format!("cannot pin the {} to a core", self.what))
     }
 
-    /// Pauses the process (SIGSTOP) until [`Peer::resume`].
+    /// Pauses the process (SIGSTOP) until [`ChildProcess::resume`].
     pub fn pause(&self) -> anyhow::Result<()> {
         self.signal(Signal::STOP)
     }
