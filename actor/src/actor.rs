@@ -346,7 +346,7 @@ impl<'a> Actor<'a> {
             0 if !self.settings.has_learned => Exploration::warm_up,
             _ => Exploration::act,
         };
-        let progress = StepCounts {
+        let steps = StepCounts {
             step: self.step,
             env_steps: policy.header().env_steps,
         };
@@ -354,7 +354,7 @@ impl<'a> Actor<'a> {
             &mut self.exploration,
             policy.parameters(),
             current.observations(),
-            progress,
+            steps,
             &mut self.actions,
         );
     }

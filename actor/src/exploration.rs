@@ -57,19 +57,19 @@ impl Exploration {
     }
 
     /// Chooses the actions before the policy's first update.
-    pub fn warm_up(&mut self, parameters: &[f32], observations: &[f32], progress: StepCounts, actions: &mut [f32]) {
+    pub fn warm_up(&mut self, parameters: &[f32], observations: &[f32], steps: StepCounts, actions: &mut [f32]) {
         match self {
             Self::Noise(network, noise) if noise.warmup() == Warmup::Uniform => {
-                draw_uniformly(noise.stream_at(progress.step), actions, network.range());
+                draw_uniformly(noise.stream_at(steps.step), actions, network.range());
             }
-            Self::Gaussian(policy, stream) => draw_uniformly(seek(stream, progress.step), actions, policy.range()),
-            _ => self.act(parameters, observations, progress, actions),
+            Self::Gaussian(policy, stream) => draw_uniformly(seek(stream, steps.step), actions, policy.range()),
+            _ => self.act(parameters, observations, steps, actions),
         }
     }
 
     /// Chooses the actions, one for each observation.
-    pub fn act(&mut self, parameters: &[f32], observations: &[f32], progress: StepCounts, actions: &mut [f32]) {
-        let StepCounts { step, env_steps } = progress;
+    pub fn act(&mut self, parameters: &[f32], observations: &[f32], steps: StepCounts, actions: &mut [f32]) {
+        let StepCounts { step, env_steps } = steps;
         match self {
             Self::Noise(network, noise) => {
                 network.forward(parameters, observations, actions);
@@ -336,8 +336,8 @@ mod tests {
         let mut best = |env_steps| {
             let mut action = [f32::NAN];
             let steps = (0..2_000).filter(|step| {
-                let progress = StepCounts { step: *step, env_steps };
-                exploration.act(&parameters, &[0.5], progress, &mut action);
+                let steps = StepCounts { step: *step, env_steps };
+                exploration.act(&parameters, &[0.5], steps, &mut action);
                 action[0] == 2.0
             });
             steps.count()

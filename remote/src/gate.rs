@@ -180,7 +180,7 @@ struct Gate<'a> {
     /// The policy that was sent last, as bytes.
     encoded_policy: Option<(PolicyId, Arc<Vec<u8>>)>,
     policy_limiter: RateLimiter,
-    /// Version of the learner's newest policy, as far as it was looked at.
+    /// Version of the newest policy that was read from the learner.
     policy_version: u64,
     learner_notifier: Notifier,
     heartbeat: HeartbeatSender,
@@ -436,7 +436,7 @@ impl<'a> Gate<'a> {
         }
     }
 
-    /// Warns once in a while: somebody may repeat what is wrong without end.
+    /// Warns, but at most once in [`WARN_AGAIN`]: a host may repeat the same fault without end.
     fn warn(&mut self, what: fmt::Arguments<'_>) {
         if self.warned_at.is_none_or(|warned| warned.elapsed() >= WARN_AGAIN) {
             self.warned_at = Some(Instant::now());
@@ -715,7 +715,7 @@ impl<'a> Gate<'a> {
         let waits = self.actors.values().any(|actor| actor.forwarding.is_waiting());
         let cut_off = |host: &Host| host.heard_at.elapsed() >= CUT_OFF;
         self.heartbeat.beat(match waits {
-            // While a host is away, no other process is to blame that all wait.
+            // Waiting for a host that is away is no fault of a process here, so none is replaced for it.
             _ if self.hosts.values().any(cut_off) => Activity::Working,
             true => Activity::WaitingForRatio,
             false => Activity::WaitingForPeer,

@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-/// What may be taken now. It refills at a constant rate, up to what comes in half a second.
+/// A token bucket: tokens arrive at a constant rate, and at most those of half a second are kept.
 #[derive(Clone, Copy, Debug)]
 pub struct RateLimiter {
     rate: f64,
@@ -13,7 +13,7 @@ pub struct RateLimiter {
 const BURST: Duration = Duration::from_millis(500);
 
 impl RateLimiter {
-    /// A full limiter that refills with `rate` a second.
+    /// A full bucket that gets `rate` tokens a second.
     pub fn new(rate: f64, now: Instant) -> Self {
         Self {
             rate,
@@ -22,8 +22,8 @@ impl RateLimiter {
         }
     }
 
-    /// Takes an amount if the limiter is not empty, and returns whether it did. An amount may be larger than what is in the
-    /// limiter, which then takes longer to refill: otherwise an amount larger than the limiter could never be taken.
+    /// Takes `amount` tokens if any are there, and returns whether it did. The amount may be larger than the number of
+    /// tokens. That becomes negative then, so the next amount has to wait longer.
     pub fn take(&mut self, amount: f64, now: Instant) -> bool {
         let refilled = self.available + self.rate * now.saturating_duration_since(self.at).as_secs_f64();
         self.available = refilled.min(self.rate * BURST.as_secs_f64());

@@ -127,7 +127,7 @@ struct Wake {
 
 impl Wake {
     fn send(&self, arrival: Arrival) {
-        // Both fail only while the relay ends, or if it has been woken a great many times already.
+        // Both fail only while the relay ends, or if the counter of wake-ups is full, which wakes it as well.
         let _ = self.arrivals.send(arrival);
         let _ = rustix::io::write(&self.event, &1_u64.to_ne_bytes());
     }

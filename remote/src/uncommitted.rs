@@ -17,7 +17,7 @@ pub enum Consequence {
     /// The replay has lost chunks that were committed, and the next chunks of the actor do not follow on what it has. End
     /// the actor unless it has a later incarnation than this; its successor begins with a handshake.
     StartAgain(u64),
-    /// Another host has the actor's index now: end the actor for good.
+    /// Another host has the actor's index now: end the actor and do not replace it.
     TakenOver,
 }
 
@@ -28,7 +28,7 @@ pub struct UncommittedChunks<C> {
     /// Index of the next chunk to send.
     next_to_send: usize,
     committed: ChunkId,
-    /// The last chunk that the gate is known to have.
+    /// The last chunk that the gate has acknowledged as forwarded.
     forwarded: ChunkId,
     /// The last chunk that was added.
     newest_added: ChunkId,
@@ -36,16 +36,16 @@ pub struct UncommittedChunks<C> {
     progress_at: Duration,
     /// Chunks that were sent more than once.
     resent: u64,
-    /// The furthest chunk that was sent.
+    /// The last chunk that was ever sent; later sendings of it or of earlier ones are repetitions.
     furthest_sent: ChunkId,
 }
 
 /// A chunk to be sent.
 #[derive(Debug)]
 pub struct KeptChunk<C> {
-    /// The numbers in its header.
+    /// Its id, from its header.
     pub id: ChunkId,
-    /// Those of the chunk before it.
+    /// The id of the chunk before it.
     previous: ChunkId,
     /// The chunk.
     pub chunk: C,

@@ -70,9 +70,6 @@ const PRESETS: [(&str, &str); 15] = [
     ),
 ];
 
-/// The upper bound of `actors.max`.
-const MOST_ACTORS: i64 = 256;
-
 /// The presets' names.
 pub fn preset_names() -> impl Iterator<Item = &'static str> {
     PRESETS.iter().map(|(name, _)| *name)
@@ -315,7 +312,11 @@ fn resolve(
         && count > i64::from(ActorsConfig::default().max)
         && table.get("actors").is_some_and(|actors| actors.get("max").is_none())
     {
-        put(&mut table, &["actors", "max"], count.min(MOST_ACTORS).into())?;
+        put(
+            &mut table,
+            &["actors", "max"],
+            count.min(ActorsConfig::GREATEST_MAX.into()).into(),
+        )?;
         sources.set("actors.max".into(), SettingSource::Follows("actors.count".into()));
     }
     // A file may be the configuration of another run.

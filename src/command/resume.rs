@@ -88,7 +88,7 @@ pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
             bail!("{here} has finished {episodes_ended} of {episodes} episodes already: give it more with --episodes");
         }
     }
-    // Found now, and not by roles that fail one after the other.
+    // Checked here, so that a missing program is one error of this command and not repeated failures of the roles.
     ServerLocation::of_run(&run).with_context(|| format!("cannot resume {here}"))?;
     if let Some(signal) = reevaluate_best_policy(&run, &revision)? {
         return Ok(exit_code(signal));

@@ -60,7 +60,7 @@ pub(crate) struct RunArgs {
     /// Run directory to create [default: runs/<preset>-<n>].
     #[arg(long, value_name = "DIR")]
     pub(crate) run: Option<PathBuf>,
-    /// How to learn: ddpg, td3, sac, dqn, reinforce, q-learning or sarsa [default: the preset's; for gym: the one that
+    /// The algorithm: ddpg, td3, sac, dqn, reinforce, q-learning or sarsa [default: the preset's; for gym: the one that
     /// suits the spaces].
     #[arg(long = "method", value_name = "METHOD", value_parser = PossibleValuesParser::new(shoal_run::algorithm::names()))]
     pub(crate) algorithm: Option<String>,

@@ -57,7 +57,7 @@ impl Revision {
         let edited = Config::from_table(table.clone(), &origin).ok();
         let mut sources = SettingSources::of_file(&origin, &text);
         if let Some(edited) = &edited {
-            // Nobody has set what is as before.
+            // A key that has not changed was not set by the user.
             let differing: Vec<String> = used.differences(edited).into_iter().map(|it| it.key).collect();
             let same = edited.values().into_keys().filter(|key| !differing.contains(key));
             same.for_each(|key| sources.set(key, SettingSource::Run));
@@ -192,7 +192,7 @@ pub fn store_actors(run: &RunDir, used: &Config, actors: u32, now: Moment) -> an
     Ok(config)
 }
 
-/// What `config.toml` asks a run for that is not running, in words; `None` if it is what the run was last used with.
+/// For a run that is not running: what `config.toml` changes for the next resume, in words; `None` if it is what the run was last used with.
 pub fn edited(run: &RunDir, used: &Config) -> Option<String> {
     match Revision::new(run, used, &RequestedChanges::default()) {
         Err(error) => Some(format!("it cannot be resumed: {error:#}")),
@@ -204,7 +204,7 @@ pub fn edited(run: &RunDir, used: &Config) -> Option<String> {
     }
 }
 
-/// As it is in `config.toml`: without what only `config/used.toml` has.
+/// The configuration without the keys that only `config/used.toml` has, as in `config.toml`.
 pub(super) fn as_written(config: &Config) -> Config {
     let mut config = config.clone();
     (config.replay.ratio_since, config.replay.updates_before) = (0, 0);
