@@ -188,7 +188,7 @@ struct Launcher<'a> {
     /// The run's status when this launcher started.
     initial: RunStatus,
     /// When the end was first requested.
-    stop_requested: Option<Instant>,
+    stop_requested_at: Option<Instant>,
     /// Whether the roles are being ended.
     ending: bool,
     supervisor: Supervisor,
@@ -197,7 +197,7 @@ struct Launcher<'a> {
     progress: ProgressLine,
     signals: &'a Signals,
     stalls: StallDetector,
-    begun: Instant,
+    started_at: Instant,
     tick: Duration,
     heartbeats: Reports<Heartbeat>,
     episode_reports: Reports<EpisodeReport>,
@@ -227,7 +227,7 @@ impl<'a> Launcher<'a> {
         Ok(Self {
             control: ControlPort::open(domain)?,
             initial,
-            stop_requested: None,
+            stop_requested_at: None,
             ending: false,
             run,
             lock,
@@ -243,7 +243,7 @@ impl<'a> Launcher<'a> {
             progress: ProgressLine::new(&config, run, quiet),
             config,
             signals,
-            begun: Instant::now(),
+            started_at: Instant::now(),
             tick: SHORTEST_TICK,
         })
     }
@@ -292,7 +292,7 @@ impl<'a> Launcher<'a> {
         }
         Ok(TrainingOutcome {
             ending,
-            wall: self.begun.elapsed(),
+            wall: self.started_at.elapsed(),
             after,
             before: self.initial,
         })
@@ -321,7 +321,7 @@ impl<'a> Launcher<'a> {
                     return Ok(RunEnd::Finished);
                 }
                 supervisor::RunCondition::SharedMemoryOccupied | supervisor::RunCondition::FilesRemoved
-                    if self.stop_requested.is_some() => {}
+                    if self.stop_requested_at.is_some() => {}
                 supervisor::RunCondition::SharedMemoryOccupied => {
                     return Ok(self.renew("dead processes occupy shared memory for good"));
                 }
@@ -346,7 +346,7 @@ impl<'a> Launcher<'a> {
             }
             // A learner that has just died is restarted first, so that it takes in what the actors have sent.
             let may_end = |asked: Instant| self.supervisor.has_learner() || asked.elapsed() >= LEARNER_RESTART;
-            if self.stop_requested.is_some_and(may_end) {
+            if self.stop_requested_at.is_some_and(may_end) {
                 return Ok(RunEnd::Stopped);
             }
             self.progress.draw(&self.supervisor);
@@ -376,7 +376,7 @@ impl<'a> Launcher<'a> {
 
     /// Answers requests from other terminals. A request to stop is answered when the run has ended.
     fn answer_requests(&mut self) -> anyhow::Result<()> {
-        let now = self.recorder.moment(self.begun.elapsed());
+        let now = self.recorder.moment(self.started_at.elapsed());
         let Self {
             config,
             run,
@@ -385,7 +385,7 @@ impl<'a> Launcher<'a> {
             progress,
             initial,
             ending,
-            stop_requested,
+            stop_requested_at,
             log,
             domain,
             ..
@@ -405,7 +405,7 @@ impl<'a> Launcher<'a> {
                         Ok(Some(ControlResponse::Refused("the run is ending".into())))
                     }
                     ControlRequest::Scale { actors } => requests::scale(config, run, supervisor, actors, now).map(Some),
-                    ControlRequest::Admit(_) if *ending || stop_requested.is_some() => {
+                    ControlRequest::Admit(_) if *ending || stop_requested_at.is_some() => {
                         Ok(Some(ControlResponse::Refused("the run is ending".into())))
                     }
                     ControlRequest::Admit(request) => supervisor.admit(domain, request).map(Some),
@@ -414,10 +414,10 @@ impl<'a> Launcher<'a> {
                         Ok(Some(ControlResponse::Refused("this is the learner's host".into())))
                     }
                     ControlRequest::Stop => {
-                        if stop_requested.is_none() {
+                        if stop_requested_at.is_none() {
                             log.note("launcher", "`shoal stop` ends the run");
                         }
-                        stop_requested.get_or_insert_with(Instant::now);
+                        stop_requested_at.get_or_insert_with(Instant::now);
                         Ok(None)
                     }
                 }
@@ -472,7 +472,7 @@ impl<'a> Launcher<'a> {
     }
 
     fn read_reports(&mut self) -> anyhow::Result<()> {
-        let wall = self.begun.elapsed();
+        let wall = self.started_at.elapsed();
         while let Some(heartbeat) = self.heartbeats.receive()? {
             self.supervisor.record(&heartbeat);
         }

@@ -303,12 +303,12 @@ impl<'a> Evaluator<'a> {
     }
 
     /// Runs evaluation episodes with these parameters, from number `first` on: one in each environment, and at most
-    /// `left`. Returns their returns, or `None` if the server was lost.
+    /// `episodes_left`. Returns their returns, or `None` if the server was lost.
     fn run_episodes(
         &mut self,
         parameters: &[f32],
         first: u32,
-        left: u32,
+        episodes_left: u32,
     ) -> Result<Option<Vec<f64>>, Exit<ActorError>> {
         let Self {
             client,
@@ -319,7 +319,7 @@ impl<'a> Evaluator<'a> {
             ..
         } = self;
         // No environment is reset more often than an episode is needed.
-        let episodes = left.min(self.settings.envs as u32);
+        let episodes = episodes_left.min(self.settings.envs as u32);
         let request = ResetRequest::Evaluation {
             first: first.into(),
             episodes,

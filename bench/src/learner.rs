@@ -97,7 +97,7 @@ pub(super) fn measure(algorithm: Option<&str>, budget: &TimeBudget) -> anyhow::R
         .then(|| Case::new(&config, LARGE_BATCH))
         .transpose()?;
     let mut shared = learner(&config, batch)?;
-    shared.set_threads(Threads::two()?);
+    shared.set_threads(Threads::two_threads()?);
     let mut updates_of_two = IntervalResults::default();
     let cases = [&mut configured]
         .into_iter()

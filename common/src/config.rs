@@ -130,7 +130,7 @@ impl Config {
     pub fn from_table(table: toml::Table, origin: impl Display) -> Result<Self, ConfigError> {
         let config: Self = table.clone().try_into().map_err(|error| ConfigError::Malformed {
             origin: origin.to_string(),
-            message: sections::at_fault(&table).unwrap_or_else(|| one_line(&error)),
+            message: sections::first_unreadable(&table).unwrap_or_else(|| one_line(&error)),
         })?;
         config.check()?;
         Ok(config)

@@ -25,7 +25,7 @@ pub enum ChunkOrder {
 pub struct Forwarding {
     committed: ChunkId,
     /// The numbers in the headers of the chunks passed on and not committed, in order.
-    passed: VecDeque<ChunkId>,
+    in_flight: VecDeque<ChunkId>,
     /// The most of them: as many as the history of the learner's channel has.
     window: usize,
 }
@@ -35,14 +35,14 @@ impl Forwarding {
     pub fn new(committed: ChunkId, window: u32) -> Self {
         Self {
             committed,
-            passed: VecDeque::new(),
+            in_flight: VecDeque::new(),
             window: window as usize,
         }
     }
 
     /// The last chunk that was passed on or committed.
     pub fn last_forwarded(&self) -> ChunkId {
-        self.passed.back().copied().unwrap_or(self.committed)
+        self.in_flight.back().copied().unwrap_or(self.committed)
     }
 
     /// The last committed chunk.
@@ -52,7 +52,7 @@ impl Forwarding {
 
     /// Whether chunks were passed on that are not committed.
     pub fn is_waiting(&self) -> bool {
-        !self.passed.is_empty()
+        !self.in_flight.is_empty()
     }
 
     /// Decides about a chunk. After [`ChunkOrder::Next`], the caller must pass it on.
@@ -62,14 +62,14 @@ impl Forwarding {
             return ChunkOrder::Repeated;
         }
         // Only the learner knows the number that a handshake is committed with, and so what follows on it.
-        let after_handshake = self.passed.back().is_some_and(|before| before.sequence == 0);
+        let after_handshake = self.in_flight.back().is_some_and(|before| before.sequence == 0);
         let follows = !after_handshake
             && (chunk.incarnation, Some(chunk.sequence)) == (last.incarnation, last.sequence.checked_add(1));
         let is_handshake = chunk.sequence == 0;
-        if self.passed.len() >= self.window || !(is_handshake || follows) {
+        if self.in_flight.len() >= self.window || !(is_handshake || follows) {
             return ChunkOrder::Early;
         }
-        self.passed.push_back(chunk);
+        self.in_flight.push_back(chunk);
         ChunkOrder::Next
     }
 
@@ -77,10 +77,10 @@ impl Forwarding {
     /// last chunks in a power loss; forwarding then continues from it.
     pub fn commit(&mut self, committed: ChunkId) {
         if committed < self.committed {
-            self.passed.clear();
+            self.in_flight.clear();
         }
-        while self.passed.front().is_some_and(|passed| *passed <= committed) {
-            self.passed.pop_front();
+        while self.in_flight.front().is_some_and(|passed| *passed <= committed) {
+            self.in_flight.pop_front();
         }
         self.committed = committed;
     }

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 pub struct RateLimiter {
     rate: f64,
     available: f64,
-    at: Instant,
+    refilled_at: Instant,
 }
 
 const BURST: Duration = Duration::from_millis(500);
@@ -18,16 +18,16 @@ impl RateLimiter {
         Self {
             rate,
             available: rate * BURST.as_secs_f64(),
-            at: now,
+            refilled_at: now,
         }
     }
 
     /// Takes `amount` tokens if any are there, and returns whether it did. The amount may be larger than the number of
     /// tokens. That becomes negative then, so the next amount has to wait longer.
     pub fn take(&mut self, amount: f64, now: Instant) -> bool {
-        let refilled = self.available + self.rate * now.saturating_duration_since(self.at).as_secs_f64();
+        let refilled = self.available + self.rate * now.saturating_duration_since(self.refilled_at).as_secs_f64();
         self.available = refilled.min(self.rate * BURST.as_secs_f64());
-        self.at = now;
+        self.refilled_at = now;
         let may = self.available > 0.0;
         if may {
             self.available -= amount;

@@ -27,7 +27,7 @@ use crate::files::{FileError, HostFile, KeyFile};
 use crate::join::ask_to_join;
 use crate::network::{self, NetworkError, failed};
 use crate::requests::LauncherRequests;
-use crate::uncommitted::{Consequence, UncommittedChunks};
+use crate::uncommitted::{ActorFollowUp, UncommittedChunks};
 use crate::wire::vector_instructions;
 use crate::wire::{
     Acknowledgement, Admission, Hello, HostReport, Message, PolicyRequest, RemoteEpisode, RemoteRole, RunPhase,
@@ -368,7 +368,7 @@ impl<'a> Relay<'a> {
                 rows: of_actor.rows,
             };
             let limit = self.settings.host.limit;
-            let consequence = actor
+            let follow_up = actor
                 .uncommitted
                 .acknowledge(id(of_actor.forwarded), commit.last_chunk, limit, now);
             if other_gate {
@@ -378,7 +378,7 @@ impl<'a> Relay<'a> {
                 actor.commit = commit;
                 changed.push(of_actor.actor);
             }
-            follow(&self.requests, of_actor.actor, consequence);
+            follow_up_on(&self.requests, of_actor.actor, follow_up);
         }
         if other_gate || !changed.is_empty() {
             let of_host = acknowledgement.actors.iter();
@@ -464,8 +464,8 @@ impl<'a> Relay<'a> {
             while let Some(chunk) = actor.receiver.receive()? {
                 let (rows, snapshot) = chunk.parts();
                 let bytes = WireChunk::encode(self.settings.host.host, chunk.header(), rows, snapshot);
-                let consequence = actor.uncommitted.add(id_of(chunk.header()), bytes.into(), now);
-                follow(&self.requests, *index, consequence);
+                let follow_up = actor.uncommitted.add(id_of(chunk.header()), bytes.into(), now);
+                follow_up_on(&self.requests, *index, follow_up);
                 self.heartbeat.count(chunk.header().rows.into());
             }
         }
@@ -577,15 +577,15 @@ impl<'a> Relay<'a> {
     }
 }
 
-fn follow(requests: &LauncherRequests<()>, actor: u32, consequence: Consequence) {
-    match consequence {
-        Consequence::Continue => {}
-        Consequence::StartAgain(incarnation) => {
+fn follow_up_on(requests: &LauncherRequests<()>, actor: u32, follow_up: ActorFollowUp) {
+    match follow_up {
+        ActorFollowUp::Continue => {}
+        ActorFollowUp::StartAgain(incarnation) => {
             tracing::warn!("the replay has lost chunks of actor {actor}; the actor is started again");
             requests.ask(ControlRequest::Replace { actor, incarnation }, ());
         }
         // The gate's next acknowledgement no longer names the actor.
-        Consequence::TakenOver => tracing::warn!("actor {actor} now belongs to another host"),
+        ActorFollowUp::TakenOver => tracing::warn!("actor {actor} now belongs to another host"),
     }
 }
 

@@ -11,7 +11,7 @@ use shoal_common::commit::ChunkId;
 
 /// What the relay must do about an actor after an acknowledgement of the gate.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Consequence {
+pub enum ActorFollowUp {
     /// Nothing.
     Continue,
     /// The replay has lost chunks that were committed, and the next chunks of the actor do not follow on what it has. End
@@ -96,13 +96,13 @@ impl<C> UncommittedChunks<C> {
     /// that after a power loss. One that was added or committed
     /// before is ignored, because a new relay receives the history of the actor's channel; so is one that does not follow
     /// on the others.
-    pub fn add(&mut self, id: ChunkId, chunk: C, now: Duration) -> Consequence {
+    pub fn add(&mut self, id: ChunkId, chunk: C, now: Duration) -> ActorFollowUp {
         if id <= self.newest_added {
-            return Consequence::Continue;
+            return ActorFollowUp::Continue;
         }
         let follows = id.incarnation == self.newest_added.incarnation && id.sequence - self.newest_added.sequence == 1;
         if id.sequence > 0 && !follows {
-            return Consequence::StartAgain(id.incarnation);
+            return ActorFollowUp::StartAgain(id.incarnation);
         }
         let mut previous = self.newest_added;
         // An actor that ended before its handshake was committed has sent nothing else.
@@ -118,7 +118,7 @@ impl<C> UncommittedChunks<C> {
         }
         self.chunks.push_back(KeptChunk { id, previous, chunk });
         self.newest_added = id;
-        Consequence::Continue
+        ActorFollowUp::Continue
     }
 
     /// The next chunk to send. It stays the next one until [`note_sent`](Self::note_sent) is called. A handshake waits until all
@@ -141,7 +141,7 @@ impl<C> UncommittedChunks<C> {
 
     /// Takes note of what the gate has forwarded, and of what is committed. This host's processes have incarnations below
     /// `limit`, and every process that was started elsewhere later has one that is not.
-    pub fn acknowledge(&mut self, forwarded: ChunkId, committed: ChunkId, limit: u64, now: Duration) -> Consequence {
+    pub fn acknowledge(&mut self, forwarded: ChunkId, committed: ChunkId, limit: u64, now: Duration) -> ActorFollowUp {
         if committed < self.committed {
             let ended = self.newest_added.incarnation;
             *self = Self {
@@ -149,7 +149,7 @@ impl<C> UncommittedChunks<C> {
                 resent: self.resent,
                 ..Self::new(committed)
             };
-            return Consequence::StartAgain(ended);
+            return ActorFollowUp::StartAgain(ended);
         }
         if forwarded > self.forwarded {
             self.progress_at = now;
@@ -161,9 +161,9 @@ impl<C> UncommittedChunks<C> {
         self.chunks.drain(..confirmed);
         self.next_to_send = self.next_to_send.saturating_sub(confirmed);
         if committed.incarnation >= limit {
-            return Consequence::TakenOver;
+            return ActorFollowUp::TakenOver;
         }
-        Consequence::Continue
+        ActorFollowUp::Continue
     }
 
     /// Whether the gate has forwarded all chunks.

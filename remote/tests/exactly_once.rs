@@ -10,7 +10,7 @@ use std::time::Duration;
 use proptest::prelude::*;
 use shoal_common::commit::ChunkId;
 use shoal_remote::forwarding::{ChunkOrder, Forwarding};
-use shoal_remote::uncommitted::{Consequence, UncommittedChunks};
+use shoal_remote::uncommitted::{ActorFollowUp, UncommittedChunks};
 
 const WINDOW: usize = 3;
 const PATIENCE: Duration = Duration::from_millis(200);
@@ -172,8 +172,8 @@ impl World {
             Event::ActorWorks => self.actor_works(),
             Event::RelayReceives => {
                 if let Some(Sent { id, content }) = self.to_relay.pop_front() {
-                    let consequence = self.relay.add(id, content, self.now);
-                    self.follow(consequence);
+                    let follow_up = self.relay.add(id, content, self.now);
+                    self.follow_up_on(follow_up);
                     assert!(self.relay.len() <= 2 * WINDOW + 2, "too much is kept: {self:?}");
                 }
             }
@@ -315,24 +315,24 @@ impl World {
         }
         let other_gate = acknowledgement.gate != self.seen.0;
         self.seen = (acknowledgement.gate, acknowledgement.number);
-        let consequence = self
+        let follow_up = self
             .relay
             .acknowledge(acknowledgement.forwarded, acknowledgement.committed, LIMIT, self.now);
         self.mirror = acknowledgement.committed;
-        self.follow(consequence);
+        self.follow_up_on(follow_up);
         if other_gate {
             self.relay.go_back(self.now);
         }
     }
 
-    fn follow(&mut self, consequence: Consequence) {
-        match consequence {
-            Consequence::StartAgain(incarnation) if self.actor.incarnation <= incarnation => {
+    fn follow_up_on(&mut self, follow_up: ActorFollowUp) {
+        match follow_up {
+            ActorFollowUp::StartAgain(incarnation) if self.actor.incarnation <= incarnation => {
                 assert!(self.may_have_lost);
                 self.start_actor();
             }
-            Consequence::Continue | Consequence::StartAgain(_) => {}
-            Consequence::TakenOver => unreachable!("nobody else has this actor"),
+            ActorFollowUp::Continue | ActorFollowUp::StartAgain(_) => {}
+            ActorFollowUp::TakenOver => unreachable!("nobody else has this actor"),
         }
     }
 

@@ -89,7 +89,7 @@ pub fn ranking(runs: &[RunDir]) -> anyhow::Result<Vec<String>> {
 
 impl Report {
     /// The reasons why runs have no playable episodes, each with the names of the runs concerned.
-    pub fn not_played(&self) -> Vec<(&str, Vec<&str>)> {
+    pub fn runs_without_episodes(&self) -> Vec<(&str, Vec<&str>)> {
         let mut reasons: Vec<(&str, Vec<&str>)> = Vec::new();
         for run in &self.runs {
             let Some(reason) = run.played.why_not.as_deref() else {

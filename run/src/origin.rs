@@ -230,7 +230,7 @@ impl Predecessor {
             None => 0,
             Some((old, _)) => {
                 let mut new = Replay::create(&run.replay_file(), &replay_layout(config))?;
-                new.begin_with(old, self.rows(old, config))?
+                new.inherit_rows(old, self.rows(old, config))?
             }
         };
         let Checkpoint { counters, arrays } = &self.checkpoint;

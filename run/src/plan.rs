@@ -476,7 +476,7 @@ fn about_environment(error: anyhow::Error, sources: &SettingSources) -> anyhow::
             (key, with_suggestion(of_environment.to_string()))
         }
     };
-    sources.blame(&format!("environment.{key}"), &text)
+    sources.error_naming_source(&format!("environment.{key}"), &text)
 }
 
 /// Directory and configuration of the run whose networks the new one begins with.
@@ -498,7 +498,7 @@ fn follow_networks(table: &mut Table, sources: &mut SettingSources, overrides: &
     }
     for (section, key, value) in shapes(&config)? {
         let name = format!("{section}.{key}");
-        if !sources.of(&name).is_users() {
+        if !sources.of(&name).is_from_user() {
             put(table, &[section, &key], value)?;
             sources.set(name, SettingSource::Follows("--from".into()));
         }
@@ -524,7 +524,7 @@ fn follow_algorithm(table: &mut Table, sources: &mut SettingSources) -> anyhow::
     ] {
         let name = format!("{section}.{key}");
         let now = table.get(section).and_then(|values| values.get(key));
-        let Some(value) = value.filter(|value| now != Some(value) && !sources.of(&name).is_users()) else {
+        let Some(value) = value.filter(|value| now != Some(value) && !sources.of(&name).is_from_user()) else {
             continue;
         };
         put(table, &[section, key], value)?;

@@ -12,7 +12,7 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
 
 pub use self::child_group::ChildGroup;
-pub use self::child_output::{ChildOutput, Line, Writer, harmless};
+pub use self::child_output::{ChildOutput, Line, Writer, escape_control_characters};
 pub use self::child_process::ChildProcess;
 
 /// Waits at most `most` until one of these is readable, or a child whose [`ChildGroup`] is among them has ended.

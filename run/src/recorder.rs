@@ -111,7 +111,7 @@ pub struct Recorder {
     /// Environment steps of the newest policy whose evaluation is recorded.
     evaluated: Option<u64>,
     previous: Option<(Duration, LearnerReport)>,
-    flushed: Instant,
+    flushed_at: Instant,
 }
 
 impl Recorder {
@@ -152,7 +152,7 @@ impl Recorder {
             episode_steps,
             evaluated,
             previous: None,
-            flushed,
+            flushed_at: flushed,
         };
         if continues.is_some() {
             let resumed = Incident::of_launcher(IncidentKind::Resumed, String::new());
@@ -180,7 +180,7 @@ impl Recorder {
             ("episode/steps", report.steps.into()),
         ];
         self.scalars(self.episode_steps, &scalars)?;
-        if self.flushed.elapsed() >= MAX_UNFLUSHED {
+        if self.flushed_at.elapsed() >= MAX_UNFLUSHED {
             self.flush()
         } else {
             Ok(())
@@ -273,7 +273,7 @@ impl Recorder {
 
     /// Writes everything to the files, so that it survives the death of this process.
     pub fn flush(&mut self) -> Result<(), RecordError> {
-        self.flushed = Instant::now();
+        self.flushed_at = Instant::now();
         for table in [&mut self.episodes, &mut self.evaluations, &mut self.learner] {
             table.flush()?;
         }

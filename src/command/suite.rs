@@ -326,7 +326,7 @@ struct SuiteProgressDisplay<'a> {
     running: Vec<usize>,
     done: Vec<usize>,
     failed: usize,
-    begun: Instant,
+    started_at: Instant,
 }
 
 /// How far a run is, and how far it goes: in episodes if they limit it, otherwise in environment steps.
@@ -366,7 +366,7 @@ impl<'a> SuiteProgressDisplay<'a> {
             running: Vec::new(),
             done: Vec::new(),
             failed: 0,
-            begun: Instant::now(),
+            started_at: Instant::now(),
         };
         progress.print(&format!("{} of {} runs to train", due.len(), suite.trials.len()));
         progress
@@ -443,7 +443,7 @@ impl<'a> SuiteProgressDisplay<'a> {
             }
         }
         left += waiting * total.checked_div(known)?;
-        let seconds = self.begun.elapsed().as_secs_f64() * left as f64 / made as f64;
+        let seconds = self.started_at.elapsed().as_secs_f64() * left as f64 / made as f64;
         (made > 0 && left > 0).then(|| format!("{:#}", HumanDuration(Duration::from_secs(seconds as u64))))
     }
 

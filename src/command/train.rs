@@ -24,7 +24,7 @@ pub(crate) struct TrainArgs {
     /// one of the last four with -sac or -td3, gym: with a Gymnasium environment (gym:HalfCheetah-v5), or a
     /// configuration file (FILE.toml).
     #[arg(value_name = "PRESET|gym:ID|FILE.toml", required_unless_present = "help_config")]
-    #[arg(add = ArgValueCompleter::new(completion::what_to_train))]
+    #[arg(add = ArgValueCompleter::new(completion::presets_and_files))]
     pub(crate) what: Option<String>,
     /// Explain every key of the configuration, or those of the named preset or file, without training.
     #[arg(long)]

@@ -71,7 +71,7 @@ struct Host<'a> {
     heartbeats: Reports<Heartbeat>,
     stop_requested: bool,
     /// Since when the relay has had no connection.
-    cut_off: Option<Instant>,
+    cut_off_since: Option<Instant>,
 }
 
 impl<'a> Host<'a> {
@@ -98,7 +98,7 @@ impl<'a> Host<'a> {
             log,
             config,
             stop_requested: false,
-            cut_off: None,
+            cut_off_since: None,
         })
     }
 
@@ -150,9 +150,9 @@ impl<'a> Host<'a> {
             }
             match self.supervisor.activity(Role::Relay) {
                 Some(Activity::Done) => return Ok(JoinEnd::Over),
-                Some(Activity::Working) => self.cut_off = None,
+                Some(Activity::Working) => self.cut_off_since = None,
                 _ => {
-                    let since = self.cut_off.get_or_insert_with(Instant::now);
+                    let since = self.cut_off_since.get_or_insert_with(Instant::now);
                     if since.elapsed() >= give_up {
                         return Ok(JoinEnd::GaveUp);
                     }

@@ -34,8 +34,8 @@ pub(super) struct ProgressLine {
     recent: std::collections::VecDeque<(Duration, LearnerReport)>,
     evaluated: Option<EvaluationReport>,
     /// When the learner's last report arrived.
-    reported: Instant,
-    drawn: Instant,
+    reported_at: Instant,
+    drawn_at: Instant,
 }
 
 impl ProgressLine {
@@ -60,8 +60,8 @@ impl ProgressLine {
             learner: None,
             recent: [].into(),
             evaluated: None,
-            reported: Instant::now(),
-            drawn: Instant::now(),
+            reported_at: Instant::now(),
+            drawn_at: Instant::now(),
         }
     }
 
@@ -77,7 +77,7 @@ impl ProgressLine {
 
     pub(super) fn add_learner_report(&mut self, report: &LearnerReport, wall: Duration) {
         self.learner = Some(*report);
-        self.reported = Instant::now();
+        self.reported_at = Instant::now();
         self.recent.push_back((wall, *report));
         while self.recent.front().is_some_and(|(then, _)| wall - *then > SPAN) {
             self.recent.pop_front();
@@ -126,10 +126,10 @@ impl ProgressLine {
     }
 
     pub(super) fn draw(&mut self, supervisor: &Supervisor) {
-        if self.drawn.elapsed() < Duration::from_millis(250) || self.bar.is_hidden() {
+        if self.drawn_at.elapsed() < Duration::from_millis(250) || self.bar.is_hidden() {
             return;
         }
-        self.drawn = Instant::now();
+        self.drawn_at = Instant::now();
         let Some(learner) = self.learner else { return };
         self.bar.set_position(self.done(&learner));
         self.bar.set_message(self.line(&learner, supervisor));
@@ -188,7 +188,7 @@ impl ProgressLine {
     }
 
     fn pace(&self, count: impl Fn(&LearnerReport) -> u64) -> Option<f64> {
-        if self.reported.elapsed() > SPAN {
+        if self.reported_at.elapsed() > SPAN {
             return None;
         }
         let ((then, old), (now, new)) = (self.recent.front()?, self.recent.back()?);

@@ -20,7 +20,7 @@ const WORK: u32 = 3;
 #[derive(Debug)]
 pub(super) struct StallDetector {
     patience: Duration,
-    looked: Instant,
+    checked_at: Instant,
 }
 
 impl StallDetector {
@@ -28,7 +28,7 @@ impl StallDetector {
     pub(super) fn new(patience: Duration) -> Self {
         Self {
             patience: patience.max(SILENT),
-            looked: Instant::now(),
+            checked_at: Instant::now(),
         }
     }
 
@@ -36,7 +36,7 @@ impl StallDetector {
     /// the last call.
     pub(super) fn find(&mut self, children: &mut [Child], busy: Duration) -> Vec<(usize, &'static str)> {
         let now = Instant::now();
-        let since = now - std::mem::replace(&mut self.looked, now);
+        let since = now - std::mem::replace(&mut self.checked_at, now);
         if since.saturating_sub(busy) >= PAUSED {
             children.iter_mut().for_each(Child::reset_clocks);
             return Vec::new();

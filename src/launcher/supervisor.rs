@@ -77,9 +77,9 @@ pub(super) struct Supervisor {
     actors_with_services: u32,
     window: u32,
     /// Since when dead processes have occupied shared memory in spite of clean-ups.
-    occupied: Option<Instant>,
+    occupied_since: Option<Instant>,
     /// Time spent on clean-ups since the last search for stalls.
-    busy: Duration,
+    cleanup_time: Duration,
     /// The wanted actors of this host, in order; and the most that the run may have on all hosts.
     actors: Vec<u32>,
     max_actors: u32,
@@ -94,16 +94,16 @@ pub(super) struct Supervisor {
     server_output: Writer,
     /// The file with the number of processes ever started. It lasts over resumes: incarnations are never used twice.
     counter: PathBuf,
-    started: u64,
+    processes_started: u64,
     /// Invalid answers of environments since the launcher started, and the last one.
     faults: u32,
     max_faults: u32,
     last_fault: String,
     all_ready: bool,
-    cleaned: Instant,
+    cleaned_at: Instant,
     learner_done: bool,
     /// How the learner ended, if it ended without saving its state.
-    unsaved: Option<String>,
+    unsaved_learner: Option<String>,
 }
 
 impl Supervisor {
@@ -149,8 +149,8 @@ impl Supervisor {
             services,
             actors_with_services: 0,
             window: config.actors.window,
-            occupied: None,
-            busy: Duration::ZERO,
+            occupied_since: None,
+            cleanup_time: Duration::ZERO,
             actors,
             hosts: Hosts::new(started),
             max_actors: config.actors.max,
@@ -164,14 +164,14 @@ impl Supervisor {
                 _ => Writer::Program,
             },
             counter,
-            started,
+            processes_started: started,
             faults: 0,
             max_faults: config.environment.faults,
             last_fault: String::new(),
             all_ready: false,
-            cleaned: Instant::now(),
+            cleaned_at: Instant::now(),
             learner_done: false,
-            unsaved: None,
+            unsaved_learner: None,
         })
     }
 
@@ -259,8 +259,8 @@ impl Supervisor {
             )));
         };
         actors.sort_unstable();
-        let first_incarnation = self.started + 1;
-        self.started += INCARNATIONS;
+        let first_incarnation = self.processes_started + 1;
+        self.processes_started += INCARNATIONS;
         self.write_counter()?;
         let highest = actors.iter().max().map_or(0, |highest| highest + 1);
         self.create_services(domain, highest)?;
@@ -272,7 +272,7 @@ impl Supervisor {
             epoch: self.hosts.epoch(),
             actors,
             first_incarnation,
-            limit: self.started + 1,
+            limit: self.processes_started + 1,
         };
         self.hosts.admit(lease.clone());
         self.share_lockstep_actors();
@@ -330,7 +330,7 @@ impl Supervisor {
     }
 
     fn write_counter(&self) -> anyhow::Result<()> {
-        let text = self.started.to_string();
+        let text = self.processes_started.to_string();
         write_atomically(&self.counter, |file| std::io::Write::write_all(file, text.as_bytes()))
             .with_context(|| format!("cannot write {}", self.counter.display()))
     }
@@ -350,10 +350,10 @@ impl Supervisor {
     }
 
     fn start(&mut self, i: usize) -> anyhow::Result<()> {
-        self.started += 1;
+        self.processes_started += 1;
         self.write_counter()?;
         let child = &mut self.children[i];
-        child.instance.incarnation = self.started;
+        child.instance.incarnation = self.processes_started;
         let writer = match child.instance.role {
             Role::EnvServer => self.server_output,
             _ => Writer::Shoal,
@@ -462,9 +462,9 @@ impl Supervisor {
 
     /// The time until the next restart or clean-up, unless a process ends earlier.
     pub(super) fn idle_for(&self) -> Duration {
-        let since_clean = self.cleaned.elapsed();
+        let since_clean = self.cleaned_at.elapsed();
         let cleaning = self
-            .occupied
+            .occupied_since
             .map_or(CLEANING, |_| CLEANING_AGAIN)
             .saturating_sub(since_clean);
         let missing = |child: &&Child| child.process.is_none() && self.is_wanted(child);
@@ -496,7 +496,7 @@ impl Supervisor {
             // Frees their shared memory for their successors.
             state = self.clean(domain)?;
         } else if self.is_cleaning_due() {
-            self.cleaned = Instant::now();
+            self.cleaned_at = Instant::now();
             if domain.has_dead_nodes() || self.services.ports_of_dead_processes() > 0 {
                 state = self.clean(domain)?;
             }
@@ -512,7 +512,7 @@ impl Supervisor {
     }
 
     fn is_cleaning_due(&self) -> bool {
-        self.cleaned.elapsed() >= self.occupied.map_or(CLEANING, |_| CLEANING_AGAIN)
+        self.cleaned_at.elapsed() >= self.occupied_since.map_or(CLEANING, |_| CLEANING_AGAIN)
     }
 
     /// Whether the learner's end has been observed, and it was the planned one.
@@ -580,7 +580,7 @@ impl Supervisor {
 
     /// Kills stalled processes, so that they are replaced. Returns a message for each.
     pub(super) fn replace_stalled(&mut self, stalls: &mut StallDetector) -> Vec<String> {
-        let stalled = stalls.find(&mut self.children, std::mem::take(&mut self.busy));
+        let stalled = stalls.find(&mut self.children, std::mem::take(&mut self.cleanup_time));
         let mut messages = Vec::new();
         for (i, why) in stalled {
             let child = &mut self.children[i];
@@ -633,16 +633,16 @@ impl Supervisor {
     fn clean(&mut self, domain: &Domain) -> anyhow::Result<RunCondition> {
         let begun = Instant::now();
         let cleaned = cleaner::clean_up(domain, &self.services);
-        self.cleaned = Instant::now();
-        self.busy += begun.elapsed();
+        self.cleaned_at = Instant::now();
+        self.cleanup_time += begun.elapsed();
         if let Err(error) = &cleaned {
             self.log.note("launcher", &format!("{error:#}"));
         }
         if self.services.ports_of_dead_processes() == 0 {
-            self.occupied = None;
+            self.occupied_since = None;
             return Ok(RunCondition::AtWork);
         }
-        let since = *self.occupied.get_or_insert(begun);
+        let since = *self.occupied_since.get_or_insert(begun);
         if cleaned.is_ok() && since.elapsed() >= OCCUPIED_PATIENCE {
             return Ok(RunCondition::SharedMemoryOccupied);
         }
@@ -720,7 +720,7 @@ impl Supervisor {
                     process.ask_to_end();
                 }
                 None if child.instance.role == Role::Learner && !self.learner_done => {
-                    self.unsaved = Some("it had died and was not restarted yet".into());
+                    self.unsaved_learner = Some("it had died and was not restarted yet".into());
                 }
                 None => {}
             }
@@ -736,7 +736,7 @@ impl Supervisor {
                 Some(status) => {
                     child.process = None;
                     if child.instance.role == Role::Learner && !status.success() {
-                        self.unsaved = Some(ending(status));
+                        self.unsaved_learner = Some(ending(status));
                     }
                 }
                 None => all = false,
@@ -755,7 +755,7 @@ impl Supervisor {
                 self.incidents
                     .push(Incident::of(child.instance, IncidentKind::Killed, detail));
                 if child.instance.role == Role::Learner {
-                    self.unsaved = Some("it did not end when asked to, and was killed".into());
+                    self.unsaved_learner = Some("it did not end when asked to, and was killed".into());
                 }
             }
         }
@@ -767,7 +767,9 @@ impl Supervisor {
     /// When the learner did not save its state before it ended.
     pub(super) fn check_saved(&self) -> anyhow::Result<()> {
         self.log.note("launcher", ALL_ENDED);
-        let Some(how) = &self.unsaved else { return Ok(()) };
+        let Some(how) = &self.unsaved_learner else {
+            return Ok(());
+        };
         let lines = self.log.last_lines(&name(RoleInstance {
             role: Role::Learner,
             index: 0,

@@ -28,7 +28,7 @@ const TIMEOUT: Duration = Duration::from_secs(60);
 /// A running training process.
 pub(super) struct Training {
     launcher: ChildProcess,
-    begun: Instant,
+    started_at: Instant,
     /// Incarnation of the newest learner seen.
     incarnation: u64,
     observer: Option<Observer>,
@@ -77,11 +77,11 @@ impl Training {
             .args(["train", "pendulum", "--quiet", "--seed", "1"]);
         command.args(["--set", "run.steps=1_000_000_000_000", "--run"]);
         command.arg(directory.path().join("run"));
-        let begun = Instant::now();
+        let started_at = Instant::now();
         let launcher = ChildProcess::start(&mut command, "training".into()).context("cannot start a training")?;
         Ok(Self {
             launcher,
-            begun,
+            started_at,
             incarnation: 0,
             observer: None,
             directory,
@@ -113,7 +113,7 @@ impl Training {
     /// Observes the run until the first policy that gradient steps have changed.
     pub(super) fn begin(&mut self, budget: &TimeBudget) -> anyhow::Result<Startup> {
         let run = RunDir::planned(&self.directory.path().join("run"));
-        let begun = self.begun;
+        let begun = self.started_at;
         // Joining before the launcher would look like the remains of an earlier run. The launcher writes this file
         // before it starts the first process, and has created the services by then.
         let counter = run.incarnations();
@@ -160,9 +160,9 @@ impl Training {
 
     /// Lets the run work for a while.
     pub(super) fn settle(&mut self, budget: &TimeBudget) -> anyhow::Result<()> {
-        let begun = Instant::now();
+        let started_at = Instant::now();
         self.wait(budget, "no steady state", |_| {
-            Ok((begun.elapsed() >= SETTLING_TIME).then_some(()))
+            Ok((started_at.elapsed() >= SETTLING_TIME).then_some(()))
         })
     }
 
@@ -219,14 +219,14 @@ impl Training {
         missing: &str,
         mut look: impl FnMut(&mut u64) -> anyhow::Result<Option<T>>,
     ) -> anyhow::Result<T> {
-        let begun = Instant::now();
+        let started_at = Instant::now();
         loop {
             if let Some(found) = look(&mut self.incarnation)? {
                 return Ok(found);
             }
             budget.check()?;
             self.launcher.check()?;
-            if begun.elapsed() >= TIMEOUT {
+            if started_at.elapsed() >= TIMEOUT {
                 bail!("the training showed {missing} for {} s", TIMEOUT.as_secs());
             }
             std::thread::sleep(POLL_INTERVAL);

@@ -16,7 +16,7 @@ const INTERVAL: Duration = Duration::from_millis(500);
 pub struct HeartbeatSender {
     reporter: Reporter<Heartbeat>,
     heartbeat: Heartbeat,
-    last: Option<Instant>,
+    last_sent_at: Option<Instant>,
 }
 
 impl HeartbeatSender {
@@ -28,7 +28,7 @@ impl HeartbeatSender {
         Ok(Self {
             reporter: Reporter::open(domain)?,
             heartbeat: Heartbeat::new(instance),
-            last: None,
+            last_sent_at: None,
         })
     }
 
@@ -63,8 +63,8 @@ impl HeartbeatSender {
 
     /// Sends a heartbeat if one is due.
     pub fn beat(&mut self, activity: Activity) {
-        if self.last.is_none_or(|last| last.elapsed() >= INTERVAL) {
-            self.last = Some(Instant::now());
+        if self.last_sent_at.is_none_or(|last| last.elapsed() >= INTERVAL) {
+            self.last_sent_at = Some(Instant::now());
             self.heartbeat.set_activity(activity);
             self.reporter.refresh_connections();
             self.reporter.send(self.heartbeat);
@@ -73,7 +73,7 @@ impl HeartbeatSender {
 
     /// Sends a heartbeat at once.
     pub fn beat_now(&mut self, activity: Activity) {
-        self.last = None;
+        self.last_sent_at = None;
         self.beat(activity);
     }
 }

@@ -109,7 +109,7 @@ impl TryFrom<Sections> for Config {
 
 /// What is wrong with the first section that cannot be read, beginning with the key and its value: serde's own error does
 /// not name the key. The sections of algorithms, whose errors do, are not among these.
-pub(super) fn at_fault(sections: &Table) -> Option<String> {
+pub(super) fn first_unreadable(sections: &Table) -> Option<String> {
     fn fault<T: DeserializeOwned>(sections: &Table, name: &str) -> Option<String> {
         let error = section::read::<T>(name, sections.get(name)?.clone()).err()?;
         let message = error.message().replace('\n', " ");

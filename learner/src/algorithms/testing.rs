@@ -119,6 +119,6 @@ pub(super) fn assert_threads_do_not_change_the_bits<L: MinibatchLearner>(
             .collect::<Vec<_>>()
     };
     // A thread can start a second one only once.
-    let shared = std::thread::scope(|scope| scope.spawn(|| run(Threads::two().unwrap())).join().unwrap());
+    let shared = std::thread::scope(|scope| scope.spawn(|| run(Threads::two_threads().unwrap())).join().unwrap());
     assert_eq!(shared, run(Threads::ALONE), "{what}");
 }

@@ -17,7 +17,7 @@ impl Replay {
     ///
     /// # Panics
     /// If this replay is not empty, or its rows have another layout.
-    pub fn begin_with(&mut self, other: &Self, most: u64) -> Result<u64, ReplayError> {
+    pub fn inherit_rows(&mut self, other: &Self, most: u64) -> Result<u64, ReplayError> {
         assert_eq!(self.head(), 0, "only an empty replay begins with other rows");
         assert_eq!(self.layout.row, other.layout.row, "rows of another layout");
         let rows = other.rows();
@@ -77,7 +77,7 @@ mod tests {
         for (ring, most, expected) in [(20, 20, 6), (20, 4, 4), (3, 20, 3)] {
             let name = path(&format!("{ring}-{most}"));
             let mut new = Replay::create(&name, &layout(ring)).unwrap();
-            assert_eq!(new.begin_with(&old, most).unwrap(), expected);
+            assert_eq!(new.inherit_rows(&old, most).unwrap(), expected);
             drop(new);
             let mut new = Replay::open(&name, &layout(ring)).unwrap();
             assert!(new.warnings().is_empty(), "{:?}", new.warnings());

@@ -91,7 +91,7 @@ fn a_run_without_playable_episodes_is_shown_with_the_reason() {
     config.environment.server = vec!["no-such-program".into()];
     let served = directory(parent.path(), "served", &config, Some(parameters));
     let report = gather(&[begun, damaged, served]).unwrap();
-    let reasons = report.not_played();
+    let reasons = report.runs_without_episodes();
     assert_eq!(reasons.len(), 3);
     for ((reason, runs), (name, part)) in reasons.iter().zip([
         ("begun", "No policy has been evaluated yet."),

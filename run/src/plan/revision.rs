@@ -241,7 +241,7 @@ fn refuse(differences: &[Difference], used: &Config, sources: &SettingSources) -
         };
         let [before, after] = [before, after].map(|value| if value.is_empty() { "nothing" } else { value });
         let text = format!("{key} = {after}: cannot change {place}, which has {before}: {why}");
-        return Err(sources.blame(key, &text));
+        return Err(sources.error_naming_source(key, &text));
     }
     Ok(())
 }

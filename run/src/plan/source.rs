@@ -36,7 +36,7 @@ pub enum SettingSource {
 
 impl SettingSource {
     /// Whether the user has chosen the value.
-    pub(super) fn is_users(&self) -> bool {
+    pub(super) fn is_from_user(&self) -> bool {
         matches!(self, Self::File(..) | Self::Option(_) | Self::Set)
     }
 }
@@ -153,14 +153,14 @@ impl SettingSources {
         if let Some(of_environment) = message.strip_prefix("spec.") {
             return anyhow::anyhow!("{origin}: the environment's {of_environment}");
         }
-        if self.of(key).is_users() {
-            return self.blame(key, &message);
+        if self.of(key).is_from_user() {
+            return self.error_naming_source(key, &message);
         }
         self.explain_other(key, &message, origin, table)
     }
 
     /// The error for a key that the user may have set: names the option, or the file and the line.
-    pub(super) fn blame(&self, key: &str, message: &str) -> anyhow::Error {
+    pub(super) fn error_naming_source(&self, key: &str, message: &str) -> anyhow::Error {
         match self.of(key) {
             SettingSource::Option(option) => UsageError(format!("{option}: {message}")).into(),
             SettingSource::Set => UsageError(message.into()).into(),
@@ -178,7 +178,7 @@ impl SettingSources {
 
     /// The same for a key that the user has not set, or that the message does not name.
     fn explain_other(&self, key: &str, message: &str, origin: &str, table: &Table) -> anyhow::Error {
-        let Some(other) = bounding(key).into_iter().find(|other| self.of(other).is_users()) else {
+        let Some(other) = bounding(key).into_iter().find(|other| self.of(other).is_from_user()) else {
             return self.explain_section(message, origin);
         };
         let value = other
@@ -194,7 +194,7 @@ impl SettingSources {
             "{other} = {value}: does not go with {stated} ({}), which {expected}{advice}",
             self.of(key)
         );
-        self.blame(&other, &text)
+        self.error_naming_source(&other, &text)
     }
 
     /// The same for a message about whole sections.
