@@ -1,4 +1,4 @@
-//! The exploring actor: acts with the newest policy and noise, and writes transitions into chunks for the learner.
+//! The actor: acts with the newest policy and exploration, and writes transitions into chunks for the learner.
 //!
 //! ```text
 //! loop {

@@ -203,14 +203,14 @@ fn watch(
     let mut results = IntervalResults::default();
     let mut published: Vec<(Instant, u64)> = Vec::new();
     let (begun, mut opened) = (Instant::now(), (Instant::now(), progress.rows()));
-    let window = INTERVAL.min(length);
+    let interval = INTERVAL.min(length);
     loop {
         std::thread::sleep(POLL_INTERVAL);
         let (now, updates) = (Instant::now(), progress.updates()?);
         if updates > 0 && published.last().is_none_or(|(_, before)| updates > *before) {
             published.push((now, updates));
         }
-        if now - opened.0 < window {
+        if now - opened.0 < interval {
             continue;
         }
         let rows = progress.rows();

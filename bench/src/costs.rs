@@ -156,8 +156,8 @@ fn environment_step(config: &Config, length: Duration, budget: &TimeBudget) -> a
     Ok(taken)
 }
 
-/// The mean time of a request within each interval, and the median of these. A forward pass precedes each request, so the
-/// server falls asleep in between, as in a run.
+/// The mean time of a request within each interval, and the median of these. A forward pass precedes each request, so
+/// the server falls asleep in between, as in a run.
 fn round_trip(
     config: &Config,
     domain: &Domain,

@@ -41,21 +41,21 @@ pub fn serve(
                 started = true;
                 heartbeat.begin_work();
                 request
-                    .answer(|_, blocks| environments.reset(reset, blocks.observations))?
+                    .respond(|_, blocks| environments.reset(reset, blocks.observations))?
                     .err()
             }
             Some(RequestKind::Step) if started => {
                 heartbeat.begin_work();
                 let refused = request
-                    .answer(|actions, blocks| environments.step(actions, blocks))?
+                    .respond(|actions, blocks| environments.step(actions, blocks))?
                     .err();
                 heartbeat.count(environments.count() as u64);
                 heartbeat.beat(Activity::Working);
                 refused
             }
-            Some(RequestKind::Snapshot) if started => {
-                request.answer_snapshot(|words| environments.snapshot(words))?.err()
-            }
+            Some(RequestKind::Snapshot) if started => request
+                .respond_with_snapshot(|words| environments.snapshot(words))?
+                .err(),
             Some(RequestKind::Step | RequestKind::Snapshot) => {
                 request.not_started()?;
                 None
@@ -63,7 +63,7 @@ pub fn serve(
             Some(RequestKind::Restore) => {
                 let words = request.words();
                 let refused = request
-                    .answer(|_, blocks| environments.restore(&words, blocks.observations))?
+                    .respond(|_, blocks| environments.restore(&words, blocks.observations))?
                     .err();
                 started |= refused.is_none();
                 refused

@@ -2,8 +2,8 @@
 //!
 //! Chunks are identified by the incarnation and the sequence number in their headers, and ordered by both. A handshake,
 //! the first chunk of an incarnation, has sequence number 0. The relay sends it once all chunks before it are committed
-//! ([`crate::uncommitted`]). So the gate has at most a window of chunks on their way to the learner, which are all in its
-//! channel's history, and a new learner receives them.
+//! ([`crate::uncommitted`]). So the gate has at most a window of chunks on their way to the learner, which are all in
+//! its channel's history, and a new learner receives them.
 
 use std::collections::VecDeque;
 

@@ -1,7 +1,7 @@
 //! What the relay keeps: the chunks of one actor that are not committed, and which of them to send next.
 //!
-//! This is the sending half of go-back-N. The relay sends each chunk once, and sends again from the first one that
-//! the gate has not forwarded, if the gate has forwarded nothing for too long or was restarted. A chunk is kept until it is
+//! This is the sending half of go-back-N. The relay sends each chunk once, and sends again from the first one that the
+//! gate has not forwarded, if the gate has forwarded nothing for too long or was restarted. A chunk is kept until it is
 //! committed: when gate or learner end, they lose all that is not in the replay.
 
 use std::collections::VecDeque;
@@ -14,8 +14,8 @@ use shoal_common::commit::ChunkId;
 pub enum ActorFollowUp {
     /// Nothing.
     Continue,
-    /// The replay has lost chunks that were committed, and the next chunks of the actor do not follow on what it has. End
-    /// the actor unless it has a later incarnation than this; its successor begins with a handshake.
+    /// The replay has lost chunks that were committed, and the next chunks of the actor do not follow on what it has.
+    /// End the actor unless it has a later incarnation than this; its successor begins with a handshake.
     StartAgain(u64),
     /// Another host has the actor's index now: end the actor and do not replace it.
     TakenOver,
@@ -92,10 +92,9 @@ impl<C> UncommittedChunks<C> {
         self.resent
     }
 
-    /// Adds a chunk of the actor. A window of chunks and a handshake are kept at most, or twice
-    /// that after a power loss. One that was added or committed
-    /// before is ignored, because a new relay receives the history of the actor's channel; so is one that does not follow
-    /// on the others.
+    /// Adds a chunk of the actor. A window of chunks and a handshake are kept at most, or twice that after a power
+    /// loss. One that was added or committed before is ignored, because a new relay receives the history of the actor's
+    /// channel; so is one that does not follow on the others.
     pub fn add(&mut self, id: ChunkId, chunk: C, now: Duration) -> ActorFollowUp {
         if id <= self.newest_added {
             return ActorFollowUp::Continue;
@@ -121,8 +120,8 @@ impl<C> UncommittedChunks<C> {
         ActorFollowUp::Continue
     }
 
-    /// The next chunk to send. It stays the next one until [`note_sent`](Self::note_sent) is called. A handshake waits until all
-    /// chunks before it are committed: its number does not tell the gate whether one is missing.
+    /// The next chunk to send. It stays the next one until [`note_sent`](Self::note_sent) is called. A handshake waits
+    /// until all chunks before it are committed: its number does not tell the gate whether one is missing.
     pub fn next(&self) -> Option<&KeptChunk<C>> {
         let next = self.chunks.get(self.next_to_send);
         next.filter(|kept| !kept.is_handshake() || kept.previous <= self.committed)
@@ -139,8 +138,8 @@ impl<C> UncommittedChunks<C> {
         }
     }
 
-    /// Takes note of what the gate has forwarded, and of what is committed. This host's processes have incarnations below
-    /// `limit`, and every process that was started elsewhere later has one that is not.
+    /// Takes note of what the gate has forwarded, and of what is committed. This host's processes have incarnations
+    /// below `limit`, and every process that was started elsewhere later has one that is not.
     pub fn acknowledge(&mut self, forwarded: ChunkId, committed: ChunkId, limit: u64, now: Duration) -> ActorFollowUp {
         if committed < self.committed {
             let ended = self.newest_added.incarnation;
@@ -171,7 +170,8 @@ impl<C> UncommittedChunks<C> {
         self.chunks.back().is_none_or(|kept| kept.id <= self.forwarded)
     }
 
-    /// Goes back to the first chunk that the gate has not forwarded, if it has forwarded none for `patience` although some were sent.
+    /// Goes back to the first chunk that the gate has not forwarded, if it has forwarded none for `patience` although
+    /// some were sent.
     pub fn go_back_if_overdue(&mut self, now: Duration, patience: Duration) {
         let outstanding = self.next_to_send > 0 && self.chunks[self.next_to_send - 1].id > self.forwarded;
         if !outstanding {

@@ -60,8 +60,8 @@ pub(crate) fn named_in(table: &Table) -> Option<&'static str> {
         .or_else(|| table.contains_key("exploration").then_some("ddpg"))
 }
 
-/// Makes a preset for another algorithm. What the preset says about learning was chosen for its own algorithm, so only the
-/// environment, the run's length and the evaluation are kept. Returns what is kept.
+/// Makes a preset for another algorithm. What the preset says about learning was chosen for its own algorithm, so only
+/// the environment, the run's length and the evaluation are kept. Returns what is kept.
 pub(crate) fn replace(preset: &mut Table, algorithm: &'static str) -> anyhow::Result<Table> {
     preset.retain(|section, _| ["run", "environment", "evaluation"].contains(&section));
     if let Some(Value::Table(run)) = preset.get_mut("run") {

@@ -117,7 +117,7 @@ fn wait_for_input() -> anyhow::Result<Input> {
     let mut fds = [PollFd::new(&stdin, PollFlags::IN)];
     let tick = Timespec::try_from(TICK).context("cannot wait for the keyboard")?;
     match poll(&mut fds, Some(&tick)) {
-        // A signal: the size of the window may have changed.
+        // A signal: the size of the terminal may have changed.
         Err(Errno::INTR) => return Ok(Input::Something),
         polled => polled.context("cannot wait for the keyboard")?,
     };

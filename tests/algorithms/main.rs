@@ -1,5 +1,5 @@
-//! The algorithms other than DDPG, in real processes. Q-learning finds the lake's values. Each algorithm gives the bits of
-//! its algorithm in a single process, even if roles are killed. A run ends after a given number of episodes.
+//! The algorithms other than DDPG, in real processes. Q-learning finds the lake's values. Each algorithm gives the bits
+//! of its algorithm in a single process, even if roles are killed. A run ends after a given number of episodes.
 
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
 

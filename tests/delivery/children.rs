@@ -290,7 +290,7 @@ fn mute_env_server(domain: &Domain) {
         }
         let start = shoal_env_server::vector::Reset::Next;
         request
-            .answer(|_, blocks| environments.reset(start, blocks.observations))
+            .respond(|_, blocks| environments.reset(start, blocks.observations))
             .unwrap()
             .unwrap();
     }

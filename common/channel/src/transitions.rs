@@ -397,8 +397,8 @@ impl ReceivedChunk {
         self.sample.user_header()
     }
 
-    /// The chunk's id. `committed` is the id of the last committed chunk of its actor: a handshake keeps its sequence number,
-    /// and only announces the new incarnation.
+    /// The chunk's id. `committed` is the id of the last committed chunk of its actor: a handshake keeps its sequence
+    /// number, and only announces the new incarnation.
     pub fn id(&self, committed: ChunkId) -> ChunkId {
         let ChunkHeader {
             incarnation, sequence, ..

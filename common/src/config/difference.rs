@@ -22,8 +22,8 @@ pub struct Difference {
 }
 
 impl Config {
-    /// The keys in which `after`, another configuration of this run, differs, by name. If the algorithms differ, nothing else
-    /// is named.
+    /// The keys in which `after`, another configuration of this run, differs, by name. If the algorithms differ,
+    /// nothing else is named.
     pub fn differences(&self, after: &Self) -> Vec<Difference> {
         let algorithms = [self, after].map(|config| config.algorithm.name());
         if algorithms[0] != algorithms[1] {

@@ -20,8 +20,8 @@ section! {
         /// Transitions collected before the first update.
         warmup: u64 = 1_000, bounds: from(0, MAX_ROWS), unit: "transitions", source: "ours",
             change: in_free_runs("its rounds so far have had the updates that it allows");
-        /// Updates for each environment step beyond the warm-up: gradient steps, or rows for algorithms that use each row
-        /// once. The thesis has 1.
+        /// Updates for each environment step beyond the warm-up: gradient steps, or rows for algorithms that use each
+        /// row once. The thesis has 1.
         updates_per_step: f64 = 1.0, bounds: from(0.0, 1_000.0),
             unit: "updates per environment step", source: "Algorithm 4",
             change: in_free_runs("its replay is as large as it requires");

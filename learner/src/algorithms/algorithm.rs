@@ -22,8 +22,8 @@ pub trait AlgorithmFactory {
     /// normalised observations are not among them.
     fn weights(&self) -> &'static [&'static str];
 
-    /// The matrix products of one or a few updates in an environment like `spec`; none if the algorithm has no networks,
-    /// or if its updates have no fixed size.
+    /// The matrix products of one or a few updates in an environment like `spec`; none if the algorithm has no
+    /// networks, or if its updates have no fixed size.
     fn products(&self, spec: &EnvironmentSpec) -> Products;
 
     /// The total length of all arrays of the learner's state, without the statistics of normalised observations.

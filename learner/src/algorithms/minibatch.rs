@@ -40,16 +40,16 @@ impl Minibatch {
     }
 
     /// Copies the rows with these numbers into the columns, from the first on. A row with a number that is not finite is
-    /// replaced by the next good one of `window`. Panics if the replay does not hold one of the rows, or if there are
+    /// replaced by the next good one of `range`. Panics if the replay does not hold one of the rows, or if there are
     /// more rows than columns.
-    pub fn gather(&mut self, replay: &Replay, indices: &[u64], window: &Range<u64>) {
+    pub fn gather(&mut self, replay: &Replay, indices: &[u64], range: &Range<u64>) {
         // Random rows are cache misses. Both ends of all rows are read before any is copied, so that the misses
         // overlap; this is three times as fast. Both ends, because a row may lie on two cache lines.
         let ends = |row: &[f32]| row[0] + row[row.len() - 1];
         std::hint::black_box(indices.iter().map(|&index| ends(replay.row(index))).sum::<f32>());
         let layout = replay.layout().row;
         for (column, &index) in indices.iter().enumerate() {
-            self.set(column, &layout.read(replay.finite_row(index, window)));
+            self.set(column, &layout.read(replay.finite_row(index, range)));
         }
     }
 

@@ -87,10 +87,10 @@ impl<L: MinibatchLearner> Algorithm for MinibatchAlgorithm<L> {
     }
 
     fn update(&mut self, replay: &Replay, rows: u64) -> Losses {
-        let window = replay.sampling_range(rows, self.capacity);
+        let range = replay.sampling_range(rows, self.capacity);
         self.sampler
-            .indices(self.learner.updates(), window.clone(), &mut self.indices);
-        self.batch.gather(replay, &self.indices, &window);
+            .indices(self.learner.updates(), range.clone(), &mut self.indices);
+        self.batch.gather(replay, &self.indices, &range);
         if let Some(normaliser) = &mut self.normaliser {
             normaliser.count(replay, rows);
             normaliser.apply(&mut self.batch);

@@ -60,8 +60,8 @@ pub fn inherited(
     fresh.state().into_iter().map(array).collect()
 }
 
-/// The matrix products of one or a few updates of that learner; none if its algorithm has no networks, or if its updates
-/// have no fixed size.
+/// The matrix products of one or a few updates of that learner; none if its algorithm has no networks, or if its
+/// updates have no fixed size.
 pub fn products(config: &Config) -> Products {
     factory(&config.algorithm).products(&config.spec)
 }

@@ -124,7 +124,7 @@ pub fn replay_layout(config: &Config) -> ReplayLayout {
     }
 }
 
-/// Rows in the ring: the sampling window and, in lockstep, the rows of two checkpoint intervals and two rounds, because
+/// Rows in the ring: the sampling range and, in lockstep, the rows of two checkpoint intervals and two rounds, because
 /// a learner that continues from a checkpoint samples them again.
 fn ring_rows(config: &Config) -> u64 {
     let chunk = config.chunk_rows() as u64;

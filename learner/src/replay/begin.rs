@@ -23,7 +23,7 @@ impl Replay {
         let rows = other.rows();
         let first = rows.end.saturating_sub(most.min(self.layout.ring)).max(rows.start);
         let count = rows.end - first;
-        // As for a chunk: recovery after a kill must know that these offsets may have been written.
+        // As for a chunk: recovery after a kill must know that these places may have been written.
         self.words.store(self.offsets.write_horizon, count);
         let mut numbers = Vec::new();
         let mut next = first;

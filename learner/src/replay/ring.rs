@@ -10,7 +10,7 @@ use shoal_common::commit::{FileOffsets, ReplayLayout};
 use super::check;
 use super::step::WriteStep;
 
-/// The offsets of the ring. Row `index` is stored in place `index` mod `ring`.
+/// The places of the ring. Row `index` is stored in place `index` mod `ring`.
 pub(super) struct Ring {
     map: MmapMut,
     /// Where the rows begin in the mapping, in bytes; the checks begin at 0.
@@ -86,8 +86,8 @@ impl Ring {
         check != check::NONE && check == check::of_row(index, self.row(index))
     }
 
-    /// Empties the offsets outside `rows`. Otherwise a row that was never committed, or was given up after a power loss,
-    /// could pass for the later row with its number. Returns true if a place was not empty.
+    /// Empties the places outside `rows`. Otherwise a row that was never committed, or was given up after a power
+    /// loss, could pass for the later row with its number. Returns true if a place was not empty.
     pub(super) fn clear_outside(&mut self, rows: Range<u64>) -> bool {
         let mut cleared = false;
         for index in rows.end..rows.start + self.ring {

@@ -45,7 +45,7 @@ proptest! {
             for (step, mut image) in images.lock().unwrap().drain(..) {
                 committed |= step == WriteStep::Sealed;
                 if step == WriteStep::WriteHorizonSet {
-                    // If the kill comes while rows are copied, their offsets may hold anything.
+                    // If the kill comes while rows are copied, their places may hold anything.
                     for index in before.head()..after.head() {
                         let place = offsets(ring).rows.start + (index % ring) as usize * 4 * WIDTH;
                         if noise >> (index % 32) & 1 == 1 {

@@ -60,8 +60,8 @@ fn use_file(path: &std::path::Path, image: &[u8]) -> Result<(), TestCaseError> {
         prop_assert!(rows.end - rows.start <= RING);
         rows.clone().for_each(|index| drop(replay.row(index).to_vec()));
         for (head, capacity) in [(0, 1), (rows.end, RING), (u64::MAX, u64::MAX), (rows.start, 0)] {
-            let window = replay.sampling_range(head, capacity);
-            prop_assert!(window.is_empty() || rows.start <= window.start && window.end <= rows.end);
+            let range = replay.sampling_range(head, capacity);
+            prop_assert!(range.is_empty() || rows.start <= range.start && range.end <= rows.end);
         }
         for actor in 0..ACTORS {
             let ChunkId { incarnation, sequence } = replay.committed(actor).last_chunk;

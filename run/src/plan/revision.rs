@@ -192,7 +192,8 @@ pub fn store_actors(run: &RunDir, used: &Config, actors: u32, now: Moment) -> an
     Ok(config)
 }
 
-/// For a run that is not running: what `config.toml` changes for the next resume, in words; `None` if it is what the run was last used with.
+/// For a run that is not running: what `config.toml` changes for the next resume, in words; `None` if it is what the
+/// run was last used with.
 pub fn edited(run: &RunDir, used: &Config) -> Option<String> {
     match Revision::new(run, used, &RequestedChanges::default()) {
         Err(error) => Some(format!("it cannot be resumed: {error:#}")),

@@ -44,7 +44,7 @@ pub const SYNCED: usize = 2;
 pub struct ReplayLayout {
     /// The fields of a row.
     pub row: RowLayout,
-    /// Rows in the ring: the sampling window, and the reserve that lockstep runs need beyond it.
+    /// Rows in the ring: the sampling range, and the reserve that lockstep runs need beyond it.
     pub ring: u64,
     /// The most actors; their indices are `0 .. actors`.
     pub actors: usize,

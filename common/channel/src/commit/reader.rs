@@ -147,8 +147,8 @@ impl CommitReader {
             // generation: the record is complete.
             fence(Ordering::Acquire);
             let value = read(self.offsets.slots[(generation % 2) as usize]);
-            // SYNC POINT with the first Release fence of `CommitRecord::store`: if `read` has seen a word of a later record
-            // in this slot, the load below sees a newer generation.
+            // SYNC POINT with the first Release fence of `CommitRecord::store`: if `read` has seen a word of a later
+            // record in this slot, the load below sees a newer generation.
             fence(Ordering::Acquire);
             if self.words.load(self.offsets.published) == generation {
                 return value;

@@ -1,22 +1,22 @@
-//! Checks of what an environment returns. The client checks every answer, whatever program serves the environment, so
+//! Checks of what an environment returns. The client checks every response, whatever program serves the environment, so
 //! that later code need not expect NaN, infinities or impossible indices.
 
 use shoal_base::space::{EnvironmentSpec, Space};
 
 use super::message::{Block, ResponseLayout};
 
-/// An invalid answer. It ends the server's episodes.
+/// An invalid response. It ends the server's episodes.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum ResponseFault {
     /// The server itself has found invalid numbers, and has written them to its standard error.
     #[error("the environment server reports that an environment returned something invalid")]
     Reported,
-    /// The answer has a wrong length.
+    /// The response has a wrong length.
     #[error("the environment server answered with {found} numbers instead of {expected}")]
     Length {
-        /// Numbers in the answer.
+        /// Numbers in the response.
         found: usize,
-        /// Numbers in a valid answer.
+        /// Numbers in a valid response.
         expected: usize,
     },
     /// An invalid number.
@@ -36,9 +36,9 @@ pub enum ResponseFault {
 /// Which part of a response is used.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum ResponsePart {
-    /// All of it: the answer to a step.
+    /// All of it: the response to a step.
     Step,
-    /// The observations to act on: the answer to a reset or a restore.
+    /// The observations to act on: the response to a reset or a restore.
     Observations,
 }
 
@@ -114,7 +114,7 @@ mod tests {
         }
     }
 
-    /// Checks an answer of two environments to a step, with one number changed.
+    /// Checks a response of two environments to a step, with one number changed.
     fn fault_of(observation: Space, at: usize, value: f32, part: ResponsePart) -> Result<(), ResponseFault> {
         let spec = spec(observation);
         let layout = ResponseLayout::new(2, spec.observation.width());

@@ -65,7 +65,7 @@ pub struct EnvironmentResponse {
     layout: ResponseLayout,
 }
 
-/// The actor's end. While it waits for an answer, it calls `idle` some twenty times a second.
+/// The actor's end. While it waits for a response, it calls `idle` some twenty times a second.
 #[derive(Debug)]
 pub struct EnvironmentClient {
     service: EnvironmentService,
@@ -123,7 +123,7 @@ impl EnvironmentResponse {
 }
 
 /// Asks environment server `index` for its spaces and the number of its environments, when neither is known yet.
-/// While it waits for the answer, it calls `idle` about twenty times a second.
+/// While it waits for the response, it calls `idle` about twenty times a second.
 ///
 /// # Errors
 /// When `stop` is requested, or the channel fails.
@@ -146,7 +146,7 @@ pub fn describe(
 
 impl EnvironmentClient {
     /// Connects to environment server `index`, which is expected to step this many environments like `spec`; use
-    /// [`describe`](Self::describe) to verify it. Waiting for an answer ends when `stop` is requested.
+    /// [`describe`](Self::describe) to verify it. Waiting for a response ends when `stop` is requested.
     ///
     /// # Errors
     /// When shared memory is unavailable.
@@ -186,7 +186,7 @@ impl EnvironmentClient {
     /// Asks the server for its spaces and the number of its environments.
     ///
     /// # Errors
-    /// When a stop is requested, the channel fails, the server refuses, or its answer fits no spaces.
+    /// When a stop is requested, the channel fails, the server refuses, or its response fits no spaces.
     pub fn describe(
         &self,
         listener: &Listener,
@@ -198,7 +198,7 @@ impl EnvironmentClient {
             &[],
             &mut idle,
         )?;
-        let (header, payload) = (response.user_header(), self.answered(&response)?);
+        let (header, payload) = (response.user_header(), self.accepted_payload(&response)?);
         let described = header.described(payload);
         described.ok_or_else(|| ChannelError::new(&self.channel, "describe", PeerError::DescriptionLength).into())
     }
@@ -227,7 +227,8 @@ impl EnvironmentClient {
     ///
     /// # Errors
     /// When a stop is requested, the channel fails, the server refuses the actions, it denies having begun the
-    /// episodes, or its answer is [invalid](ChannelError::fault). After an invalid answer new episodes must be begun.
+    /// episodes, or its response is [invalid](ChannelError::fault). After an invalid response new episodes must be
+    /// begun.
     pub fn step(
         &self,
         listener: &Listener,
@@ -249,7 +250,7 @@ impl EnvironmentClient {
         let Some(response) = self.request_within_episodes(listener, RequestKind::Snapshot, &[], &mut idle)? else {
             return Ok(SnapshotResult::Lost);
         };
-        let words = words_of(self.answered(&response)?);
+        let words = words_of(self.accepted_payload(&response)?);
         if words.len() != self.snapshot_words {
             return Err(self.refused().into());
         }
@@ -291,7 +292,7 @@ impl EnvironmentClient {
     }
 
     fn observed(&self, response: ServerResponse, part: ResponsePart) -> Result<EnvironmentResponse, ChannelError> {
-        let numbers = self.answered(&response)?;
+        let numbers = self.accepted_payload(&response)?;
         if numbers.len() != self.layout.len() {
             let fault = ResponseFault::Length {
                 found: numbers.len(),
@@ -308,7 +309,7 @@ impl EnvironmentClient {
     }
 
     /// The payload of a response; an error if the server refused.
-    fn answered<'a>(&self, response: &'a ServerResponse) -> Result<&'a [f32], ChannelError> {
+    fn accepted_payload<'a>(&self, response: &'a ServerResponse) -> Result<&'a [f32], ChannelError> {
         let status = response.user_header().status;
         if status == ResponseStatus::Answered as u32 {
             return Ok(response.payload());
@@ -337,7 +338,7 @@ impl EnvironmentClient {
             return Ok(None);
         }
         let sent = self.send(server, RequestHeader::new(kind, 0, 0), payload)?;
-        let Some(response) = self.answer(listener, &sent, idle)? else {
+        let Some(response) = self.receive_response(listener, &sent, idle)? else {
             return Ok(None);
         };
         if response.user_header().status != ResponseStatus::NotStarted as u32 {
@@ -360,7 +361,7 @@ impl EnvironmentClient {
         let mut unreachable = None;
         loop {
             let sent = self.send(self.server(), header, payload)?;
-            if let Some(response) = self.answer(listener, &sent, idle)? {
+            if let Some(response) = self.receive_response(listener, &sent, idle)? {
                 return Ok(response);
             }
             if sent.server.is_none() || sent.is_delivered() {
@@ -392,15 +393,15 @@ impl EnvironmentClient {
         Ok(Sent { pending, server })
     }
 
-    /// Waits for the answer; `None` if the server that was asked is gone or did not get the request.
-    fn answer(
+    /// Waits for the response; `None` if the server that was asked is gone or did not get the request.
+    fn receive_response(
         &self,
         listener: &Listener,
         sent: &Sent,
         idle: &mut dyn FnMut(),
     ) -> Result<Option<ServerResponse>, Exit<ChannelError>> {
         let lost = Cell::new(false);
-        let answer = wait_for(
+        let response = wait_for(
             listener,
             &self.stop,
             || match sent.pending.receive() {
@@ -417,7 +418,7 @@ impl EnvironmentClient {
                 Ok(())
             },
         )?;
-        Ok(answer)
+        Ok(response)
     }
 
     /// The server that is connected to the service.

@@ -36,15 +36,15 @@ impl RequestKind {
     ];
 }
 
-/// Header of a request. The payload has the actions, environment after environment, for [`RequestKind::Step`], the words of the
-/// snapshot for [`RequestKind::Restore`], and is empty otherwise.
+/// Header of a request. The payload has the actions, environment after environment, for [`RequestKind::Step`], the
+/// words of the snapshot for [`RequestKind::Restore`], and is empty otherwise.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ZeroCopySend)]
 #[type_name("ShoalEnvironmentRequest")]
 #[repr(C)]
 pub struct RequestHeader {
     pub(super) kind: u32,
-    /// Number of evaluation episodes of [`RequestKind::ResetToEvaluation`], of which `episode` is the first; 0 means no limit.
-    /// An environment whose next episode would be beyond them is not reset again.
+    /// Number of evaluation episodes of [`RequestKind::ResetToEvaluation`], of which `episode` is the first; 0 means no
+    /// limit. An environment whose next episode would be beyond them is not reset again.
     pub episodes: u32,
     /// The episode of [`RequestKind::ResetToTraining`], or the first episode of [`RequestKind::ResetToEvaluation`].
     pub episode: u64,
@@ -73,8 +73,9 @@ pub(super) enum ResponseStatus {
     Invalid = 3,
 }
 
-/// Header of a response. For [`RequestKind::Describe`] the payload has the least and greatest values of an observation and of
-/// an action (for boxes), for [`RequestKind::Snapshot`] the snapshot's words, and otherwise the blocks of [`ResponseLayout`].
+/// Header of a response. For [`RequestKind::Describe`] the payload has the least and greatest values of an observation
+/// and of an action (for boxes), for [`RequestKind::Snapshot`] the snapshot's words, and otherwise the blocks of
+/// [`ResponseLayout`].
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ZeroCopySend)]
 #[type_name("ShoalEnvironmentResponse")]
 #[repr(C)]
@@ -97,8 +98,8 @@ pub struct ResponseHeader {
 }
 
 impl ResponseHeader {
-    /// The spaces and the number of environments in a response to [`RequestKind::Describe`] with payload `bounds`. `None` if
-    /// the payload has another length.
+    /// The spaces and the number of environments in a response to [`RequestKind::Describe`] with payload `bounds`.
+    /// `None` if the payload has another length.
     pub(super) fn described(&self, bounds: &[f32]) -> Option<(EnvironmentSpec, usize)> {
         let spaces = [
             (self.discrete_observations, self.observation_width),

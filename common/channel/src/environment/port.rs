@@ -122,13 +122,13 @@ impl Request<'_> {
     ///
     /// # Errors
     /// When the response cannot be sent.
-    pub fn answer<E>(
+    pub fn respond<E>(
         self,
         write: impl FnOnce(&[f32], StepBlocks<'_>) -> Result<(), E>,
     ) -> Result<Result<(), E>, ChannelError> {
         let layout = self.port.layout;
         let mut result = Ok(());
-        self.respond(layout.len(), |payload| {
+        self.send_response(layout.len(), |payload| {
             result = write(self.request.payload(), layout.split_mut(payload));
             if result.is_ok() {
                 ResponseStatus::Answered
@@ -149,7 +149,7 @@ impl Request<'_> {
     ///
     /// # Errors
     /// When the response cannot be sent.
-    pub fn answer_snapshot<E>(
+    pub fn respond_with_snapshot<E>(
         self,
         write: impl FnOnce(&mut [u64]) -> Result<(), E>,
     ) -> Result<Result<(), E>, ChannelError> {
@@ -160,7 +160,7 @@ impl Request<'_> {
             return Ok(Err(error));
         }
         let numbers = numbers_of(&words);
-        self.respond(numbers.len(), |payload| {
+        self.send_response(numbers.len(), |payload| {
             payload.copy_from_slice(numbers);
             ResponseStatus::Answered
         })?;
@@ -172,7 +172,7 @@ impl Request<'_> {
     /// # Errors
     /// When the response cannot be sent.
     pub fn not_started(self) -> Result<(), ChannelError> {
-        self.respond(0, |_| ResponseStatus::NotStarted)
+        self.send_response(0, |_| ResponseStatus::NotStarted)
     }
 
     /// Answers that the request is invalid.
@@ -180,7 +180,7 @@ impl Request<'_> {
     /// # Errors
     /// When the response cannot be sent.
     pub fn refuse(self) -> Result<(), ChannelError> {
-        self.respond(0, |_| ResponseStatus::Refused)
+        self.send_response(0, |_| ResponseStatus::Refused)
     }
 
     fn describe(self) -> Result<(), ChannelError> {
@@ -194,13 +194,17 @@ impl Request<'_> {
                 Space::Discrete { start, .. } => bounds.push(*start as f32),
             }
         }
-        self.respond(bounds.len(), |payload| {
+        self.send_response(bounds.len(), |payload| {
             payload.copy_from_slice(&bounds);
             ResponseStatus::Answered
         })
     }
 
-    fn respond(&self, length: usize, write: impl FnOnce(&mut [f32]) -> ResponseStatus) -> Result<(), ChannelError> {
+    fn send_response(
+        &self,
+        length: usize,
+        write: impl FnOnce(&mut [f32]) -> ResponseStatus,
+    ) -> Result<(), ChannelError> {
         let EnvironmentPort {
             spec, layout, channel, ..
         } = self.port;
