@@ -1,4 +1,4 @@
-//! What the gate passes on to the learner: of each actor exactly the next chunk, whatever the network does.
+//! What the gate forwards to the learner: of each actor exactly the next chunk, whatever the network does.
 //!
 //! Chunks are identified by the incarnation and the sequence number in their headers, and ordered by both. A handshake,
 //! the first chunk of an incarnation, has sequence number 0. The relay sends it once all chunks before it are committed
@@ -12,26 +12,26 @@ use shoal_common::commit::ChunkId;
 /// The gate's decision about a chunk that has arrived.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ChunkOrder {
-    /// It is the next one: pass it on.
+    /// It is the next one: forward it.
     Next,
-    /// It was passed on or committed before.
+    /// It was forwarded or committed before.
     Repeated,
     /// A chunk before it is missing. The relay sends both again.
     Early,
 }
 
-/// How far the chunks of one actor have been passed on.
+/// How far the chunks of one actor have been forwarded.
 #[derive(Clone, Debug)]
 pub struct Forwarding {
     committed: ChunkId,
-    /// The numbers in the headers of the chunks passed on and not committed, in order.
+    /// The numbers in the headers of the chunks forwarded and not committed, in order.
     in_flight: VecDeque<ChunkId>,
     /// The most of them: as many as the history of the learner's channel has.
     window: usize,
 }
 
 impl Forwarding {
-    /// Continues after what is committed. At most `window` chunks are passed on and not committed.
+    /// Continues after what is committed. At most `window` chunks are forwarded and not committed.
     pub fn new(committed: ChunkId, window: u32) -> Self {
         Self {
             committed,
@@ -40,7 +40,7 @@ impl Forwarding {
         }
     }
 
-    /// The last chunk that was passed on or committed.
+    /// The last chunk that was forwarded or committed.
     pub fn last_forwarded(&self) -> ChunkId {
         self.in_flight.back().copied().unwrap_or(self.committed)
     }
@@ -50,12 +50,12 @@ impl Forwarding {
         self.committed
     }
 
-    /// Whether chunks were passed on that are not committed.
+    /// Whether chunks were forwarded that are not committed.
     pub fn is_waiting(&self) -> bool {
         !self.in_flight.is_empty()
     }
 
-    /// Decides about a chunk. After [`ChunkOrder::Next`], the caller must pass it on.
+    /// Decides about a chunk. After [`ChunkOrder::Next`], the caller must forward it.
     pub fn offer(&mut self, chunk: ChunkId) -> ChunkOrder {
         let last = self.last_forwarded();
         if chunk <= last {
@@ -95,7 +95,7 @@ mod tests {
     }
 
     #[test]
-    fn only_the_next_chunk_is_passed_on() {
+    fn only_the_next_chunk_is_forwarded() {
         let mut forwarding = Forwarding::new(id(7, 4), 2);
         assert_eq!(forwarding.offer(id(7, 6)), ChunkOrder::Early);
         assert_eq!(forwarding.offer(id(7, 5)), ChunkOrder::Next);
@@ -105,7 +105,7 @@ mod tests {
     }
 
     #[test]
-    fn at_most_a_window_is_passed_on_and_not_committed() {
+    fn at_most_a_window_is_forwarded_and_not_committed() {
         let mut forwarding = Forwarding::new(id(7, 4), 2);
         assert_eq!(
             [5, 6, 7].map(|n| forwarding.offer(id(7, n))),

@@ -1,5 +1,5 @@
-//! The gate, a role on the learner's host. To the learner it is each actor of the other hosts: it passes on their chunks,
-//! each exactly once and in order. To the hosts it tells what has become of the chunks, and gives them the newest policy.
+//! The gate, a role on the learner's host. To the learner it is each actor of the other hosts: it forwards their chunks,
+//! each exactly once and in order. It acknowledges the chunks to the hosts, and sends them the newest policy.
 
 use std::collections::HashMap;
 use std::fmt;
@@ -39,33 +39,33 @@ use crate::wire::{
 };
 
 /// The least and the greatest time between two acknowledgements to a host.
-const ACKNOWLEDGEMENTS_APART: Duration = Duration::from_millis(1);
-const ACKNOWLEDGEMENTS_WITHIN: Duration = Duration::from_millis(100);
+const SHORTEST_ACKNOWLEDGEMENT_INTERVAL: Duration = Duration::from_millis(1);
+const LONGEST_ACKNOWLEDGEMENT_INTERVAL: Duration = Duration::from_millis(100);
 
 /// How long to sleep while chunks wait to be committed: at first, and at most while nothing is committed.
 const SHORTEST_SLEEP: Duration = Duration::from_micros(200);
 const LONGEST_SLEEP: Duration = Duration::from_millis(20);
 
 /// How often to refresh connections, which a restarted learner needs.
-const REFRESH: Duration = Duration::from_millis(50);
+const REFRESH_INTERVAL: Duration = Duration::from_millis(50);
 
-/// How often the launcher is told how the hosts are.
-const STATUS: Duration = Duration::from_millis(500);
+/// How often the launcher gets the status of the hosts.
+const STATUS_INTERVAL: Duration = Duration::from_millis(500);
 
 /// A host that is silent for this long is cut off, or gone.
-const CUT_OFF: Duration = Duration::from_secs(3);
+const CUT_OFF_AFTER: Duration = Duration::from_secs(3);
 
 /// How long a query for a policy is kept before the host has to ask again.
 const POLICY_PATIENCE: Duration = Duration::from_secs(8);
 
 /// How long the hosts may take to hand over what they have when the run is over.
-const HAND_OVER: Duration = Duration::from_secs(5);
+const HAND_OVER_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// How often a host that sends wrong chunks, or a connection that was refused, is named.
-const WARN_AGAIN: Duration = Duration::from_secs(10);
+/// The least time between two warnings about wrong chunks of a host, or about refused connections.
+const WARNING_INTERVAL: Duration = Duration::from_secs(10);
 
-/// How long at least to say that the run is over.
-const LAST_WORDS: Duration = Duration::from_secs(1);
+/// How long at least to announce that the run is over.
+const END_ANNOUNCEMENT: Duration = Duration::from_secs(1);
 
 /// Bytes a second that policies may take, for all hosts together.
 const POLICY_BANDWIDTH: f64 = 30e6;
@@ -136,7 +136,7 @@ struct Host {
     has_left: bool,
     newest_report: Option<HostReport>,
     warned_at: Option<Instant>,
-    /// Rows that were passed on to the learner.
+    /// Rows that were forwarded to the learner.
     forwarded_rows: u64,
     /// The time of the last status, and `forwarded_rows` at that time.
     rows_at_last_status: (Instant, u64),
@@ -193,8 +193,8 @@ struct Gate<'a> {
     /// Since when the run is over.
     over_since: Option<Instant>,
     connections_refreshed_at: Instant,
-    /// When the launcher was last told how the hosts are.
-    launcher_told_at: Option<Instant>,
+    /// When the launcher last got the status of the hosts.
+    reported_to_launcher_at: Option<Instant>,
     /// The launcher has not answered the last report on the hosts yet.
     launcher_owes_answer: bool,
     sleep: Duration,
@@ -255,7 +255,7 @@ impl<'a> Gate<'a> {
             warned_at: None,
             over_since: None,
             connections_refreshed_at: Instant::now(),
-            launcher_told_at: None,
+            reported_to_launcher_at: None,
             launcher_owes_answer: false,
             sleep: LONGEST_SLEEP,
         }))
@@ -266,21 +266,21 @@ impl<'a> Gate<'a> {
             // The senders stay as long as the session, which is ours.
             let first = self.arrivals.recv_timeout(self.sleep).ok();
             let more: Vec<Arrival> = self.arrivals.try_iter().collect();
-            let mut passed_on = 0;
+            let mut forwarded_rows = 0;
             for arrival in first.into_iter().chain(more) {
-                passed_on += self.take(arrival)?;
+                forwarded_rows += self.take(arrival)?;
             }
-            if passed_on > 0 {
+            if forwarded_rows > 0 {
                 self.learner_notifier.notify();
-                self.heartbeat.count(passed_on);
+                self.heartbeat.count(forwarded_rows);
             }
             self.take_answers()?;
-            let progress = self.look_at_commits();
+            let progress = self.read_commits();
             self.send_acknowledgements()?;
             self.send_policies()?;
-            self.tell_launcher();
+            self.report_to_launcher();
             self.refresh_connections()?;
-            self.choose_sleep(passed_on > 0 || progress);
+            self.choose_sleep(forwarded_rows > 0 || progress);
             if self.is_done() {
                 return Ok(());
             }
@@ -297,13 +297,13 @@ impl<'a> Gate<'a> {
             return true;
         }
         let since = *self.over_since.get_or_insert_with(Instant::now);
-        // A host that was away until now learns of the end too, if it is back.
-        let were_told = since.elapsed() >= LAST_WORDS;
-        let gone = |host: &Host| host.has_left || (were_told && host.heard_at.elapsed() >= CUT_OFF);
-        since.elapsed() >= HAND_OVER || self.hosts.values().all(gone)
+        // The announcement also reaches a host that reconnects meanwhile.
+        let was_announced = since.elapsed() >= END_ANNOUNCEMENT;
+        let gone = |host: &Host| host.has_left || (was_announced && host.heard_at.elapsed() >= CUT_OFF_AFTER);
+        since.elapsed() >= HAND_OVER_TIMEOUT || self.hosts.values().all(gone)
     }
 
-    /// Handles what a host has sent. Returns the rows that were passed on to the learner.
+    /// Handles what a host has sent. Returns the rows that were forwarded to the learner.
     fn take(&mut self, arrival: Arrival) -> Result<u64, GateError> {
         match arrival {
             Arrival::Chunk(bytes) => return self.take_chunk(&bytes),
@@ -342,7 +342,7 @@ impl<'a> Gate<'a> {
         let finite = |rows: &[f32]| rows.iter().all(|number| number.is_finite());
         if !(ours && parts.is_some_and(|(rows, _)| finite(rows))) {
             // The host repeats it again and again.
-            if host.warned_at.is_none_or(|warned| warned.elapsed() >= WARN_AGAIN) {
+            if host.warned_at.is_none_or(|warned| warned.elapsed() >= WARNING_INTERVAL) {
                 host.warned_at = Some(Instant::now());
                 tracing::warn!(
                     "host {} sent a chunk of actor {} that no actor of this run sends; it is ignored",
@@ -363,7 +363,7 @@ impl<'a> Gate<'a> {
 
     fn take_report(&mut self, report: HostReport) -> Result<(), GateError> {
         let Some(host) = self.hosts.get_mut(&report.host) else {
-            // It learns that it must ask to be admitted.
+            // The empty acknowledgement makes it ask to be admitted.
             return self.acknowledge_nothing(report.host);
         };
         host.heard_at = Instant::now();
@@ -436,9 +436,9 @@ impl<'a> Gate<'a> {
         }
     }
 
-    /// Warns, but at most once in [`WARN_AGAIN`]: a host may repeat the same fault without end.
+    /// Warns, but at most once in [`WARNING_INTERVAL`]: a host may repeat the same fault without end.
     fn warn(&mut self, what: fmt::Arguments<'_>) {
-        if self.warned_at.is_none_or(|warned| warned.elapsed() >= WARN_AGAIN) {
+        if self.warned_at.is_none_or(|warned| warned.elapsed() >= WARNING_INTERVAL) {
             self.warned_at = Some(Instant::now());
             tracing::warn!("{what}");
         }
@@ -548,7 +548,7 @@ impl<'a> Gate<'a> {
     }
 
     /// Reads what the learner has committed. Returns whether it is news.
-    fn look_at_commits(&mut self) -> bool {
+    fn read_commits(&mut self) -> bool {
         let mut news = false;
         for (index, actor) in &mut self.actors {
             let committed = self.replay.committed(*index as usize);
@@ -567,7 +567,7 @@ impl<'a> Gate<'a> {
         if self
             .hosts
             .values()
-            .all(|host| host.acknowledged_at.elapsed() < ACKNOWLEDGEMENTS_APART)
+            .all(|host| host.acknowledged_at.elapsed() < SHORTEST_ACKNOWLEDGEMENT_INTERVAL)
         {
             return Ok(());
         }
@@ -579,7 +579,7 @@ impl<'a> Gate<'a> {
         }
         for host in self.hosts.values_mut() {
             let since = host.acknowledged_at.elapsed();
-            if since < ACKNOWLEDGEMENTS_APART {
+            if since < SHORTEST_ACKNOWLEDGEMENT_INTERVAL {
                 continue;
             }
             let of = |actor: &u32| {
@@ -601,7 +601,8 @@ impl<'a> Gate<'a> {
                 }
             };
             let actors: Vec<ActorAcknowledgement> = host.lease.actors.iter().map(of).collect();
-            if !host.acknowledgement_due && since < ACKNOWLEDGEMENTS_WITHIN && actors == host.last_acknowledged {
+            if !host.acknowledgement_due && since < LONGEST_ACKNOWLEDGEMENT_INTERVAL && actors == host.last_acknowledged
+            {
                 continue;
             }
             self.acknowledgements_sent += 1;
@@ -683,12 +684,16 @@ impl<'a> Gate<'a> {
         Ok(())
     }
 
-    /// Tells the launcher how the hosts are, and asks which are admitted.
-    fn tell_launcher(&mut self) {
-        if self.launcher_owes_answer || self.launcher_told_at.is_some_and(|at| at.elapsed() < STATUS) {
+    /// Sends the launcher the status of the hosts, and asks which are admitted.
+    fn report_to_launcher(&mut self) {
+        if self.launcher_owes_answer
+            || self
+                .reported_to_launcher_at
+                .is_some_and(|at| at.elapsed() < STATUS_INTERVAL)
+        {
             return;
         }
-        (self.launcher_told_at, self.launcher_owes_answer) = (Some(Instant::now()), true);
+        (self.reported_to_launcher_at, self.launcher_owes_answer) = (Some(Instant::now()), true);
         let newest = self.policy_version;
         let statuses = self.hosts.values_mut().map(|host| host.status(newest)).collect();
         self.requests
@@ -697,7 +702,7 @@ impl<'a> Gate<'a> {
     }
 
     fn refresh_connections(&mut self) -> Result<(), GateError> {
-        if self.connections_refreshed_at.elapsed() < REFRESH {
+        if self.connections_refreshed_at.elapsed() < REFRESH_INTERVAL {
             return Ok(());
         }
         self.connections_refreshed_at = Instant::now();
@@ -713,7 +718,7 @@ impl<'a> Gate<'a> {
         self.heartbeats.refresh_connections();
         self.episodes.refresh_connections();
         let waits = self.actors.values().any(|actor| actor.forwarding.is_waiting());
-        let cut_off = |host: &Host| host.heard_at.elapsed() >= CUT_OFF;
+        let cut_off = |host: &Host| host.heard_at.elapsed() >= CUT_OFF_AFTER;
         self.heartbeat.beat(match waits {
             // Waiting for a host that is away is no fault of a process here, so none is replaced for it.
             _ if self.hosts.values().any(cut_off) => Activity::Working,
@@ -746,7 +751,7 @@ impl Host {
         }
         self.rows_at_last_status = (Instant::now(), self.forwarded_rows);
         let silent = self.heard_at.elapsed();
-        let cut_off = silent >= CUT_OFF;
+        let cut_off = silent >= CUT_OFF_AFTER;
         let mut roles = Vec::new();
         for role in self.newest_report.iter().flat_map(|report| &report.roles) {
             let key = (role.role, role.index);

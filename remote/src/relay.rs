@@ -35,36 +35,36 @@ use crate::wire::{
 };
 
 /// The gate is away if it has sent no acknowledgement for this long.
-const CUT_OFF: Duration = Duration::from_secs(3);
+const CUT_OFF_AFTER: Duration = Duration::from_secs(3);
 
 /// Chunks are sent again if the gate has got none for this long; or for some round trips, if that is longer.
-const PATIENCE: Duration = Duration::from_millis(200);
-const ROUND_TRIPS: u32 = 4;
+const RESEND_AFTER: Duration = Duration::from_millis(200);
+const RESEND_AFTER_ROUND_TRIPS: u32 = 4;
 
 /// Time between two reports.
-const REPORTS: Duration = Duration::from_millis(250);
+const REPORT_INTERVAL: Duration = Duration::from_millis(250);
 
 /// How long to wait for news before looking at everything again.
-const SLEEP: Duration = Duration::from_millis(20);
+const LONGEST_SLEEP: Duration = Duration::from_millis(20);
 
 /// How often to refresh connections.
-const REFRESH: Duration = Duration::from_millis(50);
+const REFRESH_INTERVAL: Duration = Duration::from_millis(50);
 
 /// Chunks on their way to the thread that sends them.
-const SENDING: usize = 64;
+const CHUNK_QUEUE_LENGTH: usize = 64;
 
 /// Episodes kept for the next report; more are dropped while the gate is away.
-const EPISODES: usize = 10_000;
+const MAX_KEPT_EPISODES: usize = 10_000;
 
 /// How long a query for a policy may take, and the pause after one without an answer.
-const POLICY_QUERY: Duration = Duration::from_secs(10);
+const POLICY_QUERY_TIMEOUT: Duration = Duration::from_secs(10);
 const POLICY_PAUSE: Duration = Duration::from_millis(50);
 
 /// How long the gate may take to get the last chunks. It waits a little longer for its hosts.
-const HAND_OVER: Duration = Duration::from_secs(3);
+const HAND_OVER_TIMEOUT: Duration = Duration::from_secs(3);
 
 /// How long to wait before asking again to be admitted.
-const JOIN_AGAIN: Duration = Duration::from_secs(1);
+const REJOIN_INTERVAL: Duration = Duration::from_secs(1);
 
 /// What the relay needs.
 #[derive(Clone, Debug)]
@@ -281,7 +281,7 @@ impl<'a> Relay<'a> {
             self.take_chunks()?;
             self.send_chunks();
             self.read_reports()?;
-            if self.last_report.1.elapsed() >= REPORTS {
+            if self.last_report.1.elapsed() >= REPORT_INTERVAL {
                 self.send_report(false)?;
             }
             self.refresh_connections()?;
@@ -300,11 +300,11 @@ impl<'a> Relay<'a> {
         }
         let since = *self.stop_seen_at.get_or_insert_with(Instant::now);
         let handed_over = self.actors.values().all(|actor| actor.uncommitted.all_forwarded());
-        handed_over || self.is_cut_off() || since.elapsed() >= HAND_OVER
+        handed_over || self.is_cut_off() || since.elapsed() >= HAND_OVER_TIMEOUT
     }
 
     fn is_cut_off(&self) -> bool {
-        self.heard_at.is_none_or(|heard| heard.elapsed() >= CUT_OFF)
+        self.heard_at.is_none_or(|heard| heard.elapsed() >= CUT_OFF_AFTER)
     }
 
     fn now(&self) -> Duration {
@@ -396,7 +396,7 @@ impl<'a> Relay<'a> {
     fn ask_to_rejoin(&mut self) {
         let waits = self
             .rejoin_request
-            .is_some_and(|(then, open)| open || then.elapsed() < JOIN_AGAIN);
+            .is_some_and(|(then, open)| open || then.elapsed() < REJOIN_INTERVAL);
         if waits {
             return;
         }
@@ -475,7 +475,7 @@ impl<'a> Relay<'a> {
     /// Hands chunks to the thread that sends them, as many as it takes. While the gate is away they stay here.
     fn send_chunks(&mut self) {
         let (now, cut_off) = (self.now(), self.is_cut_off());
-        let patience = PATIENCE.max(ROUND_TRIPS * self.round_trip.unwrap_or_default());
+        let patience = RESEND_AFTER.max(RESEND_AFTER_ROUND_TRIPS * self.round_trip.unwrap_or_default());
         for actor in self.actors.values_mut() {
             if cut_off {
                 continue;
@@ -497,7 +497,7 @@ impl<'a> Relay<'a> {
             }
         }
         while let Some(episode) = self.episode_reports.receive()? {
-            if self.episodes.len() < EPISODES {
+            if self.episodes.len() < MAX_KEPT_EPISODES {
                 self.episodes.push(episode.into());
             }
         }
@@ -542,7 +542,7 @@ impl<'a> Relay<'a> {
     }
 
     fn refresh_connections(&mut self) -> Result<(), RelayError> {
-        if self.connections_refreshed_at.elapsed() < REFRESH {
+        if self.connections_refreshed_at.elapsed() < REFRESH_INTERVAL {
             return Ok(());
         }
         self.connections_refreshed_at = Instant::now();
@@ -560,7 +560,7 @@ impl<'a> Relay<'a> {
 
     /// Waits for an actor or the gate, for a while.
     fn sleep(&self) -> Result<(), RelayError> {
-        let patience = Timespec::try_from(SLEEP).ok();
+        let patience = Timespec::try_from(LONGEST_SLEEP).ok();
         let mut ready = [
             PollFd::from_borrowed_fd(self.listener.as_fd(), PollFlags::IN),
             PollFd::from_borrowed_fd(self.wake.event.as_fd(), PollFlags::IN),
@@ -597,7 +597,7 @@ fn start_sending(session: &Session, host: &HostFile) -> Result<SyncSender<ZBytes
         .priority(Priority::DataHigh)
         .wait()
         .map_err(failed("send chunks"))?;
-    let (sender, chunks) = sync_channel::<ZBytes>(SENDING);
+    let (sender, chunks) = sync_channel::<ZBytes>(CHUNK_QUEUE_LENGTH);
     std::thread::Builder::new().name("sender".into()).spawn(move || {
         for chunk in chunks {
             if let Err(cause) = publisher.put(chunk).wait() {
@@ -639,7 +639,7 @@ fn start_asking_for_policies(
             let replies = session
                 .get(&key)
                 .payload(request)
-                .timeout(POLICY_QUERY)
+                .timeout(POLICY_QUERY_TIMEOUT)
                 // The policy has the congestion control of the request: `Drop` would never deliver a large one.
                 .congestion_control(CongestionControl::Block)
                 .wait();
@@ -651,7 +651,7 @@ fn start_asking_for_policies(
             wake.send(Arrival::Policy(sample.payload().to_bytes().into_owned()));
             // The next request names this policy, so it waits until it is published here.
             let asked = Instant::now();
-            while newest.get() == have && asked.elapsed() < POLICY_QUERY {
+            while newest.get() == have && asked.elapsed() < POLICY_QUERY_TIMEOUT {
                 std::thread::sleep(Duration::from_millis(1));
             }
         }

@@ -170,7 +170,7 @@ pub struct PolicyRequest {
     pub have: Option<(u64, u64)>,
 }
 
-/// What a host says to be admitted to a run.
+/// A host's request to be admitted to a run.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Hello {
     /// Version of the program.
@@ -266,7 +266,7 @@ pub struct ActorAcknowledgement {
     pub actor: u32,
     /// Incarnation and sequence number of its last committed chunk.
     pub committed: (u64, u64),
-    /// Those of the last chunk that the gate has passed on to the learner.
+    /// Those of the last chunk that the gate has forwarded to the learner.
     pub forwarded: (u64, u64),
     /// Rows of all its committed chunks.
     pub rows: u64,

@@ -71,7 +71,7 @@ pub struct ChunkSender {
 #[derive(Debug)]
 pub struct Handshake(ChunkSender);
 
-/// The end of the process that passes on what an actor of another host has sent. It is to the learner what the actor
+/// The end of the process that forwards what an actor of another host has sent. It is to the learner what the actor
 /// would be: its headers are the actor's own, and its history is the actor's.
 #[derive(Debug)]
 pub struct ChunkForwarder {

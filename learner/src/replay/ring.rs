@@ -58,9 +58,9 @@ impl Ring {
 
     /// Writes rows `first ..`, at most a ring of them, and then their checks.
     pub(super) fn put(&mut self, first: u64, numbers: &[f32], mut step: impl FnMut(WriteStep)) {
-        let (start, offsets, width) = (self.place(first), self.ring as usize, self.width);
+        let (start, places, width) = (self.place(first), self.ring as usize, self.width);
         let (checks, rows) = self.parts();
-        let (before, after) = numbers.split_at(numbers.len().min((offsets - start) * width));
+        let (before, after) = numbers.split_at(numbers.len().min((places - start) * width));
         rows[start * width..][..before.len()].copy_from_slice(before);
         step(WriteStep::RowsBeforeWrap);
         rows[..after.len()].copy_from_slice(after);
