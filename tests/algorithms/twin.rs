@@ -93,7 +93,7 @@ impl World {
 /// values that are no longer 0.
 pub(crate) fn tabular(config: &Config) -> (String, u64, usize) {
     let (AlgorithmConfig::QLearning(settings) | AlgorithmConfig::Sarsa(settings)) = &config.algorithm else {
-        panic!("this twin is for tabular methods")
+        panic!("this twin is for tabular algorithms")
     };
     let (alpha, gamma) = (settings.alpha as f32, settings.gamma as f32);
     let mut q = [0.0_f32; STATES * ACTIONS];
