@@ -20,7 +20,7 @@ pub(crate) fn answer(command: fn() -> Command) {
 }
 
 /// Presets, the prefix of Gymnasium environments, and configuration files.
-pub(crate) fn what_to_train(typed: &OsStr) -> Vec<CompletionCandidate> {
+pub(crate) fn presets_and_files(typed: &OsStr) -> Vec<CompletionCandidate> {
     let typed_text = typed.to_string_lossy();
     let names = preset_names()
         .chain([GYMNASIUM])
@@ -124,9 +124,9 @@ mod tests {
 
     #[test]
     fn presets_and_keys_are_completed() {
-        let presets = values(what_to_train(OsStr::new("point-mass-r3")));
+        let presets = values(presets_and_files(OsStr::new("point-mass-r3")));
         assert_eq!(presets, ["point-mass-r3", "point-mass-r3-sac", "point-mass-r3-td3"]);
-        assert_eq!(values(what_to_train(OsStr::new("gy"))), ["gym:"]);
+        assert_eq!(values(presets_and_files(OsStr::new("gy"))), ["gym:"]);
         assert_eq!(values(settings(OsStr::new("ddpg.ta"))), ["ddpg.tau="]);
         assert_eq!(
             values(settings(OsStr::new("environment.fric"))),

@@ -20,7 +20,7 @@ use std::os::fd::AsFd;
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
-use shoal_common::channel::control::{Answer, ControlPort, Question, RunStatus};
+use shoal_common::channel::control::{ControlPort, ControlRequest, ControlResponse, RunStatus};
 use shoal_common::channel::reports::{Report, Reports};
 use shoal_common::channel::{Domain, DomainError};
 use shoal_common::config::Config;
@@ -37,9 +37,9 @@ use shoal_run::{preflight, signals, status};
 pub(crate) use self::cleaner::work as clean_up;
 use self::log::Log;
 pub(crate) use self::log::{ALL_ENDED, FAILED, note};
-use self::progress::Progress;
-use self::stall::Stalls;
-use self::supervisor::{Members, Supervisor};
+use self::progress::ProgressLine;
+use self::stall::StallDetector;
+use self::supervisor::{RolesOnHost, Supervisor};
 
 /// How often the launcher reads reports and checks its children if nothing wakes it. Ticks start short and become
 /// longer while reports arrive slowly: a full buffer loses its oldest reports.
@@ -71,7 +71,7 @@ const HOUR: Duration = Duration::from_secs(3600);
 
 /// How a run ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Ending {
+pub(crate) enum RunEnd {
     /// All steps are taken and learned from.
     Finished,
     /// It was stopped by `shoal stop`; the learner saved its state.
@@ -86,7 +86,7 @@ pub(crate) enum Ending {
 /// The result of a training.
 #[derive(Clone, Debug)]
 pub(crate) struct TrainingOutcome {
-    pub(crate) ending: Ending,
+    pub(crate) ending: RunEnd,
     pub(crate) wall: Duration,
     /// The run's status when this launcher started, and now.
     pub(crate) before: RunStatus,
@@ -95,7 +95,7 @@ pub(crate) struct TrainingOutcome {
 
 /// How a launcher shows what it does, and whether other hosts may join its run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Manner {
+pub(crate) struct RunOptions {
     /// No live line.
     pub(crate) quiet: bool,
     /// There is a gate, at the endpoint in `join.toml`.
@@ -107,14 +107,14 @@ pub(crate) fn run(
     mut config: Config,
     (run, lock): (&RunDir, &RunLock),
     signals: &Signals,
-    manner: Manner,
+    options: RunOptions,
 ) -> anyhow::Result<TrainingOutcome> {
     let (mut renewals, mut before, mut wall) = (Vec::new(), None, Duration::ZERO);
     loop {
-        let outcome = run_once(config, (run, lock), signals, manner)?;
+        let outcome = run_once(config, (run, lock), signals, options)?;
         wall += outcome.wall;
         let before = before.get_or_insert(outcome.before.clone());
-        if outcome.ending != Ending::Renewed {
+        if outcome.ending != RunEnd::Renewed {
             let before = before.clone();
             return Ok(TrainingOutcome {
                 before,
@@ -136,7 +136,7 @@ fn run_once(
     config: Config,
     (run, lock): (&RunDir, &RunLock),
     signals: &Signals,
-    manner: Manner,
+    options: RunOptions,
 ) -> anyhow::Result<TrainingOutcome> {
     let saved = status::saved_status(&config, run)?;
     let starts = RunOutcome::new(RunState::Running, saved.env_steps, saved.episodes).with_reason(STARTING);
@@ -145,7 +145,7 @@ fn run_once(
     Domain::remove_abandoned()?;
     let domain = Domain::join(&config.run.id, config.actors.max)?;
     let outcome = preflight::reserve(&config, run, &domain)
-        .and_then(|()| Launcher::new(config, (run, lock), &domain, signals, manner))
+        .and_then(|()| Launcher::new(config, (run, lock), &domain, signals, options))
         .and_then(Launcher::run);
     // Also after an error: no role is left by now.
     let left = domain.leave();
@@ -188,16 +188,16 @@ struct Launcher<'a> {
     /// The run's status when this launcher started.
     initial: RunStatus,
     /// When the end was first requested.
-    stop_requested: Option<Instant>,
+    stop_requested_at: Option<Instant>,
     /// Whether the roles are being ended.
     ending: bool,
     supervisor: Supervisor,
     log: Log,
     recorder: Recorder,
-    progress: Progress,
+    progress: ProgressLine,
     signals: &'a Signals,
-    stalls: Stalls,
-    begun: Instant,
+    stalls: StallDetector,
+    started_at: Instant,
     tick: Duration,
     heartbeats: Reports<Heartbeat>,
     episode_reports: Reports<EpisodeReport>,
@@ -211,7 +211,7 @@ impl<'a> Launcher<'a> {
         (run, lock): (&'a RunDir, &'a RunLock),
         domain: &'a Domain,
         signals: &'a Signals,
-        Manner { quiet, gate }: Manner,
+        RunOptions { quiet, gate }: RunOptions,
     ) -> anyhow::Result<Self> {
         let log = Log::open(&run.log())?;
         write_iox_config(domain, run)?;
@@ -224,11 +224,11 @@ impl<'a> Launcher<'a> {
         let initial = status::saved_status(&config, run)?;
         RunOutcome::new(RunState::Running, initial.env_steps, initial.episodes).write(run)?;
         // Creates the services that are opened below.
-        let supervisor = Supervisor::new(&config, run, domain, log.clone(), Members::Learner { gate })?;
+        let supervisor = Supervisor::new(&config, run, domain, log.clone(), RolesOnHost::Learner { gate })?;
         Ok(Self {
             control: ControlPort::open(domain)?,
             initial,
-            stop_requested: None,
+            stop_requested_at: None,
             ending: false,
             run,
             lock,
@@ -238,13 +238,13 @@ impl<'a> Launcher<'a> {
             evaluation_reports: Reports::open(domain)?,
             learner_reports: Reports::open(domain)?,
             supervisor,
-            stalls: Stalls::new(Duration::from_secs(config.run.stall_seconds)),
+            stalls: StallDetector::new(Duration::from_secs(config.run.stall_seconds)),
             log,
             recorder,
-            progress: Progress::new(&config, run, quiet),
+            progress: ProgressLine::new(&config, run, quiet),
             config,
             signals,
-            begun: Instant::now(),
+            started_at: Instant::now(),
             tick: SHORTEST_TICK,
         })
     }
@@ -260,15 +260,15 @@ impl<'a> Launcher<'a> {
         let ended = self.end_all();
         self.progress.clear();
         self.control.answer_waiting(&match &ended {
-            Ok(()) => Answer::Accepted,
-            Err(error) => Answer::Refused(format!("{error:#}")),
+            Ok(()) => ControlResponse::Accepted,
+            Err(error) => ControlResponse::Refused(format!("{error:#}")),
         });
         // If the directory is gone, all other errors follow from that, and nothing may be written at its path. The open
         // log is still the run's own.
         self.lock
             .check(self.run)
             .inspect_err(|gone| self.log.note("launcher", &format!("{FAILED}{gone}")))?;
-        let renewed = matches!(ending, Ok(Ending::Renewed));
+        let renewed = matches!(ending, Ok(RunEnd::Renewed));
         let failure = ending.as_ref().err().or(ended.as_ref().err().filter(|_| !renewed));
         if let Some(error) = failure {
             let why = format!("{error:#}").replace('\n', " ");
@@ -280,20 +280,20 @@ impl<'a> Launcher<'a> {
         }
         let ending = ending?;
         // With new shared memory, the learner continues from its newest checkpoint.
-        ended.or_else(|error| if ending == Ending::Renewed { Ok(()) } else { Err(error) })?;
+        ended.or_else(|error| if ending == RunEnd::Renewed { Ok(()) } else { Err(error) })?;
         self.recorder.flush()?;
         // What the learner saved: its last report may have arrived too late.
         let after = status::saved_status(&self.config, self.run)?;
         let stopped = RunOutcome::new(RunState::Stopped, after.env_steps, after.episodes);
         match ending {
-            Ending::Stopped => stopped.with_reason("by request").write(self.run)?,
-            Ending::Interrupted(signal) => stopped.with_reason(format!("signal {signal}")).write(self.run)?,
+            RunEnd::Stopped => stopped.with_reason("by request").write(self.run)?,
+            RunEnd::Interrupted(signal) => stopped.with_reason(format!("signal {signal}")).write(self.run)?,
             // The final evaluation of a finished run is still to come.
-            Ending::Finished | Ending::Renewed => {}
+            RunEnd::Finished | RunEnd::Renewed => {}
         }
         Ok(TrainingOutcome {
             ending,
-            wall: self.begun.elapsed(),
+            wall: self.started_at.elapsed(),
             after,
             before: self.initial,
         })
@@ -304,29 +304,29 @@ impl<'a> Launcher<'a> {
         Ok(RunOutcome::new(state, saved.env_steps, saved.episodes))
     }
 
-    fn watch(&mut self) -> anyhow::Result<Ending> {
+    fn watch(&mut self) -> anyhow::Result<RunEnd> {
         self.supervisor.start_all(self.domain)?;
         loop {
             if let Some(signal) = self.signals.received() {
                 self.log
                     .note("launcher", &format!("{} ends the run", signals::describe(signal)));
-                return Ok(Ending::Interrupted(signal));
+                return Ok(RunEnd::Interrupted(signal));
             }
             self.lock.check(self.run)?;
             self.read_reports()?;
             self.answer_requests()?;
             match self.supervisor.maintain(self.domain)? {
-                supervisor::Situation::AtWork => {}
-                supervisor::Situation::LearnerDone => {
+                supervisor::RunCondition::AtWork => {}
+                supervisor::RunCondition::LearnerDone => {
                     self.await_last_evaluation()?;
-                    return Ok(Ending::Finished);
+                    return Ok(RunEnd::Finished);
                 }
-                supervisor::Situation::SharedMemoryOccupied | supervisor::Situation::FilesRemoved
-                    if self.stop_requested.is_some() => {}
-                supervisor::Situation::SharedMemoryOccupied => {
+                supervisor::RunCondition::SharedMemoryOccupied | supervisor::RunCondition::FilesRemoved
+                    if self.stop_requested_at.is_some() => {}
+                supervisor::RunCondition::SharedMemoryOccupied => {
                     return Ok(self.renew("dead processes occupy shared memory for good"));
                 }
-                supervisor::Situation::FilesRemoved => {
+                supervisor::RunCondition::FilesRemoved => {
                     let directory = self.domain.directory()?;
                     let what = format!(
                         "another program has removed files of this run in {}",
@@ -347,8 +347,8 @@ impl<'a> Launcher<'a> {
             }
             // A learner that has just died is restarted first, so that it takes in what the actors have sent.
             let may_end = |asked: Instant| self.supervisor.has_learner() || asked.elapsed() >= LEARNER_RESTART;
-            if self.stop_requested.is_some_and(may_end) {
-                return Ok(Ending::Stopped);
+            if self.stop_requested_at.is_some_and(may_end) {
+                return Ok(RunEnd::Stopped);
             }
             self.progress.draw(&self.supervisor);
             self.sleep(self.tick.min(self.supervisor.idle_for()));
@@ -356,11 +356,11 @@ impl<'a> Launcher<'a> {
     }
 
     /// Says why the run continues in new shared memory.
-    fn renew(&self, why: &str) -> Ending {
+    fn renew(&self, why: &str) -> RunEnd {
         let why = format!("{why}: the run continues in new shared memory");
         self.log.note("launcher", &why);
         self.progress.print(&why);
-        Ending::Renewed
+        RunEnd::Renewed
     }
 
     /// Sleeps at most `most`, until a process ends, a signal arrives or a request comes.
@@ -377,7 +377,7 @@ impl<'a> Launcher<'a> {
 
     /// Answers requests from other terminals. A request to stop is answered when the run has ended.
     fn answer_requests(&mut self) -> anyhow::Result<()> {
-        let now = self.recorder.moment(self.begun.elapsed());
+        let now = self.recorder.moment(self.started_at.elapsed());
         let Self {
             config,
             run,
@@ -386,36 +386,44 @@ impl<'a> Launcher<'a> {
             progress,
             initial,
             ending,
-            stop_requested,
+            stop_requested_at,
             log,
             domain,
             ..
         } = self;
-        control.answer_questions(run.key()?, run.path(), |question| -> anyhow::Result<Option<Answer>> {
-            match question {
-                Question::Status => Ok(Some(
-                    match requests::status(config, run, supervisor, progress, initial) {
-                        Ok(status) => Answer::Status(status),
-                        Err(error) => Answer::Refused(error.to_string()),
-                    },
-                )),
-                Question::Scale { .. } if *ending => Ok(Some(Answer::Refused("the run is ending".into()))),
-                Question::Scale { actors } => requests::scale(config, run, supervisor, actors, now).map(Some),
-                Question::Admit(_) if *ending || stop_requested.is_some() => {
-                    Ok(Some(Answer::Refused("the run is ending".into())))
-                }
-                Question::Admit(request) => supervisor.admit(domain, request).map(Some),
-                Question::Hosts(statuses) => Ok(Some(supervisor.update_hosts(statuses))),
-                Question::Replace { .. } => Ok(Some(Answer::Refused("this is the learner's host".into()))),
-                Question::Stop => {
-                    if stop_requested.is_none() {
-                        log.note("launcher", "`shoal stop` ends the run");
+        control.answer_requests(
+            run.key()?,
+            run.path(),
+            |request| -> anyhow::Result<Option<ControlResponse>> {
+                match request {
+                    ControlRequest::Status => Ok(Some(
+                        match requests::status(config, run, supervisor, progress, initial) {
+                            Ok(status) => ControlResponse::Status(status),
+                            Err(error) => ControlResponse::Refused(error.to_string()),
+                        },
+                    )),
+                    ControlRequest::Scale { .. } if *ending => {
+                        Ok(Some(ControlResponse::Refused("the run is ending".into())))
                     }
-                    stop_requested.get_or_insert_with(Instant::now);
-                    Ok(None)
+                    ControlRequest::Scale { actors } => requests::scale(config, run, supervisor, actors, now).map(Some),
+                    ControlRequest::Admit(_) if *ending || stop_requested_at.is_some() => {
+                        Ok(Some(ControlResponse::Refused("the run is ending".into())))
+                    }
+                    ControlRequest::Admit(request) => supervisor.admit(domain, request).map(Some),
+                    ControlRequest::Hosts(statuses) => Ok(Some(supervisor.update_hosts(statuses))),
+                    ControlRequest::Replace { .. } => {
+                        Ok(Some(ControlResponse::Refused("this is the learner's host".into())))
+                    }
+                    ControlRequest::Stop => {
+                        if stop_requested_at.is_none() {
+                            log.note("launcher", "`shoal stop` ends the run");
+                        }
+                        stop_requested_at.get_or_insert_with(Instant::now);
+                        Ok(None)
+                    }
                 }
-            }
-        })
+            },
+        )
     }
 
     /// Waits for the report on the last period's policy.
@@ -465,7 +473,7 @@ impl<'a> Launcher<'a> {
     }
 
     fn read_reports(&mut self) -> anyhow::Result<()> {
-        let wall = self.begun.elapsed();
+        let wall = self.started_at.elapsed();
         while let Some(heartbeat) = self.heartbeats.receive()? {
             self.supervisor.record(&heartbeat);
         }

@@ -9,7 +9,7 @@ use serde::Serialize;
 use shoal_common::channel::control::RunStatus;
 use shoal_common::run_dir::RunDir;
 use shoal_run::client::RunClient;
-use shoal_run::evaluation::WhichPolicy;
+use shoal_run::evaluation::SavedPolicy;
 use shoal_run::final_evaluation::FinalEvaluation;
 use shoal_run::outcome::{RunOutcome, RunState};
 use shoal_run::plan;
@@ -61,7 +61,7 @@ impl ListedState {
 
 /// A run in a list.
 #[derive(Clone, Debug, Serialize)]
-pub(crate) struct Listed {
+pub(crate) struct ListedRun {
     pub(crate) name: String,
     pub(crate) path: PathBuf,
     pub(crate) state: ListedState,
@@ -79,7 +79,7 @@ pub(crate) struct Listed {
     pub(crate) final_return: Option<f64>,
 }
 
-impl Listed {
+impl ListedRun {
     /// Reads the run in this directory. A failure becomes its state, so that the other runs are still listed.
     pub(crate) fn new(path: &Path) -> Self {
         let name = path.file_name().map(|name| name.to_string_lossy().into_owned());
@@ -127,7 +127,7 @@ impl Listed {
                     state_after_early_end(run)?
                 };
                 let evaluation = FinalEvaluation::read(run, status.env_steps)?;
-                self.final_return = evaluation.and_then(|it| it.of(WhichPolicy::Best)?.return_mean);
+                self.final_return = evaluation.and_then(|it| it.of(SavedPolicy::Best)?.return_mean);
                 self.set_progress(&status);
                 self.reason = plan::edited(run, &used);
             }

@@ -7,11 +7,11 @@ use std::path::Path;
 use std::process::ExitCode;
 
 use anyhow::Context;
-use shoal_actor::{evaluator, explorer};
+use shoal_actor::{actor, evaluator};
 use shoal_common::channel::environment::EnvironmentPort;
 use shoal_common::channel::{Domain, EventName, HeartbeatSender};
 use shoal_common::config::{Config, Mode};
-use shoal_common::report::{Identity, Role};
+use shoal_common::report::{Role, RoleInstance};
 use shoal_common::run_dir::RunDir;
 use shoal_common::stop::Stop;
 use shoal_env_server::vector::VectorEnvironment;
@@ -22,7 +22,7 @@ use shoal_remote::{
     files::{HostFile, JoinFile, KeyFile},
 };
 use shoal_run::external_environment::{self, LaunchSpec, server_iceoryx2_config};
-use shoal_run::server_location::Surroundings;
+use shoal_run::server_location::ServerSurroundings;
 use shoal_run::status::evaluated_period;
 use tracing_subscriber::Layer;
 use tracing_subscriber::filter::{LevelFilter, Targets};
@@ -63,19 +63,19 @@ pub(crate) fn run(role: Role, args: &RoleArgs) -> anyhow::Result<ExitCode> {
     }
     let run = RunDir::open(&args.run)?;
     let config = run.config()?;
-    let identity = Identity {
+    let instance = RoleInstance {
         role,
         index: args.index,
         incarnation: args.incarnation,
     };
     if role == Role::EnvServer
-        && let Some(program) = launch_spec(&config, &run, identity)?.command(&config.environment)?
+        && let Some(program) = launch_spec(&config, &run, instance)?.command(&config.environment)?
     {
         return external_environment::serve_with(&program);
     }
     let stop = Stop::when_stdin_closes().context("cannot watch standard input")?;
     let domain = Domain::join(&config.run.id, config.actors.max)?;
-    let ended = work(&domain, &config, &run, identity, &stop);
+    let ended = work(&domain, &config, &run, instance, &stop);
     let left = domain.leave();
     ended?;
     if let Err(error) = left {
@@ -85,20 +85,20 @@ pub(crate) fn run(role: Role, args: &RoleArgs) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-fn work(domain: &Domain, config: &Config, run: &RunDir, identity: Identity, stop: &Stop) -> anyhow::Result<()> {
-    match identity.role {
-        Role::EnvServer => serve(domain, config, &launch_spec(config, run, identity)?, identity, stop),
+fn work(domain: &Domain, config: &Config, run: &RunDir, instance: RoleInstance, stop: &Stop) -> anyhow::Result<()> {
+    match instance.role {
+        Role::EnvServer => serve(domain, config, &launch_spec(config, run, instance)?, instance, stop),
         Role::Actor => {
-            let settings = explorer::ExplorerSettings::new(config, run, identity);
-            Ok(explorer::explore(domain, &settings, stop)?)
+            let settings = actor::ActorSettings::new(config, run, instance);
+            Ok(actor::run(domain, &settings, stop)?)
         }
         Role::Evaluator => {
-            let settings = evaluator::EvaluatorSettings::new(config, run, identity, evaluated_period(config, run)?);
+            let settings = evaluator::EvaluatorSettings::new(config, run, instance, evaluated_period(config, run)?);
             Ok(evaluator::evaluate(domain, &settings, stop)?)
         }
         Role::Learner => {
             let settings = process::LearnerSettings {
-                identity,
+                instance,
                 config: config.clone(),
                 run: run.clone(),
                 evaluated_period: evaluated_period(config, run)?,
@@ -109,7 +109,7 @@ fn work(domain: &Domain, config: &Config, run: &RunDir, identity: Identity, stop
         Role::Gate => {
             let endpoint = JoinFile::read(run.path())?.listen;
             let settings = shoal_remote::gate::GateSettings {
-                identity,
+                instance,
                 config: config.clone(),
                 run: run.clone(),
                 key: key(&endpoint, &run.path().join(KeyFile::GATE))?,
@@ -121,7 +121,7 @@ fn work(domain: &Domain, config: &Config, run: &RunDir, identity: Identity, stop
         Role::Relay => {
             let host = HostFile::read(run)?;
             let settings = shoal_remote::relay::RelaySettings {
-                identity,
+                instance,
                 config: config.clone(),
                 run: run.clone(),
                 key: key(&host.endpoint, &run.path().join(KeyFile::JOIN))?,
@@ -141,8 +141,8 @@ fn key(endpoint: &Endpoint, path: &Path) -> anyhow::Result<Option<KeyFile>> {
 }
 
 /// The arguments of an environment server.
-fn launch_spec<'a>(config: &'a Config, run: &RunDir, identity: Identity) -> anyhow::Result<LaunchSpec<'a>> {
-    let Identity { index, incarnation, .. } = identity;
+fn launch_spec<'a>(config: &'a Config, run: &RunDir, instance: RoleInstance) -> anyhow::Result<LaunchSpec<'a>> {
+    let RoleInstance { index, incarnation, .. } = instance;
     let (client, environments) = if index == config.evaluation_server() {
         (EventName(Role::Evaluator, 0), config.evaluation_envs())
     } else {
@@ -162,7 +162,7 @@ fn launch_spec<'a>(config: &'a Config, run: &RunDir, identity: Identity) -> anyh
         } else {
             incarnation
         },
-        surroundings: Surroundings::of_run(run, config)?,
+        surroundings: ServerSurroundings::of_run(run, config)?,
     })
 }
 
@@ -170,7 +170,7 @@ fn serve(
     domain: &Domain,
     config: &Config,
     launch: &LaunchSpec<'_>,
-    identity: Identity,
+    instance: RoleInstance,
     stop: &Stop,
 ) -> anyhow::Result<()> {
     let environment = &config.environment;
@@ -184,7 +184,7 @@ fn serve(
     )?;
     let spec = environments.spec().clone();
     let port = EnvironmentPort::open(domain, launch.index, spec, environments.count(), launch.client)?;
-    let heartbeat = HeartbeatSender::new(domain, identity)?;
+    let heartbeat = HeartbeatSender::new(domain, instance)?;
     Ok(shoal_env_server::server::serve(
         &mut environments,
         &port,

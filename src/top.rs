@@ -5,7 +5,7 @@ mod view;
 
 use std::collections::VecDeque;
 
-pub(crate) use link::{Link, Request, RunEvent};
+pub(crate) use link::{LauncherLink, Request, RunEvent};
 use shoal_common::channel::control::RunStatus;
 pub(crate) use view::draw;
 
@@ -44,7 +44,7 @@ pub(crate) enum Overlay {
 pub(crate) struct Screen {
     /// The run's directory, as given by the user.
     pub(crate) run: String,
-    /// Environment, method and mode.
+    /// Environment, algorithm and mode.
     pub(crate) task: String,
     pub(crate) launcher: LauncherState,
     pub(crate) status: RunStatus,

@@ -152,7 +152,7 @@ fn invalid_training_arguments_are_refused_before_anything_is_created() {
         ),
         (
             &["pendulum", "--method", "sac", "--set", "td3.tau=0.01"],
-            "sac and td3 are two methods, and a run has one",
+            "sac and td3 are two algorithms, and a run has one",
         ),
         (
             &["pendulum", "--method", "dqn"],
@@ -164,7 +164,7 @@ fn invalid_training_arguments_are_refused_before_anything_is_created() {
         ),
         (
             &["frozen-lake", "--set", "observation.normalise=true"],
-            "[observation] and [reward] are for methods that learn from minibatches",
+            "[observation] and [reward] are for algorithms that learn from minibatches",
         ),
         (
             &["frozen-lake", "--set", "exploration.sigma=0.1"],

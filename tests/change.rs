@@ -145,7 +145,7 @@ fn what_cannot_change_is_refused_by_the_name_of_its_key() {
         ("spec.time_limit=100", "spec.time_limit cannot be set"),
         (
             "sac.tau=0.1",
-            "this run learns with ddpg, and the method of a run cannot change",
+            "this run learns with ddpg, and the algorithm of a run cannot change",
         ),
         (
             "observation.normalise=true",

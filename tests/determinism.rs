@@ -9,14 +9,14 @@ use rand::RngExt;
 use shoal_actor::noise::OrnsteinUhlenbeck;
 use shoal_common::channel::environment::ResponseLayout;
 use shoal_common::commit::CommitReader;
-use shoal_common::config::{Algorithm, Config, Warmup};
+use shoal_common::config::{AlgorithmConfig, Config, Warmup};
 use shoal_common::network::{ActionRange, DeterministicPolicy};
 use shoal_common::stream::{Purpose, seek, stream};
 use shoal_common::transition::Transition;
-use shoal_env_server::vector::{Start, VectorEnvironment};
+use shoal_env_server::vector::{Reset, VectorEnvironment};
 use shoal_learner::algorithms::ddpg::Ddpg;
 use shoal_learner::algorithms::minibatch::Minibatch;
-use shoal_learner::algorithms::replayed::MinibatchLearner;
+use shoal_learner::algorithms::minibatch_algorithm::MinibatchLearner;
 use shoal_learner::algorithms::sampling::Sampler;
 use support::{QUICK, Workplace, final_result, json, until, wait_for_rows};
 
@@ -290,7 +290,7 @@ fn three_tanh_layers_give_the_bits_of_a_single_process_with_one_thread_and_with_
 fn twin(config: &Config) -> String {
     let seed = config.run.seed;
     let row = config.row_layout();
-    let Algorithm::Ddpg(ddpg) = &config.algorithm else {
+    let AlgorithmConfig::Ddpg(ddpg) = &config.algorithm else {
         panic!("this twin is for DDPG")
     };
     let exploration = &ddpg.exploration;
@@ -312,7 +312,7 @@ fn twin(config: &Config) -> String {
 
     let mut s = vec![0.0; row.observation_width()];
     let mut a = vec![0.0; row.action_width()];
-    environment.reset(Start::Next, &mut s).unwrap();
+    environment.reset(Reset::Next, &mut s).unwrap();
     for t in 0..config.run.steps {
         if learner.updates() == 0 && exploration.warmup == Warmup::Uniform {
             let uniform = seek(&mut uniform, t);

@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::rc::Rc;
 
-use shoal_common::channel::environment::{Begin, EnvironmentClient, Stepped};
+use shoal_common::channel::environment::{EnvironmentClient, ResetRequest, StepResult};
 use shoal_common::channel::policy::{self, PolicyHeader, PolicyReader};
 use shoal_common::channel::reports::Reporter;
 use shoal_common::channel::{ChannelError, Domain, EventName, HeartbeatSender, Listener, Notifier, wait_for};
@@ -12,18 +12,18 @@ use shoal_common::evaluator_state::EvaluatorState;
 use shoal_common::exit::Exit;
 use shoal_common::policy::Policy;
 use shoal_common::policy_file::PolicyFile;
-use shoal_common::report::{Activity, EvaluatedReport, EvaluationReport, Identity, Role};
+use shoal_common::report::{Activity, EvaluatedReport, EvaluationReport, Role, RoleInstance};
 use shoal_common::run_dir::RunDir;
 use shoal_common::stop::Stop;
 
+use crate::actor::{after_fault, connect};
 use crate::error::ActorError;
-use crate::explorer::{after_fault, connect};
 
 /// The settings of an evaluator.
 #[derive(Clone, Debug)]
 pub struct EvaluatorSettings {
     /// Which process this is.
-    pub identity: Identity,
+    pub instance: RoleInstance,
     /// The run's configuration.
     pub config: Config,
     /// The environment server's index.
@@ -39,9 +39,9 @@ pub struct EvaluatorSettings {
 impl EvaluatorSettings {
     /// The settings of this run's evaluator. `evaluated_period` is the period of the policy that a previous one
     /// evaluated last.
-    pub fn new(config: &Config, run: &RunDir, identity: Identity, evaluated_period: Option<u64>) -> Self {
+    pub fn new(config: &Config, run: &RunDir, instance: RoleInstance, evaluated_period: Option<u64>) -> Self {
         Self {
-            identity,
+            instance,
             config: config.clone(),
             server: config.evaluation_server(),
             envs: config.evaluation_envs() as usize,
@@ -146,8 +146,8 @@ impl<'a> Evaluator<'a> {
     fn new(domain: &Domain, settings: &'a EvaluatorSettings, stop: &'a Stop) -> Result<Self, Exit<ActorError>> {
         let policy = settings.config.policy(settings.envs)?;
         let layout = policy.layout();
-        let listener = Listener::bind(domain, EventName(Role::Evaluator, settings.identity.index))?;
-        let mut heartbeat = HeartbeatSender::new(domain, settings.identity)?;
+        let listener = Listener::bind(domain, EventName(Role::Evaluator, settings.instance.index))?;
+        let mut heartbeat = HeartbeatSender::new(domain, settings.instance)?;
         let client = connect(
             domain,
             &listener,
@@ -197,7 +197,7 @@ impl<'a> Evaluator<'a> {
     }
 
     fn evaluate_next(&mut self) -> Result<(), Exit<ActorError>> {
-        let published = self.await_due_policy().map_err(Exit::widen)?;
+        let published = self.await_due_policy().map_err(Exit::convert)?;
         let header = published.header();
         let returns = self.returns(published.parameters(), 0, self.settings.config.evaluation.episodes)?;
         let (return_mean, return_std) = mean_and_std(&returns);
@@ -231,7 +231,7 @@ impl<'a> Evaluator<'a> {
     }
 
     /// Compares this policy with the best one and remembers the better one. Returns whether it is this policy.
-    fn becomes_best(&mut self, published: &policy::Policy, mean: f64) -> Result<bool, Exit<ActorError>> {
+    fn becomes_best(&mut self, published: &policy::PublishedPolicy, mean: f64) -> Result<bool, Exit<ActorError>> {
         let candidate = Best {
             version: published.header().version,
             mean,
@@ -262,7 +262,7 @@ impl<'a> Evaluator<'a> {
                 Ok(Some(more)) => returns.extend(more),
                 Ok(None) => {}
                 Err(Exit::Failed(ActorError::Channel(error))) if error.fault().is_some() => {
-                    after_fault(&error, &mut self.heartbeat, &self.listener, self.stop).map_err(Exit::widen)?;
+                    after_fault(&error, &mut self.heartbeat, &self.listener, self.stop).map_err(Exit::convert)?;
                 }
                 Err(exit) => return Err(exit),
             }
@@ -272,7 +272,7 @@ impl<'a> Evaluator<'a> {
     }
 
     /// Waits for a policy of a period that has not been evaluated.
-    fn await_due_policy(&mut self) -> Result<Rc<policy::Policy>, Exit<ChannelError>> {
+    fn await_due_policy(&mut self) -> Result<Rc<policy::PublishedPolicy>, Exit<ChannelError>> {
         let Self {
             reader,
             evaluated_period,
@@ -303,12 +303,12 @@ impl<'a> Evaluator<'a> {
     }
 
     /// Runs evaluation episodes with these parameters, from number `first` on: one in each environment, and at most
-    /// `left`. Returns their returns, or `None` if the server was lost.
+    /// `episodes_left`. Returns their returns, or `None` if the server was lost.
     fn run_episodes(
         &mut self,
         parameters: &[f32],
         first: u32,
-        left: u32,
+        episodes_left: u32,
     ) -> Result<Option<Vec<f64>>, Exit<ActorError>> {
         let Self {
             client,
@@ -319,23 +319,23 @@ impl<'a> Evaluator<'a> {
             ..
         } = self;
         // No environment is reset more often than an episode is needed.
-        let episodes = left.min(self.settings.envs as u32);
-        let begin = Begin::Evaluation {
+        let episodes = episodes_left.min(self.settings.envs as u32);
+        let request = ResetRequest::Evaluation {
             first: first.into(),
             episodes,
         };
-        let begun = client.reset(listener, begin, || {
+        let begun = client.reset(listener, request, || {
             heartbeat.beat(Activity::WaitingForServer);
         });
-        let mut current = begun.map_err(Exit::widen)?;
+        let mut current = begun.map_err(Exit::convert)?;
         let mut returns = vec![0.0; self.settings.envs];
         let mut running: Vec<_> = (0..self.settings.envs).map(|e| (e as u32) < episodes).collect();
         while running.contains(&true) {
             policy.act(parameters, current.observations(), actions);
             let stepped = client.step(listener, actions, || heartbeat.beat(Activity::WaitingForServer));
-            match stepped.map_err(Exit::widen)? {
-                Stepped::Taken(next) => current = next,
-                Stepped::Lost => return Ok(None),
+            match stepped.map_err(Exit::convert)? {
+                StepResult::Taken(next) => current = next,
+                StepResult::Lost => return Ok(None),
             }
             for (e, (running, total)) in running.iter_mut().zip(&mut returns).enumerate() {
                 if *running {
@@ -354,7 +354,7 @@ impl<'a> Evaluator<'a> {
 
     fn write_policy(
         &self,
-        published: &policy::Policy,
+        published: &policy::PublishedPolicy,
         return_mean: f64,
         return_std: f64,
         path: &Path,

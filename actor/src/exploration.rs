@@ -4,7 +4,7 @@ use rand::RngExt;
 use rand_distr::StandardNormal;
 use shoal_common::algorithms::{Behaviour, Epsilon, Warmup};
 use shoal_common::network::{ActionRange, DeterministicPolicy, GaussianPolicy};
-use shoal_common::policy::{PolicyLayout, Scores, highest};
+use shoal_common::policy::{PolicyLayout, Scores, argmax};
 use shoal_common::stream::{Stream, seek};
 
 use crate::noise::OrnsteinUhlenbeck;
@@ -26,7 +26,7 @@ pub enum Exploration {
 
 /// How far a run has come when actions are chosen.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Progress {
+pub struct StepCounts {
     /// Steps that each environment has made before, since the actor's random stream began.
     pub step: u64,
     /// Environment steps of all actors that the policy was learned from.
@@ -57,19 +57,19 @@ impl Exploration {
     }
 
     /// Chooses the actions before the policy's first update.
-    pub fn warm_up(&mut self, parameters: &[f32], observations: &[f32], progress: Progress, actions: &mut [f32]) {
+    pub fn warm_up(&mut self, parameters: &[f32], observations: &[f32], steps: StepCounts, actions: &mut [f32]) {
         match self {
             Self::Noise(network, noise) if noise.warmup() == Warmup::Uniform => {
-                draw_uniformly(noise.stream_at(progress.step), actions, network.range());
+                draw_uniformly(noise.stream_at(steps.step), actions, network.range());
             }
-            Self::Gaussian(policy, stream) => draw_uniformly(seek(stream, progress.step), actions, policy.range()),
-            _ => self.act(parameters, observations, progress, actions),
+            Self::Gaussian(policy, stream) => draw_uniformly(seek(stream, steps.step), actions, policy.range()),
+            _ => self.act(parameters, observations, steps, actions),
         }
     }
 
     /// Chooses the actions, one for each observation.
-    pub fn act(&mut self, parameters: &[f32], observations: &[f32], progress: Progress, actions: &mut [f32]) {
-        let Progress { step, env_steps } = progress;
+    pub fn act(&mut self, parameters: &[f32], observations: &[f32], steps: StepCounts, actions: &mut [f32]) {
+        let StepCounts { step, env_steps } = steps;
         match self {
             Self::Noise(network, noise) => {
                 network.forward(parameters, observations, actions);
@@ -94,7 +94,7 @@ impl Exploration {
                     // Both are always drawn, so that the next environment's numbers do not depend on the first.
                     let (explore, which): (f64, f64) = (stream.random(), stream.random());
                     let any = (which * count as f64) as usize;
-                    *action = if explore < epsilon { any } else { highest(values) } as f32;
+                    *action = if explore < epsilon { any } else { argmax(values) } as f32;
                 }
             }
         }
@@ -134,7 +134,7 @@ fn draw_uniformly(stream: &mut Stream, actions: &mut [f32], range: &ActionRange)
 
 /// Draws an action from the softmax of these logits by `u`, which is uniform in [0, 1).
 fn draw(logits: &[f32], u: f64) -> usize {
-    let greatest = f64::from(logits[highest(logits)]);
+    let greatest = f64::from(logits[argmax(logits)]);
     let weight = |logit: &f32| (f64::from(*logit) - greatest).exp();
     let mut left = u * logits.iter().map(weight).sum::<f64>();
     for (action, logit) in logits.iter().enumerate() {
@@ -150,13 +150,13 @@ fn draw(logits: &[f32], u: f64) -> usize {
 mod tests {
     use super::*;
     use shoal_common::config::{
-        Algorithm, DdpgConfig, DqnConfig, ReinforceConfig, SacConfig, TabularConfig, Td3Config,
+        AlgorithmConfig, DdpgConfig, DqnConfig, ReinforceConfig, SacConfig, TabularConfig, Td3Config,
     };
     use shoal_common::space::{EnvironmentSpec, Space};
     use shoal_common::stream::{Purpose, stream};
 
-    fn at(step: u64) -> Progress {
-        Progress { step, env_steps: 0 }
+    fn at(step: u64) -> StepCounts {
+        StepCounts { step, env_steps: 0 }
     }
 
     fn lake(epsilon: f64) -> Exploration {
@@ -171,7 +171,11 @@ mod tests {
             ..TabularConfig::default()
         };
         let stream = stream(7, Purpose::Exploration, 0, 0);
-        Exploration::new(Algorithm::QLearning(tabular).behaviour(&spec, 1).unwrap(), 1, stream)
+        Exploration::new(
+            AlgorithmConfig::QLearning(tabular).behaviour(&spec, 1).unwrap(),
+            1,
+            stream,
+        )
     }
 
     /// How often each action was chosen in 4,000 steps.
@@ -208,7 +212,7 @@ mod tests {
             state_width: 1,
         };
         let stream = stream(7, Purpose::Exploration, 0, 0);
-        let algorithm = Algorithm::Reinforce(ReinforceConfig {
+        let algorithm = AlgorithmConfig::Reinforce(ReinforceConfig {
             hidden: [1, 1].into(),
             ..ReinforceConfig::default()
         });
@@ -228,7 +232,7 @@ mod tests {
             time_limit: 100,
             state_width: 1,
         };
-        let new_for = |algorithm: Algorithm| {
+        let new_for = |algorithm: AlgorithmConfig| {
             let behaviour = algorithm.behaviour(&spec, 1).unwrap();
             Exploration::new(behaviour, 1, stream(7, Purpose::Exploration, 0, 0))
         };
@@ -237,12 +241,12 @@ mod tests {
                 warmup,
                 ..Default::default()
             };
-            new_for(Algorithm::Ddpg(DdpgConfig {
+            new_for(AlgorithmConfig::Ddpg(DdpgConfig {
                 exploration: noise,
                 ..DdpgConfig::default()
             }))
         };
-        type Act = fn(&mut Exploration, &[f32], &[f32], Progress, &mut [f32]);
+        type Act = fn(&mut Exploration, &[f32], &[f32], StepCounts, &mut [f32]);
         let choose = |exploration: &mut Exploration, act: Act, step| {
             let parameters = vec![0.0; exploration.layout().parameters()];
             let mut action = [f32::NAN; 2];
@@ -266,8 +270,8 @@ mod tests {
             }
         }
         for algorithm in [
-            Algorithm::Td3(Td3Config::default()),
-            Algorithm::Sac(SacConfig::default()),
+            AlgorithmConfig::Td3(Td3Config::default()),
+            AlgorithmConfig::Sac(SacConfig::default()),
         ] {
             assert_eq!(choose(&mut new_for(algorithm), warm_up, 77), warm[77]);
         }
@@ -289,7 +293,7 @@ mod tests {
             time_limit: 100,
             state_width: 1,
         };
-        let algorithm = Algorithm::Sac(SacConfig {
+        let algorithm = AlgorithmConfig::Sac(SacConfig {
             hidden: [1].into(),
             ..SacConfig::default()
         });
@@ -319,7 +323,7 @@ mod tests {
             time_limit: 100,
             state_width: 1,
         };
-        let algorithm = Algorithm::Dqn(DqnConfig {
+        let algorithm = AlgorithmConfig::Dqn(DqnConfig {
             hidden: [1].into(),
             epsilon_end: 0.0,
             epsilon_steps: 1_000,
@@ -332,8 +336,8 @@ mod tests {
         let mut best = |env_steps| {
             let mut action = [f32::NAN];
             let steps = (0..2_000).filter(|step| {
-                let progress = Progress { step: *step, env_steps };
-                exploration.act(&parameters, &[0.5], progress, &mut action);
+                let steps = StepCounts { step: *step, env_steps };
+                exploration.act(&parameters, &[0.5], steps, &mut action);
                 action[0] == 2.0
             });
             steps.count()

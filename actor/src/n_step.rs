@@ -177,14 +177,14 @@ mod tests {
     fn by_definition(episode: &[Vec<f32>], n: usize) -> Vec<(f64, f64, f32)> {
         (0..episode.len())
             .map(|t| {
-                let window = &episode[t..episode.len().min(t + n)];
-                let rewards = window.iter().enumerate();
+                let steps = &episode[t..episode.len().min(t + n)];
+                let rewards = steps.iter().enumerate();
                 let r = rewards.map(|(k, step)| f64::from(GAMMA).powi(k as i32) * f64::from(row().read(step).r));
-                let end = row().read(window.last().unwrap());
+                let end = row().read(steps.last().unwrap());
                 let discount = if end.discount == 0.0 {
                     0.0
                 } else {
-                    f64::from(GAMMA).powi(window.len() as i32)
+                    f64::from(GAMMA).powi(steps.len() as i32)
                 };
                 (r.sum(), discount, end.s_next[0])
             })

@@ -8,18 +8,18 @@ use anyhow::{Context, bail};
 use serde::Serialize;
 
 use super::costs::{self, Costs};
-use super::measurement::{Budget, Figures};
+use super::intervals::IntervalResults;
+use super::measurement::{Figures, TimeBudget};
 use super::model::{Bottleneck, Stages};
 use super::one_core::{self, OneCore};
 use super::processes::Processes;
-use super::progress::{POLL_INTERVAL, Progress};
+use super::progress::{POLL_INTERVAL, RunProgress};
 use super::rows::ENVIRONMENTS;
 use super::temporary_run::{TemporaryRun, settings_for_counting};
-use super::window::Windows;
 
 mod table;
 
-const WINDOW: Duration = Duration::from_millis(100);
+const INTERVAL: Duration = Duration::from_millis(100);
 
 /// Shares of the time: counting steps, the actor and its server on one core, and the separate stages.
 const SHARES: [f64; 3] = [0.5, 0.25, 0.25];
@@ -71,7 +71,7 @@ struct Rate {
     expected_rows_per_second: f64,
     expected_updates_per_second: f64,
     #[serde(skip)]
-    windows: Windows,
+    results: IntervalResults,
 }
 
 /// The model's prediction when every process has a core of its own.
@@ -104,7 +104,7 @@ fn counts(typed: Option<&str>, cores: u32) -> anyhow::Result<Vec<u32>> {
     Ok(counts)
 }
 
-pub(super) fn measure(typed: Option<&str>, budget: &Budget) -> anyhow::Result<ActorFigures> {
+pub(super) fn measure(typed: Option<&str>, budget: &TimeBudget) -> anyhow::Result<ActorFigures> {
     let cores = std::thread::available_parallelism().map_or(1, |cores| cores.get() as u32);
     let counts = counts(typed, cores)?;
     let [counting, alone, stages] = SHARES.map(|share| budget.length.mul_f64(share));
@@ -134,15 +134,15 @@ pub(super) fn measure(typed: Option<&str>, budget: &Budget) -> anyhow::Result<Ac
         None => bail!("nothing was counted"),
     };
     let counts = counted.into_iter().map(|(actors, collecting, learning)| {
-        let rate = |(windows, updates): (Windows, f64), one: f64, with_updates| {
+        let rate = |(results, updates): (IntervalResults, f64), one: f64, with_updates| {
             let expected = stages.on_cores(cores, actors, with_updates);
             Rate {
-                rows_per_second: windows.median(),
+                rows_per_second: results.median(),
                 updates_per_second: updates,
-                efficiency: windows.median() / (f64::from(actors) * one),
+                efficiency: results.median() / (f64::from(actors) * one),
                 expected_rows_per_second: rows * expected.chunks_per_second,
                 expected_updates_per_second: expected.updates_per_second,
-                windows,
+                results,
             }
         };
         Count {
@@ -181,13 +181,13 @@ fn scaling(stages: &Stages, actors: u32, rows: f64) -> Scaling {
     }
 }
 
-/// The rate of committed rows with `actors` actors, in windows, and the learner's gradient steps per second.
-fn count(actors: u32, updates: bool, length: Duration, budget: &Budget) -> anyhow::Result<(Windows, f64)> {
+/// The rate of committed rows with `actors` actors in each interval, and the learner's gradient steps per second.
+fn count(actors: u32, updates: bool, length: Duration, budget: &TimeBudget) -> anyhow::Result<(IntervalResults, f64)> {
     let temporary = TemporaryRun::of(actors, ENVIRONMENTS as u32, &settings_for_counting(actors, updates))?;
     temporary.with_processes(
         |_| None,
         |domain, processes| {
-            let mut progress = Progress::begin(&temporary, domain, processes, budget)?;
+            let mut progress = RunProgress::begin(&temporary, domain, processes, budget)?;
             progress.sleep(length.mul_f64(WARM_UP), processes, budget)?;
             watch(&mut progress, length.mul_f64(1.0 - WARM_UP), processes, budget)
         },
@@ -195,26 +195,26 @@ fn count(actors: u32, updates: bool, length: Duration, budget: &Budget) -> anyho
 }
 
 fn watch(
-    progress: &mut Progress<'_>,
+    progress: &mut RunProgress<'_>,
     length: Duration,
     processes: &mut Processes,
-    budget: &Budget,
-) -> anyhow::Result<(Windows, f64)> {
-    let mut windows = Windows::default();
+    budget: &TimeBudget,
+) -> anyhow::Result<(IntervalResults, f64)> {
+    let mut results = IntervalResults::default();
     let mut published: Vec<(Instant, u64)> = Vec::new();
     let (begun, mut opened) = (Instant::now(), (Instant::now(), progress.rows()));
-    let window = WINDOW.min(length);
+    let interval = INTERVAL.min(length);
     loop {
         std::thread::sleep(POLL_INTERVAL);
         let (now, updates) = (Instant::now(), progress.updates()?);
         if updates > 0 && published.last().is_none_or(|(_, before)| updates > *before) {
             published.push((now, updates));
         }
-        if now - opened.0 < window {
+        if now - opened.0 < interval {
             continue;
         }
         let rows = progress.rows();
-        windows.add((rows - opened.1) as f64 / (now - opened.0).as_secs_f64());
+        results.add((rows - opened.1) as f64 / (now - opened.0).as_secs_f64());
         opened = (now, rows);
         budget.check()?;
         processes.check()?;
@@ -229,7 +229,7 @@ fn watch(
         }
         _ => 0.0,
     };
-    Ok((windows, rate))
+    Ok((results, rate))
 }
 
 #[cfg(test)]

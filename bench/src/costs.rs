@@ -4,8 +4,8 @@ use std::time::{Duration, Instant};
 
 use anyhow::bail;
 use serde::Serialize;
-use shoal_actor::exploration::{Exploration, Progress};
-use shoal_common::channel::environment::{Begin, EnvironmentClient, ResponseLayout, Stepped};
+use shoal_actor::exploration::{Exploration, StepCounts};
+use shoal_common::channel::environment::{EnvironmentClient, ResetRequest, ResponseLayout, StepResult};
 use shoal_common::channel::transitions::ChunkSender;
 use shoal_common::channel::{Domain, EventName, Listener, Notifier};
 use shoal_common::commit::CommitReader;
@@ -13,20 +13,20 @@ use shoal_common::config::Config;
 use shoal_common::network::{ActionRange, DeterministicPolicy};
 use shoal_common::report::Role;
 use shoal_common::stream::{Purpose, stream};
-use shoal_env_server::vector::{Start, VectorEnvironment};
+use shoal_env_server::vector::{Reset, VectorEnvironment};
 use shoal_learner::algorithms::registry;
 use shoal_learner::networks::initialise::initialise;
 use shoal_learner::process::intake::Intake;
 use shoal_learner::replay::Replay;
-use shoal_run::process::Peer;
+use shoal_run::process::ChildProcess;
 
-use super::measurement::{Budget, interrupted};
+use super::intervals::{self, IntervalResults};
+use super::measurement::{TimeBudget, interrupted};
 use super::rows::{ENVIRONMENTS, Rows};
 use super::temporary_run::{TemporaryRun, ddpg};
-use super::window::{self, Windows};
 
-/// Windows per stage; the result is their median.
-const WINDOWS: u32 = 5;
+/// Intervals per stage; the result is the median of theirs.
+const INTERVALS: u32 = 5;
 
 /// Times of the stages in microseconds. A step is one of all 64 environments.
 #[derive(Clone, Copy, Debug, Serialize)]
@@ -78,7 +78,7 @@ impl Inference {
 }
 
 /// Measures every stage, in about `length` altogether.
-pub(super) fn measure(length: Duration, budget: &Budget) -> anyhow::Result<Costs> {
+pub(super) fn measure(length: Duration, budget: &TimeBudget) -> anyhow::Result<Costs> {
     let temporary = TemporaryRun::of(1, ENVIRONMENTS as u32, &[])?;
     let config = &temporary.config;
     let each = length / 6;
@@ -96,7 +96,7 @@ pub(super) fn measure(length: Duration, budget: &Budget) -> anyhow::Result<Costs
             actions,
             ..
         } = &mut inference;
-        let progress = Progress { step, env_steps: 0 };
+        let progress = StepCounts { step, env_steps: 0 };
         exploration.act(parameters, std::hint::black_box(observations), progress, actions);
         step += 1;
         std::hint::black_box(actions);
@@ -110,10 +110,10 @@ pub(super) fn measure(length: Duration, budget: &Budget) -> anyhow::Result<Costs
     let (writing_chunk_us, intake_of_chunk_us) =
         temporary.in_shared_memory(|domain| chunks(&temporary, domain, &mut replay, each, budget))?;
 
-    let mut method = registry::new(config)?;
+    let mut algorithm = registry::new(config)?;
     let head = replay.head();
     let update_us = microseconds(each, budget, || {
-        std::hint::black_box(method.update(&replay, head));
+        std::hint::black_box(algorithm.update(&replay, head));
     })?;
     Ok(Costs {
         inference_us,
@@ -126,24 +126,24 @@ pub(super) fn measure(length: Duration, budget: &Budget) -> anyhow::Result<Costs
     })
 }
 
-/// The median time of `work` over several windows, after a warm-up.
-fn microseconds(length: Duration, budget: &Budget, mut work: impl FnMut()) -> anyhow::Result<f64> {
-    let part = length / (WINDOWS + 1);
-    window::rate(part, &mut work);
-    let mut windows = Windows::default();
-    for _ in 0..WINDOWS {
+/// The median time of `work` over several intervals, after a warm-up.
+fn microseconds(length: Duration, budget: &TimeBudget, mut work: impl FnMut()) -> anyhow::Result<f64> {
+    let part = length / (INTERVALS + 1);
+    intervals::rate(part, &mut work);
+    let mut results = IntervalResults::default();
+    for _ in 0..INTERVALS {
         budget.check()?;
-        windows.add(1e6 / window::rate(part, &mut work));
+        results.add(1e6 / intervals::rate(part, &mut work));
     }
-    Ok(windows.median())
+    Ok(results.median())
 }
 
-fn environment_step(config: &Config, length: Duration, budget: &Budget) -> anyhow::Result<f64> {
+fn environment_step(config: &Config, length: Duration, budget: &TimeBudget) -> anyhow::Result<f64> {
     let (name, parameters) = (&config.environment.name, &config.environment.parameters);
     let mut environments = VectorEnvironment::new(name, parameters, config.actors.envs, config.run.seed, 0, 0)?;
     let layout = ResponseLayout::new(ENVIRONMENTS, config.spec.observation.width());
     let mut response = vec![0.0; layout.len()];
-    environments.reset(Start::Next, layout.split_mut(&mut response).observations)?;
+    environments.reset(Reset::Next, layout.split_mut(&mut response).observations)?;
     let actions = vec![0.5; ENVIRONMENTS * config.spec.action.width()];
     let mut refused = Ok(());
     let taken = microseconds(length, budget, || {
@@ -156,42 +156,44 @@ fn environment_step(config: &Config, length: Duration, budget: &Budget) -> anyho
     Ok(taken)
 }
 
-/// The mean time of a request within each window, and the median of these. A forward pass precedes each request, so the
-/// server falls asleep in between, as in a run.
+/// The mean time of a request within each interval, and the median of these. A forward pass precedes each request, so
+/// the server falls asleep in between, as in a run.
 fn round_trip(
     config: &Config,
     domain: &Domain,
-    server: &mut Peer,
+    server: &mut ChildProcess,
     inference: &mut Inference,
     length: Duration,
-    budget: &Budget,
+    budget: &TimeBudget,
 ) -> anyhow::Result<f64> {
     let listener = Listener::bind(domain, EventName(Role::Actor, 0))?;
     let client = EnvironmentClient::open(domain, 0, &config.spec, ENVIRONMENTS, budget.stop.clone())?;
     client.describe(&listener, || ()).map_err(interrupted)?;
-    client.reset(&listener, Begin::Next, || ()).map_err(interrupted)?;
+    client
+        .reset(&listener, ResetRequest::Next, || ())
+        .map_err(interrupted)?;
     let actions = vec![0.5; ENVIRONMENTS * config.spec.action.width()];
-    let part = length / (WINDOWS + 1);
-    let mut windows = Windows::default();
-    for window in 0..=WINDOWS {
+    let part = length / (INTERVALS + 1);
+    let mut results = IntervalResults::default();
+    for interval in 0..=INTERVALS {
         budget.check()?;
         server.check()?;
         let (begun, mut asked, mut taken) = (Instant::now(), 0.0, Duration::ZERO);
         while asked == 0.0 || begun.elapsed() < part {
             inference.step();
             let before = Instant::now();
-            if let Stepped::Lost = client.step(&listener, &actions, || ()).map_err(interrupted)? {
+            if let StepResult::Lost = client.step(&listener, &actions, || ()).map_err(interrupted)? {
                 bail!("the environment server lost its episodes");
             }
             taken += before.elapsed();
             asked += 1.0;
         }
-        // The first window is the warm-up.
-        if window > 0 {
-            windows.add(taken.as_secs_f64() * 1e6 / asked);
+        // The first interval is the warm-up.
+        if interval > 0 {
+            results.add(taken.as_secs_f64() * 1e6 / asked);
         }
     }
-    Ok(windows.median())
+    Ok(results.median())
 }
 
 /// The times to send a chunk and to receive it. This process does both: it sends a window of chunks, then receives them
@@ -201,7 +203,7 @@ fn chunks(
     domain: &Domain,
     replay: &mut Replay,
     length: Duration,
-    budget: &Budget,
+    budget: &TimeBudget,
 ) -> anyhow::Result<(f64, f64)> {
     let config = &temporary.config;
     let (row, window) = (config.row_layout(), config.actors.window);
@@ -220,7 +222,7 @@ fn chunks(
         .wait(&commits, &listener, &budget.stop, || {})
         .map_err(interrupted)?;
 
-    let (mut writing, mut taking_in) = (Windows::default(), Windows::default());
+    let (mut writing, mut taking_in) = (IntervalResults::default(), IntervalResults::default());
     let begun = Instant::now();
     // The first pass over the replay measures page faults, so it does not count.
     while replay.head() < config.replay.capacity || writing.is_empty() || begun.elapsed() < length {

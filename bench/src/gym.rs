@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use shoal_common::config::EnvironmentConfig;
 use shoal_run::external_environment::{ExternalEnvironment, default_command};
 
-use super::measurement::{Budget, Figures};
+use super::measurement::{Figures, TimeBudget};
 use super::step::quantile_of;
 
 const NAME: &str = "gym:Pendulum-v1";
@@ -45,7 +45,7 @@ struct Gymnasium {
     async_vector_steps_per_second: f64,
 }
 
-pub(super) fn measure(budget: &Budget) -> anyhow::Result<GymFigures> {
+pub(super) fn measure(budget: &TimeBudget) -> anyhow::Result<GymFigures> {
     let server = default_command(NAME).context("found no server for Gymnasium's environments")?;
     let environment = EnvironmentConfig::new(NAME.into(), server, toml::Table::new());
     let length = budget.length.mul_f64(SHARE);
@@ -68,7 +68,7 @@ fn times(
     environment: &EnvironmentConfig,
     environments: u32,
     length: Duration,
-    budget: &Budget,
+    budget: &TimeBudget,
 ) -> anyhow::Result<Vec<u32>> {
     let mut conversation = ExternalEnvironment::begin(environment, environments, 1)?;
     conversation.begin_evaluation(0)?;

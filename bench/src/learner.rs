@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use serde::Serialize;
-use shoal_common::commit::ChunkMark;
+use shoal_common::commit::ChunkId;
 use shoal_common::config::Config;
 use shoal_common::stream::{Purpose, stream};
 use shoal_learner::algorithms::algorithm::Algorithm;
@@ -14,17 +14,17 @@ use shoal_learner::networks::threads::Threads;
 use shoal_learner::replay::Replay;
 use toml::{Table, Value};
 
-use super::measurement::{Budget, Figures};
-use super::product::Multiplication;
+use super::intervals::{self, IntervalResults};
+use super::measurement::{Figures, TimeBudget};
+use super::product::TimedProduct;
 use super::rows::{ENVIRONMENTS, Rows};
 use super::target::{Line, Target};
 use super::temporary_run::TemporaryRun;
-use super::window::{self, Windows};
 
-const WINDOW: Duration = Duration::from_millis(100);
+const INTERVAL: Duration = Duration::from_millis(100);
 
 /// Share of the time for each of seven measurements: for both minibatch sizes the gradient steps, the fastest product
-/// and all products; and gradient steps on two threads. A method whose minibatches are large has only four.
+/// and all products; and gradient steps on two threads. An algorithm whose minibatches are large has only four.
 const SHARE: f64 = 1.0 / 7.0;
 
 /// The second minibatch size, large enough that Adam takes little of the time.
@@ -39,7 +39,8 @@ const WARM_UP: f64 = 0.05;
 /// The fields of `bench learner --json`.
 #[derive(Serialize)]
 pub(super) struct LearnerFigures {
-    method: String,
+    #[serde(rename = "method")]
+    algorithm: String,
     #[serde(flatten)]
     configured: Figure,
     /// Missing if the configured minibatches have this size.
@@ -65,11 +66,11 @@ struct Figure {
     products_gflops: f64,
     share_of_products: f64,
     #[serde(skip)]
-    updates: Windows,
+    updates: IntervalResults,
     #[serde(skip)]
-    limit: Windows,
+    limit: IntervalResults,
     #[serde(skip)]
-    products: Windows,
+    products: IntervalResults,
 }
 
 /// The configured minibatch size, on two threads.
@@ -79,12 +80,12 @@ struct TwoThreads {
     /// Relative to one thread.
     speedup: f64,
     #[serde(skip)]
-    updates: Windows,
+    updates: IntervalResults,
 }
 
-/// Measures one of the [methods](super::methods), by default DDPG.
-pub(super) fn measure(method: Option<&str>, budget: &Budget) -> anyhow::Result<LearnerFigures> {
-    let temporary = TemporaryRun::with_method(method)?;
+/// Measures one of the [algorithms](super::algorithms), by default DDPG.
+pub(super) fn measure(algorithm: Option<&str>, budget: &TimeBudget) -> anyhow::Result<LearnerFigures> {
+    let temporary = TemporaryRun::with_algorithm(algorithm)?;
     let replay = Replay::create(&temporary.run.replay_file(), &temporary.replay_layout())?;
     // The mapping outlives the file, so nothing is left behind even if this process is killed.
     let config = temporary.remove_directory()?;
@@ -96,25 +97,25 @@ pub(super) fn measure(method: Option<&str>, budget: &Budget) -> anyhow::Result<L
         .then(|| Case::new(&config, LARGE_BATCH))
         .transpose()?;
     let mut shared = learner(&config, batch)?;
-    shared.set_threads(Threads::two()?);
-    let mut updates_of_two = Windows::default();
+    shared.set_threads(Threads::two_threads()?);
+    let mut updates_of_two = IntervalResults::default();
     let cases = [&mut configured]
         .into_iter()
         .chain(&mut large)
         .map(|case| &mut case.learner);
     for learner in cases.chain([&mut shared]) {
-        window::rate(budget.length.mul_f64(WARM_UP), || update(learner, &replay));
+        intervals::rate(budget.length.mul_f64(WARM_UP), || update(learner, &replay));
     }
-    for _ in 0..window::count(budget.length, SHARE, WINDOW) {
+    for _ in 0..intervals::count(budget.length, SHARE, INTERVAL) {
         budget.check()?;
         configured.measure(&replay);
-        updates_of_two.add(window::rate(WINDOW, || update(&mut shared, &replay)));
+        updates_of_two.add(intervals::rate(INTERVAL, || update(&mut shared, &replay)));
         large.iter_mut().for_each(|large| large.measure(&replay));
     }
 
     let configured = configured.figure();
     Ok(LearnerFigures {
-        method: config.algorithm.name().into(),
+        algorithm: config.algorithm.name().into(),
         two_threads: TwoThreads {
             updates_per_second: updates_of_two.median(),
             speedup: updates_of_two.median() / configured.updates_per_second,
@@ -136,18 +137,18 @@ fn with_batch(config: &Config, size: usize) -> anyhow::Result<Config> {
 }
 
 /// Fills the replay to its capacity.
-fn filled(config: &Config, mut replay: Replay, budget: &Budget) -> anyhow::Result<Replay> {
+fn filled(config: &Config, mut replay: Replay, budget: &TimeBudget) -> anyhow::Result<Replay> {
     let row = config.row_layout();
     let mut rows = Rows::new(config)?;
     let mut chunk = vec![0.0; ENVIRONMENTS * row.width()];
     for sequence in 1..=config.replay.capacity / ENVIRONMENTS as u64 {
         budget.check()?;
         rows.fill(&mut chunk)?;
-        let mark = ChunkMark {
+        let id = ChunkId {
             incarnation: 0,
             sequence,
         };
-        replay.append_and_commit(0, mark, &chunk).context("the replay")?;
+        replay.append_and_commit(0, id, &chunk).context("the replay")?;
     }
     Ok(replay)
 }
@@ -170,10 +171,10 @@ struct Case {
     /// The number of updates whose products are in the list.
     updates_of_list: f64,
     list: List,
-    fastest: Multiplication,
-    updates: Windows,
-    limit: Windows,
-    products: Windows,
+    fastest: TimedProduct,
+    updates: IntervalResults,
+    limit: IntervalResults,
+    products: IntervalResults,
 }
 
 impl Case {
@@ -187,20 +188,20 @@ impl Case {
             updates_of_list: products.updates as f64,
             list,
             fastest,
-            updates: Windows::default(),
-            limit: Windows::default(),
-            products: Windows::default(),
+            updates: IntervalResults::default(),
+            limit: IntervalResults::default(),
+            products: IntervalResults::default(),
         })
     }
 
-    /// Adds one window to each measurement.
+    /// Adds the result of one interval to each measurement.
     fn measure(&mut self, replay: &Replay) {
         let flop_of_list = self.flop_per_update as f64 * self.updates_of_list;
         self.updates
-            .add(window::rate(WINDOW, || update(&mut self.learner, replay)));
-        self.limit.add(self.fastest.gflops(WINDOW));
+            .add(intervals::rate(INTERVAL, || update(&mut self.learner, replay)));
+        self.limit.add(self.fastest.gflops(INTERVAL));
         self.products
-            .add(window::rate(WINDOW, || self.list.multiply_all()) * flop_of_list / 1e9);
+            .add(intervals::rate(INTERVAL, || self.list.multiply_all()) * flop_of_list / 1e9);
     }
 
     fn figure(self) -> Figure {
@@ -225,7 +226,7 @@ impl Case {
 
 /// An update's products in their order. A repeated shape uses the same matrices again.
 struct List {
-    distinct: Vec<Multiplication>,
+    distinct: Vec<TimedProduct>,
     order: Vec<usize>,
 }
 
@@ -238,19 +239,19 @@ impl List {
 }
 
 /// All products, each with its best kernel, and a copy of the fastest one.
-fn multiplications(config: &Config, products: &Products) -> (List, Multiplication) {
+fn multiplications(config: &Config, products: &Products) -> (List, TimedProduct) {
     let mut random = stream(config.run.seed, Purpose::Exploration, 1, 0);
-    let (mut distinct, mut order): (Vec<Multiplication>, Vec<usize>) = Default::default();
+    let (mut distinct, mut order): (Vec<TimedProduct>, Vec<usize>) = Default::default();
     for &product in &products.products {
         let known = distinct.iter().position(|known| known.product == product);
         order.push(known.unwrap_or(distinct.len()));
         if known.is_none() {
-            distinct.push(Multiplication::new(product, &mut random));
+            distinct.push(TimedProduct::new(product, &mut random));
         }
     }
     // In turn, so that a disturbance does not affect all attempts at one shape.
     for _ in 0..ATTEMPTS {
-        distinct.iter_mut().for_each(Multiplication::try_kernels);
+        distinct.iter_mut().for_each(TimedProduct::try_kernels);
     }
     let best = (0..distinct.len()).fold(0, |best, i| {
         if distinct[i].best > distinct[best].best {
@@ -259,7 +260,7 @@ fn multiplications(config: &Config, products: &Products) -> (List, Multiplicatio
             best
         }
     });
-    let mut fastest = Multiplication::new(distinct[best].product, &mut random);
+    let mut fastest = TimedProduct::new(distinct[best].product, &mut random);
     fastest.kernel = distinct[best].kernel;
     (List { distinct, order }, fastest)
 }
@@ -307,7 +308,7 @@ impl Figures for LearnerFigures {
             self.configured.batch,
             two.speedup
         );
-        let mut lines = vec![("method", self.method.clone())];
+        let mut lines = vec![("algorithm", self.algorithm.clone())];
         lines.extend(self.configured.lines());
         lines.push(("updates a second", two));
         lines.extend(self.large_batch.iter().flat_map(Figure::lines));

@@ -4,6 +4,7 @@ mod actors;
 mod cores;
 mod costs;
 mod gym;
+mod intervals;
 mod learner;
 mod measurement;
 mod memory;
@@ -21,16 +22,15 @@ mod target;
 mod temporary_run;
 mod transitions;
 mod whole_run;
-mod window;
 
-use shoal_common::algorithms::Algorithm;
+use shoal_common::algorithms::AlgorithmConfig;
 use shoal_run::plan::UsageError;
 
-use self::measurement::{Budget, print};
+use self::measurement::{TimeBudget, print};
 
-/// The methods that [`Stage::Learner`] can measure: those that learn from minibatches.
-pub fn methods() -> impl Iterator<Item = &'static str> {
-    Algorithm::of_minibatches().map(|algorithm| algorithm.name())
+/// The algorithms that [`Stage::Learner`] can measure: those that learn from minibatches.
+pub fn algorithms() -> impl Iterator<Item = &'static str> {
+    AlgorithmConfig::of_minibatches().map(|algorithm| algorithm.name())
 }
 
 /// A stage to measure.
@@ -57,20 +57,20 @@ pub enum Stage {
 }
 
 /// Measures a stage and prints the result, as a table or with `json` also as one JSON object. `actors` lists the
-/// numbers of actors that [`Stage::Actors`] measures, `method` is that of [`Stage::Learner`].
+/// numbers of actors that [`Stage::Actors`] measures, `algorithm` is that of [`Stage::Learner`].
 ///
 /// # Errors
 /// If a measured process fails, or the user interrupts.
-pub fn run(stage: Stage, actors: Option<&str>, method: Option<&str>, json: bool) -> anyhow::Result<()> {
-    let budget = Budget::new()?;
+pub fn run(stage: Stage, actors: Option<&str>, algorithm: Option<&str>, json: bool) -> anyhow::Result<()> {
+    let budget = TimeBudget::new()?;
     if actors.is_some() && stage != Stage::Actors {
         return Err(UsageError("--actors is only for `shoal bench actors`".into()).into());
     }
-    if method.is_some() && stage != Stage::Learner {
+    if algorithm.is_some() && stage != Stage::Learner {
         return Err(UsageError("--method is only for `shoal bench learner`".into()).into());
     }
     match stage {
-        Stage::Learner => learner::measure(method, &budget).and_then(|it| print(&it, json)),
+        Stage::Learner => learner::measure(algorithm, &budget).and_then(|it| print(&it, json)),
         Stage::Transitions => transitions::measure(&budget).and_then(|it| print(&it, json)),
         Stage::Step => step::measure(&budget).and_then(|it| print(&it, json)),
         Stage::Policy => policy::measure(&budget).and_then(|it| print(&it, json)),

@@ -36,7 +36,7 @@ pub(super) trait Figures: Serialize {
 
 /// How long to measure, and whether the user has interrupted.
 #[derive(Clone, Debug)]
-pub(super) struct Budget {
+pub(super) struct TimeBudget {
     pub(super) length: Duration,
     pub(super) stop: Stop,
 }
@@ -49,7 +49,7 @@ pub(super) fn interrupted(exit: Exit<ChannelError>) -> anyhow::Error {
     }
 }
 
-impl Budget {
+impl TimeBudget {
     pub(super) fn new() -> anyhow::Result<Self> {
         let seconds = match std::env::var(SECONDS) {
             Ok(text) => text.parse().ok().filter(|seconds| (0.01..=600.0).contains(seconds)),

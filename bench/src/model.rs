@@ -12,7 +12,7 @@ use serde::Serialize;
 
 /// Actors that fill chunks, and one learner that receives them.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Network {
+pub(super) struct QueueingNetwork {
     pub(super) actors: u32,
     /// Chunks in circulation per actor.
     pub(super) window: u32,
@@ -22,7 +22,7 @@ pub(super) struct Network {
     pub(super) service: f64,
 }
 
-impl Network {
+impl QueueingNetwork {
     /// Chunks a second.
     pub(super) fn throughput(&self) -> f64 {
         let ratio = (self.service / self.think).ln();
@@ -137,7 +137,7 @@ impl Stages {
         } else {
             0.0
         };
-        let chunks_per_second = Network {
+        let chunks_per_second = QueueingNetwork {
             actors,
             window: self.window,
             think,
@@ -188,8 +188,8 @@ impl Stages {
 mod tests {
     use super::*;
 
-    fn network(actors: u32, window: u32, think: f64, service: f64) -> Network {
-        Network {
+    fn network(actors: u32, window: u32, think: f64, service: f64) -> QueueingNetwork {
+        QueueingNetwork {
             actors,
             window,
             think,

@@ -10,12 +10,12 @@ use shoal_common::report::Role;
 
 use super::cores::Cores;
 use super::costs::Inference;
-use super::measurement::Budget;
+use super::intervals::{self, IntervalResults};
+use super::measurement::TimeBudget;
 use super::processes::Processes;
-use super::progress::Progress;
+use super::progress::RunProgress;
 use super::rows::ENVIRONMENTS;
 use super::temporary_run::{TemporaryRun, settings_for_counting};
-use super::window::{self, Windows};
 
 /// Length of a turn of the actor and its server. A turn of the policy alone takes half as long.
 const TURN: Duration = Duration::from_millis(200);
@@ -36,7 +36,7 @@ pub(super) struct OneCore {
 }
 
 /// Measures for about `length`.
-pub(super) fn measure(length: Duration, budget: &Budget) -> anyhow::Result<OneCore> {
+pub(super) fn measure(length: Duration, budget: &TimeBudget) -> anyhow::Result<OneCore> {
     let temporary = TemporaryRun::of(1, ENVIRONMENTS as u32, &settings_for_counting(1, false))?;
     let mut inference = Inference::new(&temporary.config)?;
     let cores = Cores::choose()?;
@@ -47,23 +47,27 @@ pub(super) fn measure(length: Duration, budget: &Budget) -> anyhow::Result<OneCo
         })
     };
     temporary.with_processes(cores_for, |domain, processes| {
-        let mut progress = Progress::begin(&temporary, domain, processes, budget)?;
-        let turns = window::count(length, 1.0, TURN.mul_f64(1.5));
+        let mut progress = RunProgress::begin(&temporary, domain, processes, budget)?;
+        let turns = intervals::count(length, 1.0, TURN.mul_f64(1.5));
         let turn = TURN.min(length.div_f64(1.5));
         take_turns(&mut progress, processes, &cores, turns, turn, &mut inference, budget)
     })
 }
 
 fn take_turns(
-    progress: &mut Progress<'_>,
+    progress: &mut RunProgress<'_>,
     processes: &mut Processes,
     cores: &Cores,
     turns: usize,
     turn: Duration,
     inference: &mut Inference,
-    budget: &Budget,
+    budget: &TimeBudget,
 ) -> anyhow::Result<OneCore> {
-    let (mut pair, mut alone, mut shares) = (Windows::default(), Windows::default(), Windows::default());
+    let (mut pair, mut alone, mut shares) = (
+        IntervalResults::default(),
+        IntervalResults::default(),
+        IntervalResults::default(),
+    );
     for _ in 0..turns {
         sched_setaffinity(None, &cores.others)?;
         // The actor and its server have just been resumed.
@@ -74,7 +78,7 @@ fn take_turns(
         let rate = processes.with_actors_paused(|| -> anyhow::Result<f64> {
             sched_setaffinity(None, &cores.pair)?;
             inference.step();
-            Ok(window::rate(turn / 2, || inference.step()))
+            Ok(intervals::rate(turn / 2, || inference.step()))
         })??;
         pair.add(rows);
         alone.add(rate * ENVIRONMENTS as f64);

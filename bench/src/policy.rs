@@ -9,14 +9,14 @@ use shoal_common::stream::{Purpose, stream};
 use shoal_learner::networks::initialise::initialise;
 use shoal_learner::networks::product::{Product, Transposed};
 
-use super::measurement::{Budget, Figures};
-use super::product::Multiplication;
+use super::intervals::{self, IntervalResults};
+use super::measurement::{Figures, TimeBudget};
+use super::product::TimedProduct;
 use super::rows::{ENVIRONMENTS, Rows};
 use super::target::{Line, Target};
 use super::temporary_run::{TemporaryRun, ddpg};
-use super::window::{self, Windows};
 
-const WINDOW: Duration = Duration::from_millis(50);
+const INTERVAL: Duration = Duration::from_millis(50);
 
 /// Share of the time for each of four measurements: two batch sizes and the limit of each.
 const SHARE: f64 = 0.25;
@@ -44,10 +44,10 @@ pub(super) struct PolicyFigures {
     parameters: usize,
     threads: u32,
     #[serde(skip)]
-    calls: [Windows; 2],
+    calls: [IntervalResults; 2],
 }
 
-pub(super) fn measure(budget: &Budget) -> anyhow::Result<PolicyFigures> {
+pub(super) fn measure(budget: &TimeBudget) -> anyhow::Result<PolicyFigures> {
     let temporary = TemporaryRun::new(&[])?;
     let config = temporary.remove_directory()?;
     let range = ActionRange::new(&config.spec.action)?;
@@ -63,7 +63,7 @@ pub(super) fn measure(budget: &Budget) -> anyhow::Result<PolicyFigures> {
     let mut calls_of = |batch: usize, length| {
         let actions = &mut actions[..batch * policy.range().width()];
         let observations = &rows.observations()[..batch * width];
-        window::rate(length, || {
+        intervals::rate(length, || {
             policy.forward(&parameters, std::hint::black_box(observations), actions);
             std::hint::black_box(&mut *actions);
         })
@@ -72,15 +72,15 @@ pub(super) fn measure(budget: &Budget) -> anyhow::Result<PolicyFigures> {
     for batch in batches {
         calls_of(batch, budget.length.mul_f64(WARM_UP));
     }
-    let mut calls: [Windows; 2] = Default::default();
-    let (mut readings, mut limit) = (Windows::default(), Windows::default());
-    for _ in 0..window::count(budget.length, SHARE, WINDOW) {
+    let mut calls: [IntervalResults; 2] = Default::default();
+    let (mut readings, mut limit) = (IntervalResults::default(), IntervalResults::default());
+    for _ in 0..intervals::count(budget.length, SHARE, INTERVAL) {
         budget.check()?;
-        for (windows, batch) in calls.iter_mut().zip(batches) {
-            windows.add(calls_of(batch, WINDOW));
+        for (results, batch) in calls.iter_mut().zip(batches) {
+            results.add(calls_of(batch, INTERVAL));
         }
-        readings.add(window::rate(WINDOW, || read(std::hint::black_box(&parameters))));
-        limit.add(product.gflops(WINDOW));
+        readings.add(intervals::rate(INTERVAL, || read(std::hint::black_box(&parameters))));
+        limit.add(product.gflops(INTERVAL));
     }
     let [one, many] = [calls[0].median(), calls[1].median()];
     let sizes = layout.layer_sizes();
@@ -102,7 +102,7 @@ pub(super) fn measure(budget: &Budget) -> anyhow::Result<PolicyFigures> {
 }
 
 /// The second layer's product for a batch of 64, with its fastest kernel. It is nearly the whole computation.
-fn widest_product(layout: &NetworkLayout, seed: u64) -> Multiplication {
+fn widest_product(layout: &NetworkLayout, seed: u64) -> TimedProduct {
     let (k, m) = layout.layer_size(1);
     let product = Product {
         m,
@@ -110,7 +110,7 @@ fn widest_product(layout: &NetworkLayout, seed: u64) -> Multiplication {
         n: ENVIRONMENTS,
         transposed: Transposed::Neither,
     };
-    let mut product = Multiplication::new(product, &mut stream(seed, Purpose::Exploration, 1, 0));
+    let mut product = TimedProduct::new(product, &mut stream(seed, Purpose::Exploration, 1, 0));
     (0..ATTEMPTS).for_each(|_| product.try_kernels());
     product
 }
@@ -131,7 +131,7 @@ fn read(numbers: &[f32]) {
 
 impl Figures for PolicyFigures {
     fn lines(&self) -> Vec<(&'static str, String)> {
-        let line = |calls: &Windows, batch: usize, time: f64| {
+        let line = |calls: &IntervalResults, batch: usize, time: f64| {
             let unit = 1e3 / batch as f64;
             format!("{} thousand actions a second, {time:.1} µs a call", calls.show(unit, 0))
         };

@@ -2,13 +2,13 @@
 //! launcher that would replace a process that dies.
 
 use rustix::thread::CpuSet;
-use shoal_common::report::{Identity, Role};
+use shoal_common::report::{Role, RoleInstance};
 use shoal_common::run_dir::RunDir;
-use shoal_run::process::Peer;
+use shoal_run::process::ChildProcess;
 
 /// The running processes.
 #[derive(Debug)]
-pub(super) struct Processes(Vec<(Role, Peer)>);
+pub(super) struct Processes(Vec<(Role, ChildProcess)>);
 
 impl Processes {
     /// Starts a learner, and `actors` actors each with its environment server. `cores_for` returns the cores to bind a
@@ -17,12 +17,12 @@ impl Processes {
         let pairs = (0..actors).flat_map(|index| [(Role::EnvServer, index), (Role::Actor, index)]);
         let mut processes = Self(Vec::new());
         for (incarnation, (role, index)) in (1..).zip([(Role::Learner, 0)].into_iter().chain(pairs)) {
-            let identity = Identity {
+            let instance = RoleInstance {
                 role,
                 index,
                 incarnation,
             };
-            let peer = Peer::member(identity, run)?;
+            let peer = ChildProcess::member(instance, run)?;
             if let Some(cores) = cores_for(role) {
                 peer.pin(&cores)?;
             }
@@ -38,12 +38,12 @@ impl Processes {
 
     /// Calls `act` while all processes except the learner are stopped.
     pub(super) fn with_actors_paused<T>(&self, act: impl FnOnce() -> T) -> anyhow::Result<T> {
-        let explorers = || self.0.iter().filter(|(role, _)| *role != Role::Learner);
-        let paused = explorers().try_for_each(|(_, peer)| peer.pause());
+        let all_but_the_learner = || self.0.iter().filter(|(role, _)| *role != Role::Learner);
+        let paused = all_but_the_learner().try_for_each(|(_, peer)| peer.pause());
         let acted = paused.is_ok().then(act);
         // Even after an error, because a stopped process would not end.
         let mut resumed = Ok(());
-        for (_, peer) in explorers() {
+        for (_, peer) in all_but_the_learner() {
             resumed = resumed.and(peer.resume());
         }
         paused.and(resumed)?;

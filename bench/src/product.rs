@@ -15,7 +15,7 @@ use shoal_common::stream::Stream;
 use shoal_learner::networks::aligned::Aligned;
 use shoal_learner::networks::product::{Product, Transposed};
 
-use super::window;
+use super::intervals;
 
 /// Length of an attempt. It is shorter than a time slice, so that most attempts are undisturbed.
 const ATTEMPT: Duration = Duration::from_millis(2);
@@ -44,7 +44,7 @@ impl Kernel {
 
 /// A product with its matrices, and its fastest kernel.
 #[derive(Debug)]
-pub(super) struct Multiplication {
+pub(super) struct TimedProduct {
     pub(super) product: Product,
     pub(super) kernel: Kernel,
     /// The best rate seen, in GFLOP/s.
@@ -54,7 +54,7 @@ pub(super) struct Multiplication {
     c: Aligned,
 }
 
-impl Multiplication {
+impl TimedProduct {
     /// Random factors; the kernel is faer until others are tried.
     pub(super) fn new(product: Product, random: &mut Stream) -> Self {
         let Product { m, k, n, .. } = product;
@@ -95,7 +95,7 @@ impl Multiplication {
 
     /// The rate over `length`, in GFLOP/s.
     pub(super) fn gflops(&mut self, length: Duration) -> f64 {
-        window::rate(length, || self.multiply()) * self.product.flop() as f64 / 1e9
+        intervals::rate(length, || self.multiply()) * self.product.flop() as f64 / 1e9
     }
 
     pub(super) fn multiply(&mut self) {
@@ -145,7 +145,7 @@ mod tests {
     use shoal_common::stream::{Purpose, stream};
 
     /// The product by its definition, in `f64`, column by column.
-    fn by_definition(multiplication: &Multiplication) -> Vec<f64> {
+    fn by_definition(multiplication: &TimedProduct) -> Vec<f64> {
         let Product { m, k, n, transposed } = multiplication.product;
         let a = |i: usize, j: usize| match transposed {
             Transposed::Left => multiplication.a[i * k + j],
@@ -166,7 +166,7 @@ mod tests {
         let mut kernels = 0;
         for transposed in [Transposed::Neither, Transposed::Left, Transposed::Right] {
             for (m, k, n) in [(12, 7, 9), (1, 8, 6), (10, 3, 4), (64, 2, 32)] {
-                let mut multiplication = Multiplication::new(Product { m, k, n, transposed }, &mut random);
+                let mut multiplication = TimedProduct::new(Product { m, k, n, transposed }, &mut random);
                 let expected = by_definition(&multiplication);
                 for &kernel in multiplication.kernels() {
                     multiplication.kernel = kernel;

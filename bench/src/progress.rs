@@ -9,7 +9,7 @@ use shoal_common::commit::{CommitReader, OpenError};
 use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
 
-use super::measurement::Budget;
+use super::measurement::TimeBudget;
 use super::processes::Processes;
 use super::temporary_run::TemporaryRun;
 
@@ -21,19 +21,19 @@ const STARTUP_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// The counters of a run in which every actor sends rows.
 #[derive(Debug)]
-pub(super) struct Progress<'a> {
+pub(super) struct RunProgress<'a> {
     temporary: &'a TemporaryRun,
     commits: CommitReader,
     policies: PolicyReader,
 }
 
-impl<'a> Progress<'a> {
+impl<'a> RunProgress<'a> {
     /// Waits until rows of every actor are committed.
     pub(super) fn begin(
         temporary: &'a TemporaryRun,
         domain: &Domain,
         processes: &mut Processes,
-        budget: &Budget,
+        budget: &TimeBudget,
     ) -> anyhow::Result<Self> {
         let policies = policy_reader(&temporary.config, domain)?;
         let begun = Instant::now();
@@ -75,7 +75,7 @@ impl<'a> Progress<'a> {
     }
 
     /// Sleeps for `length`. Returns an error early if the user interrupts or a role ends.
-    pub(super) fn sleep(&self, length: Duration, processes: &mut Processes, budget: &Budget) -> anyhow::Result<()> {
+    pub(super) fn sleep(&self, length: Duration, processes: &mut Processes, budget: &TimeBudget) -> anyhow::Result<()> {
         let begun = Instant::now();
         loop {
             budget.check()?;

@@ -6,7 +6,7 @@ use shoal_common::config::Config;
 use shoal_common::space::Space;
 use shoal_common::stream::{Purpose, Stream, stream};
 use shoal_common::transition::{RowLayout, Transition};
-use shoal_env_server::vector::{Start, VectorEnvironment};
+use shoal_env_server::vector::{Reset, VectorEnvironment};
 
 /// Environments that are stepped together, and so the number of rows that each step yields.
 pub(super) const ENVIRONMENTS: usize = 64;
@@ -32,7 +32,7 @@ impl Rows {
         let mut environments = VectorEnvironment::new(name, parameters, ENVIRONMENTS as u32, config.run.seed, 0, 0)?;
         let row = config.row_layout();
         let mut observations = vec![0.0; ENVIRONMENTS * row.observation_width()];
-        environments.reset(Start::Next, &mut observations)?;
+        environments.reset(Reset::Next, &mut observations)?;
         let layout = ResponseLayout::new(ENVIRONMENTS, row.observation_width());
         let bounds = match &config.spec.action {
             Space::Box { low, high } => low.iter().copied().zip(high.iter().copied()).collect(),

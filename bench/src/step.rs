@@ -5,15 +5,15 @@ use std::time::{Duration, Instant};
 use anyhow::bail;
 use rustix::thread::sched_setaffinity;
 use serde::Serialize;
-use shoal_common::channel::environment::{Begin, EnvironmentClient, Stepped};
+use shoal_common::channel::environment::{EnvironmentClient, ResetRequest, StepResult};
 use shoal_common::channel::{ChannelError, Domain, EventName, Listener};
 use shoal_common::config::Config;
 use shoal_common::exit::Exit;
 use shoal_common::report::Role;
-use shoal_run::process::Peer;
+use shoal_run::process::ChildProcess;
 
 use super::cores::Cores;
-use super::measurement::{Budget, Figures};
+use super::measurement::{Figures, TimeBudget};
 use super::spin;
 use super::target::{Line, Target};
 use super::temporary_run::TemporaryRun;
@@ -47,7 +47,7 @@ pub(super) struct StepFigures {
     one_core_p99_us: f64,
 }
 
-pub(super) fn measure(budget: &Budget) -> anyhow::Result<StepFigures> {
+pub(super) fn measure(budget: &TimeBudget) -> anyhow::Result<StepFigures> {
     let temporary = TemporaryRun::new(&[])?;
     let mut spins = spin::times(budget.length.mul_f64(SPIN / 2.0));
     let [apart, together] = SHARES.map(|share| budget.length.mul_f64(share));
@@ -74,7 +74,7 @@ pub(super) fn measure(budget: &Budget) -> anyhow::Result<StepFigures> {
 }
 
 /// Times of round trips while this process and the server share a core.
-fn on_one_core(length: Duration, budget: &Budget) -> anyhow::Result<Vec<u32>> {
+fn on_one_core(length: Duration, budget: &TimeBudget) -> anyhow::Result<Vec<u32>> {
     let temporary = TemporaryRun::new(&[])?;
     let cores = Cores::choose()?;
     temporary.with_peer(Role::EnvServer, |domain, server| {
@@ -93,9 +93,9 @@ pub(super) fn quantile_of(sorted: &[u32], quantile: f64) -> f64 {
 fn round_trips(
     config: &Config,
     domain: &Domain,
-    server: &mut Peer,
+    server: &mut ChildProcess,
     length: Duration,
-    budget: &Budget,
+    budget: &TimeBudget,
 ) -> anyhow::Result<Vec<u32>> {
     let environments = config.actors.envs as usize;
     let listener = Listener::bind(domain, EventName(Role::Actor, 0))?;
@@ -106,7 +106,7 @@ fn round_trips(
         Err(Exit::Failed(error)) => server.check().and(Err(error.into())),
     };
     ask(&|| client.describe(&listener, || ()).map(|_| ()))?;
-    ask(&|| client.reset(&listener, Begin::Next, || ()).map(|_| ()))?;
+    ask(&|| client.reset(&listener, ResetRequest::Next, || ()).map(|_| ()))?;
 
     let actions = vec![0.5; environments * config.spec.action.width()];
     let mut times = Vec::new();
@@ -115,8 +115,8 @@ fn round_trips(
     loop {
         let before = Instant::now();
         match client.step(&listener, &actions, || ()) {
-            Ok(Stepped::Taken(_)) => {}
-            Ok(Stepped::Lost) => {
+            Ok(StepResult::Taken(_)) => {}
+            Ok(StepResult::Lost) => {
                 server.check()?;
                 bail!("the environment server lost its episodes");
             }

@@ -6,7 +6,7 @@ use comfy_table::Table;
 use comfy_table::presets::UTF8_BORDERS_ONLY;
 use serde_json::{Map, Value};
 
-use super::measurement::{Budget, Figures};
+use super::measurement::{Figures, TimeBudget};
 use super::target::Line;
 use super::{actors, learner, policy, step, transitions, whole_run};
 
@@ -25,7 +25,7 @@ impl All {
 }
 
 /// Measures every stage that needs no other program, each for the full length, and prints the results.
-pub(super) fn measure_all(json: bool, budget: &Budget) -> anyhow::Result<()> {
+pub(super) fn measure_all(json: bool, budget: &TimeBudget) -> anyhow::Result<()> {
     let mut all = All {
         stages: Map::new(),
         lines: Vec::new(),

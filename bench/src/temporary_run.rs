@@ -10,7 +10,7 @@ use shoal_common::run_dir::RunDir;
 use shoal_run::plan::Plan;
 use shoal_run::plan::RunOverrides;
 use shoal_run::preflight;
-use shoal_run::process::Peer;
+use shoal_run::process::ChildProcess;
 use tempfile::TempDir;
 
 use super::processes::Processes;
@@ -34,11 +34,15 @@ impl TemporaryRun {
         Self::of(1, 1, set)
     }
 
-    /// The preset for a method, or as it is, with one actor and one environment. For DQN it is `cart-pole`.
-    pub(super) fn with_method(method: Option<&str>) -> anyhow::Result<Self> {
-        let preset = if method == Some("dqn") { "cart-pole" } else { "pendulum" };
+    /// The preset for an algorithm, or as it is, with one actor and one environment. For DQN it is `cart-pole`.
+    pub(super) fn with_algorithm(algorithm: Option<&str>) -> anyhow::Result<Self> {
+        let preset = if algorithm == Some("dqn") {
+            "cart-pole"
+        } else {
+            "pendulum"
+        };
         let overrides = RunOverrides {
-            method: method.map(Into::into),
+            algorithm: algorithm.map(Into::into),
             actors: Some(1),
             envs: Some(1),
             ..RunOverrides::default()
@@ -94,10 +98,10 @@ impl TemporaryRun {
     pub(super) fn with_peer<T>(
         &self,
         role: Role,
-        act: impl FnOnce(&Domain, &mut Peer) -> anyhow::Result<T>,
+        act: impl FnOnce(&Domain, &mut ChildProcess) -> anyhow::Result<T>,
     ) -> anyhow::Result<T> {
         self.in_shared_memory(|domain| {
-            let mut peer = Peer::role(role, &self.run)?;
+            let mut peer = ChildProcess::role(role, &self.run)?;
             let acted = act(domain, &mut peer);
             let ended = peer.end();
             let acted = acted?;

@@ -14,16 +14,16 @@ use shoal_common::run_dir::RunDir;
 use shoal_learner::algorithms::minibatch::Minibatch;
 use shoal_learner::algorithms::sampling::Sampler;
 use shoal_learner::replay::Replay;
-use shoal_run::process::Peer;
+use shoal_run::process::ChildProcess;
 
-use super::measurement::{Budget, Figures};
+use super::intervals::{self, IntervalResults};
+use super::measurement::{Figures, TimeBudget};
 use super::rows::{ENVIRONMENTS, Rows};
 use super::target::{Line, Target};
 use super::temporary_run::{TemporaryRun, ddpg};
-use super::window::{self, Windows};
 
-const WINDOW: Duration = Duration::from_millis(100);
-const SAMPLING_WINDOW: Duration = Duration::from_millis(20);
+const INTERVAL: Duration = Duration::from_millis(100);
+const SAMPLING_INTERVAL: Duration = Duration::from_millis(20);
 
 /// Shares of the time: warming up (the first access to the replay's pages), moving rows, and sampling them.
 const SHARES: [f64; 3] = [0.15, 0.65, 0.2];
@@ -43,12 +43,12 @@ pub(super) struct TransitionFigures {
     replay_rows: u64,
     batch: usize,
     #[serde(skip)]
-    moved: Windows,
+    moved: IntervalResults,
     #[serde(skip)]
-    sampled: Windows,
+    sampled: IntervalResults,
 }
 
-pub(super) fn measure(budget: &Budget) -> anyhow::Result<TransitionFigures> {
+pub(super) fn measure(budget: &TimeBudget) -> anyhow::Result<TransitionFigures> {
     let temporary = TemporaryRun::new(&[
         "actors.chunk_steps=64",
         "replay.updates_per_step=0",
@@ -79,9 +79,9 @@ fn move_rows(
     config: &Config,
     run: &RunDir,
     domain: &Domain,
-    learner: &mut Peer,
-    budget: &Budget,
-) -> anyhow::Result<Windows> {
+    learner: &mut ChildProcess,
+    budget: &TimeBudget,
+) -> anyhow::Result<IntervalResults> {
     let row = config.row_layout();
     let mut rows = Rows::new(config)?;
     let mut chunks = vec![vec![0.0; ENVIRONMENTS * row.width()]; CHUNKS];
@@ -101,8 +101,8 @@ fn move_rows(
         .map_err(super::measurement::interrupted)?;
 
     let [warm_up, moving, _] = SHARES;
-    let mut windows = Windows::default();
-    let mut left = window::count(budget.length, moving, WINDOW);
+    let mut results = IntervalResults::default();
+    let mut left = intervals::count(budget.length, moving, INTERVAL);
     let (mut begun, mut length, mut committed) = (Instant::now(), budget.length.mul_f64(warm_up), None);
     loop {
         for numbers in &chunks {
@@ -135,14 +135,14 @@ fn move_rows(
             let now = commits.rows();
             // The first window is the warm-up.
             if let Some(before) = committed.replace(now) {
-                windows.add((now - before) as f64 / elapsed.as_secs_f64());
+                results.add((now - before) as f64 / elapsed.as_secs_f64());
                 left -= 1;
                 if left == 0 {
-                    return Ok(windows);
+                    return Ok(results);
                 }
             }
             budget.check()?;
-            (begun, length) = (Instant::now(), WINDOW);
+            (begun, length) = (Instant::now(), INTERVAL);
         }
     }
 }
@@ -150,8 +150,8 @@ fn move_rows(
 fn wait_for_replay(
     run: &RunDir,
     listener: &Listener,
-    learner: &mut Peer,
-    budget: &Budget,
+    learner: &mut ChildProcess,
+    budget: &TimeBudget,
 ) -> anyhow::Result<CommitReader> {
     loop {
         match CommitReader::open(&run.replay_file()) {
@@ -167,27 +167,27 @@ fn wait_for_replay(
 }
 
 /// The rates of rows drawn into minibatches, as the learner does it.
-fn sample(replay: &Replay, config: &Config, budget: &Budget) -> anyhow::Result<Windows> {
+fn sample(replay: &Replay, config: &Config, budget: &TimeBudget) -> anyhow::Result<IntervalResults> {
     let sampler = Sampler::new(config.run.seed);
     let size = ddpg(config)?.batch;
     let mut batch = Minibatch::new(config.row_layout(), size);
     let mut indices = vec![0; size];
     let mut update = 0;
     let mut gather = || {
-        let newest = replay.window(replay.head(), config.replay.capacity);
+        let newest = replay.sampling_range(replay.head(), config.replay.capacity);
         sampler.indices(update, newest.clone(), &mut indices);
         update += 1;
         batch.gather(replay, &indices, &newest);
         std::hint::black_box(&mut batch);
     };
     // Warms up: the first access to each page of the new mapping is a page fault.
-    window::rate(budget.length.mul_f64(SHARES[2] / 4.0), &mut gather);
-    let mut windows = Windows::default();
-    for _ in 0..window::count(budget.length, SHARES[2], SAMPLING_WINDOW) {
+    intervals::rate(budget.length.mul_f64(SHARES[2] / 4.0), &mut gather);
+    let mut results = IntervalResults::default();
+    for _ in 0..intervals::count(budget.length, SHARES[2], SAMPLING_INTERVAL) {
         budget.check()?;
-        windows.add(window::rate(SAMPLING_WINDOW, &mut gather) * size as f64);
+        results.add(intervals::rate(SAMPLING_INTERVAL, &mut gather) * size as f64);
     }
-    Ok(windows)
+    Ok(results)
 }
 
 impl Figures for TransitionFigures {

@@ -9,10 +9,10 @@ use serde::Serialize;
 use shoal_common::report::Role;
 
 use self::training::{Recovery, Startup, Training};
-use super::measurement::{Budget, Figures};
+use super::intervals::IntervalResults;
+use super::measurement::{Figures, TimeBudget};
 use super::memory::Memory;
 use super::target::{Line, Target};
-use super::window::Windows;
 
 mod training;
 
@@ -65,7 +65,7 @@ struct RoleMemory {
     memory: Memory,
 }
 
-pub(super) fn measure(budget: &Budget) -> anyhow::Result<RunFigures> {
+pub(super) fn measure(budget: &TimeBudget) -> anyhow::Result<RunFigures> {
     let begun = Instant::now();
     let mut starts = Vec::new();
     loop {
@@ -90,7 +90,7 @@ pub(super) fn measure(budget: &Budget) -> anyhow::Result<RunFigures> {
 fn recoveries_and_memory(
     training: &mut Training,
     begun: Instant,
-    budget: &Budget,
+    budget: &TimeBudget,
 ) -> anyhow::Result<(Vec<Recovery>, Vec<RoleMemory>)> {
     let mut recoveries = Vec::new();
     let mut roles = Vec::new();
@@ -139,11 +139,11 @@ impl RunFigures {
 impl Spread {
     /// Panics if there are no times.
     fn of(times: impl Iterator<Item = Duration>) -> Self {
-        let mut windows = Windows::default();
-        times.for_each(|time| windows.add(time.as_secs_f64()));
+        let mut results = IntervalResults::default();
+        times.for_each(|time| results.add(time.as_secs_f64()));
         Self {
-            median: windows.median(),
-            worst: windows.greatest(),
+            median: results.median(),
+            worst: results.greatest(),
         }
     }
 

@@ -12,13 +12,13 @@ mod sac;
 mod tabular;
 mod td3;
 
-pub use algorithm::{ActorCritic, AlgorithmSettings, AlgorithmSpec, Experience, Learned, Shape};
+pub use algorithm::{ActorCritic, AlgorithmSettings, AlgorithmSpec, LearnedShapes, Shape, TransitionUse};
 pub use behaviour::{Behaviour, Epsilon};
 pub use ddpg::DdpgConfig;
 pub use dqn::DqnConfig;
 pub use exploration::{ExplorationConfig, Warmup};
 pub use preparation::{ObservationConfig, RewardConfig};
-pub use reinforce::{ReinforceConfig, ReinforceNetworks, Weight};
+pub use reinforce::{ReinforceConfig, ReinforceNetworks, ReturnWeighting};
 pub use sac::SacConfig;
 use serde::Serialize;
 use shoal_base::section::{self, OutOfRange, Section, describe};
@@ -32,11 +32,11 @@ macro_rules! registry {
         /// The algorithm of a run, with its settings. Its section in `config.toml` has its name.
         #[derive(Clone, Debug, PartialEq, Serialize)]
         #[serde(rename_all = "kebab-case")]
-        pub enum Algorithm {
+        pub enum AlgorithmConfig {
             $($(#[$attribute])* $variant($settings)),*
         }
 
-        impl Algorithm {
+        impl AlgorithmConfig {
             /// Each algorithm with its default settings.
             pub fn all() -> Vec<Self> {
                 vec![$(Self::$variant(<$settings>::default())),*]
@@ -111,18 +111,18 @@ registry! {
     Sarsa(TabularConfig) is tabular::SARSA;
 }
 
-impl Default for Algorithm {
+impl Default for AlgorithmConfig {
     /// The algorithm of a configuration that has no algorithm's section.
     fn default() -> Self {
         Self::Ddpg(DdpgConfig::default())
     }
 }
 
-impl Algorithm {
+impl AlgorithmConfig {
     /// Each algorithm that learns from minibatches, with its default settings.
     pub fn of_minibatches() -> impl Iterator<Item = Self> {
         let all = Self::all().into_iter();
-        all.filter(|algorithm| algorithm.spec().experience == Experience::Minibatches)
+        all.filter(|algorithm| algorithm.spec().transition_use == TransitionUse::Minibatches)
     }
 
     /// Its name, which is its section's.
@@ -175,7 +175,7 @@ mod tests {
         let counted = || Space::discrete(3);
         let takes = |observation: fn() -> Space, action: fn() -> Space| -> Vec<bool> {
             let spec = spec(observation(), action());
-            let all = Algorithm::all().into_iter();
+            let all = AlgorithmConfig::all().into_iter();
             all.map(|algorithm| algorithm.check_spaces(&spec).is_ok()).collect()
         };
         let (yes, no) = (true, false);
@@ -189,13 +189,16 @@ mod tests {
 
     #[test]
     fn an_algorithm_is_written_and_read_under_its_name() {
-        for algorithm in Algorithm::all() {
+        for algorithm in AlgorithmConfig::all() {
             let written = toml::Table::try_from(&algorithm).unwrap();
             assert_eq!(written.keys().collect::<Vec<_>>(), [algorithm.name()]);
             let section = written[algorithm.name()].clone();
-            assert_eq!(Algorithm::read(algorithm.name(), section).unwrap().unwrap(), algorithm);
+            assert_eq!(
+                AlgorithmConfig::read(algorithm.name(), section).unwrap().unwrap(),
+                algorithm
+            );
         }
-        assert!(Algorithm::read("exploration", toml::Table::new().into()).is_none());
+        assert!(AlgorithmConfig::read("exploration", toml::Table::new().into()).is_none());
     }
 
     #[test]
@@ -206,7 +209,7 @@ mod tests {
             spec(real(), counted()),
             spec(counted(), counted()),
         ];
-        for algorithm in Algorithm::all() {
+        for algorithm in AlgorithmConfig::all() {
             let fits = specs
                 .iter()
                 .find_map(|spec| Some((spec, algorithm.behaviour(spec, 0).ok()?)));

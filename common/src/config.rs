@@ -33,15 +33,15 @@ use shoal_base::transition::{ChunkLayout, RowLayout};
 use shoal_policy::{Policy, PolicyError, PolicyLayout};
 
 pub use crate::algorithms::{
-    Algorithm, DdpgConfig, DqnConfig, ExplorationConfig, ObservationConfig, ReinforceConfig, RewardConfig, SacConfig,
-    TabularConfig, Td3Config, Warmup, Weight,
+    AlgorithmConfig, DdpgConfig, DqnConfig, ExplorationConfig, ObservationConfig, ReinforceConfig, ReturnWeighting,
+    RewardConfig, SacConfig, TabularConfig, Td3Config, Warmup,
 };
-use crate::algorithms::{Behaviour, Experience, Learned};
+use crate::algorithms::{Behaviour, LearnedShapes, TransitionUse};
 
 /// The complete configuration of a run.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Config {
-    /// Identity and length of the run.
+    /// Id and length of the run.
     pub run: RunConfig,
     /// The environment.
     pub environment: EnvironmentConfig,
@@ -50,10 +50,10 @@ pub struct Config {
     /// The actors, and the size of their chunks.
     pub actors: ActorsConfig,
     /// The algorithm and its settings.
-    pub algorithm: Algorithm,
-    /// How observations are prepared for networks. Only methods that learn from minibatches have a choice.
+    pub algorithm: AlgorithmConfig,
+    /// How observations are prepared for networks. Only algorithms that learn from minibatches have a choice.
     pub observation: ObservationConfig,
-    /// How rewards are prepared. Only methods that learn from minibatches have a choice.
+    /// How rewards are prepared. Only algorithms that learn from minibatches have a choice.
     pub reward: RewardConfig,
     /// The learner's threads.
     pub learner: LearnerConfig,
@@ -130,7 +130,7 @@ impl Config {
     pub fn from_table(table: toml::Table, origin: impl Display) -> Result<Self, ConfigError> {
         let config: Self = table.clone().try_into().map_err(|error| ConfigError::Malformed {
             origin: origin.to_string(),
-            message: sections::at_fault(&table).unwrap_or_else(|| one_line(&error)),
+            message: sections::first_unreadable(&table).unwrap_or_else(|| one_line(&error)),
         })?;
         config.check()?;
         Ok(config)
@@ -173,7 +173,7 @@ impl Config {
     }
 
     /// The networks or tables that are learned.
-    pub fn learned(&self) -> Learned {
+    pub fn learned(&self) -> LearnedShapes {
         let learned = self.algorithm.settings().learned(&self.spec);
         learned.normalising(self.observation.normalise)
     }
@@ -253,7 +253,7 @@ impl Config {
 
     /// The names of the algorithms that can control the environment.
     fn fitting(&self) -> String {
-        let all = Algorithm::all().into_iter();
+        let all = AlgorithmConfig::all().into_iter();
         let fitting = all.filter(|algorithm| algorithm.check_spaces(&self.spec).is_ok());
         let names: Vec<&str> = fitting.map(|algorithm| algorithm.name()).collect();
         if names.is_empty() {
@@ -275,7 +275,7 @@ impl Config {
             let why = "learns only from transitions of the newest policy";
             return Err(only("run.mode", "free".into(), "lockstep", why));
         }
-        if spec.experience == Experience::Episodes {
+        if spec.transition_use == TransitionUse::Episodes {
             let why = "learns from whole episodes, each in a chunk of its own";
             let (limit, steps) = (self.spec.time_limit, self.actors.chunk_steps);
             if steps != limit {

@@ -5,11 +5,11 @@ use std::collections::VecDeque;
 use std::io::{self, Write};
 use std::path::Path;
 
-use shoal_base::durable::{Kind, SealError, read_sealed, seal, write_atomically_unsynced};
+use shoal_base::durable::{FileKind, SealError, read_sealed, seal, write_atomically_unsynced};
 use shoal_base::report::EvaluationReport;
 use shoal_channel::reports::Report;
 
-const KIND: Kind = Kind {
+const KIND: FileKind = FileKind {
     magic: *b"SHOALEVA",
     version: 1,
     name: "an evaluator's state",

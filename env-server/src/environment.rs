@@ -14,7 +14,7 @@ pub use interface::{Environment, Step};
 use schemars::JsonSchema;
 use serde::{Serialize, de::DeserializeOwned};
 use shoal_base::section::{self, Key};
-pub use signal::{Goal, Picture, Signal, Source};
+pub use signal::{Goal, Picture, Signal, SignalSource};
 
 /// Every environment: its name, and how it is made from its parameters. A new one needs its file, a `mod` line above
 /// and a line here.
@@ -145,9 +145,9 @@ mod tests {
                 assert!(signals[..i].iter().all(|other| other.key != *key), "{name}: {key}");
                 assert!(
                     match *source {
-                        Source::Observation(i) => i < observation,
-                        Source::Action(i) => i < action,
-                        Source::Angle { cos, sin } => cos < observation && sin < observation,
+                        SignalSource::Observation(i) => i < observation,
+                        SignalSource::Action(i) => i < action,
+                        SignalSource::Angle { cos, sin } => cos < observation && sin < observation,
                     },
                     "{name}: {key}"
                 );

@@ -2,10 +2,10 @@
 
 use shoal_base::report::Activity;
 use shoal_base::stop::Stop;
-use shoal_channel::environment::{Ask, EnvironmentPort};
+use shoal_channel::environment::{EnvironmentPort, RequestKind};
 use shoal_channel::{ChannelError, HeartbeatSender};
 
-use crate::vector::{Start, VectorEnvironment};
+use crate::vector::{Reset, VectorEnvironment};
 
 /// Answers requests until `stop`. `seed` determines the evaluation episodes.
 ///
@@ -25,43 +25,45 @@ pub fn serve(
             Ok(request) => request,
             Err(exit) => return exit.into_result(),
         };
-        let refused = match request.ask() {
-            Some(ask @ (Ask::Reset | Ask::ResetToTraining | Ask::ResetToEvaluation)) => {
+        let refused = match request.kind() {
+            Some(kind @ (RequestKind::Reset | RequestKind::ResetToTraining | RequestKind::ResetToEvaluation)) => {
                 let first = request.episode();
                 let episodes = vec![first; environments.count()];
-                let start = match ask {
-                    Ask::ResetToTraining => Start::Episodes(&episodes),
-                    Ask::ResetToEvaluation => Start::Evaluation {
+                let reset = match kind {
+                    RequestKind::ResetToTraining => Reset::Episodes(&episodes),
+                    RequestKind::ResetToEvaluation => Reset::Evaluation {
                         seed,
                         first,
                         episodes: request.episodes(),
                     },
-                    _ => Start::Next,
+                    _ => Reset::Next,
                 };
                 started = true;
                 heartbeat.begin_work();
                 request
-                    .answer(|_, blocks| environments.reset(start, blocks.observations))?
+                    .respond(|_, blocks| environments.reset(reset, blocks.observations))?
                     .err()
             }
-            Some(Ask::Step) if started => {
+            Some(RequestKind::Step) if started => {
                 heartbeat.begin_work();
                 let refused = request
-                    .answer(|actions, blocks| environments.step(actions, blocks))?
+                    .respond(|actions, blocks| environments.step(actions, blocks))?
                     .err();
                 heartbeat.count(environments.count() as u64);
                 heartbeat.beat(Activity::Working);
                 refused
             }
-            Some(Ask::Snapshot) if started => request.answer_snapshot(|words| environments.snapshot(words))?.err(),
-            Some(Ask::Step | Ask::Snapshot) => {
+            Some(RequestKind::Snapshot) if started => request
+                .respond_with_snapshot(|words| environments.snapshot(words))?
+                .err(),
+            Some(RequestKind::Step | RequestKind::Snapshot) => {
                 request.not_started()?;
                 None
             }
-            Some(Ask::Restore) => {
+            Some(RequestKind::Restore) => {
                 let words = request.words();
                 let refused = request
-                    .answer(|_, blocks| environments.restore(&words, blocks.observations))?
+                    .respond(|_, blocks| environments.restore(&words, blocks.observations))?
                     .err();
                 started |= refused.is_none();
                 refused

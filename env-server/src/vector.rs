@@ -47,7 +47,7 @@ struct Evaluation {
 
 /// Where the environments start.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Start<'a> {
+pub enum Reset<'a> {
     /// Each in its next training episode. Episodes are counted from 0, across resets and automatic resets.
     Next,
     /// Environment e in training episode `episodes[e]`, below 2⁴⁰; its later episodes are counted from there.
@@ -116,7 +116,7 @@ impl VectorEnvironment {
     ///
     /// A wrong count changes nothing. After a refused state the episodes are undefined until the next successful reset.
     /// Panics unless `observations` has E × observation width numbers.
-    pub fn reset(&mut self, start: Start<'_>, observations: &mut [f32]) -> Result<(), RequestError> {
+    pub fn reset(&mut self, start: Reset<'_>, observations: &mut [f32]) -> Result<(), RequestError> {
         let count = self.running.len();
         assert_eq!(
             observations.len(),
@@ -124,14 +124,14 @@ impl VectorEnvironment {
             "length of `observations`"
         );
         self.evaluation = match start {
-            Start::Evaluation { seed, first, episodes } => {
+            Reset::Evaluation { seed, first, episodes } => {
                 for (number, running) in (first..).zip(&mut self.running) {
                     running.next_evaluation = number;
                 }
                 let end = episodes.map(|episodes| first.saturating_add(episodes.into()));
                 Some(Evaluation { seed, end })
             }
-            Start::Episodes(episodes) => {
+            Reset::Episodes(episodes) => {
                 if episodes.len() != count {
                     return Err(wrong_count("episodes", episodes.len(), count, "one each".to_owned()));
                 }
@@ -140,15 +140,15 @@ impl VectorEnvironment {
                 }
                 None
             }
-            Start::States(states) if count == 0 || !states.len().is_multiple_of(count) => {
+            Reset::States(states) if count == 0 || !states.len().is_multiple_of(count) => {
                 return Err(wrong_count("states", states.len(), count, "one state each".to_owned()));
             }
-            Start::Next | Start::States(_) => None,
+            Reset::Next | Reset::States(_) => None,
         };
         let width = self.spec.observation.width();
         for (e, observation) in observations.chunks_exact_mut(width).enumerate() {
             self.begin_episode(e);
-            if let Start::States(states) = start {
+            if let Reset::States(states) = start {
                 let width = states.len() / count;
                 self.running[e].environment.reset_to(&states[e * width..][..width])?;
             }

@@ -1,13 +1,13 @@
-//! The learning methods: their interface ([`algorithm`]), their list ([`registry`]), and a file for each of them.
+//! The learning algorithms: their interface ([`algorithm`]), their list ([`registry`]), and a file for each of them.
 
 pub mod algorithm;
 pub mod ddpg;
 pub mod dqn;
 pub mod minibatch;
+pub mod minibatch_algorithm;
 mod normaliser;
 pub mod registry;
 pub mod reinforce;
-pub mod replayed;
 pub mod sac;
 pub mod sampling;
 pub mod tabular;

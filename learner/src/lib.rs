@@ -1,4 +1,4 @@
-//! The learner: its networks ([`networks`]), the replay ([`replay`]), the learning methods ([`algorithms`]) and the
+//! The learner: its networks ([`networks`]), the replay ([`replay`]), the learning algorithms ([`algorithms`]) and the
 //! process that runs them ([`process`]). Each of these modules imports only from those named before it.
 //!
 //! The way of a transition, from an actor through shared memory into the replay:
@@ -26,7 +26,7 @@
 //! let receiver = ChunkReceiver::open(&domain, 0, chunks, 4)?;
 //! let mut take = |replay: &mut Replay| -> Result<(), Box<dyn std::error::Error>> {
 //!     let chunk = receiver.receive()?.ok_or("no chunk")?;
-//!     replay.append_and_commit(0, chunk.mark(replay.committed(0).mark), chunk.rows())?;
+//!     replay.append_and_commit(0, chunk.id(replay.committed(0).last_chunk), chunk.rows())?;
 //!     Ok(())
 //! };
 //!

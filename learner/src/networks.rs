@@ -9,4 +9,4 @@ pub mod initialise;
 pub mod pass;
 pub mod product;
 pub mod threads;
-pub mod trained;
+pub mod trainable;

@@ -1,13 +1,13 @@
 //! The replay: a ring of rows in a mapped file. Only the learner writes it, and it samples rows in place.
 //!
 //! Rows are numbered in the order they are committed, from 0, for the life of the file. A chunk becomes part of the
-//! replay in three steps that cannot be taken out of order: [`Replay::begin`], [`Reserved::fill`], [`Filled::commit`].
-//! A process that is killed between any two instructions leaves the last committed state. `docs/REPLAY_FORMAT.md` has
-//! the layout, the invariants and what survives a power loss.
+//! replay in three steps that cannot be taken out of order: [`Replay::begin`], [`ReservedChunk::fill`],
+//! [`FilledChunk::commit`]. A process that is killed between any two instructions leaves the last committed state.
+//! `docs/REPLAY_FORMAT.md` has the layout, the invariants and what survives a power loss.
 //!
 //! ```
 //! use shoal_common::transition::{RowLayout, Transition};
-//! use shoal_learner::replay::{Appended, ChunkMark, Replay, ReplayLayout};
+//! use shoal_learner::replay::{Appended, ChunkId, Replay, ReplayLayout};
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
 //! let row = RowLayout::new(2, 1); // two numbers of an observation, one of an action
@@ -19,10 +19,10 @@
 //! let transition = Transition { s: &s, a: &a, r: -1.0, discount: 0.99, s_next: &s_next, last: false };
 //! let mut chunk = vec![0.0; row.width()]; // of one row
 //! row.write(&transition, &mut chunk);
-//! let mark = ChunkMark { incarnation: 0, sequence: 1 };
-//! assert_eq!(replay.append_and_commit(0, mark, &chunk)?, Appended::Accepted);
+//! let id = ChunkId { incarnation: 0, sequence: 1 };
+//! assert_eq!(replay.append_and_commit(0, id, &chunk)?, Appended::Accepted);
 //! // After a crash a chunk may arrive again.
-//! assert_eq!(replay.append_and_commit(0, mark, &chunk)?, Appended::Duplicate);
+//! assert_eq!(replay.append_and_commit(0, id, &chunk)?, Appended::Duplicate);
 //! assert_eq!(replay.rows(), 0..1);
 //! assert_eq!(row.read(replay.row(0)).r, -1.0);
 //! # Ok(())
@@ -40,9 +40,9 @@ mod step;
 mod store;
 mod sync;
 
-pub use shoal_common::commit::{ActorCommit, ChunkMark, ReplayLayout};
+pub use shoal_common::commit::{ActorCommit, ChunkId, ReplayLayout};
 
-pub use self::append::{Appended, Filled, Reserved};
+pub use self::append::{Appended, FilledChunk, ReservedChunk};
 pub use self::error::{ChunkError, ReplayError};
 pub use self::step::WriteStep;
 pub use self::store::{Replay, are_finite};

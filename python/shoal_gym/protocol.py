@@ -4,7 +4,7 @@ import ctypes
 import enum
 
 
-class Ask(enum.IntEnum):
+class RequestKind(enum.IntEnum):
     """What a request asks for."""
 
     DESCRIBE = 0
@@ -16,7 +16,7 @@ class Ask(enum.IntEnum):
     RESET_TO_TRAINING = 6
 
 
-class Verdict(enum.IntEnum):
+class ResponseStatus(enum.IntEnum):
     """How a request was taken."""
 
     ANSWERED = 0
@@ -40,7 +40,7 @@ class RequestHeader(ctypes.Structure):
     """Header of a request."""
 
     _fields_ = [
-        ("ask", ctypes.c_uint32),
+        ("kind", ctypes.c_uint32),
         ("episodes", ctypes.c_uint32),
         ("episode", ctypes.c_uint64),
     ]
@@ -54,7 +54,7 @@ class ResponseHeader(ctypes.Structure):
     """Header of a response."""
 
     _fields_ = [
-        ("verdict", ctypes.c_uint32),
+        ("status", ctypes.c_uint32),
         ("environments", ctypes.c_uint32),
         ("discrete_observations", ctypes.c_uint32),
         ("observation_width", ctypes.c_uint32),

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from .environments import Blocks, Environments
 from .port import Port
-from .protocol import Ask, ResponseHeader, Verdict
+from .protocol import RequestKind, ResponseHeader, ResponseStatus
 from .spaces import Invalid
 
 
@@ -26,7 +26,7 @@ def serve(environments: Environments, port: Port) -> None:
     server = Server(environments)
     while True:
         request = port.next_request()
-        if request.user_header().contents.ask != Ask.DESCRIBE:
+        if request.user_header().contents.kind != RequestKind.DESCRIBE:
             port.begin_work()
         server.answer(request)
         port.notify()
@@ -49,26 +49,26 @@ class Server:
     def answer(self, request: Any) -> None:
         """Answers a request of any kind."""
         header = request.user_header().contents
-        match header.ask:
-            case Ask.DESCRIBE:
+        match header.kind:
+            case RequestKind.DESCRIBE:
                 bounds = self._environments.observation.bounds() + self._environments.action.bounds()
                 self._respond(request, np.concatenate(bounds) if bounds else np.empty(0, np.float32))
-            case Ask.RESET:
+            case RequestKind.RESET:
                 self._begin(request, self._environments.begin_next)
-            case Ask.RESET_TO_TRAINING:
+            case RequestKind.RESET_TO_TRAINING:
                 self._begin(request, lambda blocks: self._environments.begin_training(header.episode, blocks))
-            case Ask.RESET_TO_EVALUATION:
+            case RequestKind.RESET_TO_EVALUATION:
                 self._begin(
                     request,
                     lambda blocks: self._environments.begin_evaluation(header.episode, header.episodes, blocks),
                 )
-            case Ask.STEP | Ask.SNAPSHOT if not self._started:
-                self._send(self._loan(request, 0), Verdict.NOT_STARTED)
-            case Ask.STEP:
+            case RequestKind.STEP | RequestKind.SNAPSHOT if not self._started:
+                self._send(self._loan(request, 0), ResponseStatus.NOT_STARTED)
+            case RequestKind.STEP:
                 self._step(request)
             case _:
                 # Gymnasium's environments cannot say their state: there are no snapshots.
-                self._send(self._loan(request, 0), Verdict.REFUSED)
+                self._send(self._loan(request, 0), ResponseStatus.REFUSED)
 
     def _begin(self, request: Any, begin: Callable[[Blocks], None]) -> None:
         response, blocks = self._loan_blocks(request)
@@ -79,7 +79,7 @@ class Server:
             self._invalid(request, reason)
             return
         self._started = True
-        self._send(response, Verdict.ANSWERED)
+        self._send(response, ResponseStatus.ANSWERED)
 
     def _step(self, request: Any) -> None:
         environments = self._environments
@@ -100,22 +100,22 @@ class Server:
             self._invalid(request, reason)
             return
         self._stepped += len(environments)
-        self._send(response, Verdict.ANSWERED)
+        self._send(response, ResponseStatus.ANSWERED)
 
     def _invalid(self, request: Any, reason: Invalid) -> None:
         """The episodes end here: the client begins new ones."""
         print(f"error: {reason}", file=sys.stderr, flush=True)
         self._started = False
-        self._send(self._loan(request, 0), Verdict.INVALID)
+        self._send(self._loan(request, 0), ResponseStatus.INVALID)
 
     def _refuse(self, request: Any, reason: str) -> None:
         print(f"a request was refused: {reason}", file=sys.stderr, flush=True)
-        self._send(self._loan(request, 0), Verdict.REFUSED)
+        self._send(self._loan(request, 0), ResponseStatus.REFUSED)
 
     def _respond(self, request: Any, numbers: NDArray[np.float32]) -> None:
         response = self._loan(request, len(numbers))
         _numbers(response.payload())[:] = numbers
-        self._send(response, Verdict.ANSWERED)
+        self._send(response, ResponseStatus.ANSWERED)
 
     def _loan(self, request: Any, length: int) -> Any:
         return request.loan_slice_uninit(length)
@@ -125,10 +125,10 @@ class Server:
         response = self._loan(request, Blocks.length(count, width))
         return response, Blocks.of(_numbers(response.payload()), count, width)
 
-    def _send(self, response: Any, verdict: Verdict) -> None:
+    def _send(self, response: Any, status: ResponseStatus) -> None:
         environments = self._environments
         response.user_header()[0] = ResponseHeader(
-            verdict=verdict,
+            status=status,
             environments=len(environments),
             discrete_observations=environments.observation.discrete,
             observation_width=environments.observation.width,

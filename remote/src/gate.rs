@@ -1,5 +1,5 @@
-//! The gate, a role on the learner's host. To the learner it is each actor of the other hosts: it passes on their chunks,
-//! each exactly once and in order. To the hosts it tells what has become of the chunks, and gives them the newest policy.
+//! The gate, a role on the learner's host. To the learner it is each actor of the other hosts: it forwards their chunks,
+//! each exactly once and in order. It acknowledges the chunks to the hosts, and sends them the newest policy.
 
 use std::collections::HashMap;
 use std::fmt;
@@ -8,16 +8,16 @@ use std::sync::mpsc::{Receiver, Sender, channel};
 use std::time::{Duration, Instant};
 
 use shoal_common::channel::control::{
-    Answer, HostLease, HostRequest, HostState, HostStatus, Question, RoleState, RoleStatus,
+    ControlRequest, ControlResponse, HostLease, HostRequest, HostState, HostStatus, RoleState, RoleStatus,
 };
-use shoal_common::channel::policy::{Policy, PolicyReader};
+use shoal_common::channel::policy::{PolicyReader, PublishedPolicy};
 use shoal_common::channel::reports::Reporter;
 use shoal_common::channel::transitions::ChunkForwarder;
 use shoal_common::channel::{ChannelError, Domain, EventName, HeartbeatSender, Notifier};
 use shoal_common::commit::{CommitReader, OpenError};
 use shoal_common::config::{Config, Mode};
 use shoal_common::policy::PolicyError;
-use shoal_common::report::{Activity, EpisodeReport, Heartbeat, Identity, Role};
+use shoal_common::report::{Activity, EpisodeReport, Heartbeat, Role, RoleInstance};
 use shoal_common::run_dir::{RunDir, RunDirError};
 use shoal_common::stop::Stop;
 use zenoh::pubsub::Publisher;
@@ -25,47 +25,47 @@ use zenoh::qos::{CongestionControl, Priority};
 use zenoh::query::Query;
 use zenoh::{Session, Wait};
 
-use crate::bucket::Bucket;
 use crate::endpoint::Endpoint;
 use crate::files::KeyFile;
-use crate::forwarding::{Forwarding, Offer};
+use crate::forwarding::{ChunkOrder, Forwarding};
 use crate::network::{self, NetworkError, failed};
+use crate::rate_limiter::RateLimiter;
 use crate::refused;
-use crate::requests::Requests;
+use crate::requests::LauncherRequests;
 use crate::wire::vector_instructions;
 use crate::wire::{
-    ActorMarks, Admission, Hello, HostReport, Lease, Marks, Message, Phase, PolicyQuestion, WireChunk, WireError,
-    WirePolicy,
+    Acknowledgement, ActorAcknowledgement, Admission, Hello, HostReport, Lease, Message, PolicyRequest, RunPhase,
+    WireChunk, WireError, WirePolicy,
 };
 
-/// The least and the greatest time between two messages of marks to a host.
-const MARKS_APART: Duration = Duration::from_millis(1);
-const MARKS_WITHIN: Duration = Duration::from_millis(100);
+/// The least and the greatest time between two acknowledgements to a host.
+const SHORTEST_ACKNOWLEDGEMENT_INTERVAL: Duration = Duration::from_millis(1);
+const LONGEST_ACKNOWLEDGEMENT_INTERVAL: Duration = Duration::from_millis(100);
 
 /// How long to sleep while chunks wait to be committed: at first, and at most while nothing is committed.
 const SHORTEST_SLEEP: Duration = Duration::from_micros(200);
 const LONGEST_SLEEP: Duration = Duration::from_millis(20);
 
 /// How often to refresh connections, which a restarted learner needs.
-const REFRESH: Duration = Duration::from_millis(50);
+const REFRESH_INTERVAL: Duration = Duration::from_millis(50);
 
-/// How often the launcher is told how the hosts are.
-const STATUS: Duration = Duration::from_millis(500);
+/// How often the launcher gets the status of the hosts.
+const STATUS_INTERVAL: Duration = Duration::from_millis(500);
 
 /// A host that is silent for this long is cut off, or gone.
-const CUT_OFF: Duration = Duration::from_secs(3);
+const CUT_OFF_AFTER: Duration = Duration::from_secs(3);
 
 /// How long a query for a policy is kept before the host has to ask again.
 const POLICY_PATIENCE: Duration = Duration::from_secs(8);
 
 /// How long the hosts may take to hand over what they have when the run is over.
-const HAND_OVER: Duration = Duration::from_secs(5);
+const HAND_OVER_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// How often a host that sends wrong chunks, or a connection that was refused, is named.
-const WARN_AGAIN: Duration = Duration::from_secs(10);
+/// The least time between two warnings about wrong chunks of a host, or about refused connections.
+const WARNING_INTERVAL: Duration = Duration::from_secs(10);
 
-/// How long at least to say that the run is over.
-const LAST_WORDS: Duration = Duration::from_secs(1);
+/// How long at least to announce that the run is over.
+const END_ANNOUNCEMENT: Duration = Duration::from_secs(1);
 
 /// Bytes a second that policies may take, for all hosts together.
 const POLICY_BANDWIDTH: f64 = 30e6;
@@ -74,7 +74,7 @@ const POLICY_BANDWIDTH: f64 = 30e6;
 #[derive(Clone, Debug)]
 pub struct GateSettings {
     /// Which process this is.
-    pub identity: Identity,
+    pub instance: RoleInstance,
     /// The run's configuration.
     pub config: Config,
     /// The run's directory.
@@ -125,24 +125,26 @@ enum Arrival {
 /// A host that is admitted.
 struct Host {
     lease: HostLease,
-    marks: Publisher<'static>,
-    last_marks: Vec<ActorMarks>,
-    marked: Instant,
-    /// Marks are sent soon, whether they have changed or not.
-    due: bool,
-    heard: Instant,
-    report: u64,
-    left: bool,
-    newest: Option<HostReport>,
-    warned: Option<Instant>,
-    /// Rows that were passed on, and the same with the time of the last status.
-    rows: u64,
-    counted: (Instant, u64),
-    rate: f64,
+    acknowledgements: Publisher<'static>,
+    last_acknowledged: Vec<ActorAcknowledgement>,
+    acknowledged_at: Instant,
+    /// An acknowledgement is sent soon, whether anything has changed or not.
+    acknowledgement_due: bool,
+    heard_at: Instant,
+    /// The number of its last report.
+    last_report: u64,
+    has_left: bool,
+    newest_report: Option<HostReport>,
+    warned_at: Option<Instant>,
+    /// Rows that were forwarded to the learner.
+    forwarded_rows: u64,
+    /// The time of the last status, and `forwarded_rows` at that time.
+    rows_at_last_status: (Instant, u64),
+    rows_per_second: f64,
     /// The steps of its processes at the last status.
-    steps: HashMap<(Role, u32), (u64, u64)>,
-    /// A query for a policy, and the one that the host has.
-    wants: Option<(Query, PolicyId, Instant)>,
+    steps_at_last_status: HashMap<(Role, u32), (u64, u64)>,
+    /// Its query for a policy, the policy that it has, and when the query arrived.
+    policy_query: Option<(Query, PolicyId, Instant)>,
 }
 
 /// The learner's incarnation and the version of a policy, if there is one.
@@ -156,8 +158,8 @@ struct RemoteActor {
     forwarding: Forwarding,
 }
 
-/// What a question to the launcher was about.
-enum Matter {
+/// What a request to the launcher was about.
+enum PendingRequest {
     Join(Box<Query>, Hello),
     Hosts,
 }
@@ -168,7 +170,7 @@ struct Gate<'a> {
     stop: &'a Stop,
     session: Session,
     arrivals: Receiver<Arrival>,
-    requests: Requests<Matter>,
+    requests: LauncherRequests<PendingRequest>,
     /// Of the launcher; `None` before its first answer.
     epoch: Option<u64>,
     hosts: HashMap<u64, Host>,
@@ -176,22 +178,25 @@ struct Gate<'a> {
     replay: CommitReader,
     policy: PolicyReader,
     /// The policy that was sent last, as bytes.
-    encoded: Option<(PolicyId, Arc<Vec<u8>>)>,
-    bucket: Bucket,
-    /// Version of the learner's newest policy, as far as it was looked at.
+    encoded_policy: Option<(PolicyId, Arc<Vec<u8>>)>,
+    policy_limiter: RateLimiter,
+    /// Version of the newest policy that was read from the learner.
     policy_version: u64,
-    learner: Notifier,
+    learner_notifier: Notifier,
     heartbeat: HeartbeatSender,
     heartbeats: Reporter<Heartbeat>,
     episodes: Reporter<EpisodeReport>,
-    marks: u64,
+    /// The number of the last acknowledgement.
+    acknowledgements_sent: u64,
     /// When something wrong was last named.
-    warned: Option<Instant>,
-    over: Option<Instant>,
-    refreshed: Instant,
-    told: Option<Instant>,
-    /// The launcher has not answered yet.
-    asking: bool,
+    warned_at: Option<Instant>,
+    /// Since when the run is over.
+    over_since: Option<Instant>,
+    connections_refreshed_at: Instant,
+    /// When the launcher last got the status of the hosts.
+    reported_to_launcher_at: Option<Instant>,
+    /// The launcher has not answered the last report on the hosts yet.
+    launcher_owes_answer: bool,
     sleep: Duration,
 }
 
@@ -210,7 +215,7 @@ impl<'a> Gate<'a> {
     /// `None` if it was asked to end before there was a replay.
     fn new(domain: &'a Domain, settings: &'a GateSettings, stop: &'a Stop) -> Result<Option<Self>, GateError> {
         let (config, run) = (&settings.config, &settings.run);
-        let mut heartbeat = HeartbeatSender::new(domain, settings.identity)?;
+        let mut heartbeat = HeartbeatSender::new(domain, settings.instance)?;
         let replay = loop {
             match CommitReader::open(&run.replay_file()) {
                 Ok(replay) => break replay,
@@ -221,7 +226,7 @@ impl<'a> Gate<'a> {
         };
         let layout = config.policy_layout()?;
         let policy = PolicyReader::open(domain, layout.fingerprint(), layout.parameters())?;
-        let requests = Requests::start(&config.run.id, config.actors.max, run.key()?)?;
+        let requests = LauncherRequests::start(&config.run.id, config.actors.max, run.key()?)?;
         let session = network::listen(&settings.endpoint, settings.key.as_ref())?;
         let (sender, arrivals) = channel();
         declare(&session, &config.run.id, &sender)?;
@@ -239,19 +244,19 @@ impl<'a> Gate<'a> {
             actors: HashMap::new(),
             replay,
             policy,
-            encoded: None,
-            bucket: Bucket::new(POLICY_BANDWIDTH, Instant::now()),
+            encoded_policy: None,
+            policy_limiter: RateLimiter::new(POLICY_BANDWIDTH, Instant::now()),
             policy_version: 0,
-            learner: Notifier::new(domain, EventName(Role::Learner, 0))?,
+            learner_notifier: Notifier::new(domain, EventName(Role::Learner, 0))?,
             heartbeat,
             heartbeats: Reporter::open(domain)?,
             episodes: Reporter::open(domain)?,
-            marks: 0,
-            warned: None,
-            over: None,
-            refreshed: Instant::now(),
-            told: None,
-            asking: false,
+            acknowledgements_sent: 0,
+            warned_at: None,
+            over_since: None,
+            connections_refreshed_at: Instant::now(),
+            reported_to_launcher_at: None,
+            launcher_owes_answer: false,
             sleep: LONGEST_SLEEP,
         }))
     }
@@ -261,21 +266,21 @@ impl<'a> Gate<'a> {
             // The senders stay as long as the session, which is ours.
             let first = self.arrivals.recv_timeout(self.sleep).ok();
             let more: Vec<Arrival> = self.arrivals.try_iter().collect();
-            let mut passed_on = 0;
+            let mut forwarded_rows = 0;
             for arrival in first.into_iter().chain(more) {
-                passed_on += self.take(arrival)?;
+                forwarded_rows += self.take(arrival)?;
             }
-            if passed_on > 0 {
-                self.learner.notify();
-                self.heartbeat.count(passed_on);
+            if forwarded_rows > 0 {
+                self.learner_notifier.notify();
+                self.heartbeat.count(forwarded_rows);
             }
             self.take_answers()?;
-            let progress = self.look_at_commits();
-            self.send_marks()?;
+            let progress = self.read_commits();
+            self.send_acknowledgements()?;
             self.send_policies()?;
-            self.tell_launcher();
+            self.report_to_launcher();
             self.refresh_connections()?;
-            self.choose_sleep(passed_on > 0 || progress);
+            self.choose_sleep(forwarded_rows > 0 || progress);
             if self.is_done() {
                 return Ok(());
             }
@@ -291,14 +296,14 @@ impl<'a> Gate<'a> {
         if self.stop.at_once() {
             return true;
         }
-        let since = *self.over.get_or_insert_with(Instant::now);
-        // A host that was away until now learns of the end too, if it is back.
-        let told = since.elapsed() >= LAST_WORDS;
-        let gone = |host: &Host| host.left || (told && host.heard.elapsed() >= CUT_OFF);
-        since.elapsed() >= HAND_OVER || self.hosts.values().all(gone)
+        let since = *self.over_since.get_or_insert_with(Instant::now);
+        // The announcement also reaches a host that reconnects meanwhile.
+        let was_announced = since.elapsed() >= END_ANNOUNCEMENT;
+        let gone = |host: &Host| host.has_left || (was_announced && host.heard_at.elapsed() >= CUT_OFF_AFTER);
+        since.elapsed() >= HAND_OVER_TIMEOUT || self.hosts.values().all(gone)
     }
 
-    /// Handles what a host has sent. Returns the rows that were passed on to the learner.
+    /// Handles what a host has sent. Returns the rows that were forwarded to the learner.
     fn take(&mut self, arrival: Arrival) -> Result<u64, GateError> {
         match arrival {
             Arrival::Chunk(bytes) => return self.take_chunk(&bytes),
@@ -326,7 +331,7 @@ impl<'a> Gate<'a> {
         let Some(host) = self.hosts.get_mut(&chunk.host).filter(|_| actor.host == chunk.host) else {
             return Ok(0);
         };
-        host.heard = Instant::now();
+        host.heard_at = Instant::now();
         // A host that was admitted again still has processes that an earlier launcher has given incarnations to.
         let ours = chunk.header.incarnation < host.lease.limit;
         // Until there is a way to the learner, the host sends it again.
@@ -337,8 +342,8 @@ impl<'a> Gate<'a> {
         let finite = |rows: &[f32]| rows.iter().all(|number| number.is_finite());
         if !(ours && parts.is_some_and(|(rows, _)| finite(rows))) {
             // The host repeats it again and again.
-            if host.warned.is_none_or(|warned| warned.elapsed() >= WARN_AGAIN) {
-                host.warned = Some(Instant::now());
+            if host.warned_at.is_none_or(|warned| warned.elapsed() >= WARNING_INTERVAL) {
+                host.warned_at = Some(Instant::now());
                 tracing::warn!(
                     "host {} sent a chunk of actor {} that no actor of this run sends; it is ignored",
                     host.lease.name,
@@ -347,27 +352,27 @@ impl<'a> Gate<'a> {
             }
             return Ok(0);
         }
-        if actor.forwarding.offer(chunk.mark()) != Offer::Next {
+        if actor.forwarding.offer(chunk.id()) != ChunkOrder::Next {
             return Ok(0);
         }
         forwarder.send(chunk.header, &chunk.numbers)?;
-        host.rows += u64::from(chunk.header.rows);
-        host.due = true;
+        host.forwarded_rows += u64::from(chunk.header.rows);
+        host.acknowledgement_due = true;
         Ok(chunk.header.rows.into())
     }
 
     fn take_report(&mut self, report: HostReport) -> Result<(), GateError> {
         let Some(host) = self.hosts.get_mut(&report.host) else {
-            // It learns that it must ask to be admitted.
-            return self.send_empty_marks(report.host);
+            // The empty acknowledgement makes it ask to be admitted.
+            return self.acknowledge_nothing(report.host);
         };
-        host.heard = Instant::now();
-        if report.number <= host.report {
+        host.heard_at = Instant::now();
+        if report.number <= host.last_report {
             return Ok(());
         }
-        host.report = report.number;
-        host.due = true;
-        host.left = report.leaving;
+        host.last_report = report.number;
+        host.acknowledgement_due = true;
+        host.has_left = report.leaving;
         for role in &report.roles {
             if role.role == Role::Actor && host.lease.actors.contains(&role.index) {
                 self.heartbeats.send(role.heartbeat());
@@ -378,7 +383,7 @@ impl<'a> Gate<'a> {
                 self.episodes.send((*episode).into());
             }
         }
-        host.newest = Some(report);
+        host.newest_report = Some(report);
         Ok(())
     }
 
@@ -412,37 +417,39 @@ impl<'a> Gate<'a> {
             actors: hello.actors,
             held: hello.held.clone(),
         };
-        self.requests
-            .ask(Question::Admit(request), Matter::Join(Box::new(query), hello));
+        self.requests.ask(
+            ControlRequest::Admit(request),
+            PendingRequest::Join(Box::new(query), hello),
+        );
         Ok(())
     }
 
     fn take_policy_query(&mut self, query: Query) {
         let bytes = query.payload().map(|payload| payload.to_bytes().into_owned());
-        match PolicyQuestion::decode(&bytes.unwrap_or_default()) {
-            Ok(question) => {
-                if let Some(host) = self.hosts.get_mut(&question.host) {
-                    host.wants = Some((query, question.have, Instant::now()));
+        match PolicyRequest::decode(&bytes.unwrap_or_default()) {
+            Ok(request) => {
+                if let Some(host) = self.hosts.get_mut(&request.host) {
+                    host.policy_query = Some((query, request.have, Instant::now()));
                 }
             }
-            Err(error) => self.warn(format_args!("a host sent a question that is not read: {error}")),
+            Err(error) => self.warn(format_args!("a host sent a request that is not read: {error}")),
         }
     }
 
-    /// Warns once in a while: somebody may repeat what is wrong without end.
+    /// Warns, but at most once in [`WARNING_INTERVAL`]: a host may repeat the same fault without end.
     fn warn(&mut self, what: fmt::Arguments<'_>) {
-        if self.warned.is_none_or(|warned| warned.elapsed() >= WARN_AGAIN) {
-            self.warned = Some(Instant::now());
+        if self.warned_at.is_none_or(|warned| warned.elapsed() >= WARNING_INTERVAL) {
+            self.warned_at = Some(Instant::now());
             tracing::warn!("{what}");
         }
     }
 
     /// Takes what the launcher has answered.
     fn take_answers(&mut self) -> Result<(), GateError> {
-        while let Some((answer, matter)) = self.requests.answer() {
-            self.asking &= !matches!(matter, Matter::Hosts);
-            match (answer, matter) {
-                (Ok(Answer::Admitted(lease)), Matter::Join(query, hello)) => {
+        while let Some((answer, pending)) = self.requests.answer() {
+            self.launcher_owes_answer &= !matches!(pending, PendingRequest::Hosts);
+            match (answer, pending) {
+                (Ok(ControlResponse::Admitted(lease)), PendingRequest::Join(query, hello)) => {
                     tracing::info!(
                         "host {} is admitted with {} actors: {:?}",
                         hello.name,
@@ -461,22 +468,22 @@ impl<'a> Gate<'a> {
                     self.admit(lease)?;
                     answer_join(&query, &Admission::Admitted(answer))?;
                 }
-                (answer, Matter::Join(query, hello)) => {
+                (answer, PendingRequest::Join(query, hello)) => {
                     let why = match answer {
-                        Ok(Answer::Refused(why)) | Err(why) => why,
+                        Ok(ControlResponse::Refused(why)) | Err(why) => why,
                         Ok(other) => format!("the launcher gave an unexpected answer: {other:?}"),
                     };
                     tracing::warn!("host {} is refused: {why}", hello.name);
                     answer_join(&query, &Admission::Refused(why))?;
                 }
-                (Ok(Answer::Leases { epoch, leases }), Matter::Hosts) => {
+                (Ok(ControlResponse::Leases { epoch, leases }), PendingRequest::Hosts) => {
                     self.epoch = Some(epoch);
                     let released = |host: &u64| !leases.iter().any(|lease| lease.host == *host);
                     let gone: Vec<u64> = self.hosts.keys().copied().filter(released).collect();
                     gone.iter().for_each(|host| self.release(*host));
                     leases.into_iter().try_for_each(|lease| self.admit(lease))?;
                 }
-                (answer, Matter::Hosts) => {
+                (answer, PendingRequest::Hosts) => {
                     tracing::debug!("the launcher did not say which hosts are admitted: {answer:?}")
                 }
             }
@@ -489,7 +496,7 @@ impl<'a> Gate<'a> {
         if self.hosts.get(&lease.host).is_some_and(|host| host.lease == lease) {
             return Ok(());
         }
-        let report = self.hosts.get(&lease.host).map_or(0, |host| host.report);
+        let report = self.hosts.get(&lease.host).map_or(0, |host| host.last_report);
         self.release(lease.host);
         let config = &self.settings.config;
         for actor in &lease.actors {
@@ -503,20 +510,20 @@ impl<'a> Gate<'a> {
         }
         let now = Instant::now();
         let host = Host {
-            marks: marks_publisher(&self.session, &config.run.id, lease.host)?,
-            last_marks: Vec::new(),
-            marked: now,
-            due: true,
-            heard: now,
-            report,
-            left: false,
-            newest: None,
-            warned: None,
-            rows: 0,
-            counted: (now, 0),
-            rate: 0.0,
-            steps: HashMap::new(),
-            wants: None,
+            acknowledgements: acknowledgement_publisher(&self.session, &config.run.id, lease.host)?,
+            last_acknowledged: Vec::new(),
+            acknowledged_at: now,
+            acknowledgement_due: true,
+            heard_at: now,
+            last_report: report,
+            has_left: false,
+            newest_report: None,
+            warned_at: None,
+            forwarded_rows: 0,
+            rows_at_last_status: (now, 0),
+            rows_per_second: 0.0,
+            steps_at_last_status: HashMap::new(),
+            policy_query: None,
             lease,
         };
         self.hosts.insert(host.lease.host, host);
@@ -541,7 +548,7 @@ impl<'a> Gate<'a> {
     }
 
     /// Reads what the learner has committed. Returns whether it is news.
-    fn look_at_commits(&mut self) -> bool {
+    fn read_commits(&mut self) -> bool {
         let mut news = false;
         for (index, actor) in &mut self.actors {
             let committed = self.replay.committed(*index as usize);
@@ -553,22 +560,26 @@ impl<'a> Gate<'a> {
         news
     }
 
-    fn send_marks(&mut self) -> Result<(), GateError> {
-        let Some(without_actors) = self.marks_without_actors() else {
+    fn send_acknowledgements(&mut self) -> Result<(), GateError> {
+        let Some(without_actors) = self.acknowledgement_without_actors() else {
             return Ok(());
         };
-        if self.hosts.values().all(|host| host.marked.elapsed() < MARKS_APART) {
+        if self
+            .hosts
+            .values()
+            .all(|host| host.acknowledged_at.elapsed() < SHORTEST_ACKNOWLEDGEMENT_INTERVAL)
+        {
             return Ok(());
         }
-        // Marks and snapshots must belong together.
+        // What is committed and the snapshots must belong together.
         let has_snapshots = self.replay.layout().actor_snapshot_words > 0;
         let record = if has_snapshots { self.replay.snapshot() } else { None };
         if has_snapshots && record.is_none() {
             return Ok(());
         }
         for host in self.hosts.values_mut() {
-            let since = host.marked.elapsed();
-            if since < MARKS_APART {
+            let since = host.acknowledged_at.elapsed();
+            if since < SHORTEST_ACKNOWLEDGEMENT_INTERVAL {
                 continue;
             }
             let of = |actor: &u32| {
@@ -577,46 +588,50 @@ impl<'a> Gate<'a> {
                     Some(record) => (record.actor(index), record.actor_snapshot(index).to_vec()),
                     None => (self.replay.actor(index), Vec::new()),
                 };
-                let got = self
+                let forwarded = self
                     .actors
                     .get(actor)
-                    .map_or(commit.mark, |actor| actor.forwarding.got());
-                ActorMarks {
+                    .map_or(commit.last_chunk, |actor| actor.forwarding.last_forwarded());
+                ActorAcknowledgement {
                     actor: *actor,
-                    committed: (commit.mark.incarnation, commit.mark.sequence),
-                    got: (got.incarnation, got.sequence),
+                    committed: (commit.last_chunk.incarnation, commit.last_chunk.sequence),
+                    forwarded: (forwarded.incarnation, forwarded.sequence),
                     rows: commit.rows,
                     snapshot,
                 }
             };
-            let actors: Vec<ActorMarks> = host.lease.actors.iter().map(of).collect();
-            if !host.due && since < MARKS_WITHIN && actors == host.last_marks {
+            let actors: Vec<ActorAcknowledgement> = host.lease.actors.iter().map(of).collect();
+            if !host.acknowledgement_due && since < LONGEST_ACKNOWLEDGEMENT_INTERVAL && actors == host.last_acknowledged
+            {
                 continue;
             }
-            self.marks += 1;
-            let marks = Marks {
-                number: self.marks,
-                report: host.report,
+            self.acknowledgements_sent += 1;
+            let acknowledgement = Acknowledgement {
+                number: self.acknowledgements_sent,
+                report: host.last_report,
                 actors,
                 ..without_actors.clone()
             };
-            host.marks.put(marks.encode()?).wait().map_err(failed("send marks"))?;
-            host.last_marks = marks.actors;
-            (host.marked, host.due) = (Instant::now(), false);
+            host.acknowledgements
+                .put(acknowledgement.encode()?)
+                .wait()
+                .map_err(failed("send an acknowledgement"))?;
+            host.last_acknowledged = acknowledgement.actors;
+            (host.acknowledged_at, host.acknowledgement_due) = (Instant::now(), false);
         }
         Ok(())
     }
 
-    /// What the next marks have in common, whichever host they are for. `None` before the launcher has answered.
-    fn marks_without_actors(&self) -> Option<Marks> {
-        Some(Marks {
+    /// What the next acknowledgement has, whichever host it is for. `None` before the launcher has answered.
+    fn acknowledgement_without_actors(&self) -> Option<Acknowledgement> {
+        Some(Acknowledgement {
             epoch: self.epoch?,
-            gate: self.settings.identity.incarnation,
-            number: self.marks + 1,
-            phase: if self.over.is_some() {
-                Phase::Over
+            gate: self.settings.instance.incarnation,
+            number: self.acknowledgements_sent + 1,
+            phase: if self.over_since.is_some() {
+                RunPhase::Over
             } else {
-                Phase::Running
+                RunPhase::Running
             },
             rows: self.replay.rows(),
             report: 0,
@@ -624,23 +639,29 @@ impl<'a> Gate<'a> {
         })
     }
 
-    /// Marks for a host that is not admitted, which have no actors.
-    fn send_empty_marks(&mut self, host: u64) -> Result<(), GateError> {
-        let Some(marks) = self.marks_without_actors() else {
+    /// An acknowledgement without actors, for a host that is not admitted.
+    fn acknowledge_nothing(&mut self, host: u64) -> Result<(), GateError> {
+        let Some(acknowledgement) = self.acknowledgement_without_actors() else {
             return Ok(());
         };
-        self.marks = marks.number;
-        let publisher = marks_publisher(&self.session, &self.settings.config.run.id, host)?;
-        publisher.put(marks.encode()?).wait().map_err(failed("send marks"))?;
+        self.acknowledgements_sent = acknowledgement.number;
+        let publisher = acknowledgement_publisher(&self.session, &self.settings.config.run.id, host)?;
+        publisher
+            .put(acknowledgement.encode()?)
+            .wait()
+            .map_err(failed("send an acknowledgement"))?;
         Ok(())
     }
 
     /// Answers the queries for a policy that is there, as far as the bandwidth allows.
     fn send_policies(&mut self) -> Result<(), GateError> {
-        self.hosts
-            .values_mut()
-            .for_each(|host| drop(host.wants.take_if(|(.., since)| since.elapsed() >= POLICY_PATIENCE)));
-        if self.hosts.values().all(|host| host.wants.is_none()) {
+        self.hosts.values_mut().for_each(|host| {
+            drop(
+                host.policy_query
+                    .take_if(|(.., since)| since.elapsed() >= POLICY_PATIENCE),
+            )
+        });
+        if self.hosts.values().all(|host| host.policy_query.is_none()) {
             return Ok(());
         }
         let Some(newest) = self.policy.latest()? else {
@@ -649,37 +670,42 @@ impl<'a> Gate<'a> {
         self.policy_version = newest.header().version;
         let id = Some((newest.header().incarnation, newest.header().version));
         for host in self.hosts.values_mut() {
-            if host.wants.as_ref().is_none_or(|(_, have, _)| id == *have) {
+            if host.policy_query.as_ref().is_none_or(|(_, have, _)| id == *have) {
                 continue;
             }
-            let bytes = encoded(&mut self.encoded, &newest);
-            if !self.bucket.take(bytes.len() as f64, Instant::now()) {
+            let bytes = encoded(&mut self.encoded_policy, &newest);
+            if !self.policy_limiter.take(bytes.len() as f64, Instant::now()) {
                 break;
             }
-            if let Some((query, ..)) = host.wants.take() {
+            if let Some((query, ..)) = host.policy_query.take() {
                 answer_policy(query, bytes)?;
             }
         }
         Ok(())
     }
 
-    /// Tells the launcher how the hosts are, and asks which are admitted.
-    fn tell_launcher(&mut self) {
-        if self.asking || self.told.is_some_and(|told| told.elapsed() < STATUS) {
+    /// Sends the launcher the status of the hosts, and asks which are admitted.
+    fn report_to_launcher(&mut self) {
+        if self.launcher_owes_answer
+            || self
+                .reported_to_launcher_at
+                .is_some_and(|at| at.elapsed() < STATUS_INTERVAL)
+        {
             return;
         }
-        (self.told, self.asking) = (Some(Instant::now()), true);
+        (self.reported_to_launcher_at, self.launcher_owes_answer) = (Some(Instant::now()), true);
         let newest = self.policy_version;
         let statuses = self.hosts.values_mut().map(|host| host.status(newest)).collect();
-        self.requests.ask(Question::Hosts(statuses), Matter::Hosts);
+        self.requests
+            .ask(ControlRequest::Hosts(statuses), PendingRequest::Hosts);
         self.heartbeat.set_policy_version(newest);
     }
 
     fn refresh_connections(&mut self) -> Result<(), GateError> {
-        if self.refreshed.elapsed() < REFRESH {
+        if self.connections_refreshed_at.elapsed() < REFRESH_INTERVAL {
             return Ok(());
         }
-        self.refreshed = Instant::now();
+        self.connections_refreshed_at = Instant::now();
         if let Some(why) = refused::take() {
             self.warn(format_args!(
                 "a connection was refused: {why}; only who has the run's join.key is let in"
@@ -692,9 +718,9 @@ impl<'a> Gate<'a> {
         self.heartbeats.refresh_connections();
         self.episodes.refresh_connections();
         let waits = self.actors.values().any(|actor| actor.forwarding.is_waiting());
-        let cut_off = |host: &Host| host.heard.elapsed() >= CUT_OFF;
+        let cut_off = |host: &Host| host.heard_at.elapsed() >= CUT_OFF_AFTER;
         self.heartbeat.beat(match waits {
-            // While a host is away, no other process is to blame that all wait.
+            // Waiting for a host that is away is no fault of a process here, so none is replaced for it.
             _ if self.hosts.values().any(cut_off) => Activity::Working,
             true => Activity::WaitingForRatio,
             false => Activity::WaitingForPeer,
@@ -718,18 +744,18 @@ impl<'a> Gate<'a> {
 
 impl Host {
     fn status(&mut self, newest: u64) -> HostStatus {
-        let (then, rows) = self.counted;
+        let (then, rows) = self.rows_at_last_status;
         let seconds = then.elapsed().as_secs_f64();
         if seconds > 0.0 {
-            self.rate = (self.rows - rows) as f64 / seconds;
+            self.rows_per_second = (self.forwarded_rows - rows) as f64 / seconds;
         }
-        self.counted = (Instant::now(), self.rows);
-        let silent = self.heard.elapsed();
-        let cut_off = silent >= CUT_OFF;
+        self.rows_at_last_status = (Instant::now(), self.forwarded_rows);
+        let silent = self.heard_at.elapsed();
+        let cut_off = silent >= CUT_OFF_AFTER;
         let mut roles = Vec::new();
-        for role in self.newest.iter().flat_map(|report| &report.roles) {
+        for role in self.newest_report.iter().flat_map(|report| &report.roles) {
             let key = (role.role, role.index);
-            let before = self.steps.insert(key, (role.incarnation, role.steps));
+            let before = self.steps_at_last_status.insert(key, (role.incarnation, role.steps));
             let taken = before
                 .filter(|(incarnation, _)| *incarnation == role.incarnation)
                 .map_or(0, |(_, steps)| role.steps.saturating_sub(steps));
@@ -748,17 +774,17 @@ impl Host {
                 policy_lag: (role.role == Role::Actor).then(|| newest.saturating_sub(role.policy_version)),
             });
         }
-        let report = self.newest.as_ref();
+        let report = self.newest_report.as_ref();
         HostStatus {
             host: self.lease.host,
             name: self.lease.name.clone(),
-            state: match (self.left, cut_off) {
+            state: match (self.has_left, cut_off) {
                 (true, _) => HostState::Left,
                 (false, true) => HostState::CutOff,
                 (false, false) => HostState::Connected,
             },
             actors: self.lease.actors.len() as u32,
-            rows_per_second: self.rate,
+            rows_per_second: self.rows_per_second,
             resent_chunks: report.map_or(0, |report| report.resent),
             round_trip_us: report.and_then(|report| report.round_trip_us),
             policy_lag: report.map_or(0, |report| newest.saturating_sub(report.policy_version)),
@@ -811,15 +837,15 @@ fn declare(session: &Session, run_id: &str, arrivals: &Sender<Arrival>) -> Resul
         .map_err(failed("be asked"))
 }
 
-/// Only the newest marks count, and they are repeated, so they may be dropped where the network is busy.
-fn marks_publisher(session: &Session, run_id: &str, host: u64) -> Result<Publisher<'static>, NetworkError> {
+/// Only the newest acknowledgement counts, and it is repeated, so one may be dropped where the network is busy.
+fn acknowledgement_publisher(session: &Session, run_id: &str, host: u64) -> Result<Publisher<'static>, NetworkError> {
     session
-        .declare_publisher(network::marks(run_id, host))
+        .declare_publisher(network::acknowledgements(run_id, host))
         .congestion_control(CongestionControl::Drop)
         .priority(Priority::InteractiveHigh)
         .express(true)
         .wait()
-        .map_err(failed("send marks"))
+        .map_err(failed("send an acknowledgement"))
 }
 
 fn answer_join(query: &Query, admission: &Admission) -> Result<(), GateError> {
@@ -844,7 +870,7 @@ fn answer_policy(query: Query, bytes: Arc<Vec<u8>>) -> Result<(), GateError> {
     Ok(())
 }
 
-fn encoded(cache: &mut Option<(PolicyId, Arc<Vec<u8>>)>, newest: &Policy) -> Arc<Vec<u8>> {
+fn encoded(cache: &mut Option<(PolicyId, Arc<Vec<u8>>)>, newest: &PublishedPolicy) -> Arc<Vec<u8>> {
     let id = Some((newest.header().incarnation, newest.header().version));
     if let Some((_, bytes)) = cache.as_ref().filter(|(cached, _)| *cached == id) {
         return bytes.clone();

@@ -3,14 +3,14 @@
 //! speak over a network; no other role knows of it.
 //!
 //! A chunk is committed exactly once, whatever the network loses, repeats or reorders, and whichever process dies:
-//! [`unconfirmed`] is the sending half of the protocol, [`forwarding`] the receiving half, and [`wire`] the bytes between
-//! them. These need no network. Gate and relay themselves are built with the feature `network`.
+//! [`uncommitted`] is the sending half of the protocol, [`forwarding`] the receiving half, and [`wire`] the bytes
+//! between them. These need no network. Gate and relay themselves are built with the feature `network`.
 
-pub mod bucket;
 pub mod endpoint;
 pub mod files;
 pub mod forwarding;
-pub mod unconfirmed;
+pub mod rate_limiter;
+pub mod uncommitted;
 pub mod wire;
 
 #[cfg(feature = "network")]

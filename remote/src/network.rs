@@ -2,7 +2,7 @@
 //!
 //! Zenoh carries bytes: it finds a way, connects again, encrypts, and separates messages. It may lose, repeat or reorder
 //! whole messages when a connection breaks, and a `put` succeeds while nobody is connected. What makes chunks arrive
-//! exactly once is in [`crate::unconfirmed`] and [`crate::forwarding`].
+//! exactly once is in [`crate::uncommitted`] and [`crate::forwarding`].
 
 use std::os::unix::process::CommandExt;
 use std::process::Command;
@@ -87,13 +87,13 @@ pub(crate) fn reports(run_id: &str, host: &str) -> String {
     format!("shoal/{run_id}/up/{host}/reports")
 }
 
-/// Marks for a host.
-pub(crate) fn marks(run_id: &str, host: u64) -> String {
+/// Acknowledgements for a host.
+pub(crate) fn acknowledgements(run_id: &str, host: u64) -> String {
     format!("shoal/{run_id}/down/{host}/marks")
 }
 
 /// A session that waits for others at this endpoint. With a key, only hosts with the run's key are let in, and they may do
-/// nothing but join, send chunks and reports, and receive marks and policies.
+/// nothing but join, send chunks and reports, and receive acknowledgements and policies.
 ///
 /// # Errors
 /// When the endpoint is taken, or the key cannot be used.
@@ -193,7 +193,7 @@ fn open(ours: &[(&str, serde_json::Value)], action: &'static str) -> Result<Sess
         ("scouting/gossip/enabled", json!(false)),
         // A host that vanishes is noticed after this many milliseconds.
         ("transport/link/tx/lease", json!(3000)),
-        // Marks must not wait in the kernel behind a policy.
+        // Acknowledgements must not wait in the kernel behind a policy.
         ("transport/link/tcp/so_sndbuf", json!(65536)),
     ];
     for (key, value) in common.iter().chain(ours) {

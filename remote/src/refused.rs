@@ -1,5 +1,5 @@
-//! What the network engine notes about connections that it refuses. It does so in its own words, and once for each attempt;
-//! the gate says it once in a while, in ours.
+//! What the network engine notes about connections that it refuses. It does so in its own words, and once for each
+//! attempt. The gate logs it in ours, and not more often than it logs other warnings.
 
 use std::fmt::{Debug, Write};
 use std::sync::{Mutex, PoisonError};

@@ -8,14 +8,14 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
-use shoal_common::channel::control::Question;
+use shoal_common::channel::control::ControlRequest;
 use shoal_common::channel::policy::PolicyPublisher;
 use shoal_common::channel::reports::Reports;
 use shoal_common::channel::transitions::ChunkReceiver;
 use shoal_common::channel::{ChannelError, Domain, EventName, HeartbeatSender, Listener, Notifier};
-use shoal_common::commit::{ActorCommit, ChunkMark, CommitMirror, ReplayLayout};
+use shoal_common::commit::{ActorCommit, ChunkId, CommitMirror, ReplayLayout};
 use shoal_common::config::Config;
-use shoal_common::report::{Activity, EpisodeReport, Heartbeat, Identity, Role};
+use shoal_common::report::{Activity, EpisodeReport, Heartbeat, Role, RoleInstance};
 use shoal_common::run_dir::{RunDir, RunDirError};
 use shoal_common::stop::Stop;
 use zenoh::bytes::ZBytes;
@@ -26,51 +26,51 @@ use zenoh::{Session, Wait};
 use crate::files::{FileError, HostFile, KeyFile};
 use crate::join::ask_to_join;
 use crate::network::{self, NetworkError, failed};
-use crate::requests::Requests;
-use crate::unconfirmed::{Consequence, Unconfirmed};
+use crate::requests::LauncherRequests;
+use crate::uncommitted::{ActorFollowUp, UncommittedChunks};
 use crate::wire::vector_instructions;
 use crate::wire::{
-    Admission, Hello, HostReport, Marks, Message, Phase, PolicyQuestion, RemoteEpisode, RemoteRole, WireChunk,
-    WireError, WirePolicy, mark_of,
+    Acknowledgement, Admission, Hello, HostReport, Message, PolicyRequest, RemoteEpisode, RemoteRole, RunPhase,
+    WireChunk, WireError, WirePolicy, id_of,
 };
 
-/// The gate is away if it has sent no marks for this long.
-const CUT_OFF: Duration = Duration::from_secs(3);
+/// The gate is away if it has sent no acknowledgement for this long.
+const CUT_OFF_AFTER: Duration = Duration::from_secs(3);
 
 /// Chunks are sent again if the gate has got none for this long; or for some round trips, if that is longer.
-const PATIENCE: Duration = Duration::from_millis(200);
-const ROUND_TRIPS: u32 = 4;
+const RESEND_AFTER: Duration = Duration::from_millis(200);
+const RESEND_AFTER_ROUND_TRIPS: u32 = 4;
 
 /// Time between two reports.
-const REPORTS: Duration = Duration::from_millis(250);
+const REPORT_INTERVAL: Duration = Duration::from_millis(250);
 
 /// How long to wait for news before looking at everything again.
-const SLEEP: Duration = Duration::from_millis(20);
+const LONGEST_SLEEP: Duration = Duration::from_millis(20);
 
 /// How often to refresh connections.
-const REFRESH: Duration = Duration::from_millis(50);
+const REFRESH_INTERVAL: Duration = Duration::from_millis(50);
 
 /// Chunks on their way to the thread that sends them.
-const SENDING: usize = 64;
+const CHUNK_QUEUE_LENGTH: usize = 64;
 
 /// Episodes kept for the next report; more are dropped while the gate is away.
-const EPISODES: usize = 10_000;
+const MAX_KEPT_EPISODES: usize = 10_000;
 
 /// How long a query for a policy may take, and the pause after one without an answer.
-const POLICY_QUERY: Duration = Duration::from_secs(10);
+const POLICY_QUERY_TIMEOUT: Duration = Duration::from_secs(10);
 const POLICY_PAUSE: Duration = Duration::from_millis(50);
 
 /// How long the gate may take to get the last chunks. It waits a little longer for its hosts.
-const HAND_OVER: Duration = Duration::from_secs(3);
+const HAND_OVER_TIMEOUT: Duration = Duration::from_secs(3);
 
 /// How long to wait before asking again to be admitted.
-const JOIN_AGAIN: Duration = Duration::from_secs(1);
+const REJOIN_INTERVAL: Duration = Duration::from_secs(1);
 
 /// What the relay needs.
 #[derive(Clone, Debug)]
 pub struct RelaySettings {
     /// Which process this is.
-    pub identity: Identity,
+    pub instance: RoleInstance,
     /// The run's configuration, as on this host.
     pub config: Config,
     /// The host's directory.
@@ -112,9 +112,9 @@ pub enum RelayError {
 
 /// Something that has come from the gate.
 enum Arrival {
-    Marks(Vec<u8>),
+    Acknowledgement(Vec<u8>),
     Policy(Vec<u8>),
-    /// The answer to the question whether this host is still admitted.
+    /// The answer to the request whether this host is still admitted.
     Admission(Result<Admission, String>),
 }
 
@@ -127,16 +127,16 @@ struct Wake {
 
 impl Wake {
     fn send(&self, arrival: Arrival) {
-        // Both fail only while the relay ends, or if it has been woken a great many times already.
+        // Both fail only while the relay ends, or if the counter of wake-ups is full, which wakes it as well.
         let _ = self.arrivals.send(arrival);
         let _ = rustix::io::write(&self.event, &1_u64.to_ne_bytes());
     }
 }
 
 /// An actor of this host.
-struct Source {
+struct LocalActor {
     receiver: ChunkReceiver,
-    unconfirmed: Unconfirmed<ZBytes>,
+    uncommitted: UncommittedChunks<ZBytes>,
     notifier: Notifier,
     commit: ActorCommit,
 }
@@ -149,35 +149,35 @@ struct Relay<'a> {
     listener: Listener,
     wake: Wake,
     arrivals: Receiver<Arrival>,
-    requests: Requests<()>,
-    sender: SyncSender<ZBytes>,
-    reports: Publisher<'static>,
+    requests: LauncherRequests<()>,
+    chunk_queue: SyncSender<ZBytes>,
+    report_publisher: Publisher<'static>,
     mirror: CommitMirror,
-    sources: BTreeMap<u32, Source>,
-    publisher: Option<PolicyPublisher>,
+    actors: BTreeMap<u32, LocalActor>,
+    policy_publisher: Option<PolicyPublisher>,
     /// The newest policy, for the thread that asks for the next one.
-    newest: Newest,
+    newest_policy: NewestPolicy,
     heartbeat: HeartbeatSender,
-    heartbeats: Reports<Heartbeat>,
+    heartbeat_reports: Reports<Heartbeat>,
     episode_reports: Reports<EpisodeReport>,
     roles: BTreeMap<(Role, u32), RemoteRole>,
     episodes: Vec<RemoteEpisode>,
     epoch: u64,
-    /// Gate and number of the newest marks.
-    marks: (u64, u64),
-    heard: Option<Instant>,
-    begun: Instant,
+    /// Gate and number of the newest acknowledgement.
+    last_acknowledgement: (u64, u64),
+    heard_at: Option<Instant>,
+    started_at: Instant,
     /// Number and time of the last report.
-    report: (u64, Instant),
-    /// A report that no marks have confirmed yet.
-    echo: Option<(u64, Instant)>,
+    last_report: (u64, Instant),
+    /// A report that no acknowledgement has confirmed yet.
+    unconfirmed_report: Option<(u64, Instant)>,
     round_trip: Option<Duration>,
-    refreshed: Instant,
+    connections_refreshed_at: Instant,
     /// When this host last asked to be admitted again, and whether an answer is still to come.
-    asked: Option<(Instant, bool)>,
-    over: bool,
-    /// When it was first seen that it should end.
-    ending: Option<Instant>,
+    rejoin_request: Option<(Instant, bool)>,
+    run_is_over: bool,
+    /// When a request to stop was first seen.
+    stop_seen_at: Option<Instant>,
 }
 
 /// Stands in for the learner until `stop`.
@@ -191,7 +191,7 @@ pub fn relay(domain: &Domain, settings: &RelaySettings, stop: &Stop) -> Result<(
 impl<'a> Relay<'a> {
     fn new(domain: &'a Domain, settings: &'a RelaySettings, stop: &'a Stop) -> Result<Self, RelayError> {
         let RelaySettings { config, run, host, .. } = settings;
-        let heartbeat = HeartbeatSender::new(domain, settings.identity)?;
+        let heartbeat = HeartbeatSender::new(domain, settings.instance)?;
         let listener = Listener::bind(domain, EventName(Role::Learner, 0))?;
         let chunk = config.chunk_layout();
         let layout = ReplayLayout {
@@ -203,16 +203,16 @@ impl<'a> Relay<'a> {
             fingerprint: config.fingerprint(),
         };
         let mirror = CommitMirror::open(&run.replay_file(), &layout).map_err(RelayError::Mirror)?;
-        let mut sources = BTreeMap::new();
-        for actor in &host.actors {
-            let commit = mirror.actor(*actor as usize);
-            let source = Source {
-                receiver: ChunkReceiver::open(domain, *actor, chunk, config.actors.window)?,
-                unconfirmed: Unconfirmed::new(commit.mark),
-                notifier: Notifier::new(domain, EventName(Role::Actor, *actor))?,
+        let mut actors = BTreeMap::new();
+        for index in &host.actors {
+            let commit = mirror.actor(*index as usize);
+            let actor = LocalActor {
+                receiver: ChunkReceiver::open(domain, *index, chunk, config.actors.window)?,
+                uncommitted: UncommittedChunks::new(commit.last_chunk),
+                notifier: Notifier::new(domain, EventName(Role::Actor, *index))?,
                 commit,
             };
-            sources.insert(*actor, source);
+            actors.insert(*index, actor);
         }
         let session = network::connect(&host.endpoint, settings.key.as_ref())?;
         let (sender, arrivals) = channel();
@@ -223,24 +223,24 @@ impl<'a> Relay<'a> {
         };
         let to = wake.clone();
         session
-            .declare_subscriber(network::marks(&host.run_id, host.host))
-            .callback(move |sample| to.send(Arrival::Marks(sample.payload().to_bytes().into_owned())))
+            .declare_subscriber(network::acknowledgements(&host.run_id, host.host))
+            .callback(move |sample| to.send(Arrival::Acknowledgement(sample.payload().to_bytes().into_owned())))
             .background()
             .wait()
-            .map_err(failed("receive marks"))?;
+            .map_err(failed("receive acknowledgements"))?;
         let reports = session
             .declare_publisher(network::reports(&host.run_id, &host.host.to_string()))
             .congestion_control(CongestionControl::Drop)
             .express(true)
             .wait()
             .map_err(failed("send reports"))?;
-        let newest = Newest::default();
+        let newest = NewestPolicy::default();
         start_asking_for_policies(&session, host, wake.clone(), newest.clone())?;
         let now = Instant::now();
         Ok(Self {
-            sender: start_sending(&session, host)?,
-            requests: Requests::start(&config.run.id, config.actors.max, run.key()?)?,
-            heartbeats: Reports::open(domain)?,
+            chunk_queue: start_sending(&session, host)?,
+            requests: LauncherRequests::start(&config.run.id, config.actors.max, run.key()?)?,
+            heartbeat_reports: Reports::open(domain)?,
             episode_reports: Reports::open(domain)?,
             settings,
             domain,
@@ -249,25 +249,25 @@ impl<'a> Relay<'a> {
             listener,
             wake,
             arrivals,
-            reports,
+            report_publisher: reports,
             mirror,
-            sources,
-            publisher: None,
-            newest,
+            actors,
+            policy_publisher: None,
+            newest_policy: newest,
             heartbeat,
             roles: BTreeMap::new(),
             episodes: Vec::new(),
             epoch: host.epoch,
-            marks: (0, 0),
-            heard: None,
-            begun: now,
-            report: (0, now),
-            echo: None,
+            last_acknowledgement: (0, 0),
+            heard_at: None,
+            started_at: now,
+            last_report: (0, now),
+            unconfirmed_report: None,
             round_trip: None,
-            refreshed: now,
-            asked: None,
-            over: false,
-            ending: None,
+            connections_refreshed_at: now,
+            rejoin_request: None,
+            run_is_over: false,
+            stop_seen_at: None,
         })
     }
 
@@ -281,7 +281,7 @@ impl<'a> Relay<'a> {
             self.take_chunks()?;
             self.send_chunks();
             self.read_reports()?;
-            if self.report.1.elapsed() >= REPORTS {
+            if self.last_report.1.elapsed() >= REPORT_INTERVAL {
                 self.send_report(false)?;
             }
             self.refresh_connections()?;
@@ -298,25 +298,25 @@ impl<'a> Relay<'a> {
         if !self.stop.requested() {
             return false;
         }
-        let since = *self.ending.get_or_insert_with(Instant::now);
-        let handed_over = self.sources.values().all(|source| source.unconfirmed.all_got());
-        handed_over || self.is_cut_off() || since.elapsed() >= HAND_OVER
+        let since = *self.stop_seen_at.get_or_insert_with(Instant::now);
+        let handed_over = self.actors.values().all(|actor| actor.uncommitted.all_forwarded());
+        handed_over || self.is_cut_off() || since.elapsed() >= HAND_OVER_TIMEOUT
     }
 
     fn is_cut_off(&self) -> bool {
-        self.heard.is_none_or(|heard| heard.elapsed() >= CUT_OFF)
+        self.heard_at.is_none_or(|heard| heard.elapsed() >= CUT_OFF_AFTER)
     }
 
     fn now(&self) -> Duration {
-        self.begun.elapsed()
+        self.started_at.elapsed()
     }
 
     fn take(&mut self, arrival: Arrival) -> Result<(), RelayError> {
         match arrival {
-            Arrival::Marks(bytes) => match Marks::decode(&bytes) {
-                Ok(marks) => self.take_marks(&marks),
+            Arrival::Acknowledgement(bytes) => match Acknowledgement::decode(&bytes) {
+                Ok(acknowledgement) => self.take_acknowledgement(&acknowledgement),
                 Err(error) => {
-                    tracing::warn!("the gate sent marks that are not read: {error}");
+                    tracing::warn!("the gate sent an acknowledgement that is not read: {error}");
                     Ok(())
                 }
             },
@@ -331,71 +331,76 @@ impl<'a> Relay<'a> {
         }
     }
 
-    fn take_marks(&mut self, marks: &Marks) -> Result<(), RelayError> {
-        if (marks.gate, marks.number) <= self.marks {
+    fn take_acknowledgement(&mut self, acknowledgement: &Acknowledgement) -> Result<(), RelayError> {
+        if (acknowledgement.gate, acknowledgement.number) <= self.last_acknowledgement {
             return Ok(());
         }
-        let other_gate = marks.gate != self.marks.0;
-        self.marks = (marks.gate, marks.number);
+        let other_gate = acknowledgement.gate != self.last_acknowledgement.0;
+        self.last_acknowledgement = (acknowledgement.gate, acknowledgement.number);
         if self.is_cut_off() {
             tracing::info!("connected to the gate");
         }
-        self.heard = Some(Instant::now());
-        if marks.phase == Phase::Over && !self.over {
+        self.heard_at = Some(Instant::now());
+        if acknowledgement.phase == RunPhase::Over && !self.run_is_over {
             tracing::info!("the run is over");
-            self.over = true;
+            self.run_is_over = true;
         }
-        if let Some((_, sent)) = self.echo.take_if(|(number, _)| *number <= marks.report) {
+        if let Some((_, sent)) = self
+            .unconfirmed_report
+            .take_if(|(number, _)| *number <= acknowledgement.report)
+        {
             self.round_trip = Some(sent.elapsed());
         }
-        let covered = |actor: &u32| marks.actors.iter().any(|marks| marks.actor == *actor);
-        if marks.epoch != self.epoch || !self.settings.host.actors.iter().all(covered) {
-            self.ask_again();
+        let covered = |actor: &u32| acknowledgement.actors.iter().any(|of| of.actor == *actor);
+        if acknowledgement.epoch != self.epoch || !self.settings.host.actors.iter().all(covered) {
+            self.ask_to_rejoin();
             return Ok(());
         }
         let now = self.now();
         let mut changed = Vec::new();
-        for marks in &marks.actors {
-            let Some(source) = self.sources.get_mut(&marks.actor) else {
+        for of_actor in &acknowledgement.actors {
+            let Some(actor) = self.actors.get_mut(&of_actor.actor) else {
                 continue;
             };
-            let mark = |(incarnation, sequence)| ChunkMark { incarnation, sequence };
+            let id = |(incarnation, sequence)| ChunkId { incarnation, sequence };
             let commit = ActorCommit {
-                mark: mark(marks.committed),
-                rows: marks.rows,
+                last_chunk: id(of_actor.committed),
+                rows: of_actor.rows,
             };
             let limit = self.settings.host.limit;
-            let consequence = source.unconfirmed.confirm(mark(marks.got), commit.mark, limit, now);
+            let follow_up = actor
+                .uncommitted
+                .acknowledge(id(of_actor.forwarded), commit.last_chunk, limit, now);
             if other_gate {
-                source.unconfirmed.go_back(now);
+                actor.uncommitted.go_back(now);
             }
-            if commit != source.commit {
-                source.commit = commit;
-                changed.push(marks.actor);
+            if commit != actor.commit {
+                actor.commit = commit;
+                changed.push(of_actor.actor);
             }
-            follow(&self.requests, marks.actor, consequence);
+            follow_up_on(&self.requests, of_actor.actor, follow_up);
         }
         if other_gate || !changed.is_empty() {
-            let of_host = marks.actors.iter();
-            let commits = of_host.filter_map(|marks| {
-                let source = self.sources.get(&marks.actor)?;
-                Some((marks.actor, source.commit, &marks.snapshot[..]))
+            let of_host = acknowledgement.actors.iter();
+            let commits = of_host.filter_map(|of_actor| {
+                let actor = self.actors.get(&of_actor.actor)?;
+                Some((of_actor.actor, actor.commit, &of_actor.snapshot[..]))
             });
-            self.mirror.publish(marks.rows, commits);
-            changed.iter().for_each(|actor| self.sources[actor].notifier.notify());
+            self.mirror.publish(acknowledgement.rows, commits);
+            changed.iter().for_each(|index| self.actors[index].notifier.notify());
         }
         Ok(())
     }
 
     /// Asks whether this host is still admitted: the launcher of the run is another process, or has given its actors away.
-    fn ask_again(&mut self) {
+    fn ask_to_rejoin(&mut self) {
         let waits = self
-            .asked
-            .is_some_and(|(then, open)| open || then.elapsed() < JOIN_AGAIN);
+            .rejoin_request
+            .is_some_and(|(then, open)| open || then.elapsed() < REJOIN_INTERVAL);
         if waits {
             return;
         }
-        self.asked = Some((Instant::now(), true));
+        self.rejoin_request = Some((Instant::now(), true));
         let host = &self.settings.host;
         let hello = Hello {
             program: env!("CARGO_PKG_VERSION").into(),
@@ -412,12 +417,12 @@ impl<'a> Relay<'a> {
         };
         if let Err(cause) = std::thread::Builder::new().name("join".into()).spawn(ask) {
             tracing::warn!("cannot ask to be admitted again: {cause}");
-            self.asked = Some((Instant::now(), false));
+            self.rejoin_request = Some((Instant::now(), false));
         }
     }
 
     fn take_admission(&mut self, answer: Result<Admission, String>) -> Result<(), RelayError> {
-        self.asked = Some((Instant::now(), false));
+        self.rejoin_request = Some((Instant::now(), false));
         let host = &self.settings.host;
         match answer {
             Ok(Admission::Admitted(lease)) if lease.actors == host.actors => {
@@ -435,32 +440,32 @@ impl<'a> Relay<'a> {
     }
 
     fn publish(&mut self, policy: &WirePolicy) -> Result<(), RelayError> {
-        let publisher = match &self.publisher {
+        let publisher = match &self.policy_publisher {
             Some(publisher) => publisher,
             None => self
-                .publisher
+                .policy_publisher
                 .insert(PolicyPublisher::open(self.domain, policy.parameters.len())?),
         };
         publisher.publish(&policy.parameters, policy.header)?;
-        self.newest.set(policy.header.incarnation, policy.header.version);
+        self.newest_policy.set(policy.header.incarnation, policy.header.version);
         self.heartbeat.set_policy_version(policy.header.version);
-        self.sources.values().for_each(|source| source.notifier.notify());
+        self.actors.values().for_each(|actor| actor.notifier.notify());
         Ok(())
     }
 
     /// Takes the chunks of the actors.
     fn take_chunks(&mut self) -> Result<(), RelayError> {
-        // Before the first marks nobody knows what is committed.
-        if self.heard.is_none() {
+        // Before the first acknowledgement nobody knows what is committed.
+        if self.heard_at.is_none() {
             return Ok(());
         }
         let now = self.now();
-        for (actor, source) in &mut self.sources {
-            while let Some(chunk) = source.receiver.receive()? {
+        for (index, actor) in &mut self.actors {
+            while let Some(chunk) = actor.receiver.receive()? {
                 let (rows, snapshot) = chunk.parts();
                 let bytes = WireChunk::encode(self.settings.host.host, chunk.header(), rows, snapshot);
-                let consequence = source.unconfirmed.add(mark_of(chunk.header()), bytes.into(), now);
-                follow(&self.requests, *actor, consequence);
+                let follow_up = actor.uncommitted.add(id_of(chunk.header()), bytes.into(), now);
+                follow_up_on(&self.requests, *index, follow_up);
                 self.heartbeat.count(chunk.header().rows.into());
             }
         }
@@ -470,15 +475,15 @@ impl<'a> Relay<'a> {
     /// Hands chunks to the thread that sends them, as many as it takes. While the gate is away they stay here.
     fn send_chunks(&mut self) {
         let (now, cut_off) = (self.now(), self.is_cut_off());
-        let patience = PATIENCE.max(ROUND_TRIPS * self.round_trip.unwrap_or_default());
-        for source in self.sources.values_mut() {
+        let patience = RESEND_AFTER.max(RESEND_AFTER_ROUND_TRIPS * self.round_trip.unwrap_or_default());
+        for actor in self.actors.values_mut() {
             if cut_off {
                 continue;
             }
-            source.unconfirmed.go_back_if_overdue(now, patience);
-            while let Some(kept) = source.unconfirmed.next() {
-                match self.sender.try_send(kept.chunk.clone()) {
-                    Ok(()) => source.unconfirmed.sent(),
+            actor.uncommitted.go_back_if_overdue(now, patience);
+            while let Some(kept) = actor.uncommitted.next() {
+                match self.chunk_queue.try_send(kept.chunk.clone()) {
+                    Ok(()) => actor.uncommitted.note_sent(),
                     Err(TrySendError::Full(_) | TrySendError::Disconnected(_)) => return,
                 }
             }
@@ -486,13 +491,13 @@ impl<'a> Relay<'a> {
     }
 
     fn read_reports(&mut self) -> Result<(), RelayError> {
-        while let Some(heartbeat) = self.heartbeats.receive()? {
+        while let Some(heartbeat) = self.heartbeat_reports.receive()? {
             if let Some(role) = RemoteRole::of(&heartbeat).filter(|role| role.role != Role::Relay) {
                 self.roles.insert((role.role, role.index), role);
             }
         }
         while let Some(episode) = self.episode_reports.receive()? {
-            if self.episodes.len() < EPISODES {
+            if self.episodes.len() < MAX_KEPT_EPISODES {
                 self.episodes.push(episode.into());
             }
         }
@@ -501,9 +506,9 @@ impl<'a> Relay<'a> {
 
     fn send_report(&mut self, leaving: bool) -> Result<(), RelayError> {
         let now = Instant::now();
-        self.report = (self.report.0 + 1, now);
+        self.last_report = (self.last_report.0 + 1, now);
         let number = self.number();
-        self.echo.get_or_insert((number, now));
+        self.unconfirmed_report.get_or_insert((number, now));
         // What is sent while the gate is away is lost.
         let episodes = if self.is_cut_off() {
             Vec::new()
@@ -515,12 +520,12 @@ impl<'a> Relay<'a> {
             number,
             round_trip_us: self.round_trip.map(|trip| trip.as_micros() as u64),
             leaving,
-            resent: self.sources.values().map(|source| source.unconfirmed.resent()).sum(),
-            policy_version: self.newest.get().map_or(0, |(_, version)| version),
+            resent: self.actors.values().map(|actor| actor.uncommitted.resent()).sum(),
+            policy_version: self.newest_policy.get().map_or(0, |(_, version)| version),
             roles: self.roles.values().copied().collect(),
             episodes,
         };
-        self.reports
+        self.report_publisher
             .put(report.encode()?)
             .wait()
             .map_err(failed("send a report"))?;
@@ -533,18 +538,18 @@ impl<'a> Relay<'a> {
 
     /// The number of this report. It grows over restarts of the relay, whose incarnations grow.
     fn number(&self) -> u64 {
-        (self.settings.identity.incarnation << 32) + self.report.0
+        (self.settings.instance.incarnation << 32) + self.last_report.0
     }
 
     fn refresh_connections(&mut self) -> Result<(), RelayError> {
-        if self.refreshed.elapsed() < REFRESH {
+        if self.connections_refreshed_at.elapsed() < REFRESH_INTERVAL {
             return Ok(());
         }
-        self.refreshed = Instant::now();
-        if let Some(publisher) = &self.publisher {
+        self.connections_refreshed_at = Instant::now();
+        if let Some(publisher) = &self.policy_publisher {
             publisher.refresh_connections()?;
         }
-        let activity = match (self.over, self.is_cut_off()) {
+        let activity = match (self.run_is_over, self.is_cut_off()) {
             (true, _) => Activity::Done,
             (false, true) => Activity::WaitingForPeer,
             (false, false) => Activity::Working,
@@ -555,7 +560,7 @@ impl<'a> Relay<'a> {
 
     /// Waits for an actor or the gate, for a while.
     fn sleep(&self) -> Result<(), RelayError> {
-        let patience = Timespec::try_from(SLEEP).ok();
+        let patience = Timespec::try_from(LONGEST_SLEEP).ok();
         let mut ready = [
             PollFd::from_borrowed_fd(self.listener.as_fd(), PollFlags::IN),
             PollFd::from_borrowed_fd(self.wake.event.as_fd(), PollFlags::IN),
@@ -572,15 +577,15 @@ impl<'a> Relay<'a> {
     }
 }
 
-fn follow(requests: &Requests<()>, actor: u32, consequence: Consequence) {
-    match consequence {
-        Consequence::Continue => {}
-        Consequence::StartAgain(incarnation) => {
+fn follow_up_on(requests: &LauncherRequests<()>, actor: u32, follow_up: ActorFollowUp) {
+    match follow_up {
+        ActorFollowUp::Continue => {}
+        ActorFollowUp::StartAgain(incarnation) => {
             tracing::warn!("the replay has lost chunks of actor {actor}; the actor is started again");
-            requests.ask(Question::Replace { actor, incarnation }, ());
+            requests.ask(ControlRequest::Replace { actor, incarnation }, ());
         }
-        // The gate's next marks no longer name the actor.
-        Consequence::TakenOver => tracing::warn!("actor {actor} now belongs to another host"),
+        // The gate's next acknowledgement no longer names the actor.
+        ActorFollowUp::TakenOver => tracing::warn!("actor {actor} now belongs to another host"),
     }
 }
 
@@ -592,7 +597,7 @@ fn start_sending(session: &Session, host: &HostFile) -> Result<SyncSender<ZBytes
         .priority(Priority::DataHigh)
         .wait()
         .map_err(failed("send chunks"))?;
-    let (sender, chunks) = sync_channel::<ZBytes>(SENDING);
+    let (sender, chunks) = sync_channel::<ZBytes>(CHUNK_QUEUE_LENGTH);
     std::thread::Builder::new().name("sender".into()).spawn(move || {
         for chunk in chunks {
             if let Err(cause) = publisher.put(chunk).wait() {
@@ -605,9 +610,9 @@ fn start_sending(session: &Session, host: &HostFile) -> Result<SyncSender<ZBytes
 
 /// Learner's incarnation and version of the newest policy of this host; `None` before the first.
 #[derive(Clone, Debug, Default)]
-struct Newest(Arc<Mutex<Option<(u64, u64)>>>);
+struct NewestPolicy(Arc<Mutex<Option<(u64, u64)>>>);
 
-impl Newest {
+impl NewestPolicy {
     fn get(&self) -> Option<(u64, u64)> {
         *self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -618,19 +623,24 @@ impl Newest {
 }
 
 /// Starts the thread that always asks for a policy other than the last one.
-fn start_asking_for_policies(session: &Session, host: &HostFile, wake: Wake, newest: Newest) -> Result<(), RelayError> {
+fn start_asking_for_policies(
+    session: &Session,
+    host: &HostFile,
+    wake: Wake,
+    newest: NewestPolicy,
+) -> Result<(), RelayError> {
     let (session, key, host) = (session.clone(), network::policy(&host.run_id), host.host);
     let ask = move || {
         while !session.is_closed() {
             let have = newest.get();
-            let Ok(question) = (PolicyQuestion { host, have }).encode() else {
+            let Ok(request) = (PolicyRequest { host, have }).encode() else {
                 return;
             };
             let replies = session
                 .get(&key)
-                .payload(question)
-                .timeout(POLICY_QUERY)
-                // The policy has the congestion control of the question: `Drop` would never deliver a large one.
+                .payload(request)
+                .timeout(POLICY_QUERY_TIMEOUT)
+                // The policy has the congestion control of the request: `Drop` would never deliver a large one.
                 .congestion_control(CongestionControl::Block)
                 .wait();
             let reply = replies.ok().and_then(|replies| replies.recv().ok());
@@ -639,9 +649,9 @@ fn start_asking_for_policies(session: &Session, host: &HostFile, wake: Wake, new
                 continue;
             };
             wake.send(Arrival::Policy(sample.payload().to_bytes().into_owned()));
-            // The next question names this policy, so it waits until it is published here.
+            // The next request names this policy, so it waits until it is published here.
             let asked = Instant::now();
-            while newest.get() == have && asked.elapsed() < POLICY_QUERY {
+            while newest.get() == have && asked.elapsed() < POLICY_QUERY_TIMEOUT {
                 std::thread::sleep(Duration::from_millis(1));
             }
         }

@@ -8,8 +8,8 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use shoal_common::channel::policy::PolicyHeader;
 use shoal_common::channel::transitions::ChunkHeader;
-use shoal_common::commit::ChunkMark;
-use shoal_common::report::{Activity, EpisodeReport, Heartbeat, Identity, Role};
+use shoal_common::commit::ChunkId;
+use shoal_common::report::{Activity, EpisodeReport, Heartbeat, Role, RoleInstance};
 
 /// The version of this format. Increase it with every change.
 pub const VERSION: u32 = 1;
@@ -24,7 +24,7 @@ const CHECKSUM: usize = size_of::<u32>();
 pub enum WireError {
     /// They do not begin as a message of this kind.
     #[error("the message is not what was expected")]
-    Kind,
+    MessageKind,
     /// They have another version of the format.
     #[error("the message has format {0}, this program uses format {VERSION}: use the same program on all hosts")]
     Version(u32),
@@ -43,14 +43,14 @@ pub enum WireError {
 #[doc(hidden)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u32)]
-pub enum Kind {
+pub enum MessageKind {
     Chunk = 1,
     Policy = 2,
     Hello = 3,
     Admission = 4,
-    Marks = 5,
+    Acknowledgement = 5,
     HostReport = 6,
-    PolicyQuestion = 7,
+    PolicyRequest = 7,
 }
 
 /// The first word of a message has these letters in its upper half and the kind in its lower; the second is the version.
@@ -72,8 +72,8 @@ pub struct WireChunk {
 
 impl WireChunk {
     /// Its own incarnation and sequence number.
-    pub fn mark(&self) -> ChunkMark {
-        mark_of(&self.header)
+    pub fn id(&self) -> ChunkId {
+        id_of(&self.header)
     }
 
     /// The bytes of a chunk.
@@ -86,7 +86,7 @@ impl WireChunk {
             u64::from(header.rows) << 32 | u64::from(header.actor),
         ];
         sealed(
-            Kind::Chunk,
+            MessageKind::Chunk,
             &[
                 &words(&start),
                 bytemuck::cast_slice(rows),
@@ -100,7 +100,7 @@ impl WireChunk {
     /// # Errors
     /// When the bytes are not a whole chunk of this version.
     pub fn decode(bytes: &[u8]) -> Result<Self, WireError> {
-        let body = opened(Kind::Chunk, bytes)?;
+        let body = opened(MessageKind::Chunk, bytes)?;
         let ([host, incarnation, sequence, policy_version, rows_and_actor], numbers) = split(body, bytes.len())?;
         let header = ChunkHeader {
             incarnation,
@@ -114,8 +114,8 @@ impl WireChunk {
 }
 
 /// The numbers in a chunk's header that identify it; a handshake has sequence number 0.
-pub fn mark_of(header: &ChunkHeader) -> ChunkMark {
-    ChunkMark {
+pub fn id_of(header: &ChunkHeader) -> ChunkId {
+    ChunkId {
         incarnation: header.incarnation,
         sequence: header.sequence,
     }
@@ -140,7 +140,7 @@ impl WirePolicy {
             header.updates,
             header.fingerprint,
         ];
-        sealed(Kind::Policy, &[&words(&start), bytemuck::cast_slice(parameters)])
+        sealed(MessageKind::Policy, &[&words(&start), bytemuck::cast_slice(parameters)])
     }
 
     /// Reads a policy.
@@ -148,7 +148,7 @@ impl WirePolicy {
     /// # Errors
     /// When the bytes are not a whole policy of this version.
     pub fn decode(bytes: &[u8]) -> Result<Self, WireError> {
-        let body = opened(Kind::Policy, bytes)?;
+        let body = opened(MessageKind::Policy, bytes)?;
         let ([incarnation, version, env_steps, updates, fingerprint], parameters) = split(body, bytes.len())?;
         let header = PolicyHeader {
             incarnation,
@@ -161,16 +161,16 @@ impl WirePolicy {
     }
 }
 
-/// A host's question for a policy that it does not have. The gate answers when there is one.
+/// A host's request for a policy that it does not have. The gate answers when there is one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct PolicyQuestion {
+pub struct PolicyRequest {
     /// The host.
     pub host: u64,
     /// The policy that it has: the learner's incarnation, and the version.
     pub have: Option<(u64, u64)>,
 }
 
-/// What a host says to be admitted to a run.
+/// A host's request to be admitted to a run.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Hello {
     /// Version of the program.
@@ -233,41 +233,41 @@ pub struct Lease {
 
 /// Whether the run continues.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub enum Phase {
+pub enum RunPhase {
     /// The run continues.
     Running,
     /// It is over, because it is finished or was stopped: the host ends too.
     Over,
 }
 
-/// What the gate tells a host: what is committed of its actors, and what has arrived. Only the newest marks count.
+/// What the gate tells a host: what is committed of its actors, and what it has forwarded. Only the newest one counts.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Marks {
+pub struct Acknowledgement {
     /// See [`Lease::epoch`].
     pub epoch: u64,
-    /// Incarnation of the gate. Marks of a later gate, and later marks of the same gate, are newer.
+    /// Incarnation of the gate. Those of a later gate, and later ones of the same gate, are newer.
     pub gate: u64,
-    /// The number of these marks among those of this gate.
+    /// Its number among those of this gate.
     pub number: u64,
     /// Whether the run continues.
-    pub phase: Phase,
+    pub phase: RunPhase,
     /// Rows in the replay.
     pub rows: u64,
     /// The number of the last report that the gate has received from this host.
     pub report: u64,
     /// For each actor of the host.
-    pub actors: Vec<ActorMarks>,
+    pub actors: Vec<ActorAcknowledgement>,
 }
 
 /// What has become of an actor's chunks.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct ActorMarks {
+pub struct ActorAcknowledgement {
     /// The actor.
     pub actor: u32,
     /// Incarnation and sequence number of its last committed chunk.
     pub committed: (u64, u64),
-    /// Those of the last chunk that the gate has passed on to the learner.
-    pub got: (u64, u64),
+    /// Those of the last chunk that the gate has forwarded to the learner.
+    pub forwarded: (u64, u64),
     /// Rows of all its committed chunks.
     pub rows: u64,
     /// The actor's snapshot after its last committed chunk, in runs that have snapshots.
@@ -281,7 +281,7 @@ pub struct HostReport {
     pub host: u64,
     /// The number of this report.
     pub number: u64,
-    /// Microseconds between an earlier report and marks that confirmed it; `None` before the first.
+    /// Microseconds between an earlier report and the acknowledgement that confirmed it; `None` before the first.
     pub round_trip_us: Option<u64>,
     /// Whether the host is leaving the run, and sends nothing more.
     pub leaving: bool,
@@ -330,7 +330,7 @@ impl RemoteRole {
 
     /// The heartbeat.
     pub fn heartbeat(&self) -> Heartbeat {
-        let mut heartbeat = Heartbeat::new(Identity {
+        let mut heartbeat = Heartbeat::new(RoleInstance {
             role: self.role,
             index: self.index,
             incarnation: self.incarnation,
@@ -393,7 +393,7 @@ impl From<RemoteEpisode> for EpisodeReport {
 /// A message that bincode encodes.
 pub trait Message: Serialize + DeserializeOwned {
     #[doc(hidden)]
-    const KIND: Kind;
+    const KIND: MessageKind;
 
     /// Its bytes.
     ///
@@ -419,24 +419,24 @@ pub trait Message: Serialize + DeserializeOwned {
     }
 }
 
-impl Message for PolicyQuestion {
-    const KIND: Kind = Kind::PolicyQuestion;
+impl Message for PolicyRequest {
+    const KIND: MessageKind = MessageKind::PolicyRequest;
 }
 
 impl Message for Hello {
-    const KIND: Kind = Kind::Hello;
+    const KIND: MessageKind = MessageKind::Hello;
 }
 
 impl Message for Admission {
-    const KIND: Kind = Kind::Admission;
+    const KIND: MessageKind = MessageKind::Admission;
 }
 
-impl Message for Marks {
-    const KIND: Kind = Kind::Marks;
+impl Message for Acknowledgement {
+    const KIND: MessageKind = MessageKind::Acknowledgement;
 }
 
 impl Message for HostReport {
-    const KIND: Kind = Kind::HostReport;
+    const KIND: MessageKind = MessageKind::HostReport;
 }
 
 /// The limit keeps a damaged length from allocating memory without bound.
@@ -444,7 +444,7 @@ fn encoding() -> impl bincode::config::Config {
     bincode::config::standard().with_limit::<{ 4 << 20 }>()
 }
 
-fn sealed(kind: Kind, parts: &[&[u8]]) -> Vec<u8> {
+fn sealed(kind: MessageKind, parts: &[&[u8]]) -> Vec<u8> {
     let length = START + parts.iter().map(|part| part.len()).sum::<usize>() + CHECKSUM;
     let mut bytes = Vec::with_capacity(length);
     bytes.extend((LETTERS | kind as u32).to_le_bytes());
@@ -456,7 +456,7 @@ fn sealed(kind: Kind, parts: &[&[u8]]) -> Vec<u8> {
 }
 
 /// The bytes between the first words and the checksum.
-fn opened(kind: Kind, bytes: &[u8]) -> Result<&[u8], WireError> {
+fn opened(kind: MessageKind, bytes: &[u8]) -> Result<&[u8], WireError> {
     let length = Err(WireError::Length(bytes.len()));
     if bytes.len() > LONGEST {
         return length;
@@ -466,7 +466,7 @@ fn opened(kind: Kind, bytes: &[u8]) -> Result<&[u8], WireError> {
         return length;
     };
     if found != LETTERS | kind as u32 {
-        return Err(WireError::Kind);
+        return Err(WireError::MessageKind);
     }
     if version != VERSION {
         return Err(WireError::Version(version));

@@ -8,9 +8,9 @@ use std::collections::VecDeque;
 use std::time::Duration;
 
 use proptest::prelude::*;
-use shoal_common::commit::ChunkMark;
-use shoal_remote::forwarding::{Forwarding, Offer};
-use shoal_remote::unconfirmed::{Consequence, Unconfirmed};
+use shoal_common::commit::ChunkId;
+use shoal_remote::forwarding::{ChunkOrder, Forwarding};
+use shoal_remote::uncommitted::{ActorFollowUp, UncommittedChunks};
 
 const WINDOW: usize = 3;
 const PATIENCE: Duration = Duration::from_millis(200);
@@ -22,16 +22,16 @@ type Content = Option<(u64, u64)>;
 
 #[derive(Clone, Copy, Debug)]
 struct Sent {
-    mark: ChunkMark,
+    id: ChunkId,
     content: Content,
 }
 
 #[derive(Clone, Copy, Debug)]
-struct Marks {
+struct Acknowledgement {
     gate: u64,
     number: u64,
-    got: ChunkMark,
-    committed: ChunkMark,
+    forwarded: ChunkId,
+    committed: ChunkId,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -43,9 +43,9 @@ enum Event {
     ChunkIsLost(usize),
     ChunkIsRepeated(usize),
     LearnerTakes(usize),
-    GateMarks,
-    MarksArrive(usize),
-    MarksAreLost(usize),
+    GateAcknowledges,
+    AcknowledgementArrives(usize),
+    AcknowledgementIsLost(usize),
     TimePasses,
     ActorIsKilled,
     RelayIsKilled,
@@ -67,7 +67,7 @@ struct Actor {
 #[derive(Debug)]
 struct Gate {
     life: u64,
-    marks: u64,
+    acknowledgements: u64,
     forwarding: Forwarding,
     history: VecDeque<Sent>,
 }
@@ -79,20 +79,20 @@ struct World {
     actor: Actor,
     /// On its way from actor to relay.
     to_relay: VecDeque<Sent>,
-    relay: Unconfirmed<Content>,
+    relay: UncommittedChunks<Content>,
     /// The relay's file: it lasts over its restarts, and the actor reads it.
-    mirror: ChunkMark,
-    /// Of the newest marks that the relay has seen.
+    mirror: ChunkId,
+    /// Of the newest acknowledgement that the relay has seen.
     seen: (u64, u64),
     up: Vec<Sent>,
-    down: Vec<Marks>,
+    down: Vec<Acknowledgement>,
     gate: Gate,
     /// What the learner has not taken, from each gate that it was connected to.
     to_learner: Vec<(u64, VecDeque<Sent>)>,
-    committed: ChunkMark,
+    committed: ChunkId,
     log: Vec<(u64, u64)>,
     /// What was committed after each chunk; a power loss returns to one of these.
-    past: Vec<(ChunkMark, usize)>,
+    past: Vec<(ChunkId, usize)>,
     /// Whether chunks may have been lost with a killed actor, or in a power loss.
     may_have_lost: bool,
     made: Vec<(u64, u64)>,
@@ -100,20 +100,20 @@ struct World {
 
 impl World {
     fn new() -> Self {
-        let none = ChunkMark::default();
+        let none = ChunkId::default();
         let mut world = Self {
             now: Duration::ZERO,
             started: 0,
             actor: Actor::default(),
             to_relay: VecDeque::new(),
-            relay: Unconfirmed::new(none),
+            relay: UncommittedChunks::new(none),
             mirror: none,
             seen: (0, 0),
             up: Vec::new(),
             down: Vec::new(),
             gate: Gate {
                 life: 0,
-                marks: 0,
+                acknowledgements: 0,
                 forwarding: Forwarding::new(none, WINDOW as u32),
                 history: VecDeque::new(),
             },
@@ -144,11 +144,11 @@ impl World {
     }
 
     fn send(&mut self, sequence: u64, content: Content) {
-        let mark = ChunkMark {
+        let id = ChunkId {
             incarnation: self.actor.incarnation,
             sequence,
         };
-        let sent = Sent { mark, content };
+        let sent = Sent { id, content };
         self.to_relay.push_back(sent);
         self.actor.history.push_back(sent);
         if self.actor.history.len() > WINDOW {
@@ -160,7 +160,7 @@ impl World {
         let life = self.start();
         self.gate = Gate {
             life,
-            marks: 0,
+            acknowledgements: 0,
             forwarding: Forwarding::new(self.committed, WINDOW as u32),
             history: VecDeque::new(),
         };
@@ -171,19 +171,19 @@ impl World {
         match event {
             Event::ActorWorks => self.actor_works(),
             Event::RelayReceives => {
-                if let Some(Sent { mark, content }) = self.to_relay.pop_front() {
-                    let consequence = self.relay.add(mark, content, self.now);
-                    self.follow(consequence);
+                if let Some(Sent { id, content }) = self.to_relay.pop_front() {
+                    let follow_up = self.relay.add(id, content, self.now);
+                    self.follow_up_on(follow_up);
                     assert!(self.relay.len() <= 2 * WINDOW + 2, "too much is kept: {self:?}");
                 }
             }
             Event::RelaySends => {
                 if let Some(kept) = self.relay.next() {
                     self.up.push(Sent {
-                        mark: kept.mark,
+                        id: kept.id,
                         content: kept.chunk,
                     });
-                    self.relay.sent();
+                    self.relay.note_sent();
                 }
             }
             Event::ChunkArrives(which) if !self.up.is_empty() => {
@@ -205,21 +205,21 @@ impl World {
                     self.learner_takes(waiting[which % waiting.len()]);
                 }
             }
-            Event::GateMarks => {
+            Event::GateAcknowledges => {
                 self.gate.forwarding.commit(self.committed);
-                self.gate.marks += 1;
-                self.down.push(Marks {
+                self.gate.acknowledgements += 1;
+                self.down.push(Acknowledgement {
                     gate: self.gate.life,
-                    number: self.gate.marks,
-                    got: self.gate.forwarding.got(),
+                    number: self.gate.acknowledgements,
+                    forwarded: self.gate.forwarding.last_forwarded(),
                     committed: self.gate.forwarding.committed(),
                 });
             }
-            Event::MarksArrive(which) if !self.down.is_empty() => {
-                let marks = self.down.remove(which % self.down.len());
-                self.relay_learns(marks);
+            Event::AcknowledgementArrives(which) if !self.down.is_empty() => {
+                let acknowledgement = self.down.remove(which % self.down.len());
+                self.relay_learns(acknowledgement);
             }
-            Event::MarksAreLost(which) if !self.down.is_empty() => {
+            Event::AcknowledgementIsLost(which) if !self.down.is_empty() => {
                 self.down.remove(which % self.down.len());
             }
             Event::TimePasses => {
@@ -231,7 +231,7 @@ impl World {
                 self.start_actor();
             }
             Event::RelayIsKilled => {
-                self.relay = Unconfirmed::new(self.mirror);
+                self.relay = UncommittedChunks::new(self.mirror);
                 self.to_relay = self.actor.history.clone();
             }
             Event::GateIsKilled => self.start_gate(),
@@ -268,7 +268,7 @@ impl World {
     }
 
     fn gate_gets(&mut self, sent: Sent) {
-        if self.gate.forwarding.offer(sent.mark) != Offer::Next {
+        if self.gate.forwarding.offer(sent.id) != ChunkOrder::Next {
             return;
         }
         let history = &mut self.gate.history;
@@ -285,52 +285,54 @@ impl World {
 
     /// As the learner's intake and replay do.
     fn learner_takes(&mut self, from: usize) {
-        let Some(Sent { mark, content }) = self.to_learner[from].1.pop_front() else {
+        let Some(Sent { id, content }) = self.to_learner[from].1.pop_front() else {
             return;
         };
-        let mark = ChunkMark {
-            sequence: if mark.sequence == 0 {
+        let id = ChunkId {
+            sequence: if id.sequence == 0 {
                 self.committed.sequence
             } else {
-                mark.sequence
+                id.sequence
             },
-            ..mark
+            ..id
         };
-        if mark <= self.committed {
+        if id <= self.committed {
             return;
         }
         assert!(
-            mark.is_next(self.committed),
-            "the learner would fail: {mark:?} after {:?}",
+            id.is_next(self.committed),
+            "the learner would fail: {id:?} after {:?}",
             self.committed
         );
-        self.committed = mark;
+        self.committed = id;
         self.log.extend(content);
-        self.past.push((mark, self.log.len()));
+        self.past.push((id, self.log.len()));
     }
 
-    fn relay_learns(&mut self, marks: Marks) {
-        if (marks.gate, marks.number) <= self.seen {
+    fn relay_learns(&mut self, acknowledgement: Acknowledgement) {
+        if (acknowledgement.gate, acknowledgement.number) <= self.seen {
             return;
         }
-        let other_gate = marks.gate != self.seen.0;
-        self.seen = (marks.gate, marks.number);
-        let consequence = self.relay.confirm(marks.got, marks.committed, LIMIT, self.now);
-        self.mirror = marks.committed;
-        self.follow(consequence);
+        let other_gate = acknowledgement.gate != self.seen.0;
+        self.seen = (acknowledgement.gate, acknowledgement.number);
+        let follow_up = self
+            .relay
+            .acknowledge(acknowledgement.forwarded, acknowledgement.committed, LIMIT, self.now);
+        self.mirror = acknowledgement.committed;
+        self.follow_up_on(follow_up);
         if other_gate {
             self.relay.go_back(self.now);
         }
     }
 
-    fn follow(&mut self, consequence: Consequence) {
-        match consequence {
-            Consequence::StartAgain(incarnation) if self.actor.incarnation <= incarnation => {
+    fn follow_up_on(&mut self, follow_up: ActorFollowUp) {
+        match follow_up {
+            ActorFollowUp::StartAgain(incarnation) if self.actor.incarnation <= incarnation => {
                 assert!(self.may_have_lost);
                 self.start_actor();
             }
-            Consequence::Continue | Consequence::StartAgain(_) => {}
-            Consequence::TakenOver => unreachable!("nobody else has this actor"),
+            ActorFollowUp::Continue | ActorFollowUp::StartAgain(_) => {}
+            ActorFollowUp::TakenOver => unreachable!("nobody else has this actor"),
         }
     }
 
@@ -342,8 +344,8 @@ impl World {
                 Event::RelaySends,
                 Event::ChunkArrives(0),
                 Event::LearnerTakes(0),
-                Event::GateMarks,
-                Event::MarksArrive(0),
+                Event::GateAcknowledges,
+                Event::AcknowledgementArrives(0),
                 Event::TimePasses,
             ] {
                 self.happens(event);
@@ -370,9 +372,9 @@ fn event() -> impl Strategy<Value = Event> {
         3 => any_of().prop_map(Event::ChunkIsLost),
         3 => any_of().prop_map(Event::ChunkIsRepeated),
         12 => any_of().prop_map(Event::LearnerTakes),
-        6 => Just(Event::GateMarks),
-        6 => any_of().prop_map(Event::MarksArrive),
-        2 => any_of().prop_map(Event::MarksAreLost),
+        6 => Just(Event::GateAcknowledges),
+        6 => any_of().prop_map(Event::AcknowledgementArrives),
+        2 => any_of().prop_map(Event::AcknowledgementIsLost),
         3 => Just(Event::TimePasses),
         1 => Just(Event::ActorIsKilled),
         1 => Just(Event::RelayIsKilled),

@@ -7,8 +7,8 @@ use shoal_common::channel::policy::PolicyHeader;
 use shoal_common::channel::transitions::ChunkHeader;
 use shoal_common::report::{Activity, Role};
 use shoal_remote::wire::{
-    ActorMarks, Admission, Hello, HostReport, Lease, Marks, Message, Phase, PolicyQuestion, RemoteEpisode, RemoteRole,
-    VERSION, WireChunk, WireError, WirePolicy,
+    Acknowledgement, ActorAcknowledgement, Admission, Hello, HostReport, Lease, Message, PolicyRequest, RemoteEpisode,
+    RemoteRole, RunPhase, VERSION, WireChunk, WireError, WirePolicy,
 };
 
 fn header() -> ChunkHeader {
@@ -57,18 +57,18 @@ fn admission() -> Admission {
     })
 }
 
-fn marks() -> Marks {
-    Marks {
+fn acknowledgement() -> Acknowledgement {
+    Acknowledgement {
         epoch: 6,
         gate: 8,
         number: 3,
-        phase: Phase::Running,
+        phase: RunPhase::Running,
         rows: 640,
         report: 2,
-        actors: vec![ActorMarks {
+        actors: vec![ActorAcknowledgement {
             actor: 1,
             committed: (7, 4),
-            got: (7, 5),
+            forwarded: (7, 5),
             rows: 256,
             snapshot: vec![1, 300],
         }],
@@ -104,8 +104,8 @@ fn report() -> HostReport {
     }
 }
 
-fn question() -> PolicyQuestion {
-    PolicyQuestion {
+fn request() -> PolicyRequest {
+    PolicyRequest {
         host: 9,
         have: Some((1, 2)),
     }
@@ -117,9 +117,9 @@ fn all() -> Vec<Vec<u8>> {
         policy(),
         hello().encode().unwrap(),
         admission().encode().unwrap(),
-        marks().encode().unwrap(),
+        acknowledgement().encode().unwrap(),
         report().encode().unwrap(),
-        question().encode().unwrap(),
+        request().encode().unwrap(),
     ]
 }
 
@@ -130,9 +130,9 @@ fn read(bytes: &[u8]) -> [Option<WireError>; 7] {
         WirePolicy::decode(bytes).err(),
         Hello::decode(bytes).err(),
         Admission::decode(bytes).err(),
-        Marks::decode(bytes).err(),
+        Acknowledgement::decode(bytes).err(),
         HostReport::decode(bytes).err(),
-        PolicyQuestion::decode(bytes).err(),
+        PolicyRequest::decode(bytes).err(),
     ]
 }
 
@@ -144,12 +144,19 @@ fn every_message_arrives_unchanged_and_is_no_other() {
     assert_eq!(WirePolicy::decode(&policy()).unwrap().parameters, [1.5]);
     assert_eq!(Hello::decode(&hello().encode().unwrap()), Ok(hello()));
     assert_eq!(Admission::decode(&admission().encode().unwrap()), Ok(admission()));
-    assert_eq!(Marks::decode(&marks().encode().unwrap()), Ok(marks()));
+    assert_eq!(
+        Acknowledgement::decode(&acknowledgement().encode().unwrap()),
+        Ok(acknowledgement())
+    );
     assert_eq!(HostReport::decode(&report().encode().unwrap()), Ok(report()));
-    assert_eq!(PolicyQuestion::decode(&question().encode().unwrap()), Ok(question()));
+    assert_eq!(PolicyRequest::decode(&request().encode().unwrap()), Ok(request()));
     for (i, bytes) in all().iter().enumerate() {
         for (j, error) in read(bytes).into_iter().enumerate() {
-            assert_eq!(error, (i != j).then_some(WireError::Kind), "message {i} read as {j}");
+            assert_eq!(
+                error,
+                (i != j).then_some(WireError::MessageKind),
+                "message {i} read as {j}"
+            );
         }
     }
 }

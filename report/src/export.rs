@@ -10,27 +10,30 @@ use shoal_common::network::{ActionRange, Activation, NetworkLayout, OBSERVATION_
 use shoal_common::policy::{PolicyLayout, combine_heads};
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::space::Space;
-use shoal_run::final_evaluation::FinallyEvaluated;
+use shoal_run::final_evaluation::FinalPolicyResult;
 use shoal_run::rollout::policy_layout;
 
 /// A policy in a form that needs no part of Shoal to run.
 #[derive(Clone, Debug)]
-pub struct Portable {
-    body: Body,
-    starts: Starts,
+pub struct PortablePolicy {
+    body: PolicyFunction,
+    starts: SpaceStarts,
     /// Describes the policy and its origin; the file contains it as key-value pairs. Lists are written as JSON.
     metadata: BTreeMap<String, String>,
 }
 
 /// The computation from an observation to the outputs.
 #[derive(Clone, Debug)]
-enum Body {
+enum PolicyFunction {
     /// μ of DDPG and TD3, or the mean of SAC's π: the network, tanh, and the scaling to the range of the actions.
-    Actions { network: Network, range: ActionRange },
+    Actions {
+        network: ExportedNetwork,
+        range: ActionRange,
+    },
     /// REINFORCE's π: the network, and softmax.
-    Probabilities { network: Network },
+    Probabilities { network: ExportedNetwork },
     /// DQN's action-values: the network.
-    Values { network: Network },
+    Values { network: ExportedNetwork },
     /// Action-values Q(s, a), state by state.
     Table {
         states: usize,
@@ -41,14 +44,14 @@ enum Body {
 
 /// The environment's own numbers of the first observation and the first action of discrete spaces; 0 for a box.
 #[derive(Clone, Copy, Debug)]
-struct Starts {
+struct SpaceStarts {
     observation: i32,
     action: i32,
 }
 
 /// A sequence of layers, with the activation between them.
 #[derive(Clone, Debug)]
-struct Network {
+struct ExportedNetwork {
     /// The mean and the factor of each observed number, if they are normalised first.
     normalisation: Option<(Vec<f32>, Vec<f32>)>,
     activation: Activation,
@@ -64,38 +67,38 @@ struct Dense {
     biases: Vec<f32>,
 }
 
-impl Portable {
+impl PortablePolicy {
     /// The policy in `file`, from a run with configuration `config`. `which` is its name in the run: "best" or "last".
     pub fn new(config: &Config, file: &PolicyFile, which: &str) -> anyhow::Result<Self> {
         let body = match policy_layout(config)? {
-            PolicyLayout::Deterministic(network) => Body::Actions {
-                network: Network::new(&network, &file.parameters),
+            PolicyLayout::Deterministic(network) => PolicyFunction::Actions {
+                network: ExportedNetwork::new(&network, &file.parameters),
                 range: ActionRange::new(&config.spec.action)?,
             },
             PolicyLayout::Gaussian(network) => {
                 let range = ActionRange::new(&config.spec.action)?;
-                Body::Actions {
-                    network: Network::new(&network, &file.parameters).with_first_outputs(range.width()),
+                PolicyFunction::Actions {
+                    network: ExportedNetwork::new(&network, &file.parameters).with_first_outputs(range.width()),
                     range,
                 }
             }
-            PolicyLayout::Softmax(network) => Body::Probabilities {
-                network: Network::new(&network, &file.parameters),
+            PolicyLayout::Softmax(network) => PolicyFunction::Probabilities {
+                network: ExportedNetwork::new(&network, &file.parameters),
             },
-            PolicyLayout::ActionValues(network) => Body::Values {
-                network: Network::new(&network, &file.parameters),
+            PolicyLayout::ActionValues(network) => PolicyFunction::Values {
+                network: ExportedNetwork::new(&network, &file.parameters),
             },
-            PolicyLayout::Dueling(network) => Body::Values {
-                network: Network::new(&network, &file.parameters).with_combined_heads(),
+            PolicyLayout::Dueling(network) => PolicyFunction::Values {
+                network: ExportedNetwork::new(&network, &file.parameters).with_combined_heads(),
             },
-            PolicyLayout::Table { states, actions } => Body::Table {
+            PolicyLayout::Table { states, actions } => PolicyFunction::Table {
                 states,
                 actions,
                 values: file.parameters.clone(),
             },
         };
         let metadata = metadata(config, file, which, &body)?;
-        let starts = Starts {
+        let starts = SpaceStarts {
             observation: config.spec.observation.start(),
             action: config.spec.action.start(),
         };
@@ -103,7 +106,7 @@ impl Portable {
     }
 
     /// Adds the policy's result in its run's final evaluation to the metadata.
-    pub fn evaluated(mut self, seed: u64, evaluated: &FinallyEvaluated) -> anyhow::Result<Self> {
+    pub fn evaluated(mut self, seed: u64, evaluated: &FinalPolicyResult) -> anyhow::Result<Self> {
         let entries = [
             ("return", serde_json::to_string(&evaluated.return_mean)?),
             ("std", serde_json::to_string(&evaluated.return_std)?),
@@ -127,7 +130,7 @@ impl Portable {
     }
 }
 
-impl Network {
+impl ExportedNetwork {
     fn new(layout: &NetworkLayout, parameters: &[f32]) -> Self {
         let layers = layout.layers(parameters).zip(layout.layer_sizes());
         let dense = layers.map(|(layer, (inputs, outputs))| Dense {
@@ -178,7 +181,12 @@ impl Network {
     }
 }
 
-fn metadata(config: &Config, file: &PolicyFile, which: &str, body: &Body) -> anyhow::Result<BTreeMap<String, String>> {
+fn metadata(
+    config: &Config,
+    file: &PolicyFile,
+    which: &str,
+    body: &PolicyFunction,
+) -> anyhow::Result<BTreeMap<String, String>> {
     let mut metadata = BTreeMap::from([
         ("environment".to_owned(), config.environment.name.clone()),
         ("algorithm".to_owned(), config.algorithm.name().to_owned()),
@@ -200,7 +208,10 @@ fn metadata(config: &Config, file: &PolicyFile, which: &str, body: &Body) -> any
             insert(name, start.to_string());
         }
     }
-    if let Body::Actions { network, .. } | Body::Probabilities { network } | Body::Values { network } = body {
+    if let PolicyFunction::Actions { network, .. }
+    | PolicyFunction::Probabilities { network }
+    | PolicyFunction::Values { network } = body
+    {
         let activation = match network.activation {
             Activation::Relu => "relu",
             Activation::Tanh => "tanh",
@@ -211,7 +222,7 @@ fn metadata(config: &Config, file: &PolicyFile, which: &str, body: &Body) -> any
         }
     }
     match body {
-        Body::Actions { .. } => {
+        PolicyFunction::Actions { .. } => {
             insert(
                 "output_activation",
                 "tanh, then scaled to action_low .. action_high".into(),
@@ -221,9 +232,9 @@ fn metadata(config: &Config, file: &PolicyFile, which: &str, body: &Body) -> any
                 insert("action_high", serde_json::to_string(high)?);
             }
         }
-        Body::Probabilities { .. } => insert("output_activation", "softmax".into()),
-        Body::Values { .. } => insert("output_activation", "none: the outputs are action values".into()),
-        Body::Table { .. } => insert("contents", "action values, a row for each state".into()),
+        PolicyFunction::Probabilities { .. } => insert("output_activation", "softmax".into()),
+        PolicyFunction::Values { .. } => insert("output_activation", "none: the outputs are action values".into()),
+        PolicyFunction::Table { .. } => insert("contents", "action values, a row for each state".into()),
     }
     Ok(metadata)
 }
@@ -238,7 +249,7 @@ mod tests {
     fn weights_are_exported_in_row_major_order() {
         let layout = NetworkLayout::new(3, Hidden::relu([2, 1]), 1);
         let parameters: Vec<f32> = (0..layout.parameters()).map(|i| i as f32).collect();
-        let first = &Network::new(&layout, &parameters).layers[0];
+        let first = &ExportedNetwork::new(&layout, &parameters).layers[0];
         assert_eq!(first.weights, [0.0, 2.0, 4.0, 1.0, 3.0, 5.0]);
         assert_eq!(first.biases, [6.0, 7.0]);
     }

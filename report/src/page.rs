@@ -15,7 +15,7 @@ use serde::Serialize;
 use shoal_common::run_dir::RunDir;
 
 use self::comparison::Comparison;
-use self::numbers::Limits;
+use self::numbers::PageLimits;
 use self::ranking::Ranking;
 use self::run::Run;
 
@@ -52,7 +52,7 @@ pub fn gather(runs: &[RunDir]) -> anyhow::Result<Report> {
     let names = run::names(runs);
     let mut gathered = Vec::new();
     for (number, (run, name)) in runs.iter().zip(names).enumerate() {
-        let limits = Limits::of(number, runs.len());
+        let limits = PageLimits::of(number, runs.len());
         gathered.push(Run::read(run, name, limits)?);
     }
     let comparisons = comparison::compare(&gathered);
@@ -78,7 +78,7 @@ fn rankings(comparisons: &[Comparison], runs: &[Run]) -> Vec<Ranking> {
 /// When a run cannot be read.
 pub fn ranking(runs: &[RunDir]) -> anyhow::Result<Vec<String>> {
     let named = runs.iter().zip(run::names(runs));
-    let read = named.map(|(run, name)| Run::read(run, name, Limits::NONE));
+    let read = named.map(|(run, name)| Run::read(run, name, PageLimits::NONE));
     let read = read.collect::<anyhow::Result<Vec<_>>>()?;
     let found = rankings(&comparison::compare(&read), &read);
     Ok(found
@@ -89,7 +89,7 @@ pub fn ranking(runs: &[RunDir]) -> anyhow::Result<Vec<String>> {
 
 impl Report {
     /// The reasons why runs have no playable episodes, each with the names of the runs concerned.
-    pub fn not_played(&self) -> Vec<(&str, Vec<&str>)> {
+    pub fn runs_without_episodes(&self) -> Vec<(&str, Vec<&str>)> {
         let mut reasons: Vec<(&str, Vec<&str>)> = Vec::new();
         for run in &self.runs {
             let Some(reason) = run.played.why_not.as_deref() else {

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
 use shoal_run::description::Description;
-use shoal_run::evaluation::WhichPolicy;
+use shoal_run::evaluation::SavedPolicy;
 use shoal_run::recorder::read_evaluations;
 use shoal_run::rollout::Rollout;
 
@@ -30,7 +30,7 @@ fn behaviour(run: &RunDir, config: &Config, out: &Path) -> anyhow::Result<Vec<Pa
     if !config.environment.server.is_empty() {
         return Ok(Vec::new());
     }
-    let policy = WhichPolicy::Best.read(run, config)?;
+    let policy = SavedPolicy::Best.read(run, config)?;
     let mut rollout = Rollout::new(config, &policy.parameters)?;
     if let Some(files) = thesis::behaviour(config, &mut rollout, out)? {
         return Ok(files);

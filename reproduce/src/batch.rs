@@ -4,15 +4,15 @@ use std::collections::{BTreeMap, VecDeque};
 use std::sync::mpsc;
 
 use anyhow::bail;
-use shoal_run::batch::work_off;
+use shoal_run::batch::run_jobs;
 use shoal_run::signals::Signals;
 
 use super::experiment::{Effort, Length};
 use super::folder::Folder;
-use super::progress::Progress;
-use super::request::{BatchEnding, Job, Name};
+use super::progress::ProgressDisplay;
+use super::request::{Job, JobName, ReproductionEnd};
 use super::settings::RunSettings;
-use super::training::{Ending, RunState, train};
+use super::training::{RunState, TrainingEnd, train};
 
 /// The seeds to run, and where.
 pub(super) struct Batch<'a> {
@@ -38,14 +38,14 @@ impl Batch<'_> {
     pub(super) fn run(
         &self,
         parallel: usize,
-        write: impl Fn(&BTreeMap<Name, String>) -> anyhow::Result<()>,
-    ) -> anyhow::Result<BatchEnding> {
+        write: impl Fn(&BTreeMap<JobName, String>) -> anyhow::Result<()>,
+    ) -> anyhow::Result<ReproductionEnd> {
         let signals = Signals::register()?;
         let due: VecDeque<Job> = self.jobs.iter().copied().filter(|job| self.is_due(job)).collect();
-        let mut progress = Progress::new(self.folder, self.effort, self.jobs.len(), &due)?;
+        let mut progress = ProgressDisplay::new(self.folder, self.effort, self.jobs.len(), &due)?;
         let mut failures = BTreeMap::new();
         let work = |job: Job, events: &mpsc::Sender<Event>| self.work(job, &signals, events);
-        work_off(due, parallel, &signals, work, |event| {
+        run_jobs(due, parallel, &signals, work, |event| {
             match event {
                 None => {}
                 Some(Event::Started(job)) => progress.started(job),
@@ -70,9 +70,9 @@ impl Batch<'_> {
         progress.clear();
         write(&failures)?;
         Ok(match (signals.received(), failures.len()) {
-            (None, 0) => BatchEnding::Complete,
-            (None, failed) => BatchEnding::Failed(failed),
-            (Some(signal), _) => BatchEnding::Interrupted(signal),
+            (None, 0) => ReproductionEnd::Complete,
+            (None, failed) => ReproductionEnd::Failed(failed),
+            (Some(signal), _) => ReproductionEnd::Interrupted(signal),
         })
     }
 
@@ -85,13 +85,13 @@ impl Batch<'_> {
         // A closed channel is no reason to stop: the results are still stored.
         let _ = events.send(Event::Started(job));
         match self.run_stages(job, signals, events) {
-            Ok(Ending::Finished) => _ = events.send(Event::Finished(job)),
-            Ok(Ending::Interrupted) => {}
+            Ok(TrainingEnd::Finished) => _ = events.send(Event::Finished(job)),
+            Ok(TrainingEnd::Interrupted) => {}
             Err(error) => _ = events.send(Event::Failed(job, error)),
         }
     }
 
-    fn run_stages(&self, job: Job, signals: &Signals, events: &mpsc::Sender<Event>) -> anyhow::Result<Ending> {
+    fn run_stages(&self, job: Job, signals: &Signals, events: &mpsc::Sender<Event>) -> anyhow::Result<TrainingEnd> {
         let Job {
             family,
             experiment,
@@ -111,8 +111,8 @@ impl Batch<'_> {
                     run.display()
                 );
             }
-            if train(experiment, self.effort, seed, length, &run, &|| signals.received())? == Ending::Interrupted {
-                return Ok(Ending::Interrupted);
+            if train(experiment, self.effort, seed, length, &run, &|| signals.received())? == TrainingEnd::Interrupted {
+                return Ok(TrainingEnd::Interrupted);
             }
             (family.store_result)(
                 self.folder,
@@ -124,6 +124,6 @@ impl Batch<'_> {
             )?;
             let _ = events.send(Event::Stored(job, length));
         }
-        Ok(Ending::Finished)
+        Ok(TrainingEnd::Finished)
     }
 }

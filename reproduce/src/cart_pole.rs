@@ -4,13 +4,13 @@ use rand::RngExt;
 use serde::{Deserialize, Serialize};
 use shoal_common::policy::Policy;
 use shoal_common::stream::{Purpose, stream};
-use shoal_report::figure::{self, Frame, Setting};
+use shoal_report::figure::{self, CurvesOfSetting, Frame};
 
 use super::claim::{Claim, Scope, median, percent, spread};
 use super::experiment::{Experiment, Length, Stage};
 use super::family::{Family, Policies, Results};
+use super::report_section::{FigureWriter, ReportSection};
 use super::result::SeedResult;
-use super::section::{FigureWriter, Section};
 
 /// Number of episodes in the moving average of figure 4.6.
 const SPAN: usize = 100;
@@ -147,13 +147,13 @@ impl Family for CartPole {
         Ok(Tests::of(&returns, is_dead(policies)?))
     }
 
-    fn sections(results: &Results<Tests>, writer: &FigureWriter) -> anyhow::Result<Vec<Section>> {
+    fn sections(results: &Results<Tests>, writer: &FigureWriter) -> anyhow::Result<Vec<ReportSection>> {
         let variants = VARIANTS.map(|(name, label)| (label, results.of(name, "")));
-        let settings: Vec<Setting> = variants
+        let settings: Vec<CurvesOfSetting> = variants
             .iter()
             .map(|(label, seeds)| {
                 let runs: Vec<_> = seeds.iter().map(|seed| seed.tests.curve()).collect();
-                Setting {
+                CurvesOfSetting {
                     label: (*label).into(),
                     curve: figure::pointwise(&runs, median),
                     runs,
@@ -179,7 +179,7 @@ impl Family for CartPole {
                 |path| figure::lines_by_setting(&frame, &settings, path),
             )?,
         ];
-        Ok(vec![Section {
+        Ok(vec![ReportSection {
             title: "CartPole with REINFORCE (section 4.2)",
             from: EXPERIMENTS.iter().map(|experiment| (experiment.name, "")).collect(),
             remark: REMARK.into(),

@@ -7,13 +7,13 @@ use serde::de::DeserializeOwned;
 use shoal_common::config::Config;
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::run_dir::RunDir;
-use shoal_run::evaluation::{WhichPolicy, evaluate};
+use shoal_run::evaluation::{SavedPolicy, evaluate};
 use shoal_run::recorder::{EpisodeRecord, read_episodes, read_evaluations};
 
 use super::experiment::{Experiment, Length, Stage};
 use super::folder::Folder;
+use super::report_section::{FigureWriter, ReportSection};
 use super::result::{Evaluation, Header, Policy, SeedResult};
-use super::section::{FigureWriter, Section};
 use super::settings::RunSettings;
 
 /// A family of related experiments. A new family implements this trait and has a line in [`super::FAMILIES`].
@@ -28,7 +28,7 @@ pub(super) trait Family {
     fn test(policies: &Policies, stage: &Stage) -> anyhow::Result<Self::Tests>;
 
     /// Checks the thesis's claims and draws its figures, from stored results alone.
-    fn sections(results: &Results<Self::Tests>, writer: &FigureWriter) -> anyhow::Result<Vec<Section>>;
+    fn sections(results: &Results<Self::Tests>, writer: &FigureWriter) -> anyhow::Result<Vec<ReportSection>>;
 }
 
 /// The policies of a run.
@@ -79,17 +79,17 @@ impl<T> Results<T> {
 
 /// A [`Family`] without its type, so that a list can contain different families.
 #[derive(Debug)]
-pub(super) struct Entry {
+pub(super) struct FamilyEntry {
     pub(super) experiments: &'static [Experiment],
     /// Makes and stores the result of a run that has reached the end of a stage.
     pub(super) store_result: fn(&Folder, &'static Experiment, &Stage, u64, Length, &RunSettings) -> anyhow::Result<()>,
     /// Makes the report's sections from the results in the folder.
-    pub(super) sections: fn(&Folder, &FigureWriter) -> anyhow::Result<Vec<Section>>,
+    pub(super) sections: fn(&Folder, &FigureWriter) -> anyhow::Result<Vec<ReportSection>>,
 }
 
-/// The [`Entry`] of a family.
-pub(super) const fn entry<F: Family>() -> Entry {
-    Entry {
+/// The [`FamilyEntry`] of a family.
+pub(super) const fn entry<F: Family>() -> FamilyEntry {
+    FamilyEntry {
         experiments: F::EXPERIMENTS,
         store_result: store_result::<F>,
         sections: sections::<F>,
@@ -110,8 +110,8 @@ fn store_result<F: Family>(
     // The result's header states the settings of the run itself, so they must be the expected ones.
     RunSettings::of_run(run.path(), seed)?.check(&run.path().display().to_string(), settings)?;
     let policies = Policies {
-        best: WhichPolicy::Best.read(&run, &config)?,
-        last: WhichPolicy::Last.read(&run, &config)?,
+        best: SavedPolicy::Best.read(&run, &config)?,
+        last: SavedPolicy::Last.read(&run, &config)?,
         config,
         run,
     };
@@ -143,7 +143,7 @@ fn store_result<F: Family>(
     folder.add(experiment, stage, &result)
 }
 
-fn sections<F: Family>(folder: &Folder, writer: &FigureWriter) -> anyhow::Result<Vec<Section>> {
+fn sections<F: Family>(folder: &Folder, writer: &FigureWriter) -> anyhow::Result<Vec<ReportSection>> {
     let mut by_name = BTreeMap::new();
     for experiment in F::EXPERIMENTS {
         for stage in experiment.stages {

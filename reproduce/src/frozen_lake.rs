@@ -6,15 +6,15 @@ use anyhow::Context;
 use serde::{Deserialize, Serialize};
 use shoal_common::policy_file::PolicyFile;
 use shoal_env_server::environment::frozen_lake::{ACTIONS, STATES};
-use shoal_report::figure::{self, Frame, Setting};
+use shoal_report::figure::{self, CurvesOfSetting, Frame};
 use shoal_run::analysis::lake::{LIMIT, Walk, greedy, optimal};
 use shoal_run::recorder::read_evaluations;
 use shoal_run::rollout::policy_layout;
 
 use super::experiment::{Experiment, Length, Stage};
 use super::family::{Family, Policies, Results};
+use super::report_section::{Figure, FigureWriter, ReportSection};
 use super::result::{SeedResult, representative};
-use super::section::{Figure, FigureWriter, Section};
 
 /// γ of every experiment of this family.
 const GAMMA: f64 = 0.999;
@@ -172,7 +172,7 @@ impl Family for FrozenLake {
         })
     }
 
-    fn sections(results: &Results<Tests>, writer: &FigureWriter) -> anyhow::Result<Vec<Section>> {
+    fn sections(results: &Results<Tests>, writer: &FigureWriter) -> anyhow::Result<Vec<ReportSection>> {
         let good = results.of(GOOD, "");
         let q_star = optimal(GAMMA);
         let best: Vec<f32> = q_star.iter().flatten().map(|q| *q as f32).collect();
@@ -201,7 +201,7 @@ impl Family for FrozenLake {
             "The optimal policy and its action-values, by value iteration",
             |path| draw_table(&best, path),
         )?);
-        Ok(vec![Section {
+        Ok(vec![ReportSection {
             title: "FrozenLake with Q-learning (section 4.1)",
             from: EXPERIMENTS.iter().map(|experiment| (experiment.name, "")).collect(),
             remark: remark(walk.reached),
@@ -243,10 +243,10 @@ fn of_sweep(
     number: &str,
     best: Walk,
 ) -> anyhow::Result<Vec<Figure>> {
-    let settings = |of: fn(&EvaluatedPolicy) -> f64| -> Vec<Setting> {
+    let settings = |of: fn(&EvaluatedPolicy) -> f64| -> Vec<CurvesOfSetting> {
         let curves = sweep.iter().map(|(label, seeds)| {
             let runs: Vec<_> = seeds.iter().map(|seed| seed.tests.on_grid(of)).collect();
-            Setting {
+            CurvesOfSetting {
                 label: (*label).into(),
                 curve: figure::pointwise(&runs, mean),
                 runs,

@@ -9,15 +9,15 @@ mod experiment;
 mod family;
 mod folder;
 mod frozen_lake;
-mod methods;
+mod newer_algorithms;
 mod pendulum;
 mod point_mass;
 mod progress;
 mod report;
+mod report_section;
 mod request;
 mod result;
 mod results_file;
-mod section;
 mod settings;
 mod training;
 
@@ -28,20 +28,20 @@ use anyhow::Context;
 use self::batch::Batch;
 pub use self::experiment::Effort;
 use self::experiment::Experiment;
-use self::family::{Entry, entry};
+use self::family::{FamilyEntry, entry};
 use self::folder::Folder;
 use self::request::Job;
-pub use self::request::{BatchEnding, Request};
+pub use self::request::{ReproductionEnd, Request};
 use self::settings::RunSettings;
 
 /// Every family, in the report's order.
-const FAMILIES: [Entry; 6] = [
+const FAMILIES: [FamilyEntry; 6] = [
     entry::<frozen_lake::FrozenLake>(),
     entry::<cart_pole::CartPole>(),
     entry::<pendulum::Pendulum>(),
     entry::<point_mass::PointMass>(),
-    entry::<methods::PendulumMethods>(),
-    entry::<methods::PointMassMethods>(),
+    entry::<newer_algorithms::PendulumAlgorithms>(),
+    entry::<newer_algorithms::PointMassAlgorithms>(),
 ];
 
 /// The names of the experiments on the command line.
@@ -53,7 +53,7 @@ pub fn names() -> impl Iterator<Item = &'static str> {
 
 /// Runs the requested seeds that have no result yet, stores each result, and writes the report from all results in the
 /// folder.
-pub fn run(request: &Request) -> anyhow::Result<BatchEnding> {
+pub fn run(request: &Request) -> anyhow::Result<ReproductionEnd> {
     let folder = Folder::open(&request.folder, experiments().map(|(_, experiment)| experiment))?;
     let settings = expected(request.effort)?;
     let requested = experiments()
@@ -86,8 +86,8 @@ pub fn run(request: &Request) -> anyhow::Result<BatchEnding> {
     batch.run(request.jobs, write)
 }
 
-fn experiments() -> impl Iterator<Item = (&'static Entry, &'static Experiment)> {
-    const ENTRIES: &[Entry] = &FAMILIES;
+fn experiments() -> impl Iterator<Item = (&'static FamilyEntry, &'static Experiment)> {
+    const ENTRIES: &[FamilyEntry] = &FAMILIES;
     ENTRIES
         .iter()
         .flat_map(|entry| entry.experiments.iter().map(move |experiment| (entry, experiment)))

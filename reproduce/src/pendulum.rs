@@ -8,8 +8,8 @@ use shoal_run::rollout::Rollout;
 use super::claim::{Claim, Scope, spread};
 use super::experiment::{Experiment, Length, Stage};
 use super::family::{Family, Policies, Results};
+use super::report_section::{FigureWriter, ReportSection};
 use super::result::{SeedResult, representative};
-use super::section::{FigureWriter, Section};
 
 /// 600 episodes of 200 steps.
 pub(super) const EXPERIMENTS: [Experiment; 1] = [Experiment {
@@ -62,7 +62,7 @@ impl Family for Pendulum {
         })
     }
 
-    fn sections(results: &Results<Tests>, writer: &FigureWriter) -> anyhow::Result<Vec<Section>> {
+    fn sections(results: &Results<Tests>, writer: &FigureWriter) -> anyhow::Result<Vec<ReportSection>> {
         let seeds = results.of("pendulum", "");
         let curves: Vec<_> = seeds.iter().map(SeedResult::curve).collect();
         let mut figures = vec![writer.add(
@@ -80,7 +80,7 @@ impl Family for Pendulum {
                 |path| figure::swing_up(&middle.tests.swing_up, path),
             )?);
         }
-        Ok(vec![Section {
+        Ok(vec![ReportSection {
             title: "Pendulum (section 4.3.2)",
             from: vec![("pendulum", "")],
             remark: REMARK.into(),

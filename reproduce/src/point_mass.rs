@@ -9,7 +9,7 @@ use shoal_run::rollout::Rollout;
 
 use super::experiment::{Experiment, Length, Stage};
 use super::family::{Family, Policies, Results};
-use super::section::{FigureWriter, Section};
+use super::report_section::{FigureWriter, ReportSection};
 
 /// The suffix of the stage after the additional training with r2.
 const LONGER: &str = "-longer";
@@ -94,10 +94,10 @@ impl Family for PointMass {
         })
     }
 
-    fn sections(results: &Results<Tests>, writer: &FigureWriter) -> anyhow::Result<Vec<Section>> {
+    fn sections(results: &Results<Tests>, writer: &FigureWriter) -> anyhow::Result<Vec<ReportSection>> {
         let [r1, r2, r3] = ["point-mass-r1", "point-mass-r2", "point-mass-r3"].map(|name| results.of(name, ""));
         let longer = results.of("point-mass-r2", LONGER);
-        let section = |title, from: &[(&'static str, &'static str)], remark: &str, claims, figures| Section {
+        let section = |title, from: &[(&'static str, &'static str)], remark: &str, claims, figures| ReportSection {
             title,
             from: from.into(),
             remark: remark.into(),

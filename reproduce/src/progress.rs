@@ -12,20 +12,20 @@ use shoal_run::recorder::recorded;
 
 use super::experiment::{self, Effort, Length};
 use super::folder::Folder;
-use super::request::{Job, Name};
+use super::request::{Job, JobName};
 use super::training::RunState;
 
 /// The live line and its data.
-pub(super) struct Progress<'a> {
+pub(super) struct ProgressDisplay<'a> {
     folder: &'a Folder,
     bar: ProgressBar,
     live: bool,
     /// Number of all jobs, including those that had finished before the batch began.
     total: usize,
     /// Every job that had not finished when the batch began.
-    due: BTreeMap<Name, Due>,
-    running: BTreeMap<Name, PathBuf>,
-    ended: Vec<Name>,
+    due: BTreeMap<JobName, Due>,
+    running: BTreeMap<JobName, PathBuf>,
+    ended: Vec<JobName>,
     started_at: Instant,
 }
 
@@ -48,7 +48,7 @@ impl Due {
     }
 }
 
-impl<'a> Progress<'a> {
+impl<'a> ProgressDisplay<'a> {
     pub(super) fn new<'j>(
         folder: &'a Folder,
         effort: Effort,
@@ -56,7 +56,7 @@ impl<'a> Progress<'a> {
         due: impl IntoIterator<Item = &'j Job>,
     ) -> anyhow::Result<Self> {
         let live = std::io::stderr().is_terminal();
-        let due: BTreeMap<Name, Due> = due
+        let due: BTreeMap<JobName, Due> = due
             .into_iter()
             .filter_map(|job| {
                 // If the run cannot be read, the error is reported when the job starts.

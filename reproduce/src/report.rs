@@ -10,18 +10,18 @@ use shoal_common::durable::write_atomically;
 
 use super::claim::{Claim, Verdict};
 use super::experiment::{Effort, Experiment, Stage};
-use super::family::Entry;
+use super::family::FamilyEntry;
 use super::folder::Folder;
-use super::request::{Job, Name, Request};
-use super::section::{Figure, FigureWriter, Section};
+use super::report_section::{Figure, FigureWriter, ReportSection};
+use super::request::{Job, JobName, Request};
 
 /// Writes the report from all results of the folder, and draws its figures.
 pub(super) fn write(
-    families: &[Entry],
+    families: &[FamilyEntry],
     folder: &Folder,
     request: &Request,
     jobs: &[Job],
-    failures: &BTreeMap<Name, String>,
+    failures: &BTreeMap<JobName, String>,
 ) -> anyhow::Result<()> {
     let figures = folder.path().join("figures");
     let writer = FigureWriter::in_directory(figures.clone(), request.png)?;
@@ -54,10 +54,10 @@ pub(super) fn write(
 
 /// The stages of a family, with their results and failures.
 struct Stages<'a> {
-    family: &'a Entry,
+    family: &'a FamilyEntry,
     folder: &'a Folder,
     jobs: &'a [Job],
-    failures: &'a BTreeMap<Name, String>,
+    failures: &'a BTreeMap<JobName, String>,
     effort: Effort,
 }
 
@@ -85,7 +85,7 @@ impl Stages<'_> {
 
     /// The seeds that a section uses and those that are missing, a line for each stage. `None` if none were requested
     /// and none exist.
-    fn seeds_of(&self, section: &Section) -> Option<Vec<String>> {
+    fn seeds_of(&self, section: &ReportSection) -> Option<Vec<String>> {
         let (mut lines, mut in_report) = (Vec::new(), false);
         for (name, suffix) in &section.from {
             let experiment = self
@@ -141,7 +141,7 @@ const QUICK_LOOK: &str = "\
 
 ";
 
-fn compose(sections: &[(Section, Vec<String>, String)], effort: Effort, figures: &Path) -> String {
+fn compose(sections: &[(ReportSection, Vec<String>, String)], effort: Effort, figures: &Path) -> String {
     let mut text = String::from("# Reproduction of the thesis's experiments\n\n");
     let quick = if effort == Effort::Quick { " --quick" } else { "" };
     if effort == Effort::Quick {
@@ -244,7 +244,7 @@ mod tests {
 
     #[test]
     fn a_report_contains_verdicts_notes_figures_and_missing_seeds() {
-        let section = |held: &[bool], png| Section {
+        let section = |held: &[bool], png| ReportSection {
             title: "Pendulum",
             from: vec![("pendulum", "")],
             remark: "Upright is 0.".into(),

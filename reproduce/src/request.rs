@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use super::experiment::{Effort, Experiment};
-use super::family::Entry;
+use super::family::FamilyEntry;
 
 /// What to reproduce, and how.
 #[derive(Clone, Debug)]
@@ -26,7 +26,7 @@ pub struct Request {
 
 /// How a request ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum BatchEnding {
+pub enum ReproductionEnd {
     /// Every requested result exists.
     Complete,
     /// This many seeds failed.
@@ -38,16 +38,16 @@ pub enum BatchEnding {
 /// One seed of one experiment, with all its stages.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Job {
-    pub(super) family: &'static Entry,
+    pub(super) family: &'static FamilyEntry,
     pub(super) experiment: &'static Experiment,
     pub(super) seed: u64,
 }
 
 /// The name of a job: experiment and seed.
-pub(super) type Name = (&'static str, u64);
+pub(super) type JobName = (&'static str, u64);
 
 impl Job {
-    pub(super) fn name(&self) -> Name {
+    pub(super) fn name(&self) -> JobName {
         (self.experiment.name, self.seed)
     }
 }

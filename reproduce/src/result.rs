@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use shoal_run::evaluation::EvaluationSummary;
 
 use super::experiment::{Experiment, Length};
-use super::results_file::Line;
+use super::results_file::ResultLine;
 use super::settings::RunSettings;
 
 /// The version of a result's format. Increase it whenever the meaning of a key changes.
@@ -91,7 +91,7 @@ impl Header {
     }
 
     /// Reads the header of a result.
-    pub(super) fn read(line: &Line) -> anyhow::Result<Self> {
+    pub(super) fn read(line: &ResultLine) -> anyhow::Result<Self> {
         /// The key that results of every version have.
         #[derive(Deserialize)]
         struct Versioned {
@@ -134,11 +134,11 @@ impl Header {
 }
 
 /// Reads a whole result.
-pub(super) fn read<T: DeserializeOwned>(line: &Line) -> anyhow::Result<SeedResult<T>> {
+pub(super) fn read<T: DeserializeOwned>(line: &ResultLine) -> anyhow::Result<SeedResult<T>> {
     parse(line)
 }
 
-fn parse<T: DeserializeOwned>(line: &Line) -> anyhow::Result<T> {
+fn parse<T: DeserializeOwned>(line: &ResultLine) -> anyhow::Result<T> {
     serde_json::from_str(&line.text).with_context(|| {
         format!(
             "{} is not a result of this program: move it away, and the result will be made again",
@@ -200,8 +200,8 @@ pub(super) mod tests {
         &super::super::pendulum::EXPERIMENTS[0]
     }
 
-    fn line(text: &str) -> Line {
-        Line::at("pendulum.jsonl.gz (seed 3)", text)
+    fn line(text: &str) -> ResultLine {
+        ResultLine::at("pendulum.jsonl.gz (seed 3)", text)
     }
 
     #[test]

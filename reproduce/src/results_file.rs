@@ -39,7 +39,7 @@ struct Key {
 
 /// A result as it is stored.
 #[derive(Debug)]
-pub(super) struct Line {
+pub(super) struct ResultLine {
     /// JSON on one line. It is copied and never formatted again, so that every digit is kept.
     pub(super) text: String,
     /// Where it is stored, for messages.
@@ -49,7 +49,7 @@ pub(super) struct Line {
 }
 
 #[cfg(test)]
-impl Line {
+impl ResultLine {
     pub(super) fn at(place: &str, text: &str) -> Self {
         Self {
             text: text.into(),
@@ -66,7 +66,7 @@ pub(super) struct ResultsFile {
     /// The directory of the runs and of results in the old format.
     directory: PathBuf,
     head: Head,
-    lines: BTreeMap<Key, Line>,
+    lines: BTreeMap<Key, ResultLine>,
 }
 
 impl ResultsFile {
@@ -121,7 +121,7 @@ impl ResultsFile {
         for text in lines {
             let key: Key = serde_json::from_str(text).with_context(damaged)?;
             let place = place(&self.path, &key);
-            let line = Line {
+            let line = ResultLine {
                 text: text.into(),
                 place: place.clone(),
                 old: None,
@@ -149,7 +149,7 @@ impl ResultsFile {
         }
         match self.lines.entry(key) {
             btree_map::Entry::Vacant(vacant) => {
-                vacant.insert(Line {
+                vacant.insert(ResultLine {
                     text,
                     place: here.to_string(),
                     old: Some(path),
@@ -186,7 +186,7 @@ impl ResultsFile {
     pub(super) fn add(&mut self, result: &str, stage: &Stage) -> anyhow::Result<()> {
         let (key, text) = line(result, stage)?;
         let place = place(&self.path, &key);
-        self.lines.insert(key.clone(), Line { text, place, old: None });
+        self.lines.insert(key.clone(), ResultLine { text, place, old: None });
         let written = self.write();
         if written.is_err() {
             self.lines.remove(&key);
@@ -200,7 +200,7 @@ impl ResultsFile {
     }
 
     /// Seeds and results of a stage, ordered by seed.
-    pub(super) fn of(&self, stage: &Stage) -> impl Iterator<Item = (u64, &Line)> {
+    pub(super) fn of(&self, stage: &Stage) -> impl Iterator<Item = (u64, &ResultLine)> {
         self.lines
             .iter()
             .filter(|(key, _)| key.stage == stage.suffix)

@@ -5,9 +5,9 @@ use std::path::Path;
 use std::process::Command;
 
 use shoal_common::run_dir::{RunDir, RunDirError};
-pub(super) use shoal_run::batch::Ending;
+pub(super) use shoal_run::batch::TrainingEnd;
 use shoal_run::batch::run_training;
-use shoal_run::evaluation::WhichPolicy;
+use shoal_run::evaluation::SavedPolicy;
 use shoal_run::status;
 
 use super::experiment::{Effort, Experiment, Length, Progress};
@@ -57,11 +57,11 @@ pub(super) fn train(
     length: Length,
     run: &Path,
     interrupted: Interrupted<'_>,
-) -> anyhow::Result<Ending> {
+) -> anyhow::Result<TrainingEnd> {
     let mut command = Command::new("/proc/self/exe");
     command.arg0("shoal");
     match RunState::of(run)? {
-        RunState::Started(progress) if has_ended(run, length, progress)? => return Ok(Ending::Finished),
+        RunState::Started(progress) if has_ended(run, length, progress)? => return Ok(TrainingEnd::Finished),
         RunState::Absent => {
             command
                 .args(["train", experiment.preset, "--lockstep", "--run"])
@@ -87,7 +87,7 @@ fn has_ended(run: &Path, length: Length, progress: Progress) -> anyhow::Result<b
     if !run.last_policy().exists() {
         return Ok(false);
     }
-    let steps = WhichPolicy::Last.read(&run, &run.config()?)?.env_steps;
+    let steps = SavedPolicy::Last.read(&run, &run.config()?)?.env_steps;
     Ok(match length {
         Length::Steps(wanted) => steps >= wanted,
         Length::Episodes(wanted) => progress.episodes >= wanted && steps == progress.steps,

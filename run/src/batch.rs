@@ -8,7 +8,7 @@ use std::time::Duration;
 use anyhow::{Context, bail};
 use rustix::process::Signal;
 
-use crate::process::Peer;
+use crate::process::ChildProcess;
 use crate::signals::Signals;
 
 /// How often `observe` is called without an event.
@@ -19,7 +19,7 @@ const SIGNAL_INTERVAL: Duration = Duration::from_millis(100);
 
 /// How a training ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Ending {
+pub enum TrainingEnd {
     /// In order.
     Finished,
     /// By a signal; its state is saved.
@@ -28,7 +28,7 @@ pub enum Ending {
 
 /// Works off the queue with `parallel` threads until it is empty or a signal has arrived. `work` may send events, which
 /// this thread passes to `observe`; that is also called once a second without an event.
-pub fn work_off<Job: Send, Event: Send>(
+pub fn run_jobs<Job: Send, Event: Send>(
     queue: VecDeque<Job>,
     parallel: usize,
     signals: &Signals,
@@ -65,8 +65,8 @@ pub fn work_off<Job: Send, Event: Send>(
 ///
 /// # Errors
 /// When it cannot be started, or fails: its last line.
-pub fn run_training(command: &mut Command, interrupted: &dyn Fn() -> Option<i32>) -> anyhow::Result<Ending> {
-    let mut training = Peer::start(command, "training".into()).context("cannot start a training")?;
+pub fn run_training(command: &mut Command, interrupted: &dyn Fn() -> Option<i32>) -> anyhow::Result<TrainingEnd> {
+    let mut training = ChildProcess::start(command, "training".into()).context("cannot start a training")?;
     let mut terminated = false;
     let status = loop {
         if let Some(status) = training.wait(SIGNAL_INTERVAL) {
@@ -81,7 +81,7 @@ pub fn run_training(command: &mut Command, interrupted: &dyn Fn() -> Option<i32>
         }
     };
     if interrupted().is_some() {
-        return Ok(Ending::Interrupted);
+        return Ok(TrainingEnd::Interrupted);
     }
     if !status.success() {
         bail!(
@@ -91,20 +91,20 @@ pub fn run_training(command: &mut Command, interrupted: &dyn Fn() -> Option<i32>
                 .unwrap_or_else(|| format!("a training ended with {status}"))
         );
     }
-    Ok(Ending::Finished)
+    Ok(TrainingEnd::Finished)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn shell(script: &str, signal: Option<i32>) -> anyhow::Result<Ending> {
+    fn shell(script: &str, signal: Option<i32>) -> anyhow::Result<TrainingEnd> {
         run_training(Command::new("sh").args(["-c", script]), &|| signal)
     }
 
     #[test]
     fn the_error_of_a_failed_training_is_its_last_line() {
-        assert_eq!(shell("exit 0", None).unwrap(), Ending::Finished);
+        assert_eq!(shell("exit 0", None).unwrap(), TrainingEnd::Finished);
         let error = shell(
             "echo 'warning: hot' >&2; echo 'error: no room' >&2; echo >&2; exit 1",
             None,
@@ -119,7 +119,7 @@ mod tests {
         let start = std::time::Instant::now();
         assert_eq!(
             shell("sleep 60 & trap 'kill $!; exit 143' TERM; wait", Some(15)).unwrap(),
-            Ending::Interrupted
+            TrainingEnd::Interrupted
         );
         assert!(start.elapsed() < Duration::from_secs(30));
     }
@@ -129,7 +129,7 @@ mod tests {
         let signals = Signals::register().unwrap();
         let mut done = Vec::new();
         let work = |job: u32, events: &mpsc::Sender<u32>| events.send(job * 2).unwrap();
-        work_off((0..50).collect(), 3, &signals, work, |event| done.extend(event));
+        run_jobs((0..50).collect(), 3, &signals, work, |event| done.extend(event));
         done.sort_unstable();
         assert_eq!(done, (0..50).map(|job| job * 2).collect::<Vec<_>>());
     }

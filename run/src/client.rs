@@ -4,7 +4,7 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use anyhow::bail;
-use shoal_common::channel::control::{self, Answer, ControlError, Question, RunStatus};
+use shoal_common::channel::control::{self, ControlError, ControlRequest, ControlResponse, RunStatus};
 use shoal_common::channel::{Domain, Sweeper};
 use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
@@ -36,24 +36,29 @@ impl RunClient {
     }
 
     /// Asks the run's launcher; `None` if there is none, or it ends before it answers.
-    fn ask(&self, question: Question, patience: Duration) -> anyhow::Result<Option<Answer>> {
+    fn ask(&self, request: ControlRequest, patience: Duration) -> anyhow::Result<Option<ControlResponse>> {
         if !self.run.is_running()? {
             return Ok(None);
         }
         let domain = Domain::visit(&self.config.run.id, self.config.actors.max)?;
-        let answer = self.ask_in(&domain, question, patience);
+        let answer = self.ask_in(&domain, request, patience);
         let left = domain.leave();
         let answer = answer?;
         left?;
         Ok(answer)
     }
 
-    fn ask_in(&self, domain: &Domain, question: Question, patience: Duration) -> anyhow::Result<Option<Answer>> {
+    fn ask_in(
+        &self,
+        domain: &Domain,
+        request: ControlRequest,
+        patience: Duration,
+    ) -> anyhow::Result<Option<ControlResponse>> {
         let _sweeper = Sweeper::start(domain)?;
         let lives = || self.run.is_running().unwrap_or(true);
-        let is_about_status = question == Question::Status;
-        match control::ask(domain, self.run.key()?, question, patience, lives) {
-            Ok(Answer::AnotherRun(there)) => {
+        let is_about_status = request == ControlRequest::Status;
+        match control::ask(domain, self.run.key()?, request, patience, lives) {
+            Ok(ControlResponse::AnotherRun(there)) => {
                 let here = self.run.path().display();
                 bail!("{here} is a copy of {there}, which is running; the launcher in {here} waits for it to end")
             }
@@ -64,7 +69,7 @@ impl RunClient {
             }
             Err(error @ (ControlError::Missing | ControlError::Silence)) if is_about_status => {
                 match self.without_roles(&error)? {
-                    Some(status) => Ok(Some(Answer::Status(status))),
+                    Some(status) => Ok(Some(ControlResponse::Status(status))),
                     None => Err(error.into()),
                 }
             }
@@ -115,20 +120,20 @@ impl RunClient {
     pub fn status(&self) -> anyhow::Result<Option<RunStatus>> {
         // A launcher that leaves its start may remove the shared memory in which it was asked.
         let starts = self.reason_for_no_roles()? == Some(STARTING);
-        let answer = match self.ask(Question::Status, PATIENCE) {
-            Err(_) if starts => Some(Answer::Status(self.saved(STARTING)?)),
+        let answer = match self.ask(ControlRequest::Status, PATIENCE) {
+            Err(_) if starts => Some(ControlResponse::Status(self.saved(STARTING)?)),
             answer => answer?,
         };
         match answer {
             None => Ok(None),
-            Some(Answer::Status(status)) => Ok(Some(status)),
+            Some(ControlResponse::Status(status)) => Ok(Some(status)),
             Some(other) => bail!("the launcher gave an unexpected answer: {other:?}"),
         }
     }
 
     /// Changes the number of actors.
     pub fn scale(&self, actors: u32) -> anyhow::Result<()> {
-        match self.ask(Question::Scale { actors }, PATIENCE)? {
+        match self.ask(ControlRequest::Scale { actors }, PATIENCE)? {
             None => bail!("{}", self.not_running()),
             Some(answer) => accepted(answer),
         }
@@ -146,7 +151,7 @@ impl RunClient {
             ),
             Some(_) => {}
         }
-        let answer = self.ask(Question::Stop, STOP_PATIENCE)?;
+        let answer = self.ask(ControlRequest::Stop, STOP_PATIENCE)?;
         let asked = Instant::now();
         while self.run.is_running()? {
             if asked.elapsed() >= PATIENCE {
@@ -176,10 +181,10 @@ impl RunClient {
     }
 }
 
-fn accepted(answer: Answer) -> anyhow::Result<()> {
+fn accepted(answer: ControlResponse) -> anyhow::Result<()> {
     match answer {
-        Answer::Accepted => Ok(()),
-        Answer::Refused(reason) => bail!("{reason}"),
+        ControlResponse::Accepted => Ok(()),
+        ControlResponse::Refused(reason) => bail!("{reason}"),
         other => bail!("the launcher gave an unexpected answer: {other:?}"),
     }
 }

@@ -4,14 +4,14 @@ use shoal_common::config::Config;
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::run_dir::RunDir;
 
-use crate::evaluation::{EvaluationSummary, WhichPolicy, evaluate_until};
+use crate::evaluation::{EvaluationSummary, SavedPolicy, evaluate_until};
 use crate::external_environment::GYMNASIUM;
 use crate::server_location::ServerLocation;
 use crate::signals::Interrupt;
 
 /// The best policy's mean return before, and the one now.
 #[derive(Clone, Debug, PartialEq)]
-pub struct EvaluatedAnew {
+pub struct ReevaluatedPolicy {
     /// The one stored in `best.policy` before.
     pub before: f64,
     /// The one stored now.
@@ -26,11 +26,15 @@ pub struct EvaluatedAnew {
 ///
 /// # Errors
 /// When the policy cannot be read or written, the environment fails, or a signal has arrived.
-pub fn evaluate_anew(run: &RunDir, config: &Config, interrupt: &Interrupt) -> anyhow::Result<Option<EvaluatedAnew>> {
+pub fn reevaluate_if_needed(
+    run: &RunDir,
+    config: &Config,
+    interrupt: &Interrupt,
+) -> anyhow::Result<Option<ReevaluatedPolicy>> {
     if !config.environment.name.starts_with(GYMNASIUM) || run.server_file().exists() {
         return Ok(None);
     }
-    let evaluated = evaluate_best(run, config, interrupt)?;
+    let evaluated = reevaluate_best(run, config, interrupt)?;
     if let Some(location) = ServerLocation::here(&config.environment.server)? {
         location.write(run)?;
     }
@@ -41,11 +45,15 @@ pub fn evaluate_anew(run: &RunDir, config: &Config, interrupt: &Interrupt) -> an
 ///
 /// # Errors
 /// When the policy cannot be read or written, the environment fails, or a signal has arrived.
-pub fn evaluate_best(run: &RunDir, config: &Config, interrupt: &Interrupt) -> anyhow::Result<Option<EvaluatedAnew>> {
+pub fn reevaluate_best(
+    run: &RunDir,
+    config: &Config,
+    interrupt: &Interrupt,
+) -> anyhow::Result<Option<ReevaluatedPolicy>> {
     if !run.best_policy().exists() {
         return Ok(None);
     }
-    let best = WhichPolicy::Best.read(run, config)?;
+    let best = SavedPolicy::Best.read(run, config)?;
     let amount = (config.evaluation.episodes, config.run.seed);
     let now = evaluate_until(run, config, &best.parameters, amount, interrupt, |_| ())?;
     let anew = PolicyFile {
@@ -55,7 +63,7 @@ pub fn evaluate_best(run: &RunDir, config: &Config, interrupt: &Interrupt) -> an
         ..best.clone()
     };
     anew.write(&run.best_policy())?;
-    Ok(Some(EvaluatedAnew {
+    Ok(Some(ReevaluatedPolicy {
         before: best.return_mean,
         now,
     }))

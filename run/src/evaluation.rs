@@ -11,9 +11,10 @@ use crate::description::Description;
 use crate::rollout::{Rollout, policy_layout};
 use crate::signals::Interrupt;
 
-/// One of a run's policies.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
-pub enum WhichPolicy {
+/// One of the two policies that a run saves.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+pub enum SavedPolicy {
     /// The policy with the best evaluation so far.
     #[default]
     Best,
@@ -21,7 +22,7 @@ pub enum WhichPolicy {
     Last,
 }
 
-impl WhichPolicy {
+impl SavedPolicy {
     /// Reads this policy of a run. It must fit the run's network.
     pub fn read(self, run: &RunDir, config: &Config) -> anyhow::Result<PolicyFile> {
         let path = match self {
@@ -103,7 +104,7 @@ fn evaluate_by(
 mod tests {
     use super::*;
     use crate::testing::small;
-    use shoal_common::config::Algorithm;
+    use shoal_common::config::AlgorithmConfig;
 
     #[test]
     fn the_same_seed_gives_the_same_evaluation() {
@@ -138,7 +139,7 @@ mod tests {
         let (mut config, parameters) = small("name = \"pendulum\"");
         std::fs::write(run.config_file(), config.to_toml().unwrap()).unwrap();
         std::fs::create_dir(run.checkpoints()).unwrap();
-        let missing = WhichPolicy::Best.read(&run, &config).unwrap_err().to_string();
+        let missing = SavedPolicy::Best.read(&run, &config).unwrap_err().to_string();
         assert!(missing.contains("best.policy") && !missing.contains('\n'), "{missing}");
 
         let fingerprint = policy_layout(&config).unwrap().fingerprint();
@@ -152,12 +153,12 @@ mod tests {
             parameters,
         };
         policy.write(&run.last_policy()).unwrap();
-        assert_eq!(WhichPolicy::Last.read(&run, &config).unwrap(), policy);
-        let Algorithm::Ddpg(ddpg) = &mut config.algorithm else {
+        assert_eq!(SavedPolicy::Last.read(&run, &config).unwrap(), policy);
+        let AlgorithmConfig::Ddpg(ddpg) = &mut config.algorithm else {
             unreachable!()
         };
         ddpg.hidden = [5, 3].into();
-        let foreign = WhichPolicy::Last.read(&run, &config).unwrap_err().to_string();
+        let foreign = SavedPolicy::Last.read(&run, &config).unwrap_err().to_string();
         assert!(
             foreign.contains("another network") && !foreign.contains('\n'),
             "{foreign}"

@@ -19,7 +19,9 @@ use rustix::process::{
     Pid, PidfdFlags, Signal, getpgrp, getpid, getppid, kill_process, kill_process_group, pidfd_open,
     set_parent_process_death_signal,
 };
-use shoal_common::channel::environment::{Begin, EnvironmentClient, Fault, Observed, Stepped, describe};
+use shoal_common::channel::environment::{
+    EnvironmentClient, EnvironmentResponse, ResetRequest, ResponseFault, StepResult, describe,
+};
 use shoal_common::channel::{ChannelError, Domain, EventName, Listener, Services};
 use shoal_common::config::EnvironmentConfig;
 use shoal_common::exit::Exit;
@@ -27,8 +29,8 @@ use shoal_common::report::Role;
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::stop::{GRACE, Stop};
 
-use crate::process::{Peer, wait_for_any};
-use crate::server_location::Surroundings;
+use crate::process::{ChildProcess, wait_for_any};
+use crate::server_location::ServerSurroundings;
 use crate::signals::Interrupt;
 
 /// The prefix of the names of Gymnasium environments.
@@ -73,7 +75,7 @@ pub struct LaunchSpec<'a> {
     /// With seed and index, selects the random streams of its training episodes.
     pub stream: u64,
     /// Where it is started, and with what.
-    pub surroundings: Surroundings,
+    pub surroundings: ServerSurroundings,
 }
 
 impl LaunchSpec<'_> {
@@ -82,7 +84,7 @@ impl LaunchSpec<'_> {
         let Some((program, arguments)) = environment.server.split_first() else {
             return Ok(None);
         };
-        let Surroundings { location, hash_seed } = &self.surroundings;
+        let ServerSurroundings { location, hash_seed } = &self.surroundings;
         let mut command = match location {
             Some(location) => {
                 let mut command = Command::new(location.program());
@@ -230,7 +232,7 @@ pub struct ExternalEnvironment {
     client: EnvironmentClient,
     listener: Listener,
     spec: EnvironmentSpec,
-    program: Peer,
+    program: ChildProcess,
     /// Ends every wait for an answer.
     stop: Stop,
     interrupt: Interrupt,
@@ -264,7 +266,7 @@ impl ExternalEnvironment {
             environment,
             environments,
             seed,
-            Surroundings::default(),
+            ServerSurroundings::default(),
             Interrupt::default(),
         )
     }
@@ -278,7 +280,7 @@ impl ExternalEnvironment {
         environment: &EnvironmentConfig,
         environments: u32,
         seed: u64,
-        surroundings: Surroundings,
+        surroundings: ServerSurroundings,
         interrupt: Interrupt,
     ) -> anyhow::Result<Self> {
         Domain::remove_abandoned()?;
@@ -325,11 +327,11 @@ impl ExternalEnvironment {
     ///
     /// # Errors
     /// When the server has ended, refuses or does not answer, or a signal has arrived.
-    pub fn begin_evaluation(&mut self, number: u64) -> anyhow::Result<Observed> {
+    pub fn begin_evaluation(&mut self, number: u64) -> anyhow::Result<EnvironmentResponse> {
         let asked = Instant::now();
         let begun = self.client.reset(
             &self.listener,
-            Begin::Evaluation {
+            ResetRequest::Evaluation {
                 first: number,
                 episodes: 1,
             },
@@ -342,12 +344,12 @@ impl ExternalEnvironment {
     ///
     /// # Errors
     /// When the server has ended, refuses or does not answer, or a signal has arrived.
-    pub fn step(&mut self, actions: &[f32]) -> anyhow::Result<Observed> {
+    pub fn step(&mut self, actions: &[f32]) -> anyhow::Result<EnvironmentResponse> {
         let asked = Instant::now();
         let stepped = self.client.step(&self.listener, actions, || self.give_up(asked));
         match checked(stepped, &mut self.program)?.map_or_else(|| self.unanswered(asked), Ok)? {
-            Stepped::Taken(observed) => Ok(observed),
-            Stepped::Lost => {
+            StepResult::Taken(observed) => Ok(observed),
+            StepResult::Lost => {
                 // It has left shared memory and is about to end. The last lines it writes name the reason.
                 self.program.wait(LAST_WORDS);
                 self.program.check()?;
@@ -390,7 +392,14 @@ impl Drop for ExternalEnvironment {
     }
 }
 
-type Opened = (Services, EnvironmentClient, Listener, EnvironmentSpec, Peer, Stop);
+type Opened = (
+    Services,
+    EnvironmentClient,
+    Listener,
+    EnvironmentSpec,
+    ChildProcess,
+    Stop,
+);
 
 fn open(
     domain: &Domain,
@@ -406,8 +415,8 @@ fn open(
     services.create_common(domain)?;
     services.create_environment(domain, launch.index)?;
     let listener = Listener::bind(domain, launch.client)?;
-    let mut program =
-        Peer::start(&mut tied(&command)?, "environment server".into()).with_context(|| cannot_start(&command))?;
+    let mut program = ChildProcess::start(&mut tied(&command)?, "environment server".into())
+        .with_context(|| cannot_start(&command))?;
     let has_answered = Stop::default();
     let stop = stop_when_it_ends(&program, has_answered.clone(), environment)?;
     let described = describe(domain, launch.index, &listener, stop.clone(), || {
@@ -440,7 +449,11 @@ fn with_advice(error: anyhow::Error) -> anyhow::Error {
 }
 
 /// A stop that is requested when the program has ended, or has not answered within its limit. A slow start is reported.
-fn stop_when_it_ends(program: &Peer, has_answered: Stop, environment: &EnvironmentConfig) -> anyhow::Result<Stop> {
+fn stop_when_it_ends(
+    program: &ChildProcess,
+    has_answered: Stop,
+    environment: &EnvironmentConfig,
+) -> anyhow::Result<Stop> {
     let stop = Stop::default();
     let flag = stop.clone();
     let (name, limit) = (environment.name.clone(), environment.start_limit());
@@ -467,14 +480,14 @@ fn stop_when_it_ends(program: &Peer, has_answered: Stop, environment: &Environme
 }
 
 /// The result; `None` if the program has not answered within its limit. If the program has ended, that is the error.
-fn checked<T>(result: Result<T, Exit<ChannelError>>, program: &mut Peer) -> anyhow::Result<Option<T>> {
+fn checked<T>(result: Result<T, Exit<ChannelError>>, program: &mut ChildProcess) -> anyhow::Result<Option<T>> {
     result.map(Some).or_else(|exit| {
         program.check()?;
         match exit {
             Exit::Stopped => Ok(None),
             Exit::Failed(error) => match (error.fault(), program.last_line()) {
                 // Its last line describes the fault.
-                (Some(Fault::Reported), Some(line)) => bail!("{line}"),
+                (Some(ResponseFault::Reported), Some(line)) => bail!("{line}"),
                 _ => Err(error.into()),
             },
         }

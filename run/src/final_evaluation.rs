@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use shoal_common::durable::write_atomically;
 use shoal_common::run_dir::RunDir;
 
-use crate::evaluation::{EvaluationSummary, WhichPolicy};
+use crate::evaluation::{EvaluationSummary, SavedPolicy};
 
 /// The version of the file's format.
 const FORMAT: u32 = 1;
@@ -21,26 +21,16 @@ pub struct FinalEvaluation {
     /// The run's environment steps at that time. A run that has more now has been resumed.
     pub env_steps: u64,
     /// The evaluated policies.
-    pub policies: Vec<FinallyEvaluated>,
+    pub policies: Vec<FinalPolicyResult>,
     /// The better policy by this evaluation, which then became `best.policy`.
-    pub kept: FinalPolicy,
-}
-
-/// Which policy was evaluated.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum FinalPolicy {
-    /// The policy with the best evaluation in training.
-    Best,
-    /// The learner's last policy.
-    Last,
+    pub kept: SavedPolicy,
 }
 
 /// A policy's result in the final evaluation. A number that is not finite is `None`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct FinallyEvaluated {
+pub struct FinalPolicyResult {
     /// Whether it was the best or the last policy when it was evaluated.
-    pub policy: FinalPolicy,
+    pub policy: SavedPolicy,
     /// Its version.
     pub version: u64,
     /// Environment steps that it was learned from.
@@ -55,9 +45,9 @@ pub struct FinallyEvaluated {
     pub interval: Option<(f64, f64)>,
 }
 
-impl FinallyEvaluated {
+impl FinalPolicyResult {
     /// The entry of a policy of this version and number of environment steps.
-    pub fn new(policy: FinalPolicy, (version, env_steps): (u64, u64), summary: &EvaluationSummary) -> Self {
+    pub fn new(policy: SavedPolicy, (version, env_steps): (u64, u64), summary: &EvaluationSummary) -> Self {
         let finite = |number: f64| Some(number).filter(|number| number.is_finite());
         Self {
             policy,
@@ -73,7 +63,7 @@ impl FinallyEvaluated {
 
 impl FinalEvaluation {
     /// The final evaluation of a run with this number of environment steps.
-    pub fn new(seed: u64, env_steps: u64, policies: Vec<FinallyEvaluated>, kept: FinalPolicy) -> Self {
+    pub fn new(seed: u64, env_steps: u64, policies: Vec<FinalPolicyResult>, kept: SavedPolicy) -> Self {
         Self {
             format: FORMAT,
             seed,
@@ -84,10 +74,10 @@ impl FinalEvaluation {
     }
 
     /// The result of the policy that now has this name.
-    pub fn of(&self, which: WhichPolicy) -> Option<&FinallyEvaluated> {
+    pub fn of(&self, which: SavedPolicy) -> Option<&FinalPolicyResult> {
         let policy = match which {
-            WhichPolicy::Best => self.kept,
-            WhichPolicy::Last => FinalPolicy::Last,
+            SavedPolicy::Best => self.kept,
+            SavedPolicy::Last => SavedPolicy::Last,
         };
         self.policies.iter().find(|evaluated| evaluated.policy == policy)
     }
@@ -180,14 +170,14 @@ mod tests {
         let run = RunDir::create(&parent.path().join("run")).unwrap();
         assert_eq!(FinalEvaluation::read(&run, 10).unwrap(), None);
         let policies = vec![
-            FinallyEvaluated::new(FinalPolicy::Best, (3, 5), &summary(f64::NAN, 0.0, 9)),
-            FinallyEvaluated::new(FinalPolicy::Last, (4, 10), &summary(-1.0, 0.5, 9)),
+            FinalPolicyResult::new(SavedPolicy::Best, (3, 5), &summary(f64::NAN, 0.0, 9)),
+            FinalPolicyResult::new(SavedPolicy::Last, (4, 10), &summary(-1.0, 0.5, 9)),
         ];
-        let written = FinalEvaluation::new(1, 10, policies, FinalPolicy::Last);
+        let written = FinalEvaluation::new(1, 10, policies, SavedPolicy::Last);
         written.write(&run).unwrap();
         assert_eq!(FinalEvaluation::read(&run, 10).unwrap(), Some(written.clone()));
         assert_eq!(FinalEvaluation::read(&run, 11).unwrap(), None);
-        assert_eq!(written.of(WhichPolicy::Best).unwrap().version, 4);
+        assert_eq!(written.of(SavedPolicy::Best).unwrap().version, 4);
         assert_eq!(written.policies[0].return_mean, None);
         let other = serde_json::to_string(&written)
             .unwrap()

@@ -7,7 +7,7 @@ use shoal_common::config::Config;
 use shoal_common::run_dir::{RunDir, RunLock};
 
 use crate::external_environment::ExternalEnvironment;
-use crate::server_location::{ServerLocation, Surroundings};
+use crate::server_location::{ServerLocation, ServerSurroundings};
 use crate::signals::Interrupt;
 
 /// Makes the directory at `path` from the run's configuration. The run's processes on this host find each other under a name
@@ -44,7 +44,7 @@ fn fill(run: &RunDir, configuration: &str, first_incarnation: u64, interrupt: In
     std::fs::write(run.incarnations(), (first_incarnation - 1).to_string()).context("cannot write a counter")?;
     if let Some(location) = ServerLocation::here(&config.environment.server)? {
         location.write(run)?;
-        let surroundings = Surroundings::of_run(run, &config)?;
+        let surroundings = ServerSurroundings::of_run(run, &config)?;
         let environment = ExternalEnvironment::begin_in(&config.environment, 1, 0, surroundings, interrupt)?;
         let found = environment.spec();
         if !found.matches(&config.spec) {

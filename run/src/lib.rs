@@ -1,6 +1,7 @@
 //! Everything about a run except starting it: its configuration and directory, the resources it needs, its records, and
 //! the evaluation of its policies.
 
+pub mod algorithm;
 pub mod analysis;
 pub mod batch;
 pub mod client;
@@ -10,7 +11,6 @@ pub mod evaluation;
 pub mod external_environment;
 pub mod final_evaluation;
 pub mod joining;
-pub mod method;
 pub mod numbers;
 pub mod origin;
 pub mod outcome;

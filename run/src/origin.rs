@@ -7,7 +7,7 @@ use std::path::Path;
 
 use anyhow::{Context, bail};
 use serde::{Deserialize, Serialize};
-use shoal_common::algorithms::Experience;
+use shoal_common::algorithms::TransitionUse;
 use shoal_common::config::{Config, explanation};
 use shoal_common::durable::write_atomically;
 use shoal_common::run_dir::{RunDir, RunDirError, RunLock};
@@ -154,12 +154,12 @@ impl Predecessor {
     fn check_networks(&self, config: &Config) -> Result<(), UsageError> {
         let there = self.run.path().display();
         let (old, new) = (&self.config, config);
-        let methods = [old, new].map(|config| config.algorithm.name());
+        let algorithms = [old, new].map(|config| config.algorithm.name());
         let refused = |what: String| Err(UsageError(format!("--from {there}: {what}")));
-        if methods[0] != methods[1] {
+        if algorithms[0] != algorithms[1] {
             return refused(format!(
                 "it has networks of {}, and this run learns with {}",
-                methods[0], methods[1]
+                algorithms[0], algorithms[1]
             ));
         }
         let learned = |config: &Config| config.algorithm.settings().learned(&config.spec);
@@ -183,7 +183,7 @@ impl Predecessor {
         let there = self.run.path().display();
         let refused = |what: String| Err(UsageError(format!("--with-replay: {what}; leave out --with-replay")));
         let (old, new) = (&self.config, config);
-        if config.algorithm.spec().experience != Experience::Minibatches {
+        if config.algorithm.spec().transition_use != TransitionUse::Minibatches {
             return refused(format!(
                 "{} learns from each step once, as it happens",
                 config.algorithm.name()
@@ -230,13 +230,13 @@ impl Predecessor {
             None => 0,
             Some((old, _)) => {
                 let mut new = Replay::create(&run.replay_file(), &replay_layout(config))?;
-                new.begin_with(old, self.rows(old, config))?
+                new.inherit_rows(old, self.rows(old, config))?
             }
         };
-        let Checkpoint { counters, sections } = &self.checkpoint;
+        let Checkpoint { counters, arrays } = &self.checkpoint;
         let weights = registry::weights(config);
         let fresh = registry::new(config)?;
-        let state = registry::inherited(&*fresh, &weights, SavedState::from(sections.clone()), rows)?;
+        let state = registry::inherited(&*fresh, &weights, SavedState::from(arrays.clone()), rows)?;
         let borrowed: Vec<(&str, &[f32])> = state
             .iter()
             .map(|(name, numbers)| (*name, numbers.as_slice()))
@@ -246,7 +246,7 @@ impl Predecessor {
             ..Counters::default()
         };
         Checkpoints::new(&run.checkpoints(), config.fingerprint()).save(&begun, &borrowed)?;
-        let of_weights = |name: &&str| sections.iter().find(|(found, _)| found == name);
+        let of_weights = |name: &&str| arrays.iter().find(|(found, _)| found == name);
         let numbers: Vec<&[f32]> = weights
             .iter()
             .filter_map(of_weights)

@@ -10,7 +10,7 @@ use shoal_common::run_dir::RunDir;
 /// The version of the file's format.
 const FORMAT: u32 = 1;
 
-/// The reason in the outcome of a run whose launcher answers no questions yet. Its state is `Running`.
+/// The reason in the outcome of a run whose launcher answers no requests yet. Its state is `Running`.
 pub const STARTING: &str = "starting";
 
 /// The reason in the outcome of a run that evaluates its policies once more. Its state is still `Running`.

@@ -9,25 +9,25 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 use serde::de::DeserializeOwned;
-use shoal_common::algorithms::Experience;
+use shoal_common::algorithms::TransitionUse;
 use shoal_common::config::explanation::{self, Key};
-use shoal_common::config::{ActorsConfig, Algorithm, Config, EnvironmentConfig, IdentityFormat, Mode, RunConfig};
+use shoal_common::config::{ActorsConfig, AlgorithmConfig, Config, EnvironmentConfig, IdentityFormat, Mode, RunConfig};
 use shoal_common::run_dir::{RunDir, RunLock};
 use shoal_common::section;
 use shoal_env_server::environment::{self, EnvironmentError};
 use toml::{Table, Value};
 
 use self::revision::as_written;
-pub use self::revision::{Asked, Revision, edited, store_actors};
-pub use self::source::{Source, Sources, UsageError};
+pub use self::revision::{RequestedChanges, Revision, edited, store_actors};
+pub use self::source::{SettingSource, SettingSources, UsageError};
 use self::suggestion::{nearest, with_suggestion};
 
+use crate::algorithm;
 use crate::external_environment::{self, ExternalEnvironment, GYMNASIUM};
-use crate::method;
 use crate::numbers::count;
 use crate::origin::{Origin, Predecessor, shapes};
 use crate::preflight;
-use crate::server_location::{ServerLocation, Surroundings, hash_seed};
+use crate::server_location::{ServerLocation, ServerSurroundings, hash_seed};
 use crate::signals::Interrupt;
 
 const PRESETS: [(&str, &str); 15] = [
@@ -41,7 +41,7 @@ const PRESETS: [(&str, &str); 15] = [
         include_str!("../../presets/frozen-lake-sarsa.toml"),
     ),
     ("cart-pole", include_str!("../../presets/cart-pole.toml")),
-    // Those for another method than the thesis's have the name of their task and that of the method.
+    // Those for another algorithm than the thesis's have the name of their task and that of the algorithm.
     ("pendulum-sac", include_str!("../../presets/pendulum-sac.toml")),
     ("pendulum-td3", include_str!("../../presets/pendulum-td3.toml")),
     (
@@ -70,9 +70,6 @@ const PRESETS: [(&str, &str); 15] = [
     ),
 ];
 
-/// The upper bound of `actors.max`.
-const MOST_ACTORS: i64 = 256;
-
 /// The presets' names.
 pub fn preset_names() -> impl Iterator<Item = &'static str> {
     PRESETS.iter().map(|(name, _)| *name)
@@ -84,8 +81,8 @@ pub fn resolved(what: &str) -> anyhow::Result<Config> {
 }
 
 /// The resolved configuration of a preset or a file with these overrides, and where each value comes from.
-pub fn resolved_with_sources(what: &str, overrides: &RunOverrides) -> anyhow::Result<(Config, Sources)> {
-    let (_, table, sources) = for_method(what, overrides)?;
+pub fn resolved_with_sources(what: &str, overrides: &RunOverrides) -> anyhow::Result<(Config, SettingSources)> {
+    let (_, table, sources) = for_algorithm(what, overrides)?;
     resolve(table, sources, overrides, what)
 }
 
@@ -105,8 +102,8 @@ pub fn warning(config: &Config) -> Option<String> {
 pub struct RunOverrides {
     /// Run directory to create; by default `runs/<name>-<n>`.
     pub run: Option<PathBuf>,
-    /// The method, by its name.
-    pub method: Option<String>,
+    /// The algorithm, by its name.
+    pub algorithm: Option<String>,
     /// `run.seed`.
     pub seed: Option<u64>,
     /// `actors.count`.
@@ -199,7 +196,7 @@ fn fill(run: &RunDir, config: &Config) -> anyhow::Result<Config> {
 
 /// The configuration of a preset or a file with these overrides, and the default name of its run. Creates nothing.
 pub fn decide(what: &str, overrides: &RunOverrides) -> anyhow::Result<(String, Config)> {
-    let (name, table, sources) = for_method(what, overrides)?;
+    let (name, table, sources) = for_algorithm(what, overrides)?;
     let (config, _) = resolve(table, sources, overrides, what)?;
     Ok((name, config))
 }
@@ -208,50 +205,50 @@ fn preset(name: &str) -> Option<(&'static str, &'static str)> {
     PRESETS.into_iter().find(|(known, _)| *known == name)
 }
 
-/// As [`sections`], for the method that is asked for.
-fn for_method(what: &str, overrides: &RunOverrides) -> anyhow::Result<(String, Table, Sources)> {
+/// As [`sections`], for the algorithm that is asked for.
+fn for_algorithm(what: &str, overrides: &RunOverrides) -> anyhow::Result<(String, Table, SettingSources)> {
     let (mut name, mut table, mut sources) = sections(what)?;
-    let asked = method::asked_for(overrides.method.as_deref(), &overrides.set)?;
+    let asked = algorithm::asked_for(overrides.algorithm.as_deref(), &overrides.set)?;
     let of_networks = predecessor(overrides)?.map(|(_, config)| config.algorithm.name());
-    let Some(method) = asked.or(of_networks) else {
+    let Some(algorithm) = asked.or(of_networks) else {
         return Ok((name, table, sources));
     };
-    let named = method::named_in(&table);
-    // A preset for another method than its task's first one ends with that method's name.
+    let named = algorithm::named_in(&table);
+    // A preset for another algorithm than its task's first one ends with that algorithm's name.
     let task = named
         .and_then(|named| what.strip_suffix(named)?.strip_suffix('-'))
         .unwrap_or(what);
-    if let Some((own, _)) = preset(&format!("{task}-{method}")) {
+    if let Some((own, _)) = preset(&format!("{task}-{algorithm}")) {
         return sections(own);
     }
-    let default = Algorithm::default().name();
-    if task != what && method == default && preset(task).is_some() {
+    let default = AlgorithmConfig::default().name();
+    if task != what && algorithm == default && preset(task).is_some() {
         return sections(task);
     }
-    let defaults = Source::Method(method);
+    let defaults = SettingSource::Algorithm(algorithm);
     if preset(what).is_some() {
-        if named.unwrap_or(default) != method {
-            let before = method::replace(&mut table, method)?;
-            sources = Sources::of_preset(&name, &before);
-            name = format!("{name}-{method}");
+        if named.unwrap_or(default) != algorithm {
+            let before = algorithm::replace(&mut table, algorithm)?;
+            sources = SettingSources::of_preset(&name, &before);
+            name = format!("{name}-{algorithm}");
         }
-    } else if let Some(other) = named.filter(|named| *named != method) {
-        bail!("{what} is for {other}, but {method} is asked for: remove what belongs to {other} from the file");
-    } else if named.is_none() && method != default {
+    } else if let Some(other) = named.filter(|named| *named != algorithm) {
+        bail!("{what} is for {other}, but {algorithm} is asked for: remove what belongs to {other} from the file");
+    } else if named.is_none() && algorithm != default {
         let environment = table.get("environment").and_then(|section| section.get("name"));
         let environment = environment.and_then(Value::as_str).unwrap_or_default().to_owned();
-        method::add_defaults(&mut table, &environment, method)?;
+        algorithm::add_defaults(&mut table, &environment, algorithm)?;
     }
-    table.entry(method).or_insert_with(|| Table::new().into());
+    table.entry(algorithm).or_insert_with(|| Table::new().into());
     sources.add(&table, &defaults);
     Ok((name, table, sources))
 }
 
 /// The default name of a run of a preset or a file, its sections, and where their values come from.
-fn sections(what: &str) -> anyhow::Result<(String, Table, Sources)> {
+fn sections(what: &str) -> anyhow::Result<(String, Table, SettingSources)> {
     if let Some((name, text)) = preset(what) {
         let table = text.parse().with_context(|| format!("preset {name}"))?;
-        let sources = Sources::of_preset(name, &table);
+        let sources = SettingSources::of_preset(name, &table);
         return Ok((name.into(), table, sources));
     }
     if let Some(id) = what.strip_prefix(GYMNASIUM) {
@@ -259,7 +256,7 @@ fn sections(what: &str) -> anyhow::Result<(String, Table, Sources)> {
         put(&mut table, &["environment", "name"], what.into())?;
         let is_plain = |c: char| c.is_ascii_alphanumeric() || "-._".contains(c);
         let name = format!("gym-{}", id.replace(|c| !is_plain(c), "-"));
-        return Ok((name, table, Sources::default()));
+        return Ok((name, table, SettingSources::default()));
     }
     let path = PathBuf::from(what);
     if path.extension().is_none_or(|extension| extension != "toml") {
@@ -272,7 +269,7 @@ fn sections(what: &str) -> anyhow::Result<(String, Table, Sources)> {
     let name = path
         .file_stem()
         .map_or_else(|| "run".into(), |stem| stem.to_string_lossy().into_owned());
-    let sources = Sources::of_file(what, &text);
+    let sources = SettingSources::of_file(what, &text);
     Ok((name, table, sources))
 }
 
@@ -300,23 +297,27 @@ fn is_gymnasium(name: &str) -> bool {
 
 fn resolve(
     mut table: Table,
-    mut sources: Sources,
+    mut sources: SettingSources,
     overrides: &RunOverrides,
     origin: &str,
-) -> anyhow::Result<(Config, Sources)> {
+) -> anyhow::Result<(Config, SettingSources)> {
     set_options(&mut table, &mut sources, overrides)?;
     for assignment in &overrides.set {
         set_key(&mut table, &mut sources, assignment)?;
     }
-    let mistaken = |error: UsageError, sources: &Sources, table: &Table| sources.explain(error.0, origin, table);
+    let mistaken = |error: UsageError, sources: &SettingSources, table: &Table| sources.explain(error.0, origin, table);
     read_counts(&mut table).map_err(|error| mistaken(error, &sources, &table))?;
     // For more actors than the default of `actors.max`, raise it, but not beyond its bounds.
     if let Some(count) = integer(&table, "actors", "count")
         && count > i64::from(ActorsConfig::default().max)
         && table.get("actors").is_some_and(|actors| actors.get("max").is_none())
     {
-        put(&mut table, &["actors", "max"], count.min(MOST_ACTORS).into())?;
-        sources.set("actors.max".into(), Source::Follows("actors.count".into()));
+        put(
+            &mut table,
+            &["actors", "max"],
+            count.min(ActorsConfig::GREATEST_MAX.into()).into(),
+        )?;
+        sources.set("actors.max".into(), SettingSource::Follows("actors.count".into()));
     }
     // A file may be the configuration of another run.
     for key in explanation::set_by_program() {
@@ -336,9 +337,9 @@ fn resolve(
     put(&mut table, &["run", "identity_format"], format.into())?;
     let chosen = table.clone();
     describe_environment(&mut table).map_err(|error| about_environment(error, &sources))?;
-    // What is added are a method's settings for a Gymnasium environment, and the environment's own defaults.
-    sources.add_new(&chosen, &table, &Source::Gymnasium);
-    follow_method(&mut table, &mut sources)?;
+    // What is added are an algorithm's settings for a Gymnasium environment, and the environment's own defaults.
+    sources.add_new(&chosen, &table, &SettingSource::Gymnasium);
+    follow_algorithm(&mut table, &mut sources)?;
     follow_networks(&mut table, &mut sources, overrides)?;
     let mut config = Config::from_table(table.clone(), "").map_err(|error| {
         let message = error.to_string();
@@ -348,24 +349,24 @@ fn resolve(
     // A short run must end with an evaluation too.
     if config.run.steps < config.evaluation.every {
         config.evaluation.every = config.run.steps;
-        sources.set("evaluation.every".into(), Source::Follows("run.steps".into()));
+        sources.set("evaluation.every".into(), SettingSource::Follows("run.steps".into()));
     }
     set_what_follows(&mut config, &mut sources);
     Ok((config, sources))
 }
 
 /// Sets what follows from the run's length if it is left open.
-fn set_what_follows(config: &mut Config, sources: &mut Sources) {
-    if let Algorithm::Dqn(dqn) = &mut config.algorithm
+fn set_what_follows(config: &mut Config, sources: &mut SettingSources) {
+    if let AlgorithmConfig::Dqn(dqn) = &mut config.algorithm
         && dqn.epsilon_steps == 0
     {
         dqn.epsilon_steps = (config.run.steps / 10).max(1);
-        sources.set("dqn.epsilon_steps".into(), Source::Follows("run.steps".into()));
+        sources.set("dqn.epsilon_steps".into(), SettingSource::Follows("run.steps".into()));
     }
 }
 
 /// Sets the keys that have options of their own.
-fn set_options(table: &mut Table, sources: &mut Sources, overrides: &RunOverrides) -> anyhow::Result<()> {
+fn set_options(table: &mut Table, sources: &mut SettingSources, overrides: &RunOverrides) -> anyhow::Result<()> {
     let whole = |option: &str, number: Option<u64>| -> anyhow::Result<Option<Value>> {
         let number = number.map(i64::try_from).transpose();
         Ok(number
@@ -393,14 +394,14 @@ fn set_options(table: &mut Table, sources: &mut Sources, overrides: &RunOverride
     ] {
         if let Some(value) = value {
             put(table, &[section, key], value)?;
-            sources.set(format!("{section}.{key}"), Source::Option(option));
+            sources.set(format!("{section}.{key}"), SettingSource::Option(option));
         }
     }
     Ok(())
 }
 
 /// Sets a key as `--set` says.
-fn set_key(table: &mut Table, sources: &mut Sources, assignment: &str) -> anyhow::Result<()> {
+fn set_key(table: &mut Table, sources: &mut SettingSources, assignment: &str) -> anyhow::Result<()> {
     let wrong = |why: String| UsageError(format!("--set {assignment}: {why}"));
     let (key, value) = assignment
         .split_once('=')
@@ -411,7 +412,10 @@ fn set_key(table: &mut Table, sources: &mut Sources, assignment: &str) -> anyhow
         return Err(wrong(format!("{key} cannot be set: the program sets it")).into());
     }
     put(table, &path, value_of(value)).map_err(|error| wrong(error.to_string()))?;
-    sources.set(path.iter().take(2).copied().collect::<Vec<_>>().join("."), Source::Set);
+    sources.set(
+        path.iter().take(2).copied().collect::<Vec<_>>().join("."),
+        SettingSource::Set,
+    );
     Ok(())
 }
 
@@ -454,7 +458,7 @@ fn read_counts(table: &mut Table) -> Result<(), UsageError> {
 }
 
 /// The error about an environment's own parameters, with the place where the user has set the one at fault.
-fn about_environment(error: anyhow::Error, sources: &Sources) -> anyhow::Error {
+fn about_environment(error: anyhow::Error, sources: &SettingSources) -> anyhow::Error {
     let Some(of_environment) = error.downcast_ref::<EnvironmentError>() else {
         return error;
     };
@@ -472,7 +476,7 @@ fn about_environment(error: anyhow::Error, sources: &Sources) -> anyhow::Error {
             (key, with_suggestion(of_environment.to_string()))
         }
     };
-    sources.blame(&format!("environment.{key}"), &text)
+    sources.error_naming_source(&format!("environment.{key}"), &text)
 }
 
 /// Directory and configuration of the run whose networks the new one begins with.
@@ -483,35 +487,35 @@ fn predecessor(overrides: &RunOverrides) -> anyhow::Result<Option<(PathBuf, Conf
 }
 
 /// Sets the shapes of the networks that a run begins with, unless the user has set others.
-fn follow_networks(table: &mut Table, sources: &mut Sources, overrides: &RunOverrides) -> anyhow::Result<()> {
+fn follow_networks(table: &mut Table, sources: &mut SettingSources, overrides: &RunOverrides) -> anyhow::Result<()> {
     let Some((path, config)) = predecessor(overrides)? else {
         return Ok(());
     };
     put(table, &["run", "from"], path.display().to_string().into())?;
     if !table.contains_key(config.algorithm.name()) {
-        // Networks of another method, which are refused later.
+        // Networks of another algorithm, which are refused later.
         return Ok(());
     }
     for (section, key, value) in shapes(&config)? {
         let name = format!("{section}.{key}");
-        if !sources.of(&name).is_users() {
+        if !sources.of(&name).is_from_user() {
             put(table, &[section, &key], value)?;
-            sources.set(name, Source::Follows("--from".into()));
+            sources.set(name, SettingSource::Follows("--from".into()));
         }
     }
     Ok(())
 }
 
-/// Sets what the method fixes, unless the user has set it.
-fn follow_method(table: &mut Table, sources: &mut Sources) -> anyhow::Result<()> {
+/// Sets what the algorithm fixes, unless the user has set it.
+fn follow_algorithm(table: &mut Table, sources: &mut SettingSources) -> anyhow::Result<()> {
     let limit = integer(table, "spec", "time_limit");
-    let algorithms = Algorithm::all();
-    let Some(method) = algorithms.iter().find(|one| table.contains_key(one.name())) else {
+    let algorithms = AlgorithmConfig::all();
+    let Some(algorithm) = algorithms.iter().find(|one| table.contains_key(one.name())) else {
         return Ok(());
     };
-    let spec = method.spec();
-    let once = spec.experience != Experience::Minibatches;
-    let episodes = spec.experience == Experience::Episodes;
+    let spec = algorithm.spec();
+    let once = spec.transition_use != TransitionUse::Minibatches;
+    let episodes = spec.transition_use == TransitionUse::Episodes;
     for (section, key, value) in [
         ("run", "mode", (!spec.off_policy).then(|| Value::from("lockstep"))),
         ("replay", "warmup", once.then(|| 0.into())),
@@ -520,17 +524,17 @@ fn follow_method(table: &mut Table, sources: &mut Sources) -> anyhow::Result<()>
     ] {
         let name = format!("{section}.{key}");
         let now = table.get(section).and_then(|values| values.get(key));
-        let Some(value) = value.filter(|value| now != Some(value) && !sources.of(&name).is_users()) else {
+        let Some(value) = value.filter(|value| now != Some(value) && !sources.of(&name).is_from_user()) else {
             continue;
         };
         put(table, &[section, key], value)?;
-        sources.set(name, Source::Follows(method.name().into()));
+        sources.set(name, SettingSource::Follows(algorithm.name().into()));
     }
     Ok(())
 }
 
 /// Fills in `[spec]` from the environment. Adds every parameter of a built-in environment, and for a Gymnasium
-/// environment the settings of a suitable method if the configuration names none.
+/// environment the settings of a suitable algorithm if the configuration names none.
 fn describe_environment(table: &mut Table) -> anyhow::Result<()> {
     let run = table.get("run");
     let mode = run.and_then(|run| run.get("mode")).and_then(Value::as_str);
@@ -560,7 +564,7 @@ fn describe_environment(table: &mut Table) -> anyhow::Result<()> {
     };
     let (environment, spec) = if let Some(server) = server {
         let environment = configured(name, server, section.clone());
-        let surroundings = Surroundings {
+        let surroundings = ServerSurroundings {
             location: ServerLocation::here(&environment.server)?,
             hash_seed: hash_seed(mode, seed),
         };
@@ -573,10 +577,10 @@ fn describe_environment(table: &mut Table) -> anyhow::Result<()> {
         let spec = environment::make(&name, &parameters)?.spec();
         (configured(name, Vec::new(), parameters), spec)
     };
-    let named = method::named_in(table);
+    let named = algorithm::named_in(table);
     if environment.name.starts_with(GYMNASIUM) {
-        let method = named.unwrap_or_else(|| method::suitable(&spec));
-        method::add_defaults(table, &environment.name, method)?;
+        let algorithm = named.unwrap_or_else(|| algorithm::suitable(&spec));
+        algorithm::add_defaults(table, &environment.name, algorithm)?;
     }
     table.insert("environment".into(), Value::try_from(environment)?);
     table.insert("spec".into(), Value::try_from(spec)?);
@@ -715,9 +719,9 @@ mod tests {
 
     #[test]
     fn a_method_has_its_preset_for_the_task_or_its_own_defaults() {
-        let with = |what: &str, method: &str, set: &[&str]| {
+        let with = |what: &str, algorithm: &str, set: &[&str]| {
             let overrides = RunOverrides {
-                method: (!method.is_empty()).then(|| method.into()),
+                algorithm: (!algorithm.is_empty()).then(|| algorithm.into()),
                 set: set.iter().map(|assignment| (*assignment).into()).collect(),
                 ..RunOverrides::default()
             };
@@ -732,12 +736,12 @@ mod tests {
             with("pendulum", "ddpg", &[]).1.algorithm,
             resolved("pendulum").unwrap().algorithm
         );
-        // There is no preset for the pole with DQN: the task's length and evaluation, and the method's defaults.
+        // There is no preset for the pole with DQN: the task's length and evaluation, and the algorithm's defaults.
         let (name, dqn) = with("cart-pole", "dqn", &["run.steps=40_000"]);
         assert_eq!(name, "cart-pole-dqn");
         assert_eq!((dqn.run.mode, dqn.replay.updates_per_step), (Mode::Free, 0.25));
         assert_eq!((dqn.run.episodes, dqn.actors.chunk_steps), (Some(5_000), 8));
-        let Algorithm::Dqn(settings) = dqn.algorithm else {
+        let AlgorithmConfig::Dqn(settings) = dqn.algorithm else {
             panic!("{:?}", dqn.algorithm)
         };
         assert_eq!(settings.epsilon_steps, 4_000, "a tenth of the run");

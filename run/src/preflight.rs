@@ -32,7 +32,7 @@ pub fn check(config: &Config, run: &RunDir) -> anyhow::Result<()> {
 /// # Errors
 /// As for [`check`].
 pub fn reserve(config: &Config, run: &RunDir, domain: &Domain) -> anyhow::Result<()> {
-    domain.promise(needs::shared_memory(config))?;
+    domain.reserve_memory(needs::shared_memory(config))?;
     check(config, run)
 }
 
@@ -51,7 +51,7 @@ pub fn side_by_side(config: &Config) -> anyhow::Result<usize> {
 /// # Errors
 /// When shared memory or open files are short.
 pub fn reserve_for_host(config: &Config, domain: &Domain) -> anyhow::Result<()> {
-    domain.promise(needs::shared_memory(config))?;
+    domain.reserve_memory(needs::shared_memory(config))?;
     Domain::remove_abandoned()?;
     check_open_files(config)?;
     check_shared_memory(config)

@@ -3,7 +3,7 @@
 
 mod child_group;
 mod child_output;
-mod peer;
+mod child_process;
 
 use std::os::fd::BorrowedFd;
 use std::time::Duration;
@@ -12,8 +12,8 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
 
 pub use self::child_group::ChildGroup;
-pub use self::child_output::{ChildOutput, Line, Writer, harmless};
-pub use self::peer::Peer;
+pub use self::child_output::{ChildOutput, Line, Writer, escape_control_characters};
+pub use self::child_process::ChildProcess;
 
 /// Waits at most `most` until one of these is readable, or a child whose [`ChildGroup`] is among them has ended.
 /// Returns whether that happened. A signal to this process ends the wait early.

@@ -18,7 +18,8 @@ pub use table::RecordError;
 use table::Table;
 
 use self::tensorboard::EventFile;
-use crate::final_evaluation::{FinalEvaluation, FinalPolicy};
+use crate::evaluation::SavedPolicy;
+use crate::final_evaluation::FinalEvaluation;
 use crate::rate::per_second;
 
 /// The longest time that rows stay unflushed. A `kill -9` of the launcher loses at most these.
@@ -51,7 +52,7 @@ pub struct EvaluationRecord {
     pub wall_seconds: f64,
     /// Environment steps the policy was learned from.
     pub env_steps: u64,
-    /// Updates that made the policy: gradient steps, or consumed rows for methods that use each row once.
+    /// Updates that made the policy: gradient steps, or consumed rows for algorithms that use each row once.
     pub updates: u64,
     /// Version of the policy.
     pub policy_version: u64,
@@ -76,7 +77,7 @@ pub struct LearnerRecord {
     /// Episodes ended; 0 in the records of earlier versions.
     #[serde(default)]
     pub episodes: u64,
-    /// Updates done: gradient steps, or consumed rows for methods that use each row once.
+    /// Updates done: gradient steps, or consumed rows for algorithms that use each row once.
     pub updates: u64,
     policy_version: u64,
     /// Mean loss of the value estimate since the previous row.
@@ -112,7 +113,7 @@ pub struct Recorder {
     /// Environment steps of the newest policy whose evaluation is recorded.
     evaluated: Option<u64>,
     previous: Option<(Duration, LearnerReport)>,
-    flushed: Instant,
+    flushed_at: Instant,
 }
 
 /// Records the final evaluation for TensorBoard, as scalars named `final/…`.
@@ -121,8 +122,8 @@ pub fn record_final(run: &RunDir, evaluation: &FinalEvaluation) -> Result<(), Re
         let mut events = EventFile::create(&run.tensorboard(), None)?;
         for policy in &evaluation.policies {
             let name = match policy.policy {
-                FinalPolicy::Best => "best",
-                FinalPolicy::Last => "last",
+                SavedPolicy::Best => "best",
+                SavedPolicy::Last => "last",
             };
             let [mean, std] = ["mean", "std"].map(|which| format!("final/{name}_return_{which}"));
             let scalars = [(&*mean, policy.return_mean), (&*std, policy.return_std)];
@@ -176,7 +177,7 @@ impl Recorder {
             episode_steps,
             evaluated,
             previous: None,
-            flushed,
+            flushed_at: flushed,
         };
         if continues.is_some() {
             let resumed = Incident::of_launcher(IncidentKind::Resumed, String::new());
@@ -216,7 +217,7 @@ impl Recorder {
             ("episode/steps", report.steps.into()),
         ];
         self.scalars(self.episode_steps, &scalars)?;
-        if self.flushed.elapsed() >= MAX_UNFLUSHED {
+        if self.flushed_at.elapsed() >= MAX_UNFLUSHED {
             self.flush()
         } else {
             Ok(())
@@ -309,7 +310,7 @@ impl Recorder {
 
     /// Writes everything to the files, so that it survives the death of this process.
     pub fn flush(&mut self) -> Result<(), RecordError> {
-        self.flushed = Instant::now();
+        self.flushed_at = Instant::now();
         for table in [&mut self.episodes, &mut self.evaluations, &mut self.learner] {
             table.flush()?;
         }

@@ -7,12 +7,12 @@ use shoal_common::config::Config;
 use shoal_common::policy::{Policy, PolicyLayout};
 use shoal_common::run_dir::RunDir;
 use shoal_common::space::EnvironmentSpec;
-use shoal_env_server::environment::Source;
+use shoal_env_server::environment::SignalSource;
 use shoal_env_server::environment::angle::unwrapped;
-use shoal_env_server::vector::{Start, VectorEnvironment};
+use shoal_env_server::vector::{Reset, VectorEnvironment};
 
 use crate::external_environment::ExternalEnvironment;
-use crate::server_location::Surroundings;
+use crate::server_location::ServerSurroundings;
 use crate::signals::Interrupt;
 
 /// How often an episode is begun if the environment's server fails in it, each time with a new server.
@@ -39,12 +39,12 @@ impl Trajectory {
 
     /// A signal's values: T + 1 for a part of the observation, T for a part of the action. A number that does not exist
     /// is NaN.
-    pub fn values(&self, source: Source) -> Vec<f64> {
+    pub fn values(&self, source: SignalSource) -> Vec<f64> {
         let number = |row: &Vec<f32>, i: usize| row.get(i).map_or(f64::NAN, |number| f64::from(*number));
         match source {
-            Source::Observation(i) => self.observations.iter().map(|row| number(row, i)).collect(),
-            Source::Action(i) => self.actions.iter().map(|row| number(row, i)).collect(),
-            Source::Angle { cos, sin } => {
+            SignalSource::Observation(i) => self.observations.iter().map(|row| number(row, i)).collect(),
+            SignalSource::Action(i) => self.actions.iter().map(|row| number(row, i)).collect(),
+            SignalSource::Angle { cos, sin } => {
                 let seen = self
                     .observations
                     .iter()
@@ -62,7 +62,7 @@ pub struct Rollout<'a> {
     host: Host,
     policy: Policy,
     parameters: &'a [f32],
-    surroundings: Surroundings,
+    surroundings: ServerSurroundings,
     interrupt: Interrupt,
 }
 
@@ -100,7 +100,7 @@ impl<'a> Rollout<'a> {
             host: Host::new(config)?,
             policy,
             parameters,
-            surroundings: Surroundings::default(),
+            surroundings: ServerSurroundings::default(),
             interrupt: Interrupt::default(),
         })
     }
@@ -108,7 +108,7 @@ impl<'a> Rollout<'a> {
     /// As [`new`](Self::new), for a run: an environment that another program serves is started as in training.
     pub fn of_run(run: &RunDir, config: &'a Config, parameters: &'a [f32]) -> anyhow::Result<Self> {
         Ok(Self {
-            surroundings: Surroundings::of_run(run, config)?,
+            surroundings: ServerSurroundings::of_run(run, config)?,
             ..Self::new(config, parameters)?
         })
     }
@@ -120,7 +120,7 @@ impl<'a> Rollout<'a> {
 
     /// Runs evaluation episode `number` of `seed`. The two determine its start state.
     pub fn evaluation_episode(&mut self, seed: u64, number: u64) -> anyhow::Result<Trajectory> {
-        self.episode(Start::Evaluation {
+        self.episode(Reset::Evaluation {
             seed,
             first: number,
             episodes: Some(1),
@@ -129,14 +129,14 @@ impl<'a> Rollout<'a> {
 
     /// Runs an episode that starts in this physical state of the environment, which must be a built-in one.
     pub fn episode_from(&mut self, state: &[f64]) -> anyhow::Result<Trajectory> {
-        self.episode(Start::States(state))
+        self.episode(Reset::States(state))
     }
 
     /// Runs an episode. If the environment's server fails in it, it is run again with a new server.
-    fn episode(&mut self, start: Start<'_>) -> anyhow::Result<Trajectory> {
+    fn episode(&mut self, reset: Reset<'_>) -> anyhow::Result<Trajectory> {
         let mut tries = 1;
         loop {
-            match self.try_episode(start) {
+            match self.try_episode(reset) {
                 Err(_) if tries < TRIES && self.interrupt.signal().is_none() && self.host.can_be_restarted() => {
                     tries += 1;
                 }
@@ -146,10 +146,10 @@ impl<'a> Rollout<'a> {
         }
     }
 
-    fn try_episode(&mut self, start: Start<'_>) -> anyhow::Result<Trajectory> {
+    fn try_episode(&mut self, reset: Reset<'_>) -> anyhow::Result<Trajectory> {
         let mut observation = self
             .host
-            .begin(self.config, &self.surroundings, start, &self.interrupt)?;
+            .begin(self.config, &self.surroundings, reset, &self.interrupt)?;
         let mut action = vec![0.0; self.config.spec.action.width()];
         let mut trajectory = Trajectory {
             observations: vec![observation.clone()],
@@ -201,17 +201,17 @@ impl Host {
     fn begin(
         &mut self,
         config: &Config,
-        surroundings: &Surroundings,
-        start: Start<'_>,
+        surroundings: &ServerSurroundings,
+        reset: Reset<'_>,
         interrupt: &Interrupt,
     ) -> anyhow::Result<Vec<f32>> {
-        match (self, start) {
-            (Self::Builtin(environment), start) => {
+        match (self, reset) {
+            (Self::Builtin(environment), reset) => {
                 let mut observation = vec![0.0; config.spec.observation.width()];
-                environment.reset(start, &mut observation)?;
+                environment.reset(reset, &mut observation)?;
                 Ok(observation)
             }
-            (Self::External(server), Start::Evaluation { seed, first, .. }) => {
+            (Self::External(server), Reset::Evaluation { seed, first, .. }) => {
                 if server.as_ref().is_none_or(|(of, _)| *of != seed) {
                     // The old server ends before the new one starts.
                     *server = None;

@@ -153,14 +153,14 @@ fn is_program(path: &Path) -> bool {
 
 /// Where an environment server that is another program is started, and with which environment variables.
 #[derive(Clone, Debug, Default)]
-pub struct Surroundings {
+pub struct ServerSurroundings {
     /// Its directory and program. `None`: the current directory, and the program that `PATH` leads to.
     pub location: Option<ServerLocation>,
     /// The environment variable `PYTHONHASHSEED`, which decides the order of Python's sets. `None`: unchanged.
     pub hash_seed: Option<u32>,
 }
 
-impl Surroundings {
+impl ServerSurroundings {
     /// The surroundings of a run's server.
     ///
     /// # Errors

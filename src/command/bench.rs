@@ -12,9 +12,9 @@ pub(crate) struct BenchArgs {
     /// With `actors`: the numbers of actors to measure [default: 1,2,4, … up to the number of cores].
     #[arg(long, value_name = "N,N,…", allow_hyphen_values = true)]
     pub(crate) actors: Option<String>,
-    /// With `learner`: the method to measure [default: ddpg].
-    #[arg(long, value_parser = PossibleValuesParser::new(shoal_bench::methods()))]
-    pub(crate) method: Option<String>,
+    /// With `learner`: the algorithm to measure [default: ddpg].
+    #[arg(long = "method", value_name = "METHOD", value_parser = PossibleValuesParser::new(shoal_bench::algorithms()))]
+    pub(crate) algorithm: Option<String>,
     /// Print one JSON object on standard output.
     #[arg(long)]
     pub(crate) json: bool,
@@ -22,5 +22,5 @@ pub(crate) struct BenchArgs {
 
 /// Measures a stage and prints the result as a table or as JSON.
 pub(crate) fn run(args: &BenchArgs) -> anyhow::Result<()> {
-    shoal_bench::run(args.stage, args.actors.as_deref(), args.method.as_deref(), args.json)
+    shoal_bench::run(args.stage, args.actors.as_deref(), args.algorithm.as_deref(), args.json)
 }

@@ -11,7 +11,7 @@ use shoal_common::policy_file::PolicyFile;
 use shoal_common::run_dir::RunDir;
 use shoal_env_server::environment::Goal;
 use shoal_run::description::Description;
-use shoal_run::evaluation::{EvaluationSummary, WhichPolicy, evaluate_until};
+use shoal_run::evaluation::{EvaluationSummary, SavedPolicy, evaluate_until};
 use shoal_run::numbers::from_one;
 use shoal_run::signals::{Signals, exit_code};
 
@@ -21,7 +21,7 @@ pub(crate) struct EvalArgs {
     pub(crate) run: PathBuf,
     /// Which policy to evaluate.
     #[arg(long, value_enum, default_value_t)]
-    pub(crate) policy: WhichPolicy,
+    pub(crate) policy: SavedPolicy,
     /// Number of episodes. Their start states are the same every time.
     #[arg(long, default_value_t = 100, value_parser = from_one)]
     pub(crate) episodes: u32,

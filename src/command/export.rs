@@ -8,8 +8,8 @@ use clap::Args;
 use clap::ValueEnum;
 use shoal_common::durable::write_atomically;
 use shoal_common::run_dir::RunDir;
-use shoal_report::export::Portable;
-use shoal_run::evaluation::WhichPolicy;
+use shoal_report::export::PortablePolicy;
+use shoal_run::evaluation::SavedPolicy;
 use shoal_run::final_evaluation::FinalEvaluation;
 
 #[derive(Args, Clone, Debug)]
@@ -21,7 +21,7 @@ pub(crate) struct ExportArgs {
     pub(crate) format: Format,
     /// Which policy to write.
     #[arg(long, value_enum, default_value_t)]
-    pub(crate) policy: WhichPolicy,
+    pub(crate) policy: SavedPolicy,
     /// The file to write [default: <policy>.<format> in the run directory].
     #[arg(long, value_name = "FILE")]
     pub(crate) out: Option<PathBuf>,
@@ -45,7 +45,7 @@ pub(crate) fn run(args: &ExportArgs) -> anyhow::Result<()> {
     };
     let which = name(args.policy.to_possible_value());
     let file = args.policy.read(&run, &config)?;
-    let mut policy = Portable::new(&config, &file, &which)?;
+    let mut policy = PortablePolicy::new(&config, &file, &which)?;
     // The version tells whether the evaluation was of this policy.
     let evaluation = FinalEvaluation::read(&run, 0)?;
     if let Some(evaluation) = evaluation

@@ -6,7 +6,7 @@ use std::io::Write as _;
 use shoal_common::config::Config;
 use shoal_common::config::explanation::{Change, Key, sections};
 use shoal_env_server::environment;
-use shoal_run::plan::{RunOverrides, Source, preset_names, resolved, resolved_with_sources};
+use shoal_run::plan::{RunOverrides, SettingSource, preset_names, resolved, resolved_with_sources};
 use toml::{Table, Value};
 
 /// Explains the keys of one preset or file with these overrides, or all keys if none is named.
@@ -144,7 +144,7 @@ fn explain_one(what: &str, overrides: &RunOverrides) -> anyhow::Result<String> {
     Ok(text)
 }
 
-fn write_key(text: &mut String, key: &Key, value: Option<&Value>, source_of_value: Option<&Source>) {
+fn write_key(text: &mut String, key: &Key, value: Option<&Value>, source_of_value: Option<&SettingSource>) {
     let Key {
         name,
         meaning,

@@ -110,7 +110,7 @@ mod with_network {
     use shoal_run::signals::{Signals, exit_code};
 
     use super::*;
-    use crate::launcher::joined::{self, Ending};
+    use crate::launcher::joined::{self, JoinEnd};
 
     /// The exit code if the run could not be reached for too long.
     const GAVE_UP: u8 = 4;
@@ -183,13 +183,13 @@ mod with_network {
         say(&format!("joined {endpoint} with {} actors: {actors:?}", actors.len()));
         let ending = joined::run(config, (&run, &lock), signals, actors, args.give_up)?;
         Ok(match ending {
-            Ending::Over => {
+            JoinEnd::Over => {
                 say("the run is over");
                 ExitCode::SUCCESS
             }
-            Ending::Stopped => ExitCode::SUCCESS,
-            Ending::Interrupted(signal) => exit_code(signal),
-            Ending::GaveUp => {
+            JoinEnd::Stopped => ExitCode::SUCCESS,
+            JoinEnd::Interrupted(signal) => exit_code(signal),
+            JoinEnd::GaveUp => {
                 say(&format!(
                     "error: {endpoint} could not be reached for {} s",
                     args.give_up.as_secs()

@@ -11,7 +11,7 @@ use serde::Serialize;
 use shoal_run::numbers::thousands;
 use shoal_run::suite::Suite;
 
-use crate::listing::{Listed, runs_in};
+use crate::listing::{ListedRun, runs_in};
 
 #[derive(Args, Clone, Debug)]
 pub(crate) struct ListArgs {
@@ -27,7 +27,7 @@ pub(crate) struct ListArgs {
 #[derive(Serialize)]
 struct Printed<'a> {
     directory: &'a Path,
-    runs: &'a [Listed],
+    runs: &'a [ListedRun],
     suites: &'a [ListedSuite],
 }
 
@@ -51,7 +51,7 @@ pub(crate) fn run(args: &ListArgs) -> anyhow::Result<()> {
     }
     let runs: Vec<PathBuf> =
         runs_in(directory).with_context(|| format!("cannot read the directory {}", directory.display()))?;
-    let runs: Vec<Listed> = runs.iter().map(|run| Listed::new(run)).collect();
+    let runs: Vec<ListedRun> = runs.iter().map(|run| ListedRun::new(run)).collect();
     let suites = suites_in(directory).with_context(|| format!("cannot read the directory {}", directory.display()))?;
     let mut stdout = std::io::stdout().lock();
     if args.json {
@@ -100,14 +100,14 @@ fn suites_in(directory: &Path) -> std::io::Result<Vec<ListedSuite>> {
     Ok(suites)
 }
 
-fn table(runs: &[Listed]) -> Table {
+fn table(runs: &[ListedRun]) -> Table {
     let mut table = Table::new();
     table.load_style(NOTHING);
     table.set_header([
         "run",
         "state",
         "environment",
-        "method",
+        "algorithm",
         "steps",
         "of",
         "best return",

@@ -36,7 +36,7 @@ pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<()> {
     };
     check_replaceable(&out)?;
     let report = page::gather(&runs)?;
-    for (reason, names) in report.not_played() {
+    for (reason, names) in report.runs_without_episodes() {
         writeln!(
             std::io::stderr().lock(),
             "{}: no episode is shown: {reason}",

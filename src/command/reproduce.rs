@@ -8,7 +8,7 @@ use anyhow::bail;
 use clap::Args;
 use clap::builder::PossibleValuesParser;
 use shoal_report::figure::CAN_RASTERISE;
-use shoal_reproduce::{BatchEnding, Effort, Request};
+use shoal_reproduce::{Effort, ReproductionEnd, Request};
 use shoal_run::numbers::from_one;
 use shoal_run::signals::exit_code;
 
@@ -78,15 +78,15 @@ pub(crate) fn run(args: &ReproduceArgs) -> anyhow::Result<ExitCode> {
     writeln!(std::io::stdout().lock(), "{}", request.report.display())?;
     let mut stderr = std::io::stderr().lock();
     Ok(match ending {
-        BatchEnding::Complete => ExitCode::SUCCESS,
-        BatchEnding::Failed(seeds) => {
+        ReproductionEnd::Complete => ExitCode::SUCCESS,
+        ReproductionEnd::Failed(seeds) => {
             writeln!(
                 stderr,
                 "error: {seeds} of the seeds failed; repeat the command to continue with them"
             )?;
             ExitCode::FAILURE
         }
-        BatchEnding::Interrupted(signal) => {
+        ReproductionEnd::Interrupted(signal) => {
             writeln!(
                 stderr,
                 "interrupted; every training is saved: repeat the command to continue"

@@ -8,10 +8,10 @@ use anyhow::{Context, bail};
 use clap::Args;
 use clap_complete::engine::ArgValueCompleter;
 use shoal_common::run_dir::RunDir;
-use shoal_run::earlier_best::{EvaluatedAnew, evaluate_anew, evaluate_best};
+use shoal_run::earlier_best::{ReevaluatedPolicy, reevaluate_best, reevaluate_if_needed};
 use shoal_run::numbers::count;
 use shoal_run::origin::Origin;
-use shoal_run::plan::{Asked, Revision, UsageError, warning};
+use shoal_run::plan::{RequestedChanges, Revision, UsageError, warning};
 use shoal_run::recorder::{ChangeRecord, Moment};
 use shoal_run::server_location::ServerLocation;
 use shoal_run::signals::{Signals, exit_code};
@@ -70,7 +70,7 @@ pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
         bail!("the start of {here} was interrupted before it had its networks: remove it and train again");
     }
     let saved = status::saved_status(&used, &run).with_context(|| format!("cannot resume {here}"))?;
-    let asked = Asked {
+    let asked = RequestedChanges {
         steps: args.steps,
         episodes: args.episodes,
         set: args.set.clone(),
@@ -88,9 +88,9 @@ pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
             bail!("{here} has finished {episodes_ended} of {episodes} episodes already: give it more with --episodes");
         }
     }
-    // Found now, and not by roles that fail one after the other.
+    // Checked here, so that a missing program is one error of this command and not repeated failures of the roles.
     ServerLocation::of_run(&run).with_context(|| format!("cannot resume {here}"))?;
-    if let Some(signal) = evaluate_best_anew(&run, &revision)? {
+    if let Some(signal) = reevaluate_best_policy(&run, &revision)? {
         return Ok(exit_code(signal));
     }
     // A learner that was killed has reported more steps than it has saved.
@@ -125,28 +125,28 @@ fn resume_suite(suite: &Suite, args: &ResumeArgs) -> anyhow::Result<ExitCode> {
         let why = "a suite goes on as it was made: change its runs one by one, or train another one";
         return Err(UsageError(why.into()).into());
     }
-    let manner = suite::Manner {
+    let options = suite::SuiteOptions {
         jobs: args.jobs,
         output: &args.output,
     };
-    suite::resume(suite, &args.run, manner)
+    suite::resume(suite, &args.run, options)
 }
 
 /// Evaluates the best policy again if an earlier version did that from other starts, or if later policies are evaluated
 /// with another number of episodes. Returns the signal that ended it, if one did.
-fn evaluate_best_anew(run: &RunDir, revision: &Revision) -> anyhow::Result<Option<i32>> {
+fn reevaluate_best_policy(run: &RunDir, revision: &Revision) -> anyhow::Result<Option<i32>> {
     let signals = Signals::register()?;
     let interrupt = signals.interrupt();
     let here = run.path().display();
     let config = &revision.config;
     let (evaluated, why) = if revision.changes("evaluation.episodes") {
         (
-            evaluate_best(run, config, &interrupt),
+            reevaluate_best(run, config, &interrupt),
             "it has another number of episodes now",
         )
     } else {
         (
-            evaluate_anew(run, config, &interrupt),
+            reevaluate_if_needed(run, config, &interrupt),
             "an earlier version used other starts",
         )
     };
@@ -160,7 +160,7 @@ fn evaluate_best_anew(run: &RunDir, revision: &Revision) -> anyhow::Result<Optio
         }
         (evaluated, _) => {
             let evaluated = evaluated.with_context(|| format!("cannot resume {here}: its best policy"))?;
-            if let Some(EvaluatedAnew { before, now }) = evaluated {
+            if let Some(ReevaluatedPolicy { before, now }) = evaluated {
                 writeln!(
                     std::io::stderr(),
                     "the best policy is evaluated anew, for {why}: {:.2} instead of {before:.2}",

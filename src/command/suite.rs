@@ -13,8 +13,8 @@ use serde::Serialize;
 use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
 use shoal_report::page;
-use shoal_run::batch::{Ending, run_training, work_off};
-use shoal_run::evaluation::WhichPolicy;
+use shoal_run::batch::{TrainingEnd, run_jobs, run_training};
+use shoal_run::evaluation::SavedPolicy;
 use shoal_run::external_environment::tied;
 use shoal_run::final_evaluation::FinalEvaluation;
 use shoal_run::numbers::thousands;
@@ -30,7 +30,7 @@ use super::training::OutputMode;
 
 /// How many runs at a time, and what is printed.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Manner<'a> {
+pub(crate) struct SuiteOptions<'a> {
     pub(crate) jobs: Option<u16>,
     pub(crate) output: &'a OutputMode,
 }
@@ -75,7 +75,7 @@ pub(crate) fn train(args: &TrainArgs, what: &str, overrides: &RunOverrides) -> a
         ..overrides.clone()
     };
     let suite = Suite::new(what, arguments(&common), &sweeps, &seeds)?;
-    let manner = Manner {
+    let options = SuiteOptions {
         // Each takes the lock of the run whose replay it copies.
         jobs: if common.with_replay { Some(1) } else { args.jobs },
         output: &args.output,
@@ -85,7 +85,7 @@ pub(crate) fn train(args: &TrainArgs, what: &str, overrides: &RunOverrides) -> a
     {
         let here = directory.display();
         return match Suite::read(directory)? {
-            Some(found) if found == suite => run(&suite, directory, &common, manner),
+            Some(found) if found == suite => run(&suite, directory, &common, options),
             Some(_) => bail!(
                 "{here} is a suite of other runs: continue it with `shoal resume {here}`, or choose another directory with --run"
             ),
@@ -99,19 +99,19 @@ pub(crate) fn train(args: &TrainArgs, what: &str, overrides: &RunOverrides) -> a
         None => RunDir::create_next(Path::new("runs"), &format!("{name}-suite"))?,
     };
     suite.write(directory.path())?;
-    run(&suite, directory.path(), &common, manner)
+    run(&suite, directory.path(), &common, options)
 }
 
 /// Continues the suite in this directory.
-pub(crate) fn resume(suite: &Suite, directory: &Path, manner: Manner<'_>) -> anyhow::Result<ExitCode> {
-    run(suite, directory, &RunOverrides::default(), manner)
+pub(crate) fn resume(suite: &Suite, directory: &Path, options: SuiteOptions<'_>) -> anyhow::Result<ExitCode> {
+    run(suite, directory, &RunOverrides::default(), options)
 }
 
 /// The arguments of `train` for these overrides, except directory and seed.
 fn arguments(overrides: &RunOverrides) -> Vec<String> {
     let RunOverrides {
         run: _,
-        method,
+        algorithm,
         seed: _,
         actors,
         envs,
@@ -126,7 +126,7 @@ fn arguments(overrides: &RunOverrides) -> Vec<String> {
     let mut option = |name: &str, value: Option<String>| {
         arguments.extend(value.into_iter().flat_map(|value| [name.to_owned(), value]));
     };
-    option("--method", method.clone());
+    option("--method", algorithm.clone());
     option("--actors", actors.map(|number| number.to_string()));
     option("--envs", envs.map(|number| number.to_string()));
     option("--steps", steps.map(|number| number.to_string()));
@@ -171,7 +171,7 @@ enum Event {
 }
 
 /// Trains all runs of the suite that have not finished.
-fn run(suite: &Suite, directory: &Path, common: &RunOverrides, manner: Manner<'_>) -> anyhow::Result<ExitCode> {
+fn run(suite: &Suite, directory: &Path, common: &RunOverrides, options: SuiteOptions<'_>) -> anyhow::Result<ExitCode> {
     let directory =
         &std::fs::canonicalize(directory).with_context(|| format!("cannot resolve {}", directory.display()))?;
     let _lock = suite::lock(directory)?;
@@ -182,25 +182,25 @@ fn run(suite: &Suite, directory: &Path, common: &RunOverrides, manner: Manner<'_
             due.push_back(number);
         }
     }
-    let jobs = match (manner.jobs, due.front()) {
+    let jobs = match (options.jobs, due.front()) {
         (Some(jobs), _) => jobs.into(),
         (None, None) => 1,
         (None, Some(first)) => usual_jobs(suite, directory, *first, common),
     };
-    let mut progress = Progress::new(suite, directory, &due, manner.output.quiet);
+    let mut progress = SuiteProgressDisplay::new(suite, directory, &due, options.output.quiet);
     let work = |number: usize, events: &Sender<Event>| {
         // A closed channel is no reason to stop.
         let _ = events.send(Event::Started(number));
         let trained = train_one(suite, &suite.trials[number], directory, &signals);
         let _ = events.send(match trained {
-            Ok(Ending::Finished) => Event::Finished(number),
-            Ok(Ending::Interrupted) => Event::Interrupted(number),
+            Ok(TrainingEnd::Finished) => Event::Finished(number),
+            Ok(TrainingEnd::Interrupted) => Event::Interrupted(number),
             Err(error) => Event::Failed(number, format!("{error:#}").replace('\n', " ")),
         });
     };
-    work_off(due, jobs, &signals, work, |event| progress.observe(event));
+    run_jobs(due, jobs, &signals, work, |event| progress.observe(event));
     let failed = progress.end();
-    report(suite, directory, manner.output)?;
+    report(suite, directory, options.output)?;
     let here = directory.display();
     let mut stderr = std::io::stderr().lock();
     match (signals.received(), failed) {
@@ -247,7 +247,7 @@ fn is_finished(run: &Path) -> anyhow::Result<bool> {
 }
 
 /// Trains or resumes a run as a process of its own.
-fn train_one(suite: &Suite, trial: &Trial, directory: &Path, signals: &Signals) -> anyhow::Result<Ending> {
+fn train_one(suite: &Suite, trial: &Trial, directory: &Path, signals: &Signals) -> anyhow::Result<TrainingEnd> {
     let run = directory.join(&trial.name);
     let mut command = Command::new("/proc/self/exe");
     if run.exists() {
@@ -309,13 +309,13 @@ fn printed<'a>(name: &'a str, path: &Path) -> anyhow::Result<PrintedRun<'a>> {
         let status = saved_status(&run.config()?, &run)?;
         let evaluation = FinalEvaluation::read(&run, status.env_steps)?;
         (printed.finished, printed.env_steps) = (status.finished, status.env_steps);
-        printed.eval_return_mean = evaluation.and_then(|it| it.of(WhichPolicy::Best)?.return_mean);
+        printed.eval_return_mean = evaluation.and_then(|it| it.of(SavedPolicy::Best)?.return_mean);
     }
     Ok(printed)
 }
 
 /// The live line, or a line for each event where standard error is no terminal.
-struct Progress<'a> {
+struct SuiteProgressDisplay<'a> {
     suite: &'a Suite,
     directory: &'a Path,
     bar: ProgressBar,
@@ -326,7 +326,7 @@ struct Progress<'a> {
     running: Vec<usize>,
     done: Vec<usize>,
     failed: usize,
-    begun: Instant,
+    started_at: Instant,
 }
 
 /// How far a run is, and how far it goes: in episodes if they limit it, otherwise in environment steps.
@@ -340,7 +340,7 @@ fn distance(run: &Path) -> Option<(u64, u64)> {
     })
 }
 
-impl<'a> Progress<'a> {
+impl<'a> SuiteProgressDisplay<'a> {
     fn new(suite: &'a Suite, directory: &'a Path, due: &VecDeque<usize>, quiet: bool) -> Self {
         let live = !quiet && std::io::stderr().is_terminal();
         let target = if live {
@@ -366,7 +366,7 @@ impl<'a> Progress<'a> {
             running: Vec::new(),
             done: Vec::new(),
             failed: 0,
-            begun: Instant::now(),
+            started_at: Instant::now(),
         };
         progress.print(&format!("{} of {} runs to train", due.len(), suite.trials.len()));
         progress
@@ -416,7 +416,7 @@ impl<'a> Progress<'a> {
 
     fn result(&self, number: usize) -> Option<f64> {
         let run = RunDir::open(&self.run(number)).ok()?;
-        FinalEvaluation::read(&run, 0).ok()??.of(WhichPolicy::Best)?.return_mean
+        FinalEvaluation::read(&run, 0).ok()??.of(SavedPolicy::Best)?.return_mean
     }
 
     fn count(&self) -> String {
@@ -443,7 +443,7 @@ impl<'a> Progress<'a> {
             }
         }
         left += waiting * total.checked_div(known)?;
-        let seconds = self.begun.elapsed().as_secs_f64() * left as f64 / made as f64;
+        let seconds = self.started_at.elapsed().as_secs_f64() * left as f64 / made as f64;
         (made > 0 && left > 0).then(|| format!("{:#}", HumanDuration(Duration::from_secs(seconds as u64))))
     }
 

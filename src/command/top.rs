@@ -19,7 +19,7 @@ use shoal_run::signals::{Signals, exit_code};
 use signal_hook::consts::SIGHUP;
 
 use super::status::show_saved;
-use crate::top::{Link, Screen, draw};
+use crate::top::{LauncherLink, Screen, draw};
 
 #[derive(Args, Clone, Debug)]
 pub(crate) struct TopArgs {
@@ -30,7 +30,7 @@ pub(crate) struct TopArgs {
 /// The longest delay until a key, a signal or an event is handled.
 const TICK: Duration = Duration::from_millis(200);
 
-/// How long the main loop may take to end after a signal. A tick and the wait in `Link::close` take less.
+/// How long the main loop may take to end after a signal. A tick and the wait in `LauncherLink::close` take less.
 const END_PATIENCE: Duration = Duration::from_secs(3);
 
 /// Shows the run until `q` or a signal, and then restores the terminal.
@@ -48,7 +48,7 @@ pub(crate) fn run(args: &TopArgs) -> anyhow::Result<ExitCode> {
     let signal = watched_signals()?;
     let here = args.run.display().to_string();
     let mut screen = Screen::new(here, task(&client.config), colours());
-    let link = Link::new(client)?;
+    let link = LauncherLink::new(client)?;
     let restore = RestoreOnDrop;
     let mut terminal = ratatui::try_init().context("cannot draw on this terminal")?;
     let shown = show(&mut terminal, &mut screen, &link, &signal);
@@ -71,7 +71,12 @@ impl Drop for RestoreOnDrop {
     }
 }
 
-fn show(terminal: &mut DefaultTerminal, screen: &mut Screen, link: &Link, signal: &AtomicUsize) -> anyhow::Result<()> {
+fn show(
+    terminal: &mut DefaultTerminal,
+    screen: &mut Screen,
+    link: &LauncherLink,
+    signal: &AtomicUsize,
+) -> anyhow::Result<()> {
     let mut changed = true;
     while signal.load(Ordering::Relaxed) == 0 {
         if changed {
@@ -112,7 +117,7 @@ fn wait_for_input() -> anyhow::Result<Input> {
     let mut fds = [PollFd::new(&stdin, PollFlags::IN)];
     let tick = Timespec::try_from(TICK).context("cannot wait for the keyboard")?;
     match poll(&mut fds, Some(&tick)) {
-        // A signal: the size of the window may have changed.
+        // A signal: the size of the terminal may have changed.
         Err(Errno::INTR) => return Ok(Input::Something),
         polled => polled.context("cannot wait for the keyboard")?,
     };
@@ -129,7 +134,7 @@ fn wait_for_input() -> anyhow::Result<Input> {
 }
 
 /// Handles the keys that were pressed; returns whether one of them quits.
-fn read_keys(screen: &mut Screen, link: &Link) -> anyhow::Result<bool> {
+fn read_keys(screen: &mut Screen, link: &LauncherLink) -> anyhow::Result<bool> {
     while event::poll(Duration::ZERO).context("cannot read the keyboard")? {
         let Event::Key(key) = event::read().context("cannot read the keyboard")? else {
             continue;

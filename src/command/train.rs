@@ -24,7 +24,7 @@ pub(crate) struct TrainArgs {
     /// one of the last four with -sac or -td3, gym: with a Gymnasium environment (gym:HalfCheetah-v5), or a
     /// configuration file (FILE.toml).
     #[arg(value_name = "PRESET|gym:ID|FILE.toml", required_unless_present = "help_config")]
-    #[arg(add = ArgValueCompleter::new(completion::what_to_train))]
+    #[arg(add = ArgValueCompleter::new(completion::presets_and_files))]
     pub(crate) what: Option<String>,
     /// Explain every key of the configuration, or those of the named preset or file, without training.
     #[arg(long)]
@@ -60,10 +60,10 @@ pub(crate) struct RunArgs {
     /// Run directory to create [default: runs/<preset>-<n>].
     #[arg(long, value_name = "DIR")]
     pub(crate) run: Option<PathBuf>,
-    /// How to learn: ddpg, td3, sac, dqn, reinforce, q-learning or sarsa [default: the preset's; for gym: the one that
+    /// The algorithm: ddpg, td3, sac, dqn, reinforce, q-learning or sarsa [default: the preset's; for gym: the one that
     /// suits the spaces].
-    #[arg(long, value_name = "METHOD", value_parser = PossibleValuesParser::new(shoal_run::method::names()))]
-    pub(crate) method: Option<String>,
+    #[arg(long = "method", value_name = "METHOD", value_parser = PossibleValuesParser::new(shoal_run::algorithm::names()))]
+    pub(crate) algorithm: Option<String>,
     /// Seed of every random stream.
     #[arg(long)]
     pub(crate) seed: Option<u64>,
@@ -85,7 +85,7 @@ pub(crate) struct RunArgs {
     /// Set a key of the configuration, as in --set ddpg.tau=0.005. May be repeated.
     #[arg(long, value_name = "SECTION.KEY=VALUE", add = ArgValueCompleter::new(completion::settings))]
     pub(crate) set: Vec<String>,
-    /// Begin with the networks of this run, whose method and shapes it then has.
+    /// Begin with the networks of this run, whose algorithm and shapes it then has.
     #[arg(long, value_name = "RUN")]
     pub(crate) from: Option<PathBuf>,
     /// Begin with the replay of that run too. The new run's steps are counted from its rows on.
@@ -97,7 +97,7 @@ impl RunArgs {
     fn overrides(&self) -> RunOverrides {
         let Self {
             run,
-            method,
+            algorithm,
             seed,
             actors,
             envs,
@@ -110,7 +110,7 @@ impl RunArgs {
         } = self.clone();
         RunOverrides {
             run,
-            method,
+            algorithm,
             seed,
             actors,
             envs,

@@ -16,15 +16,15 @@ use shoal_learner::algorithms::registry;
 use shoal_learner::networks::digest;
 use shoal_learner::process::checkpoint::Checkpoints;
 use shoal_report::plots;
-use shoal_run::evaluation::{EvaluationSummary, WhichPolicy, evaluate_until};
-use shoal_run::final_evaluation::{FinalEvaluation, FinalPolicy, FinallyEvaluated};
+use shoal_run::evaluation::{EvaluationSummary, SavedPolicy, evaluate_until};
+use shoal_run::final_evaluation::{FinalEvaluation, FinalPolicyResult};
 use shoal_run::numbers::thousands;
 use shoal_run::outcome::{FINAL_EVALUATION, RunOutcome, RunState};
 use shoal_run::recorder::record_final;
 use shoal_run::signals::{Interrupt, Signals, describe, exit_code};
 
 use super::listen::ListenArgs;
-use crate::launcher::{self, Ending, Manner, TrainingOutcome};
+use crate::launcher::{self, RunEnd, RunOptions, TrainingOutcome};
 
 /// The output options of a training.
 #[derive(Args, Clone, Debug, Default)]
@@ -65,11 +65,11 @@ pub(crate) fn run_training(
     listen: &ListenArgs,
 ) -> anyhow::Result<ExitCode> {
     let gate = listen.prepare(&config, run)?;
-    let manner = Manner {
+    let options = RunOptions {
         quiet: output.quiet,
         gate,
     };
-    let trained = train_and_report(config, run, lock, output, manner);
+    let trained = train_and_report(config, run, lock, output, options);
     // Whatever else has failed follows from it.
     lock.check(run)?;
     trained
@@ -80,16 +80,16 @@ fn train_and_report(
     run: &RunDir,
     lock: &RunLock,
     output: &OutputMode,
-    manner: Manner,
+    options: RunOptions,
 ) -> anyhow::Result<ExitCode> {
     let signals = Signals::register()?;
-    let outcome = launcher::run(config.clone(), (run, lock), &signals, manner)?;
+    let outcome = launcher::run(config.clone(), (run, lock), &signals, options)?;
     let mut evaluated = Vec::new();
     let RunStatus {
         env_steps, episodes, ..
     } = outcome.after;
     let mut finished = RunOutcome::new(RunState::Finished, env_steps, episodes);
-    if outcome.ending == Ending::Finished {
+    if outcome.ending == RunEnd::Finished {
         let interrupt = signals.interrupt();
         let under_way = RunOutcome::new(RunState::Running, env_steps, episodes);
         under_way.with_reason(FINAL_EVALUATION).write(run)?;
@@ -116,7 +116,7 @@ fn train_and_report(
         let why = format!("{error:#}").replace('\n', " ");
         say(&format!("the figures could not be drawn: {why}"));
     }
-    if outcome.ending == Ending::Finished {
+    if outcome.ending == RunEnd::Finished {
         finished.write(run)?;
     }
     let summary = Summary::new(&config, run, &outcome, evaluated.first().map(|(_, summary)| summary))?;
@@ -129,10 +129,10 @@ fn train_and_report(
     }
     Ok(match outcome.ending {
         // The final evaluation may have been interrupted.
-        Ending::Finished => signals.interrupt().signal().map_or(ExitCode::SUCCESS, exit_code),
-        Ending::Stopped | Ending::Renewed => ExitCode::SUCCESS,
+        RunEnd::Finished => signals.interrupt().signal().map_or(ExitCode::SUCCESS, exit_code),
+        RunEnd::Stopped | RunEnd::Renewed => ExitCode::SUCCESS,
         // As a shell reports a process that was ended by the signal.
-        Ending::Interrupted(signal) => exit_code(signal),
+        RunEnd::Interrupted(signal) => exit_code(signal),
     })
 }
 
@@ -161,13 +161,13 @@ fn final_evaluation(
         "final evaluation, {msg} {bar:16.cyan/dim} {pos}/{len} episodes",
     )?);
     let mut evaluated = Vec::new();
-    for (name, path, which, policy) in [
-        ("best policy", run.best_policy(), WhichPolicy::Best, FinalPolicy::Best),
-        ("last policy", run.last_policy(), WhichPolicy::Last, FinalPolicy::Last),
+    for (name, path, policy) in [
+        ("best policy", run.best_policy(), SavedPolicy::Best),
+        ("last policy", run.last_policy(), SavedPolicy::Last),
     ] {
         if path.exists() {
             bar.set_message(name);
-            let file = which.read(run, config)?;
+            let file = policy.read(run, config)?;
             if !file.parameters.iter().all(|parameter| parameter.is_finite()) {
                 continue;
             }
@@ -179,7 +179,7 @@ fn final_evaluation(
     }
     bar.finish_and_clear();
     // The last policy replaces the best one only if it is better.
-    let mut kept: Option<&(&str, FinalPolicy, PolicyFile, EvaluationSummary)> = None;
+    let mut kept: Option<&(&str, SavedPolicy, PolicyFile, EvaluationSummary)> = None;
     for candidate in evaluated.iter().filter(|(.., summary)| summary.return_mean.is_finite()) {
         if kept.is_none_or(|(.., summary)| candidate.3.return_mean > summary.return_mean) {
             kept = Some(candidate);
@@ -188,7 +188,7 @@ fn final_evaluation(
     let Some((_, kept_policy, file, kept_summary)) = kept else {
         anyhow::bail!("no policy has a finite return");
     };
-    if *kept_policy == FinalPolicy::Last {
+    if *kept_policy == SavedPolicy::Last {
         let best = PolicyFile {
             return_mean: kept_summary.return_mean,
             return_std: kept_summary.return_std,
@@ -197,14 +197,14 @@ fn final_evaluation(
         };
         best.write(&run.best_policy())?;
     }
-    let entry = |(_, policy, file, summary): &(_, FinalPolicy, PolicyFile, _)| {
-        FinallyEvaluated::new(*policy, (file.version, file.env_steps), summary)
+    let entry = |(_, policy, file, summary): &(_, SavedPolicy, PolicyFile, _)| {
+        FinalPolicyResult::new(*policy, (file.version, file.env_steps), summary)
     };
     let result = FinalEvaluation::new(seed, env_steps, evaluated.iter().map(entry).collect(), *kept_policy);
     result.write(run)?;
     record_final(run, &result)?;
     let best = ("best policy", kept_summary.clone());
-    let last = evaluated.iter().filter(|(_, policy, ..)| *policy == FinalPolicy::Last);
+    let last = evaluated.iter().filter(|(_, policy, ..)| *policy == SavedPolicy::Last);
     let last = last.map(|(name, .., summary)| (*name, summary.clone()));
     Ok(std::iter::once(best).chain(last).collect())
 }
@@ -212,9 +212,9 @@ fn final_evaluation(
 /// Keeps the last policy as the best one if there is no policy with a finite evaluation, so that the run has a policy to
 /// use.
 fn keep_some_policy(config: &Config, run: &RunDir) -> anyhow::Result<()> {
-    let kept = run.best_policy().exists() && WhichPolicy::Best.read(run, config)?.return_mean.is_finite();
+    let kept = run.best_policy().exists() && SavedPolicy::Best.read(run, config)?.return_mean.is_finite();
     if !kept && run.last_policy().exists() {
-        let last = WhichPolicy::Last.read(run, config)?;
+        let last = SavedPolicy::Last.read(run, config)?;
         if last.parameters.iter().all(|parameter| parameter.is_finite()) {
             last.write(&run.best_policy())?;
         }
@@ -260,8 +260,8 @@ impl Summary {
 fn weights_sha256(config: &Config, run: &RunDir) -> anyhow::Result<Option<String>> {
     let loaded = Checkpoints::new(&run.checkpoints(), config.fingerprint()).load_newest()?;
     Ok(loaded.map(|loaded| {
-        let section = |name| loaded.checkpoint.sections.iter().find(|(found, _)| found == name);
-        let weights = registry::weights(config).into_iter().filter_map(section);
+        let array = |name| loaded.checkpoint.arrays.iter().find(|(found, _)| found == name);
+        let weights = registry::weights(config).into_iter().filter_map(array);
         digest::sha256(&weights.map(|(_, numbers)| numbers.as_slice()).collect::<Vec<_>>())
     }))
 }
@@ -301,7 +301,7 @@ fn write_summary(
     }
     writeln!(to, "{table}")?;
     let here = run.path().display();
-    if outcome.ending != Ending::Finished {
+    if outcome.ending != RunEnd::Finished {
         writeln!(to, "The learner's state is saved; to continue: shoal resume {here}")?;
     }
     writeln!(to, "{here}")?;

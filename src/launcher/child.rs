@@ -5,7 +5,7 @@ use std::process::ExitStatus;
 use std::time::{Duration, Instant};
 
 use shoal_common::channel::control::{RoleState, RoleStatus};
-use shoal_common::report::{Activity, Heartbeat, Identity, Role};
+use shoal_common::report::{Activity, Heartbeat, Role, RoleInstance};
 use shoal_run::rate::per_second;
 use signal_hook::consts::{SIGABRT, SIGBUS, SIGFPE, SIGILL, SIGSEGV};
 
@@ -36,17 +36,17 @@ const RATE_SPAN: Duration = Duration::from_millis(400);
 /// A role of the run, its current process, and the history of the earlier ones.
 #[derive(Debug)]
 pub(super) struct Child {
-    pub(super) identity: Identity,
+    pub(super) instance: RoleInstance,
     pub(super) process: Option<Process>,
     /// The exit status of a process whose end has been observed but not handled.
     pub(super) ended: Option<ExitStatus>,
     /// The process was asked to hand over its transitions and end; it is not replaced.
-    pub(super) retires: bool,
+    pub(super) is_retiring: bool,
     /// The process was asked to end with the run.
-    pub(super) ends: bool,
+    pub(super) is_asked_to_end: bool,
     pub(super) restarts: u32,
     pub(super) restart_at: Instant,
-    begun: Instant,
+    started_at: Instant,
     /// Failed starts since the last process that was able to work, and the time of the first of them.
     failures: u32,
     failing_since: Option<Instant>,
@@ -57,7 +57,7 @@ pub(super) struct Child {
     /// The last heartbeat of the current process, with its time of arrival.
     last_heartbeat: Option<(Instant, Heartbeat)>,
     /// When the process last made progress: started, took steps, got another policy, or changed its activity.
-    pub(super) moved: Instant,
+    pub(super) progress_at: Instant,
     /// How often the process was replaced for lack of progress since it last took steps.
     pub(super) stalls: u32,
     /// The environment server that it uses, if any.
@@ -65,13 +65,13 @@ pub(super) struct Child {
     /// Whether the user was told that it is slow, since it was last heard of or started.
     reported_slow: bool,
     /// The time and the steps at which its rate was last computed.
-    span: (Instant, u64),
+    rate_computed_at: (Instant, u64),
     rate: f64,
 }
 
 /// The launcher's reaction to the end of a process.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Consequence {
+pub(super) enum RestartDecision {
     /// Start the role again after this pause.
     Restart(Duration),
     /// Give the role up, after this many failures.
@@ -83,27 +83,27 @@ impl Child {
     pub(super) fn new(role: Role, index: u32) -> Self {
         let now = Instant::now();
         Self {
-            identity: Identity {
+            instance: RoleInstance {
                 role,
                 index,
                 incarnation: 0,
             },
             process: None,
             ended: None,
-            retires: false,
-            ends: false,
+            is_retiring: false,
+            is_asked_to_end: false,
             restarts: 0,
             restart_at: now,
-            begun: now,
+            started_at: now,
             failures: 0,
             failing_since: None,
             usual_start: None,
             longest_start: Duration::ZERO,
             last_heartbeat: None,
-            moved: now,
+            progress_at: now,
             stalls: 0,
             server: (role == Role::Actor).then_some(index),
-            span: (now, 0),
+            rate_computed_at: (now, 0),
             reported_slow: false,
             rate: 0.0,
         }
@@ -123,19 +123,19 @@ impl Child {
     }
 
     pub(super) fn is(&self, role: Role, index: u32) -> bool {
-        (self.identity.role, self.identity.index) == (role, index)
+        (self.instance.role, self.instance.index) == (role, index)
     }
 
     /// Assigns the role to a new process.
     pub(super) fn begin(&mut self, process: Process) {
         self.process = Some(process);
-        self.retires = false;
+        self.is_retiring = false;
         self.begin_at(Instant::now());
     }
 
     fn begin_at(&mut self, now: Instant) {
-        self.begun = now;
-        self.moved = now;
+        self.started_at = now;
+        self.progress_at = now;
         self.last_heartbeat = None;
         self.reported_slow = false;
         self.rate = 0.0;
@@ -165,39 +165,39 @@ impl Child {
         let first = before.is_none();
         let position = |heartbeat: &Heartbeat| (heartbeat.steps, heartbeat.policy_version, heartbeat.activity());
         if before.is_none_or(|before| position(&before) != position(heartbeat)) {
-            self.moved = now;
+            self.progress_at = now;
         }
         if heartbeat.steps > 0 {
             self.stalls = 0;
         }
-        let (then, steps) = self.span;
+        let (then, steps) = self.rate_computed_at;
         if first || now - then >= RATE_SPAN {
             let rate = per_second((Duration::ZERO, steps), (now - then, heartbeat.steps));
             self.rate = if first { 0.0 } else { rate.unwrap_or(0.0) };
-            self.span = (now, heartbeat.steps);
+            self.rate_computed_at = (now, heartbeat.steps);
         }
-        let took = first.then(|| now - self.begun)?;
+        let took = first.then(|| now - self.started_at)?;
         self.usual_start = self.usual_start.max(Some(took));
         Some(took)
     }
 
     /// Handles the end of its process, which was not asked to end.
-    pub(super) fn has_ended(&mut self, status: ExitStatus) -> Consequence {
+    pub(super) fn has_ended(&mut self, status: ExitStatus) -> RestartDecision {
         self.has_ended_at(status, Instant::now())
     }
 
     /// After a process that was able to work, the role is restarted and its failures are forgotten. Being killed while
     /// it waited, after its first step, or within the usual time of a start is not a failure either. Any other end is.
-    fn has_ended_at(&mut self, status: ExitStatus, now: Instant) -> Consequence {
+    fn has_ended_at(&mut self, status: ExitStatus, now: Instant) -> RestartDecision {
         (self.process, self.ended) = (None, None);
         let crash_signals = [SIGABRT, SIGBUS, SIGFPE, SIGILL, SIGSEGV];
         let was_killed = status.signal().is_some_and(|signal| !crash_signals.contains(&signal));
-        let lived = now - self.begun;
+        let lived = now - self.started_at;
         let steps = self.last_heartbeat.map_or(0, |(_, heartbeat)| heartbeat.steps);
-        let served = self.identity.role == Role::EnvServer && steps >= PROVEN_STEPS;
+        let served = self.instance.role == Role::EnvServer && steps >= PROVEN_STEPS;
         if self.is_ready() && (lived >= PROVEN || served) {
             (self.failures, self.failing_since) = (0, None);
-            return Consequence::Restart(if was_killed { Duration::ZERO } else { FIRST_PAUSE });
+            return RestartDecision::Restart(if was_killed { Duration::ZERO } else { FIRST_PAUSE });
         }
         let blameless = match self.activity() {
             Some(activity) => steps > 0 || activity != Activity::Working,
@@ -207,16 +207,16 @@ impl Child {
             }
         };
         if was_killed && blameless {
-            return Consequence::Restart(if self.is_ready() { Duration::ZERO } else { FIRST_PAUSE });
+            return RestartDecision::Restart(if self.is_ready() { Duration::ZERO } else { FIRST_PAUSE });
         }
         self.failures += 1;
-        let since = *self.failing_since.get_or_insert(self.begun);
+        let since = *self.failing_since.get_or_insert(self.started_at);
         let longest = self.longest_start.max(self.usual_start.unwrap_or_default());
         if self.failures >= MAX_FAILURES && now - since >= SPAN_OF_FAILURES.max(2 * longest) {
-            return Consequence::GiveUp(self.failures);
+            return RestartDecision::GiveUp(self.failures);
         }
         let doubled = FIRST_PAUSE * 2_u32.pow((self.failures - 1).min(10));
-        Consequence::Restart(doubled.min(LONGEST_PAUSE))
+        RestartDecision::Restart(doubled.min(LONGEST_PAUSE))
     }
 
     /// Whether a recent heartbeat reports that it waits.
@@ -227,30 +227,30 @@ impl Child {
 
     /// Whether it has a process that is expected to keep working.
     pub(super) fn is_active(&self) -> bool {
-        self.process.is_some() && self.ended.is_none() && !self.retires && !self.ends
+        self.process.is_some() && self.ended.is_none() && !self.is_retiring && !self.is_asked_to_end
     }
 
     /// Restarts the clocks for progress and heartbeats.
     pub(super) fn reset_clocks(&mut self) {
-        self.moved = Instant::now();
+        self.progress_at = Instant::now();
         if let Some((then, _)) = &mut self.last_heartbeat {
-            *then = self.moved;
+            *then = self.progress_at;
         }
     }
 
     /// The time since its last heartbeat, or since its start.
     pub(super) fn silent_for(&self) -> Duration {
-        self.last_heartbeat.map_or(self.moved, |(then, _)| then).elapsed()
+        self.last_heartbeat.map_or(self.progress_at, |(then, _)| then).elapsed()
     }
 
     /// How long it has been starting; `None` once it is ready, and while it has no process.
     pub(super) fn starting_for(&self) -> Option<Duration> {
-        (self.is_active() && !self.is_ready()).then(|| self.begun.elapsed())
+        (self.is_active() && !self.is_ready()).then(|| self.started_at.elapsed())
     }
 
     /// Ends its process, which has not become ready in time.
     pub(super) fn end_slow_start(&mut self) {
-        self.begun = Instant::now();
+        self.started_at = Instant::now();
         if let Some(process) = &mut self.process {
             process.kill();
         }
@@ -293,7 +293,7 @@ impl Child {
 
     /// Its status. `newest` is the version of the learner's newest policy.
     pub(super) fn status(&self, newest: u64) -> RoleStatus {
-        let Identity { role, index, .. } = self.identity;
+        let RoleInstance { role, index, .. } = self.instance;
         let policy_version = self
             .last_heartbeat
             .filter(|_| role != Role::EnvServer)
@@ -313,11 +313,11 @@ impl Child {
 
     fn state(&self) -> RoleState {
         match (&self.process, self.last_heartbeat) {
-            (None, _) if self.ends => RoleState::Done,
+            (None, _) if self.is_asked_to_end => RoleState::Done,
             (None, _) => RoleState::Restarting,
             (_, Some((then, _))) if then.elapsed() >= SILENT => RoleState::Silent,
-            _ if self.retires => RoleState::Retiring,
-            _ if self.ends => RoleState::Ending,
+            _ if self.is_retiring => RoleState::Retiring,
+            _ if self.is_asked_to_end => RoleState::Ending,
             (_, None) => RoleState::Starting,
             (_, Some((_, heartbeat))) => match heartbeat.activity() {
                 Some(Activity::WaitingForPeer | Activity::WaitingForServer) => RoleState::WaitingForPeer,
@@ -360,21 +360,27 @@ mod tests {
         }
 
         /// A process lives for `lived` and then ends. It is ready after `ready`, with this last heartbeat.
-        fn live(&mut self, lived: Duration, ready: Option<Duration>, last: Heartbeat, end: ExitStatus) -> Consequence {
+        fn live(
+            &mut self,
+            lived: Duration,
+            ready: Option<Duration>,
+            last: Heartbeat,
+            end: ExitStatus,
+        ) -> RestartDecision {
             self.child.begin_at(self.now);
             if let Some(ready) = ready {
                 self.child.record_at(&last, self.now + ready);
             }
             self.now += lived;
             let consequence = self.child.has_ended_at(end, self.now);
-            if let Consequence::Restart(pause) = consequence {
+            if let RestartDecision::Restart(pause) = consequence {
                 self.now += pause;
             }
             consequence
         }
 
         fn heartbeat(&self, activity: Activity, steps: u64) -> Heartbeat {
-            let mut heartbeat = Heartbeat::new(self.child.identity);
+            let mut heartbeat = Heartbeat::new(self.child.instance);
             heartbeat.set_activity(activity);
             heartbeat.steps = steps;
             heartbeat
@@ -388,7 +394,7 @@ mod tests {
         let mut child = Simulation::new(Role::Actor);
         let (begun, mut pauses) = (child.now, Vec::new());
         let last = child.heartbeat(Activity::Working, 0);
-        while let Consequence::Restart(pause) = child.live(READY, None, last, with_code(1)) {
+        while let RestartDecision::Restart(pause) = child.live(READY, None, last, with_code(1)) {
             pauses.push(pause.as_millis());
         }
         assert_eq!(pauses[..7], [100, 200, 400, 800, 1600, 3200, 4000]);
@@ -402,7 +408,7 @@ mod tests {
         let begun = child.now;
         let last = child.heartbeat(Activity::Working, 0);
         let mut starts = 1;
-        while child.live(Duration::from_secs(60), None, last, with_code(1)) != Consequence::GiveUp(starts) {
+        while child.live(Duration::from_secs(60), None, last, with_code(1)) != RestartDecision::GiveUp(starts) {
             starts += 1;
         }
         assert_eq!(starts, MAX_FAILURES);
@@ -420,7 +426,7 @@ mod tests {
             for (ready, last) in [(None, idle), (Some(READY), idle), (Some(READY), at_work)] {
                 let consequence = child.live(10 * READY, ready, last, by_signal(KILLED));
                 let pause = if ready.is_some() { Duration::ZERO } else { FIRST_PAUSE };
-                assert_eq!(consequence, Consequence::Restart(pause));
+                assert_eq!(consequence, RestartDecision::Restart(pause));
             }
         }
     }
@@ -431,10 +437,10 @@ mod tests {
         let idle = child.heartbeat(Activity::WaitingForPeer, 0);
         child.live(READY, Some(READY), idle, by_signal(KILLED));
         let killed = |child: &mut Simulation, lived| child.live(lived, None, idle, by_signal(KILLED));
-        assert_eq!(killed(&mut child, START_TIME), Consequence::Restart(FIRST_PAUSE));
+        assert_eq!(killed(&mut child, START_TIME), RestartDecision::Restart(FIRST_PAUSE));
         let counted = (0..100).find_map(|_| match killed(&mut child, 2 * START_TIME) {
-            Consequence::GiveUp(starts) => Some(starts),
-            Consequence::Restart(_) => None,
+            RestartDecision::GiveUp(starts) => Some(starts),
+            RestartDecision::Restart(_) => None,
         });
         assert!(counted.is_some());
     }
@@ -446,7 +452,7 @@ mod tests {
             let in_first_step = child.heartbeat(Activity::Working, 0);
             let given_up = (0..100).any(|_| {
                 let consequence = child.live(10 * READY, Some(READY), in_first_step, end);
-                matches!(consequence, Consequence::GiveUp(_))
+                matches!(consequence, RestartDecision::GiveUp(_))
             });
             assert!(given_up, "{end}");
         }
@@ -457,7 +463,7 @@ mod tests {
         let mut child = Simulation::new(Role::EnvServer);
         let at_work = child.heartbeat(Activity::Working, 3);
         let mut ends = (0..100).map(|_| child.live(10 * READY, Some(READY), at_work, with_code(1)));
-        assert!(ends.any(|end| matches!(end, Consequence::GiveUp(_))));
+        assert!(ends.any(|end| matches!(end, RestartDecision::GiveUp(_))));
     }
 
     #[test]
@@ -465,7 +471,7 @@ mod tests {
         let mut child = Simulation::new(Role::Learner);
         let at_work = child.heartbeat(Activity::Working, 3000);
         let mut ends = (0..100).map(|_| child.live(Duration::from_secs(5), Some(READY), at_work, with_code(1)));
-        assert!(ends.any(|end| matches!(end, Consequence::GiveUp(_))));
+        assert!(ends.any(|end| matches!(end, RestartDecision::GiveUp(_))));
     }
 
     #[test]
@@ -474,7 +480,7 @@ mod tests {
         let at_work = child.heartbeat(Activity::Working, 3000);
         for _ in 0..1000 {
             let consequence = child.live(Duration::from_secs(1), Some(READY), at_work, with_code(1));
-            assert_eq!(consequence, Consequence::Restart(FIRST_PAUSE));
+            assert_eq!(consequence, RestartDecision::Restart(FIRST_PAUSE));
         }
     }
 }

@@ -20,7 +20,7 @@ pub(super) struct Hosts {
 #[derive(Debug)]
 struct Admitted {
     lease: HostLease,
-    heard: Instant,
+    heard_at: Instant,
     status: Option<HostStatus>,
 }
 
@@ -67,7 +67,7 @@ impl Hosts {
         self.admitted.retain(|admitted| admitted.lease.host != lease.host);
         self.admitted.push(Admitted {
             lease,
-            heard: Instant::now(),
+            heard_at: Instant::now(),
             status: None,
         });
     }
@@ -81,7 +81,7 @@ impl Hosts {
                 .find(|admitted| admitted.lease.host == status.host)
             {
                 if status.state == HostState::Connected {
-                    admitted.heard = Instant::now();
+                    admitted.heard_at = Instant::now();
                 }
                 admitted.status = Some(status);
             }
@@ -95,7 +95,7 @@ impl Hosts {
             let name = &admitted.lease.name;
             if left {
                 messages.push(format!("host {name} has left"));
-            } else if admitted.heard.elapsed() >= LOST {
+            } else if admitted.heard_at.elapsed() >= LOST {
                 messages.push(format!(
                     "host {name} was silent for {} s: its actors are free",
                     LOST.as_secs()

@@ -12,8 +12,8 @@ pub(super) fn last_committed(run: &RunDir) -> anyhow::Result<u64> {
         Err(OpenError::NotYet { .. }) => return Ok(0),
         opened => opened?,
     };
-    let marks = (0..commits.layout().actors).map(|actor| commits.committed(actor).incarnation);
-    Ok(marks.max().unwrap_or(0))
+    let incarnations = (0..commits.layout().actors).map(|actor| commits.committed(actor).incarnation);
+    Ok(incarnations.max().unwrap_or(0))
 }
 
 /// The number in the file at `path`; 0 if there is no file.

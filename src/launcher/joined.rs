@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::bail;
 use shoal_common::channel::Domain;
-use shoal_common::channel::control::{Answer, ControlPort, Question, RunStatus};
+use shoal_common::channel::control::{ControlPort, ControlRequest, ControlResponse, RunStatus};
 use shoal_common::channel::reports::Reports;
 use shoal_common::config::Config;
 use shoal_common::report::{Activity, Heartbeat, Role};
@@ -15,8 +15,8 @@ use shoal_run::process::wait_for_any;
 use shoal_run::signals::{self, Signals};
 
 use super::log::Log;
-use super::stall::Stalls;
-use super::supervisor::{Members, Situation, Supervisor};
+use super::stall::StallDetector;
+use super::supervisor::{RolesOnHost, RunCondition, Supervisor};
 use super::{OTHERS_END, write_iox_config};
 
 /// How often heartbeats are read if nothing wakes the launcher.
@@ -27,7 +27,7 @@ const HAND_OVER: Duration = Duration::from_secs(6);
 
 /// How the work for another host's run ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Ending {
+pub(crate) enum JoinEnd {
     /// The run is over.
     Over,
     /// The run could not be reached for too long.
@@ -45,7 +45,7 @@ pub(crate) fn run(
     signals: &Signals,
     actors: Vec<u32>,
     give_up: Duration,
-) -> anyhow::Result<Ending> {
+) -> anyhow::Result<JoinEnd> {
     Domain::remove_abandoned()?;
     let domain = Domain::join(&config.run.id, config.actors.max)?;
     let ending = preflight::reserve_for_host(&config, &domain)
@@ -66,12 +66,12 @@ struct Host<'a> {
     control: ControlPort,
     supervisor: Supervisor,
     signals: &'a Signals,
-    stalls: Stalls,
+    stalls: StallDetector,
     log: Log,
     heartbeats: Reports<Heartbeat>,
     stop_requested: bool,
     /// Since when the relay has had no connection.
-    cut_off: Option<Instant>,
+    cut_off_since: Option<Instant>,
 }
 
 impl<'a> Host<'a> {
@@ -85,11 +85,11 @@ impl<'a> Host<'a> {
         let log = Log::open(&run.log())?;
         write_iox_config(domain, run)?;
         // Creates the services that are opened below.
-        let supervisor = Supervisor::new(&config, run, domain, log.clone(), Members::Host { actors })?;
+        let supervisor = Supervisor::new(&config, run, domain, log.clone(), RolesOnHost::Host { actors })?;
         Ok(Self {
             control: ControlPort::open(domain)?,
             heartbeats: Reports::open(domain)?,
-            stalls: Stalls::new(Duration::from_secs(config.run.stall_seconds)),
+            stalls: StallDetector::new(Duration::from_secs(config.run.stall_seconds)),
             supervisor,
             run,
             lock,
@@ -98,44 +98,44 @@ impl<'a> Host<'a> {
             log,
             config,
             stop_requested: false,
-            cut_off: None,
+            cut_off_since: None,
         })
     }
 
-    fn run(mut self, give_up: Duration) -> anyhow::Result<Ending> {
+    fn run(mut self, give_up: Duration) -> anyhow::Result<JoinEnd> {
         let ending = self.watch(give_up);
         // The roles are ended in every case, also after an error. The relay stays while actors hand over what they have. If
         // the run is over, they try that only for a moment: its learner takes no more than it needs.
         match ending {
-            Ok(Ending::Over | Ending::GaveUp) => self.supervisor.ask_to_end(|role| role == Role::Actor),
+            Ok(JoinEnd::Over | JoinEnd::GaveUp) => self.supervisor.ask_to_end(|role| role == Role::Actor),
             _ => self.supervisor.ask_to_retire(Role::Actor),
         }
         self.await_end(|role| role == Role::Actor, HAND_OVER);
         self.supervisor.ask_to_end(|_| true);
         self.await_end(|_| true, OTHERS_END);
-        self.control.answer_waiting(&Answer::Accepted);
+        self.control.answer_waiting(&ControlResponse::Accepted);
         if let Err(error) = &ending {
             self.log.note("launcher", &format!("{error:#}").replace('\n', " "));
         }
         ending
     }
 
-    fn watch(&mut self, give_up: Duration) -> anyhow::Result<Ending> {
+    fn watch(&mut self, give_up: Duration) -> anyhow::Result<JoinEnd> {
         self.supervisor.start_all(self.domain)?;
         loop {
             if let Some(signal) = self.signals.received() {
                 let what = format!("{} ends the work for the run", signals::describe(signal));
                 self.log.note("launcher", &what);
-                return Ok(Ending::Interrupted(signal));
+                return Ok(JoinEnd::Interrupted(signal));
             }
             self.lock.check(self.run)?;
             self.read_heartbeats()?;
-            self.answer_questions()?;
+            self.answer_requests()?;
             match self.supervisor.maintain(self.domain)? {
-                Situation::AtWork => {}
-                Situation::LearnerDone => bail!("a learner has ended on a host that has none"),
-                Situation::SharedMemoryOccupied => bail!("dead processes occupy shared memory for good: join again"),
-                Situation::FilesRemoved => bail!(
+                RunCondition::AtWork => {}
+                RunCondition::LearnerDone => bail!("a learner has ended on a host that has none"),
+                RunCondition::SharedMemoryOccupied => bail!("dead processes occupy shared memory for good: join again"),
+                RunCondition::FilesRemoved => bail!(
                     "another program has removed files of this host in {}: join again",
                     self.domain.directory()?.display()
                 ),
@@ -146,15 +146,15 @@ impl<'a> Host<'a> {
                 self.log.note("launcher", &slow);
             }
             if self.stop_requested {
-                return Ok(Ending::Stopped);
+                return Ok(JoinEnd::Stopped);
             }
             match self.supervisor.activity(Role::Relay) {
-                Some(Activity::Done) => return Ok(Ending::Over),
-                Some(Activity::Working) => self.cut_off = None,
+                Some(Activity::Done) => return Ok(JoinEnd::Over),
+                Some(Activity::Working) => self.cut_off_since = None,
                 _ => {
-                    let since = self.cut_off.get_or_insert_with(Instant::now);
+                    let since = self.cut_off_since.get_or_insert_with(Instant::now);
                     if since.elapsed() >= give_up {
-                        return Ok(Ending::GaveUp);
+                        return Ok(JoinEnd::GaveUp);
                     }
                 }
             }
@@ -171,7 +171,7 @@ impl<'a> Host<'a> {
         self.supervisor.check_faults()
     }
 
-    fn answer_questions(&mut self) -> anyhow::Result<()> {
+    fn answer_requests(&mut self) -> anyhow::Result<()> {
         let Self {
             control,
             run,
@@ -180,25 +180,25 @@ impl<'a> Host<'a> {
             config,
             ..
         } = self;
-        control.answer_questions(run.key()?, run.path(), |question| {
-            Ok::<_, anyhow::Error>(match question {
-                Question::Status => Some(Answer::Status(RunStatus {
+        control.answer_requests(run.key()?, run.path(), |request| {
+            Ok::<_, anyhow::Error>(match request {
+                ControlRequest::Status => Some(ControlResponse::Status(RunStatus {
                     roles: supervisor.status(0),
                     actors: supervisor.actors(),
                     steps: config.run.steps,
                     ..RunStatus::default()
                 })),
-                Question::Stop => {
+                ControlRequest::Stop => {
                     *stop_requested = true;
                     None
                 }
-                Question::Replace { actor, incarnation } => {
+                ControlRequest::Replace { actor, incarnation } => {
                     supervisor.replace_actor(actor, incarnation);
-                    Some(Answer::Accepted)
+                    Some(ControlResponse::Accepted)
                 }
-                Question::Scale { .. } | Question::Admit(_) | Question::Hosts(_) => {
+                ControlRequest::Scale { .. } | ControlRequest::Admit(_) | ControlRequest::Hosts(_) => {
                     let why = "this is a host that has joined a run: ask on the learner's host";
-                    Some(Answer::Refused(why.into()))
+                    Some(ControlResponse::Refused(why.into()))
                 }
             })
         })
@@ -211,7 +211,7 @@ impl<'a> Host<'a> {
                 self.supervisor.kill(which);
             }
             // An error here must not prevent the end.
-            let _ = self.answer_questions();
+            let _ = self.answer_requests();
             self.sleep(deadline.saturating_duration_since(Instant::now()).min(TICK));
         }
     }

@@ -7,7 +7,7 @@ use std::path::Path;
 use std::process::{ChildStdin, Command, ExitStatus};
 
 use anyhow::Context;
-use shoal_common::report::Identity;
+use shoal_common::report::RoleInstance;
 use shoal_run::process::{ChildGroup, ChildOutput, Writer};
 
 use super::log::Log;
@@ -22,18 +22,18 @@ pub(super) struct Process {
 
 impl Process {
     /// Starts this program as a role. `writer` is who writes to its standard error.
-    pub(super) fn start(identity: Identity, run: &Path, log: &Log, writer: Writer) -> anyhow::Result<Self> {
-        let Identity {
+    pub(super) fn start(instance: RoleInstance, run: &Path, log: &Log, writer: Writer) -> anyhow::Result<Self> {
+        let RoleInstance {
             role,
             index,
             incarnation,
-        } = identity;
+        } = instance;
         let mut command = Command::new("/proc/self/exe");
         command.arg0("shoal").arg(role.name()).arg(run);
         command.args([index.to_string(), incarnation.to_string()]);
         let (group, stdin, stderr) =
             ChildGroup::start(&mut command).with_context(|| format!("cannot start {} {index}", role.name()))?;
-        let (who, log) = (name(identity), log.clone());
+        let (who, log) = (name(instance), log.clone());
         let read = stderr
             .map(|stderr| ChildOutput::read(&who.clone(), stderr, writer, move |line| log.line(&who, line, writer)));
         let output = read.transpose().context("cannot read the output of a role")?;
@@ -78,6 +78,6 @@ impl Process {
 }
 
 /// The name of a process in the log and in messages.
-pub(super) fn name(identity: Identity) -> String {
-    format!("{}-{}", identity.role.name(), identity.index)
+pub(super) fn name(instance: RoleInstance) -> String {
+    format!("{}-{}", instance.role.name(), instance.index)
 }

@@ -22,7 +22,7 @@ const NEARLY: f64 = 0.98;
 
 /// Shows the progress of a run on standard error.
 #[derive(Debug)]
-pub(super) struct Progress {
+pub(super) struct ProgressLine {
     bar: ProgressBar,
     /// Whether plain lines are printed instead of the bar.
     plain: bool,
@@ -34,11 +34,11 @@ pub(super) struct Progress {
     recent: std::collections::VecDeque<(Duration, LearnerReport)>,
     evaluated: Option<EvaluationReport>,
     /// When the learner's last report arrived.
-    reported: Instant,
-    drawn: Instant,
+    reported_at: Instant,
+    drawn_at: Instant,
 }
 
-impl Progress {
+impl ProgressLine {
     pub(super) fn new(config: &Config, run: &RunDir, quiet: bool) -> Self {
         let target = if quiet {
             ProgressDrawTarget::hidden()
@@ -60,8 +60,8 @@ impl Progress {
             learner: None,
             recent: [].into(),
             evaluated: None,
-            reported: Instant::now(),
-            drawn: Instant::now(),
+            reported_at: Instant::now(),
+            drawn_at: Instant::now(),
         }
     }
 
@@ -77,7 +77,7 @@ impl Progress {
 
     pub(super) fn add_learner_report(&mut self, report: &LearnerReport, wall: Duration) {
         self.learner = Some(*report);
-        self.reported = Instant::now();
+        self.reported_at = Instant::now();
         self.recent.push_back((wall, *report));
         while self.recent.front().is_some_and(|(then, _)| wall - *then > SPAN) {
             self.recent.pop_front();
@@ -126,10 +126,10 @@ impl Progress {
     }
 
     pub(super) fn draw(&mut self, supervisor: &Supervisor) {
-        if self.drawn.elapsed() < Duration::from_millis(250) || self.bar.is_hidden() {
+        if self.drawn_at.elapsed() < Duration::from_millis(250) || self.bar.is_hidden() {
             return;
         }
-        self.drawn = Instant::now();
+        self.drawn_at = Instant::now();
         let Some(learner) = self.learner else { return };
         self.bar.set_position(self.done(&learner));
         self.bar.set_message(self.line(&learner, supervisor));
@@ -188,7 +188,7 @@ impl Progress {
     }
 
     fn pace(&self, count: impl Fn(&LearnerReport) -> u64) -> Option<f64> {
-        if self.reported.elapsed() > SPAN {
+        if self.reported_at.elapsed() > SPAN {
             return None;
         }
         let ((then, old), (now, new)) = (self.recent.front()?, self.recent.back()?);

@@ -1,6 +1,6 @@
 //! The launcher's answers to requests from other terminals.
 
-use shoal_common::channel::control::{Answer, RunStatus};
+use shoal_common::channel::control::{ControlResponse, RunStatus};
 use shoal_common::commit::OpenError;
 use shoal_common::config::{Config, Mode};
 use shoal_common::report::{Activity, Role};
@@ -8,7 +8,7 @@ use shoal_common::run_dir::RunDir;
 use shoal_run::recorder::Moment;
 use shoal_run::{plan, status};
 
-use super::progress::Progress;
+use super::progress::ProgressLine;
 use super::supervisor::Supervisor;
 
 /// The run's status. `initial` is its status when the launcher started.
@@ -16,7 +16,7 @@ pub(super) fn status(
     config: &Config,
     run: &RunDir,
     supervisor: &Supervisor,
-    progress: &Progress,
+    progress: &ProgressLine,
     initial: &RunStatus,
 ) -> Result<RunStatus, OpenError> {
     let mut status = RunStatus {
@@ -51,10 +51,10 @@ pub(super) fn scale(
     supervisor: &mut Supervisor,
     actors: u32,
     now: Moment,
-) -> anyhow::Result<Answer> {
+) -> anyhow::Result<ControlResponse> {
     if config.run.mode == Mode::Lockstep {
         let reason = "the number of actors of a lockstep run cannot change: its results depend on it";
-        return Ok(Answer::Refused(reason.into()));
+        return Ok(ControlResponse::Refused(reason.into()));
     }
     let (max, most) = (config.actors.max, supervisor.most_actors());
     if !(1..=most).contains(&actors) {
@@ -67,15 +67,15 @@ pub(super) fn scale(
                 max - most
             )
         };
-        return Ok(Answer::Refused(reason));
+        return Ok(ControlResponse::Refused(reason));
     }
     // Before the actors start, so that a learner that is started now reads the new number.
     match plan::store_actors(run, config, actors, now) {
         Ok(scaled) => *config = scaled,
-        Err(error) => return Ok(Answer::Refused(format!("{error:#}"))),
+        Err(error) => return Ok(ControlResponse::Refused(format!("{error:#}"))),
     }
     supervisor.scale(actors);
-    Ok(Answer::Accepted)
+    Ok(ControlResponse::Accepted)
 }
 
 /// Who waits for whom, in words, by the last heartbeats of actors and learner.

@@ -18,17 +18,17 @@ const WORK: u32 = 3;
 
 /// Looks for processes that make no progress.
 #[derive(Debug)]
-pub(super) struct Stalls {
+pub(super) struct StallDetector {
     patience: Duration,
-    looked: Instant,
+    checked_at: Instant,
 }
 
-impl Stalls {
+impl StallDetector {
     /// `patience` is the longest time without progress.
     pub(super) fn new(patience: Duration) -> Self {
         Self {
             patience: patience.max(SILENT),
-            looked: Instant::now(),
+            checked_at: Instant::now(),
         }
     }
 
@@ -36,7 +36,7 @@ impl Stalls {
     /// the last call.
     pub(super) fn find(&mut self, children: &mut [Child], busy: Duration) -> Vec<(usize, &'static str)> {
         let now = Instant::now();
-        let since = now - std::mem::replace(&mut self.looked, now);
+        let since = now - std::mem::replace(&mut self.checked_at, now);
         if since.saturating_sub(busy) >= PAUSED {
             children.iter_mut().for_each(Child::reset_clocks);
             return Vec::new();
@@ -63,11 +63,11 @@ impl Stalls {
             clients.any(|client| client.is_responsive() && client.activity() == Some(Activity::WaitingForServer))
         };
         let servers = children.iter().enumerate().filter(|(_, child)| {
-            child.identity.role == Role::EnvServer && child.is_active() && child.is_ready() && !child.is_stopped()
+            child.instance.role == Role::EnvServer && child.is_active() && child.is_ready() && !child.is_stopped()
         });
         servers
             .map(|(i, server)| (i, server.silent_for()))
-            .filter(|(i, silent)| *silent >= self.patience && is_waited_for(children[*i].identity.index))
+            .filter(|(i, silent)| *silent >= self.patience && is_waited_for(children[*i].instance.index))
             .collect()
     }
 
@@ -77,11 +77,11 @@ impl Stalls {
         if !child.is_active() {
             return None;
         }
-        if child.identity.role == Role::EnvServer {
+        if child.instance.role == Role::EnvServer {
             // Only if replacing its client has not helped.
             let client = children
                 .iter()
-                .find(|client| client.server() == Some(child.identity.index))?;
+                .find(|client| client.server() == Some(child.instance.index))?;
             let both = client.stalls > 0 && self.waits_for_an_idle_server(children, client);
             return both.then_some("it does not receive the request that its client waits on");
         }
@@ -99,7 +99,7 @@ impl Stalls {
         let server = client.server().and_then(|index| find(children, Role::EnvServer, index));
         let waits = match client.activity() {
             // It becomes ready when its server has described its environments.
-            None => client.is_active() && client.moved.elapsed() >= self.patience,
+            None => client.is_active() && client.progress_at.elapsed() >= self.patience,
             Some(activity) => activity == Activity::WaitingForServer && self.is_idle(client),
         };
         waits && server.is_some_and(|server| self.is_idle(server))
@@ -107,7 +107,7 @@ impl Stalls {
 
     /// Whether it has waited without progress for too long.
     fn is_idle(&self, child: &Child) -> bool {
-        child.is_active() && child.is_waiting() && child.moved.elapsed() >= self.patience
+        child.is_active() && child.is_waiting() && child.progress_at.elapsed() >= self.patience
     }
 
     /// If all processes wait: the actors and the evaluator, or, if replacing them has not helped, the learner.
@@ -120,7 +120,7 @@ impl Stalls {
         } else {
             &[Role::Actor, Role::Evaluator]
         };
-        let chosen = |i: &usize| roles.contains(&children[*i].identity.role);
+        let chosen = |i: &usize| roles.contains(&children[*i].instance.role);
         (0..children.len())
             .filter(chosen)
             .map(|i| (i, "every process of the run waits for another"))

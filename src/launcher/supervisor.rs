@@ -7,25 +7,25 @@ use std::process::ExitStatus;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
-use shoal_actor::explorer::GIVEN_UP;
-use shoal_common::channel::control::{Answer, HostLease, HostRequest, HostStatus, RoleStatus};
-use shoal_common::channel::environment::Fault;
+use shoal_actor::actor::GIVEN_UP;
+use shoal_common::channel::control::{ControlResponse, HostLease, HostRequest, HostStatus, RoleStatus};
+use shoal_common::channel::environment::ResponseFault;
 use shoal_common::channel::{Domain, Services};
 use shoal_common::config::{Config, Mode};
 use shoal_common::durable::write_atomically;
-use shoal_common::report::{Activity, Heartbeat, Identity, Role};
+use shoal_common::report::{Activity, Heartbeat, Role, RoleInstance};
 use shoal_common::run_dir::RunDir;
 use shoal_run::process::Writer;
 use shoal_run::recorder::{Incident, IncidentKind};
 use tracing_subscriber::filter::LevelFilter;
 
-use super::child::{Child, Consequence};
+use super::child::{Child, RestartDecision};
 use super::cleaner;
 use super::hosts::{Hosts, INCARNATIONS};
 use super::incarnations::{last_committed, read_counter};
 use super::log::{ALL_ENDED, Log};
 use super::process::{Process, name};
-use super::stall::Stalls;
+use super::stall::StallDetector;
 use crate::log_level::log_level;
 
 /// How often to look for dead processes whose end the launcher does not observe, such as `shoal status`.
@@ -44,7 +44,7 @@ const STARTS_WITHOUT_CHUNK: u64 = 100_000;
 
 /// The situation of the run's processes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Situation {
+pub(super) enum RunCondition {
     AtWork,
     LearnerDone,
     /// Dead processes occupy shared memory that cannot be freed.
@@ -55,7 +55,7 @@ pub(super) enum Situation {
 
 /// Which processes there are.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) enum Members {
+pub(super) enum RolesOnHost {
     /// Those of the learner's host, with a gate if other hosts may join.
     Learner {
         /// Whether there is a gate.
@@ -77,9 +77,9 @@ pub(super) struct Supervisor {
     actors_with_services: u32,
     window: u32,
     /// Since when dead processes have occupied shared memory in spite of clean-ups.
-    occupied: Option<Instant>,
+    occupied_since: Option<Instant>,
     /// Time spent on clean-ups since the last search for stalls.
-    busy: Duration,
+    cleanup_time: Duration,
     /// The wanted actors of this host, in order; and the most that the run may have on all hosts.
     actors: Vec<u32>,
     max_actors: u32,
@@ -94,16 +94,16 @@ pub(super) struct Supervisor {
     server_output: Writer,
     /// The file with the number of processes ever started. It lasts over resumes: incarnations are never used twice.
     counter: PathBuf,
-    started: u64,
+    processes_started: u64,
     /// Invalid answers of environments since the launcher started, and the last one.
     faults: u32,
     max_faults: u32,
     last_fault: String,
     all_ready: bool,
-    cleaned: Instant,
+    cleaned_at: Instant,
     learner_done: bool,
     /// How the learner ended, if it ended without saving its state.
-    unsaved: Option<String>,
+    unsaved_learner: Option<String>,
 }
 
 impl Supervisor {
@@ -112,7 +112,7 @@ impl Supervisor {
         run: &RunDir,
         domain: &Domain,
         log: Log,
-        members: Members,
+        members: RolesOnHost,
     ) -> anyhow::Result<Self> {
         let counter = run.incarnations();
         let mut started = read_counter(&counter)?;
@@ -131,7 +131,7 @@ impl Supervisor {
         let lockstep = config.run.mode == Mode::Lockstep;
         let mut lockstep_actors = None;
         let (children, actors) = match members {
-            Members::Learner { gate } => {
+            RolesOnHost::Learner { gate } => {
                 services.create_environment(domain, server)?;
                 let mut children = vec![
                     Child::new(Role::Learner, 0),
@@ -142,15 +142,15 @@ impl Supervisor {
                 lockstep_actors = lockstep.then_some(config.actors.count);
                 (children, (0..config.actors.count).collect())
             }
-            Members::Host { actors } => (vec![Child::new(Role::Relay, 0)], actors),
+            RolesOnHost::Host { actors } => (vec![Child::new(Role::Relay, 0)], actors),
         };
         Ok(Self {
             children,
             services,
             actors_with_services: 0,
             window: config.actors.window,
-            occupied: None,
-            busy: Duration::ZERO,
+            occupied_since: None,
+            cleanup_time: Duration::ZERO,
             actors,
             hosts: Hosts::new(started),
             max_actors: config.actors.max,
@@ -164,14 +164,14 @@ impl Supervisor {
                 _ => Writer::Program,
             },
             counter,
-            started,
+            processes_started: started,
             faults: 0,
             max_faults: config.environment.faults,
             last_fault: String::new(),
             all_ready: false,
-            cleaned: Instant::now(),
+            cleaned_at: Instant::now(),
             learner_done: false,
-            unsaved: None,
+            unsaved_learner: None,
         })
     }
 
@@ -221,7 +221,7 @@ impl Supervisor {
     ///
     /// # Errors
     /// When services cannot be created, or the counter cannot be written.
-    pub(super) fn admit(&mut self, domain: &Domain, request: HostRequest) -> anyhow::Result<Answer> {
+    pub(super) fn admit(&mut self, domain: &Domain, request: HostRequest) -> anyhow::Result<ControlResponse> {
         let HostRequest {
             host,
             name,
@@ -229,7 +229,7 @@ impl Supervisor {
             held,
         } = request;
         if let Some(lease) = self.hosts.lease(host) {
-            return Ok(Answer::Admitted(lease.clone()));
+            return Ok(ControlResponse::Admitted(lease.clone()));
         }
         let free: Vec<u32> = match self.lockstep_actors {
             // The host takes over actors of this one, which end; theirs continue from the same snapshots.
@@ -246,12 +246,12 @@ impl Supervisor {
             free[..count as usize].to_vec()
         } else {
             if let Some(count) = self.lockstep_actors {
-                return Ok(Answer::Refused(format!(
+                return Ok(ControlResponse::Refused(format!(
                     "this lockstep run has {count} actors, of which other hosts have {}",
                     count as usize - free.len()
                 )));
             }
-            return Ok(Answer::Refused(format!(
+            return Ok(ControlResponse::Refused(format!(
                 "the run may have {} actors on all hosts together (actors.max, fixed when it was created), of which {} \
                  are free",
                 self.max_actors,
@@ -259,8 +259,8 @@ impl Supervisor {
             )));
         };
         actors.sort_unstable();
-        let first_incarnation = self.started + 1;
-        self.started += INCARNATIONS;
+        let first_incarnation = self.processes_started + 1;
+        self.processes_started += INCARNATIONS;
         self.write_counter()?;
         let highest = actors.iter().max().map_or(0, |highest| highest + 1);
         self.create_services(domain, highest)?;
@@ -272,20 +272,20 @@ impl Supervisor {
             epoch: self.hosts.epoch(),
             actors,
             first_incarnation,
-            limit: self.started + 1,
+            limit: self.processes_started + 1,
         };
         self.hosts.admit(lease.clone());
         self.share_lockstep_actors();
-        Ok(Answer::Admitted(lease))
+        Ok(ControlResponse::Admitted(lease))
     }
 
     /// Updates the status of the other hosts. The answer tells which of them are admitted.
-    pub(super) fn update_hosts(&mut self, statuses: Vec<HostStatus>) -> Answer {
+    pub(super) fn update_hosts(&mut self, statuses: Vec<HostStatus>) -> ControlResponse {
         for message in self.hosts.update(statuses) {
             self.log.note("launcher", &message);
         }
         self.share_lockstep_actors();
-        Answer::Leases {
+        ControlResponse::Leases {
             epoch: self.hosts.epoch(),
             leases: self.hosts.leases(),
         }
@@ -306,7 +306,7 @@ impl Supervisor {
     /// Kills an actor of this incarnation or an earlier one, so that it is started again.
     pub(super) fn replace_actor(&mut self, index: u32, incarnation: u64) {
         let actor = self.children.iter_mut().find(|child| child.is(Role::Actor, index));
-        if let Some(actor) = actor.filter(|actor| actor.identity.incarnation <= incarnation)
+        if let Some(actor) = actor.filter(|actor| actor.instance.incarnation <= incarnation)
             && let Some(process) = &mut actor.process
         {
             process.kill();
@@ -330,7 +330,7 @@ impl Supervisor {
     }
 
     fn write_counter(&self) -> anyhow::Result<()> {
-        let text = self.started.to_string();
+        let text = self.processes_started.to_string();
         write_atomically(&self.counter, |file| std::io::Write::write_all(file, text.as_bytes()))
             .with_context(|| format!("cannot write {}", self.counter.display()))
     }
@@ -350,17 +350,17 @@ impl Supervisor {
     }
 
     fn start(&mut self, i: usize) -> anyhow::Result<()> {
-        self.started += 1;
+        self.processes_started += 1;
         self.write_counter()?;
         let child = &mut self.children[i];
-        child.identity.incarnation = self.started;
-        let writer = match child.identity.role {
+        child.instance.incarnation = self.processes_started;
+        let writer = match child.instance.role {
             Role::EnvServer => self.server_output,
             _ => Writer::Shoal,
         };
-        let process = Process::start(child.identity, &self.run, &self.log, writer)?;
+        let process = Process::start(child.instance, &self.run, &self.log, writer)?;
         self.log
-            .note(&name(child.identity), &format!("started as process {}", process.pid()));
+            .note(&name(child.instance), &format!("started as process {}", process.pid()));
         child.begin(process);
         Ok(())
     }
@@ -368,19 +368,19 @@ impl Supervisor {
     /// Records a heartbeat.
     pub(super) fn record(&mut self, heartbeat: &Heartbeat) {
         let child = self.children.iter_mut().find(|child| {
-            let Identity {
+            let RoleInstance {
                 role,
                 index,
                 incarnation,
-            } = child.identity;
+            } = child.instance;
             (heartbeat.role(), heartbeat.index, heartbeat.incarnation) == (Some(role), index, incarnation)
         });
         let Some(child) = child else { return };
         let faults = heartbeat.faults.saturating_sub(child.faults());
-        let (client, server) = (name(child.identity), child.server());
+        let (client, server) = (name(child.instance), child.server());
         if let Some(after) = child.record(heartbeat) {
             self.log
-                .note(&name(child.identity), &format!("ready after {} ms", after.as_millis()));
+                .note(&name(child.instance), &format!("ready after {} ms", after.as_millis()));
         }
         if let Some(index) = server {
             // No process can make the launcher list more than the run may have.
@@ -398,15 +398,15 @@ impl Supervisor {
         if let Some(server) = server {
             // The server has written what it was, unless it is one that does not check itself: then its client has.
             let by_client = self.log.last_lines(client).pop().filter(|line| line.contains(GIVEN_UP));
-            let last = by_client.filter(|line| !line.contains(&Fault::Reported.to_string()));
+            let last = by_client.filter(|line| !line.contains(&ResponseFault::Reported.to_string()));
             let last = last
-                .or_else(|| self.log.last_lines(&name(server.identity)).pop())
+                .or_else(|| self.log.last_lines(&name(server.instance)).pop())
                 .unwrap_or_default();
-            self.log.write_left_out(&name(server.identity));
+            self.log.write_left_out(&name(server.instance));
             let last = last.strip_prefix("error: ").unwrap_or(&last);
-            self.last_fault = format!("{}: {last}", name(server.identity));
+            self.last_fault = format!("{}: {last}", name(server.instance));
             self.incidents
-                .push(Incident::of(server.identity, IncidentKind::Fault, last.into()));
+                .push(Incident::of(server.instance, IncidentKind::Fault, last.into()));
         }
     }
 
@@ -428,7 +428,7 @@ impl Supervisor {
 
     /// The activity of a role: that of its first process with a heartbeat.
     pub(super) fn activity(&self, role: Role) -> Option<Activity> {
-        let mut of_role = self.children.iter().filter(|child| child.identity.role == role);
+        let mut of_role = self.children.iter().filter(|child| child.instance.role == role);
         of_role.find_map(Child::activity)
     }
 
@@ -437,7 +437,7 @@ impl Supervisor {
         let mut learners = self
             .children
             .iter()
-            .filter(|child| child.identity.role == Role::Learner);
+            .filter(|child| child.instance.role == Role::Learner);
         learners.any(|learner| learner.process.is_some() && learner.is_ready())
     }
 
@@ -449,7 +449,7 @@ impl Supervisor {
     /// The status of all processes. `newest` is the version of the learner's newest policy.
     pub(super) fn status(&self, newest: u64) -> Vec<RoleStatus> {
         let mut children: Vec<_> = self.children.iter().collect();
-        children.sort_by_key(|child| (std::cmp::Reverse(child.identity.role), child.identity.index));
+        children.sort_by_key(|child| (std::cmp::Reverse(child.instance.role), child.instance.index));
         children.into_iter().map(|child| child.status(newest)).collect()
     }
 
@@ -462,9 +462,9 @@ impl Supervisor {
 
     /// The time until the next restart or clean-up, unless a process ends earlier.
     pub(super) fn idle_for(&self) -> Duration {
-        let since_clean = self.cleaned.elapsed();
+        let since_clean = self.cleaned_at.elapsed();
         let cleaning = self
-            .occupied
+            .occupied_since
             .map_or(CLEANING, |_| CLEANING_AGAIN)
             .saturating_sub(since_clean);
         let missing = |child: &&Child| child.process.is_none() && self.is_wanted(child);
@@ -484,26 +484,26 @@ impl Supervisor {
     }
 
     /// Handles collected ends, restarts processes that are due, and starts or retires actors.
-    pub(super) fn maintain(&mut self, domain: &Domain) -> anyhow::Result<Situation> {
-        let mut state = Situation::AtWork;
+    pub(super) fn maintain(&mut self, domain: &Domain) -> anyhow::Result<RunCondition> {
+        let mut state = RunCondition::AtWork;
         let ended = self.children.iter().any(|child| child.ended.is_some());
         // Before anything is cleaned up or started: both would find the files of another run, or none.
         if (ended || self.is_cleaning_due()) && !self.learner_has_finished() && !domain.is_intact(self.services.count())
         {
-            return Ok(Situation::FilesRemoved);
+            return Ok(RunCondition::FilesRemoved);
         }
         if ended {
             // Frees their shared memory for their successors.
             state = self.clean(domain)?;
         } else if self.is_cleaning_due() {
-            self.cleaned = Instant::now();
+            self.cleaned_at = Instant::now();
             if domain.has_dead_nodes() || self.services.ports_of_dead_processes() > 0 {
                 state = self.clean(domain)?;
             }
         }
         for i in 0..self.children.len() {
-            if self.maintain_one(i)? == Situation::LearnerDone {
-                return Ok(Situation::LearnerDone);
+            if self.maintain_one(i)? == RunCondition::LearnerDone {
+                return Ok(RunCondition::LearnerDone);
             }
         }
         self.retire_surplus();
@@ -512,7 +512,7 @@ impl Supervisor {
     }
 
     fn is_cleaning_due(&self) -> bool {
-        self.cleaned.elapsed() >= self.occupied.map_or(CLEANING, |_| CLEANING_AGAIN)
+        self.cleaned_at.elapsed() >= self.occupied_since.map_or(CLEANING, |_| CLEANING_AGAIN)
     }
 
     /// Whether the learner's end has been observed, and it was the planned one.
@@ -520,15 +520,15 @@ impl Supervisor {
         let mut learners = self
             .children
             .iter()
-            .filter(|child| child.identity.role == Role::Learner);
+            .filter(|child| child.instance.role == Role::Learner);
         learners.any(|learner| learner.ended.is_some_and(|status| status.success()))
     }
 
-    fn maintain_one(&mut self, i: usize) -> anyhow::Result<Situation> {
+    fn maintain_one(&mut self, i: usize) -> anyhow::Result<RunCondition> {
         if let Some(status) = self.children[i].ended.take()
-            && self.handle_end(i, status)? == Situation::LearnerDone
+            && self.handle_end(i, status)? == RunCondition::LearnerDone
         {
-            return Ok(Situation::LearnerDone);
+            return Ok(RunCondition::LearnerDone);
         }
         let is_wanted = self.is_wanted(&self.children[i]);
         let child = &mut self.children[i];
@@ -537,25 +537,25 @@ impl Supervisor {
             self.start(i)?;
             self.note_incident(i, IncidentKind::StartedAgain, String::new());
         }
-        Ok(Situation::AtWork)
+        Ok(RunCondition::AtWork)
     }
 
-    fn handle_end(&mut self, i: usize, status: ExitStatus) -> anyhow::Result<Situation> {
+    fn handle_end(&mut self, i: usize, status: ExitStatus) -> anyhow::Result<RunCondition> {
         let child = &mut self.children[i];
-        let name = name(child.identity);
+        let name = name(child.instance);
         self.log.write_left_out(&name);
-        if child.identity.role == Role::Learner && status.success() {
+        if child.instance.role == Role::Learner && status.success() {
             child.process = None;
             self.learner_done = true;
             self.log.note(&name, "done");
-            return Ok(Situation::LearnerDone);
+            return Ok(RunCondition::LearnerDone);
         }
-        if child.retires {
+        if child.is_retiring {
             child.process = None;
             child.restart_at = Instant::now();
             self.log.note(&name, &format!("retired: {}", ending(status)));
             self.note_incident(i, IncidentKind::Retired, String::new());
-            return Ok(Situation::AtWork);
+            return Ok(RunCondition::AtWork);
         }
         let consequence = child.has_ended(status);
         let what = if status.signal().is_some() {
@@ -565,13 +565,13 @@ impl Supervisor {
         };
         self.note_incident(i, what, ending(status));
         match consequence {
-            Consequence::Restart(pause) => {
+            RestartDecision::Restart(pause) => {
                 self.children[i].restart_at = Instant::now() + pause;
                 self.log
                     .note(&name, &format!("{}; restarting it in {pause:?}", ending(status)));
-                Ok(Situation::AtWork)
+                Ok(RunCondition::AtWork)
             }
-            Consequence::GiveUp(starts) => {
+            RestartDecision::GiveUp(starts) => {
                 self.note_incident(i, IncidentKind::GivenUp, String::new());
                 self.give_up(&name, starts, status)
             }
@@ -579,14 +579,14 @@ impl Supervisor {
     }
 
     /// Kills stalled processes, so that they are replaced. Returns a message for each.
-    pub(super) fn replace_stalled(&mut self, stalls: &mut Stalls) -> Vec<String> {
-        let stalled = stalls.find(&mut self.children, std::mem::take(&mut self.busy));
+    pub(super) fn replace_stalled(&mut self, stalls: &mut StallDetector) -> Vec<String> {
+        let stalled = stalls.find(&mut self.children, std::mem::take(&mut self.cleanup_time));
         let mut messages = Vec::new();
         for (i, why) in stalled {
             let child = &mut self.children[i];
             messages.push(format!(
                 "{} makes no progress: {why}; it is replaced",
-                name(child.identity)
+                name(child.instance)
             ));
             if let Some(process) = &mut child.process {
                 process.kill();
@@ -598,12 +598,12 @@ impl Supervisor {
 
     /// What is to be said of processes that are slow, each once: environment servers over one step or reset, and roles that
     /// are starting. An environment's program that is not ready within `start_limit` is ended, which counts as a failure.
-    pub(super) fn report_slow(&mut self, stalls: &Stalls, start_limit: Option<Duration>) -> Vec<String> {
+    pub(super) fn report_slow(&mut self, stalls: &StallDetector, start_limit: Option<Duration>) -> Vec<String> {
         let mut said = Vec::new();
         for (i, silent) in stalls.slow_servers(&self.children) {
             let child = &mut self.children[i];
             if child.report_slow() {
-                let (name, seconds) = (name(child.identity), silent.as_secs());
+                let (name, seconds) = (name(child.instance), silent.as_secs());
                 said.push(format!(
                     "{name} has been over one step or reset of its environments for {seconds} s; it is left alone"
                 ));
@@ -611,14 +611,14 @@ impl Supervisor {
         }
         for child in &mut self.children {
             let Some(starting) = child.starting_for() else { continue };
-            let limit = start_limit.filter(|_| child.identity.role == Role::EnvServer);
+            let limit = start_limit.filter(|_| child.instance.role == Role::EnvServer);
             if limit.is_some_and(|limit| starting >= limit) {
                 let text = "is not ready within environment.start_seconds and is ended";
-                self.log.note(&name(child.identity), text);
+                self.log.note(&name(child.instance), text);
                 child.end_slow_start();
             } else if starting >= SLOW_START && child.report_slow() {
                 let limit = limit.map_or(String::new(), |limit| format!(", for at most {} s", limit.as_secs()));
-                said.push(format!("waiting for {} to start{limit}", name(child.identity)));
+                said.push(format!("waiting for {} to start{limit}", name(child.instance)));
             }
         }
         said
@@ -626,53 +626,53 @@ impl Supervisor {
 
     fn note_incident(&mut self, i: usize, what: IncidentKind, detail: String) {
         self.incidents
-            .push(Incident::of(self.children[i].identity, what, detail));
+            .push(Incident::of(self.children[i].instance, what, detail));
     }
 
     /// Frees shared memory that dead processes occupy.
-    fn clean(&mut self, domain: &Domain) -> anyhow::Result<Situation> {
+    fn clean(&mut self, domain: &Domain) -> anyhow::Result<RunCondition> {
         let begun = Instant::now();
         let cleaned = cleaner::clean_up(domain, &self.services);
-        self.cleaned = Instant::now();
-        self.busy += begun.elapsed();
+        self.cleaned_at = Instant::now();
+        self.cleanup_time += begun.elapsed();
         if let Err(error) = &cleaned {
             self.log.note("launcher", &format!("{error:#}"));
         }
         if self.services.ports_of_dead_processes() == 0 {
-            self.occupied = None;
-            return Ok(Situation::AtWork);
+            self.occupied_since = None;
+            return Ok(RunCondition::AtWork);
         }
-        let since = *self.occupied.get_or_insert(begun);
+        let since = *self.occupied_since.get_or_insert(begun);
         if cleaned.is_ok() && since.elapsed() >= OCCUPIED_PATIENCE {
-            return Ok(Situation::SharedMemoryOccupied);
+            return Ok(RunCondition::SharedMemoryOccupied);
         }
-        Ok(Situation::AtWork)
+        Ok(RunCondition::AtWork)
     }
 
     /// Retires surplus actors and then their environment servers.
     fn retire_surplus(&mut self) {
         let has_no_client = |children: &[Child], child: &Child| {
-            child.identity.role == Role::EnvServer
-                && !children.iter().any(|actor| actor.is(Role::Actor, child.identity.index))
+            child.instance.role == Role::EnvServer
+                && !children.iter().any(|actor| actor.is(Role::Actor, child.instance.index))
         };
         let mut children = std::mem::take(&mut self.children);
         children.retain(|child| {
             let stays = child.process.is_some() || self.is_wanted(child);
             if !stays {
-                self.log.note(&name(child.identity), "no longer needed");
+                self.log.note(&name(child.instance), "no longer needed");
             }
             stays
         });
         self.children = children;
         for i in 0..self.children.len() {
-            if self.is_wanted(&self.children[i]) || self.children[i].retires {
+            if self.is_wanted(&self.children[i]) || self.children[i].is_retiring {
                 continue;
             }
             let may_end =
-                self.children[i].identity.role == Role::Actor || has_no_client(&self.children, &self.children[i]);
+                self.children[i].instance.role == Role::Actor || has_no_client(&self.children, &self.children[i]);
             let child = &mut self.children[i];
             if let Some(process) = child.process.as_mut().filter(|_| may_end) {
-                child.retires = true;
+                child.is_retiring = true;
                 process.ask_to_retire();
             }
         }
@@ -680,13 +680,13 @@ impl Supervisor {
 
     /// Whether the child is not a surplus actor or the environment server of one.
     fn is_wanted(&self, child: &Child) -> bool {
-        let Identity { role, index, .. } = child.identity;
+        let RoleInstance { role, index, .. } = child.instance;
         // The index of the evaluator's server is the maximum number of actors.
         !matches!(role, Role::Actor | Role::EnvServer) || index >= self.max_actors || self.actors.contains(&index)
     }
 
     /// One line: what happened to whom, its last message, and what to do. The log has its earlier messages.
-    fn give_up(&self, name: &str, starts: u32, status: ExitStatus) -> anyhow::Result<Situation> {
+    fn give_up(&self, name: &str, starts: u32, status: ExitStatus) -> anyhow::Result<RunCondition> {
         let lines = self.log.last_lines(name);
         let message = match lines.last() {
             None if status.signal().is_some() => "it wrote no message; is memory short?",
@@ -703,9 +703,9 @@ impl Supervisor {
 
     /// Asks the processes of a role to hand over what they have and then to end.
     pub(super) fn ask_to_retire(&mut self, role: Role) {
-        for child in self.children.iter_mut().filter(|child| child.identity.role == role) {
+        for child in self.children.iter_mut().filter(|child| child.instance.role == role) {
             if let Some(process) = &mut child.process {
-                child.ends = true;
+                child.is_asked_to_end = true;
                 process.ask_to_retire();
             }
         }
@@ -713,14 +713,14 @@ impl Supervisor {
 
     /// Asks the processes of some roles to end.
     pub(super) fn ask_to_end(&mut self, which: impl Fn(Role) -> bool) {
-        for child in self.children.iter_mut().filter(|child| which(child.identity.role)) {
+        for child in self.children.iter_mut().filter(|child| which(child.instance.role)) {
             match &mut child.process {
                 Some(process) => {
-                    child.ends = true;
+                    child.is_asked_to_end = true;
                     process.ask_to_end();
                 }
-                None if child.identity.role == Role::Learner && !self.learner_done => {
-                    self.unsaved = Some("it had died and was not restarted yet".into());
+                None if child.instance.role == Role::Learner && !self.learner_done => {
+                    self.unsaved_learner = Some("it had died and was not restarted yet".into());
                 }
                 None => {}
             }
@@ -730,13 +730,13 @@ impl Supervisor {
     /// Whether all processes of some roles have ended.
     pub(super) fn have_ended(&mut self, which: impl Fn(Role) -> bool) -> bool {
         let mut all = true;
-        for child in self.children.iter_mut().filter(|child| which(child.identity.role)) {
+        for child in self.children.iter_mut().filter(|child| which(child.instance.role)) {
             let Some(process) = &mut child.process else { continue };
             match process.exit_status() {
                 Some(status) => {
                     child.process = None;
-                    if child.identity.role == Role::Learner && !status.success() {
-                        self.unsaved = Some(ending(status));
+                    if child.instance.role == Role::Learner && !status.success() {
+                        self.unsaved_learner = Some(ending(status));
                     }
                 }
                 None => all = false,
@@ -747,15 +747,15 @@ impl Supervisor {
 
     /// Kills the processes of some roles that did not end when they were asked to.
     pub(super) fn kill(&mut self, which: impl Fn(Role) -> bool) {
-        for child in self.children.iter_mut().filter(|child| which(child.identity.role)) {
+        for child in self.children.iter_mut().filter(|child| which(child.instance.role)) {
             if child.process.take().is_some() {
-                let name = name(child.identity);
+                let name = name(child.instance);
                 self.log.note(&name, "did not end when asked to, and was killed");
                 let detail = "did not end when asked to".into();
                 self.incidents
-                    .push(Incident::of(child.identity, IncidentKind::Killed, detail));
-                if child.identity.role == Role::Learner {
-                    self.unsaved = Some("it did not end when asked to, and was killed".into());
+                    .push(Incident::of(child.instance, IncidentKind::Killed, detail));
+                if child.instance.role == Role::Learner {
+                    self.unsaved_learner = Some("it did not end when asked to, and was killed".into());
                 }
             }
         }
@@ -767,8 +767,10 @@ impl Supervisor {
     /// When the learner did not save its state before it ended.
     pub(super) fn check_saved(&self) -> anyhow::Result<()> {
         self.log.note("launcher", ALL_ENDED);
-        let Some(how) = &self.unsaved else { return Ok(()) };
-        let lines = self.log.last_lines(&name(Identity {
+        let Some(how) = &self.unsaved_learner else {
+            return Ok(());
+        };
+        let lines = self.log.last_lines(&name(RoleInstance {
             role: Role::Learner,
             index: 0,
             incarnation: 0,

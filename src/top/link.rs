@@ -38,13 +38,13 @@ pub(crate) enum RunEvent {
 
 /// The thread that polls the run about once a second.
 #[derive(Debug)]
-pub(crate) struct Link {
+pub(crate) struct LauncherLink {
     requests: Option<Sender<Request>>,
     events: Receiver<RunEvent>,
     thread: JoinHandle<()>,
 }
 
-impl Link {
+impl LauncherLink {
     /// Starts to poll.
     ///
     /// # Errors

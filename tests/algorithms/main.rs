@@ -1,5 +1,5 @@
-//! The algorithms other than DDPG, in real processes. Q-learning finds the lake's values. Each method gives the bits of
-//! its algorithm in a single process, even if roles are killed. A run ends after a given number of episodes.
+//! The algorithms other than DDPG, in real processes. Q-learning finds the lake's values. Each algorithm gives the bits
+//! of its algorithm in a single process, even if roles are killed. A run ends after a given number of episodes.
 
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
 
@@ -11,8 +11,8 @@ mod twin;
 mod value_iteration;
 
 use rustix::process::Signal;
-use shoal_common::config::{Algorithm, Config};
-use shoal_common::policy::{PolicyLayout, highest};
+use shoal_common::config::{AlgorithmConfig, Config};
+use shoal_common::policy::{PolicyLayout, argmax};
 use shoal_common::policy_file::PolicyFile;
 use shoal_env_server::environment::frozen_lake::{ACTIONS, STATES};
 use shoal_learner::algorithms::dqn::Dqn;
@@ -55,7 +55,7 @@ fn table(place: &Workplace) -> Vec<f32> {
 }
 
 fn greedy(values: &[f32]) -> Vec<usize> {
-    values.chunks(ACTIONS).map(highest).collect()
+    values.chunks(ACTIONS).map(argmax).collect()
 }
 
 /// Lines of `episodes.csv` below the header.
@@ -150,8 +150,8 @@ fn reinforce_gives_the_bits_of_algorithm_3_in_a_single_process() {
 }
 
 /// A short lockstep run of one actor whose chunks are single steps. Returns its configuration and its result.
-fn step_by_step(place: &Workplace, preset: &str, method: &str, set: &[&str]) -> (Config, serde_json::Value) {
-    let head = ["--method", method, "--lockstep", "--actors", "1", "--envs", "1"];
+fn step_by_step(place: &Workplace, preset: &str, algorithm: &str, set: &[&str]) -> (Config, serde_json::Value) {
+    let head = ["--method", algorithm, "--lockstep", "--actors", "1", "--envs", "1"];
     let head = [&[preset][..], &head, &["--steps", "900", "--seed", "11"]].concat();
     let set = [&["actors.chunk_steps=1", "replay.warmup=300"], set].concat();
     let set = set.into_iter().flat_map(|assignment| ["--set", assignment]);
@@ -167,7 +167,7 @@ fn td3_gives_the_bits_of_its_algorithm_in_a_single_process() {
         // Large enough to be split between two threads.
         let set = ["td3.hidden=[64, 128]", "td3.batch=64", threads];
         let (config, result) = step_by_step(&place, "pendulum", "td3", &set);
-        let Algorithm::Td3(settings) = &config.algorithm else {
+        let AlgorithmConfig::Td3(settings) = &config.algorithm else {
             panic!("{:?}", config.algorithm)
         };
         let learner = Td3::new(&config.spec, settings, 11).unwrap();
@@ -185,7 +185,7 @@ fn sac_gives_the_bits_of_its_algorithm_in_a_single_process() {
         let place = Workplace::new();
         let set = ["sac.hidden=[64, 128]", "sac.batch=64", threads];
         let (config, result) = step_by_step(&place, "point-mass-r3", "sac", &set);
-        let Algorithm::Sac(settings) = &config.algorithm else {
+        let AlgorithmConfig::Sac(settings) = &config.algorithm else {
             panic!("{:?}", config.algorithm)
         };
         let learner = Sac::new(&config.spec, settings, 11).unwrap();
@@ -208,7 +208,7 @@ fn dqn_gives_the_bits_of_its_algorithm_in_a_single_process() {
             variant,
         ];
         let (config, result) = step_by_step(&place, "cart-pole", "dqn", &set);
-        let Algorithm::Dqn(settings) = &config.algorithm else {
+        let AlgorithmConfig::Dqn(settings) = &config.algorithm else {
             panic!("{:?}", config.algorithm)
         };
         let learner = Dqn::new(&config.spec, settings, 11).unwrap();
@@ -252,9 +252,9 @@ const SARSA: [&str; 17] = [
     "checkpoint.every_updates=1500",
 ];
 
-/// Two actors of two environments each, with `method` and small networks.
-fn small(preset: &'static str, method: &'static str, hidden: &'static str) -> Vec<&'static str> {
-    let head = ["--method", method, "--lockstep", "--actors", "2", "--envs", "2"];
+/// Two actors of two environments each, with `algorithm` and small networks.
+fn small(preset: &'static str, algorithm: &'static str, hidden: &'static str) -> Vec<&'static str> {
+    let head = ["--method", algorithm, "--lockstep", "--actors", "2", "--envs", "2"];
     let set = [
         "actors.chunk_steps=4",
         "replay.warmup=300",
@@ -304,7 +304,7 @@ fn the_digest_of_the_weights_includes_the_statistics_of_normalised_observations(
     let run = place.path().join("run");
     let config = Config::load(&run.join("config.toml")).unwrap();
     let loaded = Checkpoints::new(&run.join("checkpoints"), config.fingerprint()).load_newest();
-    let sections = loaded.unwrap().unwrap().checkpoint.sections;
+    let sections = loaded.unwrap().unwrap().checkpoint.arrays;
     let digest = |names: &[&str]| {
         let learned = names
             .iter()

@@ -1,18 +1,18 @@
-//! The methods other than DDPG as plain single-process programs, with one environment and the same random streams.
+//! The algorithms other than DDPG as plain single-process programs, with one environment and the same random streams.
 
-use shoal_actor::exploration::{Exploration, Progress};
+use shoal_actor::exploration::{Exploration, StepCounts};
 use shoal_common::channel::environment::ResponseLayout;
-use shoal_common::config::{Algorithm, Config};
+use shoal_common::config::{AlgorithmConfig, Config};
 use shoal_common::stream::{Purpose, stream};
 use shoal_common::transition::Transition;
 use shoal_env_server::environment::frozen_lake::{ACTIONS, STATES};
-use shoal_env_server::vector::{Start, VectorEnvironment};
+use shoal_env_server::vector::{Reset, VectorEnvironment};
 use shoal_learner::algorithms::minibatch::Minibatch;
+use shoal_learner::algorithms::minibatch_algorithm::MinibatchLearner;
 use shoal_learner::algorithms::registry;
-use shoal_learner::algorithms::replayed::MinibatchLearner;
 use shoal_learner::algorithms::sampling::Sampler;
 use shoal_learner::networks::digest::sha256;
-use shoal_learner::replay::{ChunkMark, Replay, ReplayLayout};
+use shoal_learner::replay::{ChunkId, Replay, ReplayLayout};
 
 /// An environment, and the exploration that chooses actions in it.
 struct World {
@@ -25,7 +25,7 @@ struct World {
     s: Vec<f32>,
 }
 
-type Act = fn(&mut Exploration, &[f32], &[f32], Progress, &mut [f32]);
+type Act = fn(&mut Exploration, &[f32], &[f32], StepCounts, &mut [f32]);
 
 /// The result of an action.
 struct Step {
@@ -48,7 +48,7 @@ impl World {
             t: 0,
             s: vec![0.0; spec.observation.width()],
         };
-        world.environment.reset(Start::Next, &mut world.s).unwrap();
+        world.environment.reset(Reset::Next, &mut world.s).unwrap();
         world
     }
 
@@ -60,7 +60,7 @@ impl World {
 
     /// Chooses every element of an action by a policy that was learned from `env_steps` steps.
     fn choose_all(&mut self, act: Act, env_steps: u64, parameters: &[f32], a: &mut [f32]) {
-        let progress = Progress {
+        let progress = StepCounts {
             step: self.t,
             env_steps,
         };
@@ -92,8 +92,8 @@ impl World {
 /// SARSA or Q-learning. Returns the SHA-256 of the final table, the number of truncated episodes, and the number of
 /// values that are no longer 0.
 pub(crate) fn tabular(config: &Config) -> (String, u64, usize) {
-    let (Algorithm::QLearning(settings) | Algorithm::Sarsa(settings)) = &config.algorithm else {
-        panic!("this twin is for tabular methods")
+    let (AlgorithmConfig::QLearning(settings) | AlgorithmConfig::Sarsa(settings)) = &config.algorithm else {
+        panic!("this twin is for tabular algorithms")
     };
     let (alpha, gamma) = (settings.alpha as f32, settings.gamma as f32);
     let mut q = [0.0_f32; STATES * ACTIONS];
@@ -106,7 +106,7 @@ pub(crate) fn tabular(config: &Config) -> (String, u64, usize) {
             let at = step.s[0] as usize * ACTIONS + a as usize;
             let next = step.s_next[0] as usize * ACTIONS;
             let over = step.terminated || step.truncated;
-            let target = if let Algorithm::QLearning(_) = config.algorithm {
+            let target = if let AlgorithmConfig::QLearning(_) = config.algorithm {
                 let greatest = q[next..][..ACTIONS].iter().copied().fold(f32::MIN, f32::max);
                 Some(step.r + if step.terminated { 0.0 } else { gamma * greatest })
             } else if step.terminated {
@@ -125,7 +125,7 @@ pub(crate) fn tabular(config: &Config) -> (String, u64, usize) {
                 truncated += u64::from(step.truncated);
                 break;
             }
-            if let Algorithm::QLearning(_) = config.algorithm {
+            if let AlgorithmConfig::QLearning(_) = config.algorithm {
                 a = world.choose(&q);
             }
         }
@@ -170,11 +170,11 @@ pub(crate) fn reinforce(config: &Config) -> String {
             chunk.row.write(&transition, &mut row);
             episode.extend(row);
         }
-        let mark = ChunkMark {
+        let id = ChunkId {
             incarnation: 0,
             sequence: number + 1,
         };
-        replay.append_and_commit(0, mark, &episode).unwrap();
+        replay.append_and_commit(0, id, &episode).unwrap();
         learner.update(&replay, replay.head());
     }
     let weights = registry::weights(config);
@@ -183,7 +183,7 @@ pub(crate) fn reinforce(config: &Config) -> String {
     sha256(&learned.map(|(_, numbers)| *numbers).collect::<Vec<_>>())
 }
 
-/// A method that learns from minibatches: a step, then the updates that it allows. Returns the SHA-256 of the final
+/// An algorithm that learns from minibatches: a step, then the updates that it allows. Returns the SHA-256 of the final
 /// weights.
 pub(crate) fn of_minibatches<L: MinibatchLearner>(config: &Config, mut learner: L) -> String {
     let row = config.row_layout();

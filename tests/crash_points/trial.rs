@@ -390,7 +390,7 @@ pub(crate) fn weights(place: &Workplace<'_>, run: &str) -> Result<String, String
     let loaded = Checkpoints::new(&run.checkpoints(), config.fingerprint()).load_newest();
     let loaded = loaded.map_err(|error| failed(&error))?;
     let checkpoint = loaded.ok_or_else(|| failed(&"there is no checkpoint"))?.checkpoint;
-    let section = |name| checkpoint.sections.iter().find(|(found, _)| found == name);
+    let section = |name| checkpoint.arrays.iter().find(|(found, _)| found == name);
     let weights = registry::weights(&config).into_iter().filter_map(section);
     let weights: Vec<_> = weights.map(|(_, numbers)| numbers.as_slice()).collect();
     Ok(digest::sha256(&weights))

@@ -7,12 +7,12 @@ use std::path::PathBuf;
 use std::sync::mpsc::{self, Receiver, TryRecvError};
 use std::time::{Duration, Instant};
 
-use shoal_common::channel::environment::{Ask, EnvironmentPort};
+use shoal_common::channel::environment::{EnvironmentPort, RequestKind};
 use shoal_common::channel::policy::{PolicyHeader, PolicyPublisher};
 use shoal_common::channel::transitions::ChunkSender;
 use shoal_common::channel::{Domain, EventName, HeartbeatSender, Listener, Notifier, Services, wait_for};
 use shoal_common::commit::{CommitReader, OpenError};
-use shoal_common::report::{Identity, Role};
+use shoal_common::report::{Role, RoleInstance};
 use shoal_common::stop::Stop;
 use shoal_env_server::server::serve;
 use shoal_env_server::vector::VectorEnvironment;
@@ -267,12 +267,12 @@ fn port(domain: &Domain, environments: &VectorEnvironment) -> EnvironmentPort {
 fn env_server(domain: &Domain) {
     let mut environments = pendulums();
     let port = port(domain, &environments);
-    let identity = Identity {
+    let instance = RoleInstance {
         role: Role::EnvServer,
         index: 0,
         incarnation: 0,
     };
-    let heartbeat = HeartbeatSender::new(domain, identity).unwrap();
+    let heartbeat = HeartbeatSender::new(domain, instance).unwrap();
     let stop = Stop::when_stdin_closes().unwrap();
     reply("ready");
     serve(&mut environments, &port, 1, heartbeat, &stop).unwrap();
@@ -285,12 +285,12 @@ fn mute_env_server(domain: &Domain) {
     reply("ready");
     let stop = Stop::when_stdin_closes().unwrap();
     while let Ok(request) = port.next(&stop, || ()) {
-        if matches!(request.ask(), Some(Ask::Step | Ask::Snapshot)) {
+        if matches!(request.kind(), Some(RequestKind::Step | RequestKind::Snapshot)) {
             stall("asked");
         }
-        let start = shoal_env_server::vector::Start::Next;
+        let start = shoal_env_server::vector::Reset::Next;
         request
-            .answer(|_, blocks| environments.reset(start, blocks.observations))
+            .respond(|_, blocks| environments.reset(start, blocks.observations))
             .unwrap()
             .unwrap();
     }

@@ -4,7 +4,9 @@ use std::sync::mpsc::{Receiver, Sender, channel};
 use std::time::Duration;
 
 use rustix::process::Signal;
-use shoal_common::channel::environment::{Begin, EnvironmentClient, Observed, Snapshot, Stepped};
+use shoal_common::channel::environment::{
+    EnvironmentClient, EnvironmentResponse, ResetRequest, SnapshotResult, StepResult,
+};
 use shoal_common::channel::{ChannelError, Domain, EventName, Listener};
 use shoal_common::exit::Exit;
 use shoal_common::report::Role;
@@ -34,39 +36,41 @@ impl TestClient {
         }
     }
 
-    fn reset(&self) -> Observed {
+    fn reset(&self) -> EnvironmentResponse {
         self.reset_while(|| ())
     }
 
     /// `idle` is called repeatedly during the wait.
-    fn reset_while(&self, idle: impl FnMut()) -> Observed {
-        self.inner.reset(&self.listener, Begin::Next, idle).expect("no hang")
+    fn reset_while(&self, idle: impl FnMut()) -> EnvironmentResponse {
+        self.inner
+            .reset(&self.listener, ResetRequest::Next, idle)
+            .expect("no hang")
     }
 
-    fn step(&self) -> Stepped {
+    fn step(&self) -> StepResult {
         self.step_while(|| ())
     }
 
-    fn step_while(&self, idle: impl FnMut()) -> Stepped {
+    fn step_while(&self, idle: impl FnMut()) -> StepResult {
         self.inner.step(&self.listener, &ACTIONS, idle).expect("no hang")
     }
 
-    fn snapshot(&self) -> Snapshot {
+    fn snapshot(&self) -> SnapshotResult {
         self.inner.snapshot(&self.listener, || ()).expect("no hang")
     }
 
     fn take_snapshot(&self) -> Vec<u64> {
         match self.snapshot() {
-            Snapshot::Taken(words) => words,
-            Snapshot::Lost => panic!("the server is running and was reset"),
+            SnapshotResult::Taken(words) => words,
+            SnapshotResult::Lost => panic!("the server is running and was reset"),
         }
     }
 
-    fn restore(&self, words: &[u64]) -> Result<Observed, Exit<ChannelError>> {
+    fn restore(&self, words: &[u64]) -> Result<EnvironmentResponse, Exit<ChannelError>> {
         self.restore_while(words, || ())
     }
 
-    fn restore_while(&self, words: &[u64], idle: impl FnMut()) -> Result<Observed, Exit<ChannelError>> {
+    fn restore_while(&self, words: &[u64], idle: impl FnMut()) -> Result<EnvironmentResponse, Exit<ChannelError>> {
         self.inner.restore(&self.listener, words, idle)
     }
 
@@ -74,7 +78,7 @@ impl TestClient {
     fn future(&self, steps: u32) -> Vec<u32> {
         let mut seen = Vec::new();
         for _ in 0..steps {
-            let Stepped::Taken(observed) = self.step() else {
+            let StepResult::Taken(observed) = self.step() else {
                 panic!("the server is running and was reset")
             };
             for e in 0..ENVS as usize {
@@ -89,7 +93,7 @@ impl TestClient {
 
     fn steps(&self, count: u32) {
         for _ in 0..count {
-            let Stepped::Taken(observed) = self.step() else {
+            let StepResult::Taken(observed) = self.step() else {
                 panic!("the server is running and was reset")
             };
             assert!((0..ENVS as usize).all(|e| !observed.terminated(e) && observed.reward(e) < 0.0));
@@ -126,10 +130,13 @@ fn a_step_is_lost_if_its_server_is_killed_and_the_next_server_takes_over() {
             mute.kill();
             run.start("env-server")
         });
-        assert!(matches!(client.step(), Stepped::Lost));
+        assert!(matches!(client.step(), StepResult::Lost));
         let _server = killer.join().unwrap();
         assert_eq!(seen.observations(), before, "the dead server's answer stays readable");
-        assert!(matches!(client.step(), Stepped::Lost), "the new server has no episode");
+        assert!(
+            matches!(client.step(), StepResult::Lost),
+            "the new server has no episode"
+        );
         client.reset();
         client.steps(10);
     });
@@ -144,7 +151,7 @@ fn without_a_server_a_step_is_lost_and_a_reset_waits_for_one() {
     client.reset();
     client.steps(10);
     server.kill();
-    assert!(matches!(client.step(), Stepped::Lost));
+    assert!(matches!(client.step(), StepResult::Lost));
     std::thread::scope(|scope| {
         let (waits, waiting) = channel();
         let starter = scope.spawn(|| {
@@ -170,7 +177,7 @@ fn servers_killed_at_any_moment_never_block_the_client() {
             std::thread::sleep(Duration::from_micros(kill * 1_777));
             server.kill();
         });
-        while matches!(client.step(), Stepped::Taken(_)) {}
+        while matches!(client.step(), StepResult::Taken(_)) {}
         killer.join().unwrap();
         server = run.launch("env-server");
     }
@@ -194,7 +201,7 @@ fn a_stopped_server_answers_when_it_continues() {
         server.signal(Signal::CONT);
         server
     });
-    assert!(matches!(client.step_while(notify(&waits)), Stepped::Taken(_)));
+    assert!(matches!(client.step_while(notify(&waits)), StepResult::Taken(_)));
     let server = waker.join().unwrap();
     client.steps(3);
     server.end();
@@ -209,16 +216,16 @@ fn a_new_server_continues_a_killed_ones_episodes_bit_for_bit() {
     let domain = run.join();
     let mut server = run.start("env-server");
     let client = TestClient::new(&domain);
-    assert_eq!(client.snapshot(), Snapshot::Lost, "no episode has begun");
+    assert_eq!(client.snapshot(), SnapshotResult::Lost, "no episode has begun");
     client.reset();
     client.steps(237);
     let words = client.take_snapshot();
     let whole = client.future(FUTURE);
     server.kill();
-    assert_eq!(client.snapshot(), Snapshot::Lost);
+    assert_eq!(client.snapshot(), SnapshotResult::Lost);
     let _server = run.start("env-server");
-    assert_eq!(client.snapshot(), Snapshot::Lost, "the new server has no episode");
-    assert!(matches!(client.step(), Stepped::Lost));
+    assert_eq!(client.snapshot(), SnapshotResult::Lost, "the new server has no episode");
+    assert!(matches!(client.step(), StepResult::Lost));
     let observed = client.restore(&words).unwrap().observations().to_vec();
     assert_eq!(client.take_snapshot(), words);
     assert_eq!(client.future(FUTURE), whole);
@@ -245,7 +252,7 @@ fn a_snapshot_is_lost_if_its_server_is_killed_and_a_restore_waits_for_the_next()
             mute.expect_line("asked");
             mute.kill();
         });
-        assert_eq!(client.snapshot(), Snapshot::Lost);
+        assert_eq!(client.snapshot(), SnapshotResult::Lost);
         killer.join().unwrap();
         let (waits, waiting) = channel();
         let starter = scope.spawn(|| {
@@ -268,7 +275,7 @@ fn an_invalid_snapshot_is_refused_and_the_server_continues() {
     let refusal = |words: &[u64]| client.restore(words).unwrap_err().to_string();
     assert!(refusal(&garbage).contains("refused"));
     assert!(
-        matches!(client.step(), Stepped::Lost),
+        matches!(client.step(), StepResult::Lost),
         "a refused snapshot starts no episode"
     );
     client.reset();
@@ -289,10 +296,10 @@ fn a_training_episode_depends_only_on_its_number() {
         let observed = client.inner.reset(&client.listener, begin, || ()).expect("no hang");
         observed.observations().to_vec()
     };
-    let [first, second] = [begin(Begin::Next), begin(Begin::Next)];
+    let [first, second] = [begin(ResetRequest::Next), begin(ResetRequest::Next)];
     assert_ne!(first, second);
     client.steps(10);
-    assert_eq!(begin(Begin::Training(0)), first);
-    assert_eq!(begin(Begin::Next), second, "the count continues from there");
-    assert_eq!(begin(Begin::Training(1)), second);
+    assert_eq!(begin(ResetRequest::Training(0)), first);
+    assert_eq!(begin(ResetRequest::Next), second, "the count continues from there");
+    assert_eq!(begin(ResetRequest::Training(1)), second);
 }

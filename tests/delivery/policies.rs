@@ -1,7 +1,7 @@
 //! A policy outlives its learner, reaches late readers, and is replaced by the next learner's.
 
 use shoal_common::channel::Domain;
-use shoal_common::channel::policy::{Policy, PolicyReader};
+use shoal_common::channel::policy::{PolicyReader, PublishedPolicy};
 
 use crate::children::{FINGERPRINT, PARAMETERS};
 use crate::process::Process;
@@ -16,7 +16,7 @@ fn publish(learner: &mut Process, version: u64) {
     learner.expect_line("published");
 }
 
-fn is(policy: &Policy, incarnation: u64, version: u64) -> bool {
+fn is(policy: &PublishedPolicy, incarnation: u64, version: u64) -> bool {
     let header = policy.header();
     let parameters = policy.parameters();
     let whole = parameters.iter().all(|parameter| *parameter == header.version as f32);

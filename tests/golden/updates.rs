@@ -4,7 +4,7 @@
 use nalgebra::DMatrix;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
-use shoal_common::algorithms::{AlgorithmSettings, Learned, Shape};
+use shoal_common::algorithms::{AlgorithmSettings, LearnedShapes, Shape};
 use shoal_common::config::{DdpgConfig, DqnConfig, SacConfig, Td3Config};
 use shoal_common::network::NetworkLayout;
 use shoal_common::space::{EnvironmentSpec, Space};
@@ -13,13 +13,13 @@ use shoal_learner::algorithms::algorithm::Losses;
 use shoal_learner::algorithms::ddpg::Ddpg;
 use shoal_learner::algorithms::dqn::Dqn;
 use shoal_learner::algorithms::minibatch::Minibatch;
-use shoal_learner::algorithms::replayed::MinibatchLearner;
+use shoal_learner::algorithms::minibatch_algorithm::MinibatchLearner;
 use shoal_learner::algorithms::sac::Sac;
 use shoal_learner::algorithms::td3::Td3;
 
 use super::{FLAGS, Failure, VALUES, close, read};
 
-/// Compares the updates in `file` with those of its method.
+/// Compares the updates in `file` with those of its algorithm.
 pub(super) fn check(file: &Value) -> Result<(), Failure> {
     let constants = serde_json::json!({"beta1": 0.9, "beta2": 0.999, "eps": 1e-8});
     if file["adam"] != constants {
@@ -31,7 +31,7 @@ pub(super) fn check(file: &Value) -> Result<(), Failure> {
         Some("td3") => td3(file, &batches),
         Some("sac") => sac(file, &batches),
         Some("dqn") => dqn(file, &batches),
-        Some(other) => Err(format!("unknown method {other}")),
+        Some(other) => Err(format!("unknown algorithm {other}")),
     }
 }
 
@@ -137,7 +137,7 @@ fn dqn(file: &Value, batches: &Batches) -> Result<(), Failure> {
     })
 }
 
-/// Names of networks in a file, and of their sections in the learner's state.
+/// Names of networks in a file, and of their arrays in the learner's state.
 const TWIN_CRITICS: [(&str, &str); 4] = [
     ("critic1", "critic 1"),
     ("critic2", "critic 2"),
@@ -145,20 +145,20 @@ const TWIN_CRITICS: [(&str, &str); 4] = [
     ("target_critic2", "target critic 2"),
 ];
 
-/// A network in a file, its section in the learner's state, and the name of the learned network of the same shape.
+/// A network in a file, its array in the learner's state, and the name of the learned network of the same shape.
 struct Recorded {
     name: &'static str,
-    section: &'static str,
+    array: &'static str,
     shape_of: &'static str,
 }
 
 fn recorded(networks: &[(&'static str, &'static str)]) -> Vec<Recorded> {
     networks
         .iter()
-        .map(|&(name, section)| Recorded {
+        .map(|&(name, array)| Recorded {
             name,
-            section,
-            shape_of: section.strip_prefix("target ").unwrap_or(section),
+            array,
+            shape_of: array.strip_prefix("target ").unwrap_or(array),
         })
         .collect()
 }
@@ -169,15 +169,15 @@ fn repeat<L: MinibatchLearner>(
     file: &Value,
     batches: &Batches,
     learner: &mut L,
-    learned: &Learned,
+    learned: &LearnedShapes,
     networks: &[Recorded],
     mut update: impl FnMut(&mut L, &Value, &Minibatch) -> Result<Vec<(&'static str, f32)>, Failure>,
 ) -> Result<(), Failure> {
     for (network, numbers) in parameters(&file["initial"], learned, networks)? {
         let mut state = learner.state_mut(0);
-        let section = state.iter_mut().find(|(name, _)| *name == network.section);
-        let (_, section) = section.ok_or_else(|| format!("the learner has no {}", network.section))?;
-        section.copy_from_slice(&numbers);
+        let array = state.iter_mut().find(|(name, _)| *name == network.array);
+        let (_, array) = array.ok_or_else(|| format!("the learner has no {}", network.array))?;
+        array.copy_from_slice(&numbers);
     }
     for (i, (recorded, batch, expected)) in batches.iter().enumerate() {
         let losses = update(learner, recorded, batch).map_err(|e| format!("batch {i}: {e}"))?;
@@ -193,8 +193,8 @@ fn repeat<L: MinibatchLearner>(
         for (network, numbers) in parameters(expected, learned, networks)? {
             let (_, ours) = state
                 .iter()
-                .find(|(name, _)| *name == network.section)
-                .ok_or("a section is gone")?;
+                .find(|(name, _)| *name == network.array)
+                .ok_or("an array is gone")?;
             for (at, (a, b)) in ours.iter().zip(&numbers).enumerate() {
                 close(&[f64::from(*a)], &[f64::from(*b)])
                     .map_err(|e| format!("update {i}: {}, parameter {at} {e}", network.name))?;
@@ -207,7 +207,7 @@ fn repeat<L: MinibatchLearner>(
 /// Every network's parameters in the learner's order.
 fn parameters<'a>(
     recorded: &Value,
-    learned: &Learned,
+    learned: &LearnedShapes,
     networks: &'a [Recorded],
 ) -> Result<Vec<(&'a Recorded, Vec<f32>)>, Failure> {
     let of = |network: &'a Recorded| {

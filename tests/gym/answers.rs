@@ -20,7 +20,7 @@ struct Deed {
 
 fn any_deed() -> impl Strategy<Value = Deed> {
     let what = [
-        "number", "numbers", "verdict", "length", "header", "none", "late", "exit", "refused", "twice",
+        "number", "numbers", "status", "length", "header", "none", "late", "exit", "refused", "twice",
     ];
     let number = ["nan", "inf", "-inf", "1e30", "-1e30", "1e-40", "0.5", "2", "-1", "0"];
     let chance = prop_oneof![Just(1.0), 0.0..0.3];

@@ -578,7 +578,7 @@ fn too_many_invalid_answers_end_a_run_that_can_be_resumed() {
 
 fn a_server_with_any_answers_is_survived_or_named_in_one_line() {
     let place = place();
-    for how in ["nan", "flags", "short", "long", "twice", "verdict", "huge"] {
+    for how in ["nan", "flags", "short", "long", "twice", "status", "huge"] {
         let server =
             format!("from shoal_test_environments import hostile_server; raise SystemExit(hostile_server({how:?}))");
         let server = serde_json::to_string(&["python3", "-c", &server]).unwrap();

@@ -243,7 +243,7 @@ def hostile_server(how):
     luck = np.random.default_rng(1)
     send = server.Server._send
 
-    def wrong(self, response, verdict):
+    def wrong(self, response, status):
         numbers = server._numbers(response.payload())
         if len(numbers) > 10 and luck.random() < 0.2:
             match how:
@@ -253,9 +253,9 @@ def hostile_server(how):
                     numbers[-1] = 0.5
                 case "huge":
                     numbers[:] = np.inf
-                case "verdict":
-                    verdict = 77
-        send(self, response, verdict)
+                case "status":
+                    status = 77
+        send(self, response, status)
 
     def another_length(self, request):
         response, blocks = loan_blocks(self, request)
@@ -266,7 +266,7 @@ def hostile_server(how):
     def twice(self, request):
         answer(self, request)
         if luck.random() < 0.2:
-            self._send(self._loan(request, 0), server.Verdict.REFUSED)
+            self._send(self._loan(request, 0), server.ResponseStatus.REFUSED)
 
     server.Server._send = wrong
     loan_blocks, answer = server.Server._loan_blocks, server.Server.answer
@@ -328,17 +328,17 @@ def scripted_server(plan):
     send, loan_blocks, answer = server.Server._send, server.Server._loan_blocks, server.Server.answer
     header = server.ResponseHeader
 
-    def spoiled(self, response, verdict):
+    def spoiled(self, response, status):
         numbers = server._numbers(response.payload())
-        for deed in due("number", "numbers", "verdict"):
+        for deed in due("number", "numbers", "status"):
             match deed["what"]:
                 case "number" if len(numbers) > 0:
                     numbers[luck.integers(len(numbers))] = deed["number"]
                 case "numbers":
                     numbers[:] = deed["number"]
-                case "verdict":
-                    verdict = deed["count"]
-        send(self, response, verdict)
+                case "status":
+                    status = deed["count"]
+        send(self, response, status)
 
     def another_length(self, request):
         response, blocks = loan_blocks(self, request)
@@ -365,7 +365,7 @@ def scripted_server(plan):
                     return
         answer(self, request)
         for deed in due("twice"):
-            self._send(self._loan(request, deed["count"]), server.Verdict.ANSWERED)
+            self._send(self._loan(request, deed["count"]), server.ResponseStatus.ANSWERED)
 
     server.Server._send, server.Server._loan_blocks, server.Server.answer = spoiled, another_length, answered
     server.ResponseHeader = another_header

@@ -134,7 +134,7 @@ fn rows_of(actors: u32, rate: &Rate) -> String {
     format!(
         "{}: {} thousand, expected {:.0}, efficiency {:.2}",
         of_actors(actors),
-        rate.windows.show(THOUSAND, 0),
+        rate.results.show(THOUSAND, 0),
         rate.expected_rows_per_second / THOUSAND,
         rate.efficiency
     )

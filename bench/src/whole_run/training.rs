@@ -13,10 +13,10 @@ use shoal_common::channel::reports::Reports;
 use shoal_common::report::{Heartbeat, Role};
 use shoal_common::run_dir::RunDir;
 use shoal_run::client::RunClient;
-use shoal_run::process::Peer;
+use shoal_run::process::ChildProcess;
 use tempfile::TempDir;
 
-use super::super::measurement::Budget;
+use super::super::measurement::TimeBudget;
 use super::super::progress::{POLL_INTERVAL, newest, open_commits, policy_reader};
 
 /// How long a learner runs before it is killed, so that the launcher has received its heartbeat.
@@ -27,8 +27,8 @@ const TIMEOUT: Duration = Duration::from_secs(60);
 
 /// A running training process.
 pub(super) struct Training {
-    launcher: Peer,
-    begun: Instant,
+    launcher: ChildProcess,
+    started_at: Instant,
     /// Incarnation of the newest learner seen.
     incarnation: u64,
     observer: Option<Observer>,
@@ -77,11 +77,11 @@ impl Training {
             .args(["train", "pendulum", "--quiet", "--seed", "1"]);
         command.args(["--set", "run.steps=1_000_000_000_000", "--run"]);
         command.arg(directory.path().join("run"));
-        let begun = Instant::now();
-        let launcher = Peer::start(&mut command, "training".into()).context("cannot start a training")?;
+        let started_at = Instant::now();
+        let launcher = ChildProcess::start(&mut command, "training".into()).context("cannot start a training")?;
         Ok(Self {
             launcher,
-            begun,
+            started_at,
             incarnation: 0,
             observer: None,
             directory,
@@ -111,9 +111,9 @@ impl Training {
     }
 
     /// Observes the run until the first policy that gradient steps have changed.
-    pub(super) fn begin(&mut self, budget: &Budget) -> anyhow::Result<Startup> {
+    pub(super) fn begin(&mut self, budget: &TimeBudget) -> anyhow::Result<Startup> {
         let run = RunDir::planned(&self.directory.path().join("run"));
-        let begun = self.begun;
+        let begun = self.started_at;
         // Joining before the launcher would look like the remains of an earlier run. The launcher writes this file
         // before it starts the first process, and has created the services by then.
         let counter = run.incarnations();
@@ -159,10 +159,10 @@ impl Training {
     }
 
     /// Lets the run work for a while.
-    pub(super) fn settle(&mut self, budget: &Budget) -> anyhow::Result<()> {
-        let begun = Instant::now();
+    pub(super) fn settle(&mut self, budget: &TimeBudget) -> anyhow::Result<()> {
+        let started_at = Instant::now();
         self.wait(budget, "no steady state", |_| {
-            Ok((begun.elapsed() >= SETTLING_TIME).then_some(()))
+            Ok((started_at.elapsed() >= SETTLING_TIME).then_some(()))
         })
     }
 
@@ -181,7 +181,7 @@ impl Training {
     }
 
     /// Observes the run until the successor of the learner killed at `killed` has made gradient steps.
-    pub(super) fn recover(&mut self, killed: Instant, budget: &Budget) -> anyhow::Result<Recovery> {
+    pub(super) fn recover(&mut self, killed: Instant, budget: &TimeBudget) -> anyhow::Result<Recovery> {
         let mut observer = self.observer.take().context("the training is not being observed")?;
         let (mut ready, mut first, before) = (None, None, self.incarnation);
         let came = self.wait(budget, "no update of the learner's successor", |incarnation| {
@@ -215,18 +215,18 @@ impl Training {
     /// interrupts.
     fn wait<T>(
         &mut self,
-        budget: &Budget,
+        budget: &TimeBudget,
         missing: &str,
         mut look: impl FnMut(&mut u64) -> anyhow::Result<Option<T>>,
     ) -> anyhow::Result<T> {
-        let begun = Instant::now();
+        let started_at = Instant::now();
         loop {
             if let Some(found) = look(&mut self.incarnation)? {
                 return Ok(found);
             }
             budget.check()?;
             self.launcher.check()?;
-            if begun.elapsed() >= TIMEOUT {
+            if started_at.elapsed() >= TIMEOUT {
                 bail!("the training showed {missing} for {} s", TIMEOUT.as_secs());
             }
             std::thread::sleep(POLL_INTERVAL);

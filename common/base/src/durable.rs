@@ -9,13 +9,13 @@ use std::path::{Path, PathBuf};
 /// A file that is complete and on the disk, still under its temporary name. Dropping it without publishing removes it.
 #[derive(Debug)]
 #[must_use = "the file appears only when it is published"]
-pub struct Prepared {
+pub struct PreparedFile {
     temporary: PathBuf,
     path: PathBuf,
     published: bool,
 }
 
-impl Prepared {
+impl PreparedFile {
     /// Writes and syncs a file for `path`, readable by the owner alone. The temporary name is `path` with `.new`
     /// appended; a file that a killed process left there is overwritten.
     pub fn write<E: From<io::Error>>(
@@ -65,7 +65,7 @@ impl Prepared {
     }
 }
 
-impl Drop for Prepared {
+impl Drop for PreparedFile {
     fn drop(&mut self) {
         if !self.published {
             // A failure does no harm: the next write uses the same temporary name.
@@ -80,7 +80,7 @@ pub fn write_atomically<E: From<io::Error>>(
     path: &Path,
     write: impl FnOnce(&mut BufWriter<File>) -> Result<(), E>,
 ) -> Result<(), E> {
-    Ok(Prepared::write(path, write)?.publish()?)
+    Ok(PreparedFile::write(path, write)?.publish()?)
 }
 
 /// Like [`write_atomically`], but without waiting for the disk: the file is whole after any process dies, but a power
@@ -89,7 +89,7 @@ pub fn write_atomically_unsynced<E: From<io::Error>>(
     path: &Path,
     write: impl FnOnce(&mut BufWriter<File>) -> Result<(), E>,
 ) -> Result<(), E> {
-    let (mut prepared, _) = Prepared::unsynced(path, write)?;
+    let (mut prepared, _) = PreparedFile::unsynced(path, write)?;
     Ok(prepared.rename()?)
 }
 
@@ -104,7 +104,7 @@ pub fn sync_directory_of(path: &Path) -> io::Result<()> {
 
 /// A kind of sealed file: the prefix of such files, and the kind's name.
 #[derive(Clone, Copy, Debug)]
-pub struct Kind {
+pub struct FileKind {
     /// Identifies the kind of file.
     pub magic: [u8; 8],
     /// The number of its format; increase it with every change.
@@ -141,20 +141,24 @@ const PREFIX: usize = 12;
 const SEAL: usize = 4;
 
 /// Writes magic and version, then what `body` writes, then a CRC-32 over all of it.
-pub fn seal<W: Write>(kind: Kind, writer: W, body: impl FnOnce(&mut Sealing<W>) -> io::Result<()>) -> io::Result<()> {
-    let mut sealing = Sealing {
+pub fn seal<W: Write>(
+    kind: FileKind,
+    writer: W,
+    body: impl FnOnce(&mut ChecksumWriter<W>) -> io::Result<()>,
+) -> io::Result<()> {
+    let mut sealing = ChecksumWriter {
         writer,
         hasher: crc32fast::Hasher::new(),
     };
     sealing.write_all(&kind.magic)?;
     sealing.write_all(&kind.version.to_le_bytes())?;
     body(&mut sealing)?;
-    let Sealing { mut writer, hasher } = sealing;
+    let ChecksumWriter { mut writer, hasher } = sealing;
     writer.write_all(&hasher.finalize().to_le_bytes())
 }
 
 /// Reads a file that [`seal`] wrote at `path`, checks its checksum and returns its body.
-pub fn read_sealed(kind: Kind, path: &Path) -> Result<Vec<u8>, SealError> {
+pub fn read_sealed(kind: FileKind, path: &Path) -> Result<Vec<u8>, SealError> {
     let mut bytes = Vec::new();
     File::open(path)?.read_to_end(&mut bytes)?;
     let Some([magic @ .., a, b, c, d]) = bytes.first_chunk::<PREFIX>() else {
@@ -183,12 +187,12 @@ pub fn read_sealed(kind: Kind, path: &Path) -> Result<Vec<u8>, SealError> {
 
 /// The writer for the body of a sealed file.
 #[derive(Debug)]
-pub struct Sealing<W> {
+pub struct ChecksumWriter<W> {
     writer: W,
     hasher: crc32fast::Hasher,
 }
 
-impl<W: Write> Write for Sealing<W> {
+impl<W: Write> Write for ChecksumWriter<W> {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         let written = self.writer.write(bytes)?;
         self.hasher.update(&bytes[..written]);

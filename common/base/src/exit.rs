@@ -6,7 +6,7 @@ use std::fmt;
 /// Why a role's loop ends early: it was asked to stop, or it failed with an `E`.
 ///
 /// It does not implement [`Error`], so that `?` can convert every error that converts into `E`. To convert between
-/// exits with different errors, use [`map_err`](Result::map_err) with [`Exit::widen`].
+/// exits with different errors, use [`map_err`](Result::map_err) with [`Exit::convert`].
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Exit<E> {
     /// The role was asked to end, which is not a failure.
@@ -17,7 +17,7 @@ pub enum Exit<E> {
 
 impl<E> Exit<E> {
     /// Converts the error into a wider error type.
-    pub fn widen<F: From<E>>(self) -> Exit<F> {
+    pub fn convert<F: From<E>>(self) -> Exit<F> {
         match self {
             Self::Stopped => Exit::Stopped,
             Self::Failed(error) => Exit::Failed(error.into()),
@@ -84,7 +84,7 @@ mod tests {
     }
 
     fn role(whole: &str, float: &str) -> Result<f64, Exit<RoleError>> {
-        let whole = wait(whole).map_err(Exit::widen)?;
+        let whole = wait(whole).map_err(Exit::convert)?;
         let float: f64 = float.parse()?;
         Ok(f64::from(whole) + float)
     }

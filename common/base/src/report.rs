@@ -64,7 +64,7 @@ impl Activity {
 
 /// Identifies a process of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Identity {
+pub struct RoleInstance {
     /// Its role.
     pub role: Role,
     /// Its index among the processes of that role.
@@ -113,12 +113,12 @@ pub struct Heartbeat {
 
 impl Heartbeat {
     /// The heartbeat of a role that has done nothing yet.
-    pub fn new(identity: Identity) -> Self {
-        let Identity {
+    pub fn new(instance: RoleInstance) -> Self {
+        let RoleInstance {
             role,
             index,
             incarnation,
-        } = identity;
+        } = instance;
         let activity = Activity::WaitingForPeer as u32;
         Self {
             role: role as u32,

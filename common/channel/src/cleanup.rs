@@ -23,7 +23,7 @@ use rustix::process::{Pid, test_kill_process};
 use super::domain::{Domain, DomainError, io_error, iox_config, user_root};
 use super::error::ChannelError;
 use super::files::{SHARED_MEMORY, files_of};
-use super::memory::is_promise;
+use super::memory::is_reservation;
 use super::presence::is_presence;
 
 /// Interval between two sweeps: the longest time that a half-made file of a dead process delays other processes.
@@ -109,7 +109,7 @@ pub(super) fn remove_unfinished(run_id: &str) -> io::Result<bool> {
 /// Whether iceoryx2 has not finished the file: it has no size, or is not readable.
 fn is_unfinished(path: &Path, metadata: &Metadata) -> bool {
     let name = path.file_name().map(|name| name.to_string_lossy());
-    let is_ours = name.is_some_and(|name| is_promise(&name) || is_presence(&name));
+    let is_ours = name.is_some_and(|name| is_reservation(&name) || is_presence(&name));
     metadata.is_file() && !is_ours && (metadata.len() == 0 || metadata.mode() & 0o400 == 0)
 }
 

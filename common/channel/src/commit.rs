@@ -1,7 +1,7 @@
 //! What the learner has committed to the replay: the header of the replay file.
 //!
 //! The learner is the only writer. Actors and `status` map the header read-only and follow the commit record with a
-//! [`CommitReader`]. Both sides take the layout from [`ReplayLayout::places`]. `docs/REPLAY_FORMAT.md` describes the
+//! [`CommitReader`]. Both sides take the layout from [`ReplayLayout::offsets`]. `docs/REPLAY_FORMAT.md` describes the
 //! format.
 
 mod layout;
@@ -10,8 +10,8 @@ mod reader;
 mod record;
 mod words;
 
-pub use layout::{IdentityFault, Places, ReplayLayout, SLOTS, SYNCED};
+pub use layout::{FileOffsets, PreambleError, ReplayLayout, SLOTS, SYNCED};
 pub use mirror::CommitMirror;
 pub use reader::{CommitReader, OpenError};
-pub use record::{ActorCommit, ChunkMark, MAX_INCARNATION, Record};
+pub use record::{ActorCommit, ChunkId, CommitRecord, MAX_INCARNATION};
 pub use words::{Words, WritableWords};

@@ -1,4 +1,4 @@
-//! Control of a run from another terminal: questions to its launcher, and the launcher's answers.
+//! Control of a run from another terminal: requests to its launcher, and the launcher's answers.
 
 use std::os::fd::{AsFd, BorrowedFd};
 use std::path::Path;
@@ -13,15 +13,16 @@ use iceoryx2::service::header::request_response::{
 use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::request_response::PortFactory;
 
+use self::message::{AddressedRequest, VERSION, decode, encode};
 pub use self::message::{
-    Answer, HostLease, HostRequest, HostState, HostStatus, Question, RoleState, RoleStatus, RunKey, RunStatus,
+    ControlRequest, ControlResponse, HostLease, HostRequest, HostState, HostStatus, RoleState, RoleStatus, RunKey,
+    RunStatus,
 };
-use self::message::{Asked, VERSION, decode, encode};
 use super::domain::Domain;
 use super::error::{Cause, ChannelError, ChannelErrorKind};
 use super::event::{Listener, Notifier};
 use super::memory;
-use super::service::{Entry, Held, claim, service_name};
+use super::service::{HeldService, OpenMode, claim, service_name};
 
 mod message;
 
@@ -35,23 +36,23 @@ const NODES: usize = 2 * CLIENTS;
 
 const ACTIVE_REQUESTS: usize = 2;
 
-/// Most bytes of a question from a terminal.
-const QUESTION: usize = 64;
+/// Most bytes of a request from a terminal.
+const REQUEST_BYTES: usize = 64;
 
 /// Most bytes of an answer without its roles.
-const ANSWER: usize = 1024;
+const RESPONSE_BYTES: usize = 1024;
 
 /// Most bytes of one role in an answer.
-const ANSWER_PER_ROLE: usize = 96;
+const RESPONSE_BYTES_PER_ROLE: usize = 96;
 
 /// Most bytes of another host in an answer, without its roles. Each has at least one actor.
-const ANSWER_PER_HOST: usize = 192;
+const RESPONSE_BYTES_PER_HOST: usize = 192;
 
 /// How long the client sleeps between checks for an answer. It notifies the launcher, which answers at once if it is
 /// idle.
 const POLL_INTERVAL: Duration = Duration::from_millis(5);
 
-/// How long a question about the status waits for a launcher without a service.
+/// How long a request about the status waits for a launcher without a service.
 const MISSING_PATIENCE: Duration = Duration::from_secs(1);
 
 /// How often the client checks that the launcher is still alive.
@@ -63,10 +64,10 @@ pub struct ControlPort {
     server: Server<ipc::Service, [u8], ControlHeader, [u8], ControlHeader>,
     listener: Listener,
     /// Requests that will be answered later.
-    waiting: Vec<ControlRequest>,
+    waiting: Vec<UnansweredRequest>,
 }
 
-type ControlRequest = ActiveRequest<ipc::Service, [u8], ControlHeader, [u8], ControlHeader>;
+type UnansweredRequest = ActiveRequest<ipc::Service, [u8], ControlHeader, [u8], ControlHeader>;
 
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ZeroCopySend)]
 #[repr(C)]
@@ -81,7 +82,7 @@ pub enum ControlError {
     /// The channel does not work.
     #[error(transparent)]
     Channel(#[from] ChannelError),
-    /// The launcher lives and has no service for questions: it is starting, or the roles have ended already.
+    /// The launcher lives and has no service for requests: it is starting, or the roles have ended already.
     #[error("the run is starting, or ending; try again")]
     Missing,
     /// The launcher has ended.
@@ -95,7 +96,7 @@ pub enum ControlError {
     Unreadable(String),
 }
 
-/// The descriptor becomes readable when a question arrives.
+/// The descriptor becomes readable when a request arrives.
 impl AsFd for ControlPort {
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.listener.as_fd()
@@ -109,9 +110,9 @@ impl ControlPort {
     /// When shared memory is unavailable.
     pub fn open(domain: &Domain) -> Result<Self, ChannelError> {
         let server = claim(|| {
-            service(domain, Entry::Open)?
+            service(domain, OpenMode::Open)?
                 .server_builder()
-                .initial_max_slice_len(answer_length(domain.max_actors()))
+                .initial_max_slice_len(response_length(domain.max_actors()))
                 .create()
                 .map_err(|cause| ChannelError::new(CHANNEL, "answer", cause))
         })?;
@@ -122,29 +123,33 @@ impl ControlPort {
         })
     }
 
-    /// Answers all questions about `run`, which is in the directory `place`, that have arrived since the last call. If
+    /// Answers all requests about `run`, which is in the directory `place`, that have arrived since the last call. If
     /// `answer` returns `None`, the client waits for [`answer_waiting`](Self::answer_waiting).
     ///
     /// # Errors
     /// When the channel does not work, or `answer` fails.
-    pub fn answer_questions<E: From<ChannelError>>(
+    pub fn answer_requests<E: From<ChannelError>>(
         &mut self,
         run: RunKey,
         place: &Path,
-        mut answer: impl FnMut(Question) -> Result<Option<Answer>, E>,
+        mut answer: impl FnMut(ControlRequest) -> Result<Option<ControlResponse>, E>,
     ) -> Result<(), E> {
-        // Clear the notifications before reading the questions: a later question notifies again.
+        // Clear the notifications before reading the requests: a later request notifies again.
         self.listener.notified()?;
         loop {
             let received = self
                 .server
                 .receive()
-                .map_err(|cause| ChannelError::new(CHANNEL, "receive a question", cause))?;
+                .map_err(|cause| ChannelError::new(CHANNEL, "receive a request", cause))?;
             let Some(request) = received else { return Ok(()) };
             let answer = match decode(request.user_header().version, request.payload()) {
-                Ok(Asked { run: asked, .. }) if asked != run => Some(Answer::AnotherRun(place.display().to_string())),
-                Ok(Asked { question, .. }) => answer(question)?,
-                Err(reason) => Some(Answer::Refused(format!("the question cannot be read: {reason}"))),
+                Ok(AddressedRequest { run: addressed, .. }) if addressed != run => {
+                    Some(ControlResponse::AnotherRun(place.display().to_string()))
+                }
+                Ok(AddressedRequest { request, .. }) => answer(request)?,
+                Err(reason) => Some(ControlResponse::Refused(format!(
+                    "the request cannot be read: {reason}"
+                ))),
             };
             match answer {
                 Some(answer) => send(&request, &answer),
@@ -154,7 +159,7 @@ impl ControlPort {
     }
 
     /// Answers the waiting clients and gives them a moment to receive the answer. For use before the launcher ends.
-    pub fn answer_waiting(&mut self, answer: &Answer) {
+    pub fn answer_waiting(&mut self, answer: &ControlResponse) {
         if self.waiting.is_empty() {
             return;
         }
@@ -165,11 +170,11 @@ impl ControlPort {
 
 /// Sends an answer. Failures are only logged: the launcher must not fail because a client has gone or memory is
 /// exhausted.
-fn send(request: &ControlRequest, answer: &Answer) {
+fn send(request: &UnansweredRequest, answer: &ControlResponse) {
     let bytes = match encode(answer) {
         Ok(bytes) => bytes,
         Err(cause) => {
-            return tracing::warn!("a question was not answered, because the answer cannot be encoded: {cause}");
+            return tracing::warn!("a request was not answered, because the answer cannot be encoded: {cause}");
         }
     };
     let sent = request.loan_slice(bytes.len()).map(|mut response| {
@@ -178,7 +183,7 @@ fn send(request: &ControlRequest, answer: &Answer) {
         response.send()
     });
     if !matches!(sent, Ok(Ok(()))) {
-        tracing::debug!(?sent, "a question was not answered");
+        tracing::debug!(?sent, "a request was not answered");
     }
 }
 
@@ -189,22 +194,22 @@ fn send(request: &ControlRequest, answer: &Answer) {
 pub fn ask(
     domain: &Domain,
     run: RunKey,
-    question: Question,
+    request: ControlRequest,
     patience: Duration,
     is_alive: impl Fn() -> bool,
-) -> Result<Answer, ControlError> {
+) -> Result<ControlResponse, ControlError> {
     let asked = Instant::now();
     let deadline = asked + patience;
     // Who only wants to know how the run is need not wait until it is able to answer.
-    let missing_until = match question {
-        Question::Status => deadline.min(asked + MISSING_PATIENCE),
+    let missing_until = match request {
+        ControlRequest::Status => deadline.min(asked + MISSING_PATIENCE),
         _ => deadline,
     };
-    let question = encode(&Asked { run, question }).map_err(cannot_ask)?;
+    let request = encode(&AddressedRequest { run, request }).map_err(cannot_ask)?;
     let make_client = || {
-        service(domain, Entry::Open)?
+        service(domain, OpenMode::Open)?
             .client_builder()
-            .initial_max_slice_len(question.len().max(QUESTION))
+            .initial_max_slice_len(request.len().max(REQUEST_BYTES))
             .create()
             .map_err(cannot_ask)
     };
@@ -228,7 +233,7 @@ pub fn ask(
     };
     let launcher = Notifier::to_launcher(domain);
     let notify = || launcher.iter().for_each(Notifier::notify);
-    let mut pending = ask(&question)?;
+    let mut pending = ask(&request)?;
     notify();
     let mut checked = Instant::now();
     let mut gone = false;
@@ -248,9 +253,9 @@ pub fn ask(
             checked = Instant::now();
             gone = !is_alive();
         }
-        // Ask again: the launcher had not opened its end when the question was sent.
+        // Ask again: the launcher had not opened its end when the request was sent.
         if pending.number_of_server_connections() == 0 {
-            pending = ask(&question)?;
+            pending = ask(&request)?;
             notify();
         }
     }
@@ -271,25 +276,25 @@ fn is_permanent(error: &ChannelError) -> bool {
 /// Bytes of shared memory that the service reserves in a run of up to `max_actors` actors.
 pub fn reserved(max_actors: usize) -> u64 {
     // The same formula as for an environment server, with iceoryx2's default numbers of loans.
-    let questions = 2 * ACTIVE_REQUESTS + 2;
+    let requests = 2 * ACTIVE_REQUESTS + 2;
     let answers = 2 * ACTIVE_REQUESTS * 4;
     memory::service(NODES)
-        + CLIENTS as u64 * memory::segment::<IoxRequestHeader, ControlHeader>(questions, QUESTION)
-        + memory::segment::<IoxResponseHeader, ControlHeader>(CLIENTS * answers, answer_length(max_actors))
-        + CLIENTS as u64 * memory::connection(1, ACTIVE_REQUESTS, questions, questions)
+        + CLIENTS as u64 * memory::segment::<IoxRequestHeader, ControlHeader>(requests, REQUEST_BYTES)
+        + memory::segment::<IoxResponseHeader, ControlHeader>(CLIENTS * answers, response_length(max_actors))
+        + CLIENTS as u64 * memory::connection(1, ACTIVE_REQUESTS, requests, requests)
         + CLIENTS as u64 * memory::connection(2 * ACTIVE_REQUESTS, 1, 1, CLIENTS * answers)
 }
 
 /// Most bytes of an answer. Its roles are the learner, the evaluator with its server, the gate, and each actor with its server.
-fn answer_length(max_actors: usize) -> usize {
+fn response_length(max_actors: usize) -> usize {
     // Each actor has a server, and may be the only one of its host.
-    ANSWER + ANSWER_PER_ROLE * (2 * max_actors + 4) + ANSWER_PER_HOST * max_actors
+    RESPONSE_BYTES + RESPONSE_BYTES_PER_ROLE * (2 * max_actors + 4) + RESPONSE_BYTES_PER_HOST * max_actors
 }
 
 /// Creates the service.
-pub(super) fn create(domain: &Domain) -> Result<Held, ChannelError> {
-    let service = service(domain, Entry::Create)?;
-    Ok(Held::new(move |visit| {
+pub(super) fn create(domain: &Domain) -> Result<HeldService, ChannelError> {
+    let service = service(domain, OpenMode::Create)?;
+    Ok(HeldService::new(move |visit| {
         let ports = service.dynamic_config();
         ports.list_clients(|port| visit(port.node_id, port.client_id.value()));
         ports.list_servers(|port| visit(port.node_id, port.server_id.value()));
@@ -298,7 +303,7 @@ pub(super) fn create(domain: &Domain) -> Result<Held, ChannelError> {
 
 type ControlService = PortFactory<ipc::Service, [u8], ControlHeader, [u8], ControlHeader>;
 
-fn service(domain: &Domain, entry: Entry) -> Result<ControlService, ChannelError> {
+fn service(domain: &Domain, mode: OpenMode) -> Result<ControlService, ChannelError> {
     let builder = domain
         .node()
         .service_builder(&service_name(domain, CHANNEL)?)
@@ -311,7 +316,7 @@ fn service(domain: &Domain, entry: Entry) -> Result<ControlService, ChannelError
         .max_active_requests_per_client(ACTIVE_REQUESTS)
         .max_response_buffer_size(1)
         .max_borrowed_responses_per_pending_response(1);
-    entry.service(CHANNEL, builder, |b| b.create(), |b| b.open())
+    mode.service(CHANNEL, builder, |b| b.create(), |b| b.open())
 }
 
 #[cfg(test)]
@@ -333,7 +338,7 @@ mod tests {
         std::thread::scope(|scope| {
             let asker = scope.spawn(|| {
                 let visitor = Domain::visit(&run_id, 1).unwrap();
-                let answer = ask(&visitor, run, Question::Stop, Duration::from_secs(60), || true);
+                let answer = ask(&visitor, run, ControlRequest::Stop, Duration::from_secs(60), || true);
                 visitor.leave().unwrap();
                 answer
             });
@@ -341,14 +346,14 @@ mod tests {
             while asked == 0 {
                 let woken = poll(&mut [PollFd::new(&port, PollFlags::IN)], Some(&a_minute)).unwrap();
                 assert_eq!(woken, 1, "there was no notification");
-                port.answer_questions::<ChannelError>(run, Path::new("run"), |question| {
-                    assert_eq!(question, Question::Stop);
+                port.answer_requests::<ChannelError>(run, Path::new("run"), |request| {
+                    assert_eq!(request, ControlRequest::Stop);
                     asked += 1;
-                    Ok(Some(Answer::Accepted))
+                    Ok(Some(ControlResponse::Accepted))
                 })
                 .unwrap();
             }
-            assert_eq!(asker.join().unwrap().unwrap(), Answer::Accepted);
+            assert_eq!(asker.join().unwrap().unwrap(), ControlResponse::Accepted);
             let at_once = Timespec::default();
             assert_eq!(
                 poll(&mut [PollFd::new(&port, PollFlags::IN)], Some(&at_once)).unwrap(),

@@ -163,8 +163,9 @@ impl Domain {
     ///
     /// # Errors
     /// When the record cannot be created.
-    pub fn promise(&self, bytes: u64) -> Result<(), DomainError> {
-        memory::promise(&self.run_id, bytes).map_err(io_error("record the run's needs in", Path::new(SHARED_MEMORY)))
+    pub fn reserve_memory(&self, bytes: u64) -> Result<(), DomainError> {
+        memory::reserve_memory(&self.run_id, bytes)
+            .map_err(io_error("record the run's needs in", Path::new(SHARED_MEMORY)))
     }
 
     /// The text of a configuration file with which other iceoryx2 programs find this run.

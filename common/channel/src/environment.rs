@@ -8,9 +8,9 @@ mod message;
 mod port;
 mod service;
 
-pub use check::Fault;
-pub use client::{Begin, EnvironmentClient, Observed, Snapshot, Stepped, describe};
-pub use message::{Ask, RequestHeader, ResponseHeader, ResponseLayout, StepBlocks};
+pub use check::ResponseFault;
+pub use client::{EnvironmentClient, EnvironmentResponse, ResetRequest, SnapshotResult, StepResult, describe};
+pub use message::{RequestHeader, RequestKind, ResponseHeader, ResponseLayout, StepBlocks};
 pub use port::{EnvironmentPort, Request};
 pub(super) use service::create;
 pub use service::reserved;

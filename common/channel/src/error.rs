@@ -18,7 +18,7 @@ use iceoryx2::service::port_factory::client::ClientCreateError;
 use iceoryx2::service::port_factory::server::ServerCreateError;
 use iceoryx2::service::service_name::ServiceNameError;
 
-use super::environment::Fault;
+use super::environment::ResponseFault;
 
 /// Why a channel fails: its service or port is unavailable, memory is exhausted, or the other side violates the
 /// protocol.
@@ -46,7 +46,7 @@ impl ChannelError {
     }
 
     /// The invalid answer of an environment server, if that is the cause. The server can continue with new episodes.
-    pub fn fault(&self) -> Option<&Fault> {
+    pub fn fault(&self) -> Option<&ResponseFault> {
         match self.source.downcast_ref() {
             Some(PeerError::Invalid(fault)) => Some(fault),
             _ => None,
@@ -64,7 +64,7 @@ impl ChannelError {
             | ChannelErrorKind::Corrupted
             | ChannelErrorKind::Exhausted
             | ChannelErrorKind::Unreachable
-            | ChannelErrorKind::Peer
+            | ChannelErrorKind::ChildProcess
             | ChannelErrorKind::Internal => false,
         }
     }
@@ -102,7 +102,7 @@ pub enum ChannelErrorKind {
     Unreachable,
     /// The other side violates the protocol.
     #[error("the other side violates the protocol")]
-    Peer,
+    ChildProcess,
     /// Anything else.
     #[error("an unexpected failure; is /dev/shm mounted and not full?")]
     Internal,
@@ -124,7 +124,7 @@ pub enum PeerError {
     },
     /// An environment returned something invalid.
     #[error(transparent)]
-    Invalid(Fault),
+    Invalid(ResponseFault),
     /// The environment server refused a request.
     #[error("the environment server refused the request")]
     Refused,
@@ -151,7 +151,7 @@ pub enum PeerError {
 /// the text of the kind comes first.
 fn reason(kind: ChannelErrorKind, source: &(dyn Error + Send + Sync)) -> String {
     match kind {
-        ChannelErrorKind::Peer => source.to_string(),
+        ChannelErrorKind::ChildProcess => source.to_string(),
         _ => format!("{kind} ({source})"),
     }
 }
@@ -163,7 +163,7 @@ pub(super) trait Cause: Error + Send + Sync + 'static {
 
 impl Cause for PeerError {
     fn kind(&self) -> ChannelErrorKind {
-        ChannelErrorKind::Peer
+        ChannelErrorKind::ChildProcess
     }
 }
 

@@ -20,7 +20,7 @@ use shoal_base::stop::Stop;
 
 use super::domain::Domain;
 use super::error::{Cause, ChannelError};
-use super::service::{Entry, Held, claim, service_name};
+use super::service::{HeldService, OpenMode, claim, service_name};
 use super::{descriptor, memory};
 
 /// Polls before a waiting process blocks. A peer that works on another core answers while they last. On a shared core
@@ -119,7 +119,7 @@ impl Listener {
 
     fn on(domain: &Domain, channel: String) -> Result<Self, ChannelError> {
         let listener = claim(|| {
-            service(domain, &channel, Entry::Open)?
+            service(domain, &channel, OpenMode::Open)?
                 .listener_builder()
                 .create()
                 .map_err(|e| ChannelError::new(&channel, "listen", e))
@@ -178,14 +178,14 @@ impl Notifier {
         claim(|| Self::on(domain, &channel))
     }
 
-    /// Opens a notifier for the launcher, if that is possible at once. Otherwise the launcher finds the question when
+    /// Opens a notifier for the launcher, if that is possible at once. Otherwise the launcher finds the request when
     /// it next looks by itself.
     pub(super) fn to_launcher(domain: &Domain) -> Option<Self> {
         Self::on(domain, LAUNCHER).ok()
     }
 
     fn on(domain: &Domain, channel: &str) -> Result<Self, ChannelError> {
-        let notifier = service(domain, channel, Entry::Open)?
+        let notifier = service(domain, channel, OpenMode::Open)?
             .notifier_builder()
             .create()
             .map_err(|e| ChannelError::new(channel, "notify", e))?;
@@ -237,18 +237,18 @@ pub fn wait_for<T>(
 }
 
 /// Creates the event service `name`.
-pub(super) fn create(domain: &Domain, name: EventName) -> Result<Held, ChannelError> {
+pub(super) fn create(domain: &Domain, name: EventName) -> Result<HeldService, ChannelError> {
     create_on(domain, &name.to_string())
 }
 
 /// Creates the event service of the launcher.
-pub(super) fn create_of_launcher(domain: &Domain) -> Result<Held, ChannelError> {
+pub(super) fn create_of_launcher(domain: &Domain) -> Result<HeldService, ChannelError> {
     create_on(domain, LAUNCHER)
 }
 
-fn create_on(domain: &Domain, channel: &str) -> Result<Held, ChannelError> {
-    let service = service(domain, channel, Entry::Create)?;
-    Ok(Held::new(move |visit| {
+fn create_on(domain: &Domain, channel: &str) -> Result<HeldService, ChannelError> {
+    let service = service(domain, channel, OpenMode::Create)?;
+    Ok(HeldService::new(move |visit| {
         let ports = service.dynamic_config();
         ports.list_listeners(|port| visit(port.node_id, port.listener_id.value()));
         ports.list_notifiers(|port| visit(port.node_id, port.notifier_id.value()));
@@ -259,7 +259,7 @@ fn participants(max_actors: usize) -> usize {
     2 * max_actors + 8
 }
 
-fn service(domain: &Domain, channel: &str, entry: Entry) -> Result<PortFactory<ipc::Service>, ChannelError> {
+fn service(domain: &Domain, channel: &str, mode: OpenMode) -> Result<PortFactory<ipc::Service>, ChannelError> {
     let participants = participants(domain.max_actors());
     let builder = domain
         .node()
@@ -268,7 +268,7 @@ fn service(domain: &Domain, channel: &str, entry: Entry) -> Result<PortFactory<i
         .max_listeners(2)
         .max_notifiers(participants)
         .max_nodes(participants);
-    entry.service(channel, builder, |b| b.create(), |b| b.open())
+    mode.service(channel, builder, |b| b.create(), |b| b.open())
 }
 
 #[cfg(test)]

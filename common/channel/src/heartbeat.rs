@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use shoal_base::report::{Activity, Heartbeat, Identity};
+use shoal_base::report::{Activity, Heartbeat, RoleInstance};
 
 use super::domain::Domain;
 use super::error::ChannelError;
@@ -16,7 +16,7 @@ const INTERVAL: Duration = Duration::from_millis(500);
 pub struct HeartbeatSender {
     reporter: Reporter<Heartbeat>,
     heartbeat: Heartbeat,
-    last: Option<Instant>,
+    last_sent_at: Option<Instant>,
 }
 
 impl HeartbeatSender {
@@ -24,11 +24,11 @@ impl HeartbeatSender {
     ///
     /// # Errors
     /// When shared memory is unavailable.
-    pub fn new(domain: &Domain, identity: Identity) -> Result<Self, ChannelError> {
+    pub fn new(domain: &Domain, instance: RoleInstance) -> Result<Self, ChannelError> {
         Ok(Self {
             reporter: Reporter::open(domain)?,
-            heartbeat: Heartbeat::new(identity),
-            last: None,
+            heartbeat: Heartbeat::new(instance),
+            last_sent_at: None,
         })
     }
 
@@ -63,8 +63,8 @@ impl HeartbeatSender {
 
     /// Sends a heartbeat if one is due.
     pub fn beat(&mut self, activity: Activity) {
-        if self.last.is_none_or(|last| last.elapsed() >= INTERVAL) {
-            self.last = Some(Instant::now());
+        if self.last_sent_at.is_none_or(|last| last.elapsed() >= INTERVAL) {
+            self.last_sent_at = Some(Instant::now());
             self.heartbeat.set_activity(activity);
             self.reporter.refresh_connections();
             self.reporter.send(self.heartbeat);
@@ -73,7 +73,7 @@ impl HeartbeatSender {
 
     /// Sends a heartbeat at once.
     pub fn beat_now(&mut self, activity: Activity) {
-        self.last = None;
+        self.last_sent_at = None;
         self.beat(activity);
     }
 }

@@ -1,5 +1,5 @@
 //! The capacity of shared memory: how much of it a port or a service reserves, how much is free, and how much is
-//! promised to runs.
+//! reserved to runs.
 //!
 //! iceoryx2 creates its files at their full size and sparse: a page is allocated when it is first written. A full file
 //! system then causes a SIGBUS at some later write instead of an error. So the reserved size counts, not the allocated
@@ -24,13 +24,13 @@ const CHANNEL: usize = 256;
 const SERVICE: usize = 768;
 const PARTY: usize = 96;
 
-/// An empty file records how much memory is promised to a run. Its name is the run's prefix, this word, and the number
+/// An empty file records how much memory is reserved to a run. Its name is the run's prefix, this word, and the number
 /// of bytes. (The length of a file may be limited, so it is not used.)
-const PROMISE: &str = "promise_";
+const RESERVATION: &str = "promise_";
 
-/// Whether a file of this name records a promise.
-pub(super) fn is_promise(name: &str) -> bool {
-    name.contains(PROMISE)
+/// Whether a file of this name records a reservation.
+pub(super) fn is_reservation(name: &str) -> bool {
+    name.contains(RESERVATION)
 }
 
 /// Bytes of a port's data: `chunks` chunks with headers `H` and `U` and `payload` bytes of payload.
@@ -56,7 +56,7 @@ pub(super) fn pages(bytes: usize) -> u64 {
     bytes.next_multiple_of(PAGE) as u64
 }
 
-/// Bytes of shared memory that are free and not promised to another run of this user; `None` if there is no limit.
+/// Bytes of shared memory that are free and not reserved to another run of this user; `None` if there is no limit.
 /// Memory that other programs and other users' runs have reserved but not allocated is unknown, and counts as free.
 ///
 /// # Errors
@@ -67,12 +67,12 @@ pub fn free_shared_memory(run_id: &str) -> io::Result<Option<u64>> {
         return Ok(None);
     }
     let free = status.f_bavail * status.f_frsize;
-    Ok(Some(free.saturating_sub(promised_to_others(run_id)?)))
+    Ok(Some(free.saturating_sub(reserved_by_others(run_id)?)))
 }
 
 /// Records that the run may take this many bytes. The record is removed with the run's other files.
-pub(super) fn promise(run_id: &str, bytes: u64) -> io::Result<()> {
-    let path = Path::new(SHARED_MEMORY).join(format!("{}{PROMISE}{bytes}", prefix(run_id)));
+pub(super) fn reserve_memory(run_id: &str, bytes: u64) -> io::Result<()> {
+    let path = Path::new(SHARED_MEMORY).join(format!("{}{RESERVATION}{bytes}", prefix(run_id)));
     let mut options = OpenOptions::new();
     options
         .write(true)
@@ -83,8 +83,8 @@ pub(super) fn promise(run_id: &str, bytes: u64) -> io::Result<()> {
     Ok(())
 }
 
-/// Bytes that are promised to this user's other runs and not allocated yet.
-fn promised_to_others(run_id: &str) -> io::Result<u64> {
+/// Bytes that are reserved to this user's other runs and not allocated yet.
+fn reserved_by_others(run_id: &str) -> io::Result<u64> {
     let user = rustix::process::getuid().as_raw();
     let files: Vec<(String, Metadata)> = std::fs::read_dir(SHARED_MEMORY)?
         .flatten()
@@ -93,12 +93,12 @@ fn promised_to_others(run_id: &str) -> io::Result<u64> {
         .filter(|(_, metadata)| metadata.uid() == user)
         .collect();
     let outstanding = |(name, _): &(String, Metadata)| {
-        let (run, promised) = name.split_once(PROMISE)?;
-        let promised: u64 = promised.parse().ok()?;
+        let (run, reserved) = name.split_once(RESERVATION)?;
+        let reserved: u64 = reserved.parse().ok()?;
         let others = run.starts_with("shoal_") && run != prefix(run_id);
         let taken = files.iter().filter(|(name, _)| name.starts_with(run));
         let taken: u64 = taken.map(|(_, file)| 512 * file.blocks()).sum();
-        others.then(|| promised.saturating_sub(taken))
+        others.then(|| reserved.saturating_sub(taken))
     };
     Ok(files.iter().filter_map(outstanding).sum())
 }

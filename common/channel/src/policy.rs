@@ -43,7 +43,7 @@ use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 use super::domain::Domain;
 use super::error::{ChannelError, PeerError};
 use super::memory;
-use super::service::{Entry, Held, claim, service_name};
+use super::service::{HeldService, OpenMode, claim, service_name};
 
 const CHANNEL: &str = "policy";
 
@@ -79,7 +79,7 @@ pub struct PolicyPublisher {
 #[derive(Debug)]
 pub struct PolicyReader {
     subscriber: Subscriber<ipc::Service, [f32], PolicyHeader>,
-    current: Option<Rc<Policy>>,
+    current: Option<Rc<PublishedPolicy>>,
     fingerprint: u64,
     parameters: usize,
 }
@@ -87,7 +87,7 @@ pub struct PolicyReader {
 /// A policy in the learner's memory. It stays valid and unchanged until this is dropped, even after the learner has
 /// ended.
 #[derive(Debug)]
-pub struct Policy {
+pub struct PublishedPolicy {
     sample: Sample<ipc::Service, [f32], PolicyHeader>,
 }
 
@@ -99,7 +99,7 @@ impl PolicyPublisher {
     pub fn open(domain: &Domain, parameters: usize) -> Result<Self, ChannelError> {
         let samples = samples(domain.max_actors());
         let publisher = claim(|| {
-            service(domain, Entry::Open)?
+            service(domain, OpenMode::Open)?
                 .publisher_builder()
                 .initial_max_slice_len(parameters)
                 .max_loaned_samples(1)
@@ -144,7 +144,7 @@ impl PolicyReader {
     /// When shared memory is unavailable.
     pub fn open(domain: &Domain, fingerprint: u64, parameters: usize) -> Result<Self, ChannelError> {
         let subscriber = claim(|| {
-            service(domain, Entry::Open)?
+            service(domain, OpenMode::Open)?
                 .subscriber_builder()
                 .create()
                 .map_err(|cause| ChannelError::new(CHANNEL, "read", cause))
@@ -162,7 +162,7 @@ impl PolicyReader {
     ///
     /// # Errors
     /// When the learner's memory cannot be mapped, or its policy has another layout.
-    pub fn latest(&mut self) -> Result<Option<Rc<Policy>>, ChannelError> {
+    pub fn latest(&mut self) -> Result<Option<Rc<PublishedPolicy>>, ChannelError> {
         while let Some(sample) = self
             .subscriber
             .receive()
@@ -171,13 +171,13 @@ impl PolicyReader {
             if sample.user_header().fingerprint != self.fingerprint || sample.payload().len() != self.parameters {
                 return Err(ChannelError::new(CHANNEL, "read", PeerError::PolicyLayout));
             }
-            self.current = Some(Rc::new(Policy { sample }));
+            self.current = Some(Rc::new(PublishedPolicy { sample }));
         }
         Ok(self.current.clone())
     }
 }
 
-impl Policy {
+impl PublishedPolicy {
     /// The policy's header.
     pub fn header(&self) -> &PolicyHeader {
         self.sample.user_header()
@@ -215,16 +215,16 @@ fn samples(max_actors: usize) -> usize {
 }
 
 /// Creates the service.
-pub(super) fn create(domain: &Domain) -> Result<Held, ChannelError> {
-    let service = service(domain, Entry::Create)?;
-    Ok(Held::new(move |visit| {
+pub(super) fn create(domain: &Domain) -> Result<HeldService, ChannelError> {
+    let service = service(domain, OpenMode::Create)?;
+    Ok(HeldService::new(move |visit| {
         let ports = service.dynamic_config();
         ports.list_publishers(|port| visit(port.node_id, port.publisher_id.value()));
         ports.list_subscribers(|port| visit(port.node_id, port.subscriber_id.value()));
     }))
 }
 
-fn service(domain: &Domain, entry: Entry) -> Result<PortFactory<ipc::Service, [f32], PolicyHeader>, ChannelError> {
+fn service(domain: &Domain, mode: OpenMode) -> Result<PortFactory<ipc::Service, [f32], PolicyHeader>, ChannelError> {
     let builder = domain
         .node()
         .service_builder(&service_name(domain, CHANNEL)?)
@@ -237,7 +237,7 @@ fn service(domain: &Domain, entry: Entry) -> Result<PortFactory<ipc::Service, [f
         .history_size(1)
         .subscriber_max_buffer_size(BUFFER)
         .subscriber_max_borrowed_samples(BORROWED);
-    entry.service(CHANNEL, builder, |b| b.create(), |b| b.open())
+    mode.service(CHANNEL, builder, |b| b.create(), |b| b.open())
 }
 
 #[cfg(test)]

@@ -14,7 +14,7 @@ use shoal_base::report::{EpisodeReport, EvaluatedReport, EvaluationReport, Heart
 use super::domain::Domain;
 use super::error::ChannelError;
 use super::memory;
-use super::service::{Entry, Held, claim, service_name};
+use super::service::{HeldService, OpenMode, claim, service_name};
 
 /// Reports that a reader holds at the same time: each is copied and released.
 const BORROWED: usize = 1;
@@ -178,7 +178,7 @@ impl<R: Report> Receiver<R> for Subscriber<ipc::Service, R, ()> {
 
 fn publisher<R: Report>(domain: &Domain) -> Result<Publisher<ipc::Service, R, ()>, ChannelError> {
     claim(|| {
-        service::<R>(domain, Entry::Open)?
+        service::<R>(domain, OpenMode::Open)?
             .publisher_builder()
             .max_loaned_samples(LOANED)
             .create()
@@ -188,7 +188,7 @@ fn publisher<R: Report>(domain: &Domain) -> Result<Publisher<ipc::Service, R, ()
 
 fn subscriber<R: Report>(domain: &Domain) -> Result<Subscriber<ipc::Service, R, ()>, ChannelError> {
     claim(|| {
-        service::<R>(domain, Entry::Open)?
+        service::<R>(domain, OpenMode::Open)?
             .subscriber_builder()
             .create()
             .map_err(|cause| ChannelError::new(R::CHANNEL, "read", cause))
@@ -209,16 +209,16 @@ fn participants(max_actors: usize) -> usize {
 }
 
 /// Creates the service of reports of kind `R`.
-pub(super) fn create<R: Report>(domain: &Domain) -> Result<Held, ChannelError> {
-    let service = service::<R>(domain, Entry::Create)?;
-    Ok(Held::new(move |visit| {
+pub(super) fn create<R: Report>(domain: &Domain) -> Result<HeldService, ChannelError> {
+    let service = service::<R>(domain, OpenMode::Create)?;
+    Ok(HeldService::new(move |visit| {
         let ports = service.dynamic_config();
         ports.list_publishers(|port| visit(port.node_id, port.publisher_id.value()));
         ports.list_subscribers(|port| visit(port.node_id, port.subscriber_id.value()));
     }))
 }
 
-fn service<R: Report>(domain: &Domain, entry: Entry) -> Result<PortFactory<ipc::Service, R, ()>, ChannelError> {
+fn service<R: Report>(domain: &Domain, mode: OpenMode) -> Result<PortFactory<ipc::Service, R, ()>, ChannelError> {
     let participants = participants(domain.max_actors());
     let builder = domain
         .node()
@@ -231,5 +231,5 @@ fn service<R: Report>(domain: &Domain, entry: Entry) -> Result<PortFactory<ipc::
         .history_size(R::HISTORY)
         .subscriber_max_buffer_size(R::BUFFER)
         .subscriber_max_borrowed_samples(BORROWED);
-    entry.service(R::CHANNEL, builder, |b| b.create(), |b| b.open())
+    mode.service(R::CHANNEL, builder, |b| b.create(), |b| b.open())
 }

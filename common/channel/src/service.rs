@@ -11,14 +11,14 @@ use super::error::{Cause, ChannelError};
 
 /// Whether a process creates or opens a service.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Entry {
+pub(super) enum OpenMode {
     /// Creates it. Only the run's launcher does this, through [`Services`](super::Services).
     Create,
     /// Opens it. It exists before a process that opens it is started.
     Open,
 }
 
-impl Entry {
+impl OpenMode {
     /// Creates or opens the service that `builder` describes. The two methods are passed as arguments, because
     /// iceoryx2's builders have no trait in common.
     pub(super) fn service<B, S, C: Cause, O: Cause>(
@@ -63,11 +63,11 @@ pub(super) fn claim<T>(mut attempt: impl FnMut() -> Result<T, ChannelError>) -> 
 pub(super) type VisitPort<'a> = &'a mut dyn FnMut(UniqueNodeId, u128) -> CallbackProgression;
 
 /// A service that this process keeps open, whatever its payload.
-pub(super) struct Held {
+pub(super) struct HeldService {
     list_ports: Box<dyn Fn(VisitPort<'_>)>,
 }
 
-impl Held {
+impl HeldService {
     /// Keeps the service open that `list_ports` owns. `list_ports` must visit its ports.
     pub(super) fn new(list_ports: impl Fn(VisitPort<'_>) + 'static) -> Self {
         Self {
@@ -81,9 +81,9 @@ impl Held {
     }
 }
 
-impl fmt::Debug for Held {
+impl fmt::Debug for HeldService {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Held").finish_non_exhaustive()
+        f.debug_struct("HeldService").finish_non_exhaustive()
     }
 }
 
@@ -110,11 +110,11 @@ mod tests {
     /// A service for numbers of type `T`, with at most one publisher.
     fn service<T: fmt::Debug + ZeroCopySend>(
         domain: &Domain,
-        entry: Entry,
+        mode: OpenMode,
     ) -> Result<PortFactory<ipc::Service, T, ()>, ChannelError> {
         let builder = domain.node().service_builder(&service_name(domain, CHANNEL)?);
         let builder = builder.publish_subscribe::<T>().max_publishers(1);
-        entry.service(CHANNEL, builder, |b| b.create(), |b| b.open())
+        mode.service(CHANNEL, builder, |b| b.create(), |b| b.open())
     }
 
     fn publisher(service: &Numbers) -> Result<Publisher<ipc::Service, u64, ()>, ChannelError> {
@@ -125,7 +125,7 @@ mod tests {
     #[test]
     fn a_port_can_be_claimed_after_its_dead_owner_is_cleaned_up() {
         let domain = domain("ca");
-        let held = service(&domain, Entry::Create).unwrap();
+        let held = service(&domain, OpenMode::Create).unwrap();
         let mut predecessor = Some(publisher(&held).unwrap());
         assert_eq!(publisher(&held).unwrap_err().kind, ChannelErrorKind::Occupied);
         let mut attempts = 0;
@@ -134,7 +134,7 @@ mod tests {
             if attempts == 3 {
                 predecessor = None;
             }
-            publisher(&service(&domain, Entry::Open)?)
+            publisher(&service(&domain, OpenMode::Open)?)
         });
         assert!(claimed.is_ok(), "{claimed:?}");
         assert_eq!(attempts, 3);
@@ -145,7 +145,7 @@ mod tests {
     #[test]
     fn opening_a_half_made_service_is_retried() {
         let domain = domain("cb");
-        let held = service::<u64>(&domain, Entry::Create).unwrap();
+        let held = service::<u64>(&domain, OpenMode::Create).unwrap();
         let services = domain.directory().unwrap().join("services");
         let files = std::fs::read_dir(services).unwrap().map(|entry| entry.unwrap().path());
         let [file]: [PathBuf; 1] = files.collect::<Vec<_>>().try_into().unwrap();
@@ -155,11 +155,11 @@ mod tests {
         options.write(true).create_new(true).mode(0o600).open(&file).unwrap();
         let (mut failures, mut made) = (Vec::new(), None);
         let claimed = claim(|| {
-            let attempt = service::<u64>(&domain, Entry::Open);
+            let attempt = service::<u64>(&domain, OpenMode::Open);
             if let Err(error) = &attempt {
                 failures.push(error.kind);
                 std::fs::remove_file(&file).unwrap();
-                made = Some(service::<u64>(&domain, Entry::Create).unwrap());
+                made = Some(service::<u64>(&domain, OpenMode::Create).unwrap());
             }
             attempt
         });
@@ -182,15 +182,15 @@ mod tests {
             assert!(begun.elapsed() < CLAIM_PATIENCE);
             error.unwrap_err()
         };
-        let missing = claimed(&|| service::<u64>(&domain, Entry::Open).map(drop));
+        let missing = claimed(&|| service::<u64>(&domain, OpenMode::Open).map(drop));
         assert_eq!(missing.kind, ChannelErrorKind::Missing);
         assert_eq!(
             missing.to_string(),
             "channel test: cannot open: it does not exist; has the launcher ended? \
              (PublishSubscribeOpenError::DoesNotExist)"
         );
-        let held = service::<u64>(&domain, Entry::Create).unwrap();
-        let incompatible = claimed(&|| service::<u8>(&domain, Entry::Open).map(drop));
+        let held = service::<u64>(&domain, OpenMode::Create).unwrap();
+        let incompatible = claimed(&|| service::<u8>(&domain, OpenMode::Open).map(drop));
         assert_eq!(incompatible.kind, ChannelErrorKind::Incompatible);
         let refused = claimed(&|| Err(ChannelError::new(CHANNEL, "ask", PeerError::Refused)));
         assert_eq!(

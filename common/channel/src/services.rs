@@ -15,14 +15,14 @@ use super::domain::{Domain, DomainError, io_error};
 use super::error::ChannelError;
 use super::event::EventName;
 use super::files::prefix;
-use super::service::Held;
+use super::service::HeldService;
 use super::{control, environment, event, policy, reports, transitions};
 
 /// The services of a run that this process has created. A service is removed when this is dropped and no other process
 /// has it open.
 #[derive(Debug)]
 pub struct Services {
-    held: Vec<Held>,
+    held: Vec<HeldService>,
     _sweeper: Sweeper,
 }
 

@@ -27,8 +27,8 @@ use super::domain::Domain;
 use super::error::{ChannelError, PeerError};
 use super::event::{Listener, wait_for};
 use super::memory;
-use super::service::{Entry, Held, claim, service_name};
-use crate::commit::{ChunkMark, CommitReader};
+use super::service::{HeldService, OpenMode, claim, service_name};
+use crate::commit::{ChunkId, CommitReader};
 
 /// Chunks that the learner holds at the same time.
 const BORROWED: usize = 2;
@@ -71,7 +71,7 @@ pub struct ChunkSender {
 #[derive(Debug)]
 pub struct Handshake(ChunkSender);
 
-/// The end of the process that passes on what an actor of another host has sent. It is to the learner what the actor
+/// The end of the process that forwards what an actor of another host has sent. It is to the learner what the actor
 /// would be: its headers are the actor's own, and its history is the actor's.
 #[derive(Debug)]
 pub struct ChunkForwarder {
@@ -148,7 +148,7 @@ impl ChunkSender {
     ) -> Result<Handshake, ChannelError> {
         let channel = name(actor);
         let (service, publisher) = claim(|| {
-            let service = service(domain, &channel, window, Entry::Open)?;
+            let service = service(domain, &channel, window, OpenMode::Open)?;
             let publisher = publisher(&service, &channel, &layout)?;
             Ok((service, publisher))
         })?;
@@ -170,8 +170,8 @@ impl ChunkSender {
         self.sent
     }
 
-    /// Chunks sent but not committed. `committed` is the newest mark of this actor in the replay.
-    pub fn in_flight(&self, committed: ChunkMark) -> u64 {
+    /// Chunks sent but not committed. `committed` is the id of this actor's last chunk in the replay.
+    pub fn in_flight(&self, committed: ChunkId) -> u64 {
         self.sent.saturating_sub(committed.sequence)
     }
 
@@ -247,7 +247,7 @@ impl ChunkForwarder {
         window: u32,
     ) -> Result<Option<Self>, ChannelError> {
         let channel = name(actor);
-        let opened = service(domain, &channel, window, Entry::Open);
+        let opened = service(domain, &channel, window, OpenMode::Open);
         match opened.and_then(|service| publisher(&service, &channel, &layout)) {
             Ok(publisher) => Ok(Some(Self {
                 publisher,
@@ -356,7 +356,7 @@ impl ChunkReceiver {
     pub fn open(domain: &Domain, actor: u32, layout: ChunkLayout, window: u32) -> Result<Self, ChannelError> {
         let channel = name(actor);
         let subscriber = claim(|| {
-            service(domain, &channel, window, Entry::Open)?
+            service(domain, &channel, window, OpenMode::Open)?
                 .subscriber_builder()
                 .buffer_size(buffer(window))
                 .create()
@@ -397,13 +397,13 @@ impl ReceivedChunk {
         self.sample.user_header()
     }
 
-    /// The chunk's mark. `committed` is the newest committed mark of its actor: a handshake keeps its sequence number,
-    /// and only announces the new incarnation.
-    pub fn mark(&self, committed: ChunkMark) -> ChunkMark {
+    /// The chunk's id. `committed` is the id of the last committed chunk of its actor: a handshake keeps its sequence
+    /// number, and only announces the new incarnation.
+    pub fn id(&self, committed: ChunkId) -> ChunkId {
         let ChunkHeader {
             incarnation, sequence, ..
         } = *self.header();
-        ChunkMark {
+        ChunkId {
             incarnation,
             sequence: if self.is_handshake() {
                 committed.sequence
@@ -454,9 +454,9 @@ fn buffer(window: u32) -> usize {
 }
 
 /// Creates the service for the chunks of `actor`, of which at most `window` may be uncommitted.
-pub(super) fn create(domain: &Domain, actor: u32, window: u32) -> Result<Held, ChannelError> {
-    let service = service(domain, &name(actor), window, Entry::Create)?;
-    Ok(Held::new(move |visit| {
+pub(super) fn create(domain: &Domain, actor: u32, window: u32) -> Result<HeldService, ChannelError> {
+    let service = service(domain, &name(actor), window, OpenMode::Create)?;
+    Ok(HeldService::new(move |visit| {
         let ports = service.dynamic_config();
         ports.list_publishers(|port| visit(port.node_id, port.publisher_id.value()));
         ports.list_subscribers(|port| visit(port.node_id, port.subscriber_id.value()));
@@ -478,7 +478,7 @@ fn publisher(
 
 type ChunkService = PortFactory<ipc::Service, [f32], ChunkHeader>;
 
-fn service(domain: &Domain, channel: &str, window: u32, entry: Entry) -> Result<ChunkService, ChannelError> {
+fn service(domain: &Domain, channel: &str, window: u32, mode: OpenMode) -> Result<ChunkService, ChannelError> {
     let builder = domain
         .node()
         .service_builder(&service_name(domain, channel)?)
@@ -491,5 +491,5 @@ fn service(domain: &Domain, channel: &str, window: u32, entry: Entry) -> Result<
         .history_size(window as usize)
         .subscriber_max_buffer_size(buffer(window))
         .subscriber_max_borrowed_samples(BORROWED);
-    entry.service(channel, builder, |b| b.create(), |b| b.open())
+    mode.service(channel, builder, |b| b.create(), |b| b.open())
 }

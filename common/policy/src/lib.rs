@@ -39,19 +39,19 @@ pub enum PolicyError {
     Action(#[from] ActionRangeError),
     /// A score for every action needs discrete actions.
     #[error("{algorithm} needs a discrete action space, but these actions are real-valued (a box)")]
-    CountedActions {
+    DiscreteActionsRequired {
         /// The algorithm.
         algorithm: &'static str,
     },
     /// A table needs discrete observations.
     #[error("{algorithm} needs a discrete observation space, but these observations are real-valued (a box)")]
-    CountedStates {
+    DiscreteStatesRequired {
         /// The algorithm.
         algorithm: &'static str,
     },
     /// A network needs real-valued observations: it would use an index as a quantity.
     #[error("{algorithm} needs real-valued observations (a box), but these are indices of {n} states")]
-    RealStates {
+    RealStatesRequired {
         /// The algorithm.
         algorithm: &'static str,
         /// Number of states.
@@ -149,7 +149,7 @@ impl Policy {
             Self::Scored(scores) => {
                 let all_scores = scores.of(parameters, observations);
                 for (action, scores) in actions.iter_mut().zip(all_scores) {
-                    *action = highest(scores) as f32;
+                    *action = argmax(scores) as f32;
                 }
             }
         }
@@ -228,7 +228,7 @@ pub fn action_values(
 /// When they are indices.
 pub fn check_real_observations(algorithm: &'static str, spec: &EnvironmentSpec) -> Result<(), PolicyError> {
     match spec.observation {
-        Space::Discrete { n, .. } => Err(PolicyError::RealStates { algorithm, n }),
+        Space::Discrete { n, .. } => Err(PolicyError::RealStatesRequired { algorithm, n }),
         Space::Box { .. } => Ok(()),
     }
 }
@@ -242,19 +242,19 @@ pub fn table(algorithm: &'static str, spec: &EnvironmentSpec, batch: usize) -> R
     let actions = counted_actions(algorithm, spec)?;
     match spec.observation {
         Space::Discrete { n, .. } => Ok(Scores::table(n as usize, actions, batch)),
-        Space::Box { .. } => Err(PolicyError::CountedStates { algorithm }),
+        Space::Box { .. } => Err(PolicyError::DiscreteStatesRequired { algorithm }),
     }
 }
 
 fn counted_actions(algorithm: &'static str, spec: &EnvironmentSpec) -> Result<usize, PolicyError> {
     match spec.action {
         Space::Discrete { n, .. } => Ok(n as usize),
-        Space::Box { .. } => Err(PolicyError::CountedActions { algorithm }),
+        Space::Box { .. } => Err(PolicyError::DiscreteActionsRequired { algorithm }),
     }
 }
 
 /// The index of the highest score; the first one of equal scores. A NaN is never higher than another score.
-pub fn highest(scores: &[f32]) -> usize {
+pub fn argmax(scores: &[f32]) -> usize {
     let mut best = 0;
     for (index, score) in scores.iter().enumerate() {
         if *score > scores[best] {

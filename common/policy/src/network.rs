@@ -11,7 +11,7 @@
 //! A critic has *action inputs* besides its inputs, the observation; a policy has none. They enter at one layer, as the
 //! last columns of its W. For DDPG that is the second hidden layer (thesis, section 4.3.1), or the only one: at the
 //! output layer a critic would be linear in the action, and the best action would be the same in every state. For the
-//! other methods it is the first layer: the network's input is (s, a).
+//! other algorithms it is the first layer: the network's input is (s, a).
 //!
 //! A batch of vectors is a column-major matrix, one vector after the other.
 

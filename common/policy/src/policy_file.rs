@@ -3,11 +3,11 @@
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-use shoal_base::durable::{self, Kind, SealError};
+use shoal_base::durable::{self, FileKind, SealError};
 
 use crate::PolicyLayout;
 
-const KIND: Kind = Kind {
+const KIND: FileKind = FileKind {
     magic: *b"SHOALPOL",
     version: 1,
     name: "a policy file",

@@ -6,13 +6,13 @@ use crate::network::{Network, NetworkLayout};
 /// Computes a score for every action, for a batch of observations.
 #[derive(Clone, Debug)]
 pub struct Scores {
-    source: Source,
+    function: ScoreFunction,
     actions: usize,
     scores: Vec<f32>,
 }
 
 #[derive(Clone, Debug)]
-enum Source {
+enum ScoreFunction {
     /// The logits of a softmax policy.
     Logits(Network),
     /// Action-values.
@@ -26,27 +26,27 @@ enum Source {
 impl Scores {
     /// The logits of a softmax policy, for at most `batch` observations a call.
     pub(super) fn softmax(network: NetworkLayout, batch: usize) -> Self {
-        Self::of_network(Source::Logits(Network::new(network, batch)), network, batch)
+        Self::of_network(ScoreFunction::Logits(Network::new(network, batch)), network, batch)
     }
 
     /// The action-values that a network computes, for at most `batch` observations a call.
     pub(super) fn values(network: NetworkLayout, batch: usize) -> Self {
-        Self::of_network(Source::Values(Network::new(network, batch)), network, batch)
+        Self::of_network(ScoreFunction::Values(Network::new(network, batch)), network, batch)
     }
 
     /// The action-values of a dueling network, whose outputs are V(s) and the advantages, for at most `batch`
     /// observations a call.
     pub(super) fn dueling(network: NetworkLayout, batch: usize) -> Self {
-        let scores = Self::of_network(Source::Dueling(Network::new(network, batch)), network, batch);
+        let scores = Self::of_network(ScoreFunction::Dueling(Network::new(network, batch)), network, batch);
         Self {
             actions: network.outputs() - 1,
             ..scores
         }
     }
 
-    fn of_network(source: Source, network: NetworkLayout, batch: usize) -> Self {
+    fn of_network(function: ScoreFunction, network: NetworkLayout, batch: usize) -> Self {
         Self {
-            source,
+            function,
             actions: network.outputs(),
             scores: vec![0.0; network.outputs() * batch],
         }
@@ -55,7 +55,7 @@ impl Scores {
     /// The rows of a table of action-values, for at most `batch` observations a call.
     pub(super) fn table(states: usize, actions: usize, batch: usize) -> Self {
         Self {
-            source: Source::Table { states },
+            function: ScoreFunction::Table { states },
             actions,
             scores: vec![0.0; actions * batch],
         }
@@ -63,22 +63,22 @@ impl Scores {
 
     /// The same scores, of normalised observations or not. A table has no observations that could be.
     pub fn normalising(self, normalised: bool) -> Self {
-        let source = match self.source {
-            Source::Logits(network) => Source::Logits(network.normalising(normalised)),
-            Source::Values(network) => Source::Values(network.normalising(normalised)),
-            Source::Dueling(network) => Source::Dueling(network.normalising(normalised)),
-            table @ Source::Table { .. } => table,
+        let function = match self.function {
+            ScoreFunction::Logits(network) => ScoreFunction::Logits(network.normalising(normalised)),
+            ScoreFunction::Values(network) => ScoreFunction::Values(network.normalising(normalised)),
+            ScoreFunction::Dueling(network) => ScoreFunction::Dueling(network.normalising(normalised)),
+            table @ ScoreFunction::Table { .. } => table,
         };
-        Self { source, ..self }
+        Self { function, ..self }
     }
 
     /// The layout of the parameters of [`of`](Self::of).
     pub fn layout(&self) -> PolicyLayout {
-        match &self.source {
-            Source::Logits(network) => PolicyLayout::Softmax(*network.layout()),
-            Source::Values(network) => PolicyLayout::ActionValues(*network.layout()),
-            Source::Dueling(network) => PolicyLayout::Dueling(*network.layout()),
-            Source::Table { states } => PolicyLayout::Table {
+        match &self.function {
+            ScoreFunction::Logits(network) => PolicyLayout::Softmax(*network.layout()),
+            ScoreFunction::Values(network) => PolicyLayout::ActionValues(*network.layout()),
+            ScoreFunction::Dueling(network) => PolicyLayout::Dueling(*network.layout()),
+            ScoreFunction::Table { states } => PolicyLayout::Table {
                 states: *states,
                 actions: self.actions,
             },
@@ -97,8 +97,8 @@ impl Scores {
     /// If the slices do not match the layout, or have more observations than the batch.
     pub fn of(&mut self, parameters: &[f32], observations: &[f32]) -> impl Iterator<Item = &[f32]> {
         let actions = self.actions;
-        let (batch, outputs) = match &mut self.source {
-            Source::Logits(network) | Source::Values(network) | Source::Dueling(network) => {
+        let (batch, outputs) = match &mut self.function {
+            ScoreFunction::Logits(network) | ScoreFunction::Values(network) | ScoreFunction::Dueling(network) => {
                 let (batch, outputs) = (
                     observations.len() / network.layout().inputs(),
                     network.layout().outputs(),
@@ -106,7 +106,7 @@ impl Scores {
                 network.forward(parameters, observations, &mut self.scores[..outputs * batch]);
                 (batch, outputs)
             }
-            Source::Table { states } => {
+            ScoreFunction::Table { states } => {
                 for (scores, state) in self.scores.chunks_exact_mut(actions).zip(observations) {
                     let state = (*state as usize).min(*states - 1);
                     scores.copy_from_slice(&parameters[state * actions..][..actions]);
@@ -114,7 +114,7 @@ impl Scores {
                 (observations.len(), actions)
             }
         };
-        if let Source::Dueling(_) = self.source {
+        if let ScoreFunction::Dueling(_) = self.function {
             self.scores[..outputs * batch]
                 .chunks_exact_mut(outputs)
                 .for_each(combine_heads);

@@ -16,12 +16,12 @@ pub struct AlgorithmSpec {
     /// Whether it can learn from transitions of older policies. If not, it runs in lockstep only.
     pub off_policy: bool,
     /// How it uses transitions.
-    pub experience: Experience,
+    pub transition_use: TransitionUse,
 }
 
 /// How an algorithm uses the transitions that it learns from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Experience {
+pub enum TransitionUse {
     /// In minibatches drawn at random from the replay, each transition many times.
     Minibatches,
     /// Each transition once, in order.
@@ -41,7 +41,7 @@ pub trait AlgorithmSettings {
     fn behaviour(&self, name: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError>;
 
     /// The networks or tables that it learns in an environment like `spec`.
-    fn learned(&self, spec: &EnvironmentSpec) -> Learned;
+    fn learned(&self, spec: &EnvironmentSpec) -> LearnedShapes;
 
     /// Transitions in a minibatch; 1 if it does not learn from minibatches.
     fn batch(&self) -> usize;
@@ -58,9 +58,9 @@ pub struct ActorCritic {
 
 impl ActorCritic {
     /// The actor and two critics.
-    pub(super) fn with_twin_critics(self) -> Learned {
+    pub(super) fn with_twin_critics(self) -> LearnedShapes {
         let critic = Shape::Network(self.critic);
-        Learned {
+        LearnedShapes {
             policy: ("actor", Shape::Network(self.actor)),
             others: vec![("critic 1", critic), ("critic 2", critic)],
         }
@@ -70,14 +70,14 @@ impl ActorCritic {
 /// The networks or tables that an algorithm learns, each with a name. Target networks and the state of the optimiser
 /// are not included.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Learned {
+pub struct LearnedShapes {
     /// The policy.
     pub policy: (&'static str, Shape),
     /// All other networks or tables.
     pub others: Vec<(&'static str, Shape)>,
 }
 
-impl Learned {
+impl LearnedShapes {
     /// All of them, the policy first.
     pub fn iter(&self) -> impl Iterator<Item = (&'static str, Shape)> {
         std::iter::once(self.policy).chain(self.others.iter().copied())

@@ -6,7 +6,7 @@ use shoal_base::space::EnvironmentSpec;
 use shoal_policy::PolicyError;
 use shoal_policy::network::{Activation, Hidden, Layers, NetworkLayout};
 
-use super::algorithm::{ActorCritic, AlgorithmSettings, AlgorithmSpec, Experience, Learned, Shape};
+use super::algorithm::{ActorCritic, AlgorithmSettings, AlgorithmSpec, LearnedShapes, Shape, TransitionUse};
 use super::behaviour::Behaviour;
 use super::exploration::ExplorationConfig;
 
@@ -14,7 +14,7 @@ use super::exploration::ExplorationConfig;
 pub(super) const SPEC: AlgorithmSpec = AlgorithmSpec {
     name: "ddpg",
     off_policy: true,
-    experience: Experience::Minibatches,
+    transition_use: TransitionUse::Minibatches,
 };
 
 section! {
@@ -64,9 +64,9 @@ impl AlgorithmSettings for DdpgConfig {
         Ok(Behaviour::Noise(policy, self.exploration.clone()))
     }
 
-    fn learned(&self, spec: &EnvironmentSpec) -> Learned {
+    fn learned(&self, spec: &EnvironmentSpec) -> LearnedShapes {
         let ActorCritic { actor, critic } = self.networks(spec);
-        Learned {
+        LearnedShapes {
             policy: ("actor", Shape::Network(actor)),
             others: vec![("critic", Shape::Network(critic))],
         }

@@ -6,14 +6,14 @@ use shoal_base::space::EnvironmentSpec;
 use shoal_policy::PolicyError;
 use shoal_policy::network::{Activation, Hidden, Layers, NetworkLayout};
 
-use super::algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Learned, Shape};
+use super::algorithm::{AlgorithmSettings, AlgorithmSpec, LearnedShapes, Shape, TransitionUse};
 use super::behaviour::{Behaviour, Epsilon};
 
 /// DQN.
 pub(super) const SPEC: AlgorithmSpec = AlgorithmSpec {
     name: "dqn",
     off_policy: true,
-    experience: Experience::Minibatches,
+    transition_use: TransitionUse::Minibatches,
 };
 
 section! {
@@ -76,8 +76,8 @@ impl AlgorithmSettings for DqnConfig {
         Ok(Behaviour::EpsilonGreedy(values, epsilon))
     }
 
-    fn learned(&self, spec: &EnvironmentSpec) -> Learned {
-        Learned {
+    fn learned(&self, spec: &EnvironmentSpec) -> LearnedShapes {
+        LearnedShapes {
             policy: ("action-values", Shape::Network(self.network(spec))),
             others: Vec::new(),
         }

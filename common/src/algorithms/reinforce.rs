@@ -8,14 +8,14 @@ use shoal_base::space::EnvironmentSpec;
 use shoal_policy::PolicyError;
 use shoal_policy::network::{Activation, Hidden, Layers, NetworkLayout};
 
-use super::algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Learned, Shape};
+use super::algorithm::{AlgorithmSettings, AlgorithmSpec, LearnedShapes, Shape, TransitionUse};
 use super::behaviour::Behaviour;
 
 /// REINFORCE.
 pub(super) const SPEC: AlgorithmSpec = AlgorithmSpec {
     name: "reinforce",
     off_policy: false,
-    experience: Experience::Episodes,
+    transition_use: TransitionUse::Episodes,
 };
 
 section! {
@@ -32,7 +32,7 @@ section! {
         /// Adam's step size for the policy, α.
         learning_rate: f64 = 0.01, bounds: from(0.0, 1.0), unit: "–", source: "section 4.2.1", change: Change::Learning;
         /// What a step's ∇ ln π is multiplied by.
-        weight: Weight = Weight::Normalised, unit: "–", source: "section 4.2.2",
+        weight: ReturnWeighting = ReturnWeighting::Normalised, unit: "–", source: "section 4.2.2",
             change: never("a baseline is a network of its own");
         /// Whether the product is also multiplied by γᵗ, as in line 6 of Algorithm 3.
         discount_steps: bool = false, unit: "–", source: "Algorithm 3", change: Change::Learning;
@@ -50,7 +50,7 @@ section! {
 /// What a step's ∇ ln π is multiplied by.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
-pub enum Weight {
+pub enum ReturnWeighting {
     /// The return G.
     Return,
     /// G minus its mean over the episode, divided by its standard deviation.
@@ -77,7 +77,7 @@ impl ReinforceConfig {
         };
         ReinforceNetworks {
             policy: network(self.hidden, spec.action.size()),
-            baseline: (self.weight == Weight::Baseline).then(|| network(self.baseline_hidden, 1)),
+            baseline: (self.weight == ReturnWeighting::Baseline).then(|| network(self.baseline_hidden, 1)),
         }
     }
 }
@@ -88,10 +88,10 @@ impl AlgorithmSettings for ReinforceConfig {
         Ok(Behaviour::Sample(policy))
     }
 
-    fn learned(&self, spec: &EnvironmentSpec) -> Learned {
+    fn learned(&self, spec: &EnvironmentSpec) -> LearnedShapes {
         let ReinforceNetworks { policy, baseline } = self.networks(spec);
         let baseline = baseline.map(|network| ("baseline", Shape::Network(network)));
-        Learned {
+        LearnedShapes {
             policy: ("policy", Shape::Network(policy)),
             others: baseline.into_iter().collect(),
         }

@@ -6,14 +6,14 @@ use shoal_base::space::EnvironmentSpec;
 use shoal_policy::PolicyError;
 use shoal_policy::network::{Activation, Hidden, Layers, NetworkLayout};
 
-use super::algorithm::{ActorCritic, AlgorithmSettings, AlgorithmSpec, Experience, Learned};
+use super::algorithm::{ActorCritic, AlgorithmSettings, AlgorithmSpec, LearnedShapes, TransitionUse};
 use super::behaviour::Behaviour;
 
 /// SAC.
 pub(super) const SPEC: AlgorithmSpec = AlgorithmSpec {
     name: "sac",
     off_policy: true,
-    experience: Experience::Minibatches,
+    transition_use: TransitionUse::Minibatches,
 };
 
 section! {
@@ -69,7 +69,7 @@ impl AlgorithmSettings for SacConfig {
         Ok(Behaviour::Gaussian(policy))
     }
 
-    fn learned(&self, spec: &EnvironmentSpec) -> Learned {
+    fn learned(&self, spec: &EnvironmentSpec) -> LearnedShapes {
         self.networks(spec).with_twin_critics()
     }
 

@@ -5,21 +5,21 @@ use shoal_base::section::{Change, EXPLORATION, from, never};
 use shoal_base::space::EnvironmentSpec;
 use shoal_policy::PolicyError;
 
-use super::algorithm::{AlgorithmSettings, AlgorithmSpec, Experience, Learned, Shape};
+use super::algorithm::{AlgorithmSettings, AlgorithmSpec, LearnedShapes, Shape, TransitionUse};
 use super::behaviour::{Behaviour, Epsilon};
 
 /// Q-learning.
 pub(super) const Q_LEARNING: AlgorithmSpec = AlgorithmSpec {
     name: "q-learning",
     off_policy: true,
-    experience: Experience::Transitions,
+    transition_use: TransitionUse::Transitions,
 };
 
 /// SARSA.
 pub(super) const SARSA: AlgorithmSpec = AlgorithmSpec {
     name: "sarsa",
     off_policy: false,
-    experience: Experience::Transitions,
+    transition_use: TransitionUse::Transitions,
 };
 
 section! {
@@ -42,9 +42,9 @@ impl AlgorithmSettings for TabularConfig {
         Ok(Behaviour::EpsilonGreedy(values, Epsilon::constant(self.epsilon)))
     }
 
-    fn learned(&self, spec: &EnvironmentSpec) -> Learned {
+    fn learned(&self, spec: &EnvironmentSpec) -> LearnedShapes {
         let (states, actions) = (spec.observation.size(), spec.action.size());
-        Learned {
+        LearnedShapes {
             policy: ("action-values", Shape::Table { states, actions }),
             others: Vec::new(),
         }

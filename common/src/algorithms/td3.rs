@@ -6,7 +6,7 @@ use shoal_base::space::EnvironmentSpec;
 use shoal_policy::PolicyError;
 use shoal_policy::network::{Activation, Hidden, Layers, NetworkLayout};
 
-use super::algorithm::{ActorCritic, AlgorithmSettings, AlgorithmSpec, Experience, Learned};
+use super::algorithm::{ActorCritic, AlgorithmSettings, AlgorithmSpec, LearnedShapes, TransitionUse};
 use super::behaviour::Behaviour;
 use super::exploration::{ExplorationConfig, Warmup};
 
@@ -14,7 +14,7 @@ use super::exploration::{ExplorationConfig, Warmup};
 pub(super) const SPEC: AlgorithmSpec = AlgorithmSpec {
     name: "td3",
     off_policy: true,
-    experience: Experience::Minibatches,
+    transition_use: TransitionUse::Minibatches,
 };
 
 section! {
@@ -80,7 +80,7 @@ impl AlgorithmSettings for Td3Config {
         Ok(Behaviour::Noise(policy, noise))
     }
 
-    fn learned(&self, spec: &EnvironmentSpec) -> Learned {
+    fn learned(&self, spec: &EnvironmentSpec) -> LearnedShapes {
         self.networks(spec).with_twin_critics()
     }
 

@@ -8,7 +8,8 @@ section! {
     pub struct CheckpointConfig {
         /// Seconds between checkpoints of a free run.
         every_seconds: f64 = 5.0, bounds: from(0.0, 86_400.0), unit: "s", source: "ours", change: Change::Anytime;
-        /// Updates between checkpoints of a lockstep run: gradient steps, or rows for methods that use each row once.
+        /// Updates between checkpoints of a lockstep run: gradient steps, or rows for algorithms that use each row
+        /// once.
         every_updates: u64 = 5_000, bounds: from(1, 1_000_000_000), unit: "updates", source: "ours",
             change: in_free_runs("its replay is as large as it requires");
     }

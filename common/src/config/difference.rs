@@ -22,16 +22,16 @@ pub struct Difference {
 }
 
 impl Config {
-    /// The keys in which `after`, another configuration of this run, differs, by name. If the methods differ, nothing else
-    /// is named.
+    /// The keys in which `after`, another configuration of this run, differs, by name. If the algorithms differ,
+    /// nothing else is named.
     pub fn differences(&self, after: &Self) -> Vec<Difference> {
-        let methods = [self, after].map(|config| config.algorithm.name());
-        if methods[0] != methods[1] {
+        let algorithms = [self, after].map(|config| config.algorithm.name());
+        if algorithms[0] != algorithms[1] {
             return vec![Difference {
-                key: "the method".into(),
-                before: methods[0].into(),
-                after: methods[1].into(),
-                change: never("what one method has learned is of no use to another"),
+                key: "the algorithm".into(),
+                before: algorithms[0].into(),
+                after: algorithms[1].into(),
+                change: never("what one algorithm has learned is of no use to another"),
             }];
         }
         let [before, after] = [self, after].map(values);
@@ -150,7 +150,7 @@ mod tests {
         );
         assert_eq!(
             keys(environment, &format!("{environment}[sac]\ntau = 0.1")),
-            ["the method: ddpg -> sac"]
+            ["the algorithm: ddpg -> sac"]
         );
     }
 

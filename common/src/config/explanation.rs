@@ -10,7 +10,7 @@ use super::evaluation::EvaluationConfig;
 use super::learner::LearnerConfig;
 use super::replay::ReplayConfig;
 use super::run::RunConfig;
-use crate::algorithms::{Algorithm, ExplorationConfig, ObservationConfig, RewardConfig};
+use crate::algorithms::{AlgorithmConfig, ExplorationConfig, ObservationConfig, RewardConfig};
 
 /// Every section that the user may write, including those of all algorithms, but without an environment's own
 /// parameters.
@@ -25,7 +25,7 @@ pub fn sections() -> Vec<Section> {
         environment,
         describe::<ActorsConfig>("actors"),
     ];
-    all.extend(Algorithm::sections());
+    all.extend(AlgorithmConfig::sections());
     all.extend([
         describe::<ExplorationConfig>("exploration"),
         describe::<ObservationConfig>("observation"),

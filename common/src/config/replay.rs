@@ -3,7 +3,7 @@
 use shoal_base::section;
 use shoal_base::section::{Change, OutOfRange, from, in_free_runs, never};
 
-use crate::algorithms::{Algorithm, Experience};
+use crate::algorithms::{AlgorithmConfig, TransitionUse};
 
 /// Most transitions in a replay.
 const MAX_ROWS: u64 = 1_000_000_000;
@@ -20,8 +20,8 @@ section! {
         /// Transitions collected before the first update.
         warmup: u64 = 1_000, bounds: from(0, MAX_ROWS), unit: "transitions", source: "ours",
             change: in_free_runs("its rounds so far have had the updates that it allows");
-        /// Updates for each environment step beyond the warm-up: gradient steps, or rows for methods that use each row
-        /// once. The thesis has 1.
+        /// Updates for each environment step beyond the warm-up: gradient steps, or rows for algorithms that use each
+        /// row once. The thesis has 1.
         updates_per_step: f64 = 1.0, bounds: from(0.0, 1_000.0),
             unit: "updates per environment step", source: "Algorithm 4",
             change: in_free_runs("its replay is as large as it requires");
@@ -69,7 +69,7 @@ impl ReplayConfig {
     ///
     /// # Errors
     /// For the first invalid number.
-    pub fn check(&self, algorithm: &Algorithm) -> Result<(), OutOfRange> {
+    pub fn check(&self, algorithm: &AlgorithmConfig) -> Result<(), OutOfRange> {
         self.check_bounds("replay")?;
         let Self {
             capacity,
@@ -78,13 +78,13 @@ impl ReplayConfig {
             n_step,
             ..
         } = self;
-        match algorithm.spec().experience {
-            Experience::Minibatches => {
+        match algorithm.spec().transition_use {
+            TransitionUse::Minibatches => {
                 let least = algorithm.settings().batch() as u64;
                 from(least, MAX_ROWS).check("replay.capacity", capacity)?;
                 from(1, *capacity).check("replay.warmup", warmup)
             }
-            Experience::Transitions | Experience::Episodes => {
+            TransitionUse::Transitions | TransitionUse::Episodes => {
                 let only = |key: &str, value: String, only: &str| OutOfRange {
                     key: key.into(),
                     value,

@@ -7,10 +7,10 @@ use shoal_base::space::EnvironmentSpec;
 use toml::{Table, Value};
 
 use super::{
-    ActorsConfig, Algorithm, CheckpointConfig, Config, EnvironmentConfig, EvaluationConfig, ExplorationConfig,
+    ActorsConfig, AlgorithmConfig, CheckpointConfig, Config, EnvironmentConfig, EvaluationConfig, ExplorationConfig,
     LearnerConfig, ObservationConfig, ReplayConfig, RewardConfig, RunConfig, explanation,
 };
-use crate::algorithms::Experience;
+use crate::algorithms::TransitionUse;
 
 /// The sections as they are read.
 #[derive(Deserialize)]
@@ -51,7 +51,7 @@ struct Written<'a> {
     reward: Option<&'a RewardConfig>,
     /// A section with the algorithm's name.
     #[serde(flatten)]
-    algorithm: &'a Algorithm,
+    algorithm: &'a AlgorithmConfig,
     learner: &'a LearnerConfig,
     replay: &'a ReplayConfig,
     evaluation: &'a EvaluationConfig,
@@ -71,7 +71,7 @@ impl TryFrom<Sections> for Config {
         let mut algorithm = one_algorithm(sections.others)?;
         if let Some(exploration) = sections.exploration {
             // Only DDPG has a section for its exploration.
-            let Algorithm::Ddpg(ddpg) = &mut algorithm else {
+            let AlgorithmConfig::Ddpg(ddpg) = &mut algorithm else {
                 return Err(format!(
                     "[exploration] is the noise of ddpg, but this configuration is for {}",
                     algorithm.name()
@@ -84,9 +84,9 @@ impl TryFrom<Sections> for Config {
             sections.reward.unwrap_or_default(),
         );
         let are_default = observation == ObservationConfig::default() && reward == RewardConfig::default();
-        if !are_default && algorithm.spec().experience != Experience::Minibatches {
+        if !are_default && algorithm.spec().transition_use != TransitionUse::Minibatches {
             return Err(format!(
-                "[observation] and [reward] are for methods that learn from minibatches, but this configuration is \
+                "[observation] and [reward] are for algorithms that learn from minibatches, but this configuration is \
                  for {}",
                 algorithm.name()
             ));
@@ -109,7 +109,7 @@ impl TryFrom<Sections> for Config {
 
 /// What is wrong with the first section that cannot be read, beginning with the key and its value: serde's own error does
 /// not name the key. The sections of algorithms, whose errors do, are not among these.
-pub(super) fn at_fault(sections: &Table) -> Option<String> {
+pub(super) fn first_unreadable(sections: &Table) -> Option<String> {
     fn fault<T: DeserializeOwned>(sections: &Table, name: &str) -> Option<String> {
         let error = section::read::<T>(name, sections.get(name)?.clone()).err()?;
         let message = error.message().replace('\n', " ");
@@ -132,8 +132,8 @@ pub(super) fn at_fault(sections: &Table) -> Option<String> {
 }
 
 /// The algorithm that has a section, or the default algorithm if none has one.
-fn one_algorithm(mut sections: Table) -> Result<Algorithm, String> {
-    let names = Algorithm::all().into_iter().map(|algorithm| algorithm.name());
+fn one_algorithm(mut sections: Table) -> Result<AlgorithmConfig, String> {
+    let names = AlgorithmConfig::all().into_iter().map(|algorithm| algorithm.name());
     let named: Vec<(&str, Value)> = names.filter_map(|name| Some((name, sections.remove(name)?))).collect();
     if let Some(unknown) = sections.keys().next() {
         let known = explanation::sections().into_iter().map(|section| section.name);
@@ -150,14 +150,14 @@ fn one_algorithm(mut sections: Table) -> Result<Algorithm, String> {
     }
     let read = named
         .into_iter()
-        .find_map(|(name, section)| Algorithm::read(name, section));
-    read.unwrap_or_else(|| Ok(Algorithm::default()))
+        .find_map(|(name, section)| AlgorithmConfig::read(name, section));
+    read.unwrap_or_else(|| Ok(AlgorithmConfig::default()))
         .map_err(|error| error.message().to_owned())
 }
 
 impl Serialize for Config {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        let has_minibatches = self.algorithm.spec().experience == Experience::Minibatches;
+        let has_minibatches = self.algorithm.spec().transition_use == TransitionUse::Minibatches;
         Written {
             run: &self.run,
             environment: &self.environment,
@@ -180,7 +180,7 @@ impl Serialize for Config {
 mod tests {
     use super::*;
 
-    fn algorithm(text: &str) -> Result<Algorithm, String> {
+    fn algorithm(text: &str) -> Result<AlgorithmConfig, String> {
         let rest = "[run]\nid = \"1a\"\n[environment]\nname = \"x\"\n\
             [spec]\ntime_limit = 100\nobservation.discrete.n = 16\naction.discrete.n = 4\n";
         let sections: Sections = toml::from_str(&format!("{rest}{text}")).unwrap();

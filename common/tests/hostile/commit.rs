@@ -5,7 +5,7 @@ use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
 use proptest::prelude::*;
-use shoal_common::commit::{CommitReader, OpenError, Places, ReplayLayout};
+use shoal_common::commit::{CommitReader, FileOffsets, OpenError, ReplayLayout};
 use shoal_common::transition::RowLayout;
 use tempfile::TempDir;
 
@@ -24,8 +24,8 @@ fn layout() -> ReplayLayout {
     }
 }
 
-fn places() -> Places {
-    layout().places().unwrap()
+fn offsets() -> FileOffsets {
+    layout().offsets().unwrap()
 }
 
 fn word(bytes: &mut [u8], at: usize, word: u64) {
@@ -41,14 +41,14 @@ fn sealed(bytes: &mut [u8], slot: usize, words: &[u64]) {
 
 /// A replay of six rows, all of actor 0.
 fn file() -> Vec<u8> {
-    let mut bytes = vec![0; places().end];
-    for (i, of_identity) in layout().identity().into_iter().enumerate() {
-        word(&mut bytes, 8 * i, of_identity);
+    let mut bytes = vec![0; offsets().end];
+    for (i, of_preamble) in layout().preamble().into_iter().enumerate() {
+        word(&mut bytes, 8 * i, of_preamble);
     }
     let mut words = [0; WORDS];
     words[..6].copy_from_slice(&[2, 6, 0, 1, 3, 6]);
-    sealed(&mut bytes, places().slots[0], &words);
-    word(&mut bytes, places().published, 2);
+    sealed(&mut bytes, offsets().slots[0], &words);
+    word(&mut bytes, offsets().published, 2);
     bytes
 }
 
@@ -70,7 +70,7 @@ fn read_all(path: &Path) -> Option<CommitReader> {
     if let Some(reader) = &reader {
         reader.rows();
         for actor in 0..reader.layout().actors {
-            assert_eq!(reader.actor(actor).mark, reader.committed(actor));
+            assert_eq!(reader.actor(actor).last_chunk, reader.committed(actor));
         }
         let record = reader.snapshot().unwrap();
         assert!(record.tail() <= record.head() && record.actors() == reader.layout().actors);
@@ -89,13 +89,13 @@ proptest! {
             match damage {
                 // Only bytes that are used.
                 Damage::Flip(at, bits) if in_use => {
-                    let slot = places().slots[0];
+                    let slot = offsets().slots[0];
                     let used: Vec<usize> = (0..72).chain(4096..4112).chain(slot..slot + 8 * (WORDS + 1)).collect();
                     bytes[*at.get(&used)] ^= bits;
                 }
                 damage => damage.apply(&mut bytes),
             }
-            if bytes.len() < places().end {
+            if bytes.len() < offsets().end {
                 break;
             }
         }
@@ -119,11 +119,11 @@ proptest! {
         for (slot, which, value) in changes {
             records[slot][which] = value;
         }
-        for (slot, words) in places().slots.into_iter().zip(records) {
+        for (slot, words) in offsets().slots.into_iter().zip(records) {
             sealed(&mut bytes, slot, &words);
         }
-        word(&mut bytes, places().published, published);
-        word(&mut bytes, places().write_horizon, write_horizon);
+        word(&mut bytes, offsets().published, published);
+        word(&mut bytes, offsets().write_horizon, write_horizon);
         let (_directory, path) = written(&bytes);
         read_all(&path);
     }
@@ -136,13 +136,13 @@ proptest! {
         sizes in any::<bool>(),
     ) {
         let [observation, action, row, ring, actors] = words;
-        let mut identity = layout().identity();
-        identity.truncate(8);
-        identity[2..7].copy_from_slice(&[observation, action, row, ring, actors]);
+        let mut preamble = layout().preamble();
+        preamble.truncate(8);
+        preamble[2..7].copy_from_slice(&[observation, action, row, ring, actors]);
         if width {
-            identity[4] = observation.wrapping_mul(2).wrapping_add(action).wrapping_add(3);
+            preamble[4] = observation.wrapping_mul(2).wrapping_add(action).wrapping_add(3);
         }
-        let bytes: Vec<u8> = identity.iter().flat_map(|word| word.to_le_bytes()).collect();
+        let bytes: Vec<u8> = preamble.iter().flat_map(|word| word.to_le_bytes()).collect();
         let (_directory, path) = written(&bytes);
         let file = File::options().write(true).open(&path).unwrap();
         file.write_all_at(&u64::from(crc32fast::hash(&bytes)).to_le_bytes(), 64).unwrap();
@@ -154,7 +154,7 @@ proptest! {
             fingerprint: 5,
         };
         // The file is sparse, so it takes no space.
-        let length = claimed.places().map_or(1 << 20, |places| places.end as u64);
+        let length = claimed.offsets().map_or(1 << 20, |offsets| offsets.end as u64);
         if file.set_len(if sizes { length } else { 1 << 20 }).is_ok() {
             match CommitReader::open(&path) {
                 Err(OpenError::NotYet { .. } | OpenError::Refused { .. }) => {}
@@ -181,7 +181,7 @@ fn a_record_in_which_an_actor_has_more_rows_than_all_is_damaged() {
     let mut bytes = file();
     let mut words = [0; WORDS];
     words[..6].copy_from_slice(&[2, 6, 0, 1, 3, u64::MAX]);
-    sealed(&mut bytes, places().slots[0], &words);
+    sealed(&mut bytes, offsets().slots[0], &words);
     let (_directory, path) = written(&bytes);
     assert!(read_all(&path).is_none());
 }
@@ -193,7 +193,7 @@ fn a_file_for_too_many_actors_is_refused() {
         actor_snapshot_words: 0,
         ..layout()
     };
-    let bytes: Vec<u8> = many.identity().iter().flat_map(|word| word.to_le_bytes()).collect();
+    let bytes: Vec<u8> = many.preamble().iter().flat_map(|word| word.to_le_bytes()).collect();
     let (_directory, path) = written(&bytes);
     // The length that such a layout would need: a sparse file of half a terabyte.
     let slot = (u64::from(u32::MAX) * 3 + 4) * 8;

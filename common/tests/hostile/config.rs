@@ -93,7 +93,7 @@ fn assert_usable(config: &Config) {
         actor_snapshot_words: 0,
         fingerprint: config.fingerprint(),
     };
-    assert!(layout.places().is_some());
+    assert!(layout.offsets().is_some());
     if let Some(ddpg) = config.algorithm.ddpg() {
         let batch = ddpg.batch.max(config.actors.envs as usize);
         let network = ddpg.networks(&config.spec).critic;

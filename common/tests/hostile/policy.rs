@@ -4,7 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use proptest::prelude::*;
-use shoal_common::durable::{self, Kind};
+use shoal_common::durable::{self, FileKind};
 use shoal_common::network::{Hidden, NetworkLayout};
 use shoal_common::policy::PolicyLayout;
 use shoal_common::policy_file::{PolicyFile, PolicyFileError};
@@ -78,7 +78,7 @@ proptest! {
         right_count in any::<bool>(),
         numbers in prop::collection::vec(any::<u8>(), 0..120),
     ) {
-        const KIND: Kind = Kind { magic: *b"SHOALPOL", version: 1, name: "a policy file" };
+        const KIND: FileKind = FileKind { magic: *b"SHOALPOL", version: 1, name: "a policy file" };
         let mut words = words;
         if right_network {
             words[0] = layout().fingerprint();

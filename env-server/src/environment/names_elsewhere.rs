@@ -6,13 +6,14 @@ use std::path::{Path, PathBuf};
 use super::names;
 
 /// The directories that are searched. `reproduce` and `bench` are not: they run presets.
-const SEARCHED: [&str; 9] = [
+const SEARCHED: [&str; 10] = [
     "common/base/src",
     "common/channel/src",
     "common/policy/src",
     "common/src",
     "actor/src",
     "learner/src",
+    "remote/src",
     "run/src",
     "report/src",
     "src",

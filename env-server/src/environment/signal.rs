@@ -16,12 +16,12 @@ pub struct Signal {
     /// Empty for counts and indices.
     pub unit: &'static str,
     /// Where its values come from.
-    pub source: Source,
+    pub source: SignalSource,
 }
 
 /// Where a signal's values come from. Indices count from 0.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Source {
+pub enum SignalSource {
     /// A number of the observation.
     Observation(usize),
     /// A number of the action.
@@ -39,20 +39,20 @@ pub enum Source {
 impl Signal {
     /// Number `index` of the observation. The label is the key unless `label` sets another.
     pub fn observation(index: usize, key: &str, unit: &'static str) -> Self {
-        Self::new(key, unit, Source::Observation(index))
+        Self::new(key, unit, SignalSource::Observation(index))
     }
 
     /// Number `index` of the action, in environment units.
     pub fn action(index: usize, key: &str, unit: &'static str) -> Self {
-        Self::new(key, unit, Source::Action(index))
+        Self::new(key, unit, SignalSource::Action(index))
     }
 
     /// The angle in rad whose cosine and sine are these numbers of the observation.
     pub fn angle(cos: usize, sin: usize, key: &str) -> Self {
-        Self::new(key, "rad", Source::Angle { cos, sin })
+        Self::new(key, "rad", SignalSource::Angle { cos, sin })
     }
 
-    fn new(key: &str, unit: &'static str, source: Source) -> Self {
+    fn new(key: &str, unit: &'static str, source: SignalSource) -> Self {
         Self {
             key: key.into(),
             label: key.into(),
@@ -73,24 +73,24 @@ impl Signal {
     /// The first eight numbers of the observation and of the action, named by their position, for an environment that
     /// names no signals.
     pub fn by_number(spec: &EnvironmentSpec) -> Vec<Self> {
-        let signals = |space: &Space, name: &'static str, source: fn(usize) -> Source| {
+        let signals = |space: &Space, name: &'static str, source: fn(usize) -> SignalSource| {
             (0..space.width().min(MAX_UNNAMED)).map(move |i| {
                 let number = i + 1;
                 Self::new(&format!("{name}-{number}"), "", source(i)).label(&format!("{name} {number}"))
             })
         };
-        let observed = signals(&spec.observation, "observation", Source::Observation);
+        let observed = signals(&spec.observation, "observation", SignalSource::Observation);
         observed
-            .chain(signals(&spec.action, "action", Source::Action))
+            .chain(signals(&spec.action, "action", SignalSource::Action))
             .collect()
     }
 
     /// The least and the greatest value according to the spaces; `None` if there are no finite bounds.
     pub fn range(&self, spec: &EnvironmentSpec) -> Option<[f64; 2]> {
         let (space, i) = match self.source {
-            Source::Observation(i) => (&spec.observation, i),
-            Source::Action(i) => (&spec.action, i),
-            Source::Angle { .. } => return None,
+            SignalSource::Observation(i) => (&spec.observation, i),
+            SignalSource::Action(i) => (&spec.action, i),
+            SignalSource::Angle { .. } => return None,
         };
         let range = match space {
             Space::Box { low, high } => [f64::from(*low.get(i)?), f64::from(*high.get(i)?)],

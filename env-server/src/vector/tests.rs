@@ -30,7 +30,7 @@ impl Fixture {
         Self::of(name, parameters, count, [1, 0, 0])
     }
 
-    pub(super) fn reset(&mut self, start: Start<'_>) -> Vec<f32> {
+    pub(super) fn reset(&mut self, start: Reset<'_>) -> Vec<f32> {
         self.vector.reset(start, &mut self.observations).unwrap();
         self.observations.clone()
     }
@@ -60,7 +60,7 @@ impl Fixture {
 #[test]
 fn the_time_limit_truncates_and_the_next_episode_begins() {
     let mut fixture = Fixture::new("pendulum", "time_limit = 3", 2);
-    fixture.reset(Start::Next);
+    fixture.reset(Reset::Next);
     for step in 1..=7 {
         fixture.step(&[0.5, -0.5]).unwrap();
         let ended = if step % 3 == 0 { 1.0 } else { 0.0 };
@@ -74,8 +74,8 @@ fn the_time_limit_truncates_and_the_next_episode_begins() {
         assert!(fixture.rewards.iter().all(|r| *r < 0.0));
     }
     let mut from_the_start = Fixture::new("pendulum", "", 2);
-    let third = from_the_start.reset(Start::Episodes(&[2, 2]));
-    fixture.reset(Start::Episodes(&[1, 1]));
+    let third = from_the_start.reset(Reset::Episodes(&[2, 2]));
+    fixture.reset(Reset::Episodes(&[1, 1]));
     for _ in 0..3 {
         fixture.step(&[0.0, 0.0]).unwrap();
     }
@@ -90,7 +90,7 @@ fn termination_in_the_last_step_is_not_truncation() {
     // The number of the step in which the pole falls if it is always pushed the same way.
     let fall = {
         let mut fixture = Fixture::new("cart-pole", "", 1);
-        fixture.reset(Start::States(&[0.0; 4]));
+        fixture.reset(Reset::States(&[0.0; 4]));
         (1..).find(|_| {
             fixture.step(&[1.0]).unwrap();
             fixture.terminated == [1.0]
@@ -103,7 +103,7 @@ fn termination_in_the_last_step_is_not_truncation() {
         (fall + 1, ([1.0], [0.0])),
     ] {
         let mut fixture = Fixture::new("cart-pole", &format!("time_limit = {time_limit}"), 1);
-        fixture.reset(Start::States(&[0.0; 4]));
+        fixture.reset(Reset::States(&[0.0; 4]));
         for _ in 0..time_limit.min(fall) - 1 {
             fixture.step(&[1.0]).unwrap();
             assert_eq!((fixture.terminated[0], fixture.truncated[0]), (0.0, 0.0));
@@ -132,7 +132,7 @@ fn termination_in_the_last_step_is_not_truncation() {
 
 #[test]
 fn every_counter_changes_the_start_states() {
-    let starts = |name: [u64; 3]| Fixture::of("point-mass", "", 3, name).reset(Start::Next);
+    let starts = |name: [u64; 3]| Fixture::of("point-mass", "", 3, name).reset(Reset::Next);
     let base = starts([1, 0, 0]);
     assert_eq!(base, starts([1, 0, 0]));
     assert!(
@@ -143,26 +143,26 @@ fn every_counter_changes_the_start_states() {
         assert_ne!(base[..6], starts(other)[..6], "{other:?}");
     }
     let mut fixture = Fixture::new("point-mass", "", 3);
-    assert_eq!(fixture.reset(Start::Next), base);
-    let second = fixture.reset(Start::Next);
+    assert_eq!(fixture.reset(Reset::Next), base);
+    let second = fixture.reset(Reset::Next);
     assert_ne!(second[..6], base[..6]);
     assert_eq!(
-        Fixture::new("point-mass", "", 3).reset(Start::Episodes(&[1, 1, 1])),
+        Fixture::new("point-mass", "", 3).reset(Reset::Episodes(&[1, 1, 1])),
         second
     );
-    assert_eq!(fixture.reset(Start::Episodes(&[0, 0, 0])), base);
+    assert_eq!(fixture.reset(Reset::Episodes(&[0, 0, 0])), base);
 }
 
 #[test]
 fn an_evaluation_episode_always_starts_the_same_way() {
-    let evaluation = |first| Start::Evaluation {
+    let evaluation = |first| Reset::Evaluation {
         seed: 9,
         first,
         episodes: None,
     };
     let five = Fixture::of("pendulum", "", 5, [1, 0, 0]).reset(evaluation(0));
     let mut other = Fixture::of("pendulum", "time_limit = 2", 2, [2, 3, 4]);
-    other.reset(Start::Next);
+    other.reset(Reset::Next);
     other.step(&[0.1, 0.2]).unwrap();
     assert_eq!(other.reset(evaluation(0)), five[..6]);
     for _ in 0..2 {
@@ -175,7 +175,7 @@ fn an_evaluation_episode_always_starts_the_same_way() {
     );
     assert_eq!(other.reset(evaluation(3)), five[9..]);
     assert_ne!(
-        other.reset(Start::Evaluation {
+        other.reset(Reset::Evaluation {
             seed: 8,
             first: 3,
             episodes: None
@@ -188,14 +188,14 @@ fn an_evaluation_episode_always_starts_the_same_way() {
 #[test]
 fn evaluation_does_not_disturb_training_episodes() {
     let mut fixture = Fixture::new("pendulum", "", 1);
-    fixture.reset(Start::Next);
-    fixture.reset(Start::Evaluation {
+    fixture.reset(Reset::Next);
+    fixture.reset(Reset::Evaluation {
         seed: 1,
         first: 0,
         episodes: None,
     });
-    let second = fixture.reset(Start::Next);
-    assert_eq!(second, Fixture::new("pendulum", "", 1).reset(Start::Episodes(&[1])));
+    let second = fixture.reset(Reset::Next);
+    assert_eq!(second, Fixture::new("pendulum", "", 1).reset(Reset::Episodes(&[1])));
 }
 
 #[test]
@@ -208,18 +208,18 @@ fn a_repeated_frozen_lake_episode_slips_the_same_way() {
         (0..20).map(slide).collect()
     };
     let mut fixture = Fixture::new("frozen-lake", "", 1);
-    fixture.reset(Start::Next);
+    fixture.reset(Reset::Next);
     let first = walk(&mut fixture);
-    fixture.reset(Start::Episodes(&[0]));
+    fixture.reset(Reset::Episodes(&[0]));
     assert_eq!(walk(&mut fixture), first);
-    fixture.reset(Start::Episodes(&[100]));
+    fixture.reset(Reset::Episodes(&[100]));
     assert_ne!(walk(&mut fixture), first);
 }
 
 #[test]
 fn episodes_start_from_given_states() {
     let mut fixture = Fixture::new("point-mass", "", 2);
-    let observations = fixture.reset(Start::States(&[3.0, 4.0, 0.0, 0.0, -2.0, 0.0, 0.5, 0.0]));
+    let observations = fixture.reset(Reset::States(&[3.0, 4.0, 0.0, 0.0, -2.0, 0.0, 0.5, 0.0]));
     assert_eq!(
         observations,
         [3.0, 4.0, 0.0, 0.0, 5.0, 0.0, -2.0, 0.0, 0.5, 0.0, 2.0, -0.5]
@@ -227,7 +227,7 @@ fn episodes_start_from_given_states() {
     let mut refusal = |states| {
         fixture
             .vector
-            .reset(Start::States(states), &mut fixture.observations)
+            .reset(Reset::States(states), &mut fixture.observations)
             .unwrap_err()
     };
     assert!(matches!(refusal(&[0.0; 7]), RequestError::Count { given: 7, .. }));
@@ -244,7 +244,7 @@ fn episodes_start_from_given_states() {
 fn a_refused_action_changes_nothing() {
     for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
         let mut fixture = Fixture::new("pendulum", "", 2);
-        fixture.reset(Start::Next);
+        fixture.reset(Reset::Next);
         assert!(matches!(
             fixture.step(&[1.0, bad]),
             Err(RequestError::Action { environment: 1, .. })
@@ -252,12 +252,12 @@ fn a_refused_action_changes_nothing() {
         assert!(fixture.rewards[0].is_nan(), "nothing was written");
         fixture.step(&[1.0, 1.0]).unwrap();
         let mut undisturbed = Fixture::new("pendulum", "", 2);
-        undisturbed.reset(Start::Next);
+        undisturbed.reset(Reset::Next);
         undisturbed.step(&[1.0, 1.0]).unwrap();
         assert_eq!(fixture.observations, undisturbed.observations);
     }
     let mut cart_pole = Fixture::new("cart-pole", "", 1);
-    cart_pole.reset(Start::Next);
+    cart_pole.reset(Reset::Next);
     for bad in [2.0, -1.0, 0.5, f32::NAN] {
         assert!(
             matches!(cart_pole.step(&[bad]), Err(RequestError::Action { .. })),
@@ -275,7 +275,7 @@ fn a_refused_action_changes_nothing() {
 fn actions_outside_the_box_are_clipped() {
     let reward = |action| {
         let mut fixture = Fixture::new("pendulum", "", 1);
-        fixture.reset(Start::States(&[0.0, 0.0]));
+        fixture.reset(Reset::States(&[0.0, 0.0]));
         fixture.step(&[action]).unwrap();
         (fixture.rewards[0], fixture.observations)
     };

@@ -1,4 +1,4 @@
-//! The interface between a learning method and the learner's process.
+//! The interface between a learning algorithm and the learner's process.
 
 use std::borrow::Cow;
 
@@ -10,23 +10,23 @@ use crate::networks::product::Products;
 use crate::networks::threads::Threads;
 use crate::replay::Replay;
 
-/// A learning method with its settings, before it learns.
-pub trait Method {
+/// The settings of a learning algorithm, and how to create the algorithm from them.
+pub trait AlgorithmFactory {
     /// The learner of a run with this configuration, before its first update.
     ///
     /// # Errors
-    /// When the method cannot control the environment.
-    fn start(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError>;
+    /// When the algorithm cannot control the environment.
+    fn create(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError>;
 
-    /// Names of the sections that hold what was learned, as opposed to the state of the optimiser. The statistics of
+    /// Names of the arrays that hold what was learned, as opposed to the state of the optimiser. The statistics of
     /// normalised observations are not among them.
     fn weights(&self) -> &'static [&'static str];
 
-    /// The matrix products of one or a few updates in an environment like `spec`; none if the method has no networks,
-    /// or if its updates have no fixed size.
+    /// The matrix products of one or a few updates in an environment like `spec`; none if the algorithm has no
+    /// networks, or if its updates have no fixed size.
     fn products(&self, spec: &EnvironmentSpec) -> Products;
 
-    /// The total length of all sections of the learner's state, without the statistics of normalised observations.
+    /// The total length of all arrays of the learner's state, without the statistics of normalised observations.
     fn state_numbers(&self, spec: &EnvironmentSpec, sizes: RunSizes) -> usize;
 }
 
@@ -38,7 +38,7 @@ pub trait Algorithm {
     /// The layout of the policy's parameters.
     fn layout(&self) -> PolicyLayout;
 
-    /// Gradient steps taken; for methods that use each row once, rows consumed.
+    /// Gradient steps taken; for algorithms that use each row once, rows consumed.
     fn updates(&self) -> u64;
 
     /// Makes the next update, or several, on the replay as it was after `rows` rows, and counts them in `updates`. It
@@ -50,20 +50,20 @@ pub trait Algorithm {
     fn set_threads(&mut self, _: Threads) {}
 
     /// Everything that the next update depends on besides the rows, by name.
-    fn state(&self) -> Vec<Section<'_>>;
+    fn state(&self) -> Vec<StateArray<'_>>;
 
-    /// Restores a state of the same method after `updates` updates.
+    /// Restores a state of the same algorithm after `updates` updates.
     ///
     /// # Errors
-    /// When the state is another method's. The method is unusable afterwards.
-    fn restore(&mut self, updates: u64, saved: &mut SavedState) -> Result<(), SectionError>;
+    /// When the state is another algorithm's. The algorithm is unusable afterwards.
+    fn restore(&mut self, updates: u64, saved: &mut SavedState) -> Result<(), StateArrayError>;
 }
 
-/// A part of a method's state: its name and its numbers.
-pub type Section<'a> = (&'static str, &'a [f32]);
+/// An array of an algorithm's state: its name and its numbers.
+pub type StateArray<'a> = (&'static str, &'a [f32]);
 
 /// As [`Section`], but the numbers can be overwritten.
-pub type SectionMut<'a> = (&'static str, &'a mut [f32]);
+pub type StateArrayMut<'a> = (&'static str, &'a mut [f32]);
 
 /// The losses of an update.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -77,7 +77,7 @@ pub struct Losses {
     pub q_mean: f32,
 }
 
-/// The sizes of a run that methods depend on.
+/// The sizes of a run that algorithms depend on.
 #[derive(Clone, Copy, Debug)]
 pub struct RunSizes {
     /// Transitions that minibatches are sampled from.
@@ -101,26 +101,26 @@ impl From<&Config> for RunSizes {
     }
 }
 
-/// A method's state as read from a checkpoint: numbers by name.
+/// An algorithm's state as read from a checkpoint: numbers by name.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct SavedState(Vec<(String, Vec<f32>)>);
 
-/// A section of a saved state is not what the method expects.
+/// An array of a saved state is not what the algorithm expects.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("the checkpoint's section `{name}` {reason}; it was written by another version of the program")]
-pub struct SectionError {
+#[error("the checkpoint's array `{name}` {reason}; it was written by another version of the program")]
+pub struct StateArrayError {
     name: String,
     reason: String,
 }
 
 impl From<Vec<(String, Vec<f32>)>> for SavedState {
-    fn from(sections: Vec<(String, Vec<f32>)>) -> Self {
-        Self(sections)
+    fn from(arrays: Vec<(String, Vec<f32>)>) -> Self {
+        Self(arrays)
     }
 }
 
-impl SectionError {
-    /// A section has the wrong length.
+impl StateArrayError {
+    /// An array has the wrong length.
     pub(super) fn of_length(name: &str, found: usize, expected: usize) -> Self {
         Self {
             name: name.into(),
@@ -130,19 +130,19 @@ impl SectionError {
 }
 
 impl SavedState {
-    /// Removes a section and returns it.
+    /// Removes an array and returns it.
     ///
     /// # Errors
     /// When it is missing, or does not have `length` numbers.
-    pub fn take(&mut self, name: &str, length: usize) -> Result<Vec<f32>, SectionError> {
+    pub fn take(&mut self, name: &str, length: usize) -> Result<Vec<f32>, StateArrayError> {
         let at = self.0.iter().position(|(found, _)| found == name);
-        let at = at.ok_or_else(|| SectionError {
+        let at = at.ok_or_else(|| StateArrayError {
             name: name.into(),
             reason: "is missing".into(),
         })?;
         match self.0[at].1.len() {
             found if found == length => Ok(self.0.swap_remove(at).1),
-            found => Err(SectionError::of_length(name, found, length)),
+            found => Err(StateArrayError::of_length(name, found, length)),
         }
     }
 }

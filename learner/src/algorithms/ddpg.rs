@@ -11,15 +11,15 @@ use shoal_common::network::{ActionRange, NetworkLayout};
 use shoal_common::policy::PolicyError;
 use shoal_common::space::EnvironmentSpec;
 
-use super::algorithm::{Algorithm, Losses, Method, RunSizes, Section, SectionMut};
+use super::algorithm::{Algorithm, AlgorithmFactory, Losses, RunSizes, StateArray, StateArrayMut};
 use super::minibatch::Minibatch;
-use super::replayed::{MinibatchLearner, Replayed, mean, targets};
+use super::minibatch_algorithm::{MinibatchAlgorithm, MinibatchLearner, mean, targets};
 use crate::networks::digest::sha256;
 use crate::networks::initialise::initialise;
 use crate::networks::pass::{Pass, Samples};
 use crate::networks::product::{self, Products};
 use crate::networks::threads::Threads;
-use crate::networks::trained::{Targeted, threads_for};
+use crate::networks::trainable::{NetworkWithTarget, threads_for};
 
 /// The parts of the learner's state, as named in a checkpoint.
 const PARTS: [&str; 8] = [
@@ -40,8 +40,8 @@ pub struct Ddpg {
     tau: f32,
     threads: Threads,
     updates: u64,
-    actor: Targeted,
-    critic: Targeted,
+    actor: NetworkWithTarget,
+    critic: NetworkWithTarget,
     // Buffers for the intermediate results of a gradient step.
     mu: Pass,
     q: Pass,
@@ -69,8 +69,8 @@ impl Ddpg {
             threads: Threads::ALONE,
             updates: 0,
             // Lines 1 and 2: θ at random, θ' ← θ.
-            actor: Targeted::new(mu, settings.actor_learning_rate, &initialise(&mu, seed, 0)),
-            critic: Targeted::new(q, settings.critic_learning_rate, &initialise(&q, seed, 1)),
+            actor: NetworkWithTarget::new(mu, settings.actor_learning_rate, &initialise(&mu, seed, 0)),
+            critic: NetworkWithTarget::new(q, settings.critic_learning_rate, &initialise(&q, seed, 1)),
             mu: Pass::new(mu, batch),
             q: Pass::new(q, batch),
             target_mu: Pass::new(mu, batch),
@@ -92,9 +92,9 @@ impl Ddpg {
         self.evaluate(batch);
         let (critic_loss, q_mean) = self.critic_gradient(batch);
         // Lines 13 and 15 in one sweep: Q' is not read again in this update. Likewise μ' of lines 14 and 16.
-        self.critic.descend_and_follow(&self.threads, t, self.tau);
+        self.critic.step_with_target(&self.threads, t, self.tau);
         let actor_loss = self.actor_gradient(&batch.s);
-        self.actor.descend_and_follow(&self.threads, t, self.tau);
+        self.actor.step_with_target(&self.threads, t, self.tau);
         self.updates = t;
         Losses {
             critic_loss,
@@ -219,11 +219,11 @@ impl MinibatchLearner for Ddpg {
         self.update(batch)
     }
 
-    fn state(&self) -> Vec<Section<'_>> {
+    fn state(&self) -> Vec<StateArray<'_>> {
         PARTS.into_iter().zip(self.parts()).collect()
     }
 
-    fn state_mut(&mut self, updates: u64) -> Vec<SectionMut<'_>> {
+    fn state_mut(&mut self, updates: u64) -> Vec<StateArrayMut<'_>> {
         self.updates = updates;
         let (actor, critic) = (&mut self.actor, &mut self.critic);
         let parts: [&mut [f32]; 8] = [
@@ -240,10 +240,10 @@ impl MinibatchLearner for Ddpg {
     }
 }
 
-impl Method for &config::DdpgConfig {
-    fn start(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
+impl AlgorithmFactory for &config::DdpgConfig {
+    fn create(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
         let ddpg = Ddpg::new(&config.spec, self, config.run.seed)?;
-        Ok(Box::new(Replayed::new(ddpg, config)?))
+        Ok(Box::new(MinibatchAlgorithm::new(ddpg, config)?))
     }
 
     fn weights(&self) -> &'static [&'static str] {

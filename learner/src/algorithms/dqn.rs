@@ -5,17 +5,17 @@
 
 use nalgebra::{DMatrix, DVector};
 use shoal_common::config::{self, Config};
-use shoal_common::policy::{self, PolicyError, highest};
+use shoal_common::policy::{self, PolicyError, argmax};
 use shoal_common::space::EnvironmentSpec;
 
-use super::algorithm::{Algorithm, Losses, Method, RunSizes, Section, SectionMut};
+use super::algorithm::{Algorithm, AlgorithmFactory, Losses, RunSizes, StateArray, StateArrayMut};
 use super::minibatch::Minibatch;
-use super::replayed::{MinibatchLearner, Replayed, targets};
+use super::minibatch_algorithm::{MinibatchAlgorithm, MinibatchLearner, targets};
 use crate::networks::initialise::fan_in;
 use crate::networks::pass::Pass;
 use crate::networks::product::{self, Products};
 use crate::networks::threads::Threads;
-use crate::networks::trained::{Targeted, threads_for};
+use crate::networks::trainable::{NetworkWithTarget, threads_for};
 
 /// The names of the network's numbers in a checkpoint: parameters, target, moments.
 const PARTS: [&str; 4] = [
@@ -31,7 +31,7 @@ pub struct Dqn {
     settings: config::DqnConfig,
     threads: Threads,
     updates: u64,
-    network: Targeted,
+    network: NetworkWithTarget,
     // Buffers.
     q: Pass,
     next_q: Pass,
@@ -54,7 +54,7 @@ impl Dqn {
         Ok(Self {
             threads: Threads::ALONE,
             updates: 0,
-            network: Targeted::new(layout, settings.learning_rate, &fan_in(&layout, seed, 0)),
+            network: NetworkWithTarget::new(layout, settings.learning_rate, &fan_in(&layout, seed, 0)),
             q: Pass::new(layout, batch),
             next_q: Pass::new(layout, batch),
             target_q: Pass::new(layout, batch),
@@ -117,7 +117,7 @@ impl Dqn {
         let chooser = if settings.double { &*next_q } else { &*target_q };
         let samples = chooser.output.column_iter().zip(target_q.output.column_iter());
         for (value, (chooser, target)) in next_value.iter_mut().zip(samples) {
-            *value = target[first + highest(&chooser.as_slice()[first..])];
+            *value = target[first + argmax(&chooser.as_slice()[first..])];
         }
         targets(batch, |i| next_value[i], y);
     }
@@ -178,26 +178,26 @@ impl MinibatchLearner for Dqn {
         self.update(batch)
     }
 
-    fn state(&self) -> Vec<Section<'_>> {
-        let Targeted { online, target } = &self.network;
+    fn state(&self) -> Vec<StateArray<'_>> {
+        let NetworkWithTarget { online, target } = &self.network;
         let (m, v) = (&online.adam.first_moment, &online.adam.second_moment);
         let numbers: [&[f32]; 4] = [&online.parameters, target, m, v];
         PARTS.into_iter().zip(numbers).collect()
     }
 
-    fn state_mut(&mut self, updates: u64) -> Vec<SectionMut<'_>> {
+    fn state_mut(&mut self, updates: u64) -> Vec<StateArrayMut<'_>> {
         self.updates = updates;
-        let Targeted { online, target } = &mut self.network;
+        let NetworkWithTarget { online, target } = &mut self.network;
         let (m, v) = (&mut online.adam.first_moment, &mut online.adam.second_moment);
         let numbers: [&mut [f32]; 4] = [&mut online.parameters, target, m, v];
         PARTS.into_iter().zip(numbers).collect()
     }
 }
 
-impl Method for &config::DqnConfig {
-    fn start(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
+impl AlgorithmFactory for &config::DqnConfig {
+    fn create(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
         let dqn = Dqn::new(&config.spec, self, config.run.seed)?;
-        Ok(Box::new(Replayed::new(dqn, config)?))
+        Ok(Box::new(MinibatchAlgorithm::new(dqn, config)?))
     }
 
     fn weights(&self) -> &'static [&'static str] {

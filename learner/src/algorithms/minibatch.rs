@@ -40,16 +40,16 @@ impl Minibatch {
     }
 
     /// Copies the rows with these numbers into the columns, from the first on. A row with a number that is not finite is
-    /// replaced by the next good one of `window`. Panics if the replay does not hold one of the rows, or if there are
+    /// replaced by the next good one of `range`. Panics if the replay does not hold one of the rows, or if there are
     /// more rows than columns.
-    pub fn gather(&mut self, replay: &Replay, indices: &[u64], window: &Range<u64>) {
+    pub fn gather(&mut self, replay: &Replay, indices: &[u64], range: &Range<u64>) {
         // Random rows are cache misses. Both ends of all rows are read before any is copied, so that the misses
         // overlap; this is three times as fast. Both ends, because a row may lie on two cache lines.
         let ends = |row: &[f32]| row[0] + row[row.len() - 1];
         std::hint::black_box(indices.iter().map(|&index| ends(replay.row(index))).sum::<f32>());
         let layout = replay.layout().row;
         for (column, &index) in indices.iter().enumerate() {
-            self.set(column, &layout.read(replay.finite_row(index, window)));
+            self.set(column, &layout.read(replay.finite_row(index, range)));
         }
     }
 
@@ -71,7 +71,7 @@ fn copy_into_column(matrix: &mut DMatrix<f32>, column: usize, numbers: &[f32]) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::replay::{ChunkMark, ReplayLayout};
+    use crate::replay::{ChunkId, ReplayLayout};
 
     fn layout() -> ReplayLayout {
         ReplayLayout {
@@ -87,11 +87,11 @@ mod tests {
     fn replay_of(rows: &[f32]) -> (tempfile::TempDir, Replay) {
         let directory = tempfile::tempdir().unwrap();
         let mut replay = Replay::create(&directory.path().join("replay"), &layout()).unwrap();
-        let mark = ChunkMark {
+        let id = ChunkId {
             incarnation: 0,
             sequence: 1,
         };
-        replay.append_and_commit(0, mark, rows).unwrap();
+        replay.append_and_commit(0, id, rows).unwrap();
         (directory, replay)
     }
 

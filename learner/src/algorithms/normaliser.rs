@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use shoal_common::network::normalise;
 
-use super::algorithm::{Section, SectionMut};
+use super::algorithm::{StateArray, StateArrayMut};
 use super::minibatch::Minibatch;
 use crate::replay::Replay;
 
@@ -31,7 +31,7 @@ pub(super) struct Normaliser {
 
 impl Normaliser {
     /// The name of its numbers in a checkpoint.
-    pub(super) const SECTION: &'static str = "observations";
+    pub(super) const ARRAY: &'static str = "observations";
 
     /// `f32`s in a checkpoint, for observations of this width.
     pub(super) fn state_numbers(width: usize) -> usize {
@@ -106,13 +106,13 @@ impl Normaliser {
     }
 
     /// Its numbers, each `f64` as the two halves of its bits.
-    pub(super) fn state(&self) -> Section<'_> {
-        (Self::SECTION, bytemuck::cast_slice(&self.numbers))
+    pub(super) fn state(&self) -> StateArray<'_> {
+        (Normaliser::ARRAY, bytemuck::cast_slice(&self.numbers))
     }
 
     /// As [`state`](Self::state), to be overwritten; [`restored`](Self::restored) must follow.
-    pub(super) fn state_mut(&mut self) -> SectionMut<'_> {
-        (Self::SECTION, bytemuck::cast_slice_mut(&mut self.numbers))
+    pub(super) fn state_mut(&mut self) -> StateArrayMut<'_> {
+        (Normaliser::ARRAY, bytemuck::cast_slice_mut(&mut self.numbers))
     }
 
     /// Derives the rest from a restored state.
@@ -129,7 +129,7 @@ mod tests {
     use shoal_common::transition::{RowLayout, Transition};
 
     use super::*;
-    use crate::replay::{ChunkMark, ReplayLayout};
+    use crate::replay::{ChunkId, ReplayLayout};
 
     const WIDTH: usize = 2;
 
@@ -161,11 +161,11 @@ mod tests {
                 },
                 &mut numbers,
             );
-            let mark = ChunkMark {
+            let id = ChunkId {
                 incarnation: 0,
                 sequence,
             };
-            replay.append_and_commit(0, mark, &numbers).unwrap();
+            replay.append_and_commit(0, id, &numbers).unwrap();
             observations.push(s);
         }
         (directory, replay, observations)

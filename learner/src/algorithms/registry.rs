@@ -1,42 +1,42 @@
-//! The list of the learning methods.
+//! The list of the learning algorithms.
 
 use shoal_common::config::{self, Config};
 use shoal_common::policy::PolicyError;
 
-use super::algorithm::{Algorithm, Method, RunSizes, SavedState, SectionError};
+use super::algorithm::{Algorithm, AlgorithmFactory, RunSizes, SavedState, StateArrayError};
 use super::normaliser::{self, Normaliser};
 use super::tabular;
 use crate::networks::product::Products;
 
-/// The method for the settings of a configuration.
-fn method(algorithm: &config::Algorithm) -> Box<dyn Method + '_> {
+/// The factory for the settings of a configuration.
+fn factory(algorithm: &config::AlgorithmConfig) -> Box<dyn AlgorithmFactory + '_> {
     match algorithm {
-        config::Algorithm::Ddpg(settings) => Box::new(settings),
-        config::Algorithm::Td3(settings) => Box::new(settings),
-        config::Algorithm::Sac(settings) => Box::new(settings),
-        config::Algorithm::Dqn(settings) => Box::new(settings),
-        config::Algorithm::Reinforce(settings) => Box::new(settings),
-        config::Algorithm::QLearning(settings) => Box::new(tabular::QLearning(settings)),
-        config::Algorithm::Sarsa(settings) => Box::new(tabular::Sarsa(settings)),
+        config::AlgorithmConfig::Ddpg(settings) => Box::new(settings),
+        config::AlgorithmConfig::Td3(settings) => Box::new(settings),
+        config::AlgorithmConfig::Sac(settings) => Box::new(settings),
+        config::AlgorithmConfig::Dqn(settings) => Box::new(settings),
+        config::AlgorithmConfig::Reinforce(settings) => Box::new(settings),
+        config::AlgorithmConfig::QLearning(settings) => Box::new(tabular::QLearning(settings)),
+        config::AlgorithmConfig::Sarsa(settings) => Box::new(tabular::Sarsa(settings)),
     }
 }
 
 /// The learner of a configuration, before its first update.
 ///
 /// # Errors
-/// When the method cannot control the environment.
+/// When the algorithm cannot control the environment.
 pub fn new(config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
-    method(&config.algorithm).start(config)
+    factory(&config.algorithm).create(config)
 }
 
-/// Names of the sections of a checkpoint that hold what was learned, as opposed to the state of the optimiser.
+/// Names of the arrays of a checkpoint that hold what was learned, as opposed to the state of the optimiser.
 pub fn weights(config: &Config) -> Vec<&'static str> {
-    let statistics = config.observation.normalise.then_some(Normaliser::SECTION);
-    let learned = method(&config.algorithm).weights().iter().copied();
+    let statistics = config.observation.normalise.then_some(Normaliser::ARRAY);
+    let learned = factory(&config.algorithm).weights().iter().copied();
     learned.chain(statistics).collect()
 }
 
-/// The state of a learner that is `fresh`, except that it has the sections `weights` of another one's state `saved`. The
+/// The state of a learner that is `fresh`, except that it has the arrays `weights` of another one's state `saved`. The
 /// optimisers begin anew. `rows` rows of its own replay are part of the statistics of observations already.
 ///
 /// # Errors
@@ -46,24 +46,24 @@ pub fn inherited(
     weights: &[&str],
     mut saved: SavedState,
     rows: u64,
-) -> Result<Vec<(&'static str, Vec<f32>)>, SectionError> {
-    let section = |(name, numbers): (&'static str, &[f32])| {
+) -> Result<Vec<(&'static str, Vec<f32>)>, StateArrayError> {
+    let array = |(name, numbers): (&'static str, &[f32])| {
         if !weights.contains(&name) {
             return Ok((name, numbers.to_vec()));
         }
         let mut inherited = saved.take(name, numbers.len())?;
-        if name == Normaliser::SECTION {
+        if name == Normaliser::ARRAY {
             normaliser::set_rows(&mut inherited, rows);
         }
         Ok((name, inherited))
     };
-    fresh.state().into_iter().map(section).collect()
+    fresh.state().into_iter().map(array).collect()
 }
 
-/// The matrix products of one or a few updates of that learner; none if its method has no networks, or if its updates
-/// have no fixed size.
+/// The matrix products of one or a few updates of that learner; none if its algorithm has no networks, or if its
+/// updates have no fixed size.
 pub fn products(config: &Config) -> Products {
-    method(&config.algorithm).products(&config.spec)
+    factory(&config.algorithm).products(&config.spec)
 }
 
 /// The total length of that learner's state, computed without creating the learner.
@@ -73,7 +73,7 @@ pub fn state_numbers(config: &Config) -> usize {
     } else {
         0
     };
-    method(&config.algorithm).state_numbers(&config.spec, RunSizes::from(config)) + statistics
+    factory(&config.algorithm).state_numbers(&config.spec, RunSizes::from(config)) + statistics
 }
 
 #[cfg(test)]
@@ -129,7 +129,7 @@ mod tests {
             let state = learner.state();
             let numbers: usize = state.iter().map(|(_, numbers)| numbers.len()).sum();
             assert_eq!(state_numbers(&config), numbers, "{rest}");
-            let named = |name: &&str| state.iter().any(|(section, _)| section == name);
+            let named = |name: &&str| state.iter().any(|(array, _)| array == name);
             let weights = weights(&config);
             assert_eq!(
                 weights.contains(&"observations"),
@@ -144,10 +144,10 @@ mod tests {
             let begun = inherited(&*learner, &weights, SavedState::from(other), 3).unwrap();
             for ((name, numbers), (_, fresh)) in begun.iter().zip(&state) {
                 match *name {
-                    name if weights.contains(&name) && name != Normaliser::SECTION => {
+                    name if weights.contains(&name) && name != Normaliser::ARRAY => {
                         assert!(numbers.iter().all(|it| *it == 0.5), "{name}")
                     }
-                    Normaliser::SECTION => assert_eq!(numbers[..2], bytemuck::cast::<f64, [f32; 2]>(3.0)),
+                    Normaliser::ARRAY => assert_eq!(numbers[..2], bytemuck::cast::<f64, [f32; 2]>(3.0)),
                     name => assert_eq!(numbers, fresh, "{name}"),
                 }
             }

@@ -11,13 +11,13 @@ use std::borrow::Cow;
 
 use nalgebra::DMatrix;
 use shoal_common::algorithms::{AlgorithmSettings, ReinforceNetworks};
-use shoal_common::config::{self, Config, Weight};
+use shoal_common::config::{self, Config, ReturnWeighting};
 use shoal_common::network::NetworkLayout;
 use shoal_common::policy::{self, PolicyError, PolicyLayout};
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::transition::Transition;
 
-use super::algorithm::{Algorithm, Losses, Method, RunSizes, SavedState, Section, SectionError};
+use super::algorithm::{Algorithm, AlgorithmFactory, Losses, RunSizes, SavedState, StateArray, StateArrayError};
 use crate::networks::adam::Adam;
 use crate::networks::aligned::Aligned;
 use crate::networks::initialise::glorot;
@@ -31,7 +31,7 @@ const SPREAD_FLOOR: f32 = 1e-8;
 
 /// A network without a target network, and the state of its optimiser.
 #[derive(Clone, Debug)]
-struct Learned {
+struct TrainableNetworkWithPass {
     layout: NetworkLayout,
     parameters: Aligned,
     gradient: Aligned,
@@ -41,7 +41,7 @@ struct Learned {
     d: DMatrix<f32>,
 }
 
-impl Learned {
+impl TrainableNetworkWithPass {
     fn new(layout: NetworkLayout, learning_rate: f64, seed: u64, index: u64, steps: usize) -> Self {
         let parameters = glorot(&layout, seed, index);
         Self {
@@ -77,8 +77,8 @@ impl Learned {
 #[derive(Clone, Debug)]
 pub struct Reinforce {
     settings: config::ReinforceConfig,
-    policy: Learned,
-    baseline: Option<Learned>,
+    policy: TrainableNetworkWithPass,
+    baseline: Option<TrainableNetworkWithPass>,
     /// Rows learned from.
     rows: u64,
     /// Steps taken by Adam, as stored in a checkpoint. The `f32` is exact up to 2²⁴, more episodes than any run has.
@@ -88,7 +88,7 @@ pub struct Reinforce {
 }
 
 impl Reinforce {
-    /// Names of the sections that hold what was learned.
+    /// Names of the arrays that hold what was learned.
     const WEIGHTS: [&'static str; 2] = ["policy", "baseline"];
     const MOMENTS: [[&'static str; 2]; 2] = [
         ["policy's first moment", "policy's second moment"],
@@ -110,8 +110,9 @@ impl Reinforce {
         policy::softmax("reinforce", policy, spec, 0)?;
         let steps = sizes.chunk_rows * sizes.actors as usize;
         Ok(Self {
-            policy: Learned::new(policy, settings.learning_rate, seed, 0, steps),
-            baseline: baseline.map(|network| Learned::new(network, settings.baseline_learning_rate, seed, 1, steps)),
+            policy: TrainableNetworkWithPass::new(policy, settings.learning_rate, seed, 0, steps),
+            baseline: baseline
+                .map(|network| TrainableNetworkWithPass::new(network, settings.baseline_learning_rate, seed, 1, steps)),
             settings: settings.clone(),
             rows: 0,
             steps: [0.0],
@@ -145,7 +146,7 @@ impl Reinforce {
             let mut gamma_t = 1.0;
             for (step, g) in episode.iter().zip(&returns) {
                 let weight = match (self.settings.weight, &mut self.baseline) {
-                    (Weight::Normalised, _) => (g - mean) / (spread + SPREAD_FLOOR),
+                    (ReturnWeighting::Normalised, _) => (g - mean) / (spread + SPREAD_FLOOR),
                     (_, Some(baseline)) => {
                         // The gradient of ½ δ² (equation 3.22).
                         let delta = g - baseline.pass.output[column];
@@ -191,7 +192,7 @@ impl Reinforce {
             && episode.iter().all(is_finite)
     }
 
-    fn networks(&self) -> impl Iterator<Item = &Learned> {
+    fn networks(&self) -> impl Iterator<Item = &TrainableNetworkWithPass> {
         std::iter::once(&self.policy).chain(&self.baseline)
     }
 }
@@ -223,8 +224,8 @@ fn ln_sum_exp(logits: &[f32]) -> f32 {
     greatest + logits.iter().map(|logit| (logit - greatest).exp()).sum::<f32>().ln()
 }
 
-impl Method for &config::ReinforceConfig {
-    fn start(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
+impl AlgorithmFactory for &config::ReinforceConfig {
+    fn create(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
         let (spec, seed) = (&config.spec, config.run.seed);
         Ok(Box::new(Reinforce::new(self, spec, seed, RunSizes::from(config))?))
     }
@@ -263,7 +264,7 @@ impl Algorithm for Reinforce {
         self.learn(&round)
     }
 
-    fn state(&self) -> Vec<Section<'_>> {
+    fn state(&self) -> Vec<StateArray<'_>> {
         let names = Self::WEIGHTS.into_iter().zip(Self::MOMENTS);
         let networks = self
             .networks()
@@ -278,7 +279,7 @@ impl Algorithm for Reinforce {
         networks.chain([(Self::STEPS, self.steps.as_slice())]).collect()
     }
 
-    fn restore(&mut self, updates: u64, saved: &mut SavedState) -> Result<(), SectionError> {
+    fn restore(&mut self, updates: u64, saved: &mut SavedState) -> Result<(), StateArrayError> {
         let names = Self::WEIGHTS.into_iter().zip(Self::MOMENTS);
         for (network, (name, [first, second])) in std::iter::once(&mut self.policy).chain(&mut self.baseline).zip(names)
         {

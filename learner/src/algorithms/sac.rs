@@ -17,16 +17,16 @@ use shoal_common::policy::PolicyError;
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::stream::{Purpose, Stream, seek, stream};
 
-use super::algorithm::{Algorithm, Losses, Method, RunSizes, Section, SectionMut};
+use super::algorithm::{Algorithm, AlgorithmFactory, Losses, RunSizes, StateArray, StateArrayMut};
 use super::minibatch::Minibatch;
-use super::replayed::{MinibatchLearner, Replayed, mean};
+use super::minibatch_algorithm::{MinibatchAlgorithm, MinibatchLearner, mean};
 use super::twin_critics::{self, CriticLosses, CriticPart, TwinCritics};
 use crate::networks::adam::Adam;
 use crate::networks::initialise::fan_in;
 use crate::networks::pass::{Pass, Samples};
 use crate::networks::product::{self, Products};
 use crate::networks::threads::Threads;
-use crate::networks::trained::{Trained, threads_for};
+use crate::networks::trainable::{TrainableNetwork, threads_for};
 
 /// The names of the actor's numbers in a checkpoint: parameters, moments.
 const ACTOR: [&str; 3] = ["actor", "actor's first moment", "actor's second moment"];
@@ -72,13 +72,13 @@ impl Draw {
     }
 
     /// The first `cut` samples, and the others.
-    fn split_at(&mut self, cut: usize) -> (Part<'_>, Part<'_>) {
+    fn split_at(&mut self, cut: usize) -> (MinibatchPart<'_>, MinibatchPart<'_>) {
         let width = self.a.nrows();
         let pi = self.pi.samples().split_at(cut);
         let noise = self.noise.as_slice().split_at(cut * width);
         let a = self.a.as_mut_slice().split_at_mut(cut * width);
         let log_pi = self.log_pi.as_mut_slice().split_at_mut(cut);
-        let part = |pi, noise, a, log_pi| Part {
+        let part = |pi, noise, a, log_pi| MinibatchPart {
             width,
             pi,
             noise,
@@ -90,7 +90,7 @@ impl Draw {
 }
 
 /// Some samples of a [`Draw`].
-struct Part<'a> {
+struct MinibatchPart<'a> {
     width: usize,
     pi: Samples<'a>,
     noise: &'a [f32],
@@ -98,7 +98,7 @@ struct Part<'a> {
     log_pi: &'a mut [f32],
 }
 
-impl Part<'_> {
+impl MinibatchPart<'_> {
     /// Draws a for each observation of `s` with the policy φ.
     fn draw(&mut self, phi: &[f32], s: &[f32]) {
         let width = self.width;
@@ -186,10 +186,10 @@ pub struct Sac {
     tau: f32,
     threads: Threads,
     updates: u64,
-    actor: Trained,
+    actor: TrainableNetwork,
     critics: TwinCritics,
     temperature: Temperature,
-    /// Part `u` of this stream has the noise of update number `u`.
+    /// MinibatchPart `u` of this stream has the noise of update number `u`.
     stream: Stream,
     // Buffers.
     now: Draw,
@@ -214,7 +214,7 @@ impl Sac {
             tau: settings.tau as f32,
             threads: Threads::ALONE,
             updates: 0,
-            actor: Trained::new(pi, settings.actor_learning_rate, &fan_in(&pi, seed, 0)),
+            actor: TrainableNetwork::new(pi, settings.actor_learning_rate, &fan_in(&pi, seed, 0)),
             critics: TwinCritics::new(q, settings.critic_learning_rate, batch, seed),
             temperature: Temperature {
                 target_entropy: settings.target_entropy_per_element as f32 * action as f32,
@@ -296,19 +296,20 @@ impl Sac {
         let actor = &mut self.actor;
         let phi = &*actor.parameters;
         let cut = self.threads.first_share(size);
-        let part = |mut draw: Part<'_>, [mut first, mut second]: [CriticPart<'_>; 2], s: &[f32], d_pi: &mut [f32]| {
-            first.forward(s, draw.a);
-            second.forward(s, draw.a);
-            for i in 0..draw.log_pi.len() {
-                let first_is_less = first.values()[i] <= second.values()[i];
-                let each = -1.0 / size as f32;
-                (first.d_q[i], second.d_q[i]) = if first_is_less { (each, 0.0) } else { (0.0, each) };
-            }
-            first.backward();
-            second.backward();
-            draw.backward(alpha / size as f32, [first.d_a, second.d_a], d_pi);
-            draw.pi.backward(phi, d_pi, 1);
-        };
+        let part =
+            |mut draw: MinibatchPart<'_>, [mut first, mut second]: [CriticPart<'_>; 2], s: &[f32], d_pi: &mut [f32]| {
+                first.forward(s, draw.a);
+                second.forward(s, draw.a);
+                for i in 0..draw.log_pi.len() {
+                    let first_is_less = first.values()[i] <= second.values()[i];
+                    let each = -1.0 / size as f32;
+                    (first.d_q[i], second.d_q[i]) = if first_is_less { (each, 0.0) } else { (0.0, each) };
+                }
+                first.backward();
+                second.backward();
+                draw.backward(alpha / size as f32, [first.d_a, second.d_a], d_pi);
+                draw.pi.backward(phi, d_pi, 1);
+            };
         let observations = s.as_slice().split_at(cut * s.nrows());
         let outputs = self.d_pi.nrows();
         let d_pi = self.d_pi.as_mut_slice().split_at_mut(cut * outputs);
@@ -353,8 +354,8 @@ impl MinibatchLearner for Sac {
         self.update_with_drawn_noise(batch)
     }
 
-    fn state(&self) -> Vec<Section<'_>> {
-        let Trained { parameters, adam, .. } = &self.actor;
+    fn state(&self) -> Vec<StateArray<'_>> {
+        let TrainableNetwork { parameters, adam, .. } = &self.actor;
         let actor: [&[f32]; 3] = [parameters, &adam.first_moment, &adam.second_moment];
         let Temperature { log_alpha, adam, .. } = &self.temperature;
         let temperature: [&[f32]; 3] = [log_alpha, &adam.first_moment, &adam.second_moment];
@@ -362,9 +363,9 @@ impl MinibatchLearner for Sac {
         names().zip(numbers.chain(temperature)).collect()
     }
 
-    fn state_mut(&mut self, updates: u64) -> Vec<SectionMut<'_>> {
+    fn state_mut(&mut self, updates: u64) -> Vec<StateArrayMut<'_>> {
         self.updates = updates;
-        let Trained { parameters, adam, .. } = &mut self.actor;
+        let TrainableNetwork { parameters, adam, .. } = &mut self.actor;
         let actor: [&mut [f32]; 3] = [parameters, &mut adam.first_moment, &mut adam.second_moment];
         let Temperature { log_alpha, adam, .. } = &mut self.temperature;
         let temperature: [&mut [f32]; 3] = [log_alpha, &mut adam.first_moment, &mut adam.second_moment];
@@ -377,14 +378,14 @@ impl MinibatchLearner for Sac {
 
 /// The names of all parts of the state.
 fn names() -> impl Iterator<Item = &'static str> {
-    let critics = twin_critics::SECTIONS.into_iter().flatten();
+    let critics = twin_critics::ARRAYS.into_iter().flatten();
     ACTOR.into_iter().chain(critics).chain(TEMPERATURE)
 }
 
-impl Method for &config::SacConfig {
-    fn start(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
+impl AlgorithmFactory for &config::SacConfig {
+    fn create(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
         let sac = Sac::new(&config.spec, self, config.run.seed)?;
-        Ok(Box::new(Replayed::new(sac, config)?))
+        Ok(Box::new(MinibatchAlgorithm::new(sac, config)?))
     }
 
     fn weights(&self) -> &'static [&'static str] {

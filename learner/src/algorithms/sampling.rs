@@ -21,22 +21,22 @@ impl Sampler {
         }
     }
 
-    /// Fills `out` with rows of `window`, each uniform and independent of the others, for update number `update`.
+    /// Fills `out` with rows of `range`, each uniform and independent of the others, for update number `update`.
     ///
     /// Element k comes from 64-bit number k of the update's stream by multiply and shift. Two of the `n` rows of a
-    /// window differ in probability by at most 2⁻⁶⁴, a bias that no run is long enough to show. Rejection sampling
-    /// would avoid it, but then a number's position in the stream would depend on the window.
+    /// range differ in probability by at most 2⁻⁶⁴, a bias that no run is long enough to show. Rejection sampling
+    /// would avoid it, but then a number's position in the stream would depend on the range.
     ///
     /// # Panics
-    /// If the window is empty.
-    pub fn indices(&self, update: u64, window: Range<u64>, out: &mut [u64]) {
-        assert!(!window.is_empty(), "cannot draw a minibatch from an empty window");
-        let rows = window.end - window.start;
+    /// If the range is empty.
+    pub fn indices(&self, update: u64, range: Range<u64>, out: &mut [u64]) {
+        assert!(!range.is_empty(), "cannot draw a minibatch from an empty range");
+        let rows = range.end - range.start;
         let mut numbers = self.key.clone();
         seek(&mut numbers, update);
         for index in out {
             let scaled = u128::from(numbers.next_u64()) * u128::from(rows);
-            *index = window.start + (scaled >> 64) as u64;
+            *index = range.start + (scaled >> 64) as u64;
         }
     }
 }
@@ -45,9 +45,9 @@ impl Sampler {
 mod tests {
     use super::*;
 
-    fn draw(seed: u64, update: u64, window: Range<u64>) -> Vec<u64> {
+    fn draw(seed: u64, update: u64, range: Range<u64>) -> Vec<u64> {
         let mut out = vec![0; 64];
-        Sampler::new(seed).indices(update, window, &mut out);
+        Sampler::new(seed).indices(update, range, &mut out);
         out
     }
 

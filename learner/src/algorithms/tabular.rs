@@ -8,7 +8,7 @@ use shoal_common::policy::{self, PolicyError, PolicyLayout};
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::transition::Transition;
 
-use super::algorithm::{Algorithm, Losses, Method, RunSizes, SavedState, Section, SectionError};
+use super::algorithm::{Algorithm, AlgorithmFactory, Losses, RunSizes, SavedState, StateArray, StateArrayError};
 use crate::networks::product::Products;
 use crate::replay::{Replay, are_finite};
 
@@ -29,8 +29,8 @@ pub struct QLearning<'a>(pub &'a config::TabularConfig);
 #[derive(Debug)]
 pub struct Sarsa<'a>(pub &'a config::TabularConfig);
 
-impl Method for QLearning<'_> {
-    fn start(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
+impl AlgorithmFactory for QLearning<'_> {
+    fn create(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
         let sizes = RunSizes::from(config);
         Ok(Box::new(Tabular::new(Bootstrap::Max, self.0, &config.spec, sizes)?))
     }
@@ -48,8 +48,8 @@ impl Method for QLearning<'_> {
     }
 }
 
-impl Method for Sarsa<'_> {
-    fn start(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
+impl AlgorithmFactory for Sarsa<'_> {
+    fn create(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
         let sizes = RunSizes::from(config);
         Ok(Box::new(Tabular::new(
             Bootstrap::NextAction,
@@ -111,7 +111,7 @@ struct Pending {
 const PENDING: usize = 6;
 
 impl Tabular {
-    /// Names of the sections that hold what was learned.
+    /// Names of the arrays that hold what was learned.
     const WEIGHTS: [&'static str; 1] = ["action-values"];
     const PENDING: &'static str = "steps without successor";
 
@@ -153,7 +153,7 @@ impl Tabular {
         };
         if self.bootstrap == Bootstrap::Max {
             let values = self.values(step.s_next);
-            let greatest = values[policy::highest(values)];
+            let greatest = values[policy::argmax(values)];
             return self.update_value(&step, greatest);
         }
         let mut losses = Losses::default();
@@ -258,11 +258,11 @@ impl Algorithm for Tabular {
         self.learn(&replay.layout().row.read(numbers), slot)
     }
 
-    fn state(&self) -> Vec<Section<'_>> {
+    fn state(&self) -> Vec<StateArray<'_>> {
         vec![(Self::WEIGHTS[0], &self.q), (Self::PENDING, &self.pending)]
     }
 
-    fn restore(&mut self, updates: u64, saved: &mut SavedState) -> Result<(), SectionError> {
+    fn restore(&mut self, updates: u64, saved: &mut SavedState) -> Result<(), StateArrayError> {
         self.q = saved.take(Self::WEIGHTS[0], self.q.len())?;
         // Q-learning has none, and the number of its actors may have changed.
         if self.bootstrap == Bootstrap::NextAction {

@@ -13,15 +13,15 @@ use shoal_common::policy::PolicyError;
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::stream::{Purpose, Stream, seek, stream};
 
-use super::algorithm::{Algorithm, Losses, Method, RunSizes, Section, SectionMut};
+use super::algorithm::{Algorithm, AlgorithmFactory, Losses, RunSizes, StateArray, StateArrayMut};
 use super::minibatch::Minibatch;
-use super::replayed::{MinibatchLearner, Replayed, mean};
+use super::minibatch_algorithm::{MinibatchAlgorithm, MinibatchLearner, mean};
 use super::twin_critics::{self, CriticLosses, CriticPart, TwinCritics};
 use crate::networks::initialise::fan_in;
 use crate::networks::pass::{Pass, Samples};
 use crate::networks::product::{self, Products};
 use crate::networks::threads::Threads;
-use crate::networks::trained::{Targeted, threads_for};
+use crate::networks::trainable::{NetworkWithTarget, threads_for};
 
 /// The names of the actor's numbers in a checkpoint: parameters, target, moments.
 const ACTOR: [&str; 4] = ["actor", "target actor", "actor's first moment", "actor's second moment"];
@@ -43,7 +43,7 @@ pub struct Td3 {
     range: ActionRange,
     threads: Threads,
     updates: u64,
-    actor: Targeted,
+    actor: NetworkWithTarget,
     critics: TwinCritics,
     /// Part `u` of this stream has the noise of update number `u`.
     stream: Stream,
@@ -71,7 +71,7 @@ impl Td3 {
         Ok(Self {
             threads: Threads::ALONE,
             updates: 0,
-            actor: Targeted::new(mu, settings.actor_learning_rate, &fan_in(&mu, seed, 0)),
+            actor: NetworkWithTarget::new(mu, settings.actor_learning_rate, &fan_in(&mu, seed, 0)),
             critics: TwinCritics::new(q, settings.critic_learning_rate, batch, seed),
             stream: stream(seed, Purpose::Update, 0, 0),
             actor_loss: 0.0,
@@ -105,7 +105,7 @@ impl Td3 {
         if delayed {
             self.actor_loss = self.actor_gradient(&batch.s);
             let step = t / self.settings.policy_delay;
-            self.actor.descend_and_follow(&self.threads, step, tau);
+            self.actor.step_with_target(&self.threads, step, tau);
         }
         self.updates = t;
         Losses {
@@ -194,21 +194,21 @@ impl MinibatchLearner for Td3 {
         losses
     }
 
-    fn state(&self) -> Vec<Section<'_>> {
-        let Targeted { online, target } = &self.actor;
+    fn state(&self) -> Vec<StateArray<'_>> {
+        let NetworkWithTarget { online, target } = &self.actor;
         let (m, v) = (&online.adam.first_moment, &online.adam.second_moment);
         let actor: [&[f32]; 4] = [&online.parameters, target, m, v];
-        let names = ACTOR.into_iter().chain(twin_critics::SECTIONS.into_iter().flatten());
+        let names = ACTOR.into_iter().chain(twin_critics::ARRAYS.into_iter().flatten());
         let numbers = actor.into_iter().chain(self.critics.numbers().into_iter().flatten());
         names.zip(numbers).collect()
     }
 
-    fn state_mut(&mut self, updates: u64) -> Vec<SectionMut<'_>> {
+    fn state_mut(&mut self, updates: u64) -> Vec<StateArrayMut<'_>> {
         self.updates = updates;
-        let Targeted { online, target } = &mut self.actor;
+        let NetworkWithTarget { online, target } = &mut self.actor;
         let (m, v) = (&mut online.adam.first_moment, &mut online.adam.second_moment);
         let actor: [&mut [f32]; 4] = [&mut online.parameters, target, m, v];
-        let names = ACTOR.into_iter().chain(twin_critics::SECTIONS.into_iter().flatten());
+        let names = ACTOR.into_iter().chain(twin_critics::ARRAYS.into_iter().flatten());
         let numbers = actor
             .into_iter()
             .chain(self.critics.numbers_mut().into_iter().flatten());
@@ -216,10 +216,10 @@ impl MinibatchLearner for Td3 {
     }
 }
 
-impl Method for &config::Td3Config {
-    fn start(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
+impl AlgorithmFactory for &config::Td3Config {
+    fn create(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
         let td3 = Td3::new(&config.spec, self, config.run.seed)?;
-        Ok(Box::new(Replayed::new(td3, config)?))
+        Ok(Box::new(MinibatchAlgorithm::new(td3, config)?))
     }
 
     fn weights(&self) -> &'static [&'static str] {

@@ -6,7 +6,7 @@ use shoal_common::stream::{Purpose, Stream, stream};
 use shoal_common::transition::{RowLayout, Transition};
 
 use super::minibatch::Minibatch;
-use super::replayed::MinibatchLearner;
+use super::minibatch_algorithm::MinibatchLearner;
 use crate::networks::digest::sha256;
 use crate::networks::threads::Threads;
 
@@ -93,9 +93,9 @@ pub(super) fn assert_is_gradient_of(
 /// Gives `to` the whole state of `from`.
 pub(super) fn copy_state<L: MinibatchLearner>(from: &L, to: &mut L) {
     let names: Vec<_> = from.state().iter().map(|(name, _)| *name).collect();
-    let sections = to.state_mut(from.updates());
-    assert_eq!(sections.iter().map(|(name, _)| *name).collect::<Vec<_>>(), names);
-    for ((_, to), (_, from)) in sections.into_iter().zip(from.state()) {
+    let arrays = to.state_mut(from.updates());
+    assert_eq!(arrays.iter().map(|(name, _)| *name).collect::<Vec<_>>(), names);
+    for ((_, to), (_, from)) in arrays.into_iter().zip(from.state()) {
         to.copy_from_slice(from);
     }
 }
@@ -119,6 +119,6 @@ pub(super) fn assert_threads_do_not_change_the_bits<L: MinibatchLearner>(
             .collect::<Vec<_>>()
     };
     // A thread can start a second one only once.
-    let shared = std::thread::scope(|scope| scope.spawn(|| run(Threads::two().unwrap())).join().unwrap());
+    let shared = std::thread::scope(|scope| scope.spawn(|| run(Threads::two_threads().unwrap())).join().unwrap());
     assert_eq!(shared, run(Threads::ALONE), "{what}");
 }

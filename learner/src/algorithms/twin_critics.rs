@@ -5,15 +5,15 @@ use nalgebra::{DMatrix, DVector};
 use shoal_common::network::{ActionRange, NetworkLayout};
 
 use super::minibatch::Minibatch;
-use super::replayed::{mean, targets};
+use super::minibatch_algorithm::{mean, targets};
 use crate::networks::initialise::fan_in;
 use crate::networks::pass::{Pass, Samples};
 use crate::networks::product::{self, Product};
 use crate::networks::threads::Threads;
-use crate::networks::trained::Targeted;
+use crate::networks::trainable::NetworkWithTarget;
 
 /// The names of the critics' numbers in a checkpoint: parameters, target, moments.
-pub(super) const SECTIONS: [[&str; 4]; 2] = [
+pub(super) const ARRAYS: [[&str; 4]; 2] = [
     [
         "critic 1",
         "target critic 1",
@@ -31,7 +31,7 @@ pub(super) const SECTIONS: [[&str; 4]; 2] = [
 /// A critic with its buffers for a minibatch.
 #[derive(Clone, Debug)]
 pub(super) struct Critic {
-    pub(super) network: Targeted,
+    pub(super) network: NetworkWithTarget,
     /// Its pass over the minibatch and, later in an update, over the policy's actions.
     pub(super) q: Pass,
     target_q: Pass,
@@ -104,7 +104,7 @@ impl TwinCritics {
     pub(super) fn new(layout: NetworkLayout, learning_rate: f64, batch: usize, seed: u64) -> Self {
         let action = layout.action_inputs();
         let critic = |index| Critic {
-            network: Targeted::new(layout, learning_rate, &fan_in(&layout, seed, index)),
+            network: NetworkWithTarget::new(layout, learning_rate, &fan_in(&layout, seed, index)),
             q: Pass::new(layout, batch),
             target_q: Pass::new(layout, batch),
             d_q: DMatrix::zeros(1, batch),
@@ -163,7 +163,7 @@ impl TwinCritics {
             let online = &mut network.online;
             q.backward(&Threads::ALONE, &online.parameters, s, d_q, &mut online.gradient);
             match tau {
-                Some(tau) => network.descend_and_follow(&Threads::ALONE, t, tau),
+                Some(tau) => network.step_with_target(&Threads::ALONE, t, tau),
                 None => network.online.descend(&Threads::ALONE, t),
             }
         };
@@ -171,10 +171,10 @@ impl TwinCritics {
         CriticLosses { loss, q_mean }
     }
 
-    /// Their numbers, in the order of [`SECTIONS`].
+    /// Their numbers, in the order of [`ARRAYS`].
     pub(super) fn numbers(&self) -> [[&[f32]; 4]; 2] {
         self.critics.each_ref().map(|critic| {
-            let Targeted { online, target } = &critic.network;
+            let NetworkWithTarget { online, target } = &critic.network;
             let (m, v) = (&online.adam.first_moment, &online.adam.second_moment);
             [&*online.parameters, target, m, v]
         })
@@ -183,7 +183,7 @@ impl TwinCritics {
     /// As [`numbers`](Self::numbers).
     pub(super) fn numbers_mut(&mut self) -> [[&mut [f32]; 4]; 2] {
         self.critics.each_mut().map(|critic| {
-            let Targeted { online, target } = &mut critic.network;
+            let NetworkWithTarget { online, target } = &mut critic.network;
             let (m, v) = (&mut online.adam.first_moment, &mut online.adam.second_moment);
             [&mut *online.parameters, &mut *target, &mut *m, &mut *v]
         })

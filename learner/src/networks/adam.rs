@@ -59,7 +59,7 @@ impl Adam {
     }
 
     /// As [`step`](Self::step); then `target` ← τ θ + (1 − τ) `target` (equation 3.31), in the same sweep.
-    pub fn step_and_follow(
+    pub fn step_with_target(
         &mut self,
         threads: &Threads,
         t: u64,
@@ -164,7 +164,7 @@ mod tests {
             let gradient: Vec<f32> = (0..count)
                 .map(|i| ((t as f32 * 0.37 + i as f32).sin() + 0.2) * 10f32.powi(i as i32 % 9 - 6))
                 .collect();
-            adam.step_and_follow(&Threads::ALONE, t, &gradient, &mut weights, 0.01, &mut targets);
+            adam.step_with_target(&Threads::ALONE, t, &gradient, &mut weights, 0.01, &mut targets);
             for i in 0..count {
                 expected[i] = references[i].step(1e-3, gradient[i].into(), expected[i]);
                 expected_targets[i] = 0.01 * expected[i] + 0.99 * expected_targets[i];
@@ -187,7 +187,7 @@ mod tests {
         for t in 1..=20 {
             let gradient = [0.3, -0.1 * t as f32, 0.0];
             without.step(&Threads::ALONE, t, &gradient, &mut weights);
-            with.step_and_follow(&Threads::ALONE, t, &gradient, &mut same, 0.1, &mut target);
+            with.step_with_target(&Threads::ALONE, t, &gradient, &mut same, 0.1, &mut target);
         }
         assert_eq!(weights, same);
         assert_ne!(weights[..2], [0.5; 2]);
@@ -197,9 +197,9 @@ mod tests {
     fn moments_without_gradient_end_at_zero_and_are_never_denormal() {
         let mut adam = Adam::new(1e-3, 20);
         let (mut weights, mut targets) = (vec![0.0; 20], vec![0.0; 20]);
-        adam.step_and_follow(&Threads::ALONE, 1, &[1e-9; 20], &mut weights, 0.01, &mut targets);
+        adam.step_with_target(&Threads::ALONE, 1, &[1e-9; 20], &mut weights, 0.01, &mut targets);
         for t in 2..=30_000 {
-            adam.step_and_follow(
+            adam.step_with_target(
                 &Threads::ALONE,
                 t,
                 &[if t < 500 { 1e-22 } else { 0.0 }; 20],

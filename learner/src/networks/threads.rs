@@ -23,7 +23,7 @@ impl Threads {
     ///
     /// # Errors
     /// When the system cannot start a thread, or the calling thread has a second one already.
-    pub fn two() -> Result<Self, ThreadsError> {
+    pub fn two_threads() -> Result<Self, ThreadsError> {
         // The calling thread is a member of the pool, so that it works while it waits and does not have to be woken.
         let pool = ThreadPoolBuilder::new()
             .num_threads(2)

@@ -10,9 +10,9 @@ use std::path::{Path, PathBuf};
 
 use bincode::config::{self, Config};
 use serde::{Deserialize, Serialize};
-use shoal_common::durable::{self, Kind, Prepared, SealError, sync_directory_of};
+use shoal_common::durable::{self, FileKind, PreparedFile, SealError, sync_directory_of};
 
-const KIND: Kind = Kind {
+const KIND: FileKind = FileKind {
     magic: *b"SHOALCKP",
     version: 2,
     name: "a checkpoint",
@@ -23,7 +23,7 @@ const PREVIOUS: &str = "previous.ckpt";
 /// A learner's progress.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Counters {
-    /// Gradient steps taken; for methods that use each row once, rows consumed.
+    /// Gradient steps taken; for algorithms that use each row once, rows consumed.
     pub updates: u64,
     /// Environment steps of all actors that count for the ratio of updates: rows of the replay.
     pub rows: u64,
@@ -39,7 +39,7 @@ pub struct Checkpoint {
     /// The learner's progress.
     pub counters: Counters,
     /// The learner's numbers by name, as they were given to `save`.
-    pub sections: Vec<(String, Vec<f32>)>,
+    pub arrays: Vec<(String, Vec<f32>)>,
 }
 
 /// Why a checkpoint was not written or read. The files on the disk have not changed.
@@ -82,7 +82,7 @@ pub enum CheckpointError {
 
 /// What `load_newest` found.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Loaded {
+pub struct LoadedCheckpoint {
     /// The newest checkpoint that is whole.
     pub checkpoint: Checkpoint,
     /// What is wrong with newer ones, for the run's log.
@@ -114,12 +114,12 @@ pub struct Checkpoints {
 struct Header {
     fingerprint: u64,
     counters: Counters,
-    /// Name and length of each section, in the order of their numbers.
-    sections: Vec<(String, u64)>,
+    /// Name and length of each array, in the order of their numbers.
+    arrays: Vec<(String, u64)>,
 }
 
 /// The content of one of the two files.
-enum Found {
+enum CheckpointFile {
     Missing,
     Whole(Checkpoint),
     Damaged(String),
@@ -142,23 +142,23 @@ impl Checkpoints {
     }
 
     /// Reads the newest checkpoint that is whole; `None` if there is none at all.
-    pub fn load_newest(&mut self) -> Result<Option<Loaded>, CheckpointError> {
+    pub fn load_newest(&mut self) -> Result<Option<LoadedCheckpoint>, CheckpointError> {
         let latest = self.read(LATEST)?;
-        self.latest_is_sound = Some(matches!(latest, Found::Whole(_)));
+        self.latest_is_sound = Some(matches!(latest, CheckpointFile::Whole(_)));
         let latest_path = self.directory.join(LATEST);
         let mut warnings = match latest {
-            Found::Whole(checkpoint) => {
-                return Ok(Some(Loaded {
+            CheckpointFile::Whole(checkpoint) => {
+                return Ok(Some(LoadedCheckpoint {
                     checkpoint,
                     warnings: vec![],
                 }));
             }
-            Found::Missing => vec![],
-            Found::Damaged(reason) => vec![format!("{}: {reason}", latest_path.display())],
+            CheckpointFile::Missing => vec![],
+            CheckpointFile::Damaged(reason) => vec![format!("{}: {reason}", latest_path.display())],
         };
         let previous = self.directory.join(PREVIOUS);
         match self.read(PREVIOUS)? {
-            Found::Whole(checkpoint) => {
+            CheckpointFile::Whole(checkpoint) => {
                 if warnings.is_empty() {
                     warnings.push(format!(
                         "{}: missing, probably after a crash while it was being replaced",
@@ -171,10 +171,10 @@ impl Checkpoints {
                     checkpoint.counters.updates
                 );
                 warnings.push(used);
-                return Ok(Some(Loaded { checkpoint, warnings }));
+                return Ok(Some(LoadedCheckpoint { checkpoint, warnings }));
             }
-            Found::Missing => {}
-            Found::Damaged(reason) => warnings.push(format!("{}: {reason}", previous.display())),
+            CheckpointFile::Missing => {}
+            CheckpointFile::Damaged(reason) => warnings.push(format!("{}: {reason}", previous.display())),
         }
         if warnings.is_empty() {
             return Ok(None);
@@ -186,8 +186,8 @@ impl Checkpoints {
     }
 
     /// Writes a checkpoint. When this returns it is on the disk: a power loss leaves it or a later one.
-    pub fn save(&mut self, counters: &Counters, sections: &[(&str, &[f32])]) -> Result<(), CheckpointError> {
-        let prepared = self.prepare(counters, sections)?;
+    pub fn save(&mut self, counters: &Counters, arrays: &[(&str, &[f32])]) -> Result<(), CheckpointError> {
+        let prepared = self.prepare(counters, arrays)?;
         (self.hook)(SaveStep::Prepared);
         self.keep_latest()?;
         (self.hook)(SaveStep::Kept);
@@ -196,20 +196,20 @@ impl Checkpoints {
         Ok(())
     }
 
-    fn prepare(&self, counters: &Counters, sections: &[(&str, &[f32])]) -> Result<Prepared, CheckpointError> {
+    fn prepare(&self, counters: &Counters, arrays: &[(&str, &[f32])]) -> Result<PreparedFile, CheckpointError> {
         let path = self.directory.join(LATEST);
         let header = Header {
             fingerprint: self.fingerprint,
             counters: *counters,
-            sections: sections
+            arrays: arrays
                 .iter()
                 .map(|(name, numbers)| ((*name).to_owned(), numbers.len() as u64))
                 .collect(),
         };
-        Prepared::write(&path, |file| {
+        PreparedFile::write(&path, |file| {
             durable::seal(KIND, file, |body| {
                 body.write_all(&bincode::serde::encode_to_vec(&header, encoding()).map_err(io::Error::other)?)?;
-                sections
+                arrays
                     .iter()
                     .try_for_each(|(_, numbers)| body.write_all(bytemuck::cast_slice(numbers)))
             })
@@ -222,7 +222,7 @@ impl Checkpoints {
         let latest = self.directory.join(LATEST);
         let sound = match self.latest_is_sound {
             Some(sound) => sound,
-            None => matches!(self.read(LATEST)?, Found::Whole(_)),
+            None => matches!(self.read(LATEST)?, CheckpointFile::Whole(_)),
         };
         let kept = if sound {
             self.directory.join(PREVIOUS)
@@ -240,7 +240,7 @@ impl Checkpoints {
         }
     }
 
-    fn publish(&mut self, prepared: Prepared) -> Result<(), CheckpointError> {
+    fn publish(&mut self, prepared: PreparedFile) -> Result<(), CheckpointError> {
         prepared.publish().map_err(|source| CheckpointError::Write {
             path: self.directory.join(LATEST),
             source,
@@ -260,7 +260,7 @@ impl Checkpoints {
         }
     }
 
-    fn read(&self, name: &str) -> Result<Found, CheckpointError> {
+    fn read(&self, name: &str) -> Result<CheckpointFile, CheckpointError> {
         let path = self.directory.join(name);
         let refused = |reason| CheckpointError::Refused {
             path: path.clone(),
@@ -268,12 +268,12 @@ impl Checkpoints {
         };
         let body = match durable::read_sealed(KIND, &path) {
             Ok(body) => body,
-            Err(SealError::Io(error)) if error.kind() == io::ErrorKind::NotFound => return Ok(Found::Missing),
+            Err(SealError::Io(error)) if error.kind() == io::ErrorKind::NotFound => return Ok(CheckpointFile::Missing),
             Err(error @ SealError::Version { .. }) => return Err(refused(error.to_string())),
-            Err(error) => return Ok(Found::Damaged(error.to_string())),
+            Err(error) => return Ok(CheckpointFile::Damaged(error.to_string())),
         };
         let Some((header, numbers)) = parse(&body) else {
-            return Ok(Found::Damaged("its parts do not fit together".into()));
+            return Ok(CheckpointFile::Damaged("its parts do not fit together".into()));
         };
         if header.fingerprint != self.fingerprint {
             return Err(refused(format!(
@@ -281,10 +281,10 @@ impl Checkpoints {
                 header.fingerprint, self.fingerprint
             )));
         }
-        let sections = header.sections.into_iter().map(|(name, _)| name).zip(numbers).collect();
-        Ok(Found::Whole(Checkpoint {
+        let arrays = header.arrays.into_iter().map(|(name, _)| name).zip(numbers).collect();
+        Ok(CheckpointFile::Whole(Checkpoint {
             counters: header.counters,
-            sections,
+            arrays,
         }))
     }
 }
@@ -292,7 +292,7 @@ impl Checkpoints {
 /// No run reaches this many updates, rows, episodes or versions, and counting further from here does not overflow.
 const LIMIT: u64 = 1 << 60;
 
-/// Splits a body into its header and the numbers of each section; `None` unless the lengths add up to the body's and
+/// Splits a body into its header and the numbers of each array; `None` unless the lengths add up to the body's and
 /// all counters are below `LIMIT`.
 fn parse(body: &[u8]) -> Option<(Header, Vec<Vec<f32>>)> {
     let (header, read): (Header, usize) = bincode::serde::decode_from_slice(body, encoding()).ok()?;
@@ -306,13 +306,13 @@ fn parse(body: &[u8]) -> Option<(Header, Vec<Vec<f32>>)> {
     if updates.max(rows).max(episodes).max(policy_version) >= LIMIT {
         return None;
     }
-    let mut sections = Vec::with_capacity(header.sections.len());
-    for (_, length) in &header.sections {
+    let mut arrays = Vec::with_capacity(header.arrays.len());
+    for (_, length) in &header.arrays {
         let (numbers, after) = rest.split_at_checked(usize::try_from(*length).ok()?)?;
-        sections.push(numbers.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect());
+        arrays.push(numbers.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect());
         rest = after;
     }
-    (rest.is_empty() && odd.is_empty()).then_some((header, sections))
+    (rest.is_empty() && odd.is_empty()).then_some((header, arrays))
 }
 
 /// The limit keeps an absurd length from allocating memory.

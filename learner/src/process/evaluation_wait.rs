@@ -60,6 +60,6 @@ impl EvaluationWait {
                 publisher.refresh_connections()
             },
         );
-        waited.map_err(Exit::widen)
+        waited.map_err(Exit::convert)
     }
 }

@@ -36,7 +36,7 @@ pub enum IntakeError {
 /// The receivers of all actors' chunks.
 #[derive(Debug)]
 pub struct Intake {
-    sources: Vec<Source>,
+    actors: Vec<ActorChunks>,
     chunk: ChunkLayout,
     window: u32,
     /// The number of rows beyond which none are taken.
@@ -47,7 +47,7 @@ pub struct Intake {
 }
 
 #[derive(Debug)]
-struct Source {
+struct ActorChunks {
     receiver: ChunkReceiver,
     notifier: Notifier,
 }
@@ -65,7 +65,7 @@ impl Intake {
         limit: u64,
     ) -> Result<Self, ChannelError> {
         let mut intake = Self {
-            sources: Vec::new(),
+            actors: Vec::new(),
             chunk,
             window,
             limit,
@@ -81,8 +81,8 @@ impl Intake {
     /// # Errors
     /// As `open`.
     pub fn open_receivers(&mut self, domain: &Domain, actors: u32) -> Result<(), ChannelError> {
-        for actor in self.sources.len() as u32..actors {
-            self.sources.push(Source {
+        for actor in self.actors.len() as u32..actors {
+            self.actors.push(ActorChunks {
                 receiver: ChunkReceiver::open(domain, actor, self.chunk, self.window)?,
                 notifier: Notifier::new(domain, EventName(Role::Actor, actor))?,
             });
@@ -92,7 +92,7 @@ impl Intake {
 
     /// The number of actors with an open receiver.
     pub fn actors(&self) -> usize {
-        self.sources.len()
+        self.actors.len()
     }
 
     /// Takes one chunk of each actor in turn, until none is waiting, `most` of each were taken, or `enough` returns
@@ -106,7 +106,7 @@ impl Intake {
         most: u32,
         enough: impl Fn(&Replay) -> bool,
     ) -> Result<bool, IntakeError> {
-        let actors = self.sources.len();
+        let actors = self.actors.len();
         let (mut any, mut idle) = (false, 0);
         for _ in 0..u64::from(most) * actors as u64 {
             if idle == actors || enough(replay) || replay.head() >= self.limit {
@@ -127,7 +127,7 @@ impl Intake {
     /// # Errors
     /// When the channel fails, or the chunk does not belong to this run.
     pub fn take_from(&self, actor: usize, replay: &mut Replay) -> Result<Option<Appended>, IntakeError> {
-        let source = &self.sources[actor];
+        let source = &self.actors[actor];
         let Some(chunk) = source.receiver.receive()? else {
             return Ok(None);
         };
@@ -141,7 +141,7 @@ impl Intake {
 
     /// Notifies every actor that there is a new policy.
     pub fn notify_all(&self) {
-        self.sources.iter().for_each(|source| source.notifier.notify());
+        self.actors.iter().for_each(|source| source.notifier.notify());
     }
 }
 
@@ -156,9 +156,9 @@ fn append(replay: &mut Replay, actor: usize, chunk: &ReceivedChunk, numbers: usi
             value: rows[bad],
         });
     }
-    let mark = chunk.mark(replay.committed(actor).mark);
+    let id = chunk.id(replay.committed(actor).last_chunk);
     let refused = |cause| IntakeError::Chunk { actor, cause };
-    let Some(reserved) = replay.begin(actor, mark).map_err(refused)? else {
+    let Some(reserved) = replay.begin(actor, id).map_err(refused)? else {
         return Ok(Appended::Duplicate);
     };
     let filled = reserved.fill(rows).map_err(refused)?;

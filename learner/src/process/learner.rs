@@ -1,4 +1,4 @@
-//! The learner that free and lockstep runs share, with its replay, method, channels and checkpoints.
+//! The learner that free and lockstep runs share, with its replay, algorithm, channels and checkpoints.
 
 use std::io;
 use std::thread::JoinHandle;
@@ -53,9 +53,9 @@ pub(crate) struct Learner<'a> {
     sync: Option<JoinHandle<io::Result<SyncedRows>>>,
     reporter: Reporter<LearnerReport>,
     report: LearnerReport,
-    reported: Instant,
+    reported_at: Instant,
     heartbeats: Reports<Heartbeat>,
-    looked_for_actors: Instant,
+    actors_checked_at: Instant,
 }
 
 impl<'a> Learner<'a> {
@@ -63,7 +63,7 @@ impl<'a> Learner<'a> {
         let (config, run) = (&settings.config, &settings.run);
         let mut algorithm = registry::new(config)?;
         if config.learner.threads > 1 {
-            algorithm.set_threads(Threads::two()?);
+            algorithm.set_threads(Threads::two_threads()?);
         }
         let listener = Listener::bind(domain, EventName(Role::Learner, 0))?;
         let (layout, file) = (replay_layout(config), run.replay_file());
@@ -80,7 +80,7 @@ impl<'a> Learner<'a> {
             Some(loaded) => {
                 loaded.warnings.iter().for_each(|warning| tracing::warn!("{warning}"));
                 let counters = loaded.checkpoint.counters;
-                algorithm.restore(counters.updates, &mut SavedState::from(loaded.checkpoint.sections))?;
+                algorithm.restore(counters.updates, &mut SavedState::from(loaded.checkpoint.arrays))?;
                 tracing::info!(
                     "continuing after {} updates and {} of {} rows",
                     counters.updates,
@@ -99,7 +99,7 @@ impl<'a> Learner<'a> {
             }
         };
 
-        let mut heartbeat = HeartbeatSender::new(domain, settings.identity)?;
+        let mut heartbeat = HeartbeatSender::new(domain, settings.instance)?;
         let learner = Self {
             publisher: PolicyPublisher::open(domain, algorithm.policy().len())?,
             evaluator: Notifier::new(domain, EventName(Role::Evaluator, 0))?,
@@ -115,10 +115,10 @@ impl<'a> Learner<'a> {
             episodes: counters.episodes,
             reporter: Reporter::open(domain)?,
             report: empty_report(),
-            reported: Instant::now(),
+            reported_at: Instant::now(),
             sync: None,
             heartbeats: Reports::open(domain)?,
-            looked_for_actors: Instant::now(),
+            actors_checked_at: Instant::now(),
             domain,
             settings,
             stop,
@@ -135,7 +135,7 @@ impl<'a> Learner<'a> {
         Ok(learner)
     }
 
-    /// Gradient steps taken; for methods that use each row once, rows consumed.
+    /// Gradient steps taken; for algorithms that use each row once, rows consumed.
     pub(crate) fn updates(&self) -> u64 {
         self.algorithm.updates()
     }
@@ -180,7 +180,7 @@ impl<'a> Learner<'a> {
 
     fn publish_current(&self) -> Result<(), LearnerError> {
         let header = PolicyHeader {
-            incarnation: self.settings.identity.incarnation,
+            incarnation: self.settings.instance.incarnation,
             version: self.policy_version,
             env_steps: self.rows,
             updates: self.algorithm.updates(),
@@ -191,10 +191,10 @@ impl<'a> Learner<'a> {
 
     /// Opens receivers for new actors: a run can be scaled while it is running.
     pub(crate) fn connect_new_actors(&mut self) -> Result<(), LearnerError> {
-        if self.looked_for_actors.elapsed() < NEW_ACTORS_INTERVAL {
+        if self.actors_checked_at.elapsed() < NEW_ACTORS_INTERVAL {
             return Ok(());
         }
-        self.looked_for_actors = Instant::now();
+        self.actors_checked_at = Instant::now();
         while let Some(heartbeat) = self.heartbeats.receive()? {
             if heartbeat.role() == Some(Role::Actor) && heartbeat.index < self.settings.config.actors.max {
                 self.intake.open_receivers(self.domain, heartbeat.index + 1)?;
@@ -236,13 +236,13 @@ impl<'a> Learner<'a> {
     pub(crate) fn report_activity(&mut self, activity: Activity) {
         self.heartbeat.set_policy_version(self.policy_version);
         self.heartbeat.beat(activity);
-        if self.reported.elapsed() >= REPORT_INTERVAL {
+        if self.reported_at.elapsed() >= REPORT_INTERVAL {
             self.send_report();
         }
     }
 
     fn send_report(&mut self) {
-        self.reported = Instant::now();
+        self.reported_at = Instant::now();
         let mut report = std::mem::replace(&mut self.report, empty_report());
         let n = report.averaged.max(1) as f64;
         report.critic_loss /= n;

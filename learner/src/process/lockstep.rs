@@ -4,7 +4,7 @@
 //! and publishes version k. A learner that continues from a checkpoint finds the rows of the rounds since then in the
 //! replay, and repeats the same updates.
 
-use shoal_common::algorithms::Experience;
+use shoal_common::algorithms::TransitionUse;
 use shoal_common::channel::wait_for;
 use shoal_common::exit::Exit;
 use shoal_common::report::Activity;
@@ -82,7 +82,7 @@ fn await_chunk(learner: &mut Learner<'_>, actor: usize, first: u64) -> Result<u6
                 publisher.refresh_connections()
             },
         );
-        taken.map_err(Exit::widen)??;
+        taken.map_err(Exit::convert)??;
         learner.report_activity(Activity::Working);
     }
 }
@@ -97,7 +97,7 @@ fn end_of_chunk(learner: &Learner<'_>, first: u64) -> Option<u64> {
         return (first >= steps).then_some(first);
     }
     let full = (first + config.chunk_rows() as u64).min(steps);
-    if config.algorithm.spec().experience == Experience::Episodes {
+    if config.algorithm.spec().transition_use == TransitionUse::Episodes {
         let row = replay.layout().row;
         let last = (first..head.min(full)).find(|index| row.read(replay.row(*index)).last);
         return last.map(|last| last + 1).or((head >= full).then_some(full));

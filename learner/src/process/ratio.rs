@@ -2,8 +2,8 @@
 
 use shoal_common::config;
 
-/// How many updates the environment steps collected so far allow. An update is a gradient step or, for methods that use
-/// each row once, a row.
+/// How many updates the environment steps collected so far allow. An update is a gradient step or, for algorithms that
+/// use each row once, a row.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Ratio(config::ReplayConfig);
 

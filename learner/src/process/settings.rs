@@ -6,12 +6,12 @@ use shoal_common::channel::ChannelError;
 use shoal_common::config::{Config, Mode};
 use shoal_common::policy::PolicyError;
 use shoal_common::policy_file::PolicyFileError;
-use shoal_common::report::Identity;
+use shoal_common::report::RoleInstance;
 use shoal_common::run_dir::RunDir;
 
 use super::checkpoint::CheckpointError;
 use super::intake::IntakeError;
-use crate::algorithms::algorithm::SectionError;
+use crate::algorithms::algorithm::StateArrayError;
 use crate::algorithms::registry;
 use crate::networks::threads::ThreadsError;
 use crate::replay::{ReplayError, ReplayLayout};
@@ -20,7 +20,7 @@ use crate::replay::{ReplayError, ReplayLayout};
 #[derive(Clone, Debug)]
 pub struct LearnerSettings {
     /// Which process this is.
-    pub identity: Identity,
+    pub instance: RoleInstance,
     /// The run's configuration.
     pub config: Config,
     /// The run's directory, where the replay, the checkpoints and the last policy are.
@@ -46,7 +46,7 @@ pub enum LearnerError {
     Checkpoint(#[from] CheckpointError),
     /// A checkpoint was written by another version of the program.
     #[error(transparent)]
-    Section(#[from] SectionError),
+    StateArray(#[from] StateArrayError),
     /// The algorithm cannot control the environment.
     #[error(transparent)]
     Algorithm(#[from] PolicyError),
@@ -59,7 +59,7 @@ pub enum LearnerError {
     /// The losses are no longer finite.
     #[error("the losses are no longer finite after {updates} updates: lower the learning rates or the rewards' scale")]
     Diverged {
-        /// Gradient steps taken; for methods that use each row once, rows consumed.
+        /// Gradient steps taken; for algorithms that use each row once, rows consumed.
         updates: u64,
     },
     /// A lockstep run must repeat updates on rows that the ring no longer holds.
@@ -99,8 +99,8 @@ pub fn disk_bytes(config: &Config, run: &RunDir) -> Result<u64, SizeError> {
     let replay = if run.replay_file().exists() {
         0
     } else {
-        let places = replay_layout(config).places().ok_or(SizeError::Replay { capacity })?;
-        places.end as u64
+        let offsets = replay_layout(config).offsets().ok_or(SizeError::Replay { capacity })?;
+        offsets.end as u64
     };
     let (_, policy) = config.learned().policy;
     // Three checkpoints: the latest, the one before, and the next one while it is written. Three policies: the best,
@@ -124,7 +124,7 @@ pub fn replay_layout(config: &Config) -> ReplayLayout {
     }
 }
 
-/// Rows in the ring: the sampling window and, in lockstep, the rows of two checkpoint intervals and two rounds, because
+/// Rows in the ring: the sampling range and, in lockstep, the rows of two checkpoint intervals and two rounds, because
 /// a learner that continues from a checkpoint samples them again.
 fn ring_rows(config: &Config) -> u64 {
     let chunk = config.chunk_rows() as u64;

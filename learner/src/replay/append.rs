@@ -2,7 +2,7 @@
 
 use std::sync::atomic::{Ordering, compiler_fence, fence};
 
-use shoal_common::commit::ChunkMark;
+use shoal_common::commit::ChunkId;
 
 use super::error::ChunkError;
 use super::step::{WriteStep, observe};
@@ -20,17 +20,17 @@ pub enum Appended {
 /// A chunk that is new and has no rows yet.
 #[must_use = "nothing is in the replay before `commit`"]
 #[derive(Debug)]
-pub struct Reserved<'a> {
+pub struct ReservedChunk<'a> {
     replay: &'a mut Replay,
     actor: usize,
-    mark: ChunkMark,
+    id: ChunkId,
 }
 
 /// A chunk whose rows are in the ring but not committed.
 #[must_use = "nothing is in the replay before `commit`"]
 #[derive(Debug)]
-pub struct Filled<'a> {
-    chunk: Reserved<'a>,
+pub struct FilledChunk<'a> {
+    chunk: ReservedChunk<'a>,
     rows: u64,
 }
 
@@ -40,28 +40,28 @@ impl Replay {
     /// # Errors
     /// When the actor is unknown, or the chunk is not the next one. The next one has the same incarnation and the next
     /// sequence number, or it is the first of a later incarnation, which has no rows and keeps the sequence number.
-    pub fn begin(&mut self, actor: usize, mark: ChunkMark) -> Result<Option<Reserved<'_>>, ChunkError> {
+    pub fn begin(&mut self, actor: usize, id: ChunkId) -> Result<Option<ReservedChunk<'_>>, ChunkError> {
         let actors = self.layout.actors;
         if actor >= actors {
             return Err(ChunkError::Actor { actor, actors });
         }
-        let committed = self.record.actor(actor).mark;
-        if mark <= committed {
+        let committed = self.record.actor(actor).last_chunk;
+        if id <= committed {
             return Ok(None);
         }
-        if !mark.is_next(committed) {
-            return Err(ChunkError::OutOfOrder { actor, mark, committed });
+        if !id.is_next(committed) {
+            return Err(ChunkError::OutOfOrder { actor, id, committed });
         }
-        Ok(Some(Reserved {
+        Ok(Some(ReservedChunk {
             replay: self,
             actor,
-            mark,
+            id,
         }))
     }
 
     /// Starts, fills and commits a chunk in one call.
-    pub fn append_and_commit(&mut self, actor: usize, mark: ChunkMark, rows: &[f32]) -> Result<Appended, ChunkError> {
-        match self.begin(actor, mark)? {
+    pub fn append_and_commit(&mut self, actor: usize, id: ChunkId, rows: &[f32]) -> Result<Appended, ChunkError> {
+        match self.begin(actor, id)? {
             Some(chunk) => {
                 chunk.fill(rows)?.commit();
                 Ok(Appended::Accepted)
@@ -71,12 +71,12 @@ impl Replay {
     }
 }
 
-impl<'a> Reserved<'a> {
+impl<'a> ReservedChunk<'a> {
     /// Copies the chunk's rows into the ring, over the oldest ones. On an error nothing has changed.
-    pub fn fill(self, numbers: &[f32]) -> Result<Filled<'a>, ChunkError> {
+    pub fn fill(self, numbers: &[f32]) -> Result<FilledChunk<'a>, ChunkError> {
         let Replay {
             layout,
-            places,
+            offsets,
             words,
             ring,
             record,
@@ -101,18 +101,18 @@ impl<'a> Reserved<'a> {
         }
         let head = record.head();
         // Set before the first row is overwritten, so that recovery after a kill can tell why these rows are gone.
-        words.store(places.write_horizon, head + rows);
+        words.store(offsets.write_horizon, head + rows);
         record.set_tail(record.tail().max((head + rows).saturating_sub(layout.ring)));
         compiler_fence(Ordering::SeqCst);
         observe(hook, WriteStep::WriteHorizonSet);
         ring.put(head, numbers, |step| observe(hook, step));
         // The rows are in the file before a record names them. This is for recovery: no reader reads rows.
         fence(Ordering::Release);
-        Ok(Filled { chunk: self, rows })
+        Ok(FilledChunk { chunk: self, rows })
     }
 }
 
-impl Filled<'_> {
+impl FilledChunk<'_> {
     /// Sets the actor's snapshot after the chunk, in as many words as the layout has. Without this call, the previous
     /// snapshot stays.
     ///
@@ -125,8 +125,8 @@ impl Filled<'_> {
 
     /// Makes the chunk part of the replay.
     pub fn commit(self) {
-        let Reserved { replay, actor, mark } = self.chunk;
-        replay.record.add(actor, mark, self.rows);
+        let ReservedChunk { replay, actor, id } = self.chunk;
+        replay.record.add(actor, id, self.rows);
         replay.publish(replay.record.generation() + 1);
     }
 }

@@ -17,14 +17,14 @@ impl Replay {
     ///
     /// # Panics
     /// If this replay is not empty, or its rows have another layout.
-    pub fn begin_with(&mut self, other: &Self, most: u64) -> Result<u64, ReplayError> {
+    pub fn inherit_rows(&mut self, other: &Self, most: u64) -> Result<u64, ReplayError> {
         assert_eq!(self.head(), 0, "only an empty replay begins with other rows");
         assert_eq!(self.layout.row, other.layout.row, "rows of another layout");
         let rows = other.rows();
         let first = rows.end.saturating_sub(most.min(self.layout.ring)).max(rows.start);
         let count = rows.end - first;
         // As for a chunk: recovery after a kill must know that these places may have been written.
-        self.words.store(self.places.write_horizon, count);
+        self.words.store(self.offsets.write_horizon, count);
         let mut numbers = Vec::new();
         let mut next = first;
         while next < rows.end {
@@ -36,7 +36,7 @@ impl Replay {
         }
         // The rows are in the file before a record names them.
         fence(Ordering::Release);
-        self.record.add_rows_of_nobody(count);
+        self.record.add_inherited_rows(count);
         self.publish(self.record.generation() + 1);
         self.flush()?;
         Ok(count)
@@ -47,7 +47,7 @@ impl Replay {
 mod tests {
     use shoal_common::transition::RowLayout;
 
-    use super::super::{ChunkMark, ReplayLayout};
+    use super::super::{ChunkId, ReplayLayout};
     use super::*;
 
     fn layout(ring: u64) -> ReplayLayout {
@@ -68,16 +68,16 @@ mod tests {
         let width = layout(6).row.width();
         for sequence in 1..=5_u64 {
             let rows: Vec<f32> = (0..2 * width).map(|i| (sequence * 100) as f32 + i as f32).collect();
-            let mark = ChunkMark {
+            let id = ChunkId {
                 incarnation: 0,
                 sequence,
             };
-            old.append_and_commit(0, mark, &rows).unwrap();
+            old.append_and_commit(0, id, &rows).unwrap();
         }
         for (ring, most, expected) in [(20, 20, 6), (20, 4, 4), (3, 20, 3)] {
             let name = path(&format!("{ring}-{most}"));
             let mut new = Replay::create(&name, &layout(ring)).unwrap();
-            assert_eq!(new.begin_with(&old, most).unwrap(), expected);
+            assert_eq!(new.inherit_rows(&old, most).unwrap(), expected);
             drop(new);
             let mut new = Replay::open(&name, &layout(ring)).unwrap();
             assert!(new.warnings().is_empty(), "{:?}", new.warnings());
@@ -86,11 +86,11 @@ mod tests {
                 assert_eq!(new.row(index), old.row(10 - expected + index), "row {index}");
             }
             // The first chunk of an actor is still its first one.
-            let mark = ChunkMark {
+            let id = ChunkId {
                 incarnation: 0,
                 sequence: 1,
             };
-            new.append_and_commit(1, mark, &vec![1.0; width]).unwrap();
+            new.append_and_commit(1, id, &vec![1.0; width]).unwrap();
             assert_eq!((new.head(), new.committed(1).rows), (expected + 1, 1));
         }
     }

@@ -3,7 +3,7 @@
 use std::io;
 use std::path::PathBuf;
 
-use shoal_common::commit::ChunkMark;
+use shoal_common::commit::ChunkId;
 
 /// Why a replay file was not created, opened or synced. Nothing was overwritten.
 #[derive(Debug, thiserror::Error)]
@@ -78,15 +78,15 @@ pub enum ChunkError {
     /// It is neither the next chunk of its actor nor the first one of the actor's next incarnation.
     #[error(
         "chunk {} of incarnation {} from actor {actor} after chunk {} of incarnation {}: some between them are missing",
-        mark.sequence, mark.incarnation, committed.sequence, committed.incarnation
+        id.sequence, id.incarnation, committed.sequence, committed.incarnation
     )]
     OutOfOrder {
         /// The actor's index.
         actor: usize,
-        /// The chunk's mark.
-        mark: ChunkMark,
-        /// The mark of the actor's last committed chunk.
-        committed: ChunkMark,
+        /// The chunk's id.
+        id: ChunkId,
+        /// The id of the actor's last committed chunk.
+        committed: ChunkId,
     },
     /// It ends within a row.
     #[error(

@@ -9,15 +9,15 @@ use std::time::Duration;
 use rustix::fs::{CWD, FallocateFlags, RenameFlags, fallocate, renameat_with};
 use rustix::io::Errno;
 use rustix::process::{Resource, getrlimit};
-use shoal_common::commit::{Places, Record, ReplayLayout, SYNCED, Words, WritableWords};
+use shoal_common::commit::{CommitRecord, FileOffsets, ReplayLayout, SYNCED, Words, WritableWords};
 use shoal_common::durable::sync_directory_of;
 use shoal_common::file_lock;
 
 use super::error::ReplayError;
 
 /// Creates an empty replay under a temporary name and renames it, so that a file with the replay's name is whole.
-pub(super) fn create(path: &Path, layout: &ReplayLayout) -> Result<(File, Places), ReplayError> {
-    let places = places(path, layout)?;
+pub(super) fn create(path: &Path, layout: &ReplayLayout) -> Result<(File, FileOffsets), ReplayError> {
+    let offsets = offsets(path, layout)?;
     if fs::exists(path).map_err(io(path, "look for"))? {
         return Err(ReplayError::Exists(path.into()));
     }
@@ -40,62 +40,62 @@ pub(super) fn create(path: &Path, layout: &ReplayLayout) -> Result<(File, Places
     file.set_len(0)
         .and_then(|()| file.set_permissions(Permissions::from_mode(0o600)))
         .map_err(io(path, "create"))?;
-    reserve(path, &file, places.end as u64)?;
+    reserve(path, &file, offsets.end as u64)?;
 
-    let mut words = WritableWords::map(&file, places.header).map_err(io(path, "map"))?;
-    for (i, word) in layout.identity().into_iter().enumerate() {
+    let mut words = WritableWords::map(&file, offsets.header).map_err(io(path, "map"))?;
+    for (i, word) in layout.preamble().into_iter().enumerate() {
         words.store(i * size_of::<u64>(), word);
     }
-    let mut record = Record::empty(layout);
+    let mut record = CommitRecord::empty(layout);
     record.set_generation(1);
     // As committed and as synced, so that a power loss always leaves a state to fall back to.
     for slot in [1, SYNCED] {
-        record.store(&mut words, places.slots[slot], |_| ());
+        record.store(&mut words, offsets.slots[slot], |_| ());
     }
-    words.store(places.published, record.generation());
+    words.store(offsets.published, record.generation());
     drop(words);
 
     file.sync_all().map_err(io(path, "sync"))?;
     rename_to_new(&temporary.0, path)?;
     sync_directory_of(path).map_err(io(path, "sync"))?;
-    Ok((file, places))
+    Ok((file, offsets))
 }
 
 /// Opens the file and compares it with the layout before anything is mapped for writing.
-pub(super) fn open(path: &Path, layout: &ReplayLayout) -> Result<(File, Places), ReplayError> {
+pub(super) fn open(path: &Path, layout: &ReplayLayout) -> Result<(File, FileOffsets), ReplayError> {
     let refused = |reason| ReplayError::Refused {
         path: path.into(),
         reason,
     };
-    let places = places(path, layout)?;
+    let offsets = offsets(path, layout)?;
     let file = match OpenOptions::new().read(true).write(true).open(path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Err(ReplayError::Missing(path.into())),
         file => file.map_err(io(path, "open"))?,
     };
     lock(path, &file)?;
     let length = file.metadata().map_err(io(path, "open"))?.len();
-    if length < places.header as u64 {
+    if length < offsets.header as u64 {
         return Err(refused(format!(
             "it is cut short: {length} bytes, and a replay for this run has {}",
-            places.end
+            offsets.end
         )));
     }
-    let words = Words::map(&file, places.header).map_err(io(path, "map"))?;
+    let words = Words::map(&file, offsets.header).map_err(io(path, "map"))?;
     let found = ReplayLayout::read(&words).map_err(|fault| refused(fault.to_string()))?;
     if let Some(difference) = layout.difference(&found) {
         return Err(refused(difference));
     }
-    if length != places.end as u64 {
+    if length != offsets.end as u64 {
         return Err(refused(format!(
             "it has {length} bytes, and by its header it should have {}",
-            places.end
+            offsets.end
         )));
     }
-    Ok((file, places))
+    Ok((file, offsets))
 }
 
-fn places(path: &Path, layout: &ReplayLayout) -> Result<Places, ReplayError> {
-    layout.places().ok_or_else(|| ReplayError::Impossible {
+fn offsets(path: &Path, layout: &ReplayLayout) -> Result<FileOffsets, ReplayError> {
+    layout.offsets().ok_or_else(|| ReplayError::Impossible {
         path: path.into(),
         ring: layout.ring,
         actors: layout.actors,

@@ -2,13 +2,13 @@
 //! loss any block of the file may be older than any other, so records are compared by the rows that are intact under
 //! them.
 
-use shoal_common::commit::{Places, Record, ReplayLayout, SLOTS, SYNCED, Words};
+use shoal_common::commit::{CommitRecord, FileOffsets, ReplayLayout, SLOTS, SYNCED, Words};
 
 use super::ring::Ring;
 
 /// The result of the recovery.
-pub(super) struct Found {
-    pub(super) record: Record,
+pub(super) struct RecoveredRecord {
+    pub(super) record: CommitRecord,
     /// The generation to publish first. Its slot is left as it is.
     pub(super) first_generation: u64,
     /// The generation to publish next, with `record`. It is newer than all others and belongs to the other slot.
@@ -26,7 +26,7 @@ const MAX_DISTANCE: u64 = 1 << 48;
 /// A sealed record. The rows from `tail` to its head are intact.
 struct Candidate<'a> {
     slot: usize,
-    record: &'a Record,
+    record: &'a CommitRecord,
     tail: u64,
 }
 
@@ -52,8 +52,13 @@ impl Candidate<'_> {
 
 /// Chooses the newest record if all its rows are intact, except those that were being overwritten. Otherwise, the
 /// record under which most of the synced rows are intact, then the one with most rows.
-pub(super) fn recover(words: &Words, places: &Places, layout: &ReplayLayout, ring: &Ring) -> Result<Found, String> {
-    let slots: [Option<Record>; SLOTS] = places.slots.map(|slot| Record::load(words, slot, layout));
+pub(super) fn recover(
+    words: &Words,
+    offsets: &FileOffsets,
+    layout: &ReplayLayout,
+    ring: &Ring,
+) -> Result<RecoveredRecord, String> {
+    let slots: [Option<CommitRecord>; SLOTS] = offsets.slots.map(|slot| CommitRecord::load(words, slot, layout));
     let newest_of = |from: usize| {
         let records = slots
             .iter()
@@ -66,7 +71,7 @@ pub(super) fn recover(words: &Words, places: &Places, layout: &ReplayLayout, rin
 
     // Rows before this number may be missing: an interrupted append was overwriting them.
     let replaced = words
-        .load(places.write_horizon)
+        .load(offsets.write_horizon)
         .min(newest.head() + layout.ring)
         .saturating_sub(layout.ring);
     let synced = newest_of(SYNCED).map_or(0, |(_, record)| record.head());
@@ -88,7 +93,7 @@ pub(super) fn recover(words: &Words, places: &Places, layout: &ReplayLayout, rin
             .ok_or(NONE_LEFT)?;
     }
 
-    let published = words.load(places.published);
+    let published = words.load(offsets.published);
     let warnings = warnings(&best, newest, published, replaced.max(oldest(best.record, layout)));
     // Readers may be reading the published slot. So publish the chosen record first, if it is in slot 0 or 1, and then
     // write the other slot.
@@ -110,7 +115,7 @@ pub(super) fn recover(words: &Words, places: &Places, layout: &ReplayLayout, rin
         last + 1
     };
 
-    let generation = |slot: usize| slots[slot].as_ref().map_or(0, Record::generation);
+    let generation = |slot: usize| slots[slot].as_ref().map_or(0, CommitRecord::generation);
     let (older, newer) = if generation(SYNCED) <= generation(SYNCED + 1) {
         (SYNCED, SYNCED + 1)
     } else {
@@ -118,7 +123,7 @@ pub(super) fn recover(words: &Words, places: &Places, layout: &ReplayLayout, rin
     };
     let mut record = best.record.clone();
     record.set_tail(best.tail);
-    Ok(Found {
+    Ok(RecoveredRecord {
         record,
         first_generation,
         next_generation,
@@ -129,7 +134,7 @@ pub(super) fn recover(words: &Words, places: &Places, layout: &ReplayLayout, rin
 }
 
 /// What is lost: the record `published`, rows after those of `best`, or rows from `expected` on.
-fn warnings(best: &Candidate<'_>, newest: &Record, published: u64, expected: u64) -> Vec<String> {
+fn warnings(best: &Candidate<'_>, newest: &CommitRecord, published: u64, expected: u64) -> Vec<String> {
     let mut warnings = Vec::new();
     if newest.generation() < published {
         let number = newest.generation();
@@ -153,12 +158,12 @@ fn warnings(best: &Candidate<'_>, newest: &Record, published: u64, expected: u64
 }
 
 /// The first row that the ring holds under `record` if none is damaged.
-fn oldest(record: &Record, layout: &ReplayLayout) -> u64 {
+fn oldest(record: &CommitRecord, layout: &ReplayLayout) -> u64 {
     record.tail().max(record.head().saturating_sub(layout.ring))
 }
 
 /// The first row from which on all rows up to the record's head are intact.
-fn intact_from(record: &Record, layout: &ReplayLayout, ring: &Ring) -> u64 {
+fn intact_from(record: &CommitRecord, layout: &ReplayLayout, ring: &Ring) -> u64 {
     let rows = oldest(record, layout)..record.head();
     rows.clone()
         .rev()

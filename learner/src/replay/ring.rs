@@ -5,7 +5,7 @@ use std::io;
 use std::ops::Range;
 
 use memmap2::{MmapMut, MmapOptions};
-use shoal_common::commit::{Places, ReplayLayout};
+use shoal_common::commit::{FileOffsets, ReplayLayout};
 
 use super::check;
 use super::step::WriteStep;
@@ -21,17 +21,17 @@ pub(super) struct Ring {
 
 impl Ring {
     /// Maps checks and rows of a file whose length has been compared with its layout.
-    pub(super) fn map(file: &File, layout: &ReplayLayout, places: &Places) -> io::Result<Self> {
+    pub(super) fn map(file: &File, layout: &ReplayLayout, offsets: &FileOffsets) -> io::Result<Self> {
         let mut options = MmapOptions::new();
         options
-            .offset(places.checks.start as u64)
-            .len(places.end - places.checks.start);
+            .offset(offsets.checks.start as u64)
+            .len(offsets.end - offsets.checks.start);
         // SAFETY: the bytes change under a mapping only if another process writes the file. Rows and checks are written
         // and read only by the process that holds the file's lock, which is this one, and only through this mapping.
         // Other processes map the header, which ends before it. The file is never shortened: its space was reserved
         // when it was created, and its length has been checked.
         let map = unsafe { options.map_mut(file)? };
-        let rows = places.rows.start - places.checks.start;
+        let rows = offsets.rows.start - offsets.checks.start;
         Ok(Self {
             map,
             rows,
@@ -86,8 +86,8 @@ impl Ring {
         check != check::NONE && check == check::of_row(index, self.row(index))
     }
 
-    /// Empties the places outside `rows`. Otherwise a row that was never committed, or was given up after a power loss,
-    /// could pass for the later row with its number. Returns true if a place was not empty.
+    /// Empties the places outside `rows`. Otherwise a row that was never committed, or was given up after a power
+    /// loss, could pass for the later row with its number. Returns true if a place was not empty.
     pub(super) fn clear_outside(&mut self, rows: Range<u64>) -> bool {
         let mut cleared = false;
         for index in rows.end..rows.start + self.ring {

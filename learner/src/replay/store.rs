@@ -5,7 +5,7 @@ use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering, compiler_fence};
 
-use shoal_common::commit::{ActorCommit, Places, Record, ReplayLayout, WritableWords};
+use shoal_common::commit::{ActorCommit, CommitRecord, FileOffsets, ReplayLayout, WritableWords};
 
 use super::error::ReplayError;
 use super::ring::Ring;
@@ -16,13 +16,13 @@ use super::{file, recovery};
 pub struct Replay {
     pub(super) path: PathBuf,
     pub(super) layout: ReplayLayout,
-    pub(super) places: Places,
+    pub(super) offsets: FileOffsets,
     pub(super) file: File,
     pub(super) words: WritableWords,
     pub(super) ring: Ring,
     /// What is committed, as in the active slot, except that the tail already excludes the rows that the chunk being
     /// filled overwrites.
-    pub(super) record: Record,
+    pub(super) record: CommitRecord,
     /// Which of the two slots for synced records is written next.
     pub(super) next_synced: usize,
     /// The newest generation in these two slots.
@@ -42,33 +42,34 @@ impl Replay {
     /// Creates the replay of a new run, with all its space reserved. Never replaces a file, and leaves none after an
     /// error.
     pub fn create(path: &Path, layout: &ReplayLayout) -> Result<Self, ReplayError> {
-        let (file, places) = file::create(path, layout)?;
-        Self::map(path, layout, places, file)
+        let (file, offsets) = file::create(path, layout)?;
+        Self::map(path, layout, offsets, file)
     }
 
     /// Maps the replay of a run that is resumed, and repairs it after a crash (see `warnings`). A file of another
     /// layout or configuration is refused and left as it is.
     pub fn open(path: &Path, layout: &ReplayLayout) -> Result<Self, ReplayError> {
-        let (file, places) = file::open(path, layout)?;
-        Self::map(path, layout, places, file)
+        let (file, offsets) = file::open(path, layout)?;
+        Self::map(path, layout, offsets, file)
     }
 
-    fn map(path: &Path, layout: &ReplayLayout, places: Places, file: File) -> Result<Self, ReplayError> {
+    fn map(path: &Path, layout: &ReplayLayout, offsets: FileOffsets, file: File) -> Result<Self, ReplayError> {
         let io = |source| ReplayError::Io {
             path: path.into(),
             doing: "map",
             source,
         };
-        let words = WritableWords::map(&file, places.header).map_err(io)?;
-        let ring = Ring::map(&file, layout, &places).map_err(io)?;
-        let found = recovery::recover(words.read(), &places, layout, &ring).map_err(|reason| ReplayError::Refused {
-            path: path.into(),
-            reason,
-        })?;
+        let words = WritableWords::map(&file, offsets.header).map_err(io)?;
+        let ring = Ring::map(&file, layout, &offsets).map_err(io)?;
+        let found =
+            recovery::recover(words.read(), &offsets, layout, &ring).map_err(|reason| ReplayError::Refused {
+                path: path.into(),
+                reason,
+            })?;
         let mut replay = Self {
             path: path.into(),
             layout: layout.clone(),
-            places,
+            offsets,
             file,
             words,
             ring,
@@ -79,9 +80,9 @@ impl Replay {
             hook: None,
             warned: AtomicBool::new(false),
         };
-        replay.words.store(replay.places.published, found.first_generation);
+        replay.words.store(replay.offsets.published, found.first_generation);
         replay.publish(found.next_generation);
-        replay.words.store(replay.places.write_horizon, replay.record.head());
+        replay.words.store(replay.offsets.write_horizon, replay.record.head());
         let cleared = replay.ring.clear_outside(replay.rows());
         if cleared || !replay.warnings.is_empty() {
             // A later power loss must not bring back the rows that were given up here.
@@ -169,7 +170,7 @@ impl Replay {
     /// The rows to draw a minibatch from, for a replay as it was after `logical_head` rows: the newest `capacity` rows
     /// before it. There are fewer if the replay had fewer, if rows were lost, or if the ring has overwritten some
     /// since. A caller that must rule out the last case compares the start with `logical_head - capacity`.
-    pub fn window(&self, logical_head: u64, capacity: u64) -> Range<u64> {
+    pub fn sampling_range(&self, logical_head: u64, capacity: u64) -> Range<u64> {
         let rows = self.rows();
         let end = logical_head.clamp(rows.start, rows.end);
         end.saturating_sub(capacity).max(rows.start)..end
@@ -182,16 +183,16 @@ impl Replay {
 
     /// Writes `self.record` into the slot of `generation` and makes it the active slot.
     pub(super) fn publish(&mut self, generation: u64) {
-        let published = self.words.read().load(self.places.published);
+        let published = self.words.read().load(self.offsets.published);
         assert_ne!(generation % 2, published % 2, "the active slot is never written");
         self.record.set_generation(generation);
-        let slot = self.places.slots[(generation % 2) as usize];
+        let slot = self.offsets.slots[(generation % 2) as usize];
         let hook = &mut self.hook;
         self.record
             .store(&mut self.words, slot, |step| observe(hook, step_of_record(step)));
         // SYNC POINT with the first Acquire fence of `CommitReader::consistent`. The Release fence is the last one of
-        // `Record::store`.
-        self.words.store(self.places.published, generation);
+        // `CommitRecord::store`.
+        self.words.store(self.offsets.published, generation);
         // After a kill, the stores in the file are those in program order as compiled. This fence keeps the compiler
         // from moving the next chunk's rows, which are plain stores, before this store.
         compiler_fence(Ordering::SeqCst);

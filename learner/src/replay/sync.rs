@@ -6,7 +6,7 @@
 use std::fs::File;
 use std::io;
 
-use shoal_common::commit::{Record, SYNCED};
+use shoal_common::commit::{CommitRecord, SYNCED};
 
 use super::error::ReplayError;
 use super::step::{WriteStep, observe, step_of_record};
@@ -17,14 +17,14 @@ use super::store::Replay;
 #[derive(Debug)]
 pub struct PendingSync {
     file: File,
-    record: Record,
+    record: CommitRecord,
 }
 
 /// The replay as it was at one moment, now on the disk.
 #[must_use = "the file does not record this before `finish_sync`"]
 #[derive(Debug)]
 pub struct SyncedRows {
-    record: Record,
+    record: CommitRecord,
 }
 
 impl PendingSync {
@@ -55,7 +55,7 @@ impl Replay {
         }
         let hook = &mut self.hook;
         observe(hook, WriteStep::RowsSynced);
-        let slot = self.places.slots[self.next_synced];
+        let slot = self.offsets.slots[self.next_synced];
         synced
             .record
             .store(&mut self.words, slot, |step| observe(hook, step_of_record(step)));

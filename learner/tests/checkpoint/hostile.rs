@@ -8,13 +8,13 @@ use bincode::config;
 use proptest::prelude::*;
 use proptest::sample::Index;
 use rustix::process::{Resource, Rlimit, setrlimit};
-use shoal_common::durable::{self, Kind};
-use shoal_learner::process::checkpoint::{CheckpointError, Checkpoints, Counters, Loaded};
+use shoal_common::durable::{self, FileKind};
+use shoal_learner::process::checkpoint::{CheckpointError, Checkpoints, Counters, LoadedCheckpoint};
 use tempfile::TempDir;
 
 const NAMES: [&str; 2] = ["latest.ckpt", "previous.ckpt"];
 
-/// The header as it is written: fingerprint, counters, sections.
+/// The header as it is written: fingerprint, counters, arrays.
 type Header = (u64, (u64, u64, u64, u64), Vec<(String, u64)>);
 
 /// Limits memory, so that allocating by a hostile length fails.
@@ -37,12 +37,12 @@ fn save(directory: &Path, updates: u64) {
         episodes: 0,
         policy_version: 1,
     };
-    let sections: [(&str, &[f32]); 3] = [("actor", &[1.0, 2.0]), ("empty", &[]), ("critic", &[updates as f32])];
-    Checkpoints::new(directory, 7).save(&counters, &sections).unwrap();
+    let arrays: [(&str, &[f32]); 3] = [("actor", &[1.0, 2.0]), ("empty", &[]), ("critic", &[updates as f32])];
+    Checkpoints::new(directory, 7).save(&counters, &arrays).unwrap();
 }
 
 /// Loads, and asserts that the files have not changed.
-fn load(directory: &Path) -> Result<Option<Loaded>, CheckpointError> {
+fn load(directory: &Path) -> Result<Option<LoadedCheckpoint>, CheckpointError> {
     let read = || NAMES.map(|name| fs::read(directory.join(name)).ok());
     let before = read();
     let loaded = Checkpoints::new(directory, 7).load_newest();
@@ -97,7 +97,7 @@ fn damaged(mut bytes: Vec<u8>, damage: Vec<Damage>) -> Vec<u8> {
 }
 
 fn sealed(path: &Path, body: &[u8]) {
-    const KIND: Kind = Kind {
+    const KIND: FileKind = FileKind {
         magic: *b"SHOALCKP",
         version: 2,
         name: "a checkpoint",
@@ -142,7 +142,7 @@ proptest! {
         match (load(directory.path()), whole.first()) {
             (Ok(Some(loaded)), Some(&updates)) => {
                 prop_assert_eq!(loaded.checkpoint.counters.updates, updates);
-                prop_assert_eq!(&loaded.checkpoint.sections[2].1, &[updates as f32]);
+                prop_assert_eq!(&loaded.checkpoint.arrays[2].1, &[updates as f32]);
                 prop_assert_eq!(loaded.warnings.is_empty(), updates == 2);
             }
             (Err(CheckpointError::AllDamaged { .. }), None) => {}
@@ -157,18 +157,18 @@ proptest! {
         let directory = TempDir::new().unwrap();
         save(directory.path(), 1);
         let path = directory.path().join("latest.ckpt");
-        // The bytes alone, and the bytes after hostile values for the number of sections and the length of the first
+        // The bytes alone, and the bytes after hostile values for the number of arrays and the length of the first
         // name.
-        let [sections, name, numbers] = lengths;
-        let mut claims = [7, 1, 2, 3, 4, sections, name].map(u64::to_le_bytes).concat();
+        let [arrays, name, numbers] = lengths;
+        let mut claims = [7, 1, 2, 3, 4, arrays, name].map(u64::to_le_bytes).concat();
         claims.extend(&body);
         claims.extend(numbers.to_le_bytes());
         for body in [&body, &claims] {
             sealed(&path, body);
             match load(directory.path()) {
                 Err(CheckpointError::AllDamaged { .. } | CheckpointError::Refused { .. }) => {}
-                // With no sections, there is nothing after their number.
-                Ok(Some(_)) => prop_assert!(sections == 0),
+                // With no arrays, there is nothing after their number.
+                Ok(Some(_)) => prop_assert!(arrays == 0),
                 other => prop_assert!(false, "{:?}", other),
             }
         }
@@ -178,18 +178,18 @@ proptest! {
     fn a_hostile_header_is_refused(
         fingerprint in prop_oneof![Just(7), extreme()],
         counters in (extreme(), extreme(), extreme(), extreme()),
-        sections in prop::collection::vec(("[a-z]{0,5}", prop_oneof![0..9_u64, extreme()]), 0..4),
+        arrays in prop::collection::vec(("[a-z]{0,5}", prop_oneof![0..9_u64, extreme()]), 0..4),
         right in any::<bool>(),
         odd in 0..4_usize,
         numbers in 0..20_usize,
     ) {
         limit_memory();
-        let claimed = sections.iter().try_fold(0_u64, |sum, (_, length)| sum.checked_add(*length));
+        let claimed = arrays.iter().try_fold(0_u64, |sum, (_, length)| sum.checked_add(*length));
         let numbers = match claimed {
             Some(claimed) if right && claimed < 100 => claimed as usize,
             _ => numbers,
         };
-        let header: Header = (fingerprint, counters, sections);
+        let header: Header = (fingerprint, counters, arrays);
         let encoding = config::standard().with_fixed_int_encoding();
         let mut body = bincode::serde::encode_to_vec(&header, encoding).unwrap();
         body.resize(body.len() + 4 * numbers + odd, 0x3f);

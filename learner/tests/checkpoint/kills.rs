@@ -44,10 +44,10 @@ fn load(directory: &Path, newest: u64) -> (Checkpoints, Vec<String>) {
         Some(loaded) => {
             let Checkpoint {
                 counters: found,
-                sections,
+                arrays,
             } = loaded.checkpoint;
             assert_eq!(found, counters(newest));
-            assert_eq!(sections, [("actor".to_owned(), vec![newest as f32; 3000])]);
+            assert_eq!(arrays, [("actor".to_owned(), vec![newest as f32; 3000])]);
             loaded.warnings
         }
     };

@@ -2,25 +2,25 @@
 
 use shoal_learner::replay::{Appended, ChunkError, Replay};
 
-use crate::model::{chunk, filled, layout, mark};
+use crate::model::{chunk, filled, id, layout};
 
 #[test]
 fn a_chunk_is_committed_once_and_not_from_an_old_incarnation() {
     let (directory, mut model) = filled(100, &[(0, 3), (1, 2), (0, 4)]);
     let mut replay = Replay::open(&directory.replay(), &layout(100)).unwrap();
-    let mut append = |mark| replay.append_and_commit(0, mark, &chunk(0, mark, 2)).unwrap();
-    assert_eq!(append(mark(0, 1)), Appended::Duplicate);
-    assert_eq!(append(mark(0, 2)), Appended::Duplicate);
+    let mut append = |id| replay.append_and_commit(0, id, &chunk(0, id, 2)).unwrap();
+    assert_eq!(append(id(0, 1)), Appended::Duplicate);
+    assert_eq!(append(id(0, 2)), Appended::Duplicate);
     assert_eq!(
-        append(mark(1, 2)),
+        append(id(1, 2)),
         Appended::Accepted,
         "the first chunk of an incarnation"
     );
-    assert_eq!(append(mark(0, 3)), Appended::Duplicate);
-    assert_eq!(append(mark(1, 2)), Appended::Duplicate);
-    assert_eq!(append(mark(1, 3)), Appended::Accepted);
-    for mark in [mark(1, 2), mark(1, 3)] {
-        model.add(0, mark, &chunk(0, mark, 2));
+    assert_eq!(append(id(0, 3)), Appended::Duplicate);
+    assert_eq!(append(id(1, 2)), Appended::Duplicate);
+    assert_eq!(append(id(1, 3)), Appended::Accepted);
+    for id in [id(1, 2), id(1, 3)] {
+        model.add(0, id, &chunk(0, id, 2));
     }
     model.check(&replay);
 }
@@ -41,14 +41,14 @@ fn a_chunk_that_is_not_the_next_one_is_refused_and_nothing_is_written() {
         (last, 3),
         (last, last),
     ] {
-        let mark = mark(incarnation, sequence);
-        let refused = replay.append_and_commit(0, mark, &chunk(0, mark, 2)).unwrap_err();
-        let committed = replay.committed(0).mark;
+        let id = id(incarnation, sequence);
+        let refused = replay.append_and_commit(0, id, &chunk(0, id, 2)).unwrap_err();
+        let committed = replay.committed(0).last_chunk;
         assert_eq!(
             refused,
             ChunkError::OutOfOrder {
                 actor: 0,
-                mark,
+                id,
                 committed
             }
         );
@@ -60,7 +60,7 @@ fn a_chunk_that_is_not_the_next_one_is_refused_and_nothing_is_written() {
 fn an_invalid_chunk_is_refused_and_nothing_is_written() {
     let (directory, model) = filled(10, &[(0, 10)]);
     let mut replay = Replay::open(&directory.replay(), &layout(10)).unwrap();
-    let mut append = |actor, rows: &[f32]| replay.append_and_commit(actor, mark(0, 2), rows).unwrap_err();
+    let mut append = |actor, rows: &[f32]| replay.append_and_commit(actor, id(0, 2), rows).unwrap_err();
     assert_eq!(append(3, &[0.0; 6]), ChunkError::Actor { actor: 3, actors: 3 });
     assert_eq!(
         append(0, &[0.0; 7]),
@@ -88,10 +88,10 @@ fn a_chunk_that_was_filled_and_dropped_is_not_committed_and_the_rows_it_overwrot
     let mut replay = Replay::open(&directory.replay(), &layout(10)).unwrap();
     drop(
         replay
-            .begin(1, mark(0, 1))
+            .begin(1, id(0, 1))
             .unwrap()
             .unwrap()
-            .fill(&chunk(1, mark(0, 1), 3))
+            .fill(&chunk(1, id(0, 1), 3))
             .unwrap(),
     );
     model.check(&replay);
@@ -107,9 +107,9 @@ fn a_window_is_the_newest_rows_before_its_head() {
     let (directory, _) = filled(100, &[(0, 60), (1, 60)]);
     let replay = Replay::open(&directory.replay(), &layout(100)).unwrap();
     assert_eq!(replay.rows(), 20..120);
-    assert_eq!(replay.window(120, 50), 70..120);
-    assert_eq!(replay.window(90, 50), 40..90);
-    assert_eq!(replay.window(60, 50), 20..60);
-    assert_eq!(replay.window(200, 50), 70..120);
-    assert!(replay.window(10, 50).is_empty());
+    assert_eq!(replay.sampling_range(120, 50), 70..120);
+    assert_eq!(replay.sampling_range(90, 50), 40..90);
+    assert_eq!(replay.sampling_range(60, 50), 20..60);
+    assert_eq!(replay.sampling_range(200, 50), 70..120);
+    assert!(replay.sampling_range(10, 50).is_empty());
 }

@@ -8,7 +8,7 @@ use proptest::prelude::*;
 use shoal_common::commit::{CommitReader, OpenError};
 use shoal_learner::replay::{Appended, Replay, WriteStep};
 
-use crate::model::{ACTORS, Directory, Model, WIDTH, chunk, filled, layout, mark, places, reopen};
+use crate::model::{ACTORS, Directory, Model, WIDTH, chunk, filled, id, layout, offsets, reopen};
 
 /// The content of the file after each step.
 type Images = Vec<(WriteStep, Vec<u8>)>;
@@ -31,11 +31,11 @@ proptest! {
 
         let mut before = Model::default();
         for (actor, rows, noise) in writes {
-            let mark = before.next(actor);
-            let numbers = chunk(actor, mark, rows);
-            replay.append_and_commit(actor, mark, &numbers).unwrap();
+            let id = before.next(actor);
+            let numbers = chunk(actor, id, rows);
+            replay.append_and_commit(actor, id, &numbers).unwrap();
             let mut after = before.clone();
-            after.add(actor, mark, &numbers);
+            after.add(actor, id, &numbers);
             after.check(&replay);
             if noise % 5 == 0 {
                 replay.flush().unwrap();
@@ -47,7 +47,7 @@ proptest! {
                 if step == WriteStep::WriteHorizonSet {
                     // If the kill comes while rows are copied, their places may hold anything.
                     for index in before.head()..after.head() {
-                        let place = places(ring).rows.start + (index % ring) as usize * 4 * WIDTH;
+                        let place = offsets(ring).rows.start + (index % ring) as usize * 4 * WIDTH;
                         if noise >> (index % 32) & 1 == 1 {
                             image[place + (noise % 24) as usize] ^= 0x55;
                         }
@@ -61,7 +61,7 @@ proptest! {
                 prop_assert!(reopened.rows().start <= intact, "after {:?}: {:?}", step, reopened.rows());
 
                 // The actor sends it again.
-                let again = reopened.append_and_commit(actor, mark, &numbers).unwrap();
+                let again = reopened.append_and_commit(actor, id, &numbers).unwrap();
                 prop_assert_eq!(again, if committed { Appended::Duplicate } else { Appended::Accepted });
                 after.check(&reopened);
                 drop(reopened);
@@ -91,10 +91,10 @@ proptest! {
                 replay.flush().unwrap();
                 images.push(fs::read(directory.replay()).unwrap());
             }
-            let mark = model.next(actor);
-            let numbers = chunk(actor, mark, rows);
-            replay.append_and_commit(actor, mark, &numbers).unwrap();
-            model.add(actor, mark, &numbers);
+            let id = model.next(actor);
+            let numbers = chunk(actor, id, rows);
+            replay.append_and_commit(actor, id, &numbers).unwrap();
+            model.add(actor, id, &numbers);
             states.insert(model.head(), model.clone());
             if number >= before.len() {
                 images.push(fs::read(directory.replay()).unwrap());
@@ -120,7 +120,7 @@ proptest! {
         states[&head].check(&Replay::open(&copy, &layout(ring)).unwrap());
     }
 
-    /// After damage anywhere behind the identity, the readable rows are still right.
+    /// After damage anywhere behind the preamble, the readable rows are still right.
     #[test]
     fn a_damaged_row_is_never_readable(
         writes in prop::collection::vec((0..ACTORS, 1_u64..9), 1..20),
@@ -133,16 +133,16 @@ proptest! {
         let mut partial = Model::default();
         states.insert(0, partial.clone());
         for &(actor, rows) in &writes {
-            let mark = partial.next(actor);
-            partial.add(actor, mark, &chunk(actor, mark, rows));
+            let id = partial.next(actor);
+            partial.add(actor, id, &chunk(actor, id, rows));
             states.insert(partial.head(), partial.clone());
         }
-        let places = places(ring);
+        let offsets = offsets(ring);
         // The used parts of the file, so that the damage hits something.
-        let used: Vec<usize> = (places.published..places.published + 16)
-            .chain(places.slots.iter().flat_map(|&slot| slot..slot + 104))
-            .chain(places.checks.clone())
-            .chain(places.rows.clone())
+        let used: Vec<usize> = (offsets.published..offsets.published + 16)
+            .chain(offsets.slots.iter().flat_map(|&slot| slot..slot + 104))
+            .chain(offsets.checks.clone())
+            .chain(offsets.rows.clone())
             .collect();
         for (at, byte) in damage {
             image[*at.get(&used)] = byte;
@@ -158,8 +158,8 @@ proptest! {
 fn a_torn_newest_record_falls_back_to_the_previous_one_with_a_warning() {
     let (directory, _) = filled(100, &[(0, 3), (1, 2), (0, 4)]);
     let mut image = fs::read(directory.replay()).unwrap();
-    let newest = u64::from_le_bytes(image[places(100).published..][..8].try_into().unwrap());
-    let slot = places(100).slots[newest as usize % 2];
+    let newest = u64::from_le_bytes(image[offsets(100).published..][..8].try_into().unwrap());
+    let slot = offsets(100).slots[newest as usize % 2];
     image[slot + 16] ^= 1;
     // An actor that opens it first waits until the learner has repaired it.
     fs::write(directory.replay(), &image).unwrap();
@@ -176,17 +176,12 @@ fn a_torn_newest_record_falls_back_to_the_previous_one_with_a_warning() {
         replay.warnings()
     );
     assert_eq!(
-        replay
-            .append_and_commit(0, mark(0, 2), &chunk(0, mark(0, 2), 4))
-            .unwrap(),
+        replay.append_and_commit(0, id(0, 2), &chunk(0, id(0, 2), 4)).unwrap(),
         Appended::Accepted
     );
-    assert_eq!(
-        CommitReader::open(&directory.replay()).unwrap().committed(0),
-        mark(0, 2)
-    );
+    assert_eq!(CommitReader::open(&directory.replay()).unwrap().committed(0), id(0, 2));
 
-    for slot in places(100).slots {
+    for slot in offsets(100).slots {
         image[slot..slot + 104].fill(0);
     }
     drop(replay);
@@ -199,7 +194,7 @@ fn a_torn_newest_record_falls_back_to_the_previous_one_with_a_warning() {
 fn a_damaged_row_also_loses_the_rows_before_it() {
     let (directory, model) = filled(100, &[(0, 60), (1, 30)]);
     let mut image = fs::read(directory.replay()).unwrap();
-    image[places(100).rows.start + 20 * 4 * WIDTH] ^= 1;
+    image[offsets(100).rows.start + 20 * 4 * WIDTH] ^= 1;
     let replay = reopen(&directory.replay(), &image, 100).unwrap();
     model.check(&replay);
     assert_eq!(replay.rows(), 21..90);
@@ -214,8 +209,8 @@ fn a_sync_on_another_thread_counts_once_it_is_finished() {
     let (directory, mut model) = filled(100, &[(0, 30)]);
     let mut replay = Replay::open(&directory.replay(), &layout(100)).unwrap();
     let old = replay.start_sync().unwrap();
-    let numbers = chunk(0, mark(0, 2), 5);
-    replay.append_and_commit(0, mark(0, 2), &numbers).unwrap();
+    let numbers = chunk(0, id(0, 2), 5);
+    replay.append_and_commit(0, id(0, 2), &numbers).unwrap();
     let new = replay.start_sync().unwrap();
     let new = std::thread::spawn(|| new.run().unwrap()).join().unwrap();
     replay.finish_sync(new);
@@ -223,10 +218,10 @@ fn a_sync_on_another_thread_counts_once_it_is_finished() {
     let before = fs::read(directory.replay()).unwrap();
     replay.finish_sync(old.run().unwrap());
     assert_eq!(fs::read(directory.replay()).unwrap(), before);
-    model.add(0, mark(0, 2), &numbers);
+    model.add(0, id(0, 2), &numbers);
     drop(replay);
     let mut image = fs::read(directory.replay()).unwrap();
-    for slot in &places(100).slots[..2] {
+    for slot in &offsets(100).slots[..2] {
         image[*slot] ^= 1;
     }
     model.check(&reopen(&directory.replay(), &image, 100).unwrap());
@@ -255,7 +250,7 @@ fn word(image: &[u8], at: usize) -> u64 {
 fn a_record_that_is_being_written_has_no_seal() {
     let (_directory, images) = images_of_a_commit();
     for (step, image) in images {
-        let other = places(100).slots[1 - (word(&image, places(100).published) % 2) as usize];
+        let other = offsets(100).slots[1 - (word(&image, offsets(100).published) % 2) as usize];
         let cleared = word(&image, other) == 0;
         assert_eq!(
             cleared,
@@ -269,7 +264,7 @@ fn a_record_that_is_being_written_has_no_seal() {
 fn opening_leaves_the_record_that_it_continues_from() {
     let (directory, images) = images_of_a_commit();
     for (step, image) in images {
-        let slots = places(100).slots;
+        let slots = offsets(100).slots;
         let newest = slots[..2]
             .iter()
             .max_by_key(|&&slot| (word(&image, slot) != 0, word(&image, slot + 8)));
@@ -289,12 +284,10 @@ fn a_power_loss_among_unsynced_rows_goes_back_to_the_synced_ones() {
     let (directory, mut model) = filled(100, &[(0, 30)]);
     let mut replay = Replay::open(&directory.replay(), &layout(100)).unwrap();
     replay.flush().unwrap();
-    replay
-        .append_and_commit(1, mark(0, 1), &chunk(1, mark(0, 1), 60))
-        .unwrap();
+    replay.append_and_commit(1, id(0, 1), &chunk(1, id(0, 1), 60)).unwrap();
     drop(replay);
     let mut image = fs::read(directory.replay()).unwrap();
-    let row = |index| places(100).rows.start + 4 * WIDTH * index;
+    let row = |index| offsets(100).rows.start + 4 * WIDTH * index;
     image[row(30)..row(40)].fill(0);
     let mut replay = reopen(&directory.replay(), &image, 100).unwrap();
     model.check(&replay);
@@ -304,15 +297,15 @@ fn a_power_loss_among_unsynced_rows_goes_back_to_the_synced_ones() {
         ["the newest 60 rows did not reach the disk; continuing from the 30 rows that did"]
     );
     // The lost rows do not come back under the numbers of the next rows.
-    let numbers = chunk(2, mark(0, 1), 5);
-    replay.append_and_commit(2, mark(0, 1), &numbers).unwrap();
-    model.add(2, mark(0, 1), &numbers);
+    let numbers = chunk(2, id(0, 1), 5);
+    replay.append_and_commit(2, id(0, 1), &numbers).unwrap();
+    model.add(2, id(0, 1), &numbers);
     drop(replay);
     let replay = Replay::open(&directory.replay(), &layout(100)).unwrap();
     model.check(&replay);
     assert_eq!(replay.rows(), 0..35);
     drop(replay);
     let image = fs::read(directory.replay()).unwrap();
-    let checks = &image[places(100).checks.start..][..400];
+    let checks = &image[offsets(100).checks.start..][..400];
     assert!(checks[35 * 4..].iter().all(|&byte| byte == 0));
 }

@@ -8,7 +8,7 @@ use shoal_common::commit::{CommitReader, OpenError};
 use shoal_common::transition::RowLayout;
 use shoal_learner::replay::{Replay, ReplayError, ReplayLayout};
 
-use crate::model::{Directory, filled, layout, places, reopen};
+use crate::model::{Directory, filled, layout, offsets, reopen};
 
 proptest! {
     #![proptest_config(ProptestConfig { cases: 24, failure_persistence: None, ..ProptestConfig::default() })]
@@ -142,7 +142,7 @@ fn a_replay_is_created_once_and_has_one_writer() {
     let replay = Replay::create(&path, &layout(10)).unwrap();
     assert_eq!(directory.names(), ["replay.rows"]);
     assert_eq!(fs::metadata(&path).unwrap().permissions().mode() & 0o777, 0o600);
-    assert_eq!(fs::metadata(&path).unwrap().len(), places(10).end as u64);
+    assert_eq!(fs::metadata(&path).unwrap().len(), offsets(10).end as u64);
     assert!(matches!(Replay::open(&path, &layout(10)), Err(ReplayError::InUse(_))));
     assert!(matches!(
         Replay::create(&path, &layout(10)),

@@ -4,9 +4,9 @@ use std::fs;
 
 use proptest::prelude::*;
 use shoal_common::commit::{CommitReader, OpenError};
-use shoal_learner::replay::{Appended, ChunkMark, Replay, ReplayError};
+use shoal_learner::replay::{Appended, ChunkId, Replay, ReplayError};
 
-use crate::model::{ACTORS, chunk, filled, layout, mark, places, reopen};
+use crate::model::{ACTORS, chunk, filled, id, layout, offsets, reopen};
 
 const RING: u64 = 40;
 /// Words of a record: generation, head, tail, and three per actor.
@@ -39,7 +39,7 @@ fn use_file(path: &std::path::Path, image: &[u8]) -> Result<(), TestCaseError> {
         let read_as_actor = || match CommitReader::open(path) {
             Ok(reader) => {
                 reader.rows();
-                (0..ACTORS).for_each(|actor| assert_eq!(reader.actor(actor).mark, reader.committed(actor)));
+                (0..ACTORS).for_each(|actor| assert_eq!(reader.actor(actor).last_chunk, reader.committed(actor)));
                 assert!(reader.snapshot().is_some());
             }
             Err(OpenError::NotYet { .. } | OpenError::Refused { .. }) => {}
@@ -60,14 +60,14 @@ fn use_file(path: &std::path::Path, image: &[u8]) -> Result<(), TestCaseError> {
         prop_assert!(rows.end - rows.start <= RING);
         rows.clone().for_each(|index| drop(replay.row(index).to_vec()));
         for (head, capacity) in [(0, 1), (rows.end, RING), (u64::MAX, u64::MAX), (rows.start, 0)] {
-            let window = replay.window(head, capacity);
-            prop_assert!(window.is_empty() || rows.start <= window.start && window.end <= rows.end);
+            let range = replay.sampling_range(head, capacity);
+            prop_assert!(range.is_empty() || rows.start <= range.start && range.end <= rows.end);
         }
         for actor in 0..ACTORS {
-            let ChunkMark { incarnation, sequence } = replay.committed(actor).mark;
-            let next = mark(incarnation, sequence.saturating_add(1));
+            let ChunkId { incarnation, sequence } = replay.committed(actor).last_chunk;
+            let next = id(incarnation, sequence.saturating_add(1));
             let appended = replay
-                .append_and_commit(actor, next, &chunk(actor, mark(life, 1), 30))
+                .append_and_commit(actor, next, &chunk(actor, id(life, 1), 30))
                 .unwrap();
             prop_assert_eq!(appended == Appended::Duplicate, sequence == u64::MAX);
         }
@@ -93,14 +93,14 @@ proptest! {
         let (directory, _) = filled(RING, &writes);
         let mut image = fs::read(directory.replay()).unwrap();
         for (slot, word, value) in changes {
-            put(&mut image, places(RING).slots[slot] + 8 * (1 + word), value);
+            put(&mut image, offsets(RING).slots[slot] + 8 * (1 + word), value);
         }
-        for (slot, sealed) in places(RING).slots.into_iter().zip(sealed) {
+        for (slot, sealed) in offsets(RING).slots.into_iter().zip(sealed) {
             if sealed {
                 seal(&mut image, slot);
             }
         }
-        for (at, value) in [(places(RING).published, published), (places(RING).write_horizon, write_horizon)] {
+        for (at, value) in [(offsets(RING).published, published), (offsets(RING).write_horizon, write_horizon)] {
             if let Some(value) = value {
                 put(&mut image, at, value);
             }
@@ -108,7 +108,7 @@ proptest! {
         use_file(&directory.replay(), &image)?;
     }
 
-    /// An identity with any numbers and a right checksum is refused unless it is the run's own.
+    /// A preamble with any numbers and a right checksum is refused unless it is the run's own.
     #[test]
     fn a_hostile_identity_is_refused(changes in prop::collection::vec((2..9_usize, extreme()), 1..4)) {
         let (directory, _) = filled(RING, &[(0, 10)]);

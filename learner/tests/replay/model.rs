@@ -3,9 +3,9 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use shoal_common::commit::Places;
+use shoal_common::commit::FileOffsets;
 use shoal_common::transition::RowLayout;
-use shoal_learner::replay::{ActorCommit, ChunkMark, Replay, ReplayError, ReplayLayout};
+use shoal_learner::replay::{ActorCommit, ChunkId, Replay, ReplayError, ReplayLayout};
 use tempfile::TempDir;
 
 pub(crate) const ACTORS: usize = 3;
@@ -22,21 +22,21 @@ pub(crate) fn layout(ring: u64) -> ReplayLayout {
     }
 }
 
-pub(crate) fn places(ring: u64) -> Places {
-    layout(ring).places().unwrap()
+pub(crate) fn offsets(ring: u64) -> FileOffsets {
+    layout(ring).offsets().unwrap()
 }
 
-pub(crate) fn mark(incarnation: u64, sequence: u64) -> ChunkMark {
-    ChunkMark { incarnation, sequence }
+pub(crate) fn id(incarnation: u64, sequence: u64) -> ChunkId {
+    ChunkId { incarnation, sequence }
 }
 
 /// A chunk whose rows identify themselves.
-pub(crate) fn chunk(actor: usize, mark: ChunkMark, rows: u64) -> Vec<f32> {
+pub(crate) fn chunk(actor: usize, id: ChunkId, rows: u64) -> Vec<f32> {
     let row = |i| {
         [
             actor as f32,
-            mark.incarnation as f32,
-            mark.sequence as f32,
+            id.incarnation as f32,
+            id.sequence as f32,
             i as f32,
             rows as f32,
             -1.0,
@@ -45,7 +45,7 @@ pub(crate) fn chunk(actor: usize, mark: ChunkMark, rows: u64) -> Vec<f32> {
     (0..rows).flat_map(row).collect()
 }
 
-/// What the replay should hold: every row ever committed, and the actors' marks.
+/// What the replay should hold: every row ever committed, and each actor's last chunk.
 #[derive(Clone, Default)]
 pub(crate) struct Model {
     pub(crate) rows: Vec<Vec<f32>>,
@@ -54,14 +54,14 @@ pub(crate) struct Model {
 
 impl Model {
     /// The next chunk of an actor.
-    pub(crate) fn next(&self, actor: usize) -> ChunkMark {
-        let last = self.actors[actor].mark;
-        mark(last.incarnation, last.sequence + 1)
+    pub(crate) fn next(&self, actor: usize) -> ChunkId {
+        let last = self.actors[actor].last_chunk;
+        id(last.incarnation, last.sequence + 1)
     }
 
-    pub(crate) fn add(&mut self, actor: usize, mark: ChunkMark, numbers: &[f32]) {
+    pub(crate) fn add(&mut self, actor: usize, id: ChunkId, numbers: &[f32]) {
         self.rows.extend(numbers.chunks(WIDTH).map(<[f32]>::to_vec));
-        self.actors[actor].mark = mark;
+        self.actors[actor].last_chunk = id;
         self.actors[actor].rows += (numbers.len() / WIDTH) as u64;
     }
 
@@ -111,10 +111,10 @@ pub(crate) fn filled(ring: u64, writes: &[(usize, u64)]) -> (Directory, Model) {
     let mut replay = Replay::create(&directory.replay(), &layout(ring)).unwrap();
     let mut model = Model::default();
     for &(actor, rows) in writes {
-        let mark = model.next(actor);
-        let numbers = chunk(actor, mark, rows);
-        replay.append_and_commit(actor, mark, &numbers).unwrap();
-        model.add(actor, mark, &numbers);
+        let id = model.next(actor);
+        let numbers = chunk(actor, id, rows);
+        replay.append_and_commit(actor, id, &numbers).unwrap();
+        model.add(actor, id, &numbers);
     }
     (directory, model)
 }

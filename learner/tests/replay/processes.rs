@@ -5,10 +5,10 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use shoal_common::commit::{CommitReader, OpenError, Record};
+use shoal_common::commit::{CommitReader, CommitRecord, OpenError};
 use shoal_common::transition::RowLayout;
 use shoal_learner::process::checkpoint::{CheckpointError, Checkpoints, Counters};
-use shoal_learner::replay::{ChunkMark, Replay, ReplayError, ReplayLayout};
+use shoal_learner::replay::{ChunkId, Replay, ReplayError, ReplayLayout};
 use tempfile::TempDir;
 
 const ACTORS: usize = 2;
@@ -34,14 +34,14 @@ fn rows_of(actor: usize, sequence: u64) -> u64 {
 }
 
 fn append(replay: &mut Replay, actor: usize) {
-    let sequence = replay.committed(actor).mark.sequence + 1;
+    let sequence = replay.committed(actor).last_chunk.sequence + 1;
     let rows = rows_of(actor, sequence);
     let row = |i| [actor as f32, sequence as f32, i as f32, rows as f32, -1.0, 0.5];
     let numbers: Vec<f32> = (0..rows).flat_map(row).collect();
     replay
         .append_and_commit(
             actor,
-            ChunkMark {
+            ChunkId {
                 incarnation: 0,
                 sequence,
             },
@@ -82,7 +82,7 @@ fn child_appends_forever() {
     assert_eq!(replay.warnings(), &[] as &[String]);
     for round in 1_u64.. {
         // The actors take turns, also after a kill between the two.
-        let actor = usize::from(replay.committed(0).mark > replay.committed(1).mark);
+        let actor = usize::from(replay.committed(0).last_chunk > replay.committed(1).last_chunk);
         append(&mut replay, actor);
         if round.is_multiple_of(2000) {
             replay.flush().unwrap();
@@ -91,10 +91,10 @@ fn child_appends_forever() {
 }
 
 /// Asserts that a record is of one moment: the actors' rows add up to its head, and the actors took turns.
-fn check_record(record: &Record) {
+fn check_record(record: &CommitRecord) {
     let actors = (0..ACTORS).map(|actor| record.actor(actor));
     assert_eq!(actors.map(|actor| actor.rows).sum::<u64>(), record.head());
-    assert!(record.actor(0).mark.sequence - record.actor(1).mark.sequence <= 1);
+    assert!(record.actor(0).last_chunk.sequence - record.actor(1).last_chunk.sequence <= 1);
 }
 
 /// Asserts that the rows are those of each actor's chunks, from chunk 1 to the last, whole and in order, as far back as
@@ -104,13 +104,13 @@ fn check_rows(replay: &Replay) {
         let commit = replay.committed(actor);
         assert_eq!(
             commit.rows,
-            (1..=commit.mark.sequence)
+            (1..=commit.last_chunk.sequence)
                 .map(|sequence| rows_of(actor, sequence))
                 .sum::<u64>()
         );
     }
     // Backwards from the newest chunk: actor 1 wrote last if it has as many as actor 0.
-    let (mut sequence, mut actor) = match [0, 1].map(|actor| replay.committed(actor).mark.sequence) {
+    let (mut sequence, mut actor) = match [0, 1].map(|actor| replay.committed(actor).last_chunk.sequence) {
         [first, second] if first == second => (second, 1),
         [first, _] => (first, 0),
     };
@@ -180,15 +180,15 @@ fn readers_see_whole_records_that_only_grow() {
     let directory = TempDir::new().unwrap();
     let path = directory.path().join("replay.rows");
     let mut replay = Replay::create(&path, &layout()).unwrap();
-    let check = |reader: &CommitReader, head: &mut u64, marks: &mut [ChunkMark]| {
+    let check = |reader: &CommitReader, head: &mut u64, ids: &mut [ChunkId]| {
         let record = reader.snapshot().expect("a published record can always be read");
         check_record(&record);
         assert!(record.head() >= *head && reader.rows() >= record.head());
         *head = record.head();
-        for (actor, mark) in marks.iter_mut().enumerate() {
+        for (actor, id) in ids.iter_mut().enumerate() {
             let now = reader.actor(actor);
-            assert!(now.mark >= *mark && now.mark >= record.actor(actor).mark);
-            *mark = now.mark;
+            assert!(now.last_chunk >= *id && now.last_chunk >= record.actor(actor).last_chunk);
+            *id = now.last_chunk;
         }
     };
     let reader = CommitReader::open(&path).unwrap();
@@ -199,9 +199,9 @@ fn readers_see_whole_records_that_only_grow() {
                 append(&mut replay, 1);
             }
         });
-        let (mut head, mut marks) = (0, [ChunkMark::default(); ACTORS]);
+        let (mut head, mut ids) = (0, [ChunkId::default(); ACTORS]);
         while !writer.is_finished() {
-            check(&reader, &mut head, &mut marks);
+            check(&reader, &mut head, &mut ids);
         }
         assert!(head > 0);
     });
@@ -226,7 +226,7 @@ fn under_limit(set_up: &str, test: &str, path: &Path) {
 fn child_creates_a_replay_that_is_too_large() {
     let path = path_of_child();
     let error = Replay::create(&path, &layout()).unwrap_err();
-    let bytes = layout().places().unwrap().end;
+    let bytes = layout().offsets().unwrap().end;
     assert!(matches!(error, ReplayError::NoSpace { .. }), "{error}");
     let line = error.to_string();
     assert!(

@@ -8,7 +8,7 @@ use message::{
 };
 use prost::Message;
 
-use super::{Activation, Body, Network, OBSERVATION_CLIP, Portable};
+use super::{Activation, ExportedNetwork, OBSERVATION_CLIP, PolicyFunction, PortablePolicy};
 
 /// The versions of the file format and of the operator set. They are old enough for every runtime, and new enough for
 /// `ArgMax` to have `select_last_index`, which decides between equal values.
@@ -29,13 +29,13 @@ const BATCH: &str = "batch";
 ///
 /// If the policy normalises observations, the model does so. Discrete states and actions have the environment's own
 /// numbers, which begin at the `start` of their space.
-pub(super) fn model(policy: &Portable) -> Vec<u8> {
+pub(super) fn model(policy: &PortablePolicy) -> Vec<u8> {
     let mut graph = Graph {
         name: "policy".into(),
         ..Graph::default()
     };
     match &policy.body {
-        Body::Actions { network, range } => {
+        PolicyFunction::Actions { network, range } => {
             let elements = 0..range.width();
             let half = range.half().to_vec();
             let centre: Vec<f32> = elements.map(|element| range.action(element, 0.0)).collect();
@@ -54,7 +54,7 @@ pub(super) fn model(policy: &Portable) -> Vec<u8> {
             graph.add_node("Min", &["bounded_below", "action_high"], "action", vec![]);
             graph.add_output("action", FLOAT, &[outputs]);
         }
-        Body::Probabilities { network } => {
+        PolicyFunction::Probabilities { network } => {
             graph.add_input("observation", FLOAT, &[network.layers[0].inputs]);
             graph.add_network(network, "logits");
             graph.add_node("Softmax", &["logits"], "probabilities", vec![integer("axis", 1)]);
@@ -64,7 +64,7 @@ pub(super) fn model(policy: &Portable) -> Vec<u8> {
             graph.add_output("probabilities", FLOAT, &[actions]);
             graph.add_output("action", INT64, &[]);
         }
-        Body::Values { network } => {
+        PolicyFunction::Values { network } => {
             graph.add_input("observation", FLOAT, &[network.layers[0].inputs]);
             graph.add_network(network, "action_values");
             graph.add_arg_max("action_values", policy.starts.action);
@@ -72,7 +72,7 @@ pub(super) fn model(policy: &Portable) -> Vec<u8> {
             graph.add_output("action_values", FLOAT, &[actions]);
             graph.add_output("action", INT64, &[]);
         }
-        Body::Table {
+        PolicyFunction::Table {
             states,
             actions,
             values,
@@ -110,8 +110,8 @@ pub(super) fn model(policy: &Portable) -> Vec<u8> {
 
 impl Graph {
     /// Adds the layers with the activation between them. The output of the last one is named `output`.
-    fn add_network(&mut self, network: &Network, output: &str) {
-        let Network {
+    fn add_network(&mut self, network: &ExportedNetwork, output: &str) {
+        let ExportedNetwork {
             normalisation,
             activation,
             layers,

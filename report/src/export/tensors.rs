@@ -3,18 +3,18 @@
 use safetensors::Dtype;
 use safetensors::tensor::TensorView;
 
-use super::{Body, Network, Portable};
+use super::{ExportedNetwork, PolicyFunction, PortablePolicy};
 
 /// The bytes of the file. A network has `layers.<i>.weight` (outputs × inputs, row-major) and `layers.<i>.bias` for
 /// each layer i from 0, the output layer last. If observations are normalised, `observation.mean` and
 /// `observation.factor` say how: x ← (x − mean) · factor, clipped to ±`observation_clip` of the metadata. A table has `action_values` (states × actions). The metadata describes
 /// the rest.
-pub(super) fn file(policy: &Portable) -> anyhow::Result<Vec<u8>> {
+pub(super) fn file(policy: &PortablePolicy) -> anyhow::Result<Vec<u8>> {
     let tensors = match &policy.body {
-        Body::Actions { network, .. } | Body::Probabilities { network } | Body::Values { network } => {
-            of_network(network)
-        }
-        Body::Table {
+        PolicyFunction::Actions { network, .. }
+        | PolicyFunction::Probabilities { network }
+        | PolicyFunction::Values { network } => of_network(network),
+        PolicyFunction::Table {
             states,
             actions,
             values,
@@ -33,7 +33,7 @@ pub(super) fn file(policy: &Portable) -> anyhow::Result<Vec<u8>> {
 
 type Named<'a> = (String, Vec<usize>, &'a [f32]);
 
-fn of_network(network: &Network) -> Vec<Named<'_>> {
+fn of_network(network: &ExportedNetwork) -> Vec<Named<'_>> {
     let normalisation = network.normalisation.iter().flat_map(|(mean, factor)| {
         [("observation.mean", mean), ("observation.factor", factor)]
             .map(|(name, numbers)| (name.to_owned(), vec![numbers.len()], numbers.as_slice()))
@@ -83,7 +83,7 @@ mod tests {
     #[test]
     fn tensors_and_metadata_suffice_to_compute_the_same_actions() {
         for (config, policy) in policies() {
-            let bytes = Portable::new(&config, &policy, "best")
+            let bytes = PortablePolicy::new(&config, &policy, "best")
                 .unwrap()
                 .to_safetensors()
                 .unwrap();
@@ -100,7 +100,7 @@ mod tests {
                 if !metadata.contains_key("hidden_activation") {
                     let (shape, values) = numbers(&tensors, "action_values");
                     let row = &values[observation[0] as usize * shape[1]..][..shape[1]];
-                    assert_eq!(shoal_common::policy::highest(row) as f32, expected[0]);
+                    assert_eq!(shoal_common::policy::argmax(row) as f32, expected[0]);
                     continue;
                 }
                 let mut x = observation.to_vec();
@@ -124,7 +124,7 @@ mod tests {
                 }
                 let z = linear(&tensors, last, &x);
                 if ["reinforce", "dqn"].contains(&config.algorithm.name()) {
-                    assert_eq!(shoal_common::policy::highest(&z) as f32, expected[0]);
+                    assert_eq!(shoal_common::policy::argmax(&z) as f32, expected[0]);
                     continue;
                 }
                 let bound = |name: &str| -> Vec<f32> { serde_json::from_str(&metadata[name]).unwrap() };

@@ -6,7 +6,7 @@ use plotters::style::text_anchor::HPos;
 use shoal_run::recorder::EvaluationRecord;
 
 use super::canvas::{BLUE, px, save, text};
-use super::panel::{Axis, Look, Panel, Series, range_of};
+use super::panel::{Axis, Panel, Series, SeriesStyle, range_of};
 
 const SIZE: (u32, u32) = (860, 470);
 
@@ -23,14 +23,14 @@ pub fn learning_curve(evaluations: &[EvaluationRecord], path: &Path) -> anyhow::
         .iter()
         .map(|e| (e.env_steps as f64 / unit, e.return_mean))
         .collect();
-    let window = window(raw.len());
-    let smoothed = smooth(&raw, window);
+    let averaged_points = averaged_points(raw.len());
+    let smoothed = smooth(&raw, averaged_points);
 
     let raw_label = match evaluations.last() {
         Some(evaluation) => format!("mean return of {} episodes", evaluation.episodes),
         None => String::new(),
     };
-    let smoothed_label = format!("moving average of {window} evaluations, centred");
+    let smoothed_label = format!("moving average of {averaged_points} evaluations, centred");
     let x = Axis {
         label,
         range: 0.0..last as f64 / unit,
@@ -42,7 +42,7 @@ pub fn learning_curve(evaluations: &[EvaluationRecord], path: &Path) -> anyhow::
     let mut series = Vec::new();
     if raw.len() <= 100 {
         series.push(Series {
-            look: Look::Dots,
+            style: SeriesStyle::Dots,
             opacity: 0.6,
             width: 2.5,
             ..Series::line("", BLUE, raw.clone())
@@ -54,7 +54,7 @@ pub fn learning_curve(evaluations: &[EvaluationRecord], path: &Path) -> anyhow::
         width: 1.0,
         ..Series::line(&raw_label, BLUE, raw)
     });
-    if window > 1 {
+    if averaged_points > 1 {
         series.push(Series {
             width: 3.0,
             ..Series::line(&smoothed_label, BLUE, smoothed)
@@ -90,16 +90,16 @@ pub(super) fn unit_of(last: u64) -> (f64, &'static str) {
 
 /// Number of evaluations in the moving average: about a twelfth of them, always odd, and 1 (no smoothing) if there are
 /// few.
-fn window(evaluations: usize) -> usize {
+fn averaged_points(evaluations: usize) -> usize {
     match evaluations {
         0..5 => 1,
         _ => (evaluations / 12).clamp(3, 101) | 1,
     }
 }
 
-/// The mean of the `window` points centred on each point; near the ends, of the part of the window that exists.
-fn smooth(points: &[(f64, f64)], window: usize) -> Vec<(f64, f64)> {
-    let half = window / 2;
+/// The mean of the `averaged_points` points centred on each point; near the ends, of those that exist.
+fn smooth(points: &[(f64, f64)], averaged_points: usize) -> Vec<(f64, f64)> {
+    let half = averaged_points / 2;
     let mean = |of: &[(f64, f64)]| of.iter().map(|(_, y)| y).sum::<f64>() / of.len() as f64;
     let around = |i: usize| &points[i.saturating_sub(half)..(i + half + 1).min(points.len())];
     points
@@ -149,7 +149,7 @@ mod tests {
         let points = [(0.0, 1.0), (1.0, 2.0), (2.0, 6.0), (3.0, 1.0)];
         assert_eq!(smooth(&points, 3), [(0.0, 1.5), (1.0, 3.0), (2.0, 3.0), (3.0, 3.5)]);
         assert_eq!(smooth(&points, 1), points);
-        assert!((0..10_000).all(|n| window(n) % 2 == 1 && window(n) <= n.max(1)));
+        assert!((0..10_000).all(|n| averaged_points(n) % 2 == 1 && averaged_points(n) <= n.max(1)));
     }
 
     #[test]

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use super::canvas::{BLUE, INK, save};
 use super::learning_curve::unit_of;
-use super::panel::{Axis, Look, Panel, Series, range_of};
+use super::panel::{Axis, Panel, Series, SeriesStyle, range_of};
 
 const SIZE: (u32, u32) = (860, 470);
 
@@ -28,7 +28,7 @@ pub fn learning_curves(
     if curves.len() > 2 {
         let outline = &mut lower.iter().chain(upper.iter().rev()).copied();
         series.push(Series {
-            look: Look::Area,
+            style: SeriesStyle::Area,
             opacity: 0.18,
             ..Series::line("middle half", BLUE, scaled(outline))
         });

@@ -22,7 +22,7 @@ pub struct Frame<'a> {
 }
 
 /// A setting, with the curves of its runs and one curve that summarises them.
-pub struct Setting {
+pub struct CurvesOfSetting {
     /// Its name in the legend or title.
     pub label: String,
     /// The curve that summarises all runs.
@@ -58,7 +58,7 @@ impl<'a> Frame<'a> {
 }
 
 /// Draws the summary curves of all settings in one diagram. There are four colours, which repeat.
-pub fn lines(frame: &Frame<'_>, settings: &[Setting], path: &Path) -> anyhow::Result<()> {
+pub fn lines(frame: &Frame<'_>, settings: &[CurvesOfSetting], path: &Path) -> anyhow::Result<()> {
     let series = settings.iter().zip(COLORS.iter().cycle());
     let series = series.map(|(setting, color)| Series::line(&setting.label, *color, setting.curve.clone()));
     let panel = frame.panel(frame.title, series.collect());
@@ -66,7 +66,7 @@ pub fn lines(frame: &Frame<'_>, settings: &[Setting], path: &Path) -> anyhow::Re
 }
 
 /// Draws one diagram for each setting, two in a row: thin lines for its runs, a thick one for its summary curve.
-pub fn lines_by_setting(frame: &Frame<'_>, settings: &[Setting], path: &Path) -> anyhow::Result<()> {
+pub fn lines_by_setting(frame: &Frame<'_>, settings: &[CurvesOfSetting], path: &Path) -> anyhow::Result<()> {
     let rows = settings.len().div_ceil(2).max(1);
     save(path, (1160, 380 * rows as u32), |sheet| {
         for (setting, cell) in settings.iter().zip(sheet.split_evenly((rows, 2))) {
@@ -116,9 +116,9 @@ mod tests {
             y: ("return", 0.0, 210.0),
             level: Some(("solved", 195.0)),
         };
-        let settings: Vec<Setting> = ["plain", "normalised", "skipping"]
+        let settings: Vec<CurvesOfSetting> = ["plain", "normalised", "skipping"]
             .into_iter()
-            .map(|label| Setting {
+            .map(|label| CurvesOfSetting {
                 label: label.into(),
                 curve: vec![(0.0, 20.0), (5_000.0, 200.0)],
                 runs: vec![vec![(0.0, 10.0), (5_000.0, 180.0)]],

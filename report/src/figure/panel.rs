@@ -27,7 +27,7 @@ pub(super) struct Axis<'a> {
 
 /// How the points of a series are shown.
 #[derive(Clone, Copy)]
-pub(super) enum Look {
+pub(super) enum SeriesStyle {
     Line,
     /// The interior of the polygon with these corners.
     Area,
@@ -41,7 +41,7 @@ pub(super) struct Series<'a> {
     /// Its name in the legend; empty if it has no entry.
     pub(super) label: &'a str,
     pub(super) points: Vec<(f64, f64)>,
-    pub(super) look: Look,
+    pub(super) style: SeriesStyle,
     pub(super) color: RGBColor,
     pub(super) opacity: f64,
     /// Width of the line, in pixels.
@@ -53,7 +53,7 @@ impl<'a> Series<'a> {
         Self {
             label,
             points,
-            look: Look::Line,
+            style: SeriesStyle::Line,
             color,
             opacity: 1.0,
             width: 1.8,
@@ -126,19 +126,19 @@ impl Panel<'_> {
                 .copied()
                 .filter(|(x, y)| x.abs() <= LARGEST && y.abs() <= LARGEST);
             let line = stroke(series.color, series.opacity, series.width);
-            match series.look {
-                Look::Line => chart.draw_series(LineSeries::new(finite, line))?,
-                Look::Area => {
+            match series.style {
+                SeriesStyle::Line => chart.draw_series(LineSeries::new(finite, line))?,
+                SeriesStyle::Area => {
                     let outline: Vec<_> = finite.collect();
                     let fill = series.color.mix(series.opacity).filled();
                     chart.draw_series((!outline.is_empty()).then(|| Polygon::new(outline, fill)))?
                 }
-                Look::Dots => {
+                SeriesStyle::Dots => {
                     let fill = series.color.mix(series.opacity).filled();
                     chart.draw_series(finite.map(|point| Circle::new(point, px(series.width), fill)))?
                 }
-                Look::Rings => chart.draw_series(finite.map(|point| Circle::new(point, px(4.5), line)))?,
-                Look::Crosses => chart.draw_series(finite.map(|point| Cross::new(point, px(4.5), line)))?,
+                SeriesStyle::Rings => chart.draw_series(finite.map(|point| Circle::new(point, px(4.5), line)))?,
+                SeriesStyle::Crosses => chart.draw_series(finite.map(|point| Cross::new(point, px(4.5), line)))?,
             };
         }
         Ok(())
@@ -150,15 +150,15 @@ impl Panel<'_> {
         for series in self.series.iter().filter(|series| !series.label.is_empty()) {
             let style = stroke(series.color, series.opacity, series.width);
             let (left, centre, right) = ((px(x), middle), (px(x + 10.0), middle), (px(x + 20.0), middle));
-            match series.look {
-                Look::Line => header.draw(&PathElement::new([left, right], style))?,
-                Look::Area => {
+            match series.style {
+                SeriesStyle::Line => header.draw(&PathElement::new([left, right], style))?,
+                SeriesStyle::Area => {
                     let corners = [(px(x), middle - px(5.0)), (px(x + 20.0), middle + px(5.0))];
                     header.draw(&Rectangle::new(corners, series.color.mix(series.opacity).filled()))?;
                 }
-                Look::Dots => header.draw(&Circle::new(centre, px(series.width), series.color.filled()))?,
-                Look::Rings => header.draw(&Circle::new(centre, px(4.5), style))?,
-                Look::Crosses => header.draw(&Cross::new(centre, px(4.5), style))?,
+                SeriesStyle::Dots => header.draw(&Circle::new(centre, px(series.width), series.color.filled()))?,
+                SeriesStyle::Rings => header.draw(&Circle::new(centre, px(4.5), style))?,
+                SeriesStyle::Crosses => header.draw(&Cross::new(centre, px(4.5), style))?,
             }
             header.draw_text(series.label, &text(LABEL, HPos::Left), (px(x + 26.0), middle))?;
             x += 26.0 + width_of(series.label, LABEL) + 16.0;

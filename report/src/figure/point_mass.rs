@@ -8,7 +8,7 @@ use std::path::Path;
 use shoal_run::analysis::point_mass::Drive;
 
 use super::canvas::{Area, BLUE, GREEN, INK, VERMILION, save};
-use super::panel::{Axis, Look, Panel, Series, range_of};
+use super::panel::{Axis, Panel, Series, SeriesStyle, range_of};
 
 /// Width and height of a diagram, in pixels.
 pub(super) const CELL: (u32, u32) = (400, 330);
@@ -163,14 +163,14 @@ fn draw_rewards(run: &Drive, range: Range<f64>, area: &Area<'_>) -> anyhow::Resu
 
 pub(super) fn starts<'a>(points: Vec<(f64, f64)>) -> Series<'a> {
     Series {
-        look: Look::Rings,
+        style: SeriesStyle::Rings,
         ..Series::line("start", INK, points)
     }
 }
 
 pub(super) fn goal<'a>() -> Series<'a> {
     Series {
-        look: Look::Crosses,
+        style: SeriesStyle::Crosses,
         width: 2.2,
         ..Series::line("goal", VERMILION, vec![(0.0, 0.0)])
     }

@@ -18,12 +18,12 @@ const LABEL_SETTINGS: usize = 3;
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Comparison {
     pub(super) environment: String,
-    pub(super) sets: Vec<Set>,
+    pub(super) sets: Vec<RepeatedRuns>,
 }
 
 /// Runs with the same settings, that is, repetitions.
 #[derive(Clone, Debug, Serialize)]
-pub(super) struct Set {
+pub(super) struct RepeatedRuns {
     pub(super) label: String,
     /// Their indices in the report.
     pub(super) runs: Vec<usize>,
@@ -59,10 +59,10 @@ pub(super) fn compare(runs: &[Run]) -> Vec<Comparison> {
             comparisons.len() - 1
         });
         let sets = &mut comparisons[comparison].sets;
-        let alike = |set: &&mut Set| in_common(&runs[set.runs[0]].settings).eq(in_common(&run.settings));
+        let alike = |set: &&mut RepeatedRuns| in_common(&runs[set.runs[0]].settings).eq(in_common(&run.settings));
         match sets.iter_mut().find(alike) {
             Some(set) => set.runs.push(i),
-            None => sets.push(Set {
+            None => sets.push(RepeatedRuns {
                 label: String::new(),
                 runs: vec![i],
                 by_steps: None,
@@ -91,8 +91,8 @@ pub(super) fn compare(runs: &[Run]) -> Vec<Comparison> {
 
 /// The name of a single run; otherwise the number of runs, their algorithm, and the settings in which they differ from
 /// the other sets.
-fn label(sets: &[Set], i: usize, runs: &[Run]) -> String {
-    let first = |set: &Set| &runs[set.runs[0]];
+fn label(sets: &[RepeatedRuns], i: usize, runs: &[Run]) -> String {
+    let first = |set: &RepeatedRuns| &runs[set.runs[0]];
     let set = &sets[i];
     if set.runs.len() == 1 {
         return first(set).name.clone();
@@ -105,8 +105,8 @@ fn label(sets: &[Set], i: usize, runs: &[Run]) -> String {
 }
 
 /// The settings in which a set differs from the others, but no more than a few.
-pub(super) fn own_settings(sets: &[Set], i: usize, runs: &[Run]) -> Vec<String> {
-    let first = |set: &Set| &runs[set.runs[0]];
+pub(super) fn own_settings(sets: &[RepeatedRuns], i: usize, runs: &[Run]) -> Vec<String> {
+    let first = |set: &RepeatedRuns| &runs[set.runs[0]];
     let differs = |(key, value): &&Setting| {
         sets.iter().any(|other| {
             let there = first(other).settings.iter().find(|(name, _)| name == key);

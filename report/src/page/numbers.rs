@@ -13,12 +13,12 @@ const EPISODES_TOGETHER: usize = 24;
 
 /// How much of one run the page may contain.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Limits {
+pub(super) struct PageLimits {
     pub(super) points: usize,
     pub(super) episodes: usize,
 }
 
-impl Limits {
+impl PageLimits {
     /// For what shows neither curves nor episodes.
     pub(super) const NONE: Self = Self {
         points: FEWEST_POINTS,

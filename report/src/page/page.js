@@ -42,7 +42,7 @@ function overview() {
   const facts = [
     ["state", (run) => states[run.state]],
     ["environment", (run) => run.environment],
-    ["method", (run) => `${run.algorithm}, ${run.mode}`],
+    ["algorithm", (run) => `${run.algorithm}, ${run.mode}`],
     ["seed", (run) => String(run.seed)],
     ["environment steps", planned],
     ["episodes", episodes],

@@ -5,7 +5,7 @@ use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
 use shoal_env_server::environment::Picture;
 use shoal_run::description::Description;
-use shoal_run::evaluation::WhichPolicy;
+use shoal_run::evaluation::SavedPolicy;
 use shoal_run::numbers::thousands;
 use shoal_run::rollout::{Rollout, Trajectory};
 
@@ -60,15 +60,15 @@ impl Played {
             );
         }
         let which = match (run.best_policy().exists(), run.last_policy().exists()) {
-            (true, _) => WhichPolicy::Best,
-            (false, true) => WhichPolicy::Last,
+            (true, _) => SavedPolicy::Best,
+            (false, true) => SavedPolicy::Last,
             (false, false) => return why_not("No policy has been evaluated yet.".into()),
         };
         Self::try_of(run, config, which, episodes)
             .unwrap_or_else(|error| why_not(format!("The episodes cannot be played: {error:#}.")))
     }
 
-    fn try_of(run: &RunDir, config: &Config, which: WhichPolicy, episodes: usize) -> anyhow::Result<Self> {
+    fn try_of(run: &RunDir, config: &Config, which: SavedPolicy, episodes: usize) -> anyhow::Result<Self> {
         let policy = which.read(run, config)?;
         let Description {
             signals,
@@ -85,8 +85,8 @@ impl Played {
             played.push(Episode::of(number, &trajectory, of_frames));
         }
         let called = match which {
-            WhichPolicy::Best => "best",
-            WhichPolicy::Last => "last",
+            SavedPolicy::Best => "best",
+            SavedPolicy::Last => "last",
         };
         Ok(Self {
             why_not: None,

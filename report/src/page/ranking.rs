@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 
-use super::comparison::{Set, own_settings};
+use super::comparison::{RepeatedRuns, own_settings};
 use super::numbers::short;
 use super::run::Run;
 use crate::figure::quantile;
@@ -23,14 +23,14 @@ const TAIL: f64 = 0.025;
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub(super) struct Ranking {
     pub(super) environment: String,
-    pub(super) places: Vec<Place>,
+    pub(super) places: Vec<RankedSetting>,
     /// Which setting is best and how certain that is, in a sentence; `None` for a single one.
     pub(super) verdict: Option<String>,
 }
 
 /// The result of one setting.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub(super) struct Place {
+pub(super) struct RankedSetting {
     pub(super) label: String,
     /// The number of its runs with a result.
     pub(super) runs: usize,
@@ -45,7 +45,7 @@ pub(super) struct Place {
 }
 
 /// Ranks the sets of an environment's runs; `None` if there is nothing to compare or nothing was repeated.
-pub(super) fn rank(environment: &str, sets: &[Set], runs: &[Run]) -> Option<Ranking> {
+pub(super) fn rank(environment: &str, sets: &[RepeatedRuns], runs: &[Run]) -> Option<Ranking> {
     let results: Vec<(String, usize, Vec<f64>)> = sets
         .iter()
         .enumerate()
@@ -65,10 +65,10 @@ pub(super) fn rank(environment: &str, sets: &[Set], runs: &[Run]) -> Option<Rank
         return None;
     }
     let values: Vec<&[f64]> = results.iter().map(|(.., values)| values.as_slice()).collect();
-    let mut places: Vec<Place> = results
+    let mut places: Vec<RankedSetting> = results
         .iter()
         .zip(bootstrap(&values))
-        .map(|((label, unfinished, values), (interval, best))| Place {
+        .map(|((label, unfinished, values), (interval, best))| RankedSetting {
             label: label.clone(),
             runs: values.len(),
             unfinished: *unfinished,
@@ -85,7 +85,7 @@ pub(super) fn rank(environment: &str, sets: &[Set], runs: &[Run]) -> Option<Rank
     })
 }
 
-fn verdict(places: &[Place]) -> Option<String> {
+fn verdict(places: &[RankedSetting]) -> Option<String> {
     let [best, second, ..] = places else {
         return None;
     };
@@ -202,7 +202,7 @@ mod tests {
         assert!((from - 1.33).abs() < 0.35 && (to - 4.67).abs() < 0.35, "{from} {to}");
         let same = bootstrap(&[&low, &low]);
         assert!((same[0].1.unwrap() - 0.5).abs() < 0.03, "{same:?}");
-        let place = |label: &str, mean, best| Place {
+        let place = |label: &str, mean, best| RankedSetting {
             label: label.into(),
             runs: 5,
             unfinished: 0,

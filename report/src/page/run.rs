@@ -3,8 +3,8 @@
 use serde::Serialize;
 use shoal_common::config::{Config, Mode};
 use shoal_common::run_dir::RunDir;
-use shoal_run::evaluation::WhichPolicy;
-use shoal_run::final_evaluation::{FinalEvaluation, FinallyEvaluated};
+use shoal_run::evaluation::SavedPolicy;
+use shoal_run::final_evaluation::{FinalEvaluation, FinalPolicyResult};
 use shoal_run::origin::Origin;
 use shoal_run::outcome::{RunOutcome, RunState};
 use shoal_run::recorder::{
@@ -12,7 +12,7 @@ use shoal_run::recorder::{
     read_evaluations, read_incidents, read_learner,
 };
 
-use super::numbers::{Limits, downsample, mean, parts, short};
+use super::numbers::{PageLimits, downsample, mean, parts, short};
 use super::played::Played;
 use super::settings::{self, Setting};
 
@@ -40,7 +40,7 @@ pub(super) struct Run {
     best: Option<EvaluatedPolicy>,
     last: Option<EvaluatedPolicy>,
     /// The best policy's final evaluation.
-    final_evaluation: Option<FinallyEvaluated>,
+    final_evaluation: Option<FinalPolicyResult>,
     evaluations: Curve,
     exploration: Curve,
     learner: Rates,
@@ -112,7 +112,7 @@ struct Incidents {
 }
 
 impl Run {
-    pub(super) fn read(run: &RunDir, name: String, limits: Limits) -> anyhow::Result<Self> {
+    pub(super) fn read(run: &RunDir, name: String, limits: PageLimits) -> anyhow::Result<Self> {
         let config = configuration(run)?;
         // Before the records: if the run ends now, its last records are read below.
         let is_training = run.is_running()?;
@@ -150,7 +150,7 @@ impl Run {
                 .map(EvaluatedPolicy::of),
             last: evaluation_records.last().map(EvaluatedPolicy::of),
             final_evaluation: FinalEvaluation::read(run, now.env_steps)?
-                .and_then(|it| it.of(WhichPolicy::Best).cloned()),
+                .and_then(|it| it.of(SavedPolicy::Best).cloned()),
             evaluations: Curve::of_evaluations(&evaluation_records, limits.points),
             exploration: Curve::of_episodes(&explored, limits.points),
             learner: Rates::of(learner, limits.points),

@@ -38,14 +38,16 @@ fn data(page: &str) -> serde_json::Value {
 
 /// A small configuration for an environment, with an algorithm that supports its spaces.
 fn configuration(name: &str) -> Config {
-    let method = match name {
+    let algorithm = match name {
         "cart-pole" => {
             "[run]\nid = \"1a\"\nmode = \"lockstep\"\n[actors]\nchunk_steps = 200\n[replay]\nwarmup = 0\n[reinforce]\nhidden = [4, 3]\n"
         }
         "frozen-lake" => "[run]\nid = \"1a\"\n[replay]\nwarmup = 0\n[q-learning]\n",
         _ => "[run]\nid = \"1a\"\n[ddpg]\nhidden = [4, 3]\n",
     };
-    let mut table: toml::Table = format!("{method}[environment]\nname = \"{name}\"\n").parse().unwrap();
+    let mut table: toml::Table = format!("{algorithm}[environment]\nname = \"{name}\"\n")
+        .parse()
+        .unwrap();
     let spec = make(name, &toml::Table::new()).unwrap().spec();
     table.insert("spec".into(), toml::Value::try_from(spec).unwrap());
     Config::from_table(table, "test").unwrap()
@@ -89,7 +91,7 @@ fn a_run_without_playable_episodes_is_shown_with_the_reason() {
     config.environment.server = vec!["no-such-program".into()];
     let served = directory(parent.path(), "served", &config, Some(parameters));
     let report = gather(&[begun, damaged, served]).unwrap();
-    let reasons = report.not_played();
+    let reasons = report.runs_without_episodes();
     assert_eq!(reasons.len(), 3);
     for ((reason, runs), (name, part)) in reasons.iter().zip([
         ("begun", "No policy has been evaluated yet."),
@@ -174,11 +176,11 @@ fn the_page_of_a_long_run_is_small_and_shows_its_peak() {
 fn many_runs_share_the_points_and_episodes() {
     let sizes: Vec<_> = [1, 3, 5, 30, 500]
         .iter()
-        .map(|runs| Limits::of(29, *runs))
+        .map(|runs| PageLimits::of(29, *runs))
         .map(|r| (r.points, r.episodes))
         .collect();
     assert_eq!(sizes, [(800, 6), (800, 6), (800, 4), (133, 0), (60, 0)]);
-    assert_eq!(Limits::of(0, 500).episodes, 1);
+    assert_eq!(PageLimits::of(0, 500).episodes, 1);
 }
 
 #[test]

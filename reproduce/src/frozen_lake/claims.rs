@@ -1,6 +1,6 @@
 //! The claims of section 4.1.
 
-use shoal_run::analysis::lake::{Values, Walk, dangers, greedy, mistakes};
+use shoal_run::analysis::lake::{Values, Walk, greedy, risky_states, suboptimal_states};
 
 use super::super::claim::{Claim, Scope, spread};
 use super::super::result::SeedResult;
@@ -64,7 +64,7 @@ fn at_end(seeds: &[SeedResult<Tests>]) -> f64 {
 fn optimal(good: &[SeedResult<Tests>], q_star: &Values) -> Claim {
     let wrong: Vec<Vec<usize>> = good
         .iter()
-        .map(|seed| mistakes(&greedy(&seed.tests.q), q_star))
+        .map(|seed| suboptimal_states(&greedy(&seed.tests.q), q_star))
         .collect();
     let right = wrong.iter().filter(|states| states.is_empty()).count();
     let mut where_wrong: Vec<String> = wrong.iter().flatten().map(usize::to_string).collect();
@@ -145,7 +145,7 @@ fn state_six(good: &[SeedResult<Tests>]) -> Claim {
         let by_value = |a: &&usize, b: &&usize| highest(&seed.tests, **a).total_cmp(&highest(&seed.tests, **b));
         frozen.iter().min_by(by_value).copied()
     };
-    let dangerous = |seed: &SeedResult<Tests>| dangers(&greedy(&seed.tests.q)) == [6];
+    let dangerous = |seed: &SeedResult<Tests>| risky_states(&greedy(&seed.tests.q)) == [6];
     let count = |holds: &dyn Fn(&SeedResult<Tests>) -> bool| good.iter().filter(|seed| holds(seed)).count();
     Claim {
         thesis: "Following the policy, the only state with any possibility of falling into a hole is state 6, and its \

@@ -4,12 +4,12 @@ use std::ops::Range;
 
 use shoal_report::figure::{self, Agent};
 
+use super::super::report_section::{Figure, FigureWriter};
 use super::super::result::{SeedResult, representative};
-use super::super::section::{Figure, FigureWriter};
 use super::Tests;
 
 /// The figures of a reward.
-pub(super) struct OfReward {
+pub(super) struct RewardFigures {
     name: &'static str,
     curve: &'static str,
     tests: &'static str,
@@ -17,19 +17,19 @@ pub(super) struct OfReward {
     shown: Range<usize>,
 }
 
-pub(super) const R1: OfReward = OfReward {
+pub(super) const R1: RewardFigures = RewardFigures {
     name: "r1",
     curve: "5.4",
     tests: "5.5",
     shown: 0..2,
 };
-pub(super) const R2: OfReward = OfReward {
+pub(super) const R2: RewardFigures = RewardFigures {
     name: "r2",
     curve: "5.6",
     tests: "5.7",
     shown: 2..4,
 };
-const R3: OfReward = OfReward {
+const R3: RewardFigures = RewardFigures {
     name: "r3",
     curve: "5.8",
     tests: "5.9",
@@ -43,13 +43,13 @@ const FAR: [(Range<usize>, &str, &str); 2] = [(4..8, "far-1", "A.4 to A.7"), (8.
 /// The figures of learning curves and of two test runs.
 pub(super) fn of_reward(
     writer: &FigureWriter,
-    of: &OfReward,
+    of: &RewardFigures,
     seeds: &[SeedResult<Tests>],
 ) -> anyhow::Result<Vec<Figure>> {
     let Some(middle) = representative(seeds) else {
         return Ok(Vec::new());
     };
-    let OfReward {
+    let RewardFigures {
         name,
         curve,
         tests,

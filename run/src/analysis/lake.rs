@@ -1,7 +1,7 @@
 //! The slippery lake: the exact value of a policy and the optimal values, computed from the transition table.
 
 use serde::{Deserialize, Serialize};
-use shoal_common::policy::highest;
+use shoal_common::policy::argmax;
 use shoal_env_server::environment::frozen_lake::{ACTIONS, STATES, transitions};
 
 /// Steps after which an evaluation episode ends.
@@ -63,7 +63,7 @@ impl Walk {
 
 /// The action with the highest value in each state; among equal ones the first.
 pub fn greedy(table: &[f32]) -> [usize; STATES] {
-    std::array::from_fn(|state| highest(&table[state * ACTIONS..][..ACTIONS]))
+    std::array::from_fn(|state| argmax(&table[state * ACTIONS..][..ACTIONS]))
 }
 
 /// q*, by value iteration.
@@ -91,7 +91,7 @@ pub fn optimal(gamma: f64) -> Values {
 }
 
 /// States in which the policy's action is not one of the best.
-pub fn mistakes(policy: &[usize; STATES], q_star: &Values) -> Vec<usize> {
+pub fn suboptimal_states(policy: &[usize; STATES], q_star: &Values) -> Vec<usize> {
     let best = |state: usize| q_star[state].iter().copied().fold(f64::NEG_INFINITY, f64::max);
     (0..STATES)
         .filter(|state| q_star[*state][policy[*state]] < best(*state) - TIE)
@@ -99,7 +99,7 @@ pub fn mistakes(policy: &[usize; STATES], q_star: &Values) -> Vec<usize> {
 }
 
 /// States in which the policy's action may lead into a hole.
-pub fn dangers(policy: &[usize; STATES]) -> Vec<usize> {
+pub fn risky_states(policy: &[usize; STATES]) -> Vec<usize> {
     let falls = |state: &usize| {
         // Holes and the goal have one outcome: staying.
         let mut outcomes = transitions(*state, policy[*state]);
@@ -123,15 +123,15 @@ mod tests {
         let q_star = optimal(0.999);
         assert!((q_star[0].iter().copied().fold(0.0, f64::max) - 0.785_53).abs() < 1e-4);
         let policy = best();
-        assert!(mistakes(&policy, &q_star).is_empty());
+        assert!(suboptimal_states(&policy, &q_star).is_empty());
         let walk = Walk::of(&policy);
         assert!((walk.reached - 0.74).abs() < 0.01, "{walk:?}");
         assert!((40.0..60.0).contains(&walk.steps), "{walk:?}");
-        assert_eq!(dangers(&policy), [6], "as the thesis has it");
+        assert_eq!(risky_states(&policy), [6], "as the thesis has it");
     }
 
     #[test]
-    fn a_bad_policy_has_mistakes_and_dangers() {
+    fn a_bad_policy_has_suboptimal_and_risky_states() {
         let left = [0; STATES];
         assert_eq!(
             Walk::of(&left),
@@ -140,7 +140,7 @@ mod tests {
                 steps: 100.0
             }
         );
-        assert!(mistakes(&left, &optimal(0.999)).contains(&1));
-        assert!(dangers(&[1; STATES]).contains(&1));
+        assert!(suboptimal_states(&left, &optimal(0.999)).contains(&1));
+        assert!(risky_states(&[1; STATES]).contains(&1));
     }
 }

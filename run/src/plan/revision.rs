@@ -14,15 +14,15 @@ use shoal_common::section;
 use shoal_learner::process::replay_layout;
 use toml::Table;
 
-use super::source::{Source, Sources, UsageError};
+use super::source::{SettingSource, SettingSources, UsageError};
 use super::{RunOverrides, read_counts, set_key, set_options, set_what_follows};
-use crate::method;
+use crate::algorithm;
 use crate::recorder::{ChangeRecord, Moment, read_changes, record_changes};
 use crate::status::{replay_rows, saved_status};
 
 /// What the command line asks a resumed run to change.
 #[derive(Clone, Debug, Default)]
-pub struct Asked {
+pub struct RequestedChanges {
     /// `run.steps`.
     pub steps: Option<u64>,
     /// `run.episodes`.
@@ -48,19 +48,19 @@ impl Revision {
     ///
     /// # Errors
     /// When a key cannot change, or a value is invalid. The message names the key and where it was set.
-    pub fn new(run: &RunDir, used: &Config, asked: &Asked) -> anyhow::Result<Self> {
+    pub fn new(run: &RunDir, used: &Config, asked: &RequestedChanges) -> anyhow::Result<Self> {
         let path = run.config_file();
         let origin = path.display().to_string();
         let text = std::fs::read_to_string(&path).with_context(|| format!("cannot read {origin}"))?;
         let malformed = |error| anyhow::anyhow!("{}", section::malformed(&origin, &text, &error));
         let mut table: Table = text.parse().map_err(malformed)?;
         let edited = Config::from_table(table.clone(), &origin).ok();
-        let mut sources = Sources::of_file(&origin, &text);
+        let mut sources = SettingSources::of_file(&origin, &text);
         if let Some(edited) = &edited {
-            // Nobody has set what is as before.
+            // A key that has not changed was not set by the user.
             let differing: Vec<String> = used.differences(edited).into_iter().map(|it| it.key).collect();
             let same = edited.values().into_keys().filter(|key| !differing.contains(key));
-            same.for_each(|key| sources.set(key, Source::Run));
+            same.for_each(|key| sources.set(key, SettingSource::Run));
         }
         let options = RunOverrides {
             steps: asked.steps,
@@ -69,7 +69,7 @@ impl Revision {
         };
         set_options(&mut table, &mut sources, &options)?;
         for assignment in &asked.set {
-            check_method(assignment, used)?;
+            check_algorithm(assignment, used)?;
             set_key(&mut table, &mut sources, assignment)?;
         }
         let explain = |message: String, table: &Table| sources.explain(message, &origin, table);
@@ -78,7 +78,7 @@ impl Revision {
             let message = error.to_string();
             explain(message.strip_prefix(": ").unwrap_or(&message).into(), &table)
         })?;
-        set_what_follows(&mut config, &mut Sources::default());
+        set_what_follows(&mut config, &mut SettingSources::default());
         let (since, before) = (config.replay.ratio_since, config.replay.updates_before);
         // These two are in the other file alone, because `config.toml` is written before a change is final.
         (config.replay.ratio_since, config.replay.updates_before) = if (since, before) == (0, 0) {
@@ -95,8 +95,8 @@ impl Revision {
             (config.replay.ratio_since, config.replay.updates_before) = (rows, used.replay.agreed_updates(rows));
         }
         let who = |key: &str| match sources.of(key) {
-            Source::Option(option) => option.into(),
-            Source::Set => "--set".into(),
+            SettingSource::Option(option) => option.into(),
+            SettingSource::Set => "--set".into(),
             _ => "config.toml".into(),
         };
         Ok(Self {
@@ -192,9 +192,10 @@ pub fn store_actors(run: &RunDir, used: &Config, actors: u32, now: Moment) -> an
     Ok(config)
 }
 
-/// What `config.toml` asks a run for that is not running, in words; `None` if it is what the run was last used with.
+/// For a run that is not running: what `config.toml` changes for the next resume, in words; `None` if it is what the
+/// run was last used with.
 pub fn edited(run: &RunDir, used: &Config) -> Option<String> {
-    match Revision::new(run, used, &Asked::default()) {
+    match Revision::new(run, used, &RequestedChanges::default()) {
         Err(error) => Some(format!("it cannot be resumed: {error:#}")),
         Ok(revision) => {
             let change = |(it, _): &(Difference, String)| format!("{} = {} instead of {}", it.key, it.after, it.before);
@@ -204,27 +205,27 @@ pub fn edited(run: &RunDir, used: &Config) -> Option<String> {
     }
 }
 
-/// As it is in `config.toml`: without what only `config/used.toml` has.
+/// The configuration without the keys that only `config/used.toml` has, as in `config.toml`.
 pub(super) fn as_written(config: &Config) -> Config {
     let mut config = config.clone();
     (config.replay.ratio_since, config.replay.updates_before) = (0, 0);
     config
 }
 
-/// Checks that a `--set` is not for another method.
-fn check_method(assignment: &str, used: &Config) -> Result<(), UsageError> {
+/// Checks that a `--set` is not for another algorithm.
+fn check_algorithm(assignment: &str, used: &Config) -> Result<(), UsageError> {
     let section = assignment.split('.').next().unwrap_or_default();
     let own = used.algorithm.name();
-    if section != own && method::names().any(|name| name == section) {
+    if section != own && algorithm::names().any(|name| name == section) {
         return Err(UsageError(format!(
-            "--set {assignment}: this run learns with {own}, and the method of a run cannot change"
+            "--set {assignment}: this run learns with {own}, and the algorithm of a run cannot change"
         )));
     }
     Ok(())
 }
 
 /// Refuses the first key that cannot change.
-fn refuse(differences: &[Difference], used: &Config, sources: &Sources) -> anyhow::Result<()> {
+fn refuse(differences: &[Difference], used: &Config, sources: &SettingSources) -> anyhow::Result<()> {
     let lockstep = used.run.mode == Mode::Lockstep;
     for Difference {
         key,
@@ -241,7 +242,7 @@ fn refuse(differences: &[Difference], used: &Config, sources: &Sources) -> anyho
         };
         let [before, after] = [before, after].map(|value| if value.is_empty() { "nothing" } else { value });
         let text = format!("{key} = {after}: cannot change {place}, which has {before}: {why}");
-        return Err(sources.blame(key, &text));
+        return Err(sources.error_naming_source(key, &text));
     }
     Ok(())
 }
@@ -255,10 +256,14 @@ fn check_files(run: &RunDir, used: &Config, config: &Config, differences: &[Diff
     let names: Vec<&str> = differences.iter().map(|it| it.key.as_str()).collect();
     let names = names.join(", ");
     if config.fingerprint() != used.fingerprint() {
-        let of_method = [used.algorithm.name(), "exploration"];
+        let of_algorithm = [used.algorithm.name(), "exploration"];
         let names = differences.iter().map(|it| it.key.as_str());
         let names: Vec<&str> = names
-            .filter(|key| of_method.iter().any(|section| key.starts_with(&format!("{section}."))))
+            .filter(|key| {
+                of_algorithm
+                    .iter()
+                    .any(|section| key.starts_with(&format!("{section}.")))
+            })
             .collect();
         bail!(
             "{}: cannot change in this run: an early version of the program made it, whose files are identified by \
@@ -299,7 +304,10 @@ fn newest_round(config: &Config, run: &RunDir) -> anyhow::Result<u64> {
     match CommitReader::open(&run.replay_file()) {
         Ok(reader) => {
             let actors = 0..config.actors.max as usize;
-            Ok(actors.map(|actor| reader.actor(actor).mark.sequence).max().unwrap_or(0))
+            Ok(actors
+                .map(|actor| reader.actor(actor).last_chunk.sequence)
+                .max()
+                .unwrap_or(0))
         }
         Err(OpenError::NotYet { .. }) => Ok(0),
         Err(error) => Err(error.into()),

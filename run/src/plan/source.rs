@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::fmt::{self, Display, Formatter};
 
-use shoal_common::algorithms::Algorithm;
+use shoal_common::algorithms::AlgorithmConfig;
 use shoal_common::section::line_at;
 use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
@@ -12,7 +12,7 @@ use super::suggestion::with_suggestion;
 
 /// Where the value of a key comes from.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub enum Source {
+pub enum SettingSource {
     /// No one has set the key.
     #[default]
     Default,
@@ -22,8 +22,8 @@ pub enum Source {
     File(String, usize),
     /// The defaults for a Gymnasium environment.
     Gymnasium,
-    /// The defaults for this method, which was asked for.
-    Method(&'static str),
+    /// The defaults for this algorithm, which was asked for.
+    Algorithm(&'static str),
     /// This option of the command line.
     Option(&'static str),
     /// `--set`.
@@ -34,21 +34,21 @@ pub enum Source {
     Run,
 }
 
-impl Source {
+impl SettingSource {
     /// Whether the user has chosen the value.
-    pub(super) fn is_users(&self) -> bool {
+    pub(super) fn is_from_user(&self) -> bool {
         matches!(self, Self::File(..) | Self::Option(_) | Self::Set)
     }
 }
 
-impl Display for Source {
+impl Display for SettingSource {
     fn fmt(&self, to: &mut Formatter<'_>) -> fmt::Result {
         match self {
             Self::Default => write!(to, "the default"),
             Self::Preset(name) => write!(to, "preset {name}"),
             Self::File(name, line) => write!(to, "{name}, line {line}"),
             Self::Gymnasium => write!(to, "the default for gym: environments"),
-            Self::Method(name) => write!(to, "the default for {name}"),
+            Self::Algorithm(name) => write!(to, "the default for {name}"),
             Self::Option(option) => write!(to, "{option}"),
             Self::Set => write!(to, "--set"),
             Self::Follows(what) => write!(to, "follows from {what}"),
@@ -64,14 +64,14 @@ pub struct UsageError(pub String);
 
 /// The sources of all keys, by `section.key`. A key that is not there has its default.
 #[derive(Clone, Debug, Default)]
-pub struct Sources(BTreeMap<String, Source>);
+pub struct SettingSources(BTreeMap<String, SettingSource>);
 
 /// The keys that bound the value of `key`. If `key` is refused, and the user has set one of these instead, the error must
 /// name that one.
 fn bounding(key: &str) -> Vec<String> {
     match key {
         "replay.warmup" => vec!["replay.capacity".into()],
-        "replay.capacity" => Algorithm::of_minibatches()
+        "replay.capacity" => AlgorithmConfig::of_minibatches()
             .map(|of| format!("{}.batch", of.name()))
             .collect(),
         "actors.count" => vec!["actors.max".into()],
@@ -80,11 +80,11 @@ fn bounding(key: &str) -> Vec<String> {
     }
 }
 
-impl Sources {
+impl SettingSources {
     /// All keys of `table` come from this preset.
     pub(super) fn of_preset(name: &str, table: &Table) -> Self {
         let mut sources = Self::default();
-        sources.add(table, &Source::Preset(name.into()));
+        sources.add(table, &SettingSource::Preset(name.into()));
         sources
     }
 
@@ -95,7 +95,7 @@ impl Sources {
             return sources;
         };
         for (section, value) in document.get_ref() {
-            let at = |byte| Source::File(name.into(), line_at(text, byte));
+            let at = |byte| SettingSource::File(name.into(), line_at(text, byte));
             let section_name = section.get_ref();
             sources.0.insert(format!("[{section_name}]"), at(section.span().start));
             if let DeValue::Table(keys) = value.get_ref() {
@@ -108,7 +108,7 @@ impl Sources {
     }
 
     /// Adds the keys of `now` that `before` does not have, except those of the environment.
-    pub(super) fn add_new(&mut self, before: &Table, now: &Table, source: &Source) {
+    pub(super) fn add_new(&mut self, before: &Table, now: &Table, source: &SettingSource) {
         for (section, keys) in now
             .iter()
             .filter(|(section, _)| !["environment", "spec"].contains(&section.as_str()))
@@ -122,7 +122,7 @@ impl Sources {
     }
 
     /// Adds the keys of `table` that have no source yet.
-    pub(super) fn add(&mut self, table: &Table, source: &Source) {
+    pub(super) fn add(&mut self, table: &Table, source: &SettingSource) {
         for (section, keys) in table {
             for key in keys.as_table().into_iter().flat_map(Table::keys) {
                 self.0
@@ -132,15 +132,15 @@ impl Sources {
         }
     }
 
-    pub(super) fn set(&mut self, key: String, source: Source) {
-        if let (Source::Set, Some((section, _))) = (&source, key.split_once('.')) {
-            self.0.entry(format!("[{section}]")).or_insert(Source::Set);
+    pub(super) fn set(&mut self, key: String, source: SettingSource) {
+        if let (SettingSource::Set, Some((section, _))) = (&source, key.split_once('.')) {
+            self.0.entry(format!("[{section}]")).or_insert(SettingSource::Set);
         }
         self.0.insert(key, source);
     }
 
     /// The source of a key.
-    pub fn of(&self, key: &str) -> Source {
+    pub fn of(&self, key: &str) -> SettingSource {
         self.0.get(key).cloned().unwrap_or_default()
     }
 
@@ -153,24 +153,24 @@ impl Sources {
         if let Some(of_environment) = message.strip_prefix("spec.") {
             return anyhow::anyhow!("{origin}: the environment's {of_environment}");
         }
-        if self.of(key).is_users() {
-            return self.blame(key, &message);
+        if self.of(key).is_from_user() {
+            return self.error_naming_source(key, &message);
         }
         self.explain_other(key, &message, origin, table)
     }
 
     /// The error for a key that the user may have set: names the option, or the file and the line.
-    pub(super) fn blame(&self, key: &str, message: &str) -> anyhow::Error {
+    pub(super) fn error_naming_source(&self, key: &str, message: &str) -> anyhow::Error {
         match self.of(key) {
-            Source::Option(option) => UsageError(format!("{option}: {message}")).into(),
-            Source::Set => UsageError(message.into()).into(),
-            Source::File(name, line) => anyhow::anyhow!("{name}, line {line}: {message}"),
-            Source::Default
-            | Source::Preset(_)
-            | Source::Gymnasium
-            | Source::Method(_)
-            | Source::Follows(_)
-            | Source::Run => {
+            SettingSource::Option(option) => UsageError(format!("{option}: {message}")).into(),
+            SettingSource::Set => UsageError(message.into()).into(),
+            SettingSource::File(name, line) => anyhow::anyhow!("{name}, line {line}: {message}"),
+            SettingSource::Default
+            | SettingSource::Preset(_)
+            | SettingSource::Gymnasium
+            | SettingSource::Algorithm(_)
+            | SettingSource::Follows(_)
+            | SettingSource::Run => {
                 anyhow::anyhow!("{message}")
             }
         }
@@ -178,7 +178,7 @@ impl Sources {
 
     /// The same for a key that the user has not set, or that the message does not name.
     fn explain_other(&self, key: &str, message: &str, origin: &str, table: &Table) -> anyhow::Error {
-        let Some(other) = bounding(key).into_iter().find(|other| self.of(other).is_users()) else {
+        let Some(other) = bounding(key).into_iter().find(|other| self.of(other).is_from_user()) else {
             return self.explain_section(message, origin);
         };
         let value = other
@@ -187,30 +187,30 @@ impl Sources {
         let value = value.map_or_else(String::new, Value::to_string);
         let (stated, expected) = message.split_once(": ").unwrap_or((message, ""));
         let advice = match self.of(key) {
-            Source::Run => String::new(),
+            SettingSource::Run => String::new(),
             _ => format!("; set {key} too"),
         };
         let text = format!(
             "{other} = {value}: does not go with {stated} ({}), which {expected}{advice}",
             self.of(key)
         );
-        self.blame(&other, &text)
+        self.error_naming_source(&other, &text)
     }
 
     /// The same for a message about whole sections.
     fn explain_section(&self, message: &str, origin: &str) -> anyhow::Error {
         let mut words: Vec<&str> = message.split(['`', '[', ']']).skip(1).step_by(2).collect();
-        if let Some((method, _)) = message.split_once(" cannot control ") {
-            words = vec![method];
+        if let Some((algorithm, _)) = message.split_once(" cannot control ") {
+            words = vec![algorithm];
         }
         let mut places = words.iter().map(|word| self.of(&format!("[{word}]")));
-        match places.find(|place| *place != Source::Default) {
-            Some(Source::File(name, line)) => anyhow::anyhow!("{name}, line {line}: {message}"),
+        match places.find(|place| *place != SettingSource::Default) {
+            Some(SettingSource::File(name, line)) => anyhow::anyhow!("{name}, line {line}: {message}"),
             Some(_) => UsageError(message.into()).into(),
             None if self
                 .0
                 .values()
-                .any(|source| matches!(source, Source::Set | Source::Method(_))) =>
+                .any(|source| matches!(source, SettingSource::Set | SettingSource::Algorithm(_))) =>
             {
                 UsageError(format!("{origin}: {message}")).into()
             }
@@ -226,15 +226,15 @@ mod tests {
     #[test]
     fn the_keys_of_a_file_have_their_lines() {
         let text = "# a file\n[environment]\nname = \"pendulum\"\n\n[ddpg]\ntau = 0.5\nhidden = [\n1]\ngamma = 1\n";
-        let sources = Sources::of_file("a.toml", text);
+        let sources = SettingSources::of_file("a.toml", text);
         for (key, line) in [
             ("environment.name", 3),
             ("ddpg.tau", 6),
             ("ddpg.hidden", 7),
             ("ddpg.gamma", 9),
         ] {
-            assert_eq!(sources.of(key), Source::File("a.toml".into(), line), "{key}");
+            assert_eq!(sources.of(key), SettingSource::File("a.toml".into(), line), "{key}");
         }
-        assert_eq!(sources.of("run.steps"), Source::Default);
+        assert_eq!(sources.of("run.steps"), SettingSource::Default);
     }
 }

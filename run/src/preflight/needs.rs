@@ -24,11 +24,11 @@ pub(super) fn shared_memory(config: &Config) -> u64 {
     let max = config.actors.max as usize;
     let (spec, actors) = (&config.spec, max as u64);
     let parameters = parameters(config);
-    let explorer = environment::reserved(spec, config.actors.envs as usize)
+    let of_an_actor = environment::reserved(spec, config.actors.envs as usize)
         + transitions::reserved(&config.chunk_layout(), config.actors.window);
     // The actors and the evaluator, an environment server for each, and the learner.
     let roles = 2 * (max + 1) + 1;
-    actors * explorer
+    actors * of_an_actor
         + environment::reserved(spec, config.evaluation_envs() as usize)
         + control::reserved(max)
         + policy::reserved(max, parameters)

@@ -90,7 +90,7 @@ struct Lines {
     cut: usize,
     /// Bytes that the child may write now.
     allowance: f64,
-    counted: Option<Instant>,
+    allowance_updated_at: Option<Instant>,
     left_out: u64,
 }
 
@@ -101,7 +101,7 @@ impl Lines {
             line: Vec::new(),
             cut: 0,
             allowance: BURST,
-            counted: None,
+            allowance_updated_at: None,
             left_out: 0,
         }
     }
@@ -111,7 +111,10 @@ impl Lines {
             Writer::Shoal => OWN_LINE,
             Writer::Program => LINE,
         };
-        let since = self.counted.replace(now).map_or(Duration::ZERO, |then| now - then);
+        let since = self
+            .allowance_updated_at
+            .replace(now)
+            .map_or(Duration::ZERO, |then| now - then);
         self.allowance = BURST.min(self.allowance + RATE * since.as_secs_f64());
         let mut pieces = bytes.split(|byte| *byte == b'\n').peekable();
         while let Some(piece) = pieces.next() {
@@ -126,7 +129,7 @@ impl Lines {
 
     fn take_line(&mut self, take: &mut impl FnMut(Line<'_>)) {
         let length = self.line.len() as f64;
-        let mut text = harmless(&String::from_utf8_lossy(&self.line));
+        let mut text = escape_control_characters(&String::from_utf8_lossy(&self.line));
         if self.cut > 0 {
             text += &format!(" … ({} more bytes)", self.cut);
         }
@@ -159,17 +162,17 @@ impl Lines {
 
 /// The text with control characters escaped. Otherwise they could move a terminal's cursor, change its colours or send
 /// input in the user's name.
-pub fn harmless(text: &str) -> String {
-    let mut harmless = String::with_capacity(text.len());
+pub fn escape_control_characters(text: &str) -> String {
+    let mut escaped = String::with_capacity(text.len());
     for character in text.trim_end_matches('\r').chars() {
         if character.is_control() && character != '\t' {
             // Writing into a string does not fail.
-            let _ = write!(harmless, "{}", character.escape_default());
+            let _ = write!(escaped, "{}", character.escape_default());
         } else {
-            harmless.push(character);
+            escaped.push(character);
         }
     }
-    harmless
+    escaped
 }
 
 #[cfg(test)]

@@ -1,7 +1,7 @@
 //! Incidents: what happens to a run's processes besides their first start and their end with the run.
 
 use serde::{Deserialize, Serialize};
-use shoal_common::report::Identity;
+use shoal_common::report::RoleInstance;
 
 /// The kind of an incident.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -43,7 +43,7 @@ pub struct Incident {
 
 impl Incident {
     /// An incident of this process.
-    pub fn of(process: Identity, what: IncidentKind, detail: String) -> Self {
+    pub fn of(process: RoleInstance, what: IncidentKind, detail: String) -> Self {
         Self {
             role: process.role.name(),
             index: process.index,

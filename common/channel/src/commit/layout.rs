@@ -19,8 +19,8 @@ const WORD: usize = size_of::<u64>();
 /// The unit of the layout, in bytes. Parts that are written at different times never share a block, so that a block
 /// torn by a power loss leaves its neighbours whole.
 const BLOCK: usize = 4096;
-/// Words of the identity, including its checksum.
-const IDENTITY_WORDS: usize = 10;
+/// Words of the preamble, including its checksum.
+const PREAMBLE_WORDS: usize = 10;
 
 /// Words of a commit record before those of the actors: generation, head, tail.
 pub(super) const RECORD_WORDS: usize = 3;
@@ -44,7 +44,7 @@ pub const SYNCED: usize = 2;
 pub struct ReplayLayout {
     /// The fields of a row.
     pub row: RowLayout,
-    /// Rows in the ring: the sampling window, and the reserve that lockstep runs need beyond it.
+    /// Rows in the ring: the sampling range, and the reserve that lockstep runs need beyond it.
     pub ring: u64,
     /// The most actors; their indices are `0 .. actors`.
     pub actors: usize,
@@ -56,7 +56,7 @@ pub struct ReplayLayout {
 
 /// The offsets of the parts of a replay file, in bytes.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Places {
+pub struct FileOffsets {
     /// The word with the published generation, which selects the active slot.
     pub published: usize,
     /// The word with the write horizon: the row number up to which the ring may have been written.
@@ -73,19 +73,19 @@ pub struct Places {
     pub end: usize,
 }
 
-/// Why a file's identity cannot be used.
+/// Why a file's preamble cannot be used.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum IdentityFault {
+pub enum PreambleError {
     /// The file does not begin as a replay file does.
     #[error("it is not a replay file")]
     Magic,
     /// A replay file of another format.
     #[error("its format version is {0}, this program reads version {VERSION}")]
     Version(u64),
-    /// The identity's checksum does not match.
+    /// The preamble's checksum does not match.
     #[error("its header is damaged (checksum)")]
     Checksum,
-    /// The identity is undamaged, but its numbers are impossible.
+    /// The preamble is undamaged, but its numbers are impossible.
     #[error("its header has an impossible size")]
     Size,
 }
@@ -93,7 +93,7 @@ pub enum IdentityFault {
 impl ReplayLayout {
     /// The offsets of all parts. `None` if there are no rows or no actors, if there are too many actors or snapshot
     /// words, or if the file would be larger than a file can be.
-    pub fn places(&self) -> Option<Places> {
+    pub fn offsets(&self) -> Option<FileOffsets> {
         if self.ring == 0
             || !(1..=MAX_ACTORS).contains(&self.actors)
             || self.actor_snapshot_words > MAX_ACTOR_SNAPSHOT_WORDS
@@ -118,7 +118,7 @@ impl ReplayLayout {
         let end = rows.end.checked_next_multiple_of(BLOCK)?;
         i64::try_from(end).ok()?;
         let slots = std::array::from_fn(|i| first + i * slot);
-        Some(Places {
+        Some(FileOffsets {
             published,
             write_horizon,
             slots,
@@ -136,7 +136,7 @@ impl ReplayLayout {
     }
 
     /// The words that a file of this layout begins with.
-    pub fn identity(&self) -> Vec<u64> {
+    pub fn preamble(&self) -> Vec<u64> {
         let mut words = vec![
             MAGIC,
             VERSION,
@@ -153,20 +153,20 @@ impl ReplayLayout {
     }
 
     /// Reads the layout from a file's first block, which may have any contents.
-    pub fn read(words: &Words) -> Result<Self, IdentityFault> {
-        let identity: Vec<u64> = (0..IDENTITY_WORDS).map(|i| words.load(i * WORD)).collect();
-        if identity[0] != MAGIC {
-            return Err(IdentityFault::Magic);
+    pub fn read(words: &Words) -> Result<Self, PreambleError> {
+        let preamble: Vec<u64> = (0..PREAMBLE_WORDS).map(|i| words.load(i * WORD)).collect();
+        if preamble[0] != MAGIC {
+            return Err(PreambleError::Magic);
         }
-        if identity[1] != VERSION {
-            return Err(IdentityFault::Version(identity[1]));
+        if preamble[1] != VERSION {
+            return Err(PreambleError::Version(preamble[1]));
         }
-        let (fields, checksum) = identity.split_at(IDENTITY_WORDS - 1);
+        let (fields, checksum) = preamble.split_at(PREAMBLE_WORDS - 1);
         if checksum[0] != u64::from(crc32fast::hash(bytemuck::cast_slice(fields))) {
-            return Err(IdentityFault::Checksum);
+            return Err(PreambleError::Checksum);
         }
         // The bound keeps `RowLayout::width` from overflowing.
-        let size = |word: u64| u32::try_from(word).map(|n| n as usize).map_err(|_| IdentityFault::Size);
+        let size = |word: u64| u32::try_from(word).map(|n| n as usize).map_err(|_| PreambleError::Size);
         let layout = Self {
             row: RowLayout::new(size(fields[2])?, size(fields[3])?),
             ring: fields[5],
@@ -175,7 +175,7 @@ impl ReplayLayout {
             fingerprint: fields[8],
         };
         if fields[4] != layout.row.width() as u64 {
-            return Err(IdentityFault::Size);
+            return Err(PreambleError::Size);
         }
         Ok(layout)
     }
@@ -221,5 +221,5 @@ impl ReplayLayout {
     }
 }
 
-/// Bytes of the file that contain its identity.
-pub(super) const IDENTITY_BYTES: usize = BLOCK;
+/// Bytes of the file that contain its preamble.
+pub(super) const PREAMBLE_BYTES: usize = BLOCK;

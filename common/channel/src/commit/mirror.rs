@@ -5,16 +5,16 @@ use std::io;
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
 
-use super::layout::{Places, ReplayLayout, SLOTS};
-use super::record::{ActorCommit, Record};
+use super::layout::{FileOffsets, ReplayLayout, SLOTS};
+use super::record::{ActorCommit, CommitRecord};
 use super::words::WritableWords;
 
 /// Writes the copy. The file has the length and the header of the replay, but no rows, so it takes next to no space.
 #[derive(Debug)]
 pub struct CommitMirror {
     words: WritableWords,
-    places: Places,
-    record: Record,
+    offsets: FileOffsets,
+    record: CommitRecord,
 }
 
 impl CommitMirror {
@@ -25,7 +25,7 @@ impl CommitMirror {
     /// When the layout is impossible, or the file cannot be written.
     pub fn open(path: &Path, layout: &ReplayLayout) -> io::Result<Self> {
         let impossible = || io::Error::new(io::ErrorKind::InvalidInput, "the layout of the replay is impossible");
-        let places = layout.places().ok_or_else(impossible)?;
+        let offsets = layout.offsets().ok_or_else(impossible)?;
         let file = OpenOptions::new()
             .read(true)
             .write(true)
@@ -33,13 +33,13 @@ impl CommitMirror {
             .truncate(false)
             .mode(0o600)
             .open(path)?;
-        let whole = file.metadata()?.len() == places.end as u64;
+        let whole = file.metadata()?.len() == offsets.end as u64;
         if whole {
-            let words = WritableWords::map(&file, places.header)?;
+            let words = WritableWords::map(&file, offsets.header)?;
             let same = ReplayLayout::read(words.read()).is_ok_and(|found| found == *layout);
-            let slot = places.slots[(words.read().load(places.published) % 2) as usize];
-            if let Some(record) = Record::load(words.read(), slot, layout).filter(|_| same) {
-                return Ok(Self { words, places, record });
+            let slot = offsets.slots[(words.read().load(offsets.published) % 2) as usize];
+            if let Some(record) = CommitRecord::load(words.read(), slot, layout).filter(|_| same) {
+                return Ok(Self { words, offsets, record });
             }
         }
         // Made under another name, so that an actor never finds half a file.
@@ -51,19 +51,19 @@ impl CommitMirror {
             .truncate(true)
             .mode(0o600)
             .open(&temporary)?;
-        file.set_len(places.end as u64)?;
-        let mut words = WritableWords::map(&file, places.header)?;
-        for (i, word) in layout.identity().into_iter().enumerate() {
+        file.set_len(offsets.end as u64)?;
+        let mut words = WritableWords::map(&file, offsets.header)?;
+        for (i, word) in layout.preamble().into_iter().enumerate() {
             words.store(i * size_of::<u64>(), word);
         }
-        let mut record = Record::empty(layout);
+        let mut record = CommitRecord::empty(layout);
         record.set_generation(1);
-        for slot in places.slots.iter().take(SLOTS) {
+        for slot in offsets.slots.iter().take(SLOTS) {
             record.store(&mut words, *slot, |_| ());
         }
-        words.store(places.published, record.generation());
+        words.store(offsets.published, record.generation());
         std::fs::rename(&temporary, path)?;
-        Ok(Self { words, places, record })
+        Ok(Self { words, offsets, record })
     }
 
     /// What the copy has of an actor.
@@ -92,9 +92,9 @@ impl CommitMirror {
         self.record.set_head(rows);
         let generation = self.record.generation() + 1;
         self.record.set_generation(generation);
-        let slot = self.places.slots[(generation % 2) as usize];
+        let slot = self.offsets.slots[(generation % 2) as usize];
         self.record.store(&mut self.words, slot, |_| ());
-        self.words.store(self.places.published, generation);
+        self.words.store(self.offsets.published, generation);
     }
 }
 
@@ -103,7 +103,7 @@ mod tests {
     use shoal_base::transition::RowLayout;
 
     use super::super::reader::CommitReader;
-    use super::super::record::ChunkMark;
+    use super::super::record::ChunkId;
     use super::*;
 
     fn layout() -> ReplayLayout {
@@ -118,7 +118,7 @@ mod tests {
 
     fn commit(incarnation: u64, sequence: u64, rows: u64) -> ActorCommit {
         ActorCommit {
-            mark: ChunkMark { incarnation, sequence },
+            last_chunk: ChunkId { incarnation, sequence },
             rows,
         }
     }
@@ -129,7 +129,7 @@ mod tests {
         let path = directory.path().join("replay.bin");
         let mut mirror = CommitMirror::open(&path, &layout()).unwrap();
         let reader = CommitReader::open(&path).unwrap();
-        assert_eq!((reader.rows(), reader.committed(2)), (0, ChunkMark::default()));
+        assert_eq!((reader.rows(), reader.committed(2)), (0, ChunkId::default()));
         mirror.publish(640, [(2, commit(7, 5, 320), &[3, 4][..]), (9, commit(1, 1, 1), &[])]);
         assert_eq!((reader.rows(), reader.actor(2)), (640, commit(7, 5, 320)));
         assert!(reader.snapshot().is_some());

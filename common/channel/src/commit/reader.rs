@@ -5,8 +5,8 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{Ordering, fence};
 
-use super::layout::{IDENTITY_BYTES, Places, ReplayLayout};
-use super::record::{self, ActorCommit, ChunkMark, Record};
+use super::layout::{FileOffsets, PREAMBLE_BYTES, ReplayLayout};
+use super::record::{self, ActorCommit, ChunkId, CommitRecord};
 use super::words::Words;
 
 /// Follows the commit record of a replay file that a learner may be writing. It never waits for the learner, alive or
@@ -14,7 +14,7 @@ use super::words::Words;
 #[derive(Debug)]
 pub struct CommitReader {
     words: Words,
-    places: Places,
+    offsets: FileOffsets,
     layout: ReplayLayout,
 }
 
@@ -67,22 +67,22 @@ impl CommitReader {
             file => file.map_err(io)?,
         };
         let length = file.metadata().map_err(io)?.len();
-        if length < IDENTITY_BYTES as u64 {
+        if length < PREAMBLE_BYTES as u64 {
             return Err(refused("the file is too short for a replay".into()));
         }
-        let identity = Words::map(&file, IDENTITY_BYTES).map_err(io)?;
-        let layout = ReplayLayout::read(&identity).map_err(|fault| refused(fault.to_string()))?;
-        let places = layout
-            .places()
+        let preamble = Words::map(&file, PREAMBLE_BYTES).map_err(io)?;
+        let layout = ReplayLayout::read(&preamble).map_err(|fault| refused(fault.to_string()))?;
+        let offsets = layout
+            .offsets()
             .ok_or_else(|| refused("its header has an impossible size".into()))?;
-        if length != places.end as u64 {
+        if length != offsets.end as u64 {
             return Err(refused(format!(
                 "the file has {length} bytes, its header requires {}",
-                places.end
+                offsets.end
             )));
         }
-        let words = Words::map(&file, places.header).map_err(io)?;
-        let reader = Self { words, places, layout };
+        let words = Words::map(&file, offsets.header).map_err(io)?;
+        let reader = Self { words, offsets, layout };
         // Later reads trust the record. After a power loss it may be damaged until the learner has opened the file.
         if reader.snapshot().is_none() {
             return Err(not_yet("its commit record is damaged"));
@@ -100,12 +100,12 @@ impl CommitReader {
         self.consistent(|slot| record::load_head(&self.words, slot))
     }
 
-    /// The mark of an actor's last committed chunk; the default mark before its first.
+    /// The id of an actor's last committed chunk; the default id before its first.
     ///
     /// # Panics
     /// If `actor` is not less than `layout().actors`.
-    pub fn committed(&self, actor: usize) -> ChunkMark {
-        self.actor(actor).mark
+    pub fn committed(&self, actor: usize) -> ChunkId {
+        self.actor(actor).last_chunk
     }
 
     /// What is committed of an actor.
@@ -133,8 +133,8 @@ impl CommitReader {
     }
 
     /// A consistent copy of the whole record. `None` if it is damaged; only the learner can repair it.
-    pub fn snapshot(&self) -> Option<Record> {
-        self.consistent(|slot| Record::load(&self.words, slot, &self.layout))
+    pub fn snapshot(&self) -> Option<CommitRecord> {
+        self.consistent(|slot| CommitRecord::load(&self.words, slot, &self.layout))
     }
 
     /// Reads from the active slot, and repeats if another record was published in between. The writer changes a slot
@@ -142,15 +142,15 @@ impl CommitReader {
     /// the slot was not touched.
     fn consistent<T>(&self, read: impl Fn(usize) -> T) -> T {
         loop {
-            let generation = self.words.load(self.places.published);
-            // SYNC POINT with the last Release fence of `Record::store`, after which the learner published the
+            let generation = self.words.load(self.offsets.published);
+            // SYNC POINT with the last Release fence of `CommitRecord::store`, after which the learner published the
             // generation: the record is complete.
             fence(Ordering::Acquire);
-            let value = read(self.places.slots[(generation % 2) as usize]);
-            // SYNC POINT with the first Release fence of `Record::store`: if `read` has seen a word of a later record
-            // in this slot, the load below sees a newer generation.
+            let value = read(self.offsets.slots[(generation % 2) as usize]);
+            // SYNC POINT with the first Release fence of `CommitRecord::store`: if `read` has seen a word of a later
+            // record in this slot, the load below sees a newer generation.
             fence(Ordering::Acquire);
-            if self.words.load(self.places.published) == generation {
+            if self.words.load(self.offsets.published) == generation {
                 return value;
             }
             std::hint::spin_loop();

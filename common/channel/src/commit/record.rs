@@ -5,11 +5,11 @@ use std::sync::atomic::{Ordering, fence};
 use super::layout::{ACTOR_WORDS, RECORD_WORDS, ReplayLayout};
 use super::words::{Words, WritableWords};
 
-/// Identifies a chunk of one actor. Marks are ordered by incarnation, then by sequence number.
+/// Identifies a chunk of one actor. Ids are ordered by incarnation, then by sequence number.
 ///
 /// The default means "none": incarnations and sequence numbers count from 1.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
-pub struct ChunkMark {
+pub struct ChunkId {
     /// Grows with every process that the run starts.
     pub incarnation: u64,
     /// The chunk's number, over all of the actor's incarnations.
@@ -19,7 +19,7 @@ pub struct ChunkMark {
 /// More processes than any run starts, and far below overflow.
 pub const MAX_INCARNATION: u64 = 1 << 60;
 
-impl ChunkMark {
+impl ChunkId {
     /// Whether this chunk comes right after `committed`: it has the next sequence number of the same incarnation, or it
     /// is the handshake of a later incarnation, which keeps the sequence number.
     pub fn is_next(self, committed: Self) -> bool {
@@ -36,14 +36,14 @@ impl ChunkMark {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ActorCommit {
     /// The last chunk.
-    pub mark: ChunkMark,
+    pub last_chunk: ChunkId,
     /// Rows of all its chunks, over all incarnations.
     pub rows: u64,
 }
 
 /// A commit record. Rows are numbered from 0 in the order they were committed, for the life of the file.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Record {
+pub struct CommitRecord {
     /// Exactly as in a slot: the three fields below, then for each actor three words and its snapshot.
     words: Vec<u64>,
     /// Words of an actor.
@@ -62,8 +62,8 @@ const OPEN: u64 = 0;
 /// More rows and records than any run will write.
 const LIMIT: u64 = 1 << 60;
 
-impl Record {
-    /// The record of an empty replay of this layout, which must have [`places`](ReplayLayout::places).
+impl CommitRecord {
+    /// The record of an empty replay of this layout, which must have [`offsets`](ReplayLayout::offsets).
     pub fn empty(layout: &ReplayLayout) -> Self {
         let stride = ACTOR_WORDS + layout.actor_snapshot_words;
         Self {
@@ -104,16 +104,16 @@ impl Record {
     ///
     /// # Panics
     /// If `actor` is not less than `actors()`.
-    pub fn add(&mut self, actor: usize, mark: ChunkMark, rows: u64) {
+    pub fn add(&mut self, actor: usize, id: ChunkId, rows: u64) {
         let at = ACTORS + self.stride * actor;
-        self.words[at] = mark.incarnation;
-        self.words[at + 1] = mark.sequence;
+        self.words[at] = id.incarnation;
+        self.words[at + 1] = id.sequence;
         self.words[at + 2] += rows;
         self.words[HEAD] += rows;
     }
 
     /// Adds rows that belong to no actor: those of another replay.
-    pub fn add_rows_of_nobody(&mut self, rows: u64) {
+    pub fn add_inherited_rows(&mut self, rows: u64) {
         self.words[HEAD] += rows;
     }
 
@@ -123,8 +123,8 @@ impl Record {
     /// If `actor` is not less than `actors()`.
     pub(super) fn set_actor(&mut self, actor: usize, commit: ActorCommit) {
         let at = ACTORS + self.stride * actor;
-        self.words[at] = commit.mark.incarnation;
-        self.words[at + 1] = commit.mark.sequence;
+        self.words[at] = commit.last_chunk.incarnation;
+        self.words[at + 1] = commit.last_chunk.sequence;
         self.words[at + 2] = commit.rows;
     }
 
@@ -215,7 +215,7 @@ pub(super) fn load_actor(words: &Words, offset: usize, layout: &ReplayLayout, ac
 
 fn actor_from(word: impl Fn(usize) -> u64) -> ActorCommit {
     ActorCommit {
-        mark: ChunkMark {
+        last_chunk: ChunkId {
             incarnation: word(0),
             sequence: word(1),
         },

@@ -10,7 +10,7 @@ pub(super) const VERSION: u32 = 4;
 
 /// A request to a launcher.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub enum Question {
+pub enum ControlRequest {
     /// Report the status of the run.
     Status,
     /// Continue with this many actors.
@@ -100,12 +100,12 @@ pub struct HostStatus {
     pub roles: Vec<RoleStatus>,
 }
 
-/// A question and the run that it is about. The run is checked because a copy of a run directory has the same name in
-/// shared memory: a question about the copy reaches the launcher of the original.
+/// A request and the run that it is about. The run is checked because a copy of a run directory has the same name in
+/// shared memory: a request about the copy reaches the launcher of the original.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(super) struct Asked {
+pub(super) struct AddressedRequest {
     pub(super) run: RunKey,
-    pub(super) question: Question,
+    pub(super) request: ControlRequest,
 }
 
 /// Distinguishes a run directory from its copies by device and inode.
@@ -119,7 +119,7 @@ pub struct RunKey {
 
 /// The answer of a launcher.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub enum Answer {
+pub enum ControlResponse {
     /// The status of the run.
     Status(RunStatus),
     /// The request is being carried out.
@@ -286,22 +286,22 @@ mod tests {
 
     #[test]
     fn a_message_arrives_unchanged_and_another_format_is_refused() {
-        let answer = Answer::Status(status());
+        let answer = ControlResponse::Status(status());
         assert_eq!(decode(VERSION, &encode(&answer).unwrap()), Ok(answer.clone()));
         assert!(
-            decode::<Answer>(VERSION + 1, &encode(&answer).unwrap())
+            decode::<ControlResponse>(VERSION + 1, &encode(&answer).unwrap())
                 .unwrap_err()
                 .contains("format")
         );
-        assert!(decode::<Answer>(VERSION, &[]).is_err());
+        assert!(decode::<ControlResponse>(VERSION, &[]).is_err());
     }
 
     #[test]
     fn a_truncated_or_too_long_message_is_refused() {
-        let whole = encode(&Answer::Status(status())).unwrap();
+        let whole = encode(&ControlResponse::Status(status())).unwrap();
         for end in 0..whole.len() {
             assert!(
-                decode::<Answer>(VERSION, &whole[..end]).is_err(),
+                decode::<ControlResponse>(VERSION, &whole[..end]).is_err(),
                 "{end} of {} bytes",
                 whole.len()
             );
@@ -309,7 +309,7 @@ mod tests {
         for extra in 1..4 {
             let longer = [&whole[..], &[0; 3][..extra]].concat();
             assert_eq!(
-                decode::<Answer>(VERSION, &longer),
+                decode::<ControlResponse>(VERSION, &longer),
                 Err(format!("{extra} bytes are left over"))
             );
         }
@@ -331,17 +331,17 @@ mod tests {
     proptest! {
         #[test]
         fn any_bytes_decode_to_a_message_or_an_error(bytes in proptest::collection::vec(any::<u8>(), 0..300)) {
-            prop_assert!(is_refused_or_round_trips::<Question>(&bytes));
-            prop_assert!(is_refused_or_round_trips::<Asked>(&bytes));
-            prop_assert!(is_refused_or_round_trips::<Answer>(&bytes));
+            prop_assert!(is_refused_or_round_trips::<ControlRequest>(&bytes));
+            prop_assert!(is_refused_or_round_trips::<AddressedRequest>(&bytes));
+            prop_assert!(is_refused_or_round_trips::<ControlResponse>(&bytes));
         }
 
         #[test]
         fn a_changed_message_decodes_to_an_error_or_another_message(at in any::<prop::sample::Index>(), by in 1_u8..) {
-            let sent = encode(&Answer::Status(status())).unwrap();
+            let sent = encode(&ControlResponse::Status(status())).unwrap();
             let mut changed = sent.clone();
             changed[at.index(sent.len())] ^= by;
-            if let Ok(message) = decode::<Answer>(VERSION, &changed) {
+            if let Ok(message) = decode::<ControlResponse>(VERSION, &changed) {
                 prop_assert_ne!(encode(&message).unwrap(), sent);
             }
         }

@@ -1,22 +1,22 @@
-//! Checks of what an environment returns. The client checks every answer, whatever program serves the environment, so
+//! Checks of what an environment returns. The client checks every response, whatever program serves the environment, so
 //! that later code need not expect NaN, infinities or impossible indices.
 
 use shoal_base::space::{EnvironmentSpec, Space};
 
 use super::message::{Block, ResponseLayout};
 
-/// An invalid answer. It ends the server's episodes.
+/// An invalid response. It ends the server's episodes.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
-pub enum Fault {
+pub enum ResponseFault {
     /// The server itself has found invalid numbers, and has written them to its standard error.
     #[error("the environment server reports that an environment returned something invalid")]
     Reported,
-    /// The answer has a wrong length.
+    /// The response has a wrong length.
     #[error("the environment server answered with {found} numbers instead of {expected}")]
     Length {
-        /// Numbers in the answer.
+        /// Numbers in the response.
         found: usize,
-        /// Numbers in a valid answer.
+        /// Numbers in a valid response.
         expected: usize,
     },
     /// An invalid number.
@@ -35,10 +35,10 @@ pub enum Fault {
 
 /// Which part of a response is used.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Part {
-    /// All of it: the answer to a step.
+pub(super) enum ResponsePart {
+    /// All of it: the response to a step.
     Step,
-    /// The observations to act on: the answer to a reset or a restore.
+    /// The observations to act on: the response to a reset or a restore.
     Observations,
 }
 
@@ -47,8 +47,8 @@ pub(super) fn find_fault(
     spec: &EnvironmentSpec,
     layout: &ResponseLayout,
     response: &[f32],
-    part: Part,
-) -> Result<(), Fault> {
+    part: ResponsePart,
+) -> Result<(), ResponseFault> {
     let block = |block| layout.block(block, response);
     let all = [
         (Block::Observations, "an observation"),
@@ -58,8 +58,8 @@ pub(super) fn find_fault(
         (Block::Truncated, "truncated"),
     ];
     let counts = match part {
-        Part::Step => &all[..],
-        Part::Observations => &all[..1],
+        ResponsePart::Step => &all[..],
+        ResponsePart::Observations => &all[..1],
     };
     for (which, what) in counts {
         let numbers = block(*which);
@@ -72,7 +72,7 @@ pub(super) fn find_fault(
         };
         if let Some(i) = wrong {
             let width = numbers.len() / layout.environments;
-            return Err(Fault::Number {
+            return Err(ResponseFault::Number {
                 environment: i / width,
                 what,
                 value: numbers[i],
@@ -114,8 +114,8 @@ mod tests {
         }
     }
 
-    /// Checks an answer of two environments to a step, with one number changed.
-    fn fault_of(observation: Space, at: usize, value: f32, part: Part) -> Result<(), Fault> {
+    /// Checks a response of two environments to a step, with one number changed.
+    fn fault_of(observation: Space, at: usize, value: f32, part: ResponsePart) -> Result<(), ResponseFault> {
         let spec = spec(observation);
         let layout = ResponseLayout::new(2, spec.observation.width());
         let mut response = vec![1.0; layout.len()];
@@ -136,27 +136,27 @@ mod tests {
             (16, 0.5, 0, "truncated"),
             (17, f32::NAN, 1, "truncated"),
         ] {
-            let Err(Fault::Number {
+            let Err(ResponseFault::Number {
                 environment: found,
                 what: named,
                 ..
-            }) = fault_of(boxed(), at, value, Part::Step)
+            }) = fault_of(boxed(), at, value, ResponsePart::Step)
             else {
                 panic!("{at}: {value} passed");
             };
             assert_eq!((found, named), (environment, what), "{at}");
         }
         assert_eq!(
-            fault_of(boxed(), 0, 7.0, Part::Step),
+            fault_of(boxed(), 0, 7.0, ResponsePart::Step),
             Ok(()),
             "a number outside its bounds is allowed"
         );
         assert_eq!(
-            fault_of(boxed(), 12, f32::NAN, Part::Observations),
+            fault_of(boxed(), 12, f32::NAN, ResponsePart::Observations),
             Ok(()),
             "a reset has no reward"
         );
-        assert!(fault_of(boxed(), 5, f32::NAN, Part::Observations).is_err());
+        assert!(fault_of(boxed(), 5, f32::NAN, ResponsePart::Observations).is_err());
     }
 
     #[test]
@@ -169,10 +169,10 @@ mod tests {
             (1.5, false),
             (f32::NAN, false),
         ] {
-            let found = fault_of(Space::discrete(3), 0, value, Part::Observations);
+            let found = fault_of(Space::discrete(3), 0, value, ResponsePart::Observations);
             assert_eq!(found.is_ok(), right, "{value}");
         }
-        let text = fault_of(Space::discrete(3), 1, 3.0, Part::Step)
+        let text = fault_of(Space::discrete(3), 1, 3.0, ResponsePart::Step)
             .unwrap_err()
             .to_string();
         assert!(text.contains("environment 1") && text.contains("0 to 2"), "{text}");

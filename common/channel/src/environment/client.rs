@@ -14,17 +14,17 @@ use shoal_base::report::Role;
 use shoal_base::space::{EnvironmentSpec, Space};
 use shoal_base::stop::Stop;
 
-use super::check::{Fault, Part, find_fault};
-use super::message::{Ask, Block, RequestHeader, ResponseHeader, ResponseLayout, Verdict};
-use super::service::{EnvironmentService, name, question_length, service};
+use super::check::{ResponseFault, ResponsePart, find_fault};
+use super::message::{Block, RequestHeader, RequestKind, ResponseHeader, ResponseLayout, ResponseStatus};
+use super::service::{EnvironmentService, name, request_length, service};
 use crate::domain::Domain;
 use crate::error::{ChannelError, PeerError};
 use crate::event::{EventName, Listener, Notifier, wait_for};
-use crate::service::{CLAIM_PATIENCE, Entry, claim};
+use crate::service::{CLAIM_PATIENCE, OpenMode, claim};
 
 /// Which episodes a reset begins.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Begin {
+pub enum ResetRequest {
     /// The next training episode of each environment.
     Next,
     /// The training episode with this number, of each environment's own stream.
@@ -41,16 +41,16 @@ pub enum Begin {
 
 /// The result of a step.
 #[derive(Debug)]
-pub enum Stepped {
+pub enum StepResult {
     /// Every environment took the step.
-    Taken(Observed),
+    Taken(EnvironmentResponse),
     /// The server died and another one has taken its place: the current episodes are lost.
     Lost,
 }
 
 /// The result of a request for a snapshot.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Snapshot {
+pub enum SnapshotResult {
     /// The words to restore from; their number is
     /// [`EnvironmentSpec::snapshot_words`](shoal_base::space::EnvironmentSpec::snapshot_words).
     Taken(Vec<u64>),
@@ -60,12 +60,12 @@ pub enum Snapshot {
 
 /// A response in the server's memory.
 #[derive(Debug)]
-pub struct Observed {
+pub struct EnvironmentResponse {
     response: Response<ipc::Service, [f32], ResponseHeader>,
     layout: ResponseLayout,
 }
 
-/// The actor's end. While it waits for an answer, it calls `idle` some twenty times a second.
+/// The actor's end. While it waits for a response, it calls `idle` some twenty times a second.
 #[derive(Debug)]
 pub struct EnvironmentClient {
     service: EnvironmentService,
@@ -80,7 +80,7 @@ pub struct EnvironmentClient {
     stop: Stop,
 }
 
-impl Observed {
+impl EnvironmentResponse {
     fn block(&self, block: Block) -> &[f32] {
         self.layout.block(block, self.response.payload())
     }
@@ -123,7 +123,7 @@ impl Observed {
 }
 
 /// Asks environment server `index` for its spaces and the number of its environments, when neither is known yet.
-/// While it waits for the answer, it calls `idle` about twenty times a second.
+/// While it waits for the response, it calls `idle` about twenty times a second.
 ///
 /// # Errors
 /// When `stop` is requested, or the channel fails.
@@ -146,7 +146,7 @@ pub fn describe(
 
 impl EnvironmentClient {
     /// Connects to environment server `index`, which is expected to step this many environments like `spec`; use
-    /// [`describe`](Self::describe) to verify it. Waiting for an answer ends when `stop` is requested.
+    /// [`describe`](Self::describe) to verify it. Waiting for a response ends when `stop` is requested.
     ///
     /// # Errors
     /// When shared memory is unavailable.
@@ -159,9 +159,9 @@ impl EnvironmentClient {
     ) -> Result<Self, ChannelError> {
         let channel = name(index);
         let snapshot_words = spec.snapshot_words(environments);
-        let longest = question_length(spec, environments);
+        let longest = request_length(spec, environments);
         let (service, client) = claim(|| {
-            let service = service(domain, &channel, Entry::Open)?;
+            let service = service(domain, &channel, OpenMode::Open)?;
             let client = service
                 .client_builder()
                 .initial_max_slice_len(longest)
@@ -186,14 +186,19 @@ impl EnvironmentClient {
     /// Asks the server for its spaces and the number of its environments.
     ///
     /// # Errors
-    /// When a stop is requested, the channel fails, the server refuses, or its answer fits no spaces.
+    /// When a stop is requested, the channel fails, the server refuses, or its response fits no spaces.
     pub fn describe(
         &self,
         listener: &Listener,
         mut idle: impl FnMut(),
     ) -> Result<(EnvironmentSpec, usize), Exit<ChannelError>> {
-        let response = self.ask_until_answered(listener, RequestHeader::new(Ask::Describe, 0, 0), &[], &mut idle)?;
-        let (header, payload) = (response.user_header(), self.answered(&response)?);
+        let response = self.request_until_answered(
+            listener,
+            RequestHeader::new(RequestKind::Describe, 0, 0),
+            &[],
+            &mut idle,
+        )?;
+        let (header, payload) = (response.user_header(), self.accepted_payload(&response)?);
         let described = header.described(payload);
         described.ok_or_else(|| ChannelError::new(&self.channel, "describe", PeerError::DescriptionLength).into())
     }
@@ -205,31 +210,34 @@ impl EnvironmentClient {
     pub fn reset(
         &self,
         listener: &Listener,
-        begin: Begin,
+        request: ResetRequest,
         mut idle: impl FnMut(),
-    ) -> Result<Observed, Exit<ChannelError>> {
-        let question = match begin {
-            Begin::Next => RequestHeader::new(Ask::Reset, 0, 0),
-            Begin::Training(episode) => RequestHeader::new(Ask::ResetToTraining, episode, 0),
-            Begin::Evaluation { first, episodes } => RequestHeader::new(Ask::ResetToEvaluation, first, episodes),
+    ) -> Result<EnvironmentResponse, Exit<ChannelError>> {
+        let header = match request {
+            ResetRequest::Next => RequestHeader::new(RequestKind::Reset, 0, 0),
+            ResetRequest::Training(episode) => RequestHeader::new(RequestKind::ResetToTraining, episode, 0),
+            ResetRequest::Evaluation { first, episodes } => {
+                RequestHeader::new(RequestKind::ResetToEvaluation, first, episodes)
+            }
         };
-        self.begun(self.ask_until_answered(listener, question, &[], &mut idle)?)
+        self.begun(self.request_until_answered(listener, header, &[], &mut idle)?)
     }
 
     /// Every environment takes a step with its action.
     ///
     /// # Errors
     /// When a stop is requested, the channel fails, the server refuses the actions, it denies having begun the
-    /// episodes, or its answer is [invalid](ChannelError::fault). After an invalid answer new episodes must be begun.
+    /// episodes, or its response is [invalid](ChannelError::fault). After an invalid response new episodes must be
+    /// begun.
     pub fn step(
         &self,
         listener: &Listener,
         actions: &[f32],
         mut idle: impl FnMut(),
-    ) -> Result<Stepped, Exit<ChannelError>> {
-        match self.ask_within_episodes(listener, Ask::Step, actions, &mut idle)? {
-            Some(response) => Ok(Stepped::Taken(self.observed(response, Part::Step)?)),
-            None => Ok(Stepped::Lost),
+    ) -> Result<StepResult, Exit<ChannelError>> {
+        match self.request_within_episodes(listener, RequestKind::Step, actions, &mut idle)? {
+            Some(response) => Ok(StepResult::Taken(self.observed(response, ResponsePart::Step)?)),
+            None => Ok(StepResult::Lost),
         }
     }
 
@@ -238,15 +246,15 @@ impl EnvironmentClient {
     /// # Errors
     /// When a stop is requested, the channel fails, or the server refuses because its environments cannot save their
     /// state or run evaluation episodes.
-    pub fn snapshot(&self, listener: &Listener, mut idle: impl FnMut()) -> Result<Snapshot, Exit<ChannelError>> {
-        let Some(response) = self.ask_within_episodes(listener, Ask::Snapshot, &[], &mut idle)? else {
-            return Ok(Snapshot::Lost);
+    pub fn snapshot(&self, listener: &Listener, mut idle: impl FnMut()) -> Result<SnapshotResult, Exit<ChannelError>> {
+        let Some(response) = self.request_within_episodes(listener, RequestKind::Snapshot, &[], &mut idle)? else {
+            return Ok(SnapshotResult::Lost);
         };
-        let words = words_of(self.answered(&response)?);
+        let words = words_of(self.accepted_payload(&response)?);
         if words.len() != self.snapshot_words {
             return Err(self.refused().into());
         }
-        Ok(Snapshot::Taken(words))
+        Ok(SnapshotResult::Taken(words))
     }
 
     /// Every environment continues its training episode from a snapshot. The result has the observations to act on
@@ -259,7 +267,7 @@ impl EnvironmentClient {
         listener: &Listener,
         words: &[u64],
         mut idle: impl FnMut(),
-    ) -> Result<Observed, Exit<ChannelError>> {
+    ) -> Result<EnvironmentResponse, Exit<ChannelError>> {
         if words.len() != self.snapshot_words {
             let cause = PeerError::SnapshotLength {
                 found: words.len(),
@@ -267,26 +275,26 @@ impl EnvironmentClient {
             };
             return Err(ChannelError::new(&self.channel, "restore", cause).into());
         }
-        self.begun(self.ask_until_answered(
+        self.begun(self.request_until_answered(
             listener,
-            RequestHeader::new(Ask::Restore, 0, 0),
+            RequestHeader::new(RequestKind::Restore, 0, 0),
             numbers_of(words),
             &mut idle,
         )?)
     }
 
     /// Takes the response to a reset or restore, and notes which server runs the new episodes.
-    fn begun(&self, response: Answer) -> Result<Observed, Exit<ChannelError>> {
+    fn begun(&self, response: ServerResponse) -> Result<EnvironmentResponse, Exit<ChannelError>> {
         let server = response.origin();
-        let observed = self.observed(response, Part::Observations)?;
+        let observed = self.observed(response, ResponsePart::Observations)?;
         self.episodes.set(Some(server));
         Ok(observed)
     }
 
-    fn observed(&self, response: Answer, part: Part) -> Result<Observed, ChannelError> {
-        let numbers = self.answered(&response)?;
+    fn observed(&self, response: ServerResponse, part: ResponsePart) -> Result<EnvironmentResponse, ChannelError> {
+        let numbers = self.accepted_payload(&response)?;
         if numbers.len() != self.layout.len() {
-            let fault = Fault::Length {
+            let fault = ResponseFault::Length {
                 found: numbers.len(),
                 expected: self.layout.len(),
             };
@@ -294,20 +302,20 @@ impl EnvironmentClient {
         }
         find_fault(&self.spec, &self.layout, numbers, part)
             .map_err(|fault| ChannelError::new(&self.channel, "ask", PeerError::Invalid(fault)))?;
-        Ok(Observed {
+        Ok(EnvironmentResponse {
             response,
             layout: self.layout,
         })
     }
 
     /// The payload of a response; an error if the server refused.
-    fn answered<'a>(&self, response: &'a Answer) -> Result<&'a [f32], ChannelError> {
-        let verdict = response.user_header().verdict;
-        if verdict == Verdict::Answered as u32 {
+    fn accepted_payload<'a>(&self, response: &'a ServerResponse) -> Result<&'a [f32], ChannelError> {
+        let status = response.user_header().status;
+        if status == ResponseStatus::Answered as u32 {
             return Ok(response.payload());
         }
-        if verdict == Verdict::Invalid as u32 {
-            let cause = PeerError::Invalid(Fault::Reported);
+        if status == ResponseStatus::Invalid as u32 {
+            let cause = PeerError::Invalid(ResponseFault::Reported);
             return Err(ChannelError::new(&self.channel, "ask", cause));
         }
         Err(self.refused())
@@ -318,22 +326,22 @@ impl EnvironmentClient {
     }
 
     /// Asks once: for requests about the current episodes. `None` if the server that ran them is gone.
-    fn ask_within_episodes(
+    fn request_within_episodes(
         &self,
         listener: &Listener,
-        ask: Ask,
+        kind: RequestKind,
         payload: &[f32],
         idle: &mut dyn FnMut(),
-    ) -> Result<Option<Answer>, Exit<ChannelError>> {
+    ) -> Result<Option<ServerResponse>, Exit<ChannelError>> {
         let server = self.server();
         if server != self.episodes.get() {
             return Ok(None);
         }
-        let sent = self.send(server, RequestHeader::new(ask, 0, 0), payload)?;
-        let Some(response) = self.answer(listener, &sent, idle)? else {
+        let sent = self.send(server, RequestHeader::new(kind, 0, 0), payload)?;
+        let Some(response) = self.receive_response(listener, &sent, idle)? else {
             return Ok(None);
         };
-        if response.user_header().verdict != Verdict::NotStarted as u32 {
+        if response.user_header().status != ResponseStatus::NotStarted as u32 {
             return Ok(Some(response));
         }
         if Some(response.origin()) == self.episodes.get() {
@@ -343,17 +351,17 @@ impl EnvironmentClient {
     }
 
     /// Asks until a server answers: for requests that may be sent twice.
-    fn ask_until_answered(
+    fn request_until_answered(
         &self,
         listener: &Listener,
-        question: RequestHeader,
+        header: RequestHeader,
         payload: &[f32],
         idle: &mut dyn FnMut(),
-    ) -> Result<Answer, Exit<ChannelError>> {
+    ) -> Result<ServerResponse, Exit<ChannelError>> {
         let mut unreachable = None;
         loop {
-            let sent = self.send(self.server(), question, payload)?;
-            if let Some(response) = self.answer(listener, &sent, idle)? {
+            let sent = self.send(self.server(), header, payload)?;
+            if let Some(response) = self.receive_response(listener, &sent, idle)? {
                 return Ok(response);
             }
             if sent.server.is_none() || sent.is_delivered() {
@@ -369,14 +377,14 @@ impl EnvironmentClient {
     fn send(
         &self,
         server: Option<UniqueServerId>,
-        question: RequestHeader,
+        header: RequestHeader,
         payload: &[f32],
     ) -> Result<Sent, ChannelError> {
         let mut request = self
             .client
             .loan_slice_uninit(payload.len())
             .map_err(|cause| ChannelError::new(&self.channel, "ask", cause))?;
-        *request.user_header_mut() = question;
+        *request.user_header_mut() = header;
         let pending = request
             .write_from_slice(payload)
             .send()
@@ -385,15 +393,15 @@ impl EnvironmentClient {
         Ok(Sent { pending, server })
     }
 
-    /// Waits for the answer; `None` if the server that was asked is gone or did not get the request.
-    fn answer(
+    /// Waits for the response; `None` if the server that was asked is gone or did not get the request.
+    fn receive_response(
         &self,
         listener: &Listener,
         sent: &Sent,
         idle: &mut dyn FnMut(),
-    ) -> Result<Option<Answer>, Exit<ChannelError>> {
+    ) -> Result<Option<ServerResponse>, Exit<ChannelError>> {
         let lost = Cell::new(false);
-        let answer = wait_for(
+        let response = wait_for(
             listener,
             &self.stop,
             || match sent.pending.receive() {
@@ -410,7 +418,7 @@ impl EnvironmentClient {
                 Ok(())
             },
         )?;
-        Ok(answer)
+        Ok(response)
     }
 
     /// The server that is connected to the service.
@@ -438,4 +446,4 @@ impl Sent {
 }
 
 type Pending = PendingResponse<ipc::Service, [f32], RequestHeader, [f32], ResponseHeader>;
-type Answer = Response<ipc::Service, [f32], ResponseHeader>;
+type ServerResponse = Response<ipc::Service, [f32], ResponseHeader>;

@@ -7,7 +7,7 @@ use shoal_base::space::{EnvironmentSpec, Space};
 /// The kinds of requests.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u32)]
-pub enum Ask {
+pub enum RequestKind {
     /// Return the spaces and the number of environments.
     Describe = 0,
     /// Every environment begins the next training episode of its own stream.
@@ -24,7 +24,7 @@ pub enum Ask {
     ResetToTraining = 6,
 }
 
-impl Ask {
+impl RequestKind {
     pub(super) const ALL: [Self; 7] = [
         Self::Describe,
         Self::Reset,
@@ -36,24 +36,24 @@ impl Ask {
     ];
 }
 
-/// Header of a request. The payload has the actions, environment after environment, for [`Ask::Step`], the words of the
-/// snapshot for [`Ask::Restore`], and is empty otherwise.
+/// Header of a request. The payload has the actions, environment after environment, for [`RequestKind::Step`], the
+/// words of the snapshot for [`RequestKind::Restore`], and is empty otherwise.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ZeroCopySend)]
 #[type_name("ShoalEnvironmentRequest")]
 #[repr(C)]
 pub struct RequestHeader {
-    pub(super) ask: u32,
-    /// Number of evaluation episodes of [`Ask::ResetToEvaluation`], of which `episode` is the first; 0 means no limit.
-    /// An environment whose next episode would be beyond them is not reset again.
+    pub(super) kind: u32,
+    /// Number of evaluation episodes of [`RequestKind::ResetToEvaluation`], of which `episode` is the first; 0 means no
+    /// limit. An environment whose next episode would be beyond them is not reset again.
     pub episodes: u32,
-    /// The episode of [`Ask::ResetToTraining`], or the first episode of [`Ask::ResetToEvaluation`].
+    /// The episode of [`RequestKind::ResetToTraining`], or the first episode of [`RequestKind::ResetToEvaluation`].
     pub episode: u64,
 }
 
 impl RequestHeader {
-    pub(super) fn new(ask: Ask, episode: u64, episodes: u32) -> Self {
+    pub(super) fn new(kind: RequestKind, episode: u64, episodes: u32) -> Self {
         Self {
-            ask: ask as u32,
+            kind: kind as u32,
             episodes,
             episode,
         }
@@ -63,7 +63,7 @@ impl RequestHeader {
 /// The outcome of a request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u32)]
-pub(super) enum Verdict {
+pub(super) enum ResponseStatus {
     Answered = 0,
     /// A step or a snapshot before a reset or a restore: the server is not the one that began the episode.
     NotStarted = 1,
@@ -73,13 +73,14 @@ pub(super) enum Verdict {
     Invalid = 3,
 }
 
-/// Header of a response. For [`Ask::Describe`] the payload has the least and greatest values of an observation and of
-/// an action (for boxes), for [`Ask::Snapshot`] the snapshot's words, and otherwise the blocks of [`ResponseLayout`].
+/// Header of a response. For [`RequestKind::Describe`] the payload has the least and greatest values of an observation
+/// and of an action (for boxes), for [`RequestKind::Snapshot`] the snapshot's words, and otherwise the blocks of
+/// [`ResponseLayout`].
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ZeroCopySend)]
 #[type_name("ShoalEnvironmentResponse")]
 #[repr(C)]
 pub struct ResponseHeader {
-    pub(super) verdict: u32,
+    pub(super) status: u32,
     /// Environments the server steps.
     pub environments: u32,
     /// Values of a discrete observation; 0 for a box.
@@ -97,8 +98,8 @@ pub struct ResponseHeader {
 }
 
 impl ResponseHeader {
-    /// The spaces and the number of environments in a response to [`Ask::Describe`] with payload `bounds`. `None` if
-    /// the payload has another length.
+    /// The spaces and the number of environments in a response to [`RequestKind::Describe`] with payload `bounds`.
+    /// `None` if the payload has another length.
     pub(super) fn described(&self, bounds: &[f32]) -> Option<(EnvironmentSpec, usize)> {
         let spaces = [
             (self.discrete_observations, self.observation_width),
@@ -162,7 +163,7 @@ pub(super) enum Block {
     Truncated,
 }
 
-/// Mutable blocks of a response to [`Ask::Step`]. A reset or restore fills `observations` alone.
+/// Mutable blocks of a response to [`RequestKind::Step`]. A reset or restore fills `observations` alone.
 #[derive(Debug)]
 pub struct StepBlocks<'a> {
     /// The observations to act on next. After the end of an episode this is the first observation of the next one.

@@ -9,12 +9,12 @@ use shoal_base::report::Role;
 use shoal_base::space::{EnvironmentSpec, Space};
 use shoal_base::stop::Stop;
 
-use super::message::{Ask, RequestHeader, ResponseHeader, ResponseLayout, StepBlocks, Verdict};
-use super::service::{LOANED_RESPONSES, answer_length, name, service};
+use super::message::{RequestHeader, RequestKind, ResponseHeader, ResponseLayout, ResponseStatus, StepBlocks};
+use super::service::{LOANED_RESPONSES, name, response_length, service};
 use crate::domain::Domain;
 use crate::error::ChannelError;
 use crate::event::{EventName, Listener, Notifier, wait_for};
-use crate::service::{Entry, claim};
+use crate::service::{OpenMode, claim};
 
 /// The server's end.
 #[derive(Debug)]
@@ -48,9 +48,9 @@ impl EnvironmentPort {
     ) -> Result<Self, ChannelError> {
         let channel = name(index);
         let layout = ResponseLayout::new(environments, spec.observation.width());
-        let longest = answer_length(&spec, environments);
+        let longest = response_length(&spec, environments);
         let server = claim(|| {
-            service(domain, &channel, Entry::Open)?
+            service(domain, &channel, OpenMode::Open)?
                 .server_builder()
                 .initial_max_slice_len(longest)
                 .max_loaned_responses_per_request(LOANED_RESPONSES)
@@ -90,8 +90,8 @@ impl EnvironmentPort {
                 },
             )?;
             let request = Request { request, port: self };
-            match request.ask() {
-                Some(Ask::Describe) => request.describe()?,
+            match request.kind() {
+                Some(RequestKind::Describe) => request.describe()?,
                 Some(_) => return Ok(request),
                 None => request.refuse()?,
             }
@@ -101,9 +101,9 @@ impl EnvironmentPort {
 
 impl Request<'_> {
     /// The kind of the request; `None` if this build does not know it.
-    pub fn ask(&self) -> Option<Ask> {
-        let code = self.request.user_header().ask;
-        Ask::ALL.into_iter().find(|ask| *ask as u32 == code)
+    pub fn kind(&self) -> Option<RequestKind> {
+        let code = self.request.user_header().kind;
+        RequestKind::ALL.into_iter().find(|kind| *kind as u32 == code)
     }
 
     /// The evaluation episode that environment 0 must begin, or the training episode that each environment must begin.
@@ -122,18 +122,18 @@ impl Request<'_> {
     ///
     /// # Errors
     /// When the response cannot be sent.
-    pub fn answer<E>(
+    pub fn respond<E>(
         self,
         write: impl FnOnce(&[f32], StepBlocks<'_>) -> Result<(), E>,
     ) -> Result<Result<(), E>, ChannelError> {
         let layout = self.port.layout;
         let mut result = Ok(());
-        self.respond(layout.len(), |payload| {
+        self.send_response(layout.len(), |payload| {
             result = write(self.request.payload(), layout.split_mut(payload));
             if result.is_ok() {
-                Verdict::Answered
+                ResponseStatus::Answered
             } else {
-                Verdict::Refused
+                ResponseStatus::Refused
             }
         })?;
         Ok(result)
@@ -149,7 +149,7 @@ impl Request<'_> {
     ///
     /// # Errors
     /// When the response cannot be sent.
-    pub fn answer_snapshot<E>(
+    pub fn respond_with_snapshot<E>(
         self,
         write: impl FnOnce(&mut [u64]) -> Result<(), E>,
     ) -> Result<Result<(), E>, ChannelError> {
@@ -160,9 +160,9 @@ impl Request<'_> {
             return Ok(Err(error));
         }
         let numbers = numbers_of(&words);
-        self.respond(numbers.len(), |payload| {
+        self.send_response(numbers.len(), |payload| {
             payload.copy_from_slice(numbers);
-            Verdict::Answered
+            ResponseStatus::Answered
         })?;
         Ok(Ok(()))
     }
@@ -172,7 +172,7 @@ impl Request<'_> {
     /// # Errors
     /// When the response cannot be sent.
     pub fn not_started(self) -> Result<(), ChannelError> {
-        self.respond(0, |_| Verdict::NotStarted)
+        self.send_response(0, |_| ResponseStatus::NotStarted)
     }
 
     /// Answers that the request is invalid.
@@ -180,7 +180,7 @@ impl Request<'_> {
     /// # Errors
     /// When the response cannot be sent.
     pub fn refuse(self) -> Result<(), ChannelError> {
-        self.respond(0, |_| Verdict::Refused)
+        self.send_response(0, |_| ResponseStatus::Refused)
     }
 
     fn describe(self) -> Result<(), ChannelError> {
@@ -194,13 +194,17 @@ impl Request<'_> {
                 Space::Discrete { start, .. } => bounds.push(*start as f32),
             }
         }
-        self.respond(bounds.len(), |payload| {
+        self.send_response(bounds.len(), |payload| {
             payload.copy_from_slice(&bounds);
-            Verdict::Answered
+            ResponseStatus::Answered
         })
     }
 
-    fn respond(&self, length: usize, write: impl FnOnce(&mut [f32]) -> Verdict) -> Result<(), ChannelError> {
+    fn send_response(
+        &self,
+        length: usize,
+        write: impl FnOnce(&mut [f32]) -> ResponseStatus,
+    ) -> Result<(), ChannelError> {
         let EnvironmentPort {
             spec, layout, channel, ..
         } = self.port;
@@ -209,9 +213,9 @@ impl Request<'_> {
             .request
             .loan_slice(length)
             .map_err(|cause| ChannelError::new(channel, "answer", cause))?;
-        let verdict = write(response.payload_mut());
+        let status = write(response.payload_mut());
         *response.user_header_mut() = ResponseHeader {
-            verdict: verdict as u32,
+            status: status as u32,
             environments: layout.environments as u32,
             discrete_observations: discrete(&spec.observation),
             observation_width: spec.observation.width() as u32,

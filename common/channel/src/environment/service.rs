@@ -13,9 +13,9 @@ use super::message::{RequestHeader, ResponseHeader, ResponseLayout};
 use crate::domain::Domain;
 use crate::error::ChannelError;
 use crate::memory;
-use crate::service::{Entry, Held, service_name};
+use crate::service::{HeldService, OpenMode, service_name};
 
-/// Requests that may wait for an answer: the current one, and those that a killed server left unanswered.
+/// Requests that may wait for a response: the current one, and those that a killed server left unanswered.
 const ACTIVE_REQUESTS: usize = 4;
 const LOANED_REQUESTS: usize = 2;
 /// Unread responses to one request.
@@ -32,22 +32,22 @@ pub fn reserved(spec: &EnvironmentSpec, environments: usize) -> u64 {
     let requests = 2 * ACTIVE_REQUESTS + LOANED_REQUESTS;
     let of_a_request = RESPONSE_BUFFER + BORROWED_RESPONSES + LOANED_RESPONSES;
     let responses = 2 * ACTIVE_REQUESTS * of_a_request;
-    let (question, answer) = (question_length(spec, environments), answer_length(spec, environments));
+    let (request, response) = (request_length(spec, environments), response_length(spec, environments));
     memory::service(NODES)
-        + memory::segment::<IoxRequestHeader, RequestHeader>(requests, size_of::<f32>() * question)
-        + memory::segment::<IoxResponseHeader, ResponseHeader>(responses, size_of::<f32>() * answer)
+        + memory::segment::<IoxRequestHeader, RequestHeader>(requests, size_of::<f32>() * request)
+        + memory::segment::<IoxResponseHeader, ResponseHeader>(responses, size_of::<f32>() * response)
         + memory::connection(1, ACTIVE_REQUESTS, requests, requests)
         + memory::connection(2 * ACTIVE_REQUESTS, RESPONSE_BUFFER, BORROWED_RESPONSES, responses)
 }
 
 /// The most numbers in a request: the actions or a snapshot.
-pub(super) fn question_length(spec: &EnvironmentSpec, environments: usize) -> usize {
+pub(super) fn request_length(spec: &EnvironmentSpec, environments: usize) -> usize {
     let snapshot = NUMBERS_PER_WORD * spec.snapshot_words(environments);
     (environments * spec.action.width()).max(snapshot)
 }
 
 /// The most numbers in a response: the blocks of [`ResponseLayout`], a description or a snapshot.
-pub(super) fn answer_length(spec: &EnvironmentSpec, environments: usize) -> usize {
+pub(super) fn response_length(spec: &EnvironmentSpec, environments: usize) -> usize {
     let described = 2 * (spec.observation.width() + spec.action.width());
     let snapshot = NUMBERS_PER_WORD * spec.snapshot_words(environments);
     let blocks = ResponseLayout::new(environments, spec.observation.width()).len();
@@ -59,9 +59,9 @@ pub(super) fn name(index: u32) -> String {
 }
 
 /// Creates the service of environment server `index`.
-pub(crate) fn create(domain: &Domain, index: u32) -> Result<Held, ChannelError> {
-    let service = service(domain, &name(index), Entry::Create)?;
-    Ok(Held::new(move |visit| {
+pub(crate) fn create(domain: &Domain, index: u32) -> Result<HeldService, ChannelError> {
+    let service = service(domain, &name(index), OpenMode::Create)?;
+    Ok(HeldService::new(move |visit| {
         let ports = service.dynamic_config();
         ports.list_clients(|port| visit(port.node_id, port.client_id.value()));
         ports.list_servers(|port| visit(port.node_id, port.server_id.value()));
@@ -71,7 +71,7 @@ pub(crate) fn create(domain: &Domain, index: u32) -> Result<Held, ChannelError> 
 pub(super) type EnvironmentService = PortFactory<ipc::Service, [f32], RequestHeader, [f32], ResponseHeader>;
 
 /// Creates or opens the service. It admits one client and one server, so holding the port claims the role.
-pub(super) fn service(domain: &Domain, channel: &str, entry: Entry) -> Result<EnvironmentService, ChannelError> {
+pub(super) fn service(domain: &Domain, channel: &str, mode: OpenMode) -> Result<EnvironmentService, ChannelError> {
     let builder = domain
         .node()
         .service_builder(&service_name(domain, channel)?)
@@ -85,5 +85,5 @@ pub(super) fn service(domain: &Domain, channel: &str, entry: Entry) -> Result<En
         .max_loaned_requests(LOANED_REQUESTS)
         .max_response_buffer_size(RESPONSE_BUFFER)
         .max_borrowed_responses_per_pending_response(BORROWED_RESPONSES);
-    entry.service(channel, builder, |b| b.create(), |b| b.open())
+    mode.service(channel, builder, |b| b.create(), |b| b.open())
 }

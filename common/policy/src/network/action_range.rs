@@ -16,7 +16,7 @@ pub struct ActionRange {
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum ActionRangeError {
     /// The actions are discrete.
-    #[error("the action space is discrete ({n} actions), but this method needs real-valued actions (a box)")]
+    #[error("the action space is discrete ({n} actions), but this algorithm needs real-valued actions (a box)")]
     Discrete {
         /// Number of actions.
         n: u32,

@@ -5,8 +5,8 @@ use toml::{Table, Value};
 
 use super::sorted;
 use crate::algorithms::{
-    Algorithm, DdpgConfig, ExplorationConfig, ObservationConfig, ReinforceConfig, RewardConfig, TabularConfig, Warmup,
-    Weight,
+    AlgorithmConfig, DdpgConfig, ExplorationConfig, ObservationConfig, ReinforceConfig, ReturnWeighting, RewardConfig,
+    TabularConfig, Warmup,
 };
 use crate::config::{Config, Mode};
 use shoal_policy::network::Activation;
@@ -23,10 +23,10 @@ pub(super) fn text(config: &Config) -> Option<String> {
         Mode::Lockstep => "Lockstep",
     };
     let algorithm = match &config.algorithm {
-        Algorithm::Ddpg(settings) => ddpg(settings)?,
-        Algorithm::Reinforce(settings) => reinforce(settings)?,
-        Algorithm::QLearning(settings) => format!("QLearning({})", tabular(settings)),
-        Algorithm::Sarsa(settings) => format!("Sarsa({})", tabular(settings)),
+        AlgorithmConfig::Ddpg(settings) => ddpg(settings)?,
+        AlgorithmConfig::Reinforce(settings) => reinforce(settings)?,
+        AlgorithmConfig::QLearning(settings) => format!("QLearning({})", tabular(settings)),
+        AlgorithmConfig::Sarsa(settings) => format!("Sarsa({})", tabular(settings)),
         #[allow(unreachable_patterns, reason = "an algorithm that is added later has no such text")]
         _ => return None,
     };
@@ -82,9 +82,9 @@ fn reinforce(settings: &ReinforceConfig) -> Option<String> {
         return None;
     };
     let weight = match weight {
-        Weight::Return => "Return",
-        Weight::Normalised => "Normalised",
-        Weight::Baseline => "Baseline",
+        ReturnWeighting::Return => "Return",
+        ReturnWeighting::Normalised => "Normalised",
+        ReturnWeighting::Baseline => "Baseline",
     };
     Some(format!(
         "Reinforce(Reinforce {{ hidden: [{h1}, {h2}], gamma: {gamma:?}, learning_rate: {learning_rate:?}, \

@@ -217,7 +217,7 @@ fn format_1_changes_only_with_what_rows_and_weights_depend_on() {
     let base = numbered(OLD[0].2);
     type Change = fn(&mut Config);
     fn ddpg(config: &mut Config) -> &mut crate::algorithms::DdpgConfig {
-        let crate::algorithms::Algorithm::Ddpg(ddpg) = &mut config.algorithm else {
+        let crate::algorithms::AlgorithmConfig::Ddpg(ddpg) = &mut config.algorithm else {
             panic!("the base configuration is for ddpg");
         };
         ddpg
@@ -261,7 +261,7 @@ fn format_1_changes_only_with_what_rows_and_weights_depend_on() {
         ("the rows' widths", |c| c.spec.action = Space::boxed(&[(-4.0, 4.5); 3])),
         ("spec.time_limit", |c| c.spec.time_limit += 1),
         ("the algorithm", |c| {
-            c.algorithm = crate::algorithms::Algorithm::Sarsa(Default::default())
+            c.algorithm = crate::algorithms::AlgorithmConfig::Sarsa(Default::default())
         }),
         ("ddpg.hidden", |c| ddpg(c).hidden[1] += 1),
         ("an additional hidden layer", |c| ddpg(c).hidden = [8, 8, 8].into()),

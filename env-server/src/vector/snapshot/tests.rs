@@ -7,7 +7,7 @@ use shoal_base::stream::{Purpose, Stream, stream};
 
 use super::*;
 use crate::environment::{Environment, Step, make, names};
-use crate::vector::{Start, tests::Fixture};
+use crate::vector::{Reset, tests::Fixture};
 
 const STREAM: [u64; 3] = [11, 2, 3];
 /// Steps after the restore: enough for episodes of every environment to end.
@@ -84,7 +84,7 @@ proptest! {
     ) {
         let mut rng = stream(seed, Purpose::Exploration, 0, 0);
         let mut whole = Fixture::of(name, parameters, count, STREAM);
-        whole.reset(Start::Episodes(&vec![episode; count as usize]));
+        whole.reset(Reset::Episodes(&vec![episode; count as usize]));
         for _ in 0..steps {
             let actions = actions(&whole, &mut rng);
             whole.step(&actions).unwrap();
@@ -105,7 +105,7 @@ proptest! {
     ) {
         let mut rng = stream(seed, Purpose::Exploration, 0, 0);
         let mut fixture = Fixture::new(name, parameters, 2);
-        fixture.reset(Start::Next);
+        fixture.reset(Reset::Next);
         let before = snapshot(&fixture);
         for length in [length, before.len()] {
             let garbage: Vec<u64> = (0..length).map(|_| rng.random()).collect();
@@ -123,10 +123,10 @@ proptest! {
     ) {
         let mut rng = stream(seed, Purpose::Exploration, 0, 0);
         let mut fixture = Fixture::new(name, parameters, 2);
-        fixture.reset(Start::Next);
+        fixture.reset(Reset::Next);
         let mut words = snapshot(&fixture);
         *place.get_mut(&mut words) = garbage;
-        fixture.reset(Start::Next);
+        fixture.reset(Reset::Next);
         let before = snapshot(&fixture);
         let mut fresh = Fixture::new(name, parameters, 2);
         match (restore(&mut fixture, &words), restore(&mut fresh, &words)) {
@@ -140,7 +140,7 @@ proptest! {
 #[test]
 fn whole_turns_and_the_sign_of_zero_are_kept() {
     let mut whole = Fixture::new("pendulum", "", 2);
-    whole.reset(Start::States(&[-0.0, -0.0, 1e6 * TAU + 0.1, 3.0]));
+    whole.reset(Reset::States(&[-0.0, -0.0, 1e6 * TAU + 0.1, 3.0]));
     let words = snapshot(&whole);
     assert_eq!(words[3..5], [(-0.0_f64).to_bits(); 2]);
     let mut fresh = Fixture::new("pendulum", "", 2);
@@ -153,9 +153,9 @@ fn whole_turns_and_the_sign_of_zero_are_kept() {
 #[test]
 fn a_value_that_no_episode_can_have_is_refused_by_name() {
     let mut fixture = Fixture::new("cart-pole", "time_limit = 9", 2);
-    fixture.reset(Start::Next);
+    fixture.reset(Reset::Next);
     let words = snapshot(&fixture);
-    fixture.reset(Start::Next);
+    fixture.reset(Reset::Next);
     let before = snapshot(&fixture);
     let mut refusal = |place: usize, word: u64| {
         let mut words = words.clone();
@@ -183,9 +183,9 @@ fn only_training_has_snapshots_and_a_restore_returns_to_it() {
     let mut fixture = Fixture::new("frozen-lake", "", 2);
     let mut words = vec![0; fixture.vector.snapshot_words()];
     assert_eq!(fixture.vector.snapshot(&mut words), Err(RequestError::NoTraining));
-    fixture.reset(Start::Next);
+    fixture.reset(Reset::Next);
     let training = snapshot(&fixture);
-    fixture.reset(Start::Evaluation {
+    fixture.reset(Reset::Evaluation {
         seed: 1,
         first: 0,
         episodes: None,
@@ -229,7 +229,7 @@ fn an_environment_that_cannot_save_its_state_refuses_snapshots() {
     let vector = &mut fixture.vector;
     vector.scratch = Box::new(Unsaved(make("pendulum", &toml::Table::new()).unwrap()));
     vector.spec = vector.scratch.spec();
-    fixture.reset(Start::Next);
+    fixture.reset(Reset::Next);
     assert_eq!(fixture.vector.snapshot_words(), 0);
     assert_eq!(fixture.vector.snapshot(&mut []), Err(RequestError::NoSnapshots));
     assert_eq!(restore(&mut fixture, &[]), Err(RequestError::NoSnapshots));

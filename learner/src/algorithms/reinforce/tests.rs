@@ -21,7 +21,7 @@ fn spec() -> EnvironmentSpec {
     }
 }
 
-fn settings(weight: Weight) -> config::ReinforceConfig {
+fn settings(weight: ReturnWeighting) -> config::ReinforceConfig {
     config::ReinforceConfig {
         hidden: [7, 5].into(),
         baseline_hidden: [6, 4].into(),
@@ -156,9 +156,9 @@ fn the_gradient_is_that_of_the_objective() {
         [6, 5, 7, 6, 5, 6, 7, 5].into(),
     ];
     for ((weight, discount_steps), (hidden, activation)) in [
-        (Weight::Return, false),
-        (Weight::Return, true),
-        (Weight::Normalised, false),
+        (ReturnWeighting::Return, false),
+        (ReturnWeighting::Return, true),
+        (ReturnWeighting::Normalised, false),
     ]
     .into_iter()
     .flat_map(|weight| {
@@ -180,7 +180,7 @@ fn the_gradient_is_that_of_the_objective() {
             let mean = returns.iter().sum::<f64>() / n;
             let spread = (returns.iter().map(|g| (g - mean).powi(2)).sum::<f64>() / n).sqrt();
             let weight_of = |(t, g): (usize, &f64)| match weight {
-                Weight::Normalised => (g - mean) / spread,
+                ReturnWeighting::Normalised => (g - mean) / spread,
                 _ if discount_steps => 0.9_f64.powi(t as i32) * g,
                 _ => *g,
             };
@@ -197,7 +197,7 @@ fn the_gradient_is_that_of_the_objective() {
 #[test]
 fn the_baseline_is_subtracted_from_the_return_and_learns_it() {
     let episode = Episode::random(3, 12, true);
-    let mut learner = learner(&settings(Weight::Baseline));
+    let mut learner = learner(&settings(ReturnWeighting::Baseline));
     let before = learner.policy.parameters.to_vec();
     let baseline = learner.baseline.as_ref().unwrap();
     let (layout, values) = (baseline.layout, baseline.parameters.to_vec());
@@ -223,14 +223,14 @@ fn only_complete_episodes_are_learned_from_and_those_at_the_limit_only_if_config
     let (cut, over) = (Episode::random(1, 12, false), Episode::random(2, 5, true));
     let mut skips = learner(&config::ReinforceConfig {
         learn_at_limit: false,
-        ..settings(Weight::Return)
+        ..settings(ReturnWeighting::Return)
     });
     let before = skips.policy.parameters.to_vec();
     skips.learn(&cut.steps());
     assert_eq!(*skips.policy.parameters, before);
     assert_eq!(skips.steps, [0.0]);
 
-    let mut learns = learner(&settings(Weight::Return));
+    let mut learns = learner(&settings(ReturnWeighting::Return));
     learns.learn(&cut.steps());
     assert_ne!(*learns.policy.parameters, before);
 
@@ -246,7 +246,7 @@ fn only_complete_episodes_are_learned_from_and_those_at_the_limit_only_if_config
 
 #[test]
 fn an_episode_of_equal_returns_changes_nothing_when_normalised() {
-    let mut learner = learner(&settings(Weight::Normalised));
+    let mut learner = learner(&settings(ReturnWeighting::Normalised));
     let before = learner.policy.parameters.to_vec();
     learner.learn(&Episode::random(4, 1, true).steps());
     assert_eq!(*learner.policy.parameters, before);
@@ -255,16 +255,16 @@ fn an_episode_of_equal_returns_changes_nothing_when_normalised() {
 #[test]
 fn a_restored_state_continues_with_the_same_bits() {
     let rounds: Vec<Episode> = (0..4).map(|seed| Episode::random(seed, 9, true)).collect();
-    let mut straight = learner(&settings(Weight::Baseline));
+    let mut straight = learner(&settings(ReturnWeighting::Baseline));
     for round in &rounds[..2] {
         straight.learn(&round.steps());
     }
-    let sections = straight
+    let arrays = straight
         .state()
         .into_iter()
         .map(|(name, numbers)| (name.into(), numbers.into()));
-    let mut saved = SavedState::from(sections.collect::<Vec<_>>());
-    let mut resumed = Reinforce::new(&settings(Weight::Baseline), &spec(), 2, SIZES).unwrap();
+    let mut saved = SavedState::from(arrays.collect::<Vec<_>>());
+    let mut resumed = Reinforce::new(&settings(ReturnWeighting::Baseline), &spec(), 2, SIZES).unwrap();
     resumed.restore(18, &mut saved).unwrap();
     for learner in [&mut straight, &mut resumed] {
         for round in &rounds[2..] {

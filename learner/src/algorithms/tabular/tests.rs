@@ -89,16 +89,16 @@ fn a_state_reads_back_and_an_incomplete_one_is_refused() {
     let mut old = table(Bootstrap::NextAction, 0.5);
     teach(&mut old, 3, (0, 1, 4.0, 0.5, 1, false));
     teach(&mut old, 1, (1, 1, 4.0, 0.0, 1, true));
-    let sections = old
+    let arrays = old
         .state()
         .into_iter()
         .map(|(name, numbers)| (name.into(), numbers.into()));
-    let sections: Vec<_> = sections.collect();
-    let saved = |sections: &[_]| SavedState::from(sections.to_vec());
+    let arrays: Vec<_> = arrays.collect();
+    let saved = |arrays: &[_]| SavedState::from(arrays.to_vec());
     let mut new = table(Bootstrap::NextAction, 0.5);
-    new.restore(7, &mut saved(&sections)).unwrap();
+    new.restore(7, &mut saved(&arrays)).unwrap();
     assert_eq!((&new.q, &new.pending, new.updates()), (&old.q, &old.pending, 7));
-    assert!(new.restore(7, &mut saved(&sections[1..])).is_err());
+    assert!(new.restore(7, &mut saved(&arrays[1..])).is_err());
 }
 
 #[test]

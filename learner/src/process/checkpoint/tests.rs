@@ -36,7 +36,7 @@ fn two() -> (TempDir, PathBuf, PathBuf) {
     (directory, latest, previous)
 }
 
-fn load(directory: &TempDir) -> Result<Option<Loaded>, CheckpointError> {
+fn load(directory: &TempDir) -> Result<Option<LoadedCheckpoint>, CheckpointError> {
     Checkpoints::new(directory.path(), 7).load_newest()
 }
 
@@ -52,10 +52,10 @@ fn an_empty_directory_has_no_checkpoint() {
 #[test]
 fn a_saved_checkpoint_is_loaded_bit_for_bit() {
     let (directory, latest, previous) = two();
-    let Loaded { checkpoint, warnings } = load(&directory).unwrap().unwrap();
+    let LoadedCheckpoint { checkpoint, warnings } = load(&directory).unwrap().unwrap();
     assert!(warnings.is_empty());
     assert_eq!(checkpoint.counters, counters(2));
-    let mut saved = SavedState::from(checkpoint.sections);
+    let mut saved = SavedState::from(checkpoint.arrays);
     let actor = saved.take("actor", 5).unwrap();
     assert_eq!(actor.map_bits(), WEIGHTS.to_vec().map_bits());
     assert_eq!(saved.take("empty", 0).unwrap(), [0.0_f32; 0]);
@@ -182,7 +182,7 @@ fn a_checkpoint_of_another_configuration_is_refused_and_not_replaced() {
 fn a_checkpoint_of_another_version_is_refused() {
     let (directory, latest, _) = two();
     durable::write_atomically(&latest, |file| {
-        durable::seal(Kind { version: 1, ..KIND }, file, |_| Ok(()))
+        durable::seal(FileKind { version: 1, ..KIND }, file, |_| Ok(()))
     })
     .unwrap();
     let error = load(&directory).unwrap_err().to_string();
@@ -208,7 +208,7 @@ proptest! {
 
     #[test]
     fn a_header_with_a_wrong_length_is_refused(length in any::<u64>(), numbers in 0_usize..20) {
-        let header = Header { fingerprint: 0, counters: Counters::default(), sections: vec![("a".into(), length)] };
+        let header = Header { fingerprint: 0, counters: Counters::default(), arrays: vec![("a".into(), length)] };
         let mut body = bincode::serde::encode_to_vec(&header, encoding()).unwrap();
         body.resize(body.len() + 4 * numbers, 0);
         prop_assert_eq!(parse(&body).is_some(), length == numbers as u64);

@@ -45,7 +45,7 @@ fn scores(config: &Config, policy: &PolicyFile, observations: &[f32], batch: usi
 #[test]
 fn another_runtime_computes_the_same_outputs_for_any_batch_size() {
     for (config, policy) in policies() {
-        let bytes = Portable::new(&config, &policy, "best").unwrap().to_onnx();
+        let bytes = PortablePolicy::new(&config, &policy, "best").unwrap().to_onnx();
         let model = Model::load(bytes).unwrap();
         let layout = config.policy_layout().unwrap();
         for batch in [1, 2, 33] {
@@ -88,7 +88,7 @@ fn another_runtime_computes_the_same_outputs_for_any_batch_size() {
 #[test]
 fn states_and_actions_are_counted_as_the_environment_counts_them() {
     let (config, policy) = with_starts();
-    let bytes = Portable::new(&config, &policy, "best").unwrap().to_onnx();
+    let bytes = PortablePolicy::new(&config, &policy, "best").unwrap().to_onnx();
     let model = Model::load(bytes).unwrap();
     let indices = some_observations(&config, 33);
     let states: Vec<f32> = indices.iter().map(|index| index + 1.0).collect();
@@ -107,7 +107,7 @@ fn actions_of_the_model_stay_inside_the_bounds() {
     // The last bias: tanh is −1, then 1.
     for (bias, bound) in [(-1000.0, 0.05), (1000.0, 0.45)] {
         *policy.parameters.last_mut().unwrap() = bias;
-        let bytes = Portable::new(&config, &policy, "best").unwrap().to_onnx();
+        let bytes = PortablePolicy::new(&config, &policy, "best").unwrap().to_onnx();
         let model = Model::load(bytes).unwrap();
         let observations = some_observations(&config, 4);
         let (_, actions) = computed_floats(&model, &config, &observations, "action");
@@ -123,7 +123,7 @@ fn actions_of_the_model_stay_inside_the_bounds() {
 #[test]
 fn the_model_requests_the_first_of_equal_scores() {
     let (config, policy) = policies().pop().unwrap();
-    let bytes = Portable::new(&config, &policy, "last").unwrap().to_onnx();
+    let bytes = PortablePolicy::new(&config, &policy, "last").unwrap().to_onnx();
     let graph = super::message::Model::decode(bytes.as_slice()).unwrap().graph.unwrap();
     let chosen = graph.node.iter().find(|node| node.op_type == "ArgMax").unwrap();
     let last = chosen
@@ -137,7 +137,7 @@ fn the_model_requests_the_first_of_equal_scores() {
 #[test]
 fn the_model_contains_its_origin() {
     let (config, policy) = policies().remove(0);
-    let bytes = Portable::new(&config, &policy, "best").unwrap().to_onnx();
+    let bytes = PortablePolicy::new(&config, &policy, "best").unwrap().to_onnx();
     let model = super::message::Model::decode(bytes.as_slice()).unwrap();
     let value = |key: &str| {
         model

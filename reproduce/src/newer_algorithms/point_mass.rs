@@ -10,8 +10,8 @@ use shoal_run::rollout::Rollout;
 use super::super::claim::{Claim, Scope, spread};
 use super::super::experiment::{Experiment, Stage};
 use super::super::family::{Family, Policies, Results};
+use super::super::report_section::{FigureWriter, ReportSection};
 use super::super::result::SeedResult;
-use super::super::section::{FigureWriter, Section};
 use super::{experiment, stage};
 
 type Seed = SeedResult<Tests>;
@@ -74,9 +74,9 @@ impl Tests {
 }
 
 /// SAC and TD3 on the point mass.
-pub(crate) struct PointMassMethods;
+pub(crate) struct PointMassAlgorithms;
 
-impl Family for PointMassMethods {
+impl Family for PointMassAlgorithms {
     type Tests = Tests;
     const EXPERIMENTS: &'static [Experiment] = &EXPERIMENTS;
 
@@ -88,7 +88,7 @@ impl Family for PointMassMethods {
         })
     }
 
-    fn sections(results: &Results<Tests>, writer: &FigureWriter) -> anyhow::Result<Vec<Section>> {
+    fn sections(results: &Results<Tests>, writer: &FigureWriter) -> anyhow::Result<Vec<ReportSection>> {
         let [r3, r1, r2, td3] = EXPERIMENTS.map(|experiment| (experiment.name, results.of(experiment.name, "")));
         let mut figures = Vec::new();
         for (name, seeds) in [r3, r1, r2, td3] {
@@ -111,7 +111,7 @@ impl Family for PointMassMethods {
             scope: Scope::EachSeed,
             held: seeds.iter().map(|seed| is_calm(&seed.tests)).collect(),
         };
-        Ok(vec![Section {
+        Ok(vec![ReportSection {
             title: "The point mass with SAC and TD3 (not in the thesis)",
             from: EXPERIMENTS.iter().map(|experiment| (experiment.name, "")).collect(),
             remark: format!("{REMARK}\n{}", table(&[r3, r1, r2, td3])),
@@ -193,7 +193,7 @@ mod tests {
             "",
             vec![seed(1, 0.01, 0.0, 0.0), seed(2, 0.3, 0.0, 0.0), seed(3, 0.01, 1.0, 1.0)],
         );
-        let sections = PointMassMethods::sections(&results, &writer).unwrap();
+        let sections = PointMassAlgorithms::sections(&results, &writer).unwrap();
         let [section] = sections.as_slice() else {
             panic!("one section")
         };

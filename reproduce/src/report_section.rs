@@ -8,7 +8,7 @@ use shoal_report::figure;
 use super::claim::Claim;
 
 /// A part of the report.
-pub(super) struct Section {
+pub(super) struct ReportSection {
     pub(super) title: &'static str,
     /// The results that it uses: experiments with the suffixes of their stages.
     pub(super) from: Vec<(&'static str, &'static str)>,

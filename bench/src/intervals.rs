@@ -1,4 +1,4 @@
-//! Measurement in short windows, so that a disturbance affects some of them but not their median.
+//! Measurement in short intervals, so that a disturbance affects some of them but not their median.
 
 use std::time::{Duration, Instant};
 
@@ -20,11 +20,11 @@ pub(super) fn rate(length: Duration, mut work: impl FnMut()) -> f64 {
     }
 }
 
-/// The sorted results of windows. The median is the result; the extremes show how quiet the machine was.
+/// The sorted results of intervals. The median is the result; the extremes show how quiet the machine was.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Windows(Vec<f64>);
+pub(super) struct IntervalResults(Vec<f64>);
 
-impl Windows {
+impl IntervalResults {
     pub(super) fn add(&mut self, rate: f64) {
         let place = self.0.partition_point(|other| *other < rate);
         self.0.insert(place, rate);
@@ -34,7 +34,7 @@ impl Windows {
         self.0.is_empty()
     }
 
-    /// Panics if there is no window.
+    /// Panics if there is no result.
     pub(super) fn median(&self) -> f64 {
         self.0[self.0.len() / 2]
     }
@@ -54,9 +54,9 @@ impl Windows {
     }
 }
 
-/// How many windows of length `window` fit into the `share` of `whole`; at least one.
-pub(super) fn count(whole: Duration, share: f64, window: Duration) -> usize {
-    (whole.as_secs_f64() * share / window.as_secs_f64()).round().max(1.0) as usize
+/// How many intervals of length `interval` fit into the `share` of `whole`; at least one.
+pub(super) fn count(whole: Duration, share: f64, interval: Duration) -> usize {
+    (whole.as_secs_f64() * share / interval.as_secs_f64()).round().max(1.0) as usize
 }
 
 #[cfg(test)]
@@ -73,9 +73,9 @@ mod tests {
 
     #[test]
     fn the_median_is_the_middle_of_the_sorted_rates() {
-        let mut windows = Windows::default();
-        [5.0, 1.0, 4.0, 2.0, 3.0].into_iter().for_each(|rate| windows.add(rate));
-        assert_eq!((windows.least(), windows.median(), windows.greatest()), (1.0, 3.0, 5.0));
-        assert_eq!(windows.show(1.0, 1), "3.0 (1.0 to 5.0)");
+        let mut results = IntervalResults::default();
+        [5.0, 1.0, 4.0, 2.0, 3.0].into_iter().for_each(|rate| results.add(rate));
+        assert_eq!((results.least(), results.median(), results.greatest()), (1.0, 3.0, 5.0));
+        assert_eq!(results.show(1.0, 1), "3.0 (1.0 to 5.0)");
     }
 }

@@ -6,7 +6,7 @@ use nalgebra::DVector;
 use shoal_common::config::Config;
 use shoal_common::policy::{PolicyError, PolicyLayout};
 
-use super::algorithm::{Algorithm, Losses, SavedState, Section, SectionError, SectionMut};
+use super::algorithm::{Algorithm, Losses, SavedState, StateArray, StateArrayError, StateArrayMut};
 use super::minibatch::Minibatch;
 use super::normaliser::Normaliser;
 use super::sampling::Sampler;
@@ -30,15 +30,15 @@ pub trait MinibatchLearner {
     fn learn(&mut self, batch: &Minibatch) -> Losses;
 
     /// Everything that the next gradient step depends on besides the batch, by name.
-    fn state(&self) -> Vec<Section<'_>>;
+    fn state(&self) -> Vec<StateArray<'_>>;
 
     /// The same numbers, to be overwritten with those of a learner after `updates` gradient steps.
-    fn state_mut(&mut self, updates: u64) -> Vec<SectionMut<'_>>;
+    fn state_mut(&mut self, updates: u64) -> Vec<StateArrayMut<'_>>;
 }
 
 /// A learner with its sampling from the replay.
 #[derive(Debug)]
-pub struct Replayed<L> {
+pub struct MinibatchAlgorithm<L> {
     learner: L,
     sampler: Sampler,
     batch: Minibatch,
@@ -49,7 +49,7 @@ pub struct Replayed<L> {
     reward_scale: f32,
 }
 
-impl<L: MinibatchLearner> Replayed<L> {
+impl<L: MinibatchLearner> MinibatchAlgorithm<L> {
     /// Samples minibatches for the `learner` of a run with this configuration.
     ///
     /// # Errors
@@ -70,7 +70,7 @@ impl<L: MinibatchLearner> Replayed<L> {
     }
 }
 
-impl<L: MinibatchLearner> Algorithm for Replayed<L> {
+impl<L: MinibatchLearner> Algorithm for MinibatchAlgorithm<L> {
     fn policy(&self) -> Cow<'_, [f32]> {
         match &self.normaliser {
             None => self.learner.policy().into(),
@@ -87,10 +87,10 @@ impl<L: MinibatchLearner> Algorithm for Replayed<L> {
     }
 
     fn update(&mut self, replay: &Replay, rows: u64) -> Losses {
-        let window = replay.window(rows, self.capacity);
+        let range = replay.sampling_range(rows, self.capacity);
         self.sampler
-            .indices(self.learner.updates(), window.clone(), &mut self.indices);
-        self.batch.gather(replay, &self.indices, &window);
+            .indices(self.learner.updates(), range.clone(), &mut self.indices);
+        self.batch.gather(replay, &self.indices, &range);
         if let Some(normaliser) = &mut self.normaliser {
             normaliser.count(replay, rows);
             normaliser.apply(&mut self.batch);
@@ -105,16 +105,16 @@ impl<L: MinibatchLearner> Algorithm for Replayed<L> {
         self.learner.set_threads(threads);
     }
 
-    fn state(&self) -> Vec<Section<'_>> {
-        let mut sections = self.learner.state();
-        sections.extend(self.normaliser.as_ref().map(Normaliser::state));
-        sections
+    fn state(&self) -> Vec<StateArray<'_>> {
+        let mut arrays = self.learner.state();
+        arrays.extend(self.normaliser.as_ref().map(Normaliser::state));
+        arrays
     }
 
-    fn restore(&mut self, updates: u64, saved: &mut SavedState) -> Result<(), SectionError> {
-        let mut sections = self.learner.state_mut(updates);
-        sections.extend(self.normaliser.as_mut().map(Normaliser::state_mut));
-        for (name, numbers) in sections {
+    fn restore(&mut self, updates: u64, saved: &mut SavedState) -> Result<(), StateArrayError> {
+        let mut arrays = self.learner.state_mut(updates);
+        arrays.extend(self.normaliser.as_mut().map(Normaliser::state_mut));
+        for (name, numbers) in arrays {
             numbers.copy_from_slice(&saved.take(name, numbers.len())?);
         }
         if let Some(normaliser) = &mut self.normaliser {

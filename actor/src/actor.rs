@@ -1,4 +1,4 @@
-//! The exploring actor: acts with the newest policy and noise, and writes transitions into chunks for the learner.
+//! The actor: acts with the newest policy and exploration, and writes transitions into chunks for the learner.
 //!
 //! ```text
 //! loop {
@@ -14,16 +14,18 @@ use std::path::PathBuf;
 use std::rc::Rc;
 use std::time::{Duration, Instant};
 
-use shoal_common::algorithms::Experience;
-use shoal_common::channel::environment::{Begin, EnvironmentClient, Observed, Snapshot, Stepped};
-use shoal_common::channel::policy::{Policy, PolicyReader};
+use shoal_common::algorithms::TransitionUse;
+use shoal_common::channel::environment::{
+    EnvironmentClient, EnvironmentResponse, ResetRequest, SnapshotResult, StepResult,
+};
+use shoal_common::channel::policy::{PolicyReader, PublishedPolicy};
 use shoal_common::channel::reports::Reporter;
 use shoal_common::channel::transitions::{Chunk, ChunkSender};
 use shoal_common::channel::{ChannelError, Domain, EventName, HeartbeatSender, Listener, Notifier, wait_for};
 use shoal_common::commit::{CommitReader, OpenError};
 use shoal_common::config::{Config, Mode};
 use shoal_common::exit::Exit;
-use shoal_common::report::{Activity, EpisodeReport, Identity, Role};
+use shoal_common::report::{Activity, EpisodeReport, Role, RoleInstance};
 use shoal_common::run_dir::RunDir;
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::stop::Stop;
@@ -32,7 +34,7 @@ use shoal_common::transition::{ChunkLayout, Transition};
 
 use crate::actor_snapshot::ActorSnapshot;
 use crate::error::ActorError;
-use crate::exploration::{Exploration, Progress};
+use crate::exploration::{Exploration, StepCounts};
 use crate::n_step::NStep;
 
 /// What the line about an invalid answer of an environment server ends with; the launcher looks for it.
@@ -46,9 +48,9 @@ const LAST_COMMIT_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// The settings of an actor.
 #[derive(Clone, Debug)]
-pub struct ExplorerSettings {
+pub struct ActorSettings {
     /// Which process this is.
-    pub identity: Identity,
+    pub instance: RoleInstance,
     /// The run's configuration. In lockstep, the actor waits for the policy of each round.
     pub config: Config,
     /// Environments stepped at once.
@@ -63,11 +65,11 @@ pub struct ExplorerSettings {
     pub replay: PathBuf,
 }
 
-impl ExplorerSettings {
+impl ActorSettings {
     /// The settings of an actor of this run.
-    pub fn new(config: &Config, run: &RunDir, identity: Identity) -> Self {
+    pub fn new(config: &Config, run: &RunDir, instance: RoleInstance) -> Self {
         Self {
-            identity,
+            instance,
             config: config.clone(),
             envs: config.actors.envs as usize,
             n_step: config.replay.n_step as usize,
@@ -82,19 +84,19 @@ impl ExplorerSettings {
 ///
 /// # Errors
 /// When a channel fails, or the environment is not the expected one.
-pub fn explore(domain: &Domain, settings: &ExplorerSettings, stop: &Stop) -> Result<(), ActorError> {
-    let mut explorer = match Explorer::new(domain, settings, stop) {
-        Ok(explorer) => explorer,
+pub fn run(domain: &Domain, settings: &ActorSettings, stop: &Stop) -> Result<(), ActorError> {
+    let mut actor = match Actor::new(domain, settings, stop) {
+        Ok(actor) => actor,
         Err(exit) => return exit.into_result(),
     };
-    match explorer.run() {
-        Exit::Stopped => explorer.hand_over(),
+    match actor.run() {
+        Exit::Stopped => actor.hand_over(),
         Exit::Failed(error) => Err(error),
     }
 }
 
-struct Explorer<'a> {
-    settings: &'a ExplorerSettings,
+struct Actor<'a> {
+    settings: &'a ActorSettings,
     stop: &'a Stop,
     listener: Listener,
     learner: Notifier,
@@ -124,13 +126,13 @@ struct Explorer<'a> {
     ended: Vec<EpisodeReport>,
 }
 
-impl<'a> Explorer<'a> {
-    fn new(domain: &Domain, settings: &'a ExplorerSettings, stop: &'a Stop) -> Result<Self, Exit<ActorError>> {
-        let Identity { index, incarnation, .. } = settings.identity;
+impl<'a> Actor<'a> {
+    fn new(domain: &Domain, settings: &'a ActorSettings, stop: &'a Stop) -> Result<Self, Exit<ActorError>> {
+        let RoleInstance { index, incarnation, .. } = settings.instance;
         let row = settings.chunk.row;
         let layout = settings.config.policy_layout()?;
         let listener = Listener::bind(domain, EventName(Role::Actor, index))?;
-        let mut heartbeat = HeartbeatSender::new(domain, settings.identity)?;
+        let mut heartbeat = HeartbeatSender::new(domain, settings.instance)?;
         let client = connect(domain, &listener, index, &settings.config.spec, settings.envs, stop)?;
         let policy = PolicyReader::open(domain, layout.fingerprint(), layout.parameters())?;
         heartbeat.beat(Activity::WaitingForPeer);
@@ -147,7 +149,7 @@ impl<'a> Explorer<'a> {
         learner.notify();
         let sender = handshake
             .wait(&commits, &listener, stop, || heartbeat.beat(Activity::WaitingForPeer))
-            .map_err(Exit::widen)?;
+            .map_err(Exit::convert)?;
         // In lockstep the bits must not depend on how often an actor was started: it continues after its last chunk.
         let incarnation = match settings.config.run.mode {
             Mode::Lockstep => 0,
@@ -204,7 +206,7 @@ impl<'a> Explorer<'a> {
                 Ok(()) => tracing::warn!("the environment server was restarted"),
                 Err(Exit::Failed(ActorError::Channel(error))) if error.fault().is_some() => {
                     if let Err(exit) = after_fault(&error, &mut self.heartbeat, &self.listener, self.stop) {
-                        return exit.widen();
+                        return exit.convert();
                     }
                 }
                 Err(exit) => return exit,
@@ -214,11 +216,11 @@ impl<'a> Explorer<'a> {
 
     /// Drops the current episodes and begins new ones. In lockstep, continues those of the last chunk's snapshot, if
     /// there is one.
-    fn begin(&mut self) -> Result<Observed, Exit<ActorError>> {
+    fn begin(&mut self) -> Result<EnvironmentResponse, Exit<ActorError>> {
         self.n_step.clear();
         if self.settings.config.run.mode == Mode::Free {
             (0..self.settings.envs).for_each(|environment| self.begin_episode(environment));
-            return self.reset(Begin::Next);
+            return self.reset(ResetRequest::Next);
         }
         self.chunk.clear();
         self.ended.clear();
@@ -232,7 +234,7 @@ impl<'a> Explorer<'a> {
             self.lengths.clone_from(&snapshot.lengths);
             let idle = || self.heartbeat.beat(Activity::WaitingForServer);
             let restored = self.client.restore(&self.listener, &snapshot.environments, idle);
-            return restored.map_err(Exit::widen);
+            return restored.map_err(Exit::convert);
         }
         (0..self.settings.envs).for_each(|environment| self.begin_episode(environment));
         // Without a snapshot, only the first episodes of the run can be repeated with the same bits.
@@ -240,13 +242,17 @@ impl<'a> Explorer<'a> {
         // A row of n steps is sent n − 1 steps after its first.
         let sent_steps = sent * (self.settings.chunk.rows / self.settings.envs) as u64;
         self.step = sent_steps + if sent == 0 { 0 } else { self.settings.n_step as u64 - 1 };
-        let begin = if sent == 0 { Begin::Training(0) } else { Begin::Next };
-        self.reset(begin)
+        let request = if sent == 0 {
+            ResetRequest::Training(0)
+        } else {
+            ResetRequest::Next
+        };
+        self.reset(request)
     }
 
-    fn reset(&mut self, begin: Begin) -> Result<Observed, Exit<ActorError>> {
+    fn reset(&mut self, request: ResetRequest) -> Result<EnvironmentResponse, Exit<ActorError>> {
         let idle = || self.heartbeat.beat(Activity::WaitingForServer);
-        self.client.reset(&self.listener, begin, idle).map_err(Exit::widen)
+        self.client.reset(&self.listener, request, idle).map_err(Exit::convert)
     }
 
     fn run_until_server_lost(&mut self) -> Result<(), Exit<ActorError>> {
@@ -254,17 +260,17 @@ impl<'a> Explorer<'a> {
         // A snapshot may hold transitions that are complete.
         let mut connected = self.send_complete_chunks()?;
         while connected {
-            let policy = self.await_policy().map_err(Exit::widen)?;
+            let policy = self.await_policy().map_err(Exit::convert)?;
             self.heartbeat.begin_work();
             self.act(&policy, &current);
             let idle = || self.heartbeat.beat(Activity::WaitingForServer);
             let stepped = self.client.step(&self.listener, &self.actions, idle);
-            match stepped.map_err(Exit::widen)? {
-                Stepped::Taken(next) => {
+            match stepped.map_err(Exit::convert)? {
+                StepResult::Taken(next) => {
                     self.store(&current, &next, policy.header().version);
                     current = next;
                 }
-                Stepped::Lost => return Ok(()),
+                StepResult::Lost => return Ok(()),
             }
             self.step += 1;
             self.heartbeat.count(self.settings.envs as u64);
@@ -288,7 +294,7 @@ impl<'a> Explorer<'a> {
             if !self.append_snapshot()? {
                 return Ok(false);
             }
-            self.await_capacity().map_err(Exit::widen)?;
+            self.await_capacity().map_err(Exit::convert)?;
             self.send()?;
         }
     }
@@ -296,12 +302,12 @@ impl<'a> Explorer<'a> {
     /// Whether the chunk is full or, if a chunk is one episode, the episode is over.
     fn chunk_is_complete(&self) -> bool {
         let episode_is_over =
-            self.settings.config.algorithm.spec().experience == Experience::Episodes && !self.ended.is_empty();
+            self.settings.config.algorithm.spec().transition_use == TransitionUse::Episodes && !self.ended.is_empty();
         self.chunk.is_full() || episode_is_over
     }
 
     /// Waits for the policy to act with: the newest, or in lockstep the one after the last round.
-    fn await_policy(&mut self) -> Result<Rc<Policy>, Exit<ChannelError>> {
+    fn await_policy(&mut self) -> Result<Rc<PublishedPolicy>, Exit<ChannelError>> {
         let wanted = match self.settings.config.run.mode {
             Mode::Free => 0,
             Mode::Lockstep => self.sender.sent(),
@@ -314,7 +320,7 @@ impl<'a> Explorer<'a> {
             stop,
             ..
         } = self;
-        let newest = |reader: &mut PolicyReader| -> Result<Option<Rc<Policy>>, _> {
+        let newest = |reader: &mut PolicyReader| -> Result<Option<Rc<PublishedPolicy>>, _> {
             Ok(reader.latest()?.filter(|policy| policy.header().version >= wanted))
         };
         let newest = match newest(policy)? {
@@ -335,12 +341,12 @@ impl<'a> Explorer<'a> {
     }
 
     /// Chooses an action for every environment.
-    fn act(&mut self, policy: &Policy, current: &Observed) {
+    fn act(&mut self, policy: &PublishedPolicy, current: &EnvironmentResponse) {
         let act = match policy.header().updates {
             0 if !self.settings.has_learned => Exploration::warm_up,
             _ => Exploration::act,
         };
-        let progress = Progress {
+        let steps = StepCounts {
             step: self.step,
             env_steps: policy.header().env_steps,
         };
@@ -348,13 +354,13 @@ impl<'a> Explorer<'a> {
             &mut self.exploration,
             policy.parameters(),
             current.observations(),
-            progress,
+            steps,
             &mut self.actions,
         );
     }
 
     /// Adds the transition of every environment to the chunk (line 10 of Algorithm 4).
-    fn store(&mut self, current: &Observed, next: &Observed, version: u64) {
+    fn store(&mut self, current: &EnvironmentResponse, next: &EnvironmentResponse, version: u64) {
         let width = self.settings.chunk.row.action_width();
         let gamma = self.settings.config.algorithm.gamma() as f32;
         self.policy_version = version;
@@ -377,7 +383,7 @@ impl<'a> Explorer<'a> {
             self.lengths[e] += 1;
             if transition.last {
                 self.ended.push(EpisodeReport {
-                    actor: self.settings.identity.index,
+                    actor: self.settings.instance.index,
                     environment: e as u32,
                     steps: self.lengths[e],
                     terminated: terminated.into(),
@@ -402,8 +408,8 @@ impl<'a> Explorer<'a> {
             return Ok(true);
         }
         let idle = || self.heartbeat.beat(Activity::WaitingForServer);
-        let environments = self.client.snapshot(&self.listener, idle).map_err(Exit::widen)?;
-        let Snapshot::Taken(environments) = environments else {
+        let environments = self.client.snapshot(&self.listener, idle).map_err(Exit::convert)?;
+        let SnapshotResult::Taken(environments) = environments else {
             return Ok(false);
         };
         let snapshot = ActorSnapshot {
@@ -431,7 +437,7 @@ impl<'a> Explorer<'a> {
             ..
         } = self;
         let has_capacity = || {
-            let committed = commits.committed(settings.identity.index as usize);
+            let committed = commits.committed(settings.instance.index as usize);
             (sender.in_flight(committed) < u64::from(settings.config.actors.window)).then_some(())
         };
         if has_capacity().is_some() {
@@ -481,7 +487,7 @@ impl<'a> Explorer<'a> {
 
     /// Waits until at most `most` chunks are uncommitted. Returns false if it gave up because the whole run is ending.
     fn await_commits(&mut self, most: u64) -> Result<bool, ChannelError> {
-        let index = self.settings.identity.index as usize;
+        let index = self.settings.instance.index as usize;
         while self.sender.in_flight(self.commits.committed(index)) > most {
             if self.stop.at_once() {
                 let ending_since = self.ending_since.get_or_insert_with(Instant::now);
@@ -507,7 +513,7 @@ pub(crate) fn connect(
     stop: &Stop,
 ) -> Result<EnvironmentClient, Exit<ActorError>> {
     let client = EnvironmentClient::open(domain, index, spec, envs, stop.clone())?;
-    let (served, served_envs) = client.describe(listener, || ()).map_err(Exit::widen)?;
+    let (served, served_envs) = client.describe(listener, || ()).map_err(Exit::convert)?;
     if !served.matches(spec) || served_envs != envs {
         let served = format!("{served_envs} times {served:?}");
         let configured = format!("{envs} times {spec:?}");
@@ -541,7 +547,7 @@ pub(crate) fn after_fault(
 }
 
 fn wait_for_replay(
-    settings: &ExplorerSettings,
+    settings: &ActorSettings,
     listener: &Listener,
     stop: &Stop,
     heartbeat: &mut HeartbeatSender,

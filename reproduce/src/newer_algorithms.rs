@@ -1,10 +1,10 @@
-//! Newer methods on the thesis's tasks: TD3 and SAC on the pendulum and the point mass.
+//! Newer algorithms on the thesis's tasks: TD3 and SAC on the pendulum and the point mass.
 
 mod pendulum;
 mod point_mass;
 
-pub(super) use pendulum::PendulumMethods;
-pub(super) use point_mass::PointMassMethods;
+pub(super) use pendulum::PendulumAlgorithms;
+pub(super) use point_mass::PointMassAlgorithms;
 
 use super::experiment::{Experiment, Length, Stage};
 

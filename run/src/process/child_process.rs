@@ -10,7 +10,7 @@ use std::time::Duration;
 use anyhow::{Context, bail};
 use rustix::process::{Pid, Signal, kill_process};
 use rustix::thread::{CpuSet, sched_setaffinity};
-use shoal_common::report::{Identity, Role};
+use shoal_common::report::{Role, RoleInstance};
 use shoal_common::run_dir::RunDir;
 
 use crate::process::{ChildGroup, ChildOutput, Line, Writer};
@@ -26,7 +26,7 @@ const TERMINATED: i32 = 143;
 
 /// A process that ends when its standard input closes, and therefore also when this process is gone.
 #[derive(Debug)]
-pub struct Peer {
+pub struct ChildProcess {
     group: ChildGroup,
     stdin: Option<ChildStdin>,
     /// Reads what the process writes.
@@ -35,16 +35,16 @@ pub struct Peer {
     what: String,
 }
 
-impl AsFd for Peer {
+impl AsFd for ChildProcess {
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.group.as_fd()
     }
 }
 
-impl Peer {
+impl ChildProcess {
     /// Starts this program again as `role` 0 of the run.
     pub fn role(role: Role, run: &RunDir) -> anyhow::Result<Self> {
-        let first = Identity {
+        let first = RoleInstance {
             role,
             index: 0,
             incarnation: 1,
@@ -53,12 +53,12 @@ impl Peer {
     }
 
     /// Starts this program again as a role of the run.
-    pub fn member(identity: Identity, run: &RunDir) -> anyhow::Result<Self> {
-        let Identity {
+    pub fn member(instance: RoleInstance, run: &RunDir) -> anyhow::Result<Self> {
+        let RoleInstance {
             role,
             index,
             incarnation,
-        } = identity;
+        } = instance;
         let mut command = Command::new("/proc/self/exe");
         command.arg0("shoal").arg(role.name()).arg(run.path());
         command.args([index.to_string(), incarnation.to_string()]);
@@ -109,7 +109,7 @@ impl Peer {
         sched_setaffinity(Some(self.pid()), cores).with_context(|| format!("cannot pin the {} to a core", self.what))
     }
 
-    /// Pauses the process (SIGSTOP) until [`Peer::resume`].
+    /// Pauses the process (SIGSTOP) until [`ChildProcess::resume`].
     pub fn pause(&self) -> anyhow::Result<()> {
         self.signal(Signal::STOP)
     }

@@ -8,8 +8,8 @@ use shoal_run::rollout::Rollout;
 use super::super::claim::{Claim, Scope, spread};
 use super::super::experiment::{Experiment, Stage};
 use super::super::family::{Family, Policies, Results};
+use super::super::report_section::{FigureWriter, ReportSection};
 use super::super::result::SeedResult;
-use super::super::section::{FigureWriter, Section};
 use super::{experiment, stage};
 
 /// The final evaluation is over a thousand starts.
@@ -54,9 +54,9 @@ pub(crate) struct Tests {
 }
 
 /// SAC and TD3 on the pendulum.
-pub(crate) struct PendulumMethods;
+pub(crate) struct PendulumAlgorithms;
 
-impl Family for PendulumMethods {
+impl Family for PendulumAlgorithms {
     type Tests = Tests;
     const EXPERIMENTS: &'static [Experiment] = &EXPERIMENTS;
 
@@ -65,7 +65,7 @@ impl Family for PendulumMethods {
         Ok(Tests { best: best.measures() })
     }
 
-    fn sections(results: &Results<Tests>, writer: &FigureWriter) -> anyhow::Result<Vec<Section>> {
+    fn sections(results: &Results<Tests>, writer: &FigureWriter) -> anyhow::Result<Vec<ReportSection>> {
         let [sac, td3] = ["pendulum-sac", "pendulum-td3"].map(|name| results.of(name, ""));
         let mut figures = Vec::new();
         for (name, seeds) in [("pendulum-sac", sac), ("pendulum-td3", td3)] {
@@ -77,7 +77,7 @@ impl Family for PendulumMethods {
                 })?);
             }
         }
-        Ok(vec![Section {
+        Ok(vec![ReportSection {
             title: "The pendulum with SAC and TD3 (not in the thesis)",
             from: vec![("pendulum-sac", ""), ("pendulum-td3", "")],
             remark: "A sixth of the steps of section 4.3. The final evaluation is over 1,000 starts.".into(),

@@ -1,4 +1,4 @@
-//! The method of a new run: the one that was asked for, or the one that suits the environment; and its defaults.
+//! The algorithm of a new run: the one that was asked for, or the one that suits the environment; and its defaults.
 
 use anyhow::Context;
 use shoal_common::space::{EnvironmentSpec, Space};
@@ -6,7 +6,7 @@ use toml::{Table, Value};
 
 use crate::plan::UsageError;
 
-/// The defaults of each method: its section, and the keys of other sections that go with it.
+/// The defaults of each algorithm: its section, and the keys of other sections that go with it.
 const DEFAULTS: [(&str, &str); 7] = [
     ("ddpg", include_str!("../../presets/method/ddpg.toml")),
     ("td3", include_str!("../../presets/method/td3.toml")),
@@ -17,26 +17,26 @@ const DEFAULTS: [(&str, &str); 7] = [
     ("sarsa", include_str!("../../presets/method/sarsa.toml")),
 ];
 
-/// Settings for single Gymnasium environments, `[ID.METHOD]`, which replace the method's defaults.
+/// Settings for single Gymnasium environments, `[ID.METHOD]`, which replace the algorithm's defaults.
 const OF_ENVIRONMENTS: &str = include_str!("../../presets/method/environments.toml");
 
-/// The methods' names.
+/// The algorithms' names.
 pub fn names() -> impl Iterator<Item = &'static str> {
     DEFAULTS.iter().map(|(name, _)| *name)
 }
 
-/// The method that the user asks for: by its name, or by a key of its section.
+/// The algorithm that the user asks for: by its name, or by a key of its section.
 ///
 /// # Errors
-/// When there is no such method, or two are asked for.
-pub(crate) fn asked_for(method: Option<&str>, set: &[String]) -> anyhow::Result<Option<&'static str>> {
+/// When there is no such algorithm, or two are asked for.
+pub(crate) fn asked_for(algorithm: Option<&str>, set: &[String]) -> anyhow::Result<Option<&'static str>> {
     let known = |name: &str| names().find(|known| *known == name);
-    let by_name = match method {
+    let by_name = match algorithm {
         None => None,
         Some(name) => Some(known(name).ok_or_else(|| {
             let names: Vec<&str> = names().collect();
             UsageError(format!(
-                "--method {name}: there is no such method; choose {}",
+                "--method {name}: there is no such algorithm; choose {}",
                 names.join(", ")
             ))
         })?),
@@ -45,7 +45,7 @@ pub(crate) fn asked_for(method: Option<&str>, set: &[String]) -> anyhow::Result<
     let mut asked = by_name;
     for section in sections.filter_map(known) {
         if let Some(other) = asked.filter(|other| *other != section) {
-            let two = format!("{other} and {section} are two methods, and a run has one: leave out one of them");
+            let two = format!("{other} and {section} are two algorithms, and a run has one: leave out one of them");
             return Err(UsageError(two).into());
         }
         asked = Some(section);
@@ -53,25 +53,25 @@ pub(crate) fn asked_for(method: Option<&str>, set: &[String]) -> anyhow::Result<
     Ok(asked)
 }
 
-/// The method whose section is in the table; DDPG if there is only `[exploration]`, the noise of its actors.
+/// The algorithm whose section is in the table; DDPG if there is only `[exploration]`, the noise of its actors.
 pub(crate) fn named_in(table: &Table) -> Option<&'static str> {
     names()
         .find(|name| table.contains_key(*name))
         .or_else(|| table.contains_key("exploration").then_some("ddpg"))
 }
 
-/// Makes a preset for another method. What the preset says about learning was chosen for its own method, so only the
-/// environment, the run's length and the evaluation are kept. Returns what is kept.
-pub(crate) fn replace(preset: &mut Table, method: &'static str) -> anyhow::Result<Table> {
+/// Makes a preset for another algorithm. What the preset says about learning was chosen for its own algorithm, so only
+/// the environment, the run's length and the evaluation are kept. Returns what is kept.
+pub(crate) fn replace(preset: &mut Table, algorithm: &'static str) -> anyhow::Result<Table> {
     preset.retain(|section, _| ["run", "environment", "evaluation"].contains(&section));
     if let Some(Value::Table(run)) = preset.get_mut("run") {
         run.remove("mode");
-        // A preset that ends by episodes has steps only as an upper bound. The method's own steps replace them.
+        // A preset that ends by episodes has steps only as an upper bound. The algorithm's own steps replace them.
         if run.contains_key("episodes") {
             run.remove("steps");
         }
     }
-    let mut defaults = defaults(method)?;
+    let mut defaults = defaults(algorithm)?;
     // The preset's own length and evaluation suit its task.
     defaults.remove("evaluation");
     if preset.get("run").and_then(|run| run.get("steps")).is_some()
@@ -84,7 +84,7 @@ pub(crate) fn replace(preset: &mut Table, method: &'static str) -> anyhow::Resul
     Ok(kept)
 }
 
-/// The method that suits a Gymnasium environment's spaces.
+/// The algorithm that suits a Gymnasium environment's spaces.
 pub(crate) fn suitable(spec: &EnvironmentSpec) -> &'static str {
     match (&spec.observation, &spec.action) {
         (Space::Box { .. }, Space::Box { .. }) => "sac",
@@ -94,20 +94,22 @@ pub(crate) fn suitable(spec: &EnvironmentSpec) -> &'static str {
     }
 }
 
-/// Adds the defaults of a method, and those for the environment `name`, to a table. Existing settings are kept.
-pub(crate) fn add_defaults(table: &mut Table, name: &str, method: &'static str) -> anyhow::Result<()> {
+/// Adds the defaults of an algorithm, and those for the environment `name`, to a table. Existing settings are kept.
+pub(crate) fn add_defaults(table: &mut Table, name: &str, algorithm: &'static str) -> anyhow::Result<()> {
     let of_environments: Table = OF_ENVIRONMENTS.parse()?;
-    let own = of_environments.get(name).and_then(|methods| methods.get(method));
+    let own = of_environments
+        .get(name)
+        .and_then(|algorithms| algorithms.get(algorithm));
     if let Some(Value::Table(own)) = own {
         add(table, own.clone());
     }
-    add(table, defaults(method)?);
+    add(table, defaults(algorithm)?);
     Ok(())
 }
 
-fn defaults(method: &str) -> anyhow::Result<Table> {
-    let text = DEFAULTS.iter().find(|(name, _)| *name == method);
-    let (_, text) = text.with_context(|| format!("there is no method {method}"))?;
+fn defaults(algorithm: &str) -> anyhow::Result<Table> {
+    let text = DEFAULTS.iter().find(|(name, _)| *name == algorithm);
+    let (_, text) = text.with_context(|| format!("there is no algorithm {algorithm}"))?;
     Ok(text.parse()?)
 }
 
@@ -141,7 +143,7 @@ mod tests {
 
     #[test]
     fn every_method_has_defaults_that_are_read_and_environments_name_methods() {
-        let all: Vec<_> = shoal_common::config::Algorithm::all();
+        let all: Vec<_> = shoal_common::config::AlgorithmConfig::all();
         assert_eq!(
             names().collect::<Vec<_>>(),
             all.iter().map(|one| one.name()).collect::<Vec<_>>()
@@ -150,9 +152,9 @@ mod tests {
             assert!(defaults(name).unwrap().contains_key(name), "{name}");
         }
         let of_environments: Table = OF_ENVIRONMENTS.parse().unwrap();
-        for (environment, methods) in of_environments {
-            for method in methods.as_table().unwrap().keys() {
-                assert!(names().any(|name| name == method), "{environment}: {method}");
+        for (environment, algorithms) in of_environments {
+            for algorithm in algorithms.as_table().unwrap().keys() {
+                assert!(names().any(|name| name == algorithm), "{environment}: {algorithm}");
             }
         }
     }

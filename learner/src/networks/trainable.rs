@@ -27,7 +27,7 @@ pub fn threads_for(layout: &NetworkLayout, batch: usize, threads: Threads) -> Th
 
 /// A network that learns.
 #[derive(Clone, Debug)]
-pub struct Trained {
+pub struct TrainableNetwork {
     /// The layout of the parameters.
     pub layout: NetworkLayout,
     /// θ.
@@ -38,7 +38,7 @@ pub struct Trained {
     pub adam: Adam,
 }
 
-impl Trained {
+impl TrainableNetwork {
     /// A network with these parameters, before its first step.
     pub fn new(layout: NetworkLayout, learning_rate: f64, parameters: &[f32]) -> Self {
         Self {
@@ -57,31 +57,31 @@ impl Trained {
 
 /// A network that learns, and its target network.
 #[derive(Clone, Debug)]
-pub struct Targeted {
+pub struct NetworkWithTarget {
     /// The network, θ.
-    pub online: Trained,
+    pub online: TrainableNetwork,
     /// The target network's parameters, θ'.
     pub target: Aligned,
 }
 
-impl Targeted {
+impl NetworkWithTarget {
     /// A network with these parameters, before its first step; θ' ← θ.
     pub fn new(layout: NetworkLayout, learning_rate: f64, parameters: &[f32]) -> Self {
         Self {
-            online: Trained::new(layout, learning_rate, parameters),
+            online: TrainableNetwork::new(layout, learning_rate, parameters),
             target: Aligned::from_slice(parameters, 1),
         }
     }
 
     /// Takes step number `t` (from 1) of Adam against the gradient; then θ' ← τ θ + (1 − τ) θ'.
-    pub fn descend_and_follow(&mut self, threads: &Threads, t: u64, tau: f32) {
-        let Trained {
+    pub fn step_with_target(&mut self, threads: &Threads, t: u64, tau: f32) {
+        let TrainableNetwork {
             parameters,
             gradient,
             adam,
             ..
         } = &mut self.online;
-        adam.step_and_follow(threads, t, gradient, parameters, tau, &mut self.target);
+        adam.step_with_target(threads, t, gradient, parameters, tau, &mut self.target);
     }
 
     /// θ' ← θ.
