@@ -86,6 +86,15 @@ pub(crate) enum Command {
     CleanUp(CleanUpArgs),
     #[command(hide = true)]
     Tied(TiedArgs),
+    #[command(hide = true)]
+    InNewSession(InNewSessionArgs),
+}
+
+/// The arguments of this program in a session of its own.
+#[derive(Args, Clone, Debug)]
+pub(crate) struct InNewSessionArgs {
+    #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
+    pub(crate) arguments: Vec<OsString>,
 }
 
 /// The arguments with which a program is started that is killed when its parent process dies.

@@ -2,6 +2,7 @@
 
 pub(crate) mod bench;
 pub(crate) mod completions;
+pub(crate) mod detach;
 pub(crate) mod eval;
 pub(crate) mod export;
 mod help_config;

@@ -88,6 +88,7 @@ fn run(command: &Command) -> anyhow::Result<ExitCode> {
         Command::Gate(args) => role::run(Role::Gate, args),
         Command::Relay(args) => role::run(Role::Relay, args),
         Command::Tied(args) => shoal_run::external_environment::exec_tied(args.parent, &args.program),
+        Command::InNewSession(args) => command::detach::exec_in_new_session(&args.arguments),
         Command::CleanUp(args) => launcher::clean_up(&args.run_id),
     }
 }

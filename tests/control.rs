@@ -5,7 +5,7 @@
 mod support;
 
 use std::io::BufRead;
-use std::process::{Output, Stdio};
+use std::process::{Command, Output, Stdio};
 
 use serde_json::Value;
 use support::{Workplace, json, parse, until};
@@ -282,4 +282,97 @@ fn a_launcher_that_does_not_answer_is_reported() {
     assert_eq!(output.status.code(), Some(1));
     assert!(stderr(&output).contains("does not answer"), "{}", stderr(&output));
     running.wait_for_learning();
+}
+
+/// Ends what a test has detached, even if it fails.
+struct Detached<'a>(&'a Workplace, &'static str);
+
+impl Drop for Detached<'_> {
+    fn drop(&mut self) {
+        self.0.output(&["stop", self.1]);
+    }
+}
+
+#[test]
+fn a_detached_run_has_a_session_of_its_own_and_works_when_the_command_returns() {
+    let place = Workplace::new();
+    let begin = ["train", "pendulum", "--run", "run", "--detach", "--json"];
+    let output = place.output(&[&begin[..], &ENDLESS, &support::QUICK].concat());
+    let _run = Detached(&place, "run");
+    assert!(output.status.success(), "{}", stderr(&output));
+    assert!(stderr(&output).contains("runs by itself"), "{}", stderr(&output));
+    let launcher = json(&output)["pid"].as_i64().unwrap();
+    let pid = rustix::process::Pid::from_raw(launcher as i32);
+    assert_eq!(
+        rustix::process::getsid(pid).unwrap(),
+        pid.unwrap(),
+        "a terminal's hang-up does not reach it"
+    );
+    let status = place.status("run");
+    assert_eq!(status["running"], true);
+    assert_eq!(roles(&status, "learner").len(), 1);
+    let again = place.output(&["resume", "run", "--detach"]);
+    assert!(!again.status.success());
+    assert!(stderr(&again).contains("is already running"), "{}", stderr(&again));
+
+    assert!(place.output(&["stop", "run"]).status.success());
+    let changed = place.output(&[
+        "resume",
+        "run",
+        "--detach",
+        "--quiet",
+        "--set",
+        "ddpg.tau=0.01",
+        "--steps",
+        "90000000",
+    ]);
+    assert!(
+        changed.status.success() && changed.stderr.is_empty(),
+        "{}",
+        stderr(&changed)
+    );
+    let status = place.status("run");
+    assert_eq!(
+        (status["running"].as_bool(), status["steps"].as_u64()),
+        (Some(true), Some(90_000_000))
+    );
+    let changes = std::fs::read_to_string(place.path().join("run/changes.csv")).unwrap();
+    assert!(changes.contains("ddpg.tau,0.001,0.01"), "{changes}");
+}
+
+#[test]
+fn what_cannot_start_is_refused_in_the_terminal_and_leaves_no_run() {
+    let place = Workplace::new();
+    for (limit, option, code, message) in [
+        ("true", "--set=ddpg.tao=1", 2, "did you mean `tau`"),
+        ("ulimit -n 64", "--quiet", 1, "the limit is 64"),
+    ] {
+        let mut shell = Command::new("sh");
+        shell.args([
+            "-c",
+            &format!("{limit}; exec \"$@\""),
+            "sh",
+            env!("CARGO_BIN_EXE_shoal"),
+        ]);
+        shell.args(["train", "pendulum", "--run", "run", "--detach", option]);
+        let output = shell.current_dir(place.path()).output().unwrap();
+        assert_eq!(output.status.code(), Some(code), "{}", stderr(&output));
+        assert!(stderr(&output).contains(message), "{}", stderr(&output));
+        assert_eq!(stderr(&output).lines().count(), 1, "{}", stderr(&output));
+        assert!(!place.path().join("run").exists(), "{option}");
+    }
+}
+
+#[test]
+fn a_detached_suite_is_trained_to_its_end() {
+    let place = Workplace::new();
+    let begin = [
+        "train", "pendulum", "--run", "suite", "--seeds", "1..2", "--steps", "200", "--detach",
+    ];
+    let output = place.output(&[&begin[..], &support::QUICK].concat());
+    assert!(output.status.success(), "{}", stderr(&output));
+    until("both runs are finished", || {
+        let listed = place.output(&["list", "suite", "--json"]);
+        String::from_utf8_lossy(&listed.stdout).matches("\"finished\"").count() == 2
+    });
 }

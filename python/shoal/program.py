@@ -9,7 +9,6 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,9 +17,6 @@ from .errors import ShoalError
 
 if TYPE_CHECKING:
     from .run import Run
-
-#: Seconds that a training may take until its directory exists. Environments of other programs are asked first.
-START_SECONDS = 150.0
 
 #: Lines of the program's messages that are kept for an error.
 KEPT_LINES = 20
@@ -115,15 +111,6 @@ def follow(command: Sequence[str], quiet: bool) -> str:
         return printed.read()
 
 
-def new_directory(what: str) -> Path:
-    """``runs/<what>-<n>`` with the first free n, as the program names runs."""
-    name = Path(what).stem if what.endswith(".toml") else what.removeprefix("gym:").replace("/", "-").replace(":", "-")
-    number = 1
-    while Path("runs", f"{name}-{number}").exists():
-        number += 1
-    return Path("runs", f"{name}-{number}").absolute()
-
-
 def train(
     what: str,
     *,
@@ -153,11 +140,8 @@ def train(
     """
     from .run import Run
 
-    directory = Path(run).absolute() if run is not None else None
-    if directory is None and not wait:
-        directory = new_directory(what)
     options: list[tuple[str, object]] = [
-        ("--run", directory),
+        ("--run", run),
         ("--steps", steps),
         ("--episodes", episodes),
         ("--seed", seed),
@@ -166,34 +150,10 @@ def train(
         ("--method", method),
         ("--from", getattr(from_run, "path", from_run)),
     ]
-    command = [program(), "train", what, "--json"]
-    command += [str(part) for option, value in options if value is not None for part in (option, value)]
-    command += ["--lockstep"] if lockstep else []
-    command += ["--with-replay"] if with_replay else []
-    command += settings(set)
-    if wait:
-        return Run(json.loads(follow(command, quiet))["run"])
-    assert directory is not None
-    return detached(command, directory)
-
-
-def detached(command: Sequence[str], directory: Path) -> Run:
-    """Starts a training in a session of its own, and returns when its run has a replay."""
-    from .run import Run
-
-    messages = tempfile.TemporaryFile("w+")
-    child = subprocess.Popen(
-        command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=messages, start_new_session=True
-    )
-    give_up = time.monotonic() + START_SECONDS
-    # The learner makes it when everything else is there.
-    replay = directory / "replay.bin"
-    while not replay.exists() and child.poll() is None:
-        if time.monotonic() > give_up:
-            child.terminate()
-            raise ShoalError(f"the training of {directory} did not begin within {START_SECONDS:.0f} s")
-        time.sleep(0.02)
-    if child.poll() not in (None, 0):
-        messages.seek(0)
-        raise failure(messages.read(), child.returncode)
-    return Run(directory, child=child, messages=messages)
+    arguments = ["train", what, "--json"]
+    arguments += [str(part) for option, value in options if value is not None for part in (option, value)]
+    arguments += ["--lockstep"] if lockstep else []
+    arguments += ["--with-replay"] if with_replay else []
+    arguments += settings(set)
+    printed = follow([program(), *arguments], quiet) if wait else call([*arguments, "--detach", "--quiet"])
+    return Run(json.loads(printed)["run"])

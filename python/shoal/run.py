@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
 import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -33,15 +32,8 @@ class Run:
     Raises :class:`ShoalError` if the directory has no run.
     """
 
-    def __init__(
-        self,
-        path: str | os.PathLike[str],
-        *,
-        child: subprocess.Popen[Any] | None = None,
-        messages: IO[str] | None = None,
-    ) -> None:
+    def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path).absolute()
-        self._child, self._messages = child, messages
         if not (self.path / "config.toml").is_file():
             raise ShoalError(f"{self.path} is not a run directory: it has no config.toml")
 
@@ -114,28 +106,24 @@ class Run:
     def stop(self) -> None:
         """Ends the run in order: all that was sent is committed and saved. :meth:`resume` continues it."""
         program.call(["stop", self.path])
-        if self._child is not None:
-            self._child.wait()
 
     def wait(self, timeout: float | None = None) -> Run:
         """Waits until the run is no longer running, for at most ``timeout`` seconds. Returns the run.
 
-        Raises ``TimeoutError`` if it is still running, and :class:`ShoalError` if it failed and was started without
-        ``wait`` by this Python.
+        Raises ``TimeoutError`` if it is still running, and :class:`ShoalError` if it failed.
         """
         give_up = None if timeout is None else time.monotonic() + timeout
-        running = self._child_runs if self._child is not None else lambda: self.status()["running"]
-        while running():
+        while self.status()["running"]:
             if give_up is not None and time.monotonic() > give_up:
                 raise TimeoutError(f"{self.path} is still running after {timeout} s")
-            time.sleep(0.1 if self._child is not None else 0.5)
-        if self._child is not None and self._child.returncode != 0 and self._messages is not None:
-            self._messages.seek(0)
-            raise program.failure(self._messages.read(), self._child.returncode)
+            time.sleep(0.5)
+        outcome = self.path / "outcome.json"
+        end = json.loads(outcome.read_text()) if outcome.exists() else {}
+        if end.get("state") == "failed":
+            raise ShoalError(f"{self.path} failed: {end['reason']}")
+        if end.get("state") == "running":
+            raise ShoalError(f"the launcher of {self.path} was killed; resume() continues the run")
         return self
-
-    def _child_runs(self) -> bool:
-        return self._child is not None and self._child.poll() is None
 
     def resume(self, *, steps: int | None = None, set: Mapping[str, Any] | None = None, quiet: bool = False) -> Run:
         """Continues the run to its end, or to a new number of ``steps``, with changed settings. Returns the run."""

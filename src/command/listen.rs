@@ -1,5 +1,6 @@
 //! `--listen`, of `train` and `resume`: other hosts may join the run.
 
+use std::ffi::OsString;
 use std::io::Write;
 use std::path::PathBuf;
 
@@ -43,6 +44,15 @@ pub(crate) struct ListenArgs {
 }
 
 impl ListenArgs {
+    /// These options, for another process.
+    pub(crate) fn arguments(&self) -> Vec<OsString> {
+        let Self { listen } = self;
+        listen
+            .iter()
+            .map(|endpoint| format!("--listen={endpoint}").into())
+            .collect()
+    }
+
     /// Checks the endpoint before the run is created.
     pub(crate) fn check(&self) -> anyhow::Result<()> {
         let Some(endpoint) = &self.listen else { return Ok(()) };

@@ -1,5 +1,6 @@
 //! `shoal resume`: continues a run that was stopped or killed.
 
+use std::ffi::OsString;
 use std::io::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -19,9 +20,9 @@ use shoal_run::status;
 use shoal_run::suite::Suite;
 
 use super::listen::ListenArgs;
-use super::suite;
 use super::training::OutputMode;
 use super::training::run_training;
+use super::{detach, suite};
 use crate::{completion, launcher};
 
 #[derive(Args, Clone, Debug)]
@@ -46,6 +47,30 @@ pub(crate) struct ResumeArgs {
     pub(crate) listen: ListenArgs,
 }
 
+impl ResumeArgs {
+    /// The options but those of output, for another process.
+    fn for_another_process(&self) -> Vec<OsString> {
+        let Self {
+            run: _,
+            steps,
+            episodes,
+            set,
+            jobs,
+            output: _,
+            listen,
+        } = self;
+        let number = |name: &str, value: Option<u64>| value.map(|value| format!("--{name}={value}"));
+        let numbers = [
+            number("steps", *steps),
+            number("episodes", *episodes),
+            number("jobs", jobs.map(u64::from)),
+        ];
+        let set = set.iter().map(|assignment| format!("--set={assignment}"));
+        let options = numbers.into_iter().flatten().chain(set).map(OsString::from);
+        options.chain(listen.arguments()).collect()
+    }
+}
+
 /// Continues with the run's replay, counters and noise, until its old or new number of steps or episodes, and with what
 /// was changed in its configuration.
 pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
@@ -54,6 +79,9 @@ pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
     }
     if args.jobs.is_some() {
         return Err(UsageError("--jobs: only for suites, and this is one run".into()).into());
+    }
+    if args.output.detach {
+        return detach::resume_run(&args.run, &args.for_another_process(), &args.output);
     }
     let run = RunDir::open(&args.run)?;
     // Only the holder of the lock may change the configuration.
@@ -124,6 +152,9 @@ fn resume_suite(suite: &Suite, args: &ResumeArgs) -> anyhow::Result<ExitCode> {
     if args.steps.is_some() || args.episodes.is_some() || !args.set.is_empty() {
         let why = "a suite goes on as it was made: change its runs one by one, or train another one";
         return Err(UsageError(why.into()).into());
+    }
+    if args.output.detach {
+        return detach::resume_suite(&args.run, &args.for_another_process(), &args.output);
     }
     let options = suite::SuiteOptions {
         jobs: args.jobs,

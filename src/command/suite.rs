@@ -25,6 +25,7 @@ use shoal_run::signals::{Signals, exit_code};
 use shoal_run::status::saved_status;
 use shoal_run::suite::{self, Suite, Sweep, Trial};
 
+use super::detach;
 use super::train::TrainArgs;
 use super::training::OutputMode;
 
@@ -85,7 +86,7 @@ pub(crate) fn train(args: &TrainArgs, what: &str, overrides: &RunOverrides) -> a
     {
         let here = directory.display();
         return match Suite::read(directory)? {
-            Some(found) if found == suite => run(&suite, directory, &common, options),
+            Some(found) if found == suite => begin(&suite, directory, &common, options),
             Some(_) => bail!(
                 "{here} is a suite of other runs: continue it with `shoal resume {here}`, or choose another directory with --run"
             ),
@@ -99,7 +100,21 @@ pub(crate) fn train(args: &TrainArgs, what: &str, overrides: &RunOverrides) -> a
         None => RunDir::create_next(Path::new("runs"), &format!("{name}-suite"))?,
     };
     suite.write(directory.path())?;
-    run(&suite, directory.path(), &common, options)
+    begin(&suite, directory.path(), &common, options)
+}
+
+/// Trains the suite, here or in a process that outlives this terminal.
+fn begin(
+    suite: &Suite,
+    directory: &Path,
+    common: &RunOverrides,
+    options: SuiteOptions<'_>,
+) -> anyhow::Result<ExitCode> {
+    if options.output.detach {
+        let jobs = options.jobs.map(|jobs| format!("--jobs={jobs}").into());
+        return detach::resume_suite(directory, &jobs.into_iter().collect::<Vec<_>>(), options.output);
+    }
+    run(suite, directory, common, options)
 }
 
 /// Continues the suite in this directory.

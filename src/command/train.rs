@@ -12,10 +12,10 @@ use shoal_run::numbers::{count, small_count};
 use shoal_run::plan::{Plan, RunOverrides, UsageError};
 use shoal_run::suite;
 
-use super::help_config;
 use super::listen::ListenArgs;
 use super::training::OutputMode;
 use super::training::run_training;
+use super::{detach, help_config};
 use crate::{completion, launcher};
 
 #[derive(Args, Clone, Debug)]
@@ -162,6 +162,16 @@ pub(crate) fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
         if !args.output.quiet {
             writeln!(std::io::stderr(), "{line}")?;
         }
+    }
+    if args.output.detach {
+        drop(lock);
+        let begun = detach::resume_run(run.path(), &args.listen.arguments(), &args.output);
+        if let Ok(_lock) = run.lock()
+            && !run.incarnations().exists()
+        {
+            let _ = std::fs::remove_dir_all(run.path());
+        }
+        return begun;
     }
     run_training(config, &run, &lock, &args.output, &args.listen).inspect_err(|_| {
         // Where no process was started there is nothing to resume or to read, and it would be in the way of the next try.

@@ -35,6 +35,9 @@ pub(crate) struct OutputMode {
     /// Print one JSON object on standard output at the end. Everything else goes to standard error.
     #[arg(long)]
     pub(crate) json: bool,
+    /// Return as soon as it works. It outlives this terminal; `top`, `status` and `stop` find it by its directory.
+    #[arg(long)]
+    pub(crate) detach: bool,
 }
 
 /// The output of `--json`.

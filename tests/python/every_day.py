@@ -103,5 +103,6 @@ else:
     raise AssertionError("the run ended by itself")
 live.stop()
 live.wait(timeout=30)
-assert not live.status()["running"] and not live.status()["finished"]
+live.resume(steps=int(live.status()["env_steps"]) + 10_000, quiet=True)
+assert not live.status()["running"] and live.status()["finished"]
 print(f"{copies} copies of a replay of {transitions.ring} rows while {seen} were written", file=sys.stderr)

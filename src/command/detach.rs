@@ -1,0 +1,138 @@
+//! `--detach`, of `train` and `resume`: what was started outlives its terminal.
+
+use std::ffi::{OsStr, OsString};
+use std::fs::File;
+use std::io::{Read, Seek, Write};
+use std::os::unix::process::CommandExt;
+use std::path::Path;
+use std::process::{Child, Command, ExitCode, Stdio};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, bail};
+use serde::Serialize;
+use shoal_common::file_lock;
+use shoal_common::run_dir::RunDir;
+use shoal_run::client::RunClient;
+use shoal_run::suite;
+
+use super::training::OutputMode;
+
+/// The hidden command that replaces itself by this program with other arguments, in a session without a terminal.
+pub(crate) const COMMAND: &str = "in-new-session";
+
+/// How long the start may take. Environments of other programs may need `environment.start_seconds` (120) of it.
+const PATIENCE: Duration = Duration::from_secs(150);
+
+/// Pause between two looks at a run that starts.
+const PAUSE: Duration = Duration::from_millis(50);
+
+/// The output of `--json`.
+#[derive(Serialize)]
+struct Printed<'a> {
+    run: &'a Path,
+    /// The process id of the launcher.
+    pid: u32,
+}
+
+/// Resumes a run with these further arguments in a session of its own. Returns when its roles are at work.
+///
+/// # Errors
+/// When the run is running already, or does not start in time.
+pub(crate) fn resume_run(path: &Path, arguments: &[OsString], output: &OutputMode) -> anyhow::Result<ExitCode> {
+    // Otherwise a run that is running already would be taken for the one that is started here.
+    drop(RunDir::open(path)?.lock()?);
+    let is_at_work = || {
+        let status = RunClient::open(path)?.status()?;
+        Ok(status.is_some_and(|status| !status.roles.is_empty()) && RunDir::open(path)?.replay_file().exists())
+    };
+    let how_to_end = |path: &str, _| format!("look: shoal top {path}; end: shoal stop {path}");
+    resume(path, arguments, output, is_at_work, how_to_end)
+}
+
+/// As [`resume_run`] for a suite. Returns when a process works on it.
+///
+/// # Errors
+/// When a process works on it already, or none does in time.
+pub(crate) fn resume_suite(path: &Path, arguments: &[OsString], output: &OutputMode) -> anyhow::Result<ExitCode> {
+    drop(suite::lock(path)?);
+    let is_at_work = || Ok(file_lock::is_locked(&File::open(path)?)?);
+    let how_to_end = |path: &str, pid| format!("look: shoal list {path}; end: kill {pid}");
+    resume(path, arguments, output, is_at_work, how_to_end)
+}
+
+fn resume(
+    path: &Path,
+    arguments: &[OsString],
+    output: &OutputMode,
+    is_at_work: impl Fn() -> anyhow::Result<bool>,
+    how_to_end: impl Fn(&str, u32) -> String,
+) -> anyhow::Result<ExitCode> {
+    let path = std::path::absolute(path).with_context(|| format!("cannot resolve {}", path.display()))?;
+    let here = path.display();
+    let mut messages = tempfile::tempfile().context("cannot make a temporary file")?;
+    let mut command = Command::new("/proc/self/exe");
+    command.arg0("shoal").arg(COMMAND).args(["resume", "--quiet"]);
+    command.args(arguments).arg("--").arg(&path);
+    command
+        .stdin(Stdio::null())
+        .stdout(Stdio::null())
+        .stderr(messages.try_clone()?);
+    let mut child = command.spawn().context("cannot start the launcher")?;
+    let begun = Instant::now();
+    // While it starts, a launcher may be unable to answer.
+    while !is_at_work().unwrap_or(false) {
+        if let Some(status) = child.try_wait()? {
+            write_messages(&mut messages)?;
+            let code = status.code().and_then(|code| u8::try_from(code).ok());
+            return Ok(code.map_or(ExitCode::FAILURE, ExitCode::from));
+        }
+        if begun.elapsed() >= PATIENCE {
+            write_messages(&mut messages)?;
+            end(child);
+            bail!(
+                "{here} did not start within {} s and was ended; its log is shoal.log there",
+                PATIENCE.as_secs()
+            );
+        }
+        std::thread::sleep(PAUSE);
+    }
+    write_messages(&mut messages)?;
+    let pid = child.id();
+    if !output.quiet {
+        let how_to_end = how_to_end(&here.to_string(), pid);
+        // A terminal that is gone is no failure.
+        let _ = writeln!(
+            std::io::stderr(),
+            "{here} runs by itself, as process {pid}; {how_to_end}"
+        );
+    }
+    if output.json {
+        let printed = serde_json::to_string(&Printed { run: &path, pid })?;
+        writeln!(std::io::stdout(), "{printed}")?;
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Asks the launcher to end in order.
+fn end(child: Child) {
+    if let Some(pid) = rustix::process::Pid::from_raw(child.id() as i32) {
+        let _ = rustix::process::kill_process(pid, rustix::process::Signal::TERM);
+    }
+}
+
+/// Shows what the launcher has written so far: warnings, how to join, or its error.
+fn write_messages(messages: &mut File) -> anyhow::Result<()> {
+    let mut text = Vec::new();
+    messages.rewind()?;
+    messages.read_to_end(&mut text)?;
+    // As above.
+    let _ = std::io::stderr().write_all(&text);
+    Ok(())
+}
+
+/// Carries out [`COMMAND`]. Returns only on errors.
+pub(crate) fn exec_in_new_session(arguments: &[OsString]) -> anyhow::Result<ExitCode> {
+    rustix::process::setsid().context("cannot begin a session")?;
+    let mut command = Command::new("/proc/self/exe");
+    Err(command.arg0(OsStr::new("shoal")).args(arguments).exec().into())
+}
