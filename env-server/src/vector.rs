@@ -78,11 +78,23 @@ impl VectorEnvironment {
         server: u64,
         incarnation: u64,
     ) -> Result<Self, EnvironmentError> {
-        let scratch = make(name, parameters)?;
+        Self::of(|| make(name, parameters), count, (seed, server, incarnation))
+    }
+
+    /// The same for environments that `make` makes, for the server of this `(seed, index, incarnation)`.
+    ///
+    /// # Errors
+    /// When `make` fails.
+    pub fn of<E>(
+        make: impl Fn() -> Result<Box<dyn Environment>, E>,
+        count: u32,
+        (seed, server, incarnation): (u64, u64, u64),
+    ) -> Result<Self, E> {
+        let scratch = make()?;
         let spec = scratch.spec();
         let training = stream(seed, Purpose::Environment, server, incarnation);
         let running = |_| {
-            let environment = make(name, parameters)?;
+            let environment = make()?;
             Ok(Running {
                 environment,
                 rng: training.clone(),

@@ -1,0 +1,103 @@
+//! `examples/`: an environment in a crate of its own trains, and has the guarantees of a built-in one.
+
+#![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
+
+#[path = "support/suite.rs"]
+mod suite;
+mod support;
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use suite::{Need, test};
+use support::{Workplace, error_line, json, until};
+
+fn main() -> ExitCode {
+    suite::run(vec![
+        test!(the_template_trains_and_is_evaluated, RAIL),
+        test!(its_lockstep_run_has_the_same_bits_after_kills, RAIL),
+        test!(its_errors_are_one_line, RAIL),
+    ])
+}
+
+/// `cargo test --workspace` builds it; `cargo test -p shoal` does not.
+static RAIL: Need = Need::new(
+    "the example is not built: cargo build --release -p shoal-env-server --example rail",
+    || program().exists(),
+    Some("SHOAL_REQUIRE_EXAMPLES"),
+);
+
+fn program() -> PathBuf {
+    let shoal = PathBuf::from(env!("CARGO_BIN_EXE_shoal"));
+    shoal.parent().unwrap().join("examples/rail")
+}
+
+/// The folder of the template as a user has copied and built it.
+fn copy() -> Workplace {
+    let place = Workplace::new();
+    let template = include_str!("../examples/rail/rail.toml");
+    std::fs::write(place.path().join("rail.toml"), template).unwrap();
+    std::fs::create_dir_all(place.path().join("target/release")).unwrap();
+    std::fs::copy(program(), place.path().join("target/release/rail")).unwrap();
+    place
+}
+
+fn the_template_trains_and_is_evaluated() {
+    let place = copy();
+    let output = place.output(&["train", "rail.toml", "--json", "--quiet"]);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    // Without a force the cart stays where it starts: at -180 in the mean.
+    let result = json(&output)["eval_return_mean"].as_f64().unwrap();
+    assert!(result > -80.0, "{result}");
+    let evaluated = place.output(&["eval", "runs/rail-1", "--json"]);
+    assert_eq!(json(&evaluated)["return_mean"].as_f64().unwrap(), result);
+}
+
+fn its_lockstep_run_has_the_same_bits_after_kills() {
+    let place = copy();
+    let train = |name: &str| {
+        let options = [
+            "--run",
+            name,
+            "--lockstep",
+            "--steps",
+            "2500",
+            "--set",
+            "evaluation.final_episodes=3",
+        ];
+        place.launch(name, &[&["train", "rail.toml"], &options[..]].concat())
+    };
+    let digest = |running: support::Running| {
+        let (code, printed, left) = running.wait();
+        assert_eq!(code, Some(0));
+        assert!(left.processes().is_empty() && left.files().is_empty());
+        serde_json::from_str::<serde_json::Value>(&printed).unwrap()["weights_sha256"].clone()
+    };
+    let undisturbed = digest(train("undisturbed"));
+    let running = train("killed");
+    for who in ["env-server-0", "actor-0", "env-server-0"] {
+        let before = running.pids(who).len();
+        running.kill_if_alive(who);
+        until("it is replaced, or the run is over", || {
+            running.pids(who).len() > before || running.log().contains("the run is finished")
+        });
+    }
+    assert!(running.pids("env-server-0").len() > 1, "a server was killed");
+    assert_eq!(digest(running), undisturbed);
+}
+
+fn its_errors_are_one_line() {
+    let place = copy();
+    for (option, part) in [
+        ("environment.tim_limit=5", "unknown field `tim_limit`"),
+        ("environment.time_limit=\"long\"", "invalid type"),
+        (
+            "environment.server=[\"target/release/nothing\"]",
+            "target/release/nothing",
+        ),
+    ] {
+        let message = error_line(&place.output(&["train", "rail.toml", "--set", option]));
+        assert!(message.contains(part), "{message}");
+        assert!(!place.path().join("runs").exists(), "{option} leaves a run");
+    }
+}
