@@ -17,7 +17,7 @@ use clap::error::ErrorKind;
 use clap::{CommandFactory, Parser};
 use iceoryx2::prelude::{LogLevel, set_log_level};
 use shoal_common::report::Role;
-use shoal_run::plan::UsageError;
+use shoal_run::usage::UsageError;
 
 use crate::cli::{Cli, Command};
 

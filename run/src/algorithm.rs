@@ -4,7 +4,7 @@ use anyhow::Context;
 use shoal_common::space::{EnvironmentSpec, Space};
 use toml::{Table, Value};
 
-use crate::plan::UsageError;
+use crate::usage::UsageError;
 
 /// The defaults of each algorithm: its section, and the keys of other sections that go with it.
 const DEFAULTS: [(&str, &str); 7] = [

@@ -26,3 +26,4 @@ pub mod status;
 pub mod suite;
 #[cfg(any(test, feature = "testing"))]
 pub mod testing;
+pub mod usage;

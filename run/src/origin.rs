@@ -19,7 +19,7 @@ use shoal_learner::process::checkpoint::{Checkpoint, Checkpoints, Counters};
 use shoal_learner::process::replay_layout;
 use shoal_learner::replay::Replay;
 
-use crate::plan::UsageError;
+use crate::usage::UsageError;
 
 /// The number of the file's format.
 const FORMAT: u32 = 1;

@@ -18,12 +18,13 @@ use shoal_run::evaluation::SavedPolicy;
 use shoal_run::external_environment::tied;
 use shoal_run::final_evaluation::FinalEvaluation;
 use shoal_run::numbers::thousands;
-use shoal_run::plan::{self, RunOverrides, UsageError};
+use shoal_run::plan::{self, RunOverrides};
 use shoal_run::preflight;
 use shoal_run::recorder::recorded;
 use shoal_run::signals::{Signals, exit_code};
 use shoal_run::status::saved_status;
 use shoal_run::suite::{self, Suite, Sweep, Trial};
+use shoal_run::usage::UsageError;
 
 use super::train::TrainArgs;
 use super::training::OutputMode;

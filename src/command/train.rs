@@ -9,8 +9,9 @@ use clap::Args;
 use clap::builder::PossibleValuesParser;
 use clap_complete::engine::ArgValueCompleter;
 use shoal_run::numbers::{count, small_count};
-use shoal_run::plan::{Plan, RunOverrides, UsageError};
+use shoal_run::plan::{Plan, RunOverrides};
 use shoal_run::suite;
+use shoal_run::usage::UsageError;
 
 use super::help_config;
 use super::listen::ListenArgs;
