@@ -17,7 +17,7 @@ use shoal_common::config::Config;
 use shoal_common::run_dir::{RunDir, RunLock};
 
 pub use self::overrides::RunOverrides;
-pub use self::presets::preset_names;
+pub use self::presets::{preset_names, preset_patterns};
 pub use self::resolve::{decide, resolved, resolved_with_sources};
 use self::revision::as_written;
 pub use self::revision::{RequestedChanges, Revision, edited, store_actors};

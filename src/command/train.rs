@@ -9,7 +9,7 @@ use clap::Args;
 use clap::builder::PossibleValuesParser;
 use clap_complete::engine::ArgValueCompleter;
 use shoal_run::numbers::{count, small_count};
-use shoal_run::plan::{Plan, RunOverrides};
+use shoal_run::plan::{Plan, RunOverrides, preset_patterns};
 use shoal_run::suite;
 use shoal_run::usage::UsageError;
 
@@ -21,9 +21,7 @@ use crate::{completion, launcher};
 
 #[derive(Args, Clone, Debug)]
 pub(crate) struct TrainArgs {
-    /// What to train: frozen-lake, frozen-lake-sarsa, cart-pole, pendulum, point-mass-r1, point-mass-r2, point-mass-r3,
-    /// one of the last four with -sac or -td3, gym: with a Gymnasium environment (gym:HalfCheetah-v5), or a
-    /// configuration file (FILE.toml).
+    #[arg(help = help_of_what())]
     #[arg(value_name = "PRESET|gym:ID|FILE.toml", required_unless_present = "help_config")]
     #[arg(add = ArgValueCompleter::new(completion::presets_and_files))]
     pub(crate) what: Option<String>,
@@ -47,6 +45,14 @@ pub(crate) struct TrainArgs {
     pub(crate) listen: ListenArgs,
 }
 
+fn help_of_what() -> String {
+    format!(
+        "What to train: a preset ({}), gym: with a Gymnasium environment (gym:HalfCheetah-v5), or a configuration file \
+         (FILE.toml)",
+        preset_patterns()
+    )
+}
+
 /// The seeds of a suite.
 #[derive(Clone, Debug)]
 pub(crate) struct Seeds(pub(crate) Vec<u64>);
@@ -61,8 +67,7 @@ pub(crate) struct RunArgs {
     /// Run directory to create [default: runs/<preset>-<n>].
     #[arg(long, value_name = "DIR")]
     pub(crate) run: Option<PathBuf>,
-    /// The algorithm: ddpg, td3, sac, dqn, reinforce, q-learning or sarsa [default: the preset's; for gym: the one that
-    /// suits the spaces].
+    /// The algorithm [default: the preset's; for gym: the one that suits the spaces].
     #[arg(long = "method", value_name = "METHOD", value_parser = PossibleValuesParser::new(shoal_run::algorithm::names()))]
     pub(crate) algorithm: Option<String>,
     /// Seed of every random stream.

@@ -9,7 +9,7 @@ use shoal_common::section;
 use toml::{Table, Value};
 
 use super::overrides::RunOverrides;
-use super::presets::{preset, preset_names};
+use super::presets::{preset, preset_names, with_algorithm};
 use super::source::{SettingSource, SettingSources};
 use super::suggestion::nearest;
 use super::table::put;
@@ -25,18 +25,11 @@ pub(super) fn for_algorithm(what: &str, overrides: &RunOverrides) -> anyhow::Res
     let Some(algorithm) = asked.or(of_networks) else {
         return Ok((name, table, sources));
     };
+    if let Some(own) = with_algorithm(what, algorithm) {
+        (name, table, sources) = sections(own)?;
+    }
     let named = algorithm::named_in(&table);
-    // A preset for another algorithm than its task's first one ends with that algorithm's name.
-    let task = named
-        .and_then(|named| what.strip_suffix(named)?.strip_suffix('-'))
-        .unwrap_or(what);
-    if let Some((own, _)) = preset(&format!("{task}-{algorithm}")) {
-        return sections(own);
-    }
     let default = AlgorithmConfig::default().name();
-    if task != what && algorithm == default && preset(task).is_some() {
-        return sections(task);
-    }
     let defaults = SettingSource::Algorithm(algorithm);
     if preset(what).is_some() {
         if named.unwrap_or(default) != algorithm {
@@ -141,6 +134,7 @@ mod tests {
             panic!("{:?}", dqn.algorithm)
         };
         assert_eq!(settings.epsilon_steps, 4_000, "a tenth of the run");
+        assert_eq!(with("frozen-lake-sarsa", "q-learning", &[]).0, "frozen-lake");
         let (_, lake) = with("frozen-lake", "sarsa", &[]);
         assert_eq!((lake.algorithm.name(), lake.run.mode), ("sarsa", Mode::Lockstep));
     }
