@@ -4,6 +4,7 @@
 pub mod algorithm;
 pub mod analysis;
 pub mod batch;
+pub mod best_policy;
 pub mod client;
 pub mod description;
 pub mod earlier_best;
