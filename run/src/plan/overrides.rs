@@ -3,6 +3,8 @@
 use std::path::PathBuf;
 
 use anyhow::Context;
+use clap::Args;
+use clap::builder::PossibleValuesParser;
 use shoal_common::config::Config;
 use shoal_common::config::explanation::{self, Key};
 use shoal_common::run_dir::RunDir;
@@ -11,37 +13,81 @@ use toml::{Table, Value};
 
 use super::source::{SettingSource, SettingSources};
 use super::table::put;
-use crate::numbers::count;
+use crate::algorithm;
+use crate::numbers::{count, small_count};
 use crate::usage::UsageError;
 
-/// Changes to a preset or a file for one run.
-#[derive(Clone, Debug, Default)]
+/// Changes to a preset or a file for one run: the options of `train` that say what the run is.
+#[derive(Args, Clone, Debug, Default)]
 pub struct RunOverrides {
-    /// Run directory to create; by default `runs/<name>-<n>`.
+    /// Run directory to create [default: runs/<preset>-<n>].
+    #[arg(long, value_name = "DIR")]
     pub run: Option<PathBuf>,
-    /// The algorithm, by its name.
+    /// The algorithm [default: the preset's; for gym: the one that suits the spaces].
+    #[arg(long = "method", value_name = "METHOD", value_parser = PossibleValuesParser::new(algorithm::names()))]
     pub algorithm: Option<String>,
-    /// `run.seed`.
+    /// Seed of every random stream.
+    #[arg(long)]
     pub seed: Option<u64>,
-    /// `actors.count`.
+    /// Actor processes.
+    #[arg(long, value_name = "N", value_parser = small_count)]
     pub actors: Option<u32>,
-    /// `actors.envs`.
+    /// Environments of each actor.
+    #[arg(long, value_name = "E", value_parser = small_count)]
     pub envs: Option<u32>,
-    /// `run.steps`.
+    /// Environment steps of all actors together.
+    #[arg(long, value_name = "N", value_parser = count)]
     pub steps: Option<u64>,
-    /// `run.episodes`.
+    /// Episodes of all actors together; the run ends at this limit or at its steps, whichever comes first.
+    #[arg(long, value_name = "M", value_parser = count)]
     pub episodes: Option<u64>,
-    /// Whether to set `run.mode` to lockstep.
+    /// Lockstep: actors and learner take turns, and the same seed and number of actors give the same bits.
+    #[arg(long)]
     pub lockstep: bool,
-    /// Any key, as `SECTION.KEY=VALUE`.
+    /// Set a key of the configuration, as in --set ddpg.tau=0.005. May be repeated.
+    #[arg(long, value_name = "SECTION.KEY=VALUE")]
     pub set: Vec<String>,
-    /// A run whose networks this one begins with.
+    /// Begin with the networks of this run, whose algorithm and shapes it then has.
+    #[arg(long, value_name = "RUN")]
     pub from: Option<PathBuf>,
-    /// Whether it also begins with that run's replay.
+    /// Begin with the replay of that run too. The new run's steps are counted from its rows on.
+    #[arg(long, requires = "from")]
     pub with_replay: bool,
 }
 
 impl RunOverrides {
+    /// The arguments of `train` for these overrides, except directory and seed.
+    pub fn arguments(&self) -> Vec<String> {
+        let Self {
+            run: _,
+            algorithm,
+            seed: _,
+            actors,
+            envs,
+            steps,
+            episodes,
+            lockstep,
+            set,
+            from,
+            with_replay,
+        } = self;
+        let mut arguments = Vec::new();
+        let mut option = |name: &str, value: Option<String>| {
+            arguments.extend(value.into_iter().flat_map(|value| [name.to_owned(), value]));
+        };
+        option("--method", algorithm.clone());
+        option("--actors", actors.map(|number| number.to_string()));
+        option("--envs", envs.map(|number| number.to_string()));
+        option("--steps", steps.map(|number| number.to_string()));
+        option("--episodes", episodes.map(|number| number.to_string()));
+        option("--from", from.as_ref().map(|path| path.display().to_string()));
+        set.iter()
+            .for_each(|assignment| option("--set", Some(assignment.clone())));
+        arguments.extend(lockstep.then(|| "--lockstep".into()));
+        arguments.extend(with_replay.then(|| "--with-replay".into()));
+        arguments
+    }
+
     /// Directory and configuration of the run whose networks the new one begins with.
     pub(super) fn predecessor(&self) -> anyhow::Result<Option<(PathBuf, Config)>> {
         let Some(from) = &self.from else { return Ok(None) };
@@ -63,23 +109,27 @@ pub(super) fn set_options(
             .map(Value::from))
     };
     let small = |number: Option<u32>| number.map(|number| Value::from(i64::from(number)));
+    let RunOverrides {
+        seed,
+        actors,
+        envs,
+        steps,
+        episodes,
+        lockstep,
+        // The others set no key of their own, or come before.
+        run: _,
+        algorithm: _,
+        set: _,
+        from: _,
+        with_replay: _,
+    } = *overrides;
     for (option, section, key, value) in [
-        ("--seed", "run", "seed", whole("--seed", overrides.seed)?),
-        ("--steps", "run", "steps", whole("--steps", overrides.steps)?),
-        ("--actors", "actors", "count", small(overrides.actors)),
-        ("--envs", "actors", "envs", small(overrides.envs)),
-        (
-            "--episodes",
-            "run",
-            "episodes",
-            whole("--episodes", overrides.episodes)?,
-        ),
-        (
-            "--lockstep",
-            "run",
-            "mode",
-            overrides.lockstep.then(|| "lockstep".into()),
-        ),
+        ("--seed", "run", "seed", whole("--seed", seed)?),
+        ("--steps", "run", "steps", whole("--steps", steps)?),
+        ("--actors", "actors", "count", small(actors)),
+        ("--envs", "actors", "envs", small(envs)),
+        ("--episodes", "run", "episodes", whole("--episodes", episodes)?),
+        ("--lockstep", "run", "mode", lockstep.then(|| "lockstep".into())),
     ] {
         if let Some(value) = value {
             put(table, &[section, key], value)?;
@@ -155,7 +205,29 @@ fn value_of(text: &str) -> Value {
 mod tests {
     use super::super::resolve::decide;
     use super::*;
+    use clap::Parser;
     use shoal_common::config::Mode;
+
+    #[derive(clap::Parser)]
+    struct CommandLine {
+        #[command(flatten)]
+        overrides: RunOverrides,
+    }
+
+    #[test]
+    fn the_arguments_of_overrides_are_read_as_the_same_overrides() {
+        let line = "train --method sac --actors 3 --envs 2 --steps 500 --episodes 9 --from old --set sac.tau=0.01 \
+                    --set run.mode=free --lockstep --with-replay";
+        let CommandLine { overrides } = CommandLine::parse_from(line.split(' ').filter(|word| !word.is_empty()));
+        let arguments = overrides.arguments();
+        let again = CommandLine::parse_from(["train".to_owned()].into_iter().chain(arguments.clone())).overrides;
+        assert_eq!(format!("{overrides:?}"), format!("{again:?}"));
+        let mut given: Vec<&str> = line.split(' ').skip(1).filter(|word| !word.is_empty()).collect();
+        let mut written: Vec<&str> = arguments.iter().map(String::as_str).collect();
+        given.sort_unstable();
+        written.sort_unstable();
+        assert_eq!(written, given);
+    }
 
     #[test]
     fn overrides_change_the_configuration() {
