@@ -2,9 +2,9 @@
 
 use std::ffi::OsStr;
 
-use clap::Command;
+use clap::{Arg, Command};
 use clap_complete::CompleteEnv;
-use clap_complete::engine::{CompletionCandidate, PathCompleter, ValueCompleter};
+use clap_complete::engine::{ArgValueCompleter, CompletionCandidate, PathCompleter, ValueCompleter};
 use shoal_common::config::explanation::{Key, sections, set_by_program};
 use shoal_env_server::environment;
 use shoal_run::external_environment::GYMNASIUM;
@@ -16,7 +16,12 @@ pub(crate) const VARIABLE: &str = "SHOAL_COMPLETE";
 
 /// If a shell asks for completions, answers and ends the process. Otherwise does nothing.
 pub(crate) fn answer(command: fn() -> Command) {
-    CompleteEnv::with_factory(command).var(VARIABLE).complete();
+    let completed = || {
+        // The declaration of this option is in a library that knows no completions.
+        let set = |arg: Arg| arg.add(ArgValueCompleter::new(settings));
+        command().mut_subcommand("train", |train| train.mut_arg("set", set))
+    };
+    CompleteEnv::with_factory(completed).var(VARIABLE).complete();
 }
 
 /// Presets, the prefix of Gymnasium environments, and configuration files.

@@ -24,7 +24,8 @@ use shoal_common::channel::control::{ControlPort, ControlRequest, ControlRespons
 use shoal_common::channel::reports::{Report, Reports};
 use shoal_common::channel::{Domain, DomainError};
 use shoal_common::config::Config;
-use shoal_common::report::{EpisodeReport, EvaluationReport, Heartbeat, LearnerReport, Role};
+use shoal_common::report::{EpisodeReport, EvaluationReport, Heartbeat, LearnerReport};
+use shoal_common::role::Role;
 use shoal_common::run_dir::{RunDir, RunLock};
 use shoal_common::stop::GRACE;
 use shoal_run::external_environment::server_iceoryx2_config;

@@ -16,8 +16,8 @@ use std::sync::Arc;
 use clap::error::ErrorKind;
 use clap::{CommandFactory, Parser};
 use iceoryx2::prelude::{LogLevel, set_log_level};
-use shoal_common::report::Role;
-use shoal_run::plan::UsageError;
+use shoal_common::role::Role;
+use shoal_run::usage::UsageError;
 
 use crate::cli::{Cli, Command};
 

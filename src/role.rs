@@ -11,7 +11,7 @@ use shoal_actor::{actor, evaluator};
 use shoal_common::channel::environment::EnvironmentPort;
 use shoal_common::channel::{Domain, EventName, HeartbeatSender};
 use shoal_common::config::{Config, Mode};
-use shoal_common::report::{Role, RoleInstance};
+use shoal_common::role::{Role, RoleInstance};
 use shoal_common::run_dir::RunDir;
 use shoal_common::stop::Stop;
 use shoal_env_server::vector::VectorEnvironment;

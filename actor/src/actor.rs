@@ -25,23 +25,18 @@ use shoal_common::channel::{ChannelError, Domain, EventName, HeartbeatSender, Li
 use shoal_common::commit::{CommitReader, OpenError};
 use shoal_common::config::{Config, Mode};
 use shoal_common::exit::Exit;
-use shoal_common::report::{Activity, EpisodeReport, Role, RoleInstance};
+use shoal_common::report::EpisodeReport;
+use shoal_common::role::{Activity, Role, RoleInstance};
 use shoal_common::run_dir::RunDir;
-use shoal_common::space::EnvironmentSpec;
 use shoal_common::stop::Stop;
 use shoal_common::stream::{Purpose, stream};
 use shoal_common::transition::{ChunkLayout, Transition};
 
 use crate::actor_snapshot::ActorSnapshot;
+use crate::environment::{after_fault, connect};
 use crate::error::ActorError;
 use crate::exploration::{Exploration, StepCounts};
 use crate::n_step::NStep;
-
-/// What the line about an invalid answer of an environment server ends with; the launcher looks for it.
-pub const GIVEN_UP: &str = "its episodes are given up";
-
-/// How long an actor waits after an invalid answer before it begins new episodes.
-const AFTER_FAULT: Duration = Duration::from_millis(50);
 
 /// How long an actor waits for its last chunk to be committed when the whole run ends.
 const LAST_COMMIT_TIMEOUT: Duration = Duration::from_secs(1);
@@ -501,49 +496,6 @@ impl<'a> Actor<'a> {
         }
         Ok(true)
     }
-}
-
-/// Connects to environment server `index` and checks that its environments are those of the run's configuration.
-pub(crate) fn connect(
-    domain: &Domain,
-    listener: &Listener,
-    index: u32,
-    spec: &EnvironmentSpec,
-    envs: usize,
-    stop: &Stop,
-) -> Result<EnvironmentClient, Exit<ActorError>> {
-    let client = EnvironmentClient::open(domain, index, spec, envs, stop.clone())?;
-    let (served, served_envs) = client.describe(listener, || ()).map_err(Exit::convert)?;
-    if !served.matches(spec) || served_envs != envs {
-        let served = format!("{served_envs} times {served:?}");
-        let configured = format!("{envs} times {spec:?}");
-        return Err(Exit::Failed(ActorError::Server {
-            index,
-            served,
-            configured,
-        }));
-    }
-    Ok(client)
-}
-
-/// Logs an invalid answer of an environment server and pauses; the caller must then begin new episodes. Without the pause,
-/// an environment that always answers like this would fill the log before the launcher ends the run.
-pub(crate) fn after_fault(
-    error: &ChannelError,
-    heartbeat: &mut HeartbeatSender,
-    listener: &Listener,
-    stop: &Stop,
-) -> Result<(), Exit<ChannelError>> {
-    tracing::warn!("{error}; {GIVEN_UP}");
-    heartbeat.count_fault();
-    let since = Instant::now();
-    while since.elapsed() < AFTER_FAULT {
-        if stop.requested() {
-            return Err(Exit::Stopped);
-        }
-        listener.wait(AFTER_FAULT)?;
-    }
-    Ok(())
 }
 
 fn wait_for_replay(

@@ -12,11 +12,12 @@ use shoal_common::evaluator_state::EvaluatorState;
 use shoal_common::exit::Exit;
 use shoal_common::policy::Policy;
 use shoal_common::policy_file::PolicyFile;
-use shoal_common::report::{Activity, EvaluatedReport, EvaluationReport, Role, RoleInstance};
+use shoal_common::report::{EvaluatedReport, EvaluationReport};
+use shoal_common::role::{Activity, Role, RoleInstance};
 use shoal_common::run_dir::RunDir;
 use shoal_common::stop::Stop;
 
-use crate::actor::{after_fault, connect};
+use crate::environment::{after_fault, connect};
 use crate::error::ActorError;
 
 /// The settings of an evaluator.

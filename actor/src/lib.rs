@@ -3,6 +3,7 @@
 
 pub mod actor;
 mod actor_snapshot;
+pub mod environment;
 pub mod error;
 pub mod evaluator;
 pub mod exploration;

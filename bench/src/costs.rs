@@ -11,7 +11,7 @@ use shoal_common::channel::{Domain, EventName, Listener, Notifier};
 use shoal_common::commit::CommitReader;
 use shoal_common::config::Config;
 use shoal_common::network::{ActionRange, DeterministicPolicy};
-use shoal_common::report::Role;
+use shoal_common::role::Role;
 use shoal_common::stream::{Purpose, stream};
 use shoal_env_server::vector::{Reset, VectorEnvironment};
 use shoal_learner::algorithms::registry;

@@ -24,7 +24,7 @@ mod transitions;
 mod whole_run;
 
 use shoal_common::algorithms::AlgorithmConfig;
-use shoal_run::plan::UsageError;
+use shoal_run::usage::UsageError;
 
 use self::measurement::{TimeBudget, print};
 

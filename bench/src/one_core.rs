@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use rustix::thread::sched_setaffinity;
 use serde::Serialize;
-use shoal_common::report::Role;
+use shoal_common::role::Role;
 
 use super::cores::Cores;
 use super::costs::Inference;

@@ -2,7 +2,7 @@
 //! launcher that would replace a process that dies.
 
 use rustix::thread::CpuSet;
-use shoal_common::report::{Role, RoleInstance};
+use shoal_common::role::{Role, RoleInstance};
 use shoal_common::run_dir::RunDir;
 use shoal_run::process::ChildProcess;
 

@@ -9,7 +9,7 @@ use shoal_common::channel::environment::{EnvironmentClient, ResetRequest, StepRe
 use shoal_common::channel::{ChannelError, Domain, EventName, Listener};
 use shoal_common::config::Config;
 use shoal_common::exit::Exit;
-use shoal_common::report::Role;
+use shoal_common::role::Role;
 use shoal_run::process::ChildProcess;
 
 use super::cores::Cores;

@@ -5,7 +5,7 @@ use rustix::thread::CpuSet;
 use shoal_common::channel::{Domain, Services};
 use shoal_common::commit::ReplayLayout;
 use shoal_common::config::{Config, DdpgConfig};
-use shoal_common::report::Role;
+use shoal_common::role::Role;
 use shoal_common::run_dir::RunDir;
 use shoal_run::plan::Plan;
 use shoal_run::plan::RunOverrides;

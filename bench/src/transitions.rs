@@ -9,7 +9,7 @@ use shoal_common::channel::{Domain, EventName, Listener, Notifier, wait_for};
 use shoal_common::commit::{CommitReader, OpenError};
 use shoal_common::config::Config;
 use shoal_common::exit::Exit;
-use shoal_common::report::Role;
+use shoal_common::role::Role;
 use shoal_common::run_dir::RunDir;
 use shoal_learner::algorithms::minibatch::Minibatch;
 use shoal_learner::algorithms::sampling::Sampler;

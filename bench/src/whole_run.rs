@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use anyhow::Context;
 use rustix::process::{Pid, Signal, kill_process};
 use serde::Serialize;
-use shoal_common::report::Role;
+use shoal_common::role::Role;
 
 use self::training::{Recovery, Startup, Training};
 use super::intervals::IntervalResults;

@@ -4,7 +4,7 @@
 //!
 //! | package | contents |
 //! | --- | --- |
-//! | `shoal-base` | spaces, transitions, reports, random streams, files that are either complete or absent |
+//! | `shoal-base` | spaces, transitions, roles and their reports, random streams, files that are either complete or absent |
 //! | `shoal-channel` | the typed channels, and the replay's commit record |
 //! | `shoal-policy` | networks, and policies as actors and evaluator use them (imports `shoal-base` alone) |
 //! | `shoal-common` | the algorithms' settings, the configuration, the run directory |
@@ -14,7 +14,9 @@ pub mod config;
 pub mod evaluator_state;
 pub mod run_dir;
 
-pub use shoal_base::{durable, exit, file_lock, report, section, space, stop, stream, transition};
+pub use shoal_base::{
+    durable, exit, file_lock, report, role, section, space, stop, stream, transition, versioned_file,
+};
 pub use shoal_channel as channel;
 pub use shoal_channel::commit;
 pub use shoal_policy as policy;

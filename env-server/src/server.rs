@@ -1,6 +1,6 @@
 //! The environment server's loop: answers one actor's requests by stepping its environments.
 
-use shoal_base::report::Activity;
+use shoal_base::role::Activity;
 use shoal_base::stop::Stop;
 use shoal_channel::environment::{EnvironmentPort, RequestKind};
 use shoal_channel::{ChannelError, HeartbeatSender};

@@ -7,7 +7,7 @@
 //! use shoal_common::channel::transitions::{ChunkReceiver, ChunkSender};
 //! use shoal_common::channel::{Domain, EventName, Listener, Services};
 //! use shoal_common::commit::CommitReader;
-//! use shoal_common::report::Role;
+//! use shoal_common::role::Role;
 //! use shoal_common::stop::Stop;
 //! use shoal_common::transition::{ChunkLayout, RowLayout, Transition};
 //! use shoal_learner::replay::{Replay, ReplayLayout};

@@ -11,7 +11,6 @@ mod free;
 pub mod intake;
 mod learner;
 mod lockstep;
-pub mod ratio;
 mod settings;
 
 use shoal_common::channel::Domain;

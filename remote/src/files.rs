@@ -2,23 +2,18 @@
 
 use std::fmt;
 use std::fs::Permissions;
-use std::io::Write;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 
-use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
-use shoal_common::durable::write_atomically;
 use shoal_common::run_dir::RunDir;
+use shoal_common::versioned_file::{Encoding, VersionedFile, VersionedFileError};
 
 use crate::endpoint::Endpoint;
-
-const FORMAT: u32 = 1;
 
 /// `join.toml` in the directory of a run that other hosts can join.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct JoinFile {
-    format: u32,
     /// Where other hosts find the gate.
     pub endpoint: Endpoint,
     /// Where the gate listens.
@@ -29,7 +24,6 @@ pub struct JoinFile {
 /// `keys/`, or `join.key` for the hosts. Whoever has `join.key` may join.
 #[derive(Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct KeyFile {
-    format: u32,
     /// The run's name in its messages.
     pub run_id: String,
     /// The authority's certificate, as PEM.
@@ -56,7 +50,6 @@ impl KeyFile {
     /// A certificate with its private key, all as PEM.
     pub fn new(run_id: String, authority: String, certificate: String, private_key: String) -> Self {
         Self {
-            format: FORMAT,
             run_id,
             authority,
             certificate,
@@ -76,7 +69,7 @@ impl KeyFile {
     pub fn write(&self, path: &Path) -> Result<(), FileError> {
         let io = |cause| FileError::Io(path.display().to_string(), cause);
         path.parent().map_or(Ok(()), std::fs::create_dir_all).map_err(io)?;
-        write(path, self)?;
+        self.store(path)?;
         std::fs::set_permissions(path, Permissions::from_mode(0o600)).map_err(io)
     }
 
@@ -85,24 +78,18 @@ impl KeyFile {
     /// # Errors
     /// When it is missing, damaged, or of another version.
     pub fn read(path: &Path) -> Result<Self, FileError> {
-        let (shown, text) = if path == Path::new("-") {
-            ("standard input".into(), std::io::read_to_string(std::io::stdin()))
-        } else {
-            (path.display().to_string(), std::fs::read_to_string(path))
-        };
-        let text = text.map_err(|cause| FileError::Io(shown.clone(), cause))?;
-        let file: Self = parse(&shown, &text)?;
-        match file.format {
-            FORMAT => Ok(file),
-            other => Err(FileError::Format(shown, other)),
+        if path != Path::new("-") {
+            return Ok(Self::load(path)?);
         }
+        let shown = "standard input";
+        let text = std::io::read_to_string(std::io::stdin()).map_err(|cause| FileError::Io(shown.into(), cause))?;
+        Ok(Self::parse(shown, text.as_bytes())?)
     }
 }
 
 /// `host.toml` in the directory that `shoal join` makes.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct HostFile {
-    format: u32,
     /// Where the gate listens.
     pub endpoint: Endpoint,
     /// The name of the run that was joined.
@@ -129,8 +116,35 @@ pub enum FileError {
     #[error("{0} is damaged: {1}")]
     Damaged(String, String),
     /// Another version wrote it.
-    #[error("{0} is of form {1}, this program's is {FORMAT}")]
-    Format(String, u32),
+    #[error("{0} is of form {1}, this program's is {2}")]
+    Format(String, u32, u32),
+}
+
+impl From<VersionedFileError> for FileError {
+    fn from(error: VersionedFileError) -> Self {
+        match error {
+            VersionedFileError::Read { path, cause } | VersionedFileError::Write { path, cause } => {
+                Self::Io(path, cause)
+            }
+            VersionedFileError::Damaged { path, cause, .. } => Self::Damaged(path, cause),
+            VersionedFileError::Format { path, found, expected } => Self::Format(path, found, expected),
+        }
+    }
+}
+
+impl VersionedFile for KeyFile {
+    const FORMAT: u32 = 1;
+    const ENCODING: Encoding = Encoding::Toml;
+}
+
+impl VersionedFile for JoinFile {
+    const FORMAT: u32 = 1;
+    const ENCODING: Encoding = Encoding::Toml;
+}
+
+impl VersionedFile for HostFile {
+    const FORMAT: u32 = 1;
+    const ENCODING: Encoding = Encoding::Toml;
 }
 
 impl JoinFile {
@@ -139,11 +153,7 @@ impl JoinFile {
 
     /// The file of a gate that listens at `listen` and is found at `endpoint`.
     pub fn new(endpoint: Endpoint, listen: Endpoint) -> Self {
-        Self {
-            format: FORMAT,
-            endpoint,
-            listen,
-        }
+        Self { endpoint, listen }
     }
 
     /// Writes it.
@@ -151,7 +161,7 @@ impl JoinFile {
     /// # Errors
     /// When it cannot be written.
     pub fn write(&self, run: &RunDir) -> Result<(), FileError> {
-        write(&run.path().join(Self::NAME), self)
+        Ok(self.store(&run.path().join(Self::NAME))?)
     }
 
     /// Reads it.
@@ -159,11 +169,7 @@ impl JoinFile {
     /// # Errors
     /// When it is missing, damaged, or of another version.
     pub fn read(directory: &Path) -> Result<Self, FileError> {
-        let (path, file): (_, Self) = read(&directory.join(Self::NAME))?;
-        match file.format {
-            FORMAT => Ok(file),
-            other => Err(FileError::Format(path, other)),
-        }
+        Ok(Self::load(&directory.join(Self::NAME))?)
     }
 }
 
@@ -173,7 +179,6 @@ impl HostFile {
     /// A new file.
     pub fn new(endpoint: Endpoint, run_id: String, (host, name): (u64, String), lease: &crate::wire::Lease) -> Self {
         Self {
-            format: FORMAT,
             endpoint,
             run_id,
             host,
@@ -189,7 +194,7 @@ impl HostFile {
     /// # Errors
     /// When it cannot be written.
     pub fn write(&self, run: &RunDir) -> Result<(), FileError> {
-        write(&run.path().join(Self::NAME), self)
+        Ok(self.store(&run.path().join(Self::NAME))?)
     }
 
     /// Reads it.
@@ -197,29 +202,8 @@ impl HostFile {
     /// # Errors
     /// When it is missing, damaged, or of another version.
     pub fn read(run: &RunDir) -> Result<Self, FileError> {
-        let (path, file): (_, Self) = read(&run.path().join(Self::NAME))?;
-        match file.format {
-            FORMAT => Ok(file),
-            other => Err(FileError::Format(path, other)),
-        }
+        Ok(Self::load(&run.path().join(Self::NAME))?)
     }
-}
-
-fn write(path: &Path, contents: &impl Serialize) -> Result<(), FileError> {
-    let shown = path.display().to_string();
-    let text = toml::to_string(contents).map_err(|error| FileError::Damaged(shown.clone(), error.to_string()))?;
-    write_atomically(path, |file| file.write_all(text.as_bytes())).map_err(|cause| FileError::Io(shown, cause))
-}
-
-fn read<T: DeserializeOwned>(path: &Path) -> Result<(String, T), FileError> {
-    let shown = path.display().to_string();
-    let text = std::fs::read_to_string(path).map_err(|cause| FileError::Io(shown.clone(), cause))?;
-    let contents = parse(&shown, &text)?;
-    Ok((shown, contents))
-}
-
-fn parse<T: DeserializeOwned>(shown: &str, text: &str) -> Result<T, FileError> {
-    toml::from_str(text).map_err(|error| FileError::Damaged(shown.into(), error.message().into()))
 }
 
 #[cfg(test)]

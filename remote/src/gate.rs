@@ -17,7 +17,8 @@ use shoal_common::channel::{ChannelError, Domain, EventName, HeartbeatSender, No
 use shoal_common::commit::{CommitReader, OpenError};
 use shoal_common::config::{Config, Mode};
 use shoal_common::policy::PolicyError;
-use shoal_common::report::{Activity, EpisodeReport, Heartbeat, Role, RoleInstance};
+use shoal_common::report::{EpisodeReport, Heartbeat};
+use shoal_common::role::{Activity, Role, RoleInstance};
 use shoal_common::run_dir::{RunDir, RunDirError};
 use shoal_common::stop::Stop;
 use zenoh::pubsub::Publisher;

@@ -9,7 +9,8 @@ use serde::{Deserialize, Serialize};
 use shoal_common::channel::policy::PolicyHeader;
 use shoal_common::channel::transitions::ChunkHeader;
 use shoal_common::commit::ChunkId;
-use shoal_common::report::{Activity, EpisodeReport, Heartbeat, Role, RoleInstance};
+use shoal_common::report::{EpisodeReport, Heartbeat};
+use shoal_common::role::{Activity, Role, RoleInstance};
 
 /// The version of this format. Increase it with every change.
 pub const VERSION: u32 = 1;

@@ -5,7 +5,7 @@
 use proptest::prelude::*;
 use shoal_common::channel::policy::PolicyHeader;
 use shoal_common::channel::transitions::ChunkHeader;
-use shoal_common::report::{Activity, Role};
+use shoal_common::role::{Activity, Role};
 use shoal_remote::wire::{
     Acknowledgement, ActorAcknowledgement, Admission, Hello, HostReport, Lease, Message, PolicyRequest, RemoteEpisode,
     RemoteRole, RunPhase, VERSION, WireChunk, WireError, WirePolicy,

@@ -259,6 +259,7 @@ mod tests {
 mod tests_support {
     //! Configurations of every algorithm, with policies that are no special case.
 
+    use shoal_common::config::AlgorithmConfig;
     use shoal_env_server::environment::make;
 
     use super::*;
@@ -283,10 +284,15 @@ mod tests_support {
             "[environment]\nname = \"cart-pole\"\n[dqn]\nhidden = [9, 8]\n",
             "[environment]\nname = \"cart-pole\"\n[dqn]\nhidden = [9]\nactivation = \"tanh\"\ndueling = true\n",
             "[environment]\nname = \"frozen-lake\"\n[q-learning]\n[replay]\nwarmup = 0\n",
+            "mode = \"lockstep\"\n[environment]\nname = \"frozen-lake\"\n[sarsa]\n[replay]\nwarmup = 0\n",
         ];
-        tasks
-            .map(|task| with_policy(&format!("[run]\nid = \"1a\"\n{task}")))
-            .into()
+        let policies = tasks.map(|task| with_policy(&format!("[run]\nid = \"1a\"\n{task}")));
+        for algorithm in AlgorithmConfig::all() {
+            let name = algorithm.name();
+            let there = policies.iter().any(|(config, _)| config.algorithm.name() == name);
+            assert!(there, "report/src/export.rs: `policies` has none of {name}");
+        }
+        policies.into()
     }
 
     fn with_policy(text: &str) -> (Config, PolicyFile) {

@@ -1,28 +1,18 @@
 //! The algorithm of a new run: the one that was asked for, or the one that suits the environment; and its defaults.
 
 use anyhow::Context;
+use shoal_common::config::AlgorithmConfig;
 use shoal_common::space::{EnvironmentSpec, Space};
 use toml::{Table, Value};
 
-use crate::plan::UsageError;
-
-/// The defaults of each algorithm: its section, and the keys of other sections that go with it.
-const DEFAULTS: [(&str, &str); 7] = [
-    ("ddpg", include_str!("../../presets/method/ddpg.toml")),
-    ("td3", include_str!("../../presets/method/td3.toml")),
-    ("sac", include_str!("../../presets/method/sac.toml")),
-    ("dqn", include_str!("../../presets/method/dqn.toml")),
-    ("reinforce", include_str!("../../presets/method/reinforce.toml")),
-    ("q-learning", include_str!("../../presets/method/q-learning.toml")),
-    ("sarsa", include_str!("../../presets/method/sarsa.toml")),
-];
+use crate::usage::UsageError;
 
 /// Settings for single Gymnasium environments, `[ID.METHOD]`, which replace the algorithm's defaults.
 const OF_ENVIRONMENTS: &str = include_str!("../../presets/method/environments.toml");
 
 /// The algorithms' names.
 pub fn names() -> impl Iterator<Item = &'static str> {
-    DEFAULTS.iter().map(|(name, _)| *name)
+    AlgorithmConfig::all().into_iter().map(|algorithm| algorithm.name())
 }
 
 /// The algorithm that the user asks for: by its name, or by a key of its section.
@@ -108,9 +98,10 @@ pub(crate) fn add_defaults(table: &mut Table, name: &str, algorithm: &'static st
 }
 
 fn defaults(algorithm: &str) -> anyhow::Result<Table> {
-    let text = DEFAULTS.iter().find(|(name, _)| *name == algorithm);
-    let (_, text) = text.with_context(|| format!("there is no algorithm {algorithm}"))?;
-    Ok(text.parse()?)
+    let all = AlgorithmConfig::all();
+    let found = all.iter().find(|known| known.name() == algorithm);
+    let found = found.with_context(|| format!("there is no algorithm {algorithm}"))?;
+    Ok(found.spec().defaults.parse()?)
 }
 
 /// Adds the keys of `defaults` that the table does not have.
@@ -143,11 +134,6 @@ mod tests {
 
     #[test]
     fn every_method_has_defaults_that_are_read_and_environments_name_methods() {
-        let all: Vec<_> = shoal_common::config::AlgorithmConfig::all();
-        assert_eq!(
-            names().collect::<Vec<_>>(),
-            all.iter().map(|one| one.name()).collect::<Vec<_>>()
-        );
         for name in names() {
             assert!(defaults(name).unwrap().contains_key(name), "{name}");
         }

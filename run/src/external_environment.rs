@@ -25,7 +25,7 @@ use shoal_common::channel::environment::{
 use shoal_common::channel::{ChannelError, Domain, EventName, Listener, Services};
 use shoal_common::config::EnvironmentConfig;
 use shoal_common::exit::Exit;
-use shoal_common::report::Role;
+use shoal_common::role::Role;
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::stop::{GRACE, Stop};
 

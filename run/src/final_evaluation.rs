@@ -1,21 +1,14 @@
 //! The evaluation at the end of a run: `final-evaluation.json` in its directory. Its launcher writes it atomically.
 
-use std::io::{ErrorKind, Write};
-
-use anyhow::Context;
 use serde::{Deserialize, Serialize};
-use shoal_common::durable::write_atomically;
 use shoal_common::run_dir::RunDir;
+use shoal_common::versioned_file::VersionedFile;
 
 use crate::evaluation::{EvaluationSummary, SavedPolicy};
-
-/// The version of the file's format.
-const FORMAT: u32 = 1;
 
 /// What the final evaluation of a run found.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct FinalEvaluation {
-    format: u32,
     /// The seed of the start states.
     pub seed: u64,
     /// The run's environment steps at that time. A run that has more now has been resumed.
@@ -45,6 +38,11 @@ pub struct FinalPolicyResult {
     pub interval: Option<(f64, f64)>,
 }
 
+impl VersionedFile for FinalEvaluation {
+    const FORMAT: u32 = 1;
+    const IF_DAMAGED: &'static str = "; delete it: nothing else depends on it";
+}
+
 impl FinalPolicyResult {
     /// The entry of a policy of this version and number of environment steps.
     pub fn new(policy: SavedPolicy, (version, env_steps): (u64, u64), summary: &EvaluationSummary) -> Self {
@@ -65,7 +63,6 @@ impl FinalEvaluation {
     /// The final evaluation of a run with this number of environment steps.
     pub fn new(seed: u64, env_steps: u64, policies: Vec<FinalPolicyResult>, kept: SavedPolicy) -> Self {
         Self {
-            format: FORMAT,
             seed,
             env_steps,
             policies,
@@ -88,21 +85,8 @@ impl FinalEvaluation {
     /// # Errors
     /// When the file cannot be read, is damaged or has another format.
     pub fn read(run: &RunDir, env_steps: u64) -> anyhow::Result<Option<Self>> {
-        let path = run.final_evaluation();
-        let text = match std::fs::read(&path) {
-            Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
-            text => text.with_context(|| format!("cannot read {}", path.display()))?,
-        };
-        let read: Self = serde_json::from_slice(&text)
-            .with_context(|| format!("{} is damaged; delete it: nothing else depends on it", path.display()))?;
-        if read.format != FORMAT {
-            anyhow::bail!(
-                "{} has format {}, this program reads format {FORMAT}",
-                path.display(),
-                read.format
-            );
-        }
-        Ok(Some(read).filter(|read| read.env_steps >= env_steps))
+        let read = Self::load_if_any(&run.final_evaluation())?;
+        Ok(read.filter(|read| read.env_steps >= env_steps))
     }
 
     /// Writes it atomically.
@@ -110,10 +94,7 @@ impl FinalEvaluation {
     /// # Errors
     /// When it cannot be written.
     pub fn write(&self, run: &RunDir) -> anyhow::Result<()> {
-        let path = run.final_evaluation();
-        let text = serde_json::to_string(self)?;
-        write_atomically(&path, |file| writeln!(file, "{text}"))
-            .with_context(|| format!("cannot write {}", path.display()))
+        Ok(self.store(&run.final_evaluation())?)
     }
 }
 
@@ -179,9 +160,8 @@ mod tests {
         assert_eq!(FinalEvaluation::read(&run, 11).unwrap(), None);
         assert_eq!(written.of(SavedPolicy::Best).unwrap().version, 4);
         assert_eq!(written.policies[0].return_mean, None);
-        let other = serde_json::to_string(&written)
-            .unwrap()
-            .replace("\"format\":1", "\"format\":2");
+        let other = std::fs::read_to_string(run.final_evaluation()).unwrap();
+        let other = other.replace("\"format\":1", "\"format\":2");
         std::fs::write(run.final_evaluation(), other).unwrap();
         let refused = FinalEvaluation::read(&run, 10).unwrap_err().to_string();
         assert!(refused.contains("format 2") && !refused.contains('\n'), "{refused}");

@@ -4,6 +4,7 @@
 pub mod algorithm;
 pub mod analysis;
 pub mod batch;
+pub mod best_policy;
 pub mod client;
 pub mod description;
 pub mod earlier_best;
@@ -26,3 +27,4 @@ pub mod status;
 pub mod suite;
 #[cfg(any(test, feature = "testing"))]
 pub mod testing;
+pub mod usage;

@@ -2,32 +2,26 @@
 //!
 //! `origin.json` in the new run's directory is written last: without it the run's beginning was interrupted.
 
-use std::io::{ErrorKind, Write};
 use std::path::Path;
 
 use anyhow::{Context, bail};
 use serde::{Deserialize, Serialize};
 use shoal_common::algorithms::TransitionUse;
 use shoal_common::config::{Config, explanation};
-use shoal_common::durable::write_atomically;
 use shoal_common::run_dir::{RunDir, RunDirError, RunLock};
 use shoal_common::section::Change;
+use shoal_common::versioned_file::VersionedFile;
 use shoal_learner::algorithms::algorithm::SavedState;
 use shoal_learner::algorithms::registry;
-use shoal_learner::networks::digest;
 use shoal_learner::process::checkpoint::{Checkpoint, Checkpoints, Counters};
 use shoal_learner::process::replay_layout;
 use shoal_learner::replay::Replay;
 
-use crate::plan::UsageError;
-
-/// The number of the file's format.
-const FORMAT: u32 = 1;
+use crate::usage::UsageError;
 
 /// What a run began with: `origin.json`.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Origin {
-    format: u32,
     /// The directory of the other run.
     pub run: String,
     /// Environment steps that its networks had learned from.
@@ -40,33 +34,17 @@ pub struct Origin {
     pub rows: u64,
 }
 
+impl VersionedFile for Origin {
+    const FORMAT: u32 = 1;
+}
+
 impl Origin {
     /// What a run began with; `None` if it began with networks of its own.
     ///
     /// # Errors
     /// When the file cannot be read, or has another format.
     pub fn read(run: &RunDir) -> anyhow::Result<Option<Self>> {
-        let path = run.origin();
-        let here = path.display();
-        let text = match std::fs::read(&path) {
-            Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
-            text => text.with_context(|| format!("cannot read {here}"))?,
-        };
-        let origin: Self = serde_json::from_slice(&text).with_context(|| format!("{here} is damaged"))?;
-        if origin.format != FORMAT {
-            bail!(
-                "{here} has format {}, and this program reads format {FORMAT}",
-                origin.format
-            );
-        }
-        Ok(Some(origin))
-    }
-
-    fn write(&self, run: &RunDir) -> anyhow::Result<()> {
-        let path = run.origin();
-        let text = serde_json::to_string(self)?;
-        write_atomically(&path, |file| writeln!(file, "{text}"))
-            .with_context(|| format!("cannot write {}", path.display()))
+        Ok(Self::load_if_any(&run.origin())?)
     }
 
     /// In words: `begins with …`.
@@ -246,21 +224,14 @@ impl Predecessor {
             ..Counters::default()
         };
         Checkpoints::new(&run.checkpoints(), config.fingerprint()).save(&begun, &borrowed)?;
-        let of_weights = |name: &&str| arrays.iter().find(|(found, _)| found == name);
-        let numbers: Vec<&[f32]> = weights
-            .iter()
-            .filter_map(of_weights)
-            .map(|it| it.1.as_slice())
-            .collect();
         let origin = Origin {
-            format: FORMAT,
             run: self.run.path().display().to_string(),
             env_steps: counters.rows,
             updates: counters.updates,
-            weights_sha256: digest::sha256(&numbers),
+            weights_sha256: self.checkpoint.weights_sha256(config),
             rows,
         };
-        origin.write(run)?;
+        origin.store(&run.origin())?;
         Ok(origin)
     }
 

@@ -1,14 +1,8 @@
 //! How a run ended: `outcome.json` in its directory, written atomically by its launcher.
 
-use std::io::{self, ErrorKind, Write};
-
-use anyhow::Context;
 use serde::{Deserialize, Serialize};
-use shoal_common::durable::write_atomically;
 use shoal_common::run_dir::RunDir;
-
-/// The version of the file's format.
-const FORMAT: u32 = 1;
+use shoal_common::versioned_file::VersionedFile;
 
 /// The reason in the outcome of a run whose launcher answers no requests yet. Its state is `Running`.
 pub const STARTING: &str = "starting";
@@ -19,7 +13,6 @@ pub const FINAL_EVALUATION: &str = "final evaluation";
 /// How a run ended.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RunOutcome {
-    format: u32,
     /// The run's state.
     pub state: RunState,
     /// Why it ended, if it did not finish.
@@ -44,11 +37,15 @@ pub enum RunState {
     Failed,
 }
 
+impl VersionedFile for RunOutcome {
+    const FORMAT: u32 = 1;
+    const IF_DAMAGED: &'static str = "; remove it and the run can be resumed";
+}
+
 impl RunOutcome {
     /// An outcome without a reason.
     pub fn new(state: RunState, steps: u64, episodes: u64) -> Self {
         Self {
-            format: FORMAT,
             state,
             reason: None,
             steps,
@@ -69,21 +66,7 @@ impl RunOutcome {
     /// # Errors
     /// When the file cannot be read, is damaged or has another format.
     pub fn read(run: &RunDir) -> anyhow::Result<Option<Self>> {
-        let path = run.outcome();
-        let text = match std::fs::read(&path) {
-            Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
-            text => text.with_context(|| format!("cannot read {}", path.display()))?,
-        };
-        let outcome: Self = serde_json::from_slice(&text)
-            .with_context(|| format!("{} is damaged; remove it and the run can be resumed", path.display()))?;
-        if outcome.format != FORMAT {
-            anyhow::bail!(
-                "{} has format {}, and this program reads format {FORMAT}",
-                path.display(),
-                outcome.format
-            );
-        }
-        Ok(Some(outcome))
+        Ok(Self::load_if_any(&run.outcome())?)
     }
 
     /// Writes the outcome atomically.
@@ -91,9 +74,6 @@ impl RunOutcome {
     /// # Errors
     /// When it cannot be written.
     pub fn write(&self, run: &RunDir) -> anyhow::Result<()> {
-        let path = run.outcome();
-        let text = serde_json::to_string(self)?;
-        let write = |file: &mut dyn Write| -> io::Result<()> { writeln!(file, "{text}") };
-        write_atomically(&path, |file| write(file)).with_context(|| format!("cannot write {}", path.display()))
+        Ok(self.store(&run.outcome())?)
     }
 }

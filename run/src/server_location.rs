@@ -3,7 +3,6 @@
 //! and with any `PATH`.
 
 use std::ffi::OsString;
-use std::io::{self, ErrorKind, Write};
 use std::os::unix::ffi::{OsStrExt, OsStringExt};
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
@@ -11,16 +10,12 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 use serde::{Deserialize, Serialize};
 use shoal_common::config::{Config, Mode};
-use shoal_common::durable::write_atomically;
 use shoal_common::run_dir::RunDir;
-
-/// The version of the file's format.
-const FORMAT: u32 = 1;
+use shoal_common::versioned_file::{VersionedFile, VersionedFileError};
 
 /// A directory and a program, both absolute. Symbolic links are kept: Python finds its virtual environment by them.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ServerLocation {
-    format: u32,
     directory: PathText,
     program: PathText,
     /// The file that it was read from.
@@ -52,6 +47,11 @@ impl PathText {
     }
 }
 
+impl VersionedFile for ServerLocation {
+    const FORMAT: u32 = 1;
+    const IF_DAMAGED: &'static str = "; without it the environment server is started from the current directory";
+}
+
 impl ServerLocation {
     /// The current directory, and the program of this command as a shell would find it. `None` for an empty command.
     ///
@@ -67,7 +67,6 @@ impl ServerLocation {
             bail!("cannot start the environment server {program}: there is no such file");
         };
         Ok(Some(Self {
-            format: FORMAT,
             directory: PathText::of(directory),
             program: PathText::of(program),
             file: None,
@@ -81,17 +80,13 @@ impl ServerLocation {
     /// exists.
     pub fn of_run(run: &RunDir) -> anyhow::Result<Option<Self>> {
         let file = run.server_file();
-        let text = match std::fs::read(&file) {
-            Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
-            text => text.with_context(|| format!("cannot read {}", file.display()))?,
-        };
-        let shown = file.display().to_string();
-        let location: Self = serde_json::from_slice(&text).with_context(|| {
-            format!("{shown} is damaged; without it the environment server is started from the current directory")
+        let location = Self::load_if_any(&file).map_err(|error| match error {
+            VersionedFileError::Format { path, found, expected } => {
+                anyhow::anyhow!("{path} is of form {found}, this program's is {expected}")
+            }
+            other => other.into(),
         })?;
-        if location.format != FORMAT {
-            bail!("{shown} is of form {}, this program's is {FORMAT}", location.format);
-        }
+        let Some(location) = location else { return Ok(None) };
         let location = Self {
             file: Some(file),
             ..location
@@ -105,10 +100,7 @@ impl ServerLocation {
     /// # Errors
     /// When it cannot be written.
     pub fn write(&self, run: &RunDir) -> anyhow::Result<()> {
-        let file = run.server_file();
-        let text = serde_json::to_string(self)?;
-        let write = |to: &mut dyn Write| -> io::Result<()> { writeln!(to, "{text}") };
-        write_atomically(&file, |to| write(to)).with_context(|| format!("cannot write {}", file.display()))
+        Ok(self.store(&run.server_file())?)
     }
 
     /// The directory it is started in.
@@ -226,7 +218,6 @@ mod tests {
             std::fs::create_dir(&directory).unwrap();
             let program = program_in(&directory, "serve");
             let location = ServerLocation {
-                format: FORMAT,
                 directory: PathText::of(directory.clone()),
                 program: PathText::of(program.clone()),
                 file: None,

@@ -6,7 +6,6 @@ use shoal_common::config::Config;
 use shoal_common::evaluator_state::EvaluatorState;
 use shoal_common::run_dir::RunDir;
 use shoal_learner::process::checkpoint::Checkpoints;
-use shoal_learner::process::ratio::Ratio;
 
 use crate::outcome::{RunOutcome, RunState};
 use crate::recorder::read_evaluations;
@@ -50,7 +49,7 @@ fn is_finished(config: &Config, run: &RunDir, status: &RunStatus) -> anyhow::Res
         return Ok(outcome.state == RunState::Finished);
     }
     // Earlier versions wrote no outcome.
-    Ok(status.updates >= Ratio::from(&config.replay).allowed(status.env_steps))
+    Ok(status.updates >= config.replay.agreed_updates(status.env_steps))
 }
 
 /// Rows committed to a run's replay; 0 if it has none yet.

@@ -3,17 +3,14 @@
 
 use std::collections::BTreeSet;
 use std::fs::File;
-use std::io::{ErrorKind, Write};
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use anyhow::{Context, bail};
 use serde::{Deserialize, Serialize};
-use shoal_common::durable::write_atomically;
 use shoal_common::file_lock;
-
-/// The number of the file's format.
-const FORMAT: u32 = 1;
+use shoal_common::versioned_file::VersionedFile;
 
 /// Most runs in a suite.
 const MOST: usize = 10_000;
@@ -24,7 +21,6 @@ const NAME: usize = 200;
 /// What a suite consists of: `suite.json`.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Suite {
-    format: u32,
     /// The preset, environment or file.
     pub what: String,
     /// The arguments of `train` that all runs have.
@@ -128,6 +124,10 @@ pub fn seeds(text: &str) -> Result<Vec<u64>, String> {
     Ok(seeds)
 }
 
+impl VersionedFile for Suite {
+    const FORMAT: u32 = 1;
+}
+
 impl Suite {
     /// The suite of all combinations of these values, each with every seed. Without seeds, each has that of the preset or
     /// file.
@@ -180,7 +180,6 @@ impl Suite {
             }
         }
         Ok(Self {
-            format: FORMAT,
             what,
             arguments,
             trials,
@@ -197,14 +196,7 @@ impl Suite {
         if !path.is_file() {
             return Ok(None);
         }
-        let text = std::fs::read(&path).with_context(|| format!("cannot read {here}"))?;
-        let suite: Self = serde_json::from_slice(&text).with_context(|| format!("{here} is damaged"))?;
-        if suite.format != FORMAT {
-            bail!(
-                "{here} has format {}, and this program reads format {FORMAT}",
-                suite.format
-            );
-        }
+        let suite = Self::load(&path)?;
         let is_plain = |name: &str| !name.is_empty() && !name.contains('/') && name != "." && name != "..";
         if let Some(trial) = suite.trials.iter().find(|trial| !is_plain(&trial.name)) {
             bail!("{here} is damaged: {:?} is no name of a run", trial.name);
@@ -217,10 +209,7 @@ impl Suite {
     /// # Errors
     /// When it cannot be written.
     pub fn write(&self, directory: &Path) -> anyhow::Result<()> {
-        let path = file(directory);
-        let text = serde_json::to_string(self)?;
-        write_atomically(&path, |file| writeln!(file, "{text}"))
-            .with_context(|| format!("cannot write {}", path.display()))
+        Ok(self.store(&file(directory))?)
     }
 
     /// The directories of its runs that exist.

@@ -106,8 +106,8 @@ mod with_network {
     use shoal_remote::wire::{Admission, Hello, Lease, vector_instructions};
     use shoal_run::joining::make_host_directory;
     use shoal_run::outcome::{RunOutcome, RunState};
-    use shoal_run::plan::UsageError;
     use shoal_run::signals::{Signals, exit_code};
+    use shoal_run::usage::UsageError;
 
     use super::*;
     use crate::launcher::joined::{self, JoinEnd};

@@ -9,7 +9,7 @@ use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
 use shoal_remote::endpoint::Endpoint;
 use shoal_remote::files::JoinFile;
-use shoal_run::plan::UsageError;
+use shoal_run::usage::UsageError;
 
 use super::join::NOT_BUILT;
 

@@ -12,12 +12,13 @@ use shoal_common::run_dir::RunDir;
 use shoal_run::earlier_best::{ReevaluatedPolicy, reevaluate_best, reevaluate_if_needed};
 use shoal_run::numbers::count;
 use shoal_run::origin::Origin;
-use shoal_run::plan::{RequestedChanges, Revision, UsageError, warning};
+use shoal_run::plan::{RequestedChanges, Revision, warning};
 use shoal_run::recorder::{ChangeRecord, Moment};
 use shoal_run::server_location::ServerLocation;
 use shoal_run::signals::{Signals, exit_code};
 use shoal_run::status;
 use shoal_run::suite::Suite;
+use shoal_run::usage::UsageError;
 
 use super::listen::ListenArgs;
 use super::training::OutputMode;

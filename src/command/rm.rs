@@ -11,8 +11,8 @@ use shoal_common::channel::Domain;
 use shoal_common::durable::write_atomically;
 use shoal_common::run_dir::{RunDir, RunDirError, RunLock};
 use shoal_run::numbers::mebibytes;
-use shoal_run::plan::UsageError;
 use shoal_run::suite::{self, Suite};
+use shoal_run::usage::UsageError;
 
 use crate::launcher;
 

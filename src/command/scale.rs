@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use anyhow::bail;
 use clap::Args;
 use shoal_common::channel::control::{RoleState, RunStatus};
-use shoal_common::report::Role;
+use shoal_common::role::Role;
 use shoal_run::client::RunClient;
 use shoal_run::numbers::small_count;
 

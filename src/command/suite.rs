@@ -18,12 +18,13 @@ use shoal_run::evaluation::SavedPolicy;
 use shoal_run::external_environment::tied;
 use shoal_run::final_evaluation::FinalEvaluation;
 use shoal_run::numbers::thousands;
-use shoal_run::plan::{self, RunOverrides, UsageError};
+use shoal_run::plan::{self, RunOverrides};
 use shoal_run::preflight;
 use shoal_run::recorder::recorded;
 use shoal_run::signals::{Signals, exit_code};
 use shoal_run::status::saved_status;
 use shoal_run::suite::{self, Suite, Sweep, Trial};
+use shoal_run::usage::UsageError;
 
 use super::detach;
 use super::train::TrainArgs;
@@ -75,7 +76,7 @@ pub(crate) fn train(args: &TrainArgs, what: &str, overrides: &RunOverrides) -> a
         from: overrides.from.as_deref().map(absolute).transpose()?,
         ..overrides.clone()
     };
-    let suite = Suite::new(what, arguments(&common), &sweeps, &seeds)?;
+    let suite = Suite::new(what, common.arguments(), &sweeps, &seeds)?;
     let options = SuiteOptions {
         // Each takes the lock of the run whose replay it copies.
         jobs: if common.with_replay { Some(1) } else { args.jobs },
@@ -120,38 +121,6 @@ fn begin(
 /// Continues the suite in this directory.
 pub(crate) fn resume(suite: &Suite, directory: &Path, options: SuiteOptions<'_>) -> anyhow::Result<ExitCode> {
     run(suite, directory, &RunOverrides::default(), options)
-}
-
-/// The arguments of `train` for these overrides, except directory and seed.
-fn arguments(overrides: &RunOverrides) -> Vec<String> {
-    let RunOverrides {
-        run: _,
-        algorithm,
-        seed: _,
-        actors,
-        envs,
-        steps,
-        episodes,
-        lockstep,
-        set,
-        from,
-        with_replay,
-    } = overrides;
-    let mut arguments = Vec::new();
-    let mut option = |name: &str, value: Option<String>| {
-        arguments.extend(value.into_iter().flat_map(|value| [name.to_owned(), value]));
-    };
-    option("--method", algorithm.clone());
-    option("--actors", actors.map(|number| number.to_string()));
-    option("--envs", envs.map(|number| number.to_string()));
-    option("--steps", steps.map(|number| number.to_string()));
-    option("--episodes", episodes.map(|number| number.to_string()));
-    option("--from", from.as_ref().map(|path| path.display().to_string()));
-    set.iter()
-        .for_each(|assignment| option("--set", Some(assignment.clone())));
-    arguments.extend(lockstep.then(|| "--lockstep".into()));
-    arguments.extend(with_replay.then(|| "--with-replay".into()));
-    arguments
 }
 
 /// Checks the configuration of each combination of values. Returns the usual name of a run of this kind.

@@ -1,16 +1,14 @@
 //! `shoal train`: a new run, from its configuration to its result.
 
 use std::io::Write;
-use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::Context;
 use clap::Args;
-use clap::builder::PossibleValuesParser;
 use clap_complete::engine::ArgValueCompleter;
-use shoal_run::numbers::{count, small_count};
-use shoal_run::plan::{Plan, RunOverrides, UsageError};
+use shoal_run::plan::{Plan, RunOverrides, preset_patterns};
 use shoal_run::suite;
+use shoal_run::usage::UsageError;
 
 use super::listen::ListenArgs;
 use super::training::OutputMode;
@@ -20,9 +18,7 @@ use crate::{completion, launcher};
 
 #[derive(Args, Clone, Debug)]
 pub(crate) struct TrainArgs {
-    /// What to train: frozen-lake, frozen-lake-sarsa, cart-pole, pendulum, point-mass-r1, point-mass-r2, point-mass-r3,
-    /// one of the last four with -sac or -td3, gym: with a Gymnasium environment (gym:HalfCheetah-v5), or a
-    /// configuration file (FILE.toml).
+    #[arg(help = help_of_what())]
     #[arg(value_name = "PRESET|gym:ID|FILE.toml", required_unless_present = "help_config")]
     #[arg(add = ArgValueCompleter::new(completion::presets_and_files))]
     pub(crate) what: Option<String>,
@@ -30,7 +26,7 @@ pub(crate) struct TrainArgs {
     #[arg(long)]
     pub(crate) help_config: bool,
     #[command(flatten)]
-    pub(crate) overrides: RunArgs,
+    pub(crate) overrides: RunOverrides,
     /// Train a suite: a run for each of these seeds, as in 1..5 (five seeds) or 1,4,7.
     #[arg(long, value_name = "A..B", value_parser = seeds, conflicts_with = "seed")]
     pub(crate) seeds: Option<Seeds>,
@@ -46,6 +42,14 @@ pub(crate) struct TrainArgs {
     pub(crate) listen: ListenArgs,
 }
 
+fn help_of_what() -> String {
+    format!(
+        "What to train: a preset ({}), gym: with a Gymnasium environment (gym:HalfCheetah-v5), or a configuration file \
+         (FILE.toml)",
+        preset_patterns()
+    )
+}
+
 /// The seeds of a suite.
 #[derive(Clone, Debug)]
 pub(crate) struct Seeds(pub(crate) Vec<u64>);
@@ -54,80 +58,10 @@ fn seeds(text: &str) -> Result<Seeds, String> {
     suite::seeds(text).map(Seeds)
 }
 
-/// The settings of a run that have options of their own, and `--set`.
-#[derive(Args, Clone, Debug, Default)]
-pub(crate) struct RunArgs {
-    /// Run directory to create [default: runs/<preset>-<n>].
-    #[arg(long, value_name = "DIR")]
-    pub(crate) run: Option<PathBuf>,
-    /// The algorithm: ddpg, td3, sac, dqn, reinforce, q-learning or sarsa [default: the preset's; for gym: the one that
-    /// suits the spaces].
-    #[arg(long = "method", value_name = "METHOD", value_parser = PossibleValuesParser::new(shoal_run::algorithm::names()))]
-    pub(crate) algorithm: Option<String>,
-    /// Seed of every random stream.
-    #[arg(long)]
-    pub(crate) seed: Option<u64>,
-    /// Actor processes.
-    #[arg(long, value_name = "N", value_parser = small_count)]
-    pub(crate) actors: Option<u32>,
-    /// Environments of each actor.
-    #[arg(long, value_name = "E", value_parser = small_count)]
-    pub(crate) envs: Option<u32>,
-    /// Environment steps of all actors together.
-    #[arg(long, value_name = "N", value_parser = count)]
-    pub(crate) steps: Option<u64>,
-    /// Episodes of all actors together; the run ends at this limit or at its steps, whichever comes first.
-    #[arg(long, value_name = "M", value_parser = count)]
-    pub(crate) episodes: Option<u64>,
-    /// Lockstep: actors and learner take turns, and the same seed and number of actors give the same bits.
-    #[arg(long)]
-    pub(crate) lockstep: bool,
-    /// Set a key of the configuration, as in --set ddpg.tau=0.005. May be repeated.
-    #[arg(long, value_name = "SECTION.KEY=VALUE", add = ArgValueCompleter::new(completion::settings))]
-    pub(crate) set: Vec<String>,
-    /// Begin with the networks of this run, whose algorithm and shapes it then has.
-    #[arg(long, value_name = "RUN")]
-    pub(crate) from: Option<PathBuf>,
-    /// Begin with the replay of that run too. The new run's steps are counted from its rows on.
-    #[arg(long, requires = "from")]
-    pub(crate) with_replay: bool,
-}
-
-impl RunArgs {
-    fn overrides(&self) -> RunOverrides {
-        let Self {
-            run,
-            algorithm,
-            seed,
-            actors,
-            envs,
-            steps,
-            episodes,
-            lockstep,
-            set,
-            from,
-            with_replay,
-        } = self.clone();
-        RunOverrides {
-            run,
-            algorithm,
-            seed,
-            actors,
-            envs,
-            steps,
-            episodes,
-            lockstep,
-            set,
-            from,
-            with_replay,
-        }
-    }
-}
-
 /// Creates a run and trains it, or explains the configuration.
 pub(crate) fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
     if args.help_config {
-        help_config::explain(args.what.as_deref(), &args.overrides.overrides())?;
+        help_config::explain(args.what.as_deref(), &args.overrides)?;
         return Ok(ExitCode::SUCCESS);
     }
     args.listen.check()?;
@@ -141,7 +75,7 @@ pub(crate) fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
                 UsageError("--listen: other hosts join a single run, without --seeds and --sweep".into()).into(),
             );
         }
-        return super::suite::train(args, what, &args.overrides.overrides());
+        return super::suite::train(args, what, &args.overrides);
     }
     if args.jobs.is_some() {
         return Err(UsageError("--jobs: only for several runs, with --seeds or --sweep".into()).into());
@@ -152,7 +86,7 @@ pub(crate) fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
         lock,
         origin,
         warnings,
-    } = Plan::new(what, &args.overrides.overrides())?;
+    } = Plan::new(what, &args.overrides)?;
     for warning in warnings {
         writeln!(std::io::stderr(), "warning: {warning}")?;
     }

@@ -10,17 +10,13 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
 use shoal_common::channel::control::RunStatus;
 use shoal_common::config::Config;
-use shoal_common::policy_file::PolicyFile;
 use shoal_common::run_dir::{RunDir, RunLock};
-use shoal_learner::algorithms::registry;
-use shoal_learner::networks::digest;
 use shoal_learner::process::checkpoint::Checkpoints;
 use shoal_report::plots;
-use shoal_run::evaluation::{EvaluationSummary, SavedPolicy, evaluate_until};
-use shoal_run::final_evaluation::{FinalEvaluation, FinalPolicyResult};
+use shoal_run::best_policy::{self, EvaluatedPolicy};
+use shoal_run::evaluation::{EvaluationSummary, SavedPolicy};
 use shoal_run::numbers::thousands;
 use shoal_run::outcome::{FINAL_EVALUATION, RunOutcome, RunState};
-use shoal_run::recorder::record_final;
 use shoal_run::signals::{Interrupt, Signals, describe, exit_code};
 
 use super::listen::ListenArgs;
@@ -110,7 +106,7 @@ fn train_and_report(
                     "{why}; the training is finished; to evaluate it: shoal eval {here}"
                 ));
                 finished = finished.with_reason(why);
-                keep_some_policy(&config, run)?;
+                best_policy::keep_some(&config, run)?;
             }
         }
     }
@@ -122,7 +118,7 @@ fn train_and_report(
     if outcome.ending == RunEnd::Finished {
         finished.write(run)?;
     }
-    let summary = Summary::new(&config, run, &outcome, evaluated.first().map(|(_, summary)| summary))?;
+    let summary = Summary::new(&config, run, &outcome, evaluated.first().map(|first| &first.summary))?;
     if !output.quiet {
         // As in `say`.
         let _ = write_summary(&mut std::io::stderr().lock(), run, &outcome, &summary, &evaluated);
@@ -144,85 +140,37 @@ fn say(line: &str) {
     let _ = writeln!(std::io::stderr(), "{line}");
 }
 
-/// The final evaluation: first of the policy with the best evaluation, then of the last one. Afterwards `best.policy` is
-/// the better of them.
+/// As [`best_policy::choose`], with a bar for the progress.
 fn final_evaluation(
     config: &Config,
     run: &RunDir,
     env_steps: u64,
     interrupt: &Interrupt,
     quiet: bool,
-) -> anyhow::Result<Vec<(&'static str, EvaluationSummary)>> {
+) -> anyhow::Result<Vec<EvaluatedPolicy>> {
     let target = if quiet {
         ProgressDrawTarget::hidden()
     } else {
         ProgressDrawTarget::stderr()
     };
-    let (episodes, seed) = (config.evaluation.final_episodes, config.run.seed);
+    let episodes = config.evaluation.final_episodes;
     let bar = ProgressBar::with_draw_target(Some(episodes.into()), target);
     bar.set_style(ProgressStyle::with_template(
         "final evaluation, {msg} {bar:16.cyan/dim} {pos}/{len} episodes",
     )?);
-    let mut evaluated = Vec::new();
-    for (name, path, policy) in [
-        ("best policy", run.best_policy(), SavedPolicy::Best),
-        ("last policy", run.last_policy(), SavedPolicy::Last),
-    ] {
-        if path.exists() {
-            bar.set_message(name);
-            let file = policy.read(run, config)?;
-            if !file.parameters.iter().all(|parameter| parameter.is_finite()) {
-                continue;
-            }
-            let progress = |finished: u32| bar.set_position(finished.into());
-            let summary = evaluate_until(run, config, &file.parameters, (episodes, seed), interrupt, progress);
-            let summary = summary.inspect_err(|_| bar.finish_and_clear())?;
-            evaluated.push((name, policy, file, summary));
-        }
-    }
+    let evaluated = best_policy::choose(config, run, env_steps, interrupt, |policy, finished| {
+        bar.set_message(name(policy));
+        bar.set_position(finished.into());
+    });
     bar.finish_and_clear();
-    // The last policy replaces the best one only if it is better.
-    let mut kept: Option<&(&str, SavedPolicy, PolicyFile, EvaluationSummary)> = None;
-    for candidate in evaluated.iter().filter(|(.., summary)| summary.return_mean.is_finite()) {
-        if kept.is_none_or(|(.., summary)| candidate.3.return_mean > summary.return_mean) {
-            kept = Some(candidate);
-        }
-    }
-    let Some((_, kept_policy, file, kept_summary)) = kept else {
-        anyhow::bail!("no policy has a finite return");
-    };
-    if *kept_policy == SavedPolicy::Last {
-        let best = PolicyFile {
-            return_mean: kept_summary.return_mean,
-            return_std: kept_summary.return_std,
-            episodes: kept_summary.episodes.into(),
-            ..file.clone()
-        };
-        best.write(&run.best_policy())?;
-    }
-    let entry = |(_, policy, file, summary): &(_, SavedPolicy, PolicyFile, _)| {
-        FinalPolicyResult::new(*policy, (file.version, file.env_steps), summary)
-    };
-    let result = FinalEvaluation::new(seed, env_steps, evaluated.iter().map(entry).collect(), *kept_policy);
-    result.write(run)?;
-    record_final(run, &result)?;
-    let best = ("best policy", kept_summary.clone());
-    let last = evaluated.iter().filter(|(_, policy, ..)| *policy == SavedPolicy::Last);
-    let last = last.map(|(name, .., summary)| (*name, summary.clone()));
-    Ok(std::iter::once(best).chain(last).collect())
+    evaluated
 }
 
-/// Keeps the last policy as the best one if there is no policy with a finite evaluation, so that the run has a policy to
-/// use.
-fn keep_some_policy(config: &Config, run: &RunDir) -> anyhow::Result<()> {
-    let kept = run.best_policy().exists() && SavedPolicy::Best.read(run, config)?.return_mean.is_finite();
-    if !kept && run.last_policy().exists() {
-        let last = SavedPolicy::Last.read(run, config)?;
-        if last.parameters.iter().all(|parameter| parameter.is_finite()) {
-            last.write(&run.best_policy())?;
-        }
+fn name(policy: SavedPolicy) -> &'static str {
+    match policy {
+        SavedPolicy::Best => "best policy",
+        SavedPolicy::Last => "last policy",
     }
-    Ok(())
 }
 
 impl Summary {
@@ -242,6 +190,7 @@ impl Summary {
         // Saturating: a learner whose newest checkpoint was damaged has fallen back to an older one.
         let done = updates.saturating_sub(outcome.before.updates);
         let taken = env_steps.saturating_sub(outcome.before.env_steps);
+        let newest = Checkpoints::new(&run.checkpoints(), config.fingerprint()).load_newest()?;
         Ok(Self {
             run: run.path().display().to_string(),
             env_steps,
@@ -253,20 +202,9 @@ impl Summary {
             eval_return_mean: evaluated.map(|evaluated| evaluated.return_mean),
             eval_return_std: evaluated.map(|evaluated| evaluated.return_std),
             eval_episodes: evaluated.map(|evaluated| evaluated.episodes),
-            weights_sha256: weights_sha256(config, run)?,
+            weights_sha256: newest.map(|loaded| loaded.checkpoint.weights_sha256(config)),
         })
     }
-}
-
-/// SHA-256 of the learned weights in the newest checkpoint; for DDPG: actor, critic and both targets. If observations are
-/// normalised, their statistics are included.
-fn weights_sha256(config: &Config, run: &RunDir) -> anyhow::Result<Option<String>> {
-    let loaded = Checkpoints::new(&run.checkpoints(), config.fingerprint()).load_newest()?;
-    Ok(loaded.map(|loaded| {
-        let array = |name| loaded.checkpoint.arrays.iter().find(|(found, _)| found == name);
-        let weights = registry::weights(config).into_iter().filter_map(array);
-        digest::sha256(&weights.map(|(_, numbers)| numbers.as_slice()).collect::<Vec<_>>())
-    }))
 }
 
 fn write_summary(
@@ -274,7 +212,7 @@ fn write_summary(
     run: &RunDir,
     outcome: &TrainingOutcome,
     summary: &Summary,
-    evaluated: &[(&str, EvaluationSummary)],
+    evaluated: &[EvaluatedPolicy],
 ) -> std::io::Result<()> {
     let mut table = Table::new();
     table.load_style(UTF8_BORDERS_ONLY);
@@ -289,7 +227,11 @@ fn write_summary(
             summary.updates_per_second, summary.env_steps_per_second
         ),
     ]);
-    for (name, evaluated) in evaluated {
+    for EvaluatedPolicy {
+        policy,
+        summary: evaluated,
+    } in evaluated
+    {
         let mut text = format!(
             "return {:.2} ± {:.2} over {} episodes",
             evaluated.return_mean, evaluated.return_std, evaluated.episodes
@@ -300,7 +242,7 @@ fn write_summary(
                 100.0 * reached
             );
         }
-        table.add_row([*name, &text]);
+        table.add_row([name(*policy), &text]);
     }
     writeln!(to, "{table}")?;
     let here = run.path().display();

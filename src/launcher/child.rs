@@ -5,7 +5,8 @@ use std::process::ExitStatus;
 use std::time::{Duration, Instant};
 
 use shoal_common::channel::control::{RoleState, RoleStatus};
-use shoal_common::report::{Activity, Heartbeat, Role, RoleInstance};
+use shoal_common::report::Heartbeat;
+use shoal_common::role::{Activity, Role, RoleInstance};
 use shoal_run::rate::per_second;
 use signal_hook::consts::{SIGABRT, SIGBUS, SIGFPE, SIGILL, SIGSEGV};
 

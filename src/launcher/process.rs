@@ -7,7 +7,7 @@ use std::path::Path;
 use std::process::{ChildStdin, Command, ExitStatus};
 
 use anyhow::Context;
-use shoal_common::report::RoleInstance;
+use shoal_common::role::RoleInstance;
 use shoal_run::process::{ChildGroup, ChildOutput, Writer};
 
 use super::log::Log;

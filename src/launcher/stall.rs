@@ -5,7 +5,7 @@
 
 use std::time::{Duration, Instant};
 
-use shoal_common::report::{Activity, Role};
+use shoal_common::role::{Activity, Role};
 
 use super::child::{Child, SILENT};
 

@@ -7,13 +7,14 @@ use std::process::ExitStatus;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
-use shoal_actor::actor::GIVEN_UP;
+use shoal_actor::environment::GIVEN_UP;
 use shoal_common::channel::control::{ControlResponse, HostLease, HostRequest, HostStatus, RoleStatus};
 use shoal_common::channel::environment::ResponseFault;
 use shoal_common::channel::{Domain, Services};
 use shoal_common::config::{Config, Mode};
 use shoal_common::durable::write_atomically;
-use shoal_common::report::{Activity, Heartbeat, Role, RoleInstance};
+use shoal_common::report::Heartbeat;
+use shoal_common::role::{Activity, Role, RoleInstance};
 use shoal_common::run_dir::RunDir;
 use shoal_run::process::Writer;
 use shoal_run::recorder::{Incident, IncidentKind};

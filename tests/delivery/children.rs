@@ -12,7 +12,7 @@ use shoal_common::channel::policy::{PolicyHeader, PolicyPublisher};
 use shoal_common::channel::transitions::ChunkSender;
 use shoal_common::channel::{Domain, EventName, HeartbeatSender, Listener, Notifier, Services, wait_for};
 use shoal_common::commit::{CommitReader, OpenError};
-use shoal_common::report::{Role, RoleInstance};
+use shoal_common::role::{Role, RoleInstance};
 use shoal_common::stop::Stop;
 use shoal_env_server::server::serve;
 use shoal_env_server::vector::VectorEnvironment;

@@ -9,7 +9,7 @@ use shoal_common::channel::environment::{
 };
 use shoal_common::channel::{ChannelError, Domain, EventName, Listener};
 use shoal_common::exit::Exit;
-use shoal_common::report::Role;
+use shoal_common::role::Role;
 
 use crate::children::{ENVS, pendulums};
 use crate::run::{Run, TIMEOUT, Watchdog};

@@ -7,6 +7,7 @@
 
 mod crates;
 mod cycles;
+mod lists;
 mod scan;
 
 use std::path::Path;

@@ -15,7 +15,7 @@ use iceoryx2::service::port_factory::event::PortFactory;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
 use shoal_base::exit::Exit;
-use shoal_base::report::Role;
+use shoal_base::role::Role;
 use shoal_base::stop::Stop;
 
 use super::domain::Domain;

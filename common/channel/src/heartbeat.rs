@@ -2,7 +2,8 @@
 
 use std::time::{Duration, Instant};
 
-use shoal_base::report::{Activity, Heartbeat, RoleInstance};
+use shoal_base::report::Heartbeat;
+use shoal_base::role::{Activity, RoleInstance};
 
 use super::domain::Domain;
 use super::error::ChannelError;

@@ -8,7 +8,8 @@ use std::os::unix::fs::OpenOptionsExt;
 
 use iceoryx2::identifiers::UniqueNodeId;
 use iceoryx2::prelude::CallbackProgression;
-use shoal_base::report::{EpisodeReport, EvaluatedReport, EvaluationReport, Heartbeat, LearnerReport, Role};
+use shoal_base::report::{EpisodeReport, EvaluatedReport, EvaluationReport, Heartbeat, LearnerReport};
+use shoal_base::role::Role;
 
 use super::cleanup::{Sweeper, is_alive};
 use super::domain::{Domain, DomainError, io_error};

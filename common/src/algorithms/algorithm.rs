@@ -17,6 +17,9 @@ pub struct AlgorithmSpec {
     pub off_policy: bool,
     /// How it uses transitions.
     pub transition_use: TransitionUse,
+    /// The defaults of a new run, a configuration in TOML: its section, and the keys of other sections that go with it.
+    /// This is `presets/method/NAME.toml`.
+    pub defaults: &'static str,
 }
 
 /// How an algorithm uses the transitions that it learns from.

@@ -15,6 +15,7 @@ pub(super) const SPEC: AlgorithmSpec = AlgorithmSpec {
     name: "ddpg",
     off_policy: true,
     transition_use: TransitionUse::Minibatches,
+    defaults: include_str!("../../../presets/method/ddpg.toml"),
 };
 
 section! {

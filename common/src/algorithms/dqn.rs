@@ -14,6 +14,7 @@ pub(super) const SPEC: AlgorithmSpec = AlgorithmSpec {
     name: "dqn",
     off_policy: true,
     transition_use: TransitionUse::Minibatches,
+    defaults: include_str!("../../../presets/method/dqn.toml"),
 };
 
 section! {

@@ -16,6 +16,7 @@ pub(super) const SPEC: AlgorithmSpec = AlgorithmSpec {
     name: "reinforce",
     off_policy: false,
     transition_use: TransitionUse::Episodes,
+    defaults: include_str!("../../../presets/method/reinforce.toml"),
 };
 
 section! {

@@ -14,6 +14,7 @@ pub(super) const SPEC: AlgorithmSpec = AlgorithmSpec {
     name: "sac",
     off_policy: true,
     transition_use: TransitionUse::Minibatches,
+    defaults: include_str!("../../../presets/method/sac.toml"),
 };
 
 section! {

@@ -13,6 +13,7 @@ pub(super) const Q_LEARNING: AlgorithmSpec = AlgorithmSpec {
     name: "q-learning",
     off_policy: true,
     transition_use: TransitionUse::Transitions,
+    defaults: include_str!("../../../presets/method/q-learning.toml"),
 };
 
 /// SARSA.
@@ -20,6 +21,7 @@ pub(super) const SARSA: AlgorithmSpec = AlgorithmSpec {
     name: "sarsa",
     off_policy: false,
     transition_use: TransitionUse::Transitions,
+    defaults: include_str!("../../../presets/method/sarsa.toml"),
 };
 
 section! {

@@ -51,7 +51,7 @@ pub fn set_by_program() -> Vec<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::{DdpgConfig, ReinforceConfig};
+    use crate::config::{Config, DdpgConfig, ReinforceConfig};
 
     #[test]
     fn every_key_says_whether_it_may_change() {
@@ -70,6 +70,54 @@ mod tests {
                 "replay.updates_before"
             ]
         );
+    }
+
+    fn minimal() -> toml::Table {
+        let text = "[run]\nid = \"1a\"\n[environment]\nname = \"x\"\n[spec]\ntime_limit = 200\n\
+            observation.discrete.n = 16\naction.box = { low = [-2.0], high = [2.0] }\n";
+        text.parse().unwrap()
+    }
+
+    /// The error for this value of a key; `None` if it is accepted.
+    fn refused(section: &str, key: &str, value: toml::Value) -> Option<String> {
+        let mut table = minimal();
+        let own = table.entry(section).or_insert_with(|| toml::Table::new().into());
+        own.as_table_mut().unwrap().insert(key.into(), value);
+        Config::from_table(table, "test").err().map(|error| error.to_string())
+    }
+
+    #[test]
+    fn every_section_that_is_written_is_explained() {
+        let written = toml::Table::try_from(Config::from_table(minimal(), "test").unwrap()).unwrap();
+        for name in written.keys().filter(|name| *name != "spec") {
+            let explained = sections().iter().any(|section| section.name == name);
+            assert!(explained, "common/src/config/explanation.rs: no line for {name}");
+        }
+    }
+
+    #[test]
+    fn an_error_names_section_and_key_and_every_number_is_checked() {
+        for Section { name, keys, .. } in sections() {
+            if name != "environment" {
+                let error = refused(name, "nonsense", 1.into()).unwrap();
+                assert!(
+                    error.contains(&format!("{name}.nonsense = 1")),
+                    "first_unreadable: {error}"
+                );
+            }
+            // Every whole number is a seed.
+            let bounded = |key: &&Key| !key.bounds.is_empty() && key.name != "seed";
+            for key in keys.iter().filter(bounded) {
+                // Some numbers have only a least value.
+                let values = match key.whole {
+                    true => vec![toml::Value::from(0), (1_i64 << 62).into()],
+                    false => vec![f64::NAN.into()],
+                };
+                let error = values.into_iter().find_map(|value| refused(name, &key.name, value));
+                let error = error.unwrap_or_else(|| panic!("{name}.{} is not checked", key.name));
+                assert!(error.contains(&format!("{name}.{} = ", key.name)), "{error}");
+            }
+        }
     }
 
     #[test]

@@ -47,6 +47,9 @@ fn is_zero(number: &u64) -> bool {
     *number == 0
 }
 
+/// The ratio of updates to environment steps: the formulas that learner, launcher and records share. Neither the learner
+/// nor the actors may get ahead of the ratio. An update is a gradient step or, for algorithms that use each row once, a
+/// row.
 impl ReplayConfig {
     /// The environment step after which the ratio counts.
     pub fn ratio_start(&self) -> u64 {
@@ -57,6 +60,13 @@ impl ReplayConfig {
     pub fn agreed_updates(&self, rows: u64) -> u64 {
         let counted = rows.saturating_sub(self.ratio_start());
         self.updates_before + (counted as f64 * self.updates_per_step) as u64
+    }
+
+    /// Whether a learner with this many updates is behind by more than the tolerance, so that it should take no more
+    /// than `rows` environment steps.
+    pub fn is_behind(&self, rows: u64, updates: u64) -> bool {
+        let rows = rows.saturating_sub(self.tolerance);
+        rows > self.ratio_start() && self.agreed_updates(rows) > updates
     }
 
     /// Updates per environment step, both since the ratio counts; `None` before.
@@ -111,6 +121,21 @@ impl ReplayConfig {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn neither_side_gets_ahead_by_more_than_the_tolerance() {
+        let replay = ReplayConfig {
+            warmup: 100,
+            updates_per_step: 0.5,
+            tolerance: 10,
+            ..ReplayConfig::default()
+        };
+        assert_eq!([100, 101, 102].map(|rows| replay.agreed_updates(rows)), [0, 0, 1]);
+        assert!(!replay.is_behind(111, 0), "the tolerance is not used up");
+        assert!(replay.is_behind(112, 0));
+        assert!(!replay.is_behind(112, 1));
+        assert!(!replay.is_behind(5, 0));
+    }
 
     #[test]
     fn a_new_ratio_counts_from_where_it_was_agreed() {

@@ -89,6 +89,7 @@ mod tests {
     fn the_size_and_the_weights_of_a_state_are_known_before_it_exists() {
         let real = "box = { low = [-1.0, -1.0], high = [1.0, 1.0] }";
         let in_order = "[replay]\nwarmup = 0\n[spec]\ntime_limit = 8";
+        let mut tested = Vec::new();
         for (rest, observation, action) in [
             ("[ddpg]\nhidden = [7, 5]\n[spec]\ntime_limit = 8", real, real),
             ("[ddpg]\nhidden = [7]\n[spec]\ntime_limit = 8", real, real),
@@ -125,6 +126,7 @@ mod tests {
             (&format!("[sarsa]\n{in_order}"), "discrete.n = 5", "discrete.n = 3"),
         ] {
             let config = config(&format!("{rest}\nobservation.{observation}\naction.{action}\n"));
+            tested.push(config.algorithm.name());
             let learner = new(&config).unwrap();
             let state = learner.state();
             let numbers: usize = state.iter().map(|(_, numbers)| numbers.len()).sum();
@@ -153,6 +155,13 @@ mod tests {
             }
             // Only some learners have a baseline.
             assert!(weights.iter().filter(|name| **name != "baseline").all(named), "{rest}");
+        }
+        for algorithm in config::AlgorithmConfig::all() {
+            let name = algorithm.name();
+            assert!(
+                tested.contains(&name),
+                "learner/src/algorithms/registry.rs: no case for {name}"
+            );
         }
     }
 }

@@ -12,6 +12,9 @@ use bincode::config::{self, Config};
 use serde::{Deserialize, Serialize};
 use shoal_common::durable::{self, FileKind, PreparedFile, SealError, sync_directory_of};
 
+use crate::algorithms::registry;
+use crate::networks::digest;
+
 const KIND: FileKind = FileKind {
     magic: *b"SHOALCKP",
     version: 2,
@@ -40,6 +43,16 @@ pub struct Checkpoint {
     pub counters: Counters,
     /// The learner's numbers by name, as they were given to `save`.
     pub arrays: Vec<(String, Vec<f32>)>,
+}
+
+impl Checkpoint {
+    /// SHA-256 of the learned weights, in the order of [`registry::weights`]; for DDPG: actor, critic and both targets. If
+    /// observations are normalised, their statistics are included.
+    pub fn weights_sha256(&self, config: &shoal_common::config::Config) -> String {
+        let array = |name| self.arrays.iter().find(|(found, _)| found == name);
+        let weights = registry::weights(config).into_iter().filter_map(array);
+        digest::sha256(&weights.map(|(_, numbers)| numbers.as_slice()).collect::<Vec<_>>())
+    }
 }
 
 /// Why a checkpoint was not written or read. The files on the disk have not changed.

@@ -5,7 +5,8 @@ use std::time::{Duration, Instant};
 use shoal_common::channel::reports::Reports;
 use shoal_common::channel::{ChannelError, wait_for};
 use shoal_common::exit::Exit;
-use shoal_common::report::{Activity, EvaluatedReport};
+use shoal_common::report::EvaluatedReport;
+use shoal_common::role::Activity;
 
 use super::learner::Learner;
 use super::settings::LearnerError;

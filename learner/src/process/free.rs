@@ -3,11 +3,10 @@
 use std::time::{Duration, Instant};
 
 use shoal_common::exit::Exit;
-use shoal_common::report::Activity;
+use shoal_common::role::Activity;
 
 use super::evaluation_wait::EvaluationWait;
 use super::learner::Learner;
-use super::ratio::Ratio;
 use super::settings::LearnerError;
 
 /// Updates between two publications of the policy. Publishing copies the policy's weights once, which takes about a
@@ -25,7 +24,7 @@ const IDLE_WAIT: Duration = Duration::from_millis(50);
 const LAST_EVALUATION: Duration = Duration::from_secs(5);
 
 pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
-    let ratio = Ratio::from(&learner.settings.config.replay);
+    let ratio = &learner.settings.config.replay;
     let every = Duration::from_secs_f64(learner.settings.config.checkpoint.every_seconds);
     let mut saved = Instant::now();
     // After a crash the replay is ahead of the checkpoint. Those rows count.
@@ -42,7 +41,7 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
         })?;
         learner.count_rows(learner.replay.head());
 
-        if updates < ratio.allowed(learner.rows) && !learner.replay.rows().is_empty() {
+        if updates < ratio.agreed_updates(learner.rows) && !learner.replay.rows().is_empty() {
             learner.update()?;
             if learner.updates().is_multiple_of(PUBLISH_EVERY) {
                 learner.publish()?;
@@ -53,7 +52,7 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
             learner.notify_all();
             return EvaluationWait::new(learner)?.wait(learner, Some(LAST_EVALUATION));
         } else {
-            let activity = if learner.rows < ratio.start() {
+            let activity = if learner.rows < ratio.ratio_start() {
                 Activity::WaitingForPeer
             } else {
                 Activity::WaitingForRatio

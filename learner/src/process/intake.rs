@@ -2,7 +2,7 @@
 
 use shoal_common::channel::transitions::{ChunkReceiver, ReceivedChunk};
 use shoal_common::channel::{ChannelError, Domain, EventName, Notifier};
-use shoal_common::report::Role;
+use shoal_common::role::Role;
 use shoal_common::transition::ChunkLayout;
 
 use crate::replay::{Appended, ChunkError, Replay, are_finite};

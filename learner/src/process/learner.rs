@@ -9,7 +9,8 @@ use shoal_common::channel::reports::{Reporter, Reports};
 use shoal_common::channel::{Domain, EventName, HeartbeatSender, Listener, Notifier};
 use shoal_common::config::Mode;
 use shoal_common::policy_file::PolicyFile;
-use shoal_common::report::{Activity, Heartbeat, LearnerReport, Role};
+use shoal_common::report::{Heartbeat, LearnerReport};
+use shoal_common::role::{Activity, Role};
 use shoal_common::stop::Stop;
 
 use super::checkpoint::{Checkpoints, Counters};

@@ -7,18 +7,17 @@
 use shoal_common::algorithms::TransitionUse;
 use shoal_common::channel::wait_for;
 use shoal_common::exit::Exit;
-use shoal_common::report::Activity;
+use shoal_common::role::Activity;
 
 use super::evaluation_wait::EvaluationWait;
 use super::intake::IntakeError;
 use super::learner::Learner;
-use super::ratio::Ratio;
 use super::settings::LearnerError;
 
 pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
     let mut evaluation_wait = EvaluationWait::new(learner)?;
     let config = &learner.settings.config;
-    let (interval, ratio) = (config.checkpoint.every_updates, Ratio::from(&config.replay));
+    let (interval, ratio) = (config.checkpoint.every_updates, &config.replay);
     let needed = learner.rows.saturating_sub(config.replay.capacity);
     if learner.replay.rows().start > needed || learner.replay.head() < learner.rows {
         let path = learner.settings.run.replay_file();
@@ -37,7 +36,7 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
         }
         // Only after all chunks have come: a round that is interrupted before begins again.
         learner.count_rows(rows);
-        while learner.updates() < ratio.allowed(learner.rows) {
+        while learner.updates() < ratio.agreed_updates(learner.rows) {
             learner.update()?;
             learner.report_activity(Activity::Working);
         }

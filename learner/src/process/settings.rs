@@ -6,7 +6,7 @@ use shoal_common::channel::ChannelError;
 use shoal_common::config::{Config, Mode};
 use shoal_common::policy::PolicyError;
 use shoal_common::policy_file::PolicyFileError;
-use shoal_common::report::RoleInstance;
+use shoal_common::role::RoleInstance;
 use shoal_common::run_dir::RunDir;
 
 use super::checkpoint::CheckpointError;

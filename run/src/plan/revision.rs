@@ -14,11 +14,13 @@ use shoal_common::section;
 use shoal_learner::process::replay_layout;
 use toml::Table;
 
-use super::source::{SettingSource, SettingSources, UsageError};
-use super::{RunOverrides, read_counts, set_key, set_options, set_what_follows};
+use super::overrides::{RunOverrides, read_counts, set_key, set_options};
+use super::resolve::set_what_follows;
+use super::source::{SettingSource, SettingSources};
 use crate::algorithm;
 use crate::recorder::{ChangeRecord, Moment, read_changes, record_changes};
 use crate::status::{replay_rows, saved_status};
+use crate::usage::UsageError;
 
 /// What the command line asks a resumed run to change.
 #[derive(Clone, Debug, Default)]

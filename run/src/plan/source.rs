@@ -9,6 +9,7 @@ use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
 
 use super::suggestion::with_suggestion;
+use crate::usage::UsageError;
 
 /// Where the value of a key comes from.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -56,11 +57,6 @@ impl Display for SettingSource {
         }
     }
 }
-
-/// Wrong usage of the command line: the program ends with the code for that.
-#[derive(Debug, thiserror::Error)]
-#[error("{0}")]
-pub struct UsageError(pub String);
 
 /// The sources of all keys, by `section.key`. A key that is not there has its default.
 #[derive(Clone, Debug, Default)]

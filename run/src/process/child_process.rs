@@ -10,7 +10,7 @@ use std::time::Duration;
 use anyhow::{Context, bail};
 use rustix::process::{Pid, Signal, kill_process};
 use rustix::thread::{CpuSet, sched_setaffinity};
-use shoal_common::report::{Role, RoleInstance};
+use shoal_common::role::{Role, RoleInstance};
 use shoal_common::run_dir::RunDir;
 
 use crate::process::{ChildGroup, ChildOutput, Line, Writer};

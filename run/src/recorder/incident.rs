@@ -1,7 +1,7 @@
 //! Incidents: what happens to a run's processes besides their first start and their end with the run.
 
 use serde::{Deserialize, Serialize};
-use shoal_common::report::RoleInstance;
+use shoal_common::role::RoleInstance;
 
 /// The kind of an incident.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]

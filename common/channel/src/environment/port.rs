@@ -5,7 +5,7 @@ use iceoryx2::port::server::Server;
 use iceoryx2::prelude::*;
 use shoal_base::exit::Exit;
 use shoal_base::packing::{numbers_of, words_of};
-use shoal_base::report::Role;
+use shoal_base::role::Role;
 use shoal_base::space::{EnvironmentSpec, Space};
 use shoal_base::stop::Stop;
 

@@ -1,7 +1,7 @@
 """Time to learn Pendulum: Shoal's preset compared with Stable-Baselines3's DDPG with the same settings.
 
     pip install stable-baselines3==2.9.2 gymnasium==1.4.0
-    python benchmarks/wall_clock.py --shoal target/release/shoal --seeds 5
+    python bench/peers/wall_clock.py --shoal target/release/shoal --seeds 5
 
 For each seed, first Shoal and then Stable-Baselines3 runs, alone on the machine. Both are evaluated every 1,000 steps
 with episodes without exploration, whose starts are distributed as in Gymnasium. The time counts to the first mean

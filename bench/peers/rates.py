@@ -3,8 +3,8 @@
 Measures DDPG gradient steps per second in JAX and PyTorch, and environment steps per second of Gymnasium's vectors.
 
     pip install jax torch gymnasium==1.4.0
-    OMP_NUM_THREADS=1 taskset -c 1 python benchmarks/peers.py learner
-    python benchmarks/peers.py actors
+    OMP_NUM_THREADS=1 taskset -c 1 python bench/peers/rates.py learner
+    python bench/peers/rates.py actors
 
 Compare with `shoal bench learner` and `shoal bench actors`, run right before or after. Networks, batch size and
 learning rates are those of the thesis, section 4.3.1. An update does the same as in Shoal: it samples 64 rows of a

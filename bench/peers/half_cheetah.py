@@ -1,7 +1,7 @@
 """Compares Shoal with Stable-Baselines3's DDPG on HalfCheetah-v5 of Gymnasium.
 
     pip install ./python stable-baselines3==2.9.2 'gymnasium[mujoco]==1.4.0' matplotlib
-    python benchmarks/half_cheetah.py --shoal target/release/shoal --minutes 60
+    python bench/peers/half_cheetah.py --shoal target/release/shoal --minutes 60
 
 Both train at the same time, each on one core with one thread. The settings are those of RL Baselines3 Zoo for DDPG on
 its HalfCheetah (`hyperparams/ddpg.yml`, tuned for PyBullet's), and otherwise Stable-Baselines3's defaults. There are
@@ -47,7 +47,7 @@ SETTINGS = {
     "evaluation.every": EVERY,
     "evaluation.episodes": EPISODES,
 }
-DOCS = Path(__file__).parent.parent / "docs"
+DOCS = Path(__file__).parent.parent.parent / "docs"
 COLUMNS = ["program", "seconds", "env_steps", "return_mean", "return_std"]
 
 

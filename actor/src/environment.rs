@@ -1,0 +1,60 @@
+//! The environment server of an actor or of the evaluator: connecting to it, and what follows an invalid answer.
+
+use std::time::{Duration, Instant};
+
+use shoal_common::channel::environment::EnvironmentClient;
+use shoal_common::channel::{ChannelError, Domain, HeartbeatSender, Listener};
+use shoal_common::exit::Exit;
+use shoal_common::space::EnvironmentSpec;
+use shoal_common::stop::Stop;
+
+use crate::error::ActorError;
+
+/// What the line about an invalid answer of an environment server ends with; the launcher looks for it.
+pub const GIVEN_UP: &str = "its episodes are given up";
+
+/// How long an actor waits after an invalid answer before it begins new episodes.
+const AFTER_FAULT: Duration = Duration::from_millis(50);
+
+/// Connects to environment server `index` and checks that its environments are those of the run's configuration.
+pub(crate) fn connect(
+    domain: &Domain,
+    listener: &Listener,
+    index: u32,
+    spec: &EnvironmentSpec,
+    envs: usize,
+    stop: &Stop,
+) -> Result<EnvironmentClient, Exit<ActorError>> {
+    let client = EnvironmentClient::open(domain, index, spec, envs, stop.clone())?;
+    let (served, served_envs) = client.describe(listener, || ()).map_err(Exit::convert)?;
+    if !served.matches(spec) || served_envs != envs {
+        let served = format!("{served_envs} times {served:?}");
+        let configured = format!("{envs} times {spec:?}");
+        return Err(Exit::Failed(ActorError::Server {
+            index,
+            served,
+            configured,
+        }));
+    }
+    Ok(client)
+}
+
+/// Logs an invalid answer of an environment server and pauses; the caller must then begin new episodes. Without the pause,
+/// an environment that always answers like this would fill the log before the launcher ends the run.
+pub(crate) fn after_fault(
+    error: &ChannelError,
+    heartbeat: &mut HeartbeatSender,
+    listener: &Listener,
+    stop: &Stop,
+) -> Result<(), Exit<ChannelError>> {
+    tracing::warn!("{error}; {GIVEN_UP}");
+    heartbeat.count_fault();
+    let since = Instant::now();
+    while since.elapsed() < AFTER_FAULT {
+        if stop.requested() {
+            return Err(Exit::Stopped);
+        }
+        listener.wait(AFTER_FAULT)?;
+    }
+    Ok(())
+}

@@ -1,0 +1,158 @@
+//! The policy that a finished run keeps as its best one: the better of the best and the last policy, by one more evaluation
+//! of both.
+
+use anyhow::Context;
+use shoal_common::config::Config;
+use shoal_common::policy_file::PolicyFile;
+use shoal_common::run_dir::RunDir;
+
+use crate::evaluation::{EvaluationSummary, SavedPolicy, evaluate_until};
+use crate::final_evaluation::{FinalEvaluation, FinalPolicyResult};
+use crate::recorder::record_final;
+use crate::signals::Interrupt;
+
+/// A policy with its final evaluation.
+#[derive(Clone, Debug, PartialEq)]
+pub struct EvaluatedPolicy {
+    /// Which policy it is after the choice.
+    pub policy: SavedPolicy,
+    /// How it did.
+    pub summary: EvaluationSummary,
+}
+
+/// A policy as it was before the choice.
+struct Candidate {
+    policy: SavedPolicy,
+    file: PolicyFile,
+    summary: EvaluationSummary,
+}
+
+/// Evaluates the best and the last policy of a run with `env_steps` environment steps. The better one is `best.policy`
+/// afterwards. Records the results, and returns those of the best and, if it was evaluated, of the last policy. Calls
+/// `progress` with the policy and its finished episodes.
+///
+/// # Errors
+/// When a policy cannot be read or evaluated, none has a finite return, a file cannot be written, or a signal has arrived.
+pub fn choose(
+    config: &Config,
+    run: &RunDir,
+    env_steps: u64,
+    interrupt: &Interrupt,
+    mut progress: impl FnMut(SavedPolicy, u32),
+) -> anyhow::Result<Vec<EvaluatedPolicy>> {
+    let (episodes, seed) = (config.evaluation.final_episodes, config.run.seed);
+    let mut candidates = Vec::new();
+    for (policy, path) in [
+        (SavedPolicy::Best, run.best_policy()),
+        (SavedPolicy::Last, run.last_policy()),
+    ] {
+        if path.exists() {
+            progress(policy, 0);
+            let file = policy.read(run, config)?;
+            if !is_finite(&file) {
+                continue;
+            }
+            let progress = |finished: u32| progress(policy, finished);
+            let summary = evaluate_until(run, config, &file.parameters, (episodes, seed), interrupt, progress)?;
+            candidates.push(Candidate { policy, file, summary });
+        }
+    }
+    let kept = better(&candidates).context("no policy has a finite return")?;
+    if kept.policy == SavedPolicy::Last {
+        let best = PolicyFile {
+            return_mean: kept.summary.return_mean,
+            return_std: kept.summary.return_std,
+            episodes: kept.summary.episodes.into(),
+            ..kept.file.clone()
+        };
+        best.write(&run.best_policy())?;
+    }
+    let entry = |it: &Candidate| FinalPolicyResult::new(it.policy, (it.file.version, it.file.env_steps), &it.summary);
+    let result = FinalEvaluation::new(seed, env_steps, candidates.iter().map(entry).collect(), kept.policy);
+    result.write(run)?;
+    record_final(run, &result)?;
+    let best = EvaluatedPolicy {
+        policy: SavedPolicy::Best,
+        summary: kept.summary.clone(),
+    };
+    let last = candidates.iter().filter(|it| it.policy == SavedPolicy::Last);
+    let last = last.map(|it| EvaluatedPolicy {
+        policy: SavedPolicy::Last,
+        summary: it.summary.clone(),
+    });
+    Ok(std::iter::once(best).chain(last).collect())
+}
+
+/// The candidate with the greatest finite mean return; the first of equal ones, so that the last policy replaces the best
+/// one only if it is better.
+fn better(candidates: &[Candidate]) -> Option<&Candidate> {
+    let mut kept: Option<&Candidate> = None;
+    for candidate in candidates.iter().filter(|it| it.summary.return_mean.is_finite()) {
+        if kept.is_none_or(|kept| candidate.summary.return_mean > kept.summary.return_mean) {
+            kept = Some(candidate);
+        }
+    }
+    kept
+}
+
+/// Keeps the last policy as the best one if there is no policy with a finite evaluation, so that the run has a policy to
+/// use.
+///
+/// # Errors
+/// When a policy cannot be read or written.
+pub fn keep_some(config: &Config, run: &RunDir) -> anyhow::Result<()> {
+    let kept = run.best_policy().exists() && SavedPolicy::Best.read(run, config)?.return_mean.is_finite();
+    if !kept && run.last_policy().exists() {
+        let last = SavedPolicy::Last.read(run, config)?;
+        if is_finite(&last) {
+            last.write(&run.best_policy())?;
+        }
+    }
+    Ok(())
+}
+
+fn is_finite(file: &PolicyFile) -> bool {
+    file.parameters.iter().all(|parameter| parameter.is_finite())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_last_policy_is_kept_only_if_it_is_better() {
+        let candidate = |(policy, return_mean)| Candidate {
+            policy,
+            file: PolicyFile {
+                fingerprint: 0,
+                version: 1,
+                env_steps: 1,
+                return_mean: f64::NAN,
+                return_std: 0.0,
+                episodes: 0,
+                parameters: Vec::new(),
+            },
+            summary: EvaluationSummary {
+                return_mean,
+                return_std: 0.0,
+                episodes: 2,
+                final_distance_mean: None,
+                reached_fraction: None,
+            },
+        };
+        let (best, last) = (SavedPolicy::Best, SavedPolicy::Last);
+        for (returns, kept) in [
+            (vec![(best, 1.0), (last, 1.0)], Some(best)),
+            (vec![(best, 1.0), (last, 2.0)], Some(last)),
+            (vec![(best, 2.0), (last, 1.0)], Some(best)),
+            (vec![(best, f64::NAN), (last, -1.0)], Some(last)),
+            (vec![(best, -1.0), (last, f64::INFINITY)], Some(best)),
+            (vec![(last, 0.0)], Some(last)),
+            (vec![(best, f64::NAN), (last, f64::NEG_INFINITY)], None),
+            (vec![], None),
+        ] {
+            let candidates: Vec<Candidate> = returns.iter().copied().map(candidate).collect();
+            assert_eq!(better(&candidates).map(|it| it.policy), kept, "{returns:?}");
+        }
+    }
+}

@@ -1,0 +1,101 @@
+//! The environment of a new run: its sections `[environment]` and `[spec]`.
+
+use anyhow::bail;
+use serde::de::DeserializeOwned;
+use shoal_common::config::{EnvironmentConfig, Mode, RunConfig};
+use shoal_env_server::environment::{self, EnvironmentError};
+use toml::{Table, Value};
+
+use super::sections::is_gymnasium;
+use super::source::SettingSources;
+use super::suggestion::{nearest, with_suggestion};
+use crate::algorithm;
+use crate::external_environment::{self, ExternalEnvironment, GYMNASIUM};
+use crate::server_location::{ServerLocation, ServerSurroundings, hash_seed};
+use crate::signals::Interrupt;
+
+/// Fills in `[spec]` from the environment. Adds every parameter of a built-in environment, and for a Gymnasium
+/// environment the settings of a suitable algorithm if the configuration names none.
+pub(super) fn describe_environment(table: &mut Table) -> anyhow::Result<()> {
+    let run = table.get("run");
+    let mode = run.and_then(|run| run.get("mode")).and_then(Value::as_str);
+    let mode = if mode == Some("lockstep") {
+        Mode::Lockstep
+    } else {
+        Mode::Free
+    };
+    let seed = run.and_then(|run| run.get("seed")).and_then(Value::as_integer);
+    let seed = seed.map_or(RunConfig::default().seed, i64::cast_unsigned);
+    let Some(Value::Table(section)) = table.get_mut("environment") else {
+        bail!("the section [environment] is missing: it must have a name");
+    };
+    let Some(Value::String(name)) = section.remove("name") else {
+        bail!(
+            "environment.name is missing: it must be one of {}, or start with {GYMNASIUM}",
+            environment::names().collect::<Vec<_>>().join(", ")
+        );
+    };
+    let server = take(section, "server")?.or_else(|| external_environment::default_command(&name));
+    let (faults, start_seconds) = (take(section, "faults")?, take(section, "start_seconds")?);
+    let configured = |name, server, parameters| {
+        let mut environment = EnvironmentConfig::new(name, server, parameters);
+        environment.faults = faults.unwrap_or(environment.faults);
+        environment.start_seconds = start_seconds.unwrap_or(environment.start_seconds);
+        environment
+    };
+    let (environment, spec) = if let Some(server) = server {
+        let environment = configured(name, server, section.clone());
+        let surroundings = ServerSurroundings {
+            location: ServerLocation::here(&environment.server)?,
+            hash_seed: hash_seed(mode, seed),
+        };
+        let spec = ExternalEnvironment::begin_in(&environment, 1, 0, surroundings, Interrupt::default())?
+            .spec()
+            .clone();
+        (environment, spec)
+    } else {
+        let parameters = environment::resolve(&name, section)?;
+        let spec = environment::make(&name, &parameters)?.spec();
+        (configured(name, Vec::new(), parameters), spec)
+    };
+    let named = algorithm::named_in(table);
+    if environment.name.starts_with(GYMNASIUM) {
+        let algorithm = named.unwrap_or_else(|| algorithm::suitable(&spec));
+        algorithm::add_defaults(table, &environment.name, algorithm)?;
+    }
+    table.insert("environment".into(), Value::try_from(environment)?);
+    table.insert("spec".into(), Value::try_from(spec)?);
+    Ok(())
+}
+
+/// The error about an environment's own parameters, with the place where the user has set the one at fault.
+pub(super) fn about_environment(error: anyhow::Error, sources: &SettingSources) -> anyhow::Error {
+    let Some(of_environment) = error.downcast_ref::<EnvironmentError>() else {
+        return error;
+    };
+    let (key, text) = match of_environment {
+        EnvironmentError::UnknownName { name, .. } => {
+            let near = nearest(name, environment::names()).map(str::to_owned);
+            let near = Some(format!("{GYMNASIUM}{name}"))
+                .filter(|_| is_gymnasium(name))
+                .or(near);
+            let hint = near.map_or_else(String::new, |near| format!("; did you mean {near}?"));
+            ("name", format!("{of_environment}{hint}"))
+        }
+        EnvironmentError::Parameters { reason, .. } => {
+            let key = reason.split('`').nth(1).unwrap_or_default();
+            (key, with_suggestion(of_environment.to_string()))
+        }
+    };
+    sources.error_naming_source(&format!("environment.{key}"), &text)
+}
+
+/// Takes a key of `[environment]` that is no parameter of the environment.
+fn take<T: DeserializeOwned>(section: &mut Table, key: &str) -> anyhow::Result<Option<T>> {
+    let value = section.remove(key).map(Value::try_into).transpose();
+    value.map_err(|error| anyhow::anyhow!("environment.{key}: {}", one_line(&error)))
+}
+
+fn one_line(error: &toml::de::Error) -> String {
+    error.message().replace('\n', " ")
+}

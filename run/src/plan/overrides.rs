@@ -1,0 +1,265 @@
+//! Changes to a preset or a file that the command line asks for.
+
+use std::path::PathBuf;
+
+use anyhow::Context;
+use clap::Args;
+use clap::builder::PossibleValuesParser;
+use shoal_common::config::Config;
+use shoal_common::config::explanation::{self, Key};
+use shoal_common::run_dir::RunDir;
+use shoal_env_server::environment;
+use toml::{Table, Value};
+
+use super::source::{SettingSource, SettingSources};
+use super::table::put;
+use crate::algorithm;
+use crate::numbers::{count, small_count};
+use crate::usage::UsageError;
+
+/// Changes to a preset or a file for one run: the options of `train` that say what the run is.
+#[derive(Args, Clone, Debug, Default)]
+pub struct RunOverrides {
+    /// Run directory to create [default: runs/<preset>-<n>].
+    #[arg(long, value_name = "DIR")]
+    pub run: Option<PathBuf>,
+    /// The algorithm [default: the preset's; for gym: the one that suits the spaces].
+    #[arg(long = "method", value_name = "METHOD", value_parser = PossibleValuesParser::new(algorithm::names()))]
+    pub algorithm: Option<String>,
+    /// Seed of every random stream.
+    #[arg(long)]
+    pub seed: Option<u64>,
+    /// Actor processes.
+    #[arg(long, value_name = "N", value_parser = small_count)]
+    pub actors: Option<u32>,
+    /// Environments of each actor.
+    #[arg(long, value_name = "E", value_parser = small_count)]
+    pub envs: Option<u32>,
+    /// Environment steps of all actors together.
+    #[arg(long, value_name = "N", value_parser = count)]
+    pub steps: Option<u64>,
+    /// Episodes of all actors together; the run ends at this limit or at its steps, whichever comes first.
+    #[arg(long, value_name = "M", value_parser = count)]
+    pub episodes: Option<u64>,
+    /// Lockstep: actors and learner take turns, and the same seed and number of actors give the same bits.
+    #[arg(long)]
+    pub lockstep: bool,
+    /// Set a key of the configuration, as in --set ddpg.tau=0.005. May be repeated.
+    #[arg(long, value_name = "SECTION.KEY=VALUE")]
+    pub set: Vec<String>,
+    /// Begin with the networks of this run, whose algorithm and shapes it then has.
+    #[arg(long, value_name = "RUN")]
+    pub from: Option<PathBuf>,
+    /// Begin with the replay of that run too. The new run's steps are counted from its rows on.
+    #[arg(long, requires = "from")]
+    pub with_replay: bool,
+}
+
+impl RunOverrides {
+    /// The arguments of `train` for these overrides, except directory and seed.
+    pub fn arguments(&self) -> Vec<String> {
+        let Self {
+            run: _,
+            algorithm,
+            seed: _,
+            actors,
+            envs,
+            steps,
+            episodes,
+            lockstep,
+            set,
+            from,
+            with_replay,
+        } = self;
+        let mut arguments = Vec::new();
+        let mut option = |name: &str, value: Option<String>| {
+            arguments.extend(value.into_iter().flat_map(|value| [name.to_owned(), value]));
+        };
+        option("--method", algorithm.clone());
+        option("--actors", actors.map(|number| number.to_string()));
+        option("--envs", envs.map(|number| number.to_string()));
+        option("--steps", steps.map(|number| number.to_string()));
+        option("--episodes", episodes.map(|number| number.to_string()));
+        option("--from", from.as_ref().map(|path| path.display().to_string()));
+        set.iter()
+            .for_each(|assignment| option("--set", Some(assignment.clone())));
+        arguments.extend(lockstep.then(|| "--lockstep".into()));
+        arguments.extend(with_replay.then(|| "--with-replay".into()));
+        arguments
+    }
+
+    /// Directory and configuration of the run whose networks the new one begins with.
+    pub(super) fn predecessor(&self) -> anyhow::Result<Option<(PathBuf, Config)>> {
+        let Some(from) = &self.from else { return Ok(None) };
+        let run = RunDir::open(from)?;
+        Ok(Some((run.path().to_owned(), run.config()?)))
+    }
+}
+
+/// Sets the keys that have options of their own.
+pub(super) fn set_options(
+    table: &mut Table,
+    sources: &mut SettingSources,
+    overrides: &RunOverrides,
+) -> anyhow::Result<()> {
+    let whole = |option: &str, number: Option<u64>| -> anyhow::Result<Option<Value>> {
+        let number = number.map(i64::try_from).transpose();
+        Ok(number
+            .with_context(|| format!("{option}: must be below 2^63"))?
+            .map(Value::from))
+    };
+    let small = |number: Option<u32>| number.map(|number| Value::from(i64::from(number)));
+    let RunOverrides {
+        seed,
+        actors,
+        envs,
+        steps,
+        episodes,
+        lockstep,
+        // The others set no key of their own, or come before.
+        run: _,
+        algorithm: _,
+        set: _,
+        from: _,
+        with_replay: _,
+    } = *overrides;
+    for (option, section, key, value) in [
+        ("--seed", "run", "seed", whole("--seed", seed)?),
+        ("--steps", "run", "steps", whole("--steps", steps)?),
+        ("--actors", "actors", "count", small(actors)),
+        ("--envs", "actors", "envs", small(envs)),
+        ("--episodes", "run", "episodes", whole("--episodes", episodes)?),
+        ("--lockstep", "run", "mode", lockstep.then(|| "lockstep".into())),
+    ] {
+        if let Some(value) = value {
+            put(table, &[section, key], value)?;
+            sources.set(format!("{section}.{key}"), SettingSource::Option(option));
+        }
+    }
+    Ok(())
+}
+
+/// Sets a key as `--set` says.
+pub(super) fn set_key(table: &mut Table, sources: &mut SettingSources, assignment: &str) -> anyhow::Result<()> {
+    let wrong = |why: String| UsageError(format!("--set {assignment}: {why}"));
+    let (key, value) = assignment
+        .split_once('=')
+        .filter(|(key, _)| key.contains('.'))
+        .ok_or_else(|| wrong("must look like SECTION.KEY=VALUE".into()))?;
+    let path: Vec<&str> = key.split('.').collect();
+    if path[0] == "spec" || explanation::set_by_program().iter().any(|own| own == key) {
+        return Err(wrong(format!("{key} cannot be set: the program sets it")).into());
+    }
+    put(table, &path, value_of(value)).map_err(|error| wrong(error.to_string()))?;
+    sources.set(
+        path.iter().take(2).copied().collect::<Vec<_>>().join("."),
+        SettingSource::Set,
+    );
+    Ok(())
+}
+
+/// Makes whole numbers of `1e5` and `30k` where a key takes whole numbers.
+pub(super) fn read_counts(table: &mut Table) -> Result<(), UsageError> {
+    let mut keys: Vec<(&str, Key)> = Vec::new();
+    for section in explanation::sections() {
+        keys.extend(section.keys.into_iter().map(|key| (section.name, key)));
+    }
+    let name = table.get("environment").and_then(|section| section.get("name"));
+    if let Some(own) = name
+        .and_then(Value::as_str)
+        .and_then(|name| environment::explain(name).ok())
+    {
+        keys.extend(own.into_iter().map(|key| ("environment", key)));
+    }
+    for (section, key) in keys.into_iter().filter(|(_, key)| key.whole) {
+        let Some(value) = table.get_mut(section).and_then(|values| values.get_mut(&key.name)) else {
+            continue;
+        };
+        let text = match value {
+            Value::Float(number) => number.to_string(),
+            Value::String(text) => text.clone(),
+            _ => continue,
+        };
+        let read = count(&text).ok().and_then(|number| i64::try_from(number).ok());
+        let refused = || {
+            format!(
+                "{section}.{} = {value}: must be a whole number, such as 1000, 1e5 or 30k",
+                key.name
+            )
+        };
+        *value = read.ok_or_else(|| UsageError(refused()))?.into();
+    }
+    Ok(())
+}
+
+/// The text as a TOML value, or as a string if it is not valid TOML: `reward=r2` needs no quotes.
+fn value_of(text: &str) -> Value {
+    format!("value = {text}")
+        .parse::<Table>()
+        .ok()
+        .and_then(|mut table| table.remove("value"))
+        .unwrap_or_else(|| text.into())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::resolve::decide;
+    use super::*;
+    use clap::Parser;
+    use shoal_common::config::Mode;
+
+    #[derive(clap::Parser)]
+    struct CommandLine {
+        #[command(flatten)]
+        overrides: RunOverrides,
+    }
+
+    #[test]
+    fn the_arguments_of_overrides_are_read_as_the_same_overrides() {
+        let line = "train --method sac --actors 3 --envs 2 --steps 500 --episodes 9 --from old --set sac.tau=0.01 \
+                    --set run.mode=free --lockstep --with-replay";
+        let CommandLine { overrides } = CommandLine::parse_from(line.split(' ').filter(|word| !word.is_empty()));
+        let arguments = overrides.arguments();
+        let again = CommandLine::parse_from(["train".to_owned()].into_iter().chain(arguments.clone())).overrides;
+        assert_eq!(format!("{overrides:?}"), format!("{again:?}"));
+        let mut given: Vec<&str> = line.split(' ').skip(1).filter(|word| !word.is_empty()).collect();
+        let mut written: Vec<&str> = arguments.iter().map(String::as_str).collect();
+        given.sort_unstable();
+        written.sort_unstable();
+        assert_eq!(written, given);
+    }
+
+    #[test]
+    fn overrides_change_the_configuration() {
+        let overrides = RunOverrides {
+            seed: Some(7),
+            steps: Some(500),
+            actors: Some(3),
+            envs: Some(2),
+            lockstep: true,
+            set: [
+                "environment.reward=r2",
+                "environment.friction=0.03",
+                "ddpg.hidden=[20, 10]",
+            ]
+            .map(Into::into)
+            .into(),
+            ..RunOverrides::default()
+        };
+        let (name, config) = decide("point-mass-r3", &overrides).unwrap();
+        assert_eq!(name, "point-mass-r3");
+        assert_eq!(
+            (
+                config.run.seed,
+                config.run.steps,
+                config.run.mode,
+                config.actors.count,
+                config.actors.envs
+            ),
+            (7, 500, Mode::Lockstep, 3, 2)
+        );
+        assert_eq!(config.environment.parameters["reward"].as_str(), Some("r2"));
+        assert_eq!(config.environment.parameters["friction"].as_float(), Some(0.03));
+        assert_eq!(*config.algorithm.ddpg().unwrap().hidden, [20, 10]);
+    }
+}

@@ -1,0 +1,185 @@
+//! Decides the configuration of a new run: the sections, then what the command line changes, then what follows from both.
+
+use shoal_common::algorithms::TransitionUse;
+use shoal_common::config::{ActorsConfig, AlgorithmConfig, Config, IdentityFormat, explanation};
+use toml::{Table, Value};
+
+use super::environment::{about_environment, describe_environment};
+use super::overrides::{RunOverrides, read_counts, set_key, set_options};
+use super::sections::for_algorithm;
+use super::source::{SettingSource, SettingSources};
+use super::table::{integer, put};
+use crate::origin::shapes;
+use crate::usage::UsageError;
+
+/// The resolved configuration of a preset or a file, without overrides.
+pub fn resolved(what: &str) -> anyhow::Result<Config> {
+    decide(what, &RunOverrides::default()).map(|(_, config)| config)
+}
+
+/// The resolved configuration of a preset or a file with these overrides, and where each value comes from.
+pub fn resolved_with_sources(what: &str, overrides: &RunOverrides) -> anyhow::Result<(Config, SettingSources)> {
+    let (_, table, sources) = for_algorithm(what, overrides)?;
+    resolve(table, sources, overrides, what)
+}
+
+/// The configuration of a preset or a file with these overrides, and the default name of its run. Creates nothing.
+pub fn decide(what: &str, overrides: &RunOverrides) -> anyhow::Result<(String, Config)> {
+    let (name, table, sources) = for_algorithm(what, overrides)?;
+    let (config, _) = resolve(table, sources, overrides, what)?;
+    Ok((name, config))
+}
+
+fn resolve(
+    mut table: Table,
+    mut sources: SettingSources,
+    overrides: &RunOverrides,
+    origin: &str,
+) -> anyhow::Result<(Config, SettingSources)> {
+    set_options(&mut table, &mut sources, overrides)?;
+    for assignment in &overrides.set {
+        set_key(&mut table, &mut sources, assignment)?;
+    }
+    let mistaken = |error: UsageError, sources: &SettingSources, table: &Table| sources.explain(error.0, origin, table);
+    read_counts(&mut table).map_err(|error| mistaken(error, &sources, &table))?;
+    // For more actors than the default of `actors.max`, raise it, but not beyond its bounds.
+    if let Some(count) = integer(&table, "actors", "count")
+        && count > i64::from(ActorsConfig::default().max)
+        && table.get("actors").is_some_and(|actors| actors.get("max").is_none())
+    {
+        put(
+            &mut table,
+            &["actors", "max"],
+            count.min(ActorsConfig::GREATEST_MAX.into()).into(),
+        )?;
+        sources.set("actors.max".into(), SettingSource::Follows("actors.count".into()));
+    }
+    // A file may be the configuration of another run.
+    for key in explanation::set_by_program() {
+        if let Some((section, key)) = key.split_once('.')
+            && let Some(Value::Table(values)) = table.get_mut(section)
+        {
+            values.remove(key);
+        }
+    }
+    // Random and independent of the seed: the run's name in shared memory must be unique.
+    put(
+        &mut table,
+        &["run", "id"],
+        format!("{:08x}", rand::random::<u32>()).into(),
+    )?;
+    let format = i64::from(u32::from(IdentityFormat::NEWEST));
+    put(&mut table, &["run", "identity_format"], format.into())?;
+    let chosen = table.clone();
+    describe_environment(&mut table).map_err(|error| about_environment(error, &sources))?;
+    // What is added are an algorithm's settings for a Gymnasium environment, and the environment's own defaults.
+    sources.add_new(&chosen, &table, &SettingSource::Gymnasium);
+    follow_algorithm(&mut table, &mut sources)?;
+    follow_networks(&mut table, &mut sources, overrides)?;
+    let mut config = Config::from_table(table.clone(), "").map_err(|error| {
+        let message = error.to_string();
+        let message = message.strip_prefix(": ").unwrap_or(&message);
+        sources.explain(message.into(), origin, &table)
+    })?;
+    // A short run must end with an evaluation too.
+    if config.run.steps < config.evaluation.every {
+        config.evaluation.every = config.run.steps;
+        sources.set("evaluation.every".into(), SettingSource::Follows("run.steps".into()));
+    }
+    set_what_follows(&mut config, &mut sources);
+    Ok((config, sources))
+}
+
+/// Sets what follows from the run's length if it is left open.
+pub(super) fn set_what_follows(config: &mut Config, sources: &mut SettingSources) {
+    if let AlgorithmConfig::Dqn(dqn) = &mut config.algorithm
+        && dqn.epsilon_steps == 0
+    {
+        dqn.epsilon_steps = (config.run.steps / 10).max(1);
+        sources.set("dqn.epsilon_steps".into(), SettingSource::Follows("run.steps".into()));
+    }
+}
+
+/// Sets what the algorithm fixes, unless the user has set it.
+fn follow_algorithm(table: &mut Table, sources: &mut SettingSources) -> anyhow::Result<()> {
+    let limit = integer(table, "spec", "time_limit");
+    let algorithms = AlgorithmConfig::all();
+    let Some(algorithm) = algorithms.iter().find(|one| table.contains_key(one.name())) else {
+        return Ok(());
+    };
+    let spec = algorithm.spec();
+    let once = spec.transition_use != TransitionUse::Minibatches;
+    let episodes = spec.transition_use == TransitionUse::Episodes;
+    for (section, key, value) in [
+        ("run", "mode", (!spec.off_policy).then(|| Value::from("lockstep"))),
+        ("replay", "warmup", once.then(|| 0.into())),
+        ("replay", "updates_per_step", once.then(|| 1.0.into())),
+        ("actors", "chunk_steps", limit.filter(|_| episodes).map(Value::from)),
+    ] {
+        let name = format!("{section}.{key}");
+        let now = table.get(section).and_then(|values| values.get(key));
+        let Some(value) = value.filter(|value| now != Some(value) && !sources.of(&name).is_from_user()) else {
+            continue;
+        };
+        put(table, &[section, key], value)?;
+        sources.set(name, SettingSource::Follows(algorithm.name().into()));
+    }
+    Ok(())
+}
+
+/// Sets the shapes of the networks that a run begins with, unless the user has set others.
+fn follow_networks(table: &mut Table, sources: &mut SettingSources, overrides: &RunOverrides) -> anyhow::Result<()> {
+    let Some((path, config)) = overrides.predecessor()? else {
+        return Ok(());
+    };
+    put(table, &["run", "from"], path.display().to_string().into())?;
+    if !table.contains_key(config.algorithm.name()) {
+        // Networks of another algorithm, which are refused later.
+        return Ok(());
+    }
+    for (section, key, value) in shapes(&config)? {
+        let name = format!("{section}.{key}");
+        if !sources.of(&name).is_from_user() {
+            put(table, &[section, &key], value)?;
+            sources.set(name, SettingSource::Follows("--from".into()));
+        }
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn plan(what: &str, set: &[&str]) -> anyhow::Result<Config> {
+        let overrides = RunOverrides {
+            set: set.iter().map(|assignment| (*assignment).into()).collect(),
+            ..RunOverrides::default()
+        };
+        decide(what, &overrides).map(|(_, config)| config)
+    }
+
+    #[test]
+    fn errors_in_the_configuration_are_one_line() {
+        for (what, set, part) in [
+            ("pendulums", "", "no preset `pendulums`"),
+            ("missing.toml", "", "missing.toml"),
+            ("pendulum", "ddpg.gama=1", "gama"),
+            ("pendulum", "dpg.gamma=1", "dpg"),
+            ("pendulum", "gamma=1", "SECTION.KEY=VALUE"),
+            ("pendulum", "spec.time_limit=50", "cannot be set"),
+            ("pendulum", "ddpg.gamma=2", "ddpg.gamma = 2: must be from 0 to 1"),
+            ("pendulum", "ddpg.gamma=high", "high"),
+            ("pendulum", "environment.start_sped=1", "start_sped"),
+            ("pendulum", "environment.name=pendule", "pendule"),
+            ("pendulum", "actors.count=0", "actors.count = 0"),
+        ] {
+            let set: Vec<&str> = (!set.is_empty()).then_some(set).into_iter().collect();
+            let message = format!("{:#}", plan(what, &set).unwrap_err());
+            assert!(
+                message.contains(part) && !message.contains('\n'),
+                "{what} {set:?}: {message}"
+            );
+        }
+    }
+}

@@ -1,0 +1,141 @@
+//! The sections that a configuration begins with: those of a preset, a file or a Gymnasium environment, for the algorithm
+//! that is asked for.
+
+use std::path::PathBuf;
+
+use anyhow::{Context, bail};
+use shoal_common::config::AlgorithmConfig;
+use shoal_common::section;
+use toml::{Table, Value};
+
+use super::overrides::RunOverrides;
+use super::presets::{preset, preset_names, with_algorithm};
+use super::source::{SettingSource, SettingSources};
+use super::suggestion::nearest;
+use super::table::put;
+use crate::algorithm;
+use crate::external_environment::GYMNASIUM;
+use crate::usage::UsageError;
+
+/// The default name of a run of a preset or a file, its sections for the algorithm that is asked for.
+pub(super) fn for_algorithm(what: &str, overrides: &RunOverrides) -> anyhow::Result<(String, Table, SettingSources)> {
+    let (mut name, mut table, mut sources) = sections(what)?;
+    let asked = algorithm::asked_for(overrides.algorithm.as_deref(), &overrides.set)?;
+    let of_networks = overrides.predecessor()?.map(|(_, config)| config.algorithm.name());
+    let Some(algorithm) = asked.or(of_networks) else {
+        return Ok((name, table, sources));
+    };
+    if let Some(own) = with_algorithm(what, algorithm) {
+        (name, table, sources) = sections(own)?;
+    }
+    let named = algorithm::named_in(&table);
+    let default = AlgorithmConfig::default().name();
+    let defaults = SettingSource::Algorithm(algorithm);
+    if preset(what).is_some() {
+        if named.unwrap_or(default) != algorithm {
+            let before = algorithm::replace(&mut table, algorithm)?;
+            sources = SettingSources::of_preset(&name, &before);
+            name = format!("{name}-{algorithm}");
+        }
+    } else if let Some(other) = named.filter(|named| *named != algorithm) {
+        bail!("{what} is for {other}, but {algorithm} is asked for: remove what belongs to {other} from the file");
+    } else if named.is_none() && algorithm != default {
+        let environment = table.get("environment").and_then(|section| section.get("name"));
+        let environment = environment.and_then(Value::as_str).unwrap_or_default().to_owned();
+        algorithm::add_defaults(&mut table, &environment, algorithm)?;
+    }
+    table.entry(algorithm).or_insert_with(|| Table::new().into());
+    sources.add(&table, &defaults);
+    Ok((name, table, sources))
+}
+
+/// The default name of a run of a preset or a file, its sections, and where their values come from.
+fn sections(what: &str) -> anyhow::Result<(String, Table, SettingSources)> {
+    if let Some((name, text)) = preset(what) {
+        let table = text.parse().with_context(|| format!("preset {name}"))?;
+        let sources = SettingSources::of_preset(name, &table);
+        return Ok((name.into(), table, sources));
+    }
+    if let Some(id) = what.strip_prefix(GYMNASIUM) {
+        let mut table = Table::new();
+        put(&mut table, &["environment", "name"], what.into())?;
+        let is_plain = |c: char| c.is_ascii_alphanumeric() || "-._".contains(c);
+        let name = format!("gym-{}", id.replace(|c| !is_plain(c), "-"));
+        return Ok((name, table, SettingSources::default()));
+    }
+    let path = PathBuf::from(what);
+    if path.extension().is_none_or(|extension| extension != "toml") {
+        return Err(UsageError(no_preset(what)).into());
+    }
+    let text = std::fs::read_to_string(&path).with_context(|| format!("cannot read {what}"))?;
+    let table = text
+        .parse::<Table>()
+        .map_err(|error| anyhow::anyhow!("{}", section::malformed(what, &text, &error)))?;
+    let name = path
+        .file_stem()
+        .map_or_else(|| "run".into(), |stem| stem.to_string_lossy().into_owned());
+    let sources = SettingSources::of_file(what, &text);
+    Ok((name, table, sources))
+}
+
+/// The error for a name that is neither a preset nor a file.
+fn no_preset(what: &str) -> String {
+    let known: Vec<&str> = preset_names().collect();
+    let all = format!(
+        "choose {}, a file that ends in .toml, or gym: with a Gymnasium environment",
+        known.join(", ")
+    );
+    if is_gymnasium(what) {
+        return format!("there is no preset `{what}`; did you mean {GYMNASIUM}{what}? Otherwise {all}");
+    }
+    match nearest(what, known) {
+        Some(near) => format!("there is no preset `{what}`; did you mean {near}? Otherwise {all}"),
+        None => format!("there is no preset `{what}`: {all}"),
+    }
+}
+
+/// Whether this looks like the name of a Gymnasium environment, which ends in a version: `Pendulum-v1`.
+pub(super) fn is_gymnasium(name: &str) -> bool {
+    let version = name.rsplit_once("-v").map(|(_, version)| version);
+    version.is_some_and(|version| !version.is_empty() && version.bytes().all(|byte| byte.is_ascii_digit()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::resolve::{decide, resolved};
+    use super::*;
+    use shoal_common::config::Mode;
+
+    #[test]
+    fn a_method_has_its_preset_for_the_task_or_its_own_defaults() {
+        let with = |what: &str, algorithm: &str, set: &[&str]| {
+            let overrides = RunOverrides {
+                algorithm: (!algorithm.is_empty()).then(|| algorithm.into()),
+                set: set.iter().map(|assignment| (*assignment).into()).collect(),
+                ..RunOverrides::default()
+            };
+            decide(what, &overrides).unwrap()
+        };
+        let (name, own) = with("pendulum", "sac", &[]);
+        assert_eq!((name.as_str(), own.run.steps), ("pendulum-sac", 20_000));
+        assert_eq!(with("pendulum", "", &["sac.tau=0.01"]).1.replay, own.replay);
+        assert_eq!(with("pendulum-sac", "td3", &[]).0, "pendulum-td3");
+        assert_eq!(with("pendulum-sac", "ddpg", &[]).0, "pendulum");
+        assert_eq!(
+            with("pendulum", "ddpg", &[]).1.algorithm,
+            resolved("pendulum").unwrap().algorithm
+        );
+        // There is no preset for the pole with DQN: the task's length and evaluation, and the algorithm's defaults.
+        let (name, dqn) = with("cart-pole", "dqn", &["run.steps=40_000"]);
+        assert_eq!(name, "cart-pole-dqn");
+        assert_eq!((dqn.run.mode, dqn.replay.updates_per_step), (Mode::Free, 0.25));
+        assert_eq!((dqn.run.episodes, dqn.actors.chunk_steps), (Some(5_000), 8));
+        let AlgorithmConfig::Dqn(settings) = dqn.algorithm else {
+            panic!("{:?}", dqn.algorithm)
+        };
+        assert_eq!(settings.epsilon_steps, 4_000, "a tenth of the run");
+        assert_eq!(with("frozen-lake-sarsa", "q-learning", &[]).0, "frozen-lake");
+        let (_, lake) = with("frozen-lake", "sarsa", &[]);
+        assert_eq!((lake.algorithm.name(), lake.run.mode), ("sarsa", Mode::Lockstep));
+    }
+}
