@@ -19,7 +19,7 @@ use std::process::ExitCode;
 
 use clap::Parser;
 use serde::de::DeserializeOwned;
-use shoal_base::report::{Role, RoleInstance};
+use shoal_base::role::{Role, RoleInstance};
 use shoal_base::stop::Stop;
 use shoal_channel::environment::EnvironmentPort;
 use shoal_channel::{Domain, EventName, HeartbeatSender};
