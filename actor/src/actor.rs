@@ -103,7 +103,7 @@ struct Actor<'a> {
     n_step: NStep,
     /// The chunk that is being filled.
     chunk: Chunk,
-    /// Version of the policy that its last row was collected with. While it is empty, that of the previous chunk.
+    /// Version of the policy that the last row of `chunk` was collected with; if `chunk` is empty, the last row sent.
     policy_version: u64,
     commits: CommitReader,
     heartbeat: HeartbeatSender,
@@ -234,7 +234,7 @@ impl<'a> Actor<'a> {
         (0..self.settings.envs).for_each(|environment| self.begin_episode(environment));
         // Without a snapshot, only the first episodes of the run can be repeated with the same bits.
         let sent = self.sender.sent();
-        // A row of n steps is sent n − 1 steps after its first.
+        // A row of n steps is complete n − 1 steps after it began.
         let sent_steps = sent * (self.settings.chunk.rows / self.settings.envs) as u64;
         self.step = sent_steps + if sent == 0 { 0 } else { self.settings.n_step as u64 - 1 };
         let request = if sent == 0 {

@@ -52,7 +52,7 @@ impl EvaluatorSettings {
     }
 }
 
-/// The better of the best policy and a candidate, and whether it is the candidate. Among many policies, some do well on a
+/// The policy to keep, the best one or a candidate, and whether it is the candidate. Among many policies, some do well on a
 /// few episodes by chance. A candidate that seems better than the best must therefore be better on other episodes too.
 /// `confirm` returns the mean return on those, or `None` if nothing is to be confirmed.
 fn challenge<E>(

@@ -32,7 +32,7 @@ use crate::vector::VectorEnvironment;
 #[derive(Debug, Parser)]
 #[command(about = "An environment server. Shoal starts it: name it as environment.server in a configuration file.")]
 struct Arguments {
-    /// iceoryx2's configuration for this run. This program follows from the run's name where it is.
+    /// iceoryx2's configuration for this run. It is not read here: it follows from the run's name.
     #[arg(long)]
     iceoryx2: PathBuf,
     /// The run's name.

@@ -134,7 +134,7 @@ def train(
     other arguments are those of ``shoal train``. ``run`` is the directory to create, by default ``runs/<what>-<n>``.
 
     With ``wait``, this returns when the training has finished, and shows its lines unless ``quiet``. Without, it
-    returns as soon as the run exists. The training then continues even if this Python ends; :meth:`Run.stop` ends it.
+    returns as soon as all actors work. The training then continues even if this Python ends; :meth:`Run.stop` ends it.
 
     Raises :class:`ShoalError` if the program refuses or fails.
     """

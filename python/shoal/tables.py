@@ -38,7 +38,7 @@ def column(cells: list[str]) -> np.ndarray:
     for kind in (int, float):
         try:
             values: list[Any] = [kind(cell) if cell or kind is int else np.nan for cell in cells]
-        except ValueError:
+            return np.array(values, dtype=np.int64 if kind is int and cells else np.float64)
+        except (ValueError, OverflowError):
             continue
-        return np.array(values, dtype=np.int64 if kind is int and cells else np.float64)
     return np.array(cells, dtype=object)

@@ -1,13 +1,14 @@
 """Copies what a run records to a tracker, Weights & Biases or MLflow, while it runs and afterwards.
 
-``shoal track RUN --to mlflow`` calls this module. It needs the tracker's own Python package. It only reads the run, and
-writes ``tracking-<tracker>.json`` there: which run of the tracker it is, and how many lines of each file were sent. So
-it may be interrupted and repeated; at most the lines that were being sent are sent twice.
+``shoal track RUN --to mlflow`` calls this module. It needs the tracker's own Python package. Of the run's files it
+changes none. It adds ``tracking-<tracker>.json``, which says which run of the tracker this is, and how many lines of
+each file were sent. So it may be interrupted and repeated; at most the lines that were being sent are sent twice.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import fcntl
 import json
 import os
@@ -25,7 +26,7 @@ from .run import Run
 #: The files that are followed, and what their metrics are called.
 FOLLOWED = {"evaluations": "evaluation", "learner": "learner", "episodes": "episode"}
 
-#: Columns that say when something was, or count instead of measure.
+#: Columns that are no measurements: times, numbers of things, and flags.
 NOT_METRICS = {"wall_seconds", "env_steps", "actor", "environment", "best", "terminated"}
 
 #: Lines that are sent together.
@@ -178,8 +179,10 @@ def track(path: str | os.PathLike[str], to: str, *, project: str = "shoal", foll
                 break
             time.sleep(PAUSE)
     finally:
-        for copy in tracked.values():
-            copy.close()
+        with contextlib.ExitStack() as closing:
+            # One that fails does not keep the others open.
+            for copy in tracked.values():
+                closing.callback(copy.close)
 
 
 def runs(path: Path) -> list[Run]:

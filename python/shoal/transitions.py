@@ -90,7 +90,10 @@ class Transitions:
 
         Each is an array with a line for each transition: ``s, a, r, discount, s', last``. They are not copied.
         """
-        rows = self.rows
+        return self._parts(self.rows)
+
+    def _parts(self, rows: range) -> tuple[range, list[np.ndarray]]:
+        """These rows, and the parts of the ring that hold them."""
         first, end = rows.start % self.ring, rows.start % self.ring + len(rows)
         return rows, [
             part
@@ -103,10 +106,9 @@ class Transitions:
 
         Rows that the learner began to overwrite during the copy are left out, so there may be fewer.
         """
-        rows, parts = self.view()
+        valid = self.rows
+        rows, parts = self._parts(valid if newest is None else valid[max(len(valid) - newest, 0) :])
         lines = np.concatenate([np.empty((0, self._ring.shape[1]), dtype=np.float32), *parts])
-        if newest is not None:
-            rows, lines = rows[max(len(rows) - newest, 0) :], lines[max(len(lines) - newest, 0) :]
         stale = min(max(self.rows.start - rows.start, 0), len(rows))
         rows, lines = rows[stale:], lines[stale:]
         s, a = self._observation, self._action

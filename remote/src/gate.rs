@@ -1,5 +1,5 @@
-//! The gate, a role on the learner's host. To the learner it is each actor of the other hosts: it forwards their chunks,
-//! each exactly once and in order. It acknowledges the chunks to the hosts, and sends them the newest policy.
+//! The gate, a role on the learner's host. To the learner it looks like the actors of the other hosts: it
+//! forwards their chunks, each exactly once and in order. It acknowledges the chunks to the hosts, and sends them the newest policy.
 
 use std::collections::HashMap;
 use std::fmt;
@@ -670,10 +670,14 @@ impl<'a> Gate<'a> {
         };
         self.policy_version = newest.header().version;
         let id = Some((newest.header().incarnation, newest.header().version));
-        for host in self.hosts.values_mut() {
-            if host.policy_query.as_ref().is_none_or(|(_, have, _)| id == *have) {
-                continue;
-            }
+        // Who has waited longest comes first. Otherwise a host that asks again at once could keep the others waiting.
+        let waiting = self.hosts.values_mut().filter_map(|host| {
+            let (_, have, since) = host.policy_query.as_ref()?;
+            (id != *have).then_some((*since, host))
+        });
+        let mut waiting: Vec<_> = waiting.collect();
+        waiting.sort_by_key(|(since, _)| *since);
+        for (_, host) in waiting {
             let bytes = encoded(&mut self.encoded_policy, &newest);
             if !self.policy_limiter.take(bytes.len() as f64, Instant::now()) {
                 break;
@@ -709,7 +713,7 @@ impl<'a> Gate<'a> {
         self.connections_refreshed_at = Instant::now();
         if let Some(why) = refused::take() {
             self.warn(format_args!(
-                "a connection was refused: {why}; only who has the run's join.key is let in"
+                "a connection was refused: {why}; only hosts with the run's join.key are let in"
             ));
         }
         // Taken as often as an actor takes it, so that none is held long after its learner has died.

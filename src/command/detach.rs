@@ -17,11 +17,11 @@ use shoal_run::suite;
 
 use super::training::OutputMode;
 
-/// The hidden command that replaces itself by this program with other arguments, in a session without a terminal.
+/// The hidden command that begins a session without a terminal, and then executes this program with the given arguments.
 pub(crate) const COMMAND: &str = "in-new-session";
 
-/// How long the start may take. Environments of other programs may need `environment.start_seconds` (120) of it.
-const PATIENCE: Duration = Duration::from_secs(150);
+/// How long the start may take, beside what the environment is allowed (`environment.start_seconds`).
+const PATIENCE: Duration = Duration::from_secs(60);
 
 /// Pause between two looks at a run that starts.
 const PAUSE: Duration = Duration::from_millis(50);
@@ -34,19 +34,21 @@ struct Printed<'a> {
     pid: u32,
 }
 
-/// Resumes a run with these further arguments in a session of its own. Returns when its roles are at work.
+/// Resumes a run with these further arguments in a session of its own. Returns when all its actors work.
 ///
 /// # Errors
 /// When the run is running already, or does not start in time.
 pub(crate) fn resume_run(path: &Path, arguments: &[OsString], output: &OutputMode) -> anyhow::Result<ExitCode> {
     // Otherwise a run that is running already would be taken for the one that is started here.
     drop(RunDir::open(path)?.lock()?);
+    let of_environment = RunClient::open(path)?.config.environment.start_seconds;
+    let patience = PATIENCE + Duration::from_secs(of_environment.into());
     let is_at_work = || {
         let status = RunClient::open(path)?.status()?;
-        Ok(status.is_some_and(|status| !status.roles.is_empty()) && RunDir::open(path)?.replay_file().exists())
+        Ok(status.is_some_and(|status| status.all_actors_work()) && RunDir::open(path)?.replay_file().exists())
     };
     let how_to_end = |path: &str, _| format!("look: shoal top {path}; end: shoal stop {path}");
-    resume(path, arguments, output, is_at_work, how_to_end)
+    resume(path, (arguments, patience), output, is_at_work, how_to_end)
 }
 
 /// As [`resume_run`] for a suite. Returns when a process works on it.
@@ -57,12 +59,12 @@ pub(crate) fn resume_suite(path: &Path, arguments: &[OsString], output: &OutputM
     drop(suite::lock(path)?);
     let is_at_work = || Ok(file_lock::is_locked(&File::open(path)?)?);
     let how_to_end = |path: &str, pid| format!("look: shoal list {path}; end: kill {pid}");
-    resume(path, arguments, output, is_at_work, how_to_end)
+    resume(path, (arguments, PATIENCE), output, is_at_work, how_to_end)
 }
 
 fn resume(
     path: &Path,
-    arguments: &[OsString],
+    (arguments, patience): (&[OsString], Duration),
     output: &OutputMode,
     is_at_work: impl Fn() -> anyhow::Result<bool>,
     how_to_end: impl Fn(&str, u32) -> String,
@@ -79,19 +81,24 @@ fn resume(
         .stderr(messages.try_clone()?);
     let mut child = command.spawn().context("cannot start the launcher")?;
     let begun = Instant::now();
+    let mut is_over = false;
     // While it starts, a launcher may be unable to answer.
     while !is_at_work().unwrap_or(false) {
         if let Some(status) = child.try_wait()? {
+            if status.success() {
+                is_over = true;
+                break;
+            }
             write_messages(&mut messages)?;
             let code = status.code().and_then(|code| u8::try_from(code).ok());
             return Ok(code.map_or(ExitCode::FAILURE, ExitCode::from));
         }
-        if begun.elapsed() >= PATIENCE {
+        if begun.elapsed() >= patience {
             write_messages(&mut messages)?;
             end(child);
             bail!(
-                "{here} did not start within {} s and was ended; its log is shoal.log there",
-                PATIENCE.as_secs()
+                "{here} did not start within {} s, and is being ended; its log is shoal.log there",
+                patience.as_secs()
             );
         }
         std::thread::sleep(PAUSE);
@@ -99,12 +106,15 @@ fn resume(
     write_messages(&mut messages)?;
     let pid = child.id();
     if !output.quiet {
-        let how_to_end = how_to_end(&here.to_string(), pid);
+        let what = match is_over {
+            true => "is over already".into(),
+            false => format!(
+                "runs by itself, as process {pid}; {}",
+                how_to_end(&here.to_string(), pid)
+            ),
+        };
         // A terminal that is gone is no failure.
-        let _ = writeln!(
-            std::io::stderr(),
-            "{here} runs by itself, as process {pid}; {how_to_end}"
-        );
+        let _ = writeln!(std::io::stderr(), "{here} {what}");
     }
     if output.json {
         let printed = serde_json::to_string(&Printed { run: &path, pid })?;

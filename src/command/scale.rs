@@ -6,8 +6,6 @@ use std::time::{Duration, Instant};
 
 use anyhow::bail;
 use clap::Args;
-use shoal_common::channel::control::{RoleState, RunStatus};
-use shoal_common::role::Role;
 use shoal_run::client::RunClient;
 use shoal_run::numbers::small_count;
 
@@ -34,7 +32,7 @@ pub(crate) fn run(args: &ScaleArgs) -> anyhow::Result<()> {
             Some(status) if status.actors != args.actors => {
                 bail!("another command scaled {here} to {} actors", status.actors)
             }
-            Some(status) if is_at_work(&status) => break,
+            Some(status) if status.all_actors_work() => break,
             Some(_) if asked.elapsed() >= PATIENCE => {
                 bail!(
                     "{here} does not have {} actors at work after {PATIENCE:?}; `shoal status {here}` shows them",
@@ -46,16 +44,4 @@ pub(crate) fn run(args: &ScaleArgs) -> anyhow::Result<()> {
     }
     writeln!(std::io::stdout(), "{here}: actors: {}", args.actors)?;
     Ok(())
-}
-
-/// Whether the number of actors is right and all of them have started.
-fn is_at_work(status: &RunStatus) -> bool {
-    let mut actors = status.roles.iter().filter(|role| role.role == Role::Actor.name());
-    actors.clone().count() == status.actors as usize
-        && !actors.any(|actor| {
-            matches!(
-                actor.state,
-                RoleState::Starting | RoleState::Restarting | RoleState::Retiring
-            )
-        })
 }

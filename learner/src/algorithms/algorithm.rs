@@ -62,7 +62,7 @@ pub trait Algorithm {
 /// An array of an algorithm's state: its name and its numbers.
 pub type StateArray<'a> = (&'static str, &'a [f32]);
 
-/// As [`Section`], but the numbers can be overwritten.
+/// As [`StateArray`], but the numbers can be overwritten.
 pub type StateArrayMut<'a> = (&'static str, &'a mut [f32]);
 
 /// The losses of an update.

@@ -189,7 +189,7 @@ pub struct Sac {
     actor: TrainableNetwork,
     critics: TwinCritics,
     temperature: Temperature,
-    /// MinibatchPart `u` of this stream has the noise of update number `u`.
+    /// Part `u` of this stream has the noise of update number `u`.
     stream: Stream,
     // Buffers.
     now: Draw,

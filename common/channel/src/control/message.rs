@@ -4,6 +4,7 @@ use bincode::config::{self, Config};
 use bincode::error::EncodeError;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
+use shoal_base::role::Role;
 
 /// The format version of the messages. Increase it with every change: launcher and client may be of different builds.
 pub(super) const VERSION: u32 = 4;
@@ -137,6 +138,20 @@ pub enum ControlResponse {
     },
     /// The launcher runs this other directory; the one that was asked about is a copy of it.
     AnotherRun(String),
+}
+
+impl RunStatus {
+    /// Whether the number of actors is right and all of them have started.
+    pub fn all_actors_work(&self) -> bool {
+        let mut actors = self.roles.iter().filter(|role| role.role == Role::Actor.name());
+        actors.clone().count() == self.actors as usize
+            && !actors.any(|actor| {
+                matches!(
+                    actor.state,
+                    RoleState::Starting | RoleState::Restarting | RoleState::Retiring
+                )
+            })
+    }
 }
 
 /// The status of a run.

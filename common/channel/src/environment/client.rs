@@ -252,7 +252,11 @@ impl EnvironmentClient {
         };
         let words = words_of(self.accepted_payload(&response)?);
         if words.len() != self.snapshot_words {
-            return Err(self.refused().into());
+            let cause = PeerError::SnapshotLength {
+                found: words.len(),
+                expected: self.snapshot_words,
+            };
+            return Err(ChannelError::new(&self.channel, "ask", cause).into());
         }
         Ok(SnapshotResult::Taken(words))
     }
@@ -372,8 +376,8 @@ impl EnvironmentClient {
         }
     }
 
-    /// Sends a request to `server`, which was looked up before. If another server takes its place in between, the request
-    /// counts as lost and is sent again. In the other order, a lost request could count as delivered.
+    /// Sends a request to `server`. The caller must have looked it up before: if another server takes its place in between,
+    /// the request counts as lost and is sent again. A server that is looked up afterwards may never have got the request.
     fn send(
         &self,
         server: Option<UniqueServerId>,
