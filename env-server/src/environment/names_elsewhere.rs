@@ -21,7 +21,7 @@ const SEARCHED: [&str; 10] = [
 
 const ALLOWED: [&str; 6] = [
     "run/src/analysis",
-    "run/src/plan.rs",
+    "run/src/plan/presets.rs",
     "run/src/testing.rs",
     "report/src/figure",
     "report/src/figure.rs",
