@@ -3,10 +3,10 @@
 //! `examples/rail` is a whole one. Its `main` is
 //!
 //! ```no_run
-//! # use shoal_env_server::environment::pendulum::{Parameters, Pendulum};
+//! # use shoal_env_server::environment::pendulum::{Pendulum, PendulumParameters};
 //! # use std::process::ExitCode;
 //! fn main() -> ExitCode {
-//!     shoal_env_server::serve::<Parameters, _>(Pendulum::new)
+//!     shoal_env_server::serve::<PendulumParameters, _>(Pendulum::new)
 //! }
 //! ```
 //!
