@@ -1,5 +1,6 @@
 //! The gate, a role on the learner's host. To the learner it looks like the actors of the other hosts: it
-//! forwards their chunks, each exactly once and in order. It acknowledges the chunks to the hosts, and sends them the newest policy.
+//! forwards their chunks, each exactly once and in order. It acknowledges the chunks to the hosts, and sends them the
+//! newest policy.
 
 use std::collections::HashMap;
 use std::fmt;

@@ -6,7 +6,11 @@ mod point_mass;
 pub(super) use pendulum::PendulumAlgorithms;
 pub(super) use point_mass::PointMassAlgorithms;
 
+use shoal_report::figure;
+
 use super::experiment::{Experiment, Length, Stage};
+use super::report_section::{Figure, FigureWriter};
+use super::result::SeedResult;
 
 /// The name of all these experiments on the command line.
 const CLI_NAME: &str = "methods";
@@ -35,4 +39,15 @@ const fn stage(steps: u64) -> Stage {
         length: Length::Steps(steps),
         quick_length: Length::Steps(2_000),
     }
+}
+
+/// The figure with the learning curves of an experiment; `None` if it has no results.
+fn learning_curves<T>(writer: &FigureWriter, name: &str, seeds: &[SeedResult<T>]) -> anyhow::Result<Option<Figure>> {
+    let curves: Vec<_> = seeds.iter().map(SeedResult::curve).collect();
+    if curves.is_empty() {
+        return Ok(None);
+    }
+    let caption = "Mean return of the evaluations during training, every seed";
+    let draw = |path: &std::path::Path| figure::learning_curves(name, &curves, None, path);
+    writer.add(&format!("{name}-learning-curve"), caption, draw).map(Some)
 }

@@ -6,14 +6,31 @@ mod child_output;
 mod child_process;
 
 use std::os::fd::BorrowedFd;
+use std::os::unix::process::CommandExt;
+use std::path::Path;
+use std::process::Command;
 use std::time::Duration;
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
+use shoal_common::role::RoleInstance;
 
 pub use self::child_group::ChildGroup;
 pub use self::child_output::{ChildOutput, Line, Writer, escape_control_characters};
 pub use self::child_process::ChildProcess;
+
+/// The command that starts this program as a role of the run in this directory.
+pub fn role_command(instance: RoleInstance, run: &Path) -> Command {
+    let RoleInstance {
+        role,
+        index,
+        incarnation,
+    } = instance;
+    let mut command = Command::new("/proc/self/exe");
+    command.arg0("shoal").arg(role.name()).arg(run);
+    command.args([index.to_string(), incarnation.to_string()]);
+    command
+}
 
 /// Waits at most `most` until one of these is readable, or a child whose [`ChildGroup`] is among them has ended.
 /// Returns whether that happened. A signal to this process ends the wait early.

@@ -2,13 +2,12 @@
 
 use std::io::Write;
 use std::os::fd::{AsFd, BorrowedFd};
-use std::os::unix::process::CommandExt;
 use std::path::Path;
-use std::process::{ChildStdin, Command, ExitStatus};
+use std::process::{ChildStdin, ExitStatus};
 
 use anyhow::Context;
 use shoal_common::role::RoleInstance;
-use shoal_run::process::{ChildGroup, ChildOutput, Writer};
+use shoal_run::process::{ChildGroup, ChildOutput, Writer, role_command};
 
 use super::log::Log;
 
@@ -23,16 +22,9 @@ pub(super) struct Process {
 impl Process {
     /// Starts this program as a role. `writer` is who writes to its standard error.
     pub(super) fn start(instance: RoleInstance, run: &Path, log: &Log, writer: Writer) -> anyhow::Result<Self> {
-        let RoleInstance {
-            role,
-            index,
-            incarnation,
-        } = instance;
-        let mut command = Command::new("/proc/self/exe");
-        command.arg0("shoal").arg(role.name()).arg(run);
-        command.args([index.to_string(), incarnation.to_string()]);
+        let started = ChildGroup::start(&mut role_command(instance, run));
         let (group, stdin, stderr) =
-            ChildGroup::start(&mut command).with_context(|| format!("cannot start {} {index}", role.name()))?;
+            started.with_context(|| format!("cannot start {} {}", instance.role.name(), instance.index))?;
         let (who, log) = (name(instance), log.clone());
         let read = stderr
             .map(|stderr| ChildOutput::read(&who.clone(), stderr, writer, move |line| log.line(&who, line, writer)));

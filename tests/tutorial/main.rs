@@ -65,6 +65,19 @@ fn the_tutorials_environment_is_the_compiled_one() {
     assert_eq!(blocks("rust"), [include_str!("rail.rs")]);
 }
 
+/// The template in `examples/` is the same environment. It differs in what it imports and in what an environment of its
+/// own need not explain.
+#[test]
+fn the_tutorials_environment_is_that_of_the_template() {
+    let [own, template] = [include_str!("rail.rs"), include_str!("../../examples/rail/src/rail.rs")].map(|text| {
+        let (_, body) = text.split_once("/// Δt").unwrap();
+        let lines = body.lines().filter(|line| !line.contains("#[schemars("));
+        let line = |line: &str| line.replace("pub(crate) ", "pub ").replace(", JsonSchema", "");
+        lines.map(line).collect::<Vec<_>>()
+    });
+    assert_eq!(own, template);
+}
+
 #[test]
 fn the_tutorials_environment_implements_the_trait_correctly() {
     let mut rail = rail::Rail::new(rail::Parameters::default()).unwrap();

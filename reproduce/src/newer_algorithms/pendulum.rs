@@ -1,7 +1,6 @@
 //! The pendulum with SAC and TD3.
 
 use serde::{Deserialize, Serialize};
-use shoal_report::figure;
 use shoal_run::analysis::pendulum::{Measures, SwingUp};
 use shoal_run::rollout::Rollout;
 
@@ -10,7 +9,7 @@ use super::super::experiment::{Experiment, Stage};
 use super::super::family::{Family, Policies, Results};
 use super::super::report_section::{FigureWriter, ReportSection};
 use super::super::result::SeedResult;
-use super::{experiment, stage};
+use super::{experiment, learning_curves, stage};
 
 /// The final evaluation is over a thousand starts.
 const STARTS: &[&str] = &["evaluation.final_episodes=1000"];
@@ -69,13 +68,7 @@ impl Family for PendulumAlgorithms {
         let [sac, td3] = ["pendulum-sac", "pendulum-td3"].map(|name| results.of(name, ""));
         let mut figures = Vec::new();
         for (name, seeds) in [("pendulum-sac", sac), ("pendulum-td3", td3)] {
-            let curves: Vec<_> = seeds.iter().map(SeedResult::curve).collect();
-            if !curves.is_empty() {
-                let caption = "Mean return of the evaluations during training, every seed";
-                figures.push(writer.add(&format!("{name}-learning-curve"), caption, |path| {
-                    figure::learning_curves(name, &curves, None, path)
-                })?);
-            }
+            figures.extend(learning_curves(writer, name, seeds)?);
         }
         Ok(vec![ReportSection {
             title: "The pendulum with SAC and TD3 (not in the thesis)",

@@ -3,7 +3,6 @@
 use std::fmt::Write as _;
 
 use serde::{Deserialize, Serialize};
-use shoal_report::figure;
 use shoal_run::analysis::point_mass::{Drive, FAR_STARTS, Measures, NEAR_STARTS, REACHED};
 use shoal_run::rollout::Rollout;
 
@@ -12,7 +11,7 @@ use super::super::experiment::{Experiment, Stage};
 use super::super::family::{Family, Policies, Results};
 use super::super::report_section::{FigureWriter, ReportSection};
 use super::super::result::SeedResult;
-use super::{experiment, stage};
+use super::{experiment, learning_curves, stage};
 
 type Seed = SeedResult<Tests>;
 
@@ -92,13 +91,7 @@ impl Family for PointMassAlgorithms {
         let [r3, r1, r2, td3] = EXPERIMENTS.map(|experiment| (experiment.name, results.of(experiment.name, "")));
         let mut figures = Vec::new();
         for (name, seeds) in [r3, r1, r2, td3] {
-            let curves: Vec<_> = seeds.iter().map(SeedResult::curve).collect();
-            if !curves.is_empty() {
-                let caption = "Mean return of the evaluations during training, every seed";
-                figures.push(writer.add(&format!("{name}-learning-curve"), caption, |path| {
-                    figure::learning_curves(name, &curves, None, path)
-                })?);
-            }
+            figures.extend(learning_curves(writer, name, seeds)?);
         }
         let rest = |what, seeds: &[Seed]| Claim {
             thesis: what,

@@ -82,19 +82,9 @@ pub(super) fn preset(name: &str) -> Option<(&'static str, &'static str)> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::overrides::RunOverrides;
-    use super::super::resolve::decide;
+    use super::super::resolve::tests::plan;
     use super::*;
-    use shoal_common::config::Config;
     use std::path::Path;
-
-    fn plan(what: &str, set: &[&str]) -> anyhow::Result<Config> {
-        let overrides = RunOverrides {
-            set: set.iter().map(|assignment| (*assignment).into()).collect(),
-            ..RunOverrides::default()
-        };
-        decide(what, &overrides).map(|(_, config)| config)
-    }
 
     #[test]
     fn every_preset_is_a_configuration() {

@@ -148,10 +148,11 @@ fn follow_networks(table: &mut Table, sources: &mut SettingSources, overrides: &
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
 
-    fn plan(what: &str, set: &[&str]) -> anyhow::Result<Config> {
+    /// The configuration with these values of `--set`.
+    pub(in super::super) fn plan(what: &str, set: &[&str]) -> anyhow::Result<Config> {
         let overrides = RunOverrides {
             set: set.iter().map(|assignment| (*assignment).into()).collect(),
             ..RunOverrides::default()

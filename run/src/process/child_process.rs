@@ -2,7 +2,6 @@
 //! training.
 
 use std::os::fd::{AsFd, BorrowedFd};
-use std::os::unix::process::CommandExt;
 use std::process::{ChildStdin, Command, ExitStatus};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -13,7 +12,7 @@ use rustix::thread::{CpuSet, sched_setaffinity};
 use shoal_common::role::{Role, RoleInstance};
 use shoal_common::run_dir::RunDir;
 
-use crate::process::{ChildGroup, ChildOutput, Line, Writer};
+use crate::process::{ChildGroup, ChildOutput, Line, Writer, role_command};
 
 /// How long a process may take to end in order. A learner writes its replay to the disk.
 const END_PATIENCE: Duration = Duration::from_secs(15);
@@ -54,15 +53,9 @@ impl ChildProcess {
 
     /// Starts this program again as a role of the run.
     pub fn member(instance: RoleInstance, run: &RunDir) -> anyhow::Result<Self> {
-        let RoleInstance {
-            role,
-            index,
-            incarnation,
-        } = instance;
-        let mut command = Command::new("/proc/self/exe");
-        command.arg0("shoal").arg(role.name()).arg(run.path());
-        command.args([index.to_string(), incarnation.to_string()]);
-        Self::start(&mut command, role.name().into()).with_context(|| format!("cannot start the {}", role.name()))
+        let name = instance.role.name();
+        let mut command = role_command(instance, run.path());
+        Self::start(&mut command, name.into()).with_context(|| format!("cannot start the {name}"))
     }
 
     /// Starts a process; messages name it `what`.
