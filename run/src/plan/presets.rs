@@ -82,7 +82,7 @@ pub(super) fn preset(name: &str) -> Option<(&'static str, &'static str)> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::resolve::tests::plan;
+    use super::super::resolve::plan;
     use super::*;
     use std::path::Path;
 

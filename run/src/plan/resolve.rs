@@ -147,18 +147,19 @@ fn follow_networks(table: &mut Table, sources: &mut SettingSources, overrides: &
     Ok(())
 }
 
+/// The configuration with these values of `--set`.
 #[cfg(test)]
-pub(super) mod tests {
-    use super::*;
+pub(super) fn plan(what: &str, set: &[&str]) -> anyhow::Result<Config> {
+    let overrides = RunOverrides {
+        set: set.iter().map(|assignment| (*assignment).into()).collect(),
+        ..RunOverrides::default()
+    };
+    decide(what, &overrides).map(|(_, config)| config)
+}
 
-    /// The configuration with these values of `--set`.
-    pub(in super::super) fn plan(what: &str, set: &[&str]) -> anyhow::Result<Config> {
-        let overrides = RunOverrides {
-            set: set.iter().map(|assignment| (*assignment).into()).collect(),
-            ..RunOverrides::default()
-        };
-        decide(what, &overrides).map(|(_, config)| config)
-    }
+#[cfg(test)]
+mod tests {
+    use super::*;
 
     #[test]
     fn errors_in_the_configuration_are_one_line() {
