@@ -303,7 +303,7 @@ fn a_disk_too_small_for_the_replay_is_reported_and_ends_the_run() {
     let place = Workplace::new();
     // A file size limit of a few megabytes simulates a full disk: the replay needs forty.
     let script = format!(
-        "ulimit -f 8000; exec {} train pendulum --run run --json",
+        "ulimit -f 8000; exec {} train pendulum --run run --json --set run.give_up_seconds=1",
         env!("CARGO_BIN_EXE_shoal")
     );
     let mut shell = std::process::Command::new("sh");

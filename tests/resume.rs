@@ -263,7 +263,7 @@ fn files_that_do_not_belong_to_the_run_are_refused_and_left_unchanged() {
 
 /// Tries to resume the run. Returns the exit code and standard error.
 fn try_to_resume(place: &Workplace) -> (Option<i32>, String) {
-    let output = place.output(&["resume", "run"]);
+    let output = place.output(&["resume", "run", "--set", "run.give_up_seconds=1"]);
     (
         output.status.code(),
         String::from_utf8_lossy(&output.stderr).into_owned(),

@@ -208,7 +208,7 @@ fn a_failed_run_does_not_stop_the_others() {
         &["train", "pendulum", "--run", "suite"],
         &sweep[..],
         &QUICK,
-        &["--set", deep],
+        &["--set", deep, "--set", "run.give_up_seconds=1"],
     ]
     .concat();
     let output = place.output(&arguments);

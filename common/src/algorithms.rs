@@ -22,7 +22,7 @@ pub use reinforce::{ReinforceConfig, ReinforceNetworks, ReturnWeighting};
 pub use sac::SacConfig;
 use serde::Serialize;
 use shoal_base::section::{self, OutOfRange, Section, describe};
-use shoal_base::space::EnvironmentSpec;
+use shoal_base::space::{EnvironmentSpec, Space};
 use shoal_policy::PolicyError;
 pub use tabular::TabularConfig;
 pub use td3::Td3Config;
@@ -51,6 +51,12 @@ macro_rules! registry {
 
             /// Its settings, without the type of the algorithm.
             pub fn settings(&self) -> &dyn AlgorithmSettings {
+                match self {
+                    $(Self::$variant(settings) => settings),*
+                }
+            }
+
+            fn settings_mut(&mut self) -> &mut dyn AlgorithmSettings {
                 match self {
                     $(Self::$variant(settings) => settings),*
                 }
@@ -119,6 +125,33 @@ impl Default for AlgorithmConfig {
 }
 
 impl AlgorithmConfig {
+    /// The name of the algorithm that a configuration with these sections is for: the one that has a section. Only DDPG
+    /// has a second one, `[exploration]`.
+    pub fn named_in(sections: &toml::Table) -> Option<&'static str> {
+        let all = Self::all().into_iter().map(|algorithm| algorithm.name());
+        let mut named = all.filter(|name| sections.contains_key(*name));
+        named
+            .next()
+            .or_else(|| sections.contains_key("exploration").then_some(ddpg::SPEC.name))
+    }
+
+    /// The name of the algorithm that suits an environment, for a user who has chosen none.
+    pub fn suitable(spec: &EnvironmentSpec) -> &'static str {
+        let suitable = match (&spec.observation, &spec.action) {
+            (Space::Box { .. }, Space::Box { .. }) => sac::SPEC,
+            (Space::Discrete { .. }, Space::Box { .. }) => ddpg::SPEC,
+            (Space::Box { .. }, Space::Discrete { .. }) => dqn::SPEC,
+            (Space::Discrete { .. }, Space::Discrete { .. }) => tabular::Q_LEARNING,
+        };
+        suitable.name
+    }
+
+    /// Sets what follows from the length of the run, in environment steps, if it is left open. Returns the key that was
+    /// set.
+    pub fn follow_length(&mut self, steps: u64) -> Option<&'static str> {
+        self.settings_mut().follow_length(steps)
+    }
+
     /// Each algorithm that learns from minibatches, with its default settings.
     pub fn of_minibatches() -> impl Iterator<Item = Self> {
         let all = Self::all().into_iter();
@@ -158,7 +191,6 @@ impl AlgorithmConfig {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use shoal_base::space::Space;
 
     fn spec(observation: Space, action: Space) -> EnvironmentSpec {
         EnvironmentSpec {
@@ -185,6 +217,20 @@ mod tests {
         assert_eq!(takes(counted, real), [yes, no, no, no, no, no, no]);
         assert_eq!(takes(real, counted), [no, no, no, yes, yes, no, no]);
         assert_eq!(takes(counted, counted), [no, no, no, no, no, yes, yes]);
+    }
+
+    #[test]
+    fn the_suitable_algorithm_can_control_the_environment() {
+        let spaces = || [Space::boxed(&[(-1.0, 1.0); 4]), Space::discrete(3)];
+        for (observation, action) in spaces()
+            .into_iter()
+            .flat_map(|one| spaces().map(|other| (one.clone(), other)))
+        {
+            let spec = spec(observation, action);
+            let mut all = AlgorithmConfig::all().into_iter();
+            let suitable = all.find(|algorithm| algorithm.name() == AlgorithmConfig::suitable(&spec));
+            suitable.unwrap().check_spaces(&spec).unwrap();
+        }
     }
 
     #[test]

@@ -1,8 +1,7 @@
-//! The algorithm of a new run: the one that was asked for, or the one that suits the environment; and its defaults.
+//! The algorithm that the user asks for, and its defaults.
 
 use anyhow::Context;
 use shoal_common::config::AlgorithmConfig;
-use shoal_common::space::{EnvironmentSpec, Space};
 use toml::{Table, Value};
 
 use crate::usage::UsageError;
@@ -43,13 +42,6 @@ pub(crate) fn asked_for(algorithm: Option<&str>, set: &[String]) -> anyhow::Resu
     Ok(asked)
 }
 
-/// The algorithm whose section is in the table; DDPG if there is only `[exploration]`, the noise of its actors.
-pub(crate) fn named_in(table: &Table) -> Option<&'static str> {
-    names()
-        .find(|name| table.contains_key(*name))
-        .or_else(|| table.contains_key("exploration").then_some("ddpg"))
-}
-
 /// Makes a preset for another algorithm. What the preset says about learning was chosen for its own algorithm, so only
 /// the environment, the run's length and the evaluation are kept. Returns what is kept.
 pub(crate) fn replace(preset: &mut Table, algorithm: &'static str) -> anyhow::Result<Table> {
@@ -72,16 +64,6 @@ pub(crate) fn replace(preset: &mut Table, algorithm: &'static str) -> anyhow::Re
     let kept = preset.clone();
     add(preset, defaults);
     Ok(kept)
-}
-
-/// The algorithm that suits a Gymnasium environment's spaces.
-pub(crate) fn suitable(spec: &EnvironmentSpec) -> &'static str {
-    match (&spec.observation, &spec.action) {
-        (Space::Box { .. }, Space::Box { .. }) => "sac",
-        (Space::Discrete { .. }, Space::Box { .. }) => "ddpg",
-        (Space::Box { .. }, Space::Discrete { .. }) => "dqn",
-        (Space::Discrete { .. }, Space::Discrete { .. }) => "q-learning",
-    }
 }
 
 /// Adds the defaults of an algorithm, and those for the environment `name`, to a table. Existing settings are kept.

@@ -17,9 +17,8 @@ use super::process::Process;
 const PROVEN: Duration = Duration::from_secs(30);
 const PROVEN_STEPS: u64 = 1000;
 
-/// Failed starts after which a role is given up, if they span [`SPAN_OF_FAILURES`] and twice its longest start.
+/// Failed starts after which a role is given up, if they span `run.give_up_seconds` and twice its longest start.
 const MAX_FAILURES: u32 = 5;
-const SPAN_OF_FAILURES: Duration = Duration::from_secs(30);
 
 /// The pause before the restart after the first failure. It doubles with each further failure, up to the longest.
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
@@ -182,14 +181,15 @@ impl Child {
         Some(took)
     }
 
-    /// Handles the end of its process, which was not asked to end.
-    pub(super) fn has_ended(&mut self, status: ExitStatus) -> RestartDecision {
-        self.has_ended_at(status, Instant::now())
+    /// Handles the end of its process, which was not asked to end. The role is given up if its failures span
+    /// `give_up_after`.
+    pub(super) fn has_ended(&mut self, status: ExitStatus, give_up_after: Duration) -> RestartDecision {
+        self.has_ended_at(status, give_up_after, Instant::now())
     }
 
     /// After a process that was able to work, the role is restarted and its failures are forgotten. Being killed while
     /// it waited, after its first step, or within the usual time of a start is not a failure either. Any other end is.
-    fn has_ended_at(&mut self, status: ExitStatus, now: Instant) -> RestartDecision {
+    fn has_ended_at(&mut self, status: ExitStatus, give_up_after: Duration, now: Instant) -> RestartDecision {
         (self.process, self.ended) = (None, None);
         let crash_signals = [SIGABRT, SIGBUS, SIGFPE, SIGILL, SIGSEGV];
         let was_killed = status.signal().is_some_and(|signal| !crash_signals.contains(&signal));
@@ -213,7 +213,7 @@ impl Child {
         self.failures += 1;
         let since = *self.failing_since.get_or_insert(self.started_at);
         let longest = self.longest_start.max(self.usual_start.unwrap_or_default());
-        if self.failures >= MAX_FAILURES && now - since >= SPAN_OF_FAILURES.max(2 * longest) {
+        if self.failures >= MAX_FAILURES && now - since >= give_up_after.max(2 * longest) {
             return RestartDecision::GiveUp(self.failures);
         }
         let doubled = FIRST_PAUSE * 2_u32.pow((self.failures - 1).min(10));
@@ -373,7 +373,7 @@ mod tests {
                 self.child.record_at(&last, self.now + ready);
             }
             self.now += lived;
-            let consequence = self.child.has_ended_at(end, self.now);
+            let consequence = self.child.has_ended_at(end, GIVE_UP_AFTER, self.now);
             if let RestartDecision::Restart(pause) = consequence {
                 self.now += pause;
             }
@@ -389,6 +389,8 @@ mod tests {
     }
 
     const READY: Duration = Duration::from_millis(20);
+
+    const GIVE_UP_AFTER: Duration = Duration::from_secs(30);
 
     #[test]
     fn a_role_that_always_fails_is_given_up_after_half_a_minute_of_growing_pauses() {

@@ -99,6 +99,8 @@ pub(super) struct Supervisor {
     /// Invalid answers of environments since the launcher started, and the last one.
     faults: u32,
     max_faults: u32,
+    /// A role is given up if its failures span this time.
+    give_up_after: Duration,
     last_fault: String,
     all_ready: bool,
     cleaned_at: Instant,
@@ -168,6 +170,7 @@ impl Supervisor {
             processes_started: started,
             faults: 0,
             max_faults: config.environment.faults,
+            give_up_after: Duration::from_secs(config.run.give_up_seconds),
             last_fault: String::new(),
             all_ready: false,
             cleaned_at: Instant::now(),
@@ -558,7 +561,7 @@ impl Supervisor {
             self.note_incident(i, IncidentKind::Retired, String::new());
             return Ok(RunCondition::AtWork);
         }
-        let consequence = child.has_ended(status);
+        let consequence = child.has_ended(status, self.give_up_after);
         let what = if status.signal().is_some() {
             IncidentKind::Killed
         } else {

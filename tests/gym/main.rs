@@ -176,7 +176,8 @@ fn a_failing_environment_ends_the_run_with_its_last_output() {
         let run = format!("run-{how}");
         let how = format!("environment.how={how}");
         let environment = format!("{OURS}Fails-v0");
-        let output = place.output(&["train", &environment, "--run", &run, "--steps", "1000", "--set", &how]);
+        let plain = ["train", &environment, "--run", &run, "--steps", "1000"];
+        let output = place.output(&[&plain[..], &["--set", &how, "--set", "run.give_up_seconds=1"]].concat());
         let message = String::from_utf8_lossy(&output.stderr);
         assert_eq!(output.status.code(), Some(1), "{message}");
         let last = message.lines().last().unwrap_or_default();

@@ -83,7 +83,7 @@ fn a_failed_run_is_listed_as_failed() {
     let place = Workplace::new();
     // The limit on file sizes is too small for the replay.
     let script = format!(
-        "ulimit -f 8000; exec {} train pendulum --run runs/run {}",
+        "ulimit -f 8000; exec {} train pendulum --run runs/run --set run.give_up_seconds=1 {}",
         env!("CARGO_BIN_EXE_shoal"),
         QUICK[..2]
             .iter()

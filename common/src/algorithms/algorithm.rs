@@ -48,6 +48,12 @@ pub trait AlgorithmSettings {
 
     /// Transitions in a minibatch; 1 if it does not learn from minibatches.
     fn batch(&self) -> usize;
+
+    /// Sets what follows from the length of the run, in environment steps, if it is left open. Returns the key that was
+    /// set.
+    fn follow_length(&mut self, _steps: u64) -> Option<&'static str> {
+        None
+    }
 }
 
 /// The networks of an algorithm with an actor and a critic, or several critics of the same layout.

@@ -87,4 +87,12 @@ impl AlgorithmSettings for DqnConfig {
     fn batch(&self) -> usize {
         self.batch
     }
+
+    fn follow_length(&mut self, steps: u64) -> Option<&'static str> {
+        if self.epsilon_steps != 0 {
+            return None;
+        }
+        self.epsilon_steps = (steps / 10).max(1);
+        Some("epsilon_steps")
+    }
 }

@@ -1,8 +1,6 @@
 //! The sections of the configuration's text. At most one of the algorithms' sections may be present.
 
-use serde::de::DeserializeOwned;
 use serde::{Deserialize, Deserializer, Serialize, Serializer, de};
-use shoal_base::section;
 use shoal_base::space::EnvironmentSpec;
 use toml::{Table, Value};
 
@@ -108,10 +106,11 @@ impl TryFrom<Sections> for Config {
 }
 
 /// What is wrong with the first section that cannot be read, beginning with the key and its value: serde's own error does
-/// not name the key. The sections of algorithms, whose errors do, are not among these.
+/// not name the key.
 pub(super) fn first_unreadable(sections: &Table) -> Option<String> {
-    fn fault<T: DeserializeOwned>(sections: &Table, name: &str) -> Option<String> {
-        let error = section::read::<T>(name, sections.get(name)?.clone()).err()?;
+    explanation::sections().into_iter().find_map(|section| {
+        let name = section.name;
+        let error = (section.check)(name, sections.get(name)?.clone()).err()?;
         let message = error.message().replace('\n', " ");
         let is_named = message.starts_with(&format!("{name}."));
         Some(if is_named {
@@ -119,16 +118,7 @@ pub(super) fn first_unreadable(sections: &Table) -> Option<String> {
         } else {
             format!("[{name}]: {message}")
         })
-    }
-    fault::<RunConfig>(sections, "run")
-        .or_else(|| fault::<ActorsConfig>(sections, "actors"))
-        .or_else(|| fault::<ExplorationConfig>(sections, "exploration"))
-        .or_else(|| fault::<ObservationConfig>(sections, "observation"))
-        .or_else(|| fault::<RewardConfig>(sections, "reward"))
-        .or_else(|| fault::<LearnerConfig>(sections, "learner"))
-        .or_else(|| fault::<ReplayConfig>(sections, "replay"))
-        .or_else(|| fault::<EvaluationConfig>(sections, "evaluation"))
-        .or_else(|| fault::<CheckpointConfig>(sections, "checkpoint"))
+    })
 }
 
 /// The algorithm that has a section, or the default algorithm if none has one.

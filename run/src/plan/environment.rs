@@ -2,7 +2,7 @@
 
 use anyhow::bail;
 use serde::de::DeserializeOwned;
-use shoal_common::config::{EnvironmentConfig, Mode, RunConfig};
+use shoal_common::config::{AlgorithmConfig, EnvironmentConfig, Mode, RunConfig};
 use shoal_env_server::environment::{self, EnvironmentError};
 use toml::{Table, Value};
 
@@ -58,9 +58,9 @@ pub(super) fn describe_environment(table: &mut Table) -> anyhow::Result<()> {
         let spec = environment::make(&name, &parameters)?.spec();
         (configured(name, Vec::new(), parameters), spec)
     };
-    let named = algorithm::named_in(table);
+    let named = AlgorithmConfig::named_in(table);
     if environment.name.starts_with(GYMNASIUM) {
-        let algorithm = named.unwrap_or_else(|| algorithm::suitable(&spec));
+        let algorithm = named.unwrap_or_else(|| AlgorithmConfig::suitable(&spec));
         algorithm::add_defaults(table, &environment.name, algorithm)?;
     }
     table.insert("environment".into(), Value::try_from(environment)?);

@@ -92,11 +92,9 @@ fn resolve(
 
 /// Sets what follows from the run's length if it is left open.
 pub(super) fn set_what_follows(config: &mut Config, sources: &mut SettingSources) {
-    if let AlgorithmConfig::Dqn(dqn) = &mut config.algorithm
-        && dqn.epsilon_steps == 0
-    {
-        dqn.epsilon_steps = (config.run.steps / 10).max(1);
-        sources.set("dqn.epsilon_steps".into(), SettingSource::Follows("run.steps".into()));
+    if let Some(key) = config.algorithm.follow_length(config.run.steps) {
+        let key = format!("{}.{key}", config.algorithm.name());
+        sources.set(key, SettingSource::Follows("run.steps".into()));
     }
 }
 

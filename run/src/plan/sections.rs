@@ -28,7 +28,7 @@ pub(super) fn for_algorithm(what: &str, overrides: &RunOverrides) -> anyhow::Res
     if let Some(own) = with_algorithm(what, algorithm) {
         (name, table, sources) = sections(own)?;
     }
-    let named = algorithm::named_in(&table);
+    let named = AlgorithmConfig::named_in(&table);
     let default = AlgorithmConfig::default().name();
     let defaults = SettingSource::Algorithm(algorithm);
     if preset(what).is_some() {

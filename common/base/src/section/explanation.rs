@@ -3,10 +3,12 @@
 
 use schemars::{JsonSchema, schema_for};
 use serde::Serialize;
-use serde_json::Value;
-use toml::Table;
+use serde::de::DeserializeOwned;
+use serde_json::Value as Json;
+use toml::{Table, Value};
 
 use super::change::Change;
+use super::read;
 
 /// The explanation of a key.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -38,22 +40,25 @@ pub struct Section {
     pub keys: Vec<Key>,
     /// The default values; some keys have none.
     pub defaults: Table,
+    /// Reads a section of this name and type, and returns the error if that fails.
+    pub check: fn(&str, Value) -> Result<(), toml::de::Error>,
 }
 
 /// The section whose type is `T`.
-pub fn describe<T: JsonSchema + Default + Serialize>(name: &'static str) -> Section {
+pub fn describe<T: JsonSchema + Default + Serialize + DeserializeOwned>(name: &'static str) -> Section {
     Section {
         name,
         keys: keys::<T>(),
         // This cannot fail: every default is a number, a word or a list of them.
         defaults: Table::try_from(T::default()).unwrap_or_default(),
+        check: |name, section| read::<T>(name, section).map(drop),
     }
 }
 
 /// The keys of a section whose type is `T`. A field is empty if the key's declaration has nothing for it.
 pub fn keys<T: JsonSchema>() -> Vec<Key> {
     let schema = schema_for!(T).to_value();
-    let text = |property: &Value, what: &str| property[what].as_str().unwrap_or_default().replace('\n', " ");
+    let text = |property: &Json, what: &str| property[what].as_str().unwrap_or_default().replace('\n', " ");
     let properties = schema["properties"].as_object().into_iter().flatten();
     let key = properties.map(|(name, property)| Key {
         name: name.clone(),
@@ -69,13 +74,13 @@ pub fn keys<T: JsonSchema>() -> Vec<Key> {
 }
 
 /// Whether a value of this type is a whole number, or may be one.
-fn is_whole(of_type: &Value) -> bool {
+fn is_whole(of_type: &Json) -> bool {
     let any = of_type.as_array().into_iter().flatten();
     std::iter::once(of_type).chain(any).any(|name| name == "integer")
 }
 
 /// The possible values of a property, if it is a word.
-fn choices(schema: &Value, property: &Value) -> Vec<String> {
+fn choices(schema: &Json, property: &Json) -> Vec<String> {
     if property["type"] == "boolean" {
         return vec!["false".into(), "true".into()];
     }
@@ -83,11 +88,11 @@ fn choices(schema: &Value, property: &Value) -> Vec<String> {
     let Some(named) = place.and_then(|place| schema.pointer(place)) else {
         return Vec::new();
     };
-    let words = |list: &Value, of: fn(&Value) -> Option<&str>| -> Vec<String> {
+    let words = |list: &Json, of: fn(&Json) -> Option<&str>| -> Vec<String> {
         let list = list.as_array().into_iter().flatten();
         list.filter_map(of).map(str::to_owned).collect()
     };
-    let mut all = words(&named["enum"], Value::as_str);
+    let mut all = words(&named["enum"], Json::as_str);
     all.extend(words(&named["oneOf"], |one| one["const"].as_str()));
     all
 }
