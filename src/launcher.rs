@@ -28,10 +28,10 @@ use shoal_common::report::{EpisodeReport, EvaluationReport, Heartbeat, LearnerRe
 use shoal_common::role::Role;
 use shoal_common::run_dir::{RunDir, RunLock};
 use shoal_common::stop::GRACE;
+use shoal_run::child_process::wait_for_any;
 use shoal_run::external_environment::server_iceoryx2_config;
-use shoal_run::outcome::{RunOutcome, RunState, STARTING};
-use shoal_run::process::wait_for_any;
-use shoal_run::recorder::Recorder;
+use shoal_run::records::outcome::{RunOutcome, RunState, STARTING};
+use shoal_run::records::recorder::Recorder;
 use shoal_run::signals::Signals;
 use shoal_run::{preflight, signals, status};
 

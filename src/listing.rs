@@ -10,10 +10,10 @@ use shoal_common::channel::control::RunStatus;
 use shoal_common::run_dir::RunDir;
 use shoal_run::client::RunClient;
 use shoal_run::evaluation::SavedPolicy;
-use shoal_run::final_evaluation::FinalEvaluation;
-use shoal_run::outcome::{RunOutcome, RunState};
+use shoal_run::evaluation::final_evaluation::FinalEvaluation;
 use shoal_run::plan;
-use shoal_run::recorder::read_evaluations;
+use shoal_run::records::outcome::{RunOutcome, RunState};
+use shoal_run::records::recorder::read_evaluations;
 use shoal_run::status::saved_status;
 
 use crate::launcher::{ALL_ENDED, FAILED};

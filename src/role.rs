@@ -21,8 +21,8 @@ use shoal_remote::{
     endpoint::Endpoint,
     files::{HostFile, JoinFile, KeyFile},
 };
+use shoal_run::external_environment::server_location::ServerSurroundings;
 use shoal_run::external_environment::{self, LaunchSpec, server_iceoryx2_config};
-use shoal_run::server_location::ServerSurroundings;
 use shoal_run::status::evaluated_period;
 use tracing_subscriber::Layer;
 use tracing_subscriber::filter::{LevelFilter, Targets};

@@ -296,8 +296,8 @@ impl<'a> Actor<'a> {
 
     /// Whether the chunk is full or, if a chunk is one episode, the episode is over.
     fn chunk_is_complete(&self) -> bool {
-        let episode_is_over =
-            self.settings.config.algorithm.spec().transition_use == TransitionUse::Episodes && !self.ended.is_empty();
+        let episode_is_over = self.settings.config.algorithm.properties().transition_use == TransitionUse::Episodes
+            && !self.ended.is_empty();
         self.chunk.is_full() || episode_is_over
     }
 

@@ -18,7 +18,7 @@ use shoal_learner::algorithms::registry;
 use shoal_learner::networks::initialise::initialise;
 use shoal_learner::process::intake::Intake;
 use shoal_learner::replay::Replay;
-use shoal_run::process::ChildProcess;
+use shoal_run::child_process::ChildProcess;
 
 use super::intervals::{self, IntervalResults};
 use super::measurement::{TimeBudget, interrupted};

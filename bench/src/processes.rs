@@ -4,7 +4,7 @@
 use rustix::thread::CpuSet;
 use shoal_common::role::{Role, RoleInstance};
 use shoal_common::run_dir::RunDir;
-use shoal_run::process::ChildProcess;
+use shoal_run::child_process::ChildProcess;
 
 /// The running processes.
 #[derive(Debug)]

@@ -10,7 +10,7 @@ use shoal_common::channel::{ChannelError, Domain, EventName, Listener};
 use shoal_common::config::Config;
 use shoal_common::exit::Exit;
 use shoal_common::role::Role;
-use shoal_run::process::ChildProcess;
+use shoal_run::child_process::ChildProcess;
 
 use super::cores::Cores;
 use super::measurement::{Figures, TimeBudget};

@@ -7,10 +7,10 @@ use shoal_common::commit::ReplayLayout;
 use shoal_common::config::{Config, DdpgConfig};
 use shoal_common::role::Role;
 use shoal_common::run_dir::RunDir;
+use shoal_run::child_process::ChildProcess;
 use shoal_run::plan::Plan;
 use shoal_run::plan::RunOverrides;
 use shoal_run::preflight;
-use shoal_run::process::ChildProcess;
 use tempfile::TempDir;
 
 use super::processes::Processes;

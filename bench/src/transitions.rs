@@ -14,7 +14,7 @@ use shoal_common::run_dir::RunDir;
 use shoal_learner::algorithms::minibatch::Minibatch;
 use shoal_learner::algorithms::sampling::Sampler;
 use shoal_learner::replay::Replay;
-use shoal_run::process::ChildProcess;
+use shoal_run::child_process::ChildProcess;
 
 use super::intervals::{self, IntervalResults};
 use super::measurement::{Figures, TimeBudget};

@@ -12,7 +12,7 @@ mod sac;
 mod tabular;
 mod td3;
 
-pub use algorithm::{ActorCritic, AlgorithmSettings, AlgorithmSpec, LearnedShapes, Shape, TransitionUse};
+pub use algorithm::{ActorCritic, AlgorithmProperties, AlgorithmSettings, LearnedShapes, Shape, TransitionUse};
 pub use behaviour::{Behaviour, Epsilon};
 pub use ddpg::DdpgConfig;
 pub use dqn::DqnConfig;
@@ -28,7 +28,7 @@ pub use tabular::TabularConfig;
 pub use td3::Td3Config;
 
 macro_rules! registry {
-    ($($(#[$attribute:meta])* $variant:ident($settings:ty) is $spec:expr;)*) => {
+    ($($(#[$attribute:meta])* $variant:ident($settings:ty) is $properties:expr;)*) => {
         /// The algorithm of a run, with its settings. Its section in `config.toml` has its name.
         #[derive(Clone, Debug, PartialEq, Serialize)]
         #[serde(rename_all = "kebab-case")]
@@ -43,9 +43,9 @@ macro_rules! registry {
             }
 
             /// The algorithm's fixed properties.
-            pub fn spec(&self) -> AlgorithmSpec {
+            pub fn properties(&self) -> AlgorithmProperties {
                 match self {
-                    $(Self::$variant(_) => $spec),*
+                    $(Self::$variant(_) => $properties),*
                 }
             }
 
@@ -75,13 +75,13 @@ macro_rules! registry {
             /// For the first invalid number.
             pub fn check(&self) -> Result<(), OutOfRange> {
                 match self {
-                    $(Self::$variant(settings) => settings.check_bounds($spec.name)),*
+                    $(Self::$variant(settings) => settings.check_bounds($properties.name)),*
                 }
             }
 
             /// The keys of every algorithm's section.
             pub fn sections() -> Vec<Section> {
-                vec![$(describe::<$settings>($spec.name)),*]
+                vec![$(describe::<$settings>($properties.name)),*]
             }
 
             /// Reads the section of the algorithm `name`; `None` if there is no algorithm of that name.
@@ -89,7 +89,7 @@ macro_rules! registry {
             /// # Errors
             /// When a key is unknown or of the wrong type. The error names the key and its value.
             pub fn read(name: &str, section: toml::Value) -> Option<Result<Self, toml::de::Error>> {
-                $(if name == $spec.name {
+                $(if name == $properties.name {
                     return Some(section::read(name, section).map(Self::$variant));
                 })*
                 None
@@ -102,15 +102,15 @@ macro_rules! registry {
 // `[q-learning]`).
 registry! {
     /// `[ddpg]` and `[exploration]`.
-    Ddpg(DdpgConfig) is ddpg::SPEC;
+    Ddpg(DdpgConfig) is ddpg::PROPERTIES;
     /// `[td3]`.
-    Td3(Td3Config) is td3::SPEC;
+    Td3(Td3Config) is td3::PROPERTIES;
     /// `[sac]`.
-    Sac(SacConfig) is sac::SPEC;
+    Sac(SacConfig) is sac::PROPERTIES;
     /// `[dqn]`.
-    Dqn(DqnConfig) is dqn::SPEC;
+    Dqn(DqnConfig) is dqn::PROPERTIES;
     /// `[reinforce]`.
-    Reinforce(ReinforceConfig) is reinforce::SPEC;
+    Reinforce(ReinforceConfig) is reinforce::PROPERTIES;
     /// `[q-learning]`.
     QLearning(TabularConfig) is tabular::Q_LEARNING;
     /// `[sarsa]`.
@@ -132,15 +132,15 @@ impl AlgorithmConfig {
         let mut named = all.filter(|name| sections.contains_key(*name));
         named
             .next()
-            .or_else(|| sections.contains_key("exploration").then_some(ddpg::SPEC.name))
+            .or_else(|| sections.contains_key("exploration").then_some(ddpg::PROPERTIES.name))
     }
 
     /// The name of the algorithm that suits an environment, for a user who has chosen none.
     pub fn suitable(spec: &EnvironmentSpec) -> &'static str {
         let suitable = match (&spec.observation, &spec.action) {
-            (Space::Box { .. }, Space::Box { .. }) => sac::SPEC,
-            (Space::Discrete { .. }, Space::Box { .. }) => ddpg::SPEC,
-            (Space::Box { .. }, Space::Discrete { .. }) => dqn::SPEC,
+            (Space::Box { .. }, Space::Box { .. }) => sac::PROPERTIES,
+            (Space::Discrete { .. }, Space::Box { .. }) => ddpg::PROPERTIES,
+            (Space::Box { .. }, Space::Discrete { .. }) => dqn::PROPERTIES,
             (Space::Discrete { .. }, Space::Discrete { .. }) => tabular::Q_LEARNING,
         };
         suitable.name
@@ -155,12 +155,12 @@ impl AlgorithmConfig {
     /// Each algorithm that learns from minibatches, with its default settings.
     pub fn of_minibatches() -> impl Iterator<Item = Self> {
         let all = Self::all().into_iter();
-        all.filter(|algorithm| algorithm.spec().transition_use == TransitionUse::Minibatches)
+        all.filter(|algorithm| algorithm.properties().transition_use == TransitionUse::Minibatches)
     }
 
     /// Its name, which is its section's.
     pub fn name(&self) -> &'static str {
-        self.spec().name
+        self.properties().name
     }
 
     /// The settings of DDPG, if this is DDPG.

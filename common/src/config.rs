@@ -10,6 +10,7 @@ pub mod explanation;
 mod identity;
 mod identity_format;
 mod learner;
+mod remote;
 mod replay;
 mod run;
 mod sections;
@@ -24,6 +25,7 @@ pub use environment::EnvironmentConfig;
 pub use evaluation::EvaluationConfig;
 pub use identity_format::IdentityFormat;
 pub use learner::LearnerConfig;
+pub use remote::RemoteConfig;
 pub use replay::ReplayConfig;
 pub use run::{Mode, RunConfig};
 use shoal_base::section;
@@ -63,6 +65,8 @@ pub struct Config {
     pub evaluation: EvaluationConfig,
     /// How often the learner's state is saved.
     pub checkpoint: CheckpointConfig,
+    /// Actors on other hosts.
+    pub remote: RemoteConfig,
 }
 
 /// Why a configuration cannot be used.
@@ -248,7 +252,8 @@ impl Config {
         self.check_collection()?;
         self.learner.check_bounds("learner")?;
         self.evaluation.check_bounds("evaluation")?;
-        Ok(self.checkpoint.check_bounds("checkpoint")?)
+        self.checkpoint.check_bounds("checkpoint")?;
+        Ok(self.remote.check_bounds("remote")?)
     }
 
     /// The names of the algorithms that can control the environment.
@@ -265,17 +270,17 @@ impl Config {
 
     /// Checks the algorithm's requirements on the collection of transitions.
     fn check_collection(&self) -> Result<(), OutOfRange> {
-        let spec = self.algorithm.spec();
+        let algorithm = self.algorithm.properties();
         let only = |key: &str, value: String, only: &str, why: &str| OutOfRange {
             key: key.into(),
             value,
-            expected: format!("{only}: {} {why}", spec.name),
+            expected: format!("{only}: {} {why}", algorithm.name),
         };
-        if !spec.off_policy && self.run.mode == Mode::Free {
+        if !algorithm.off_policy && self.run.mode == Mode::Free {
             let why = "learns only from transitions of the newest policy";
             return Err(only("run.mode", "free".into(), "lockstep", why));
         }
-        if spec.transition_use == TransitionUse::Episodes {
+        if algorithm.transition_use == TransitionUse::Episodes {
             let why = "learns from whole episodes, each in a chunk of its own";
             let (limit, steps) = (self.spec.time_limit, self.actors.chunk_steps);
             if steps != limit {

@@ -30,7 +30,7 @@ use zenoh::{Session, Wait};
 use crate::endpoint::Endpoint;
 use crate::files::KeyFile;
 use crate::forwarding::{ChunkOrder, Forwarding};
-use crate::network::{self, NetworkError, failed};
+use crate::network::{self, CUT_OFF_AFTER, LONGEST_SLEEP, NetworkError, REFRESH_INTERVAL, failed};
 use crate::rate_limiter::RateLimiter;
 use crate::refused;
 use crate::requests::LauncherRequests;
@@ -46,16 +46,9 @@ const LONGEST_ACKNOWLEDGEMENT_INTERVAL: Duration = Duration::from_millis(100);
 
 /// How long to sleep while chunks wait to be committed: at first, and at most while nothing is committed.
 const SHORTEST_SLEEP: Duration = Duration::from_micros(200);
-const LONGEST_SLEEP: Duration = Duration::from_millis(20);
-
-/// How often to refresh connections, which a restarted learner needs.
-const REFRESH_INTERVAL: Duration = Duration::from_millis(50);
 
 /// How often the launcher gets the status of the hosts.
 const STATUS_INTERVAL: Duration = Duration::from_millis(500);
-
-/// A host that is silent for this long is cut off, or gone.
-const CUT_OFF_AFTER: Duration = Duration::from_secs(3);
 
 /// How long a query for a policy is kept before the host has to ask again.
 const POLICY_PATIENCE: Duration = Duration::from_secs(8);
@@ -68,9 +61,6 @@ const WARNING_INTERVAL: Duration = Duration::from_secs(10);
 
 /// How long at least to announce that the run is over.
 const END_ANNOUNCEMENT: Duration = Duration::from_secs(1);
-
-/// Bytes a second that policies may take, for all hosts together.
-const POLICY_BANDWIDTH: f64 = 30e6;
 
 /// What the gate needs.
 #[derive(Clone, Debug)]
@@ -222,7 +212,10 @@ impl<'a> Gate<'a> {
             match CommitReader::open(&run.replay_file()) {
                 Ok(replay) => break replay,
                 Err(OpenError::NotYet { .. }) if stop.requested() => return Ok(None),
-                Err(OpenError::NotYet { .. }) => std::thread::sleep(LONGEST_SLEEP),
+                Err(OpenError::NotYet { .. }) => {
+                    std::thread::sleep(LONGEST_SLEEP);
+                    heartbeat.beat(Activity::WaitingForPeer);
+                }
                 Err(error) => return Err(error.into()),
             }
         };
@@ -247,7 +240,7 @@ impl<'a> Gate<'a> {
             replay,
             policy,
             encoded_policy: None,
-            policy_limiter: RateLimiter::new(POLICY_BANDWIDTH, Instant::now()),
+            policy_limiter: RateLimiter::new(config.remote.policy_bandwidth, Instant::now()),
             policy_version: 0,
             learner_notifier: Notifier::new(domain, EventName(Role::Learner, 0))?,
             heartbeat,

@@ -6,6 +6,7 @@
 
 use std::os::unix::process::CommandExt;
 use std::process::Command;
+use std::time::Duration;
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
@@ -24,6 +25,15 @@ const THREADS: (&str, &str) = (
     "ZENOH_RUNTIME",
     "(app: (worker_threads: 1), acc: (handover: app), tx: (handover: app), rx: (handover: app), net: (handover: app))",
 );
+
+/// Gate or relay is away if nothing has come from it for this long.
+pub(crate) const CUT_OFF_AFTER: Duration = Duration::from_secs(3);
+
+/// How long gate and relay wait for news before they look at everything again.
+pub(crate) const LONGEST_SLEEP: Duration = Duration::from_millis(20);
+
+/// How often they refresh their connections to the processes of their host, which may have been restarted.
+pub(crate) const REFRESH_INTERVAL: Duration = Duration::from_millis(50);
 
 fn has_one_thread() -> bool {
     std::env::var(THREADS.0).is_ok_and(|value| value == THREADS.1)

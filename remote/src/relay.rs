@@ -26,7 +26,7 @@ use zenoh::{Session, Wait};
 
 use crate::files::{FileError, HostFile, KeyFile};
 use crate::join::ask_to_join;
-use crate::network::{self, NetworkError, failed};
+use crate::network::{self, CUT_OFF_AFTER, LONGEST_SLEEP, NetworkError, REFRESH_INTERVAL, failed};
 use crate::requests::LauncherRequests;
 use crate::uncommitted::{ActorFollowUp, UncommittedChunks};
 use crate::wire::vector_instructions;
@@ -35,21 +35,12 @@ use crate::wire::{
     WireChunk, WireError, WirePolicy, id_of,
 };
 
-/// The gate is away if it has sent no acknowledgement for this long.
-const CUT_OFF_AFTER: Duration = Duration::from_secs(3);
-
 /// Chunks are sent again if the gate has got none for this long; or for some round trips, if that is longer.
 const RESEND_AFTER: Duration = Duration::from_millis(200);
 const RESEND_AFTER_ROUND_TRIPS: u32 = 4;
 
 /// Time between two reports.
 const REPORT_INTERVAL: Duration = Duration::from_millis(250);
-
-/// How long to wait for news before looking at everything again.
-const LONGEST_SLEEP: Duration = Duration::from_millis(20);
-
-/// How often to refresh connections.
-const REFRESH_INTERVAL: Duration = Duration::from_millis(50);
 
 /// Chunks on their way to the thread that sends them.
 const CHUNK_QUEUE_LENGTH: usize = 64;
@@ -340,16 +331,19 @@ impl<'a> Relay<'a> {
         self.last_acknowledgement = (acknowledgement.gate, acknowledgement.number);
         if self.is_cut_off() {
             tracing::info!("connected to the gate");
+            // The report was lost or delayed by the outage, whose length says nothing about a round trip.
+            self.unconfirmed_report = None;
         }
         self.heard_at = Some(Instant::now());
         if acknowledgement.phase == RunPhase::Over && !self.run_is_over {
             tracing::info!("the run is over");
             self.run_is_over = true;
         }
-        if let Some((_, sent)) = self
+        let confirmed = self
             .unconfirmed_report
-            .take_if(|(number, _)| *number <= acknowledgement.report)
-        {
+            .take_if(|(number, _)| *number <= acknowledgement.report);
+        // If a later report is confirmed, this one was lost, or its acknowledgement.
+        if let Some((_, sent)) = confirmed.filter(|(number, _)| *number == acknowledgement.report) {
             self.round_trip = Some(sent.elapsed());
         }
         let covered = |actor: &u32| acknowledgement.actors.iter().any(|of| of.actor == *actor);

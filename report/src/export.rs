@@ -10,8 +10,8 @@ use shoal_common::network::{ActionRange, Activation, NetworkLayout, OBSERVATION_
 use shoal_common::policy::{PolicyLayout, combine_heads};
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::space::Space;
-use shoal_run::final_evaluation::FinalPolicyResult;
-use shoal_run::rollout::policy_layout;
+use shoal_run::evaluation::final_evaluation::FinalPolicyResult;
+use shoal_run::evaluation::rollout::policy_layout;
 
 /// A policy in a form that needs no part of Shoal to run.
 #[derive(Clone, Debug)]

@@ -8,8 +8,8 @@ use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
 use shoal_run::description::Description;
 use shoal_run::evaluation::SavedPolicy;
-use shoal_run::recorder::read_evaluations;
-use shoal_run::rollout::Rollout;
+use shoal_run::evaluation::rollout::Rollout;
+use shoal_run::records::recorder::read_evaluations;
 
 use crate::figure;
 
@@ -47,8 +47,8 @@ mod tests {
     use shoal_common::policy_file::PolicyFile;
 
     use super::*;
-    use shoal_run::plan::resolved;
-    use shoal_run::rollout::policy_layout;
+    use shoal_run::evaluation::rollout::policy_layout;
+    use shoal_run::plan::resolve_preset;
     use shoal_run::testing::small;
 
     /// The figures of a run with a policy, by name.
@@ -79,7 +79,7 @@ mod tests {
 
     /// A preset's configuration, and a policy for it.
     fn of_preset(name: &str) -> (Config, Vec<f32>) {
-        let config = resolved(name).unwrap();
+        let config = resolve_preset(name).unwrap();
         let parameters = vec![0.0; policy_layout(&config).unwrap().parameters()];
         (config, parameters)
     }

@@ -8,7 +8,7 @@ use shoal_common::config::Config;
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::run_dir::RunDir;
 use shoal_run::evaluation::{SavedPolicy, evaluate};
-use shoal_run::recorder::{EpisodeRecord, read_episodes, read_evaluations};
+use shoal_run::records::recorder::{EpisodeRecord, read_episodes, read_evaluations};
 
 use super::experiment::{Experiment, Length, Stage};
 use super::folder::Folder;

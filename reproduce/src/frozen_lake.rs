@@ -7,9 +7,9 @@ use serde::{Deserialize, Serialize};
 use shoal_common::policy_file::PolicyFile;
 use shoal_env_server::environment::frozen_lake::{ACTIONS, STATES};
 use shoal_report::figure::{self, CurvesOfSetting, Frame};
-use shoal_run::analysis::lake::{LIMIT, Walk, greedy, optimal};
-use shoal_run::recorder::read_evaluations;
-use shoal_run::rollout::policy_layout;
+use shoal_run::evaluation::analysis::lake::{LIMIT, Walk, greedy, optimal};
+use shoal_run::evaluation::rollout::policy_layout;
+use shoal_run::records::recorder::read_evaluations;
 
 use super::experiment::{Experiment, Length, Stage};
 use super::family::{Family, Policies, Results};

@@ -2,7 +2,6 @@
 //!
 //! A new experiment needs a file with a [`family::Family`], and a line in [`FAMILIES`].
 
-mod batch;
 mod cart_pole;
 mod claim;
 mod experiment;
@@ -13,6 +12,7 @@ mod newer_algorithms;
 mod pendulum;
 mod point_mass;
 mod progress;
+mod queue;
 mod report;
 mod report_section;
 mod request;
@@ -25,11 +25,11 @@ use std::collections::BTreeMap;
 
 use anyhow::Context;
 
-use self::batch::Batch;
 pub use self::experiment::Effort;
 use self::experiment::Experiment;
 use self::family::{FamilyEntry, entry};
 use self::folder::Folder;
+use self::queue::SeedQueue;
 use self::request::Job;
 pub use self::request::{ReproductionEnd, Request};
 use self::settings::RunSettings;
@@ -77,13 +77,13 @@ pub fn run(request: &Request) -> anyhow::Result<ReproductionEnd> {
         report::write(&FAMILIES, &folder, request, &jobs, failures)
             .with_context(|| format!("cannot write the report {}", request.report.display()))
     };
-    let batch = Batch {
+    let queue = SeedQueue {
         folder: &folder,
         effort: request.effort,
         jobs: &jobs,
         settings: &settings,
     };
-    batch.run(request.jobs, write)
+    queue.run(request.jobs, write)
 }
 
 fn experiments() -> impl Iterator<Item = (&'static FamilyEntry, &'static Experiment)> {

@@ -2,8 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 use shoal_report::figure;
-use shoal_run::analysis::pendulum::{Measures, SwingUp};
-use shoal_run::rollout::Rollout;
+use shoal_run::evaluation::analysis::pendulum::{Measures, SwingUp};
+use shoal_run::evaluation::rollout::Rollout;
 
 use super::claim::{Claim, Scope, spread};
 use super::experiment::{Experiment, Length, Stage};

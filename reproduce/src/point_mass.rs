@@ -4,8 +4,8 @@ mod claims;
 mod figures;
 
 use serde::{Deserialize, Serialize};
-use shoal_run::analysis::point_mass::{Drive, FAR_STARTS, Measures, NEAR_STARTS};
-use shoal_run::rollout::Rollout;
+use shoal_run::evaluation::analysis::point_mass::{Drive, FAR_STARTS, Measures, NEAR_STARTS};
+use shoal_run::evaluation::rollout::Rollout;
 
 use super::experiment::{Experiment, Length, Stage};
 use super::family::{Family, Policies, Results};

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use indicatif::{HumanDuration, ProgressBar, ProgressDrawTarget, ProgressStyle};
 use shoal_common::run_dir::RunDir;
 use shoal_run::numbers::thousands;
-use shoal_run::recorder::recorded;
+use shoal_run::records::recorder::recorded;
 
 use super::experiment::{self, Effort, Length};
 use super::folder::Folder;

@@ -56,7 +56,7 @@ impl RunSettings {
             set: experiment.settings(effort).map(Into::into).collect(),
             ..RunOverrides::default()
         };
-        let (_, config) = plan::decide(experiment.preset, &overrides)?;
+        let (_, config) = plan::resolve(experiment.preset, &overrides)?;
         Self::of(&config)
     }
 

@@ -5,9 +5,9 @@ use std::path::Path;
 use std::process::Command;
 
 use shoal_common::run_dir::{RunDir, RunDirError};
-pub(super) use shoal_run::batch::TrainingEnd;
-use shoal_run::batch::run_training;
 use shoal_run::evaluation::SavedPolicy;
+pub(super) use shoal_run::jobs::TrainingEnd;
+use shoal_run::jobs::run_training;
 use shoal_run::status;
 
 use super::experiment::{Effort, Experiment, Length, Progress};

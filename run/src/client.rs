@@ -9,7 +9,7 @@ use shoal_common::channel::{Domain, Sweeper};
 use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
 
-use crate::outcome::{FINAL_EVALUATION, RunOutcome, RunState, STARTING};
+use crate::records::outcome::{FINAL_EVALUATION, RunOutcome, RunState, STARTING};
 use crate::status::saved_status;
 
 /// How long a launcher may take to answer. One that is starting does not answer at once.

@@ -1,5 +1,11 @@
 //! Evaluation of a run's policies.
 
+pub mod analysis;
+pub mod best_policy;
+pub mod earlier_best;
+pub mod final_evaluation;
+pub mod rollout;
+
 use serde::{Deserialize, Serialize};
 use shoal_actor::evaluator::mean_and_std;
 use shoal_common::config::Config;
@@ -7,8 +13,8 @@ use shoal_common::policy_file::PolicyFile;
 use shoal_common::run_dir::RunDir;
 use shoal_env_server::environment::Goal;
 
+use self::rollout::{Rollout, policy_layout};
 use crate::description::Description;
-use crate::rollout::{Rollout, policy_layout};
 use crate::signals::Interrupt;
 
 /// One of the two policies that a run saves.

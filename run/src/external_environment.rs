@@ -2,6 +2,7 @@
 //! its spaces or to evaluate a policy.
 
 mod parameters;
+pub mod server_location;
 
 use std::cell::Cell;
 use std::ffi::OsString;
@@ -29,8 +30,8 @@ use shoal_common::role::Role;
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::stop::{GRACE, Stop};
 
-use crate::process::{ChildProcess, wait_for_any};
-use crate::server_location::ServerSurroundings;
+use crate::child_process::{ChildProcess, wait_for_any};
+use crate::external_environment::server_location::ServerSurroundings;
 use crate::signals::Interrupt;
 
 /// The prefix of the names of Gymnasium environments.

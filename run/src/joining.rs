@@ -7,7 +7,7 @@ use shoal_common::config::Config;
 use shoal_common::run_dir::{RunDir, RunLock};
 
 use crate::external_environment::ExternalEnvironment;
-use crate::server_location::{ServerLocation, ServerSurroundings};
+use crate::external_environment::server_location::{ServerLocation, ServerSurroundings};
 use crate::signals::Interrupt;
 
 /// Makes the directory at `path` from the run's configuration. The run's processes on this host find each other under a name

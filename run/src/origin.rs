@@ -161,7 +161,7 @@ impl Predecessor {
         let there = self.run.path().display();
         let refused = |what: String| Err(UsageError(format!("--with-replay: {what}; leave out --with-replay")));
         let (old, new) = (&self.config, config);
-        if config.algorithm.spec().transition_use != TransitionUse::Minibatches {
+        if config.algorithm.properties().transition_use != TransitionUse::Minibatches {
             return refused(format!(
                 "{} learns from each step once, as it happens",
                 config.algorithm.name()

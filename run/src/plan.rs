@@ -1,6 +1,7 @@
 //! The plan of a new run: presets, files and overrides become one resolved configuration, and its directory is created.
 //! No later code reads command-line options.
 
+pub mod algorithm;
 mod environment;
 mod overrides;
 mod presets;
@@ -18,14 +19,14 @@ use shoal_common::run_dir::{RunDir, RunLock};
 
 pub use self::overrides::RunOverrides;
 pub use self::presets::{preset_names, preset_patterns};
-pub use self::resolve::{decide, resolved, resolved_with_sources};
+pub use self::resolve::{resolve, resolve_preset, resolve_with_sources};
 use self::revision::as_written;
 pub use self::revision::{RequestedChanges, Revision, edited, store_actors};
 pub use self::source::{SettingSource, SettingSources};
 
+use crate::external_environment::server_location::ServerLocation;
 use crate::origin::{Origin, Predecessor};
 use crate::preflight;
-use crate::server_location::ServerLocation;
 
 /// What is worth a warning before a run of this configuration starts or goes on.
 pub fn warning(config: &Config) -> Option<String> {
@@ -60,7 +61,7 @@ impl Plan {
     /// When the configuration is invalid, the machine lacks resources, or the directory cannot be created. No run
     /// directory remains.
     pub fn new(what: &str, overrides: &RunOverrides) -> anyhow::Result<Self> {
-        let (name, mut config) = decide(what, overrides)?;
+        let (name, mut config) = resolve(what, overrides)?;
         let from = overrides.from.as_deref();
         let from = from
             .map(|from| Predecessor::open(from, overrides.with_replay))
@@ -116,7 +117,7 @@ mod tests {
     fn a_new_run_has_the_identity_that_its_directory_has() {
         let parent = tempfile::tempdir().unwrap();
         let run = RunDir::create(&parent.path().join("run")).unwrap();
-        let mut config = resolved("pendulum").unwrap();
+        let mut config = resolve_preset("pendulum").unwrap();
         // Parameters that other programs may take.
         let parameters = "day = 1979-05-27\nx = [nan, -inf, 1e300]\n[parameters]\nname = \"x\"";
         config.environment.parameters = parameters.parse().unwrap();

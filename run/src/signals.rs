@@ -10,7 +10,7 @@ use std::time::Duration;
 use anyhow::Context;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
-use crate::process::wait_for_any;
+use crate::child_process::wait_for_any;
 
 /// Whether a signal has arrived that ends this process in order. By default, none ever arrives.
 #[derive(Clone, Debug, Default)]

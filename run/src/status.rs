@@ -7,8 +7,8 @@ use shoal_common::evaluator_state::EvaluatorState;
 use shoal_common::run_dir::RunDir;
 use shoal_learner::process::checkpoint::Checkpoints;
 
-use crate::outcome::{RunOutcome, RunState};
-use crate::recorder::read_evaluations;
+use crate::records::outcome::{RunOutcome, RunState};
+use crate::records::recorder::read_evaluations;
 
 /// The status that a learner would continue from, by the run's files.
 ///

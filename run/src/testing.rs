@@ -8,9 +8,9 @@ use shoal_common::config::Config;
 use shoal_env_server::environment::angle::wrap;
 use shoal_env_server::environment::make;
 
-use crate::analysis::pendulum::SwingUp;
-use crate::analysis::point_mass::Drive;
-use crate::rollout::policy_layout;
+use crate::evaluation::analysis::pendulum::SwingUp;
+use crate::evaluation::analysis::point_mass::Drive;
+use crate::evaluation::rollout::policy_layout;
 
 /// A small configuration for tests, and a policy for it that always takes the action in the middle of its range.
 pub fn small(environment: &str) -> (Config, Vec<f32>) {

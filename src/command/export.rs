@@ -10,7 +10,7 @@ use shoal_common::durable::write_atomically;
 use shoal_common::run_dir::RunDir;
 use shoal_report::export::PortablePolicy;
 use shoal_run::evaluation::SavedPolicy;
-use shoal_run::final_evaluation::FinalEvaluation;
+use shoal_run::evaluation::final_evaluation::FinalEvaluation;
 
 #[derive(Args, Clone, Debug)]
 pub(crate) struct ExportArgs {

@@ -6,7 +6,7 @@ use std::io::Write as _;
 use shoal_common::config::Config;
 use shoal_common::config::explanation::{Change, Key, sections};
 use shoal_env_server::environment;
-use shoal_run::plan::{RunOverrides, SettingSource, preset_names, resolved, resolved_with_sources};
+use shoal_run::plan::{RunOverrides, SettingSource, preset_names, resolve_preset, resolve_with_sources};
 use toml::{Table, Value};
 
 /// Explains the keys of one preset or file with these overrides, or all keys if none is named.
@@ -61,7 +61,7 @@ the source of the default: a place in the thesis, or ours.
 ";
 
 fn explain_all() -> anyhow::Result<String> {
-    let preset = |name| Ok((name, table(&resolved(name)?)?));
+    let preset = |name| Ok((name, table(&resolve_preset(name)?)?));
     let presets = preset_names()
         .map(preset)
         .collect::<anyhow::Result<Vec<(&str, Table)>>>()?;
@@ -117,7 +117,7 @@ fn differing<'a>(
 }
 
 fn explain_one(what: &str, overrides: &RunOverrides) -> anyhow::Result<String> {
-    let (config, sources) = resolved_with_sources(what, overrides)?;
+    let (config, sources) = resolve_with_sources(what, overrides)?;
     let table = table(&config)?;
     let mut text = format!(
         "{HEAD}After the brackets: where the value comes from.\n\n{what} is a configuration for {}.\n",
@@ -187,7 +187,7 @@ mod tests {
     fn every_key_of_every_preset_is_explained() {
         let entries = entries().unwrap();
         for preset in preset_names() {
-            let config = resolved(preset).unwrap();
+            let config = resolve_preset(preset).unwrap();
             let environment = format!("[environment] of {}", config.environment.name);
             for (section, keys) in table(&config).unwrap() {
                 // The environment's description is not set by the user.

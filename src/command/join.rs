@@ -105,7 +105,7 @@ mod with_network {
     use shoal_remote::network::restart_with_one_thread;
     use shoal_remote::wire::{Admission, Hello, Lease, vector_instructions};
     use shoal_run::joining::make_host_directory;
-    use shoal_run::outcome::{RunOutcome, RunState};
+    use shoal_run::records::outcome::{RunOutcome, RunState};
     use shoal_run::signals::{Signals, exit_code};
     use shoal_run::usage::UsageError;
 

@@ -13,14 +13,14 @@ use serde::Serialize;
 use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
 use shoal_report::page;
-use shoal_run::batch::{TrainingEnd, run_jobs, run_training};
 use shoal_run::evaluation::SavedPolicy;
+use shoal_run::evaluation::final_evaluation::FinalEvaluation;
 use shoal_run::external_environment::tied;
-use shoal_run::final_evaluation::FinalEvaluation;
+use shoal_run::jobs::{TrainingEnd, run_jobs, run_training};
 use shoal_run::numbers::thousands;
 use shoal_run::plan::{self, RunOverrides};
 use shoal_run::preflight;
-use shoal_run::recorder::recorded;
+use shoal_run::records::recorder::recorded;
 use shoal_run::signals::{Signals, exit_code};
 use shoal_run::status::saved_status;
 use shoal_run::suite::{self, Suite, Sweep, Trial};
@@ -132,7 +132,7 @@ fn check(suite: &Suite, common: &RunOverrides) -> anyhow::Result<String> {
             continue;
         }
         checked.push(&trial.set);
-        (name, _) = plan::decide(&suite.what, &overrides_of(trial, common))?;
+        (name, _) = plan::resolve(&suite.what, &overrides_of(trial, common))?;
     }
     Ok(name)
 }
@@ -207,7 +207,7 @@ fn usual_jobs(suite: &Suite, directory: &Path, first: usize, common: &RunOverrid
     let stored = RunDir::open(&directory.join(&trial.name))
         .ok()
         .and_then(|run| run.config().ok());
-    let config = stored.or_else(|| Some(plan::decide(&suite.what, &overrides_of(trial, common)).ok()?.1));
+    let config = stored.or_else(|| Some(plan::resolve(&suite.what, &overrides_of(trial, common)).ok()?.1));
     // Where it cannot be found out, each run still checks for itself.
     let fit = config
         .and_then(|config| preflight::side_by_side(&config).ok())

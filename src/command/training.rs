@@ -13,10 +13,12 @@ use shoal_common::config::Config;
 use shoal_common::run_dir::{RunDir, RunLock};
 use shoal_learner::process::checkpoint::Checkpoints;
 use shoal_report::plots;
-use shoal_run::best_policy::{self, EvaluatedPolicy};
+use shoal_run::evaluation::best_policy::{self, EvaluatedPolicy};
+use shoal_run::evaluation::final_evaluation::FinalEvaluation;
 use shoal_run::evaluation::{EvaluationSummary, SavedPolicy};
 use shoal_run::numbers::thousands;
-use shoal_run::outcome::{FINAL_EVALUATION, RunOutcome, RunState};
+use shoal_run::records::outcome::{FINAL_EVALUATION, RunOutcome, RunState};
+use shoal_run::records::recorder::record_final;
 use shoal_run::signals::{Interrupt, Signals, describe, exit_code};
 
 use super::listen::ListenArgs;
@@ -93,7 +95,15 @@ fn train_and_report(
         let under_way = RunOutcome::new(RunState::Running, env_steps, episodes);
         under_way.with_reason(FINAL_EVALUATION).write(run)?;
         match final_evaluation(&config, run, env_steps, &interrupt, output.quiet) {
-            Ok(policies) => evaluated = policies,
+            Ok(policies) => {
+                evaluated = policies;
+                let recorded = FinalEvaluation::read(run, env_steps)?.map(|result| record_final(run, &result));
+                if let Err(error) = recorded.transpose() {
+                    say(&format!(
+                        "the final evaluation is not in TensorBoard's records: {error}"
+                    ));
+                }
+            }
             Err(error) => {
                 lock.check(run)?;
                 let why = match interrupt.signal() {

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use shoal_common::channel::control::{RoleState, RoleStatus};
 use shoal_common::report::Heartbeat;
 use shoal_common::role::{Activity, Role, RoleInstance};
-use shoal_run::rate::per_second;
+use shoal_run::records::rate::per_second;
 use signal_hook::consts::{SIGABRT, SIGBUS, SIGFPE, SIGILL, SIGSEGV};
 
 use super::process::Process;

@@ -8,7 +8,7 @@ use std::time::Duration;
 use anyhow::{Context, bail};
 use rustix::process::{Signal, set_parent_process_death_signal};
 use shoal_common::channel::{Domain, Services};
-use shoal_run::process::ChildGroup;
+use shoal_run::child_process::ChildGroup;
 
 /// The hidden command of that child process. Its argument is the run's id.
 pub(crate) const COMMAND: &str = "clean-up";

@@ -11,8 +11,8 @@ use shoal_common::config::Config;
 use shoal_common::report::Heartbeat;
 use shoal_common::role::{Activity, Role};
 use shoal_common::run_dir::{RunDir, RunLock};
+use shoal_run::child_process::wait_for_any;
 use shoal_run::preflight;
-use shoal_run::process::wait_for_any;
 use shoal_run::signals::{self, Signals};
 
 use super::log::Log;

@@ -9,7 +9,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use anyhow::Context;
 use shoal_common::run_dir::RunDir;
-use shoal_run::process::{Line, Writer};
+use shoal_run::child_process::{Line, Writer};
 use tracing_subscriber::fmt::format;
 use tracing_subscriber::fmt::time::{FormatTime, SystemTime};
 

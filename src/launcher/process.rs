@@ -7,7 +7,7 @@ use std::process::{ChildStdin, ExitStatus};
 
 use anyhow::Context;
 use shoal_common::role::RoleInstance;
-use shoal_run::process::{ChildGroup, ChildOutput, Writer, role_command};
+use shoal_run::child_process::{ChildGroup, ChildOutput, Writer, role_command};
 
 use super::log::Log;
 

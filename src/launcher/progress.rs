@@ -8,7 +8,7 @@ use shoal_common::config::{Config, ReplayConfig};
 use shoal_common::report::{EvaluationReport, LearnerReport};
 use shoal_common::run_dir::RunDir;
 use shoal_run::numbers::thousands;
-use shoal_run::rate::per_second;
+use shoal_run::records::rate::per_second;
 
 use super::requests::waiting;
 use super::supervisor::Supervisor;

@@ -5,7 +5,7 @@ use shoal_common::commit::OpenError;
 use shoal_common::config::{Config, Mode};
 use shoal_common::role::{Activity, Role};
 use shoal_common::run_dir::RunDir;
-use shoal_run::recorder::Moment;
+use shoal_run::records::recorder::Moment;
 use shoal_run::{plan, status};
 
 use super::progress::ProgressLine;

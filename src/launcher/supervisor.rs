@@ -16,8 +16,8 @@ use shoal_common::durable::write_atomically;
 use shoal_common::report::Heartbeat;
 use shoal_common::role::{Activity, Role, RoleInstance};
 use shoal_common::run_dir::RunDir;
-use shoal_run::process::Writer;
-use shoal_run::recorder::{Incident, IncidentKind};
+use shoal_run::child_process::Writer;
+use shoal_run::records::recorder::{Incident, IncidentKind};
 use tracing_subscriber::filter::LevelFilter;
 
 use super::child::{Child, RestartDecision};

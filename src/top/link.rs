@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use anyhow::Context;
 use shoal_common::channel::control::RunStatus;
 use shoal_run::client::RunClient;
-use shoal_run::recorder::read_evaluations;
+use shoal_run::records::recorder::read_evaluations;
 use shoal_run::status::saved_status;
 
 /// Time between two polls.

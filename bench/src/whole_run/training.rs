@@ -13,8 +13,8 @@ use shoal_common::channel::reports::Reports;
 use shoal_common::report::Heartbeat;
 use shoal_common::role::Role;
 use shoal_common::run_dir::RunDir;
+use shoal_run::child_process::ChildProcess;
 use shoal_run::client::RunClient;
-use shoal_run::process::ChildProcess;
 use tempfile::TempDir;
 
 use super::super::measurement::TimeBudget;

@@ -10,7 +10,7 @@ use super::behaviour::Behaviour;
 
 /// The fixed properties of an algorithm, which do not depend on its settings.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct AlgorithmSpec {
+pub struct AlgorithmProperties {
     /// Its name, which is also the name of its section.
     pub name: &'static str,
     /// Whether it can learn from transitions of older policies. If not, it runs in lockstep only.

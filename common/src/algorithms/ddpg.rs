@@ -6,12 +6,12 @@ use shoal_base::space::EnvironmentSpec;
 use shoal_policy::PolicyError;
 use shoal_policy::network::{Activation, Hidden, Layers, NetworkLayout};
 
-use super::algorithm::{ActorCritic, AlgorithmSettings, AlgorithmSpec, LearnedShapes, Shape, TransitionUse};
+use super::algorithm::{ActorCritic, AlgorithmProperties, AlgorithmSettings, LearnedShapes, Shape, TransitionUse};
 use super::behaviour::Behaviour;
 use super::exploration::ExplorationConfig;
 
 /// DDPG.
-pub(super) const SPEC: AlgorithmSpec = AlgorithmSpec {
+pub(super) const PROPERTIES: AlgorithmProperties = AlgorithmProperties {
     name: "ddpg",
     off_policy: true,
     transition_use: TransitionUse::Minibatches,

@@ -6,11 +6,11 @@ use shoal_base::space::EnvironmentSpec;
 use shoal_policy::PolicyError;
 use shoal_policy::network::{Activation, Hidden, Layers, NetworkLayout};
 
-use super::algorithm::{AlgorithmSettings, AlgorithmSpec, LearnedShapes, Shape, TransitionUse};
+use super::algorithm::{AlgorithmProperties, AlgorithmSettings, LearnedShapes, Shape, TransitionUse};
 use super::behaviour::{Behaviour, Epsilon};
 
 /// DQN.
-pub(super) const SPEC: AlgorithmSpec = AlgorithmSpec {
+pub(super) const PROPERTIES: AlgorithmProperties = AlgorithmProperties {
     name: "dqn",
     off_policy: true,
     transition_use: TransitionUse::Minibatches,

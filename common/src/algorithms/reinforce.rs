@@ -8,11 +8,11 @@ use shoal_base::space::EnvironmentSpec;
 use shoal_policy::PolicyError;
 use shoal_policy::network::{Activation, Hidden, Layers, NetworkLayout};
 
-use super::algorithm::{AlgorithmSettings, AlgorithmSpec, LearnedShapes, Shape, TransitionUse};
+use super::algorithm::{AlgorithmProperties, AlgorithmSettings, LearnedShapes, Shape, TransitionUse};
 use super::behaviour::Behaviour;
 
 /// REINFORCE.
-pub(super) const SPEC: AlgorithmSpec = AlgorithmSpec {
+pub(super) const PROPERTIES: AlgorithmProperties = AlgorithmProperties {
     name: "reinforce",
     off_policy: false,
     transition_use: TransitionUse::Episodes,

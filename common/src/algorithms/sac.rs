@@ -6,11 +6,11 @@ use shoal_base::space::EnvironmentSpec;
 use shoal_policy::PolicyError;
 use shoal_policy::network::{Activation, Hidden, Layers, NetworkLayout};
 
-use super::algorithm::{ActorCritic, AlgorithmSettings, AlgorithmSpec, LearnedShapes, TransitionUse};
+use super::algorithm::{ActorCritic, AlgorithmProperties, AlgorithmSettings, LearnedShapes, TransitionUse};
 use super::behaviour::Behaviour;
 
 /// SAC.
-pub(super) const SPEC: AlgorithmSpec = AlgorithmSpec {
+pub(super) const PROPERTIES: AlgorithmProperties = AlgorithmProperties {
     name: "sac",
     off_policy: true,
     transition_use: TransitionUse::Minibatches,

@@ -5,11 +5,11 @@ use shoal_base::section::{Change, EXPLORATION, from, never};
 use shoal_base::space::EnvironmentSpec;
 use shoal_policy::PolicyError;
 
-use super::algorithm::{AlgorithmSettings, AlgorithmSpec, LearnedShapes, Shape, TransitionUse};
+use super::algorithm::{AlgorithmProperties, AlgorithmSettings, LearnedShapes, Shape, TransitionUse};
 use super::behaviour::{Behaviour, Epsilon};
 
 /// Q-learning.
-pub(super) const Q_LEARNING: AlgorithmSpec = AlgorithmSpec {
+pub(super) const Q_LEARNING: AlgorithmProperties = AlgorithmProperties {
     name: "q-learning",
     off_policy: true,
     transition_use: TransitionUse::Transitions,
@@ -17,7 +17,7 @@ pub(super) const Q_LEARNING: AlgorithmSpec = AlgorithmSpec {
 };
 
 /// SARSA.
-pub(super) const SARSA: AlgorithmSpec = AlgorithmSpec {
+pub(super) const SARSA: AlgorithmProperties = AlgorithmProperties {
     name: "sarsa",
     off_policy: false,
     transition_use: TransitionUse::Transitions,

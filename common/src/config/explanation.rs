@@ -8,6 +8,7 @@ use super::checkpoint::CheckpointConfig;
 use super::environment::EnvironmentConfig;
 use super::evaluation::EvaluationConfig;
 use super::learner::LearnerConfig;
+use super::remote::RemoteConfig;
 use super::replay::ReplayConfig;
 use super::run::RunConfig;
 use crate::algorithms::{AlgorithmConfig, ExplorationConfig, ObservationConfig, RewardConfig};
@@ -36,6 +37,7 @@ pub fn sections() -> Vec<Section> {
         describe::<ReplayConfig>("replay"),
         describe::<EvaluationConfig>("evaluation"),
         describe::<CheckpointConfig>("checkpoint"),
+        describe::<RemoteConfig>("remote"),
     ]);
     all
 }

@@ -88,7 +88,7 @@ impl ReplayConfig {
             n_step,
             ..
         } = self;
-        match algorithm.spec().transition_use {
+        match algorithm.properties().transition_use {
             TransitionUse::Minibatches => {
                 let least = algorithm.settings().batch() as u64;
                 from(least, MAX_ROWS).check("replay.capacity", capacity)?;

@@ -6,7 +6,7 @@ use toml::{Table, Value};
 
 use super::{
     ActorsConfig, AlgorithmConfig, CheckpointConfig, Config, EnvironmentConfig, EvaluationConfig, ExplorationConfig,
-    LearnerConfig, ObservationConfig, ReplayConfig, RewardConfig, RunConfig, explanation,
+    LearnerConfig, ObservationConfig, RemoteConfig, ReplayConfig, RewardConfig, RunConfig, explanation,
 };
 use crate::algorithms::TransitionUse;
 
@@ -29,6 +29,8 @@ struct Sections {
     evaluation: EvaluationConfig,
     #[serde(default)]
     checkpoint: CheckpointConfig,
+    #[serde(default)]
+    remote: RemoteConfig,
     /// Sections of algorithms, and unknown keys.
     #[serde(flatten)]
     others: Table,
@@ -54,6 +56,9 @@ struct Written<'a> {
     replay: &'a ReplayConfig,
     evaluation: &'a EvaluationConfig,
     checkpoint: &'a CheckpointConfig,
+    /// Not written if it is the default, because most runs have one host.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    remote: Option<&'a RemoteConfig>,
 }
 
 impl<'de> Deserialize<'de> for Config {
@@ -82,7 +87,7 @@ impl TryFrom<Sections> for Config {
             sections.reward.unwrap_or_default(),
         );
         let are_default = observation == ObservationConfig::default() && reward == RewardConfig::default();
-        if !are_default && algorithm.spec().transition_use != TransitionUse::Minibatches {
+        if !are_default && algorithm.properties().transition_use != TransitionUse::Minibatches {
             return Err(format!(
                 "[observation] and [reward] are for algorithms that learn from minibatches, but this configuration is \
                  for {}",
@@ -101,6 +106,7 @@ impl TryFrom<Sections> for Config {
             replay: sections.replay,
             evaluation: sections.evaluation,
             checkpoint: sections.checkpoint,
+            remote: sections.remote,
         })
     }
 }
@@ -147,7 +153,7 @@ fn one_algorithm(mut sections: Table) -> Result<AlgorithmConfig, String> {
 
 impl Serialize for Config {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        let has_minibatches = self.algorithm.spec().transition_use == TransitionUse::Minibatches;
+        let has_minibatches = self.algorithm.properties().transition_use == TransitionUse::Minibatches;
         Written {
             run: &self.run,
             environment: &self.environment,
@@ -161,6 +167,7 @@ impl Serialize for Config {
             replay: &self.replay,
             evaluation: &self.evaluation,
             checkpoint: &self.checkpoint,
+            remote: Some(&self.remote).filter(|remote| **remote != RemoteConfig::default()),
         }
         .serialize(serializer)
     }

@@ -20,7 +20,7 @@ const SEARCHED: [&str; 10] = [
 ];
 
 const ALLOWED: [&str; 6] = [
-    "run/src/analysis",
+    "run/src/evaluation/analysis",
     "run/src/plan/presets.rs",
     "run/src/testing.rs",
     "report/src/figure",

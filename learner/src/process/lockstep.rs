@@ -96,7 +96,7 @@ fn end_of_chunk(learner: &Learner<'_>, first: u64) -> Option<u64> {
         return (first >= steps).then_some(first);
     }
     let full = (first + config.chunk_rows() as u64).min(steps);
-    if config.algorithm.spec().transition_use == TransitionUse::Episodes {
+    if config.algorithm.properties().transition_use == TransitionUse::Episodes {
         let row = replay.layout().row;
         let last = (first..head.min(full)).find(|index| row.read(replay.row(*index)).last);
         return last.map(|last| last + 1).or((head >= full).then_some(full));

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use shoal_run::analysis::point_mass::Drive;
+use shoal_run::evaluation::analysis::point_mass::Drive;
 
 use super::canvas::{BLUE, save};
 use super::panel::{Axis, Panel, Series};

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use shoal_env_server::environment::Signal;
-use shoal_run::rollout::Trajectory;
+use shoal_run::evaluation::rollout::Trajectory;
 
 use super::canvas::{BLUE, save};
 use super::panel::{Axis, Panel, Series, range_of};

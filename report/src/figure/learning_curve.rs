@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use plotters::style::text_anchor::HPos;
-use shoal_run::recorder::EvaluationRecord;
+use shoal_run::records::recorder::EvaluationRecord;
 
 use super::canvas::{BLUE, px, save, text};
 use super::panel::{Axis, Panel, Series, SeriesStyle, range_of};

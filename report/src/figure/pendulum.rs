@@ -4,7 +4,7 @@ use std::f64::consts::TAU;
 use std::path::Path;
 
 use shoal_env_server::environment::pendulum::DT;
-use shoal_run::analysis::pendulum::SwingUp;
+use shoal_run::evaluation::analysis::pendulum::SwingUp;
 
 use super::canvas::{BLUE, INK, VERMILION, save};
 use super::panel::{Axis, Panel, Series, range_of};

@@ -5,7 +5,7 @@ use std::f64::consts::PI;
 use std::ops::Range;
 use std::path::Path;
 
-use shoal_run::analysis::point_mass::Drive;
+use shoal_run::evaluation::analysis::point_mass::Drive;
 
 use super::canvas::{Area, BLUE, GREEN, INK, VERMILION, save};
 use super::panel::{Axis, Panel, Series, SeriesStyle, range_of};

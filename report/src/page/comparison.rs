@@ -1,7 +1,7 @@
 //! Comparison of runs: one diagram for each environment; repetitions also get their median and spread.
 
 use serde::Serialize;
-use shoal_run::recorder::EvaluationRecord;
+use shoal_run::records::recorder::EvaluationRecord;
 
 use super::numbers::short;
 use super::run::Run;

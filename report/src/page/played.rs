@@ -6,8 +6,8 @@ use shoal_common::run_dir::RunDir;
 use shoal_env_server::environment::Picture;
 use shoal_run::description::Description;
 use shoal_run::evaluation::SavedPolicy;
+use shoal_run::evaluation::rollout::{Rollout, Trajectory};
 use shoal_run::numbers::thousands;
-use shoal_run::rollout::{Rollout, Trajectory};
 
 use super::numbers::short;
 use super::signals::{Trace, traces};

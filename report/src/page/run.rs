@@ -4,10 +4,10 @@ use serde::Serialize;
 use shoal_common::config::{Config, Mode};
 use shoal_common::run_dir::RunDir;
 use shoal_run::evaluation::SavedPolicy;
-use shoal_run::final_evaluation::{FinalEvaluation, FinalPolicyResult};
+use shoal_run::evaluation::final_evaluation::{FinalEvaluation, FinalPolicyResult};
 use shoal_run::origin::Origin;
-use shoal_run::outcome::{RunOutcome, RunState};
-use shoal_run::recorder::{
+use shoal_run::records::outcome::{RunOutcome, RunState};
+use shoal_run::records::recorder::{
     ChangeRecord, EpisodeRecord, EvaluationRecord, IncidentRow, LearnerRecord, read_changes, read_episodes,
     read_evaluations, read_incidents, read_learner,
 };
@@ -258,7 +258,7 @@ fn last_is_incomplete(rows: &[LearnerRecord]) -> bool {
 
 impl Incidents {
     fn of(mut rows: Vec<IncidentRow>) -> Self {
-        use shoal_run::recorder::IncidentKind;
+        use shoal_run::records::recorder::IncidentKind;
         let count = |what| rows.iter().filter(|row| row.what == what).count();
         let (restarts, kills) = (count(IncidentKind::StartedAgain), count(IncidentKind::Killed));
         let more = rows.len().saturating_sub(INCIDENTS);

@@ -3,7 +3,7 @@
 use serde::Serialize;
 use shoal_common::space::EnvironmentSpec;
 use shoal_env_server::environment::Signal;
-use shoal_run::rollout::Trajectory;
+use shoal_run::evaluation::rollout::Trajectory;
 
 use super::numbers::short;
 
@@ -62,7 +62,7 @@ mod tests {
     use shoal_common::config::Config;
     use shoal_common::space::Space;
     use shoal_run::description::Description;
-    use shoal_run::rollout::Rollout;
+    use shoal_run::evaluation::rollout::Rollout;
     use shoal_run::testing::small;
 
     /// Traces of the episode that starts in this state.

@@ -1,7 +1,7 @@
 use shoal_common::config::Config;
 use shoal_common::policy_file::PolicyFile;
 use shoal_env_server::environment::{make, names};
-use shoal_run::rollout::policy_layout;
+use shoal_run::evaluation::rollout::policy_layout;
 use shoal_run::testing::small;
 
 use super::numbers::POINTS;

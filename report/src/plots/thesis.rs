@@ -4,9 +4,9 @@
 use std::path::{Path, PathBuf};
 
 use shoal_common::config::Config;
-use shoal_run::analysis::pendulum::SwingUp;
-use shoal_run::analysis::point_mass::{Drive, FAR_STARTS, NEAR_STARTS};
-use shoal_run::rollout::Rollout;
+use shoal_run::evaluation::analysis::pendulum::SwingUp;
+use shoal_run::evaluation::analysis::point_mass::{Drive, FAR_STARTS, NEAR_STARTS};
+use shoal_run::evaluation::rollout::Rollout;
 
 use crate::figure;
 

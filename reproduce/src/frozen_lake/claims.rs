@@ -1,6 +1,6 @@
 //! The claims of section 4.1.
 
-use shoal_run::analysis::lake::{Values, Walk, greedy, risky_states, suboptimal_states};
+use shoal_run::evaluation::analysis::lake::{Values, Walk, greedy, risky_states, suboptimal_states};
 
 use super::super::claim::{Claim, Scope, spread};
 use super::super::result::SeedResult;
@@ -220,7 +220,7 @@ mod tests {
     use super::super::super::result::tests::result;
     use super::super::{EXPERIMENTS, EvaluatedPolicy};
     use super::*;
-    use shoal_run::analysis::lake;
+    use shoal_run::evaluation::analysis::lake;
 
     /// A seed with these (episodes, probability of reaching the goal) during training, and these action-values at the
     /// end.

@@ -1,8 +1,8 @@
 //! The pendulum with SAC and TD3.
 
 use serde::{Deserialize, Serialize};
-use shoal_run::analysis::pendulum::{Measures, SwingUp};
-use shoal_run::rollout::Rollout;
+use shoal_run::evaluation::analysis::pendulum::{Measures, SwingUp};
+use shoal_run::evaluation::rollout::Rollout;
 
 use super::super::claim::{Claim, Scope, spread};
 use super::super::experiment::{Experiment, Stage};

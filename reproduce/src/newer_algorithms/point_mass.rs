@@ -3,8 +3,8 @@
 use std::fmt::Write as _;
 
 use serde::{Deserialize, Serialize};
-use shoal_run::analysis::point_mass::{Drive, FAR_STARTS, Measures, NEAR_STARTS, REACHED};
-use shoal_run::rollout::Rollout;
+use shoal_run::evaluation::analysis::point_mass::{Drive, FAR_STARTS, Measures, NEAR_STARTS, REACHED};
+use shoal_run::evaluation::rollout::Rollout;
 
 use super::super::claim::{Claim, Scope, spread};
 use super::super::experiment::{Experiment, Stage};

@@ -1,6 +1,6 @@
 //! The claims of section 5.3 and appendix A.
 
-use shoal_run::analysis::point_mass::{Measures, NEAR_STARTS, REACHED};
+use shoal_run::evaluation::analysis::point_mass::{Measures, NEAR_STARTS, REACHED};
 
 use super::super::claim::{Claim, Scope, percent, spread};
 use super::super::result::SeedResult;

@@ -9,9 +9,9 @@ use toml::{Table, Value};
 use super::sections::is_gymnasium;
 use super::source::SettingSources;
 use super::suggestion::{nearest, with_suggestion};
-use crate::algorithm;
+use crate::external_environment::server_location::{ServerLocation, ServerSurroundings, hash_seed};
 use crate::external_environment::{self, ExternalEnvironment, GYMNASIUM};
-use crate::server_location::{ServerLocation, ServerSurroundings, hash_seed};
+use crate::plan::algorithm;
 use crate::signals::Interrupt;
 
 /// Fills in `[spec]` from the environment. Adds every parameter of a built-in environment, and for a Gymnasium

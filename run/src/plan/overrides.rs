@@ -13,8 +13,8 @@ use toml::{Table, Value};
 
 use super::source::{SettingSource, SettingSources};
 use super::table::put;
-use crate::algorithm;
 use crate::numbers::{count, small_count};
+use crate::plan::algorithm;
 use crate::usage::UsageError;
 
 /// Changes to a preset or a file for one run: the options of `train` that say what the run is.
@@ -203,7 +203,7 @@ fn value_of(text: &str) -> Value {
 
 #[cfg(test)]
 mod tests {
-    use super::super::resolve::decide;
+    use super::super::resolve::resolve;
     use super::*;
     use clap::Parser;
     use shoal_common::config::Mode;
@@ -246,7 +246,7 @@ mod tests {
             .into(),
             ..RunOverrides::default()
         };
-        let (name, config) = decide("point-mass-r3", &overrides).unwrap();
+        let (name, config) = resolve("point-mass-r3", &overrides).unwrap();
         assert_eq!(name, "point-mass-r3");
         assert_eq!(
             (

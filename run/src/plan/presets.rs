@@ -6,7 +6,7 @@
 use shoal_common::config::AlgorithmConfig;
 use toml::Table;
 
-use crate::algorithm;
+use crate::plan::algorithm;
 
 /// The line of a preset in [`PRESETS`]: its name, and the text of `presets/NAME.toml`.
 macro_rules! preset {
@@ -82,14 +82,14 @@ pub(super) fn preset(name: &str) -> Option<(&'static str, &'static str)> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::resolve::plan;
+    use super::super::resolve::resolve_with;
     use super::*;
     use std::path::Path;
 
     #[test]
     fn every_preset_is_a_configuration() {
         for name in preset_names() {
-            let config = plan(name, &[]).unwrap();
+            let config = resolve_with(name, &[]).unwrap();
             let limit = if name.starts_with("frozen-lake") { 100 } else { 200 };
             assert_eq!(config.spec.time_limit, limit, "{name}");
             assert!(
@@ -105,12 +105,12 @@ mod tests {
     fn the_identity_of_every_preset_is_unchanged_since_its_release() {
         let mut all = String::new();
         for name in preset_names() {
-            let config = plan(name, &[]).unwrap();
+            let config = resolve_with(name, &[]).unwrap();
             all += &format!("# {name}\n{}\n", config.identity());
-            let other_rate = plan(name, &["evaluation.every=77", "run.steps=1234"]).unwrap();
+            let other_rate = resolve_with(name, &["evaluation.every=77", "run.steps=1234"]).unwrap();
             assert_eq!(other_rate.identity(), config.identity(), "{name}");
             assert_ne!(
-                plan(name, &["run.seed=5"]).unwrap().identity(),
+                resolve_with(name, &["run.seed=5"]).unwrap().identity(),
                 config.identity(),
                 "{name}"
             );
@@ -138,8 +138,8 @@ mod tests {
     #[test]
     fn a_preset_for_another_algorithm_is_found_by_its_name() {
         for name in preset_names() {
-            let config = plan(name, &[]).unwrap();
-            let of_task = plan(task(name), &[]).unwrap();
+            let config = resolve_with(name, &[]).unwrap();
+            let of_task = resolve_with(task(name), &[]).unwrap();
             assert_eq!(config.environment, of_task.environment, "{name} is for another task");
             let own = config.algorithm.name();
             if task(name) != name {

@@ -13,24 +13,24 @@ use crate::origin::shapes;
 use crate::usage::UsageError;
 
 /// The resolved configuration of a preset or a file, without overrides.
-pub fn resolved(what: &str) -> anyhow::Result<Config> {
-    decide(what, &RunOverrides::default()).map(|(_, config)| config)
+pub fn resolve_preset(what: &str) -> anyhow::Result<Config> {
+    resolve(what, &RunOverrides::default()).map(|(_, config)| config)
 }
 
 /// The resolved configuration of a preset or a file with these overrides, and where each value comes from.
-pub fn resolved_with_sources(what: &str, overrides: &RunOverrides) -> anyhow::Result<(Config, SettingSources)> {
+pub fn resolve_with_sources(what: &str, overrides: &RunOverrides) -> anyhow::Result<(Config, SettingSources)> {
     let (_, table, sources) = for_algorithm(what, overrides)?;
-    resolve(table, sources, overrides, what)
+    resolve_table(table, sources, overrides, what)
 }
 
 /// The configuration of a preset or a file with these overrides, and the default name of its run. Creates nothing.
-pub fn decide(what: &str, overrides: &RunOverrides) -> anyhow::Result<(String, Config)> {
+pub fn resolve(what: &str, overrides: &RunOverrides) -> anyhow::Result<(String, Config)> {
     let (name, table, sources) = for_algorithm(what, overrides)?;
-    let (config, _) = resolve(table, sources, overrides, what)?;
+    let (config, _) = resolve_table(table, sources, overrides, what)?;
     Ok((name, config))
 }
 
-fn resolve(
+fn resolve_table(
     mut table: Table,
     mut sources: SettingSources,
     overrides: &RunOverrides,
@@ -86,12 +86,12 @@ fn resolve(
         config.evaluation.every = config.run.steps;
         sources.set("evaluation.every".into(), SettingSource::Follows("run.steps".into()));
     }
-    set_what_follows(&mut config, &mut sources);
+    follow_length(&mut config, &mut sources);
     Ok((config, sources))
 }
 
 /// Sets what follows from the run's length if it is left open.
-pub(super) fn set_what_follows(config: &mut Config, sources: &mut SettingSources) {
+pub(super) fn follow_length(config: &mut Config, sources: &mut SettingSources) {
     if let Some(key) = config.algorithm.follow_length(config.run.steps) {
         let key = format!("{}.{key}", config.algorithm.name());
         sources.set(key, SettingSource::Follows("run.steps".into()));
@@ -105,11 +105,11 @@ fn follow_algorithm(table: &mut Table, sources: &mut SettingSources) -> anyhow::
     let Some(algorithm) = algorithms.iter().find(|one| table.contains_key(one.name())) else {
         return Ok(());
     };
-    let spec = algorithm.spec();
-    let once = spec.transition_use != TransitionUse::Minibatches;
-    let episodes = spec.transition_use == TransitionUse::Episodes;
+    let properties = algorithm.properties();
+    let once = properties.transition_use != TransitionUse::Minibatches;
+    let episodes = properties.transition_use == TransitionUse::Episodes;
     for (section, key, value) in [
-        ("run", "mode", (!spec.off_policy).then(|| Value::from("lockstep"))),
+        ("run", "mode", (!properties.off_policy).then(|| Value::from("lockstep"))),
         ("replay", "warmup", once.then(|| 0.into())),
         ("replay", "updates_per_step", once.then(|| 1.0.into())),
         ("actors", "chunk_steps", limit.filter(|_| episodes).map(Value::from)),
@@ -147,12 +147,12 @@ fn follow_networks(table: &mut Table, sources: &mut SettingSources, overrides: &
 
 /// The configuration with these values of `--set`.
 #[cfg(test)]
-pub(super) fn plan(what: &str, set: &[&str]) -> anyhow::Result<Config> {
+pub(super) fn resolve_with(what: &str, set: &[&str]) -> anyhow::Result<Config> {
     let overrides = RunOverrides {
         set: set.iter().map(|assignment| (*assignment).into()).collect(),
         ..RunOverrides::default()
     };
-    decide(what, &overrides).map(|(_, config)| config)
+    resolve(what, &overrides).map(|(_, config)| config)
 }
 
 #[cfg(test)]
@@ -175,7 +175,7 @@ mod tests {
             ("pendulum", "actors.count=0", "actors.count = 0"),
         ] {
             let set: Vec<&str> = (!set.is_empty()).then_some(set).into_iter().collect();
-            let message = format!("{:#}", plan(what, &set).unwrap_err());
+            let message = format!("{:#}", resolve_with(what, &set).unwrap_err());
             assert!(
                 message.contains(part) && !message.contains('\n'),
                 "{what} {set:?}: {message}"

@@ -15,10 +15,10 @@ use shoal_learner::process::replay_layout;
 use toml::Table;
 
 use super::overrides::{RunOverrides, read_counts, set_key, set_options};
-use super::resolve::set_what_follows;
+use super::resolve::follow_length;
 use super::source::{SettingSource, SettingSources};
-use crate::algorithm;
-use crate::recorder::{ChangeRecord, Moment, read_changes, record_changes};
+use crate::plan::algorithm;
+use crate::records::recorder::{ChangeRecord, Moment, read_changes, record_changes};
 use crate::status::{replay_rows, saved_status};
 use crate::usage::UsageError;
 
@@ -80,7 +80,7 @@ impl Revision {
             let message = error.to_string();
             explain(message.strip_prefix(": ").unwrap_or(&message).into(), &table)
         })?;
-        set_what_follows(&mut config, &mut SettingSources::default());
+        follow_length(&mut config, &mut SettingSources::default());
         let (since, before) = (config.replay.ratio_since, config.replay.updates_before);
         // These two are in the other file alone, because `config.toml` is written before a change is final.
         (config.replay.ratio_since, config.replay.updates_before) = if (since, before) == (0, 0) {

@@ -13,8 +13,8 @@ use super::presets::{preset, preset_names, with_algorithm};
 use super::source::{SettingSource, SettingSources};
 use super::suggestion::nearest;
 use super::table::put;
-use crate::algorithm;
 use crate::external_environment::GYMNASIUM;
+use crate::plan::algorithm;
 use crate::usage::UsageError;
 
 /// The default name of a run of a preset or a file, its sections for the algorithm that is asked for.
@@ -102,7 +102,7 @@ pub(super) fn is_gymnasium(name: &str) -> bool {
 
 #[cfg(test)]
 mod tests {
-    use super::super::resolve::{decide, resolved};
+    use super::super::resolve::{resolve, resolve_preset};
     use super::*;
     use shoal_common::config::Mode;
 
@@ -114,7 +114,7 @@ mod tests {
                 set: set.iter().map(|assignment| (*assignment).into()).collect(),
                 ..RunOverrides::default()
             };
-            decide(what, &overrides).unwrap()
+            resolve(what, &overrides).unwrap()
         };
         let (name, own) = with("pendulum", "sac", &[]);
         assert_eq!((name.as_str(), own.run.steps), ("pendulum-sac", 20_000));
@@ -123,7 +123,7 @@ mod tests {
         assert_eq!(with("pendulum-sac", "ddpg", &[]).0, "pendulum");
         assert_eq!(
             with("pendulum", "ddpg", &[]).1.algorithm,
-            resolved("pendulum").unwrap().algorithm
+            resolve_preset("pendulum").unwrap().algorithm
         );
         // There is no preset for the pole with DQN: the task's length and evaluation, and the algorithm's defaults.
         let (name, dqn) = with("cart-pole", "dqn", &["run.steps=40_000"]);

@@ -6,9 +6,8 @@ use shoal_common::config::Config;
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::run_dir::RunDir;
 
+use crate::evaluation::final_evaluation::{FinalEvaluation, FinalPolicyResult};
 use crate::evaluation::{EvaluationSummary, SavedPolicy, evaluate_until};
-use crate::final_evaluation::{FinalEvaluation, FinalPolicyResult};
-use crate::recorder::record_final;
 use crate::signals::Interrupt;
 
 /// A policy with its final evaluation.
@@ -70,7 +69,6 @@ pub fn choose(
     let entry = |it: &Candidate| FinalPolicyResult::new(it.policy, (it.file.version, it.file.env_steps), &it.summary);
     let result = FinalEvaluation::new(seed, env_steps, candidates.iter().map(entry).collect(), kept.policy);
     result.write(run)?;
-    record_final(run, &result)?;
     let best = EvaluatedPolicy {
         policy: SavedPolicy::Best,
         summary: kept.summary.clone(),

@@ -6,7 +6,7 @@ use shoal_common::run_dir::RunDir;
 
 use crate::evaluation::{EvaluationSummary, SavedPolicy, evaluate_until};
 use crate::external_environment::GYMNASIUM;
-use crate::server_location::ServerLocation;
+use crate::external_environment::server_location::ServerLocation;
 use crate::signals::Interrupt;
 
 /// The best policy's mean return before, and the one now.

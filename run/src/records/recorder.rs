@@ -19,8 +19,8 @@ use table::Table;
 
 use self::tensorboard::EventFile;
 use crate::evaluation::SavedPolicy;
-use crate::final_evaluation::FinalEvaluation;
-use crate::rate::per_second;
+use crate::evaluation::final_evaluation::FinalEvaluation;
+use crate::records::rate::per_second;
 
 /// The longest time that rows stay unflushed. A `kill -9` of the launcher loses at most these.
 const MAX_UNFLUSHED: Duration = Duration::from_millis(500);

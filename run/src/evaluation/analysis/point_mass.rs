@@ -5,7 +5,7 @@ use shoal_env_server::environment::angle::wrap;
 pub use shoal_env_server::environment::point_mass::REACHED;
 
 use super::{AT_REST, mean, round, tail};
-use crate::rollout::{Rollout, Trajectory};
+use crate::evaluation::rollout::{Rollout, Trajectory};
 
 /// Start positions in section 5.3 of the thesis, (x, y) in m.
 pub const NEAR_STARTS: [[f64; 2]; 4] = [[2.0, -2.0], [-2.0, 2.0], [2.0, 2.0], [-2.0, -2.0]];

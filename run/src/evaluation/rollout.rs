@@ -12,7 +12,7 @@ use shoal_env_server::environment::angle::unwrapped;
 use shoal_env_server::vector::{Reset, VectorEnvironment};
 
 use crate::external_environment::ExternalEnvironment;
-use crate::server_location::ServerSurroundings;
+use crate::external_environment::server_location::ServerSurroundings;
 use crate::signals::Interrupt;
 
 /// How often an episode is begun if the environment's server fails in it, each time with a new server.

@@ -1,9 +1,9 @@
 //! Child processes: each is started in a process group of its own and ended together with everything it started; its
 //! output is read.
 
-mod child_group;
-mod child_output;
-mod child_process;
+mod group;
+mod output;
+mod process;
 
 use std::os::fd::BorrowedFd;
 use std::os::unix::process::CommandExt;
@@ -15,9 +15,9 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
 use shoal_common::role::RoleInstance;
 
-pub use self::child_group::ChildGroup;
-pub use self::child_output::{ChildOutput, Line, Writer, escape_control_characters};
-pub use self::child_process::ChildProcess;
+pub use self::group::ChildGroup;
+pub use self::output::{ChildOutput, Line, Writer, escape_control_characters};
+pub use self::process::ChildProcess;
 
 /// The command that starts this program as a role of the run in this directory.
 pub fn role_command(instance: RoleInstance, run: &Path) -> Command {

@@ -8,7 +8,7 @@ use std::time::Duration;
 use anyhow::{Context, bail};
 use rustix::process::Signal;
 
-use crate::process::ChildProcess;
+use crate::child_process::ChildProcess;
 use crate::signals::Signals;
 
 /// How often `observe` is called without an event.

@@ -7,7 +7,7 @@ use toml::{Table, Value};
 use crate::usage::UsageError;
 
 /// Settings for single Gymnasium environments, `[ID.METHOD]`, which replace the algorithm's defaults.
-const OF_ENVIRONMENTS: &str = include_str!("../../presets/method/environments.toml");
+const OF_ENVIRONMENTS: &str = include_str!("../../../presets/method/environments.toml");
 
 /// The algorithms' names.
 pub fn names() -> impl Iterator<Item = &'static str> {
@@ -83,7 +83,7 @@ fn defaults(algorithm: &str) -> anyhow::Result<Table> {
     let all = AlgorithmConfig::all();
     let found = all.iter().find(|known| known.name() == algorithm);
     let found = found.with_context(|| format!("there is no algorithm {algorithm}"))?;
-    Ok(found.spec().defaults.parse()?)
+    Ok(found.properties().defaults.parse()?)
 }
 
 /// Adds the keys of `defaults` that the table does not have.

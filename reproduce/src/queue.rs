@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, VecDeque};
 use std::sync::mpsc;
 
 use anyhow::bail;
-use shoal_run::batch::run_jobs;
+use shoal_run::jobs::run_jobs;
 use shoal_run::signals::Signals;
 
 use super::experiment::{Effort, Length};
@@ -14,8 +14,8 @@ use super::request::{Job, JobName, ReproductionEnd};
 use super::settings::RunSettings;
 use super::training::{RunState, TrainingEnd, train};
 
-/// The seeds to run, and where.
-pub(super) struct Batch<'a> {
+/// The seeds that have no result yet, and where their results go.
+pub(super) struct SeedQueue<'a> {
     pub(super) folder: &'a Folder,
     pub(super) effort: Effort,
     pub(super) jobs: &'a [Job],
@@ -32,7 +32,7 @@ enum Event {
     Failed(Job, anyhow::Error),
 }
 
-impl Batch<'_> {
+impl SeedQueue<'_> {
     /// Runs all seeds, `parallel` of them at a time. `write` writes the report; it is called after each new result and
     /// at the end.
     pub(super) fn run(

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use shoal_env_server::environment::angle::{unwrapped, wrap};
 
 use super::{AT_REST, mean, round, tail};
-use crate::rollout::{Rollout, Trajectory};
+use crate::evaluation::rollout::{Rollout, Trajectory};
 
 /// The swing-up ends when the pendulum is nearer to upright than this, in rad.
 const UP: f64 = 0.5;

@@ -1,0 +1,5 @@
+//! What a run records while it runs and when it ends. Only its launcher writes these files.
+
+pub mod outcome;
+pub mod rate;
+pub mod recorder;
