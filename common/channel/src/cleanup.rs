@@ -5,7 +5,8 @@
 //! So half-made files of dead processes are removed here as soon as they are seen.
 //!
 //! iceoryx2 also never frees a port whose port tag is removed before the port. So missing tags are restored before
-//! iceoryx2 cleans up ([`Services::restore_port_tags`](super::Services::restore_port_tags)).
+//! iceoryx2 cleans up ([`Services::restore_port_tags`](super::Services::restore_port_tags)). `tests/iceoryx2.rs` shows
+//! both faults.
 
 use std::collections::HashSet;
 use std::fs::Metadata;
