@@ -320,7 +320,7 @@ fn a_role_that_cannot_start_is_given_up_with_its_error_and_the_run_can_be_resume
 /// Networks and batches so large that gradient steps come long after their environment steps.
 const SLOW_UPDATES: [&str; 14] = [
     "--steps",
-    "3000",
+    "1500",
     "--set",
     "replay.tolerance=1000000",
     "--set",
@@ -330,7 +330,7 @@ const SLOW_UPDATES: [&str; 14] = [
     "--set",
     "ddpg.batch=256",
     "--set",
-    "evaluation.every=3000",
+    "evaluation.every=1500",
     "--set",
     "evaluation.final_episodes=3",
 ];
@@ -340,7 +340,7 @@ fn a_run_interrupted_after_its_last_environment_step_is_finished_when_it_is_resu
     for stopped in [true, false] {
         let place = Workplace::new();
         let running = place.start_as("run", &SLOW_UPDATES);
-        until("all steps are taken", || support::committed_rows(&running) == 3000);
+        until("all steps are taken", || support::committed_rows(&running) == 1500);
         if stopped {
             assert!(place.output(&["stop", "run"]).status.success());
             assert_eq!(running.wait().0, Some(0));
@@ -354,7 +354,7 @@ fn a_run_interrupted_after_its_last_environment_step_is_finished_when_it_is_resu
         };
         let before = status_at_rest();
         assert!(
-            before["updates"].as_u64().unwrap() < 2936,
+            before["updates"].as_u64().unwrap() < 1436,
             "it was interrupted too late: {before}"
         );
         assert_eq!(before["finished"], false);
@@ -363,14 +363,14 @@ fn a_run_interrupted_after_its_last_environment_step_is_finished_when_it_is_resu
         assert_eq!(code, Some(0), "{}", place.stderr());
         assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
         let result = parse(&printed);
-        assert_eq!((&result["env_steps"], &result["updates"]), (&3000.into(), &2936.into()));
+        assert_eq!((&result["env_steps"], &result["updates"]), (&1500.into(), &1436.into()));
         assert!(result["weights_sha256"].is_string() && result["eval_return_mean"].is_number());
         let evaluations = std::fs::read_to_string(place.path().join("run/evaluations.csv")).unwrap();
-        assert!(evaluations.lines().last().unwrap().contains(",3000,"), "{evaluations}");
+        assert!(evaluations.lines().last().unwrap().contains(",1500,"), "{evaluations}");
 
         assert_eq!(status_at_rest()["finished"], true);
         let message = error_line(&place.output(&["resume", "run"]));
-        assert!(message.contains("3000 of 3000 steps already"), "{message}");
+        assert!(message.contains("1500 of 1500 steps already"), "{message}");
     }
 }
 
