@@ -171,28 +171,34 @@ fn table(status: &RunStatus) -> String {
     )
 }
 
+/// The columns of a table of hosts.
+pub(crate) const HOST_COLUMNS: [&str; 7] = ["host", "state", "actors", "rate", "resent", "round trip", "lag"];
+
+/// What a table says of a host, in the order of [`HOST_COLUMNS`].
+pub(crate) fn host_cells(host: &HostStatus) -> [String; 7] {
+    let state = match host.state {
+        HostState::Connected => "connected".into(),
+        HostState::CutOff => format!("cut off for {:.0} s", host.silent_seconds),
+        HostState::Left => "has left".into(),
+    };
+    let round_trip = host.round_trip_us;
+    [
+        host.name.clone(),
+        state,
+        host.actors.to_string(),
+        format!("{:.0}/s", host.rows_per_second),
+        thousands(host.resent_chunks),
+        round_trip.map_or_else(String::new, |time| format!("{:.1} ms", time as f64 / 1e3)),
+        thousands(host.policy_lag),
+    ]
+}
+
 fn table_of_hosts(hosts: &[HostStatus]) -> Table {
     let mut table = Table::new();
     table.load_style(NOTHING);
-    table.set_header(["host", "state", "actors", "rate", "resent", "round trip", "lag"]);
-    for host in hosts {
-        let state = match host.state {
-            HostState::Connected => "connected".into(),
-            HostState::CutOff => format!("cut off for {:.0} s", host.silent_seconds),
-            HostState::Left => "has left".into(),
-        };
-        table.add_row([
-            host.name.clone(),
-            state,
-            host.actors.to_string(),
-            format!("{:.0}/s", host.rows_per_second),
-            thousands(host.resent_chunks),
-            host.round_trip_us
-                .map_or_else(String::new, |time| format!("{:.1} ms", time as f64 / 1e3)),
-            thousands(host.policy_lag),
-        ]);
-    }
-    for column in 2..7 {
+    table.set_header(HOST_COLUMNS);
+    table.add_rows(hosts.iter().map(host_cells));
+    for column in 2..HOST_COLUMNS.len() {
         if let Some(column) = table.column_mut(column) {
             column.set_cell_alignment(CellAlignment::Right);
         }

@@ -9,11 +9,11 @@ use ratatui::text::{Line, Span};
 use ratatui::widgets::{
     Axis, Block, Borders, Cell, Chart, Clear, Dataset, Gauge, GraphType, Paragraph, Row, Sparkline, Table,
 };
-use shoal_common::channel::control::{RoleState, RoleStatus};
+use shoal_common::channel::control::{HostState, RoleState, RoleStatus};
 use shoal_run::numbers::thousands;
 
 use super::{LauncherState, Overlay, Screen};
-use crate::command::status::{progress, state_name, waiting};
+use crate::command::status::{HOST_COLUMNS, host_cells, progress, state_name, waiting};
 
 /// Number of rows above the roles, and of rows with keys at the bottom.
 const HEAD: u16 = 4;
@@ -31,20 +31,27 @@ pub(crate) fn draw(frame: &mut Frame<'_>, screen: &Screen) {
     let area = frame.area();
     let body = area.height.saturating_sub(HEAD + FOOT);
     let roles = screen.status.roles.len() as u16 + 1;
-    let curves = if area.width >= CURVES_WIDTH && body >= CURVES + 4 {
-        CURVES.max(body.saturating_sub(roles + 1))
+    // At most half of what is below the head: the roles come first.
+    let hosts = match screen.status.hosts.len() as u16 {
+        0 => 0,
+        hosts => (hosts + 2).min(body / 2),
+    };
+    let curves = if area.width >= CURVES_WIDTH && body >= CURVES + 4 + hosts {
+        CURVES.max(body.saturating_sub(roles + 1 + hosts))
     } else {
         0
     };
-    let [head, table, curve, foot] = Layout::vertical([
+    let [head, table, of_hosts, curve, foot] = Layout::vertical([
         Constraint::Length(HEAD),
         Constraint::Min(0),
+        Constraint::Length(hosts),
         Constraint::Length(curves),
         Constraint::Length(FOOT),
     ])
     .areas(area);
     draw_head(frame, screen, head);
     draw_roles(frame, screen, table);
+    draw_hosts(frame, screen, of_hosts);
     if curves > 0 {
         let halves = [Constraint::Percentage(60), Constraint::Percentage(40)];
         let [left, right] = Layout::horizontal(halves).spacing(2).areas(curve);
@@ -154,7 +161,6 @@ fn draw_roles(frame: &mut Frame<'_>, screen: &Screen, area: Rect) {
     };
     let shown = roles.len() - hidden;
     let or_none = |number: Option<u64>| number.map_or_else(String::new, thousands);
-    let right = |text: String| Cell::from(Line::raw(text).alignment(Alignment::Right));
     let mut rows: Vec<Row<'_>> = roles[..shown]
         .iter()
         .map(|role| {
@@ -185,18 +191,48 @@ fn draw_roles(frame: &mut Frame<'_>, screen: &Screen, area: Rect) {
     } else {
         (&["role", "state", "rs", "rate"], &[13, 13, 3, 8])
     };
-    let numbers = |name: &str| !matches!(name, "role" | "state");
-    let header = names.iter().map(|name| {
-        let line = Line::raw(*name);
-        Cell::from(if numbers(name) {
-            line.alignment(Alignment::Right)
-        } else {
-            line
-        })
+    draw_table(frame, names, widths, rows, area);
+}
+
+/// The other hosts of the run.
+fn draw_hosts(frame: &mut Frame<'_>, screen: &Screen, area: Rect) {
+    if area.height < 2 {
+        return;
+    }
+    let area = Rect {
+        y: area.y + 1,
+        height: area.height - 1,
+        ..area
+    };
+    let rows = screen.status.hosts.iter().map(|host| {
+        let [name, state, numbers @ ..] = host_cells(host);
+        let style = colour(
+            screen,
+            match host.state {
+                HostState::Connected => Color::Green,
+                HostState::CutOff => Color::Red,
+                HostState::Left => Color::Cyan,
+            },
+        );
+        let cells = [Cell::from(name), Cell::from(state).style(style)];
+        Row::new(cells.into_iter().chain(numbers.map(right)))
+    });
+    draw_table(frame, &HOST_COLUMNS, &[16, 16, 6, 8, 8, 10, 5], rows.collect(), area);
+}
+
+/// A table whose columns are aligned to the right, except names and states.
+fn draw_table(frame: &mut Frame<'_>, names: &[&str], widths: &[u16], rows: Vec<Row<'_>>, area: Rect) {
+    let header = names.iter().map(|name| match *name {
+        "role" | "host" | "state" => Cell::from(*name),
+        number => right(number.into()),
     });
     let table = Table::new(rows, widths.iter().map(|width| Constraint::Length(*width)))
         .header(Row::new(header).style(Modifier::BOLD));
     frame.render_widget(table, area);
+}
+
+fn right<'a>(text: String) -> Cell<'a> {
+    Cell::from(Line::raw(text).alignment(Alignment::Right))
 }
 
 fn style_of(screen: &Screen, state: RoleState) -> Style {

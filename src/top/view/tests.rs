@@ -1,6 +1,6 @@
 use ratatui::Terminal;
 use ratatui::backend::TestBackend;
-use shoal_common::channel::control::RunStatus;
+use shoal_common::channel::control::{HostStatus, RunStatus};
 
 use super::super::RunEvent;
 use super::*;
@@ -94,6 +94,38 @@ fn a_terminal_of_usual_size_shows_everything() {
     );
     assert!(text.contains("6,000") && text.contains("-1400"), "{text}");
     assert_eq!(lines[23], "+/- actors  s stop  ? help  q quit");
+}
+
+#[test]
+fn other_hosts_are_shown_below_the_roles() {
+    let mut screen = screen();
+    let host = |name: &str, state| HostStatus {
+        host: 1,
+        name: name.into(),
+        state,
+        actors: 4,
+        rows_per_second: 1_234.5,
+        resent_chunks: 7,
+        round_trip_us: Some(1_250),
+        policy_lag: 3,
+        silent_seconds: 5.2,
+        roles: Vec::new(),
+    };
+    screen.status.hosts = vec![host("node-2", HostState::Connected), host("node-3", HostState::CutOff)];
+    for height in [20, 30] {
+        let lines = lines(&screen, 80, height);
+        let row = |name: &str| {
+            let found = lines.iter().find(|line| line.starts_with(name));
+            found.unwrap_or_else(|| panic!("{lines:#?}")).clone()
+        };
+        assert!(row("host").contains("round trip"));
+        assert!(row("node-2").contains("connected") && row("node-2").contains("1.2 ms"));
+        assert!(row("node-3").contains("cut off for 5 s"));
+        assert!(row("learner 0").contains("working"));
+    }
+    // On a small terminal the roles come first.
+    let lines = lines(&screen, 40, 10);
+    assert!(lines[5].starts_with("learner 0"), "{lines:#?}");
 }
 
 #[test]

@@ -1,4 +1,4 @@
-//! The actor's end.
+//! The client: an actor or the evaluator asks its environment server for resets and steps.
 
 use std::cell::Cell;
 use std::time::Instant;

@@ -1,4 +1,4 @@
-//! The environment server's end.
+//! The server: takes the requests of its client, and answers them.
 
 use iceoryx2::active_request::ActiveRequest;
 use iceoryx2::port::server::Server;
