@@ -184,11 +184,73 @@ fn an_interrupted_or_killed_suite_continues_where_it_was() {
         (&2_000.into(), &2_000.into()),
         "{runs}"
     );
-    for refused in [&["--steps", "1"][..], &["--set", "ddpg.tau=0.1"]] {
-        let message = error_line(&place.output(&[&["resume", "suite"], refused].concat()));
-        assert!(message.contains("a suite goes on as it was made"), "{message}");
-    }
     let _ = Domain::remove_abandoned();
+}
+
+#[test]
+fn a_suite_is_changed_and_continued() {
+    let place = Workplace::new();
+    let sweep = [
+        "--seeds",
+        "1..2",
+        "--sweep",
+        "ddpg.critic_learning_rate=1e-3,1e-4",
+        "--steps",
+        "200",
+        "--jobs",
+        "2",
+    ];
+    train(&place, &sweep);
+    let suite = place.path().join("suite");
+    let file = || std::fs::read_to_string(suite.join("suite.json")).unwrap();
+    let before = file();
+    for (refused, part) in [
+        ("ddpg.critic_learning_rate=1", "the runs of this suite differ in it"),
+        ("run.seed=3", "the runs of this suite differ in it"),
+        ("ddpg.gamma=0.5", "ddpg.gamma"),
+        ("ddpg.gama=0.5", "gama"),
+    ] {
+        let message = error_line(&place.output(&["resume", "suite", "--set", refused]));
+        assert!(message.contains(part), "{message}");
+        assert_eq!(file(), before, "nothing is changed by {refused}");
+    }
+
+    // A run that has not begun gets the changes too.
+    std::fs::remove_dir_all(suite.join("critic_learning_rate=1e-4,seed=2")).unwrap();
+    let changed = [
+        "resume",
+        "suite",
+        "--json",
+        "--jobs",
+        "2",
+        "--steps",
+        "300",
+        "--set",
+        "ddpg.tau=0.004",
+    ];
+    for _ in 0..2 {
+        let output = place.output(&changed);
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let runs = json(&output)["runs"].clone();
+        for run in runs.as_array().unwrap() {
+            assert_eq!(
+                (&run["env_steps"], &run["finished"]),
+                (&300.into(), &true.into()),
+                "{run}"
+            );
+            let path = suite.join(run["run"].as_str().unwrap()).join("config.toml");
+            let config = shoal_common::config::Config::load(&path).unwrap();
+            assert_eq!((config.run.steps, config.algorithm.ddpg().unwrap().tau), (300, 0.004));
+        }
+    }
+    let recorded = std::fs::read_to_string(suite.join("critic_learning_rate=1e-3,seed=1/changes.csv")).unwrap();
+    assert_eq!(recorded.matches("ddpg.tau").count(), 1, "changed once: {recorded}");
+    // The command that made the suite continues it, with its changes.
+    let (again, said) = train(&place, &sweep);
+    assert!(
+        again["runs"][0]["env_steps"] == 300 && said.contains("0 of 4 runs to train"),
+        "{said}"
+    );
 }
 
 #[test]

@@ -27,6 +27,9 @@ pub struct Suite {
     pub arguments: Vec<String>,
     /// The runs.
     pub trials: Vec<Trial>,
+    /// What all runs have from a `resume --set` on, each as `SECTION.KEY=VALUE`.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub changes: Vec<String>,
 }
 
 /// A run of a suite.
@@ -183,6 +186,7 @@ impl Suite {
             what,
             arguments,
             trials,
+            changes: Vec::new(),
         })
     }
 
@@ -202,6 +206,29 @@ impl Suite {
             bail!("{here} is damaged: {:?} is no name of a run", trial.name);
         }
         Ok(Some(suite))
+    }
+
+    /// Adds changes of all runs, each as `SECTION.KEY=VALUE`. A later value of a key replaces an earlier one.
+    ///
+    /// # Errors
+    /// When the runs differ in such a key, because then the change would make them alike.
+    pub fn change(&mut self, changes: &[String]) -> Result<(), String> {
+        let key = |assignment: &str| assignment.split('=').next().unwrap_or_default().trim().to_owned();
+        for change in changes {
+            let key_of_change = key(change);
+            let sets_it = |assignment: &String| key(assignment) == key_of_change;
+            if key_of_change == "run.seed" || self.trials.iter().any(|trial| trial.set.iter().any(sets_it)) {
+                return Err(format!("{key_of_change}: the runs of this suite differ in it"));
+            }
+            self.changes.retain(|earlier| key(earlier) != key_of_change);
+            self.changes.push(change.clone());
+        }
+        Ok(())
+    }
+
+    /// Whether the other suite was made in the same way, whatever has been changed since.
+    pub fn has_same_runs(&self, other: &Self) -> bool {
+        (&self.what, &self.arguments, &self.trials) == (&other.what, &other.arguments, &other.trials)
     }
 
     /// Writes it into its directory.
@@ -309,6 +336,22 @@ mod tests {
                 .to_string()
                 .contains("no name of a run")
         );
+
+        let mut changed = suite.clone();
+        changed
+            .change(&["run.steps=9".into(), "ddpg.gamma=0.5".into()])
+            .unwrap();
+        changed.change(&["run.steps=10".into()]).unwrap();
+        assert_eq!(changed.changes, ["ddpg.gamma=0.5", "run.steps=10"]);
+        assert!(changed.has_same_runs(&suite) && changed != suite);
+        for key in ["ddpg.tau", "run.seed"] {
+            assert!(
+                changed
+                    .change(&[format!("{key}=1")])
+                    .unwrap_err()
+                    .contains("differ in it")
+            );
+        }
 
         let alone = Suite::new("pendulum".into(), vec![], &[], &[4]).unwrap();
         assert_eq!(alone.trials[0].name, "seed=4");

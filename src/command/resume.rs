@@ -76,7 +76,7 @@ impl ResumeArgs {
 /// was changed in its configuration.
 pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
     if let Some(suite) = Suite::read(&args.run)? {
-        return resume_suite(&suite, args);
+        return resume_suite(suite, args);
     }
     if args.jobs.is_some() {
         return Err(UsageError("--jobs: only for suites, and this is one run".into()).into());
@@ -146,14 +146,14 @@ pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
     run_training(revision.config, &run, &lock, &args.output, &args.listen)
 }
 
-fn resume_suite(suite: &Suite, args: &ResumeArgs) -> anyhow::Result<ExitCode> {
+fn resume_suite(suite: Suite, args: &ResumeArgs) -> anyhow::Result<ExitCode> {
     if args.listen.listen.is_some() {
         return Err(UsageError("--listen: other hosts join a single run, and this is a suite".into()).into());
     }
-    if args.steps.is_some() || args.episodes.is_some() || !args.set.is_empty() {
-        let why = "a suite goes on as it was made: change its runs one by one, or train another one";
-        return Err(UsageError(why.into()).into());
-    }
+    let number = |key: &str, value: Option<u64>| value.map(|value| format!("{key}={value}"));
+    let numbers = [number("run.steps", args.steps), number("run.episodes", args.episodes)];
+    let changes: Vec<String> = args.set.iter().cloned().chain(numbers.into_iter().flatten()).collect();
+    let suite = suite::change(suite, &args.run, &changes)?;
     if args.output.detach {
         return detach::resume_suite(&args.run, &args.for_another_process(), &args.output);
     }
@@ -161,7 +161,7 @@ fn resume_suite(suite: &Suite, args: &ResumeArgs) -> anyhow::Result<ExitCode> {
         jobs: args.jobs,
         output: &args.output,
     };
-    suite::resume(suite, &args.run, options)
+    suite::resume(&suite, &args.run, options)
 }
 
 /// Evaluates the best policy again if an earlier version did that from other starts, or if later policies are evaluated

@@ -18,7 +18,7 @@ use shoal_run::evaluation::final_evaluation::FinalEvaluation;
 use shoal_run::external_environment::tied;
 use shoal_run::jobs::{TrainingEnd, run_jobs, run_training};
 use shoal_run::numbers::thousands;
-use shoal_run::plan::{self, RunOverrides};
+use shoal_run::plan::{self, RequestedChanges, Revision, RunOverrides};
 use shoal_run::preflight;
 use shoal_run::records::recorder::recorded;
 use shoal_run::signals::{Signals, exit_code};
@@ -87,7 +87,7 @@ pub(crate) fn train(args: &TrainArgs, what: &str, overrides: &RunOverrides) -> a
     {
         let here = directory.display();
         return match Suite::read(directory)? {
-            Some(found) if found == suite => begin(&suite, directory, &common, options),
+            Some(found) if found.has_same_runs(&suite) => begin(&found, directory, &common, options),
             Some(_) => bail!(
                 "{here} is a suite of other runs: continue it with `shoal resume {here}`, or choose another directory with --run"
             ),
@@ -123,6 +123,33 @@ pub(crate) fn resume(suite: &Suite, directory: &Path, options: SuiteOptions<'_>)
     run(suite, directory, &RunOverrides::default(), options)
 }
 
+/// The same suite with these changes of all runs, each as `SECTION.KEY=VALUE`. They are checked for each run and stored, so
+/// that the suite can be interrupted.
+pub(crate) fn change(mut suite: Suite, directory: &Path, changes: &[String]) -> anyhow::Result<Suite> {
+    if changes.is_empty() {
+        return Ok(suite);
+    }
+    suite.change(changes).map_err(UsageError)?;
+    let _lock = suite::lock(directory)?;
+    for trial in &suite.trials {
+        let path = directory.join(&trial.name);
+        if path.exists() {
+            let run = RunDir::open(&path)?;
+            Revision::new(&run, &run.config()?, &requested(&suite))?;
+        }
+    }
+    check(&suite, &RunOverrides::default())?;
+    suite.write(directory)?;
+    Ok(suite)
+}
+
+fn requested(suite: &Suite) -> RequestedChanges {
+    RequestedChanges {
+        set: suite.changes.clone(),
+        ..RequestedChanges::default()
+    }
+}
+
 /// Checks the configuration of each combination of values. Returns the usual name of a run of this kind.
 fn check(suite: &Suite, common: &RunOverrides) -> anyhow::Result<String> {
     let mut checked: Vec<&[String]> = Vec::new();
@@ -132,16 +159,17 @@ fn check(suite: &Suite, common: &RunOverrides) -> anyhow::Result<String> {
             continue;
         }
         checked.push(&trial.set);
-        (name, _) = plan::resolve(&suite.what, &overrides_of(trial, common))?;
+        (name, _) = plan::resolve(&suite.what, &overrides_of(suite, trial, common))?;
     }
     Ok(name)
 }
 
-fn overrides_of(trial: &Trial, common: &RunOverrides) -> RunOverrides {
+fn overrides_of(suite: &Suite, trial: &Trial, common: &RunOverrides) -> RunOverrides {
+    let set = common.set.iter().chain(&trial.set).chain(&suite.changes);
     RunOverrides {
         run: None,
         seed: trial.seed,
-        set: common.set.iter().chain(&trial.set).cloned().collect(),
+        set: set.cloned().collect(),
         ..common.clone()
     }
 }
@@ -162,7 +190,7 @@ fn run(suite: &Suite, directory: &Path, common: &RunOverrides, options: SuiteOpt
     let signals = Signals::register()?;
     let mut due = VecDeque::new();
     for (number, trial) in suite.trials.iter().enumerate() {
-        if !is_finished(&directory.join(&trial.name))? {
+        if !is_finished(suite, &directory.join(&trial.name))? {
             due.push_back(number);
         }
     }
@@ -207,7 +235,7 @@ fn usual_jobs(suite: &Suite, directory: &Path, first: usize, common: &RunOverrid
     let stored = RunDir::open(&directory.join(&trial.name))
         .ok()
         .and_then(|run| run.config().ok());
-    let config = stored.or_else(|| Some(plan::resolve(&suite.what, &overrides_of(trial, common)).ok()?.1));
+    let config = stored.or_else(|| Some(plan::resolve(&suite.what, &overrides_of(suite, trial, common)).ok()?.1));
     // Where it cannot be found out, each run still checks for itself.
     let fit = config
         .and_then(|config| preflight::side_by_side(&config).ok())
@@ -216,7 +244,7 @@ fn usual_jobs(suite: &Suite, directory: &Path, first: usize, common: &RunOverrid
 }
 
 /// Whether nothing is left to do in this run directory.
-fn is_finished(run: &Path) -> anyhow::Result<bool> {
+fn is_finished(suite: &Suite, run: &Path) -> anyhow::Result<bool> {
     // A training that was killed before it wrote anything leaves an empty directory. Only such a directory is removed.
     let _ = std::fs::remove_dir(run);
     if !run.exists() {
@@ -227,7 +255,14 @@ fn is_finished(run: &Path) -> anyhow::Result<bool> {
         let here = run.path().display();
         bail!("{here} is running: end it first, with `shoal stop {here}`");
     }
-    Ok(saved_status(&run.config()?, &run)?.finished)
+    let used = run.config()?;
+    let saved = saved_status(&used, &run)?;
+    if !saved.finished || suite.changes.is_empty() {
+        return Ok(saved.finished);
+    }
+    // It may be given more steps.
+    let revision = Revision::new(&run, &used, &requested(suite))?;
+    Ok(revision.config.run.has_all_steps(saved.env_steps, saved.episodes))
 }
 
 /// Trains or resumes a run as a process of its own.
@@ -247,6 +282,9 @@ fn train_one(suite: &Suite, trial: &Trial, directory: &Path, signals: &Signals) 
             command.args(["--seed", &seed.to_string()]);
         }
         command.arg("--run").arg(&run);
+    }
+    for assignment in &suite.changes {
+        command.args(["--set", assignment]);
     }
     command.arg("--quiet");
     // Tied to this process: if that is killed, the run ends and can be resumed with the suite.
