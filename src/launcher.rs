@@ -40,7 +40,7 @@ use self::log::Log;
 pub(crate) use self::log::{ALL_ENDED, FAILED, note};
 use self::progress::ProgressLine;
 use self::stall::StallDetector;
-use self::supervisor::{RolesOnHost, Supervisor};
+use self::supervisor::{HostRoles, Supervisor};
 
 /// How often the launcher reads reports and checks its children if nothing wakes it. Ticks start short and become
 /// longer while reports arrive slowly: a full buffer loses its oldest reports.
@@ -225,7 +225,7 @@ impl<'a> Launcher<'a> {
         let initial = status::saved_status(&config, run)?;
         RunOutcome::new(RunState::Running, initial.env_steps, initial.episodes).write(run)?;
         // Creates the services that are opened below.
-        let supervisor = Supervisor::new(&config, run, domain, log.clone(), RolesOnHost::Learner { gate })?;
+        let supervisor = Supervisor::new(&config, run, domain, log.clone(), HostRoles::Learner { gate })?;
         Ok(Self {
             control: ControlPort::open(domain)?,
             initial,
@@ -352,7 +352,7 @@ impl<'a> Launcher<'a> {
                 return Ok(RunEnd::Stopped);
             }
             self.progress.draw(&self.supervisor);
-            self.sleep(self.tick.min(self.supervisor.idle_for()));
+            self.sleep(self.tick.min(self.supervisor.time_to_next_task()));
         }
     }
 

@@ -124,6 +124,16 @@ fn a_suite_trains_each_combination_with_each_seed_and_is_compared() {
     assert_eq!(left, ["notes.txt"], "what the suite did not make stays");
 }
 
+/// Settings with which a run takes seconds.
+const SLOW: [&str; 6] = [
+    "--set",
+    "ddpg.hidden=[200, 200]",
+    "--set",
+    "ddpg.batch=128",
+    "--set",
+    "replay.tolerance=64",
+];
+
 fn start(place: &Workplace, arguments: &[&str]) -> Child {
     let mut command = place.shoal(arguments);
     command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap()
@@ -137,18 +147,10 @@ fn learned(run: &Path) -> usize {
 #[test]
 fn an_interrupted_or_killed_suite_continues_where_it_was() {
     let place = Workplace::new();
-    let slow = [
-        "--set",
-        "ddpg.hidden=[300, 300]",
-        "--set",
-        "ddpg.batch=256",
-        "--set",
-        "replay.tolerance=64",
-    ];
     let suite = [
         "train", "pendulum", "--run", "suite", "--seeds", "3,1", "--steps", "2000", "--jobs", "1",
     ];
-    let arguments = [&suite[..], &QUICK, &slow].concat();
+    let arguments = [&suite[..], &QUICK, &SLOW].concat();
     let first = place.path().join("suite/seed=3");
     let mut suite = start(&place, &arguments);
     until("the first run learns", || learned(&first) > 2);
@@ -184,6 +186,74 @@ fn an_interrupted_or_killed_suite_continues_where_it_was() {
         (&2_000.into(), &2_000.into()),
         "{runs}"
     );
+    let _ = Domain::remove_abandoned();
+}
+
+#[test]
+fn with_halving_bad_settings_are_ended_early_also_after_a_kill() {
+    let place = Workplace::new();
+    let command = [
+        &["train", "pendulum", "--run", "suite", "--halving", "--jobs", "1"][..],
+        &["--sweep", "ddpg.actor_learning_rate=1e-9,1e-4,1e-8", "--steps", "4000"],
+        &["--set", "evaluation.every=400"],
+        &QUICK,
+        &SLOW,
+    ]
+    .concat();
+    let too_late = error_line(&place.output(&[&command[..], &["--set", "evaluation.every=1001"]].concat()));
+    assert!(too_late.contains("the first evaluation comes after 1001"), "{too_late}");
+    let alone = error_line(&place.output(&["train", "pendulum", "--halving", "--sweep", "ddpg.tau=0.1"]));
+    assert!(alone.contains("give several with --sweep"), "{alone}");
+
+    let mut first = start(&place, &command);
+    let path = place.path().join("suite");
+    let ended = || {
+        let text = std::fs::read_to_string(path.join("suite.json")).unwrap_or_default();
+        let suite: Value = serde_json::from_str(&text).unwrap_or_default();
+        suite["halving"]["ended"].as_array().map_or(0, Vec::len)
+    };
+    until("the first round is over", || ended() == 1);
+    kill_process(Pid::from_child(&first), Signal::KILL).unwrap();
+    first.wait().unwrap();
+    let is_running = |run: std::fs::DirEntry| {
+        let run = shoal_common::run_dir::RunDir::open(&run.path());
+        run.is_ok_and(|run| run.is_running().unwrap())
+    };
+    until("no training is running", || {
+        !std::fs::read_dir(&path).unwrap().flatten().any(is_running)
+    });
+
+    let output = place.output(&["resume", "suite", "--json"]);
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{said}");
+    assert!(
+        said.contains("ended early at 50 %") && !said.contains("at 25 %"),
+        "{said}"
+    );
+    let runs = json(&output)["runs"].as_array().unwrap().clone();
+    let best = |run: &Value| -> f64 {
+        let file = path.join(run["run"].as_str().unwrap()).join("evaluations.csv");
+        let mut rows = csv::Reader::from_path(file).unwrap();
+        let column = rows
+            .headers()
+            .unwrap()
+            .iter()
+            .position(|name| name == "return_mean")
+            .unwrap();
+        let means = rows.records().map(|row| row.unwrap()[column].parse::<f64>().unwrap());
+        means.fold(f64::NEG_INFINITY, f64::max)
+    };
+    let (ended, left): (Vec<&Value>, Vec<&Value>) = runs.iter().partition(|run| run["ended_early"] == true);
+    assert_eq!((ended.len(), left.len()), (2, 1), "{runs:?}");
+    assert_eq!(
+        (&left[0]["finished"], &left[0]["env_steps"]),
+        (&true.into(), &4000.into())
+    );
+    for run in ended {
+        let steps = run["env_steps"].as_u64().unwrap();
+        assert!((1000..4000).contains(&steps) && run["finished"] == false, "{run}");
+        assert!(best(run) <= best(left[0]), "{runs:?}");
+    }
     let _ = Domain::remove_abandoned();
 }
 

@@ -54,7 +54,7 @@ pub struct ActorSettings {
     pub n_step: usize,
     /// The layout of a chunk.
     pub chunk: ChunkLayout,
-    /// Whether the policy has learned before the run's first update, in another run.
+    /// Whether the first policy comes from another run (`--from`).
     pub has_learned: bool,
     /// The replay file; its commit record shows which chunks have arrived.
     pub replay: PathBuf,
@@ -103,7 +103,8 @@ struct Actor<'a> {
     n_step: NStep,
     /// The chunk that is being filled.
     chunk: Chunk,
-    /// Version of the policy that the last row of `chunk` was collected with; if `chunk` is empty, the last row sent.
+    /// Version of the policy with which the last row of `chunk` was collected. If `chunk` is empty, that of the last row
+    /// sent.
     policy_version: u64,
     commits: CommitReader,
     heartbeat: HeartbeatSender,
@@ -209,8 +210,8 @@ impl<'a> Actor<'a> {
         }
     }
 
-    /// Drops the current episodes and begins new ones. In lockstep, continues those of the last chunk's snapshot, if
-    /// there is one.
+    /// Drops the current episodes and begins new ones. In lockstep it continues the episodes of the last snapshot instead,
+    /// if there is one.
     fn begin(&mut self) -> Result<EnvironmentResponse, Exit<ActorError>> {
         self.n_step.clear();
         if self.settings.config.run.mode == Mode::Free {
@@ -301,7 +302,7 @@ impl<'a> Actor<'a> {
         self.chunk.is_full() || episode_is_over
     }
 
-    /// Waits for the policy to act with: the newest, or in lockstep the one after the last round.
+    /// Waits for the policy to act with. In lockstep that is the one published after the last round, otherwise the newest.
     fn await_policy(&mut self) -> Result<Rc<PublishedPolicy>, Exit<ChannelError>> {
         let wanted = match self.settings.config.run.mode {
             Mode::Free => 0,
@@ -461,8 +462,8 @@ impl<'a> Actor<'a> {
         Ok(())
     }
 
-    /// Sends the rows collected so far and waits until they are committed: without a limit if only this actor ends, for
-    /// a short time if the whole run ends. In lockstep incomplete chunks are dropped, because a round is complete or
+    /// Sends the rows collected so far and waits until they are committed. If only this actor ends, it waits as long as
+    /// needed; if the whole run ends, at most [`LAST_COMMIT_TIMEOUT`]. In lockstep incomplete chunks are dropped, because a round is complete or
     /// does not count.
     fn hand_over(&mut self) -> Result<(), ActorError> {
         if self.settings.config.run.mode == Mode::Free {

@@ -12,7 +12,7 @@ use shoal_common::evaluator_state::EvaluatorState;
 use shoal_common::exit::Exit;
 use shoal_common::policy::Policy;
 use shoal_common::policy_file::PolicyFile;
-use shoal_common::report::{EvaluatedReport, EvaluationReport};
+use shoal_common::report::{EvaluatedPeriod, EvaluationReport};
 use shoal_common::role::{Activity, Role, RoleInstance};
 use shoal_common::run_dir::RunDir;
 use shoal_common::stop::Stop;
@@ -124,7 +124,7 @@ struct Evaluator<'a> {
     policy: Policy,
     reports: Reporter<EvaluationReport>,
     state: EvaluatorState,
-    evaluated_reports: Reporter<EvaluatedReport>,
+    evaluated_reports: Reporter<EvaluatedPeriod>,
     heartbeat: HeartbeatSender,
     actions: Vec<f32>,
     /// The period of the policy evaluated last.
@@ -177,7 +177,7 @@ impl<'a> Evaluator<'a> {
         state.evaluations().for_each(|evaluation| reports.send(*evaluation));
         let evaluated_reports = Reporter::open(domain)?;
         if let Some(period) = settings.evaluated_period {
-            evaluated_reports.send(EvaluatedReport { period });
+            evaluated_reports.send(EvaluatedPeriod { period });
         }
         Ok(Self {
             settings,
@@ -226,7 +226,7 @@ impl<'a> Evaluator<'a> {
             .add(evaluation, &self.settings.run.evaluator_state())
             .map_err(ActorError::State)?;
         self.reports.send(evaluation);
-        self.evaluated_reports.send(EvaluatedReport { period });
+        self.evaluated_reports.send(EvaluatedPeriod { period });
         self.learner.notify();
         Ok(())
     }

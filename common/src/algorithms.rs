@@ -125,8 +125,7 @@ impl Default for AlgorithmConfig {
 }
 
 impl AlgorithmConfig {
-    /// The name of the algorithm that a configuration with these sections is for: the one that has a section. Only DDPG
-    /// has a second one, `[exploration]`.
+    /// The name of the algorithm whose section is among these. Only DDPG has a second section, `[exploration]`.
     pub fn named_in(sections: &toml::Table) -> Option<&'static str> {
         let all = Self::all().into_iter().map(|algorithm| algorithm.name());
         let mut named = all.filter(|name| sections.contains_key(*name));
@@ -148,8 +147,8 @@ impl AlgorithmConfig {
 
     /// Sets what follows from the length of the run, in environment steps, if it is left open. Returns the key that was
     /// set.
-    pub fn follow_length(&mut self, steps: u64) -> Option<&'static str> {
-        self.settings_mut().follow_length(steps)
+    pub fn set_from_length(&mut self, steps: u64) -> Option<&'static str> {
+        self.settings_mut().set_from_length(steps)
     }
 
     /// Each algorithm that learns from minibatches, with its default settings.

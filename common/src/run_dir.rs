@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use shoal_base::durable::write_atomically;
 use shoal_base::file_lock;
-use shoal_channel::control::RunKey;
+use shoal_channel::control::RunDirId;
 
 use crate::config::{Config, ConfigError};
 
@@ -199,13 +199,13 @@ impl RunDir {
     ///
     /// # Errors
     /// When the directory cannot be inspected.
-    pub fn key(&self) -> Result<RunKey, RunDirError> {
+    pub fn key(&self) -> Result<RunDirId, RunDirError> {
         let metadata = std::fs::metadata(&self.path).map_err(|cause| RunDirError::Io {
             action: "inspect",
             path: self.path.clone(),
             cause,
         })?;
-        Ok(RunKey {
+        Ok(RunDirId {
             device: metadata.dev(),
             inode: metadata.ino(),
         })

@@ -177,7 +177,12 @@ impl HostFile {
     const NAME: &str = "host.toml";
 
     /// A new file.
-    pub fn new(endpoint: Endpoint, run_id: String, (host, name): (u64, String), lease: &crate::wire::Lease) -> Self {
+    pub fn new(
+        endpoint: Endpoint,
+        run_id: String,
+        (host, name): (u64, String),
+        lease: &crate::wire::WireLease,
+    ) -> Self {
         Self {
             endpoint,
             run_id,
@@ -209,13 +214,13 @@ impl HostFile {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::wire::Lease;
+    use crate::wire::WireLease;
 
     #[test]
     fn files_are_read_as_they_were_written_and_others_are_refused() {
         let directory = tempfile::tempdir().unwrap();
         let run = RunDir::create(&directory.path().join("host")).unwrap();
-        let lease = Lease {
+        let lease = WireLease {
             epoch: 3,
             config: String::new(),
             actors: vec![2, 3],

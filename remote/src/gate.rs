@@ -36,8 +36,8 @@ use crate::refused;
 use crate::requests::LauncherRequests;
 use crate::wire::vector_instructions;
 use crate::wire::{
-    Acknowledgement, ActorAcknowledgement, Admission, Hello, HostReport, Lease, Message, PolicyRequest, RunPhase,
-    WireChunk, WireError, WirePolicy,
+    Acknowledgement, ActorAcknowledgement, Admission, Hello, HostReport, Message, PolicyRequest, RunPhase, WireChunk,
+    WireError, WireLease, WirePolicy,
 };
 
 /// The least and the greatest time between two acknowledgements to a host.
@@ -452,7 +452,7 @@ impl<'a> Gate<'a> {
                         lease.actors
                     );
                     let config = self.settings.config.to_toml();
-                    let answer = Lease {
+                    let answer = WireLease {
                         epoch: lease.epoch,
                         config: config.map_err(|error| GateError::Config(error.to_string()))?,
                         actors: lease.actors.clone(),

@@ -5,7 +5,7 @@ use std::sync::mpsc::{Receiver, Sender, channel};
 use std::time::Duration;
 
 use shoal_common::channel::Domain;
-use shoal_common::channel::control::{self, ControlRequest, ControlResponse, RunKey};
+use shoal_common::channel::control::{self, ControlRequest, ControlResponse, RunDirId};
 
 /// How long the launcher may take.
 const PATIENCE: Duration = Duration::from_secs(5);
@@ -22,7 +22,7 @@ impl<T: Send + 'static> LauncherRequests<T> {
     ///
     /// # Errors
     /// When it cannot be started.
-    pub(crate) fn start(run_id: &str, max_actors: u32, run: RunKey) -> std::io::Result<Self> {
+    pub(crate) fn start(run_id: &str, max_actors: u32, run: RunDirId) -> std::io::Result<Self> {
         let (requests, asked) = channel::<(ControlRequest, T)>();
         let (answered, answers) = channel();
         let run_id = run_id.to_owned();
@@ -49,7 +49,7 @@ impl<T: Send + 'static> LauncherRequests<T> {
     }
 }
 
-fn ask(run_id: &str, max_actors: u32, run: RunKey, request: ControlRequest) -> Result<ControlResponse, String> {
+fn ask(run_id: &str, max_actors: u32, run: RunDirId, request: ControlRequest) -> Result<ControlResponse, String> {
     let domain = Domain::visit(run_id, max_actors).map_err(|error| error.to_string())?;
     let answer = control::ask(&domain, run, request, PATIENCE, || true);
     let left = domain.leave();

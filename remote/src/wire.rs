@@ -212,14 +212,14 @@ pub fn vector_instructions() -> String {
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Admission {
     /// The host may work for the run.
-    Admitted(Lease),
+    Admitted(WireLease),
     /// It may not, for this reason.
     Refused(String),
 }
 
 /// What a host is given.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Lease {
+pub struct WireLease {
     /// Number of the launcher's start that admitted it. After another start it must ask again.
     pub epoch: u64,
     /// The run's `config.toml`.
@@ -244,7 +244,7 @@ pub enum RunPhase {
 /// What the gate tells a host: what is committed of its actors, and what it has forwarded. Only the newest one counts.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Acknowledgement {
-    /// See [`Lease::epoch`].
+    /// See [`WireLease::epoch`].
     pub epoch: u64,
     /// Incarnation of the gate. Those of a later gate, and later ones of the same gate, are newer.
     pub gate: u64,

@@ -7,8 +7,8 @@ use shoal_common::channel::policy::PolicyHeader;
 use shoal_common::channel::transitions::ChunkHeader;
 use shoal_common::role::{Activity, Role};
 use shoal_remote::wire::{
-    Acknowledgement, ActorAcknowledgement, Admission, Hello, HostReport, Lease, Message, PolicyRequest, RemoteEpisode,
-    RemoteRole, RunPhase, VERSION, WireChunk, WireError, WirePolicy,
+    Acknowledgement, ActorAcknowledgement, Admission, Hello, HostReport, Message, PolicyRequest, RemoteEpisode,
+    RemoteRole, RunPhase, VERSION, WireChunk, WireError, WireLease, WirePolicy,
 };
 
 fn header() -> ChunkHeader {
@@ -48,7 +48,7 @@ fn hello() -> Hello {
 }
 
 fn admission() -> Admission {
-    Admission::Admitted(Lease {
+    Admission::Admitted(WireLease {
         epoch: 6,
         config: "[run]\n".into(),
         actors: vec![1, 2],

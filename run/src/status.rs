@@ -49,7 +49,7 @@ fn is_finished(config: &Config, run: &RunDir, status: &RunStatus) -> anyhow::Res
         return Ok(outcome.state == RunState::Finished);
     }
     // Earlier versions wrote no outcome.
-    Ok(status.updates >= config.replay.agreed_updates(status.env_steps))
+    Ok(status.updates >= config.replay.allowed_updates(status.env_steps))
 }
 
 /// Rows committed to a run's replay; 0 if it has none yet.

@@ -30,6 +30,27 @@ pub struct Suite {
     /// What all runs have from a `resume --set` on, each as `SECTION.KEY=VALUE`.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub changes: Vec<String>,
+    /// Whether bad settings are ended early, and which were.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub halving: Option<Halving>,
+}
+
+/// Successive halving (Jamieson and Talwalkar 2016): after each round the worse half of the settings is ended, so that the
+/// last one or two are trained to the end. The first of `n` rounds ends when a run has done 1/2ⁿ of its steps; each further
+/// one is twice as long.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Halving {
+    /// The names of the runs that each completed round has ended.
+    pub ended: Vec<Vec<String>>,
+}
+
+/// A round of a suite with halving.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Round {
+    /// The runs that are left.
+    pub trials: Vec<Trial>,
+    /// The share of its steps that each has done at the end of the round.
+    pub share: f64,
 }
 
 /// A run of a suite.
@@ -187,6 +208,7 @@ impl Suite {
             arguments,
             trials,
             changes: Vec::new(),
+            halving: None,
         })
     }
 
@@ -226,9 +248,85 @@ impl Suite {
         Ok(())
     }
 
+    /// The settings: the numbers of the runs that differ in nothing but their seed.
+    fn settings(&self) -> Vec<Vec<usize>> {
+        let mut settings: Vec<Vec<usize>> = Vec::new();
+        for (number, trial) in self.trials.iter().enumerate() {
+            match settings.iter_mut().find(|of| self.trials[of[0]].set == trial.set) {
+                Some(same) => same.push(number),
+                None => settings.push(vec![number]),
+            }
+        }
+        settings
+    }
+
+    /// Ends bad settings early from now on.
+    ///
+    /// # Errors
+    /// When there is only one setting.
+    pub fn with_halving(mut self) -> Result<Self, String> {
+        if self.settings().len() < 2 {
+            return Err("--halving ends the worse half of the settings: give several with --sweep".into());
+        }
+        self.halving = Some(Halving::default());
+        Ok(self)
+    }
+
+    /// Whether a run was ended early.
+    pub fn has_ended(&self, trial: &Trial) -> bool {
+        let ended = self.halving.iter().flat_map(|halving| halving.ended.iter().flatten());
+        ended.into_iter().any(|name| *name == trial.name)
+    }
+
+    /// The next round whose end is to be decided; `None` without halving, and after the last round.
+    pub fn next_round(&self) -> Option<Round> {
+        let completed = self.halving.as_ref()?.ended.len() as u32;
+        let rounds = self.settings().len().next_power_of_two().ilog2();
+        (completed < rounds).then(|| Round {
+            trials: self
+                .trials
+                .iter()
+                .filter(|trial| !self.has_ended(trial))
+                .cloned()
+                .collect(),
+            share: 0.5_f64.powi((rounds - completed) as i32),
+        })
+    }
+
+    /// Ends the worse half of the settings that are left: those with the lower mean of `result` over their runs. Returns
+    /// the names of the ended runs.
+    pub fn end_worse_half(&mut self, result: impl Fn(&Trial) -> f64) -> Vec<String> {
+        let mut left = self.settings();
+        left.retain(|setting| !self.has_ended(&self.trials[setting[0]]));
+        let mean = |setting: &Vec<usize>| {
+            let sum: f64 = setting.iter().map(|number| result(&self.trials[*number])).sum();
+            sum / setting.len() as f64
+        };
+        // The first of equal ones stays.
+        left.sort_by(|a, b| mean(b).total_cmp(&mean(a)));
+        let worse = left.split_off(left.len().div_ceil(2));
+        let ended: Vec<String> = worse
+            .concat()
+            .iter()
+            .map(|number| self.trials[*number].name.clone())
+            .collect();
+        if let Some(halving) = &mut self.halving {
+            halving.ended.push(ended.clone());
+        }
+        ended
+    }
+
     /// Whether the other suite was made in the same way, whatever has been changed since.
     pub fn has_same_runs(&self, other: &Self) -> bool {
-        (&self.what, &self.arguments, &self.trials) == (&other.what, &other.arguments, &other.trials)
+        let made = |it: &Self| {
+            (
+                it.what.clone(),
+                it.arguments.clone(),
+                it.trials.clone(),
+                it.halving.is_some(),
+            )
+        };
+        made(self) == made(other)
     }
 
     /// Writes it into its directory.
@@ -355,6 +453,47 @@ mod tests {
 
         let alone = Suite::new("pendulum".into(), vec![], &[], &[4]).unwrap();
         assert_eq!(alone.trials[0].name, "seed=4");
+    }
+
+    #[test]
+    fn each_round_ends_the_worse_half_of_the_settings() {
+        let sweep = Sweep::parse("ddpg.tau=1,2,3,4,5").unwrap();
+        let suite = Suite::new("x".into(), vec![], &[sweep], &[1, 2]).unwrap();
+        assert_eq!(suite.next_round(), None);
+        let mut suite = suite.with_halving().unwrap();
+        // The result is τ, and the third setting has none.
+        let result = |trial: &Trial| match trial.name.as_bytes()[4] {
+            b'3' => f64::NEG_INFINITY,
+            tau => f64::from(tau),
+        };
+        let mut rounds = Vec::new();
+        while let Some(round) = suite.next_round() {
+            suite = serde_json::from_str(&serde_json::to_string(&suite).unwrap()).unwrap();
+            rounds.push((round.share, round.trials.len(), suite.end_worse_half(result)));
+        }
+        let names = |settings: &[u32]| -> Vec<String> {
+            let of = |tau: &u32| [1, 2].map(|seed| format!("tau={tau},seed={seed}"));
+            settings.iter().flat_map(of).collect()
+        };
+        assert_eq!(
+            rounds,
+            [
+                (0.125, 10, names(&[1, 3])),
+                (0.25, 6, names(&[2])),
+                (0.5, 4, names(&[4]))
+            ]
+        );
+        let left: Vec<&Trial> = suite.trials.iter().filter(|trial| !suite.has_ended(trial)).collect();
+        assert_eq!(
+            left.iter().map(|trial| &trial.name).collect::<Vec<_>>(),
+            ["tau=5,seed=1", "tau=5,seed=2"]
+        );
+        assert!(
+            Suite::new("x".into(), vec![], &[], &[1, 2])
+                .unwrap()
+                .with_halving()
+                .is_err()
+        );
     }
 
     #[test]

@@ -20,11 +20,12 @@ use shoal_run::jobs::{TrainingEnd, run_jobs, run_training};
 use shoal_run::numbers::thousands;
 use shoal_run::plan::{self, RequestedChanges, Revision, RunOverrides};
 use shoal_run::preflight;
-use shoal_run::records::recorder::recorded;
+use shoal_run::records::recorder::{read_evaluations, recorded};
 use shoal_run::signals::{Signals, exit_code};
 use shoal_run::status::saved_status;
 use shoal_run::suite::{self, Suite, Sweep, Trial};
 use shoal_run::usage::UsageError;
+use signal_hook::consts::SIGTERM;
 
 use super::detach;
 use super::train::TrainArgs;
@@ -39,15 +40,17 @@ pub(crate) struct SuiteOptions<'a> {
 
 /// The output of `--json`.
 #[derive(Serialize)]
-struct Printed<'a> {
+struct SuiteJson<'a> {
     suite: String,
-    runs: Vec<PrintedRun<'a>>,
+    runs: Vec<RunJson<'a>>,
 }
 
 #[derive(Serialize)]
-struct PrintedRun<'a> {
+struct RunJson<'a> {
     run: &'a str,
     finished: bool,
+    /// Whether it was ended early because its setting was bad.
+    ended_early: bool,
     env_steps: u64,
     eval_return_mean: Option<f64>,
 }
@@ -77,6 +80,11 @@ pub(crate) fn train(args: &TrainArgs, what: &str, overrides: &RunOverrides) -> a
         ..overrides.clone()
     };
     let suite = Suite::new(what, common.arguments(), &sweeps, &seeds)?;
+    let suite = if args.halving {
+        suite.with_halving().map_err(UsageError)?
+    } else {
+        suite
+    };
     let options = SuiteOptions {
         // Each takes the lock of the run whose replay it copies.
         jobs: if common.with_replay { Some(1) } else { args.jobs },
@@ -159,9 +167,27 @@ fn check(suite: &Suite, common: &RunOverrides) -> anyhow::Result<String> {
             continue;
         }
         checked.push(&trial.set);
-        (name, _) = plan::resolve(&suite.what, &overrides_of(suite, trial, common))?;
+        let config;
+        (name, config) = plan::resolve(&suite.what, &overrides_of(suite, trial, common))?;
+        check_first_round(suite, &config)?;
     }
     Ok(name)
+}
+
+/// Checks that a run is evaluated before the first round of halving ends.
+fn check_first_round(suite: &Suite, config: &Config) -> anyhow::Result<()> {
+    let Some(round) = suite.next_round() else {
+        return Ok(());
+    };
+    let (end, first) = (round.share * config.run.steps as f64, config.evaluation.every);
+    if config.run.episodes.is_none() && end < first as f64 {
+        let text = format!(
+            "--halving: the first round ends after {end:.0} steps of each run, and the first evaluation comes after {first}: \
+             lower evaluation.every, or give the runs more steps"
+        );
+        return Err(UsageError(text).into());
+    }
+    Ok(())
 }
 
 fn overrides_of(suite: &Suite, trial: &Trial, common: &RunOverrides) -> RunOverrides {
@@ -179,40 +205,44 @@ enum Event {
     Started(usize),
     Finished(usize),
     Interrupted(usize),
+    /// It has done its share of a round.
+    Paused(usize),
     Failed(usize, String),
 }
 
-/// Trains all runs of the suite that have not finished.
+/// Trains all runs of the suite that have not finished, with halving in rounds.
 fn run(suite: &Suite, directory: &Path, common: &RunOverrides, options: SuiteOptions<'_>) -> anyhow::Result<ExitCode> {
     let directory =
         &std::fs::canonicalize(directory).with_context(|| format!("cannot resolve {}", directory.display()))?;
     let _lock = suite::lock(directory)?;
     let signals = Signals::register()?;
-    let mut due = VecDeque::new();
-    for (number, trial) in suite.trials.iter().enumerate() {
-        if !is_finished(suite, &directory.join(&trial.name))? {
-            due.push_back(number);
+    let mut suite = suite.clone();
+    let mut failed = 0;
+    while let Some(round) = suite.next_round() {
+        let percent = 100.0 * round.share;
+        let is_due = |trial: &Trial| {
+            let run = directory.join(&trial.name);
+            Ok(round.trials.contains(trial) && !is_finished(&suite, &run)? && share_done(&run) < round.share)
+        };
+        let due = Due::new(&suite, directory, is_due, common, options)?;
+        due.say(&format!("until each has done {percent:.0} % of its steps:"));
+        failed += due.train(&signals, Some(round.share));
+        if signals.received().is_some() {
+            break;
+        }
+        let ended = suite.end_worse_half(|trial| best_return(&directory.join(&trial.name)));
+        suite.write(directory)?;
+        if !options.output.quiet {
+            writeln!(std::io::stderr(), "ended early at {percent:.0} %: {}", ended.join("; "))?;
         }
     }
-    let jobs = match (options.jobs, due.front()) {
-        (Some(jobs), _) => jobs.into(),
-        (None, None) => 1,
-        (None, Some(first)) => usual_jobs(suite, directory, *first, common),
-    };
-    let mut progress = SuiteProgressDisplay::new(suite, directory, &due, options.output.quiet);
-    let work = |number: usize, events: &Sender<Event>| {
-        // A closed channel is no reason to stop.
-        let _ = events.send(Event::Started(number));
-        let trained = train_one(suite, &suite.trials[number], directory, &signals);
-        let _ = events.send(match trained {
-            Ok(TrainingEnd::Finished) => Event::Finished(number),
-            Ok(TrainingEnd::Interrupted) => Event::Interrupted(number),
-            Err(error) => Event::Failed(number, format!("{error:#}").replace('\n', " ")),
-        });
-    };
-    run_jobs(due, jobs, &signals, work, |event| progress.observe(event));
-    let failed = progress.end();
-    report(suite, directory, options.output)?;
+    if signals.received().is_none() {
+        let is_due = |trial: &Trial| Ok(!suite.has_ended(trial) && !is_finished(&suite, &directory.join(&trial.name))?);
+        let due = Due::new(&suite, directory, is_due, common, options)?;
+        due.say("");
+        failed = due.train(&signals, None);
+    }
+    report(&suite, directory, options.output)?;
     let here = directory.display();
     let mut stderr = std::io::stderr().lock();
     match (signals.received(), failed) {
@@ -226,6 +256,105 @@ fn run(suite: &Suite, directory: &Path, common: &RunOverrides, options: SuiteOpt
             Ok(exit_code(signal))
         }
     }
+}
+
+/// The runs of a suite that are to be trained now.
+struct Due<'a> {
+    suite: &'a Suite,
+    directory: &'a Path,
+    numbers: VecDeque<usize>,
+    jobs: usize,
+    quiet: bool,
+}
+
+impl<'a> Due<'a> {
+    fn new(
+        suite: &'a Suite,
+        directory: &'a Path,
+        is_due: impl Fn(&Trial) -> anyhow::Result<bool>,
+        common: &RunOverrides,
+        options: SuiteOptions<'_>,
+    ) -> anyhow::Result<Self> {
+        let mut numbers = VecDeque::new();
+        for (number, trial) in suite.trials.iter().enumerate() {
+            if is_due(trial)? {
+                numbers.push_back(number);
+            }
+        }
+        let jobs = match (options.jobs, numbers.front()) {
+            (Some(jobs), _) => jobs.into(),
+            (None, None) => 1,
+            (None, Some(first)) => usual_jobs(suite, directory, *first, common),
+        };
+        Ok(Self {
+            suite,
+            directory,
+            numbers,
+            jobs,
+            quiet: options.output.quiet,
+        })
+    }
+
+    /// Prints how many runs are to be trained, after these words.
+    fn say(&self, words: &str) {
+        if !self.quiet {
+            let text = format!(
+                "{words} {} of {} runs to train",
+                self.numbers.len(),
+                self.suite.trials.len()
+            );
+            // A closed standard error is no reason to fail.
+            let _ = writeln!(std::io::stderr(), "{}", text.trim_start());
+        }
+    }
+
+    /// Trains them, each until it has done this share of its steps. Returns how many failed.
+    fn train(self, signals: &Signals, until: Option<f64>) -> usize {
+        let Self {
+            suite,
+            directory,
+            numbers,
+            jobs,
+            quiet,
+        } = self;
+        let mut progress = SuiteProgressDisplay::new(suite, directory, &numbers, quiet);
+        let work = |number: usize, events: &Sender<Event>| {
+            // A closed channel is no reason to stop.
+            let _ = events.send(Event::Started(number));
+            let trial = &suite.trials[number];
+            let run = directory.join(&trial.name);
+            let has_done_enough = || until.is_some_and(|share| share_done(&run) >= share);
+            let interrupted = || signals.received().or_else(|| has_done_enough().then_some(SIGTERM));
+            let trained = train_one(suite, trial, directory, &interrupted);
+            let _ = events.send(match trained {
+                Ok(TrainingEnd::Finished) => Event::Finished(number),
+                Ok(TrainingEnd::Interrupted) if signals.received().is_none() => Event::Paused(number),
+                Ok(TrainingEnd::Interrupted) => Event::Interrupted(number),
+                Err(error) => Event::Failed(number, format!("{error:#}").replace('\n', " ")),
+            });
+        };
+        run_jobs(numbers, jobs, signals, work, |event| progress.observe(event));
+        progress.end()
+    }
+}
+
+/// The share of its steps, or of its episodes, that a run has done.
+fn share_done(run: &Path) -> f64 {
+    distance(run).map_or(0.0, |(done, all)| done as f64 / all.max(1) as f64)
+}
+
+/// The best return of a run's evaluations so far; −∞ if there is none.
+fn best_return(run: &Path) -> f64 {
+    let evaluations = RunDir::open(run)
+        .ok()
+        .and_then(|run| read_evaluations(&run.evaluations()).ok());
+    let returns = evaluations
+        .into_iter()
+        .flatten()
+        .map(|evaluation| evaluation.return_mean);
+    returns
+        .filter(|mean| mean.is_finite())
+        .fold(f64::NEG_INFINITY, f64::max)
 }
 
 /// What cores and shared memory allow; each run keeps about two cores busy.
@@ -265,8 +394,13 @@ fn is_finished(suite: &Suite, run: &Path) -> anyhow::Result<bool> {
     Ok(revision.config.run.has_all_steps(saved.env_steps, saved.episodes))
 }
 
-/// Trains or resumes a run as a process of its own.
-fn train_one(suite: &Suite, trial: &Trial, directory: &Path, signals: &Signals) -> anyhow::Result<TrainingEnd> {
+/// Trains or resumes a run as a process of its own, until it ends or `interrupted` returns a signal.
+fn train_one(
+    suite: &Suite,
+    trial: &Trial,
+    directory: &Path,
+    interrupted: &dyn Fn() -> Option<i32>,
+) -> anyhow::Result<TrainingEnd> {
     let run = directory.join(&trial.name);
     let mut command = Command::new("/proc/self/exe");
     if run.exists() {
@@ -288,7 +422,7 @@ fn train_one(suite: &Suite, trial: &Trial, directory: &Path, signals: &Signals) 
     }
     command.arg("--quiet");
     // Tied to this process: if that is killed, the run ends and can be resumed with the suite.
-    run_training(&mut tied(&command)?, &|| signals.received())
+    run_training(&mut tied(&command)?, interrupted)
 }
 
 /// Prints what came out: a line for each setting, and which is best; with `--json` an object about the runs.
@@ -309,31 +443,32 @@ fn report(suite: &Suite, directory: &Path, output: &OutputMode) -> anyhow::Resul
     if output.json {
         let mut runs = Vec::new();
         for trial in &suite.trials {
-            runs.push(printed(&trial.name, &directory.join(&trial.name))?);
+            runs.push(run_json(suite, trial, &directory.join(&trial.name))?);
         }
-        let printed = Printed {
+        let json = SuiteJson {
             suite: here.to_string(),
             runs,
         };
-        writeln!(std::io::stdout().lock(), "{}", serde_json::to_string(&printed)?)?;
+        writeln!(std::io::stdout().lock(), "{}", serde_json::to_string(&json)?)?;
     }
     Ok(())
 }
 
-fn printed<'a>(name: &'a str, path: &Path) -> anyhow::Result<PrintedRun<'a>> {
-    let mut printed = PrintedRun {
-        run: name,
+fn run_json<'a>(suite: &Suite, trial: &'a Trial, path: &Path) -> anyhow::Result<RunJson<'a>> {
+    let mut json = RunJson {
+        run: &trial.name,
         finished: false,
+        ended_early: suite.has_ended(trial),
         env_steps: 0,
         eval_return_mean: None,
     };
     if let Ok(run) = RunDir::open(path) {
         let status = saved_status(&run.config()?, &run)?;
         let evaluation = FinalEvaluation::read(&run, status.env_steps)?;
-        (printed.finished, printed.env_steps) = (status.finished, status.env_steps);
-        printed.eval_return_mean = evaluation.and_then(|it| it.of(SavedPolicy::Best)?.return_mean);
+        (json.finished, json.env_steps) = (status.finished, status.env_steps);
+        json.eval_return_mean = evaluation.and_then(|it| it.of(SavedPolicy::Best)?.return_mean);
     }
-    Ok(printed)
+    Ok(json)
 }
 
 /// The live line, or a line for each event where standard error is no terminal.
@@ -378,7 +513,7 @@ impl<'a> SuiteProgressDisplay<'a> {
             let run = directory.join(&suite.trials[*number].name);
             (*number, distance(&run).map_or(0, |(done, _)| done))
         };
-        let progress = Self {
+        Self {
             suite,
             directory,
             bar,
@@ -389,9 +524,7 @@ impl<'a> SuiteProgressDisplay<'a> {
             done: Vec::new(),
             failed: 0,
             started_at: Instant::now(),
-        };
-        progress.print(&format!("{} of {} runs to train", due.len(), suite.trials.len()));
-        progress
+        }
     }
 
     fn observe(&mut self, event: Option<Event>) {
@@ -418,6 +551,14 @@ impl<'a> SuiteProgressDisplay<'a> {
                 ));
             }
             Some(Event::Interrupted(number)) => self.running.retain(|other| *other != number),
+            Some(Event::Paused(number)) => {
+                self.ended(number);
+                let best = best_return(&self.run(number));
+                self.print(&format!(
+                    "{}: best return so far {best:.2}",
+                    self.suite.trials[number].name
+                ));
+            }
             Some(Event::Failed(number, why)) => {
                 self.ended(number);
                 self.failed += 1;
@@ -438,7 +579,11 @@ impl<'a> SuiteProgressDisplay<'a> {
 
     fn result(&self, number: usize) -> Option<f64> {
         let run = RunDir::open(&self.run(number)).ok()?;
-        FinalEvaluation::read(&run, 0).ok()??.of(SavedPolicy::Best)?.return_mean
+        let (steps, _) = recorded(&run).ok()?.unwrap_or_default();
+        FinalEvaluation::read(&run, steps)
+            .ok()??
+            .of(SavedPolicy::Best)?
+            .return_mean
     }
 
     fn count(&self) -> String {
@@ -446,7 +591,7 @@ impl<'a> SuiteProgressDisplay<'a> {
         format!("{} of {all} runs", all - self.due.len() + self.done.len() - self.failed)
     }
 
-    /// The time that the rest takes at the rate of this suite so far. A run that has not begun is as long as the others are on
+    /// The estimated remaining time, at the rate of this suite so far. A run that has not begun is as long as the others are on
     /// average.
     fn time_left(&self) -> Option<String> {
         let (mut made, mut known, mut total) = (0, 0, 0);

@@ -33,6 +33,9 @@ pub(crate) struct TrainArgs {
     /// Train a suite: a run for each of these values, as in --sweep ddpg.tau=0.001,0.005. Repeated: for each combination.
     #[arg(long, value_name = "SECTION.KEY=A,B,C", add = ArgValueCompleter::new(completion::settings))]
     pub(crate) sweep: Vec<String>,
+    /// End bad settings of a suite early: the worse half at 1/4 of the steps, for example, and again at 1/2.
+    #[arg(long, requires = "sweep")]
+    pub(crate) halving: bool,
     /// Runs of a suite at a time [default: what cores and /dev/shm allow].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     pub(crate) jobs: Option<u16>,

@@ -116,7 +116,7 @@ fn train_and_report(
                     "{why}; the training is finished; to evaluate it: shoal eval {here}"
                 ));
                 finished = finished.with_reason(why);
-                best_policy::keep_some(&config, run)?;
+                best_policy::ensure_best_policy(&config, run)?;
             }
         }
     }

@@ -17,7 +17,7 @@ use shoal_run::signals::{self, Signals};
 
 use super::log::Log;
 use super::stall::StallDetector;
-use super::supervisor::{RolesOnHost, RunCondition, Supervisor};
+use super::supervisor::{HostRoles, RunCondition, Supervisor};
 use super::{OTHERS_END, write_iox_config};
 
 /// How often heartbeats are read if nothing wakes the launcher.
@@ -86,7 +86,7 @@ impl<'a> Host<'a> {
         let log = Log::open(&run.log())?;
         write_iox_config(domain, run)?;
         // Creates the services that are opened below.
-        let supervisor = Supervisor::new(&config, run, domain, log.clone(), RolesOnHost::Host { actors })?;
+        let supervisor = Supervisor::new(&config, run, domain, log.clone(), HostRoles::Host { actors })?;
         Ok(Self {
             control: ControlPort::open(domain)?,
             heartbeats: Reports::open(domain)?,
@@ -159,7 +159,7 @@ impl<'a> Host<'a> {
                     }
                 }
             }
-            self.sleep(TICK.min(self.supervisor.idle_for()));
+            self.sleep(TICK.min(self.supervisor.time_to_next_task()));
         }
     }
 

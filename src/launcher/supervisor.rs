@@ -1,5 +1,6 @@
 //! All processes of a run: starts them, tracks which are ready, restarts them, and gives up those that cannot work.
 
+use std::collections::HashSet;
 use std::os::fd::BorrowedFd;
 use std::os::unix::process::ExitStatusExt;
 use std::path::PathBuf;
@@ -40,7 +41,7 @@ const CLEANING_AGAIN: Duration = Duration::from_millis(200);
 /// A start that takes longer is reported to the user.
 const SLOW_START: Duration = Duration::from_secs(10);
 
-/// More starts than ever happen without any of the processes sending a chunk.
+/// More starts than there ever are between two committed chunks. A lost counter skips this many.
 const STARTS_WITHOUT_CHUNK: u64 = 100_000;
 
 /// The situation of the run's processes.
@@ -56,7 +57,7 @@ pub(super) enum RunCondition {
 
 /// Which processes there are.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) enum RolesOnHost {
+pub(super) enum HostRoles {
     /// Those of the learner's host, with a gate if other hosts may join.
     Learner {
         /// Whether there is a gate.
@@ -115,7 +116,7 @@ impl Supervisor {
         run: &RunDir,
         domain: &Domain,
         log: Log,
-        members: RolesOnHost,
+        roles: HostRoles,
     ) -> anyhow::Result<Self> {
         let counter = run.incarnations();
         let mut started = read_counter(&counter)?;
@@ -133,8 +134,8 @@ impl Supervisor {
         let server = config.evaluation_server();
         let lockstep = config.run.mode == Mode::Lockstep;
         let mut lockstep_actors = None;
-        let (children, actors) = match members {
-            RolesOnHost::Learner { gate } => {
+        let (children, actors) = match roles {
+            HostRoles::Learner { gate } => {
                 services.create_environment(domain, server)?;
                 let mut children = vec![
                     Child::new(Role::Learner, 0),
@@ -145,7 +146,7 @@ impl Supervisor {
                 lockstep_actors = lockstep.then_some(config.actors.count);
                 (children, (0..config.actors.count).collect())
             }
-            RolesOnHost::Host { actors } => (vec![Child::new(Role::Relay, 0)], actors),
+            HostRoles::Host { actors } => (vec![Child::new(Role::Relay, 0)], actors),
         };
         Ok(Self {
             children,
@@ -229,7 +230,7 @@ impl Supervisor {
         let HostRequest {
             host,
             name,
-            actors: count,
+            actors: requested,
             held,
         } = request;
         if let Some(lease) = self.hosts.lease(host) {
@@ -244,15 +245,18 @@ impl Supervisor {
                 self.free_actors().filter(|index| !exists(*index)).collect()
             }
         };
-        let mut actors = if !held.is_empty() && held.iter().all(|index| free.contains(index)) {
+        let requested = requested as usize;
+        let distinct: HashSet<u32> = held.iter().copied().collect();
+        let can_keep = held.len() == requested && distinct.len() == requested;
+        let mut actors = if can_keep && held.iter().all(|index| free.contains(index)) {
             held
-        } else if free.len() >= count as usize {
-            free[..count as usize].to_vec()
+        } else if free.len() >= requested {
+            free[..requested].to_vec()
         } else {
-            if let Some(count) = self.lockstep_actors {
+            if let Some(all) = self.lockstep_actors {
                 return Ok(ControlResponse::Refused(format!(
-                    "this lockstep run has {count} actors, of which other hosts have {}",
-                    count as usize - free.len()
+                    "this lockstep run has {all} actors, of which other hosts have {}",
+                    all as usize - free.len()
                 )));
             }
             return Ok(ControlResponse::Refused(format!(
@@ -400,7 +404,7 @@ impl Supervisor {
         self.faults = self.faults.saturating_add(1);
         let server = self.children.iter().find(|child| child.is(Role::EnvServer, index));
         if let Some(server) = server {
-            // The server has written what it was, unless it is one that does not check itself: then its client has.
+            // A server that checks its own answers has logged the fault, otherwise its client has.
             let by_client = self.log.last_lines(client).pop().filter(|line| line.contains(GIVEN_UP));
             let last = by_client.filter(|line| !line.contains(&ResponseFault::Reported.to_string()));
             let last = last
@@ -438,11 +442,8 @@ impl Supervisor {
 
     /// Whether there is a learner that is ready.
     pub(super) fn has_learner(&self) -> bool {
-        let mut learners = self
-            .children
-            .iter()
-            .filter(|child| child.instance.role == Role::Learner);
-        learners.any(|learner| learner.process.is_some() && learner.is_ready())
+        let learner = self.learner();
+        learner.is_some_and(|learner| learner.process.is_some() && learner.is_ready())
     }
 
     /// Total number of restarts.
@@ -465,12 +466,9 @@ impl Supervisor {
     }
 
     /// The time until the next restart or clean-up, unless a process ends earlier.
-    pub(super) fn idle_for(&self) -> Duration {
+    pub(super) fn time_to_next_task(&self) -> Duration {
         let since_clean = self.cleaned_at.elapsed();
-        let cleaning = self
-            .occupied_since
-            .map_or(CLEANING, |_| CLEANING_AGAIN)
-            .saturating_sub(since_clean);
+        let cleaning = self.cleaning_interval().saturating_sub(since_clean);
         let missing = |child: &&Child| child.process.is_none() && self.is_wanted(child);
         let now = Instant::now();
         let restarts = self.children.iter().filter(missing);
@@ -516,16 +514,21 @@ impl Supervisor {
     }
 
     fn is_cleaning_due(&self) -> bool {
-        self.cleaned_at.elapsed() >= self.occupied_since.map_or(CLEANING, |_| CLEANING_AGAIN)
+        self.cleaned_at.elapsed() >= self.cleaning_interval()
+    }
+
+    fn cleaning_interval(&self) -> Duration {
+        self.occupied_since.map_or(CLEANING, |_| CLEANING_AGAIN)
+    }
+
+    fn learner(&self) -> Option<&Child> {
+        self.children.iter().find(|child| child.instance.role == Role::Learner)
     }
 
     /// Whether the learner's end has been observed, and it was the planned one.
     fn learner_has_finished(&self) -> bool {
-        let mut learners = self
-            .children
-            .iter()
-            .filter(|child| child.instance.role == Role::Learner);
-        learners.any(|learner| learner.ended.is_some_and(|status| status.success()))
+        let ended = self.learner().and_then(|learner| learner.ended);
+        ended.is_some_and(|status| status.success())
     }
 
     fn maintain_one(&mut self, i: usize) -> anyhow::Result<RunCondition> {
@@ -600,8 +603,8 @@ impl Supervisor {
         messages
     }
 
-    /// What is to be said of processes that are slow, each once: environment servers over one step or reset, and roles that
-    /// are starting. An environment's program that is not ready within `start_limit` is ended, which counts as a failure.
+    /// Messages about slow processes, one for each: environment servers in one step or reset, and roles that are starting.
+    /// An environment's program that is not ready within `start_limit` is ended, which counts as a failure.
     pub(super) fn report_slow(&mut self, stalls: &StallDetector, start_limit: Option<Duration>) -> Vec<String> {
         let mut said = Vec::new();
         for (i, silent) in stalls.slow_servers(&self.children) {
@@ -609,7 +612,7 @@ impl Supervisor {
             if child.report_slow() {
                 let (name, seconds) = (name(child.instance), silent.as_secs());
                 said.push(format!(
-                    "{name} has been over one step or reset of its environments for {seconds} s; it is left alone"
+                    "{name} has spent {seconds} s in one step or reset of its environments; it is not interrupted"
                 ));
             }
         }
@@ -774,11 +777,8 @@ impl Supervisor {
         let Some(how) = &self.unsaved_learner else {
             return Ok(());
         };
-        let lines = self.log.last_lines(&name(RoleInstance {
-            role: Role::Learner,
-            index: 0,
-            incarnation: 0,
-        }));
+        let learner = self.learner().map(|learner| name(learner.instance));
+        let lines = learner.map_or_else(Vec::new, |learner| self.log.last_lines(&learner));
         let message = lines.last().map_or_else(String::new, |line| format!(": {line}"));
         bail!(
             "the learner did not save its last state ({how}){message}; `shoal resume {}` continues from the newest \

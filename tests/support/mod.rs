@@ -430,10 +430,22 @@ pub(crate) fn final_result(running: Running) -> (serde_json::Value, Vec<String>)
     )
 }
 
-/// Waits until the replay has `by` more rows than at the time of the call.
-pub(crate) fn wait_for_rows(running: &Running, by: u64) {
+/// Waits until the replay has `by` more rows than at the time of the call. Returns false if the run ends before.
+pub(crate) fn gets_rows(running: &Running, by: u64) -> bool {
     let wanted = committed_rows(running) + by;
-    until("more rows are committed", || committed_rows(running) >= wanted);
+    let ends = || running.log().matches("every role has ended").count();
+    let ends_before = ends();
+    let mut has_ended = false;
+    until("more rows are committed, or the run ends", || {
+        has_ended = ends() > ends_before;
+        has_ended || committed_rows(running) >= wanted
+    });
+    !has_ended
+}
+
+/// The same for a run that is long enough.
+pub(crate) fn wait_for_rows(running: &Running, by: u64) {
+    assert!(gets_rows(running, by), "the run has ended before: {}", running.log());
 }
 
 /// Committed rows of a run; 0 before its replay exists.

@@ -105,7 +105,7 @@ pub struct EvaluationReport {
 /// The progress of the evaluator: sent when it starts and after each policy that it has evaluated.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ZeroCopySend)]
 #[repr(C)]
-pub struct EvaluatedReport {
+pub struct EvaluatedPeriod {
     /// The period of the last evaluated policy.
     pub period: u64,
 }

@@ -15,7 +15,7 @@ use iceoryx2::service::port_factory::request_response::PortFactory;
 
 use self::message::{AddressedRequest, VERSION, decode, encode};
 pub use self::message::{
-    ControlRequest, ControlResponse, HostLease, HostRequest, HostState, HostStatus, RoleState, RoleStatus, RunKey,
+    ControlRequest, ControlResponse, HostLease, HostRequest, HostState, HostStatus, RoleState, RoleStatus, RunDirId,
     RunStatus,
 };
 use super::domain::Domain;
@@ -130,7 +130,7 @@ impl ControlPort {
     /// When the channel does not work, or `answer` fails.
     pub fn answer_requests<E: From<ChannelError>>(
         &mut self,
-        run: RunKey,
+        run: RunDirId,
         place: &Path,
         mut answer: impl FnMut(ControlRequest) -> Result<Option<ControlResponse>, E>,
     ) -> Result<(), E> {
@@ -193,7 +193,7 @@ fn send(request: &UnansweredRequest, answer: &ControlResponse) {
 /// When the launcher ends, there is no answer within `patience`, or the answer cannot be read.
 pub fn ask(
     domain: &Domain,
-    run: RunKey,
+    run: RunDirId,
     request: ControlRequest,
     patience: Duration,
     is_alive: impl Fn() -> bool,
@@ -333,7 +333,7 @@ mod tests {
         let mut services = Services::new(&domain).unwrap();
         services.create_common(&domain).unwrap();
         let mut port = ControlPort::open(&domain).unwrap();
-        let run = RunKey { device: 1, inode: 2 };
+        let run = RunDirId { device: 1, inode: 2 };
         let a_minute = Timespec { tv_sec: 60, tv_nsec: 0 };
         std::thread::scope(|scope| {
             let asker = scope.spawn(|| {

@@ -9,7 +9,7 @@ use iceoryx2::prelude::*;
 use iceoryx2::service::header::publish_subscribe::Header;
 use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
-use shoal_base::report::{EpisodeReport, EvaluatedReport, EvaluationReport, Heartbeat, LearnerReport};
+use shoal_base::report::{EpisodeReport, EvaluatedPeriod, EvaluationReport, Heartbeat, LearnerReport};
 
 use super::domain::Domain;
 use super::error::ChannelError;
@@ -81,7 +81,7 @@ report! { EvaluationReport:
     const HISTORY: usize = 2;
 }
 
-report! { EvaluatedReport:
+report! { EvaluatedPeriod:
     const CHANNEL: &'static str = "reports/judged";
     const BUFFER: usize = 8;
     // A restarted lockstep learner waits for the last report.

@@ -8,7 +8,7 @@ use std::os::unix::fs::OpenOptionsExt;
 
 use iceoryx2::identifiers::UniqueNodeId;
 use iceoryx2::prelude::CallbackProgression;
-use shoal_base::report::{EpisodeReport, EvaluatedReport, EvaluationReport, Heartbeat, LearnerReport};
+use shoal_base::report::{EpisodeReport, EvaluatedPeriod, EvaluationReport, Heartbeat, LearnerReport};
 use shoal_base::role::Role;
 
 use super::cleanup::{Sweeper, is_alive};
@@ -52,7 +52,7 @@ impl Services {
             reports::create::<Heartbeat>(domain)?,
             reports::create::<EpisodeReport>(domain)?,
             reports::create::<EvaluationReport>(domain)?,
-            reports::create::<EvaluatedReport>(domain)?,
+            reports::create::<EvaluatedPeriod>(domain)?,
             reports::create::<LearnerReport>(domain)?,
             event::create(domain, EventName(Role::Learner, 0))?,
             event::create(domain, EventName(Role::Evaluator, 0))?,

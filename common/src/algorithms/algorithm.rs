@@ -51,7 +51,7 @@ pub trait AlgorithmSettings {
 
     /// Sets what follows from the length of the run, in environment steps, if it is left open. Returns the key that was
     /// set.
-    fn follow_length(&mut self, _steps: u64) -> Option<&'static str> {
+    fn set_from_length(&mut self, _steps: u64) -> Option<&'static str> {
         None
     }
 }

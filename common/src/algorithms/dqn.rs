@@ -88,7 +88,7 @@ impl AlgorithmSettings for DqnConfig {
         self.batch
     }
 
-    fn follow_length(&mut self, steps: u64) -> Option<&'static str> {
+    fn set_from_length(&mut self, steps: u64) -> Option<&'static str> {
         if self.epsilon_steps != 0 {
             return None;
         }

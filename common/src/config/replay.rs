@@ -57,16 +57,16 @@ impl ReplayConfig {
     }
 
     /// How many updates are agreed in total after `rows` environment steps.
-    pub fn agreed_updates(&self, rows: u64) -> u64 {
+    pub fn allowed_updates(&self, rows: u64) -> u64 {
         let counted = rows.saturating_sub(self.ratio_start());
         self.updates_before + (counted as f64 * self.updates_per_step) as u64
     }
 
     /// Whether a learner with this many updates is behind by more than the tolerance, so that it should take no more
     /// than `rows` environment steps.
-    pub fn is_behind(&self, rows: u64, updates: u64) -> bool {
+    pub fn learner_is_behind(&self, rows: u64, updates: u64) -> bool {
         let rows = rows.saturating_sub(self.tolerance);
-        rows > self.ratio_start() && self.agreed_updates(rows) > updates
+        rows > self.ratio_start() && self.allowed_updates(rows) > updates
     }
 
     /// Updates per environment step, both since the ratio counts; `None` before.
@@ -130,11 +130,11 @@ mod tests {
             tolerance: 10,
             ..ReplayConfig::default()
         };
-        assert_eq!([100, 101, 102].map(|rows| replay.agreed_updates(rows)), [0, 0, 1]);
-        assert!(!replay.is_behind(111, 0), "the tolerance is not used up");
-        assert!(replay.is_behind(112, 0));
-        assert!(!replay.is_behind(112, 1));
-        assert!(!replay.is_behind(5, 0));
+        assert_eq!([100, 101, 102].map(|rows| replay.allowed_updates(rows)), [0, 0, 1]);
+        assert!(!replay.learner_is_behind(111, 0), "the tolerance is not used up");
+        assert!(replay.learner_is_behind(112, 0));
+        assert!(!replay.learner_is_behind(112, 1));
+        assert!(!replay.learner_is_behind(5, 0));
     }
 
     #[test]
@@ -146,12 +146,12 @@ mod tests {
         let after = ReplayConfig {
             updates_per_step: 0.5,
             ratio_since: 1_100,
-            updates_before: before.agreed_updates(1_100),
+            updates_before: before.allowed_updates(1_100),
             ..before.clone()
         };
-        assert_eq!((before.agreed_updates(100), before.agreed_updates(1_100)), (0, 1_000));
+        assert_eq!((before.allowed_updates(100), before.allowed_updates(1_100)), (0, 1_000));
         assert_eq!(
-            [1_000, 1_100, 1_102, 2_100].map(|rows| after.agreed_updates(rows)),
+            [1_000, 1_100, 1_102, 2_100].map(|rows| after.allowed_updates(rows)),
             [1_000, 1_000, 1_001, 1_500]
         );
         assert_eq!((before.ratio(500, 1_100), before.ratio(0, 100)), (Some(0.5), None));

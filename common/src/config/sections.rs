@@ -153,21 +153,36 @@ fn one_algorithm(mut sections: Table) -> Result<AlgorithmConfig, String> {
 
 impl Serialize for Config {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        let has_minibatches = self.algorithm.properties().transition_use == TransitionUse::Minibatches;
+        // Every field, so that the compiler names a section that is not written.
+        let Self {
+            run,
+            environment,
+            spec,
+            actors,
+            algorithm,
+            observation,
+            reward,
+            learner,
+            replay,
+            evaluation,
+            checkpoint,
+            remote,
+        } = self;
+        let has_minibatches = algorithm.properties().transition_use == TransitionUse::Minibatches;
         Written {
-            run: &self.run,
-            environment: &self.environment,
-            spec: &self.spec,
-            actors: &self.actors,
-            exploration: self.algorithm.ddpg().map(|ddpg| &ddpg.exploration),
-            observation: has_minibatches.then_some(&self.observation),
-            reward: has_minibatches.then_some(&self.reward),
-            algorithm: &self.algorithm,
-            learner: &self.learner,
-            replay: &self.replay,
-            evaluation: &self.evaluation,
-            checkpoint: &self.checkpoint,
-            remote: Some(&self.remote).filter(|remote| **remote != RemoteConfig::default()),
+            run,
+            environment,
+            spec,
+            actors,
+            exploration: algorithm.ddpg().map(|ddpg| &ddpg.exploration),
+            observation: has_minibatches.then_some(observation),
+            reward: has_minibatches.then_some(reward),
+            algorithm,
+            learner,
+            replay,
+            evaluation,
+            checkpoint,
+            remote: Some(remote).filter(|remote| **remote != RemoteConfig::default()),
         }
         .serialize(serializer)
     }

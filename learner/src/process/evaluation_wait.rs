@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use shoal_common::channel::reports::Reports;
 use shoal_common::channel::{ChannelError, wait_for};
 use shoal_common::exit::Exit;
-use shoal_common::report::EvaluatedReport;
+use shoal_common::report::EvaluatedPeriod;
 use shoal_common::role::Activity;
 
 use super::learner::Learner;
@@ -13,7 +13,7 @@ use super::settings::LearnerError;
 
 /// The evaluator's progress, as far as the learner knows it.
 pub(crate) struct EvaluationWait {
-    reports: Reports<EvaluatedReport>,
+    reports: Reports<EvaluatedPeriod>,
     /// The period of the policy evaluated last.
     evaluated_period: Option<u64>,
 }
@@ -34,7 +34,7 @@ impl EvaluationWait {
         learner: &mut Learner<'_>,
         timeout: Option<Duration>,
     ) -> Result<(), Exit<LearnerError>> {
-        let due = Some(learner.settings.config.evaluation.period(learner.rows));
+        let due = Some(learner.settings.config.evaluation.period(learner.counted_rows));
         let Learner {
             listener,
             stop,

@@ -28,7 +28,7 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
     let every = Duration::from_secs_f64(learner.settings.config.checkpoint.every_seconds);
     let mut saved = Instant::now();
     // After a crash the replay is ahead of the checkpoint. Those rows count.
-    learner.count_rows(learner.replay.head());
+    learner.advance_to(learner.replay.head());
     loop {
         if learner.stop.requested() {
             return Err(Exit::Stopped);
@@ -37,13 +37,14 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
         let updates = learner.updates();
         // After a power loss the replay may have no readable row, although it had many. Then new rows must come first.
         let drained = learner.intake.drain(&mut learner.replay, CHUNKS_AT_ONCE, |replay| {
-            !replay.rows().is_empty() && ratio.is_behind(replay.head(), updates)
+            !replay.rows().is_empty() && ratio.learner_is_behind(replay.head(), updates)
         })?;
-        learner.count_rows(learner.replay.head());
+        learner.advance_to(learner.replay.head());
 
-        if updates < ratio.agreed_updates(learner.rows) && !learner.replay.rows().is_empty() {
+        if updates < ratio.allowed_updates(learner.counted_rows) && !learner.replay.rows().is_empty() {
             learner.update()?;
-            if learner.updates().is_multiple_of(PUBLISH_EVERY) {
+            // An update may count for several.
+            if learner.updates() / PUBLISH_EVERY > updates / PUBLISH_EVERY {
                 learner.publish()?;
             }
             learner.report_activity(Activity::Working);
@@ -52,7 +53,7 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
             learner.notify_all();
             return EvaluationWait::new(learner)?.wait(learner, Some(LAST_EVALUATION));
         } else {
-            let activity = if learner.rows < ratio.ratio_start() {
+            let activity = if learner.counted_rows < ratio.ratio_start() {
                 Activity::WaitingForPeer
             } else {
                 Activity::WaitingForRatio

@@ -43,7 +43,7 @@ pub(crate) struct Learner<'a> {
     pub(crate) heartbeat: HeartbeatSender,
     /// Environment steps that count for the ratio: in a free run the replay's head, in lockstep the rows of complete
     /// rounds.
-    pub(crate) rows: u64,
+    pub(crate) counted_rows: u64,
     /// Episodes that end within these steps.
     episodes: u64,
     algorithm: Box<dyn Algorithm>,
@@ -112,7 +112,7 @@ impl<'a> Learner<'a> {
                 config.run.steps,
             )?,
             policy_version: counters.policy_version,
-            rows: counters.rows,
+            counted_rows: counters.rows,
             episodes: counters.episodes,
             reporter: Reporter::open(domain)?,
             report: empty_report(),
@@ -141,11 +141,11 @@ impl<'a> Learner<'a> {
         self.algorithm.updates()
     }
 
-    /// Makes the next update, on the replay as it was after `self.rows` rows.
+    /// Makes the next update, on the replay as it was after `self.counted_rows` rows.
     pub(crate) fn update(&mut self) -> Result<(), LearnerError> {
         let before = self.updates();
         self.heartbeat.begin_work();
-        let losses = self.algorithm.update(&self.replay, self.rows);
+        let losses = self.algorithm.update(&self.replay, self.counted_rows);
         if !(losses.critic_loss.is_finite() && losses.actor_loss.is_finite()) {
             return Err(LearnerError::Diverged {
                 updates: self.algorithm.updates(),
@@ -160,17 +160,17 @@ impl<'a> Learner<'a> {
     }
 
     /// Sets the environment steps that count for the ratio, and counts the episodes that end within them.
-    pub(crate) fn count_rows(&mut self, rows: u64) {
-        let newest = self.rows.max(self.replay.rows().start)..rows;
+    pub(crate) fn advance_to(&mut self, rows: u64) {
+        let newest = self.counted_rows.max(self.replay.rows().start)..rows;
         let layout = self.replay.layout().row;
         let ends = newest.filter(|row| layout.read(self.replay.row(*row)).last);
         self.episodes += ends.count() as u64;
-        self.rows = rows;
+        self.counted_rows = rows;
     }
 
     /// Whether all environment steps of the run, or all its episodes, have been collected.
     pub(crate) fn has_all_rows(&self) -> bool {
-        self.settings.config.run.has_all_steps(self.rows, self.episodes)
+        self.settings.config.run.has_all_steps(self.counted_rows, self.episodes)
     }
 
     /// Publishes the policy as it is now, as a new version.
@@ -183,7 +183,7 @@ impl<'a> Learner<'a> {
         let header = PolicyHeader {
             incarnation: self.settings.instance.incarnation,
             version: self.policy_version,
-            env_steps: self.rows,
+            env_steps: self.counted_rows,
             updates: self.algorithm.updates(),
             fingerprint: self.algorithm.layout().fingerprint(),
         };
@@ -216,7 +216,7 @@ impl<'a> Learner<'a> {
                 self.listener.wait(Duration::from_millis(10))?;
             }
         }
-        self.count_rows(self.replay.head());
+        self.advance_to(self.replay.head());
         Ok(())
     }
 
@@ -249,7 +249,7 @@ impl<'a> Learner<'a> {
         report.critic_loss /= n;
         report.actor_loss /= n;
         report.q_mean /= n;
-        report.env_steps = self.rows;
+        report.env_steps = self.counted_rows;
         report.episodes = self.episodes;
         report.updates = self.algorithm.updates();
         report.policy_version = self.policy_version;
@@ -276,7 +276,7 @@ impl<'a> Learner<'a> {
         }
         let counters = Counters {
             updates: self.updates(),
-            rows: self.rows,
+            rows: self.counted_rows,
             episodes: self.episodes,
             policy_version: self.policy_version,
         };
@@ -299,7 +299,7 @@ impl<'a> Learner<'a> {
         PolicyFile {
             fingerprint: self.algorithm.layout().fingerprint(),
             version: self.policy_version,
-            env_steps: self.rows,
+            env_steps: self.counted_rows,
             return_mean: f64::NAN,
             return_std: f64::NAN,
             episodes: 0,

@@ -18,8 +18,8 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
     let mut evaluation_wait = EvaluationWait::new(learner)?;
     let config = &learner.settings.config;
     let (interval, ratio) = (config.checkpoint.every_updates, &config.replay);
-    let needed = learner.rows.saturating_sub(config.replay.capacity);
-    if learner.replay.rows().start > needed || learner.replay.head() < learner.rows {
+    let needed = learner.counted_rows.saturating_sub(config.replay.capacity);
+    if learner.replay.rows().start > needed || learner.replay.head() < learner.counted_rows {
         let path = learner.settings.run.replay_file();
         return Err(LearnerError::RowsLost { path, needed }.into());
     }
@@ -29,14 +29,14 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
     learner.notify_all();
     evaluation_wait.wait(learner, None)?;
     while !learner.has_all_rows() {
-        let (before, updates) = (learner.rows, learner.updates());
+        let (before, updates) = (learner.counted_rows, learner.updates());
         let mut rows = before;
         for actor in 0..learner.intake.actors() {
             rows = await_chunk(learner, actor, rows)?;
         }
         // Only after all chunks have come: a round that is interrupted before begins again.
-        learner.count_rows(rows);
-        while learner.updates() < ratio.agreed_updates(learner.rows) {
+        learner.advance_to(rows);
+        while learner.updates() < ratio.allowed_updates(learner.counted_rows) {
             learner.update()?;
             learner.report_activity(Activity::Working);
         }

@@ -1,5 +1,5 @@
-//! The policy that a finished run keeps as its best one: the better of the best and the last policy, by one more evaluation
-//! of both.
+//! The policy that a finished run keeps as its best one. The best and the last policy are evaluated once more, and the
+//! better one is kept.
 
 use anyhow::Context;
 use shoal_common::config::Config;
@@ -27,7 +27,7 @@ struct Candidate {
 }
 
 /// Evaluates the best and the last policy of a run with `env_steps` environment steps. The better one is `best.policy`
-/// afterwards. Records the results, and returns those of the best and, if it was evaluated, of the last policy. Calls
+/// afterwards. Records the results and returns them: first that of the kept policy, then that of the last one if it was evaluated. Calls
 /// `progress` with the policy and its finished episodes.
 ///
 /// # Errors
@@ -98,7 +98,7 @@ fn better(candidates: &[Candidate]) -> Option<&Candidate> {
 ///
 /// # Errors
 /// When a policy cannot be read or written.
-pub fn keep_some(config: &Config, run: &RunDir) -> anyhow::Result<()> {
+pub fn ensure_best_policy(config: &Config, run: &RunDir) -> anyhow::Result<()> {
     let kept = run.best_policy().exists() && SavedPolicy::Best.read(run, config)?.return_mean.is_finite();
     if !kept && run.last_policy().exists() {
         let last = SavedPolicy::Last.read(run, config)?;

@@ -74,8 +74,8 @@ fn resolve_table(
     describe_environment(&mut table).map_err(|error| about_environment(error, &sources))?;
     // What is added are an algorithm's settings for a Gymnasium environment, and the environment's own defaults.
     sources.add_new(&chosen, &table, &SettingSource::Gymnasium);
-    follow_algorithm(&mut table, &mut sources)?;
-    follow_networks(&mut table, &mut sources, overrides)?;
+    set_from_algorithm(&mut table, &mut sources)?;
+    set_from_predecessor(&mut table, &mut sources, overrides)?;
     let mut config = Config::from_table(table.clone(), "").map_err(|error| {
         let message = error.to_string();
         let message = message.strip_prefix(": ").unwrap_or(&message);
@@ -86,20 +86,20 @@ fn resolve_table(
         config.evaluation.every = config.run.steps;
         sources.set("evaluation.every".into(), SettingSource::Follows("run.steps".into()));
     }
-    follow_length(&mut config, &mut sources);
+    set_from_length(&mut config, &mut sources);
     Ok((config, sources))
 }
 
 /// Sets what follows from the run's length if it is left open.
-pub(super) fn follow_length(config: &mut Config, sources: &mut SettingSources) {
-    if let Some(key) = config.algorithm.follow_length(config.run.steps) {
+pub(super) fn set_from_length(config: &mut Config, sources: &mut SettingSources) {
+    if let Some(key) = config.algorithm.set_from_length(config.run.steps) {
         let key = format!("{}.{key}", config.algorithm.name());
         sources.set(key, SettingSource::Follows("run.steps".into()));
     }
 }
 
-/// Sets what the algorithm fixes, unless the user has set it.
-fn follow_algorithm(table: &mut Table, sources: &mut SettingSources) -> anyhow::Result<()> {
+/// Sets the keys that the algorithm determines. A value that the user has set is left; `Config::check` refuses a wrong one.
+fn set_from_algorithm(table: &mut Table, sources: &mut SettingSources) -> anyhow::Result<()> {
     let limit = integer(table, "spec", "time_limit");
     let algorithms = AlgorithmConfig::all();
     let Some(algorithm) = algorithms.iter().find(|one| table.contains_key(one.name())) else {
@@ -125,8 +125,12 @@ fn follow_algorithm(table: &mut Table, sources: &mut SettingSources) -> anyhow::
     Ok(())
 }
 
-/// Sets the shapes of the networks that a run begins with, unless the user has set others.
-fn follow_networks(table: &mut Table, sources: &mut SettingSources, overrides: &RunOverrides) -> anyhow::Result<()> {
+/// Sets the shapes of the networks of the `--from` run, except those that the user has set.
+fn set_from_predecessor(
+    table: &mut Table,
+    sources: &mut SettingSources,
+    overrides: &RunOverrides,
+) -> anyhow::Result<()> {
     let Some((path, config)) = overrides.predecessor()? else {
         return Ok(());
     };

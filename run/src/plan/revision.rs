@@ -15,7 +15,7 @@ use shoal_learner::process::replay_layout;
 use toml::Table;
 
 use super::overrides::{RunOverrides, read_counts, set_key, set_options};
-use super::resolve::follow_length;
+use super::resolve::set_from_length;
 use super::source::{SettingSource, SettingSources};
 use crate::plan::algorithm;
 use crate::records::recorder::{ChangeRecord, Moment, read_changes, record_changes};
@@ -80,7 +80,7 @@ impl Revision {
             let message = error.to_string();
             explain(message.strip_prefix(": ").unwrap_or(&message).into(), &table)
         })?;
-        follow_length(&mut config, &mut SettingSources::default());
+        set_from_length(&mut config, &mut SettingSources::default());
         let (since, before) = (config.replay.ratio_since, config.replay.updates_before);
         // These two are in the other file alone, because `config.toml` is written before a change is final.
         (config.replay.ratio_since, config.replay.updates_before) = if (since, before) == (0, 0) {
@@ -94,7 +94,7 @@ impl Revision {
         let has = |key: &str| differences.iter().any(|it| it.key == key);
         if has("replay.updates_per_step") || has("replay.warmup") {
             let rows = replay_rows(run)?;
-            (config.replay.ratio_since, config.replay.updates_before) = (rows, used.replay.agreed_updates(rows));
+            (config.replay.ratio_since, config.replay.updates_before) = (rows, used.replay.allowed_updates(rows));
         }
         let who = |key: &str| match sources.of(key) {
             SettingSource::Option(option) => option.into(),

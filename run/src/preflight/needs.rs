@@ -3,7 +3,7 @@
 
 use shoal_common::channel::{Listener, control, environment, policy, reports, transitions};
 use shoal_common::config::Config;
-use shoal_common::report::{EpisodeReport, EvaluatedReport, EvaluationReport, Heartbeat, LearnerReport};
+use shoal_common::report::{EpisodeReport, EvaluatedPeriod, EvaluationReport, Heartbeat, LearnerReport};
 use shoal_common::run_dir::RunDir;
 use shoal_learner::process::{self, SizeError};
 
@@ -35,7 +35,7 @@ pub(super) fn shared_memory(config: &Config) -> u64 {
         + reports::reserved::<Heartbeat>(max, roles)
         + reports::reserved::<EpisodeReport>(max, max)
         + reports::reserved::<EvaluationReport>(max, 1)
-        + reports::reserved::<EvaluatedReport>(max, 1)
+        + reports::reserved::<EvaluatedPeriod>(max, 1)
         + reports::reserved::<LearnerReport>(max, 1)
         // One for each process, and one for the launcher.
         + (roles as u64 + 1) * Listener::reserved(max)

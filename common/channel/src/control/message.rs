@@ -105,13 +105,13 @@ pub struct HostStatus {
 /// shared memory: a request about the copy reaches the launcher of the original.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct AddressedRequest {
-    pub(super) run: RunKey,
+    pub(super) run: RunDirId,
     pub(super) request: ControlRequest,
 }
 
 /// Distinguishes a run directory from its copies by device and inode.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct RunKey {
+pub struct RunDirId {
     /// The device.
     pub device: u64,
     /// The inode.

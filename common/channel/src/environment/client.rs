@@ -65,12 +65,12 @@ pub struct EnvironmentResponse {
     layout: ResponseLayout,
 }
 
-/// The actor's end. While it waits for a response, it calls `idle` some twenty times a second.
+/// The client. While it waits for a response, it calls `idle` some twenty times a second.
 #[derive(Debug)]
 pub struct EnvironmentClient {
     service: EnvironmentService,
     /// The server that runs the current episodes.
-    episodes: Cell<Option<UniqueServerId>>,
+    episode_server: Cell<Option<UniqueServerId>>,
     client: Client<ipc::Service, [f32], RequestHeader, [f32], ResponseHeader>,
     channel: String,
     notifier: Notifier,
@@ -172,7 +172,7 @@ impl EnvironmentClient {
         let notifier = Notifier::new(domain, EventName(Role::EnvServer, index))?;
         Ok(Self {
             service,
-            episodes: Cell::new(None),
+            episode_server: Cell::new(None),
             client,
             channel,
             notifier,
@@ -220,7 +220,7 @@ impl EnvironmentClient {
                 RequestHeader::new(RequestKind::ResetToEvaluation, first, episodes)
             }
         };
-        self.begun(self.request_until_answered(listener, header, &[], &mut idle)?)
+        self.accept_episodes(self.request_until_answered(listener, header, &[], &mut idle)?)
     }
 
     /// Every environment takes a step with its action.
@@ -236,7 +236,9 @@ impl EnvironmentClient {
         mut idle: impl FnMut(),
     ) -> Result<StepResult, Exit<ChannelError>> {
         match self.request_within_episodes(listener, RequestKind::Step, actions, &mut idle)? {
-            Some(response) => Ok(StepResult::Taken(self.observed(response, ResponsePart::Step)?)),
+            Some(response) => Ok(StepResult::Taken(
+                self.accept_observations(response, ResponsePart::Step)?,
+            )),
             None => Ok(StepResult::Lost),
         }
     }
@@ -279,7 +281,7 @@ impl EnvironmentClient {
             };
             return Err(ChannelError::new(&self.channel, "restore", cause).into());
         }
-        self.begun(self.request_until_answered(
+        self.accept_episodes(self.request_until_answered(
             listener,
             RequestHeader::new(RequestKind::Restore, 0, 0),
             numbers_of(words),
@@ -288,14 +290,18 @@ impl EnvironmentClient {
     }
 
     /// Takes the response to a reset or restore, and notes which server runs the new episodes.
-    fn begun(&self, response: ServerResponse) -> Result<EnvironmentResponse, Exit<ChannelError>> {
+    fn accept_episodes(&self, response: ServerResponse) -> Result<EnvironmentResponse, Exit<ChannelError>> {
         let server = response.origin();
-        let observed = self.observed(response, ResponsePart::Observations)?;
-        self.episodes.set(Some(server));
+        let observed = self.accept_observations(response, ResponsePart::Observations)?;
+        self.episode_server.set(Some(server));
         Ok(observed)
     }
 
-    fn observed(&self, response: ServerResponse, part: ResponsePart) -> Result<EnvironmentResponse, ChannelError> {
+    fn accept_observations(
+        &self,
+        response: ServerResponse,
+        part: ResponsePart,
+    ) -> Result<EnvironmentResponse, ChannelError> {
         let numbers = self.accepted_payload(&response)?;
         if numbers.len() != self.layout.len() {
             let fault = ResponseFault::Length {
@@ -338,7 +344,7 @@ impl EnvironmentClient {
         idle: &mut dyn FnMut(),
     ) -> Result<Option<ServerResponse>, Exit<ChannelError>> {
         let server = self.server();
-        if server != self.episodes.get() {
+        if server != self.episode_server.get() {
             return Ok(None);
         }
         let sent = self.send(server, RequestHeader::new(kind, 0, 0), payload)?;
@@ -348,7 +354,7 @@ impl EnvironmentClient {
         if response.user_header().status != ResponseStatus::NotStarted as u32 {
             return Ok(Some(response));
         }
-        if Some(response.origin()) == self.episodes.get() {
+        if Some(response.origin()) == self.episode_server.get() {
             return Err(ChannelError::new(&self.channel, "ask", PeerError::EpisodesDenied).into());
         }
         Ok(None)
@@ -376,8 +382,8 @@ impl EnvironmentClient {
         }
     }
 
-    /// Sends a request to `server`. The caller must have looked it up before: if another server takes its place in between,
-    /// the request counts as lost and is sent again. A server that is looked up afterwards may never have got the request.
+    /// Sends a request to `server`, which the caller looks up before. If another server takes its place in between, the
+    /// request counts as lost and is sent again. A server that is looked up afterwards may never have got the request.
     fn send(
         &self,
         server: Option<UniqueServerId>,
@@ -412,7 +418,7 @@ impl EnvironmentClient {
                 Ok(Some(response)) => Ok(Some(Some(response))),
                 Ok(None) if lost.get() => Ok(Some(None)),
                 Ok(None) => Ok(None),
-                Err(cause) => Err(ChannelError::new(&self.channel, "receive the answer", cause)),
+                Err(cause) => Err(ChannelError::new(&self.channel, "receive the response", cause)),
             },
             || {
                 idle();
