@@ -119,10 +119,20 @@ mod tests {
         for name in names() {
             assert!(defaults(name).unwrap().contains_key(name), "{name}");
         }
+        let sections = shoal_common::config::explanation::sections();
+        let is_key = |section: &str, key: &str| {
+            let section = sections.iter().find(|known| known.name == section);
+            section.is_some_and(|section| section.keys.iter().any(|known| known.name == key))
+        };
         let of_environments: Table = OF_ENVIRONMENTS.parse().unwrap();
         for (environment, algorithms) in of_environments {
-            for algorithm in algorithms.as_table().unwrap().keys() {
+            for (algorithm, settings) in algorithms.as_table().unwrap() {
                 assert!(names().any(|name| name == algorithm), "{environment}: {algorithm}");
+                for (section, values) in settings.as_table().unwrap() {
+                    for key in values.as_table().unwrap().keys() {
+                        assert!(is_key(section, key), "{environment}.{algorithm}: {section}.{key}");
+                    }
+                }
             }
         }
     }

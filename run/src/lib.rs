@@ -23,6 +23,7 @@ pub mod recorder;
 pub mod rollout;
 pub mod server_location;
 pub mod signals;
+pub mod start;
 pub mod status;
 pub mod suite;
 #[cfg(any(test, feature = "testing"))]

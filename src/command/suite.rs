@@ -22,6 +22,7 @@ use shoal_run::plan::{self, RunOverrides};
 use shoal_run::preflight;
 use shoal_run::recorder::recorded;
 use shoal_run::signals::{Signals, exit_code};
+use shoal_run::start::StartRecord;
 use shoal_run::status::saved_status;
 use shoal_run::suite::{self, Suite, Sweep, Trial};
 use shoal_run::usage::UsageError;
@@ -101,6 +102,7 @@ pub(crate) fn train(args: &TrainArgs, what: &str, overrides: &RunOverrides) -> a
         None => RunDir::create_next(Path::new("runs"), &format!("{name}-suite"))?,
     };
     suite.write(directory.path())?;
+    StartRecord::of_this_process().write(directory.path())?;
     begin(&suite, directory.path(), &common, options)
 }
 

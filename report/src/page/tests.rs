@@ -60,7 +60,7 @@ fn episodes_of_every_environment_can_be_played() {
         let config = configuration(name);
         let parameters = vec![0.0; policy_layout(&config).unwrap().parameters()];
         let run = directory(parent.path(), &format!("run-{i}"), &config, Some(parameters));
-        let data = data(&gather(&[run]).unwrap().page().unwrap());
+        let data = data(&gather(&[run], None).unwrap().page().unwrap());
         let played = &data["runs"][0]["played"];
         assert_eq!(played["why_not"], serde_json::Value::Null, "{name}");
         let environment = make(name, &toml::Table::new()).unwrap();
@@ -90,7 +90,7 @@ fn a_run_without_playable_episodes_is_shown_with_the_reason() {
     config.environment.name = "walker".into();
     config.environment.server = vec!["no-such-program".into()];
     let served = directory(parent.path(), "served", &config, Some(parameters));
-    let report = gather(&[begun, damaged, served]).unwrap();
+    let report = gather(&[begun, damaged, served], None).unwrap();
     let reasons = report.runs_without_episodes();
     assert_eq!(reasons.len(), 3);
     for ((reason, runs), (name, part)) in reasons.iter().zip([
@@ -118,7 +118,7 @@ fn run_names_cannot_inject_markup_and_the_page_loads_nothing() {
     let (config, parameters) = small("name = \"pendulum\"");
     let name = "</script><script>alert(1)<!-- {{script}}";
     let run = directory(parent.path(), &name.replace('/', "∕"), &config, Some(parameters));
-    let mut report = gather(&[run]).unwrap();
+    let mut report = gather(&[run], None).unwrap();
     report.runs[0].name = name.into();
     let page = report.page().unwrap();
     assert!(page.starts_with(MARK));
@@ -162,7 +162,7 @@ fn the_page_of_a_long_run_is_small_and_shows_its_peak() {
     std::fs::write(run.evaluations(), evaluations).unwrap();
     std::fs::write(run.learner_log(), learner).unwrap();
     std::fs::write(run.incidents(), incidents).unwrap();
-    let page = gather(&[run]).unwrap().page().unwrap();
+    let page = gather(&[run], None).unwrap().page().unwrap();
     assert!(page.len() < 1_000_000, "{} bytes", page.len());
     let data = data(&page);
     let run = &data["runs"][0];
@@ -189,7 +189,7 @@ fn a_damaged_record_is_refused_with_one_line_that_names_the_file() {
     let (config, _) = small("name = \"pendulum\"");
     let run = directory(parent.path(), "run", &config, None);
     std::fs::write(run.incidents(), "wall_seconds,env_steps\nwhen,3\n").unwrap();
-    let error = format!("{:#}", gather(&[run]).unwrap_err());
+    let error = format!("{:#}", gather(&[run], None).unwrap_err());
     assert!(
         error.contains("incidents.csv is not a record of this program") && !error.contains('\n'),
         "{error}"

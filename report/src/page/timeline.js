@@ -77,7 +77,7 @@ class Timeline {
       "details",
       {},
       html("summary", {}, `All ${rows.length + more} incidents as a list`),
-      html("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": `Incidents of ${this.run.name}` }, html("table", {}, html("thead", {}, html("tr", {}, head)), html("tbody", {}, rows.map(cells)))),
+      scrollable(`Incidents of ${this.run.name}`, html("table", {}, html("thead", {}, html("tr", {}, head)), html("tbody", {}, rows.map(cells)))),
       more ? html("p", { class: "aside" }, `${whole(more)} later incidents are not listed: see incidents.csv`) : null,
     );
   }
