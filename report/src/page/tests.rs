@@ -168,6 +168,16 @@ fn the_page_of_a_long_run_is_small_and_shows_its_peak() {
     let run = &data["runs"][0];
     let means = run["evaluations"]["mean"].as_array().unwrap();
     assert!(means.iter().any(|mean| mean == 777.0) && means.len() <= POINTS);
+    // A moving mean over the points is that of all records.
+    let total = |key: &str| -> f64 {
+        let numbers = run["evaluations"][key].as_array().unwrap();
+        assert_eq!(numbers.len(), means.len());
+        numbers.iter().map(|number| number.as_f64().unwrap()).sum()
+    };
+    assert_eq!(total("counts"), 20_000.0);
+    let peak = 777.0 + 1_000.123_456_789 / 12_346.0;
+    let sum = peak - (1..=20_000).map(|i| 1_000.123_456_789 / f64::from(i)).sum::<f64>();
+    assert!((total("sums") - sum).abs() < 1.0, "{sum}");
     assert_eq!(run["incidents"]["kills"], 20_000);
     assert_eq!(run["learner"]["actor_loss"][0], serde_json::Value::Null);
 }
