@@ -39,6 +39,8 @@ class Chart {
       this.picture,
       this.readout,
     );
+    // From the beginning, so that nothing moves when it is drawn.
+    this.plot.style.minHeight = `${this.height}px`;
     const button = (sign, name, onclick) => html("button", { type: "button", "aria-label": `${this.title}: ${name}`, title: name, onclick }, sign);
     this.element = html(
       "figure",

@@ -161,7 +161,7 @@ class Player {
     actions[event.key]();
   }
 
-  /** A key outside the player: space plays and pauses; without focus, the arrows step as long as the player can be seen. */
+  /** A key outside the player: space plays and pauses; without focus, the arrows step as long as its picture is in sight. */
   keyOfPage(event) {
     const { target } = event;
     if (event.defaultPrevented || event.ctrlKey || event.altKey || event.metaKey || event.shiftKey || this.element.contains(target)) return;
@@ -169,16 +169,15 @@ class Player {
       event.preventDefault();
       // A key that is held down repeats.
       if (!event.repeat) this.toggle();
-      if (this.playing && !this.isVisible()) this.stage.scrollIntoView({ block: "center" });
-    } else if (target === document.body && (event.key === "ArrowLeft" || event.key === "ArrowRight") && this.isVisible()) {
+      if (this.playing && !this.isInSight()) this.stage.scrollIntoView({ block: "center" });
+    } else if (target === document.body && (event.key === "ArrowLeft" || event.key === "ArrowRight") && this.isInSight()) {
       this.key(event);
     }
   }
 
-  /** Whether most of the picture is in the window. */
-  isVisible() {
+  /** Whether the whole picture is in the window. */
+  isInSight() {
     const box = this.stage.getBoundingClientRect();
-    const middle = (box.top + box.bottom) / 2;
-    return middle > 0 && middle < innerHeight;
+    return box.top >= 0 && box.bottom <= innerHeight;
   }
 }

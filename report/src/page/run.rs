@@ -128,9 +128,14 @@ impl Run {
         let evaluation_records = read_evaluations(&run.evaluations())?;
         let learner = read_learner(&run.learner_log())?;
         let explored = read_episodes(&run.episodes())?;
-        let now = learner.last().cloned().unwrap_or_default();
-        let all_steps = config.run.has_all_steps(now.env_steps, now.episodes);
+        let mut now = learner.last().cloned().unwrap_or_default();
         let outcome = RunOutcome::read(run)?;
+        if let Some(outcome) = &outcome {
+            // The learner's last report may have been lost.
+            now.env_steps = now.env_steps.max(outcome.steps);
+            now.episodes = now.episodes.max(outcome.episodes);
+        }
+        let all_steps = config.run.has_all_steps(now.env_steps, now.episodes);
         let outcome_allows = outcome
             .as_ref()
             .is_none_or(|outcome| outcome.state == RunState::Finished);

@@ -1,6 +1,7 @@
 use shoal_common::config::Config;
 use shoal_common::policy_file::PolicyFile;
 use shoal_env_server::environment::{make, names};
+use shoal_run::outcome::{RunOutcome, RunState};
 use shoal_run::rollout::policy_layout;
 use shoal_run::testing::small;
 
@@ -110,6 +111,27 @@ fn a_run_without_playable_episodes_is_shown_with_the_reason() {
         "one for each environment"
     );
     assert_eq!(data["runs"][2]["state"], "unfinished");
+}
+
+#[test]
+fn a_run_has_finished_although_the_last_report_of_its_learner_was_lost() {
+    let parent = tempfile::tempdir().unwrap();
+    let (config, _) = small("name = \"pendulum\"");
+    let run = directory(parent.path(), "run", &config, None);
+    let steps = config.run.steps;
+    let learner = format!(
+        "wall_seconds,env_steps,episodes,updates,policy_version,critic_loss,actor_loss,q_mean,updates_per_second,env_steps_per_second,ratio\n\
+         1.0,{},3,1,1,,,,,,\n",
+        steps - 1
+    );
+    std::fs::write(run.learner_log(), learner).unwrap();
+    for (state, shown) in [(RunState::Finished, "finished"), (RunState::Failed, "unfinished")] {
+        let outcome = RunOutcome::new(state, steps, 4);
+        outcome.with_reason("the reason").write(&run).unwrap();
+        let run = &data(&gather(std::slice::from_ref(&run), None).unwrap().page().unwrap())["runs"][0];
+        assert_eq!((&run["state"], &run["env_steps"]), (&shown.into(), &steps.into()));
+        assert!(run["why"].as_str().unwrap().contains("the reason"), "{run}");
+    }
 }
 
 #[test]
