@@ -123,6 +123,8 @@ mod tests {
         let mut other = Table::new();
         add_defaults(&mut other, "gym:Other-v0", "dqn").unwrap();
         assert_eq!(other["run"]["steps"].as_integer(), Some(500_000));
+        assert_eq!(best_for("gym:MountainCarContinuous-v0").unwrap(), Some("ddpg"));
+        assert_eq!(best_for("gym:CartPole-v1").unwrap(), None);
     }
 
     #[test]
