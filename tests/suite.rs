@@ -102,6 +102,13 @@ fn a_suite_trains_each_combination_with_each_seed_and_is_compared() {
         .unwrap()
         .0;
     let shown: Value = serde_json::from_str(shown).unwrap();
+    let command = shown["suite"]["command"].as_str().unwrap();
+    assert!(
+        command.starts_with("shoal train pendulum --run suite --json --seeds 1..2 "),
+        "{command}"
+    );
+    let of_run = shown["runs"][0]["start"]["command"].as_str().unwrap();
+    assert!(of_run.contains(" --seed 1 --run "), "{of_run}");
     let places = shown["rankings"][0]["places"].as_array().unwrap();
     assert_eq!(places.len(), 2, "{places:?}");
     assert!(places[0]["mean"].as_f64() >= places[1]["mean"].as_f64());

@@ -13,6 +13,7 @@ use std::time::SystemTime;
 
 use serde::Serialize;
 use shoal_common::run_dir::RunDir;
+use shoal_run::records::start::StartRecord;
 
 use self::comparison::Comparison;
 use self::numbers::PageLimits;
@@ -25,13 +26,15 @@ pub const MARK: &str = "<!doctype html>\n<!-- made by shoal report -->\n";
 const PAGE: &str = include_str!("page/page.html");
 const STYLE: &str = include_str!("page/page.css");
 /// In dependency order: a script uses only those before it.
-const SCRIPTS: [&str; 7] = [
+const SCRIPTS: [&str; 9] = [
     include_str!("page/dom.js"),
     include_str!("page/axis.js"),
+    include_str!("page/smoothing.js"),
     include_str!("page/chart.js"),
     include_str!("page/scenes.js"),
     include_str!("page/player.js"),
     include_str!("page/timeline.js"),
+    include_str!("page/head.js"),
     include_str!("page/page.js"),
 ];
 
@@ -41,14 +44,19 @@ pub struct Report {
     version: &'static str,
     /// Seconds since 1970.
     made: u64,
+    /// The start of the suite whose runs these are; `None` if they are not exactly those of one suite.
+    suite: Option<StartRecord>,
     runs: Vec<Run>,
     comparisons: Vec<Comparison>,
     rankings: Vec<Ranking>,
 }
 
 /// Reads what the runs have recorded so far. There must be at least one. A run may still be training, or have just
-/// started.
-pub fn gather(runs: &[RunDir]) -> anyhow::Result<Report> {
+/// started. `suite` is the start of the suite whose runs these are.
+///
+/// # Errors
+/// When a run cannot be read.
+pub fn gather(runs: &[RunDir], suite: Option<StartRecord>) -> anyhow::Result<Report> {
     let names = run::names(runs);
     let mut gathered = Vec::new();
     for (number, (run, name)) in runs.iter().zip(names).enumerate() {
@@ -60,6 +68,7 @@ pub fn gather(runs: &[RunDir]) -> anyhow::Result<Report> {
     Ok(Report {
         version: env!("CARGO_PKG_VERSION"),
         made: since.map_or(0, |since| since.as_secs()),
+        suite,
         rankings: rankings(&comparisons, &gathered),
         comparisons,
         runs: gathered,

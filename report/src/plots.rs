@@ -16,7 +16,8 @@ use crate::figure;
 /// Draws the learning curve of a run so far and, if it has a best policy, that policy's behaviour. Returns the files.
 pub fn draw(run: &RunDir, config: &Config, out: &Path) -> anyhow::Result<Vec<PathBuf>> {
     let mut pictures = vec![out.join("learning-curve.svg")];
-    figure::learning_curve(&read_evaluations(&run.evaluations())?, &pictures[0])?;
+    let evaluations = read_evaluations(&run.evaluations())?;
+    figure::learning_curve((&run.name(), config.algorithm.name()), &evaluations, &pictures[0])?;
     if run.best_policy().exists() {
         pictures.extend(behaviour(run, config, out)?);
     }

@@ -27,6 +27,7 @@ pub use self::source::{SettingSource, SettingSources};
 use crate::external_environment::server_location::ServerLocation;
 use crate::origin::{Origin, Predecessor};
 use crate::preflight;
+use crate::records::start::StartRecord;
 
 /// What is worth a warning before a run of this configuration starts or goes on.
 pub fn warning(config: &Config) -> Option<String> {
@@ -78,6 +79,7 @@ impl Plan {
         let lock = run.lock()?;
         let begin = || {
             let config = fill(&run, &config)?;
+            StartRecord::of_this_process().write(run.path())?;
             let origin = from.as_ref().map(|predecessor| predecessor.begin(&run, &config));
             Ok((config, origin.transpose()?))
         };

@@ -12,6 +12,8 @@ use serde::{Deserialize, Serialize};
 use shoal_common::file_lock;
 use shoal_common::versioned_file::VersionedFile;
 
+use crate::records::start;
+
 /// Most runs in a suite.
 const MOST: usize = 10_000;
 
@@ -357,14 +359,18 @@ pub fn lock(directory: &Path) -> anyhow::Result<File> {
     Ok(file)
 }
 
-/// Removes what is left of a suite whose runs have been removed: its file and its report, and the directory if that is all
+/// Removes what is left of a suite whose runs have been removed: its files and its report, and the directory if that is all
 /// that it has.
 ///
 /// # Errors
 /// When a file cannot be removed.
 pub fn remove(directory: &Path) -> std::io::Result<()> {
     let missing = |error: &std::io::Error| error.kind() == ErrorKind::NotFound;
-    for file in [directory.join("report.html"), file(directory)] {
+    for file in [
+        directory.join("report.html"),
+        directory.join(start::FILE),
+        file(directory),
+    ] {
         std::fs::remove_file(file).or_else(|error| if missing(&error) { Ok(()) } else { Err(error) })?;
     }
     match std::fs::remove_dir(directory) {

@@ -8,6 +8,7 @@ use clap::Args;
 use shoal_common::durable::write_atomically;
 use shoal_common::run_dir::RunDir;
 use shoal_report::page::{self, MARK};
+use shoal_run::records::start::StartRecord;
 use shoal_run::suite::Suite;
 
 #[derive(Args, Clone, Debug)]
@@ -35,7 +36,11 @@ pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<()> {
         (None, _) => NAME.into(),
     };
     check_replaceable(&out)?;
-    let report = page::gather(&runs)?;
+    let suite = match &args.runs[..] {
+        [one] if Suite::read(one)?.is_some() => StartRecord::read(one)?,
+        _ => None,
+    };
+    let report = page::gather(&runs, suite)?;
     for (reason, names) in report.runs_without_episodes() {
         writeln!(
             std::io::stderr().lock(),

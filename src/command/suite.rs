@@ -21,6 +21,7 @@ use shoal_run::numbers::thousands;
 use shoal_run::plan::{self, RequestedChanges, Revision, RunOverrides};
 use shoal_run::preflight;
 use shoal_run::records::recorder::{read_evaluations, recorded};
+use shoal_run::records::start::StartRecord;
 use shoal_run::signals::{Signals, exit_code};
 use shoal_run::status::saved_status;
 use shoal_run::suite::{self, Suite, Sweep, Trial};
@@ -109,6 +110,7 @@ pub(crate) fn train(args: &TrainArgs, what: &str, overrides: &RunOverrides) -> a
         None => RunDir::create_next(Path::new("runs"), &format!("{name}-suite"))?,
     };
     suite.write(directory.path())?;
+    StartRecord::of_this_process().write(directory.path())?;
     begin(&suite, directory.path(), &common, options)
 }
 

@@ -130,6 +130,8 @@ impl Browser {
             "Home" => 36,
             "ArrowLeft" => 37,
             "ArrowRight" => 39,
+            "ArrowDown" => 40,
+            "Escape" => 27,
             "Tab" => 9,
             other => panic!("no code for {other:?}"),
         };

@@ -20,6 +20,7 @@ use support::{Running, Workplace, error_line, until};
 fn main() -> ExitCode {
     suite::run(vec![
         test!(a_report_works_in_a_browser, CHROMIUM),
+        test!(the_report_of_one_run_begins_with_its_result, CHROMIUM),
         test!(a_running_run_and_one_with_few_records_can_be_reported),
         test!(an_impossible_report_is_refused_in_one_line),
     ])
@@ -119,8 +120,27 @@ fn a_report_works_in_a_browser() {
     );
 
     check_final_evaluations(&mut browser, &place, &runs);
+    assert_eq!(
+        sections(&mut browser),
+        [
+            "Result",
+            "Learning curves",
+            "Episodes",
+            "Details",
+            "Exploration",
+            "Over time",
+            "Settings"
+        ]
+    );
     let names = browser.value("document.querySelector('.legend').innerText");
-    assert!(names.as_str().unwrap().contains("median of 2 runs of ddpg"), "{names}");
+    for part in ["median of 2 runs of ddpg", "(band: minimum to maximum)"] {
+        assert!(names.as_str().unwrap().contains(part), "{names}");
+    }
+    let band = browser.value("document.querySelector('.thick .band').getBoundingClientRect().height");
+    assert!(
+        band.as_f64().unwrap() > 1.0,
+        "the band around the median is drawn: {band}"
+    );
 
     // Every chart has a curve, and the time line shows the kill.
     let charts = browser.value("[...document.querySelectorAll('figure.chart .plot:not(.timeline)')].map((plot) => [...plot.querySelectorAll('.line')].some((line) => line.getAttribute('d').includes('L')) || plot.querySelector('circle') !== null)");
@@ -148,29 +168,208 @@ fn a_report_works_in_a_browser() {
     check_narrow_and_dark(&mut browser, &page);
 }
 
-/// The row of the final evaluation has each run's, and none for the stopped one.
+/// The table of the results has each run's final evaluation, and none for the stopped one.
 fn check_final_evaluations(browser: &mut Browser, place: &Workplace, runs: &[&str]) {
-    let row =
-        "[...document.querySelectorAll('tr')].find((row) => row.querySelector('th')?.innerText === 'final evaluation')";
-    let cells = browser.value(&format!(
-        "[...{row}.querySelectorAll('td')].map((cell) => cell.innerText)"
-    ));
-    let cells = cells.as_array().unwrap();
-    assert_eq!(cells.len(), runs.len());
-    for (run, cell) in runs.iter().zip(cells) {
-        let cell = cell.as_str().unwrap();
+    let cells = browser.value(
+        "[...document.querySelectorAll('#result tbody tr')].map((row) => [...row.querySelectorAll('td')].map((cell) => cell.innerText))",
+    );
+    // Before the results stands the ranking of the settings, the best first.
+    let rows: Vec<Vec<&str>> = cells
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|row| {
+            row.as_array()
+                .unwrap()
+                .iter()
+                .map(|cell| cell.as_str().unwrap())
+                .collect()
+        })
+        .collect();
+    let rows = &rows[rows.len() - runs.len()..];
+    for (run, row) in runs.iter().zip(rows) {
+        assert_eq!(row[0], *run);
         let file = place.path().join(run).join("final-evaluation.json");
         match std::fs::read_to_string(file) {
             Ok(text) => {
                 let found: Value = serde_json::from_str(&text).unwrap();
                 let episodes = &found["policies"][0]["episodes"];
-                assert!(
-                    cell.contains(&format!("({episodes} episodes, 95 % interval")),
-                    "{run}: {cell}"
-                );
+                assert_eq!(row[1], "finished");
+                assert!(row[2].contains(&format!("({episodes} episodes)")), "{run}: {row:?}");
+                assert!(row[3].contains(" … "), "{run}: {row:?}");
             }
-            Err(_) => assert_eq!((*run, cell), ("again", "none")),
+            Err(_) => assert_eq!(
+                (*run, &row[1..4]),
+                ("again", &["not finished: stopped (by request)", "none", "–"][..])
+            ),
         }
+    }
+}
+
+/// The headings of the page's sections.
+fn sections(browser: &mut Browser) -> Vec<String> {
+    let headings = browser.value("[...document.querySelectorAll('main h2')].map((heading) => heading.innerText)");
+    let headings = headings.as_array().unwrap();
+    headings
+        .iter()
+        .map(|heading| heading.as_str().unwrap().into())
+        .collect()
+}
+
+/// The names and values in the head of the page.
+fn facts(browser: &mut Browser) -> Vec<(String, String)> {
+    let facts = browser.value(
+        "[...document.querySelectorAll('#facts dt')].map((name) => [name.innerText, name.nextElementSibling.innerText])",
+    );
+    serde_json::from_value(facts).unwrap()
+}
+
+fn the_report_of_one_run_begins_with_its_result() {
+    let place = Workplace::new();
+    let arguments = ["pendulum", "--run", "swing", "--lockstep", "--steps", "1500"];
+    let more = ["--set", "evaluation.every=100"];
+    place.train(&[&arguments[..], &more].concat());
+    let curve = std::fs::read_to_string(place.path().join("swing/learning-curve.svg")).unwrap();
+    assert!(curve.contains("swing: learning curve of ddpg"), "{curve}");
+
+    let mut browser = Browser::start();
+    let page = report(&place, &["swing"]);
+    browser.open(&page, 1200, false);
+    assert_eq!(
+        sections(&mut browser),
+        [
+            "Result",
+            "Learning curve",
+            "Episodes",
+            "Details",
+            "Exploration",
+            "Over time",
+            "Settings"
+        ]
+    );
+    let text = std::fs::read_to_string(place.path().join("swing/final-evaluation.json")).unwrap();
+    let found: Value = serde_json::from_str(&text).unwrap();
+    let shown = browser.value("document.querySelector('#result').innerText");
+    let shown = shown.as_str().unwrap();
+    let kept = &found["policies"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .find(|it| it["policy"] == found["kept"])
+        .unwrap();
+    let mean = format!("−{:.0}", kept["return_mean"].as_f64().unwrap().abs());
+    let first = shown.lines().nth(2).unwrap_or_default().replace(',', "");
+    assert!(first.starts_with(&mean), "{mean} in {shown}");
+    for part in [
+        "mean return of the final evaluation",
+        "95 % interval of the mean: −",
+        "State: finished, 1,500 of 1,500 steps",
+    ] {
+        assert!(shown.contains(part), "{part} in {shown}");
+    }
+
+    let known = facts(&mut browser);
+    let of = |name: &str| {
+        known
+            .iter()
+            .find(|(known, _)| known == name)
+            .map(|(_, value)| value.as_str())
+    };
+    assert_eq!(of("Method"), Some("ddpg (lockstep)"));
+    assert_eq!(of("Environment"), Some("pendulum"));
+    let command = of("Command").unwrap();
+    assert!(
+        command.starts_with("shoal train pendulum --run swing --lockstep --steps 1500"),
+        "{command}"
+    );
+    assert!(of("Version").unwrap().starts_with("Shoal ") && of("Machine").unwrap().contains(" core"));
+    assert!(of("Start").unwrap().ends_with(" UTC") && of("Duration").unwrap().ends_with('s'));
+
+    check_smoothing(&mut browser, &page);
+    check_space(&mut browser, &page);
+
+    // What a run has not recorded is left out.
+    std::fs::remove_file(place.path().join("swing/start.json")).unwrap();
+    report(&place, &["swing"]);
+    browser.open(&page, 1200, false);
+    let names: Vec<String> = facts(&mut browser).into_iter().map(|(name, _)| name).collect();
+    assert_eq!(names, ["Method", "Environment", "Seed", "Duration"]);
+    assert_eq!(browser.problems(), [""; 0]);
+}
+
+/// The moving mean is drawn over the pale curve, by the keyboard alone, and forgotten with the page.
+fn check_smoothing(browser: &mut Browser, page: &std::path::Path) {
+    let drawn = |browser: &mut Browser, selector: &str| {
+        browser.value(&format!(
+            "document.querySelector('.chart').querySelector({selector:?})?.getAttribute('d') ?? null"
+        ))
+    };
+    let raw = drawn(browser, ".line");
+    assert_eq!(drawn(browser, ".smoothed .line"), Value::Null);
+    browser.value("document.querySelector('#learning-curve select').focus()");
+    for share in ["0.05", "0.1"] {
+        browser.key("ArrowDown");
+        assert_eq!(drawn(browser, ".pale .line"), raw, "{share}: the curve itself stays");
+        let smoothed = drawn(browser, ".smoothed .line");
+        assert!(smoothed.is_string() && smoothed != raw, "{share}: {smoothed}");
+    }
+    let pale = browser.value("getComputedStyle(document.querySelector('.pale .line')).opacity");
+    assert!(pale.as_str().unwrap().parse::<f64>().unwrap() < 0.5, "{pale}");
+    // Of -1, 1, 3, 1 with neighbours only, and with two points on either side.
+    let means = "[0, 4].map((width) => movingMean({ x: [0, 1, 2, 3], y: [-1, 1, 3, 1] }, width).map((mean) => Number(mean.toFixed(3))))";
+    assert_eq!(
+        browser.value(means),
+        serde_json::json!([[0, 1, 1.667, 2], [1, 1, 1, 1.667]])
+    );
+    // The second point is the last of three records.
+    let selected = "movingMean({ x: [0, 1], y: [1, 9], sums: [1, 14], counts: [1, 3] }, 0)";
+    assert_eq!(browser.value(selected), serde_json::json!([3.75, 3.75]));
+    browser.key("Home");
+    assert_eq!(drawn(browser, ".smoothed .line"), Value::Null);
+    assert_eq!(drawn(browser, ".line"), raw);
+    browser.key("End");
+    browser.open(page, 1200, false);
+    assert_eq!(
+        drawn(browser, ".smoothed .line"),
+        Value::Null,
+        "a page that is opened again is not smoothed"
+    );
+}
+
+/// Space plays and pauses from anywhere, except in what takes it itself.
+fn check_space(browser: &mut Browser, page: &std::path::Path) {
+    browser.open(page, 1200, false);
+    let in_sight = "(() => { const box = document.querySelector('.stage').getBoundingClientRect(); return box.top >= 0 && box.bottom <= innerHeight; })()";
+    assert_eq!(browser.value(in_sight), false, "the player is below the window");
+    browser.key(" ");
+    assert!(is_playing(browser));
+    until("the picture is brought into sight", || browser.value(in_sight) == true);
+    until("it plays", || frame(browser) > 0);
+    browser.key(" ");
+    assert!(!is_playing(browser));
+
+    for (selector, toggles) in [
+        ("nav a", true),
+        (".plot", true),
+        ("#details .scroll", true),
+        ("#learning-curve select", false),
+        ("#learning-curve input", false),
+        (".chart .tools button", false),
+        (".player select", false),
+        (".player", true),
+        (".player input[type=range]", true),
+        // The page's own button for it.
+        (".play", true),
+    ] {
+        browser.value(&format!("document.querySelector({selector:?}).focus()"));
+        browser.key(" ");
+        assert_eq!(is_playing(browser), toggles, "{selector}");
+        if toggles {
+            browser.key(" ");
+            assert!(!is_playing(browser), "{selector}");
+        }
+        // Closes the list of a select.
+        browser.key("Escape");
     }
 }
 
@@ -237,13 +436,14 @@ fn check_readout_and_zoom(browser: &mut Browser) {
 }
 
 fn check_narrow_and_dark(browser: &mut Browser, page: &std::path::Path) {
-    browser.open(page, 390, true);
+    browser.open(page, 360, true);
     assert_eq!(browser.problems(), [""; 0]);
     assert_eq!(
         browser.value("document.documentElement.scrollWidth"),
-        390,
+        360,
         "no horizontal scrolling"
     );
+    check_wide_table(browser);
     let small = browser.value(
         "[...document.querySelectorAll('button, select, input[type=range], nav a, summary')].filter((part) => part.offsetParent && part.getBoundingClientRect().height < 43).map((part) => part.outerHTML)",
     );
@@ -263,6 +463,22 @@ fn check_narrow_and_dark(browser: &mut Browser, page: &std::path::Path) {
     browser.key("Tab");
     let outline = browser.value("getComputedStyle(document.activeElement).outlineStyle");
     assert_eq!(outline, "solid", "the focus is visible");
+}
+
+/// A table that is too wide scrolls in its box, whose shadows show where there is more.
+fn check_wide_table(browser: &mut Browser) {
+    let shadows = "(() => { const box = document.querySelector('#details .box'); \
+        const shade = (part, of, property) => getComputedStyle(part, of)[property]; \
+        return [shade(box.querySelector('td'), null, 'boxShadow') !== 'none', shade(box, '::after', 'backgroundImage') !== 'none']; })()";
+    until("a shadow on the right", || {
+        browser.value(shadows) == serde_json::json!([false, true])
+    });
+    for (to, expected) in [(30, [true, true]), (100_000, [true, false]), (0, [false, true])] {
+        browser.value(&format!("document.querySelector('#details .scroll').scrollLeft = {to}"));
+        until("the shadows follow", || {
+            browser.value(shadows) == serde_json::json!(expected)
+        });
+    }
 }
 
 fn a_running_run_and_one_with_few_records_can_be_reported() -> Completion {

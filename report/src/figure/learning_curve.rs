@@ -10,8 +10,16 @@ use super::panel::{Axis, Panel, Series, SeriesStyle, range_of};
 
 const SIZE: (u32, u32) = (860, 470);
 
-/// Draws the evaluations as a thin line and their moving average as a thick one.
-pub fn learning_curve(evaluations: &[EvaluationRecord], path: &Path) -> anyhow::Result<()> {
+/// Most characters of a run's name in the title.
+const NAME: usize = 48;
+
+/// Draws the evaluations of `run`, which is trained by `method`, as a thin line and their moving average as a thick one.
+pub fn learning_curve(
+    (run, method): (&str, &str),
+    evaluations: &[EvaluationRecord],
+    path: &Path,
+) -> anyhow::Result<()> {
+    let title = title(run, method);
     let mut evaluations: Vec<&EvaluationRecord> = evaluations.iter().collect();
     evaluations.sort_by_key(|evaluation| evaluation.env_steps);
     let last = evaluations
@@ -63,7 +71,7 @@ pub fn learning_curve(evaluations: &[EvaluationRecord], path: &Path) -> anyhow::
 
     save(path, SIZE, |sheet| {
         Panel {
-            title: "Learning curve",
+            title: &title,
             note: "",
             x,
             y,
@@ -77,6 +85,20 @@ pub fn learning_curve(evaluations: &[EvaluationRecord], path: &Path) -> anyhow::
         }
         Ok(())
     })
+}
+
+/// The title of a run's curve. A long name is cut in its middle, and control characters, which SVG cannot have, become
+/// spaces.
+fn title(run: &str, method: &str) -> String {
+    let run: Vec<char> = run.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
+    let name: String = match run.len() {
+        0..=NAME => run.iter().collect(),
+        long => {
+            let (start, end) = (&run[..NAME / 2], &run[long - NAME / 2..]);
+            start.iter().chain(&['…']).chain(end).collect()
+        }
+    };
+    format!("{name}: learning curve of {method}")
 }
 
 /// The divisor and the label of an axis of environment steps that ends at `last`.
@@ -136,12 +158,27 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         for count in [0, 1, 2, 5, 60, 400, 5_000] {
             let path = dir.path().join(format!("learning-curve-{count}.svg"));
-            learning_curve(&evaluations(count), &path).unwrap();
+            learning_curve(("run", "ddpg"), &evaluations(count), &path).unwrap();
             let svg = std::fs::read_to_string(&path).unwrap();
             assert!(svg.contains("environment steps") && svg.contains("evaluation return"));
             assert_eq!(svg.contains("moving average"), count >= 5, "{count}");
             assert_eq!(svg.contains("no evaluation yet"), count == 0, "{count}");
         }
+    }
+
+    #[test]
+    fn the_title_names_run_and_method() {
+        assert_eq!(title("pendulum-1", "sac"), "pendulum-1: learning curve of sac");
+        let long = title(&format!("{}\n{}", "a".repeat(60), "b".repeat(60)), "sac");
+        assert_eq!(
+            long,
+            format!("{}…{}: learning curve of sac", "a".repeat(24), "b".repeat(24))
+        );
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("curve.svg");
+        learning_curve(("tau<0.1 & \u{1}b", "ddpg"), &evaluations(5), &path).unwrap();
+        let svg = std::fs::read_to_string(path).unwrap();
+        assert!(svg.contains("tau&lt;0.1 &amp;  b: learning curve of ddpg"), "{svg}");
     }
 
     #[test]
@@ -158,7 +195,7 @@ mod tests {
         let path = dir.path().join("curve.svg");
         let mut evaluations = evaluations(20);
         evaluations[3].return_mean = f64::NAN;
-        learning_curve(&evaluations, &path).unwrap();
+        learning_curve(("run", "ddpg"), &evaluations, &path).unwrap();
         assert!(!std::fs::read_to_string(path).unwrap().contains("NaN"));
     }
 
@@ -182,7 +219,7 @@ mod tests {
                 .into_iter()
                 .map(|(env_steps, return_mean)| EvaluationRecord { env_steps, return_mean, ..EvaluationRecord::default() })
                 .collect();
-            learning_curve(&evaluations, &directory.path().join("curve.svg")).unwrap();
+            learning_curve(("run", "ddpg"), &evaluations, &directory.path().join("curve.svg")).unwrap();
         }
     }
 }

@@ -8,12 +8,12 @@ const LONG_LEGEND = 12;
 
 /**
  * options: `title`, `unit` (of y), `axis` (STEPS or TIME), `link`, `series`; optionally `marks`, `height`, `line` (a target
- * value). A series has `name`, `colour`, `x`, `y`; optionally `low`, `high`, `band` (what lies between them), `look` (thin,
+ * value), `smoothing` (the share of the axis over which a moving mean is drawn; 0 for none). A series has `name`, `colour`, `x`, `y`; optionally `low`, `high`, `band` (what lies between them), `look` (thin,
  * fine, thick). A mark has `x`, `kind` and `text`.
  */
 class Chart {
   constructor(options) {
-    Object.assign(this, { marks: [], height: 300 }, options);
+    Object.assign(this, { marks: [], height: 300, smoothing: 0 }, options);
     this.hidden = new Set();
     this.cursor = null;
     this.picture = svg("svg", { role: "img", "aria-label": this.described() });
@@ -39,6 +39,8 @@ class Chart {
       this.picture,
       this.readout,
     );
+    // From the beginning, so that nothing moves when it is drawn.
+    this.plot.style.minHeight = `${this.height}px`;
     const button = (sign, name, onclick) => html("button", { type: "button", "aria-label": `${this.title}: ${name}`, title: name, onclick }, sign);
     this.element = html(
       "figure",
@@ -103,6 +105,12 @@ class Chart {
     return this.series.filter((series) => !this.hidden.has(series));
   }
 
+  /** Draws the moving mean over this share of the axis; 0 for none. */
+  smooth(share) {
+    this.smoothing = share;
+    this.draw();
+  }
+
   draw() {
     const width = this.plot.clientWidth;
     if (!width) return;
@@ -120,7 +128,13 @@ class Chart {
     this.picture.replaceChildren(
       svg("clipPath", { id: clip }, svg("rect", { x: MARGIN.left, y: 0, width: Math.max(0, width - MARGIN.left - MARGIN.right), height: height - MARGIN.bottom })),
       this.axes(domain, range, width),
-      svg("g", { "clip-path": `url(#${clip})` }, this.markLines(), this.shown().map((series) => this.curve(series))),
+      svg(
+        "g",
+        { "clip-path": `url(#${clip})` },
+        this.markLines(),
+        this.shown().map((series) => this.curve(series)),
+        this.smoothing ? this.shown().map((series) => this.smoothed(series)) : [],
+      ),
       this.pointer,
     );
     if (!visible.some(isNumber)) {
@@ -157,22 +171,42 @@ class Chart {
     return svg("g", {}, this.marks.map(line));
   }
 
+  /** The moving mean of a curve, over the smoothing's share of the whole axis. */
+  means(series) {
+    const [low, high] = this.link.whole;
+    return movingMean(series, this.smoothing * (high - low));
+  }
+
+  smoothed(series) {
+    return svg("g", { class: `smoothed c${series.colour} ${series.look ?? ""}` }, this.path(series, this.means(series)));
+  }
+
+  /** The line through these values of a curve, with gaps where there are none. */
+  path(series, values) {
+    let path = "";
+    let pen = "M";
+    values.forEach((value, i) => {
+      if (!isNumber(value) || !isNumber(series.x[i])) return (pen = "M");
+      path += pen + this.at(series, value, i);
+      return (pen = "L");
+    });
+    return svg("path", { class: "line", d: path });
+  }
+
+  at(series, value, i) {
+    return `${this.x(series.x[i]).toFixed(1)} ${this.y(value).toFixed(1)}`;
+  }
+
+  /** A curve with its band; pale beneath a smoothed one. */
   curve(series) {
-    const group = svg("g", { class: `c${series.colour} ${series.look ?? ""}` });
-    const place = (value, i) => `${this.x(series.x[i]).toFixed(1)} ${this.y(value).toFixed(1)}`;
+    const group = svg("g", { class: `c${series.colour} ${series.look ?? ""} ${this.smoothing ? "pale" : ""}` });
+    const place = (value, i) => this.at(series, value, i);
     if (series.low) {
       const known = series.low.map((_, i) => i).filter((i) => isNumber(series.low[i]) && isNumber(series.high[i]));
       const around = [...known.map((i) => place(series.high[i], i)), ...known.reverse().map((i) => place(series.low[i], i))];
       if (around.length) group.append(svg("path", { class: "band", d: `M${around.join("L")}Z` }));
     }
-    let path = "";
-    let pen = "M";
-    series.y.forEach((value, i) => {
-      if (!isNumber(value) || !isNumber(series.x[i])) return (pen = "M");
-      path += pen + place(value, i);
-      return (pen = "L");
-    });
-    group.append(svg("path", { class: "line", d: path }));
+    group.append(this.path(series, series.y));
     const few = series.y.filter(isNumber).length <= 40;
     if (few && series.look !== "thick") {
       series.y.forEach((value, i) => {
@@ -194,7 +228,12 @@ class Chart {
       ...shown.map(({ series, i }) => svg("circle", { class: `c${series.colour}`, r: 4, cx: this.x(series.x[i]), cy: this.y(series.y[i]) })),
     );
     const marks = this.marks.filter((mark) => Math.abs(this.x(mark.x) - this.x(at)) < 6).slice(0, 4);
-    const lines = shown.map(({ series, i }) => [series, `${series.name}: ${text(series.y[i])}${this.unit ? ` ${this.unit}` : ""}${series.low ? `, ${text(series.low[i])} to ${text(series.high[i])}` : ""}`]);
+    const unit = this.unit ? ` ${this.unit}` : "";
+    const lines = shown.map(({ series, i }) => {
+      const smoothed = this.smoothing ? `, smoothed ${text(this.means(series)[i])}` : "";
+      const band = series.low ? `, ${text(series.low[i])} to ${text(series.high[i])}` : "";
+      return [series, `${series.name}: ${text(series.y[i])}${unit}${smoothed}${band}`];
+    });
     this.readout.replaceChildren(
       html("b", {}, this.axis.format(at)),
       ...lines.map(([series, line]) => html("span", { class: `c${series.colour}` }, html("i", {}), line)),

@@ -28,6 +28,27 @@ function set(element, attributes) {
 /** An id that is unique within the page. */
 const freshId = ((count) => () => `part-${(count += 1)}`)(0);
 
+/** A list to choose from, with its label. `values` are pairs of a number and its words; `onchange` receives the number. */
+function choice(label, values, selected, onchange) {
+  const id = freshId();
+  const options = values.map(([value, words]) => html("option", { value, selected: value === selected }, words));
+  const select = html("select", { id, onchange: (event) => onchange(Number(event.target.value)) }, options);
+  return html("span", { class: "choice" }, html("label", { for: id }, label), select);
+}
+
+/** A table in a box of its own, which scrolls where the table is too wide, and shows at its edges that there is more. */
+function scrollable(label, table) {
+  const mark = () => {
+    outer.classList.toggle("more-left", inner.scrollLeft > 1);
+    outer.classList.toggle("more-right", inner.scrollWidth - inner.clientWidth - inner.scrollLeft > 1);
+  };
+  const inner = html("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": label, onscroll: mark }, table);
+  const outer = html("div", { class: "box" }, inner);
+  const observer = new ResizeObserver(mark);
+  for (const part of [inner, table]) observer.observe(part);
+  return outer;
+}
+
 const isNumber = (value) => typeof value === "number" && Number.isFinite(value);
 
 /** A value with about four digits and a true minus sign. */

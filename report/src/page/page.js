@@ -4,6 +4,8 @@ const report = JSON.parse(document.getElementById("data").textContent);
 const { runs } = report;
 const COLOURS = 6;
 const several = runs.length > 1;
+/** The results of more runs are listed only on request, so that their curves are in sight. */
+const MANY = 8;
 
 /** Adds a section with its heading, and a link to it at the top of the page. */
 function section(title, ...parts) {
@@ -25,22 +27,84 @@ function remarks(sentence) {
 
 const aside = (words) => html("p", { class: "aside" }, words);
 
+/** The name of a run with its colour. */
+const runName = (run, i) => [html("i", { class: `swatch c${i % COLOURS}` }), run.name];
+
 /** A table with a row for each property and a column for each run. */
 function table(label, rows) {
-  const head = html("tr", {}, html("td", {}), ...runs.map((run, i) => html("th", { scope: "col" }, html("i", { class: `swatch c${i % COLOURS}` }), run.name)));
+  const head = html("tr", {}, html("td", {}), ...runs.map((run, i) => html("th", { scope: "col" }, runName(run, i))));
   const row = ([name, values, differs]) => html("tr", { class: differs ? "differs" : "" }, html("th", { scope: "row" }, name), ...values.map((value) => html("td", {}, value)));
-  return html("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": label }, html("table", {}, html("thead", {}, head), html("tbody", {}, rows.map(row))));
+  return scrollable(label, html("table", {}, html("thead", {}, head), html("tbody", {}, rows.map(row))));
 }
 
-function overview() {
+/** A table with these columns, each a name and a function that gives a row's cell. */
+function listed(label, columns, rows, caption = null) {
+  const head = html("tr", {}, columns.map(([name]) => html("th", { scope: "col" }, name)));
+  const body = rows.map((row, i) => html("tr", {}, columns.map(([, of]) => html("td", {}, of(row, i)))));
+  return scrollable(label, html("table", {}, caption && html("caption", {}, caption), html("thead", {}, head), html("tbody", {}, body)));
+}
+
+const interval = (of) => (of ? `${text(of[0])} … ${text(of[1])}` : "–");
+
+/** A run's state with the reason, if it did not simply finish. */
+function stateOf({ state, why }) {
+  const words = { training: "training", finished: "finished", unfinished: "not finished" }[state];
+  return why ? `${words}: ${why}` : words;
+}
+
+/** How far a run is, in what limits it. */
+function progressOf(run) {
+  if (run.planned_episodes !== null) return `${whole(run.episodes)} of ${plural(run.planned_episodes, "episode")}`;
+  return `${whole(run.env_steps)} of ${plural(run.planned_steps, "step")}`;
+}
+
+/** The final evaluation of a run, if it has one with a result. */
+const finalOf = ({ final_evaluation: found }) => (found && found.return_mean !== null ? found : null);
+
+/** The result of the only run: a number, what it is, and how certain it is. */
+function onlyResult(run) {
+  const found = finalOf(run);
+  const number = (mean, what) => html("p", { class: "result" }, html("b", {}, text(mean)), what);
+  const state = html("p", {}, `State: ${stateOf(run)}, ${progressOf(run)}.`);
+  if (found) {
+    const certainty = found.interval ? `95 % interval of the mean: ${interval(found.interval)}. ` : "";
+    const spread = `Standard deviation: ${text(found.return_std)}, over ${plural(found.episodes, "episode")} without exploration. `;
+    return [number(found.return_mean, "mean return of the final evaluation"), html("p", {}, `${certainty}${spread}Its policy learned from ${plural(found.env_steps, "environment step")}.`), state];
+  }
+  const { last } = run;
+  if (!last) return [html("p", {}, "No policy has been evaluated yet."), state];
+  const spread = `Standard deviation: ${text(last.std)}, over ${plural(last.episodes, "episode")} without exploration. There is no final evaluation.`;
+  return [number(last.mean, `mean return of the last evaluation, at step ${whole(last.env_steps)}`), html("p", {}, spread), state];
+}
+
+/** The results of several runs: which settings are best, and each run's own result. */
+function resultsOfAll() {
+  const columns = [
+    ["run", runName],
+    ["state", stateOf],
+    ["final evaluation", (run) => (finalOf(run) ? `${text(finalOf(run).return_mean)} ± ${text(finalOf(run).return_std)} (${plural(finalOf(run).episodes, "episode")})` : "none")],
+    ["95 % interval of its mean", (run) => interval(finalOf(run)?.interval)],
+    ["last evaluation", (run) => (run.last ? text(run.last.mean) : "none")],
+    ["progress", progressOf],
+  ];
+  const list = listed("The results of the runs", columns, runs);
+  const words = `Results of the ${runs.length} runs`;
+  const each = runs.length > MANY ? html("details", {}, html("summary", {}, words), list) : list;
+  return [...ranking(), each, aside("Returns are means over the episodes of an evaluation, without exploration; after ± stands their standard deviation.")];
+}
+
+function result() {
+  section("Result", ...(several ? resultsOfAll() : onlyResult(runs[0])));
+}
+
+/** What else is known of the runs. */
+function details() {
   const evaluated = (of) => (of ? `${text(of.mean)} ± ${text(of.std)} (${plural(of.episodes, "episode")}, step ${whole(of.env_steps)})` : "not evaluated yet");
-  const finalEvaluation = (of) => (of && of.return_mean !== null ? `${text(of.return_mean)} ± ${text(of.return_std)} (${plural(of.episodes, "episode")}${of.interval ? `, 95 % interval of the mean ${text(of.interval[0])} … ${text(of.interval[1])}` : ""})` : "none");
-  const states = { training: "training", finished: "finished", unfinished: "not finished" };
   const planned = (run) => `${whole(run.env_steps)} of ${whole(run.planned_steps)}`;
   const episodes = (run) => (run.planned_episodes === null ? whole(run.episodes) : `${whole(run.episodes)} of ${whole(run.planned_episodes)}`);
   const incidents = ({ incidents }) => (incidents ? `${plural(incidents.kills, "kill")}, ${plural(incidents.restarts, "restart")}` : "not recorded");
+  const started = (of) => (run) => (run.start ? of(run) : "not recorded");
   const facts = [
-    ["state", (run) => states[run.state]],
     ["environment", (run) => run.environment],
     ["algorithm", (run) => `${run.algorithm}, ${run.mode}`],
     ["seed", (run) => String(run.seed)],
@@ -50,19 +114,23 @@ function overview() {
     ["time", (run) => duration(run.wall_seconds)],
     ["best return", (run) => evaluated(run.best)],
     ["last return", (run) => evaluated(run.last)],
-    ["final evaluation", (run) => finalEvaluation(run.final_evaluation)],
     ["processes", incidents],
   ];
-  if (runs.some((run) => run.origin)) facts.splice(3, 0, ["beginning", (run) => run.origin ?? "networks of its own"]);
-  section(
-    "At a glance",
-    table("The runs at a glance", facts.map(([name, of]) => [name, runs.map(of)])),
-    aside("Returns are means over the episodes of an evaluation ± their standard deviation, without exploration."),
-  );
+  if (runs.some((run) => run.origin)) facts.splice(2, 0, ["beginning", (run) => run.origin ?? "networks of its own"]);
+  // The head shows these of a single run.
+  if (several && runs.some((run) => run.start)) {
+    facts.push(
+      ["start", started((run) => date(run.start.started))],
+      ["machine", started((run) => machineOf(run) ?? "unknown")],
+      ["version", started((run) => run.start.version)],
+      ["command", started((run) => commandLine(run.start.command))],
+    );
+  }
+  section("Details", table("Details of the runs", facts.map(([name, of]) => [name, runs.map(of)])));
 }
 
 /** The curves of one environment's runs: repetitions with their median and spread. */
-function returns(comparison, axis) {
+function returns(comparison, axis, smoothing) {
   const x = (curve) => (axis === STEPS ? curve.steps : curve.time);
   const spreads = comparison.sets.filter((set) => set.by_steps);
   const all = comparison.sets.flatMap((set) => set.runs);
@@ -73,7 +141,7 @@ function returns(comparison, axis) {
     const spread = axis === STEPS ? set.by_steps : set.by_time;
     for (const i of set.runs) {
       const { evaluations } = runs[i];
-      const curve = { name: own || set.runs.length === 1 ? runs[i].name : "", colour: (own ? i : at) % COLOURS, x: x(evaluations), y: evaluations.mean };
+      const curve = { name: own || set.runs.length === 1 ? runs[i].name : "", colour: (own ? i : at) % COLOURS, x: x(evaluations), y: evaluations.mean, sums: evaluations.sums, counts: evaluations.counts };
       if (all.length === 1 && evaluations.std.length) {
         curve.low = curve.y.map((mean, n) => (isNumber(mean) ? mean - (evaluations.std[n] ?? 0) : null));
         curve.high = curve.y.map((mean, n) => (isNumber(mean) ? mean + (evaluations.std[n] ?? 0) : null));
@@ -88,28 +156,45 @@ function returns(comparison, axis) {
     }
   });
   const marks = all.length <= COLOURS ? all.flatMap((i) => named(runs[i], changesOf(runs[i], axis))) : [];
-  return new Chart({ title: `Evaluation return, ${comparison.environment}`, unit: "", axis, link: new Link(), series, marks, height: 340 });
+  return new Chart({ title: `Evaluation return, ${comparison.environment}`, unit: "", axis, link: new Link(), series, marks, height: 340, smoothing });
 }
 
 /** Marks of a run, which say whose they are where there are several runs. */
 const named = (run, marks) => marks.map((mark) => ({ ...mark, text: several ? `${run.name}: ${mark.text}` : mark.text }));
 
-function learning() {
+/** A section of charts with a choice of their axis and of the smoothing. `make` returns the charts. */
+function curves(title, make, ...after) {
   const place = html("div", {});
+  let [charts, smoothing] = [[], 0];
   const draw = (axis) => {
-    place.replaceChildren(...report.comparisons.map((comparison) => returns(comparison, axis).element));
-    place.append(...report.comparisons.flatMap((comparison) => explored(comparison, axis)));
+    charts = make(axis, smoothing);
+    place.replaceChildren(...charts.map((chart) => chart.element));
+  };
+  const smooth = (index) => {
+    smoothing = SMOOTHINGS[index];
+    for (const chart of charts) chart.smooth(smoothing);
   };
   const name = freshId();
-  const choice = (words, axis, checked) => html("label", {}, html("input", { type: "radio", name, checked, onchange: () => draw(axis) }), words);
-  section(
-    "Learning curves",
-    html("fieldset", {}, html("legend", {}, "over"), choice("environment steps", STEPS, true), choice("time", TIME, false)),
-    place,
-    ...(runs.some((run) => run.changes.length) ? [aside("Vertical lines mark changes of the configuration.")] : []),
-    aside("Drag over a diagram to zoom in and double-click it to see everything. A click on a name in the legend hides or shows its curve."),
-  );
+  const axisChoice = (words, axis, checked) => html("label", {}, html("input", { type: "radio", name, checked, onchange: () => draw(axis) }), words);
+  const axes = html("fieldset", {}, html("legend", {}, "over"), axisChoice("environment steps", STEPS, true), axisChoice("time", TIME, false));
+  const shares = SMOOTHINGS.map((share, i) => [i, share ? `moving mean over ${Math.round(100 * share)} %` : "off"]);
+  section(title, html("div", { class: "choices" }, axes, choice("Smoothing", shares, 0, smooth)), place, ...after);
   draw(STEPS);
+}
+
+function learning() {
+  const make = (axis, smoothing) => report.comparisons.map((comparison) => returns(comparison, axis, smoothing));
+  curves(
+    several ? "Learning curves" : "Learning curve",
+    make,
+    ...(runs.some((run) => run.changes.length) ? [aside("Vertical lines mark changes of the configuration.")] : []),
+    aside("Drag over a diagram to zoom in and double-click it to see everything. A click on a name in the legend hides or shows its curve. Smoothing draws the centred mean over a share of the axis, and over three points at least; the curves themselves stay, in pale."),
+  );
+}
+
+function exploration() {
+  const make = (axis, smoothing) => report.comparisons.flatMap((comparison) => explored(comparison, axis, smoothing));
+  if (make(STEPS, 0).length) curves("Exploration", make, aside("Returns of the actors' episodes, with their exploration."));
 }
 
 /** One curve for each run with values. */
@@ -118,11 +203,11 @@ function perRun(of, which = runs.map((_, i) => i)) {
   return series.filter((series) => series.y.some(isNumber));
 }
 
-function explored(comparison, axis) {
+function explored(comparison, axis, smoothing) {
   const returns = ({ exploration }) => ({ x: axis === STEPS ? exploration.steps : exploration.time, y: exploration.mean });
   const series = perRun(returns, comparison.sets.flatMap((set) => set.runs));
   const title = `Return while exploring, ${comparison.environment}`;
-  return series.length ? [new Chart({ title, unit: "", axis, link: new Link(), series, height: 240 }).element] : [];
+  return series.length ? [new Chart({ title, unit: "", axis, link: new Link(), series, height: 240, smoothing })] : [];
 }
 
 function episodes() {
@@ -150,19 +235,23 @@ function time() {
   section("Over time", ...parts, aside("The diagrams of this section are zoomed together. Vertical lines mark incidents and changes of the configuration. A horizontal dashed line is the configured ratio."));
 }
 
-/** Which settings are best, where settings were repeated with several seeds. */
+/** Which settings are best, where settings were repeated with several seeds; empty if none were. */
 function ranking() {
-  if (!report.rankings.length) return;
+  if (!report.rankings.length) return [];
   const percent = (share) => (share === null ? "–" : `${Math.round(100 * share)} %`);
-  const columns = ["setting", "runs", "interquartile mean", "95 % interval", "best in"];
+  const columns = [
+    ["setting", (place) => place.label],
+    ["runs", (place) => `${whole(place.runs)}${place.unfinished ? ` (${whole(place.unfinished)} not finished)` : ""}`],
+    ["interquartile mean", (place) => text(place.mean)],
+    ["95 % interval", (place) => interval(place.interval)],
+    // Only of several settings is one the best.
+    ...(report.rankings.some(({ verdict }) => verdict) ? [["best in", (place) => percent(place.best)]] : []),
+  ];
   const parts = report.rankings.flatMap(({ environment, places, verdict }) => {
-    const row = (place) => [place.label, `${whole(place.runs)}${place.unfinished ? ` (${whole(place.unfinished)} not finished)` : ""}`, text(place.mean), place.interval ? `${text(place.interval[0])} … ${text(place.interval[1])}` : "–", percent(place.best)];
-    const head = html("tr", {}, columns.map((name) => html("th", { scope: "col" }, name)));
-    const body = places.map((place) => html("tr", {}, row(place).map((value) => html("td", {}, value))));
-    const list = html("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": `Settings of ${environment}, the best first` }, html("table", {}, html("caption", {}, environment), html("thead", {}, head), html("tbody", {}, body)));
+    const list = listed(`Settings of ${environment}, the best first`, columns, places, environment);
     return verdict ? [html("p", {}, `${verdict}.`), list] : [list];
   });
-  section("Ranking", ...parts, aside("The results are the mean returns of the final evaluations, or of the last evaluation of a run that has not finished. The interquartile mean leaves out the best and the worst quarter of the seeds, if there are at least four. Intervals and shares are of 5,000 resamples of the seeds (bootstrap)."));
+  return [...parts, aside("These are of the mean returns of the final evaluations, or of the last evaluation of a run that has not finished. The interquartile mean leaves out the best and the worst quarter of the seeds, if there are at least four. Intervals and shares are of 5,000 resamples of the seeds (bootstrap).")];
 }
 
 /** The changes of the configuration, if there were any. */
@@ -178,9 +267,7 @@ function changes() {
     ["after", (row) => row.after || "none"],
     ["by", (row) => row.source],
   ];
-  const head = html("tr", {}, columns.map(([name]) => html("th", { scope: "col" }, name)));
-  const body = rows.map((row) => html("tr", {}, columns.map(([, of]) => html("td", {}, of(row)))));
-  section("Changes", html("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "Changes of the configuration" }, html("table", {}, html("thead", {}, head), html("tbody", {}, body))), aside("The settings below are those after the last change."));
+  section("Changes", listed("Changes of the configuration", columns, rows), aside("The settings below are those after the last change."));
 }
 
 function settings() {
@@ -197,7 +284,5 @@ function settings() {
   show(true);
 }
 
-document.getElementById("made").textContent =
-  `Made ${new Date(report.made * 1000).toISOString().slice(0, 16).replace("T", " ")} UTC by shoal ${report.version}` +
-  (runs.some((run) => run.state === "training") ? "; training was still running." : ".");
-for (const part of [overview, ranking, learning, episodes, time, changes, settings]) part();
+head(report);
+for (const part of [result, learning, episodes, details, exploration, time, changes, settings]) part();

@@ -3,6 +3,8 @@
 const SPEEDS = [0.25, 0.5, 1, 2, 4];
 /** Seconds per frame if a step of the environment has no duration. */
 const SECONDS_PER_FRAME = 0.5;
+/** Space means something else in these. */
+const TAKES_SPACE = "input, select, textarea, button, summary, [contenteditable]";
 
 class Player {
   constructor(runs) {
@@ -14,15 +16,8 @@ class Player {
     this.play = html("button", { type: "button", class: "play", onclick: () => this.toggle() }, "");
     const step = (sign, by, name) => html("button", { type: "button", "aria-label": name, title: name, onclick: () => this.step(by) }, sign);
     this.slider = html("input", { type: "range", min: 0, step: 1, "aria-label": "Step of the episode", oninput: () => this.go(Number(this.slider.value)) });
-    const choice = (label, values, selected, onchange) => {
-      const id = freshId();
-      const options = values.map(([value, words]) => html("option", { value, selected: value === selected }, words));
-      const select = html("select", { id, onchange: (event) => onchange(Number(event.target.value)) }, options);
-      return html("span", { class: "choice" }, html("label", { for: id }, label), select);
-    };
     this.speed = 1;
     this.episodes = html("span", {});
-    this.choice = choice;
     this.element = html(
       "div",
       { class: "player", tabindex: 0, role: "group", "aria-label": "Player: space plays and pauses, arrows step, Home and End jump", onkeydown: (event) => this.key(event) },
@@ -40,13 +35,9 @@ class Player {
         this.signals,
       ),
       this.policy,
-      html("p", { class: "aside" }, "Space plays and pauses, the arrow keys step, Home and End jump. A click on a signal's line jumps to that step."),
+      html("p", { class: "aside" }, "Space plays and pauses, from anywhere on the page. In the player, the arrow keys step, and Home and End jump. A click on a signal's line jumps to that step."),
     );
-    // Keys work without focus on the player too, as long as the picture is visible.
-    document.addEventListener("keydown", (event) => {
-      const box = this.element.getBoundingClientRect();
-      if (event.target === document.body && box.top < innerHeight * 0.8 && box.bottom > innerHeight * 0.2) this.key(event);
-    });
+    document.addEventListener("keydown", (event) => this.keyOfPage(event));
     this.load(runs[0], 0);
   }
 
@@ -59,7 +50,7 @@ class Player {
     this.frames = this.episode.signals[0].values.length;
     this.dt = played.time_step;
     const option = (episode, i) => [i, `${episode.number + 1}: return ${text(episode.return)}, ${plural(episode.steps, "step")}${episode.terminated ? ", terminated" : ""}`];
-    this.episodes.replaceChildren(this.choice("Episode", played.episodes.map(option), number, (i) => this.load(run, i)));
+    this.episodes.replaceChildren(choice("Episode", played.episodes.map(option), number, (i) => this.load(run, i)));
     const byKey = Object.fromEntries(this.episode.signals.map((signal) => [signal.key, signal]));
     const { element, draw } = SCENES[picture.kind](picture, byKey);
     this.drawScene = draw;
@@ -158,16 +149,35 @@ class Player {
     set(this.play, { "data-playing": String(Boolean(this.playing)) });
   }
 
+  /** A key in the player. */
   key(event) {
     const { target } = event;
     if (event.ctrlKey || event.altKey || event.metaKey || target.matches("select")) return;
     // Space activates the focused button, as usual.
     if (event.key === " " && target.matches("button")) return;
     const actions = { " ": () => this.toggle(), ArrowLeft: () => this.step(-1), ArrowRight: () => this.step(1), Home: () => this.step(-this.frames), End: () => this.step(this.frames) };
-    if (!actions[event.key] || (target === document.body && event.key !== " " && !event.key.startsWith("Arrow"))) return;
+    if (!actions[event.key]) return;
     event.preventDefault();
-    event.stopPropagation();
-    if (target === this.slider) this.pause();
     actions[event.key]();
+  }
+
+  /** A key outside the player: space plays and pauses; without focus, the arrows step as long as its picture is in sight. */
+  keyOfPage(event) {
+    const { target } = event;
+    if (event.defaultPrevented || event.ctrlKey || event.altKey || event.metaKey || event.shiftKey || this.element.contains(target)) return;
+    if (event.key === " " && !target.closest(TAKES_SPACE)) {
+      event.preventDefault();
+      // A key that is held down repeats.
+      if (!event.repeat) this.toggle();
+      if (this.playing && !this.isInSight()) this.stage.scrollIntoView({ block: "center" });
+    } else if (target === document.body && (event.key === "ArrowLeft" || event.key === "ArrowRight") && this.isInSight()) {
+      this.key(event);
+    }
+  }
+
+  /** Whether the whole picture is in the window. */
+  isInSight() {
+    const box = this.stage.getBoundingClientRect();
+    return box.top >= 0 && box.bottom <= innerHeight;
   }
 }

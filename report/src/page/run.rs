@@ -11,6 +11,7 @@ use shoal_run::records::recorder::{
     ChangeRecord, EpisodeRecord, EvaluationRecord, IncidentRow, LearnerRecord, read_changes, read_episodes,
     read_evaluations, read_incidents, read_learner,
 };
+use shoal_run::records::start::StartRecord;
 
 use super::numbers::{PageLimits, downsample, mean, parts, short};
 use super::played::Played;
@@ -29,6 +30,8 @@ pub(super) struct Run {
     seed: u64,
     mode: Mode,
     state: PageState,
+    /// Why it ended, if it did not simply finish.
+    why: Option<String>,
     pub(super) settings: Vec<Setting>,
     env_steps: u64,
     planned_steps: u64,
@@ -45,6 +48,8 @@ pub(super) struct Run {
     exploration: Curve,
     learner: Rates,
     incidents: Option<Incidents>,
+    /// How, when and where it was started; `None` in runs of earlier versions.
+    start: Option<StartRecord>,
     /// What it began with, in words.
     origin: Option<String>,
     /// The changes of its configuration after its start.
@@ -83,6 +88,10 @@ struct Curve {
     std: Vec<f64>,
     /// Number of records that the points were selected or averaged from.
     rows: usize,
+    /// What a moving mean over the points needs if they were selected from more records: the sum of the records after the
+    /// point before, up to each point, and their number. Empty if the points are all records, or means of equally many.
+    sums: Vec<f64>,
+    counts: Vec<usize>,
 }
 
 /// Rates measured over a shorter time, in s, are not shown: they are not meaningful.
@@ -119,9 +128,17 @@ impl Run {
         let evaluation_records = read_evaluations(&run.evaluations())?;
         let learner = read_learner(&run.learner_log())?;
         let explored = read_episodes(&run.episodes())?;
-        let now = learner.last().cloned().unwrap_or_default();
+        let mut now = learner.last().cloned().unwrap_or_default();
+        let outcome = RunOutcome::read(run)?;
+        if let Some(outcome) = &outcome {
+            // The learner's last report may have been lost.
+            now.env_steps = now.env_steps.max(outcome.steps);
+            now.episodes = now.episodes.max(outcome.episodes);
+        }
         let all_steps = config.run.has_all_steps(now.env_steps, now.episodes);
-        let outcome_allows = RunOutcome::read(run)?.is_none_or(|outcome| outcome.state == RunState::Finished);
+        let outcome_allows = outcome
+            .as_ref()
+            .is_none_or(|outcome| outcome.state == RunState::Finished);
         let is_finished = all_steps && outcome_allows;
         Ok(Self {
             name,
@@ -134,6 +151,7 @@ impl Run {
                 (false, true) => PageState::Finished,
                 (false, false) => PageState::Unfinished,
             },
+            why: outcome.filter(|_| !is_training).and_then(reason),
             settings: settings::of(&config)?,
             env_steps: now.env_steps,
             planned_steps: config.run.steps,
@@ -155,6 +173,7 @@ impl Run {
             exploration: Curve::of_episodes(&explored, limits.points),
             learner: Rates::of(learner, limits.points),
             incidents: read_incidents(&run.incidents())?.map(Incidents::of),
+            start: StartRecord::read(run.path())?,
             origin: Origin::read(run)?.map(|origin| origin.in_words()),
             changes: read_changes(&run.changes())?,
             played: Played::of(run, &config, limits.episodes),
@@ -188,8 +207,21 @@ impl EvaluatedPolicy {
 impl Curve {
     fn of_evaluations(rows: &[EvaluationRecord], points: usize) -> Self {
         let means: Vec<f64> = rows.iter().map(|row| row.return_mean).collect();
-        let shown: Vec<&EvaluationRecord> = downsample(&means, points).into_iter().map(|i| &rows[i]).collect();
+        let places = downsample(&means, points);
+        let (mut sums, mut counts) = (Vec::new(), Vec::new());
+        if places.len() < rows.len() {
+            let mut from = 0;
+            for place in &places {
+                let since = means[from..=*place].iter().copied().filter(|mean| mean.is_finite());
+                counts.push(since.clone().count());
+                sums.push(short(since.sum()));
+                from = place + 1;
+            }
+        }
+        let shown: Vec<&EvaluationRecord> = places.into_iter().map(|i| &rows[i]).collect();
         Self {
+            sums,
+            counts,
             steps: shown.iter().map(|row| row.env_steps).collect(),
             time: shown.iter().map(|row| short(row.wall_seconds)).collect(),
             mean: shown.iter().map(|row| short(row.return_mean)).collect(),
@@ -211,6 +243,8 @@ impl Curve {
                 .collect(),
             std: Vec::new(),
             rows: rows.len(),
+            sums: Vec::new(),
+            counts: Vec::new(),
         }
     }
 }
@@ -242,6 +276,18 @@ impl Rates {
             actor_loss: column(|row| row.actor_loss),
             q_mean: column(|row| row.q_mean),
         }
+    }
+}
+
+/// Why a run ended, in words.
+fn reason(RunOutcome { state, reason, .. }: RunOutcome) -> Option<String> {
+    let reason = reason?;
+    match state {
+        // Its launcher was killed: the reason only says what it was doing.
+        RunState::Running => None,
+        RunState::Finished => Some(reason),
+        RunState::Stopped => Some(format!("stopped ({reason})")),
+        RunState::Failed => Some(format!("failed: {reason}")),
     }
 }
 

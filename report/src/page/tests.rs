@@ -2,6 +2,7 @@ use shoal_common::config::Config;
 use shoal_common::policy_file::PolicyFile;
 use shoal_env_server::environment::{make, names};
 use shoal_run::evaluation::rollout::policy_layout;
+use shoal_run::records::outcome::{RunOutcome, RunState};
 use shoal_run::testing::small;
 
 use super::numbers::POINTS;
@@ -60,7 +61,7 @@ fn episodes_of_every_environment_can_be_played() {
         let config = configuration(name);
         let parameters = vec![0.0; policy_layout(&config).unwrap().parameters()];
         let run = directory(parent.path(), &format!("run-{i}"), &config, Some(parameters));
-        let data = data(&gather(&[run]).unwrap().page().unwrap());
+        let data = data(&gather(&[run], None).unwrap().page().unwrap());
         let played = &data["runs"][0]["played"];
         assert_eq!(played["why_not"], serde_json::Value::Null, "{name}");
         let environment = make(name, &toml::Table::new()).unwrap();
@@ -90,7 +91,7 @@ fn a_run_without_playable_episodes_is_shown_with_the_reason() {
     config.environment.name = "walker".into();
     config.environment.server = vec!["no-such-program".into()];
     let served = directory(parent.path(), "served", &config, Some(parameters));
-    let report = gather(&[begun, damaged, served]).unwrap();
+    let report = gather(&[begun, damaged, served], None).unwrap();
     let reasons = report.runs_without_episodes();
     assert_eq!(reasons.len(), 3);
     for ((reason, runs), (name, part)) in reasons.iter().zip([
@@ -113,12 +114,33 @@ fn a_run_without_playable_episodes_is_shown_with_the_reason() {
 }
 
 #[test]
+fn a_run_has_finished_although_the_last_report_of_its_learner_was_lost() {
+    let parent = tempfile::tempdir().unwrap();
+    let (config, _) = small("name = \"pendulum\"");
+    let run = directory(parent.path(), "run", &config, None);
+    let steps = config.run.steps;
+    let learner = format!(
+        "wall_seconds,env_steps,episodes,updates,policy_version,critic_loss,actor_loss,q_mean,updates_per_second,env_steps_per_second,ratio\n\
+         1.0,{},3,1,1,,,,,,\n",
+        steps - 1
+    );
+    std::fs::write(run.learner_log(), learner).unwrap();
+    for (state, shown) in [(RunState::Finished, "finished"), (RunState::Failed, "unfinished")] {
+        let outcome = RunOutcome::new(state, steps, 4);
+        outcome.with_reason("the reason").write(&run).unwrap();
+        let run = &data(&gather(std::slice::from_ref(&run), None).unwrap().page().unwrap())["runs"][0];
+        assert_eq!((&run["state"], &run["env_steps"]), (&shown.into(), &steps.into()));
+        assert!(run["why"].as_str().unwrap().contains("the reason"), "{run}");
+    }
+}
+
+#[test]
 fn run_names_cannot_inject_markup_and_the_page_loads_nothing() {
     let parent = tempfile::tempdir().unwrap();
     let (config, parameters) = small("name = \"pendulum\"");
     let name = "</script><script>alert(1)<!-- {{script}}";
     let run = directory(parent.path(), &name.replace('/', "∕"), &config, Some(parameters));
-    let mut report = gather(&[run]).unwrap();
+    let mut report = gather(&[run], None).unwrap();
     report.runs[0].name = name.into();
     let page = report.page().unwrap();
     assert!(page.starts_with(MARK));
@@ -162,12 +184,22 @@ fn the_page_of_a_long_run_is_small_and_shows_its_peak() {
     std::fs::write(run.evaluations(), evaluations).unwrap();
     std::fs::write(run.learner_log(), learner).unwrap();
     std::fs::write(run.incidents(), incidents).unwrap();
-    let page = gather(&[run]).unwrap().page().unwrap();
+    let page = gather(&[run], None).unwrap().page().unwrap();
     assert!(page.len() < 1_000_000, "{} bytes", page.len());
     let data = data(&page);
     let run = &data["runs"][0];
     let means = run["evaluations"]["mean"].as_array().unwrap();
     assert!(means.iter().any(|mean| mean == 777.0) && means.len() <= POINTS);
+    // A moving mean over the points is that of all records.
+    let total = |key: &str| -> f64 {
+        let numbers = run["evaluations"][key].as_array().unwrap();
+        assert_eq!(numbers.len(), means.len());
+        numbers.iter().map(|number| number.as_f64().unwrap()).sum()
+    };
+    assert_eq!(total("counts"), 20_000.0);
+    let peak = 777.0 + 1_000.123_456_789 / 12_346.0;
+    let sum = peak - (1..=20_000).map(|i| 1_000.123_456_789 / f64::from(i)).sum::<f64>();
+    assert!((total("sums") - sum).abs() < 1.0, "{sum}");
     assert_eq!(run["incidents"]["kills"], 20_000);
     assert_eq!(run["learner"]["actor_loss"][0], serde_json::Value::Null);
 }
@@ -189,7 +221,7 @@ fn a_damaged_record_is_refused_with_one_line_that_names_the_file() {
     let (config, _) = small("name = \"pendulum\"");
     let run = directory(parent.path(), "run", &config, None);
     std::fs::write(run.incidents(), "wall_seconds,env_steps\nwhen,3\n").unwrap();
-    let error = format!("{:#}", gather(&[run]).unwrap_err());
+    let error = format!("{:#}", gather(&[run], None).unwrap_err());
     assert!(
         error.contains("incidents.csv is not a record of this program") && !error.contains('\n'),
         "{error}"

@@ -51,6 +51,7 @@ class Timeline {
     const counts = `${plural(run.incidents.kills, "kill")}, ${plural(run.incidents.restarts, "restart")}`;
     this.picture = svg("svg", { role: "img", "aria-label": `${run.name}: ${counts}; the table below lists them` });
     this.plot = html("div", { class: "plot timeline" }, this.picture);
+    this.plot.style.minHeight = `${this.height}px`;
     const present = Object.entries(KINDS).filter(([kind]) => rows.some((row) => row.what === kind));
     const key = present.map(([, [words, look, sign]]) => html("span", { class: "key" }, svg("svg", { viewBox: "-8 -8 16 16", width: 16, height: 16, "aria-hidden": "true" }, svg("path", { class: `sign ${look}`, d: sign })), words));
     this.element = html(
@@ -77,7 +78,7 @@ class Timeline {
       "details",
       {},
       html("summary", {}, `All ${rows.length + more} incidents as a list`),
-      html("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": `Incidents of ${this.run.name}` }, html("table", {}, html("thead", {}, html("tr", {}, head)), html("tbody", {}, rows.map(cells)))),
+      scrollable(`Incidents of ${this.run.name}`, html("table", {}, html("thead", {}, html("tr", {}, head)), html("tbody", {}, rows.map(cells)))),
       more ? html("p", { class: "aside" }, `${whole(more)} later incidents are not listed: see incidents.csv`) : null,
     );
   }

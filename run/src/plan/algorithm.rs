@@ -6,8 +6,12 @@ use toml::{Table, Value};
 
 use crate::usage::UsageError;
 
-/// Settings for single Gymnasium environments, `[ID.METHOD]`, which replace the algorithm's defaults.
+/// Settings for single Gymnasium environments, `[ID.METHOD]`, which replace the algorithm's defaults; and in `[ID]`, where
+/// there is one, the algorithm that suits the environment best.
 const OF_ENVIRONMENTS: &str = include_str!("../../../presets/method/environments.toml");
+
+/// The key of an environment's best algorithm there.
+const METHOD: &str = "method";
 
 /// The algorithms' names.
 pub fn names() -> impl Iterator<Item = &'static str> {
@@ -66,6 +70,13 @@ pub(crate) fn replace(preset: &mut Table, algorithm: &'static str) -> anyhow::Re
     Ok(kept)
 }
 
+/// The algorithm that suits the Gymnasium environment `name` best, if its spaces do not tell.
+pub(crate) fn best_for(name: &str) -> anyhow::Result<Option<&'static str>> {
+    let of_environments: Table = OF_ENVIRONMENTS.parse()?;
+    let method = of_environments.get(name).and_then(|own| own.get(METHOD)?.as_str());
+    Ok(method.and_then(|method| names().find(|known| *known == method)))
+}
+
 /// Adds the defaults of an algorithm, and those for the environment `name`, to a table. Existing settings are kept.
 pub(crate) fn add_defaults(table: &mut Table, name: &str, algorithm: &'static str) -> anyhow::Result<()> {
     let of_environments: Table = OF_ENVIRONMENTS.parse()?;
@@ -112,6 +123,8 @@ mod tests {
         let mut other = Table::new();
         add_defaults(&mut other, "gym:Other-v0", "dqn").unwrap();
         assert_eq!(other["run"]["steps"].as_integer(), Some(500_000));
+        assert_eq!(best_for("gym:MountainCarContinuous-v0").unwrap(), Some("ddpg"));
+        assert_eq!(best_for("gym:CartPole-v1").unwrap(), None);
     }
 
     #[test]
@@ -119,10 +132,25 @@ mod tests {
         for name in names() {
             assert!(defaults(name).unwrap().contains_key(name), "{name}");
         }
+        let sections = shoal_common::config::explanation::sections();
+        let is_key = |section: &str, key: &str| {
+            let section = sections.iter().find(|known| known.name == section);
+            section.is_some_and(|section| section.keys.iter().any(|known| known.name == key))
+        };
         let of_environments: Table = OF_ENVIRONMENTS.parse().unwrap();
         for (environment, algorithms) in of_environments {
-            for algorithm in algorithms.as_table().unwrap().keys() {
+            for (algorithm, settings) in algorithms.as_table().unwrap() {
+                if algorithm == METHOD {
+                    let best = best_for(&environment).unwrap();
+                    assert!(algorithms.get(best.unwrap()).is_some(), "{environment}: {settings}");
+                    continue;
+                }
                 assert!(names().any(|name| name == algorithm), "{environment}: {algorithm}");
+                for (section, values) in settings.as_table().unwrap() {
+                    for key in values.as_table().unwrap().keys() {
+                        assert!(is_key(section, key), "{environment}.{algorithm}: {section}.{key}");
+                    }
+                }
             }
         }
     }

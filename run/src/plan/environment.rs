@@ -60,7 +60,10 @@ pub(super) fn describe_environment(table: &mut Table) -> anyhow::Result<()> {
     };
     let named = AlgorithmConfig::named_in(table);
     if environment.name.starts_with(GYMNASIUM) {
-        let algorithm = named.unwrap_or_else(|| AlgorithmConfig::suitable(&spec));
+        let algorithm = match named {
+            Some(named) => named,
+            None => algorithm::best_for(&environment.name)?.unwrap_or_else(|| AlgorithmConfig::suitable(&spec)),
+        };
         algorithm::add_defaults(table, &environment.name, algorithm)?;
     }
     table.insert("environment".into(), Value::try_from(environment)?);
