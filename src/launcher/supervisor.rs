@@ -1,6 +1,8 @@
 //! All processes of a run: starts them, tracks which are ready, restarts them, and gives up those that cannot work.
 
-use std::collections::HashSet;
+mod admission;
+mod faults;
+
 use std::os::fd::BorrowedFd;
 use std::os::unix::process::ExitStatusExt;
 use std::path::PathBuf;
@@ -8,9 +10,7 @@ use std::process::ExitStatus;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
-use shoal_actor::environment::GIVEN_UP;
-use shoal_common::channel::control::{ControlResponse, HostLease, HostRequest, HostStatus, RoleStatus};
-use shoal_common::channel::environment::ResponseFault;
+use shoal_common::channel::control::RoleStatus;
 use shoal_common::channel::{Domain, Services};
 use shoal_common::config::{Config, Mode};
 use shoal_common::durable::write_atomically;
@@ -21,9 +21,10 @@ use shoal_run::child_process::Writer;
 use shoal_run::records::recorder::{Incident, IncidentKind};
 use tracing_subscriber::filter::LevelFilter;
 
+use self::faults::Faults;
 use super::child::{Child, RestartDecision};
 use super::cleaner;
-use super::hosts::{Hosts, INCARNATIONS};
+use super::hosts::Hosts;
 use super::incarnations::{last_committed, read_counter};
 use super::log::{ALL_ENDED, Log};
 use super::process::{Process, name};
@@ -97,12 +98,9 @@ pub(super) struct Supervisor {
     /// The file with the number of processes ever started. It lasts over resumes: incarnations are never used twice.
     counter: PathBuf,
     processes_started: u64,
-    /// Invalid answers of environments since the launcher started, and the last one.
-    faults: u32,
-    max_faults: u32,
+    faults: Faults,
     /// A role is given up if its failures span this time.
     give_up_after: Duration,
-    last_fault: String,
     all_ready: bool,
     cleaned_at: Instant,
     learner_done: bool,
@@ -169,10 +167,12 @@ impl Supervisor {
             },
             counter,
             processes_started: started,
-            faults: 0,
-            max_faults: config.environment.faults,
+            faults: Faults {
+                count: 0,
+                most: config.environment.faults,
+                last: String::new(),
+            },
             give_up_after: Duration::from_secs(config.run.give_up_seconds),
-            last_fault: String::new(),
             all_ready: false,
             cleaned_at: Instant::now(),
             learner_done: false,
@@ -219,96 +219,6 @@ impl Supervisor {
     /// Indices that neither this host nor another has.
     fn free_actors(&self) -> impl Iterator<Item = u32> {
         (0..self.max_actors).filter(|index| !self.actors.contains(index) && !self.hosts.has(*index))
-    }
-
-    /// Gives actors and incarnations to another host. One that an earlier launcher has given actors gets them again, if
-    /// they are still free.
-    ///
-    /// # Errors
-    /// When services cannot be created, or the counter cannot be written.
-    pub(super) fn admit(&mut self, domain: &Domain, request: HostRequest) -> anyhow::Result<ControlResponse> {
-        let HostRequest {
-            host,
-            name,
-            actors: requested,
-            held,
-        } = request;
-        if let Some(lease) = self.hosts.lease(host) {
-            return Ok(ControlResponse::Admitted(lease.clone()));
-        }
-        let free: Vec<u32> = match self.lockstep_actors {
-            // The host takes over actors of this one, which end; theirs continue from the same snapshots.
-            Some(_) => self.actors.iter().rev().copied().collect(),
-            // The services of a retiring actor are in use.
-            None => {
-                let exists = |index: u32| self.children.iter().any(|child| child.is(Role::Actor, index));
-                self.free_actors().filter(|index| !exists(*index)).collect()
-            }
-        };
-        let requested = requested as usize;
-        let distinct: HashSet<u32> = held.iter().copied().collect();
-        let can_keep = held.len() == requested && distinct.len() == requested;
-        let mut actors = if can_keep && held.iter().all(|index| free.contains(index)) {
-            held
-        } else if free.len() >= requested {
-            free[..requested].to_vec()
-        } else {
-            if let Some(all) = self.lockstep_actors {
-                return Ok(ControlResponse::Refused(format!(
-                    "this lockstep run has {all} actors, of which other hosts have {}",
-                    all as usize - free.len()
-                )));
-            }
-            return Ok(ControlResponse::Refused(format!(
-                "the run may have {} actors on all hosts together (actors.max, fixed when it was created), of which {} \
-                 are free",
-                self.max_actors,
-                free.len()
-            )));
-        };
-        actors.sort_unstable();
-        let first_incarnation = self.processes_started + 1;
-        self.processes_started += INCARNATIONS;
-        self.write_counter()?;
-        let highest = actors.iter().max().map_or(0, |highest| highest + 1);
-        self.create_services(domain, highest)?;
-        self.log
-            .note("launcher", &format!("host {name} is admitted with actors {actors:?}"));
-        let lease = HostLease {
-            host,
-            name,
-            epoch: self.hosts.epoch(),
-            actors,
-            first_incarnation,
-            limit: self.processes_started + 1,
-        };
-        self.hosts.admit(lease.clone());
-        self.share_lockstep_actors();
-        Ok(ControlResponse::Admitted(lease))
-    }
-
-    /// Updates the status of the other hosts. The answer tells which of them are admitted.
-    pub(super) fn update_hosts(&mut self, statuses: Vec<HostStatus>) -> ControlResponse {
-        for message in self.hosts.update(statuses) {
-            self.log.note("launcher", &message);
-        }
-        self.share_lockstep_actors();
-        ControlResponse::Leases {
-            epoch: self.hosts.epoch(),
-            leases: self.hosts.leases(),
-        }
-    }
-
-    /// In a lockstep run this host has all actors that no other has.
-    fn share_lockstep_actors(&mut self) {
-        if let Some(count) = self.lockstep_actors {
-            self.actors = (0..count).filter(|index| !self.hosts.has(*index)).collect();
-        }
-    }
-
-    /// The status of the other hosts.
-    pub(super) fn hosts(&self) -> Vec<HostStatus> {
-        self.hosts.statuses()
     }
 
     /// Kills an actor of this incarnation or an earlier one, so that it is started again.
@@ -392,46 +302,12 @@ impl Supervisor {
         }
         if let Some(index) = server {
             // No process can make the launcher list more than the run may have.
-            (0..faults.min(self.max_faults)).for_each(|_| self.note_fault(&client, index));
+            (0..faults.min(self.faults.most)).for_each(|_| self.note_fault(&client, index));
         }
         if !self.all_ready && self.children.iter().all(Child::is_ready) {
             self.all_ready = true;
             self.log.note("launcher", "every role is ready");
         }
-    }
-
-    fn note_fault(&mut self, client: &str, index: u32) {
-        self.faults = self.faults.saturating_add(1);
-        let server = self.children.iter().find(|child| child.is(Role::EnvServer, index));
-        if let Some(server) = server {
-            // A server that checks its own answers has logged the fault, otherwise its client has.
-            let by_client = self.log.last_lines(client).pop().filter(|line| line.contains(GIVEN_UP));
-            let last = by_client.filter(|line| !line.contains(&ResponseFault::Reported.to_string()));
-            let last = last
-                .or_else(|| self.log.last_lines(&name(server.instance)).pop())
-                .unwrap_or_default();
-            self.log.write_left_out(&name(server.instance));
-            let last = last.strip_prefix("error: ").unwrap_or(&last);
-            self.last_fault = format!("{}: {last}", name(server.instance));
-            self.incidents
-                .push(Incident::of(server.instance, IncidentKind::Fault, last.into()));
-        }
-    }
-
-    /// Checks that environments have not returned something invalid too often.
-    ///
-    /// # Errors
-    /// When they have, with the last invalid answer.
-    pub(super) fn check_faults(&self) -> anyhow::Result<()> {
-        if self.faults < self.max_faults {
-            return Ok(());
-        }
-        bail!(
-            "the environments returned something invalid {} times, and environment.faults is {}; the last time: {}",
-            self.faults,
-            self.max_faults,
-            self.last_fault
-        );
     }
 
     /// The activity of a role: that of its first process with a heartbeat.

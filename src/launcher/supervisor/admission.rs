@@ -1,0 +1,106 @@
+//! Admission of other hosts: each gets actors and incarnations of its own.
+
+use std::collections::HashSet;
+
+use shoal_common::channel::Domain;
+use shoal_common::channel::control::{ControlResponse, HostLease, HostRequest, HostStatus};
+use shoal_common::role::Role;
+
+use super::Supervisor;
+use crate::launcher::hosts::INCARNATIONS;
+
+impl Supervisor {
+    /// Gives actors and incarnations to another host. One that an earlier launcher has given actors gets them again, if
+    /// they are still free.
+    ///
+    /// # Errors
+    /// When services cannot be created, or the counter cannot be written.
+    pub(in crate::launcher) fn admit(
+        &mut self,
+        domain: &Domain,
+        request: HostRequest,
+    ) -> anyhow::Result<ControlResponse> {
+        let HostRequest {
+            host,
+            name,
+            actors: requested,
+            held,
+        } = request;
+        if let Some(lease) = self.hosts.lease(host) {
+            return Ok(ControlResponse::Admitted(lease.clone()));
+        }
+        let free: Vec<u32> = match self.lockstep_actors {
+            // The host takes over actors of this one, which end; theirs continue from the same snapshots.
+            Some(_) => self.actors.iter().rev().copied().collect(),
+            // The services of a retiring actor are in use.
+            None => {
+                let exists = |index: u32| self.children.iter().any(|child| child.is(Role::Actor, index));
+                self.free_actors().filter(|index| !exists(*index)).collect()
+            }
+        };
+        let requested = requested as usize;
+        let distinct: HashSet<u32> = held.iter().copied().collect();
+        let can_keep = held.len() == requested && distinct.len() == requested;
+        let mut actors = if can_keep && held.iter().all(|index| free.contains(index)) {
+            held
+        } else if free.len() >= requested {
+            free[..requested].to_vec()
+        } else {
+            if let Some(all) = self.lockstep_actors {
+                return Ok(ControlResponse::Refused(format!(
+                    "this lockstep run has {all} actors, of which other hosts have {}",
+                    all as usize - free.len()
+                )));
+            }
+            return Ok(ControlResponse::Refused(format!(
+                "the run may have {} actors on all hosts together (actors.max, fixed when it was created), of which {} \
+                 are free",
+                self.max_actors,
+                free.len()
+            )));
+        };
+        actors.sort_unstable();
+        let first_incarnation = self.processes_started + 1;
+        self.processes_started += INCARNATIONS;
+        self.write_counter()?;
+        let highest = actors.iter().max().map_or(0, |highest| highest + 1);
+        self.create_services(domain, highest)?;
+        self.log
+            .note("launcher", &format!("host {name} is admitted with actors {actors:?}"));
+        let lease = HostLease {
+            host,
+            name,
+            epoch: self.hosts.epoch(),
+            actors,
+            first_incarnation,
+            limit: self.processes_started + 1,
+        };
+        self.hosts.admit(lease.clone());
+        self.share_lockstep_actors();
+        Ok(ControlResponse::Admitted(lease))
+    }
+
+    /// Updates the status of the other hosts. The answer tells which of them are admitted.
+    pub(in crate::launcher) fn update_hosts(&mut self, statuses: Vec<HostStatus>) -> ControlResponse {
+        for message in self.hosts.update(statuses) {
+            self.log.note("launcher", &message);
+        }
+        self.share_lockstep_actors();
+        ControlResponse::Leases {
+            epoch: self.hosts.epoch(),
+            leases: self.hosts.leases(),
+        }
+    }
+
+    /// In a lockstep run this host has all actors that no other has.
+    fn share_lockstep_actors(&mut self) {
+        if let Some(count) = self.lockstep_actors {
+            self.actors = (0..count).filter(|index| !self.hosts.has(*index)).collect();
+        }
+    }
+
+    /// The status of the other hosts.
+    pub(in crate::launcher) fn hosts(&self) -> Vec<HostStatus> {
+        self.hosts.statuses()
+    }
+}
