@@ -2,16 +2,16 @@
 //! forwards their chunks, each exactly once and in order. It acknowledges the chunks to the hosts, and sends them the
 //! newest policy.
 
+mod host;
+mod policies;
+
 use std::collections::HashMap;
 use std::fmt;
-use std::sync::Arc;
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::time::{Duration, Instant};
 
-use shoal_common::channel::control::{
-    ControlRequest, ControlResponse, HostLease, HostRequest, HostState, HostStatus, RoleState, RoleStatus,
-};
-use shoal_common::channel::policy::{PolicyReader, PublishedPolicy};
+use shoal_common::channel::control::{ControlRequest, ControlResponse, HostLease, HostRequest};
+use shoal_common::channel::policy::PolicyReader;
 use shoal_common::channel::reports::Reporter;
 use shoal_common::channel::transitions::ChunkForwarder;
 use shoal_common::channel::{ChannelError, Domain, EventName, HeartbeatSender, Notifier};
@@ -27,17 +27,18 @@ use zenoh::qos::{CongestionControl, Priority};
 use zenoh::query::Query;
 use zenoh::{Session, Wait};
 
+use self::host::Host;
+use self::policies::Policies;
 use crate::endpoint::Endpoint;
 use crate::files::KeyFile;
 use crate::forwarding::{ChunkOrder, Forwarding};
 use crate::network::{self, CUT_OFF_AFTER, LONGEST_SLEEP, NetworkError, REFRESH_INTERVAL, failed};
-use crate::rate_limiter::RateLimiter;
 use crate::refused;
 use crate::requests::LauncherRequests;
 use crate::wire::vector_instructions;
 use crate::wire::{
     Acknowledgement, ActorAcknowledgement, Admission, Hello, HostReport, Message, PolicyRequest, RunPhase, WireChunk,
-    WireError, WireLease, WirePolicy,
+    WireError, WireLease,
 };
 
 /// The least and the greatest time between two acknowledgements to a host.
@@ -49,9 +50,6 @@ const SHORTEST_SLEEP: Duration = Duration::from_micros(200);
 
 /// How often the launcher gets the status of the hosts.
 const STATUS_INTERVAL: Duration = Duration::from_millis(500);
-
-/// How long a query for a policy is kept before the host has to ask again.
-const POLICY_PATIENCE: Duration = Duration::from_secs(8);
 
 /// How long the hosts may take to hand over what they have when the run is over.
 const HAND_OVER_TIMEOUT: Duration = Duration::from_secs(5);
@@ -114,34 +112,6 @@ enum Arrival {
     Policy(Query),
 }
 
-/// A host that is admitted.
-struct Host {
-    lease: HostLease,
-    acknowledgements: Publisher<'static>,
-    last_acknowledged: Vec<ActorAcknowledgement>,
-    acknowledged_at: Instant,
-    /// An acknowledgement is sent soon, whether anything has changed or not.
-    acknowledgement_due: bool,
-    heard_at: Instant,
-    /// The number of its last report.
-    last_report: u64,
-    has_left: bool,
-    newest_report: Option<HostReport>,
-    warned_at: Option<Instant>,
-    /// Rows that were forwarded to the learner.
-    forwarded_rows: u64,
-    /// The time of the last status, and `forwarded_rows` at that time.
-    rows_at_last_status: (Instant, u64),
-    rows_per_second: f64,
-    /// The steps of its processes at the last status.
-    steps_at_last_status: HashMap<(Role, u32), (u64, u64)>,
-    /// Its query for a policy, the policy that it has, and when the query arrived.
-    policy_query: Option<(Query, PolicyId, Instant)>,
-}
-
-/// The learner's incarnation and the version of a policy, if there is one.
-type PolicyId = Option<(u64, u64)>;
-
 /// An actor of another host.
 struct RemoteActor {
     host: u64,
@@ -168,12 +138,7 @@ struct Gate<'a> {
     hosts: HashMap<u64, Host>,
     actors: HashMap<u32, RemoteActor>,
     replay: CommitReader,
-    policy: PolicyReader,
-    /// The policy that was sent last, as bytes.
-    encoded_policy: Option<(PolicyId, Arc<Vec<u8>>)>,
-    policy_limiter: RateLimiter,
-    /// Version of the newest policy that was read from the learner.
-    policy_version: u64,
+    policies: Policies,
     learner_notifier: Notifier,
     heartbeat: HeartbeatSender,
     heartbeats: Reporter<Heartbeat>,
@@ -238,10 +203,7 @@ impl<'a> Gate<'a> {
             hosts: HashMap::new(),
             actors: HashMap::new(),
             replay,
-            policy,
-            encoded_policy: None,
-            policy_limiter: RateLimiter::new(config.remote.policy_bandwidth, Instant::now()),
-            policy_version: 0,
+            policies: Policies::new(policy, config.remote.policy_bandwidth),
             learner_notifier: Notifier::new(domain, EventName(Role::Learner, 0))?,
             heartbeat,
             heartbeats: Reporter::open(domain)?,
@@ -272,7 +234,7 @@ impl<'a> Gate<'a> {
             self.take_answers()?;
             let progress = self.read_commits();
             self.send_acknowledgements()?;
-            self.send_policies()?;
+            self.policies.send(&mut self.hosts)?;
             self.report_to_launcher();
             self.refresh_connections()?;
             self.choose_sleep(forwarded_rows > 0 || progress);
@@ -648,41 +610,6 @@ impl<'a> Gate<'a> {
         Ok(())
     }
 
-    /// Answers the queries for a policy that is there, as far as the bandwidth allows.
-    fn send_policies(&mut self) -> Result<(), GateError> {
-        self.hosts.values_mut().for_each(|host| {
-            drop(
-                host.policy_query
-                    .take_if(|(.., since)| since.elapsed() >= POLICY_PATIENCE),
-            )
-        });
-        if self.hosts.values().all(|host| host.policy_query.is_none()) {
-            return Ok(());
-        }
-        let Some(newest) = self.policy.latest()? else {
-            return Ok(());
-        };
-        self.policy_version = newest.header().version;
-        let id = Some((newest.header().incarnation, newest.header().version));
-        // Who has waited longest comes first. Otherwise a host that asks again at once could keep the others waiting.
-        let waiting = self.hosts.values_mut().filter_map(|host| {
-            let (_, have, since) = host.policy_query.as_ref()?;
-            (id != *have).then_some((*since, host))
-        });
-        let mut waiting: Vec<_> = waiting.collect();
-        waiting.sort_by_key(|(since, _)| *since);
-        for (_, host) in waiting {
-            let bytes = encoded(&mut self.encoded_policy, &newest);
-            if !self.policy_limiter.take(bytes.len() as f64, Instant::now()) {
-                break;
-            }
-            if let Some((query, ..)) = host.policy_query.take() {
-                answer_policy(query, bytes)?;
-            }
-        }
-        Ok(())
-    }
-
     /// Sends the launcher the status of the hosts, and asks which are admitted.
     fn report_to_launcher(&mut self) {
         if self.launcher_owes_answer
@@ -693,7 +620,7 @@ impl<'a> Gate<'a> {
             return;
         }
         (self.reported_to_launcher_at, self.launcher_owes_answer) = (Some(Instant::now()), true);
-        let newest = self.policy_version;
+        let newest = self.policies.version();
         let statuses = self.hosts.values_mut().map(|host| host.status(newest)).collect();
         self.requests
             .ask(ControlRequest::Hosts(statuses), PendingRequest::Hosts);
@@ -710,10 +637,7 @@ impl<'a> Gate<'a> {
                 "a connection was refused: {why}; only hosts with the run's join.key are let in"
             ));
         }
-        // Taken as often as an actor takes it, so that none is held long after its learner has died.
-        if let Some(newest) = self.policy.latest()? {
-            self.policy_version = newest.header().version;
-        }
+        self.policies.refresh()?;
         self.heartbeats.refresh_connections();
         self.episodes.refresh_connections();
         let waits = self.actors.values().any(|actor| actor.forwarding.is_waiting());
@@ -738,67 +662,6 @@ impl<'a> Gate<'a> {
             (true, false) => (2 * self.sleep).min(LONGEST_SLEEP),
             (false, _) => LONGEST_SLEEP,
         };
-    }
-}
-
-impl Host {
-    fn status(&mut self, newest: u64) -> HostStatus {
-        let (then, rows) = self.rows_at_last_status;
-        let seconds = then.elapsed().as_secs_f64();
-        if seconds > 0.0 {
-            self.rows_per_second = (self.forwarded_rows - rows) as f64 / seconds;
-        }
-        self.rows_at_last_status = (Instant::now(), self.forwarded_rows);
-        let silent = self.heard_at.elapsed();
-        let cut_off = silent >= CUT_OFF_AFTER;
-        let mut roles = Vec::new();
-        for role in self.newest_report.iter().flat_map(|report| &report.roles) {
-            let key = (role.role, role.index);
-            let before = self.steps_at_last_status.insert(key, (role.incarnation, role.steps));
-            let taken = before
-                .filter(|(incarnation, _)| *incarnation == role.incarnation)
-                .map_or(0, |(_, steps)| role.steps.saturating_sub(steps));
-            roles.push(RoleStatus {
-                role: role.role.name().into(),
-                index: role.index,
-                pid: None,
-                state: if cut_off {
-                    RoleState::Silent
-                } else {
-                    state(role.activity)
-                },
-                restarts: 0,
-                rate: if seconds > 0.0 { taken as f64 / seconds } else { 0.0 },
-                policy_version: (role.role == Role::Actor).then_some(role.policy_version),
-                policy_lag: (role.role == Role::Actor).then(|| newest.saturating_sub(role.policy_version)),
-            });
-        }
-        let report = self.newest_report.as_ref();
-        HostStatus {
-            host: self.lease.host,
-            name: self.lease.name.clone(),
-            state: match (self.has_left, cut_off) {
-                (true, _) => HostState::Left,
-                (false, true) => HostState::CutOff,
-                (false, false) => HostState::Connected,
-            },
-            actors: self.lease.actors.len() as u32,
-            rows_per_second: self.rows_per_second,
-            resent_chunks: report.map_or(0, |report| report.resent),
-            round_trip_us: report.and_then(|report| report.round_trip_us),
-            policy_lag: report.map_or(0, |report| newest.saturating_sub(report.policy_version)),
-            silent_seconds: silent.as_secs_f64(),
-            roles,
-        }
-    }
-}
-
-fn state(activity: Activity) -> RoleState {
-    match activity {
-        Activity::Working => RoleState::Working,
-        Activity::WaitingForPeer | Activity::WaitingForServer => RoleState::WaitingForPeer,
-        Activity::WaitingForRatio => RoleState::WaitingForRatio,
-        Activity::Done => RoleState::Done,
     }
 }
 
@@ -853,28 +716,4 @@ fn answer_join(query: &Query, admission: &Admission) -> Result<(), GateError> {
         tracing::debug!("a host did not get its answer: {cause}");
     }
     Ok(())
-}
-
-/// Sends a policy from a thread of its own: a host with a slow connection must not delay the others. A host has one query
-/// at a time, so there is at most one thread for each.
-fn answer_policy(query: Query, bytes: Arc<Vec<u8>>) -> Result<(), GateError> {
-    let send = move || {
-        let key = query.key_expr().clone();
-        let sent = query.reply(key, bytes.as_slice()).wait();
-        if let Err(cause) = sent {
-            tracing::debug!("a policy did not arrive: {cause}");
-        }
-    };
-    std::thread::Builder::new().name("policy".into()).spawn(send)?;
-    Ok(())
-}
-
-fn encoded(cache: &mut Option<(PolicyId, Arc<Vec<u8>>)>, newest: &PublishedPolicy) -> Arc<Vec<u8>> {
-    let id = Some((newest.header().incarnation, newest.header().version));
-    if let Some((_, bytes)) = cache.as_ref().filter(|(cached, _)| *cached == id) {
-        return bytes.clone();
-    }
-    let bytes = Arc::new(WirePolicy::encode(newest.header(), newest.parameters()));
-    *cache = Some((id, bytes.clone()));
-    bytes
 }

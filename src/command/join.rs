@@ -103,7 +103,7 @@ mod with_network {
     use shoal_remote::files::{HostFile, JoinFile, KeyFile};
     use shoal_remote::join::{JoinError, join as ask};
     use shoal_remote::network::restart_with_one_thread;
-    use shoal_remote::wire::{Admission, Hello, Lease, vector_instructions};
+    use shoal_remote::wire::{Admission, Hello, WireLease, vector_instructions};
     use shoal_run::joining::make_host_directory;
     use shoal_run::records::outcome::{RunOutcome, RunState};
     use shoal_run::signals::{Signals, exit_code};
@@ -167,7 +167,7 @@ mod with_network {
     fn work(
         args: &JoinArgs,
         (endpoint, key, host, name): (Endpoint, Option<KeyFile>, u64, String),
-        lease: Lease,
+        lease: WireLease,
         path: &Path,
         signals: &Signals,
     ) -> anyhow::Result<ExitCode> {
