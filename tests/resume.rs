@@ -338,40 +338,50 @@ const SLOW_UPDATES: [&str; 14] = [
 #[test]
 fn a_run_interrupted_after_its_last_environment_step_is_finished_when_it_is_resumed() {
     for stopped in [true, false] {
-        let place = Workplace::new();
-        let running = place.start_as("run", &SLOW_UPDATES);
-        until("all steps are taken", || support::committed_rows(&running) == 1500);
-        if stopped {
-            assert!(place.output(&["stop", "run"]).status.success());
-            assert_eq!(running.wait().0, Some(0));
-        } else {
-            running.kill_all();
-        }
-        let status_at_rest = || {
-            let output = place.output(&["status", "run", "--json"]);
-            assert_eq!(output.status.code(), Some(3));
-            support::json(&output)
-        };
-        let before = status_at_rest();
-        assert!(
-            before["updates"].as_u64().unwrap() < 1436,
-            "it was interrupted too late: {before}"
-        );
-        assert_eq!(before["finished"], false);
-
-        let (code, printed, leftovers) = place.resume("run", &[]).wait();
-        assert_eq!(code, Some(0), "{}", place.stderr());
-        assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
-        let result = parse(&printed);
-        assert_eq!((&result["env_steps"], &result["updates"]), (&1500.into(), &1436.into()));
-        assert!(result["weights_sha256"].is_string() && result["eval_return_mean"].is_number());
-        let evaluations = std::fs::read_to_string(place.path().join("run/evaluations.csv")).unwrap();
-        assert!(evaluations.lines().last().unwrap().contains(",1500,"), "{evaluations}");
-
-        assert_eq!(status_at_rest()["finished"], true);
-        let message = error_line(&place.output(&["resume", "run"]));
-        assert!(message.contains("1500 of 1500 steps already"), "{message}");
+        // On a busy machine the interruption may come after the last gradient step.
+        assert!((0..20).any(|_| is_interrupted_in_time_and_finished(stopped)));
     }
+}
+
+/// Interrupts a run after its last environment step, and resumes it. Returns false if no gradient steps were left.
+fn is_interrupted_in_time_and_finished(stopped: bool) -> bool {
+    let place = Workplace::new();
+    let running = place.start_as("run", &SLOW_UPDATES);
+    until("all steps are taken", || support::committed_rows(&running) == 1500);
+    if stopped {
+        // It fails if the run is over.
+        let has_stopped = place.output(&["stop", "run"]).status.success();
+        assert_eq!(running.wait().0, Some(0));
+        if !has_stopped {
+            return false;
+        }
+    } else {
+        running.kill_all();
+    }
+    let status_at_rest = || {
+        let output = place.output(&["status", "run", "--json"]);
+        assert_eq!(output.status.code(), Some(3));
+        support::json(&output)
+    };
+    let before = status_at_rest();
+    if before["updates"] == 1436 {
+        return false;
+    }
+    assert_eq!(before["finished"], false);
+
+    let (code, printed, leftovers) = place.resume("run", &[]).wait();
+    assert_eq!(code, Some(0), "{}", place.stderr());
+    assert!(leftovers.processes().is_empty() && leftovers.files().is_empty());
+    let result = parse(&printed);
+    assert_eq!((&result["env_steps"], &result["updates"]), (&1500.into(), &1436.into()));
+    assert!(result["weights_sha256"].is_string() && result["eval_return_mean"].is_number());
+    let evaluations = std::fs::read_to_string(place.path().join("run/evaluations.csv")).unwrap();
+    assert!(evaluations.lines().last().unwrap().contains(",1500,"), "{evaluations}");
+
+    assert_eq!(status_at_rest()["finished"], true);
+    let message = error_line(&place.output(&["resume", "run"]));
+    assert!(message.contains("1500 of 1500 steps already"), "{message}");
+    true
 }
 
 #[test]
