@@ -7,6 +7,8 @@ mod support;
 use std::path::Path;
 
 use serde_json::Value;
+use shoal_common::policy_file::PolicyFile;
+use shoal_common::run_dir::RunDir;
 use support::{Workplace, error_line, json, until};
 
 /// Rows of `changes.csv` without their times.
@@ -389,6 +391,17 @@ fn the_best_policy_is_evaluated_with_the_new_number_of_episodes() {
     let (_, said) = resume(&place, &["--steps", "400", "--set", "evaluation.episodes=4"]);
     assert!(
         said.contains("the best policy is evaluated anew, for it has another number of episodes now"),
+        "{said}"
+    );
+    // A finished run keeps its last policy as the best one with the mean of its final evaluation.
+    let run = RunDir::open(&place.path().join("run")).unwrap();
+    let layout = run.config().unwrap().policy_layout().unwrap();
+    let mut best = PolicyFile::read(&run.best_policy(), &layout).unwrap();
+    best.episodes = 3;
+    best.write(&run.best_policy()).unwrap();
+    let (_, said) = resume(&place, &["--steps", "500"]);
+    assert!(
+        said.contains("evaluated anew, for the final evaluation had another number of episodes"),
         "{said}"
     );
 }

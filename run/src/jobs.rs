@@ -80,7 +80,9 @@ pub fn run_training(command: &mut Command, interrupted: &dyn Fn() -> Option<i32>
             let _ = training.signal(signal);
         }
     };
-    if interrupted().is_some() {
+    // After a signal it ends with 128 and the signal's number, or dies of it.
+    let has_failed = status.code().is_some_and(|code| (1..128).contains(&code));
+    if interrupted().is_some() && !has_failed {
         return Ok(TrainingEnd::Interrupted);
     }
     if !status.success() {
@@ -122,6 +124,8 @@ mod tests {
             TrainingEnd::Interrupted
         );
         assert!(start.elapsed() < Duration::from_secs(30));
+        let unsaved = shell("trap 'echo not saved >&2; exit 1' TERM; sleep 60 & wait", Some(15));
+        assert_eq!(unsaved.unwrap_err().to_string(), "not saved");
     }
 
     #[test]

@@ -9,6 +9,7 @@ use anyhow::{Context, bail};
 use clap::Args;
 use clap_complete::engine::ArgValueCompleter;
 use shoal_common::run_dir::RunDir;
+use shoal_run::evaluation::SavedPolicy;
 use shoal_run::evaluation::earlier_best::{ReevaluatedPolicy, reevaluate_best, reevaluate_if_needed};
 use shoal_run::external_environment::server_location::ServerLocation;
 use shoal_run::numbers::count;
@@ -75,8 +76,8 @@ impl ResumeArgs {
 /// Continues with the run's replay, counters and noise, until its old or new number of steps or episodes, and with what
 /// was changed in its configuration.
 pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
-    if let Some(suite) = Suite::read(&args.run)? {
-        return resume_suite(suite, args);
+    if Suite::read(&args.run)?.is_some() {
+        return resume_suite(args);
     }
     if args.jobs.is_some() {
         return Err(UsageError("--jobs: only for suites, and this is one run".into()).into());
@@ -146,14 +147,14 @@ pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
     run_training(revision.config, &run, &lock, &args.output, &args.listen)
 }
 
-fn resume_suite(suite: Suite, args: &ResumeArgs) -> anyhow::Result<ExitCode> {
+fn resume_suite(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
     if args.listen.listen.is_some() {
         return Err(UsageError("--listen: other hosts join a single run, and this is a suite".into()).into());
     }
     let number = |key: &str, value: Option<u64>| value.map(|value| format!("{key}={value}"));
     let numbers = [number("run.steps", args.steps), number("run.episodes", args.episodes)];
     let changes: Vec<String> = args.set.iter().cloned().chain(numbers.into_iter().flatten()).collect();
-    let suite = suite::change(suite, &args.run, &changes)?;
+    suite::change(&args.run, &changes)?;
     if args.output.detach {
         return detach::resume_suite(&args.run, &args.for_another_process(), &args.output);
     }
@@ -161,7 +162,7 @@ fn resume_suite(suite: Suite, args: &ResumeArgs) -> anyhow::Result<ExitCode> {
         jobs: args.jobs,
         output: &args.output,
     };
-    suite::resume(&suite, &args.run, options)
+    suite::resume(&args.run, options)
 }
 
 /// Evaluates the best policy again if an earlier version did that from other starts, or if later policies are evaluated
@@ -171,10 +172,20 @@ fn reevaluate_best_policy(run: &RunDir, revision: &Revision) -> anyhow::Result<O
     let interrupt = signals.interrupt();
     let here = run.path().display();
     let config = &revision.config;
+    let episodes = u64::from(config.evaluation.episodes);
+    // One that cannot be read is the evaluator's error.
+    let has_other_episodes = SavedPolicy::Best
+        .read(run, config)
+        .is_ok_and(|best| ![0, episodes].contains(&best.episodes));
     let (evaluated, why) = if revision.changes("evaluation.episodes") {
         (
             reevaluate_best(run, config, &interrupt),
             "it has another number of episodes now",
+        )
+    } else if has_other_episodes {
+        (
+            reevaluate_best(run, config, &interrupt),
+            "the final evaluation had another number of episodes",
         )
     } else {
         (

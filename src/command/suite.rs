@@ -87,8 +87,7 @@ pub(crate) fn train(args: &TrainArgs, what: &str, overrides: &RunOverrides) -> a
         suite
     };
     let options = SuiteOptions {
-        // Each takes the lock of the run whose replay it copies.
-        jobs: if common.with_replay { Some(1) } else { args.jobs },
+        jobs: args.jobs,
         output: &args.output,
     };
     if let Some(directory) = &overrides.run
@@ -96,7 +95,7 @@ pub(crate) fn train(args: &TrainArgs, what: &str, overrides: &RunOverrides) -> a
     {
         let here = directory.display();
         return match Suite::read(directory)? {
-            Some(found) if found.has_same_runs(&suite) => begin(&found, directory, &common, options),
+            Some(found) if found.has_same_runs(&suite) => begin(directory, options),
             Some(_) => bail!(
                 "{here} is a suite of other runs: continue it with `shoal resume {here}`, or choose another directory with --run"
             ),
@@ -104,43 +103,34 @@ pub(crate) fn train(args: &TrainArgs, what: &str, overrides: &RunOverrides) -> a
         };
     }
     // Before anything is made: is each of them a configuration?
-    let name = check(&suite, &common)?;
+    let name = check(&suite)?;
     let directory = match &overrides.run {
         Some(path) => RunDir::create(path)?,
         None => RunDir::create_next(Path::new("runs"), &format!("{name}-suite"))?,
     };
     suite.write(directory.path())?;
     StartRecord::of_this_process().write(directory.path())?;
-    begin(&suite, directory.path(), &common, options)
+    begin(directory.path(), options)
 }
 
-/// Trains the suite, here or in a process that outlives this terminal.
-fn begin(
-    suite: &Suite,
-    directory: &Path,
-    common: &RunOverrides,
-    options: SuiteOptions<'_>,
-) -> anyhow::Result<ExitCode> {
+/// Trains the suite in this directory, here or in a process that outlives this terminal.
+fn begin(directory: &Path, options: SuiteOptions<'_>) -> anyhow::Result<ExitCode> {
     if options.output.detach {
         let jobs = options.jobs.map(|jobs| format!("--jobs={jobs}").into());
         return detach::resume_suite(directory, &jobs.into_iter().collect::<Vec<_>>(), options.output);
     }
-    run(suite, directory, common, options)
+    resume(directory, options)
 }
 
-/// Continues the suite in this directory.
-pub(crate) fn resume(suite: &Suite, directory: &Path, options: SuiteOptions<'_>) -> anyhow::Result<ExitCode> {
-    run(suite, directory, &RunOverrides::default(), options)
-}
-
-/// The same suite with these changes of all runs, each as `SECTION.KEY=VALUE`. They are checked for each run and stored, so
-/// that the suite can be interrupted.
-pub(crate) fn change(mut suite: Suite, directory: &Path, changes: &[String]) -> anyhow::Result<Suite> {
+/// Changes all runs of the suite in this directory, each change as `SECTION.KEY=VALUE`. They are checked for each run and
+/// stored, so that the suite can be interrupted.
+pub(crate) fn change(directory: &Path, changes: &[String]) -> anyhow::Result<()> {
     if changes.is_empty() {
-        return Ok(suite);
+        return Ok(());
     }
-    suite.change(changes).map_err(UsageError)?;
     let _lock = suite::lock(directory)?;
+    let mut suite = read(directory)?;
+    suite.change(changes).map_err(UsageError)?;
     for trial in &suite.trials {
         let path = directory.join(&trial.name);
         if path.exists() {
@@ -148,9 +138,13 @@ pub(crate) fn change(mut suite: Suite, directory: &Path, changes: &[String]) -> 
             Revision::new(&run, &run.config()?, &requested(&suite))?;
         }
     }
-    check(&suite, &RunOverrides::default())?;
-    suite.write(directory)?;
-    Ok(suite)
+    check(&suite)?;
+    suite.write(directory)
+}
+
+/// The suite in this directory, which the caller has locked: another process may have changed it before.
+fn read(directory: &Path) -> anyhow::Result<Suite> {
+    Suite::read(directory)?.with_context(|| format!("{} is no suite any more", directory.display()))
 }
 
 fn requested(suite: &Suite) -> RequestedChanges {
@@ -161,7 +155,7 @@ fn requested(suite: &Suite) -> RequestedChanges {
 }
 
 /// Checks the configuration of each combination of values. Returns the usual name of a run of this kind.
-fn check(suite: &Suite, common: &RunOverrides) -> anyhow::Result<String> {
+fn check(suite: &Suite) -> anyhow::Result<String> {
     let mut checked: Vec<&[String]> = Vec::new();
     let mut name = String::new();
     for trial in &suite.trials {
@@ -170,7 +164,7 @@ fn check(suite: &Suite, common: &RunOverrides) -> anyhow::Result<String> {
         }
         checked.push(&trial.set);
         let config;
-        (name, config) = plan::resolve(&suite.what, &overrides_of(suite, trial, common))?;
+        (name, config) = plan::resolve(&suite.what, &overrides_of(suite, trial)?)?;
         check_first_round(suite, &config)?;
     }
     Ok(name)
@@ -192,14 +186,15 @@ fn check_first_round(suite: &Suite, config: &Config) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn overrides_of(suite: &Suite, trial: &Trial, common: &RunOverrides) -> RunOverrides {
+/// What all runs and this one of the suite override.
+fn overrides_of(suite: &Suite, trial: &Trial) -> anyhow::Result<RunOverrides> {
+    let common = RunOverrides::from_arguments(&suite.arguments)?;
     let set = common.set.iter().chain(&trial.set).chain(&suite.changes);
-    RunOverrides {
-        run: None,
+    Ok(RunOverrides {
         seed: trial.seed,
         set: set.cloned().collect(),
-        ..common.clone()
-    }
+        ..common
+    })
 }
 
 /// A message from a worker: the number of the trial, and what has happened to it.
@@ -212,13 +207,13 @@ enum Event {
     Failed(usize, String),
 }
 
-/// Trains all runs of the suite that have not finished, with halving in rounds.
-fn run(suite: &Suite, directory: &Path, common: &RunOverrides, options: SuiteOptions<'_>) -> anyhow::Result<ExitCode> {
+/// Trains all runs of the suite in this directory that have not finished, with halving in rounds.
+pub(crate) fn resume(directory: &Path, options: SuiteOptions<'_>) -> anyhow::Result<ExitCode> {
     let directory =
         &std::fs::canonicalize(directory).with_context(|| format!("cannot resolve {}", directory.display()))?;
     let _lock = suite::lock(directory)?;
     let signals = Signals::register()?;
-    let mut suite = suite.clone();
+    let mut suite = read(directory)?;
     let mut failed = 0;
     while let Some(round) = suite.next_round() {
         let percent = 100.0 * round.share;
@@ -226,10 +221,13 @@ fn run(suite: &Suite, directory: &Path, common: &RunOverrides, options: SuiteOpt
             let run = directory.join(&trial.name);
             Ok(round.trials.contains(trial) && !is_finished(&suite, &run)? && share_done(&run) < round.share)
         };
-        let due = Due::new(&suite, directory, is_due, common, options)?;
+        let due = Due::new(&suite, directory, is_due, options)?;
         due.say(&format!("until each has done {percent:.0} % of its steps:"));
-        failed += due.train(&signals, Some(round.share));
-        if signals.received().is_some() {
+        let due_runs = due.numbers.len();
+        let failed_now = due.train(&signals, Some(round.share));
+        failed += failed_now;
+        // If all have failed, the cause is probably not in their settings.
+        if signals.received().is_some() || (failed_now > 0 && failed_now == due_runs) {
             break;
         }
         let ended = suite.end_worse_half(|trial| best_return(&directory.join(&trial.name)));
@@ -238,11 +236,11 @@ fn run(suite: &Suite, directory: &Path, common: &RunOverrides, options: SuiteOpt
             writeln!(std::io::stderr(), "ended early at {percent:.0} %: {}", ended.join("; "))?;
         }
     }
-    if signals.received().is_none() {
+    if signals.received().is_none() && suite.next_round().is_none() {
         let is_due = |trial: &Trial| Ok(!suite.has_ended(trial) && !is_finished(&suite, &directory.join(&trial.name))?);
-        let due = Due::new(&suite, directory, is_due, common, options)?;
+        let due = Due::new(&suite, directory, is_due, options)?;
         due.say("");
-        failed = due.train(&signals, None);
+        failed += due.train(&signals, None);
     }
     report(&suite, directory, options.output)?;
     let here = directory.display();
@@ -251,10 +249,7 @@ fn run(suite: &Suite, directory: &Path, common: &RunOverrides, options: SuiteOpt
         (None, 0) => Ok(ExitCode::SUCCESS),
         (None, failed) => bail!("{failed} of the runs failed; to continue with them: shoal resume {here}"),
         (Some(signal), _) => {
-            writeln!(
-                stderr,
-                "interrupted; every run is saved; to continue: shoal resume {here}"
-            )?;
+            writeln!(stderr, "interrupted; to continue: shoal resume {here}")?;
             Ok(exit_code(signal))
         }
     }
@@ -274,7 +269,6 @@ impl<'a> Due<'a> {
         suite: &'a Suite,
         directory: &'a Path,
         is_due: impl Fn(&Trial) -> anyhow::Result<bool>,
-        common: &RunOverrides,
         options: SuiteOptions<'_>,
     ) -> anyhow::Result<Self> {
         let mut numbers = VecDeque::new();
@@ -283,10 +277,13 @@ impl<'a> Due<'a> {
                 numbers.push_back(number);
             }
         }
+        // Each run that is begun locks the run whose replay it copies.
+        let one_at_a_time = RunOverrides::from_arguments(&suite.arguments)?.with_replay;
         let jobs = match (options.jobs, numbers.front()) {
+            _ if one_at_a_time => 1,
             (Some(jobs), _) => jobs.into(),
             (None, None) => 1,
-            (None, Some(first)) => usual_jobs(suite, directory, *first, common),
+            (None, Some(first)) => usual_jobs(suite, directory, *first)?,
         };
         Ok(Self {
             suite,
@@ -360,18 +357,19 @@ fn best_return(run: &Path) -> f64 {
 }
 
 /// What cores and shared memory allow; each run keeps about two cores busy.
-fn usual_jobs(suite: &Suite, directory: &Path, first: usize, common: &RunOverrides) -> usize {
-    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+fn usual_jobs(suite: &Suite, directory: &Path, first: usize) -> anyhow::Result<usize> {
     let trial = &suite.trials[first];
+    let overrides = overrides_of(suite, trial)?;
     let stored = RunDir::open(&directory.join(&trial.name))
         .ok()
         .and_then(|run| run.config().ok());
-    let config = stored.or_else(|| Some(plan::resolve(&suite.what, &overrides_of(suite, trial, common)).ok()?.1));
+    let config = stored.or_else(|| Some(plan::resolve(&suite.what, &overrides).ok()?.1));
     // Where it cannot be found out, each run still checks for itself.
     let fit = config
         .and_then(|config| preflight::side_by_side(&config).ok())
         .unwrap_or(1);
-    (cores / 2).clamp(1, fit.max(1))
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    Ok((cores / 2).clamp(1, fit.max(1)))
 }
 
 /// Whether nothing is left to do in this run directory.

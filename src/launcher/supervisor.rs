@@ -24,7 +24,7 @@ use tracing_subscriber::filter::LevelFilter;
 use self::faults::Faults;
 use super::child::{Child, RestartDecision};
 use super::cleaner;
-use super::hosts::Hosts;
+use super::hosts::{Hosts, INCARNATIONS};
 use super::incarnations::{last_committed, read_counter};
 use super::log::{ALL_ENDED, Log};
 use super::process::{Process, name};
@@ -42,8 +42,8 @@ const CLEANING_AGAIN: Duration = Duration::from_millis(200);
 /// A start that takes longer is reported to the user.
 const SLOW_START: Duration = Duration::from_secs(10);
 
-/// More starts than there ever are between two committed chunks. A lost counter skips this many.
-const STARTS_WITHOUT_CHUNK: u64 = 100_000;
+/// More starts, leases of hosts among them, than there are between two committed chunks. A lost counter skips this many.
+const STARTS_WITHOUT_CHUNK: u64 = 64 * INCARNATIONS;
 
 /// The situation of the run's processes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

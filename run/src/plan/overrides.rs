@@ -3,8 +3,8 @@
 use std::path::PathBuf;
 
 use anyhow::Context;
-use clap::Args;
 use clap::builder::PossibleValuesParser;
+use clap::{Args, Parser};
 use shoal_common::config::Config;
 use shoal_common::config::explanation::{self, Key};
 use shoal_common::run_dir::RunDir;
@@ -86,6 +86,21 @@ impl RunOverrides {
         arguments.extend(lockstep.then(|| "--lockstep".into()));
         arguments.extend(with_replay.then(|| "--with-replay".into()));
         arguments
+    }
+
+    /// The overrides of arguments that [`arguments`](Self::arguments) has returned.
+    ///
+    /// # Errors
+    /// When they are no such arguments.
+    pub fn from_arguments(arguments: &[String]) -> anyhow::Result<Self> {
+        #[derive(Parser)]
+        struct Arguments {
+            #[command(flatten)]
+            overrides: RunOverrides,
+        }
+        let words = std::iter::once("train").chain(arguments.iter().map(String::as_str));
+        let parsed = Arguments::try_parse_from(words).context("the arguments of the suite are damaged")?;
+        Ok(parsed.overrides)
     }
 
     /// Directory and configuration of the run whose networks the new one begins with.

@@ -15,11 +15,7 @@ impl Supervisor {
     ///
     /// # Errors
     /// When services cannot be created, or the counter cannot be written.
-    pub(in crate::launcher) fn admit(
-        &mut self,
-        domain: &Domain,
-        request: HostRequest,
-    ) -> anyhow::Result<ControlResponse> {
+    pub(crate) fn admit(&mut self, domain: &Domain, request: HostRequest) -> anyhow::Result<ControlResponse> {
         let HostRequest {
             host,
             name,
@@ -81,7 +77,7 @@ impl Supervisor {
     }
 
     /// Updates the status of the other hosts. The answer tells which of them are admitted.
-    pub(in crate::launcher) fn update_hosts(&mut self, statuses: Vec<HostStatus>) -> ControlResponse {
+    pub(crate) fn update_hosts(&mut self, statuses: Vec<HostStatus>) -> ControlResponse {
         for message in self.hosts.update(statuses) {
             self.log.note("launcher", &message);
         }
@@ -100,7 +96,7 @@ impl Supervisor {
     }
 
     /// The status of the other hosts.
-    pub(in crate::launcher) fn hosts(&self) -> Vec<HostStatus> {
+    pub(crate) fn hosts(&self) -> Vec<HostStatus> {
         self.hosts.statuses()
     }
 }

@@ -43,7 +43,7 @@ impl Supervisor {
     ///
     /// # Errors
     /// When they have, with the last invalid answer.
-    pub(in crate::launcher) fn check_faults(&self) -> anyhow::Result<()> {
+    pub(crate) fn check_faults(&self) -> anyhow::Result<()> {
         let Faults { count, most, last } = &self.faults;
         if count < most {
             return Ok(());
