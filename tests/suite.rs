@@ -230,6 +230,9 @@ fn with_halving_bad_settings_are_ended_early_also_after_a_kill() {
         !std::fs::read_dir(&path).unwrap().flatten().any(is_running)
     });
 
+    // The length of the runs is that of the suite, not the preset's.
+    let message = error_line(&place.output(&["resume", "suite", "--set", "evaluation.every=3000"]));
+    assert!(message.contains("the first evaluation comes after 3000"), "{message}");
     let output = place.output(&["resume", "suite", "--json"]);
     let said = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "{said}");
