@@ -515,9 +515,9 @@ fn each<R: Report>(reports: &Reports<R>, mut handle: impl FnMut(R) -> anyhow::Re
     Ok(f64::from(count) / R::BUFFER as f64)
 }
 
-/// Writes the iceoryx2 configuration of the run twice. iceoryx2's own tools find the run's services with the first file if
-/// they are started in the run directory. The second is for external environment servers: iceoryx2 cannot read a file at
-/// every path that a run may have.
+/// Writes the iceoryx2 configuration of the run twice. iceoryx2's own tools find the run's services with the first file
+/// if they are started in the run directory. The second is for external environment servers: iceoryx2 cannot read a
+/// file at every path that a run may have.
 fn write_iox_config(domain: &Domain, run: &RunDir) -> anyhow::Result<()> {
     let text = domain.iox_config()?;
     for file in [run.iceoryx2_config(), server_iceoryx2_config(domain.run_id())?] {

@@ -1,4 +1,5 @@
-//! The configuration of a run changes when it is resumed: by `--set`, by a hand that edits `config.toml`, and by `scale`.
+//! The configuration of a run changes when it is resumed: by `--set`, by a hand that edits `config.toml`, and by
+//! `scale`.
 
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
 

@@ -103,8 +103,8 @@ struct Actor<'a> {
     n_step: NStep,
     /// The chunk that is being filled.
     chunk: Chunk,
-    /// Version of the policy with which the last row of `chunk` was collected. If `chunk` is empty, that of the last row
-    /// sent.
+    /// Version of the policy with which the last row of `chunk` was collected. If `chunk` is empty, that of the last
+    /// row sent.
     policy_version: u64,
     commits: CommitReader,
     heartbeat: HeartbeatSender,
@@ -210,8 +210,8 @@ impl<'a> Actor<'a> {
         }
     }
 
-    /// Drops the current episodes and begins new ones. In lockstep it continues the episodes of the last snapshot instead,
-    /// if there is one.
+    /// Drops the current episodes and begins new ones. In lockstep it continues the episodes of the last snapshot
+    /// instead, if there is one.
     fn begin(&mut self) -> Result<EnvironmentResponse, Exit<ActorError>> {
         self.n_step.clear();
         if self.settings.config.run.mode == Mode::Free {
@@ -302,7 +302,8 @@ impl<'a> Actor<'a> {
         self.chunk.is_full() || episode_is_over
     }
 
-    /// Waits for the policy to act with. In lockstep that is the one published after the last round, otherwise the newest.
+    /// Waits for the policy to act with. In lockstep that is the one published after the last round, otherwise the
+    /// newest.
     fn await_policy(&mut self) -> Result<Rc<PublishedPolicy>, Exit<ChannelError>> {
         let wanted = match self.settings.config.run.mode {
             Mode::Free => 0,
@@ -463,8 +464,8 @@ impl<'a> Actor<'a> {
     }
 
     /// Sends the rows collected so far and waits until they are committed. If only this actor ends, it waits as long as
-    /// needed; if the whole run ends, at most [`LAST_COMMIT_TIMEOUT`]. In lockstep incomplete chunks are dropped, because a round is complete or
-    /// does not count.
+    /// needed; if the whole run ends, at most [`LAST_COMMIT_TIMEOUT`]. In lockstep incomplete chunks are dropped,
+    /// because an incomplete round is collected again.
     fn hand_over(&mut self) -> Result<(), ActorError> {
         if self.settings.config.run.mode == Mode::Free {
             self.n_step.complete_all();

@@ -39,8 +39,8 @@ pub(crate) fn connect(
     Ok(client)
 }
 
-/// Logs an invalid answer of an environment server and pauses; the caller must then begin new episodes. Without the pause,
-/// an environment that always answers like this would fill the log before the launcher ends the run.
+/// Logs an invalid answer of an environment server and pauses; the caller must then begin new episodes. Without the
+/// pause, an environment that always answers like this would fill the log before the launcher ends the run.
 pub(crate) fn after_fault(
     error: &ChannelError,
     heartbeat: &mut HeartbeatSender,

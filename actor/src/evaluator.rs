@@ -52,9 +52,10 @@ impl EvaluatorSettings {
     }
 }
 
-/// The policy to keep, the best one or a candidate, and whether it is the candidate. Among many policies, some do well on a
-/// few episodes by chance. A candidate that seems better than the best must therefore be better on other episodes too.
-/// `confirm` returns the mean return on those, or `None` if nothing is to be confirmed.
+/// Decides whether a candidate replaces the best policy. Returns the one to keep, and whether it is the candidate.
+/// Among many policies, some do well on a few episodes by chance. A candidate that seems better than the best must
+/// therefore be better on other episodes too. `confirm` returns the mean return on those, or `None` if nothing is to be
+/// confirmed.
 fn challenge<E>(
     best: Option<Best>,
     mut candidate: Best,

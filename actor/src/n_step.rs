@@ -1,5 +1,5 @@
-//! Transitions of n steps (Sutton and Barto 2018, chapter 7): from s and a, the discounted sum of the next n rewards, and
-//! the observation after them. At the end of an episode they have fewer steps.
+//! Transitions of n steps (Sutton and Barto 2018, chapter 7): from s and a, the discounted sum of the next n rewards,
+//! and the observation after them. At the end of an episode they have fewer steps.
 
 use std::collections::VecDeque;
 

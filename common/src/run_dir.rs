@@ -211,8 +211,8 @@ impl RunDir {
         })
     }
 
-    /// The resolved configuration that the run was last used with, which its files belong to. `config.toml` may have been
-    /// edited since; such an edit takes effect when the run is resumed.
+    /// The resolved configuration that the run was last used with, which its files belong to. `config.toml` may have
+    /// been edited since; such an edit takes effect when the run is resumed.
     ///
     /// # Errors
     /// When it is missing or invalid.

@@ -60,8 +60,8 @@ impl Endpoint {
         })
     }
 
-    /// The endpoint that other hosts connect to, if this one is listened at: all addresses of a machine are reached by its
-    /// name.
+    /// The endpoint that other hosts connect to, if this one is listened at: all addresses of a machine are reached by
+    /// its name.
     pub fn seen_from_elsewhere(&self, machine: &str) -> Self {
         let all = self.address().is_some_and(|address| address.is_unspecified());
         Self {

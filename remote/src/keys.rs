@@ -1,5 +1,6 @@
-//! The keys of a run: a certificate for its gate and one for all hosts that join, both signed by an authority that exists
-//! only while they are made. A host trusts nobody but the gate, and the gate nobody but hosts with the run's key.
+//! The keys of a run: a certificate for its gate and one for all hosts that join, both signed by an authority that
+//! exists only while they are made. A host trusts nobody but the gate, and the gate nobody but hosts with the run's
+//! key.
 
 use std::time::{Duration, SystemTime};
 

@@ -1,6 +1,6 @@
-//! Remote actors. Each other host has a *relay*, which stands in for the learner: its actors send their chunks to it, and
-//! read policy and commit record from it. The learner's host has a *gate*, which stands in for the remote actors. The two
-//! speak over a network; no other role knows of it.
+//! Remote actors. Each other host has a *relay*, which stands in for the learner: its actors send their chunks to it,
+//! and read policy and commit record from it. The learner's host has a *gate*, which stands in for the remote actors.
+//! The two speak over a network; no other role knows of it.
 //!
 //! A chunk is committed exactly once, whatever the network loses, repeats or reorders, and whichever process dies:
 //! [`uncommitted`] is the sending half of the protocol, [`forwarding`] the receiving half, and [`wire`] the bytes

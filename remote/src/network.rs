@@ -1,8 +1,8 @@
 //! Zenoh sessions of gate and relay, and the names of what they exchange.
 //!
-//! Zenoh carries bytes: it finds a way, connects again, encrypts, and separates messages. It may lose, repeat or reorder
-//! whole messages when a connection breaks, and a `put` succeeds while nobody is connected. What makes chunks arrive
-//! exactly once is in [`crate::uncommitted`] and [`crate::forwarding`].
+//! Zenoh carries bytes: it finds a way, connects again, encrypts, and separates messages. It may lose, repeat or
+//! reorder whole messages when a connection breaks, and a `put` succeeds while nobody is connected. What makes chunks
+//! arrive exactly once is in [`crate::uncommitted`] and [`crate::forwarding`].
 
 use std::os::unix::process::CommandExt;
 use std::process::Command;
@@ -19,8 +19,9 @@ use crate::keys::HOST;
 
 /// The environment variable with which Zenoh starts its threads, and the value for a single thread.
 ///
-/// By default, Zenoh 1.10 reads a TLS connection in one thread and writes to it in another. rustls does not allow that, and
-/// memory is corrupted (<https://github.com/eclipse-zenoh/zenoh/issues/2557>). In one thread the two cannot coincide.
+/// By default, Zenoh 1.10 reads a TLS connection in one thread and writes to it in another. rustls does not allow that,
+/// and memory is corrupted (<https://github.com/eclipse-zenoh/zenoh/issues/2557>). In one thread the two cannot
+/// coincide.
 const THREADS: (&str, &str) = (
     "ZENOH_RUNTIME",
     "(app: (worker_threads: 1), acc: (handover: app), tx: (handover: app), rx: (handover: app), net: (handover: app))",
@@ -40,8 +41,8 @@ fn has_one_thread() -> bool {
 }
 
 /// Executes this program again, with the same arguments and in the same process, if Zenoh would otherwise use several
-/// threads: only an environment variable decides that. A session can be opened afterwards. Call this before anything else,
-/// because everything that the process has done is lost.
+/// threads: only an environment variable decides that. A session can be opened afterwards. Call this before anything
+/// else, because everything that the process has done is lost.
 ///
 /// # Errors
 /// When the program cannot be executed.
@@ -102,8 +103,8 @@ pub(crate) fn acknowledgements(run_id: &str, host: u64) -> String {
     format!("shoal/{run_id}/down/{host}/marks")
 }
 
-/// A session that waits for others at this endpoint. With a key, only hosts with the run's key are let in, and they may do
-/// nothing but join, send chunks and reports, and receive acknowledgements and policies.
+/// A session that waits for others at this endpoint. With a key, only hosts with the run's key are let in, and they may
+/// do nothing but join, send chunks and reports, and receive acknowledgements and policies.
 ///
 /// # Errors
 /// When the endpoint is taken, or the key cannot be used.
@@ -158,7 +159,8 @@ fn access(run_id: &str) -> serde_json::Value {
     })
 }
 
-/// A session with the gate at this endpoint. It connects as soon as the gate is there, now and after every interruption.
+/// A session with the gate at this endpoint. It connects as soon as the gate is there, now and after every
+/// interruption.
 ///
 /// # Errors
 /// When the key cannot be used.

@@ -387,7 +387,8 @@ impl<'a> Relay<'a> {
         Ok(())
     }
 
-    /// Asks whether this host is still admitted: the launcher of the run is another process, or has given its actors away.
+    /// Asks whether this host is still admitted: the launcher of the run is another process, or has given its actors
+    /// away.
     fn ask_to_rejoin(&mut self) {
         let waits = self
             .rejoin_request

@@ -54,7 +54,8 @@ pub enum MessageKind {
     PolicyRequest = 7,
 }
 
-/// The first word of a message has these letters in its upper half and the kind in its lower; the second is the version.
+/// The first word of a message has these letters in its upper half and the kind in its lower; the second is the
+/// version.
 const LETTERS: u32 = (b's' as u32) << 16 | (b'h' as u32) << 24;
 
 /// Bytes of the first two words.

@@ -1,6 +1,7 @@
-//! One actor's chunks over a network that loses, repeats and reorders, while every process of both hosts is restarted at
-//! any moment, and the learner's host loses power. Whatever happens, the learner never sees a gap, and commits each chunk
-//! at most once and in order; once the network is good, all chunks are committed that no killed actor took with it.
+//! One actor's chunks over a network that loses, repeats and reorders, while every process of both hosts is restarted
+//! at any moment, and the learner's host loses power. Whatever happens, the learner never sees a gap, and commits each
+//! chunk at most once and in order; once the network is good, all chunks are committed that no killed actor took with
+//! it.
 
 #![allow(clippy::expect_used, reason = "a test that panics has failed")]
 

@@ -80,8 +80,8 @@ fn rankings(comparisons: &[Comparison], runs: &[Run]) -> Vec<Ranking> {
     comparisons.iter().filter_map(of).collect()
 }
 
-/// What the runs' repetitions say about their settings: a line for each, the best first, and how certain that is. Nothing if
-/// nothing was repeated.
+/// What the runs' repetitions say about their settings: a line for each, the best first, and how certain that is.
+/// Nothing if nothing was repeated.
 ///
 /// # Errors
 /// When a run cannot be read.

@@ -10,12 +10,13 @@ use crate::external_environment::ExternalEnvironment;
 use crate::external_environment::server_location::{ServerLocation, ServerSurroundings};
 use crate::signals::Interrupt;
 
-/// Makes the directory at `path` from the run's configuration. The run's processes on this host find each other under a name
-/// of their own, so a host may join a run of the same machine. `first_incarnation` is the first that they may have.
+/// Makes the directory at `path` from the run's configuration. The run's processes on this host find each other under a
+/// name of their own, so a host may join a run of the same machine. `first_incarnation` is the first that they may
+/// have.
 ///
 /// # Errors
-/// When the directory exists, the configuration cannot be used here, or an environment that another program serves has other
-/// spaces here.
+/// When the directory exists, the configuration cannot be used here, or an environment that another program serves has
+/// other spaces here.
 pub fn make_host_directory(
     path: &Path,
     configuration: &str,

@@ -39,8 +39,8 @@ fn count(change: impl FnOnce(usize) -> usize) {
     NOBODY.store(*receivers == 0, Ordering::Relaxed);
 }
 
-/// Receives SIGINT, SIGTERM and SIGHUP. Once all `Signals` are dropped, these signals end the process again. A signal that
-/// was ignored when this process started stays ignored, such as SIGHUP under `nohup`.
+/// Receives SIGINT, SIGTERM and SIGHUP. Once all `Signals` are dropped, these signals end the process again. A signal
+/// that was ignored when this process started stays ignored, such as SIGHUP under `nohup`.
 #[derive(Debug)]
 pub struct Signals {
     last: Arc<AtomicUsize>,

@@ -37,9 +37,9 @@ pub struct Suite {
     pub halving: Option<Halving>,
 }
 
-/// Successive halving (Jamieson and Talwalkar 2016): after each round the worse half of the settings is ended, so that the
-/// last one or two are trained to the end. The first of `n` rounds ends when a run has done 1/2ⁿ of its steps; each further
-/// one is twice as long.
+/// Successive halving (Jamieson and Talwalkar 2016): after each round the worse half of the settings is ended, so that
+/// the last one or two are trained to the end. The first of `n` rounds ends when a run has done 1/2ⁿ of its steps; each
+/// further one is twice as long.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Halving {
     /// The names of the runs that each completed round has ended.
@@ -155,8 +155,8 @@ impl VersionedFile for Suite {
 }
 
 impl Suite {
-    /// The suite of all combinations of these values, each with every seed. Without seeds, each has that of the preset or
-    /// file.
+    /// The suite of all combinations of these values, each with every seed. Without seeds, each has that of the preset
+    /// or file.
     ///
     /// # Errors
     /// When a key is swept twice, or there are too many runs.
@@ -295,8 +295,8 @@ impl Suite {
         })
     }
 
-    /// Ends the worse half of the settings that are left: those with the lower mean of `result` over their runs. Returns
-    /// the names of the ended runs.
+    /// Ends the worse half of the settings that are left: those with the lower mean of `result` over their runs.
+    /// Returns the names of the ended runs.
     pub fn end_worse_half(&mut self, result: impl Fn(&Trial) -> f64) -> Vec<String> {
         let mut left = self.settings();
         left.retain(|setting| !self.has_ended(&self.trials[setting[0]]));
@@ -359,8 +359,8 @@ pub fn lock(directory: &Path) -> anyhow::Result<File> {
     Ok(file)
 }
 
-/// Removes what is left of a suite whose runs have been removed: its files and its report, and the directory if that is all
-/// that it has.
+/// Removes what is left of a suite whose runs have been removed: its files and its report, and the directory if that is
+/// all that it has.
 ///
 /// # Errors
 /// When a file cannot be removed.

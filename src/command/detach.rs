@@ -17,7 +17,8 @@ use shoal_run::suite;
 
 use super::training::OutputMode;
 
-/// The hidden command that begins a session without a terminal, and then executes this program with the given arguments.
+/// The hidden command that begins a session without a terminal, and then executes this program with the given
+/// arguments.
 pub(crate) const COMMAND: &str = "in-new-session";
 
 /// How long the start may take, beside what the environment is allowed (`environment.start_seconds`).

@@ -17,7 +17,8 @@ pub(crate) struct JoinArgs {
     /// Where the run listens, as `train --listen` prints it (tls/learner-7:7447); or the run's directory.
     #[arg(value_name = "ENDPOINT|RUN_DIR", required_unless_present = "template")]
     pub(crate) run: Option<String>,
-    /// The run's key, the file join.key in its directory; - reads it from standard input [default: that of the directory].
+    /// The run's key, the file join.key in its directory; - reads it from standard input [default: that of the
+    /// directory].
     #[arg(long, value_name = "FILE")]
     pub(crate) key: Option<PathBuf>,
     /// Actor processes on this host, each with its environment server.

@@ -122,8 +122,8 @@ fn begin(directory: &Path, options: SuiteOptions<'_>) -> anyhow::Result<ExitCode
     resume(directory, options)
 }
 
-/// Changes all runs of the suite in this directory, each change as `SECTION.KEY=VALUE`. They are checked for each run and
-/// stored, so that the suite can be interrupted.
+/// Changes all runs of the suite in this directory, each change as `SECTION.KEY=VALUE`. They are checked for each run
+/// and stored, so that the suite can be interrupted.
 pub(crate) fn change(directory: &Path, changes: &[String]) -> anyhow::Result<()> {
     if changes.is_empty() {
         return Ok(());
@@ -591,8 +591,8 @@ impl<'a> SuiteProgressDisplay<'a> {
         format!("{} of {all} runs", all - self.due.len() + self.done.len() - self.failed)
     }
 
-    /// The estimated remaining time, at the rate of this suite so far. A run that has not begun is as long as the others are on
-    /// average.
+    /// The estimated remaining time, at the rate of this suite so far. A run that has not begun is as long as the
+    /// others are on average.
     fn time_left(&self) -> Option<String> {
         let (mut made, mut known, mut total) = (0, 0, 0);
         let mut waiting = 0;

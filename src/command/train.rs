@@ -30,7 +30,8 @@ pub(crate) struct TrainArgs {
     /// Train a suite: a run for each of these seeds, as in 1..5 (five seeds) or 1,4,7.
     #[arg(long, value_name = "A..B", value_parser = seeds, conflicts_with = "seed")]
     pub(crate) seeds: Option<Seeds>,
-    /// Train a suite: a run for each of these values, as in --sweep ddpg.tau=0.001,0.005. Repeated: for each combination.
+    /// Train a suite: a run for each of these values, as in --sweep ddpg.tau=0.001,0.005. Repeated: for each
+    /// combination.
     #[arg(long, value_name = "SECTION.KEY=A,B,C", add = ArgValueCompleter::new(completion::settings))]
     pub(crate) sweep: Vec<String>,
     /// End bad settings of a suite early: the worse half at 1/4 of the steps, for example, and again at 1/2.
@@ -111,8 +112,8 @@ pub(crate) fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
         return begun;
     }
     run_training(config, &run, &lock, &args.output, &args.listen).inspect_err(|_| {
-        // Where no process was started there is nothing to resume or to read, and it would be in the way of the next try.
-        // What is at this path by now may be somebody else's.
+        // Where no process was started there is nothing to resume or to read, and it would be in the way of the next
+        // try. What is at this path by now may be somebody else's.
         if lock.check(&run).is_ok() && !run.incarnations().exists() {
             let _ = std::fs::remove_dir_all(run.path());
         }

@@ -50,9 +50,9 @@ pub(super) struct Child {
     /// Failed starts since the last process that was able to work, and the time of the first of them.
     failures: u32,
     failing_since: Option<Instant>,
-    /// The longest time from a start until the process was ready.
+    /// The longest successful start: from the start until the process was ready.
     usual_start: Option<Duration>,
-    /// The longest life of a process that ended before it was ready.
+    /// The longest failed start: the life of a process that ended before it was ready.
     longest_start: Duration,
     /// The last heartbeat of the current process, with its time of arrival.
     last_heartbeat: Option<(Instant, Heartbeat)>,

@@ -16,8 +16,8 @@ use tracing_subscriber::fmt::time::{FormatTime, SystemTime};
 /// Last lines kept of each process: they are logged when it ends, and the last one is shown when it is given up.
 const KEPT: usize = 5;
 
-/// Size of the log, in bytes, above which lines of other programs are left out. Each launcher accepts at least the second
-/// number of bytes from them. Shoal's own lines have no limit.
+/// Size of the log, in bytes, above which lines of other programs are left out. Each launcher accepts at least the
+/// second number of bytes from them. Shoal's own lines have no limit.
 const FOR_PROGRAMS: u64 = 16 * 1024 * 1024;
 const LEAST_FOR_PROGRAMS: u64 = 1024 * 1024;
 

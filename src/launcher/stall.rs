@@ -55,8 +55,8 @@ impl StallDetector {
         found
     }
 
-    /// Environment servers that have spent more than the patience on one step or reset while their clients wait, and for how
-    /// long. They are left alone.
+    /// Environment servers that have spent more than the patience on one step or reset while their clients wait, and
+    /// for how long. They are left alone.
     pub(super) fn slow_servers(&self, children: &[Child]) -> Vec<(usize, Duration)> {
         let is_waited_for = |index| {
             let mut clients = children.iter().filter(|client| client.server() == Some(index));

@@ -42,7 +42,8 @@ const CLEANING_AGAIN: Duration = Duration::from_millis(200);
 /// A start that takes longer is reported to the user.
 const SLOW_START: Duration = Duration::from_secs(10);
 
-/// More starts, leases of hosts among them, than there are between two committed chunks. A lost counter skips this many.
+/// More starts, leases of hosts among them, than there are between two committed chunks. A lost counter skips this
+/// many.
 const STARTS_WITHOUT_CHUNK: u64 = 64 * INCARNATIONS;
 
 /// The situation of the run's processes.
@@ -93,7 +94,8 @@ pub(super) struct Supervisor {
     /// Incidents since the last [`Supervisor::take_incidents`].
     incidents: Vec<Incident>,
     run: PathBuf,
-    /// Who writes what the environment servers write. With `SHOAL_LOG=debug` all of it is logged.
+    /// Whether the output of environment servers is Shoal's own or another program's. With `SHOAL_LOG=debug` all of it
+    /// is logged.
     server_output: Writer,
     /// The file with the number of processes ever started. It lasts over resumes: incarnations are never used twice.
     counter: PathBuf,
@@ -479,8 +481,8 @@ impl Supervisor {
         messages
     }
 
-    /// Messages about slow processes, one for each: environment servers in one step or reset, and roles that are starting.
-    /// An environment's program that is not ready within `start_limit` is ended, which counts as a failure.
+    /// Messages about slow processes, one for each: environment servers in one step or reset, and roles that are
+    /// starting. An environment's program that is not ready within `start_limit` is ended, which counts as a failure.
     pub(super) fn report_slow(&mut self, stalls: &StallDetector, start_limit: Option<Duration>) -> Vec<String> {
         let mut said = Vec::new();
         for (i, silent) in stalls.slow_servers(&self.children) {

@@ -434,7 +434,8 @@ fn a_stuck_server_ends_with_its_launcher() {
     });
 }
 
-/// The next launcher waits for the processes of the one before it, here for a stuck server, and answers no questions yet.
+/// The next launcher waits for the processes of the one before it, here for a stuck server, and answers no questions
+/// yet.
 fn the_status_of_a_run_that_starts_says_so() {
     let place = place();
     let arguments = [&SHORT[..], &["--steps", "100000000"]].concat();

@@ -1,6 +1,6 @@
-//! Hosts as far apart as one machine allows: each has a network, a `/dev/shm` and a root directory of its own, and a virtual
-//! cable connects them. The cable is unplugged and made silent, and processes are killed meanwhile. All traffic stays between
-//! the two.
+//! Hosts as far apart as one machine allows: each has a network, a `/dev/shm` and a root directory of its own, and a
+//! virtual cable connects them. The cable is unplugged and made silent, and processes are killed meanwhile. All traffic
+//! stays between the two.
 
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
 

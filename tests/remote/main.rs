@@ -1,5 +1,5 @@
-//! Two hosts on one machine: a run that others may join, and hosts that join it. Processes of both are killed and stopped at
-//! any moment. Everything that the actors of a living host have sent is in the replay, once.
+//! Two hosts on one machine: a run that others may join, and hosts that join it. Processes of both are killed and
+//! stopped at any moment. Everything that the actors of a living host have sent is in the replay, once.
 
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
 

@@ -390,8 +390,8 @@ pub(crate) fn committed(run: &Path, actor: usize) -> u64 {
     commits.actor(actor).rows
 }
 
-/// Checks that every row in a pendulum run's replay is whole and unique, and returns how many were ever committed. None may
-/// be terminal: the pendulum never terminates.
+/// Checks that every row in a pendulum run's replay is whole and unique, and returns how many were ever committed. None
+/// may be terminal: the pendulum never terminates.
 pub(crate) fn check_stored_rows(run: &Path, config: &Config) -> u64 {
     let replay = Replay::open(&run.join("replay.bin"), &replay_layout(config)).unwrap();
     assert_eq!(replay.warnings(), [] as [String; 0]);

@@ -45,8 +45,8 @@ impl Space {
         }
     }
 
-    /// Whether this space matches the `configured` one. Configurations of earlier versions have no `start`, so 0 matches
-    /// any.
+    /// Whether this space matches the `configured` one. Configurations of earlier versions have no `start`, so 0
+    /// matches any.
     fn matches(&self, configured: &Self) -> bool {
         match (self, configured) {
             (Self::Discrete { n, .. }, Self::Discrete { n: expected, start: 0 }) => n == expected,

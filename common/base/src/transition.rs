@@ -29,8 +29,8 @@ pub struct Transition<'a> {
     pub a: &'a [f32],
     /// Reward `r`.
     pub r: f32,
-    /// Discount of the value of `s'`: γ, or γᵏ if the row has k steps, or 0 if the environment terminated. Truncation does
-    /// not change it.
+    /// Discount of the value of `s'`: γ, or γᵏ if the row has k steps, or 0 if the environment terminated. Truncation
+    /// does not change it.
     pub discount: f32,
     /// Observation `s'` after the step.
     pub s_next: &'a [f32],

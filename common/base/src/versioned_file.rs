@@ -1,5 +1,5 @@
-//! Small text files that begin with the number of their format. They are written atomically, and a file that is damaged or
-//! has another format is refused.
+//! Small text files that begin with the number of their format. They are written atomically, and a file that is damaged
+//! or has another format is refused.
 
 use std::io::{self, ErrorKind, Write};
 use std::path::Path;

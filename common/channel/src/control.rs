@@ -285,7 +285,8 @@ pub fn reserved(max_actors: usize) -> u64 {
         + CLIENTS as u64 * memory::connection(2 * ACTIVE_REQUESTS, 1, 1, CLIENTS * answers)
 }
 
-/// Most bytes of an answer. Its roles are the learner, the evaluator with its server, the gate, and each actor with its server.
+/// Most bytes of an answer. Its roles are the learner, the evaluator with its server, the gate, and each actor with its
+/// server.
 fn response_length(max_actors: usize) -> usize {
     // Each actor has a server, and may be the only one of its host.
     RESPONSE_BYTES + RESPONSE_BYTES_PER_ROLE * (2 * max_actors + 4) + RESPONSE_BYTES_PER_HOST * max_actors

@@ -149,8 +149,8 @@ impl Domain {
     }
 
     /// The same for the run `run_id`, for a process that has not joined it. Its path is short and has only plain
-    /// characters, wherever the run's own directory is: iceoryx2 refuses to read other paths, and those of more than 255
-    /// bytes.
+    /// characters, wherever the run's own directory is: iceoryx2 refuses to read other paths, and those of more than
+    /// 255 bytes.
     ///
     /// # Errors
     /// When the user's directory cannot be used.

@@ -235,8 +235,8 @@ impl ChunkSender {
 }
 
 impl ChunkForwarder {
-    /// Opens the sending end of `actor`, whose chunks have this layout. At most `window` of them may be uncommitted. `None`
-    /// if another process sends for this actor at the moment: try again later.
+    /// Opens the sending end of `actor`, whose chunks have this layout. At most `window` of them may be uncommitted.
+    /// `None` if another process sends for this actor at the moment: try again later.
     ///
     /// # Errors
     /// When shared memory is unavailable.
@@ -259,8 +259,8 @@ impl ChunkForwarder {
         }
     }
 
-    /// The rows of a chunk with this header, and after them the numbers of the actor's snapshot. `None` if `numbers` are
-    /// not those of such a chunk: a handshake has neither rows nor a snapshot.
+    /// The rows of a chunk with this header, and after them the numbers of the actor's snapshot. `None` if `numbers`
+    /// are not those of such a chunk: a handshake has neither rows nor a snapshot.
     pub fn parts<'a>(&self, header: &ChunkHeader, numbers: &'a [f32]) -> Option<(&'a [f32], &'a [f32])> {
         let rows = header.rows as usize;
         let snapshot = self.layout.len() - self.layout.numbers_of_rows();
@@ -422,8 +422,8 @@ impl ReceivedChunk {
         &self.sample.payload()[..self.header().rows as usize * self.layout.row.width()]
     }
 
-    /// Its rows, and the numbers of the actor's snapshot after them; no numbers for a handshake, and if the layout has no
-    /// snapshots.
+    /// Its rows, and the numbers of the actor's snapshot after them; no numbers for a handshake, and if the layout has
+    /// no snapshots.
     pub fn parts(&self) -> (&[f32], &[f32]) {
         let snapshot = &self.sample.payload()[self.layout.numbers_of_rows()..];
         (self.rows(), if self.is_handshake() { &[] } else { snapshot })

@@ -1,5 +1,5 @@
-//! Faults of iceoryx2 0.10 that `cleanup.rs` works around, shown with iceoryx2 alone. If a test fails after an update, the
-//! fault is mended and its workaround may go.
+//! Faults of iceoryx2 0.10 that `cleanup.rs` works around, shown with iceoryx2 alone. If a test fails after an update,
+//! the fault is mended and its workaround may go.
 
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
 
@@ -18,7 +18,8 @@ const DIRECTORY: &str = "ICEORYX2_TEST_DIRECTORY";
 /// How long an operation may take that is over in microseconds unless it never ends.
 const PATIENCE: Duration = Duration::from_secs(3);
 
-/// The files of a test: a root directory, and names in shared memory with a prefix of its own. They are removed on drop.
+/// The files of a test: a root directory, and names in shared memory with a prefix of its own. They are removed on
+/// drop.
 struct Place {
     directory: tempfile::TempDir,
 }
@@ -122,8 +123,9 @@ fn kill_with_port(mut child: Child) {
     child.wait().unwrap();
 }
 
-/// A process that cleans up after a dead one removes the tag of each of its ports before the port itself. If it is killed
-/// in between, iceoryx2 passes over the port in all later clean-ups, and removes the dead process's node all the same.
+/// A process that cleans up after a dead one removes the tag of each of its ports before the port itself. If it is
+/// killed in between, iceoryx2 passes over the port in all later clean-ups, and removes the dead process's node all the
+/// same.
 #[test]
 fn a_port_without_its_tag_is_never_freed() {
     if let Some(directory) = directory_of_parent() {
@@ -149,8 +151,8 @@ fn a_port_without_its_tag_is_never_freed() {
     }
 }
 
-/// A process killed between `shm_open` and `ftruncate` leaves a segment without a size. Root can open it, and then maps it
-/// again and again. Other users are refused, because the segment is not readable yet.
+/// A process killed between `shm_open` and `ftruncate` leaves a segment without a size. Root can open it, and then maps
+/// it again and again. Other users are refused, because the segment is not readable yet.
 #[test]
 fn a_segment_without_a_size_is_opened_forever_by_root() {
     if let Some(directory) = directory_of_parent() {

@@ -57,8 +57,8 @@ section! {
 }
 
 impl DqnConfig {
-    /// Its network in an environment like `spec`: an output for each action, after one for the value of the state if the
-    /// heads are dueling.
+    /// Its network in an environment like `spec`: an output for each action, after one for the value of the state if
+    /// the heads are dueling.
     pub fn network(&self, spec: &EnvironmentSpec) -> NetworkLayout {
         let outputs = spec.action.size() + usize::from(self.dueling);
         let hidden = Hidden::new(self.hidden, self.activation);

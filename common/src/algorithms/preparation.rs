@@ -1,4 +1,5 @@
-//! `[observation]` and `[reward]`: how numbers of the environment are prepared for networks that learn from minibatches.
+//! `[observation]` and `[reward]`: how numbers of the environment are prepared for networks that learn from
+//! minibatches.
 
 use shoal_base::section;
 use shoal_base::section::{Change, above, never};

@@ -52,8 +52,8 @@ section! {
 }
 
 impl SacConfig {
-    /// Its networks in an environment like `spec`. Both critics have the same layout. The actor has two outputs for each
-    /// element of the action: all means, then all log standard deviations.
+    /// Its networks in an environment like `spec`. Both critics have the same layout. The actor has two outputs for
+    /// each element of the action: all means, then all log standard deviations.
     pub fn networks(&self, spec: &EnvironmentSpec) -> ActorCritic {
         let (observation, action) = (spec.observation.width(), spec.action.width());
         let hidden = Hidden::new(self.hidden, self.activation);

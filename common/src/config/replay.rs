@@ -36,7 +36,7 @@ section! {
         #[serde(skip_serializing_if = "is_zero")]
         ratio_since: u64 = 0, bounds: from(0, MAX_COUNT), unit: "environment steps", source: "ours",
             change: Change::ByProgram;
-        /// Updates that were agreed until then.
+        /// Updates that were allowed before `ratio_since`.
         #[serde(skip_serializing_if = "is_zero")]
         updates_before: u64 = 0, bounds: from(0, MAX_COUNT), unit: "updates", source: "ours", change: Change::ByProgram;
     }
@@ -47,9 +47,9 @@ fn is_zero(number: &u64) -> bool {
     *number == 0
 }
 
-/// The ratio of updates to environment steps: the formulas that learner, launcher and records share. Neither the learner
-/// nor the actors may get ahead of the ratio. An update is a gradient step or, for algorithms that use each row once, a
-/// row.
+/// The ratio of updates to environment steps: the formulas that learner, launcher and records share. Neither the
+/// learner nor the actors may get ahead of the ratio. An update is a gradient step or, for algorithms that use each row
+/// once, a row.
 impl ReplayConfig {
     /// The environment step after which the ratio counts.
     pub fn ratio_start(&self) -> u64 {

@@ -1,5 +1,5 @@
-//! Deep Q-network: Mnih et al. 2015, with the double estimate of van Hasselt et al. 2016 and, as a setting, dueling heads
-//! after Wang et al. 2016, but on hidden layers that they share.
+//! Deep Q-network: Mnih et al. 2015, with the double estimate of van Hasselt et al. 2016 and, as a setting, dueling
+//! heads after Wang et al. 2016, but on hidden layers that they share.
 //!
 //! Symbols as there: action-values Q with parameters θ, target network Q' with θ⁻, target y.
 

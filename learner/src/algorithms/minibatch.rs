@@ -39,8 +39,8 @@ impl Minibatch {
         self.r.len()
     }
 
-    /// Copies the rows with these numbers into the columns, from the first on. A row with a number that is not finite is
-    /// replaced by the next good one of `range`. Panics if the replay does not hold one of the rows, or if there are
+    /// Copies the rows with these numbers into the columns, from the first on. A row with a number that is not finite
+    /// is replaced by the next good one of `range`. Panics if the replay does not hold one of the rows, or if there are
     /// more rows than columns.
     pub fn gather(&mut self, replay: &Replay, indices: &[u64], range: &Range<u64>) {
         // Random rows are cache misses. Both ends of all rows are read before any is copied, so that the misses

@@ -1,9 +1,9 @@
 //! Soft actor-critic with a learned temperature: Haarnoja et al. 2018b, algorithm 1. As in widespread programs, ln α is
 //! learned instead of α, and its step comes first; the losses have α from before it.
 //!
-//! Symbols as there: policy π with parameters φ, critics Q₁ and Q₂ and their targets with a prime, temperature α, target
-//! entropy H̄. An action is a = tanh u, u = μ + σ ε, with ε standard normal. Actions within an update are scaled to
-//! [−1, 1], as is the density π(a|s).
+//! Symbols as there: policy π with parameters φ, critics Q₁ and Q₂ and their targets with a prime, temperature α,
+//! target entropy H̄. An action is a = tanh u, u = μ + σ ε, with ε standard normal. Actions within an update are scaled
+//! to [−1, 1], as is the density π(a|s).
 
 use std::f32::consts::{LN_2, PI};
 
@@ -117,8 +117,8 @@ impl MinibatchPart<'_> {
         }
     }
 
-    /// Computes ∂L/∂(μ, ln σ) of the draw from both critics' ∂L/∂a and from `share`, the weight of each sample's ln π in
-    /// L. With ε fixed, ∂ ln π/∂u = 2 tanh u, ∂u/∂μ = 1 and ∂u/∂ln σ = σ ε.
+    /// Computes ∂L/∂(μ, ln σ) of the draw from both critics' ∂L/∂a and from `share`, the weight of each sample's ln π
+    /// in L. With ε fixed, ∂ ln π/∂u = 2 tanh u, ∂u/∂μ = 1 and ∂u/∂ln σ = σ ε.
     fn backward(&self, share: f32, d_a: [&[f32]; 2], d_pi: &mut [f32]) {
         let width = self.width;
         let of_sample = self

@@ -1,5 +1,5 @@
-//! Two critics with their targets, as TD3 and SAC have them: Q₁ and Q₂ over (s, a), with a scaled to [−1, 1]. The smaller
-//! of their values is believed (clipped double Q-learning, Fujimoto et al. 2018, section 4.2).
+//! Two critics with their targets, as TD3 and SAC have them: Q₁ and Q₂ over (s, a), with a scaled to [−1, 1]. The
+//! smaller of their values is believed (clipped double Q-learning, Fujimoto et al. 2018, section 4.2).
 
 use nalgebra::{DMatrix, DVector};
 use shoal_common::network::{ActionRange, NetworkLayout};

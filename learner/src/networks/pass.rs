@@ -260,8 +260,8 @@ impl<'a> Samples<'a> {
         }
     }
 
-    /// Writes ∂L/∂action into `to`, given `d` = ∂L/∂output. It does not go below the layer where the action inputs enter,
-    /// and does nothing if there are none.
+    /// Writes ∂L/∂action into `to`, given `d` = ∂L/∂output. It does not go below the layer where the action inputs
+    /// enter, and does nothing if there are none.
     pub fn backward_to_actions(&mut self, parameters: &[f32], d: &[f32], to: &mut [f32]) {
         let layout = self.layout;
         let Some(layer) = layout.action_layer() else {

@@ -33,7 +33,8 @@ pub struct Replay {
     warned: AtomicBool,
 }
 
-/// Whether all these numbers are finite. It does not stop at the first that is not, so that it can use vector instructions.
+/// Whether all these numbers are finite. It does not stop at the first that is not, so that it can use vector
+/// instructions.
 pub fn are_finite(numbers: &[f32]) -> bool {
     numbers.iter().fold(true, |all, number| all & number.is_finite())
 }
@@ -139,9 +140,9 @@ impl Replay {
         self.ring.row(index)
     }
 
-    /// Row `index` if its numbers are all finite. Otherwise the next such row of `within`, where the first follows the last,
-    /// or row `index` if there is none. Only rows of earlier versions can have other numbers: learners now check chunks
-    /// before they commit them.
+    /// Row `index` if its numbers are all finite. Otherwise the next such row of `within`, where the first follows the
+    /// last, or row `index` if there is none. Only rows of earlier versions can have other numbers: learners now check
+    /// chunks before they commit them.
     ///
     /// # Panics
     /// As [`row`](Self::row).

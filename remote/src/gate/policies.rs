@@ -90,8 +90,8 @@ fn id_of(policy: &PublishedPolicy) -> PolicyId {
     Some((policy.header().incarnation, policy.header().version))
 }
 
-/// Sends a policy from a thread of its own: a host with a slow connection must not delay the others. A host has one query
-/// at a time, so there is at most one thread for each.
+/// Sends a policy from a thread of its own: a host with a slow connection must not delay the others. A host has one
+/// query at a time, so there is at most one thread for each.
 fn answer(query: Query, bytes: Arc<Vec<u8>>) -> Result<(), GateError> {
     let send = move || {
         let key = query.key_expr().clone();

@@ -7,8 +7,8 @@ use super::{ExportedNetwork, PolicyFunction, PortablePolicy};
 
 /// The bytes of the file. A network has `layers.<i>.weight` (outputs × inputs, row-major) and `layers.<i>.bias` for
 /// each layer i from 0, the output layer last. If observations are normalised, `observation.mean` and
-/// `observation.factor` say how: x ← (x − mean) · factor, clipped to ±`observation_clip` of the metadata. A table has `action_values` (states × actions). The metadata describes
-/// the rest.
+/// `observation.factor` say how: x ← (x − mean) · factor, clipped to ±`observation_clip` of the metadata. A table has
+/// `action_values` (states × actions). The metadata describes the rest.
 pub(super) fn file(policy: &PortablePolicy) -> anyhow::Result<Vec<u8>> {
     let tensors = match &policy.body {
         PolicyFunction::Actions { network, .. }

@@ -13,7 +13,8 @@ const SIZE: (u32, u32) = (860, 470);
 /// Most characters of a run's name in the title.
 const NAME: usize = 48;
 
-/// Draws the evaluations of `run`, which is trained by `method`, as a thin line and their moving average as a thick one.
+/// Draws the evaluations of `run`, which is trained by `method`, as a thin line and their moving average as a thick
+/// one.
 pub fn learning_curve(
     (run, method): (&str, &str),
     evaluations: &[EvaluationRecord],

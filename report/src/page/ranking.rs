@@ -1,4 +1,5 @@
-//! Which settings are best, and how certain that is: the results of repetitions with bootstrap intervals over their seeds.
+//! Which settings are best, and how certain that is: the results of repetitions with bootstrap intervals over their
+//! seeds.
 
 use serde::Serialize;
 
@@ -130,8 +131,8 @@ impl Ranking {
     }
 }
 
-/// For each list of results the 95 % interval of its interquartile mean, and the share of the resamples in which that is the
-/// highest. The lists are resampled independently of each other.
+/// For each list of results the 95 % interval of its interquartile mean, and the share of the resamples in which that
+/// is the highest. The lists are resampled independently of each other.
 fn bootstrap(values: &[&[f64]]) -> Vec<(Option<[f64; 2]>, Option<f64>)> {
     // Always the same numbers, so that a report made again is the same.
     let mut random = SplitMix(1);

@@ -88,8 +88,9 @@ struct Curve {
     std: Vec<f64>,
     /// Number of records that the points were selected or averaged from.
     rows: usize,
-    /// What a moving mean over the points needs if they were selected from more records: the sum of the records after the
-    /// point before, up to each point, and their number. Empty if the points are all records, or means of equally many.
+    /// What a moving mean over the points needs if they were selected from more records: the sum of the records after
+    /// the point before, up to each point, and their number. Empty if the points are all records, or means of equally
+    /// many.
     sums: Vec<f64>,
     counts: Vec<usize>,
 }
@@ -183,8 +184,8 @@ impl Run {
 }
 
 impl Run {
-    /// The run's result, and whether it has finished: the mean return of its final evaluation, or of its last evaluation if
-    /// there is none.
+    /// The run's result, and whether it has finished: the mean return of its final evaluation, or of its last
+    /// evaluation if there is none.
     pub(super) fn result(&self) -> Option<(f64, bool)> {
         let finally = self.final_evaluation.as_ref().and_then(|it| it.return_mean);
         let last = || self.evaluation_records.last().map(|row| row.return_mean);

@@ -32,7 +32,8 @@ pub enum Writer {
 pub enum Line<'a> {
     /// A line for the log.
     Kept(&'a str),
-    /// A line beyond the rate. It is not for the log, unless it turns out to be one of the last before the program failed.
+    /// A line beyond the rate. It is not for the log, unless it turns out to be one of the last before the program
+    /// failed.
     TooMuch(&'a str),
     /// The number of lines beyond the rate since the last one that was kept.
     LeftOut(u64),

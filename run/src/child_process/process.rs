@@ -134,8 +134,8 @@ impl ChildProcess {
         }
     }
 
-    /// Ends a launcher with SIGTERM and waits for it. A launcher does not watch its standard input, and ignores SIGINT if
-    /// this process was started in the background of a script.
+    /// Ends a launcher with SIGTERM and waits for it. A launcher does not watch its standard input, and ignores SIGINT
+    /// if this process was started in the background of a script.
     pub fn interrupt(mut self, patience: Duration) -> anyhow::Result<()> {
         self.signal(Signal::TERM)?;
         let status = self.await_end(patience)?;

@@ -13,7 +13,7 @@ use crate::signals::Interrupt;
 /// A policy with its final evaluation.
 #[derive(Clone, Debug, PartialEq)]
 pub struct EvaluatedPolicy {
-    /// Which policy it is after the choice.
+    /// Its role after the choice: best or last.
     pub policy: SavedPolicy,
     /// How it did.
     pub summary: EvaluationSummary,
@@ -27,11 +27,12 @@ struct Candidate {
 }
 
 /// Evaluates the best and the last policy of a run with `env_steps` environment steps. The better one is `best.policy`
-/// afterwards. Records the results and returns them: first that of the kept policy, then that of the last one if it was evaluated. Calls
-/// `progress` with the policy and its finished episodes.
+/// afterwards. Records the results and returns them: first that of the kept policy, then that of the last one if it was
+/// evaluated. Calls `progress` with the policy and its finished episodes.
 ///
 /// # Errors
-/// When a policy cannot be read or evaluated, none has a finite return, a file cannot be written, or a signal has arrived.
+/// When a policy cannot be read or evaluated, none has a finite return, a file cannot be written, or a signal has
+/// arrived.
 pub fn choose(
     config: &Config,
     run: &RunDir,
@@ -81,8 +82,8 @@ pub fn choose(
     Ok(std::iter::once(best).chain(last).collect())
 }
 
-/// The candidate with the greatest finite mean return; the first of equal ones, so that the last policy replaces the best
-/// one only if it is better.
+/// The candidate with the greatest finite mean return; the first of equal ones, so that the last policy replaces the
+/// best one only if it is better.
 fn better(candidates: &[Candidate]) -> Option<&Candidate> {
     let mut kept: Option<&Candidate> = None;
     for candidate in candidates.iter().filter(|it| it.summary.return_mean.is_finite()) {
@@ -93,8 +94,8 @@ fn better(candidates: &[Candidate]) -> Option<&Candidate> {
     kept
 }
 
-/// Keeps the last policy as the best one if there is no policy with a finite evaluation, so that the run has a policy to
-/// use.
+/// Keeps the last policy as the best one if there is no policy with a finite evaluation, so that the run has a policy
+/// to use.
 ///
 /// # Errors
 /// When a policy cannot be read or written.

@@ -18,11 +18,12 @@ pub struct ReevaluatedPolicy {
     pub now: EvaluationSummary,
 }
 
-/// Evaluates the best policy of a Gymnasium run of an earlier version again, once. In that version the seeds of episodes
-/// could be above 2³¹, so half of the starts differ from today's. By luck alone, the policy may have looked better or worse.
+/// Evaluates the best policy of a Gymnasium run of an earlier version again, once. In that version the seeds of
+/// episodes could be above 2³¹, so half of the starts differ from today's. By luck alone, the policy may have looked
+/// better or worse.
 ///
-/// Such a run has no `server.json`, which came with the same version as the new seeds. This function writes that file, so
-/// the next call finds nothing to do.
+/// Such a run has no `server.json`, which came with the same version as the new seeds. This function writes that file,
+/// so the next call finds nothing to do.
 ///
 /// # Errors
 /// When the policy cannot be read or written, the environment fails, or a signal has arrived.

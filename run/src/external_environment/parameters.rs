@@ -6,8 +6,8 @@ use toml::{Table, Value};
 /// Parameters in this table are parameters too, whatever their names: `name` and `server` are keys of `[environment]`.
 const NESTED: &str = "parameters";
 
-/// The parameters as JSON, as Python's `json` reads it: with `NaN`, `Infinity` and `-Infinity`, which JSON itself lacks. TOML's
-/// dates and times are strings in RFC 3339's form.
+/// The parameters as JSON, as Python's `json` reads it: with `NaN`, `Infinity` and `-Infinity`, which JSON itself
+/// lacks. TOML's dates and times are strings in RFC 3339's form.
 ///
 /// # Errors
 /// When a parameter is given twice.

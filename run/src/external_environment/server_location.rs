@@ -1,6 +1,6 @@
-//! Where the environment server of a run is started, if it is another program: `server.json` in the run's directory, written
-//! when the run is made. With it `eval`, `resume` and `report` start the program that `train` has started, from any directory
-//! and with any `PATH`.
+//! Where the environment server of a run is started, if it is another program: `server.json` in the run's directory,
+//! written when the run is made. With it `eval`, `resume` and `report` start the program that `train` has started, from
+//! any directory and with any `PATH`.
 
 use std::ffi::OsString;
 use std::os::unix::ffi::{OsStrExt, OsStringExt};

@@ -1,7 +1,7 @@
 //! The built-in configurations: the files of `presets/`.
 //!
-//! A preset has the name of its task. One for another algorithm than the task's first one has the name `TASK-ALGORITHM`,
-//! and is found by that name.
+//! A preset has the name of its task. One for another algorithm than the task's first one has the name
+//! `TASK-ALGORITHM`, and is found by that name.
 
 use shoal_common::config::AlgorithmConfig;
 use toml::Table;

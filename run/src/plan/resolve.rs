@@ -1,4 +1,5 @@
-//! Decides the configuration of a new run: the sections, then what the command line changes, then what follows from both.
+//! Decides the configuration of a new run: the sections, then what the command line changes, then what follows from
+//! both.
 
 use shoal_common::algorithms::TransitionUse;
 use shoal_common::config::{ActorsConfig, AlgorithmConfig, Config, IdentityFormat, explanation};
@@ -98,7 +99,8 @@ pub(super) fn set_from_length(config: &mut Config, sources: &mut SettingSources)
     }
 }
 
-/// Sets the keys that the algorithm determines. A value that the user has set is left; `Config::check` refuses a wrong one.
+/// Sets the keys that the algorithm determines. A value that the user has set is left; `Config::check` refuses a wrong
+/// one.
 fn set_from_algorithm(table: &mut Table, sources: &mut SettingSources) -> anyhow::Result<()> {
     let limit = integer(table, "spec", "time_limit");
     let algorithms = AlgorithmConfig::all();

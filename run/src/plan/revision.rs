@@ -1,5 +1,5 @@
-//! The configuration of a run that is resumed: what `config.toml` and the command line ask for, compared key by key with
-//! what the run was last used with.
+//! The configuration of a run that is resumed: what `config.toml` and the command line ask for, compared key by key
+//! with what the run was last used with.
 //!
 //! Three files take part, and are written in this order: `config.toml`, `changes.csv`, `config/used.toml`. After a kill
 //! between two of them the next resume finds the same difference again and does what is left.
@@ -117,8 +117,8 @@ impl Revision {
         self.changes.iter().any(|(change, _)| change.key == key)
     }
 
-    /// Writes the run's files, so that the run is used with this configuration from now on. Returns the rows that are new
-    /// in `changes.csv`.
+    /// Writes the run's files, so that the run is used with this configuration from now on. Returns the rows that are
+    /// new in `changes.csv`.
     ///
     /// # Errors
     /// When a file cannot be read or written.
@@ -136,8 +136,8 @@ impl Revision {
         Ok(rows)
     }
 
-    /// The rows that `changes.csv` lacks. A launcher may have been killed after it recorded a change and before the change
-    /// was final; the change may now be made, or be withdrawn.
+    /// The rows that `changes.csv` lacks. A launcher may have been killed after it recorded a change and before the
+    /// change was final; the change may now be made, or be withdrawn.
     fn unrecorded(&self, recorded: &[ChangeRecord], now: Moment) -> Vec<ChangeRecord> {
         let values = self.config.values();
         let changed = self.changes.iter().map(|(change, _)| &change.key);
@@ -163,8 +163,8 @@ impl Revision {
     }
 }
 
-/// Changes the number of actors of a running run in its files. What else was edited in `config.toml` stays there until the
-/// run is resumed.
+/// Changes the number of actors of a running run in its files. What else was edited in `config.toml` stays there until
+/// the run is resumed.
 ///
 /// # Errors
 /// When a file cannot be written.
@@ -249,8 +249,8 @@ fn refuse(differences: &[Difference], used: &Config, sources: &SettingSources) -
     Ok(())
 }
 
-/// Checks that the run's files still belong to the configuration, and that a lockstep run can begin with it at a definite
-/// round.
+/// Checks that the run's files still belong to the configuration, and that a lockstep run can begin with it at a
+/// definite round.
 fn check_files(run: &RunDir, used: &Config, config: &Config, differences: &[Difference]) -> anyhow::Result<()> {
     if differences.is_empty() {
         return Ok(());

@@ -62,8 +62,8 @@ impl Display for SettingSource {
 #[derive(Clone, Debug, Default)]
 pub struct SettingSources(BTreeMap<String, SettingSource>);
 
-/// The keys that bound the value of `key`. If `key` is refused, and the user has set one of these instead, the error must
-/// name that one.
+/// The keys that bound the value of `key`. If `key` is refused, and the user has set one of these instead, the error
+/// must name that one.
 fn bounding(key: &str) -> Vec<String> {
     match key {
         "replay.warmup" => vec!["replay.capacity".into()],

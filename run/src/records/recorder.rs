@@ -198,8 +198,8 @@ impl Recorder {
         })
     }
 
-    /// Records an exploration episode that ended `wall` after this launcher's start. Its steps are those of all actors by
-    /// then. They never fall, even if reports arrive out of order or a replay has lost rows.
+    /// Records an exploration episode that ended `wall` after this launcher's start. Its steps are those of all actors
+    /// by then. They never fall, even if reports arrive out of order or a replay has lost rows.
     pub fn episode(&mut self, report: &EpisodeReport, wall: Duration) -> Result<(), RecordError> {
         self.episode_steps = self.episode_steps.max(report.env_steps);
         self.episodes.write(&EpisodeRecord {
@@ -253,8 +253,8 @@ impl Recorder {
         self.flush()
     }
 
-    /// Records the learner's progress and flushes all records. Reports come twice a second. A learner that continues from
-    /// an older checkpoint repeats steps: they are not recorded again.
+    /// Records the learner's progress and flushes all records. Reports come twice a second. A learner that continues
+    /// from an older checkpoint repeats steps: they are not recorded again.
     pub fn learner(&mut self, report: &LearnerReport, wall: Duration) -> Result<(), RecordError> {
         if report.env_steps < self.env_steps {
             return self.flush();

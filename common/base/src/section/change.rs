@@ -14,8 +14,8 @@ pub enum Change {
     Learning,
     /// It may in a free run. In a lockstep run it may not, for this reason.
     InFreeRuns(Cow<'static, str>),
-    /// It is part of the shape of a network, and never changes. A run that begins with the networks of another run takes
-    /// it from there.
+    /// It is part of the shape of a network, and never changes. A run that begins with the networks of another run
+    /// takes it from there.
     Shape,
     /// It never changes, for this reason.
     Never(Cow<'static, str>),

@@ -18,8 +18,8 @@ pub struct CommitMirror {
 }
 
 impl CommitMirror {
-    /// Opens the copy at `path`, and continues with what is in it. A file that is missing, or is not a whole copy of this
-    /// layout, is made anew.
+    /// Opens the copy at `path`, and continues with what is in it. A file that is missing, or is not a whole copy of
+    /// this layout, is made anew.
     ///
     /// # Errors
     /// When the layout is impossible, or the file cannot be written.
@@ -74,8 +74,8 @@ impl CommitMirror {
         self.record.actor(actor)
     }
 
-    /// Publishes what is committed of some actors, with their snapshots, and how many rows the replay has. Readers see all
-    /// of it or nothing. Actors that the layout does not have are ignored, and so are snapshots of another length.
+    /// Publishes what is committed of some actors, with their snapshots, and how many rows the replay has. Readers see
+    /// all of it or nothing. Actors that the layout does not have are ignored, and so are snapshots of another length.
     pub fn publish<'a>(&mut self, rows: u64, actors: impl IntoIterator<Item = (u32, ActorCommit, &'a [u64])>) {
         let count = self.record.actors();
         let mut rows = rows;

@@ -50,7 +50,8 @@ pub fn matrix_mut(slice: &mut [f32], rows: usize) -> MatMut<'_, f32> {
 }
 
 impl NetworkLayout {
-    /// Computes the network's output for a batch of `inputs` and of `actions` (empty if the layout has no action inputs).
+    /// Computes the network's output for a batch of `inputs` and of `actions` (empty if the layout has no action
+    /// inputs).
     ///
     /// Every slice must have one column for each sample of the batch, and `to.hidden` must have a slice for each hidden
     /// layer. The same numbers give the same bits, whatever the alignment of the slices. Nothing is allocated.

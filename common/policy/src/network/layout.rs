@@ -27,8 +27,8 @@ pub struct LayerRange {
 }
 
 impl NetworkLayout {
-    /// A network from `inputs` to `outputs` numbers, without action inputs: a policy, or the values of a state or of all
-    /// actions.
+    /// A network from `inputs` to `outputs` numbers, without action inputs: a policy, or the values of a state or of
+    /// all actions.
     pub fn new(inputs: usize, hidden: Hidden, outputs: usize) -> Self {
         Self {
             inputs,
@@ -161,8 +161,8 @@ impl NetworkLayout {
     /// The fingerprint: two layouts have the same one only if they read parameters alike (FNV-1a over the sizes).
     ///
     /// With two ReLU layers it is that of files from before other networks existed. For any other list the length and
-    /// the activation are appended, and a 1 if action inputs enter at the first of several layers, or a 2 if the inputs are
-    /// normalised, so that no two layouts hash the same numbers.
+    /// the activation are appended, and a 1 if action inputs enter at the first of several layers, or a 2 if the inputs
+    /// are normalised, so that no two layouts hash the same numbers.
     pub fn fingerprint(&self) -> u64 {
         let Hidden { layers, activation } = self.hidden;
         let joined = (layers.len() > 1 && self.action_layer() == Some(0)).then_some(1);

@@ -44,8 +44,8 @@ pub(super) struct Table {
 }
 
 impl Table {
-    /// Opens the table at `path`, or creates it with its header. Removes a last line that a crash cut short. A file with
-    /// another header is refused and left unchanged.
+    /// Opens the table at `path`, or creates it with its header. Removes a last line that a crash cut short. A file
+    /// with another header is refused and left unchanged.
     pub(super) fn open<Row: Serialize + Default>(path: &Path) -> Result<Self, RecordError> {
         let write = |cause| RecordError::Write {
             path: path.to_owned(),

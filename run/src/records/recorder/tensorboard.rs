@@ -1,5 +1,5 @@
-//! TensorBoard event files: scalars, and the settings of the run for its tab HParams. Written here because the crates that do this need `protoc` or depend on
-//! outdated image crates.
+//! TensorBoard event files: scalars, and the settings of the run for its tab HParams. Written here because the crates
+//! that do this need `protoc` or depend on outdated image crates.
 
 use std::collections::BTreeMap;
 use std::fs::File;
