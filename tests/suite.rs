@@ -134,9 +134,9 @@ fn a_suite_trains_each_combination_with_each_seed_and_is_compared() {
 /// Settings with which a run takes seconds.
 const SLOW: [&str; 6] = [
     "--set",
-    "ddpg.hidden=[200, 200]",
+    "ddpg.hidden=[300, 300]",
     "--set",
-    "ddpg.batch=128",
+    "ddpg.batch=256",
     "--set",
     "replay.tolerance=64",
 ];
@@ -201,14 +201,14 @@ fn with_halving_bad_settings_are_ended_early_also_after_a_kill() {
     let place = Workplace::new();
     let command = [
         &["train", "pendulum", "--run", "suite", "--halving", "--jobs", "1"][..],
-        &["--sweep", "ddpg.actor_learning_rate=1e-9,1e-4,1e-8", "--steps", "4000"],
-        &["--set", "evaluation.every=400"],
+        &["--sweep", "ddpg.actor_learning_rate=1e-9,1e-4,1e-8", "--steps", "2000"],
+        &["--set", "evaluation.every=200"],
         &QUICK,
         &SLOW,
     ]
     .concat();
-    let too_late = error_line(&place.output(&[&command[..], &["--set", "evaluation.every=1001"]].concat()));
-    assert!(too_late.contains("the first evaluation comes after 1001"), "{too_late}");
+    let too_late = error_line(&place.output(&[&command[..], &["--set", "evaluation.every=501"]].concat()));
+    assert!(too_late.contains("the first evaluation comes after 501"), "{too_late}");
     let alone = error_line(&place.output(&["train", "pendulum", "--halving", "--sweep", "ddpg.tau=0.1"]));
     assert!(alone.contains("give several with --sweep"), "{alone}");
 
@@ -231,8 +231,8 @@ fn with_halving_bad_settings_are_ended_early_also_after_a_kill() {
     });
 
     // The length of the runs is that of the suite, not the preset's.
-    let message = error_line(&place.output(&["resume", "suite", "--set", "evaluation.every=3000"]));
-    assert!(message.contains("the first evaluation comes after 3000"), "{message}");
+    let message = error_line(&place.output(&["resume", "suite", "--set", "evaluation.every=1500"]));
+    assert!(message.contains("the first evaluation comes after 1500"), "{message}");
     let output = place.output(&["resume", "suite", "--json"]);
     let said = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "{said}");
@@ -257,11 +257,11 @@ fn with_halving_bad_settings_are_ended_early_also_after_a_kill() {
     assert_eq!((ended.len(), left.len()), (2, 1), "{runs:?}");
     assert_eq!(
         (&left[0]["finished"], &left[0]["env_steps"]),
-        (&true.into(), &4000.into())
+        (&true.into(), &2000.into())
     );
     for run in ended {
         let steps = run["env_steps"].as_u64().unwrap();
-        assert!((1000..4000).contains(&steps) && run["finished"] == false, "{run}");
+        assert!((500..2000).contains(&steps) && run["finished"] == false, "{run}");
         assert!(best(run) <= best(left[0]), "{runs:?}");
     }
     let _ = Domain::remove_abandoned();

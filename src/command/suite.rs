@@ -23,7 +23,7 @@ use shoal_run::preflight;
 use shoal_run::records::recorder::{read_evaluations, recorded};
 use shoal_run::records::start::StartRecord;
 use shoal_run::signals::{Signals, exit_code};
-use shoal_run::status::saved_status;
+use shoal_run::status::{replay_rows, saved_status};
 use shoal_run::suite::{self, Suite, Sweep, Trial};
 use shoal_run::usage::UsageError;
 use signal_hook::consts::SIGTERM;
@@ -223,20 +223,22 @@ pub(crate) fn resume(directory: &Path, options: SuiteOptions<'_>) -> anyhow::Res
         };
         let due = Due::new(&suite, directory, is_due, options)?;
         due.say(&format!("until each has done {percent:.0} % of its steps:"));
-        let due_runs = due.numbers.len();
-        let failed_now = due.train(&signals, Some(round.share));
-        failed += failed_now;
-        // If all have failed, the cause is probably not in their settings.
-        if signals.received().is_some() || (failed_now > 0 && failed_now == due_runs) {
+        failed += due.train(&signals, Some(round.share));
+        if signals.received().is_some() {
             break;
         }
-        let ended = suite.end_worse_half(|trial| best_return(&directory.join(&trial.name)));
+        let result = |trial: &Trial| best_return(&directory.join(&trial.name));
+        if !round.trials.iter().any(|trial| result(trial).is_finite()) {
+            let here = directory.display();
+            bail!("no run of {here} was evaluated in the first {percent:.0} % of its steps, so none can be preferred");
+        }
+        let ended = suite.end_worse_half(result);
         suite.write(directory)?;
         if !options.output.quiet {
             writeln!(std::io::stderr(), "ended early at {percent:.0} %: {}", ended.join("; "))?;
         }
     }
-    if signals.received().is_none() && suite.next_round().is_none() {
+    if signals.received().is_none() {
         let is_due = |trial: &Trial| Ok(!suite.has_ended(trial) && !is_finished(&suite, &directory.join(&trial.name))?);
         let due = Due::new(&suite, directory, is_due, options)?;
         due.say("");
@@ -337,9 +339,17 @@ impl<'a> Due<'a> {
     }
 }
 
-/// The share of its steps, or of its episodes, that a run has done.
+/// The share of its steps, or of its episodes, that a run has done. Steps are those in the replay: the records are half a
+/// second behind, and take longer to read.
 fn share_done(run: &Path) -> f64 {
-    distance(run).map_or(0.0, |(done, all)| done as f64 / all.max(1) as f64)
+    let of_steps = || {
+        let run = RunDir::open(run).ok()?;
+        let limits = run.config().ok()?.run;
+        let rows = replay_rows(&run).ok()?;
+        limits.episodes.is_none().then_some((rows, limits.steps))
+    };
+    let progress = of_steps().or_else(|| distance(run));
+    progress.map_or(0.0, |(done, all)| done as f64 / all.max(1) as f64)
 }
 
 /// The best return of a run's evaluations so far; −∞ if there is none.
