@@ -51,7 +51,7 @@ const SHORTEST_TICK: Duration = Duration::from_millis(20);
 const LOW_FILL: f64 = 0.1;
 
 /// How long the last evaluation's report may take after the learner is done. The learner has waited for the evaluation.
-const LAST_EVALUATION: Duration = Duration::from_secs(1);
+const LAST_EVALUATION_REPORT: Duration = Duration::from_secs(1);
 
 /// How long to wait for a learner that is being restarted when the run is asked to stop.
 const LEARNER_RESTART: Duration = Duration::from_secs(5);
@@ -431,7 +431,7 @@ impl<'a> Launcher<'a> {
     fn await_last_evaluation(&mut self) -> anyhow::Result<()> {
         let last = status::saved_status(&self.config, self.run)?.env_steps;
         let patience = Instant::now();
-        while patience.elapsed() < LAST_EVALUATION && self.signals.received().is_none() {
+        while patience.elapsed() < LAST_EVALUATION_REPORT && self.signals.received().is_none() {
             self.read_reports()?;
             self.answer_requests()?;
             let period = |steps| self.config.evaluation.period(steps);
@@ -463,7 +463,7 @@ impl<'a> Launcher<'a> {
     /// Waits until processes have ended that were asked to, and kills them after a while.
     fn await_end(&mut self, which: impl Fn(Role) -> bool + Copy, patience: Duration) {
         let deadline = Instant::now() + patience;
-        while !self.supervisor.have_ended(which) {
+        while !self.supervisor.reap(which) {
             if Instant::now() >= deadline {
                 self.supervisor.kill(which);
             }

@@ -36,7 +36,7 @@ use crate::actor_snapshot::ActorSnapshot;
 use crate::environment::{after_fault, connect};
 use crate::error::ActorError;
 use crate::exploration::{Exploration, StepCounts};
-use crate::n_step::NStep;
+use crate::n_step::NStepReturns;
 
 /// How long an actor waits for its last chunk to be committed when the whole run ends.
 const LAST_COMMIT_TIMEOUT: Duration = Duration::from_secs(1);
@@ -100,7 +100,7 @@ struct Actor<'a> {
     exploration: Exploration,
     sender: ChunkSender,
     /// What is not in a chunk yet, if a transition has several steps.
-    n_step: NStep,
+    n_step: NStepReturns,
     /// The chunk that is being filled.
     chunk: Chunk,
     /// Version of the policy with which the last row of `chunk` was collected. If `chunk` is empty, that of the last
@@ -182,7 +182,7 @@ impl<'a> Actor<'a> {
             snapshot,
             ending_since: None,
             ended: Vec::new(),
-            n_step: NStep::new(settings.n_step, settings.envs, row),
+            n_step: NStepReturns::new(settings.n_step, settings.envs, row),
             chunk: sender.begin()?,
             policy_version: 0,
             sender,

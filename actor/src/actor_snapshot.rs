@@ -16,7 +16,7 @@ pub(crate) struct ActorSnapshot {
     pub(crate) returns: Vec<f64>,
     /// Their lengths.
     pub(crate) lengths: Vec<u32>,
-    /// The state of [`NStep`](crate::n_step::NStep).
+    /// The state of [`NStepReturns`](crate::n_step::NStepReturns).
     pub(crate) n_step: Vec<u64>,
 }
 

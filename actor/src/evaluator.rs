@@ -65,7 +65,7 @@ fn challenge<E>(
         return Ok((best, false));
     }
     // A previous evaluator may have died after it wrote this policy and before it reported that.
-    let Some(mut best) = best.filter(|best| best.version != candidate.version) else {
+    let Some(mut best) = best.filter(|best| !best.is_same_policy(&candidate)) else {
         return Ok((Some(candidate), true));
     };
     let mut better = candidate.mean > best.mean;
@@ -142,6 +142,13 @@ struct Best {
     parameters: Vec<f32>,
     /// Mean return of the episodes that a better policy is confirmed on, once they were run.
     confirmed: Option<f64>,
+}
+
+impl Best {
+    /// After a learner's death its successor gives versions again, to other policies. So the parameters count too.
+    fn is_same_policy(&self, other: &Self) -> bool {
+        self.version == other.version && self.parameters == other.parameters
+    }
 }
 
 impl<'a> Evaluator<'a> {
@@ -422,9 +429,14 @@ mod tests {
         assert_eq!(decided(best(), policy(2, 6.0, f32::NAN)), (Some(1), false, 2));
         assert_eq!(decided(best(), policy(2, 4.0, 9.0)), (Some(1), false, 0), "worse");
         assert_eq!(
-            decided(best(), policy(1, 4.0, 4.0)),
+            decided(best(), policy(1, 4.0, 5.0)),
             (Some(1), true, 0),
             "the same one again"
+        );
+        assert_eq!(
+            decided(best(), policy(1, 4.0, 4.0)),
+            (Some(1), false, 0),
+            "another policy with the version of the best"
         );
         let known = Some(Best {
             confirmed: Some(5.0),

@@ -1,14 +1,17 @@
 //! Suites of runs: `shoal train --seeds` and `--sweep`, and `shoal resume SUITE`, which continues one.
 
-use std::collections::{BTreeMap, VecDeque};
-use std::io::{IsTerminal, Write};
-use std::path::{Path, PathBuf};
+mod measure;
+mod progress;
+
+use std::collections::VecDeque;
+use std::io::Write;
+use std::path::Path;
 use std::process::{Command, ExitCode};
 use std::sync::mpsc::Sender;
-use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
-use indicatif::{HumanDuration, ProgressBar, ProgressDrawTarget, ProgressStyle};
+use measure::{best_return, share_done};
+use progress::{Event, SuiteProgress};
 use serde::Serialize;
 use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
@@ -17,13 +20,11 @@ use shoal_run::evaluation::SavedPolicy;
 use shoal_run::evaluation::final_evaluation::FinalEvaluation;
 use shoal_run::external_environment::tied;
 use shoal_run::jobs::{TrainingEnd, run_jobs, run_training};
-use shoal_run::numbers::thousands;
 use shoal_run::plan::{self, RequestedChanges, Revision, RunOverrides};
 use shoal_run::preflight;
-use shoal_run::records::recorder::{read_evaluations, recorded};
 use shoal_run::records::start::StartRecord;
 use shoal_run::signals::{Signals, exit_code};
-use shoal_run::status::{replay_rows, saved_status};
+use shoal_run::status::saved_status;
 use shoal_run::suite::{self, Suite, Sweep, Trial};
 use shoal_run::usage::UsageError;
 use signal_hook::consts::SIGTERM;
@@ -197,16 +198,6 @@ fn overrides_of(suite: &Suite, trial: &Trial) -> anyhow::Result<RunOverrides> {
     })
 }
 
-/// A message from a worker: the number of the trial, and what has happened to it.
-enum Event {
-    Started(usize),
-    Finished(usize),
-    Interrupted(usize),
-    /// It has done its share of a round.
-    Paused(usize),
-    Failed(usize, String),
-}
-
 /// Trains all runs of the suite in this directory that have not finished, with halving in rounds.
 pub(crate) fn resume(directory: &Path, options: SuiteOptions<'_>) -> anyhow::Result<ExitCode> {
     let directory =
@@ -318,7 +309,7 @@ impl<'a> Due<'a> {
             jobs,
             quiet,
         } = self;
-        let mut progress = SuiteProgressDisplay::new(suite, directory, &numbers, quiet);
+        let mut progress = SuiteProgress::new(suite, directory, &numbers, until, quiet);
         let work = |number: usize, events: &Sender<Event>| {
             // A closed channel is no reason to stop.
             let _ = events.send(Event::Started(number));
@@ -337,33 +328,6 @@ impl<'a> Due<'a> {
         run_jobs(numbers, jobs, signals, work, |event| progress.observe(event));
         progress.end()
     }
-}
-
-/// The share of its steps, or of its episodes, that a run has done. Steps are those in the replay: the records are half a
-/// second behind, and take longer to read.
-fn share_done(run: &Path) -> f64 {
-    let of_steps = || {
-        let run = RunDir::open(run).ok()?;
-        let limits = run.config().ok()?.run;
-        let rows = replay_rows(&run).ok()?;
-        limits.episodes.is_none().then_some((rows, limits.steps))
-    };
-    let progress = of_steps().or_else(|| distance(run));
-    progress.map_or(0.0, |(done, all)| done as f64 / all.max(1) as f64)
-}
-
-/// The best return of a run's evaluations so far; −∞ if there is none.
-fn best_return(run: &Path) -> f64 {
-    let evaluations = RunDir::open(run)
-        .ok()
-        .and_then(|run| read_evaluations(&run.evaluations()).ok());
-    let returns = evaluations
-        .into_iter()
-        .flatten()
-        .map(|evaluation| evaluation.return_mean);
-    returns
-        .filter(|mean| mean.is_finite())
-        .fold(f64::NEG_INFINITY, f64::max)
 }
 
 /// What cores and shared memory allow; each run keeps about two cores busy.
@@ -479,182 +443,4 @@ fn run_json<'a>(suite: &Suite, trial: &'a Trial, path: &Path) -> anyhow::Result<
         json.eval_return_mean = evaluation.and_then(|it| it.of(SavedPolicy::Best)?.return_mean);
     }
     Ok(json)
-}
-
-/// The live line, or a line for each event where standard error is no terminal.
-struct SuiteProgressDisplay<'a> {
-    suite: &'a Suite,
-    directory: &'a Path,
-    bar: ProgressBar,
-    live: bool,
-    quiet: bool,
-    /// By the number of its trial: each run that had not finished at the beginning, with what it had done by then.
-    due: BTreeMap<usize, u64>,
-    running: Vec<usize>,
-    done: Vec<usize>,
-    failed: usize,
-    started_at: Instant,
-}
-
-/// How far a run is, and how far it goes: in episodes if they limit it, otherwise in environment steps.
-fn distance(run: &Path) -> Option<(u64, u64)> {
-    let run = RunDir::open(run).ok()?;
-    let config: Config = run.config().ok()?;
-    let (steps, episodes) = recorded(&run).ok()?.unwrap_or_default();
-    Some(match config.run.episodes {
-        Some(limit) => (episodes, limit),
-        None => (steps, config.run.steps),
-    })
-}
-
-impl<'a> SuiteProgressDisplay<'a> {
-    fn new(suite: &'a Suite, directory: &'a Path, due: &VecDeque<usize>, quiet: bool) -> Self {
-        let live = !quiet && std::io::stderr().is_terminal();
-        let target = if live {
-            ProgressDrawTarget::stderr()
-        } else {
-            ProgressDrawTarget::hidden()
-        };
-        let bar = ProgressBar::with_draw_target(Some(suite.trials.len() as u64), target);
-        if let Ok(style) = ProgressStyle::with_template("{bar:16.cyan/dim} {msg}") {
-            bar.set_style(style.progress_chars("━━─"));
-        }
-        let begun = |number: &usize| {
-            let run = directory.join(&suite.trials[*number].name);
-            (*number, distance(&run).map_or(0, |(done, _)| done))
-        };
-        Self {
-            suite,
-            directory,
-            bar,
-            live,
-            quiet,
-            due: due.iter().map(begun).collect(),
-            running: Vec::new(),
-            done: Vec::new(),
-            failed: 0,
-            started_at: Instant::now(),
-        }
-    }
-
-    fn observe(&mut self, event: Option<Event>) {
-        match event {
-            None => {}
-            Some(Event::Started(number)) => {
-                self.running.push(number);
-                if !self.live {
-                    self.print(&format!("{}: started", self.suite.trials[number].name));
-                }
-            }
-            Some(Event::Finished(number)) => {
-                self.ended(number);
-                let left = self
-                    .time_left()
-                    .map_or_else(String::new, |left| format!(", about {left} left"));
-                let result = self
-                    .result(number)
-                    .map_or_else(String::new, |mean| format!(", return {mean:.2}"));
-                self.print(&format!(
-                    "{}: done{result}, {}{left}",
-                    self.suite.trials[number].name,
-                    self.count()
-                ));
-            }
-            Some(Event::Interrupted(number)) => self.running.retain(|other| *other != number),
-            Some(Event::Paused(number)) => {
-                self.ended(number);
-                let best = best_return(&self.run(number));
-                self.print(&format!(
-                    "{}: best return so far {best:.2}",
-                    self.suite.trials[number].name
-                ));
-            }
-            Some(Event::Failed(number, why)) => {
-                self.ended(number);
-                self.failed += 1;
-                self.print(&format!("{}: failed: {why}", self.suite.trials[number].name));
-            }
-        }
-        self.draw();
-    }
-
-    fn ended(&mut self, number: usize) {
-        self.running.retain(|other| *other != number);
-        self.done.push(number);
-    }
-
-    fn run(&self, number: usize) -> PathBuf {
-        self.directory.join(&self.suite.trials[number].name)
-    }
-
-    fn result(&self, number: usize) -> Option<f64> {
-        let run = RunDir::open(&self.run(number)).ok()?;
-        let (steps, _) = recorded(&run).ok()?.unwrap_or_default();
-        FinalEvaluation::read(&run, steps)
-            .ok()??
-            .of(SavedPolicy::Best)?
-            .return_mean
-    }
-
-    fn count(&self) -> String {
-        let all = self.suite.trials.len();
-        format!("{} of {all} runs", all - self.due.len() + self.done.len() - self.failed)
-    }
-
-    /// The estimated remaining time, at the rate of this suite so far. A run that has not begun is as long as the
-    /// others are on average.
-    fn time_left(&self) -> Option<String> {
-        let (mut made, mut known, mut total) = (0, 0, 0);
-        let mut waiting = 0;
-        let mut left = 0;
-        for (number, begin) in &self.due {
-            match distance(&self.run(*number)) {
-                Some((done, all)) => {
-                    let done = if self.done.contains(number) { all } else { done };
-                    made += done.saturating_sub(*begin);
-                    left += all.saturating_sub(done);
-                    (known, total) = (known + 1, total + all);
-                }
-                None if self.done.contains(number) => {}
-                None => waiting += 1,
-            }
-        }
-        left += waiting * total.checked_div(known)?;
-        let seconds = self.started_at.elapsed().as_secs_f64() * left as f64 / made as f64;
-        (made > 0 && left > 0).then(|| format!("{:#}", HumanDuration(Duration::from_secs(seconds as u64))))
-    }
-
-    fn draw(&self) {
-        if !self.live {
-            return;
-        }
-        let mut lines = vec![self.count()];
-        if let Some(left) = self.time_left() {
-            lines[0] += &format!(" · {left} left");
-        }
-        for number in &self.running {
-            if let Some((done, all)) = distance(&self.run(*number)) {
-                let name: String = self.suite.trials[*number].name.chars().take(50).collect();
-                lines.push(format!("{name}: {} of {}", thousands(done), thousands(all)));
-            }
-        }
-        self.bar
-            .set_position((self.suite.trials.len() - self.due.len() + self.done.len()) as u64);
-        self.bar.set_message(lines.join("\n  "));
-    }
-
-    /// Ends the live line. Returns how many runs have failed.
-    fn end(self) -> usize {
-        self.bar.finish_and_clear();
-        self.failed
-    }
-
-    fn print(&self, line: &str) {
-        if !self.quiet {
-            self.bar.suspend(|| {
-                // A closed standard error is no reason to fail.
-                let _ = writeln!(std::io::stderr(), "{line}");
-            });
-        }
-    }
 }

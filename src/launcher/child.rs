@@ -51,9 +51,9 @@ pub(super) struct Child {
     failures: u32,
     failing_since: Option<Instant>,
     /// The longest successful start: from the start until the process was ready.
-    usual_start: Option<Duration>,
+    longest_good_start: Option<Duration>,
     /// The longest failed start: the life of a process that ended before it was ready.
-    longest_start: Duration,
+    longest_failed_start: Duration,
     /// The last heartbeat of the current process, with its time of arrival.
     last_heartbeat: Option<(Instant, Heartbeat)>,
     /// When the process last made progress: started, took steps, got another policy, or changed its activity.
@@ -97,8 +97,8 @@ impl Child {
             started_at: now,
             failures: 0,
             failing_since: None,
-            usual_start: None,
-            longest_start: Duration::ZERO,
+            longest_good_start: None,
+            longest_failed_start: Duration::ZERO,
             last_heartbeat: None,
             progress_at: now,
             stalls: 0,
@@ -177,19 +177,19 @@ impl Child {
             self.rate_computed_at = (now, heartbeat.steps);
         }
         let took = first.then(|| now - self.started_at)?;
-        self.usual_start = self.usual_start.max(Some(took));
+        self.longest_good_start = self.longest_good_start.max(Some(took));
         Some(took)
     }
 
     /// Handles the end of its process, which was not asked to end. The role is given up if its failures span
     /// `give_up_after`.
-    pub(super) fn has_ended(&mut self, status: ExitStatus, give_up_after: Duration) -> RestartDecision {
-        self.has_ended_at(status, give_up_after, Instant::now())
+    pub(super) fn handle_end(&mut self, status: ExitStatus, give_up_after: Duration) -> RestartDecision {
+        self.handle_end_at(status, give_up_after, Instant::now())
     }
 
     /// After a process that was able to work, the role is restarted and its failures are forgotten. Being killed while
     /// it waited, after its first step, or within the usual time of a start is not a failure either. Any other end is.
-    fn has_ended_at(&mut self, status: ExitStatus, give_up_after: Duration, now: Instant) -> RestartDecision {
+    fn handle_end_at(&mut self, status: ExitStatus, give_up_after: Duration, now: Instant) -> RestartDecision {
         (self.process, self.ended) = (None, None);
         let crash_signals = [SIGABRT, SIGBUS, SIGFPE, SIGILL, SIGSEGV];
         let was_killed = status.signal().is_some_and(|signal| !crash_signals.contains(&signal));
@@ -203,8 +203,8 @@ impl Child {
         let blameless = match self.activity() {
             Some(activity) => steps > 0 || activity != Activity::Working,
             None => {
-                self.longest_start = self.longest_start.max(lived);
-                lived <= START_TIME.max(self.usual_start.unwrap_or_default())
+                self.longest_failed_start = self.longest_failed_start.max(lived);
+                lived <= START_TIME.max(self.longest_good_start.unwrap_or_default())
             }
         };
         if was_killed && blameless {
@@ -212,7 +212,9 @@ impl Child {
         }
         self.failures += 1;
         let since = *self.failing_since.get_or_insert(self.started_at);
-        let longest = self.longest_start.max(self.usual_start.unwrap_or_default());
+        let longest = self
+            .longest_failed_start
+            .max(self.longest_good_start.unwrap_or_default());
         if self.failures >= MAX_FAILURES && now - since >= give_up_after.max(2 * longest) {
             return RestartDecision::GiveUp(self.failures);
         }
@@ -373,7 +375,7 @@ mod tests {
                 self.child.record_at(&last, self.now + ready);
             }
             self.now += lived;
-            let consequence = self.child.has_ended_at(end, GIVE_UP_AFTER, self.now);
+            let consequence = self.child.handle_end_at(end, GIVE_UP_AFTER, self.now);
             if let RestartDecision::Restart(pause) = consequence {
                 self.now += pause;
             }

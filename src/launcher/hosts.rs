@@ -8,7 +8,7 @@ use shoal_common::channel::control::{HostLease, HostState, HostStatus};
 pub(super) const INCARNATIONS: u64 = 1 << 20;
 
 /// A host that is silent for this long loses its actors, so that another host may have them.
-const LOST: Duration = Duration::from_secs(60);
+const LOST_AFTER: Duration = Duration::from_secs(60);
 
 /// The admitted hosts.
 #[derive(Debug)]
@@ -95,10 +95,10 @@ impl Hosts {
             let name = &admitted.lease.name;
             if left {
                 messages.push(format!("host {name} has left"));
-            } else if admitted.heard_at.elapsed() >= LOST {
+            } else if admitted.heard_at.elapsed() >= LOST_AFTER {
                 messages.push(format!(
                     "host {name} was silent for {} s: its actors are free",
-                    LOST.as_secs()
+                    LOST_AFTER.as_secs()
                 ));
             } else {
                 return true;

@@ -207,7 +207,7 @@ impl<'a> Host<'a> {
 
     fn await_end(&mut self, which: impl Fn(Role) -> bool + Copy, patience: Duration) {
         let deadline = Instant::now() + patience;
-        while !self.supervisor.have_ended(which) {
+        while !self.supervisor.reap(which) {
             if Instant::now() >= deadline {
                 self.supervisor.kill(which);
             }

@@ -11,10 +11,10 @@ use super::child::{Child, SILENT};
 
 /// If the launcher itself did not run for this long, it was stopped, and perhaps the others too. No process is replaced
 /// then.
-const PAUSED: Duration = Duration::from_secs(2);
+const LAUNCHER_PAUSE: Duration = Duration::from_secs(2);
 
 /// A process that may be at work is silent for too long only after this multiple of the patience.
-const WORK: u32 = 3;
+const WORKING_FACTOR: u32 = 3;
 
 /// Looks for processes that make no progress.
 #[derive(Debug)]
@@ -37,7 +37,7 @@ impl StallDetector {
     pub(super) fn find(&mut self, children: &mut [Child], busy: Duration) -> Vec<(usize, &'static str)> {
         let now = Instant::now();
         let since = now - std::mem::replace(&mut self.checked_at, now);
-        if since.saturating_sub(busy) >= PAUSED {
+        if since.saturating_sub(busy) >= LAUNCHER_PAUSE {
             children.iter_mut().for_each(Child::reset_clocks);
             return Vec::new();
         }
@@ -88,7 +88,7 @@ impl StallDetector {
         if self.waits_for_an_idle_server(children, child) && child.stalls == 0 {
             return Some("it waits for an answer from its environment server, which is idle");
         }
-        let silent = child.silent_for() >= WORK * self.patience;
+        let silent = child.silent_for() >= WORKING_FACTOR * self.patience;
         let idle_server = child
             .server()
             .is_none_or(|index| find(children, Role::EnvServer, index).is_some_and(|server| self.is_idle(server)));

@@ -32,12 +32,12 @@ use super::stall::StallDetector;
 use crate::log_level::log_level;
 
 /// How often to look for dead processes whose end the launcher does not observe, such as `shoal status`.
-const CLEANING: Duration = Duration::from_secs(2);
+const CLEANUP_INTERVAL: Duration = Duration::from_secs(2);
 
 /// How long dead processes may keep occupying shared memory in spite of clean-ups, and how soon a clean-up is repeated.
 /// A killed process may take a moment to disappear.
 const OCCUPIED_PATIENCE: Duration = Duration::from_secs(2);
-const CLEANING_AGAIN: Duration = Duration::from_millis(200);
+const OCCUPIED_CLEANUP_INTERVAL: Duration = Duration::from_millis(200);
 
 /// A start that takes longer is reported to the user.
 const SLOW_START: Duration = Duration::from_secs(10);
@@ -346,7 +346,7 @@ impl Supervisor {
     /// The time until the next restart or clean-up, unless a process ends earlier.
     pub(super) fn time_to_next_task(&self) -> Duration {
         let since_clean = self.cleaned_at.elapsed();
-        let cleaning = self.cleaning_interval().saturating_sub(since_clean);
+        let cleaning = self.cleanup_interval().saturating_sub(since_clean);
         let missing = |child: &&Child| child.process.is_none() && self.is_wanted(child);
         let now = Instant::now();
         let restarts = self.children.iter().filter(missing);
@@ -368,14 +368,14 @@ impl Supervisor {
         let mut state = RunCondition::AtWork;
         let ended = self.children.iter().any(|child| child.ended.is_some());
         // Before anything is cleaned up or started: both would find the files of another run, or none.
-        if (ended || self.is_cleaning_due()) && !self.learner_has_finished() && !domain.is_intact(self.services.count())
+        if (ended || self.is_cleanup_due()) && !self.learner_has_finished() && !domain.is_intact(self.services.count())
         {
             return Ok(RunCondition::FilesRemoved);
         }
         if ended {
             // Frees their shared memory for their successors.
             state = self.clean(domain)?;
-        } else if self.is_cleaning_due() {
+        } else if self.is_cleanup_due() {
             self.cleaned_at = Instant::now();
             if domain.has_dead_nodes() || self.services.ports_of_dead_processes() > 0 {
                 state = self.clean(domain)?;
@@ -391,12 +391,13 @@ impl Supervisor {
         Ok(state)
     }
 
-    fn is_cleaning_due(&self) -> bool {
-        self.cleaned_at.elapsed() >= self.cleaning_interval()
+    fn is_cleanup_due(&self) -> bool {
+        self.cleaned_at.elapsed() >= self.cleanup_interval()
     }
 
-    fn cleaning_interval(&self) -> Duration {
-        self.occupied_since.map_or(CLEANING, |_| CLEANING_AGAIN)
+    fn cleanup_interval(&self) -> Duration {
+        self.occupied_since
+            .map_or(CLEANUP_INTERVAL, |_| OCCUPIED_CLEANUP_INTERVAL)
     }
 
     fn learner(&self) -> Option<&Child> {
@@ -418,7 +419,8 @@ impl Supervisor {
         let is_wanted = self.is_wanted(&self.children[i]);
         let child = &mut self.children[i];
         if child.process.is_none() && is_wanted && Instant::now() >= child.restart_at {
-            child.restarts += 1;
+            // One that has retired and is wanted again did not fail.
+            child.restarts += u32::from(!child.is_retiring);
             self.start(i)?;
             self.note_incident(i, IncidentKind::StartedAgain, String::new());
         }
@@ -442,7 +444,7 @@ impl Supervisor {
             self.note_incident(i, IncidentKind::Retired, String::new());
             return Ok(RunCondition::AtWork);
         }
-        let consequence = child.has_ended(status, self.give_up_after);
+        let consequence = child.handle_end(status, self.give_up_after);
         let what = if status.signal().is_some() {
             IncidentKind::Killed
         } else {
@@ -612,8 +614,8 @@ impl Supervisor {
         }
     }
 
-    /// Whether all processes of some roles have ended.
-    pub(super) fn have_ended(&mut self, which: impl Fn(Role) -> bool) -> bool {
+    /// Collects the exit statuses of some roles' processes. Returns whether all of them have ended.
+    pub(super) fn reap(&mut self, which: impl Fn(Role) -> bool) -> bool {
         let mut all = true;
         for child in self.children.iter_mut().filter(|child| which(child.instance.role)) {
             let Some(process) = &mut child.process else { continue };

@@ -82,7 +82,7 @@ report! { EvaluationReport:
 }
 
 report! { EvaluatedPeriod:
-    const CHANNEL: &'static str = "reports/judged";
+    const CHANNEL: &'static str = "reports/evaluated-periods";
     const BUFFER: usize = 8;
     // A restarted lockstep learner waits for the last report.
     const HISTORY: usize = 1;

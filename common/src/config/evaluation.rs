@@ -7,7 +7,7 @@ section! {
     /// How often the policy is evaluated.
     #[derive(Eq)]
     pub struct EvaluationConfig {
-        /// Environment steps from one evaluation to the next.
+        /// Environment steps from one evaluation to the next; at most `run.steps`, so that a short run is evaluated once.
         every: u64 = 2_000, bounds: from(1, u64::MAX), unit: "environment steps", source: "ours",
             change: Change::Anytime;
         /// Episodes of an evaluation. Their start states are always the same.

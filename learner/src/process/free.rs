@@ -21,7 +21,7 @@ const IDLE_WAIT: Duration = Duration::from_millis(50);
 
 /// How long the learner waits for the evaluation of the last policy. A restarted evaluator can get that policy only
 /// from a live learner.
-const LAST_EVALUATION: Duration = Duration::from_secs(5);
+const LAST_EVALUATION_WAIT: Duration = Duration::from_secs(5);
 
 pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
     let ratio = &learner.settings.config.replay;
@@ -51,7 +51,7 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
         } else if learner.has_all_rows() {
             learner.publish()?;
             learner.notify_all();
-            return EvaluationWait::new(learner)?.wait(learner, Some(LAST_EVALUATION));
+            return EvaluationWait::new(learner)?.wait(learner, Some(LAST_EVALUATION_WAIT));
         } else {
             let activity = if learner.counted_rows < ratio.ratio_start() {
                 Activity::WaitingForPeer

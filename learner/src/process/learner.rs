@@ -1,6 +1,7 @@
 //! The learner that free and lockstep runs share, with its replay, algorithm, channels and checkpoints.
 
 use std::io;
+use std::ops::Range;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
@@ -96,7 +97,10 @@ impl<'a> Learner<'a> {
                         counters.rows
                     );
                 }
-                counters
+                Counters {
+                    episodes: remaining_episodes(&counters, &replay),
+                    ..counters
+                }
             }
         };
 
@@ -162,9 +166,7 @@ impl<'a> Learner<'a> {
     /// Sets the environment steps that count for the ratio, and counts the episodes that end within them.
     pub(crate) fn advance_to(&mut self, rows: u64) {
         let newest = self.counted_rows.max(self.replay.rows().start)..rows;
-        let layout = self.replay.layout().row;
-        let ends = newest.filter(|row| layout.read(self.replay.row(*row)).last);
-        self.episodes += ends.count() as u64;
+        self.episodes += ended_episodes(&self.replay, newest);
         self.counted_rows = rows;
     }
 
@@ -312,6 +314,27 @@ impl<'a> Learner<'a> {
     }
 }
 
+/// Episodes of the checkpoint that end within the rows that the replay still has. A power loss can take the newest
+/// rows. Their replacements are counted when they arrive. If the ring has overwritten its first rows, the number is
+/// estimated.
+fn remaining_episodes(counters: &Counters, replay: &Replay) -> u64 {
+    let head = replay.head();
+    if head >= counters.rows {
+        counters.episodes
+    } else if replay.rows().start == 0 {
+        ended_episodes(replay, 0..head)
+    } else {
+        let share = head as f64 / counters.rows as f64;
+        (counters.episodes as f64 * share).round() as u64
+    }
+}
+
+/// The number of episodes that end within `rows`.
+fn ended_episodes(replay: &Replay, rows: Range<u64>) -> u64 {
+    let layout = replay.layout().row;
+    rows.filter(|row| layout.read(replay.row(*row)).last).count() as u64
+}
+
 fn empty_report() -> LearnerReport {
     LearnerReport {
         env_steps: 0,
@@ -322,5 +345,64 @@ fn empty_report() -> LearnerReport {
         actor_loss: 0.0,
         q_mean: 0.0,
         averaged: 0,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use shoal_common::transition::{RowLayout, Transition};
+
+    use super::*;
+    use crate::replay::{ChunkId, ReplayLayout};
+
+    /// A replay with this many rows, in episodes of two.
+    fn replay(rows: u64, ring: u64) -> (tempfile::TempDir, Replay) {
+        let directory = tempfile::tempdir().unwrap();
+        let row = RowLayout::new(1, 1);
+        let layout = ReplayLayout {
+            row,
+            ring,
+            actors: 1,
+            actor_snapshot_words: 0,
+            fingerprint: 0,
+        };
+        let mut replay = Replay::create(&directory.path().join("replay"), &layout).unwrap();
+        for sequence in 1..=rows {
+            let mut numbers = vec![0.0; row.width()];
+            let transition = Transition {
+                s: &[0.0],
+                a: &[0.0],
+                r: 0.0,
+                discount: 1.0,
+                s_next: &[0.0],
+                last: sequence % 2 == 0,
+            };
+            row.write(&transition, &mut numbers);
+            let id = ChunkId {
+                incarnation: 0,
+                sequence,
+            };
+            replay.append_and_commit(0, id, &numbers).unwrap();
+        }
+        (directory, replay)
+    }
+
+    #[test]
+    fn episodes_that_a_power_loss_took_are_not_counted() {
+        let checkpoint = |rows, episodes| Counters {
+            rows,
+            episodes,
+            ..Counters::default()
+        };
+        let (_directory, whole) = replay(10, 100);
+        assert_eq!(remaining_episodes(&checkpoint(8, 4), &whole), 4, "no row is missing");
+        assert_eq!(remaining_episodes(&checkpoint(10, 5), &whole), 5);
+        assert_eq!(
+            remaining_episodes(&checkpoint(15, 7), &whole),
+            5,
+            "five rows are missing"
+        );
+        let (_directory, wrapped) = replay(10, 4);
+        assert_eq!(remaining_episodes(&checkpoint(20, 9), &wrapped), 5, "estimated");
     }
 }

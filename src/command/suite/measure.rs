@@ -1,0 +1,58 @@
+//! How far a run of a suite is and how good, read from its directory while it may be running.
+
+use std::path::Path;
+
+use shoal_common::config::Config;
+use shoal_common::run_dir::RunDir;
+use shoal_run::evaluation::SavedPolicy;
+use shoal_run::evaluation::final_evaluation::FinalEvaluation;
+use shoal_run::records::recorder::{read_evaluations, recorded};
+use shoal_run::status::replay_rows;
+
+/// The share of its steps, or of its episodes, that a run has done. Steps are those in the replay: the records are half a
+/// second behind, and take longer to read.
+pub(super) fn share_done(run: &Path) -> f64 {
+    let of_steps = || {
+        let run = RunDir::open(run).ok()?;
+        let limits = run.config().ok()?.run;
+        let rows = replay_rows(&run).ok()?;
+        limits.episodes.is_none().then_some((rows, limits.steps))
+    };
+    let progress = of_steps().or_else(|| distance(run));
+    progress.map_or(0.0, |(done, all)| done as f64 / all.max(1) as f64)
+}
+
+/// The best return of a run's evaluations so far; −∞ if there is none.
+pub(super) fn best_return(run: &Path) -> f64 {
+    let evaluations = RunDir::open(run)
+        .ok()
+        .and_then(|run| read_evaluations(&run.evaluations()).ok());
+    let returns = evaluations
+        .into_iter()
+        .flatten()
+        .map(|evaluation| evaluation.return_mean);
+    returns
+        .filter(|mean| mean.is_finite())
+        .fold(f64::NEG_INFINITY, f64::max)
+}
+
+/// How far a run is, and how far it goes: in episodes if they limit it, otherwise in environment steps.
+pub(super) fn distance(run: &Path) -> Option<(u64, u64)> {
+    let run = RunDir::open(run).ok()?;
+    let config: Config = run.config().ok()?;
+    let (steps, episodes) = recorded(&run).ok()?.unwrap_or_default();
+    Some(match config.run.episodes {
+        Some(limit) => (episodes, limit),
+        None => (steps, config.run.steps),
+    })
+}
+
+/// The mean return of a finished run's best policy in its final evaluation.
+pub(super) fn final_return(run: &Path) -> Option<f64> {
+    let run = RunDir::open(run).ok()?;
+    let (steps, _) = recorded(&run).ok()?.unwrap_or_default();
+    FinalEvaluation::read(&run, steps)
+        .ok()??
+        .of(SavedPolicy::Best)?
+        .return_mean
+}

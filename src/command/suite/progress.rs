@@ -1,0 +1,246 @@
+//! The progress of a suite: a live line, or a line for each event where standard error is no terminal.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::io::{IsTerminal, Write};
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use indicatif::{HumanDuration, ProgressBar, ProgressDrawTarget, ProgressStyle};
+use shoal_run::numbers::thousands;
+use shoal_run::suite::Suite;
+
+use super::measure::{best_return, distance, final_return};
+
+/// A message from a worker: the number of the trial, and what has happened to it.
+pub(super) enum Event {
+    Started(usize),
+    Finished(usize),
+    Interrupted(usize),
+    /// It has done its share of a round.
+    Paused(usize),
+    Failed(usize, String),
+}
+
+pub(super) struct SuiteProgress<'a> {
+    suite: &'a Suite,
+    directory: &'a Path,
+    bar: ProgressBar,
+    live: bool,
+    quiet: bool,
+    /// Each run is trained until it has done this share of its steps.
+    until: f64,
+    /// The runs that are to be trained, by the numbers of their trials.
+    due: BTreeMap<usize, DueRun>,
+    running: Vec<usize>,
+    failed: usize,
+    started_at: Instant,
+}
+
+struct DueRun {
+    /// What it had done when this process began.
+    begin: u64,
+    ended: bool,
+}
+
+/// The steps of a run, or its episodes, that the remaining time is estimated from.
+struct RunLength {
+    /// Made since this process began.
+    made: u64,
+    left: u64,
+    /// Of the whole run; 0 if nobody knows.
+    goal: u64,
+}
+
+impl<'a> SuiteProgress<'a> {
+    /// The progress of the trials with the numbers `due`, each until it has done the share `until` of its steps.
+    pub(super) fn new(
+        suite: &'a Suite,
+        directory: &'a Path,
+        due: &VecDeque<usize>,
+        until: Option<f64>,
+        quiet: bool,
+    ) -> Self {
+        let live = !quiet && std::io::stderr().is_terminal();
+        let target = if live {
+            ProgressDrawTarget::stderr()
+        } else {
+            ProgressDrawTarget::hidden()
+        };
+        let bar = ProgressBar::with_draw_target(Some(suite.trials.len() as u64), target);
+        if let Ok(style) = ProgressStyle::with_template("{bar:16.cyan/dim} {msg}") {
+            bar.set_style(style.progress_chars("━━─"));
+        }
+        let due_run = |number: &usize| {
+            let run = directory.join(&suite.trials[*number].name);
+            let begin = distance(&run).map_or(0, |(done, _)| done);
+            (*number, DueRun { begin, ended: false })
+        };
+        Self {
+            suite,
+            directory,
+            bar,
+            live,
+            quiet,
+            until: until.unwrap_or(1.0),
+            due: due.iter().map(due_run).collect(),
+            running: Vec::new(),
+            failed: 0,
+            started_at: Instant::now(),
+        }
+    }
+
+    /// Prints what the event says and draws the live line again; `None` only draws it.
+    pub(super) fn observe(&mut self, event: Option<Event>) {
+        match event {
+            None => {}
+            Some(Event::Started(number)) => {
+                self.running.push(number);
+                if !self.live {
+                    self.print(&format!("{}: started", self.suite.trials[number].name));
+                }
+            }
+            Some(Event::Finished(number)) => {
+                self.end_run(number);
+                let left = self
+                    .time_left()
+                    .map_or_else(String::new, |left| format!(", about {left} left"));
+                let result =
+                    final_return(&self.run(number)).map_or_else(String::new, |mean| format!(", return {mean:.2}"));
+                self.print(&format!(
+                    "{}: done{result}, {}{left}",
+                    self.suite.trials[number].name,
+                    self.count()
+                ));
+            }
+            Some(Event::Interrupted(number)) => self.running.retain(|other| *other != number),
+            Some(Event::Paused(number)) => {
+                self.end_run(number);
+                let best = best_return(&self.run(number));
+                self.print(&format!(
+                    "{}: best return so far {best:.2}",
+                    self.suite.trials[number].name
+                ));
+            }
+            Some(Event::Failed(number, why)) => {
+                self.end_run(number);
+                self.failed += 1;
+                self.print(&format!("{}: failed: {why}", self.suite.trials[number].name));
+            }
+        }
+        self.draw();
+    }
+
+    /// Ends the live line. Returns how many runs have failed.
+    pub(super) fn end(self) -> usize {
+        self.bar.finish_and_clear();
+        self.failed
+    }
+
+    fn end_run(&mut self, number: usize) {
+        self.running.retain(|other| *other != number);
+        if let Some(run) = self.due.get_mut(&number) {
+            run.ended = true;
+        }
+    }
+
+    fn run(&self, number: usize) -> PathBuf {
+        self.directory.join(&self.suite.trials[number].name)
+    }
+
+    /// How many runs have nothing left to do, failed ones included.
+    fn ended(&self) -> usize {
+        self.suite.trials.len() - self.due.values().filter(|run| !run.ended).count()
+    }
+
+    fn count(&self) -> String {
+        format!("{} of {} runs", self.ended() - self.failed, self.suite.trials.len())
+    }
+
+    fn time_left(&self) -> Option<String> {
+        let length = |(number, run): (&usize, &DueRun)| {
+            let Some((done, all)) = distance(&self.run(*number)) else {
+                let nothing = RunLength {
+                    made: 0,
+                    left: 0,
+                    goal: 0,
+                };
+                return run.ended.then_some(nothing);
+            };
+            let goal = (self.until * all as f64).ceil() as u64;
+            Some(RunLength {
+                made: done.saturating_sub(run.begin),
+                left: if run.ended { 0 } else { goal.saturating_sub(done) },
+                goal,
+            })
+        };
+        let lengths: Vec<_> = self.due.iter().map(length).collect();
+        let seconds = seconds_left(&lengths, self.started_at.elapsed())?;
+        Some(format!("{:#}", HumanDuration(Duration::from_secs(seconds as u64))))
+    }
+
+    fn draw(&self) {
+        if !self.live {
+            return;
+        }
+        let mut lines = vec![self.count()];
+        if let Some(left) = self.time_left() {
+            lines[0] += &format!(" · {left} left");
+        }
+        for number in &self.running {
+            if let Some((done, all)) = distance(&self.run(*number)) {
+                let name: String = self.suite.trials[*number].name.chars().take(50).collect();
+                lines.push(format!("{name}: {} of {}", thousands(done), thousands(all)));
+            }
+        }
+        self.bar.set_position(self.ended() as u64);
+        self.bar.set_message(lines.join("\n  "));
+    }
+
+    fn print(&self, line: &str) {
+        if !self.quiet {
+            self.bar.suspend(|| {
+                // A closed standard error is no reason to fail.
+                let _ = writeln!(std::io::stderr(), "{line}");
+            });
+        }
+    }
+}
+
+/// The estimated remaining time in s, at the rate since `elapsed` ago; `None` if no rate is known or nothing is left. A
+/// run that has not begun is `None` and as long as the others are on average.
+fn seconds_left(runs: &[Option<RunLength>], elapsed: Duration) -> Option<f64> {
+    let begun = || runs.iter().flatten();
+    let made: u64 = begun().map(|run| run.made).sum();
+    let left: u64 = begun().map(|run| run.left).sum();
+    let waiting = runs.len() - begun().count();
+    let goals: Vec<u64> = begun().map(|run| run.goal).filter(|goal| *goal > 0).collect();
+    let mean_goal = goals.iter().sum::<u64>() as f64 / goals.len().max(1) as f64;
+    let left = left as f64 + waiting as f64 * mean_goal;
+    (made > 0 && left > 0.0).then(|| elapsed.as_secs_f64() * left / made as f64)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_remaining_time_counts_what_each_run_has_left() {
+        let run = |made, left, goal| Some(RunLength { made, left, goal });
+        let seconds = |runs: &[Option<RunLength>]| seconds_left(runs, Duration::from_secs(10));
+        assert_eq!(seconds(&[run(100, 300, 400)]), Some(30.0));
+        assert_eq!(seconds(&[run(100, 300, 900)]), Some(30.0), "a resumed run");
+        assert_eq!(seconds(&[run(100, 0, 200), None]), Some(20.0), "one that waits");
+        assert_eq!(
+            seconds(&[run(10, 0, 200), run(90, 100, 200)]),
+            Some(10.0),
+            "one that failed"
+        );
+        assert_eq!(
+            seconds(&[run(0, 0, 0), run(100, 0, 100), None]),
+            Some(10.0),
+            "one that failed at once"
+        );
+        assert_eq!(seconds(&[run(100, 0, 100)]), None, "nothing is left");
+        assert_eq!(seconds(&[None, run(0, 100, 100)]), None, "there is no rate yet");
+    }
+}
