@@ -147,9 +147,13 @@ impl Browser {
 
     /// Clicks into an element, at the fraction `share` of its width.
     pub(crate) fn click(&mut self, selector: &str, share: f64) {
+        // The page may still be moving: layout and scrolling take some frames on a busy machine.
         let place = self.value(&format!(
-            "(() => {{ const e = document.querySelector({selector:?}); e.scrollIntoView({{ block: 'center', behavior: 'instant' }}); \
-             const b = e.getBoundingClientRect(); return [b.left + {share} * b.width, b.top + b.height / 2]; }})()"
+            "(async () => {{ const e = document.querySelector({selector:?}); e.scrollIntoView({{ block: 'center', behavior: 'instant' }}); \
+             const frames = () => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done))); \
+             let before, b; \
+             do {{ before = b; await frames(); b = e.getBoundingClientRect(); }} while (!before || b.top !== before.top || b.left !== before.left); \
+             return [b.left + {share} * b.width, b.top + b.height / 2]; }})()"
         ));
         for kind in ["mousePressed", "mouseReleased"] {
             let event =
