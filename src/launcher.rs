@@ -481,6 +481,7 @@ impl<'a> Launcher<'a> {
         for incident in self.supervisor.take_incidents() {
             self.recorder.incident(&incident, wall)?;
         }
+        self.recorder.hosts(&self.supervisor.hosts(), wall)?;
         self.supervisor.check_faults()?;
         let fills = [
             each(&self.episode_reports, |report| {

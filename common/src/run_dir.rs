@@ -331,6 +331,11 @@ impl RunDir {
         self.path.join("learner.csv")
     }
 
+    /// `hosts.csv`: other hosts that have joined, and how they did.
+    pub fn hosts(&self) -> PathBuf {
+        self.path.join("hosts.csv")
+    }
+
     /// `incidents.csv`: starts, ends and failures of processes.
     pub fn incidents(&self) -> PathBuf {
         self.path.join("incidents.csv")

@@ -2,6 +2,7 @@
 //! else.
 
 mod comparison;
+mod hosts;
 mod numbers;
 mod played;
 mod ranking;

@@ -13,16 +13,17 @@ use shoal_run::usage::UsageError;
 
 use super::join::NOT_BUILT;
 
-/// Makes the keys of the run, unless it has them from an earlier start. Returns the path of the hosts' key.
+/// Makes the keys of the run, unless it has them from an earlier start and no new ones are asked for. Returns the path
+/// of the hosts' key.
 #[cfg(feature = "remote")]
-fn make_keys(config: &Config, run: &RunDir) -> anyhow::Result<PathBuf> {
+fn make_keys(config: &Config, run: &RunDir, new: bool) -> anyhow::Result<PathBuf> {
     use std::time::SystemTime;
 
     use shoal_remote::files::KeyFile;
     use shoal_remote::keys::{self, VALID};
 
     let (gate, join) = (run.path().join(KeyFile::GATE), run.path().join(KeyFile::JOIN));
-    if !(gate.exists() && join.exists()) {
+    if new || !(gate.exists() && join.exists()) {
         let keys = keys::make(&config.run.id, SystemTime::now() + VALID)?;
         keys.gate.write(&gate)?;
         keys.join.write(&join)?;
@@ -31,7 +32,7 @@ fn make_keys(config: &Config, run: &RunDir) -> anyhow::Result<PathBuf> {
 }
 
 #[cfg(not(feature = "remote"))]
-fn make_keys(_config: &Config, _run: &RunDir) -> anyhow::Result<PathBuf> {
+fn make_keys(_config: &Config, _run: &RunDir, _new: bool) -> anyhow::Result<PathBuf> {
     anyhow::bail!(NOT_BUILT)
 }
 
@@ -41,16 +42,18 @@ pub(crate) struct ListenArgs {
     /// all addresses and a free port, or those of before].
     #[arg(long, value_name = "ENDPOINT", num_args = 0..=1, default_missing_value = Endpoint::DEFAULT)]
     pub(crate) listen: Option<String>,
+
+    /// Make new keys. The old `join.key` opens nothing any more.
+    #[arg(long, requires = "listen")]
+    pub(crate) new_keys: bool,
 }
 
 impl ListenArgs {
     /// These options, for another process.
     pub(crate) fn arguments(&self) -> Vec<OsString> {
-        let Self { listen } = self;
-        listen
-            .iter()
-            .map(|endpoint| format!("--listen={endpoint}").into())
-            .collect()
+        let Self { listen, new_keys } = self;
+        let listen = listen.iter().map(|endpoint| format!("--listen={endpoint}").into());
+        listen.chain(new_keys.then(|| "--new-keys".into())).collect()
     }
 
     /// Checks the endpoint before the run is created.
@@ -82,7 +85,7 @@ impl ListenArgs {
         JoinFile::new(endpoint.clone(), listen).write(run)?;
         let mut line = format!("listening on {endpoint}; on other hosts: shoal join {endpoint}");
         if endpoint.is_encrypted() {
-            let key = make_keys(config, run)?;
+            let key = make_keys(config, run, self.new_keys)?;
             line += &format!(" --key {}", key.display());
         }
         // As everywhere, a terminal that is gone must not make the run a failure.

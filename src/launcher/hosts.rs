@@ -7,13 +7,12 @@ use shoal_common::channel::control::{HostLease, HostState, HostStatus};
 /// Incarnations that a host gets at once: more than it will ever need.
 pub(super) const INCARNATIONS: u64 = 1 << 20;
 
-/// A host that is silent for this long loses its actors, so that another host may have them.
-const LOST_AFTER: Duration = Duration::from_secs(60);
-
 /// The admitted hosts.
 #[derive(Debug)]
 pub(super) struct Hosts {
     epoch: u64,
+    /// A host that is silent for this long loses its actors, so that another host may have them.
+    lost_after: Duration,
     admitted: Vec<Admitted>,
 }
 
@@ -25,10 +24,12 @@ struct Admitted {
 }
 
 impl Hosts {
-    /// No hosts. `epoch` is the number of this start of the launcher.
-    pub(super) fn new(epoch: u64) -> Self {
+    /// No hosts. `epoch` is the number of this start of the launcher; a host that is silent for `lost_after` loses its
+    /// actors.
+    pub(super) fn new(epoch: u64, lost_after: Duration) -> Self {
         Self {
             epoch,
+            lost_after,
             admitted: Vec::new(),
         }
     }
@@ -95,10 +96,10 @@ impl Hosts {
             let name = &admitted.lease.name;
             if left {
                 messages.push(format!("host {name} has left"));
-            } else if admitted.heard_at.elapsed() >= LOST_AFTER {
+            } else if admitted.heard_at.elapsed() >= self.lost_after {
                 messages.push(format!(
                     "host {name} was silent for {} s: its actors are free",
-                    LOST_AFTER.as_secs()
+                    self.lost_after.as_secs()
                 ));
             } else {
                 return true;

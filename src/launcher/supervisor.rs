@@ -156,7 +156,7 @@ impl Supervisor {
             occupied_since: None,
             cleanup_time: Duration::ZERO,
             actors,
-            hosts: Hosts::new(started),
+            hosts: Hosts::new(started, Duration::from_secs_f64(config.remote.lost_seconds)),
             max_actors: config.actors.max,
             lockstep_actors,
             log,

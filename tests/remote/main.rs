@@ -359,6 +359,64 @@ fn only_the_key_of_the_run_opens_an_encrypted_endpoint() {
     assert_eq!(in_replay(&path, &[1]), sent);
 }
 
+#[test]
+fn new_keys_replace_the_old_ones() {
+    let run = Run::start(&["--actors", "1", "--listen", "tls/127.0.0.1:0"]);
+    let endpoint = run.endpoint();
+    let old = run.place.path().join("old.key");
+    std::fs::copy(run.running.run.join("join.key"), &old).unwrap();
+    assert!(run.place.output(&["stop", "run"]).status.success());
+    let Run { place, running } = run;
+    let (code, ..) = running.wait();
+    assert_eq!(code, Some(0), "{}", place.stderr());
+
+    let running = place.resume("run", &["--listen", "--new-keys"]);
+    let run = Run { place, running };
+    assert_eq!(run.endpoint(), endpoint);
+    let old = old.display().to_string();
+    let refused = ["join", &endpoint, "--actors", "1", "--key", &old, "--give-up", "2s"];
+    let refused = run.place.output(&refused);
+    assert_eq!(refused.status.code(), Some(4));
+    assert!(error_line(&refused).contains("is this its key"));
+    let new = run.running.run.join("join.key").display().to_string();
+    let host = Host::join(&run, &["--actors", "1", "--key", &new]);
+    wait_for_actors(&run, &[1]);
+    stop(run);
+    host.ends_with(0);
+}
+
+#[test]
+fn the_actors_of_a_host_that_vanishes_are_free_after_a_while() {
+    let run = Run::start(&[
+        "--actors",
+        "1",
+        "--set",
+        "actors.max=3",
+        "--set",
+        "remote.lost_seconds=6",
+    ]);
+    let host = Host::join(&run, &["--actors", "2", "--name", "vanishing"]);
+    wait_for_actors(&run, &[1, 2]);
+    host.running.kill_all();
+    until("the host is shown as cut off", || run.hosts()[0]["state"] == "cut-off");
+    // Its actors are still its own.
+    let refused = run.place.output(&["join", &run.endpoint(), "--actors", "2"]);
+    assert!(error_line(&refused).contains("0 are free"), "{}", error_line(&refused));
+    until("the host has lost its actors", || run.hosts().is_empty());
+    assert!(run.running.log().contains("host vanishing was silent for 6 s"));
+    let host = Host::join(&run, &["--actors", "2", "--name", "next"]);
+    wait_for_actors(&run, &[1, 2]);
+    let path = stop(run);
+    host.ends_with(0);
+    let records = std::fs::read_to_string(path.join("hosts.csv")).unwrap();
+    let has = |name: &str, state: &str| records.lines().any(|row| row.contains(&format!(",{name},{state},")));
+    assert!(
+        has("vanishing", "connected") && has("vanishing", "cut-off") && has("vanishing", "gone"),
+        "{records}"
+    );
+    assert!(has("next", "connected"), "{records}");
+}
+
 /// The template as an executable file, with this text replaced.
 fn template(place: &Workplace, name: &str, replaced: (&str, &str)) -> std::path::PathBuf {
     let printed = place.output(&["join", "--template", name]);

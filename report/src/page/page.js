@@ -235,6 +235,25 @@ function time() {
   section("Over time", ...parts, aside("The diagrams of this section are zoomed together. Vertical lines mark incidents and changes of the configuration. A horizontal dashed line is the configured ratio."));
 }
 
+/** The hosts that have joined, if there were any. */
+function hosts() {
+  const rows = runs.flatMap((run) => run.hosts.map((host) => ({ ...host, run: run.name })));
+  if (!rows.length) return;
+  const columns = [
+    ...(several ? [["run", (row) => row.run]] : []),
+    ["host", (row) => row.name],
+    ["actors", (row) => whole(row.actors)],
+    ["joined", (row) => duration(row.joined)],
+    ["gone", (row) => (row.gone === null ? "–" : duration(row.gone))],
+    ["rows/s", (row) => text(row.rows_per_second)],
+    ["round trip", (row) => (row.round_trip === null ? "–" : `${text(row.round_trip)} ms`)],
+    ["policy behind", (row) => text(row.policy_lag)],
+    ["resent chunks", (row) => whole(row.resent_chunks)],
+    ["cut off", (row) => plural(row.cut_offs, "time")],
+  ];
+  section("Other hosts", listed("Other hosts of the runs", columns, rows), aside("Times are those of the run. Rows per second, round trip and how many versions the policy was behind are medians over the time while the host was connected."));
+}
+
 /** Which settings are best, where settings were repeated with several seeds; empty if none were. */
 function ranking() {
   if (!report.rankings.length) return [];
@@ -285,4 +304,4 @@ function settings() {
 }
 
 head(report);
-for (const part of [result, learning, episodes, details, exploration, time, changes, settings]) part();
+for (const part of [result, learning, episodes, details, exploration, time, hosts, changes, settings]) part();

@@ -9,10 +9,11 @@ use shoal_run::origin::Origin;
 use shoal_run::records::outcome::{RunOutcome, RunState};
 use shoal_run::records::recorder::{
     ChangeRecord, EpisodeRecord, EvaluationRecord, IncidentRow, LearnerRecord, read_changes, read_episodes,
-    read_evaluations, read_incidents, read_learner,
+    read_evaluations, read_hosts, read_incidents, read_learner,
 };
 use shoal_run::records::start::StartRecord;
 
+use super::hosts::Host;
 use super::numbers::{PageLimits, downsample, mean, parts, short};
 use super::played::Played;
 use super::settings::{self, Setting};
@@ -48,6 +49,8 @@ pub(super) struct Run {
     exploration: Curve,
     learner: Rates,
     incidents: Option<Incidents>,
+    /// The other hosts that have joined.
+    hosts: Vec<Host>,
     /// How, when and where it was started; `None` in runs of earlier versions.
     start: Option<StartRecord>,
     /// What it began with, in words.
@@ -174,6 +177,7 @@ impl Run {
             exploration: Curve::of_episodes(&explored, limits.points),
             learner: Rates::of(learner, limits.points),
             incidents: read_incidents(&run.incidents())?.map(Incidents::of),
+            hosts: Host::all(&read_hosts(&run.hosts())?),
             start: StartRecord::read(run.path())?,
             origin: Origin::read(run)?.map(|origin| origin.in_words()),
             changes: read_changes(&run.changes())?,

@@ -1,6 +1,7 @@
-//! The run's records: five tables, three of them also as TensorBoard scalars.
+//! The run's records: six tables, three of them also as TensorBoard scalars.
 
 mod change;
+mod host;
 mod incident;
 mod table;
 mod tensorboard;
@@ -9,8 +10,11 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 pub use change::{ChangeRecord, Moment, read_changes, record_changes};
+use host::HostTable;
+pub use host::{HostRecord, RecordedHostState, read_hosts};
 pub use incident::{Incident, IncidentKind, IncidentRow};
 use serde::{Deserialize, Serialize};
+use shoal_common::channel::control::HostStatus;
 use shoal_common::config::{Config, ReplayConfig};
 use shoal_common::report::{EpisodeReport, EvaluationReport, LearnerReport};
 use shoal_common::run_dir::RunDir;
@@ -101,6 +105,7 @@ pub struct Recorder {
     evaluations: Table,
     learner: Table,
     incidents: Table,
+    hosts: HostTable,
     events: EventFile,
     events_path: std::path::PathBuf,
     ratio: ReplayConfig,
@@ -169,6 +174,7 @@ impl Recorder {
             evaluations,
             learner,
             incidents,
+            hosts: HostTable::new(run.hosts()),
             events,
             events_path,
             ratio: ratio.clone(),
@@ -306,6 +312,13 @@ impl Recorder {
             detail: incident.detail.clone(),
         })?;
         self.incidents.flush()
+    }
+
+    /// Records the other hosts as they are `wall` after this launcher's start. It may be called at any rate; each host
+    /// is recorded when its state changes, and every few seconds.
+    pub fn hosts(&mut self, hosts: &[HostStatus], wall: Duration) -> Result<(), RecordError> {
+        let moment = self.moment(wall);
+        self.hosts.record(hosts, wall, moment)
     }
 
     /// Writes everything to the files, so that it survives the death of this process.
