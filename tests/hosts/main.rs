@@ -9,8 +9,9 @@ mod suite;
 #[path = "../support/mod.rs"]
 mod support;
 
-use std::path::PathBuf;
-use std::process::{Command, ExitCode};
+use std::io::Read;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitCode, Stdio};
 use std::time::Duration;
 
 use shoal_common::config::Config;
@@ -20,13 +21,25 @@ use support::{QUICK, Running, Workplace, check_stored_rows, committed, sent, unt
 /// Network namespaces and virtual cables.
 static NAMESPACES: Need = Need::new(
     "this machine makes no network namespaces (root and iproute2 are needed)",
+    makes_namespaces,
+    None,
+);
+
+/// What `slow_cable.py` needs besides.
+static SLOW_CABLES: Need = Need::new(
+    "this machine makes no network namespaces, or has no TUN devices or no python3",
     || {
-        let name = format!("shoal-try-{}", std::process::id());
-        let made = try_ip(&["netns", "add", &name]);
-        made && try_ip(&["netns", "del", &name])
+        let python = Command::new("python3").arg("--version").output();
+        makes_namespaces() && Path::new("/dev/net/tun").exists() && python.is_ok_and(|output| output.status.success())
     },
     None,
 );
+
+fn makes_namespaces() -> bool {
+    let name = format!("shoal-try-{}-{:?}", std::process::id(), std::thread::current().id());
+    let made = try_ip(&["netns", "add", &name]);
+    made && try_ip(&["netns", "del", &name])
+}
 
 fn main() -> ExitCode {
     suite::run(vec![
@@ -35,6 +48,7 @@ fn main() -> ExitCode {
             NAMESPACES
         ),
         test!(cut_cables_and_killed_processes_lose_and_repeat_no_row, NAMESPACES),
+        test!(a_slow_cable_that_loses_packets_loses_and_repeats_no_row, SLOW_CABLES),
     ])
 }
 
@@ -52,6 +66,8 @@ fn ip(arguments: &[&str]) {
 /// Two hosts and the cable between them.
 struct Cable {
     number: u32,
+    /// Passes the packets if the cable is slow.
+    slow: Option<Child>,
 }
 
 const LEARNER: &str = "a";
@@ -60,11 +76,8 @@ const OTHER: &str = "b";
 impl Cable {
     /// `number` distinguishes it from the cables of other tests.
     fn new(number: u32) -> Self {
-        let cable = Self { number };
+        let cable = Self::without_cable(number);
         let [learner, other] = [LEARNER, OTHER].map(|host| cable.namespace(host));
-        for name in [&learner, &other] {
-            ip(&["netns", "add", name]);
-        }
         let [plug, socket] = [LEARNER, OTHER].map(|host| cable.device(host));
         ip(&[
             "link", "add", &plug, "netns", &learner, "type", "veth", "peer", "name", &socket, "netns", &other,
@@ -81,6 +94,34 @@ impl Cable {
                 &device,
             ]);
             ip(&["-n", &name, "link", "set", &device, "up"]);
+        }
+        cable
+    }
+
+    /// One that delays every packet by `delay`, and loses this share of them.
+    fn slow(number: u32, delay: Duration, loss: f64) -> Self {
+        let mut cable = Self::without_cable(number);
+        let program = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/hosts/slow_cable.py");
+        let mut command = Command::new("python3");
+        command.arg(program);
+        for (host, address) in [(LEARNER, "1"), (OTHER, "2")] {
+            command.args([cable.namespace(host), format!("10.99.{number}.{address}")]);
+        }
+        command.args([delay.as_millis().to_string(), loss.to_string()]);
+        let mut slow = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
+        let mut ready = [0; 6];
+        slow.stdout.as_mut().unwrap().read_exact(&mut ready).unwrap();
+        assert_eq!(&ready, b"ready\n");
+        cable.slow = Some(slow);
+        cable
+    }
+
+    /// The two hosts.
+    fn without_cable(number: u32) -> Self {
+        let cable = Self { number, slow: None };
+        for host in [LEARNER, OTHER] {
+            let name = cable.namespace(host);
+            ip(&["netns", "add", &name]);
             ip(&["-n", &name, "link", "set", "lo", "up"]);
         }
         cable
@@ -190,6 +231,10 @@ impl Cable {
 
 impl Drop for Cable {
     fn drop(&mut self) {
+        if let Some(slow) = &mut self.slow {
+            drop(slow.stdin.take());
+            slow.wait().unwrap();
+        }
         for host in [LEARNER, OTHER] {
             try_ip(&["netns", "del", &self.namespace(host)]);
         }
@@ -204,8 +249,7 @@ struct Pair {
 }
 
 impl Pair {
-    fn start(number: u32, settings: &[&str]) -> Self {
-        let cable = Cable::new(number);
+    fn start(cable: Cable, settings: &[&str]) -> Self {
         let place = Workplace::logging_chunks();
         let endpoint = cable.endpoint();
         let train = [
@@ -239,9 +283,14 @@ impl Pair {
         String::from_utf8(output.stdout).unwrap()
     }
 
-    fn state_of_host(&self) -> serde_json::Value {
+    /// What `status` says of the other host.
+    fn host(&self) -> serde_json::Value {
         let status: serde_json::Value = serde_json::from_str(&self.output(&["status", "run", "--json"])).unwrap();
-        status["hosts"][0]["state"].clone()
+        status["hosts"][0].clone()
+    }
+
+    fn state_of_host(&self) -> serde_json::Value {
+        self.host()["state"].clone()
     }
 
     fn rows_of_host(&self) -> u64 {
@@ -271,7 +320,7 @@ impl Pair {
 
 fn a_pendulum_is_trained_by_two_hosts_and_nothing_else_is_contacted() {
     let quick = [&QUICK[..], &["--steps", "100000"]].concat();
-    let pair = Pair::start(41, &quick);
+    let pair = Pair::start(Cable::new(41), &quick);
     pair.wait_for_host();
     // Addresses are in hexadecimal, the last byte first.
     for (host, other) in [(LEARNER, "0229630A"), (OTHER, "0129630A")] {
@@ -299,7 +348,7 @@ fn cut_cables_and_killed_processes_lose_and_repeat_no_row() {
         &["--steps", "100000000", "--set", "replay.updates_per_step=0.2"],
     ]
     .concat();
-    let pair = Pair::start(42, &settings);
+    let pair = Pair::start(Cable::new(42), &settings);
     pair.wait_for_host();
     for (seconds, silent) in [(1, false), (4, false), (1, true), (5, true)] {
         let cut = |cut: bool| match silent {
@@ -335,6 +384,35 @@ fn cut_cables_and_killed_processes_lose_and_repeat_no_row() {
         pair.wait_for_host();
     }
     pair.wait_for_host();
+    let (sent, in_replay) = pair.stop();
+    assert!(sent > 0);
+    assert_eq!(in_replay, sent);
+}
+
+fn a_slow_cable_that_loses_packets_loses_and_repeats_no_row() {
+    let settings = [
+        &QUICK[..],
+        &["--steps", "100000000", "--set", "replay.updates_per_step=0.2"],
+    ]
+    .concat();
+    let delay = Duration::from_millis(20);
+    let pair = Pair::start(Cable::slow(43, delay, 0.02), &settings);
+    pair.wait_for_host();
+    for role in ["gate-0", "relay-0", "learner-0", "env-server-1"] {
+        let running = if ["gate-0", "learner-0"].contains(&role) {
+            &pair.learner.1
+        } else {
+            &pair.other.1
+        };
+        running.kill_if_alive(role);
+        wait_for_rows(&pair.learner.1, 400);
+        pair.wait_for_host();
+    }
+    until("the round trip is shown", || {
+        pair.host()["round_trip_us"].as_u64().is_some()
+    });
+    let round_trip = Duration::from_micros(pair.host()["round_trip_us"].as_u64().unwrap());
+    assert!(round_trip >= 2 * delay, "{round_trip:?}");
     let (sent, in_replay) = pair.stop();
     assert!(sent > 0);
     assert_eq!(in_replay, sent);
