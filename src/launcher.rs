@@ -225,7 +225,7 @@ impl<'a> Launcher<'a> {
         let initial = status::saved_status(&config, run)?;
         RunOutcome::new(RunState::Running, initial.env_steps, initial.episodes).write(run)?;
         // Creates the services that are opened below.
-        let supervisor = Supervisor::new(&config, run, domain, log.clone(), HostRoles::Learner { gate })?;
+        let supervisor = Supervisor::new(&config, run, domain, log.clone(), HostRoles::LearnerHost { gate })?;
         Ok(Self {
             control: ControlPort::open(domain)?,
             initial,

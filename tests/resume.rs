@@ -385,6 +385,34 @@ fn is_interrupted_in_time_and_finished(stopped: bool) -> bool {
 }
 
 #[test]
+fn a_run_of_some_episodes_ends_although_its_learner_is_slower_than_its_actors() {
+    let place = Workplace::new();
+    let limits = [
+        "--episodes",
+        "4",
+        "--steps",
+        "6000",
+        "--set",
+        "replay.tolerance=64",
+        "--json",
+    ];
+    let arguments = [&["train", "pendulum", "--run", "run"], &SLOW_UPDATES[2..], &limits].concat();
+    let output = place.output(&arguments);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let result = support::json(&output);
+    let (steps, episodes) = (
+        result["env_steps"].as_u64().unwrap(),
+        result["episodes"].as_u64().unwrap(),
+    );
+    assert!(
+        (4..10).contains(&episodes) && steps < 3000,
+        "{steps} steps, {episodes} episodes"
+    );
+    // Every row was learned from.
+    assert_eq!(result["updates"], steps - 64);
+}
+
+#[test]
 fn stopping_a_waiting_copy_does_not_stop_the_original() {
     let place = Workplace::new();
     let running = place.start("run", &ENDLESS);

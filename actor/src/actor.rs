@@ -36,7 +36,7 @@ use crate::actor_snapshot::ActorSnapshot;
 use crate::environment::{after_fault, connect};
 use crate::error::ActorError;
 use crate::exploration::{Exploration, StepCounts};
-use crate::n_step::NStepReturns;
+use crate::n_step::NStepTransitions;
 
 /// How long an actor waits for its last chunk to be committed when the whole run ends.
 const LAST_COMMIT_TIMEOUT: Duration = Duration::from_secs(1);
@@ -100,11 +100,10 @@ struct Actor<'a> {
     exploration: Exploration,
     sender: ChunkSender,
     /// What is not in a chunk yet, if a transition has several steps.
-    n_step: NStepReturns,
+    n_step: NStepTransitions,
     /// The chunk that is being filled.
     chunk: Chunk,
-    /// Version of the policy with which the last row of `chunk` was collected. If `chunk` is empty, that of the last
-    /// row sent.
+    /// Version of the policy that took the newest step of `chunk`, or, if that is empty, the newest step sent.
     policy_version: u64,
     commits: CommitReader,
     heartbeat: HeartbeatSender,
@@ -161,13 +160,18 @@ impl<'a> Actor<'a> {
         let snapshot = if settings.config.run.mode == Mode::Lockstep && sender.sent() > 0 {
             let words = commits.actor_snapshot(index as usize);
             let n_step = row.n_step_words(settings.n_step, settings.envs);
-            ActorSnapshot::read(
+            let snapshot = ActorSnapshot::read(
                 &words,
                 &settings.chunk,
                 settings.envs,
                 exploration.state().len(),
                 n_step,
-            )
+            );
+            // To begin new episodes instead would change the run's bits.
+            if snapshot.is_none() && settings.chunk.actor_snapshot_words > 0 {
+                return Err(Exit::Failed(ActorError::Snapshot));
+            }
+            snapshot
         } else {
             None
         };
@@ -182,7 +186,7 @@ impl<'a> Actor<'a> {
             snapshot,
             ending_since: None,
             ended: Vec::new(),
-            n_step: NStepReturns::new(settings.n_step, settings.envs, row),
+            n_step: NStepTransitions::new(settings.n_step, settings.envs, row),
             chunk: sender.begin()?,
             policy_version: 0,
             sender,
@@ -222,7 +226,7 @@ impl<'a> Actor<'a> {
         self.ended.clear();
         if let Some(snapshot) = &self.snapshot {
             self.step = snapshot.step;
-            self.exploration.restore(&snapshot.noise);
+            self.exploration.restore(&snapshot.exploration);
             if !self.n_step.restore(&snapshot.n_step) {
                 return Err(Exit::Failed(ActorError::Snapshot));
             }
@@ -412,7 +416,7 @@ impl<'a> Actor<'a> {
         let snapshot = ActorSnapshot {
             environments,
             step: self.step,
-            noise: self.exploration.state().into(),
+            exploration: self.exploration.state().into(),
             returns: self.returns.clone(),
             lengths: self.lengths.clone(),
             n_step: self.n_step.words(),

@@ -10,20 +10,24 @@ pub(crate) struct ActorSnapshot {
     pub(crate) environments: Vec<u64>,
     /// Steps of each environment since the actor's random stream began.
     pub(crate) step: u64,
-    /// The state of the noise, one environment after another.
-    pub(crate) noise: Vec<f64>,
+    /// The state of the exploration, one environment after another.
+    pub(crate) exploration: Vec<f64>,
     /// Returns of the current episodes.
     pub(crate) returns: Vec<f64>,
     /// Their lengths.
     pub(crate) lengths: Vec<u32>,
-    /// The state of [`NStepReturns`](crate::n_step::NStepReturns).
+    /// The state of [`NStepTransitions`](crate::n_step::NStepTransitions).
     pub(crate) n_step: Vec<u64>,
 }
 
 impl ActorSnapshot {
     /// The words that follow a chunk's rows.
     pub(crate) fn words(&self) -> Vec<u64> {
-        let own = self.noise.iter().chain(&self.returns).map(|number| number.to_bits());
+        let own = self
+            .exploration
+            .iter()
+            .chain(&self.returns)
+            .map(|number| number.to_bits());
         let lengths = self.lengths.iter().map(|length| u64::from(*length));
         let step = std::iter::once(self.step);
         self.environments
@@ -36,21 +40,27 @@ impl ActorSnapshot {
             .collect()
     }
 
-    /// Reads the words of an actor with `envs` environments, `noise` numbers of noise and `n_step` words of transitions
+    /// Reads the words of an actor with `envs` environments, `exploration` numbers of exploration and `n_step` words of transitions
     /// of several steps; `None` if their count is not that of `layout`.
-    pub(crate) fn read(words: &[u64], layout: &ChunkLayout, envs: usize, noise: usize, n_step: usize) -> Option<Self> {
-        let own = 1 + noise + 2 * envs + n_step;
+    pub(crate) fn read(
+        words: &[u64],
+        layout: &ChunkLayout,
+        envs: usize,
+        exploration: usize,
+        n_step: usize,
+    ) -> Option<Self> {
+        let own = 1 + exploration + 2 * envs + n_step;
         let environments = layout.actor_snapshot_words.checked_sub(own)?;
         let (environments, rest) = words.split_at_checked(environments)?;
         let (step, rest) = rest.split_first()?;
-        let (noise, rest) = rest.split_at_checked(noise)?;
+        let (exploration, rest) = rest.split_at_checked(exploration)?;
         let (returns, rest) = rest.split_at_checked(envs)?;
         let (lengths, rest) = rest.split_at_checked(envs)?;
         let numbers = |words: &[u64]| words.iter().map(|bits| f64::from_bits(*bits)).collect();
         (rest.len() == n_step).then(|| Self {
             environments: environments.into(),
             step: *step,
-            noise: numbers(noise),
+            exploration: numbers(exploration),
             returns: numbers(returns),
             // Every length was written from a `u32`.
             lengths: lengths.iter().map(|length| *length as u32).collect(),
@@ -75,7 +85,7 @@ mod tests {
         let snapshot = ActorSnapshot {
             environments: (0..10).collect(),
             step: 77,
-            noise: vec![0.5, -0.0, f64::MIN_POSITIVE, 3.0],
+            exploration: vec![0.5, -0.0, f64::MIN_POSITIVE, 3.0],
             returns: vec![-1200.5, 0.0],
             lengths: vec![199, 0],
             n_step: vec![7, 8, 9],

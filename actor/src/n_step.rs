@@ -12,7 +12,7 @@ use shoal_common::transition::{RowLayout, Transition};
 /// A step of all environments completes at most n transitions in each, and those are put into chunks before the next
 /// step. So there are never more than n rows for each environment.
 #[derive(Clone, Debug, PartialEq)]
-pub struct NStepReturns {
+pub struct NStepTransitions {
     n: usize,
     row: RowLayout,
     /// For each environment the rows of its latest steps, the oldest first; fewer than n.
@@ -21,7 +21,7 @@ pub struct NStepReturns {
     complete: VecDeque<Vec<f32>>,
 }
 
-impl NStepReturns {
+impl NStepTransitions {
     /// For transitions of `n` steps in `environments` environments.
     pub fn new(n: usize, environments: usize, row: RowLayout) -> Self {
         Self {
@@ -198,7 +198,7 @@ mod tests {
             episodes in prop::collection::vec((1_usize..12, any::<bool>()), 1..6),
             cut in 0_usize..40,
         ) {
-            let mut n_step = NStepReturns::new(n, 1, row());
+            let mut n_step = NStepTransitions::new(n, 1, row());
             let mut expected = Vec::new();
             let mut total = 0;
             for (length, terminated) in episodes {
@@ -213,8 +213,8 @@ mod tests {
                     total += 1;
                     if total == cut {
                         // As another process that takes over.
-                        let mut successor = NStepReturns::new(n, 1, row());
-                        let kept = NStepReturns {
+                        let mut successor = NStepTransitions::new(n, 1, row());
+                        let kept = NStepTransitions {
                             complete: VecDeque::new(),
                             ..n_step.clone()
                         };
@@ -239,7 +239,7 @@ mod tests {
 
     #[test]
     fn environments_do_not_mix_and_an_episode_has_one_last_row() {
-        let mut n_step = NStepReturns::new(3, 2, row());
+        let mut n_step = NStepTransitions::new(3, 2, row());
         for t in 0..4 {
             n_step.add(0, &row().read(&step(t, 1.0, t == 3, false)));
             n_step.add(1, &row().read(&step(10 + t, 2.0, false, false)));
@@ -257,19 +257,21 @@ mod tests {
         assert_eq!(rows, [(12.0, 3.8, 14.0, false), (13.0, 2.0, 14.0, false)]);
         assert_eq!(n_step.words().len(), row().n_step_words(3, 2));
         n_step.clear();
-        assert_eq!(n_step, NStepReturns::new(3, 2, row()));
+        assert_eq!(n_step, NStepTransitions::new(3, 2, row()));
     }
 
     #[test]
     fn words_of_another_layout_are_refused() {
-        let mut n_step = NStepReturns::new(3, 2, row());
+        let mut n_step = NStepTransitions::new(3, 2, row());
         n_step.add(0, &row().read(&step(0, 1.0, false, false)));
         let words = n_step.words();
-        assert!(!NStepReturns::new(4, 2, row()).restore(&words));
-        assert!(!NStepReturns::new(3, 1, row()).restore(&words));
+        assert!(!NStepTransitions::new(4, 2, row()).restore(&words));
+        assert!(!NStepTransitions::new(3, 1, row()).restore(&words));
         let mut many = words.clone();
         many[0] = u64::MAX;
-        assert!(!NStepReturns::new(3, 2, row()).restore(&many));
-        assert!(NStepReturns::new(1, 2, row()).restore(&[]) && NStepReturns::new(1, 2, row()).words().is_empty());
+        assert!(!NStepTransitions::new(3, 2, row()).restore(&many));
+        assert!(
+            NStepTransitions::new(1, 2, row()).restore(&[]) && NStepTransitions::new(1, 2, row()).words().is_empty()
+        );
     }
 }

@@ -170,12 +170,12 @@ impl AlgorithmConfig {
         }
     }
 
-    /// How its actors act in `batch` environments like `spec`, if observations are not normalised.
+    /// How its actors act in `envs` environments like `spec`, if observations are not normalised.
     ///
     /// # Errors
     /// When it cannot control such environments.
-    pub fn behaviour(&self, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError> {
-        self.settings().behaviour(self.name(), spec, batch)
+    pub fn behaviour(&self, spec: &EnvironmentSpec, envs: usize) -> Result<Behaviour, PolicyError> {
+        self.settings().behaviour(self.name(), spec, envs)
     }
 
     /// Checks that it can control environments like `spec`.
@@ -212,7 +212,7 @@ mod tests {
         let (yes, no) = (true, false);
         // DDPG, TD3, SAC, DQN, REINFORCE, Q-learning, SARSA.
         assert_eq!(takes(real, real), [yes, yes, yes, no, no, no, no]);
-        // DDPG's networks take an index as a quantity, as they did before there was a choice.
+        // DDPG's networks take an index as a number, as in earlier versions.
         assert_eq!(takes(counted, real), [yes, no, no, no, no, no, no]);
         assert_eq!(takes(real, counted), [no, no, no, yes, yes, no, no]);
         assert_eq!(takes(counted, counted), [no, no, no, no, no, yes, yes]);

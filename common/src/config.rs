@@ -151,12 +151,12 @@ impl Config {
         })
     }
 
-    /// How actors act in `batch` environments.
+    /// How actors act in `envs` environments.
     ///
     /// # Errors
     /// When the algorithm cannot control the environment; a checked configuration has no such algorithm.
-    pub fn behaviour(&self, batch: usize) -> Result<Behaviour, PolicyError> {
-        let behaviour = self.algorithm.behaviour(&self.spec, batch)?;
+    pub fn behaviour(&self, envs: usize) -> Result<Behaviour, PolicyError> {
+        let behaviour = self.algorithm.behaviour(&self.spec, envs)?;
         Ok(behaviour.normalising(self.observation.normalise))
     }
 

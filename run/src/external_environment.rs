@@ -359,7 +359,8 @@ impl ExternalEnvironment {
         }
     }
 
-    /// Whether the server did not answer a request in time. A new server would take as long.
+    /// Whether the wait for an answer has ended without one: in time none came, or a signal did. A new server would take
+    /// as long.
     pub fn is_silent(&self) -> bool {
         self.silent.get()
     }

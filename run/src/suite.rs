@@ -29,7 +29,7 @@ pub struct Suite {
     pub arguments: Vec<String>,
     /// The runs.
     pub trials: Vec<Trial>,
-    /// What all runs have from a `resume --set` on, each as `SECTION.KEY=VALUE`.
+    /// Changes of all runs by `resume --set`, each as `SECTION.KEY=VALUE`.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub changes: Vec<String>,
     /// Whether bad settings are ended early, and which were.
@@ -37,9 +37,9 @@ pub struct Suite {
     pub halving: Option<Halving>,
 }
 
-/// Successive halving (Jamieson and Talwalkar 2016): after each round the worse half of the settings is ended, so that
-/// the last one or two are trained to the end. The first of `n` rounds ends when a run has done 1/2ⁿ of its steps; each
-/// further one is twice as long.
+/// Successive halving (Jamieson and Talwalkar 2016): after each round the worse half of the settings is ended, and the
+/// one that is left is trained to the end. With n rounds, the first ends when each run has done 1/2ⁿ of its steps, and
+/// each further one when it has done twice as many.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Halving {
     /// The names of the runs that each completed round has ended.

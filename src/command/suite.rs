@@ -3,7 +3,7 @@
 mod measure;
 mod progress;
 
-use std::collections::VecDeque;
+use std::collections::{BTreeSet, VecDeque};
 use std::io::Write;
 use std::path::Path;
 use std::process::{Command, ExitCode};
@@ -143,7 +143,7 @@ pub(crate) fn change(directory: &Path, changes: &[String]) -> anyhow::Result<()>
     suite.write(directory)
 }
 
-/// The suite in this directory, which the caller has locked: another process may have changed it before.
+/// The suite in this directory. The caller has locked it: until then another process may have changed it.
 fn read(directory: &Path) -> anyhow::Result<Suite> {
     Suite::read(directory)?.with_context(|| format!("{} is no suite any more", directory.display()))
 }
@@ -205,16 +205,16 @@ pub(crate) fn resume(directory: &Path, options: SuiteOptions<'_>) -> anyhow::Res
     let _lock = suite::lock(directory)?;
     let signals = Signals::register()?;
     let mut suite = read(directory)?;
-    let mut failed = 0;
+    let mut failed = BTreeSet::new();
     while let Some(round) = suite.next_round() {
         let percent = 100.0 * round.share;
         let is_due = |trial: &Trial| {
             let run = directory.join(&trial.name);
-            Ok(round.trials.contains(trial) && !is_finished(&suite, &run)? && share_done(&run) < round.share)
+            Ok(round.trials.contains(trial) && !check_finished(&suite, &run)? && share_done(&run) < round.share)
         };
         let due = Due::new(&suite, directory, is_due, options)?;
         due.say(&format!("until each has done {percent:.0} % of its steps:"));
-        failed += due.train(&signals, Some(round.share));
+        due.train(&signals, Some(round.share), &mut failed);
         if signals.received().is_some() {
             break;
         }
@@ -226,23 +226,26 @@ pub(crate) fn resume(directory: &Path, options: SuiteOptions<'_>) -> anyhow::Res
         let ended = suite.end_worse_half(result);
         suite.write(directory)?;
         if !options.output.quiet {
-            writeln!(std::io::stderr(), "ended early at {percent:.0} %: {}", ended.join("; "))?;
+            // A closed standard error is no reason to fail.
+            let _ = writeln!(std::io::stderr(), "ended early at {percent:.0} %: {}", ended.join("; "));
         }
     }
     if signals.received().is_none() {
-        let is_due = |trial: &Trial| Ok(!suite.has_ended(trial) && !is_finished(&suite, &directory.join(&trial.name))?);
+        let is_due =
+            |trial: &Trial| Ok(!suite.has_ended(trial) && !check_finished(&suite, &directory.join(&trial.name))?);
         let due = Due::new(&suite, directory, is_due, options)?;
         due.say("");
-        failed += due.train(&signals, None);
+        due.train(&signals, None, &mut failed);
     }
     report(&suite, directory, options.output)?;
     let here = directory.display();
     let mut stderr = std::io::stderr().lock();
-    match (signals.received(), failed) {
+    failed.retain(|number| !suite.has_ended(&suite.trials[*number]));
+    match (signals.received(), failed.len()) {
         (None, 0) => Ok(ExitCode::SUCCESS),
         (None, failed) => bail!("{failed} of the runs failed; to continue with them: shoal resume {here}"),
         (Some(signal), _) => {
-            writeln!(stderr, "interrupted; to continue: shoal resume {here}")?;
+            let _ = writeln!(stderr, "interrupted; to continue: shoal resume {here}");
             Ok(exit_code(signal))
         }
     }
@@ -270,7 +273,7 @@ impl<'a> Due<'a> {
                 numbers.push_back(number);
             }
         }
-        // Each run that is begun locks the run whose replay it copies.
+        // A new run locks the run whose replay it copies.
         let one_at_a_time = RunOverrides::from_arguments(&suite.arguments)?.with_replay;
         let jobs = match (options.jobs, numbers.front()) {
             _ if one_at_a_time => 1,
@@ -300,8 +303,9 @@ impl<'a> Due<'a> {
         }
     }
 
-    /// Trains them, each until it has done this share of its steps. Returns how many failed.
-    fn train(self, signals: &Signals, until: Option<f64>) -> usize {
+    /// Trains them, each until it has done this share of its steps. `failed` has the numbers of the trials that failed
+    /// when they were trained last.
+    fn train(self, signals: &Signals, until: Option<f64>, failed: &mut BTreeSet<usize>) {
         let Self {
             suite,
             directory,
@@ -309,6 +313,7 @@ impl<'a> Due<'a> {
             jobs,
             quiet,
         } = self;
+        let due = numbers.clone();
         let mut progress = SuiteProgress::new(suite, directory, &numbers, until, quiet);
         let work = |number: usize, events: &Sender<Event>| {
             // A closed channel is no reason to stop.
@@ -326,7 +331,8 @@ impl<'a> Due<'a> {
             });
         };
         run_jobs(numbers, jobs, signals, work, |event| progress.observe(event));
-        progress.end()
+        failed.retain(|number| !due.contains(number));
+        failed.extend(progress.end());
     }
 }
 
@@ -338,7 +344,7 @@ fn usual_jobs(suite: &Suite, directory: &Path, first: usize) -> anyhow::Result<u
         .ok()
         .and_then(|run| run.config().ok());
     let config = stored.or_else(|| Some(plan::resolve(&suite.what, &overrides).ok()?.1));
-    // Where it cannot be found out, each run still checks for itself.
+    // If this fails: one. Each run checks for itself what it needs.
     let fit = config
         .and_then(|config| preflight::side_by_side(&config).ok())
         .unwrap_or(1);
@@ -347,7 +353,7 @@ fn usual_jobs(suite: &Suite, directory: &Path, first: usize) -> anyhow::Result<u
 }
 
 /// Whether nothing is left to do in this run directory.
-fn is_finished(suite: &Suite, run: &Path) -> anyhow::Result<bool> {
+fn check_finished(suite: &Suite, run: &Path) -> anyhow::Result<bool> {
     // A training that was killed before it wrote anything leaves an empty directory. Only such a directory is removed.
     let _ = std::fs::remove_dir(run);
     if !run.exists() {

@@ -64,6 +64,8 @@ pub(super) struct Child {
     server: Option<u32>,
     /// Whether the user was told that it is slow, since it was last heard of or started.
     reported_slow: bool,
+    /// The process did not become ready in time and was killed for that.
+    start_timed_out: bool,
     /// The time and the steps at which its rate was last computed.
     rate_computed_at: (Instant, u64),
     rate: f64,
@@ -105,6 +107,7 @@ impl Child {
             server: (role == Role::Actor).then_some(index),
             rate_computed_at: (now, 0),
             reported_slow: false,
+            start_timed_out: false,
             rate: 0.0,
         }
     }
@@ -138,6 +141,7 @@ impl Child {
         self.progress_at = now;
         self.last_heartbeat = None;
         self.reported_slow = false;
+        self.start_timed_out = false;
         self.rate = 0.0;
     }
 
@@ -204,7 +208,7 @@ impl Child {
             Some(activity) => steps > 0 || activity != Activity::Working,
             None => {
                 self.longest_failed_start = self.longest_failed_start.max(lived);
-                lived <= START_TIME.max(self.longest_good_start.unwrap_or_default())
+                !self.start_timed_out && lived <= START_TIME.max(self.longest_good_start.unwrap_or_default())
             }
         };
         if was_killed && blameless {
@@ -246,21 +250,22 @@ impl Child {
         self.last_heartbeat.map_or(self.progress_at, |(then, _)| then).elapsed()
     }
 
-    /// How long it has been starting; `None` once it is ready, and while it has no process.
+    /// How long it has been starting; `None` once it is ready or was killed, and while it has no process.
     pub(super) fn starting_for(&self) -> Option<Duration> {
-        (self.is_active() && !self.is_ready()).then(|| self.started_at.elapsed())
+        let is_starting = self.is_active() && !self.is_ready() && !self.start_timed_out;
+        is_starting.then(|| self.started_at.elapsed())
     }
 
-    /// Ends its process, which has not become ready in time.
-    pub(super) fn end_slow_start(&mut self) {
-        self.started_at = Instant::now();
+    /// Kills its process, which has not become ready in time. Its end counts as a failure.
+    pub(super) fn kill_slow_start(&mut self) {
+        self.start_timed_out = true;
         if let Some(process) = &mut self.process {
             process.kill();
         }
     }
 
     /// Takes note that the user is told that it is slow; whether that is news.
-    pub(super) fn report_slow(&mut self) -> bool {
+    pub(super) fn mark_reported_slow(&mut self) -> bool {
         !std::mem::replace(&mut self.reported_slow, true)
     }
 
@@ -448,6 +453,22 @@ mod tests {
             RestartDecision::Restart(_) => None,
         });
         assert!(counted.is_some());
+    }
+
+    #[test]
+    fn a_role_that_never_starts_in_time_is_given_up() {
+        let mut child = Simulation::new(Role::EnvServer);
+        let given_up = (0..100).any(|_| {
+            child.child.begin_at(child.now);
+            child.child.kill_slow_start();
+            child.now += READY;
+            let consequence = child.child.handle_end_at(by_signal(KILLED), GIVE_UP_AFTER, child.now);
+            if let RestartDecision::Restart(pause) = consequence {
+                child.now += pause;
+            }
+            matches!(consequence, RestartDecision::GiveUp(_))
+        });
+        assert!(given_up);
     }
 
     #[test]

@@ -24,7 +24,7 @@ struct Admitted {
 }
 
 impl Hosts {
-    /// No hosts. `epoch` is the number of this start of the launcher; a host that is silent for `lost_after` loses its
+    /// No hosts. `epoch` is greater for each start of the launcher; a host that is silent for `lost_after` loses its
     /// actors.
     pub(super) fn new(epoch: u64, lost_after: Duration) -> Self {
         Self {

@@ -86,7 +86,7 @@ impl<'a> Host<'a> {
         let log = Log::open(&run.log())?;
         write_iox_config(domain, run)?;
         // Creates the services that are opened below.
-        let supervisor = Supervisor::new(&config, run, domain, log.clone(), HostRoles::Host { actors })?;
+        let supervisor = Supervisor::new(&config, run, domain, log.clone(), HostRoles::RemoteHost { actors })?;
         Ok(Self {
             control: ControlPort::open(domain)?,
             heartbeats: Reports::open(domain)?,
@@ -185,7 +185,7 @@ impl<'a> Host<'a> {
             Ok::<_, anyhow::Error>(match request {
                 ControlRequest::Status => Some(ControlResponse::Status(RunStatus {
                     roles: supervisor.status(0),
-                    actors: supervisor.actors(),
+                    actors: supervisor.actor_count(),
                     steps: config.run.steps,
                     ..RunStatus::default()
                 })),

@@ -21,7 +21,7 @@ pub(super) fn status(
 ) -> Result<RunStatus, OpenError> {
     let mut status = RunStatus {
         replay_rows: status::replay_rows(run)?,
-        actors: supervisor.actors(),
+        actors: supervisor.actor_count(),
         ..initial.clone()
     };
     if let Some(learner) = progress.learner() {
@@ -56,7 +56,7 @@ pub(super) fn scale(
         let reason = "the number of actors of a lockstep run cannot change: its results depend on it";
         return Ok(ControlResponse::Refused(reason.into()));
     }
-    let (max, most) = (config.actors.max, supervisor.most_actors());
+    let (max, most) = (config.actors.max, supervisor.max_actors_now());
     if !(1..=most).contains(&actors) {
         let reason = if most == max {
             format!("this run can have 1 to {max} actors (actors.max, fixed when it was created)")

@@ -34,16 +34,18 @@ use crate::log_level::log_level;
 /// How often to look for dead processes whose end the launcher does not observe, such as `shoal status`.
 const CLEANUP_INTERVAL: Duration = Duration::from_secs(2);
 
-/// How long dead processes may keep occupying shared memory in spite of clean-ups, and how soon a clean-up is repeated.
-/// A killed process may take a moment to disappear.
+/// How long dead processes may keep occupying shared memory in spite of clean-ups. A killed process may take a moment to
+/// disappear.
 const OCCUPIED_PATIENCE: Duration = Duration::from_secs(2);
+
+/// How soon a clean-up is repeated while they do.
 const OCCUPIED_CLEANUP_INTERVAL: Duration = Duration::from_millis(200);
 
 /// A start that takes longer is reported to the user.
 const SLOW_START: Duration = Duration::from_secs(10);
 
-/// More starts, leases of hosts among them, than there are between two committed chunks. A lost counter skips this
-/// many.
+/// More incarnations than are used between two committed chunks, those of other hosts included. If the counter is lost,
+/// this many are skipped.
 const STARTS_WITHOUT_CHUNK: u64 = 64 * INCARNATIONS;
 
 /// The situation of the run's processes.
@@ -61,12 +63,12 @@ pub(super) enum RunCondition {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum HostRoles {
     /// Those of the learner's host, with a gate if other hosts may join.
-    Learner {
+    LearnerHost {
         /// Whether there is a gate.
         gate: bool,
     },
     /// Those of another host: a relay, and these actors with their environment servers.
-    Host {
+    RemoteHost {
         /// The actors.
         actors: Vec<u32>,
     },
@@ -84,8 +86,9 @@ pub(super) struct Supervisor {
     occupied_since: Option<Instant>,
     /// Time spent on clean-ups since the last search for stalls.
     cleanup_time: Duration,
-    /// The wanted actors of this host, in order; and the most that the run may have on all hosts.
+    /// The wanted actors of this host, in order.
     actors: Vec<u32>,
+    /// The most actors that the run may have on all hosts.
     max_actors: u32,
     /// The number of actors of a lockstep run, on all hosts together. It never changes.
     lockstep_actors: Option<u32>,
@@ -135,7 +138,7 @@ impl Supervisor {
         let lockstep = config.run.mode == Mode::Lockstep;
         let mut lockstep_actors = None;
         let (children, actors) = match roles {
-            HostRoles::Learner { gate } => {
+            HostRoles::LearnerHost { gate } => {
                 services.create_environment(domain, server)?;
                 let mut children = vec![
                     Child::new(Role::Learner, 0),
@@ -146,7 +149,7 @@ impl Supervisor {
                 lockstep_actors = lockstep.then_some(config.actors.count);
                 (children, (0..config.actors.count).collect())
             }
-            HostRoles::Host { actors } => (vec![Child::new(Role::Relay, 0)], actors),
+            HostRoles::RemoteHost { actors } => (vec![Child::new(Role::Relay, 0)], actors),
         };
         Ok(Self {
             children,
@@ -209,13 +212,13 @@ impl Supervisor {
     }
 
     /// The wanted number of actors on this host.
-    pub(super) fn actors(&self) -> u32 {
+    pub(super) fn actor_count(&self) -> u32 {
         self.actors.len() as u32
     }
 
     /// The most actors that this host may have now.
-    pub(super) fn most_actors(&self) -> u32 {
-        self.actors() + self.free_actors().count() as u32
+    pub(super) fn max_actors_now(&self) -> u32 {
+        self.actor_count() + self.free_actors().count() as u32
     }
 
     /// Indices that neither this host nor another has.
@@ -303,7 +306,7 @@ impl Supervisor {
                 .note(&name(child.instance), &format!("ready after {} ms", after.as_millis()));
         }
         if let Some(index) = server {
-            // No process can make the launcher list more than the run may have.
+            // A heartbeat may claim any number.
             (0..faults.min(self.faults.most)).for_each(|_| self.note_fault(&client, index));
         }
         if !self.all_ready && self.children.iter().all(Child::is_ready) {
@@ -365,7 +368,7 @@ impl Supervisor {
 
     /// Handles collected ends, restarts processes that are due, and starts or retires actors.
     pub(super) fn maintain(&mut self, domain: &Domain) -> anyhow::Result<RunCondition> {
-        let mut state = RunCondition::AtWork;
+        let mut condition = RunCondition::AtWork;
         let ended = self.children.iter().any(|child| child.ended.is_some());
         // Before anything is cleaned up or started: both would find the files of another run, or none.
         if (ended || self.is_cleanup_due()) && !self.learner_has_finished() && !domain.is_intact(self.services.count())
@@ -374,11 +377,11 @@ impl Supervisor {
         }
         if ended {
             // Frees their shared memory for their successors.
-            state = self.clean(domain)?;
+            condition = self.clean(domain)?;
         } else if self.is_cleanup_due() {
             self.cleaned_at = Instant::now();
             if domain.has_dead_nodes() || self.services.ports_of_dead_processes() > 0 {
-                state = self.clean(domain)?;
+                condition = self.clean(domain)?;
             }
         }
         for i in 0..self.children.len() {
@@ -388,7 +391,7 @@ impl Supervisor {
         }
         self.retire_surplus();
         self.start_missing(domain)?;
-        Ok(state)
+        Ok(condition)
     }
 
     fn is_cleanup_due(&self) -> bool {
@@ -444,14 +447,14 @@ impl Supervisor {
             self.note_incident(i, IncidentKind::Retired, String::new());
             return Ok(RunCondition::AtWork);
         }
-        let consequence = child.handle_end(status, self.give_up_after);
+        let decision = child.handle_end(status, self.give_up_after);
         let what = if status.signal().is_some() {
             IncidentKind::Killed
         } else {
             IncidentKind::Failed
         };
         self.note_incident(i, what, ending(status));
-        match consequence {
+        match decision {
             RestartDecision::Restart(pause) => {
                 self.children[i].restart_at = Instant::now() + pause;
                 self.log
@@ -489,7 +492,7 @@ impl Supervisor {
         let mut said = Vec::new();
         for (i, silent) in stalls.slow_servers(&self.children) {
             let child = &mut self.children[i];
-            if child.report_slow() {
+            if child.mark_reported_slow() {
                 let (name, seconds) = (name(child.instance), silent.as_secs());
                 said.push(format!(
                     "{name} has spent {seconds} s in one step or reset of its environments; it is not interrupted"
@@ -502,8 +505,8 @@ impl Supervisor {
             if limit.is_some_and(|limit| starting >= limit) {
                 let text = "is not ready within environment.start_seconds and is ended";
                 self.log.note(&name(child.instance), text);
-                child.end_slow_start();
-            } else if starting >= SLOW_START && child.report_slow() {
+                child.kill_slow_start();
+            } else if starting >= SLOW_START && child.mark_reported_slow() {
                 let limit = limit.map_or(String::new(), |limit| format!(", for at most {} s", limit.as_secs()));
                 said.push(format!("waiting for {} to start{limit}", name(child.instance)));
             }
@@ -565,7 +568,7 @@ impl Supervisor {
         }
     }
 
-    /// Whether the child is not a surplus actor or the environment server of one.
+    /// Whether the child should run: not a surplus actor, and not the environment server of one.
     fn is_wanted(&self, child: &Child) -> bool {
         let RoleInstance { role, index, .. } = child.instance;
         // The index of the evaluator's server is the maximum number of actors.

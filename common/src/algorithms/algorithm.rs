@@ -36,12 +36,12 @@ pub enum TransitionUse {
 /// The settings of an algorithm: its section of the configuration, and everything derived from it. Observations are as
 /// the environment has them; `Config` adds their normalisation.
 pub trait AlgorithmSettings {
-    /// Its policy in an environment like `spec`, for at most `batch` observations a call, and how actors explore with
+    /// Its policy in an environment like `spec`, for at most `envs` observations a call, and how actors explore with
     /// it. `name` is the name of the algorithm.
     ///
     /// # Errors
     /// When it cannot control that environment.
-    fn behaviour(&self, name: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError>;
+    fn behaviour(&self, name: &'static str, spec: &EnvironmentSpec, envs: usize) -> Result<Behaviour, PolicyError>;
 
     /// The networks or tables that it learns in an environment like `spec`.
     fn learned(&self, spec: &EnvironmentSpec) -> LearnedShapes;

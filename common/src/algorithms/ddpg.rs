@@ -60,8 +60,8 @@ impl DdpgConfig {
 }
 
 impl AlgorithmSettings for DdpgConfig {
-    fn behaviour(&self, _: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError> {
-        let policy = shoal_policy::deterministic(self.networks(spec).actor, spec, batch)?;
+    fn behaviour(&self, _: &'static str, spec: &EnvironmentSpec, envs: usize) -> Result<Behaviour, PolicyError> {
+        let policy = shoal_policy::deterministic(self.networks(spec).actor, spec, envs)?;
         Ok(Behaviour::Noise(policy, self.exploration.clone()))
     }
 

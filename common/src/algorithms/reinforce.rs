@@ -84,8 +84,8 @@ impl ReinforceConfig {
 }
 
 impl AlgorithmSettings for ReinforceConfig {
-    fn behaviour(&self, name: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError> {
-        let policy = shoal_policy::softmax(name, self.networks(spec).policy, spec, batch)?;
+    fn behaviour(&self, name: &'static str, spec: &EnvironmentSpec, envs: usize) -> Result<Behaviour, PolicyError> {
+        let policy = shoal_policy::softmax(name, self.networks(spec).policy, spec, envs)?;
         Ok(Behaviour::Sample(policy))
     }
 

@@ -65,8 +65,8 @@ impl SacConfig {
 }
 
 impl AlgorithmSettings for SacConfig {
-    fn behaviour(&self, name: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError> {
-        let policy = shoal_policy::gaussian(name, self.networks(spec).actor, spec, batch)?;
+    fn behaviour(&self, name: &'static str, spec: &EnvironmentSpec, envs: usize) -> Result<Behaviour, PolicyError> {
+        let policy = shoal_policy::gaussian(name, self.networks(spec).actor, spec, envs)?;
         Ok(Behaviour::Gaussian(policy))
     }
 

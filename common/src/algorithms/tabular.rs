@@ -39,8 +39,8 @@ section! {
 }
 
 impl AlgorithmSettings for TabularConfig {
-    fn behaviour(&self, name: &'static str, spec: &EnvironmentSpec, batch: usize) -> Result<Behaviour, PolicyError> {
-        let values = shoal_policy::table(name, spec, batch)?;
+    fn behaviour(&self, name: &'static str, spec: &EnvironmentSpec, envs: usize) -> Result<Behaviour, PolicyError> {
+        let values = shoal_policy::table(name, spec, envs)?;
         Ok(Behaviour::EpsilonGreedy(values, Epsilon::constant(self.epsilon)))
     }
 

@@ -111,8 +111,8 @@ impl TryFrom<Sections> for Config {
     }
 }
 
-/// What is wrong with the first section that cannot be read, beginning with the key and its value: serde's own error
-/// does not name the key.
+/// The error of the first section that cannot be read. It begins with the key and its value, which serde's own error
+/// does not name.
 pub(super) fn first_unreadable(sections: &Table) -> Option<String> {
     explanation::sections().into_iter().find_map(|section| {
         let name = section.name;

@@ -24,7 +24,7 @@ const IDLE_WAIT: Duration = Duration::from_millis(50);
 const LAST_EVALUATION_WAIT: Duration = Duration::from_secs(5);
 
 pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
-    let ratio = &learner.settings.config.replay;
+    let replay_config = &learner.settings.config.replay;
     let every = Duration::from_secs_f64(learner.settings.config.checkpoint.every_seconds);
     let mut saved = Instant::now();
     // After a crash the replay is ahead of the checkpoint. Those rows count.
@@ -35,25 +35,27 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
         }
         learner.connect_new_actors()?;
         let updates = learner.updates();
-        // After a power loss the replay may have no readable row, although it had many. Then new rows must come first.
-        let drained = learner.intake.drain(&mut learner.replay, CHUNKS_AT_ONCE, |replay| {
-            !replay.rows().is_empty() && ratio.learner_is_behind(replay.head(), updates)
-        })?;
+        // After the last episode no more rows are taken: a slow learner would never make all the updates of theirs.
+        let drained = !learner.has_all_steps()
+            // After a power loss the replay may have no readable row, although it had many. Then new rows come first.
+            && learner.intake.drain(&mut learner.replay, CHUNKS_AT_ONCE, |replay| {
+                !replay.rows().is_empty() && replay_config.learner_is_behind(replay.head(), updates)
+            })?;
         learner.advance_to(learner.replay.head());
 
-        if updates < ratio.allowed_updates(learner.counted_rows) && !learner.replay.rows().is_empty() {
+        if updates < replay_config.allowed_updates(learner.counted_rows) && !learner.replay.rows().is_empty() {
             learner.update()?;
             // An update may count for several.
             if learner.updates() / PUBLISH_EVERY > updates / PUBLISH_EVERY {
                 learner.publish()?;
             }
             learner.report_activity(Activity::Working);
-        } else if learner.has_all_rows() {
+        } else if learner.has_all_steps() {
             learner.publish()?;
             learner.notify_all();
             return EvaluationWait::new(learner)?.wait(learner, Some(LAST_EVALUATION_WAIT));
         } else {
-            let activity = if learner.counted_rows < ratio.ratio_start() {
+            let activity = if learner.counted_rows < replay_config.ratio_start() {
                 Activity::WaitingForPeer
             } else {
                 Activity::WaitingForRatio

@@ -91,7 +91,7 @@ impl Intake {
     }
 
     /// The number of actors with an open receiver.
-    pub fn actors(&self) -> usize {
+    pub fn actor_count(&self) -> usize {
         self.actors.len()
     }
 

@@ -171,7 +171,7 @@ impl<'a> Learner<'a> {
     }
 
     /// Whether all environment steps of the run, or all its episodes, have been collected.
-    pub(crate) fn has_all_rows(&self) -> bool {
+    pub(crate) fn has_all_steps(&self) -> bool {
         self.settings.config.run.has_all_steps(self.counted_rows, self.episodes)
     }
 

@@ -17,7 +17,7 @@ use super::settings::LearnerError;
 pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
     let mut evaluation_wait = EvaluationWait::new(learner)?;
     let config = &learner.settings.config;
-    let (interval, ratio) = (config.checkpoint.every_updates, &config.replay);
+    let (interval, replay_config) = (config.checkpoint.every_updates, &config.replay);
     let needed = learner.counted_rows.saturating_sub(config.replay.capacity);
     if learner.replay.rows().start > needed || learner.replay.head() < learner.counted_rows {
         let path = learner.settings.run.replay_file();
@@ -28,15 +28,15 @@ pub(crate) fn run(learner: &mut Learner<'_>) -> Result<(), Exit<LearnerError>> {
     }
     learner.notify_all();
     evaluation_wait.wait(learner, None)?;
-    while !learner.has_all_rows() {
+    while !learner.has_all_steps() {
         let (before, updates) = (learner.counted_rows, learner.updates());
         let mut rows = before;
-        for actor in 0..learner.intake.actors() {
+        for actor in 0..learner.intake.actor_count() {
             rows = await_chunk(learner, actor, rows)?;
         }
         // Only after all chunks have come: a round that is interrupted before begins again.
         learner.advance_to(rows);
-        while learner.updates() < ratio.allowed_updates(learner.counted_rows) {
+        while learner.updates() < replay_config.allowed_updates(learner.counted_rows) {
             learner.update()?;
             learner.report_activity(Activity::Working);
         }

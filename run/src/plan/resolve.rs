@@ -1,5 +1,5 @@
-//! Decides the configuration of a new run: the sections, then what the command line changes, then what follows from
-//! both.
+//! Decides the configuration of a new run: takes the sections of the preset or file, applies the command line, and sets
+//! the keys that follow from both.
 
 use shoal_common::algorithms::TransitionUse;
 use shoal_common::config::{ActorsConfig, AlgorithmConfig, Config, IdentityFormat, explanation};
@@ -7,7 +7,7 @@ use toml::{Table, Value};
 
 use super::environment::{about_environment, describe_environment};
 use super::overrides::{RunOverrides, read_counts, set_key, set_options};
-use super::sections::for_algorithm;
+use super::sections::sections_for_algorithm;
 use super::source::{SettingSource, SettingSources};
 use super::table::{integer, put};
 use crate::origin::shapes;
@@ -20,13 +20,13 @@ pub fn resolve_preset(what: &str) -> anyhow::Result<Config> {
 
 /// The resolved configuration of a preset or a file with these overrides, and where each value comes from.
 pub fn resolve_with_sources(what: &str, overrides: &RunOverrides) -> anyhow::Result<(Config, SettingSources)> {
-    let (_, table, sources) = for_algorithm(what, overrides)?;
+    let (_, table, sources) = sections_for_algorithm(what, overrides)?;
     resolve_table(table, sources, overrides, what)
 }
 
 /// The configuration of a preset or a file with these overrides, and the default name of its run. Creates nothing.
 pub fn resolve(what: &str, overrides: &RunOverrides) -> anyhow::Result<(String, Config)> {
-    let (name, table, sources) = for_algorithm(what, overrides)?;
+    let (name, table, sources) = sections_for_algorithm(what, overrides)?;
     let (config, _) = resolve_table(table, sources, overrides, what)?;
     Ok((name, config))
 }
@@ -73,7 +73,7 @@ fn resolve_table(
     put(&mut table, &["run", "identity_format"], format.into())?;
     let chosen = table.clone();
     describe_environment(&mut table).map_err(|error| about_environment(error, &sources))?;
-    // What is added are an algorithm's settings for a Gymnasium environment, and the environment's own defaults.
+    // That has added an algorithm's settings for a Gymnasium environment, and the environment's own defaults.
     sources.add_new(&chosen, &table, &SettingSource::Gymnasium);
     set_from_algorithm(&mut table, &mut sources)?;
     set_from_predecessor(&mut table, &mut sources, overrides)?;

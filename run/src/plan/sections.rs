@@ -18,7 +18,10 @@ use crate::plan::algorithm;
 use crate::usage::UsageError;
 
 /// The default name of a run of a preset or a file, its sections for the algorithm that is asked for.
-pub(super) fn for_algorithm(what: &str, overrides: &RunOverrides) -> anyhow::Result<(String, Table, SettingSources)> {
+pub(super) fn sections_for_algorithm(
+    what: &str,
+    overrides: &RunOverrides,
+) -> anyhow::Result<(String, Table, SettingSources)> {
     let (mut name, mut table, mut sources) = sections(what)?;
     let asked = algorithm::asked_for(overrides.algorithm.as_deref(), &overrides.set)?;
     let of_networks = overrides.predecessor()?.map(|(_, config)| config.algorithm.name());

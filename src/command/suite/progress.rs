@@ -1,6 +1,6 @@
 //! The progress of a suite: a live line, or a line for each event where standard error is no terminal.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::io::{IsTerminal, Write};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -32,7 +32,7 @@ pub(super) struct SuiteProgress<'a> {
     /// The runs that are to be trained, by the numbers of their trials.
     due: BTreeMap<usize, DueRun>,
     running: Vec<usize>,
-    failed: usize,
+    failed: BTreeSet<usize>,
     started_at: Instant,
 }
 
@@ -84,7 +84,7 @@ impl<'a> SuiteProgress<'a> {
             until: until.unwrap_or(1.0),
             due: due.iter().map(due_run).collect(),
             running: Vec::new(),
-            failed: 0,
+            failed: BTreeSet::new(),
             started_at: Instant::now(),
         }
     }
@@ -123,15 +123,15 @@ impl<'a> SuiteProgress<'a> {
             }
             Some(Event::Failed(number, why)) => {
                 self.end_run(number);
-                self.failed += 1;
+                self.failed.insert(number);
                 self.print(&format!("{}: failed: {why}", self.suite.trials[number].name));
             }
         }
         self.draw();
     }
 
-    /// Ends the live line. Returns how many runs have failed.
-    pub(super) fn end(self) -> usize {
+    /// Ends the live line. Returns the numbers of the trials that have failed.
+    pub(super) fn end(self) -> BTreeSet<usize> {
         self.bar.finish_and_clear();
         self.failed
     }
@@ -153,7 +153,11 @@ impl<'a> SuiteProgress<'a> {
     }
 
     fn count(&self) -> String {
-        format!("{} of {} runs", self.ended() - self.failed, self.suite.trials.len())
+        format!(
+            "{} of {} runs",
+            self.ended() - self.failed.len(),
+            self.suite.trials.len()
+        )
     }
 
     fn time_left(&self) -> Option<String> {

@@ -26,7 +26,7 @@ impl Supervisor {
             return Ok(ControlResponse::Admitted(lease.clone()));
         }
         let free: Vec<u32> = match self.lockstep_actors {
-            // The host takes over actors of this one, which end; theirs continue from the same snapshots.
+            // Processes for these actors end here; those of the other host continue from the same snapshots.
             Some(_) => self.actors.iter().rev().copied().collect(),
             // The services of a retiring actor are in use.
             None => {

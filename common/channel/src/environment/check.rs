@@ -43,7 +43,7 @@ pub(super) enum ResponsePart {
 }
 
 /// Finds the first invalid number of a response.
-pub(super) fn find_fault(
+pub(super) fn check_response(
     spec: &EnvironmentSpec,
     layout: &ResponseLayout,
     response: &[f32],
@@ -120,7 +120,7 @@ mod tests {
         let layout = ResponseLayout::new(2, spec.observation.width());
         let mut response = vec![1.0; layout.len()];
         response[at] = value;
-        find_fault(&spec, &layout, &response, part)
+        check_response(&spec, &layout, &response, part)
     }
 
     #[test]

@@ -14,7 +14,7 @@ use shoal_base::role::Role;
 use shoal_base::space::{EnvironmentSpec, Space};
 use shoal_base::stop::Stop;
 
-use super::check::{ResponseFault, ResponsePart, find_fault};
+use super::check::{ResponseFault, ResponsePart, check_response};
 use super::message::{Block, RequestHeader, RequestKind, ResponseHeader, ResponseLayout, ResponseStatus};
 use super::service::{EnvironmentService, name, request_length, service};
 use crate::domain::Domain;
@@ -310,7 +310,7 @@ impl EnvironmentClient {
             };
             return Err(ChannelError::new(&self.channel, "ask", PeerError::Invalid(fault)));
         }
-        find_fault(&self.spec, &self.layout, numbers, part)
+        check_response(&self.spec, &self.layout, numbers, part)
             .map_err(|fault| ChannelError::new(&self.channel, "ask", PeerError::Invalid(fault)))?;
         Ok(EnvironmentResponse {
             response,
@@ -382,8 +382,8 @@ impl EnvironmentClient {
         }
     }
 
-    /// Sends a request to `server`, which the caller looks up before. If another server takes its place in between, the
-    /// request counts as lost and is sent again. A server that is looked up afterwards may never have got the request.
+    /// Sends a request to `server`, which must be looked up before this call: one that is found afterwards may not have
+    /// got the request. If another server takes its place in between, the request counts as lost and is sent again.
     fn send(
         &self,
         server: Option<UniqueServerId>,
