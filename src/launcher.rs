@@ -251,14 +251,20 @@ impl<'a> Launcher<'a> {
     }
 
     fn run(mut self) -> anyhow::Result<TrainingOutcome> {
-        let ending = self.watch();
+        let mut ending = self.watch();
         if self.lock.check(self.run).is_err() {
             // The run's directory is gone, so the roles cannot save anything. By now, another run may be at this path.
             self.supervisor.kill(|_| true);
         }
         // The roles are ended in every case, also after an error.
         self.progress.set_message("ending");
-        let ended = self.end_all();
+        let ended = self.end_all(matches!(
+            ending,
+            Ok(RunEnd::Finished | RunEnd::Stopped | RunEnd::Interrupted(_))
+        ));
+        if matches!(ending, Ok(RunEnd::Renewed)) && self.stop_requested_at.is_some() {
+            ending = Ok(RunEnd::Stopped);
+        }
         self.progress.clear();
         self.control.answer_waiting(&match &ended {
             Ok(()) => ControlResponse::Accepted,
@@ -443,13 +449,16 @@ impl<'a> Launcher<'a> {
         Ok(())
     }
 
-    /// Ends all roles, the actors first, so that the learner still receives what they send.
-    fn end_all(&mut self) -> anyhow::Result<()> {
+    /// Ends all roles, the actors first, so that the learner still receives what they send. Other hosts are told that
+    /// the run is over, or, if it may continue, nothing: then they wait for it.
+    fn end_all(&mut self, is_over: bool) -> anyhow::Result<()> {
         self.ending = true;
         self.end(|role| role == Role::Actor, ACTORS_END);
-        // The gate tells the other hosts, which hand over what they have while the learner is still there.
-        self.supervisor.ask_to_retire(Role::Gate);
-        self.await_end(|role| role == Role::Gate, GATE_END);
+        if is_over {
+            // They hand over what they have while the learner is still there.
+            self.supervisor.ask_to_retire(Role::Gate);
+            self.await_end(|role| role == Role::Gate, GATE_END);
+        }
         self.end(|_| true, OTHERS_END);
         self.read_reports()?;
         self.supervisor.check_saved()

@@ -4,7 +4,7 @@ use std::fs::{DirBuilder, File};
 use std::io::{self, ErrorKind, Write};
 use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use shoal_base::durable::write_atomically;
 use shoal_base::file_lock;
@@ -72,6 +72,9 @@ fn write(path: &Path, head: &str, config: &Config) -> Result<(), RunDirError> {
     write_atomically(path, |file| write!(file, "{head}{text}")).map_err(io)
 }
 
+/// How long `config.toml` may be missing: some editors rename the old file before they write the new one.
+const EDITING: Duration = Duration::from_millis(300);
+
 /// The lock of a run. The launcher holds it while the run is running; the system releases it when the launcher dies.
 #[derive(Debug)]
 pub struct RunLock {
@@ -85,11 +88,18 @@ impl RunLock {
     /// When its directory was removed or renamed, even if there is another one now.
     pub fn check(&self, run: &RunDir) -> Result<(), RunDirError> {
         let number = |metadata: io::Result<std::fs::Metadata>| metadata.map(|it| (it.dev(), it.ino())).ok();
-        let same = number(self.directory.metadata()) == number(std::fs::metadata(&run.path));
-        match same && run.config_file().is_file() {
-            true => Ok(()),
-            false => Err(RunDirError::Gone(run.path.clone())),
+        let is_same = || number(self.directory.metadata()) == number(std::fs::metadata(&run.path));
+        let since = Instant::now();
+        while is_same() {
+            if run.config_file().is_file() {
+                return Ok(());
+            }
+            if since.elapsed() >= EDITING {
+                break;
+            }
+            std::thread::sleep(Duration::from_millis(10));
         }
+        Err(RunDirError::Gone(run.path.clone()))
     }
 }
 

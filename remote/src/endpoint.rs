@@ -1,8 +1,10 @@
 //! The address at which a gate listens, as in `tls/10.0.0.1:7447`.
 
 use std::fmt;
+use std::io::ErrorKind;
 use std::net::{IpAddr, TcpListener, ToSocketAddrs};
 use std::str::FromStr;
+use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
 
@@ -45,15 +47,23 @@ impl Endpoint {
         self.protocol == Protocol::Tls
     }
 
-    /// The same endpoint, with a free port if its port is 0.
+    /// The same endpoint, with a free port if its port is 0. Waits at most `patience` for a port that is taken.
     ///
     /// # Errors
-    /// When the port is taken, none is free, or the address is not one of this machine.
-    pub fn with_port(&self) -> Result<Self, EndpointError> {
+    /// When the port stays taken, none is free, or the address is not one of this machine.
+    pub fn with_port(&self, patience: Duration) -> Result<Self, EndpointError> {
         let failed = |cause: std::io::Error| EndpointError::Port(self.to_string(), cause.to_string());
         let address = format!("{}:{}", self.host, self.port);
         let addresses: Vec<_> = address.to_socket_addrs().map_err(failed)?.collect();
-        let listener = TcpListener::bind(&addresses[..]).map_err(failed)?;
+        let begun = Instant::now();
+        let listener = loop {
+            match TcpListener::bind(&addresses[..]) {
+                Err(cause) if cause.kind() == ErrorKind::AddrInUse && begun.elapsed() < patience => {
+                    std::thread::sleep(Duration::from_millis(50));
+                }
+                bound => break bound.map_err(failed)?,
+            }
+        };
         Ok(Self {
             port: listener.local_addr().map_err(failed)?.port(),
             ..self.clone()
@@ -169,7 +179,11 @@ mod tests {
 
     #[test]
     fn port_0_becomes_a_free_one_and_all_addresses_become_the_name_of_the_machine() {
-        let endpoint = Endpoint::DEFAULT.parse::<Endpoint>().unwrap().with_port().unwrap();
+        let endpoint = Endpoint::DEFAULT
+            .parse::<Endpoint>()
+            .unwrap()
+            .with_port(Duration::ZERO)
+            .unwrap();
         assert_ne!(endpoint.to_string(), Endpoint::DEFAULT);
         let seen = endpoint.seen_from_elsewhere("node-7").to_string();
         assert!(seen.starts_with("tls/node-7:"), "{seen}");
@@ -178,7 +192,7 @@ mod tests {
         let elsewhere: Endpoint = "tls/192.0.2.1:0".parse().unwrap();
         assert!(
             elsewhere
-                .with_port()
+                .with_port(Duration::ZERO)
                 .unwrap_err()
                 .to_string()
                 .contains("cannot listen at")

@@ -347,7 +347,7 @@ impl<'a> Gate<'a> {
     fn take_join(&mut self, query: Query) -> Result<(), GateError> {
         let bytes = query.payload().map(|payload| payload.to_bytes().into_owned());
         let hello = match Hello::decode(&bytes.unwrap_or_default()) {
-            Ok(hello) => hello,
+            Ok(hello) => hello.with_plain_name(),
             Err(error) => return answer_join(&query, &Admission::Refused(error.to_string())),
         };
         if hello.program != env!("CARGO_PKG_VERSION") {
@@ -641,10 +641,9 @@ impl<'a> Gate<'a> {
         self.heartbeats.refresh_connections();
         self.episodes.refresh_connections();
         let waits = self.actors.values().any(|actor| actor.forwarding.is_waiting());
-        let cut_off = |host: &Host| host.heard_at.elapsed() >= CUT_OFF_AFTER;
         self.heartbeat.beat(match waits {
-            // Waiting for a host that is away is no fault of a process here, so none is replaced for it.
-            _ if self.hosts.values().any(cut_off) => Activity::Working,
+            // Waiting for another host is no fault of a process here, so none is replaced for it.
+            _ if self.hosts.values().any(Host::is_awaited) => Activity::Working,
             true => Activity::WaitingForRatio,
             false => Activity::WaitingForPeer,
         });

@@ -1,5 +1,7 @@
 //! Asking a run to be admitted.
 
+use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
+use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use zenoh::{Session, Wait};
@@ -7,7 +9,7 @@ use zenoh::{Session, Wait};
 use crate::endpoint::Endpoint;
 use crate::files::KeyFile;
 use crate::network::{self, NetworkError, failed};
-use crate::wire::{Admission, Hello, Message, WireError};
+use crate::wire::{Admission, Hello, HostReport, Message, WireError};
 
 /// How long the gate may take to answer.
 const ANSWER: Duration = Duration::from_secs(10);
@@ -44,8 +46,64 @@ fn also(endpoint: &str) -> &'static str {
     }
 }
 
+/// The pause between two reports of a host that is preparing its work.
+const REPORT_INTERVAL: Duration = Duration::from_secs(1);
+
+/// A connection with the gate that has admitted this host.
+#[derive(Debug)]
+pub struct GateConnection(Session);
+
+/// Sends reports for a host that is admitted and whose relay does not run yet, so that its actors stay its own.
+#[derive(Debug)]
+pub struct LeaseKeeper {
+    thread: JoinHandle<()>,
+    /// Ends the thread; true if the host leaves.
+    end: Sender<bool>,
+}
+
+impl LeaseKeeper {
+    /// For this host of the run `run_id`.
+    ///
+    /// # Errors
+    /// When there can be no thread.
+    pub fn start(connection: GateConnection, run_id: String, host: u64) -> Result<Self, std::io::Error> {
+        let (end, ended) = channel();
+        let keep = move || {
+            let key = network::reports(&run_id, &host.to_string());
+            let send = |number, leaving| {
+                let report = HostReport::without_processes(host, number, leaving);
+                if let Ok(bytes) = report.encode() {
+                    // If it is lost, the next one may arrive; without any, the host loses its actors after a while.
+                    let _ = connection.0.put(&key, bytes).wait();
+                }
+            };
+            // The numbers of the relay's reports are greater.
+            for number in 1.. {
+                send(number, false);
+                match ended.recv_timeout(REPORT_INTERVAL) {
+                    Err(RecvTimeoutError::Timeout) => {}
+                    Ok(false) | Err(RecvTimeoutError::Disconnected) => break,
+                    Ok(true) => {
+                        send(number + 1, true);
+                        break;
+                    }
+                }
+            }
+            let _ = connection.0.close().wait();
+        };
+        let thread = std::thread::Builder::new().name("lease".into()).spawn(keep)?;
+        Ok(Self { thread, end })
+    }
+
+    /// Ends the reports: the relay sends them from now on, or the host leaves and its actors are free.
+    pub fn end(self, leaves: bool) {
+        let _ = self.end.send(leaves);
+        let _ = self.thread.join();
+    }
+}
+
 /// Asks the gate at this endpoint, whichever run it belongs to, until it answers, `patience` is over, or `stop` returns
-/// true.
+/// true. The connection is for a [`LeaseKeeper`].
 ///
 /// # Errors
 /// When there is no answer, or it cannot be read.
@@ -55,7 +113,7 @@ pub fn join(
     hello: &Hello,
     patience: Duration,
     stop: impl Fn() -> bool,
-) -> Result<Admission, JoinError> {
+) -> Result<(Admission, GateConnection), JoinError> {
     let session = network::connect(endpoint, key)?;
     let begun = Instant::now();
     loop {
@@ -66,10 +124,11 @@ pub fn join(
                 let endpoint = endpoint.to_string();
                 return Err(JoinError::Silence { endpoint });
             }
-            answer => {
+            Err(error) => {
                 session.close().wait().map_err(failed("close"))?;
-                return answer;
+                return Err(error);
             }
+            Ok(admission) => return Ok((admission, GateConnection(session))),
         }
     }
 }

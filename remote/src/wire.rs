@@ -189,6 +189,19 @@ pub struct Hello {
     pub held: Vec<u32>,
 }
 
+/// The longest name of a host, in bytes.
+const LONGEST_NAME: usize = 64;
+
+impl Hello {
+    /// The same with a name that can be shown on a terminal and fits into messages.
+    pub fn with_plain_name(mut self) -> Self {
+        self.name = self.name.chars().filter(|letter| !letter.is_control()).collect();
+        let end = (0..=LONGEST_NAME).rev().find(|end| self.name.is_char_boundary(*end));
+        self.name.truncate(end.unwrap_or(0));
+        self
+    }
+}
+
 /// The vector instructions of this processor that the program may use.
 pub fn vector_instructions() -> String {
     let mut found = Vec::new();
@@ -295,6 +308,22 @@ pub struct HostReport {
     pub roles: Vec<RemoteRole>,
     /// Episodes that ended since the last report.
     pub episodes: Vec<RemoteEpisode>,
+}
+
+impl HostReport {
+    /// The report of a host without processes.
+    pub fn without_processes(host: u64, number: u64, leaving: bool) -> Self {
+        Self {
+            host,
+            number,
+            round_trip_us: None,
+            leaving,
+            resent: 0,
+            policy_version: 0,
+            roles: Vec::new(),
+            episodes: Vec::new(),
+        }
+    }
 }
 
 /// The last heartbeat of a process on another host.

@@ -19,7 +19,11 @@ use zenoh::{Session, Wait};
 const RUN: &str = "1a2b";
 
 fn endpoint() -> Endpoint {
-    "tls/127.0.0.1:0".parse::<Endpoint>().unwrap().with_port().unwrap()
+    "tls/127.0.0.1:0"
+        .parse::<Endpoint>()
+        .unwrap()
+        .with_port(Duration::ZERO)
+        .unwrap()
 }
 
 fn fresh() -> Keys {

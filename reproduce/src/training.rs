@@ -6,6 +6,7 @@ use std::process::Command;
 
 use shoal_common::run_dir::{RunDir, RunDirError};
 use shoal_run::evaluation::SavedPolicy;
+use shoal_run::interrupted_start::remove_interrupted_start;
 pub(super) use shoal_run::jobs::TrainingEnd;
 use shoal_run::jobs::run_training;
 use shoal_run::status;
@@ -21,10 +22,7 @@ pub(super) enum RunState {
 
 impl RunState {
     pub(super) fn of(run: &Path) -> anyhow::Result<Self> {
-        // A training that was killed before it wrote anything leaves an empty directory. Only such a directory is
-        // removed.
-        let _ = std::fs::remove_dir(run);
-        if !run.exists() {
+        if remove_interrupted_start(run)? {
             return Ok(Self::Absent);
         }
         let directory = RunDir::open(run)?;

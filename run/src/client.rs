@@ -18,6 +18,9 @@ const PATIENCE: Duration = Duration::from_secs(5);
 /// How long a run may take to end. Its roles are given less.
 const STOP_PATIENCE: Duration = Duration::from_secs(60);
 
+/// How long the launcher of a stopped run may take to draw its figures.
+const FIGURES_PATIENCE: Duration = Duration::from_secs(60);
+
 /// A run, whose launcher is asked if it has one.
 #[derive(Debug)]
 pub struct RunClient {
@@ -154,7 +157,7 @@ impl RunClient {
         let answer = self.ask(ControlRequest::Stop, STOP_PATIENCE)?;
         let asked = Instant::now();
         while self.run.is_running()? {
-            if asked.elapsed() >= PATIENCE {
+            if asked.elapsed() >= FIGURES_PATIENCE {
                 bail!("{} was told to stop but is still running", self.run.path().display());
             }
             std::thread::sleep(Duration::from_millis(10));

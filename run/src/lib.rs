@@ -6,6 +6,7 @@ pub mod client;
 pub mod description;
 pub mod evaluation;
 pub mod external_environment;
+pub mod interrupted_start;
 pub mod jobs;
 pub mod joining;
 pub mod numbers;

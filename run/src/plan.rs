@@ -76,14 +76,14 @@ impl Plan {
             Some(path) => RunDir::create(path)?,
             None => RunDir::create_next(Path::new("runs"), &name)?,
         };
-        let lock = run.lock()?;
         let begin = || {
+            let lock = run.lock()?;
             let config = fill(&run, &config)?;
             StartRecord::of_this_process().write(run.path())?;
             let origin = from.as_ref().map(|predecessor| predecessor.begin(&run, &config));
-            Ok((config, origin.transpose()?))
+            Ok((lock, config, origin.transpose()?))
         };
-        let (config, origin) = begin().inspect_err(|_: &anyhow::Error| {
+        let (lock, config, origin) = begin().inspect_err(|_: &anyhow::Error| {
             // The directory would block the next attempt.
             let _ = std::fs::remove_dir_all(run.path());
         })?;

@@ -295,14 +295,18 @@ impl Suite {
         })
     }
 
-    /// Ends the worse half of the settings that are left: those with the lower mean of `result` over their runs.
-    /// Returns the names of the ended runs.
+    /// Ends the worse half of the settings that are left: those with the lower mean of `result` over their runs, without
+    /// the runs whose result is not finite. Returns the names of the ended runs.
     pub fn end_worse_half(&mut self, result: impl Fn(&Trial) -> f64) -> Vec<String> {
         let mut left = self.settings();
         left.retain(|setting| !self.has_ended(&self.trials[setting[0]]));
         let mean = |setting: &Vec<usize>| {
-            let sum: f64 = setting.iter().map(|number| result(&self.trials[*number])).sum();
-            sum / setting.len() as f64
+            let results = setting.iter().map(|number| result(&self.trials[*number]));
+            let results: Vec<f64> = results.filter(|result| result.is_finite()).collect();
+            match results.len() {
+                0 => f64::NEG_INFINITY,
+                n => results.iter().sum::<f64>() / n as f64,
+            }
         };
         // The first of equal ones stays.
         left.sort_by(|a, b| mean(b).total_cmp(&mean(a)));

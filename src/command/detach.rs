@@ -10,10 +10,12 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use serde::Serialize;
+use shoal_common::channel::control::RunStatus;
 use shoal_common::file_lock;
 use shoal_common::run_dir::RunDir;
 use shoal_run::client::RunClient;
-use shoal_run::suite;
+use shoal_run::records::outcome::FINAL_EVALUATION;
+use shoal_run::suite::{self, Suite};
 
 use super::training::OutputMode;
 
@@ -46,19 +48,25 @@ pub(crate) fn resume_run(path: &Path, arguments: &[OsString], output: &OutputMod
     let patience = PATIENCE + Duration::from_secs(of_environment.into());
     let is_at_work = || {
         let status = RunClient::open(path)?.status()?;
-        Ok(status.is_some_and(|status| status.all_actors_work()) && RunDir::open(path)?.replay_file().exists())
+        let is_evaluated = |status: &RunStatus| status.waiting.as_deref() == Some(FINAL_EVALUATION);
+        let works = status.is_some_and(|status| status.all_actors_work() || is_evaluated(&status));
+        Ok(works && RunDir::open(path)?.replay_file().exists())
     };
     let how_to_end = |path: &str, _| format!("look: shoal top {path}; end: shoal stop {path}");
     resume(path, (arguments, patience), output, is_at_work, how_to_end)
 }
 
-/// As [`resume_run`] for a suite. Returns when a process works on it.
+/// As [`resume_run`] for a suite. Returns when a process trains one of its runs.
 ///
 /// # Errors
-/// When a process works on it already, or none does in time.
+/// When a process works on it already, or none trains in time.
 pub(crate) fn resume_suite(path: &Path, arguments: &[OsString], output: &OutputMode) -> anyhow::Result<ExitCode> {
     drop(suite::lock(path)?);
-    let is_at_work = || Ok(file_lock::is_locked(&File::open(path)?)?);
+    let is_at_work = || {
+        let trials = Suite::read(path)?.map(|suite| suite.runs(path)).unwrap_or_default();
+        let mut runs = trials.iter().filter_map(|run| RunDir::open(run).ok());
+        Ok(file_lock::is_locked(&File::open(path)?)? && runs.any(|run| run.is_running().unwrap_or(false)))
+    };
     let how_to_end = |path: &str, pid| format!("look: shoal list {path}; end: kill {pid}");
     resume(path, (arguments, PATIENCE), output, is_at_work, how_to_end)
 }

@@ -102,7 +102,7 @@ mod with_network {
     use shoal_common::run_dir::RunDir;
     use shoal_remote::endpoint::Endpoint;
     use shoal_remote::files::{HostFile, JoinFile, KeyFile};
-    use shoal_remote::join::{JoinError, join as ask};
+    use shoal_remote::join::{GateConnection, JoinError, LeaseKeeper, join as ask};
     use shoal_remote::network::restart_with_one_thread;
     use shoal_remote::wire::{Admission, Hello, WireLease, vector_instructions};
     use shoal_run::joining::make_host_directory;
@@ -140,9 +140,9 @@ mod with_network {
         if let Some(signal) = interrupt.signal() {
             return Ok(exit_code(signal));
         }
-        let lease = match admission {
-            Ok(Admission::Admitted(lease)) => lease,
-            Ok(Admission::Refused(why)) => bail!("{endpoint} does not admit this host: {why}"),
+        let (lease, connection) = match admission {
+            Ok((Admission::Admitted(lease), connection)) => (lease, connection),
+            Ok((Admission::Refused(why), _)) => bail!("{endpoint} does not admit this host: {why}"),
             Err(JoinError::Silence { .. }) if is_finished(run) => {
                 say("the run is over");
                 return Ok(ExitCode::SUCCESS);
@@ -155,7 +155,7 @@ mod with_network {
         };
         let temporary = std::env::temp_dir().join(format!("shoal-join-{host:016x}"));
         let path = args.local.as_deref().unwrap_or(&temporary);
-        let worked = work(args, (endpoint, key, host, name), lease, path, &signals);
+        let worked = work(args, (endpoint, key, host, name), (lease, connection), path, &signals);
         if args.local.is_none() {
             match &worked {
                 Ok(_) => drop(std::fs::remove_dir_all(path)),
@@ -168,18 +168,26 @@ mod with_network {
     fn work(
         args: &JoinArgs,
         (endpoint, key, host, name): (Endpoint, Option<KeyFile>, u64, String),
-        lease: WireLease,
+        (lease, connection): (WireLease, GateConnection),
         path: &Path,
         signals: &Signals,
     ) -> anyhow::Result<ExitCode> {
-        let interrupt = signals.interrupt();
-        let (config, run, lock) = make_host_directory(path, &lease.config, lease.first_incarnation, interrupt)?;
         // The name of the run in its messages is that of its own configuration.
         let run_id = joined_run_id(&lease.config)?;
-        if let Some(key) = key {
-            key.write(&run.path().join(KeyFile::JOIN))?;
-        }
-        HostFile::new(endpoint.clone(), run_id, (host, name), &lease).write(&run)?;
+        // The environment may take minutes to start, and it may not be usable here.
+        let keeper = LeaseKeeper::start(connection, run_id.clone(), host)?;
+        let prepare = || {
+            let interrupt = signals.interrupt();
+            let made = make_host_directory(path, &lease.config, lease.first_incarnation, interrupt)?;
+            if let Some(key) = key {
+                key.write(&made.1.path().join(KeyFile::JOIN))?;
+            }
+            HostFile::new(endpoint.clone(), run_id, (host, name), &lease).write(&made.1)?;
+            anyhow::Ok(made)
+        };
+        let prepared = prepare();
+        keeper.end(prepared.is_err());
+        let (config, run, lock) = prepared?;
         let actors = lease.actors.clone();
         say(&format!("joined {endpoint} with {} actors: {actors:?}", actors.len()));
         let ending = joined::run(config, (&run, &lock), signals, actors, args.give_up)?;

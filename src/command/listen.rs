@@ -3,6 +3,7 @@
 use std::ffi::OsString;
 use std::io::Write;
 use std::path::PathBuf;
+use std::time::Duration;
 
 use clap::Args;
 use shoal_common::config::Config;
@@ -13,18 +14,29 @@ use shoal_run::usage::UsageError;
 
 use super::join::NOT_BUILT;
 
+/// How long the gate of an earlier launcher may still be listening: it ends after its launcher, but not at once.
+const EARLIER_GATE: Duration = Duration::from_secs(15);
+
 /// Makes the keys of the run, unless it has them from an earlier start and no new ones are asked for. Returns the path
 /// of the hosts' key.
 #[cfg(feature = "remote")]
 fn make_keys(config: &Config, run: &RunDir, new: bool) -> anyhow::Result<PathBuf> {
     use std::time::SystemTime;
 
+    use anyhow::Context;
     use shoal_remote::files::KeyFile;
     use shoal_remote::keys::{self, VALID};
 
     let (gate, join) = (run.path().join(KeyFile::GATE), run.path().join(KeyFile::JOIN));
     if new || !(gate.exists() && join.exists()) {
         let keys = keys::make(&config.run.id, SystemTime::now() + VALID)?;
+        // If this process is killed in between, one of two keys that do not match must not be left.
+        match std::fs::remove_file(&join) {
+            Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+                return Err(error).with_context(|| format!("cannot remove {}", join.display()));
+            }
+            _ => {}
+        }
         keys.gate.write(&gate)?;
         keys.join.write(&join)?;
     }
@@ -73,13 +85,15 @@ impl ListenArgs {
         self.check()?;
         let Some(endpoint) = &self.listen else { return Ok(false) };
         let mut endpoint = endpoint.parse::<Endpoint>()?;
+        let before = JoinFile::read(run.path()).ok();
+        let patience = before.as_ref().map_or(Duration::ZERO, |_| EARLIER_GATE);
         // A resumed run listens where the hosts of before are trying to reach it.
         if endpoint.to_string() == Endpoint::DEFAULT
-            && let Ok(before) = JoinFile::read(run.path())
+            && let Some(before) = before
         {
             endpoint = before.listen;
         }
-        let listen = endpoint.with_port()?;
+        let listen = endpoint.with_port(patience)?;
         let machine = rustix::system::uname().nodename().to_string_lossy().into_owned();
         let endpoint = listen.seen_from_elsewhere(&machine);
         JoinFile::new(endpoint.clone(), listen).write(run)?;

@@ -138,11 +138,11 @@ pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
         let line = format!("{key} changes from {before} to {after} at step {env_steps} ({source})");
         launcher::note(&run, &line);
         if !args.output.quiet {
-            writeln!(std::io::stderr(), "{line}")?;
+            let _ = writeln!(std::io::stderr(), "{line}");
         }
     }
     if let Some(warning) = warning(config) {
-        writeln!(std::io::stderr(), "warning: {warning}")?;
+        let _ = writeln!(std::io::stderr(), "warning: {warning}");
     }
     run_training(revision.config, &run, &lock, &args.output, &args.listen)
 }
@@ -195,22 +195,22 @@ fn reevaluate_best_policy(run: &RunDir, revision: &Revision) -> anyhow::Result<O
     };
     match (evaluated, interrupt.signal()) {
         (Err(_), Some(signal)) => {
-            writeln!(
+            let _ = writeln!(
                 std::io::stderr(),
                 "ended by signal {signal}; nothing has changed in {here}"
-            )?;
+            );
             Ok(Some(signal))
         }
-        (evaluated, _) => {
+        (evaluated, signal) => {
             let evaluated = evaluated.with_context(|| format!("cannot resume {here}: its best policy"))?;
             if let Some(ReevaluatedPolicy { before, now }) = evaluated {
-                writeln!(
+                let _ = writeln!(
                     std::io::stderr(),
                     "the best policy is evaluated anew, for {why}: {:.2} instead of {before:.2}",
                     now.return_mean
-                )?;
+                );
             }
-            Ok(None)
+            Ok(signal)
         }
     }
 }

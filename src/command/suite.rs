@@ -19,6 +19,7 @@ use shoal_report::page;
 use shoal_run::evaluation::SavedPolicy;
 use shoal_run::evaluation::final_evaluation::FinalEvaluation;
 use shoal_run::external_environment::tied;
+use shoal_run::interrupted_start::remove_interrupted_start;
 use shoal_run::jobs::{TrainingEnd, run_jobs, run_training};
 use shoal_run::plan::{self, RequestedChanges, Revision, RunOverrides};
 use shoal_run::preflight;
@@ -212,9 +213,15 @@ pub(crate) fn resume(directory: &Path, options: SuiteOptions<'_>) -> anyhow::Res
             let run = directory.join(&trial.name);
             Ok(round.trials.contains(trial) && !check_finished(&suite, &run)? && share_done(&run) < round.share)
         };
-        let due = Due::new(&suite, directory, is_due, options)?;
-        due.say(&format!("until each has done {percent:.0} % of its steps:"));
-        due.train(&signals, Some(round.share), &mut failed);
+        // A run that failed gets a second chance before it counts as worse: disk or memory may have been full.
+        for chance in 0..2 {
+            let due = Due::new(&suite, directory, is_due, options)?;
+            if signals.received().is_some() || (chance > 0 && due.numbers.is_empty()) {
+                break;
+            }
+            due.say(&format!("until each has done {percent:.0} % of its steps:"));
+            due.train(&signals, Some(round.share), &mut failed);
+        }
         if signals.received().is_some() {
             break;
         }
@@ -354,9 +361,7 @@ fn usual_jobs(suite: &Suite, directory: &Path, first: usize) -> anyhow::Result<u
 
 /// Whether nothing is left to do in this run directory.
 fn check_finished(suite: &Suite, run: &Path) -> anyhow::Result<bool> {
-    // A training that was killed before it wrote anything leaves an empty directory. Only such a directory is removed.
-    let _ = std::fs::remove_dir(run);
-    if !run.exists() {
+    if remove_interrupted_start(run)? {
         return Ok(false);
     }
     let run = RunDir::open(run)?;
@@ -416,9 +421,9 @@ fn report(suite: &Suite, directory: &Path, output: &OutputMode) -> anyhow::Resul
             .collect::<Result<Vec<_>, _>>()?;
         let mut stderr = std::io::stderr().lock();
         for line in page::ranking(&runs)? {
-            writeln!(stderr, "{line}")?;
+            let _ = writeln!(stderr, "{line}");
         }
-        writeln!(stderr, "{here}\n  compare the runs: shoal report {here}")?;
+        let _ = writeln!(stderr, "{here}\n  compare the runs: shoal report {here}");
     }
     if output.json {
         let mut runs = Vec::new();

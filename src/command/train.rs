@@ -92,13 +92,14 @@ pub(crate) fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
         warnings,
     } = Plan::new(what, &args.overrides)?;
     for warning in warnings {
-        writeln!(std::io::stderr(), "warning: {warning}")?;
+        // A closed standard error is no reason to fail.
+        let _ = writeln!(std::io::stderr(), "warning: {warning}");
     }
     if let Some(origin) = origin {
         let line = format!("{} {}", run.name(), origin.in_words());
         launcher::note(&run, &line);
         if !args.output.quiet {
-            writeln!(std::io::stderr(), "{line}")?;
+            let _ = writeln!(std::io::stderr(), "{line}");
         }
     }
     if args.output.detach {

@@ -90,7 +90,7 @@ impl<'a> Host<'a> {
         Ok(Self {
             control: ControlPort::open(domain)?,
             heartbeats: Reports::open(domain)?,
-            stalls: StallDetector::new(Duration::from_secs(config.run.stall_seconds)),
+            stalls: StallDetector::of_remote_host(Duration::from_secs(config.run.stall_seconds)),
             supervisor,
             run,
             lock,
@@ -140,6 +140,9 @@ impl<'a> Host<'a> {
                     "another program has removed files of this host in {}: join again",
                     self.domain.directory()?.display()
                 ),
+            }
+            for stalled in self.supervisor.replace_stalled(&mut self.stalls) {
+                self.log.note("launcher", &stalled);
             }
             let start_limit =
                 (!self.config.environment.server.is_empty()).then(|| self.config.environment.start_limit());

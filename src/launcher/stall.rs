@@ -20,6 +20,8 @@ const WORKING_FACTOR: u32 = 3;
 #[derive(Debug)]
 pub(super) struct StallDetector {
     patience: Duration,
+    /// Whether it sees all processes of the run, and not only those of a host that has joined.
+    sees_whole_run: bool,
     checked_at: Instant,
 }
 
@@ -28,7 +30,16 @@ impl StallDetector {
     pub(super) fn new(patience: Duration) -> Self {
         Self {
             patience: patience.max(SILENT),
+            sees_whole_run: true,
             checked_at: Instant::now(),
+        }
+    }
+
+    /// For the processes of a host that has joined a run. All of them may wait for the learner's host.
+    pub(super) fn of_remote_host(patience: Duration) -> Self {
+        Self {
+            sees_whole_run: false,
+            ..Self::new(patience)
         }
     }
 
@@ -45,7 +56,7 @@ impl StallDetector {
             .filter_map(|i| Some((i, self.fault(children, i)?)))
             .filter(|(i, _)| !children[*i].is_stopped())
             .collect();
-        if found.is_empty() {
+        if found.is_empty() && self.sees_whole_run {
             found = self.deadlock(children);
         }
         for (i, _) in &found {

@@ -229,10 +229,10 @@ fn hosts_wait_for_a_killed_launcher_and_continue_with_its_successor() {
     wait_for_actors(&run, &[1, 2]);
     let endpoint = run.endpoint();
     run.running.signal(Signal::KILL);
-    run.running.leftovers().wait_until_gone();
     let Run { place, running } = run;
-    let (code, ..) = running.wait();
+    let (code, ..) = running.wait_for_launcher();
     assert_eq!(code, None);
+    // At once: the old gate may still be listening.
     let running = place.resume("run", &["--listen", &endpoint]);
     let run = Run { place, running };
     wait_for_actors(&run, &[1, 2]);
@@ -381,6 +381,31 @@ fn new_keys_replace_the_old_ones() {
     let new = run.running.run.join("join.key").display().to_string();
     let host = Host::join(&run, &["--actors", "1", "--key", &new]);
     wait_for_actors(&run, &[1]);
+    stop(run);
+    host.ends_with(0);
+}
+
+#[test]
+fn a_host_that_cannot_work_gives_its_actors_back_and_its_name_is_shown_plainly() {
+    let run = Run::start(&["--actors", "1", "--set", "actors.max=2"]);
+    let endpoint = run.endpoint();
+    std::fs::create_dir(run.place.path().join("taken")).unwrap();
+    let failed = run
+        .place
+        .output(&["join", &endpoint, "--actors", "1", "--local", "taken"]);
+    assert!(
+        error_line(&failed).contains("exists already"),
+        "{}",
+        error_line(&failed)
+    );
+    // Sooner than after `remote.lost_seconds`.
+    until("the host has left", || run.running.log().contains("has left"));
+    let name = format!("node\u{1b}[31m-{}", "x".repeat(5000));
+    let host = Host::join(&run, &["--actors", "1", "--name", &name]);
+    wait_for_actors(&run, &[1]);
+    until("the host is shown", || run.hosts().len() == 1);
+    let shown = run.hosts()[0]["name"].as_str().unwrap().to_owned();
+    assert!(shown.starts_with("node[31m-xx") && shown.len() == 64, "{shown}");
     stop(run);
     host.ends_with(0);
 }

@@ -3,8 +3,9 @@
 
 use std::fs::{self, File, OpenOptions, Permissions};
 use std::io::{self, BufWriter, Read, Write};
-use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt, PermissionsExt};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU32, Ordering};
 
 /// A file that is complete and on the disk, still under its temporary name. Dropping it without publishing removes it.
 #[derive(Debug)]
@@ -13,43 +14,39 @@ pub struct PreparedFile {
     temporary: PathBuf,
     path: PathBuf,
     published: bool,
+    /// Locked, so that no other process writes the temporary file before it has its final name.
+    file: File,
 }
 
 impl PreparedFile {
     /// Writes and syncs a file for `path`, readable by the owner alone. The temporary name is `path` with `.new`
-    /// appended; a file that a killed process left there is overwritten.
+    /// appended; a file that a killed process left there is overwritten. While another process writes that file, this
+    /// one has a name of its own.
     pub fn write<E: From<io::Error>>(
         path: &Path,
         write: impl FnOnce(&mut BufWriter<File>) -> Result<(), E>,
     ) -> Result<Self, E> {
-        let (prepared, file) = Self::unsynced(path, write)?;
-        file.sync_all()?;
+        let prepared = Self::unsynced(path, write)?;
+        prepared.file.sync_all()?;
         Ok(prepared)
     }
 
     fn unsynced<E: From<io::Error>>(
         path: &Path,
         write: impl FnOnce(&mut BufWriter<File>) -> Result<(), E>,
-    ) -> Result<(Self, File), E> {
-        let mut temporary = path.as_os_str().to_owned();
-        temporary.push(".new");
-        let temporary = PathBuf::from(temporary);
-        let file = OpenOptions::new()
-            .write(true)
-            .create(true)
-            .truncate(true)
-            .mode(0o600)
-            .open(&temporary)?;
+    ) -> Result<Self, E> {
+        let (temporary, file) = open_temporary(path)?;
         let prepared = Self {
             temporary,
             path: path.into(),
             published: false,
+            file: file.try_clone()?,
         };
         file.set_permissions(Permissions::from_mode(0o600))?;
         let mut writer = BufWriter::with_capacity(1 << 16, file);
         write(&mut writer)?;
-        let file = writer.into_inner().map_err(io::IntoInnerError::into_error)?;
-        Ok((prepared, file))
+        writer.flush()?;
+        Ok(prepared)
     }
 
     /// Renames the file to its final name, which atomically replaces a file of that name.
@@ -74,6 +71,42 @@ impl Drop for PreparedFile {
     }
 }
 
+/// Opens an empty temporary file for `path`. As long as it is open, no other process opens it.
+fn open_temporary(path: &Path) -> io::Result<(PathBuf, File)> {
+    let named = |ending: &str| {
+        let mut name = path.as_os_str().to_owned();
+        name.push(ending);
+        PathBuf::from(name)
+    };
+    let open = |temporary: &Path| {
+        let mut options = OpenOptions::new();
+        // Truncated only under the lock.
+        options
+            .write(true)
+            .create(true)
+            .truncate(false)
+            .mode(0o600)
+            .open(temporary)
+    };
+    let temporary = named(".new");
+    let file = open(&temporary)?;
+    let is_there = |file: &File| -> io::Result<bool> {
+        let (opened, there) = (file.metadata()?, fs::metadata(&temporary));
+        Ok(there.is_ok_and(|there| (there.dev(), there.ino()) == (opened.dev(), opened.ino())))
+    };
+    // If it is not there any more, another process has renamed it.
+    if file.try_lock().is_ok() && is_there(&file)? {
+        file.set_len(0)?;
+        return Ok((temporary, file));
+    }
+    static OWN: AtomicU32 = AtomicU32::new(0);
+    let number = OWN.fetch_add(1, Ordering::Relaxed);
+    let temporary = named(&format!(".{}-{number}.new", std::process::id()));
+    let file = open(&temporary)?;
+    file.set_len(0)?;
+    Ok((temporary, file))
+}
+
 /// Writes a file atomically: at any moment `path` is either the old file or the complete new one, even after a power
 /// loss.
 pub fn write_atomically<E: From<io::Error>>(
@@ -89,7 +122,7 @@ pub fn write_atomically_unsynced<E: From<io::Error>>(
     path: &Path,
     write: impl FnOnce(&mut BufWriter<File>) -> Result<(), E>,
 ) -> Result<(), E> {
-    let (mut prepared, _) = PreparedFile::unsynced(path, write)?;
+    let mut prepared = PreparedFile::unsynced(path, write)?;
     Ok(prepared.rename()?)
 }
 
@@ -201,5 +234,35 @@ impl<W: Write> Write for ChecksumWriter<W> {
 
     fn flush(&mut self) -> io::Result<()> {
         self.writer.flush()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn two_writers_of_a_file_do_not_mix_their_bytes() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("file");
+        let prepare = |text: &'static str| PreparedFile::write(&path, |file| file.write_all(text.as_bytes())).unwrap();
+        // A killed writer has left this.
+        fs::write(
+            directory.path().join("file.new"),
+            "a long text that was never published",
+        )
+        .unwrap();
+        let first = prepare("first");
+        let second = prepare("second");
+        first.publish().unwrap();
+        assert_eq!(fs::read_to_string(&path).unwrap(), "first");
+        drop(prepare("third"));
+        second.publish().unwrap();
+        assert_eq!(fs::read_to_string(&path).unwrap(), "second");
+        assert_eq!(
+            fs::read_dir(directory.path()).unwrap().count(),
+            1,
+            "no temporary file is left"
+        );
     }
 }

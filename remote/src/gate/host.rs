@@ -38,6 +38,13 @@ pub(super) struct Host {
 }
 
 impl Host {
+    /// Whether it may be the reason why a lockstep run makes no progress: it is cut off, or one of its processes is at
+    /// work.
+    pub(super) fn is_awaited(&self) -> bool {
+        let mut roles = self.newest_report.iter().flat_map(|report| &report.roles);
+        self.heard_at.elapsed() >= CUT_OFF_AFTER || roles.any(|role| role.activity == Activity::Working)
+    }
+
     /// Its status, when the newest policy has this version. Rates are those since the last call.
     pub(super) fn status(&mut self, newest: u64) -> HostStatus {
         let (then, rows) = self.rows_at_last_status;

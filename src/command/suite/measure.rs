@@ -6,17 +6,28 @@ use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
 use shoal_run::evaluation::SavedPolicy;
 use shoal_run::evaluation::final_evaluation::FinalEvaluation;
+use shoal_run::origin::Origin;
 use shoal_run::records::recorder::{read_evaluations, recorded};
 use shoal_run::status::replay_rows;
 
 /// The share of its steps, or of its episodes, that a run has done. Steps are those in the replay: the records are half a
-/// second behind, and take longer to read.
+/// second behind, and take longer to read. Rows that it began with do not count.
 pub(super) fn share_done(run: &Path) -> f64 {
     let of_steps = || {
         let run = RunDir::open(run).ok()?;
         let limits = run.config().ok()?.run;
+        let origin = Origin::read(&run).ok()?;
+        if limits.from.is_some() && origin.is_none() {
+            // They are being copied.
+            return Some((0, limits.steps));
+        }
+        let inherited = origin.map_or(0, |origin| origin.rows);
         let rows = replay_rows(&run).ok()?;
-        limits.episodes.is_none().then_some((rows, limits.steps))
+        let without = |rows: u64| rows.saturating_sub(inherited);
+        limits
+            .episodes
+            .is_none()
+            .then_some((without(rows), without(limits.steps)))
     };
     let progress = of_steps().or_else(|| distance(run));
     progress.map_or(0.0, |(done, all)| done as f64 / all.max(1) as f64)

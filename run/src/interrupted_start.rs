@@ -1,0 +1,87 @@
+//! Directories of runs whose start was interrupted: `train` was killed before the run could be resumed.
+
+use std::path::Path;
+
+use anyhow::Context;
+use shoal_common::run_dir::RunDir;
+
+use crate::origin::Origin;
+
+/// The names, or beginnings of names, of the files that exist before `config.toml`.
+const FIRST_FILES: [&str; 2] = ["server.json", "config.toml."];
+
+/// Removes the directory at `path` if the start of a run in it was interrupted. Returns whether nothing is at `path` now.
+/// A directory with anything else in it is left alone.
+///
+/// # Errors
+/// When the directory cannot be read or removed.
+pub fn remove_interrupted_start(path: &Path) -> anyhow::Result<bool> {
+    // A start that was killed at once leaves an empty directory.
+    let _ = std::fs::remove_dir(path);
+    if !path.exists() {
+        return Ok(true);
+    }
+    let run = RunDir::planned(path);
+    // Whoever holds the lock is starting the run, or works on it.
+    let Ok(_lock) = run.lock() else { return Ok(false) };
+    let is_interrupted = is_interrupted(&run)?;
+    if is_interrupted {
+        std::fs::remove_dir_all(path).with_context(|| format!("cannot remove {}", path.display()))?;
+    }
+    Ok(is_interrupted)
+}
+
+fn is_interrupted(run: &RunDir) -> anyhow::Result<bool> {
+    if run.incarnations().exists() {
+        return Ok(false);
+    }
+    if run.config_file().exists() {
+        // `origin.json` is written after the networks and rows that the run begins with.
+        return Ok(run.config()?.run.from.is_some() && Origin::read(run)?.is_none());
+    }
+    let entries = std::fs::read_dir(run.path()).with_context(|| format!("cannot read {}", run.path().display()))?;
+    for entry in entries {
+        let name = entry.context("cannot read the directory")?.file_name();
+        let name = name.to_string_lossy();
+        if !FIRST_FILES.iter().any(|first| name.starts_with(first)) {
+            return Ok(false);
+        }
+    }
+    Ok(true)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::plan::resolve_preset;
+
+    #[test]
+    fn only_what_an_interrupted_start_left_is_removed() {
+        let parent = tempfile::tempdir().unwrap();
+        let path = parent.path().join("run");
+        let with = |files: &[&str]| {
+            let _ = std::fs::remove_dir_all(&path);
+            std::fs::create_dir(&path).unwrap();
+            files
+                .iter()
+                .for_each(|name| std::fs::write(path.join(name), "").unwrap());
+            remove_interrupted_start(&path).unwrap()
+        };
+        assert!(with(&[]) && !path.exists());
+        assert!(with(&["server.json", "config.toml.new"]) && !path.exists());
+        assert!(!with(&["server.json", "notes"]) && path.join("notes").exists());
+        assert!(!with(&["config.toml.new", "incarnations"]));
+
+        let mut config = resolve_preset("pendulum").unwrap();
+        let _ = std::fs::remove_dir_all(&path);
+        RunDir::create(&path).unwrap().write_config(&config).unwrap();
+        assert!(!remove_interrupted_start(&path).unwrap(), "it can be resumed");
+        config.run.from = Some("another".into());
+        RunDir::open(&path).unwrap().write_config(&config).unwrap();
+        let lock = RunDir::open(&path).unwrap().lock().unwrap();
+        assert!(!remove_interrupted_start(&path).unwrap(), "it is being started");
+        drop(lock);
+        assert!(remove_interrupted_start(&path).unwrap(), "it has no networks");
+        assert!(!path.exists());
+    }
+}
