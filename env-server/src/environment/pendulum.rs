@@ -152,8 +152,7 @@ impl Environment for Pendulum {
             .circle(Class::Guide, [0.0, 0.0], L)
             .line(Class::Guide, &[[0.0, 1.05 * L], [0.0, 1.2 * L]])
             .line(Class::Rod, &[[0.0, 0.0], bob])
-            .circle(Class::Body, bob, 0.11)
-            .trail(bob);
+            .circle(Class::Body, bob, 0.11);
         let turn = 2.4
             * action
                 .first()

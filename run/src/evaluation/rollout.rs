@@ -132,15 +132,21 @@ impl<'a> Rollout<'a> {
             .map(|(trajectory, _)| trajectory)
     }
 
-    /// As [`evaluation_episode`](Self::evaluation_episode), with at most about `most` pictures of it that are at least
-    /// `stride` steps apart, or the reason why there are none: a sentence without its full stop. Other programs draw
-    /// only for a rollout that is [`seen`](Self::seen). Calls `progress` with the number of steps.
+    /// As [`evaluation_episode`](Self::evaluation_episode), with at most about `most` pictures of it, or the reason why
+    /// there are none: a sentence without its full stop. Other programs draw only for a rollout that is
+    /// [`seen`](Self::seen). An episode that may have more steps is played twice: its length decides which states are
+    /// drawn, because drawing takes much longer than stepping. Calls `progress` with the number of steps.
     pub fn filmed_episode(
         &mut self,
         (seed, number): (u64, u64),
-        (most, stride): (usize, usize),
+        most: usize,
         mut progress: impl FnMut(usize),
     ) -> anyhow::Result<(Trajectory, Result<Frames, String>)> {
+        let mut stride = 1;
+        if self.config.spec.time_limit as usize >= most {
+            let (played, _) = self.episode(evaluation(seed, number), &mut |_| (), None)?;
+            stride = played.actions.len().div_ceil(most.max(2) - 1);
+        }
         self.episode(evaluation(seed, number), &mut progress, Some((most, stride)))
     }
 
@@ -159,8 +165,7 @@ impl<'a> Rollout<'a> {
     ) -> anyhow::Result<(Trajectory, Result<Frames, String>)> {
         let mut tries = 1;
         loop {
-            let (most, stride) = frames.unwrap_or((0, 1));
-            let mut recorder = frames.map(|_| Recorder::new(most, stride));
+            let mut recorder = frames.map(|(most, stride)| Recorder::new(most, stride));
             match self.try_episode(reset, progress, &mut recorder) {
                 Err(_) if tries < TRIES && self.interrupt.signal().is_none() && self.host.can_be_restarted() => {
                     tries += 1;
@@ -197,7 +202,7 @@ impl<'a> Rollout<'a> {
             progress(steps);
             self.policy.act(self.parameters, &observation, &mut action);
             if let Some(recorder) = recorder.as_mut().filter(|recorder| recorder.wants(steps)) {
-                recorder.add(steps, self.host.see(&action)?);
+                recorder.add(self.host.see(&action)?);
             }
             let last = steps + 1 == self.config.spec.time_limit as usize;
             let wants_next = recorder.as_ref().is_some_and(|it| last || it.wants(steps + 1));
