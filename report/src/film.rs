@@ -246,7 +246,7 @@ impl<'a, W: Write> Writer<'a, W> {
                     check(interrupt)?;
                     let step = (n as f64 / *fps * rate + 1e-6) as usize;
                     let i = if step >= steps { last } else { (step / stride).min(last) };
-                    ffmpeg.add(&images[i])?;
+                    ffmpeg.add(&images[i], interrupt)?;
                 }
                 Ok(pictures as f64 / *fps)
             }
@@ -267,3 +267,6 @@ fn check(interrupt: &Interrupt) -> anyhow::Result<()> {
         None => Ok(()),
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -5,6 +5,7 @@ use std::io::{Read, Write};
 use std::os::unix::process::CommandExt;
 use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
+use std::sync::mpsc::{SyncSender, TrySendError, sync_channel};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
@@ -14,7 +15,7 @@ use tempfile::TempDir;
 
 /// The program's name.
 const PROGRAM: &str = "ffmpeg";
-/// How long it may take to end after the last picture.
+/// How long it may take for a picture, and to end after the last one.
 const PATIENCE: Duration = Duration::from_secs(120);
 
 /// Checks that the program is there.
@@ -34,6 +35,8 @@ pub(super) fn check() -> anyhow::Result<()> {
 /// A running `ffmpeg`. It is ended on drop.
 pub(super) struct Ffmpeg {
     child: Child,
+    /// To the thread that writes to it, so that a program that reads nothing does not block this one.
+    pictures: Option<SyncSender<Vec<u8>>>,
     place: TempDir,
 }
 
@@ -42,7 +45,7 @@ impl Ffmpeg {
     pub(super) fn start((width, height): (usize, usize), fps: f64) -> anyhow::Result<Self> {
         let place = tempfile::tempdir().context("cannot make a temporary directory")?;
         let words = File::create(place.path().join("words")).context("cannot write a temporary file")?;
-        let child = Command::new(PROGRAM)
+        let mut child = Command::new(PROGRAM)
             .args(["-nostdin", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"])
             .args(["-s", &format!("{width}x{height}"), "-framerate", &format!("{fps:.6}")])
             // The usual players need even sides and these colours.
@@ -63,33 +66,45 @@ impl Ffmpeg {
             .process_group(0)
             .spawn()
             .context("cannot start ffmpeg")?;
-        Ok(Self { child, place })
+        let stdin = child.stdin.take();
+        let (pictures, receiver) = sync_channel::<Vec<u8>>(2);
+        std::thread::Builder::new().name("film".into()).spawn(move || {
+            let Some(mut stdin) = stdin else { return };
+            // After a failed write the channel closes.
+            while let Ok(bytes) = receiver.recv()
+                && stdin.write_all(&bytes).is_ok()
+            {}
+        })?;
+        let pictures = Some(pictures);
+        Ok(Self { child, pictures, place })
     }
 
     /// Adds a picture.
-    pub(super) fn add(&mut self, image: &Image) -> anyhow::Result<()> {
-        let written = self.child.stdin.as_mut().map(|stdin| stdin.write_all(&image.rgb));
-        match written {
-            Some(Ok(())) => Ok(()),
-            _ => Err(self.failure()),
+    pub(super) fn add(&mut self, image: &Image, interrupt: &Interrupt) -> anyhow::Result<()> {
+        let Some(pictures) = &self.pictures else {
+            return Err(self.failure());
+        };
+        let since = Instant::now();
+        let mut bytes = image.rgb.clone();
+        loop {
+            bytes = match pictures.try_send(bytes) {
+                Ok(()) => return Ok(()),
+                Err(TrySendError::Full(bytes)) => bytes,
+                Err(TrySendError::Disconnected(_)) => return Err(self.failure()),
+            };
+            pause(since, interrupt)?;
         }
     }
 
     /// Waits for the film and copies it.
     pub(super) fn finish(mut self, to: &mut impl Write, interrupt: &Interrupt) -> anyhow::Result<()> {
-        drop(self.child.stdin.take());
+        drop(self.pictures.take());
         let since = Instant::now();
         let status = loop {
             if let Some(status) = self.child.try_wait()? {
                 break status;
             }
-            if let Some(signal) = interrupt.signal() {
-                bail!("ended by signal {signal}");
-            }
-            if since.elapsed() > PATIENCE {
-                bail!("ffmpeg did not finish the film within {} s", PATIENCE.as_secs());
-            }
-            std::thread::sleep(Duration::from_millis(20));
+            pause(since, interrupt)?;
         };
         if !status.success() {
             return Err(self.failure());
@@ -116,6 +131,18 @@ impl Ffmpeg {
             .unwrap_or("it has ended");
         anyhow::anyhow!("ffmpeg failed: {}", last.trim())
     }
+}
+
+/// Waits for a moment, unless a signal has arrived or it has lasted too long.
+fn pause(since: Instant, interrupt: &Interrupt) -> anyhow::Result<()> {
+    if let Some(signal) = interrupt.signal() {
+        bail!("ended by signal {signal}");
+    }
+    if since.elapsed() > PATIENCE {
+        bail!("ffmpeg has not gone on for {} s", PATIENCE.as_secs());
+    }
+    std::thread::sleep(Duration::from_millis(5));
+    Ok(())
 }
 
 impl Drop for Ffmpeg {
