@@ -47,7 +47,7 @@ class Pictures:
             return gym.make(name, **parameters)
         _without_display()
         try:
-            return gym.make(name, render_mode=MODE, **parameters)
+            return gym.make(name, render_mode=MODE, **{**size(name, self._height), **parameters})
         except Exception as reason:
             # If it cannot be made at all, the next line says so.
             environment = gym.make(name, **parameters)
@@ -78,6 +78,16 @@ class Pictures:
             self._file.write_bytes(line.encode() + b"\n" + pixels)
         except OSError as reason:
             print(f"cannot write a picture: {reason}", file=sys.stderr, flush=True)
+
+
+def size(name: str, height: int) -> dict[str, Any]:
+    """Arguments with which a simulator draws no more pixels than are kept: without a graphics card, drawing is slow."""
+    try:
+        entry_point = gym.spec(name).entry_point
+    except gym.error.Error:
+        return {}
+    is_mujoco = isinstance(entry_point, str) and entry_point.startswith("gymnasium.envs.mujoco")
+    return {"width": height, "height": height} if is_mujoco and height < HEIGHT else {}
 
 
 def scaled(picture: NDArray[np.uint8], height: int) -> NDArray[np.uint8]:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shoal_gym.environments import Blocks, Environments
-from shoal_gym.pictures import Pictures, scaled
+from shoal_gym.pictures import Pictures, scaled, size
 
 
 class Drawn(gym.Env[Any, Any]):
@@ -131,6 +131,12 @@ class Written(unittest.TestCase):
         self.assertLessEqual(np.abs(picture[:, 0, 0] - expected).max(), 1)
         checks = np.array([[0, 255], [255, 0]], np.uint8)[:, :, None].repeat(3, 2)
         self.assertEqual(scaled(checks, 1).tolist(), [[[128] * 3]])
+
+    def test_mujoco_draws_no_more_pixels_than_are_kept(self) -> None:
+        self.assertEqual(size("HalfCheetah-v5", 240), {"width": 240, "height": 240})
+        self.assertEqual(size("HalfCheetah-v5", 2048), {})
+        self.assertEqual(size("Pendulum-v1", 240), {})
+        self.assertEqual(size("no_such_module:Nothing-v0", 240), {})
 
     def test_pictures_are_drawn_only_where_they_are_wanted(self) -> None:
         with patch.dict(os.environ, clear=True):

@@ -159,7 +159,10 @@ pub fn film(
             Err(_) => Err(std::io::Error::other("no film")),
         }
     });
-    wrote?;
+    wrote.map_err(|error| match error.is::<gif::EncodingError>() {
+        true => error.context(cannot_write()),
+        false => error,
+    })?;
     published.with_context(cannot_write)?;
     Ok(shown)
 }

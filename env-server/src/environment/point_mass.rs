@@ -249,7 +249,7 @@ impl Environment for PointMass {
     /// The vehicle from above; the cross is the goal, the arrow the force.
     fn draw(&self, action: &[f64]) -> Option<Drawing> {
         let place = [self.x.position, self.y.position];
-        let edge = 1.03 * WALL;
+        let edge = 1.06 * WALL;
         let mut drawing = Drawing::new([-edge, -edge], [edge, edge]);
         for i in -3..=3 {
             let at = f64::from(i) * WALL / 4.0;

@@ -78,7 +78,7 @@ fn the_pendulums_bob_is_where_its_angle_says() {
 
 #[test]
 fn a_long_film_is_thinned_out_and_lasts_as_long() {
-    let (_, _, pictures, shown) = filmed("name = \"point-mass\"\nreward = \"r1\"\ntime_limit = 2000", 1);
+    let (_, _, pictures, shown) = filmed("name = \"pendulum\"\ntime_limit = 2000", 1);
     assert!(
         (PICTURES_OF_GIF / 2..=PICTURES_OF_GIF + 1).contains(&pictures.len()),
         "{}",
