@@ -168,10 +168,10 @@ pub fn film(
 }
 
 /// The pictures in pixels, all of one size.
-fn images(frames: &Frames, height: u32) -> anyhow::Result<Vec<Cow<'_, Image>>> {
+fn images<'a>(frames: &'a Frames, height: u32) -> anyhow::Result<Vec<Cow<'a, Image>>> {
     let mut painter = Painter::new(height);
-    let image = |frame| match frame {
-        &Frame::Image(ref image) => Some(Cow::Borrowed(image)),
+    let image = |frame: &'a Frame| match frame {
+        Frame::Image(image) => Some(Cow::Borrowed(image)),
         Frame::Drawing(drawing) => painter.paint(drawing).map(Cow::Owned),
     };
     let images: Option<Vec<_>> = frames.frames.iter().map(image).collect();
