@@ -9,6 +9,7 @@ use crate::command::bench::BenchArgs;
 use crate::command::completions::CompletionsArgs;
 use crate::command::eval::EvalArgs;
 use crate::command::export::ExportArgs;
+use crate::command::film::FilmArgs;
 use crate::command::join::JoinArgs;
 use crate::command::list::ListArgs;
 use crate::command::man::ManArgs;
@@ -52,6 +53,8 @@ pub(crate) enum Command {
     Plot(PlotArgs),
     /// Write an interactive report of one run, or of several side by side, into a single HTML file.
     Report(ReportArgs),
+    /// Play a run's policy and write what is seen into a GIF or a video.
+    Film(FilmArgs),
     /// Write a run's policy into a file for other programs.
     Export(ExportArgs),
     /// Copy what a run records to Weights & Biases or MLflow.

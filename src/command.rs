@@ -5,6 +5,7 @@ pub(crate) mod completions;
 pub(crate) mod detach;
 pub(crate) mod eval;
 pub(crate) mod export;
+pub(crate) mod film;
 mod help_config;
 pub(crate) mod join;
 pub(crate) mod list;

@@ -72,6 +72,7 @@ fn run(command: &Command) -> anyhow::Result<ExitCode> {
         Command::Eval(args) => command::eval::run(args),
         Command::Plot(args) => command::plot::run(args).map(done),
         Command::Report(args) => command::report::run(args).map(done),
+        Command::Film(args) => command::film::run(args),
         Command::Export(args) => command::export::run(args).map(done),
         Command::Track(args) => command::track::run(args).map(done),
         Command::Rm(args) => command::rm::run(args),

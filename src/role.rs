@@ -163,6 +163,7 @@ fn launch_spec<'a>(config: &'a Config, run: &RunDir, instance: RoleInstance) -> 
             incarnation
         },
         surroundings: ServerSurroundings::of_run(run, config)?,
+        pictures: None,
     })
 }
 

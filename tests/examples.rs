@@ -51,6 +51,22 @@ fn the_template_trains_and_is_evaluated() {
     assert!(result > -80.0, "{result}");
     let evaluated = place.output(&["eval", "runs/rail-1", "--json"]);
     assert_eq!(json(&evaluated)["return_mean"].as_f64().unwrap(), result);
+
+    let filmed = place.output(&["film", "runs/rail-1", "--size", "150", "--out", "rail.gif"]);
+    assert!(filmed.status.success(), "{}", String::from_utf8_lossy(&filmed.stderr));
+    let film = std::fs::read(place.path().join("rail.gif")).unwrap();
+    let decoder = gif::Decoder::new(&film[..]).unwrap();
+    // The drawing is 4.8 m wide and 1.5 m high: at most twice as wide as 150 pixels.
+    assert_eq!((decoder.width(), decoder.height()), (300, 94));
+    let reported = place.output(&["report", "runs/rail-1", "--out", "page.html"]);
+    assert!(
+        reported.status.success(),
+        "{}",
+        String::from_utf8_lossy(&reported.stderr)
+    );
+    let page = std::fs::read_to_string(place.path().join("page.html")).unwrap();
+    // Two episodes of 100 steps.
+    assert_eq!(page.matches("\"class\":\"body\"").count(), 2 * 101);
 }
 
 fn its_lockstep_run_has_the_same_bits_after_kills() {

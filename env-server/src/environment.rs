@@ -2,6 +2,7 @@
 
 pub mod angle;
 pub mod cart_pole;
+mod drawing;
 mod error;
 pub mod frozen_lake;
 mod interface;
@@ -9,6 +10,7 @@ pub mod pendulum;
 pub mod point_mass;
 mod signal;
 
+pub use drawing::{Class, Drawing, Form, Point, Shape};
 pub use error::{EnvironmentError, OutOfRange, RequestError};
 pub use interface::{Environment, Step};
 use schemars::JsonSchema;

@@ -1,6 +1,7 @@
 //! The environments, and the server that steps a vector of them. It does not depend on how anything is learned.
 
 pub mod environment;
+pub mod frame;
 pub mod program;
 pub mod server;
 pub mod vector;

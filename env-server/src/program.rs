@@ -25,6 +25,7 @@ use shoal_channel::environment::EnvironmentPort;
 use shoal_channel::{Domain, EventName, HeartbeatSender};
 
 use crate::environment::{Environment, OutOfRange};
+use crate::frame::FrameFile;
 use crate::server;
 use crate::vector::VectorEnvironment;
 
@@ -107,7 +108,8 @@ fn serve_until_stopped(
         stream,
         ..
     } = arguments;
-    let mut environments = VectorEnvironment::of(make, *count, (*seed, (*index).into(), *stream))?;
+    let environments = VectorEnvironment::of(make, *count, (*seed, (*index).into(), *stream))?;
+    let mut environments = environments.drawn_into(FrameFile::wanted());
     let stop = Stop::when_stdin_closes().map_err(|error| format!("cannot watch standard input: {error}"))?;
     // A server opens services that the launcher has made, so the number of actors is not needed.
     let domain = Domain::join(run, 1).map_err(in_words)?;

@@ -7,7 +7,8 @@ use shoal_base::space::{EnvironmentSpec, Space};
 use shoal_base::stream::{Purpose, Stream, stream};
 use shoal_channel::environment::StepBlocks;
 
-use crate::environment::{Environment, EnvironmentError, RequestError, make};
+use crate::environment::{Drawing, Environment, EnvironmentError, RequestError, make};
+use crate::frame::FrameFile;
 
 /// The low bits of a stream's number are the episode, the bits above them the environment.
 const EPISODE_BITS: u32 = 40;
@@ -25,6 +26,8 @@ pub struct VectorEnvironment {
     action: Vec<f64>,
     /// Tries states before they are restored, so that a refused one changes nothing.
     scratch: Box<dyn Environment>,
+    /// Where the first environment is drawn.
+    frames: Option<FrameFile>,
 }
 
 struct Running {
@@ -111,7 +114,21 @@ impl VectorEnvironment {
             spec,
             training,
             scratch,
+            frames: None,
         })
+    }
+
+    /// Draws the first environment into this file after each reset and each step, before an episode that has ended is
+    /// followed by the next one.
+    #[must_use]
+    pub fn drawn_into(self, frames: Option<FrameFile>) -> Self {
+        Self { frames, ..self }
+    }
+
+    /// The first environment's current state, with this action.
+    pub fn draw(&self, action: &[f32]) -> Option<Drawing> {
+        let action: Vec<f64> = action.iter().map(|a| f64::from(*a)).collect();
+        self.running.first()?.environment.draw(&action)
     }
 
     /// Spaces and time limit of each environment.
@@ -166,6 +183,9 @@ impl VectorEnvironment {
             }
             self.running[e].environment.observe(observation);
         }
+        if let (Some(frames), Some(Running { environment, .. })) = (&self.frames, self.running.first()) {
+            frames.write(|| environment.draw(&[]), per_second(environment.as_ref()));
+        }
         Ok(())
     }
 
@@ -214,6 +234,10 @@ impl VectorEnvironment {
             rewards[e] = step.reward as f32;
             terminated[e] = f32::from(u8::from(step.terminated));
             truncated[e] = f32::from(u8::from(out_of_time));
+            if let (0, Some(frames)) = (e, &self.frames) {
+                let environment = running.environment.as_ref();
+                frames.write(|| environment.draw(&self.action), per_second(environment));
+            }
             let next_observation = &mut next_observations[e * width..][..width];
             running.environment.observe(next_observation);
             let observation = &mut observations[e * width..][..width];
@@ -267,6 +291,11 @@ impl VectorEnvironment {
             None => Ok(()),
         }
     }
+}
+
+/// Steps in a second of the environment's time.
+fn per_second(environment: &dyn Environment) -> Option<f64> {
+    environment.time_step().map(f64::recip)
 }
 
 /// Stream (e, episode) of a server's environments.

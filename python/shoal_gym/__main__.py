@@ -8,6 +8,7 @@ import sys
 import gymnasium as gym
 
 from .environments import Environments
+from .pictures import Pictures
 from .port import Ended, Port, Unreachable
 from .server import longest, serve
 from .spaces import Unsupported
@@ -37,6 +38,7 @@ def main() -> int:
             arguments.seed,
             arguments.index,
             arguments.stream,
+            Pictures.wanted(),
         )
     except (Unsupported, gym.error.Error, ImportError, TypeError) as reason:
         print(f"error: {arguments.name}: {' '.join(str(reason).split())}", file=sys.stderr)

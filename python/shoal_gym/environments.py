@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import spaces
+from .pictures import Pictures
 from .spaces import Invalid, Unsupported, served
 
 SEEDS = 2**31
@@ -60,13 +61,22 @@ class Environments:
     """
 
     def __init__(
-        self, name: str, parameters: dict[str, Any], count: int, seed: int, server: int, stream: int
+        self,
+        name: str,
+        parameters: dict[str, Any],
+        count: int,
+        seed: int,
+        server: int,
+        stream: int,
+        pictures: Pictures | None = None,
     ) -> None:
+        """``pictures`` are drawn of the first environment."""
         self._name = name
+        self._pictures = pictures
         _seed_process(seed, server, stream)
         parameters = {"disable_env_checker": True, **parameters}
         os.environ["SHOAL_SERVER"] = str(server)
-        self._environments = [_make(name, parameters, e) for e in range(count)]
+        self._environments = [_make(name, parameters, e, pictures) for e in range(count)]
         first = self._environments[0]
         self.observation = served(first.observation_space, "observations")
         self.action = served(first.action_space, "actions")
@@ -133,6 +143,7 @@ class Environments:
             if terminated or truncated:
                 over.append(e)
         blocks.observations[:] = blocks.next_observations
+        self._draw()
         for e in over:
             self._begin(e, blocks)
 
@@ -143,6 +154,11 @@ class Environments:
     def _begin_all(self, blocks: Blocks) -> None:
         for e in range(len(self)):
             self._begin(e, blocks)
+        self._draw()
+
+    def _draw(self) -> None:
+        if self._pictures is not None:
+            self._pictures.draw(self._environments[0])
 
     def _begin(self, e: int, blocks: Blocks) -> None:
         if self._purpose is Purpose.EVALUATION:
@@ -172,8 +188,10 @@ class Environments:
         return Invalid(f"{self._name}: {method} returned {reason} ({where})")
 
 
-def _make(name: str, parameters: dict[str, Any], e: int) -> gym.Env[Any, Any]:
+def _make(name: str, parameters: dict[str, Any], e: int, pictures: Pictures | None) -> gym.Env[Any, Any]:
     os.environ["SHOAL_ENVIRONMENT"] = str(e)
+    if pictures is not None and e == 0:
+        return pictures.make(name, parameters)
     return gym.make(name, **parameters)
 
 

@@ -2,5 +2,6 @@
 
 pub mod export;
 pub mod figure;
+pub mod film;
 pub mod page;
 pub mod plots;

@@ -4,6 +4,7 @@
 mod comparison;
 mod hosts;
 mod numbers;
+mod pictures;
 mod played;
 mod ranking;
 mod run;
@@ -27,12 +28,13 @@ pub const MARK: &str = "<!doctype html>\n<!-- made by shoal report -->\n";
 const PAGE: &str = include_str!("page/page.html");
 const STYLE: &str = include_str!("page/page.css");
 /// In dependency order: a script uses only those before it.
-const SCRIPTS: [&str; 9] = [
+const SCRIPTS: [&str; 10] = [
     include_str!("page/dom.js"),
     include_str!("page/axis.js"),
     include_str!("page/smoothing.js"),
     include_str!("page/chart.js"),
     include_str!("page/scenes.js"),
+    include_str!("page/drawings.js"),
     include_str!("page/player.js"),
     include_str!("page/timeline.js"),
     include_str!("page/head.js"),

@@ -4,6 +4,7 @@ pub mod analysis;
 pub mod best_policy;
 pub mod earlier_best;
 pub mod final_evaluation;
+pub mod frames;
 pub mod rollout;
 
 use serde::{Deserialize, Serialize};

@@ -29,6 +29,7 @@ use shoal_common::exit::Exit;
 use shoal_common::role::Role;
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::stop::{GRACE, Stop};
+use shoal_env_server::frame::{self, Written};
 
 use crate::child_process::{ChildProcess, wait_for_any};
 use crate::external_environment::server_location::ServerSurroundings;
@@ -77,6 +78,8 @@ pub struct LaunchSpec<'a> {
     pub stream: u64,
     /// Where it is started, and with what.
     pub surroundings: ServerSurroundings,
+    /// The file into which it is asked to write pictures, and their greatest height in pixels.
+    pub pictures: Option<(PathBuf, u32)>,
 }
 
 impl LaunchSpec<'_> {
@@ -85,7 +88,9 @@ impl LaunchSpec<'_> {
         let Some((program, arguments)) = environment.server.split_first() else {
             return Ok(None);
         };
-        let ServerSurroundings { location, hash_seed } = &self.surroundings;
+        let ServerSurroundings {
+            location, hash_seed, ..
+        } = &self.surroundings;
         let mut command = match location {
             Some(location) => {
                 let mut command = Command::new(location.program());
@@ -97,6 +102,12 @@ impl LaunchSpec<'_> {
         if let Some(seed) = hash_seed {
             command.env("PYTHONHASHSEED", seed.to_string());
         }
+        match &self.pictures {
+            Some((file, height)) => command
+                .env(frame::FILE_VARIABLE, file)
+                .env(frame::HEIGHT_VARIABLE, height.to_string()),
+            None => command.env_remove(frame::FILE_VARIABLE),
+        };
         command
             .args(arguments)
             .arg("--iceoryx2")
@@ -234,6 +245,8 @@ pub struct ExternalEnvironment {
     listener: Listener,
     spec: EnvironmentSpec,
     program: ChildProcess,
+    /// Where it writes pictures, if it is asked for them.
+    pictures: Option<PathBuf>,
     /// Ends every wait for an answer.
     stop: Stop,
     interrupt: Interrupt,
@@ -287,7 +300,10 @@ impl ExternalEnvironment {
         Domain::remove_abandoned()?;
         let run_id = format!("{:08x}", rand::random::<u32>());
         let domain = Domain::join(&run_id, 1)?;
+        let picture_file = domain.directory()?.join("picture");
+        let pictures = surroundings.picture_height.map(|height| (picture_file, height));
         let launch = LaunchSpec {
+            pictures: pictures.clone(),
             // In the domain's directory, so that it is cleaned up with it if all processes are killed.
             iceoryx2: domain.directory()?.join("iceoryx2.toml"),
             run_id: &run_id,
@@ -305,6 +321,7 @@ impl ExternalEnvironment {
                 listener,
                 spec,
                 program,
+                pictures: pictures.map(|(file, _)| file),
                 stop,
                 interrupt,
                 silent: Cell::new(false),
@@ -357,6 +374,26 @@ impl ExternalEnvironment {
                 bail!("the environment server has lost its episodes")
             }
         }
+    }
+
+    /// Asks for a picture of the state that the next answer describes.
+    ///
+    /// # Errors
+    /// When the last picture cannot be removed.
+    pub fn ask_for_picture(&self) -> anyhow::Result<()> {
+        self.pictures
+            .as_deref()
+            .map_or(Ok(()), frame::ask)
+            .context("the environment server's picture cannot be removed")
+    }
+
+    /// The picture that was asked for last; `None` if the server has written none.
+    ///
+    /// # Errors
+    /// When it cannot be read.
+    pub fn picture(&self) -> anyhow::Result<Option<Written>> {
+        let Some(file) = &self.pictures else { return Ok(None) };
+        frame::read(file).context("the environment server's picture cannot be read")
     }
 
     /// Whether the wait for an answer has ended without one: in time none came, or a signal did. A new server would take

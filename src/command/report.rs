@@ -2,9 +2,11 @@
 
 use std::io::{ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use anyhow::{Context, bail, ensure};
 use clap::Args;
+use indicatif::ProgressBar;
 use shoal_common::durable::write_atomically;
 use shoal_common::run_dir::RunDir;
 use shoal_report::page::{self, MARK};
@@ -40,7 +42,12 @@ pub(crate) fn run(args: &ReportArgs) -> anyhow::Result<()> {
         [one] if Suite::read(one)?.is_some() => StartRecord::read(one)?,
         _ => None,
     };
-    let report = page::gather(&runs, suite)?;
+    // Pictures of some environments take a while. Nothing is shown where standard error is no terminal.
+    let bar = ProgressBar::new_spinner().with_message("reading the runs and playing episodes");
+    bar.enable_steady_tick(Duration::from_millis(200));
+    let report = page::gather(&runs, suite);
+    bar.finish_and_clear();
+    let report = report?;
     for (reason, names) in report.runs_without_episodes() {
         writeln!(
             std::io::stderr().lock(),

@@ -204,6 +204,30 @@ class Grows(Ends):
         return observation, float(self.resets), *rest
 
 
+class Draws(Ends):
+    """Shows its step as the height of a red column in a picture of 60 by 40 pixels; with ``dies`` its server is killed once,
+    in the third step of a film or always."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
+
+    def __init__(self, render_mode=None, dies="never"):
+        super().__init__(after=0)
+        self.render_mode, self.dies = render_mode, dies
+
+    def step(self, action):
+        is_filmed = "SHOAL_PICTURES" in os.environ
+        if is_filmed and self.steps == 2 and (self.dies == "always" or self.dies == "once" and not os.path.exists("died")):
+            open("died", "w").close()
+            os.kill(os.getpid(), 9)
+        return super().step(action)
+
+    def render(self):
+        picture = np.full((40, 60, 3), 255, np.uint8)
+        picture[40 - 6 * (self.steps + 1) :, 20:30] = (200, 0, 0)
+        return picture
+
+
+gym.register("Draws-v0", entry_point=Draws, max_episode_steps=5)
 gym.register("Grows-v0", entry_point=Grows, max_episode_steps=5)
 gym.register("Finale-v0", entry_point=Finale, max_episode_steps=5)
 gym.register("Ends-v0", entry_point=Ends, max_episode_steps=5)

@@ -9,7 +9,7 @@ use shoal_base::{
 };
 
 use super::{
-    Environment, Picture, RequestError, Signal, Step,
+    Class, Drawing, Environment, Picture, RequestError, Signal, Step,
     error::{OutOfRange, check_time_limit},
 };
 
@@ -135,6 +135,28 @@ impl Environment for CartPole {
 
     fn time_step(&self) -> Option<f64> {
         Some(DT)
+    }
+
+    /// The cart on its track; the arrow is the push.
+    fn draw(&self, action: &[f64]) -> Option<Drawing> {
+        let [x, _, theta, _] = self.state;
+        let (half, top) = (0.25, 0.26);
+        let tip = [x + 2.0 * L * theta.sin(), top + 2.0 * L * theta.cos()];
+        let end = |x: f64| [[x, -0.12], [x, 0.12]];
+        let drawing = Drawing::new([-X_LIMIT - 0.3, -0.5], [X_LIMIT + 0.3, 1.7])
+            .line(Class::Wall, &[[-X_LIMIT, 0.0], [X_LIMIT, 0.0]])
+            .line(Class::Wall, &end(-X_LIMIT))
+            .line(Class::Wall, &end(X_LIMIT))
+            .rectangle(Class::Ground, [x - half, 0.0], [x + half, top])
+            .line(Class::Rod, &[[x, top], tip])
+            .circle(Class::Body, tip, 0.07);
+        Some(match action.first() {
+            Some(push) => {
+                let side = if *push < 0.5 { -1.0 } else { 1.0 };
+                drawing.arrow(Class::Force, [x + 0.27 * side, 0.13], [x + 0.67 * side, 0.13])
+            }
+            None => drawing,
+        })
     }
 
     fn picture(&self) -> Picture {

@@ -9,7 +9,7 @@ use shoal_base::{
 };
 
 use super::{
-    Environment, Picture, RequestError, Signal, Step,
+    Class, Drawing, Environment, Picture, RequestError, Signal, Step,
     error::{OutOfRange, check_time_limit},
 };
 
@@ -169,6 +169,34 @@ impl Environment for FrozenLake {
             Signal::observation(0, "field", ""),
             Signal::action(0, "direction", "").label("intended direction (0 ←, 1 ↓, 2 →, 3 ↑)"),
         ]
+    }
+
+    /// The lake from above, its first row at the top; the arrow is the action, and the walker may slip.
+    fn draw(&self, action: &[f64]) -> Option<Drawing> {
+        let corner = |cell: usize| [(cell % SIDE) as f64, (SIDE - 1 - cell / SIDE) as f64];
+        let side = SIDE as f64;
+        let mut drawing = Drawing::new([-0.05, -0.05], [side + 0.05, side + 0.05]);
+        for (cell, kind) in MAP.iter().enumerate() {
+            let [x, y] = corner(cell);
+            let (class, name) = match kind {
+                b'H' => (Class::Hazard, " hole"),
+                b'G' => (Class::Target, " goal"),
+                b'S' => (Class::Ground, " start"),
+                _ => (Class::Ground, ""),
+            };
+            drawing = drawing
+                .rectangle(class, [x, y], [x + 1.0, y + 1.0])
+                .text([x + 0.06, y + 0.8], &format!("{cell}{name}"));
+        }
+        let [x, y] = corner(self.state).map(|low| low + 0.5);
+        let drawing = drawing.circle(Class::Body, [x, y], 0.16).trail([x, y]);
+        let arrow = |(dx, dy): (f64, f64)| {
+            let along = |length: f64| [x + length * dx, y + length * dy];
+            drawing.clone().arrow(Class::Force, along(0.2), along(0.5))
+        };
+        let ways = [(-1.0, 0.0), (0.0, -1.0), (1.0, 0.0), (0.0, 1.0)];
+        let way = action.first().and_then(|action| ways.get(*action as usize)).copied();
+        Some(way.map_or_else(|| drawing.clone(), arrow))
     }
 
     fn picture(&self) -> Picture {

@@ -3,6 +3,7 @@
 use shoal_base::space::EnvironmentSpec;
 use shoal_base::stream::Stream;
 
+use super::drawing::Drawing;
 use super::error::RequestError;
 use super::signal::{Goal, Picture, Signal};
 
@@ -73,6 +74,13 @@ pub trait Environment: Send {
 
     /// The criterion of success, if there is one besides the return.
     fn goal(&self) -> Option<Goal> {
+        None
+    }
+
+    /// Draws the current state, for films and the report. `action` is the one taken in this state or, where it is not
+    /// known yet, the one that led to it; empty if there is none. An environment that does not draw itself keeps this
+    /// default.
+    fn draw(&self, _action: &[f64]) -> Option<Drawing> {
         None
     }
 

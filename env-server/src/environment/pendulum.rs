@@ -11,7 +11,7 @@ use shoal_base::{
 };
 
 use super::{
-    Environment, Picture, RequestError, Signal, Step,
+    Class, Drawing, Environment, Picture, RequestError, Signal, Step,
     angle::wrap,
     error::{OutOfRange, check, check_time_limit},
 };
@@ -141,6 +141,29 @@ impl Environment for Pendulum {
 
     fn time_step(&self) -> Option<f64> {
         Some(DT)
+    }
+
+    /// The rod on its joint; the arc at the joint is the torque.
+    fn draw(&self, action: &[f64]) -> Option<Drawing> {
+        // Upright is 0; angles grow counterclockwise.
+        let at = |angle: f64, radius: f64| [-radius * angle.sin(), radius * angle.cos()];
+        let bob = at(self.theta, L);
+        let drawing = Drawing::new([-1.6, -1.4], [1.6, 1.4])
+            .circle(Class::Guide, [0.0, 0.0], L)
+            .line(Class::Guide, &[[0.0, 1.05 * L], [0.0, 1.2 * L]])
+            .line(Class::Rod, &[[0.0, 0.0], bob])
+            .circle(Class::Body, bob, 0.11);
+        let turn = 2.4
+            * action
+                .first()
+                .map_or(0.0, |torque| (torque / MAX_TORQUE).clamp(-1.0, 1.0));
+        let drawing = if turn.abs() < 0.05 {
+            drawing
+        } else {
+            let arc: Vec<_> = (0..=12).map(|i| at(turn * f64::from(i) / 12.0, 0.32)).collect();
+            drawing.line(Class::Force, &arc).arrow(Class::Force, arc[11], arc[12])
+        };
+        Some(drawing.circle(Class::Joint, [0.0, 0.0], 0.05))
     }
 
     fn picture(&self) -> Picture {

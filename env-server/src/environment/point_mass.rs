@@ -13,7 +13,7 @@ use shoal_base::{
     stream::Stream,
 };
 
-use super::{Environment, Goal, Picture, RequestError, Signal, Step, angle::wrap, error::OutOfRange};
+use super::{Class, Drawing, Environment, Goal, Picture, RequestError, Signal, Step, angle::wrap, error::OutOfRange};
 
 /// Δt in s.
 const DT: f64 = 0.05;
@@ -243,6 +243,42 @@ impl Environment for PointMass {
         Some(Goal {
             distance: Self::distance(),
             within: REACHED,
+        })
+    }
+
+    /// The vehicle from above; the cross is the goal, the arrow the force.
+    fn draw(&self, action: &[f64]) -> Option<Drawing> {
+        let place = [self.x.position, self.y.position];
+        let edge = 1.06 * WALL;
+        let mut drawing = Drawing::new([-edge, -edge], [edge, edge]);
+        for i in -3..=3 {
+            let at = f64::from(i) * WALL / 4.0;
+            drawing = drawing
+                .line(Class::Guide, &[[at, -WALL], [at, WALL]])
+                .line(Class::Guide, &[[-WALL, at], [WALL, at]]);
+        }
+        let outline = [
+            [-WALL, -WALL],
+            [WALL, -WALL],
+            [WALL, WALL],
+            [-WALL, WALL],
+            [-WALL, -WALL],
+        ];
+        let drawing = drawing
+            .line(Class::Wall, &outline)
+            .text([-0.97 * WALL, 0.92 * WALL], &format!("walls at ±{WALL} m"))
+            .line(Class::Goal, &[[-0.16, 0.0], [0.16, 0.0]])
+            .line(Class::Goal, &[[0.0, -0.16], [0.0, 0.16]])
+            .text([0.2, -0.35], "goal")
+            .circle(Class::Body, place, 0.045 * WALL)
+            .trail(place);
+        Some(match *action {
+            [theta, force] => {
+                let length = 0.3 * WALL * (force / MAX_FORCE).clamp(0.0, 1.0);
+                let tip = [place[0] + length * theta.cos(), place[1] + length * theta.sin()];
+                drawing.arrow(Class::Force, place, tip)
+            }
+            _ => drawing,
         })
     }
 

@@ -11,11 +11,23 @@ const FEWEST_POINTS: usize = 60;
 const EPISODES: usize = 6;
 const EPISODES_TOGETHER: usize = 24;
 
+/// Pictures of all runs whose environments other programs draw. Drawing takes time, and the page stays small.
+const PICTURES_TOGETHER: usize = 300;
+const PICTURES: usize = 150;
+const FEWEST_PICTURES: usize = 25;
+const BYTES_TOGETHER: usize = 6_000_000;
+
 /// How much of one run the page may contain.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct PageLimits {
     pub(super) points: usize,
     pub(super) episodes: usize,
+    /// Playable episodes with pictures that another program draws.
+    pub(super) pictured: usize,
+    /// Pictures of such an episode.
+    pub(super) pictures: usize,
+    /// Bytes of them all.
+    pub(super) bytes: usize,
 }
 
 impl PageLimits {
@@ -23,16 +35,27 @@ impl PageLimits {
     pub(super) const NONE: Self = Self {
         points: FEWEST_POINTS,
         episodes: 0,
+        pictured: 0,
+        pictures: 0,
+        bytes: 0,
     };
 
     /// For run `number`, counted from 0, of `runs` in the report.
     pub(super) fn of(number: usize, runs: usize) -> Self {
+        let pictured = match runs {
+            1 => 2,
+            _ => usize::from(number < PICTURES_TOGETHER / FEWEST_PICTURES),
+        };
+        let shown = runs.min(PICTURES_TOGETHER / FEWEST_PICTURES) * pictured.max(1);
         Self {
             points: (POINTS_TOGETHER / runs).clamp(FEWEST_POINTS, POINTS),
             episodes: match EPISODES_TOGETHER / runs {
                 0 => usize::from(number < EPISODES_TOGETHER),
                 share => share.min(EPISODES),
             },
+            pictured,
+            pictures: (PICTURES_TOGETHER / shown).min(PICTURES),
+            bytes: BYTES_TOGETHER / shown,
         }
     }
 }

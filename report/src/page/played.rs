@@ -9,7 +9,8 @@ use shoal_run::evaluation::SavedPolicy;
 use shoal_run::evaluation::rollout::{Rollout, Trajectory};
 use shoal_run::numbers::thousands;
 
-use super::numbers::short;
+use super::numbers::{PageLimits, short};
+use super::pictures::{self, Pictures};
 use super::signals::{Trace, traces};
 
 /// At most about this many frames of an episode. A longer episode shows every second step, every third, and so on.
@@ -24,6 +25,10 @@ pub(super) struct Played {
     /// A sentence for the reader of the page if there are no episodes.
     pub(super) why_not: Option<String>,
     picture: Picture,
+    /// Another program's environment: a sentence for the reader if an episode has no pictures.
+    no_pictures: Option<String>,
+    /// How long a step is shown in s, if it has no duration of its own but the environment says so.
+    pace: Option<f64>,
     /// Δt of a step in s; `None` if a step of the environment has no duration.
     time_step: Option<f64>,
     /// Describes the policy that acts.
@@ -42,17 +47,18 @@ pub(super) struct Episode {
     episode_return: f64,
     terminated: bool,
     pub(super) signals: Vec<Trace>,
+    /// What another program has drawn.
+    pictures: Option<Pictures>,
 }
 
 impl Played {
-    /// Runs the first `episodes` evaluation episodes of the run's seed. A failure is no error: its reason is in
-    /// `why_not`.
-    pub(super) fn of(run: &RunDir, config: &Config, episodes: usize) -> Self {
+    /// Runs the first evaluation episodes of the run's seed. A failure is no error: its reason is in `why_not`.
+    pub(super) fn of(run: &RunDir, config: &Config, limits: PageLimits) -> Self {
         let why_not = |why_not: String| Self {
             why_not: Some(why_not),
             ..Self::default()
         };
-        if episodes == 0 {
+        if limits.episodes == 0 {
             return why_not(
                 "A report of this many runs has no space for this run's episodes; a report of this run alone shows \
                  them."
@@ -64,11 +70,11 @@ impl Played {
             (false, true) => SavedPolicy::Last,
             (false, false) => return why_not("No policy has been evaluated yet.".into()),
         };
-        Self::try_of(run, config, which, episodes)
+        Self::try_of(run, config, which, limits)
             .unwrap_or_else(|error| why_not(format!("The episodes cannot be played: {error:#}.")))
     }
 
-    fn try_of(run: &RunDir, config: &Config, which: SavedPolicy, episodes: usize) -> anyhow::Result<Self> {
+    fn try_of(run: &RunDir, config: &Config, which: SavedPolicy, limits: PageLimits) -> anyhow::Result<Self> {
         let policy = which.read(run, config)?;
         let Description {
             signals,
@@ -76,13 +82,36 @@ impl Played {
             picture,
             ..
         } = Description::of(config)?;
+        // Built-in environments are drawn by the page, from their signals.
+        let is_external = !config.environment.server.is_empty();
         let mut rollout = Rollout::of_run(run, config, &policy.parameters)?;
+        let (mut no_pictures, mut pace) = (None, None);
+        if is_external && limits.pictured > 0 {
+            rollout = rollout.seen(pictures::HEIGHT);
+        } else if is_external {
+            no_pictures = Some("A report of this many runs has no space for this run's pictures.".into());
+        }
         let limit = config.spec.time_limit.max(1) as usize;
         let mut played = Vec::new();
-        for number in 0..episodes.min(STEPS / limit).max(1) {
-            let trajectory = rollout.evaluation_episode(config.run.seed, number as u64)?;
+        for number in 0..limits.episodes.min(STEPS / limit).max(1) {
+            let which = (config.run.seed, number as u64);
+            let (trajectory, frames) = if is_external && number < limits.pictured && no_pictures.is_none() {
+                let (trajectory, frames) = rollout.filmed_episode(which, limits.pictures, |_| ())?;
+                pace = frames.as_ref().ok().and_then(|frames| frames.fps).map(f64::recip);
+                let frames = frames.and_then(|frames| Pictures::of(&frames, limits.bytes));
+                no_pictures = frames
+                    .as_ref()
+                    .err()
+                    .map(|reason| format!("This environment cannot be shown: {reason}."));
+                (trajectory, frames.ok())
+            } else {
+                (rollout.evaluation_episode(which.0, which.1)?, None)
+            };
             let of_frames = |frames: &[usize]| traces(&signals, &config.spec, &trajectory, frames);
-            played.push(Episode::of(number, &trajectory, of_frames));
+            played.push(Episode::of(number, &trajectory, of_frames, frames));
+        }
+        if is_external && no_pictures.is_none() {
+            no_pictures = Some("Only the first episodes have pictures, so that the page stays small.".into());
         }
         let called = match which {
             SavedPolicy::Best => "best",
@@ -91,6 +120,8 @@ impl Played {
         Ok(Self {
             why_not: None,
             picture,
+            no_pictures,
+            pace,
             time_step,
             policy: format!(
                 "the {called} policy, learned from {} environment steps",
@@ -103,7 +134,12 @@ impl Played {
 
 impl Episode {
     /// `of_frames` returns the traces at the given frames.
-    fn of(number: usize, trajectory: &Trajectory, of_frames: impl Fn(&[usize]) -> Vec<Trace>) -> Self {
+    fn of(
+        number: usize,
+        trajectory: &Trajectory,
+        of_frames: impl Fn(&[usize]) -> Vec<Trace>,
+        pictures: Option<Pictures>,
+    ) -> Self {
         let steps = trajectory.actions.len();
         let stride = steps.div_ceil(FRAMES).max(1);
         let frames: Vec<usize> = (0..steps).step_by(stride).chain([steps]).collect();
@@ -114,6 +150,7 @@ impl Episode {
             episode_return: short(trajectory.episode_return()),
             terminated: trajectory.terminated,
             signals: of_frames(&frames),
+            pictures,
         }
     }
 }

@@ -52,10 +52,11 @@ class Player {
     const option = (episode, i) => [i, `${episode.number + 1}: return ${text(episode.return)}, ${plural(episode.steps, "step")}${episode.terminated ? ", terminated" : ""}`];
     this.episodes.replaceChildren(choice("Episode", played.episodes.map(option), number, (i) => this.load(run, i)));
     const byKey = Object.fromEntries(this.episode.signals.map((signal) => [signal.key, signal]));
-    const { element, draw } = SCENES[picture.kind](picture, byKey);
+    const own = this.episode.pictures !== null;
+    const { element, draw } = own ? ownScene(this.episode) : SCENES[picture.kind](picture, byKey, played);
     this.drawScene = draw;
     this.stage.replaceChildren(element);
-    this.element.classList.toggle("without-picture", picture.kind === "none");
+    this.element.classList.toggle("without-picture", !own && picture.kind === "none");
     this.cursors = this.episode.signals.map((signal) => this.strip(signal));
     this.policy.textContent = `${run.name}: ${played.policy}, without exploration, from the start states of the evaluations.`;
     set(this.slider, { max: this.frames - 1 });
@@ -126,7 +127,8 @@ class Player {
     let [before, due] = [null, 0];
     const tick = (now) => {
       if (!this.playing) return;
-      const seconds = this.dt === null ? SECONDS_PER_FRAME : this.dt * this.episode.stride;
+      const step = this.dt ?? this.run.played.pace;
+      const seconds = step === null ? SECONDS_PER_FRAME : step * this.episode.stride;
       due += before === null ? 0 : (Math.min(250, now - before) / 1000 / seconds) * this.speed;
       before = now;
       const frames = Math.floor(due);

@@ -181,7 +181,7 @@ impl Run {
             start: StartRecord::read(run.path())?,
             origin: Origin::read(run)?.map(|origin| origin.in_words()),
             changes: read_changes(&run.changes())?,
-            played: Played::of(run, &config, limits.episodes),
+            played: Played::of(run, &config, limits),
             evaluation_records,
         })
     }

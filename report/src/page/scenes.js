@@ -174,7 +174,8 @@ const SCENES = {
     return { element, draw };
   },
 
-  none() {
-    return { element: html("p", {}, "This environment has no picture; the signals are the policy's observations and actions."), draw() {} };
+  none(picture, signals, { no_pictures }) {
+    const reason = no_pictures ?? "This environment has no picture.";
+    return { element: html("p", {}, `${reason} The signals are the policy's observations and actions.`), draw() {} };
   },
 };

@@ -1,4 +1,4 @@
-//! Whole episodes of a policy without exploration, for `eval`, `plot` and `report`. Built-in environments run in this
+//! Whole episodes of a policy without exploration, for `eval`, `plot`, `report` and `film`. Built-in environments run in this
 //! process, others in their servers.
 
 use anyhow::{Context, bail, ensure};
@@ -9,8 +9,10 @@ use shoal_common::run_dir::RunDir;
 use shoal_common::space::EnvironmentSpec;
 use shoal_env_server::environment::SignalSource;
 use shoal_env_server::environment::angle::unwrapped;
+use shoal_env_server::frame::{Frame, Written};
 use shoal_env_server::vector::{Reset, VectorEnvironment};
 
+use crate::evaluation::frames::{Frames, Recorder};
 use crate::external_environment::ExternalEnvironment;
 use crate::external_environment::server_location::ServerSurroundings;
 use crate::signals::Interrupt;
@@ -118,35 +120,73 @@ impl<'a> Rollout<'a> {
         Self { interrupt, ..self }
     }
 
+    /// Asks an environment that another program serves for pictures, at most this many pixels high.
+    pub fn seen(mut self, height: u32) -> Self {
+        self.surroundings.picture_height = Some(height);
+        self
+    }
+
     /// Runs evaluation episode `number` of `seed`. The two determine its start state.
     pub fn evaluation_episode(&mut self, seed: u64, number: u64) -> anyhow::Result<Trajectory> {
-        self.episode(Reset::Evaluation {
-            seed,
-            first: number,
-            episodes: Some(1),
-        })
+        self.episode(evaluation(seed, number), &mut |_| (), None)
+            .map(|(trajectory, _)| trajectory)
+    }
+
+    /// As [`evaluation_episode`](Self::evaluation_episode), with at most about `most` pictures of it, or the reason why
+    /// there are none: a sentence without its full stop. Other programs draw only for a rollout that is
+    /// [`seen`](Self::seen). An episode that may have more steps is played twice: its length decides which states are
+    /// drawn, because drawing takes much longer than stepping. Calls `progress` with the number of steps.
+    pub fn filmed_episode(
+        &mut self,
+        (seed, number): (u64, u64),
+        most: usize,
+        mut progress: impl FnMut(usize),
+    ) -> anyhow::Result<(Trajectory, Result<Frames, String>)> {
+        let mut stride = 1;
+        if self.config.spec.time_limit as usize >= most {
+            let (played, _) = self.episode(evaluation(seed, number), &mut |_| (), None)?;
+            stride = played.actions.len().div_ceil(most.max(2) - 1);
+        }
+        self.episode(evaluation(seed, number), &mut progress, Some((most, stride)))
     }
 
     /// Runs an episode that starts in this physical state of the environment, which must be a built-in one.
     pub fn episode_from(&mut self, state: &[f64]) -> anyhow::Result<Trajectory> {
-        self.episode(Reset::States(state))
+        self.episode(Reset::States(state), &mut |_| (), None)
+            .map(|(trajectory, _)| trajectory)
     }
 
     /// Runs an episode. If the environment's server fails in it, it is run again with a new server.
-    fn episode(&mut self, reset: Reset<'_>) -> anyhow::Result<Trajectory> {
+    fn episode(
+        &mut self,
+        reset: Reset<'_>,
+        progress: &mut dyn FnMut(usize),
+        frames: Option<(usize, usize)>,
+    ) -> anyhow::Result<(Trajectory, Result<Frames, String>)> {
         let mut tries = 1;
         loop {
-            match self.try_episode(reset) {
+            let mut recorder = frames.map(|(most, stride)| Recorder::new(most, stride));
+            match self.try_episode(reset, progress, &mut recorder) {
                 Err(_) if tries < TRIES && self.interrupt.signal().is_none() && self.host.can_be_restarted() => {
                     tries += 1;
                 }
                 Err(error) if tries > 1 => bail!("{error:#} (the episode was begun {tries} times)"),
-                result => return result,
+                Err(error) => return Err(error),
+                Ok(trajectory) => {
+                    let nothing = || Err("no pictures were asked for".into());
+                    return Ok((trajectory, recorder.map_or_else(nothing, Recorder::finish)));
+                }
             }
         }
     }
 
-    fn try_episode(&mut self, reset: Reset<'_>) -> anyhow::Result<Trajectory> {
+    fn try_episode(
+        &mut self,
+        reset: Reset<'_>,
+        progress: &mut dyn FnMut(usize),
+        recorder: &mut Option<Recorder>,
+    ) -> anyhow::Result<Trajectory> {
+        self.host.ask_for_picture()?;
         let mut observation = self
             .host
             .begin(self.config, &self.surroundings, reset, &self.interrupt)?;
@@ -155,21 +195,43 @@ impl<'a> Rollout<'a> {
             observations: vec![observation.clone()],
             ..Trajectory::default()
         };
-        loop {
+        for steps in 0.. {
             if let Some(signal) = self.interrupt.signal() {
                 bail!("ended by signal {signal}");
             }
+            progress(steps);
             self.policy.act(self.parameters, &observation, &mut action);
+            if let Some(recorder) = recorder.as_mut().filter(|recorder| recorder.wants(steps)) {
+                recorder.add(self.host.see(&action)?);
+            }
+            let last = steps + 1 == self.config.spec.time_limit as usize;
+            let wants_next = recorder.as_ref().is_some_and(|it| last || it.wants(steps + 1));
+            if wants_next {
+                self.host.ask_for_picture()?;
+            }
             let step = self.host.step(&action)?;
             observation.clone_from(&step.s_next);
             trajectory.observations.push(step.s_next);
             trajectory.actions.push(action.clone());
             trajectory.rewards.push(step.reward);
             if step.terminated || step.truncated {
+                if let (Some(recorder), true) = (recorder, wants_next || self.host.is_builtin()) {
+                    recorder.add_last(self.host.see(&[])?.and_then(|written| written.frame.ok()));
+                }
                 trajectory.terminated = step.terminated;
-                return Ok(trajectory);
+                break;
             }
         }
+        Ok(trajectory)
+    }
+}
+
+/// The start of evaluation episode `number`.
+fn evaluation(seed: u64, number: u64) -> Reset<'static> {
+    Reset::Evaluation {
+        seed,
+        first: number,
+        episodes: Some(1),
     }
 }
 
@@ -229,6 +291,32 @@ impl Host {
                 Ok(server.begin_evaluation(first)?.observation(0).to_vec())
             }
             (Self::External(_), _) => bail!("episodes of {} cannot start in a chosen state", config.environment.name),
+        }
+    }
+
+    fn is_builtin(&self) -> bool {
+        matches!(self, Self::Builtin(_))
+    }
+
+    /// Asks for a picture of the state that the next begin or step leads to.
+    fn ask_for_picture(&self) -> anyhow::Result<()> {
+        match self {
+            Self::External(Some((_, server))) => server.ask_for_picture(),
+            Self::External(None) | Self::Builtin(_) => Ok(()),
+        }
+    }
+
+    /// The picture of the current state, in which `action` will be taken; `None` if there is none. Another program knows
+    /// only the action before, and has written the picture when it reached the state.
+    fn see(&self, action: &[f32]) -> anyhow::Result<Option<Written>> {
+        match self {
+            Self::Builtin(environment) => {
+                let drawing = environment.draw(action).map(Frame::Drawing);
+                let frame = drawing.ok_or_else(|| "the environment does not draw itself".into());
+                Ok(Some(Written { frame, fps: None }))
+            }
+            Self::External(Some((_, server))) => server.picture(),
+            Self::External(None) => Ok(None),
         }
     }
 

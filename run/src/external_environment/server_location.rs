@@ -150,6 +150,8 @@ pub struct ServerSurroundings {
     pub location: Option<ServerLocation>,
     /// The environment variable `PYTHONHASHSEED`, which decides the order of Python's sets. `None`: unchanged.
     pub hash_seed: Option<u32>,
+    /// The greatest height in pixels of the pictures that it is asked for. `None`: it is asked for none.
+    pub picture_height: Option<u32>,
 }
 
 impl ServerSurroundings {
@@ -161,6 +163,7 @@ impl ServerSurroundings {
         Ok(Self {
             location: ServerLocation::of_run(run)?,
             hash_seed: hash_seed(config.run.mode, config.run.seed),
+            picture_height: None,
         })
     }
 }

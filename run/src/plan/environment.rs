@@ -48,6 +48,7 @@ pub(super) fn describe_environment(table: &mut Table) -> anyhow::Result<()> {
         let surroundings = ServerSurroundings {
             location: ServerLocation::here(&environment.server)?,
             hash_seed: hash_seed(mode, seed),
+            picture_height: None,
         };
         let spec = ExternalEnvironment::begin_in(&environment, 1, 0, surroundings, Interrupt::default())?
             .spec()

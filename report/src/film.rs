@@ -1,0 +1,275 @@
+//! Films of a policy's evaluation episodes.
+
+mod animation;
+mod ffmpeg;
+mod paint;
+
+use std::borrow::Cow;
+use std::io::Write;
+use std::path::Path;
+
+use anyhow::{Context, bail, ensure};
+use shoal_common::config::Config;
+use shoal_common::durable::write_atomically;
+use shoal_common::run_dir::RunDir;
+use shoal_common::space::Space;
+use shoal_env_server::frame::{Frame, Image};
+use shoal_run::description::Description;
+use shoal_run::evaluation::frames::Frames;
+use shoal_run::evaluation::rollout::Rollout;
+use shoal_run::signals::Interrupt;
+
+use self::animation::Animation;
+use self::ffmpeg::Ffmpeg;
+pub(crate) use self::paint::Painter;
+
+/// Pictures of all episodes of a film, at most about this many; longer episodes are thinned out.
+const PICTURES_OF_GIF: usize = 300;
+const PICTURES_OF_MP4: usize = 600;
+/// Each episode has at least this many.
+const FEWEST_PICTURES: usize = 20;
+
+/// Players slow down pictures of a GIF that are shown for less than this many hundredths of a second.
+const SHORTEST_DELAY: f64 = 2.0;
+/// The greatest number of pictures in a second of an MP4.
+const MOST_FPS: f64 = 60.0;
+/// How long the last picture of an episode is shown, in s.
+const PAUSE: f64 = 0.6;
+
+/// Steps in a second where nothing says how many there are.
+const STEPS_PER_SECOND: f64 = 30.0;
+/// The same where the states are places, such as cells of a grid.
+const MOVES_PER_SECOND: f64 = 4.0;
+
+/// The file formats.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Format {
+    /// Animated GIF.
+    Gif,
+    /// MP4, written by the program `ffmpeg`.
+    Mp4,
+}
+
+impl Format {
+    /// The format of a file's name.
+    ///
+    /// # Errors
+    /// When the name has another ending, or the program for this format is missing.
+    pub fn of(file: &Path) -> anyhow::Result<Self> {
+        let ending = file.extension().map(|ending| ending.to_ascii_lowercase());
+        match ending.as_deref().and_then(|ending| ending.to_str()) {
+            Some("gif") => Ok(Self::Gif),
+            Some("mp4") => ffmpeg::check().map(|()| Self::Mp4),
+            _ => bail!("{}: a film's name ends in .gif or .mp4", file.display()),
+        }
+    }
+
+    /// Whether a file that begins with these bytes has this format.
+    pub fn is(self, start: &[u8]) -> bool {
+        match self {
+            Self::Gif => start.starts_with(b"GIF8"),
+            Self::Mp4 => start.get(4..8) == Some(b"ftyp"),
+        }
+    }
+}
+
+/// What is filmed.
+#[derive(Clone, Copy, Debug)]
+pub struct Request<'a> {
+    /// The policy's parameters.
+    pub parameters: &'a [f32],
+    /// Evaluation episodes 0 … `episodes` − 1 of `seed`.
+    pub episodes: u32,
+    /// Seed of the start states.
+    pub seed: u64,
+    /// The pictures' greatest height in pixels; they are at most twice as wide.
+    pub height: u32,
+    /// Steps shown in a second; `None`: as many as the environment says.
+    pub steps_per_second: Option<f64>,
+}
+
+/// What a film shows.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Shown {
+    /// Each episode's return and number of steps.
+    pub episodes: Vec<(f64, usize)>,
+    /// How long the film is, in s.
+    pub seconds: f64,
+}
+
+/// Plays the episodes and writes their film to `out`, whole or not at all. Calls `progress` with the number of the
+/// episode, counted from 0, and the number of its steps.
+///
+/// # Errors
+/// When the environment fails or cannot be drawn, the file cannot be written, or a signal has arrived.
+pub fn film(
+    run: &RunDir,
+    config: &Config,
+    request: Request<'_>,
+    (out, format): (&Path, Format),
+    interrupt: &Interrupt,
+    mut progress: impl FnMut(u32, usize),
+) -> anyhow::Result<Shown> {
+    let rollout = Rollout::of_run(run, config, request.parameters)?;
+    let mut rollout = rollout.until(interrupt.clone()).seen(request.height);
+    let time_step = Description::of(config)?.time_step;
+    let pictures = match format {
+        Format::Gif => PICTURES_OF_GIF,
+        Format::Mp4 => PICTURES_OF_MP4,
+    };
+    let most = (pictures / request.episodes.max(1) as usize).max(FEWEST_PICTURES);
+    let mut shown = Shown::default();
+    let cannot_write = || format!("cannot write {}; choose another place with --out", out.display());
+    let mut wrote = Ok(());
+    let published = write_atomically(out, |file| {
+        wrote = (|| {
+            let mut writer: Option<Writer<'_, _>> = None;
+            let mut file = Some(file);
+            for number in 0..request.episodes {
+                let steps = |steps| progress(number, steps);
+                let (trajectory, frames) = rollout.filmed_episode((request.seed, number.into()), most, steps)?;
+                let name = &config.environment.name;
+                let frames = frames.map_err(|reason| anyhow::anyhow!("{name} cannot be filmed: {reason}"))?;
+                let rate = request
+                    .steps_per_second
+                    .or(time_step.map(f64::recip))
+                    .or(frames.fps)
+                    .unwrap_or(match config.spec.observation {
+                        Space::Discrete { .. } => MOVES_PER_SECOND,
+                        Space::Box { .. } => STEPS_PER_SECOND,
+                    });
+                let steps = trajectory.actions.len();
+                let images = images(&frames, request.height)?;
+                let size = (images[0].width, images[0].height);
+                let writer = match &mut writer {
+                    Some(writer) => writer,
+                    None => {
+                        let file = file.take().context("the film was begun twice")?;
+                        writer.insert(Writer::new(file, format, size, rate)?)
+                    }
+                };
+                shown.seconds += writer.add(&images, frames.stride, steps, rate, interrupt)?;
+                shown.episodes.push((trajectory.episode_return(), steps));
+            }
+            writer.context("there is no episode")?.finish(interrupt)
+        })();
+        // What failed was not the file: it is returned as it is.
+        match &wrote {
+            Ok(()) => Ok(()),
+            Err(_) => Err(std::io::Error::other("no film")),
+        }
+    });
+    wrote.map_err(|error| match error.is::<gif::EncodingError>() {
+        true => error.context(cannot_write()),
+        false => error,
+    })?;
+    published.with_context(cannot_write)?;
+    Ok(shown)
+}
+
+/// The pictures in pixels, all of one size.
+fn images<'a>(frames: &'a Frames, height: u32) -> anyhow::Result<Vec<Cow<'a, Image>>> {
+    let mut painter = Painter::new(height);
+    let image = |frame: &'a Frame| match frame {
+        Frame::Image(image) => Some(Cow::Borrowed(image)),
+        Frame::Drawing(drawing) => painter.paint(drawing).map(Cow::Owned),
+    };
+    let images: Option<Vec<_>> = frames.frames.iter().map(image).collect();
+    let images = images
+        .filter(|images| !images.is_empty())
+        .context("the environment's drawing has no size")?;
+    let size = |image: &Image| (image.width, image.height);
+    let one = images.iter().all(|image| size(image) == size(&images[0]));
+    ensure!(one, "the environment's pictures change their size");
+    Ok(images)
+}
+
+/// Writes pictures in either format.
+struct Writer<'a, W: Write> {
+    size: (usize, usize),
+    /// Hundredths of a second that rounding has left over.
+    left_over: f64,
+    to: To<'a, W>,
+}
+
+enum To<'a, W: Write> {
+    Gif(Animation<&'a mut W>),
+    Mp4 { file: &'a mut W, ffmpeg: Ffmpeg, fps: f64 },
+}
+
+impl<'a, W: Write> Writer<'a, W> {
+    fn new(file: &'a mut W, format: Format, size: (usize, usize), rate: f64) -> anyhow::Result<Self> {
+        let to = match format {
+            Format::Gif => To::Gif(Animation::new(file, size)?),
+            Format::Mp4 => {
+                // A whole number of steps per picture.
+                let fps = rate / (rate / MOST_FPS).ceil().max(1.0);
+                let ffmpeg = Ffmpeg::start(size, fps)?;
+                To::Mp4 { file, ffmpeg, fps }
+            }
+        };
+        let left_over = 0.0;
+        Ok(Self { size, left_over, to })
+    }
+
+    /// Adds the pictures of an episode that are `stride` steps apart, and returns how long they are shown, in s.
+    fn add(
+        &mut self,
+        images: &[Cow<'_, Image>],
+        stride: usize,
+        steps: usize,
+        rate: f64,
+        interrupt: &Interrupt,
+    ) -> anyhow::Result<f64> {
+        let size = (images[0].width, images[0].height);
+        ensure!(size == self.size, "the environment's pictures change their size");
+        let last = images.len() - 1;
+        match &mut self.to {
+            To::Gif(animation) => {
+                let every = (SHORTEST_DELAY * rate / 100.0 / stride as f64).ceil().max(1.0) as usize;
+                let mut seconds = 0.0;
+                let shown: Vec<usize> = (0..last).step_by(every).chain([last]).collect();
+                for (n, i) in shown.iter().enumerate() {
+                    check(interrupt)?;
+                    let step = |i: usize| if i == last { steps } else { i * stride };
+                    let lasts = shown
+                        .get(n + 1)
+                        .map_or(PAUSE, |next| (step(*next) - step(*i)) as f64 / rate);
+                    let exact = 100.0 * lasts + self.left_over;
+                    let delay = exact.round().clamp(SHORTEST_DELAY, f64::from(u16::MAX));
+                    self.left_over = (exact - delay).clamp(-SHORTEST_DELAY, SHORTEST_DELAY);
+                    animation.add(&images[*i], delay as u16)?;
+                    seconds += delay / 100.0;
+                }
+                Ok(seconds)
+            }
+            To::Mp4 { ffmpeg, fps, .. } => {
+                let pictures = ((steps as f64 / rate + PAUSE) * *fps).round().max(1.0) as usize;
+                for n in 0..pictures {
+                    check(interrupt)?;
+                    let step = (n as f64 / *fps * rate + 1e-6) as usize;
+                    let i = if step >= steps { last } else { (step / stride).min(last) };
+                    ffmpeg.add(&images[i], interrupt)?;
+                }
+                Ok(pictures as f64 / *fps)
+            }
+        }
+    }
+
+    fn finish(self, interrupt: &Interrupt) -> anyhow::Result<()> {
+        match self.to {
+            To::Gif(animation) => animation.finish(),
+            To::Mp4 { file, ffmpeg, .. } => ffmpeg.finish(file, interrupt),
+        }
+    }
+}
+
+fn check(interrupt: &Interrupt) -> anyhow::Result<()> {
+    match interrupt.signal() {
+        Some(signal) => bail!("ended by signal {signal}"),
+        None => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests;
