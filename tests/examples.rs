@@ -2,6 +2,9 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
 
+#[path = "report/browser.rs"]
+#[allow(dead_code, reason = "this suite uses a part of this file")]
+mod browser;
 #[path = "support/suite.rs"]
 mod suite;
 mod support;
@@ -9,6 +12,7 @@ mod support;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
+use browser::{Browser, CHROMIUM};
 use suite::{Need, test};
 use support::{Workplace, error_line, json, until};
 
@@ -16,6 +20,7 @@ fn main() -> ExitCode {
     suite::run(vec![
         test!(the_template_trains_and_is_evaluated, RAIL),
         test!(its_lockstep_run_has_the_same_bits_after_kills, RAIL),
+        test!(its_drawings_are_played_in_the_report, RAIL, CHROMIUM),
         test!(its_errors_are_one_line, RAIL),
     ])
 }
@@ -100,6 +105,39 @@ fn its_lockstep_run_has_the_same_bits_after_kills() {
     }
     assert!(running.pids("env-server-0").len() > 1, "a server was killed");
     assert_eq!(digest(running), undisturbed);
+}
+
+fn its_drawings_are_played_in_the_report() {
+    let place = copy();
+    let trained = place.output(&["train", "rail.toml", "--steps", "3000", "--quiet"]);
+    assert!(trained.status.success(), "{}", String::from_utf8_lossy(&trained.stderr));
+    assert!(
+        place
+            .output(&["report", "runs/rail-1", "--out", "page.html"])
+            .status
+            .success()
+    );
+    let mut browser = Browser::start();
+    browser.open(&place.path().join("page.html").canonicalize().unwrap(), 1200, false);
+    for key in ["Home", "End"] {
+        browser.value("document.querySelector('.player').focus()");
+        browser.key(key);
+        // The picture is 4.8 m wide. The first line is the position.
+        let middle = "(() => { const cart = document.querySelector('[data-part=moves]').getBoundingClientRect(); \
+                      const scene = document.querySelector('.scene').getBoundingClientRect(); \
+                      return [(cart.left + cart.width / 2 - scene.left) / scene.width * 4.8 - 2.4, \
+                      document.querySelector('.strip b').textContent]; })()";
+        let found = browser.value(middle);
+        let position = found[1].as_str().unwrap().replace('\u{2212}', "-");
+        let (drawn, position) = (found[0].as_f64().unwrap(), position.parse::<f64>().unwrap());
+        assert!(
+            (drawn - position).abs() < 0.05,
+            "{key}: drawn at {drawn}, it is at {position}"
+        );
+    }
+    let goal = browser.value("document.querySelector('.scene .goal') !== null");
+    assert_eq!(goal, true, "the middle is marked");
+    assert_eq!(browser.problems(), [""; 0]);
 }
 
 fn its_errors_are_one_line() {

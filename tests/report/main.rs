@@ -14,13 +14,14 @@ use std::process::ExitCode;
 use browser::{Browser, CHROMIUM};
 use libtest_mimic::Completion;
 use serde_json::Value;
-use suite::test;
+use suite::{PYTHON, test};
 use support::{Running, Workplace, error_line, until};
 
 fn main() -> ExitCode {
     suite::run(vec![
         test!(a_report_works_in_a_browser, CHROMIUM),
         test!(the_report_of_one_run_begins_with_its_result, CHROMIUM),
+        test!(frames_of_gymnasium_are_played, CHROMIUM, PYTHON),
         test!(a_running_run_and_one_with_few_records_can_be_reported),
         test!(an_impossible_report_is_refused_in_one_line),
     ])
@@ -105,6 +106,48 @@ fn frame(browser: &mut Browser) -> u64 {
 
 fn is_playing(browser: &mut Browser) -> bool {
     browser.value("document.querySelector('.play').dataset.playing") == "true"
+}
+
+/// How many pixels of the red column of `Draws` are seen: six for each state so far.
+fn red_pixels(browser: &mut Browser) -> f64 {
+    let count = "(async () => { const image = document.querySelector('.stage img'); await image.decode(); \
+                 const canvas = document.createElement('canvas'); canvas.width = image.naturalWidth; \
+                 canvas.height = image.naturalHeight; const drawn = canvas.getContext('2d'); \
+                 drawn.drawImage(image, 0, 0); const { data } = drawn.getImageData(25, 0, 1, canvas.height); \
+                 return [...data].filter((_, i) => i % 4 === 0 && data[i] > 120 && data[i + 1] < 120).length; })()";
+    browser.value(count).as_f64().unwrap()
+}
+
+fn frames_of_gymnasium_are_played() {
+    let place = Workplace::new();
+    let module = include_str!("../gym/shoal_test_environments.py");
+    std::fs::write(place.path().join("shoal_test_environments.py"), module).unwrap();
+    let environment = "gym:shoal_test_environments:Draws-v0";
+    place.train(&[environment, "--run", "run", "--steps", "200", "--envs", "2"]);
+    let page = report(&place, &["run"]);
+    let mut browser = Browser::start();
+    browser.open(&page, 1200, true);
+    assert!((red_pixels(&mut browser) - 6.0).abs() <= 1.0);
+    browser.value("document.querySelector('.player').focus()");
+    for (key, states) in [("ArrowRight", 2.0), ("ArrowRight", 3.0), ("End", 6.0), ("Home", 1.0)] {
+        browser.key(key);
+        let pixels = red_pixels(&mut browser);
+        assert!((pixels - 6.0 * states).abs() <= 1.0, "{pixels} pixels after {key}");
+    }
+    browser.value(
+        "(() => { const list = document.querySelector('.player .choices > span select'); list.value = 2; \
+         list.dispatchEvent(new Event('change')); })()",
+    );
+    let without = browser.value("document.querySelector('.stage').innerText");
+    assert!(
+        without
+            .as_str()
+            .unwrap()
+            .contains("Only the first episodes have pictures"),
+        "{without}"
+    );
+    assert_eq!(browser.problems(), [""; 0]);
+    assert_eq!(browser.requests(), [format!("file://{}", page.display())]);
 }
 
 fn a_report_works_in_a_browser() {

@@ -13,7 +13,7 @@ mod support;
 use std::process::Command;
 
 use shoal_common::stream::{Purpose, stream};
-use shoal_env_server::environment::{Environment, OutOfRange, RequestError, Signal, Step};
+use shoal_env_server::environment::{Class, Drawing, Environment, OutOfRange, RequestError, Signal, Step};
 
 use support::{Leftovers, Workplace};
 

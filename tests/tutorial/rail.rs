@@ -8,7 +8,7 @@ use shoal_base::{
     stream::Stream,
 };
 
-use super::{Environment, OutOfRange, RequestError, Signal, Step};
+use super::{Class, Drawing, Environment, OutOfRange, RequestError, Signal, Step};
 
 /// Δt in s.
 const DT: f64 = 0.05;
@@ -104,5 +104,22 @@ impl Environment for Rail {
             Signal::observation(1, "velocity", "m/s"),
             Signal::action(0, "force", "N"),
         ]
+    }
+
+    fn time_step(&self) -> Option<f64> {
+        Some(DT)
+    }
+
+    /// The cart on its rail, for `shoal film` and the report; the arrow is the force.
+    fn draw(&self, action: &[f64]) -> Option<Drawing> {
+        let (x, force) = (self.x, action.first().copied().unwrap_or(0.0).clamp(-1.0, 1.0));
+        let drawing = Drawing::new([-X - 0.4, -0.6], [X + 0.4, 0.9])
+            .line(
+                Class::Wall,
+                &[[-X - 0.2, 0.3], [-X - 0.2, 0.0], [X + 0.2, 0.0], [X + 0.2, 0.3]],
+            )
+            .line(Class::Goal, &[[0.0, -0.1], [0.0, 0.1]])
+            .rectangle(Class::Body, [x - 0.2, 0.0], [x + 0.2, 0.2]);
+        Some(drawing.arrow(Class::Force, [x, 0.4], [x + 0.8 * force, 0.4]))
     }
 }
