@@ -125,6 +125,7 @@ def train(
     set: Mapping[str, Any] | None = None,
     from_run: str | os.PathLike[str] | Run | None = None,
     with_replay: bool = False,
+    demonstrations: str | None = None,
     wait: bool = True,
     quiet: bool = False,
 ) -> Run:
@@ -149,6 +150,7 @@ def train(
         ("--envs", envs),
         ("--method", method),
         ("--from", getattr(from_run, "path", from_run)),
+        ("--demonstrations", demonstrations),
     ]
     arguments = ["train", what, "--json"]
     arguments += [str(part) for option, value in options if value is not None for part in (option, value)]

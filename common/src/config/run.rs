@@ -34,6 +34,9 @@ section! {
         /// The run whose networks this one began with, from `--from`.
         #[serde(skip_serializing_if = "Option::is_none")]
         from: Option<String> = None, unit: "–", source: "ours", change: Change::ByProgram;
+        /// The dataset with whose rows this one's replay began, from `--demonstrations`.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        demonstrations: Option<String> = None, unit: "–", source: "ours", change: Change::ByProgram;
         /// The format of the text that identifies the run's files. Chosen by the program when the run directory is
         /// created.
         #[serde(skip_serializing_if = "IdentityFormat::is_unnumbered")]
