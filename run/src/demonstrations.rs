@@ -104,7 +104,9 @@ impl Demonstrations {
             ("actions", &self.header.action, &config.spec.action),
         ] {
             if there != here {
-                return refused(format!("the space of its {what} is {there:?}, and the environment's is {here:?}"));
+                return refused(format!(
+                    "the space of its {what} is {there:?}, and the environment's is {here:?}"
+                ));
             }
         }
         let capacity = config.replay.capacity;
@@ -143,11 +145,17 @@ impl Demonstrations {
                 Space::Box { .. } => numbers.iter().position(|number| !number.is_finite()),
             };
             if let Some(wrong) = wrong {
-                return Some(format!("number {wrong} of {what} is {}, which is not in {space:?}", numbers[wrong]));
+                return Some(format!(
+                    "number {wrong} of {what} is {}, which is not in {space:?}",
+                    numbers[wrong]
+                ));
             }
         }
         if !row.r.is_finite() {
-            return Some(format!("the reward is {}, which is not finite as a 32-bit float", row.r));
+            return Some(format!(
+                "the reward is {}, which is not finite as a 32-bit float",
+                row.r
+            ));
         }
         let terminated = row.discount;
         (terminated != 0.0 && (terminated != 1.0 || !row.last)).then(|| "the end of the episode is damaged".into())
@@ -279,7 +287,12 @@ mod tests {
             assert!(error.contains(part) && !error.contains('\n'), "{error}");
         }
         let other = "action = { discrete = { n = 2 } }";
-        for (row, fits) in [(with(3, 1.0), true), (ROW, false), (with(3, -1.0), false), (with(3, 0.5), false)] {
+        for (row, fits) in [
+            (with(3, 1.0), true),
+            (ROW, false),
+            (with(3, -1.0), false),
+            (with(3, 0.5), false),
+        ] {
             let read = Demonstrations::parse(file(&[row], 1, other)).unwrap();
             assert_eq!(read.fault(&read.layout.read(&row)).is_none(), fits, "{row:?}");
             let error = read.check(&config).unwrap_err().to_string();
@@ -300,14 +313,20 @@ mod tests {
         }
         let mut other = whole;
         other[8] = 2;
-        for file in [other, file(&[ROW; 2], 3, ACTIONS), file(&[ROW; 2], 2, ""), file(&[ROW; 2], usize::MAX, ACTIONS)] {
+        for file in [
+            other,
+            file(&[ROW; 2], 3, ACTIONS),
+            file(&[ROW; 2], 2, ""),
+            file(&[ROW; 2], usize::MAX, ACTIONS),
+        ] {
             Demonstrations::parse(file).unwrap_err();
         }
     }
 
     #[test]
     fn another_environment_of_gymnasium_is_worth_a_warning() {
-        let read = Demonstrations::parse(file(&[ROW], 1, &format!("environment = \"Pendulum-v1\"\n{ACTIONS}"))).unwrap();
+        let read =
+            Demonstrations::parse(file(&[ROW], 1, &format!("environment = \"Pendulum-v1\"\n{ACTIONS}"))).unwrap();
         let mut config = resolve_preset("pendulum").unwrap();
         for (name, warned) in [
             ("pendulum", false),

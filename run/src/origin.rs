@@ -189,7 +189,9 @@ impl Predecessor {
     /// replay.
     fn check(&self, config: &Config) -> Result<Option<u64>, UsageError> {
         self.check_networks(config)?;
-        let Some((replay, _)) = &self.replay else { return Ok(None) };
+        let Some((replay, _)) = &self.replay else {
+            return Ok(None);
+        };
         self.check_rows(config)?;
         Ok(Some(self.rows(replay, config)))
     }

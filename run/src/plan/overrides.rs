@@ -261,6 +261,10 @@ mod tests {
         given.sort_unstable();
         written.sort_unstable();
         assert_eq!(written, given);
+
+        let line = ["train", "--demonstrations", "pendulum/expert-v0"];
+        let CommandLine { overrides } = CommandLine::parse_from(line);
+        assert_eq!(overrides.arguments(), line[1..]);
     }
 
     #[test]
