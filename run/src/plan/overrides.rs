@@ -265,6 +265,11 @@ mod tests {
         let line = ["train", "--demonstrations", "pendulum/expert-v0"];
         let CommandLine { overrides } = CommandLine::parse_from(line);
         assert_eq!(overrides.arguments(), line[1..]);
+        let both = [&line[..], &["--from", "old"]].concat();
+        assert!(
+            CommandLine::try_parse_from(both).is_err(),
+            "the rows are of one or of the other"
+        );
     }
 
     #[test]
