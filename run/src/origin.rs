@@ -93,7 +93,7 @@ impl Origin {
 /// What a new run is to begin with.
 #[derive(Debug)]
 pub(crate) enum Beginning {
-    Run(Predecessor),
+    Run(Box<Predecessor>),
     Dataset(Demonstrations),
 }
 

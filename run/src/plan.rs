@@ -65,7 +65,10 @@ impl Plan {
     pub fn new(what: &str, overrides: &RunOverrides) -> anyhow::Result<Self> {
         let (name, mut config) = resolve(what, overrides)?;
         let beginning = match (&overrides.from, &overrides.demonstrations) {
-            (Some(from), _) => Some(Beginning::Run(Predecessor::open(from, overrides.with_replay)?)),
+            (Some(from), _) => {
+                let predecessor = Predecessor::open(from, overrides.with_replay)?;
+                Some(Beginning::Run(Box::new(predecessor)))
+            }
             (None, Some(dataset)) => Some(Beginning::Dataset(Demonstrations::read(dataset, &config)?)),
             (None, None) => None,
         };
