@@ -54,6 +54,7 @@ def check(run, name, gamma, discrete=False):
         assert not (episode.terminations | episode.truncations)[:-1].any(), "an episode ends with its last row"
         assert np.array_equal(episode.terminations | episode.truncations, batch.last[places])
         assert np.array_equal(episode.terminations, batch.discount[places] == 0)
+        assert np.array_equal(episode.truncations, batch.last[places] & (batch.discount[places] != 0))
         discount = np.where(episode.terminations, 0, gamma).astype(np.float32)[:, None]
         ends = (episode.terminations | episode.truncations).astype(np.float32)[:, None]
         rows = [observations[:-1], actions, np.asarray(episode.rewards)[:, None], discount, observations[1:], ends]
