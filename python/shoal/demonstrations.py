@@ -1,8 +1,8 @@
 """A dataset of Minari as rows for a replay: ``shoal train … --demonstrations DATASET`` reads it through this module.
 
-The file has the form of the program's other sealed files: the bytes ``SHOALDEM``, the format's number (u32), a body, and
-a CRC-32 of all before. The body is the length of a header (u64), the header as TOML, and the rows as f32: ``s, a, r,
-terminated, s', last``. All numbers are little-endian. The program makes a row's discount of ``terminated`` and its γ.
+The file has the form of the program's other sealed files: the bytes ``SHOALDEM``, the format's number (u32), a body,
+and a CRC-32 of all before. The body is the length of a header (u64), the header as TOML, and the rows as f32: ``s, a,
+r, terminated, s', last``. All numbers are little-endian. The program makes a row's discount of ``terminated`` and its γ.
 ``run/src/demonstrations.rs`` reads it.
 """
 

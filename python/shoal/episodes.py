@@ -92,8 +92,8 @@ def rows_before(batch: Batch) -> np.ndarray:
     """For each row the place of the row whose episode it continues, or -1.
 
     Rows of several actors and environments are interleaved, and do not say whose they are. A row continues the episode
-    that is under way and whose s' has the bits of its s. Raises :class:`Ambiguous` if another one has them too, or if an
-    episode begins where one was under way.
+    that is under way and whose s' has the bits of its s. Raises :class:`Ambiguous` if another one has them too, or
+    if an episode begins where one was under way.
     """
     observations, following = words(batch.observation), words(batch.next_observation)
     before = np.full(len(batch), -1)

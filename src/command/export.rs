@@ -5,6 +5,7 @@ use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
+use clap::ArgGroup;
 use clap::Args;
 use clap::ValueEnum;
 use shoal_common::durable::write_atomically;
@@ -16,11 +17,12 @@ use shoal_run::python;
 use shoal_run::usage::UsageError;
 
 #[derive(Args, Clone, Debug)]
+#[command(group = ArgGroup::new("what").required(true))]
 pub(crate) struct ExportArgs {
     /// Run directory.
     pub(crate) run: PathBuf,
     /// Write the policy, in this format.
-    #[arg(long, value_enum, required_unless_present = "minari", conflicts_with_all = ["minari", "author"])]
+    #[arg(long, value_enum, group = "what")]
     pub(crate) format: Option<Format>,
     /// Which policy to write.
     #[arg(long, value_enum, default_value_t)]
@@ -29,10 +31,10 @@ pub(crate) struct ExportArgs {
     #[arg(long, value_name = "FILE")]
     pub(crate) out: Option<PathBuf>,
     /// Write the replay as a new dataset of Minari, like pendulum/expert-v0. This needs Python's package minari.
-    #[arg(long, value_name = "DATASET", conflicts_with_all = ["policy", "out"])]
+    #[arg(long, value_name = "DATASET", group = "what", conflicts_with_all = ["policy", "out"])]
     pub(crate) minari: Option<String>,
     /// Who made the dataset.
-    #[arg(long, value_name = "NAME", requires = "minari")]
+    #[arg(long, value_name = "NAME", conflicts_with = "format")]
     pub(crate) author: Option<String>,
 }
 

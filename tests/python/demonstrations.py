@@ -1,4 +1,4 @@
-"""Replays as datasets of Minari, read by Minari's own loader, and datasets as the first rows of a replay: bit for bit."""
+"""Replays as datasets of Minari, read by its own loader, and datasets as the first rows of a replay: bit for bit."""
 
 import collections
 import os
@@ -49,7 +49,8 @@ def check(run, name, gamma, discrete=False):
             actions = actions.astype(np.float32).reshape(steps, -1)
         else:
             actions = np.asarray(episode.actions).reshape(steps, -1)
-        assert same(observations[:-1], batch.observation[places]) and same(observations[1:], batch.next_observation[places])
+        assert same(observations[:-1], batch.observation[places])
+        assert same(observations[1:], batch.next_observation[places])
         assert same(actions, batch.action[places]) and same(episode.rewards, batch.reward[places])
         assert not (episode.terminations | episode.truncations)[:-1].any(), "an episode ends with its last row"
         assert np.array_equal(episode.terminations | episode.truncations, batch.last[places])
@@ -99,8 +100,9 @@ assert metadata["algorithm_name"] == "Shoal ddpg" and set(metadata["author"]) ==
 assert "the environment pendulum" in metadata["description"], metadata
 assert minari.list_local_datasets()["pendulum/alone-v0"]["total_steps"] == 1_900
 
+warm = {**SMALL, "replay.warmup": 64}
 began = shoal.train(
-    "pendulum", run="began", steps=300, seed=4, set={**SMALL, "replay.warmup": 64}, demonstrations="pendulum/alone-v0", quiet=True
+    "pendulum", run="began", steps=300, seed=4, set=warm, demonstrations="pendulum/alone-v0", quiet=True
 )
 equal(first_rows(began, 1_900), alone.transitions().copy())
 assert len(began.transitions()) == 2_200 and began.status()["updates"] == 300, began.status()
@@ -117,9 +119,9 @@ began.to_minari("pendulum/began-v0")
 own = check(began, "pendulum/began-v0", 0.99)
 assert own.total_steps == 500 and "1900 rows with which" in own.storage.metadata["description"]
 # Another γ is that of the rows.
-other = shoal.train(
-    "pendulum", run="other", steps=100, set={**SMALL, "ddpg.gamma": 0.5}, demonstrations="datasets/pendulum/alone-v0", quiet=True
-)
+near = {**SMALL, "ddpg.gamma": 0.5}
+directory = "datasets/pendulum/alone-v0"
+other = shoal.train("pendulum", run="other", steps=100, set=near, demonstrations=directory, quiet=True)
 assert set(first_rows(other, 1_900).discount.tolist()) == {0.5}
 assert same(first_rows(other, 1_900).observation, alone.transitions().copy().observation)
 assert Path(other.config["run"]["demonstrations"]).is_absolute()
@@ -127,7 +129,7 @@ assert Path(other.config["run"]["demonstrations"]).is_absolute()
 weights = []
 for run in ("first", "second"):
     arguments = ["pendulum", "--run", run, "--lockstep", "--steps", "200", "--demonstrations", "pendulum/alone-v0"]
-    settings = shoal.program.settings({**SMALL, "replay.warmup": 64})
+    settings = shoal.program.settings(warm)
     weights.append(shoal.program.call(["train", *arguments, *settings, "--json", "--quiet"]).split("weights_sha256")[1])
 assert weights[0] == weights[1], weights
 
@@ -142,7 +144,8 @@ assert any(len(episode.rewards) == 200 for episode in whole), "an episode is as 
 assert all(len(episode.rewards) <= 200 for episode in wrapped.iterate_episodes())
 
 # Discrete actions, terminations, and an environment of Gymnasium with an argument.
-cart = shoal.train("gym:CartPole-v1", run="cart", steps=1_500, actors=2, envs=2, set={**QUICK, "environment.max_episode_steps": 40}, quiet=True)
+short = {**QUICK, "environment.max_episode_steps": 40}
+cart = shoal.train("gym:CartPole-v1", run="cart", steps=1_500, actors=2, envs=2, set=short, quiet=True)
 shoal.program.call(["export", cart.path, "--minari", "cart/random-v0", "--author", "somebody"])
 dataset = check(cart, "cart/random-v0", cart.config["dqn"]["gamma"], discrete=True)
 assert dataset.action_space == gymnasium.spaces.Discrete(2)

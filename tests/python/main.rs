@@ -196,6 +196,14 @@ fn what_is_missing_for_datasets_is_named() {
         let message = refused(&["export", run, "--minari", "pendulum/none-v0"]);
         assert!(message.contains(part), "{run}: {message}");
     }
+    for wrong in [
+        &["--format", "onnx", "--author", "me"][..],
+        &["--minari", "x/y-v0", "--out", "file"],
+        &[],
+    ] {
+        let output = place.output(&[&["export", "plain"], wrong].concat());
+        assert_eq!(output.status.code(), Some(2), "{wrong:?}");
+    }
     let message = refused(&[
         "train",
         "pendulum",
