@@ -1,13 +1,18 @@
-//! A new run begins with the networks of another one, and with its replay: `train --from RUN --with-replay`.
+//! A new run begins with the networks of another one, and with its replay: `train --from RUN --with-replay`. Or it begins
+//! with the rows of a dataset: `train --demonstrations DATASET`.
 
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
 
 mod support;
 
+use std::io::Write;
+use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
+use std::process::Output;
 
 use serde_json::Value;
 use shoal_common::config::Config;
+use shoal_common::durable::{FileKind, seal};
 use support::{Workplace, error_line, json};
 
 /// A short lockstep run in `old`. Returns its result.
@@ -234,4 +239,201 @@ fn what_does_not_fit_is_refused_and_leaves_no_run() {
     running.wait_for_learning();
     let (message, _) = refused(&["pendulum", "--from", "running", "--with-replay"]);
     assert!(message.contains("is running, and its replay with it"), "{message}");
+}
+
+/// Rows of a pendulum: s, a, r, whether it was terminated, s', last.
+fn demonstrated() -> Vec<[f32; 10]> {
+    let row = |number: usize| {
+        let x = number as f32 / 100.0;
+        let last = f32::from(number % 20 == 19);
+        [x, -x, 2.0 * x, 1.0 - x, -x, f32::from(number == 39), x, x, -x, last]
+    };
+    (0..100).map(row).collect()
+}
+
+/// A `python3` that says what the package `shoal` says about a dataset with these rows. Any other dataset is missing.
+fn python(place: &Workplace, rows: &[[f32; 10]]) {
+    let header = format!(
+        "dataset = \"pendulum/hand-v0\"\nepisodes = 5\nrows = {}\n\
+         observation = {{ box = {{ low = [-1.0, -1.0, -8.0], high = [1.0, 1.0, 8.0] }} }}\n\
+         action = {{ box = {{ low = [-2.0], high = [2.0] }} }}\n",
+        rows.len()
+    );
+    let kind = FileKind {
+        magic: *b"SHOALDEM",
+        version: 1,
+        name: "",
+    };
+    let mut file = Vec::new();
+    let written = seal(kind, &mut file, |body| {
+        body.write_all(&(header.len() as u64).to_le_bytes())?;
+        body.write_all(header.as_bytes())?;
+        rows.iter()
+            .flatten()
+            .try_for_each(|number| body.write_all(&number.to_le_bytes()))
+    });
+    written.unwrap();
+    std::fs::write(place.path().join("rows"), file).unwrap();
+    std::fs::create_dir_all(place.path().join("bin")).unwrap();
+    let program = place.path().join("bin/python3");
+    let here = place.path().display();
+    std::fs::write(
+        &program,
+        format!(
+            "#!/bin/sh\n[ \"$1\" = -c ] && exit\n[ \"$4\" = pendulum/hand-v0 ] && exec cat '{here}/rows'\n\
+             echo a warning >&2; echo 'error: there is none' >&2; echo >&2; exit 1\n"
+        ),
+    )
+    .unwrap();
+    std::fs::set_permissions(&program, std::fs::Permissions::from_mode(0o755)).unwrap();
+}
+
+/// Calls the program with that `python3`.
+fn with_python(place: &Workplace, arguments: &[&str]) -> Output {
+    let path = format!("{}/bin:/usr/bin:/bin", place.path().display());
+    place.shoal(arguments).env("PATH", path).output().unwrap()
+}
+
+const HAND: [&str; 2] = ["--demonstrations", "pendulum/hand-v0"];
+
+#[test]
+fn a_replay_begins_with_the_rows_of_a_dataset() {
+    let place = Workplace::new();
+    python(&place, &demonstrated());
+    let short = [
+        "--steps",
+        "200",
+        "--set",
+        "evaluation.final_episodes=2",
+        "--set",
+        "replay.warmup=64",
+        "--json",
+    ];
+    let mut weights = Vec::new();
+    for (run, more) in [("new", &["--lockstep"][..]), ("again", &["--lockstep"]), ("free", &[])] {
+        let arguments = [&["train", "pendulum", "--run", run], &HAND[..], &short, more].concat();
+        let output = with_python(&place, &arguments);
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(output.status.success(), "{said}");
+        let begins = format!("{run} begins with 100 rows of the dataset pendulum/hand-v0 (5 episodes)");
+        let log = std::fs::read_to_string(place.path().join(run).join("shoal.log")).unwrap();
+        assert!(said.contains(&begins) && log.contains(&begins), "{said}");
+        let result = json(&output);
+        assert_eq!((&result["env_steps"], &result["updates"]), (&300.into(), &200.into()));
+        weights.push(result["weights_sha256"].clone());
+    }
+    assert_eq!(
+        weights[0], weights[1],
+        "in lockstep the same beginning has the same end"
+    );
+    let run = place.path().join("new");
+    let origin: Value = serde_json::from_str(&std::fs::read_to_string(run.join("origin.json")).unwrap()).unwrap();
+    let expected = serde_json::json!({"format": 1, "dataset": "pendulum/hand-v0", "episodes": 5, "rows": 100});
+    assert_eq!(origin, expected);
+    let config = config(&run);
+    assert_eq!(config.run.demonstrations.as_deref(), Some("pendulum/hand-v0"));
+
+    // They are the first rows, with the discount of an actor's.
+    let expected: Vec<u8> = demonstrated()
+        .into_iter()
+        .flat_map(|mut row| {
+            row[5] = if row[5] == 1.0 { 0.0 } else { 0.99 };
+            row.map(f32::to_le_bytes).concat()
+        })
+        .collect();
+    let bytes = std::fs::read(run.join("replay.bin")).unwrap();
+    let ring = shoal_learner::process::replay_layout(&config).ring as usize * 4 * config.row_layout().width();
+    assert!(bytes[bytes.len() - ring.next_multiple_of(4096)..].starts_with(&expected));
+
+    let resume = ["resume", "new", "--steps", "400", "--json"];
+    assert_eq!(json(&place.output(&resume))["updates"], 300);
+    assert!(place.output(&["report", "new", "--out", "page.html"]).status.success());
+    let page = std::fs::read_to_string(place.path().join("page.html")).unwrap();
+    assert!(page.contains("begins with 100 rows of the dataset pendulum/hand-v0"));
+
+    // As after a kill while the first files were written.
+    std::fs::remove_file(run.join("origin.json")).unwrap();
+    let message = error_line(&place.output(&["resume", "new", "--steps", "500"]));
+    assert!(message.contains("the start of new was interrupted"), "{message}");
+}
+
+#[test]
+fn each_run_of_a_suite_begins_with_the_dataset() {
+    let place = Workplace::new();
+    python(&place, &demonstrated());
+    let short = [
+        "--steps",
+        "100",
+        "--set",
+        "evaluation.final_episodes=1",
+        "--seeds",
+        "1..2",
+        "--quiet",
+    ];
+    let output = with_python(
+        &place,
+        &[&["train", "pendulum", "--run", "suite"], &HAND[..], &short].concat(),
+    );
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let origins = std::fs::read_dir(place.path().join("suite")).unwrap();
+    let origins = origins.filter(|entry| entry.as_ref().unwrap().path().join("origin.json").exists());
+    assert_eq!(origins.count(), 2);
+}
+
+#[test]
+fn a_dataset_that_does_not_fit_is_refused_and_leaves_no_run() {
+    let place = Workplace::new();
+    python(&place, &demonstrated());
+    let refused = |arguments: &[&str]| {
+        let output = with_python(&place, &[&["train"], arguments, &["--run", "new"]].concat());
+        let message = error_line(&output);
+        assert!(!place.path().join("new").exists(), "{message}");
+        (message, output.status.code())
+    };
+    for (arguments, part, code) in [
+        (&["frozen-lake"][..], "q-learning learns from each step once", 2),
+        (&["cart-pole"], "reinforce learns from each step once", 2),
+        (
+            &["pendulum", "--set", "replay.n_step=3"],
+            "replay.n_step = 3: the rows of a dataset have one step",
+            2,
+        ),
+        (&["point-mass-r1"], "the space of its observations is Box", 2),
+        (
+            &["pendulum", "--set", "replay.capacity=99", "--set", "replay.warmup=64"],
+            "it has 100 rows, and replay.capacity = 99",
+            2,
+        ),
+        (
+            &["pendulum", "--set", "run.demonstrations=x"],
+            "run.demonstrations cannot be set",
+            2,
+        ),
+    ] {
+        let (message, found) = refused(&[arguments, &HAND].concat());
+        assert!(
+            message.contains(part) && found == Some(code),
+            "{arguments:?}: {message}"
+        );
+    }
+    let (message, code) = refused(&["pendulum", "--demonstrations", "pendulum/none-v0"]);
+    assert_eq!(
+        (message.trim_end(), code),
+        ("error: --demonstrations pendulum/none-v0: there is none", Some(1))
+    );
+
+    let mut rows = demonstrated();
+    rows[7][3] = 2.5;
+    python(&place, &rows);
+    let (message, _) = refused(&[&["pendulum"], &HAND[..]].concat());
+    assert!(
+        message.contains("in its row 7, number 0 of the action is 2.5"),
+        "{message}"
+    );
+    std::fs::write(place.path().join("rows"), "something else").unwrap();
+    let (message, _) = refused(&[&["pendulum"], &HAND[..]].concat());
+    assert!(message.contains("python3 has another package shoal"), "{message}");
+    std::fs::write(place.path().join("bin/python3"), "#!/bin/sh\nexit 1\n").unwrap();
+    let (message, _) = refused(&[&["pendulum"], &HAND[..]].concat());
+    assert!(message.contains("python3 has no package shoal"), "{message}");
 }

@@ -9,7 +9,8 @@
 array([0.03], dtype=float32)
 
 The package calls the program ``shoal`` and reads the files of its runs. It finds the program through the environment
-variable ``SHOAL``, in ``PATH``, or beside the Python interpreter. Reading a run needs no program.
+variable ``SHOAL``, in its own installation, in ``PATH``, or beside the Python interpreter. Reading a run needs no
+program.
 """
 
 from .errors import ShoalError

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import importlib.metadata
 import json
 import os
 import shutil
@@ -23,16 +24,27 @@ KEPT_LINES = 20
 
 
 def program() -> str:
-    """The path of the program: ``$SHOAL``, else ``shoal`` in ``PATH``, else beside the Python interpreter."""
+    """The path of the program: ``$SHOAL``, else that of this installation if a wheel brought one, else ``shoal`` in
+    ``PATH``, else beside the Python interpreter."""
     named = os.environ.get("SHOAL")
     beside = Path(sys.executable).parent / "shoal"
-    found = named or shutil.which("shoal") or (str(beside) if beside.exists() else None)
+    found = named or installed() or shutil.which("shoal") or (str(beside) if beside.exists() else None)
     if found is None:
         raise ShoalError(
             "there is no program `shoal` in PATH: install it with `cargo install --path .` in Shoal's directory, "
             "or name it in the environment variable SHOAL"
         )
     return found
+
+
+def installed() -> str | None:
+    """The program that was installed together with this package."""
+    try:
+        files = importlib.metadata.files("shoal-gym") or []
+    except importlib.metadata.PackageNotFoundError:
+        return None
+    programs = (Path(file.locate()) for file in files if file.parts[-2:] == ("bin", "shoal"))
+    return next((os.path.normpath(path) for path in programs if path.exists()), None)
 
 
 def text_of(value: Any) -> str:
@@ -125,6 +137,7 @@ def train(
     set: Mapping[str, Any] | None = None,
     from_run: str | os.PathLike[str] | Run | None = None,
     with_replay: bool = False,
+    demonstrations: str | None = None,
     wait: bool = True,
     quiet: bool = False,
 ) -> Run:
@@ -149,6 +162,7 @@ def train(
         ("--envs", envs),
         ("--method", method),
         ("--from", getattr(from_run, "path", from_run)),
+        ("--demonstrations", demonstrations),
     ]
     arguments = ["train", what, "--json"]
     arguments += [str(part) for option, value in options if value is not None for part in (option, value)]

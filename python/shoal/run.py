@@ -18,6 +18,7 @@ from .policy import Policy
 from .transitions import Transitions
 
 if TYPE_CHECKING:
+    import minari
     import pandas
 
 if sys.version_info >= (3, 11):
@@ -94,6 +95,36 @@ class Run:
     def transitions(self) -> Transitions:
         """The run's replay, mapped read-only, even while the run continues."""
         return Transitions(self.path / "replay.bin")
+
+    def to_minari(
+        self,
+        dataset_id: str,
+        *,
+        author: str | None = None,
+        author_email: str | None = None,
+        code_permalink: str | None = None,
+        description: str | None = None,
+    ) -> minari.MinariDataset:
+        """Writes the run's replay to a new dataset of Minari, like ``"pendulum/expert-v0"``, and returns it.
+
+        The dataset has every row that the run collected itself and the ring still has, unchanged, in the environment's
+        units: boxes as float32, discrete observations and actions as the environment's integers. Rows with which the
+        run began (``with_replay``, demonstrations) are left out. An episode whose beginning was overwritten begins
+        later. One that was cut ends neither terminated nor truncated.
+
+        This needs minari and h5py. Raises :class:`ShoalError` for a replay that has no steps of the environment
+        (``replay.n_step``, a γ of 0), and where episodes of several actors cannot be told apart.
+        """
+        from . import datasets
+
+        return datasets.to_minari(
+            self,
+            dataset_id,
+            author=author,
+            author_email=author_email,
+            code_permalink=code_permalink,
+            description=description,
+        )
 
     def status(self) -> dict[str, Any]:
         """What ``shoal status --json`` says."""

@@ -40,6 +40,10 @@ class Batch:
     def __len__(self) -> int:
         return len(self.row)
 
+    def __getitem__(self, part: slice) -> Batch:
+        """Some of the transitions."""
+        return Batch(*(getattr(self, field.name)[part] for field in dataclasses.fields(self)))
+
 
 class Transitions:
     """The replay of a run, mapped read-only. The learner may be adding transitions meanwhile.
@@ -63,24 +67,37 @@ class Transitions:
             raise ShoalError(f"the header of {path} is damaged (checksum)")
         self._observation, self._action, width, self.ring, actors, snapshot = identity[2:8]
         blocks = lambda size: -(-size // BLOCK) * BLOCK  # noqa: E731
-        self._slot = blocks(8 * (1 + 3 + actors * (3 + snapshot)))
+        self._actors, self._stride = actors, 3 + snapshot
+        self._slot = blocks(8 * (1 + 3 + actors * self._stride))
         checks = 2 * BLOCK + 4 * self._slot
         rows = blocks(checks + 4 * self.ring)
         if len(self._words) * 8 < rows + 4 * width * self.ring:
             raise ShoalError(f"{path} is cut short")
         self._ring = np.memmap(path, dtype="<f4", mode="r", offset=rows, shape=(self.ring, width))
 
-    @property
-    def rows(self) -> range:
-        """The numbers of the transitions that are valid now."""
-        published, horizon = BLOCK // 8, BLOCK // 8 + 1
+    def _record(self, words: int) -> np.ndarray:
+        """The first words of what is committed: seal, generation, head, tail, and some words for each actor."""
+        published = BLOCK // 8
         while True:
             generation = int(self._words[published])
             slot = (2 * BLOCK + self._slot * (generation % 2)) // 8
-            head, tail = int(self._words[slot + 2]), int(self._words[slot + 3])
+            record = self._words[slot : slot + words].copy()
             # The slot was not written meanwhile if the same generation is published.
             if int(self._words[published]) == generation:
-                return range(min(max(tail, int(self._words[horizon]) - self.ring), head), head)
+                return record
+
+    @property
+    def rows(self) -> range:
+        """The numbers of the transitions that are valid now."""
+        horizon = BLOCK // 8 + 1
+        head, tail = (int(word) for word in self._record(4)[2:])
+        return range(min(max(tail, int(self._words[horizon]) - self.ring), head), head)
+
+    def written(self) -> tuple[int, int]:
+        """How many of all rows so far the run began with, and how many actors have collected the others."""
+        record = self._record(4 + self._actors * self._stride)
+        rows = record[4 + 2 :: self._stride]
+        return int(record[2]) - int(rows.sum()), int(np.count_nonzero(rows))
 
     def __len__(self) -> int:
         return len(self.rows)

@@ -37,7 +37,7 @@ fn is_interrupted(run: &RunDir) -> anyhow::Result<bool> {
     }
     if run.config_file().exists() {
         // `origin.json` is written after the networks and rows that the run begins with.
-        return Ok(run.config()?.run.from.is_some() && Origin::read(run)?.is_none());
+        return Ok(run.config()?.run.begins_with_others() && Origin::read(run)?.is_none());
     }
     let entries = std::fs::read_dir(run.path()).with_context(|| format!("cannot read {}", run.path().display()))?;
     for entry in entries {

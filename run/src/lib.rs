@@ -3,6 +3,7 @@
 
 pub mod child_process;
 pub mod client;
+pub(crate) mod demonstrations;
 pub mod description;
 pub mod evaluation;
 pub mod external_environment;
@@ -13,6 +14,7 @@ pub mod numbers;
 pub mod origin;
 pub mod plan;
 pub mod preflight;
+pub mod python;
 pub mod records;
 pub mod signals;
 pub mod status;

@@ -1,4 +1,5 @@
-//! The run whose networks a new run begins with, and whose replay if that is asked for.
+//! What a new run begins with: the networks of another run, with its replay if that is asked for, or the rows of a
+//! dataset.
 //!
 //! `origin.json` in the new run's directory is written last: without it the run's beginning was interrupted.
 
@@ -17,11 +18,33 @@ use shoal_learner::process::checkpoint::{Checkpoint, Checkpoints, Counters};
 use shoal_learner::process::replay_layout;
 use shoal_learner::replay::Replay;
 
+use crate::demonstrations::Demonstrations;
 use crate::usage::UsageError;
 
 /// What a run began with: `origin.json`.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Origin {
+#[serde(untagged)]
+pub enum Origin {
+    /// With the networks of another run.
+    Run(RunOrigin),
+    /// With the rows of a dataset.
+    Dataset(DatasetOrigin),
+}
+
+/// A dataset with whose rows a replay began.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct DatasetOrigin {
+    /// Its name.
+    pub dataset: String,
+    /// Its episodes.
+    pub episodes: u64,
+    /// Its rows.
+    pub rows: u64,
+}
+
+/// A run with whose networks another one began.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RunOrigin {
     /// The directory of the other run.
     pub run: String,
     /// Environment steps that its networks had learned from.
@@ -47,17 +70,79 @@ impl Origin {
         Ok(Self::load_if_any(&run.origin())?)
     }
 
+    /// Rows that the run's replay began with.
+    pub fn rows(&self) -> u64 {
+        match self {
+            Self::Run(origin) => origin.rows,
+            Self::Dataset(origin) => origin.rows,
+        }
+    }
+
     /// In words: `begins with …`.
     pub fn in_words(&self) -> String {
-        let rows = if self.rows > 0 {
-            format!(" and with {} rows of its replay", self.rows)
-        } else {
-            String::new()
+        match self {
+            Self::Run(RunOrigin { run, updates, rows, .. }) => {
+                let rows = if *rows > 0 {
+                    format!(" and with {rows} rows of its replay")
+                } else {
+                    String::new()
+                };
+                format!("begins with the networks of {run} after {updates} updates{rows}")
+            }
+            Self::Dataset(DatasetOrigin {
+                dataset,
+                episodes,
+                rows,
+            }) => format!("begins with {rows} rows of the dataset {dataset} ({episodes} episodes)"),
+        }
+    }
+}
+
+/// What a new run is to begin with.
+#[derive(Debug)]
+pub(crate) enum Beginning {
+    Run(Box<Predecessor>),
+    Dataset(Demonstrations),
+}
+
+impl Beginning {
+    /// Checks that a run with this configuration can begin with it. Counts the rows that it takes along into the run's
+    /// steps.
+    ///
+    /// # Errors
+    /// When networks or rows do not fit. The message says what differs.
+    pub(crate) fn prepare(&self, config: &mut Config) -> anyhow::Result<()> {
+        let rows = match self {
+            Self::Run(predecessor) => predecessor.check(config)?,
+            Self::Dataset(demonstrations) => Some(demonstrations.check(config)?),
         };
-        format!(
-            "begins with the networks of {} after {} updates{rows}",
-            self.run, self.updates
-        )
+        let Some(rows) = rows else { return Ok(()) };
+        config.run.steps = config.run.steps.saturating_add(rows);
+        // Updates begin with the run's own steps. Those for another run's rows were made by it.
+        (config.replay.ratio_since, config.replay.updates_before) = (rows, 0);
+        Ok(config.check()?)
+    }
+
+    /// Writes the first files of the new run in this directory. Its configuration has been [prepared](Self::prepare).
+    ///
+    /// # Errors
+    /// When a file cannot be written.
+    pub(crate) fn begin(&self, run: &RunDir, config: &Config) -> anyhow::Result<Origin> {
+        std::fs::create_dir_all(run.checkpoints()).context("cannot create the directory for checkpoints")?;
+        let origin = match self {
+            Self::Run(predecessor) => Origin::Run(predecessor.begin(run, config)?),
+            Self::Dataset(demonstrations) => Origin::Dataset(demonstrations.begin(run, config)?),
+        };
+        origin.store(&run.origin())?;
+        Ok(origin)
+    }
+
+    /// What is worth a warning before a run of this configuration takes the rows along.
+    pub(crate) fn warning(&self, config: &Config) -> Option<String> {
+        match self {
+            Self::Run(predecessor) => predecessor.warning(config),
+            Self::Dataset(demonstrations) => demonstrations.warning(config),
+        }
     }
 }
 
@@ -108,20 +193,15 @@ impl Predecessor {
         })
     }
 
-    /// Checks that a run with this configuration can begin with it. Counts the rows that it takes along into the run's
-    /// steps.
-    ///
-    /// # Errors
-    /// When networks or rows do not fit. The message says what differs.
-    pub(crate) fn prepare(&self, config: &mut Config) -> anyhow::Result<()> {
+    /// Checks that it fits a run with this configuration. Returns how many rows that run takes along, if it takes the
+    /// replay.
+    fn check(&self, config: &Config) -> Result<Option<u64>, UsageError> {
         self.check_networks(config)?;
-        let Some((replay, _)) = &self.replay else { return Ok(()) };
+        let Some((replay, _)) = &self.replay else {
+            return Ok(None);
+        };
         self.check_rows(config)?;
-        let rows = self.rows(replay, config);
-        config.run.steps = config.run.steps.saturating_add(rows);
-        // The rows' own updates were made by the other run.
-        (config.replay.ratio_since, config.replay.updates_before) = (rows, 0);
-        Ok(config.check()?)
+        Ok(Some(self.rows(replay, config)))
     }
 
     fn rows(&self, replay: &Replay, config: &Config) -> u64 {
@@ -198,12 +278,7 @@ impl Predecessor {
         Ok(())
     }
 
-    /// Writes the first files of the new run in this directory. Its configuration has been [prepared](Self::prepare).
-    ///
-    /// # Errors
-    /// When a file cannot be written.
-    pub(crate) fn begin(&self, run: &RunDir, config: &Config) -> anyhow::Result<Origin> {
-        std::fs::create_dir_all(run.checkpoints()).context("cannot create the directory for checkpoints")?;
+    fn begin(&self, run: &RunDir, config: &Config) -> anyhow::Result<RunOrigin> {
         let rows = match &self.replay {
             None => 0,
             Some((old, _)) => {
@@ -224,19 +299,16 @@ impl Predecessor {
             ..Counters::default()
         };
         Checkpoints::new(&run.checkpoints(), config.fingerprint()).save(&begun, &borrowed)?;
-        let origin = Origin {
+        Ok(RunOrigin {
             run: self.run.path().display().to_string(),
             env_steps: counters.rows,
             updates: counters.updates,
             weights_sha256: self.checkpoint.weights_sha256(config),
             rows,
-        };
-        origin.store(&run.origin())?;
-        Ok(origin)
+        })
     }
 
-    /// What is worth a warning before a run of this configuration takes the rows along.
-    pub(crate) fn warning(&self, config: &Config) -> Option<String> {
+    fn warning(&self, config: &Config) -> Option<String> {
         self.replay.as_ref()?;
         let own = |key: &str| key.starts_with("environment.") && key != "environment.server";
         let differences = self.config.differences(config).into_iter();

@@ -24,8 +24,9 @@ use self::revision::as_written;
 pub use self::revision::{RequestedChanges, Revision, edited, store_actors};
 pub use self::source::{SettingSource, SettingSources};
 
+use crate::demonstrations::Demonstrations;
 use crate::external_environment::server_location::ServerLocation;
-use crate::origin::{Origin, Predecessor};
+use crate::origin::{Beginning, Origin, Predecessor};
 use crate::preflight;
 use crate::records::start::StartRecord;
 
@@ -63,12 +64,16 @@ impl Plan {
     /// directory remains.
     pub fn new(what: &str, overrides: &RunOverrides) -> anyhow::Result<Self> {
         let (name, mut config) = resolve(what, overrides)?;
-        let from = overrides.from.as_deref();
-        let from = from
-            .map(|from| Predecessor::open(from, overrides.with_replay))
-            .transpose()?;
-        if let Some(predecessor) = &from {
-            predecessor.prepare(&mut config)?;
+        let beginning = match (&overrides.from, &overrides.demonstrations) {
+            (Some(from), _) => {
+                let predecessor = Predecessor::open(from, overrides.with_replay)?;
+                Some(Beginning::Run(Box::new(predecessor)))
+            }
+            (None, Some(dataset)) => Some(Beginning::Dataset(Demonstrations::read(dataset, &config)?)),
+            (None, None) => None,
+        };
+        if let Some(beginning) = &beginning {
+            beginning.prepare(&mut config)?;
         }
         let place = overrides.run.clone().unwrap_or_else(|| Path::new("runs").join(&name));
         preflight::check(&config, &RunDir::planned(&place))?;
@@ -80,14 +85,14 @@ impl Plan {
             let lock = run.lock()?;
             let config = fill(&run, &config)?;
             StartRecord::of_this_process().write(run.path())?;
-            let origin = from.as_ref().map(|predecessor| predecessor.begin(&run, &config));
+            let origin = beginning.as_ref().map(|beginning| beginning.begin(&run, &config));
             Ok((lock, config, origin.transpose()?))
         };
         let (lock, config, origin) = begin().inspect_err(|_: &anyhow::Error| {
             // The directory would block the next attempt.
             let _ = std::fs::remove_dir_all(run.path());
         })?;
-        let of_rows = from.and_then(|predecessor| predecessor.warning(&config));
+        let of_rows = beginning.and_then(|beginning| beginning.warning(&config));
         Ok(Self {
             warnings: warning(&config).into_iter().chain(of_rows).collect(),
             config,

@@ -96,8 +96,8 @@ pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
              and export still work, and `shoal train … --from {here}` begins a new run with its networks"
         );
     }
-    if used.run.from.is_some() && Origin::read(&run)?.is_none() {
-        bail!("the start of {here} was interrupted before it had its networks: remove it and train again");
+    if used.run.begins_with_others() && Origin::read(&run)?.is_none() {
+        bail!("the start of {here} was interrupted before it had what it begins with: remove it and train again");
     }
     let saved = status::saved_status(&used, &run).with_context(|| format!("cannot resume {here}"))?;
     let asked = RequestedChanges {

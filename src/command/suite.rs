@@ -80,6 +80,7 @@ pub(crate) fn train(args: &TrainArgs, what: &str, overrides: &RunOverrides) -> a
     };
     let common = RunOverrides {
         from: overrides.from.as_deref().map(absolute).transpose()?,
+        demonstrations: overrides.demonstrations_from_anywhere()?,
         ..overrides.clone()
     };
     let suite = Suite::new(what, common.arguments(), &sweeps, &seeds)?;

@@ -2,11 +2,10 @@
 
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
 
-use anyhow::bail;
 use clap::{Args, ValueEnum};
 use shoal_common::run_dir::RunDir;
+use shoal_run::python;
 use shoal_run::suite::Suite;
 
 #[derive(Args, Clone, Debug)]
@@ -38,17 +37,11 @@ pub(crate) fn run(args: &TrackArgs) -> anyhow::Result<()> {
     if Suite::read(&args.run)?.is_none() {
         RunDir::open(&args.run)?;
     }
-    let mut python = Command::new("python3");
-    python.args(["-c", "import shoal.track"]).stderr(Stdio::null());
-    if !python.status().is_ok_and(|status| status.success()) {
-        bail!("python3 has no package shoal: pip install ./python, in Shoal's directory");
-    }
     let to = match args.to {
         Tracker::Wandb => "wandb",
         Tracker::Mlflow => "mlflow",
     };
-    let mut command = Command::new("python3");
-    command.args(["-m", "shoal.track"]);
+    let mut command = python::module("shoal.track")?;
     // A directory may begin with a hyphen.
     command.arg(Path::new(".").join(&args.run));
     command.args(["--to", to]).arg(format!("--project={}", args.project));

@@ -16,11 +16,16 @@ use shoal_common::policy::policy_file::PolicyFile;
 use shoal_common::run_dir::RunDir;
 use shoal_common::space::Space;
 use suite::{Need, PYTHON, test};
-use support::{Workplace, until};
+use support::{Workplace, error_line, until};
 
 static MATPLOTLIB: Need = Need::new("python3 has no matplotlib", || python_has("matplotlib"), None);
 
 static MLFLOW: Need = Need::new("python3 has no mlflow", || python_has("mlflow"), None);
+static MINARI: Need = Need::new(
+    "python3 has no minari, h5py and pillow",
+    || python_has("minari, h5py, PIL"),
+    None,
+);
 static WANDB: Need = Need::new("python3 has no wandb", || python_has("wandb"), None);
 
 fn main() -> ExitCode {
@@ -30,6 +35,8 @@ fn main() -> ExitCode {
         test!(the_tutorials_python_works, PYTHON),
         test!(the_notebook_works, PYTHON, MATPLOTLIB),
         test!(a_run_is_tracked_while_it_runs, PYTHON, MLFLOW, WANDB),
+        test!(replays_become_datasets_and_begin_with_them, PYTHON, MINARI),
+        test!(what_is_missing_for_datasets_is_named, PYTHON),
     ])
 }
 
@@ -154,6 +161,62 @@ fn the_notebook_works() {
     let text: String = lines.map(|line| line.as_str().unwrap_or("\n")).collect();
     let checked = format!("{text}\nassert total > -700 and abs(torque).max() > 1.5, total");
     python(&Workplace::new(), &["-c", &checked]);
+}
+
+/// Minari's own loader reads what was written.
+fn replays_become_datasets_and_begin_with_them() {
+    python(&Workplace::new(), &[&script("demonstrations.py")]);
+}
+
+fn what_is_missing_for_datasets_is_named() {
+    let place = Workplace::new();
+    std::fs::create_dir(place.path().join("without")).unwrap();
+    std::fs::write(place.path().join("without/minari.py"), "raise ImportError('none')\n").unwrap();
+    let quick = ["--steps", "100", "--quiet", "--set", "evaluation.final_episodes=1"];
+    for (run, set) in [
+        ("plain", "replay.n_step=1"),
+        ("several", "replay.n_step=3"),
+        ("short", "ddpg.gamma=0"),
+    ] {
+        let arguments = [&["train", "pendulum", "--run", run, "--set", set], &quick[..]].concat();
+        assert!(place.output(&arguments).status.success(), "{run}");
+    }
+    let refused = |arguments: &[&str]| {
+        let mut command = place.shoal(arguments);
+        command.env("PYTHONPATH", place.path().join("without"));
+        let output = command.output().unwrap();
+        assert_eq!(output.status.code(), Some(1), "{arguments:?}");
+        error_line(&output)
+    };
+    for (run, part) in [
+        ("plain", "pip install minari"),
+        ("several", "replay.n_step = 3"),
+        ("short", "ddpg.gamma = 0"),
+    ] {
+        let message = refused(&["export", run, "--minari", "pendulum/none-v0"]);
+        assert!(message.contains(part), "{run}: {message}");
+    }
+    for wrong in [
+        &["--format", "onnx", "--author", "me"][..],
+        &["--minari", "x/y-v0", "--out", "file"],
+        &[],
+    ] {
+        let output = place.output(&[&["export", "plain"], wrong].concat());
+        assert_eq!(output.status.code(), Some(2), "{wrong:?}");
+    }
+    let message = refused(&[
+        "train",
+        "pendulum",
+        "--run",
+        "new",
+        "--demonstrations",
+        "pendulum/none-v0",
+    ]);
+    assert!(
+        message.contains("--demonstrations pendulum/none-v0: ") && message.contains("pip install minari"),
+        "{message}"
+    );
+    assert!(!place.path().join("new").exists());
 }
 
 /// The trackers' own programs read what was stored.

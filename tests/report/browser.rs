@@ -203,7 +203,9 @@ impl Browser {
     }
 
     fn receive(&self) -> Value {
-        self.from.recv_timeout(TIMEOUT).expect("Chromium has ended or hangs")
+        self.from
+            .recv_timeout(TIMEOUT)
+            .unwrap_or_else(|_| panic!("Chromium has ended or hangs"))
     }
 }
 

@@ -194,6 +194,11 @@ pub fn seal<W: Write>(
 pub fn read_sealed(kind: FileKind, path: &Path) -> Result<Vec<u8>, SealError> {
     let mut bytes = Vec::new();
     File::open(path)?.read_to_end(&mut bytes)?;
+    unseal(kind, bytes)
+}
+
+/// Checks the checksum of what [`seal`] wrote and returns its body.
+pub fn unseal(kind: FileKind, mut bytes: Vec<u8>) -> Result<Vec<u8>, SealError> {
     let Some([magic @ .., a, b, c, d]) = bytes.first_chunk::<PREFIX>() else {
         return Err(SealError::Checksum);
     };

@@ -67,6 +67,7 @@ mod tests {
         assert_eq!(
             set_by_program(),
             [
+                "run.demonstrations",
                 "run.from",
                 "run.id",
                 "run.identity_format",

@@ -34,6 +34,9 @@ section! {
         /// The run whose networks this one began with, from `--from`.
         #[serde(skip_serializing_if = "Option::is_none")]
         from: Option<String> = None, unit: "–", source: "ours", change: Change::ByProgram;
+        /// The dataset with whose rows this one's replay began, from `--demonstrations`.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        demonstrations: Option<String> = None, unit: "–", source: "ours", change: Change::ByProgram;
         /// The format of the text that identifies the run's files. Chosen by the program when the run directory is
         /// created.
         #[serde(skip_serializing_if = "IdentityFormat::is_unnumbered")]
@@ -54,6 +57,11 @@ pub enum Mode {
 }
 
 impl RunConfig {
+    /// Whether the run begins with another run's networks or with a dataset's rows.
+    pub fn begins_with_others(&self) -> bool {
+        self.from.is_some() || self.demonstrations.is_some()
+    }
+
     /// Whether this many environment steps or episodes complete the collection. Updates may remain to be made.
     pub fn has_all_steps(&self, env_steps: u64, episodes: u64) -> bool {
         env_steps >= self.steps || self.episodes.is_some_and(|limit| episodes >= limit)

@@ -1,4 +1,4 @@
-//! Beginning with the rows of another replay.
+//! Beginning with rows that no actor of the run has sent: those of another replay, or others.
 
 use std::sync::atomic::{Ordering, fence};
 
@@ -18,20 +18,39 @@ impl Replay {
     /// # Panics
     /// If this replay is not empty, or its rows have another layout.
     pub fn inherit_rows(&mut self, other: &Self, most: u64) -> Result<u64, ReplayError> {
-        assert_eq!(self.head(), 0, "only an empty replay begins with other rows");
         assert_eq!(self.layout.row, other.layout.row, "rows of another layout");
         let rows = other.rows();
         let first = rows.end.saturating_sub(most.min(self.layout.ring)).max(rows.start);
-        let count = rows.end - first;
+        self.begin_with(rows.end - first, |index| other.row(first + index))
+    }
+
+    /// Fills this empty replay with these rows, one after the other, and syncs them. They belong to no actor. Returns
+    /// their number.
+    ///
+    /// # Errors
+    /// When the file cannot be synced.
+    ///
+    /// # Panics
+    /// If this replay is not empty, if these are no whole rows, or if they are more than a ring.
+    pub fn begin_with_rows(&mut self, numbers: &[f32]) -> Result<u64, ReplayError> {
+        let width = self.layout.row.width();
+        assert!(numbers.len().is_multiple_of(width), "rows of another layout");
+        let count = (numbers.len() / width) as u64;
+        assert!(count <= self.layout.ring, "more rows than a ring");
+        self.begin_with(count, |index| &numbers[index as usize * width..][..width])
+    }
+
+    fn begin_with<'a>(&mut self, count: u64, row: impl Fn(u64) -> &'a [f32]) -> Result<u64, ReplayError> {
+        assert_eq!(self.head(), 0, "only an empty replay begins with other rows");
         // As for a chunk: recovery after a kill must know that these places may have been written.
         self.words.store(self.offsets.write_horizon, count);
         let mut numbers = Vec::new();
-        let mut next = first;
-        while next < rows.end {
-            let end = (next + AT_ONCE).min(rows.end);
+        let mut next = 0;
+        while next < count {
+            let end = (next + AT_ONCE).min(count);
             numbers.clear();
-            (next..end).for_each(|index| numbers.extend_from_slice(other.row(index)));
-            self.ring.put(next - first, &numbers, |_| ());
+            (next..end).for_each(|index| numbers.extend_from_slice(row(index)));
+            self.ring.put(next, &numbers, |_| ());
             next = end;
         }
         // The rows are in the file before a record names them.
@@ -93,5 +112,20 @@ mod tests {
             new.append_and_commit(1, id, &vec![1.0; width]).unwrap();
             assert_eq!((new.head(), new.committed(1).rows), (expected + 1, 1));
         }
+    }
+
+    #[test]
+    fn rows_from_elsewhere_are_the_first_ones() {
+        let directory = tempfile::tempdir().unwrap();
+        let name = directory.path().join("replay");
+        let width = layout(6).row.width();
+        let numbers: Vec<f32> = (0..5 * width).map(|number| number as f32).collect();
+        let mut new = Replay::create(&name, &layout(6)).unwrap();
+        assert_eq!(new.begin_with_rows(&numbers).unwrap(), 5);
+        drop(new);
+        let new = Replay::open(&name, &layout(6)).unwrap();
+        assert!(new.warnings().is_empty(), "{:?}", new.warnings());
+        let read: Vec<f32> = new.rows().flat_map(|index| new.row(index).to_vec()).collect();
+        assert_eq!((new.rows(), read), (0..5, numbers));
     }
 }

@@ -9,7 +9,7 @@ pub(super) type Setting = (String, String);
 const NOT_COMPARED: [&str; 3] = ["run.seed", "run.steps", "run.episodes"];
 
 /// Set by the program, and still a setting that distinguishes runs.
-const ORIGIN: &str = "run.from";
+const ORIGIN: [&str; 2] = ["run.from", "run.demonstrations"];
 
 /// All settings in the order of `config.toml`, except most of those that the program fills in.
 pub(super) fn of(config: &Config) -> anyhow::Result<Vec<Setting>> {
@@ -17,7 +17,7 @@ pub(super) fn of(config: &Config) -> anyhow::Result<Vec<Setting>> {
     let mut settings = Vec::new();
     flatten("", &table, &mut settings);
     let of_program = explanation::set_by_program();
-    settings.retain(|(key, _)| !of_program.contains(key) || key == ORIGIN);
+    settings.retain(|(key, _)| !of_program.contains(key) || ORIGIN.contains(&key.as_str()));
     Ok(settings)
 }
 

@@ -1,6 +1,6 @@
 //! Changes to a preset or a file that the command line asks for.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use clap::builder::PossibleValuesParser;
@@ -53,6 +53,10 @@ pub struct RunOverrides {
     /// Begin with the replay of that run too. The new run's steps are counted from its rows on.
     #[arg(long, requires = "from")]
     pub with_replay: bool,
+    /// Begin with the rows of this dataset of Minari in the replay: its name, like pendulum/expert-v0, or a directory.
+    /// The run's steps are counted from these rows on.
+    #[arg(long, value_name = "DATASET", conflicts_with = "from")]
+    pub demonstrations: Option<String>,
 }
 
 impl RunOverrides {
@@ -70,6 +74,7 @@ impl RunOverrides {
             set,
             from,
             with_replay,
+            demonstrations,
         } = self;
         let mut arguments = Vec::new();
         let mut option = |name: &str, value: Option<String>| {
@@ -81,6 +86,7 @@ impl RunOverrides {
         option("--steps", steps.map(|number| number.to_string()));
         option("--episodes", episodes.map(|number| number.to_string()));
         option("--from", from.as_ref().map(|path| path.display().to_string()));
+        option("--demonstrations", demonstrations.clone());
         set.iter()
             .for_each(|assignment| option("--set", Some(assignment.clone())));
         arguments.extend(lockstep.then(|| "--lockstep".into()));
@@ -101,6 +107,18 @@ impl RunOverrides {
         let words = std::iter::once("train").chain(arguments.iter().map(String::as_str));
         let parsed = Arguments::try_parse_from(words).context("the arguments of the suite are damaged")?;
         Ok(parsed.overrides)
+    }
+
+    /// The dataset for a process in another directory.
+    ///
+    /// # Errors
+    /// When the current directory is unknown.
+    pub fn demonstrations_from_anywhere(&self) -> anyhow::Result<Option<String>> {
+        let absolute = |dataset: &String| match Path::new(dataset).is_dir() {
+            true => Ok(std::path::absolute(dataset)?.display().to_string()),
+            false => Ok(dataset.clone()),
+        };
+        self.demonstrations.as_ref().map(absolute).transpose()
     }
 
     /// Directory and configuration of the run whose networks the new one begins with.
@@ -137,6 +155,7 @@ pub(super) fn set_options(
         set: _,
         from: _,
         with_replay: _,
+        demonstrations: _,
     } = *overrides;
     for (option, section, key, value) in [
         ("--seed", "run", "seed", whole("--seed", seed)?),
@@ -242,6 +261,15 @@ mod tests {
         given.sort_unstable();
         written.sort_unstable();
         assert_eq!(written, given);
+
+        let line = ["train", "--demonstrations", "pendulum/expert-v0"];
+        let CommandLine { overrides } = CommandLine::parse_from(line);
+        assert_eq!(overrides.arguments(), line[1..]);
+        let both = [&line[..], &["--from", "old"]].concat();
+        assert!(
+            CommandLine::try_parse_from(both).is_err(),
+            "the rows are of one or of the other"
+        );
     }
 
     #[test]

@@ -77,6 +77,9 @@ fn resolve_table(
     sources.add_new(&chosen, &table, &SettingSource::Gymnasium);
     set_from_algorithm(&mut table, &mut sources)?;
     set_from_predecessor(&mut table, &mut sources, overrides)?;
+    if let Some(dataset) = overrides.demonstrations_from_anywhere()? {
+        put(&mut table, &["run", "demonstrations"], dataset.into())?;
+    }
     let mut config = Config::from_table(table.clone(), "").map_err(|error| {
         let message = error.to_string();
         let message = message.strip_prefix(": ").unwrap_or(&message);

@@ -17,11 +17,11 @@ pub(super) fn share_done(run: &Path) -> f64 {
         let run = RunDir::open(run).ok()?;
         let limits = run.config().ok()?.run;
         let origin = Origin::read(&run).ok()?;
-        if limits.from.is_some() && origin.is_none() {
+        if limits.begins_with_others() && origin.is_none() {
             // They are being copied.
             return Some((0, limits.steps));
         }
-        let inherited = origin.map_or(0, |origin| origin.rows);
+        let inherited = origin.map_or(0, |origin| origin.rows());
         let rows = replay_rows(&run).ok()?;
         let without = |rows: u64| rows.saturating_sub(inherited);
         limits
