@@ -1,6 +1,6 @@
 //! `examples/`: an environment in a crate of its own trains, and has the guarantees of a built-in one.
 
-#![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
+#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that panics has failed")]
 
 #[path = "report/browser.rs"]
 #[allow(dead_code, reason = "this suite uses a part of this file")]
