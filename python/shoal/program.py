@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 #: Lines of the program's messages that are kept for an error.
 KEPT_LINES = 20
 
+#: How the program's messages are read, whatever the locale is.
+TEXT: Any = {"encoding": "utf-8", "errors": "replace"}
+
 
 def program() -> str:
     """The path of the program: ``$SHOAL``, else that of this installation if a wheel brought one, else ``shoal`` in
@@ -80,7 +83,7 @@ def call(arguments: Sequence[str | os.PathLike[str]], accepted: Sequence[int] = 
     Raises :class:`ShoalError` with its message if its exit code is none of those ``accepted``.
     """
     command = [program(), *(os.fspath(argument) for argument in arguments)]
-    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True)
+    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, **TEXT)
     if done.returncode not in accepted:
         raise failure(done.stderr, done.returncode)
     return done.stdout
@@ -100,9 +103,9 @@ def follow(command: Sequence[str], quiet: bool) -> str:
     If this Python is interrupted, the training is too: it saves what it has, and then ``KeyboardInterrupt`` is raised.
     """
     last: collections.deque[str] = collections.deque(maxlen=KEPT_LINES)
-    with tempfile.TemporaryFile("w+") as printed:
+    with tempfile.TemporaryFile("w+", **TEXT) as printed:
         child = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=printed, stderr=subprocess.PIPE, text=True, start_new_session=True
+            command, stdin=subprocess.DEVNULL, stdout=printed, stderr=subprocess.PIPE, start_new_session=True, **TEXT
         )
         assert child.stderr is not None
         try:

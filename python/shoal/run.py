@@ -48,7 +48,7 @@ class Run:
         # Runs of earlier versions have config.toml alone.
         path = used if used.exists() else self.path / "config.toml"
         try:
-            return tomllib.loads(path.read_text())
+            return tomllib.loads(path.read_text(encoding="utf-8"))
         except (OSError, tomllib.TOMLDecodeError) as error:
             raise ShoalError(f"{path} cannot be read: {error}") from error
 
@@ -84,7 +84,7 @@ class Run:
     def result(self) -> dict[str, Any] | None:
         """The final evaluation of a finished run (``final-evaluation.json``); ``None`` before."""
         path = self.path / "final-evaluation.json"
-        return json.loads(path.read_text()) if path.exists() else None
+        return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
 
     def policy(self, which: str = "best") -> Policy:
         """The ``"best"`` policy of the run's evaluations, or its ``"last"`` one. It can be called with observations."""
@@ -149,7 +149,7 @@ class Run:
                 raise TimeoutError(f"{self.path} is still running after {timeout} s")
             time.sleep(0.5)
         outcome = self.path / "outcome.json"
-        end = json.loads(outcome.read_text()) if outcome.exists() else {}
+        end = json.loads(outcome.read_text(encoding="utf-8")) if outcome.exists() else {}
         if end.get("state") == "failed":
             raise ShoalError(f"{self.path} failed: {end['reason']}")
         if end.get("state") == "running":

@@ -18,7 +18,7 @@ def read(path: Path) -> np.ndarray:
     is being written is left out.
     """
     try:
-        text = path.read_text()
+        text = path.read_text(encoding="utf-8")
     except OSError as error:
         raise ShoalError(f"{path} cannot be read: {error.strerror}") from error
     whole = text[: text.rfind("\n") + 1]

@@ -194,7 +194,7 @@ def runs(path: Path) -> list[Run]:
 
 def trials(suite: Path) -> list[str]:
     try:
-        return [trial["name"] for trial in json.loads((suite / "suite.json").read_text())["trials"]]
+        return [trial["name"] for trial in json.loads((suite / "suite.json").read_text(encoding="utf-8"))["trials"]]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ShoalError(f"{suite / 'suite.json'} cannot be read: {error}") from error
 
@@ -217,7 +217,7 @@ class Copy:
     def __init__(self, run: Run, to: str, project: str, group: str | None) -> None:
         self.run = run
         self._file = run.path / f"tracking-{to}.json"
-        state = json.loads(self._file.read_text()) if self._file.exists() else {}
+        state = json.loads(self._file.read_text(encoding="utf-8")) if self._file.exists() else {}
         # The file is written again when a setting changes.
         self._begun: float = state.get("begun", (run.path / "config.toml").stat().st_mtime)
         self._lines: dict[str, int] = state.get("lines", {})
@@ -247,7 +247,7 @@ class Copy:
         files = [self.run.path / name for name in ARTIFACTS]
         self._tracker.files(self.run, [path for path in files if path.is_file()])
         outcome = self.run.path / "outcome.json"
-        finished = outcome.is_file() and json.loads(outcome.read_text())["state"] == "finished"
+        finished = outcome.is_file() and json.loads(outcome.read_text(encoding="utf-8"))["state"] == "finished"
         running = is_worked_on(self.run.path)
         self._tracker.close("running" if running else "finished" if finished else "stopped")
 
@@ -284,7 +284,7 @@ def main() -> int:
     arguments = parser.parse_args()
     try:
         track(arguments.run, arguments.to, project=arguments.project, follow=not arguments.once)
-    except ShoalError as error:
+    except (ShoalError, OSError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
