@@ -67,7 +67,7 @@ pub fn evaluate(config: &Config, parameters: &[f32], episodes: u32, seed: u64) -
 ///
 /// # Errors
 /// When the environment fails, or a signal has arrived.
-pub fn evaluate_until(
+pub fn evaluate_policy(
     run: &RunDir,
     config: &Config,
     parameters: &[f32],

@@ -11,7 +11,7 @@ use shoal_common::policy_file::PolicyFile;
 use shoal_common::run_dir::RunDir;
 use shoal_env_server::environment::Goal;
 use shoal_run::description::Description;
-use shoal_run::evaluation::{EvaluationSummary, SavedPolicy, evaluate_until};
+use shoal_run::evaluation::{EvaluationSummary, SavedPolicy, evaluate_policy};
 use shoal_run::numbers::from_one;
 use shoal_run::signals::{Signals, exit_code};
 
@@ -42,7 +42,7 @@ pub(crate) fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
     let signals = Signals::register()?;
     let interrupt = signals.interrupt();
     let amount = (args.episodes, seed);
-    let evaluated = evaluate_until(&run, &config, &policy.parameters, amount, &interrupt, |_| ());
+    let evaluated = evaluate_policy(&run, &config, &policy.parameters, amount, &interrupt, |_| ());
     if let (Err(_), Some(signal)) = (&evaluated, interrupt.signal()) {
         writeln!(
             std::io::stderr(),

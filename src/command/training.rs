@@ -150,7 +150,7 @@ fn say(line: &str) {
     let _ = writeln!(std::io::stderr(), "{line}");
 }
 
-/// As [`best_policy::choose`], with a bar for the progress.
+/// As [`best_policy::evaluate_and_keep_best`], with a bar for the progress.
 fn final_evaluation(
     config: &Config,
     run: &RunDir,
@@ -168,7 +168,7 @@ fn final_evaluation(
     bar.set_style(ProgressStyle::with_template(
         "final evaluation, {msg} {bar:16.cyan/dim} {pos}/{len} episodes",
     )?);
-    let evaluated = best_policy::choose(config, run, env_steps, interrupt, |policy, finished| {
+    let evaluated = best_policy::evaluate_and_keep_best(config, run, env_steps, interrupt, |policy, finished| {
         bar.set_message(name(policy));
         bar.set_position(finished.into());
     });

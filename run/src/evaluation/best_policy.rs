@@ -7,7 +7,7 @@ use shoal_common::policy_file::PolicyFile;
 use shoal_common::run_dir::RunDir;
 
 use crate::evaluation::final_evaluation::{FinalEvaluation, FinalPolicyResult};
-use crate::evaluation::{EvaluationSummary, SavedPolicy, evaluate_until};
+use crate::evaluation::{EvaluationSummary, SavedPolicy, evaluate_policy};
 use crate::signals::Interrupt;
 
 /// A policy with its final evaluation.
@@ -33,7 +33,7 @@ struct Candidate {
 /// # Errors
 /// When a policy cannot be read or evaluated, none has a finite return, a file cannot be written, or a signal has
 /// arrived.
-pub fn choose(
+pub fn evaluate_and_keep_best(
     config: &Config,
     run: &RunDir,
     env_steps: u64,
@@ -47,13 +47,13 @@ pub fn choose(
         (SavedPolicy::Last, run.last_policy()),
     ] {
         if path.exists() {
-            progress(policy, 0);
             let file = policy.read(run, config)?;
             if !is_finite(&file) {
                 continue;
             }
+            progress(policy, 0);
             let progress = |finished: u32| progress(policy, finished);
-            let summary = evaluate_until(run, config, &file.parameters, (episodes, seed), interrupt, progress)?;
+            let summary = evaluate_policy(run, config, &file.parameters, (episodes, seed), interrupt, progress)?;
             candidates.push(Candidate { policy, file, summary });
         }
     }

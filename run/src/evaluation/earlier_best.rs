@@ -4,7 +4,7 @@ use shoal_common::config::Config;
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::run_dir::RunDir;
 
-use crate::evaluation::{EvaluationSummary, SavedPolicy, evaluate_until};
+use crate::evaluation::{EvaluationSummary, SavedPolicy, evaluate_policy};
 use crate::external_environment::GYMNASIUM;
 use crate::external_environment::server_location::ServerLocation;
 use crate::signals::Interrupt;
@@ -56,7 +56,7 @@ pub fn reevaluate_best(
     }
     let best = SavedPolicy::Best.read(run, config)?;
     let amount = (config.evaluation.episodes, config.run.seed);
-    let now = evaluate_until(run, config, &best.parameters, amount, interrupt, |_| ())?;
+    let now = evaluate_policy(run, config, &best.parameters, amount, interrupt, |_| ())?;
     let anew = PolicyFile {
         return_mean: now.return_mean,
         return_std: now.return_std,
