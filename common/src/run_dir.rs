@@ -25,7 +25,7 @@ pub enum RunDirError {
     #[error("{0} exists already; choose another directory with --run, or remove it")]
     Exists(PathBuf),
     /// There is no run in this directory.
-    #[error("{0} is not a run directory: it has no config.toml{hint}", hint = did_you_mean(.0))]
+    #[error("{0} is not a run directory: {why}{hint}", why = what_it_is(.0), hint = did_you_mean(.0))]
     NotARun(PathBuf),
     /// Another launcher is running the run.
     #[error("the run in {0} is already running: a launcher holds its lock; end that one first")]
@@ -49,6 +49,16 @@ pub enum RunDirError {
 }
 
 /// A hint for a bare name that is a run in `runs`, where `shoal train` makes its runs; otherwise empty.
+fn what_it_is(path: &Path) -> String {
+    if !path.exists() {
+        "there is no such directory".into()
+    } else if path.join("suite.json").is_file() {
+        format!("it is a suite of runs; `shoal list {}` shows them", path.display())
+    } else {
+        "it has no config.toml".into()
+    }
+}
+
 fn did_you_mean(path: &Path) -> String {
     let there = Path::new("runs").join(path);
     if path.components().count() == 1 && there.join("config.toml").is_file() {

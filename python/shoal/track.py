@@ -284,6 +284,7 @@ def main() -> int:
     arguments = parser.parse_args()
     try:
         track(arguments.run, arguments.to, project=arguments.project, follow=not arguments.once)
+        print(f"{arguments.run} is in {arguments.to}, project {arguments.project}", file=sys.stderr)
     except (ShoalError, OSError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

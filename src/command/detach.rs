@@ -3,6 +3,7 @@
 use std::ffi::{OsStr, OsString};
 use std::fs::File;
 use std::io::{Read, Seek, Write};
+use std::os::unix::fs::MetadataExt;
 use std::os::unix::process::CommandExt;
 use std::path::Path;
 use std::process::{Child, Command, ExitCode, Stdio};
@@ -92,7 +93,7 @@ fn resume(
     let begun = Instant::now();
     let mut is_over = false;
     // While it starts, a launcher may be unable to answer.
-    while !is_at_work().unwrap_or(false) {
+    while !(is_at_work().unwrap_or(false) && holds_lock(child.id(), &path)) {
         if let Some(status) = child.try_wait()? {
             if status.success() {
                 is_over = true;
@@ -130,6 +131,21 @@ fn resume(
         writeln!(std::io::stdout(), "{printed}")?;
     }
     Ok(ExitCode::SUCCESS)
+}
+
+/// Whether this process holds the lock of the directory, and not another that was started at the same time. True where
+/// the system does not say.
+fn holds_lock(pid: u32, directory: &Path) -> bool {
+    let (Ok(locks), Ok(directory)) = (std::fs::read_to_string("/proc/locks"), directory.metadata()) else {
+        return true;
+    };
+    // As in `1: FLOCK  ADVISORY  WRITE 4711 08:01:1234 0 EOF`.
+    locks.lines().any(|line| {
+        let mut fields = line.split_whitespace().skip(4);
+        let (owner, file) = (fields.next(), fields.next().unwrap_or_default());
+        let inode = file.rsplit(':').next().and_then(|inode| inode.parse().ok());
+        owner == Some(&pid.to_string()) && inode == Some(directory.ino())
+    })
 }
 
 /// Asks the launcher to end in order.

@@ -99,7 +99,7 @@ pub(crate) fn run(args: &FilmArgs) -> anyhow::Result<ExitCode> {
 fn in_words(shown: &Shown) -> String {
     let episode = |(episode_return, steps): &(f64, usize)| format!("return {episode_return:.2} in {steps} steps");
     let episodes: Vec<String> = shown.episodes.iter().map(episode).collect();
-    format!("{:.1} s: {}", shown.seconds, episodes.join("; "))
+    format!("a film of {:.1} s: {}", shown.seconds, episodes.join("; "))
 }
 
 /// Checks that `out` does not exist or is a film of this format: no other file is replaced.

@@ -112,7 +112,9 @@ pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
     // A run with all its steps may still lack updates or the last evaluation.
     if saved.finished || (steps, episodes) != (used.run.steps, used.run.episodes) {
         if steps_taken >= steps {
-            bail!("{here} has taken {steps_taken} of {steps} steps already: give it more with --steps");
+            bail!(
+                "{here} has taken {steps_taken} of {steps} steps already, and nothing has changed: give it more with --steps"
+            );
         }
         if let Some(episodes) = episodes.filter(|episodes| episodes_ended >= *episodes) {
             bail!("{here} has finished {episodes_ended} of {episodes} episodes already: give it more with --episodes");

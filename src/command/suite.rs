@@ -10,7 +10,7 @@ use std::process::{Command, ExitCode};
 use std::sync::mpsc::Sender;
 
 use anyhow::{Context, bail};
-use measure::{best_return, share_done};
+use measure::{best_return, is_evaluated, share_done};
 use progress::{Event, SuiteProgress};
 use serde::Serialize;
 use shoal_common::config::Config;
@@ -178,13 +178,18 @@ fn check_first_round(suite: &Suite, config: &Config) -> anyhow::Result<()> {
     let Some(round) = suite.next_round() else {
         return Ok(());
     };
-    let (end, first) = (round.share * config.run.steps as f64, config.evaluation.every);
-    if config.run.episodes.is_none() && end < first as f64 {
-        let text = format!(
-            "--halving: the first round ends after {end:.0} steps of each run, and the first evaluation comes after {first}: \
-             lower evaluation.every, or give the runs more steps"
-        );
-        return Err(UsageError(text).into());
+    let end = round.share * config.run.steps as f64;
+    for (first, what, key) in [
+        (config.evaluation.every, "evaluation comes after", "evaluation.every"),
+        (config.replay.warmup.saturating_add(1), "update after", "replay.warmup"),
+    ] {
+        if config.run.episodes.is_none() && end < first as f64 {
+            let text = format!(
+                "--halving: the first round ends after {end:.0} steps of each run, and the first {what} {first}: lower \
+                 {key}, or give the runs more steps"
+            );
+            return Err(UsageError(text).into());
+        }
     }
     Ok(())
 }
@@ -212,7 +217,8 @@ pub(crate) fn resume(directory: &Path, options: SuiteOptions<'_>) -> anyhow::Res
         let percent = 100.0 * round.share;
         let is_due = |trial: &Trial| {
             let run = directory.join(&trial.name);
-            Ok(round.trials.contains(trial) && !check_finished(&suite, &run)? && share_done(&run) < round.share)
+            let has_done_enough = share_done(&run) >= round.share && is_evaluated(&run);
+            Ok(round.trials.contains(trial) && !check_finished(&suite, &run)? && !has_done_enough)
         };
         // A run that failed gets a second chance before it counts as worse: disk or memory may have been full.
         for chance in 0..2 {
@@ -328,7 +334,8 @@ impl<'a> Due<'a> {
             let _ = events.send(Event::Started(number));
             let trial = &suite.trials[number];
             let run = directory.join(&trial.name);
-            let has_done_enough = || until.is_some_and(|share| share_done(&run) >= share);
+            // Its evaluation may come a little later.
+            let has_done_enough = || until.is_some_and(|share| share_done(&run) >= share && is_evaluated(&run));
             let interrupted = || signals.received().or_else(|| has_done_enough().then_some(SIGTERM));
             let trained = train_one(suite, trial, directory, &interrupted);
             let _ = events.send(match trained {

@@ -566,7 +566,7 @@ fn an_impossible_report_is_refused_in_one_line() {
     for (arguments, part) in [
         (
             &["nowhere"][..],
-            "nowhere is not a run directory: it has no config.toml",
+            "nowhere is not a run directory: there is no such directory",
         ),
         (&["run", "empty"], "empty is not a run directory"),
         (&["run", "run/../run"], "is named twice"),

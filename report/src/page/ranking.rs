@@ -65,20 +65,27 @@ pub(super) fn rank(environment: &str, sets: &[RepeatedRuns], runs: &[Run]) -> Op
     if !results.iter().any(|(.., values)| values.len() > 1) {
         return None;
     }
-    let values: Vec<&[f64]> = results.iter().map(|(.., values)| values.as_slice()).collect();
-    let mut places: Vec<RankedSetting> = results
-        .iter()
-        .zip(bootstrap(&values))
-        .map(|((label, unfinished, values), (interval, best))| RankedSetting {
-            label: label.clone(),
-            runs: values.len(),
-            unfinished: *unfinished,
-            mean: short(trimmed_mean(values.clone())),
-            interval,
-            best,
-        })
-        .collect();
-    places.sort_by(|a, b| b.mean.total_cmp(&a.mean));
+    // Settings that were trained to the end are not compared with those that were not.
+    let any_finished = results.iter().any(|(_, unfinished, _)| *unfinished == 0);
+    let is_compared = |unfinished: usize| !any_finished || unfinished == 0;
+    let (compared, rest): (Vec<_>, Vec<_>) = results.iter().partition(|(_, unfinished, _)| is_compared(*unfinished));
+    let mut places = Vec::new();
+    for (group, is_compared) in [(compared, true), (rest, false)] {
+        let values: Vec<&[f64]> = group.iter().map(|(.., values)| values.as_slice()).collect();
+        let mut of_group = Vec::new();
+        for ((label, unfinished, values), (interval, best)) in group.iter().zip(bootstrap(&values)) {
+            of_group.push(RankedSetting {
+                label: label.clone(),
+                runs: values.len(),
+                unfinished: *unfinished,
+                mean: short(trimmed_mean(values.clone())),
+                interval,
+                best: best.filter(|_| is_compared),
+            });
+        }
+        of_group.sort_by(|a, b| b.mean.total_cmp(&a.mean));
+        places.extend(of_group);
+    }
     Some(Ranking {
         environment: environment.into(),
         verdict: verdict(&places),
@@ -90,6 +97,12 @@ fn verdict(places: &[RankedSetting]) -> Option<String> {
     let [best, second, ..] = places else {
         return None;
     };
+    if best.unfinished == 0 && second.unfinished > 0 {
+        return Some(format!(
+            "{} is the only setting that was trained to the end, so nothing says how certain it is the best",
+            best.label
+        ));
+    }
     let share = best.best?;
     let certainty = match share {
         0.975.. => "almost certainly the best",
@@ -101,7 +114,11 @@ fn verdict(places: &[RankedSetting]) -> Option<String> {
         Some(runs) if runs < FEW => format!("; {runs} runs are few, so train more seeds to be sure"),
         _ => String::new(),
     };
-    let others = if places.len() > 2 { "all others" } else { &second.label };
+    let others = match places.iter().filter(|place| place.best.is_some()).count() {
+        3.. if places.iter().any(|place| place.best.is_none()) => "all others that were trained to the end",
+        3.. => "all others",
+        _ => &second.label,
+    };
     Some(format!(
         "{} is {certainty}, ahead of {others} in {:.0} % of the resamples{few}",
         best.label,
@@ -124,8 +141,11 @@ impl Ranking {
                 .best
                 .map_or_else(String::new, |share| format!(", best in {:.0} %", 100.0 * share));
             format!(
-                "{}: {:.2}{interval}, {} runs{unfinished}{best}",
-                place.label, place.mean, place.runs
+                "{}: {:.2}{interval}, {} {}{unfinished}{best}",
+                place.label,
+                place.mean,
+                place.runs,
+                if place.runs == 1 { "run" } else { "runs" }
             )
         })
     }
@@ -214,6 +234,20 @@ mod tests {
         let told = verdict(&[place("b", 13.0, found[1].1), place("a", 3.0, found[0].1)]);
         let expected = "b is almost certainly the best, ahead of a in 100 % of the resamples";
         assert_eq!(told.as_deref(), Some(expected));
+        let halved = |best: Option<f64>| RankedSetting {
+            unfinished: 5,
+            ..place("ended early", 20.0, best)
+        };
+        let told = verdict(&[place("b", 13.0, Some(0.99)), place("a", 3.0, Some(0.01)), halved(None)]);
+        assert!(
+            told.unwrap().contains("ahead of a in 99 %"),
+            "one that was ended early is not compared"
+        );
+        let told = verdict(&[place("b", 13.0, None), halved(None)]);
+        assert!(
+            told.unwrap()
+                .starts_with("b is the only setting that was trained to the end")
+        );
         let single = bootstrap(&[&[1.0], &low]);
         assert_eq!((single[0], single[1].1), ((None, None), None));
     }

@@ -33,18 +33,29 @@ pub(super) fn share_done(run: &Path) -> f64 {
     progress.map_or(0.0, |(done, all)| done as f64 / all.max(1) as f64)
 }
 
+/// Whether a policy of the run that has learned something was evaluated.
+pub(super) fn is_evaluated(run: &Path) -> bool {
+    returns(run).next().is_some()
+}
+
 /// The best return of a run's evaluations so far; −∞ if there is none.
 pub(super) fn best_return(run: &Path) -> f64 {
+    returns(run)
+        .filter(|mean| mean.is_finite())
+        .fold(f64::NEG_INFINITY, f64::max)
+}
+
+/// The mean returns of a run's evaluations so far. Policies that have learned nothing do not count: they are the same
+/// for all settings.
+fn returns(run: &Path) -> impl Iterator<Item = f64> {
     let evaluations = RunDir::open(run)
         .ok()
         .and_then(|run| read_evaluations(&run.evaluations()).ok());
-    let returns = evaluations
+    let learned = evaluations
         .into_iter()
         .flatten()
-        .map(|evaluation| evaluation.return_mean);
-    returns
-        .filter(|mean| mean.is_finite())
-        .fold(f64::NEG_INFINITY, f64::max)
+        .filter(|evaluation| evaluation.updates > 0);
+    learned.map(|evaluation| evaluation.return_mean)
 }
 
 /// How far a run is, and how far it goes: in episodes if they limit it, otherwise in environment steps.
