@@ -455,7 +455,8 @@ impl<'a> Launcher<'a> {
         self.ending = true;
         self.end(|role| role == Role::Actor, ACTORS_END);
         if is_over {
-            // They hand over what they have while the learner is still there.
+            // They hand over what they have while the learner is still there. A gate that has just died must tell them too.
+            self.supervisor.ensure_gate()?;
             self.supervisor.ask_to_retire(Role::Gate);
             self.await_end(|role| role == Role::Gate, GATE_END);
         }

@@ -257,7 +257,9 @@ impl<'a> Gate<'a> {
         // The announcement also reaches a host that reconnects meanwhile.
         let was_announced = since.elapsed() >= END_ANNOUNCEMENT;
         let gone = |host: &Host| host.has_left || (was_announced && host.heard_at.elapsed() >= CUT_OFF_AFTER);
-        since.elapsed() >= HAND_OVER_TIMEOUT || self.hosts.values().all(gone)
+        // A gate that has just started does not know its hosts before the launcher has answered.
+        let has_told_all = self.epoch.is_some() && self.hosts.values().all(gone);
+        has_told_all || since.elapsed() >= HAND_OVER_TIMEOUT
     }
 
     /// Handles what a host has sent. Returns the rows that were forwarded to the learner.

@@ -288,6 +288,22 @@ impl Supervisor {
         Ok(())
     }
 
+    /// Starts the gate again if it has just died and other hosts are waiting for news.
+    ///
+    /// # Errors
+    /// When it cannot be started.
+    pub(super) fn ensure_gate(&mut self) -> anyhow::Result<()> {
+        if self.hosts.leases().is_empty() {
+            return Ok(());
+        }
+        self.reap(|role| role == Role::Gate);
+        let is_missing = |child: &Child| child.instance.role == Role::Gate && child.process.is_none();
+        match self.children.iter().position(is_missing) {
+            Some(i) => self.start(i),
+            None => Ok(()),
+        }
+    }
+
     /// Records a heartbeat.
     pub(super) fn record(&mut self, heartbeat: &Heartbeat) {
         let child = self.children.iter_mut().find(|child| {

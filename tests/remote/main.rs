@@ -265,6 +265,24 @@ fn a_host_that_is_ended_hands_over_what_it_has_and_frees_its_actors() {
     assert_eq!(in_replay(&path, &[1, 2]), sent + more);
 }
 
+#[test]
+fn hosts_end_with_a_run_whose_gate_has_just_died() {
+    let run = Run::start(&["--actors", "1"]);
+    let host = Host::join(&run, &["--actors", "1"]);
+    wait_for_actors(&run, &[1]);
+    // The launcher learns of the death and of the request at the same time.
+    run.running.signal(Signal::STOP);
+    run.running.kill_if_alive("gate-0");
+    let mut stop = run.place.shoal(&["stop", "run"]).spawn().unwrap();
+    std::thread::sleep(Duration::from_millis(300));
+    run.running.signal(Signal::CONT);
+    until("the run is stopped", || stop.try_wait().unwrap().is_some());
+    assert!(stop.wait().unwrap().success());
+    let Run { place, running } = run;
+    assert_eq!(running.wait().0, Some(0), "{}", place.stderr());
+    host.ends_with(0);
+}
+
 /// The weights and evaluations of a lockstep run with three actors, of which another host takes over two, if `joined`.
 fn lockstep(joined: bool) -> (serde_json::Value, Vec<String>) {
     let place = Workplace::new();
