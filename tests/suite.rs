@@ -244,13 +244,12 @@ fn with_halving_bad_settings_are_ended_early_also_after_a_kill() {
     let best = |run: &Value| -> f64 {
         let file = path.join(run["run"].as_str().unwrap()).join("evaluations.csv");
         let mut rows = csv::Reader::from_path(file).unwrap();
-        let column = rows
-            .headers()
-            .unwrap()
-            .iter()
-            .position(|name| name == "return_mean")
-            .unwrap();
-        let means = rows.records().map(|row| row.unwrap()[column].parse::<f64>().unwrap());
+        let headers = rows.headers().unwrap().clone();
+        let column = |name: &str| headers.iter().position(|header| header == name).unwrap();
+        let (mean, updates) = (column("return_mean"), column("updates"));
+        // Policies that have learned nothing do not count.
+        let learned = rows.records().map(Result::unwrap).filter(|row| &row[updates] != "0");
+        let means = learned.map(|row| row[mean].parse::<f64>().unwrap());
         means.fold(f64::NEG_INFINITY, f64::max)
     };
     let (ended, left): (Vec<&Value>, Vec<&Value>) = runs.iter().partition(|run| run["ended_early"] == true);
