@@ -40,8 +40,8 @@ impl ActorSnapshot {
             .collect()
     }
 
-    /// Reads the words of an actor with `envs` environments, `exploration` numbers of exploration and `n_step` words of transitions
-    /// of several steps; `None` if their count is not that of `layout`.
+    /// Reads the words of an actor with `envs` environments, `exploration` numbers of exploration and `n_step` words of
+    /// transitions of several steps; `None` if their count is not that of `layout`.
     pub(crate) fn read(
         words: &[u64],
         layout: &ChunkLayout,

@@ -27,6 +27,9 @@ pub(crate) const COMMAND: &str = "in-new-session";
 /// How long the start may take, beside what the environment is allowed (`environment.start_seconds`).
 const PATIENCE: Duration = Duration::from_secs(60);
 
+/// How long a process may take to end that is refused because another works already.
+const REFUSED_END: Duration = Duration::from_secs(5);
+
 /// Pause between two looks at a run that starts.
 const PAUSE: Duration = Duration::from_millis(50);
 
@@ -90,10 +93,17 @@ fn resume(
         .stdout(Stdio::null())
         .stderr(messages.try_clone()?);
     let mut child = command.spawn().context("cannot start the launcher")?;
+    // Another process may have been started at the same time. Of the two, one is refused and ends.
+    let pid = child.id();
+    let is_by_child = |since: &mut Option<Instant>| {
+        let since = *since.get_or_insert_with(Instant::now);
+        holds_lock(pid, &path) || since.elapsed() >= REFUSED_END
+    };
     let begun = Instant::now();
     let mut is_over = false;
     // While it starts, a launcher may be unable to answer.
-    while !(is_at_work().unwrap_or(false) && holds_lock(child.id(), &path)) {
+    let mut at_work_since = None;
+    while !(is_at_work().unwrap_or(false) && is_by_child(&mut at_work_since)) {
         if let Some(status) = child.try_wait()? {
             if status.success() {
                 is_over = true;
@@ -114,7 +124,6 @@ fn resume(
         std::thread::sleep(PAUSE);
     }
     write_messages(&mut messages)?;
-    let pid = child.id();
     if !output.quiet {
         let what = match is_over {
             true => "is over already".into(),
@@ -133,11 +142,10 @@ fn resume(
     Ok(ExitCode::SUCCESS)
 }
 
-/// Whether this process holds the lock of the directory, and not another that was started at the same time. True where
-/// the system does not say.
+/// Whether the system says that this process holds the lock of the directory. Some file systems show other inodes there.
 fn holds_lock(pid: u32, directory: &Path) -> bool {
     let (Ok(locks), Ok(directory)) = (std::fs::read_to_string("/proc/locks"), directory.metadata()) else {
-        return true;
+        return false;
     };
     // As in `1: FLOCK  ADVISORY  WRITE 4711 08:01:1234 0 EOF`.
     locks.lines().any(|line| {

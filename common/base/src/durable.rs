@@ -71,7 +71,7 @@ impl Drop for PreparedFile {
     }
 }
 
-/// Opens an empty temporary file for `path`. As long as it is open, no other process opens it.
+/// Opens an empty temporary file for `path`. As long as it is open, no other process writes it.
 fn open_temporary(path: &Path) -> io::Result<(PathBuf, File)> {
     let named = |ending: &str| {
         let mut name = path.as_os_str().to_owned();

@@ -55,7 +55,7 @@ pub struct HostRecord {
 pub(super) struct HostTable {
     path: PathBuf,
     table: Option<Table>,
-    /// The last row of each host, with the time of its writing.
+    /// The last row of each host that is not gone, with the time of its writing.
     last: HashMap<u64, (Duration, HostRecord)>,
 }
 
@@ -104,7 +104,7 @@ impl HostTable {
             }
         }
         for (host, (_, last)) in &self.last {
-            if last.state != RecordedHostState::Gone && !hosts.iter().any(|status| status.host == *host) {
+            if !hosts.iter().any(|status| status.host == *host) {
                 let row = HostRecord {
                     wall_seconds: moment.wall_seconds,
                     env_steps: moment.env_steps,
