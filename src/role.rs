@@ -130,7 +130,7 @@ fn work(domain: &Domain, config: &Config, run: &RunDir, instance: RoleInstance, 
             Ok(shoal_remote::relay::relay(domain, &settings, stop)?)
         }
         #[cfg(not(feature = "remote"))]
-        Role::Gate | Role::Relay => anyhow::bail!(crate::command::join::NOT_BUILT),
+        Role::Gate | Role::Relay => anyhow::bail!(shoal_remote::NOT_BUILT),
     }
 }
 

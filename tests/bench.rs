@@ -323,3 +323,23 @@ fn eventually<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
         std::thread::sleep(Duration::from_millis(5));
     }
 }
+
+/// The network is not built by default.
+#[cfg(not(feature = "remote"))]
+#[test]
+fn without_the_network_each_command_that_needs_it_says_how_to_build_it() {
+    let temporary = TempDir::new().unwrap();
+    let commands: [&[&str]; 3] = [
+        &["bench", "remote"],
+        &["join", "tcp/127.0.0.1:1", "--actors", "1"],
+        &["train", "pendulum", "--listen"],
+    ];
+    for arguments in commands {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_shoal"));
+        let output = output_of(command.args(arguments).current_dir(temporary.path()));
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert!(!output.status.success(), "{arguments:?}");
+        assert_eq!(said.lines().count(), 1, "{said}");
+        assert!(said.contains("--features remote"), "{said}");
+    }
+}

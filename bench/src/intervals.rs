@@ -34,6 +34,11 @@ impl IntervalResults {
         self.0.is_empty()
     }
 
+    #[cfg(feature = "remote")]
+    pub(super) fn len(&self) -> usize {
+        self.0.len()
+    }
+
     /// Panics if there is no result.
     pub(super) fn median(&self) -> f64 {
         self.0[self.0.len() / 2]

@@ -14,6 +14,8 @@ mod policy;
 mod processes;
 mod product;
 mod progress;
+#[cfg(feature = "remote")]
+mod remote;
 mod rows;
 mod spin;
 mod step;
@@ -49,7 +51,10 @@ pub enum Stage {
     Actors,
     /// A training run: time to its first gradient steps, time to recover from a crash, and memory of each process.
     Run,
-    /// Every stage except `gym`, and one table of the results, the machine's limits and the targets.
+    /// Transitions per second from actors of other hosts, what gate and relay cost, and how soon transitions come back
+    /// after an interruption.
+    Remote,
+    /// Every stage except `gym` and `remote`, and one table of the results, the machine's limits and the targets.
     All,
     /// Steps per second of a Gymnasium environment served from Python, compared with Gymnasium's own vector
     /// environments.
@@ -76,6 +81,10 @@ pub fn run(stage: Stage, actors: Option<&str>, algorithm: Option<&str>, json: bo
         Stage::Policy => policy::measure(&budget).and_then(|it| print(&it, json)),
         Stage::Actors => actors::measure(actors, &budget).and_then(|it| print(&it, json)),
         Stage::Run => whole_run::measure(&budget).and_then(|it| print(&it, json)),
+        #[cfg(feature = "remote")]
+        Stage::Remote => remote::measure(&budget).and_then(|it| print(&it, json)),
+        #[cfg(not(feature = "remote"))]
+        Stage::Remote => anyhow::bail!(shoal_remote::NOT_BUILT),
         Stage::All => table::measure_all(json, &budget),
         Stage::Gym => gym::measure(&budget).and_then(|it| print(&it, json)),
     }

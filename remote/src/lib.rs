@@ -13,6 +13,10 @@ pub mod rate_limiter;
 pub mod uncommitted;
 pub mod wire;
 
+/// The message of a program without the network.
+pub const NOT_BUILT: &str = "this program was built without remote actors: build it with `cargo build --release \
+                             --features remote`";
+
 #[cfg(feature = "network")]
 pub mod gate;
 #[cfg(feature = "network")]

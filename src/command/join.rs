@@ -8,10 +8,6 @@ use std::time::Duration;
 use clap::{Args, ValueEnum};
 use shoal_run::numbers::small_count;
 
-/// The message of a program without the network.
-pub(crate) const NOT_BUILT: &str = "this program was built without remote actors: build it with `cargo build --release \
-                                    --features remote`";
-
 #[derive(Args, Clone, Debug)]
 pub(crate) struct JoinArgs {
     /// Where the run listens, as `train --listen` prints it (tls/learner-7:7447); or the run's directory.
@@ -88,7 +84,7 @@ fn time(text: &str) -> Result<Duration, String> {
 
 #[cfg(not(feature = "remote"))]
 fn join(_args: &JoinArgs, _run: &str, _actors: u32) -> anyhow::Result<ExitCode> {
-    anyhow::bail!(NOT_BUILT)
+    anyhow::bail!(shoal_remote::NOT_BUILT)
 }
 
 #[cfg(feature = "remote")]

@@ -8,11 +8,10 @@ use std::time::Duration;
 use clap::Args;
 use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
+use shoal_remote::NOT_BUILT;
 use shoal_remote::endpoint::Endpoint;
 use shoal_remote::files::JoinFile;
 use shoal_run::usage::UsageError;
-
-use super::join::NOT_BUILT;
 
 /// How long the gate of an earlier launcher may still be listening: it ends after its launcher, but not at once.
 const EARLIER_GATE: Duration = Duration::from_secs(15);

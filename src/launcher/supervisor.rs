@@ -3,6 +3,7 @@
 mod admission;
 mod faults;
 
+use std::collections::BTreeSet;
 use std::os::fd::BorrowedFd;
 use std::os::unix::process::ExitStatusExt;
 use std::path::PathBuf;
@@ -12,7 +13,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, bail};
 use shoal_common::channel::control::RoleStatus;
 use shoal_common::channel::{Domain, Services};
-use shoal_common::config::{Config, Mode};
+use shoal_common::config::{ActorsConfig, Config, Mode};
 use shoal_common::durable::write_atomically;
 use shoal_common::report::Heartbeat;
 use shoal_common::role::{Activity, Role, RoleInstance};
@@ -79,8 +80,11 @@ pub(super) enum HostRoles {
 pub(super) struct Supervisor {
     children: Vec<Child>,
     services: Services,
-    /// Number of actors whose services have been created.
-    actors_with_services: u32,
+    /// Actors whose services for transitions exist, and those whose environment server has its services.
+    actors_with_services: BTreeSet<u32>,
+    servers_with_services: BTreeSet<u32>,
+    /// Whether the learner is on this host.
+    has_learner: bool,
     window: u32,
     /// Since when dead processes have occupied shared memory in spite of clean-ups.
     occupied_since: Option<Instant>,
@@ -137,6 +141,7 @@ impl Supervisor {
         let server = config.evaluation_server();
         let lockstep = config.run.mode == Mode::Lockstep;
         let mut lockstep_actors = None;
+        let has_learner = matches!(roles, HostRoles::LearnerHost { .. });
         let (children, actors) = match roles {
             HostRoles::LearnerHost { gate } => {
                 services.create_environment(domain, server)?;
@@ -154,7 +159,9 @@ impl Supervisor {
         Ok(Self {
             children,
             services,
-            actors_with_services: 0,
+            actors_with_services: BTreeSet::new(),
+            servers_with_services: BTreeSet::new(),
+            has_learner,
             window: config.actors.window,
             occupied_since: None,
             cleanup_time: Duration::ZERO,
@@ -218,7 +225,8 @@ impl Supervisor {
 
     /// The most actors that this host may have now.
     pub(super) fn max_actors_now(&self) -> u32 {
-        self.actor_count() + self.free_actors().count() as u32
+        let all = self.actor_count() + self.free_actors().count() as u32;
+        all.min(ActorsConfig::GREATEST_COUNT)
     }
 
     /// Indices that neither this host nor another has.
@@ -236,20 +244,30 @@ impl Supervisor {
         }
     }
 
-    /// Creates the services of all actors below `end`.
-    fn create_services(&mut self, domain: &Domain, end: u32) -> anyhow::Result<()> {
-        while self.actors_with_services < end {
-            self.services
-                .create_actor(domain, self.actors_with_services, self.window)?;
-            self.actors_with_services += 1;
+    /// Creates the services for the transitions of these actors.
+    fn create_transitions(&mut self, domain: &Domain, actors: impl IntoIterator<Item = u32>) -> anyhow::Result<()> {
+        for actor in actors {
+            if !self.actors_with_services.contains(&actor) {
+                self.services.create_transitions(domain, actor, self.window)?;
+                self.actors_with_services.insert(actor);
+            }
         }
         Ok(())
     }
 
-    /// Creates the services of all wanted actors.
+    /// Creates the services of all wanted actors and their environment servers.
     fn create_wanted_services(&mut self, domain: &Domain) -> anyhow::Result<()> {
-        let end = self.actors.iter().max().map_or(0, |last| last + 1);
-        self.create_services(domain, end)
+        for actor in &self.actors {
+            if !self.servers_with_services.contains(actor) {
+                self.services.create_environment(domain, *actor)?;
+                self.servers_with_services.insert(*actor);
+            }
+        }
+        match self.actors.iter().max().copied() {
+            // The learner opens those of all actors up to the last one.
+            Some(last) if self.has_learner => self.create_transitions(domain, 0..=last),
+            _ => self.create_transitions(domain, self.actors.clone()),
+        }
     }
 
     fn write_counter(&self) -> anyhow::Result<()> {

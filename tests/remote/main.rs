@@ -6,7 +6,7 @@
 #[path = "../support/mod.rs"]
 mod support;
 
-use std::process::Command;
+use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 use rand::seq::IndexedRandom;
@@ -15,7 +15,8 @@ use rustix::process::Signal;
 use shoal_common::config::Config;
 use shoal_common::stream::Stream;
 use support::{
-    QUICK, Running, Workplace, check_stored_rows, committed, error_line, final_result, sent, until, wait_for_rows,
+    QUICK, Running, Workplace, check_stored_rows, committed, error_line, final_result, output_of, sent, until,
+    wait_for_rows,
 };
 
 /// Steps that no test reaches.
@@ -458,6 +459,34 @@ fn the_actors_of_a_host_that_vanishes_are_free_after_a_while() {
         "{records}"
     );
     assert!(has("next", "connected"), "{records}");
+}
+
+#[test]
+fn the_rates_of_joined_hosts_are_measured_and_nothing_is_left() {
+    let temporary = tempfile::TempDir::new().unwrap();
+    let mut command = Command::new(env!("CARGO_BIN_EXE_shoal"));
+    command.args(["bench", "remote", "--json"]).stdin(Stdio::null());
+    command
+        .env("SHOAL_BENCH_SECONDS", "0.3")
+        .env("TMPDIR", temporary.path());
+    let output = output_of(&mut command);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let figures: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    let positive = |figure: &serde_json::Value| figure.as_f64().is_some_and(|number| number > 0.0);
+    let links = ["loopback", "cable", "gigabit"].map(|link| &figures[link]);
+    // Only root can make cables.
+    for link in links.into_iter().filter(|link| !link.is_null()) {
+        for field in ["rows_per_second", "gate_cores", "relay_cores", "learner_cores"] {
+            assert!(positive(&link[field]), "{field} in {figures}");
+        }
+    }
+    assert!(positive(&figures["loopback"]["rows_per_second"]), "{figures}");
+    let many = &figures["many"];
+    assert_eq!((&many["hosts"], &many["actors"]), (&32.into(), &1024.into()));
+    for field in ["rows_per_second", "fairness", "gate_open_files", "rejoined_s"] {
+        assert!(positive(&many[field]), "{field} in {figures}");
+    }
+    assert_eq!(std::fs::read_dir(temporary.path()).unwrap().count(), 0);
 }
 
 /// The template as an executable file, with this text replaced.

@@ -29,13 +29,21 @@ const MAY_IMPORT: [(&str, &[&str]); 13] = [
     ("shoal-remote", &["shoal-common"]),
     ("shoal-run", &CORE),
     ("shoal-report", &RUN_AND_CORE),
-    ("shoal-bench", &RUN_AND_CORE),
+    ("shoal-bench", &REMOTE_RUN_AND_CORE),
     ("shoal-reproduce", &REPORT_RUN_AND_CORE),
     ("shoal", &EVERYTHING),
 ];
 
 const CORE: [&str; 4] = ["shoal-common", "shoal-env-server", "shoal-actor", "shoal-learner"];
 const RUN_AND_CORE: [&str; 5] = [
+    "shoal-run",
+    "shoal-common",
+    "shoal-env-server",
+    "shoal-actor",
+    "shoal-learner",
+];
+const REMOTE_RUN_AND_CORE: [&str; 6] = [
+    "shoal-remote",
     "shoal-run",
     "shoal-common",
     "shoal-env-server",

@@ -79,6 +79,15 @@ impl Services {
     /// As [`create_common`](Self::create_common).
     pub fn create_actor(&mut self, domain: &Domain, index: u32, window: u32) -> Result<(), ChannelError> {
         self.create_environment(domain, index)?;
+        self.create_transitions(domain, index, window)
+    }
+
+    /// Creates the services between actor `index` and the learner: all that the learner's host needs for an actor of
+    /// another host.
+    ///
+    /// # Errors
+    /// As [`create_common`](Self::create_common).
+    pub fn create_transitions(&mut self, domain: &Domain, index: u32, window: u32) -> Result<(), ChannelError> {
         self.held.extend([
             transitions::create(domain, index, window)?,
             event::create(domain, EventName(Role::Actor, index))?,

@@ -51,7 +51,7 @@ fn resolve_table(
         put(
             &mut table,
             &["actors", "max"],
-            count.min(ActorsConfig::GREATEST_MAX.into()).into(),
+            count.min(ActorsConfig::GREATEST_COUNT.into()).into(),
         )?;
         sources.set("actors.max".into(), SettingSource::Follows("actors.count".into()));
     }

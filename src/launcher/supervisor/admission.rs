@@ -4,6 +4,7 @@ use std::collections::HashSet;
 
 use shoal_common::channel::Domain;
 use shoal_common::channel::control::{ControlResponse, HostLease, HostRequest, HostStatus};
+use shoal_common::config::ActorsConfig;
 use shoal_common::role::Role;
 
 use super::Supervisor;
@@ -24,6 +25,10 @@ impl Supervisor {
         } = request;
         if let Some(lease) = self.hosts.lease(host) {
             return Ok(ControlResponse::Admitted(lease.clone()));
+        }
+        if requested > ActorsConfig::GREATEST_COUNT {
+            let why = format!("a host can have at most {} actors", ActorsConfig::GREATEST_COUNT);
+            return Ok(ControlResponse::Refused(why));
         }
         let free: Vec<u32> = match self.lockstep_actors {
             // Processes for these actors end here; those of the other host continue from the same snapshots.
@@ -59,8 +64,9 @@ impl Supervisor {
         let first_incarnation = self.processes_started + 1;
         self.processes_started += INCARNATIONS;
         self.write_counter()?;
-        let highest = actors.iter().max().map_or(0, |highest| highest + 1);
-        self.create_services(domain, highest)?;
+        // The learner opens those of all actors up to the last one.
+        let last = actors.iter().max().copied();
+        self.create_transitions(domain, last.map_or(0..0, |last| 0..last + 1))?;
         self.log
             .note("launcher", &format!("host {name} is admitted with actors {actors:?}"));
         let lease = HostLease {

@@ -1,0 +1,476 @@
+//! Remote actors: the rate of rows from joined hosts into the learner's replay, what gate and relay cost, and how soon
+//! rows flow again after an interruption. Learner, gate and relays are the ordinary roles.
+
+mod cable;
+mod hosts;
+mod model;
+mod processes;
+
+use std::time::{Duration, Instant};
+
+use serde::Serialize;
+
+use self::cable::Cable;
+use self::hosts::{Network, RemoteRun};
+use self::model::{Bottleneck, Costs, PolicyAge, policy_age};
+use super::intervals::{self, IntervalResults};
+use super::measurement::{Figures, TimeBudget};
+use super::memory::Memory;
+use super::temporary_run::TemporaryRun;
+
+const INTERVAL: Duration = Duration::from_millis(100);
+
+/// Rows of a chunk, chunks of a window, and actors of the host whose rate is measured.
+const CHUNK_ROWS: u32 = 64;
+const WINDOW: u32 = 64;
+const ACTORS: u32 = 8;
+
+/// The limited cable.
+const GIGABIT: u64 = 1_000_000_000;
+
+/// What a gigabit a second carries of rows of Pendulum in chunks, 64 × 40 bytes and a header, with TCP's and IP's own
+/// headers.
+const GIGABIT_ROWS: f64 = 2.84e6;
+
+/// For the model: a slow cable, the time in which an actor fills a chunk, the default window, and numbers of actors.
+const SLOW: u64 = 100_000_000;
+const THINK: Duration = Duration::from_millis(1);
+const DEFAULT_WINDOW: u32 = 8;
+const COUNTS: [u32; 4] = [1, 2, 4, 8];
+
+/// A policy of Pendulum with the thesis's networks, how many a learner publishes a second (every fourth of 600 updates),
+/// and the default of `remote.policy_bandwidth`, all in bytes.
+const POLICY_BYTES: f64 = 488_804.0;
+const PUBLISHED: f64 = 150.0;
+const POLICY_BANDWIDTH: f64 = 30e6;
+
+/// Hosts that join one gate, and the actors of each.
+const MANY: (u32, u32) = (32, 32);
+
+/// The first pause of the cable, and by how much each is longer than the one before.
+const OUTAGE: Duration = Duration::from_millis(1_000);
+const LONGER_OUTAGE: Duration = Duration::from_millis(700);
+
+/// How long rows may take to come back.
+const RETURN_TIMEOUT: Duration = Duration::from_secs(60);
+
+/// Shares of the time: each of the rates, the outages, the many hosts, and each rate that the model predicts. A tenth
+/// of each warms up.
+const SHARES: [f64; 4] = [0.2, 0.2, 0.2, 0.15];
+const WARM_UP: f64 = 0.1;
+
+/// The fields of `bench remote --json`.
+#[derive(Serialize)]
+pub(super) struct RemoteFigures {
+    chunk_rows: u32,
+    window_chunks: u32,
+    actors: u32,
+    /// One host with `actors` actors, over the loopback device, without encryption.
+    loopback: LinkFigures,
+    /// The same over a virtual cable, with encryption; `None` where the machine makes no virtual cable.
+    cable: Option<LinkFigures>,
+    /// The same over a cable of 1 Gbit/s.
+    gigabit: Option<LinkFigures>,
+    outages: Option<OutageFigures>,
+    many: ManyFigures,
+    /// What a queueing model predicts, beside measurements.
+    model: Option<ModelFigures>,
+    /// Why there is no virtual cable.
+    #[serde(skip)]
+    no_cable: Option<String>,
+}
+
+/// Actors that fill a chunk in a millisecond, on one host behind a cable of 100 Mbit/s; and what the model expects of
+/// 1,024 on 32 hosts with cables of 1 Gbit/s.
+#[derive(Serialize)]
+struct ModelFigures {
+    rows: Vec<ModelRow>,
+    relay_us: f64,
+    gate_us: f64,
+    intake_us: f64,
+    delay_us: f64,
+    expected_of_many: f64,
+    first_bottleneck: Bottleneck,
+    policy_age: PolicyAge,
+}
+
+#[derive(Serialize)]
+struct ModelRow {
+    actors: u32,
+    rows_per_second: f64,
+    expected: f64,
+}
+
+#[derive(Serialize)]
+struct LinkFigures {
+    rows_per_second: f64,
+    /// Cores that the processes keep busy.
+    gate_cores: f64,
+    relay_cores: f64,
+    learner_cores: f64,
+    #[serde(skip)]
+    rates: IntervalResults,
+}
+
+/// The cable is unplugged and plugged in again.
+#[derive(Serialize)]
+struct OutageFigures {
+    count: usize,
+    /// From plugging in to the next rows in the replay.
+    median_s: f64,
+    longest_s: f64,
+}
+
+/// Many hosts and one gate, over the loopback device.
+#[derive(Serialize)]
+struct ManyFigures {
+    hosts: u32,
+    actors: u32,
+    rows_per_second: f64,
+    /// Rows of the slowest host divided by those of the fastest.
+    fairness: f64,
+    gate_open_files: usize,
+    gate_private_bytes: u64,
+    gate_shared_memory_bytes: u64,
+    /// From `kill -9` of the gate until its successor has brought rows of each host.
+    rejoined_s: f64,
+}
+
+pub(super) fn measure(budget: &TimeBudget) -> anyhow::Result<RemoteFigures> {
+    let [rates, outages, many, modelled] = SHARES.map(|share| budget.length.mul_f64(share));
+    let loopback = over(&Network::Loopback, rates, budget)?;
+    let cables = || -> anyhow::Result<_> {
+        let cable = |limit| Cable::new(limit).map(Network::Cable);
+        Ok([cable(None)?, cable(Some(GIGABIT))?, cable(Some(SLOW))?])
+    };
+    let mut figures = RemoteFigures {
+        chunk_rows: CHUNK_ROWS,
+        window_chunks: WINDOW,
+        actors: ACTORS,
+        loopback,
+        cable: None,
+        gigabit: None,
+        outages: None,
+        many: join_many(many, budget)?,
+        model: None,
+        no_cable: None,
+    };
+    match cables() {
+        Ok([unlimited, gigabit, slow]) => {
+            let cable = over(&unlimited, rates, budget)?;
+            figures.gigabit = Some(over(&gigabit, rates, budget)?);
+            figures.outages = Some(interrupt(&unlimited, outages, budget)?);
+            figures.model = Some(predict(&cable, &slow, modelled, budget)?);
+            figures.cable = Some(cable);
+        }
+        Err(why) => figures.no_cable = Some(format!("{why:#}")),
+    }
+    Ok(figures)
+}
+
+/// A run whose learner makes no gradient steps.
+fn temporary_run(actors: u32, window: u32) -> anyhow::Result<TemporaryRun> {
+    let (most, window) = (format!("actors.max={actors}"), format!("actors.window={window}"));
+    TemporaryRun::of(
+        // All actors are of other hosts, but a run has one of its own.
+        1,
+        1,
+        &[
+            &format!("actors.chunk_steps={CHUNK_ROWS}"),
+            &window,
+            &most,
+            "replay.updates_per_step=0",
+            "run.steps=1_000_000_000_000",
+            // Writing a checkpoint to disk would disturb the measurement.
+            "checkpoint.every_seconds=86_400",
+        ],
+    )
+}
+
+/// The rate of one host.
+fn over(network: &Network, length: Duration, budget: &TimeBudget) -> anyhow::Result<LinkFigures> {
+    let temporary = temporary_run(ACTORS, WINDOW)?;
+    RemoteRun::with(&temporary, network, (1, ACTORS), budget, |run| {
+        run.send_for(length.mul_f64(WARM_UP))?;
+        let observed = [run.gate(), run.relay(), run.learner()];
+        let busy = || -> anyhow::Result<_> { observed.into_iter().map(processes::busy).collect() };
+        let before: Vec<Duration> = busy()?;
+        let begun = Instant::now();
+        let mut rates = IntervalResults::default();
+        for _ in 0..intervals::count(length, 1.0 - WARM_UP, INTERVAL) {
+            let (then, rows) = (Instant::now(), run.rows());
+            run.send_for(INTERVAL)?;
+            rates.add((run.rows() - rows) as f64 / then.elapsed().as_secs_f64());
+        }
+        let elapsed = begun.elapsed().as_secs_f64();
+        let after: Vec<Duration> = busy()?;
+        let cores = |i: usize| after[i].saturating_sub(before[i]).as_secs_f64() / elapsed;
+        Ok(LinkFigures {
+            rows_per_second: rates.median(),
+            gate_cores: cores(0),
+            relay_cores: cores(1),
+            learner_cores: cores(2),
+            rates,
+        })
+    })
+}
+
+/// Unplugs the cable several times, each time for longer.
+fn interrupt(network: &Network, length: Duration, budget: &TimeBudget) -> anyhow::Result<OutageFigures> {
+    let Network::Cable(cable) = network else {
+        anyhow::bail!("only a cable can be unplugged");
+    };
+    let temporary = temporary_run(ACTORS, WINDOW)?;
+    RemoteRun::with(&temporary, network, (1, ACTORS), budget, |run| {
+        let mut returned = IntervalResults::default();
+        // Nine for the default length.
+        for i in 0..intervals::count(length, 1.0, Duration::from_secs_f64(0.13)) as u32 {
+            run.send_for(INTERVAL)?;
+            cable.set_plugged(false)?;
+            run.send_for(OUTAGE + LONGER_OUTAGE * i)?;
+            // Nothing is under way between relay and replay any more.
+            let before = run.rows();
+            cable.set_plugged(true)?;
+            let plugged = Instant::now();
+            if !run.send_until(RETURN_TIMEOUT, |run| run.rows() > before)? {
+                anyhow::bail!(
+                    "no rows came within {} s of plugging the cable in",
+                    RETURN_TIMEOUT.as_secs()
+                );
+            }
+            returned.add(plugged.elapsed().as_secs_f64());
+        }
+        Ok(OutageFigures {
+            count: returned.len(),
+            median_s: returned.median(),
+            longest_s: returned.greatest(),
+        })
+    })
+}
+
+/// Compares the model with measurements over a slow cable. The costs of relay, gate and learner are those seen over the
+/// unlimited one.
+fn predict(
+    unlimited: &LinkFigures,
+    slow: &Network,
+    length: Duration,
+    budget: &TimeBudget,
+) -> anyhow::Result<ModelFigures> {
+    let chunks_per_second = unlimited.rows_per_second / f64::from(CHUNK_ROWS);
+    let of_gigabit = f64::from(CHUNK_ROWS) / GIGABIT_ROWS;
+    let mut costs = Costs {
+        think: 0.0,
+        relay: unlimited.relay_cores / chunks_per_second,
+        host_link: of_gigabit * GIGABIT as f64 / SLOW as f64,
+        learner_link: 0.0,
+        gate: unlimited.gate_cores / chunks_per_second,
+        intake: unlimited.learner_cores / chunks_per_second,
+        delay: 0.0,
+        window: 1,
+    };
+    // A single chunk under way waits for nothing but the delay.
+    let alone = paced(slow, 1, 1, Duration::ZERO, length, budget)?;
+    costs.delay = (1.0 / alone - 1.0 / costs.throughput(1, 1)).max(0.0);
+    (costs.think, costs.window) = (THINK.as_secs_f64(), DEFAULT_WINDOW);
+    let row = |actors: u32| -> anyhow::Result<ModelRow> {
+        let measured = paced(slow, actors, DEFAULT_WINDOW, THINK, length, budget)?;
+        Ok(ModelRow {
+            actors,
+            rows_per_second: measured * f64::from(CHUNK_ROWS),
+            expected: costs.throughput(1, actors) * f64::from(CHUNK_ROWS),
+        })
+    };
+    let rows = COUNTS.into_iter().map(row).collect::<anyhow::Result<_>>()?;
+    let (hosts, actors) = MANY;
+    let many = Costs {
+        host_link: of_gigabit,
+        learner_link: of_gigabit,
+        ..costs
+    };
+    Ok(ModelFigures {
+        rows,
+        relay_us: costs.relay * 1e6,
+        gate_us: costs.gate * 1e6,
+        intake_us: costs.intake * 1e6,
+        delay_us: costs.delay * 1e6,
+        expected_of_many: many.throughput(hosts, actors) * f64::from(CHUNK_ROWS),
+        first_bottleneck: many.first_bottleneck(hosts),
+        policy_age: policy_age(
+            POLICY_BYTES,
+            hosts,
+            PUBLISHED,
+            POLICY_BANDWIDTH,
+            GIGABIT as f64 / 8.0,
+            costs.delay,
+        ),
+    })
+}
+
+/// Chunks a second of a host's actors, each of which needs `think` to fill one.
+fn paced(
+    network: &Network,
+    actors: u32,
+    window: u32,
+    think: Duration,
+    length: Duration,
+    budget: &TimeBudget,
+) -> anyhow::Result<f64> {
+    let temporary = temporary_run(actors, window)?;
+    RemoteRun::with(&temporary, network, (1, actors), budget, |run| {
+        run.set_pace(think);
+        run.send_for(length.mul_f64(WARM_UP))?;
+        let (begun, rows) = (Instant::now(), run.rows());
+        run.send_for(length.mul_f64(1.0 - WARM_UP))?;
+        Ok((run.rows() - rows) as f64 / f64::from(CHUNK_ROWS) / begun.elapsed().as_secs_f64())
+    })
+}
+
+/// Many hosts at one gate, which is killed once.
+fn join_many(length: Duration, budget: &TimeBudget) -> anyhow::Result<ManyFigures> {
+    let (hosts, actors) = MANY;
+    let temporary = temporary_run(hosts * actors, DEFAULT_WINDOW)?;
+    RemoteRun::with(&temporary, &Network::Loopback, MANY, budget, |run| {
+        run.send_for(length.mul_f64(WARM_UP))?;
+        let (begun, before) = (Instant::now(), run.rows_of_hosts());
+        run.send_for(length.mul_f64(1.0 - WARM_UP))?;
+        let (elapsed, after) = (begun.elapsed().as_secs_f64(), run.rows_of_hosts());
+        let of_hosts: Vec<u64> = after
+            .iter()
+            .zip(&before)
+            .map(|(after, before)| after - before)
+            .collect();
+        let [least, most] = [of_hosts.iter().min(), of_hosts.iter().max()].map(|rows| rows.copied().unwrap_or(0));
+        let gate = run.gate();
+        let memory = Memory::of(gate, &temporary.run.replay_file())?;
+        let gate_open_files = processes::open_files(gate)?;
+        let killed = Instant::now();
+        run.replace_gate()?;
+        let before = run.rows_of_hosts();
+        let all = |run: &RemoteRun<'_>| {
+            run.rows_of_hosts()
+                .iter()
+                .zip(&before)
+                .all(|(after, before)| after > before)
+        };
+        if !run.send_until(RETURN_TIMEOUT, all)? {
+            anyhow::bail!(
+                "not all hosts came back within {} s of the gate's death",
+                RETURN_TIMEOUT.as_secs()
+            );
+        }
+        Ok(ManyFigures {
+            hosts,
+            actors: hosts * actors,
+            rows_per_second: of_hosts.iter().sum::<u64>() as f64 / elapsed,
+            fairness: least as f64 / most.max(1) as f64,
+            gate_open_files,
+            gate_private_bytes: memory.private_bytes,
+            gate_shared_memory_bytes: memory.shared_memory_bytes,
+            rejoined_s: killed.elapsed().as_secs_f64(),
+        })
+    })
+}
+
+impl ModelFigures {
+    fn show_rows(&self) -> String {
+        let one = |row: &ModelRow| {
+            let ModelRow {
+                actors,
+                rows_per_second,
+                expected,
+            } = row;
+            format!("{actors}: {:.0} ({:.0})", rows_per_second / 1e3, expected / 1e3)
+        };
+        let rows: Vec<String> = self.rows.iter().map(one).collect();
+        format!("{} thousand rows a second", rows.join(", "))
+    }
+
+    fn show_many(&self) -> String {
+        let Bottleneck { station, actors } = self.first_bottleneck;
+        let PolicyAge {
+            policies_per_second,
+            mean_age_s,
+        } = self.policy_age;
+        format!(
+            "{:.1} million rows a second; first limit {station}, by {actors:.0} actors; each host gets {policies_per_second:.1} \
+             policies a second, {mean_age_s:.2} s old",
+            self.expected_of_many / 1e6
+        )
+    }
+}
+
+impl LinkFigures {
+    fn show(&self) -> String {
+        format!(
+            "{} million rows a second; gate {:.2} cores, relay {:.2}",
+            self.rates.show(1e6, 2),
+            self.gate_cores,
+            self.relay_cores
+        )
+    }
+}
+
+impl Figures for RemoteFigures {
+    fn lines(&self) -> Vec<(&'static str, String)> {
+        let none = || self.no_cable.clone().unwrap_or_default();
+        let link = |link: &Option<LinkFigures>| link.as_ref().map_or_else(none, LinkFigures::show);
+        let many = &self.many;
+        vec![
+            ("one host, loopback, unencrypted", self.loopback.show()),
+            ("one host, virtual cable, encrypted", link(&self.cable)),
+            (
+                "one host, cable of 1 Gbit/s",
+                self.gigabit.as_ref().map_or_else(none, |gigabit| {
+                    let share = gigabit.rows_per_second / GIGABIT_ROWS;
+                    format!("{} ({share:.2} of the cable)", gigabit.show())
+                }),
+            ),
+            (
+                "cable plugged in, to the next rows",
+                self.outages.as_ref().map_or_else(none, |outages| {
+                    let OutageFigures {
+                        count,
+                        median_s,
+                        longest_s,
+                    } = outages;
+                    format!("{median_s:.2} s, at worst {longest_s:.2} (of {count})")
+                }),
+            ),
+            (
+                "many hosts",
+                format!(
+                    "{} with {} actors: {:.2} million rows a second, the slowest has {:.2} of the fastest",
+                    many.hosts,
+                    many.actors,
+                    many.rows_per_second / 1e6,
+                    many.fairness
+                ),
+            ),
+            (
+                "their gate",
+                format!(
+                    "{} open files, {:.1} MB private, {:.1} MB of shared memory; killed, rows of all hosts again after {:.2} s",
+                    many.gate_open_files,
+                    many.gate_private_bytes as f64 / 1e6,
+                    many.gate_shared_memory_bytes as f64 / 1e6,
+                    many.rejoined_s
+                ),
+            ),
+            (
+                "actors over 100 Mbit/s (expected)",
+                self.model.as_ref().map_or_else(none, ModelFigures::show_rows),
+            ),
+            (
+                "expected of many over 1 Gbit/s",
+                self.model.as_ref().map_or_else(none, ModelFigures::show_many),
+            ),
+            (
+                "chunks",
+                format!(
+                    "{} rows, {} chunks in the window of each of {} actors (of the many: 8)",
+                    self.chunk_rows, self.window_chunks, self.actors
+                ),
+            ),
+        ]
+    }
+}
