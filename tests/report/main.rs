@@ -422,7 +422,7 @@ fn check_player(browser: &mut Browser, run: &str) {
     browser.click(".player input[type=range]", 0.5);
     let middle = frame(browser);
     assert!(middle > 0, "{run}: the slider was moved");
-    // Several positions, because the lake's walker is back at its start half-way.
+    // Several positions, because the lake's agent is back at its start half-way.
     let mut places = vec![start, moving_part(browser)];
     browser.value("document.querySelector('.player').focus()");
     browser.key("Home");

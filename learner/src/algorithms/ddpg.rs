@@ -11,7 +11,7 @@ use shoal_common::network::{ActionRange, NetworkLayout};
 use shoal_common::policy::PolicyError;
 use shoal_common::space::EnvironmentSpec;
 
-use super::algorithm::{Algorithm, AlgorithmFactory, Losses, RunSizes, StateArray, StateArrayMut};
+use super::algorithm::{Algorithm, AlgorithmDefinition, Losses, RunSizes, StateArray, StateArrayMut};
 use super::minibatch::Minibatch;
 use super::minibatch_algorithm::{MinibatchAlgorithm, MinibatchLearner, mean, targets};
 use crate::networks::digest::sha256;
@@ -240,7 +240,7 @@ impl MinibatchLearner for Ddpg {
     }
 }
 
-impl AlgorithmFactory for &config::DdpgConfig {
+impl AlgorithmDefinition for &config::DdpgConfig {
     fn create(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
         let ddpg = Ddpg::new(&config.spec, self, config.run.seed)?;
         Ok(Box::new(MinibatchAlgorithm::new(ddpg, config)?))

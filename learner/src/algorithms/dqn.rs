@@ -8,7 +8,7 @@ use shoal_common::config::{self, Config};
 use shoal_common::policy::{self, PolicyError, argmax};
 use shoal_common::space::EnvironmentSpec;
 
-use super::algorithm::{Algorithm, AlgorithmFactory, Losses, RunSizes, StateArray, StateArrayMut};
+use super::algorithm::{Algorithm, AlgorithmDefinition, Losses, RunSizes, StateArray, StateArrayMut};
 use super::minibatch::Minibatch;
 use super::minibatch_algorithm::{MinibatchAlgorithm, MinibatchLearner, targets};
 use crate::networks::initialise::fan_in;
@@ -194,7 +194,7 @@ impl MinibatchLearner for Dqn {
     }
 }
 
-impl AlgorithmFactory for &config::DqnConfig {
+impl AlgorithmDefinition for &config::DqnConfig {
     fn create(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
         let dqn = Dqn::new(&config.spec, self, config.run.seed)?;
         Ok(Box::new(MinibatchAlgorithm::new(dqn, config)?))

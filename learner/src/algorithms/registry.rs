@@ -3,13 +3,13 @@
 use shoal_common::config::{self, Config};
 use shoal_common::policy::PolicyError;
 
-use super::algorithm::{Algorithm, AlgorithmFactory, RunSizes, SavedState, StateArrayError};
+use super::algorithm::{Algorithm, AlgorithmDefinition, RunSizes, SavedState, StateArrayError};
 use super::normaliser::{self, Normaliser};
 use super::tabular;
 use crate::networks::product::Products;
 
-/// The factory for the settings of a configuration.
-fn factory(algorithm: &config::AlgorithmConfig) -> Box<dyn AlgorithmFactory + '_> {
+/// The definition of the algorithm with these settings.
+fn definition(algorithm: &config::AlgorithmConfig) -> Box<dyn AlgorithmDefinition + '_> {
     match algorithm {
         config::AlgorithmConfig::Ddpg(settings) => Box::new(settings),
         config::AlgorithmConfig::Td3(settings) => Box::new(settings),
@@ -26,13 +26,13 @@ fn factory(algorithm: &config::AlgorithmConfig) -> Box<dyn AlgorithmFactory + '_
 /// # Errors
 /// When the algorithm cannot control the environment.
 pub fn new(config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
-    factory(&config.algorithm).create(config)
+    definition(&config.algorithm).create(config)
 }
 
 /// Names of the arrays of a checkpoint that hold what was learned, as opposed to the state of the optimiser.
 pub fn weights(config: &Config) -> Vec<&'static str> {
     let statistics = config.observation.normalise.then_some(Normaliser::ARRAY);
-    let learned = factory(&config.algorithm).weights().iter().copied();
+    let learned = definition(&config.algorithm).weights().iter().copied();
     learned.chain(statistics).collect()
 }
 
@@ -63,7 +63,7 @@ pub fn inherited(
 /// The matrix products of one or a few updates of that learner; none if its algorithm has no networks, or if its
 /// updates have no fixed size.
 pub fn products(config: &Config) -> Products {
-    factory(&config.algorithm).products(&config.spec)
+    definition(&config.algorithm).products(&config.spec)
 }
 
 /// The total length of that learner's state, computed without creating the learner.
@@ -73,7 +73,7 @@ pub fn state_numbers(config: &Config) -> usize {
     } else {
         0
     };
-    factory(&config.algorithm).state_numbers(&config.spec, RunSizes::from(config)) + statistics
+    definition(&config.algorithm).state_numbers(&config.spec, RunSizes::from(config)) + statistics
 }
 
 #[cfg(test)]

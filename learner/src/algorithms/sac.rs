@@ -17,7 +17,7 @@ use shoal_common::policy::PolicyError;
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::stream::{Purpose, Stream, seek, stream};
 
-use super::algorithm::{Algorithm, AlgorithmFactory, Losses, RunSizes, StateArray, StateArrayMut};
+use super::algorithm::{Algorithm, AlgorithmDefinition, Losses, RunSizes, StateArray, StateArrayMut};
 use super::minibatch::Minibatch;
 use super::minibatch_algorithm::{MinibatchAlgorithm, MinibatchLearner, mean};
 use super::twin_critics::{self, CriticLosses, CriticPart, TwinCritics};
@@ -382,7 +382,7 @@ fn names() -> impl Iterator<Item = &'static str> {
     ACTOR.into_iter().chain(critics).chain(TEMPERATURE)
 }
 
-impl AlgorithmFactory for &config::SacConfig {
+impl AlgorithmDefinition for &config::SacConfig {
     fn create(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
         let sac = Sac::new(&config.spec, self, config.run.seed)?;
         Ok(Box::new(MinibatchAlgorithm::new(sac, config)?))

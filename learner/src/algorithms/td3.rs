@@ -13,7 +13,7 @@ use shoal_common::policy::PolicyError;
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::stream::{Purpose, Stream, seek, stream};
 
-use super::algorithm::{Algorithm, AlgorithmFactory, Losses, RunSizes, StateArray, StateArrayMut};
+use super::algorithm::{Algorithm, AlgorithmDefinition, Losses, RunSizes, StateArray, StateArrayMut};
 use super::minibatch::Minibatch;
 use super::minibatch_algorithm::{MinibatchAlgorithm, MinibatchLearner, mean};
 use super::twin_critics::{self, CriticLosses, CriticPart, TwinCritics};
@@ -216,7 +216,7 @@ impl MinibatchLearner for Td3 {
     }
 }
 
-impl AlgorithmFactory for &config::Td3Config {
+impl AlgorithmDefinition for &config::Td3Config {
     fn create(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
         let td3 = Td3::new(&config.spec, self, config.run.seed)?;
         Ok(Box::new(MinibatchAlgorithm::new(td3, config)?))
