@@ -2,13 +2,13 @@
 
 mod child;
 mod cleaner;
-mod hosts;
 mod incarnations;
 #[cfg_attr(
     not(feature = "remote"),
     expect(dead_code, reason = "only `join` uses it, which is not built")
 )]
 pub(crate) mod joined;
+mod joined_hosts;
 mod log;
 mod process;
 mod progress;
@@ -40,7 +40,7 @@ use self::log::Log;
 pub(crate) use self::log::{ALL_ENDED, FAILED, note};
 use self::progress::ProgressLine;
 use self::stall::StallDetector;
-use self::supervisor::{HostRoles, Supervisor};
+use self::supervisor::{SupervisedHost, Supervisor};
 
 /// How often the launcher reads reports and checks its children if nothing wakes it. Ticks start short and become
 /// longer while reports arrive slowly: a full buffer loses its oldest reports.
@@ -225,7 +225,7 @@ impl<'a> Launcher<'a> {
         let initial = status::saved_status(&config, run)?;
         RunOutcome::new(RunState::Running, initial.env_steps, initial.episodes).write(run)?;
         // Creates the services that are opened below.
-        let supervisor = Supervisor::new(&config, run, domain, log.clone(), HostRoles::LearnerHost { gate })?;
+        let supervisor = Supervisor::new(&config, run, domain, log.clone(), SupervisedHost::OfLearner { gate })?;
         Ok(Self {
             control: ControlPort::open(domain)?,
             initial,
@@ -417,7 +417,7 @@ impl<'a> Launcher<'a> {
                         Ok(Some(ControlResponse::Refused("the run is ending".into())))
                     }
                     ControlRequest::Admit(request) => supervisor.admit(domain, request).map(Some),
-                    ControlRequest::Hosts(statuses) => Ok(Some(supervisor.update_hosts(statuses))),
+                    ControlRequest::Hosts(statuses) => Ok(Some(supervisor.update_joined_hosts(statuses))),
                     ControlRequest::Replace { .. } => {
                         Ok(Some(ControlResponse::Refused("this is the learner's host".into())))
                     }
@@ -491,7 +491,7 @@ impl<'a> Launcher<'a> {
         for incident in self.supervisor.take_incidents() {
             self.recorder.incident(&incident, wall)?;
         }
-        self.recorder.hosts(&self.supervisor.hosts(), wall)?;
+        self.recorder.hosts(&self.supervisor.joined_hosts(), wall)?;
         self.supervisor.check_faults()?;
         let fills = [
             each(&self.episode_reports, |report| {

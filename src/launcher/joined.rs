@@ -1,4 +1,4 @@
-//! The launcher of a host that has joined a run: starts a relay, actors and environment servers, and watches them.
+//! The launcher of a joined host: starts a relay, actors and environment servers, and watches them.
 
 use std::os::fd::AsFd;
 use std::time::{Duration, Instant};
@@ -17,7 +17,7 @@ use shoal_run::signals::{self, Signals};
 
 use super::log::Log;
 use super::stall::StallDetector;
-use super::supervisor::{HostRoles, RunCondition, Supervisor};
+use super::supervisor::{RunCondition, SupervisedHost, Supervisor};
 use super::{OTHERS_END, write_iox_config};
 
 /// How often heartbeats are read if nothing wakes the launcher.
@@ -50,8 +50,8 @@ pub(crate) fn run(
     Domain::remove_abandoned()?;
     let domain = Domain::join(&config.run.id, config.actors.max)?;
     let ending = preflight::reserve_for_host(&config, &domain)
-        .and_then(|()| Host::new(config, (run, lock), &domain, signals, actors))
-        .and_then(|host| host.run(give_up));
+        .and_then(|()| JoinedLauncher::new(config, (run, lock), &domain, signals, actors))
+        .and_then(|launcher| launcher.run(give_up));
     // Also after an error: no role is left by now.
     let left = domain.leave();
     let ending = ending?;
@@ -59,7 +59,7 @@ pub(crate) fn run(
     Ok(ending)
 }
 
-struct Host<'a> {
+struct JoinedLauncher<'a> {
     config: Config,
     run: &'a RunDir,
     lock: &'a RunLock,
@@ -75,7 +75,7 @@ struct Host<'a> {
     cut_off_since: Option<Instant>,
 }
 
-impl<'a> Host<'a> {
+impl<'a> JoinedLauncher<'a> {
     fn new(
         config: Config,
         (run, lock): (&'a RunDir, &'a RunLock),
@@ -86,11 +86,11 @@ impl<'a> Host<'a> {
         let log = Log::open(&run.log())?;
         write_iox_config(domain, run)?;
         // Creates the services that are opened below.
-        let supervisor = Supervisor::new(&config, run, domain, log.clone(), HostRoles::RemoteHost { actors })?;
+        let supervisor = Supervisor::new(&config, run, domain, log.clone(), SupervisedHost::Joined { actors })?;
         Ok(Self {
             control: ControlPort::open(domain)?,
             heartbeats: Reports::open(domain)?,
-            stalls: StallDetector::of_remote_host(Duration::from_secs(config.run.stall_seconds)),
+            stalls: StallDetector::of_joined_host(Duration::from_secs(config.run.stall_seconds)),
             supervisor,
             run,
             lock,
@@ -201,7 +201,7 @@ impl<'a> Host<'a> {
                     Some(ControlResponse::Accepted)
                 }
                 ControlRequest::Scale { .. } | ControlRequest::Admit(_) | ControlRequest::Hosts(_) => {
-                    let why = "this is a host that has joined a run: ask on the learner's host";
+                    let why = "this is a joined host: ask on the learner's host";
                     Some(ControlResponse::Refused(why.into()))
                 }
             })

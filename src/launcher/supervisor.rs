@@ -24,8 +24,8 @@ use tracing_subscriber::filter::LevelFilter;
 use self::faults::Faults;
 use super::child::{Child, RestartDecision};
 use super::cleaner;
-use super::hosts::{Hosts, INCARNATIONS};
 use super::incarnations::{last_committed, read_counter};
+use super::joined_hosts::{INCARNATIONS, JoinedHosts};
 use super::log::{ALL_ENDED, Log};
 use super::process::{Process, name};
 use super::stall::StallDetector;
@@ -59,16 +59,16 @@ pub(super) enum RunCondition {
     FilesRemoved,
 }
 
-/// Which processes there are.
+/// The host whose processes are supervised, and with it which processes there are.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) enum HostRoles {
-    /// Those of the learner's host, with a gate if other hosts may join.
-    LearnerHost {
+pub(super) enum SupervisedHost {
+    /// The learner's host, with a gate if other hosts may join.
+    OfLearner {
         /// Whether there is a gate.
         gate: bool,
     },
-    /// Those of another host: a relay, and these actors with their environment servers.
-    RemoteHost {
+    /// A joined host: a relay, and these actors with their environment servers.
+    Joined {
         /// The actors.
         actors: Vec<u32>,
     },
@@ -92,7 +92,7 @@ pub(super) struct Supervisor {
     max_actors: u32,
     /// The number of actors of a lockstep run, on all hosts together. It never changes.
     lockstep_actors: Option<u32>,
-    hosts: Hosts,
+    joined_hosts: JoinedHosts,
     log: Log,
     /// Incidents since the last [`Supervisor::take_incidents`].
     incidents: Vec<Incident>,
@@ -119,7 +119,7 @@ impl Supervisor {
         run: &RunDir,
         domain: &Domain,
         log: Log,
-        roles: HostRoles,
+        host: SupervisedHost,
     ) -> anyhow::Result<Self> {
         let counter = run.incarnations();
         let mut started = read_counter(&counter)?;
@@ -137,8 +137,8 @@ impl Supervisor {
         let server = config.evaluation_server();
         let lockstep = config.run.mode == Mode::Lockstep;
         let mut lockstep_actors = None;
-        let (children, actors) = match roles {
-            HostRoles::LearnerHost { gate } => {
+        let (children, actors) = match host {
+            SupervisedHost::OfLearner { gate } => {
                 services.create_environment(domain, server)?;
                 let mut children = vec![
                     Child::new(Role::Learner, 0),
@@ -149,7 +149,7 @@ impl Supervisor {
                 lockstep_actors = lockstep.then_some(config.actors.count);
                 (children, (0..config.actors.count).collect())
             }
-            HostRoles::RemoteHost { actors } => (vec![Child::new(Role::Relay, 0)], actors),
+            SupervisedHost::Joined { actors } => (vec![Child::new(Role::Relay, 0)], actors),
         };
         Ok(Self {
             children,
@@ -159,7 +159,7 @@ impl Supervisor {
             occupied_since: None,
             cleanup_time: Duration::ZERO,
             actors,
-            hosts: Hosts::new(started, Duration::from_secs_f64(config.remote.lost_seconds)),
+            joined_hosts: JoinedHosts::new(started, Duration::from_secs_f64(config.remote.lost_seconds)),
             max_actors: config.actors.max,
             lockstep_actors,
             log,
@@ -223,7 +223,7 @@ impl Supervisor {
 
     /// Indices that neither this host nor another has.
     fn free_actors(&self) -> impl Iterator<Item = u32> {
-        (0..self.max_actors).filter(|index| !self.actors.contains(index) && !self.hosts.has(*index))
+        (0..self.max_actors).filter(|index| !self.actors.contains(index) && !self.joined_hosts.has(*index))
     }
 
     /// Kills an actor of this incarnation or an earlier one, so that it is started again.
@@ -293,7 +293,7 @@ impl Supervisor {
     /// # Errors
     /// When it cannot be started.
     pub(super) fn ensure_gate(&mut self) -> anyhow::Result<()> {
-        if self.hosts.leases().is_empty() {
+        if self.joined_hosts.leases().is_empty() {
             return Ok(());
         }
         self.reap(|role| role == Role::Gate);

@@ -32,7 +32,8 @@ pub trait AlgorithmDefinition {
     fn state_numbers(&self, spec: &EnvironmentSpec, sizes: RunSizes) -> usize;
 }
 
-/// An algorithm that is learning: its updates from rows of the replay, its policy for the actors, and its state for checkpoints.
+/// An algorithm that is learning: its updates from rows of the replay, its policy for the actors, and its state for
+/// checkpoints.
 pub trait Algorithm {
     /// The policy's parameters.
     fn policy(&self) -> Cow<'_, [f32]>;

@@ -21,7 +21,7 @@ fn definition(algorithm: &config::AlgorithmConfig) -> Box<dyn AlgorithmDefinitio
     }
 }
 
-/// The learner of a configuration, before its first update.
+/// The algorithm of a configuration, before its first update.
 ///
 /// # Errors
 /// When the algorithm cannot control the environment.
@@ -36,7 +36,7 @@ pub fn weights(config: &Config) -> Vec<&'static str> {
     learned.chain(statistics).collect()
 }
 
-/// The state of a learner that is `fresh`, except that it has the arrays `weights` of another one's state `saved`. The
+/// The state of the algorithm `fresh`, except that the arrays `weights` are those of another one's state `saved`. The
 /// optimisers begin anew. `rows` rows of its own replay are part of the statistics of observations already.
 ///
 /// # Errors
@@ -60,13 +60,13 @@ pub fn inherited(
     fresh.state().into_iter().map(array).collect()
 }
 
-/// The matrix products of one or a few updates of that learner; none if its algorithm has no networks, or if its
-/// updates have no fixed size.
+/// The matrix products of one or a few updates of that algorithm; none if it has no networks, or if its updates
+/// have no fixed size.
 pub fn products(config: &Config) -> Products {
     definition(&config.algorithm).products(&config.spec)
 }
 
-/// The total length of that learner's state, computed without creating the learner.
+/// The total length of that algorithm's state, computed without creating the algorithm.
 pub fn state_numbers(config: &Config) -> usize {
     let statistics = if config.observation.normalise {
         Normaliser::state_numbers(config.spec.observation.width())
@@ -127,8 +127,8 @@ mod tests {
         ] {
             let config = config(&format!("{rest}\nobservation.{observation}\naction.{action}\n"));
             tested.push(config.algorithm.name());
-            let learner = new(&config).unwrap();
-            let state = learner.state();
+            let algorithm = new(&config).unwrap();
+            let state = algorithm.state();
             let numbers: usize = state.iter().map(|(_, numbers)| numbers.len()).sum();
             assert_eq!(state_numbers(&config), numbers, "{rest}");
             let named = |name: &&str| state.iter().any(|(array, _)| array == name);
@@ -138,12 +138,12 @@ mod tests {
                 rest.contains("normalise = true"),
                 "{rest}"
             );
-            // A learner inherits its weights, and nothing of the optimiser.
+            // An algorithm inherits its weights, and nothing of the optimiser.
             let other: Vec<(String, Vec<f32>)> = state
                 .iter()
                 .map(|(name, numbers)| ((*name).to_owned(), vec![0.5; numbers.len()]))
                 .collect();
-            let begun = inherited(&*learner, &weights, SavedState::from(other), 3).unwrap();
+            let begun = inherited(&*algorithm, &weights, SavedState::from(other), 3).unwrap();
             for ((name, numbers), (_, fresh)) in begun.iter().zip(&state) {
                 match *name {
                     name if weights.contains(&name) && name != Normaliser::ARRAY => {
@@ -153,7 +153,7 @@ mod tests {
                     name => assert_eq!(numbers, fresh, "{name}"),
                 }
             }
-            // Only some learners have a baseline.
+            // Only some algorithms have a baseline.
             assert!(weights.iter().filter(|name| **name != "baseline").all(named), "{rest}");
         }
         for algorithm in config::AlgorithmConfig::all() {

@@ -72,7 +72,7 @@ impl TrainableNetworkWithPass {
     }
 }
 
-/// The learner of REINFORCE.
+/// The state of REINFORCE.
 #[derive(Clone, Debug)]
 pub struct Reinforce {
     settings: config::ReinforceConfig,
@@ -187,7 +187,7 @@ impl Reinforce {
         episode
             .last()
             .is_some_and(|end| end.last && (self.settings.learn_at_limit || end.discount == 0.0))
-            // Learners of earlier versions did not check their rows.
+            // Earlier versions did not check their rows.
             && episode.iter().all(is_finite)
     }
 

@@ -242,7 +242,7 @@ impl Algorithm for Tabular {
         let slot = self.slot(row);
         let numbers = replay.row(row);
         if !are_finite(numbers) {
-            // From a learner of an earlier version, which did not check its rows. The step before has lost its
+            // From an earlier version, which did not check its rows. The step before has lost its
             // successor.
             self.take_pending(slot);
             return Losses::default();
