@@ -6,12 +6,12 @@ use toml::{Table, Value};
 
 use crate::usage::UsageError;
 
-/// Settings for single Gymnasium environments, `[ID.METHOD]`, which replace the algorithm's defaults; and in `[ID]`,
+/// Settings for single Gymnasium environments, `[ID.ALGORITHM]`, which replace the algorithm's defaults; and in `[ID]`,
 /// where there is one, the algorithm that suits the environment best.
 const OF_ENVIRONMENTS: &str = include_str!("../../../presets/method/environments.toml");
 
 /// The key of an environment's best algorithm there.
-const METHOD: &str = "method";
+const BEST: &str = "method";
 
 /// The algorithms' names.
 pub fn names() -> impl Iterator<Item = &'static str> {
@@ -73,8 +73,8 @@ pub(crate) fn replace(preset: &mut Table, algorithm: &'static str) -> anyhow::Re
 /// The algorithm that suits the Gymnasium environment `name` best, if its spaces do not tell.
 pub(crate) fn best_for(name: &str) -> anyhow::Result<Option<&'static str>> {
     let of_environments: Table = OF_ENVIRONMENTS.parse()?;
-    let method = of_environments.get(name).and_then(|own| own.get(METHOD)?.as_str());
-    Ok(method.and_then(|method| names().find(|known| *known == method)))
+    let best = of_environments.get(name).and_then(|own| own.get(BEST)?.as_str());
+    Ok(best.and_then(|best| names().find(|known| *known == best)))
 }
 
 /// Adds the defaults of an algorithm, and those for the environment `name`, to a table. Existing settings are kept.
@@ -128,7 +128,7 @@ mod tests {
     }
 
     #[test]
-    fn every_method_has_defaults_that_are_read_and_environments_name_methods() {
+    fn every_algorithm_has_defaults_that_are_read_and_environments_name_algorithms() {
         for name in names() {
             assert!(defaults(name).unwrap().contains_key(name), "{name}");
         }
@@ -140,7 +140,7 @@ mod tests {
         let of_environments: Table = OF_ENVIRONMENTS.parse().unwrap();
         for (environment, algorithms) in of_environments {
             for (algorithm, settings) in algorithms.as_table().unwrap() {
-                if algorithm == METHOD {
+                if algorithm == BEST {
                     let best = best_for(&environment).unwrap();
                     assert!(algorithms.get(best.unwrap()).is_some(), "{environment}: {settings}");
                     continue;

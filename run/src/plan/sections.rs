@@ -110,7 +110,7 @@ mod tests {
     use shoal_common::config::Mode;
 
     #[test]
-    fn a_method_has_its_preset_for_the_task_or_its_own_defaults() {
+    fn an_algorithm_has_its_preset_for_the_task_or_its_own_defaults() {
         let with = |what: &str, algorithm: &str, set: &[&str]| {
             let overrides = RunOverrides {
                 algorithm: (!algorithm.is_empty()).then(|| algorithm.into()),
