@@ -2,6 +2,7 @@
 
 mod child;
 mod cleaner;
+mod end_roles;
 mod incarnations;
 #[cfg_attr(
     not(feature = "remote"),
@@ -16,7 +17,6 @@ mod requests;
 mod stall;
 mod supervisor;
 
-use std::os::fd::AsFd;
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
@@ -28,7 +28,6 @@ use shoal_common::report::{EpisodeReport, EvaluationReport, Heartbeat, LearnerRe
 use shoal_common::role::Role;
 use shoal_common::run_dir::{RunDir, RunLock};
 use shoal_common::stop::GRACE;
-use shoal_run::child_process::wait_for_any;
 use shoal_run::external_environment::server_iceoryx2_config;
 use shoal_run::records::outcome::{RunOutcome, RunState, STARTING};
 use shoal_run::records::recorder::Recorder;
@@ -36,6 +35,7 @@ use shoal_run::signals::Signals;
 use shoal_run::{preflight, signals, status};
 
 pub(crate) use self::cleaner::work as clean_up;
+use self::end_roles::EndRoles;
 use self::log::Log;
 pub(crate) use self::log::{ALL_ENDED, FAILED, note};
 use self::progress::ProgressLine;
@@ -346,9 +346,7 @@ impl<'a> Launcher<'a> {
                 self.log.note("launcher", &stalled);
                 self.progress.print(&stalled);
             }
-            let start_limit =
-                (!self.config.environment.server.is_empty()).then(|| self.config.environment.start_limit());
-            for slow in self.supervisor.report_slow(&self.stalls, start_limit) {
+            for slow in self.supervisor.report_slow(&self.stalls) {
                 self.log.note("launcher", &slow);
                 self.progress.print(&slow);
             }
@@ -370,19 +368,82 @@ impl<'a> Launcher<'a> {
         RunEnd::Renewed
     }
 
-    /// Sleeps at most `most`, until a process ends, a signal arrives or a request comes.
-    fn sleep(&mut self, most: Duration) {
-        let mut wakers: Vec<_> = self.supervisor.exit_descriptors().collect();
-        wakers.extend([self.signals.as_fd(), self.control.as_fd()]);
-        if wait_for_any(&wakers, most) {
-            self.tick = SHORTEST_TICK;
+    /// Waits for the report on the last period's policy.
+    fn await_last_evaluation(&mut self) -> anyhow::Result<()> {
+        let last = status::saved_status(&self.config, self.run)?.env_steps;
+        let patience = Instant::now();
+        while patience.elapsed() < LAST_EVALUATION_REPORT && self.signals.received().is_none() {
+            self.read_reports()?;
+            self.answer_requests()?;
+            let period = |steps| self.config.evaluation.period(steps);
+            if self.recorder.evaluated().map(period) >= Some(period(last)) {
+                break;
+            }
+            self.sleep(SHORTEST_TICK);
         }
-        // So that the same events do not wake it again.
-        self.signals.received();
-        self.supervisor.collect_exits();
+        Ok(())
     }
 
-    /// Answers requests from other terminals. A request to stop is answered when the run has ended.
+    /// Ends all roles, the actors first, so that the learner still receives what they send. Other hosts are told that
+    /// the run is over, or, if it may continue, nothing: then they wait for it.
+    fn end_all(&mut self, is_over: bool) -> anyhow::Result<()> {
+        self.ending = true;
+        self.end(|role| role == Role::Actor, ACTORS_END);
+        if is_over {
+            // They hand over what they have while the learner is still there. A gate that has just died must tell them too.
+            self.supervisor.ensure_gate()?;
+            self.supervisor.ask_to_retire(Role::Gate);
+            self.await_end(|role| role == Role::Gate, GATE_END);
+        }
+        self.end(|_| true, OTHERS_END);
+        self.read_reports()?;
+        self.supervisor.check_saved()
+    }
+
+    fn end(&mut self, which: impl Fn(Role) -> bool + Copy, patience: Duration) {
+        self.supervisor.ask_to_end(which);
+        self.await_end(which, patience);
+    }
+
+    fn read_reports(&mut self) -> anyhow::Result<()> {
+        let wall = self.started_at.elapsed();
+        while let Some(heartbeat) = self.heartbeats.receive()? {
+            self.supervisor.record(&heartbeat);
+        }
+        for incident in self.supervisor.take_incidents() {
+            self.recorder.incident(&incident, wall)?;
+        }
+        self.recorder.hosts(&self.supervisor.joined_hosts(), wall)?;
+        self.supervisor.check_faults()?;
+        let fills = [
+            each(&self.episode_reports, |report| {
+                Ok(self.recorder.episode(&report, wall)?)
+            })?,
+            each(&self.evaluation_reports, |report| {
+                // A restarted evaluator reports some again.
+                let is_new = self.recorder.evaluated() < Some(report.env_steps);
+                self.progress.set_evaluation(&report, is_new);
+                Ok(self.recorder.evaluation(&report, wall)?)
+            })?,
+            each(&self.learner_reports, |report| {
+                self.progress.add_learner_report(&report, wall);
+                Ok(self.recorder.learner(&report, wall)?)
+            })?,
+        ];
+        self.tick = match fills.into_iter().fold(0.0, f64::max) {
+            0.0..=LOW_FILL => (self.tick * 3 / 2).min(TICK),
+            fill => self.tick.mul_f64(LOW_FILL / fill).max(SHORTEST_TICK),
+        };
+        Ok(())
+    }
+}
+
+impl EndRoles for Launcher<'_> {
+    fn supervisor(&mut self) -> &mut Supervisor {
+        &mut self.supervisor
+    }
+
+    /// A request to stop is answered when the run has ended.
     fn answer_requests(&mut self) -> anyhow::Result<()> {
         let now = self.recorder.moment(self.started_at.elapsed());
         let Self {
@@ -433,86 +494,10 @@ impl<'a> Launcher<'a> {
         )
     }
 
-    /// Waits for the report on the last period's policy.
-    fn await_last_evaluation(&mut self) -> anyhow::Result<()> {
-        let last = status::saved_status(&self.config, self.run)?.env_steps;
-        let patience = Instant::now();
-        while patience.elapsed() < LAST_EVALUATION_REPORT && self.signals.received().is_none() {
-            self.read_reports()?;
-            self.answer_requests()?;
-            let period = |steps| self.config.evaluation.period(steps);
-            if self.recorder.evaluated().map(period) >= Some(period(last)) {
-                break;
-            }
-            self.sleep(SHORTEST_TICK);
+    fn sleep(&mut self, most: Duration) {
+        if self.supervisor.sleep(self.signals, &self.control, most) {
+            self.tick = SHORTEST_TICK;
         }
-        Ok(())
-    }
-
-    /// Ends all roles, the actors first, so that the learner still receives what they send. Other hosts are told that
-    /// the run is over, or, if it may continue, nothing: then they wait for it.
-    fn end_all(&mut self, is_over: bool) -> anyhow::Result<()> {
-        self.ending = true;
-        self.end(|role| role == Role::Actor, ACTORS_END);
-        if is_over {
-            // They hand over what they have while the learner is still there. A gate that has just died must tell them too.
-            self.supervisor.ensure_gate()?;
-            self.supervisor.ask_to_retire(Role::Gate);
-            self.await_end(|role| role == Role::Gate, GATE_END);
-        }
-        self.end(|_| true, OTHERS_END);
-        self.read_reports()?;
-        self.supervisor.check_saved()
-    }
-
-    fn end(&mut self, which: impl Fn(Role) -> bool + Copy, patience: Duration) {
-        self.supervisor.ask_to_end(which);
-        self.await_end(which, patience);
-    }
-
-    /// Waits until processes have ended that were asked to, and kills them after a while.
-    fn await_end(&mut self, which: impl Fn(Role) -> bool + Copy, patience: Duration) {
-        let deadline = Instant::now() + patience;
-        while !self.supervisor.reap(which) {
-            if Instant::now() >= deadline {
-                self.supervisor.kill(which);
-            }
-            // An error here must not prevent the end.
-            let _ = self.answer_requests();
-            self.sleep(deadline.saturating_duration_since(Instant::now()).min(TICK));
-        }
-    }
-
-    fn read_reports(&mut self) -> anyhow::Result<()> {
-        let wall = self.started_at.elapsed();
-        while let Some(heartbeat) = self.heartbeats.receive()? {
-            self.supervisor.record(&heartbeat);
-        }
-        for incident in self.supervisor.take_incidents() {
-            self.recorder.incident(&incident, wall)?;
-        }
-        self.recorder.hosts(&self.supervisor.joined_hosts(), wall)?;
-        self.supervisor.check_faults()?;
-        let fills = [
-            each(&self.episode_reports, |report| {
-                Ok(self.recorder.episode(&report, wall)?)
-            })?,
-            each(&self.evaluation_reports, |report| {
-                // A restarted evaluator reports some again.
-                let is_new = self.recorder.evaluated() < Some(report.env_steps);
-                self.progress.set_evaluation(&report, is_new);
-                Ok(self.recorder.evaluation(&report, wall)?)
-            })?,
-            each(&self.learner_reports, |report| {
-                self.progress.add_learner_report(&report, wall);
-                Ok(self.recorder.learner(&report, wall)?)
-            })?,
-        ];
-        self.tick = match fills.into_iter().fold(0.0, f64::max) {
-            0.0..=LOW_FILL => (self.tick * 3 / 2).min(TICK),
-            fill => self.tick.mul_f64(LOW_FILL / fill).max(SHORTEST_TICK),
-        };
-        Ok(())
     }
 }
 

@@ -1,6 +1,5 @@
 //! The launcher of a joined host: starts a relay, actors and environment servers, and watches them.
 
-use std::os::fd::AsFd;
 use std::time::{Duration, Instant};
 
 use anyhow::bail;
@@ -11,10 +10,10 @@ use shoal_common::config::Config;
 use shoal_common::report::Heartbeat;
 use shoal_common::role::{Activity, Role};
 use shoal_common::run_dir::{RunDir, RunLock};
-use shoal_run::child_process::wait_for_any;
 use shoal_run::preflight;
 use shoal_run::signals::{self, Signals};
 
+use super::end_roles::EndRoles;
 use super::log::Log;
 use super::stall::StallDetector;
 use super::supervisor::{RunCondition, SupervisedHost, Supervisor};
@@ -144,9 +143,7 @@ impl<'a> JoinedLauncher<'a> {
             for stalled in self.supervisor.replace_stalled(&mut self.stalls) {
                 self.log.note("launcher", &stalled);
             }
-            let start_limit =
-                (!self.config.environment.server.is_empty()).then(|| self.config.environment.start_limit());
-            for slow in self.supervisor.report_slow(&self.stalls, start_limit) {
+            for slow in self.supervisor.report_slow(&self.stalls) {
                 self.log.note("launcher", &slow);
             }
             if self.stop_requested {
@@ -173,6 +170,12 @@ impl<'a> JoinedLauncher<'a> {
         // The learner's host keeps the records.
         self.supervisor.take_incidents();
         self.supervisor.check_faults()
+    }
+}
+
+impl EndRoles for JoinedLauncher<'_> {
+    fn supervisor(&mut self) -> &mut Supervisor {
+        &mut self.supervisor
     }
 
     fn answer_requests(&mut self) -> anyhow::Result<()> {
@@ -208,25 +211,7 @@ impl<'a> JoinedLauncher<'a> {
         })
     }
 
-    fn await_end(&mut self, which: impl Fn(Role) -> bool + Copy, patience: Duration) {
-        let deadline = Instant::now() + patience;
-        while !self.supervisor.reap(which) {
-            if Instant::now() >= deadline {
-                self.supervisor.kill(which);
-            }
-            // An error here must not prevent the end.
-            let _ = self.answer_requests();
-            self.sleep(deadline.saturating_duration_since(Instant::now()).min(TICK));
-        }
-    }
-
-    /// Sleeps at most `most`, until a process ends, a signal arrives or a request comes.
     fn sleep(&mut self, most: Duration) {
-        let mut wakers: Vec<_> = self.supervisor.exit_descriptors().collect();
-        wakers.extend([self.signals.as_fd(), self.control.as_fd()]);
-        wait_for_any(&wakers, most);
-        // So that the same events do not wake it again.
-        self.signals.received();
-        self.supervisor.collect_exits();
+        self.supervisor.sleep(self.signals, &self.control, most);
     }
 }

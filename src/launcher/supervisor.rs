@@ -3,22 +3,23 @@
 mod admission;
 mod faults;
 
-use std::os::fd::BorrowedFd;
+use std::os::fd::AsFd;
 use std::os::unix::process::ExitStatusExt;
 use std::path::PathBuf;
 use std::process::ExitStatus;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
-use shoal_common::channel::control::RoleStatus;
+use shoal_common::channel::control::{ControlPort, RoleStatus};
 use shoal_common::channel::{Domain, Services};
 use shoal_common::config::{Config, Mode};
 use shoal_common::durable::write_atomically;
 use shoal_common::report::Heartbeat;
 use shoal_common::role::{Activity, Role, RoleInstance};
 use shoal_common::run_dir::RunDir;
-use shoal_run::child_process::Writer;
+use shoal_run::child_process::{Writer, wait_for_any};
 use shoal_run::records::recorder::{Incident, IncidentKind};
+use shoal_run::signals::Signals;
 use tracing_subscriber::filter::LevelFilter;
 
 use self::faults::Faults;
@@ -100,6 +101,8 @@ pub(super) struct Supervisor {
     /// Whether the output of environment servers is Shoal's own or another program's. With `SHOAL_LOG=debug` all of it
     /// is logged.
     server_output: Writer,
+    /// How long an environment's own program may take to start.
+    server_start_limit: Option<Duration>,
     /// The file with the number of processes ever started. It lasts over resumes: incarnations are never used twice.
     counter: PathBuf,
     processes_started: u64,
@@ -170,6 +173,7 @@ impl Supervisor {
                 _ if config.environment.server.is_empty() => Writer::Shoal,
                 _ => Writer::Program,
             },
+            server_start_limit: (!config.environment.server.is_empty()).then(|| config.environment.start_limit()),
             counter,
             processes_started: started,
             faults: Faults {
@@ -355,11 +359,19 @@ impl Supervisor {
         children.into_iter().map(|child| child.status(newest)).collect()
     }
 
-    /// Descriptors that wake the launcher when a process ends.
-    pub(super) fn exit_descriptors(&self) -> impl Iterator<Item = BorrowedFd<'_>> {
-        self.children
+    /// Sleeps at most `most`, until a process ends, a signal arrives or a request comes. Returns whether one of them
+    /// has happened.
+    pub(super) fn sleep(&mut self, signals: &Signals, control: &ControlPort, most: Duration) -> bool {
+        let exits = self
+            .children
             .iter()
-            .filter_map(|child| child.process.as_ref().and_then(Process::exit_descriptor))
+            .filter_map(|child| child.process.as_ref()?.exit_descriptor());
+        let wakers: Vec<_> = exits.chain([signals.as_fd(), control.as_fd()]).collect();
+        let woken = wait_for_any(&wakers, most);
+        // So that the same events do not wake it again.
+        signals.received();
+        self.collect_exits();
+        woken
     }
 
     /// The time until the next restart or clean-up, unless a process ends earlier.
@@ -376,7 +388,7 @@ impl Supervisor {
 
     /// Collects the exit statuses of ended processes. Their last reports are read before [`maintain`](Self::maintain)
     /// handles the ends.
-    pub(super) fn collect_exits(&mut self) {
+    fn collect_exits(&mut self) {
         for child in self.children.iter_mut().filter(|child| child.ended.is_none()) {
             child.ended = child.process.as_mut().and_then(Process::exit_status);
         }
@@ -503,8 +515,8 @@ impl Supervisor {
     }
 
     /// Messages about slow processes, one for each: environment servers in one step or reset, and roles that are
-    /// starting. An environment's program that is not ready within `start_limit` is ended, which counts as a failure.
-    pub(super) fn report_slow(&mut self, stalls: &StallDetector, start_limit: Option<Duration>) -> Vec<String> {
+    /// starting. An environment's program that is not ready in time is ended, which counts as a failure.
+    pub(super) fn report_slow(&mut self, stalls: &StallDetector) -> Vec<String> {
         let mut said = Vec::new();
         for (i, silent) in stalls.slow_servers(&self.children) {
             let child = &mut self.children[i];
@@ -517,7 +529,9 @@ impl Supervisor {
         }
         for child in &mut self.children {
             let Some(starting) = child.starting_for() else { continue };
-            let limit = start_limit.filter(|_| child.instance.role == Role::EnvServer);
+            let limit = self
+                .server_start_limit
+                .filter(|_| child.instance.role == Role::EnvServer);
             if limit.is_some_and(|limit| starting >= limit) {
                 let text = "is not ready within environment.start_seconds and is ended";
                 self.log.note(&name(child.instance), text);
