@@ -1,7 +1,7 @@
 //! The algorithm that the user asks for, and its defaults.
 
 use anyhow::Context;
-use shoal_common::config::AlgorithmConfig;
+use shoal_common::algorithms::{AlgorithmConfig, AlgorithmProperties};
 use toml::{Table, Value};
 
 use crate::usage::UsageError;
@@ -18,12 +18,19 @@ pub fn names() -> impl Iterator<Item = &'static str> {
     AlgorithmConfig::all().into_iter().map(|algorithm| algorithm.name())
 }
 
+/// The algorithm of this name.
+pub(super) fn of_name(name: &str) -> Option<AlgorithmProperties> {
+    let all = AlgorithmConfig::all().into_iter();
+    all.map(|algorithm| algorithm.properties())
+        .find(|known| known.name == name)
+}
+
 /// The algorithm that the user asks for: by its name, or by a key of its section.
 ///
 /// # Errors
 /// When there is no such algorithm, or two are asked for.
 pub(crate) fn asked_for(algorithm: Option<&str>, set: &[String]) -> anyhow::Result<Option<&'static str>> {
-    let known = |name: &str| names().find(|known| *known == name);
+    let known = |name: &str| of_name(name).map(|algorithm| algorithm.name);
     let by_name = match algorithm {
         None => None,
         Some(name) => Some(known(name).ok_or_else(|| {
@@ -74,7 +81,7 @@ pub(crate) fn replace(preset: &mut Table, algorithm: &'static str) -> anyhow::Re
 pub(crate) fn best_for(name: &str) -> anyhow::Result<Option<&'static str>> {
     let of_environments: Table = OF_ENVIRONMENTS.parse()?;
     let best = of_environments.get(name).and_then(|own| own.get(BEST)?.as_str());
-    Ok(best.and_then(|best| names().find(|known| *known == best)))
+    Ok(best.and_then(of_name).map(|best| best.name))
 }
 
 /// Adds the defaults of an algorithm, and those for the environment `name`, to a table. Existing settings are kept.
@@ -91,10 +98,8 @@ pub(crate) fn add_defaults(table: &mut Table, name: &str, algorithm: &'static st
 }
 
 fn defaults(algorithm: &str) -> anyhow::Result<Table> {
-    let all = AlgorithmConfig::all();
-    let found = all.iter().find(|known| known.name() == algorithm);
-    let found = found.with_context(|| format!("there is no algorithm {algorithm}"))?;
-    Ok(found.properties().defaults.parse()?)
+    let found = of_name(algorithm).with_context(|| format!("there is no algorithm {algorithm}"))?;
+    Ok(found.defaults.parse()?)
 }
 
 /// Adds the keys of `defaults` that the table does not have.
@@ -145,7 +150,7 @@ mod tests {
                     assert!(algorithms.get(best.unwrap()).is_some(), "{environment}: {settings}");
                     continue;
                 }
-                assert!(names().any(|name| name == algorithm), "{environment}: {algorithm}");
+                assert!(of_name(algorithm).is_some(), "{environment}: {algorithm}");
                 for (section, values) in settings.as_table().unwrap() {
                     for key in values.as_table().unwrap().keys() {
                         assert!(is_key(section, key), "{environment}.{algorithm}: {section}.{key}");

@@ -31,7 +31,7 @@ pub(super) fn sections_for_algorithm(
     if let Some(own) = with_algorithm(what, algorithm) {
         (name, table, sources) = sections(own)?;
     }
-    let named = AlgorithmConfig::named_in(&table);
+    let named = AlgorithmConfig::named_in(&table).map(|named| named.name);
     let default = AlgorithmConfig::default().name();
     let defaults = SettingSource::Algorithm(algorithm);
     if preset(what).is_some() {
