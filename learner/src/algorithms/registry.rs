@@ -78,65 +78,72 @@ pub fn state_numbers(config: &Config) -> usize {
 
 #[cfg(test)]
 mod tests {
+    use shoal_common::algorithms::TransitionUse;
+    use shoal_common::config::AlgorithmConfig;
+
     use super::*;
 
-    fn config(rest: &str) -> Config {
-        let text = format!("[run]\nid = \"1a\"\nmode = \"lockstep\"\n[environment]\nname = \"x\"\n{rest}");
-        Config::from_table(text.parse().unwrap(), "test").unwrap()
+    const REAL: &str = "box = { low = [-1.0, -1.0], high = [1.0, 1.0] }";
+    const COUNTED: &str = "discrete.n = 5";
+
+    fn config(sections: &str, observation: &str, action: &str) -> Option<Config> {
+        let text = format!(
+            "[run]\nid = \"1a\"\nmode = \"lockstep\"\n[environment]\nname = \"x\"\n{sections}\n\
+             [spec]\ntime_limit = 8\nobservation.{observation}\naction.{action}\n"
+        );
+        Config::from_table(text.parse().unwrap(), "test").ok()
+    }
+
+    /// Each algorithm with its defaults, in an environment that it can control.
+    fn defaults() -> impl Iterator<Item = (String, Config)> {
+        AlgorithmConfig::all().into_iter().map(|algorithm| {
+            let once = algorithm.properties().transition_use != TransitionUse::Minibatches;
+            let replay = if once { "[replay]\nwarmup = 0" } else { "" };
+            let sections = format!("[{}]\n{replay}", algorithm.name());
+            let spaces = [(REAL, REAL), (REAL, COUNTED), (COUNTED, COUNTED)];
+            let mut fitting = spaces.iter().filter_map(|(s, a)| config(&sections, s, a));
+            let config = fitting.next().unwrap();
+            (sections, config)
+        })
+    }
+
+    /// Settings that change what the state consists of.
+    fn variants() -> impl Iterator<Item = (String, Config)> {
+        let variants = [
+            ("[ddpg]\nhidden = [7]", REAL, REAL),
+            ("[ddpg]\nhidden = [7, 5, 6]", REAL, REAL),
+            ("[ddpg]\n[observation]\nnormalise = true", REAL, REAL),
+            ("[sac]\n[observation]\nnormalise = true", REAL, REAL),
+            ("[dqn]\ndueling = true\nhidden = [7]", REAL, COUNTED),
+            (
+                "[reinforce]\nweight = \"baseline\"\n[replay]\nwarmup = 0",
+                REAL,
+                COUNTED,
+            ),
+            (
+                "[q-learning]\n[replay]\nwarmup = 0\n[actors]\nenvs = 3",
+                COUNTED,
+                COUNTED,
+            ),
+        ];
+        variants
+            .into_iter()
+            .map(|(sections, s, a)| (sections.to_owned(), config(sections, s, a).unwrap()))
     }
 
     #[test]
     fn the_size_and_the_weights_of_a_state_are_known_before_it_exists() {
-        let real = "box = { low = [-1.0, -1.0], high = [1.0, 1.0] }";
-        let in_order = "[replay]\nwarmup = 0\n[spec]\ntime_limit = 8";
-        let mut tested = Vec::new();
-        for (rest, observation, action) in [
-            ("[ddpg]\nhidden = [7, 5]\n[spec]\ntime_limit = 8", real, real),
-            ("[ddpg]\nhidden = [7]\n[spec]\ntime_limit = 8", real, real),
-            ("[ddpg]\nhidden = [7, 5, 6]\n[spec]\ntime_limit = 8", real, real),
-            ("[td3]\nhidden = [7, 5]\n[spec]\ntime_limit = 8", real, real),
-            ("[sac]\nhidden = [7, 5]\n[spec]\ntime_limit = 8", real, real),
-            ("[dqn]\nhidden = [7, 5]\n[spec]\ntime_limit = 8", real, "discrete.n = 3"),
-            (
-                "[dqn]\ndueling = true\nhidden = [7]\n[spec]\ntime_limit = 8",
-                real,
-                "discrete.n = 3",
-            ),
-            (
-                "[ddpg]\n[observation]\nnormalise = true\n[spec]\ntime_limit = 8",
-                real,
-                real,
-            ),
-            (
-                "[sac]\n[observation]\nnormalise = true\n[spec]\ntime_limit = 8",
-                real,
-                real,
-            ),
-            (&format!("[reinforce]\n{in_order}"), real, "discrete.n = 3"),
-            (
-                &format!("[reinforce]\nweight = \"baseline\"\n{in_order}"),
-                real,
-                "discrete.n = 3",
-            ),
-            (
-                &format!("[actors]\nenvs = 3\n[q-learning]\n{in_order}"),
-                "discrete.n = 5",
-                "discrete.n = 3",
-            ),
-            (&format!("[sarsa]\n{in_order}"), "discrete.n = 5", "discrete.n = 3"),
-        ] {
-            let config = config(&format!("{rest}\nobservation.{observation}\naction.{action}\n"));
-            tested.push(config.algorithm.name());
+        for (sections, config) in defaults().chain(variants()) {
             let algorithm = new(&config).unwrap();
             let state = algorithm.state();
             let numbers: usize = state.iter().map(|(_, numbers)| numbers.len()).sum();
-            assert_eq!(state_numbers(&config), numbers, "{rest}");
+            assert_eq!(state_numbers(&config), numbers, "{sections}");
             let named = |name: &&str| state.iter().any(|(array, _)| array == name);
             let weights = weights(&config);
             assert_eq!(
                 weights.contains(&"observations"),
-                rest.contains("normalise = true"),
-                "{rest}"
+                sections.contains("normalise = true"),
+                "{sections}"
             );
             // An algorithm inherits its weights, and nothing of the optimiser.
             let other: Vec<(String, Vec<f32>)> = state
@@ -154,13 +161,9 @@ mod tests {
                 }
             }
             // Only some algorithms have a baseline.
-            assert!(weights.iter().filter(|name| **name != "baseline").all(named), "{rest}");
-        }
-        for algorithm in config::AlgorithmConfig::all() {
-            let name = algorithm.name();
             assert!(
-                tested.contains(&name),
-                "learner/src/algorithms/registry.rs: no case for {name}"
+                weights.iter().filter(|name| **name != "baseline").all(named),
+                "{sections}"
             );
         }
     }
