@@ -1,6 +1,9 @@
 //! All processes of a run: starts them, tracks which are ready, restarts them, and gives up those that cannot work.
 
+mod actors;
 mod admission;
+mod cleaning;
+mod ending;
 mod faults;
 
 use std::os::fd::AsFd;
@@ -22,25 +25,15 @@ use shoal_run::records::recorder::{Incident, IncidentKind};
 use shoal_run::signals::Signals;
 use tracing_subscriber::filter::LevelFilter;
 
+use self::cleaning::Cleaning;
 use self::faults::Faults;
 use super::child::{Child, RestartDecision};
-use super::cleaner;
 use super::incarnations::{last_committed, read_counter};
 use super::joined_hosts::{INCARNATIONS, JoinedHosts};
-use super::log::{ALL_ENDED, Log};
-use super::process::{Process, name};
+use super::log::Log;
+use super::process::{Process, ending, name};
 use super::stall::StallDetector;
 use crate::log_level::log_level;
-
-/// How often to look for dead processes whose end the launcher does not observe, such as `shoal status`.
-const CLEANUP_INTERVAL: Duration = Duration::from_secs(2);
-
-/// How long dead processes may keep occupying shared memory in spite of clean-ups. A killed process may take a moment to
-/// disappear.
-const OCCUPIED_PATIENCE: Duration = Duration::from_secs(2);
-
-/// How soon a clean-up is repeated while they do.
-const OCCUPIED_CLEANUP_INTERVAL: Duration = Duration::from_millis(200);
 
 /// A start that takes longer is reported to the user.
 const SLOW_START: Duration = Duration::from_secs(10);
@@ -83,10 +76,7 @@ pub(super) struct Supervisor {
     /// Number of actors whose services have been created.
     actors_with_services: u32,
     window: u32,
-    /// Since when dead processes have occupied shared memory in spite of clean-ups.
-    occupied_since: Option<Instant>,
-    /// Time spent on clean-ups since the last search for stalls.
-    cleanup_time: Duration,
+    cleaning: Cleaning,
     /// The wanted actors of this host, in order.
     actors: Vec<u32>,
     /// The most actors that the run may have on all hosts.
@@ -110,7 +100,6 @@ pub(super) struct Supervisor {
     /// A role is given up if its failures span this time.
     give_up_after: Duration,
     all_ready: bool,
-    cleaned_at: Instant,
     learner_done: bool,
     /// How the learner ended, if it ended without saving its state.
     unsaved_learner: Option<String>,
@@ -159,8 +148,7 @@ impl Supervisor {
             services,
             actors_with_services: 0,
             window: config.actors.window,
-            occupied_since: None,
-            cleanup_time: Duration::ZERO,
+            cleaning: Cleaning::new(),
             actors,
             joined_hosts: JoinedHosts::new(started, Duration::from_secs_f64(config.remote.lost_seconds)),
             max_actors: config.actors.max,
@@ -183,7 +171,6 @@ impl Supervisor {
             },
             give_up_after: Duration::from_secs(config.run.give_up_seconds),
             all_ready: false,
-            cleaned_at: Instant::now(),
             learner_done: false,
             unsaved_learner: None,
         })
@@ -201,79 +188,10 @@ impl Supervisor {
         std::mem::take(&mut self.incidents)
     }
 
-    /// Changes the wanted number of actors. [`maintain`](Self::maintain) starts or retires them.
-    pub(super) fn scale(&mut self, actors: u32) {
-        let before = self.actors.len();
-        self.log
-            .note("launcher", &format!("scaled from {before} to {actors} actors"));
-        let detail = format!("{before} to {actors} actors");
-        self.incidents.push(Incident::of_launcher(IncidentKind::Scaled, detail));
-        self.actors.truncate(actors as usize);
-        let missing = actors as usize - self.actors.len();
-        let more: Vec<u32> = self.free_actors().take(missing).collect();
-        self.actors.extend(more);
-        self.actors.sort_unstable();
-    }
-
-    /// The wanted number of actors on this host.
-    pub(super) fn actor_count(&self) -> u32 {
-        self.actors.len() as u32
-    }
-
-    /// The most actors that this host may have now.
-    pub(super) fn max_actors_now(&self) -> u32 {
-        self.actor_count() + self.free_actors().count() as u32
-    }
-
-    /// Indices that neither this host nor another has.
-    fn free_actors(&self) -> impl Iterator<Item = u32> {
-        (0..self.max_actors).filter(|index| !self.actors.contains(index) && !self.joined_hosts.has(*index))
-    }
-
-    /// Kills an actor of this incarnation or an earlier one, so that it is started again.
-    pub(super) fn replace_actor(&mut self, index: u32, incarnation: u64) {
-        let actor = self.children.iter_mut().find(|child| child.is(Role::Actor, index));
-        if let Some(actor) = actor.filter(|actor| actor.instance.incarnation <= incarnation)
-            && let Some(process) = &mut actor.process
-        {
-            process.kill();
-        }
-    }
-
-    /// Creates the services of all actors below `end`.
-    fn create_services(&mut self, domain: &Domain, end: u32) -> anyhow::Result<()> {
-        while self.actors_with_services < end {
-            self.services
-                .create_actor(domain, self.actors_with_services, self.window)?;
-            self.actors_with_services += 1;
-        }
-        Ok(())
-    }
-
-    /// Creates the services of all wanted actors.
-    fn create_wanted_services(&mut self, domain: &Domain) -> anyhow::Result<()> {
-        let end = self.actors.iter().max().map_or(0, |last| last + 1);
-        self.create_services(domain, end)
-    }
-
     fn write_counter(&self) -> anyhow::Result<()> {
         let text = self.processes_started.to_string();
         write_atomically(&self.counter, |file| std::io::Write::write_all(file, text.as_bytes()))
             .with_context(|| format!("cannot write {}", self.counter.display()))
-    }
-
-    /// Adds and starts the wanted actors that do not exist, each with its environment server.
-    fn start_missing(&mut self, domain: &Domain) -> anyhow::Result<()> {
-        self.create_wanted_services(domain)?;
-        for index in self.actors.clone() {
-            for role in [Role::EnvServer, Role::Actor] {
-                if !self.children.iter().any(|child| child.is(role, index)) {
-                    self.children.push(Child::new(role, index));
-                    self.start(self.children.len() - 1)?;
-                }
-            }
-        }
-        Ok(())
     }
 
     fn start(&mut self, i: usize) -> anyhow::Result<()> {
@@ -376,14 +294,12 @@ impl Supervisor {
 
     /// The time until the next restart or clean-up, unless a process ends earlier.
     pub(super) fn time_to_next_task(&self) -> Duration {
-        let since_clean = self.cleaned_at.elapsed();
-        let cleaning = self.cleanup_interval().saturating_sub(since_clean);
         let missing = |child: &&Child| child.process.is_none() && self.is_wanted(child);
         let now = Instant::now();
         let restarts = self.children.iter().filter(missing);
         restarts
             .map(|child| child.restart_at.saturating_duration_since(now))
-            .fold(cleaning, Duration::min)
+            .fold(self.cleaning.time_to_next(), Duration::min)
     }
 
     /// Collects the exit statuses of ended processes. Their last reports are read before [`maintain`](Self::maintain)
@@ -396,22 +312,18 @@ impl Supervisor {
 
     /// Handles collected ends, restarts processes that are due, and starts or retires actors.
     pub(super) fn maintain(&mut self, domain: &Domain) -> anyhow::Result<RunCondition> {
-        let mut condition = RunCondition::AtWork;
         let ended = self.children.iter().any(|child| child.ended.is_some());
         // Before anything is cleaned up or started: both would find the files of another run, or none.
-        if (ended || self.is_cleanup_due()) && !self.learner_has_finished() && !domain.is_intact(self.services.count())
+        if (ended || self.cleaning.is_due()) && !self.learner_has_finished() && !domain.is_intact(self.services.count())
         {
             return Ok(RunCondition::FilesRemoved);
         }
-        if ended {
-            // Frees their shared memory for their successors.
-            condition = self.clean(domain)?;
-        } else if self.is_cleanup_due() {
-            self.cleaned_at = Instant::now();
-            if domain.has_dead_nodes() || self.services.ports_of_dead_processes() > 0 {
-                condition = self.clean(domain)?;
-            }
-        }
+        let can_be_freed = if ended {
+            // For the successors of those that have ended.
+            self.cleaning.clean(domain, &self.services, &self.log)
+        } else {
+            !self.cleaning.is_due() || self.cleaning.clean_if_needed(domain, &self.services, &self.log)
+        };
         for i in 0..self.children.len() {
             if self.maintain_one(i)? == RunCondition::LearnerDone {
                 return Ok(RunCondition::LearnerDone);
@@ -419,16 +331,11 @@ impl Supervisor {
         }
         self.retire_surplus();
         self.start_missing(domain)?;
-        Ok(condition)
-    }
-
-    fn is_cleanup_due(&self) -> bool {
-        self.cleaned_at.elapsed() >= self.cleanup_interval()
-    }
-
-    fn cleanup_interval(&self) -> Duration {
-        self.occupied_since
-            .map_or(CLEANUP_INTERVAL, |_| OCCUPIED_CLEANUP_INTERVAL)
+        Ok(if can_be_freed {
+            RunCondition::AtWork
+        } else {
+            RunCondition::SharedMemoryOccupied
+        })
     }
 
     fn learner(&self) -> Option<&Child> {
@@ -498,7 +405,7 @@ impl Supervisor {
 
     /// Kills stalled processes, so that they are replaced. Returns a message for each.
     pub(super) fn replace_stalled(&mut self, stalls: &mut StallDetector) -> Vec<String> {
-        let stalled = stalls.find(&mut self.children, std::mem::take(&mut self.cleanup_time));
+        let stalled = stalls.find(&mut self.children, self.cleaning.take_time());
         let mut messages = Vec::new();
         for (i, why) in stalled {
             let child = &mut self.children[i];
@@ -549,62 +456,6 @@ impl Supervisor {
             .push(Incident::of(self.children[i].instance, what, detail));
     }
 
-    /// Frees shared memory that dead processes occupy.
-    fn clean(&mut self, domain: &Domain) -> anyhow::Result<RunCondition> {
-        let begun = Instant::now();
-        let cleaned = cleaner::clean_up(domain, &self.services);
-        self.cleaned_at = Instant::now();
-        self.cleanup_time += begun.elapsed();
-        if let Err(error) = &cleaned {
-            self.log.note("launcher", &format!("{error:#}"));
-        }
-        if self.services.ports_of_dead_processes() == 0 {
-            self.occupied_since = None;
-            return Ok(RunCondition::AtWork);
-        }
-        let since = *self.occupied_since.get_or_insert(begun);
-        if cleaned.is_ok() && since.elapsed() >= OCCUPIED_PATIENCE {
-            return Ok(RunCondition::SharedMemoryOccupied);
-        }
-        Ok(RunCondition::AtWork)
-    }
-
-    /// Retires surplus actors and then their environment servers.
-    fn retire_surplus(&mut self) {
-        let has_no_client = |children: &[Child], child: &Child| {
-            child.instance.role == Role::EnvServer
-                && !children.iter().any(|actor| actor.is(Role::Actor, child.instance.index))
-        };
-        let mut children = std::mem::take(&mut self.children);
-        children.retain(|child| {
-            let stays = child.process.is_some() || self.is_wanted(child);
-            if !stays {
-                self.log.note(&name(child.instance), "no longer needed");
-            }
-            stays
-        });
-        self.children = children;
-        for i in 0..self.children.len() {
-            if self.is_wanted(&self.children[i]) || self.children[i].is_retiring {
-                continue;
-            }
-            let may_end =
-                self.children[i].instance.role == Role::Actor || has_no_client(&self.children, &self.children[i]);
-            let child = &mut self.children[i];
-            if let Some(process) = child.process.as_mut().filter(|_| may_end) {
-                child.is_retiring = true;
-                process.ask_to_retire();
-            }
-        }
-    }
-
-    /// Whether the child should run: not a surplus actor, and not the environment server of one.
-    fn is_wanted(&self, child: &Child) -> bool {
-        let RoleInstance { role, index, .. } = child.instance;
-        // The index of the evaluator's server is the maximum number of actors.
-        !matches!(role, Role::Actor | Role::EnvServer) || index >= self.max_actors || self.actors.contains(&index)
-    }
-
     /// One line: what happened to whom, its last message, and what to do. The log has its earlier messages.
     fn give_up(&self, name: &str, starts: u32, status: ExitStatus) -> anyhow::Result<RunCondition> {
         let lines = self.log.last_lines(name);
@@ -619,92 +470,5 @@ impl Supervisor {
             ending(status),
             self.run.display()
         );
-    }
-
-    /// Asks the processes of a role to hand over what they have and then to end.
-    pub(super) fn ask_to_retire(&mut self, role: Role) {
-        for child in self.children.iter_mut().filter(|child| child.instance.role == role) {
-            if let Some(process) = &mut child.process {
-                child.is_asked_to_end = true;
-                process.ask_to_retire();
-            }
-        }
-    }
-
-    /// Asks the processes of some roles to end.
-    pub(super) fn ask_to_end(&mut self, which: impl Fn(Role) -> bool) {
-        for child in self.children.iter_mut().filter(|child| which(child.instance.role)) {
-            match &mut child.process {
-                Some(process) => {
-                    child.is_asked_to_end = true;
-                    process.ask_to_end();
-                }
-                None if child.instance.role == Role::Learner && !self.learner_done => {
-                    self.unsaved_learner = Some("it had died and was not restarted yet".into());
-                }
-                None => {}
-            }
-        }
-    }
-
-    /// Collects the exit statuses of some roles' processes. Returns whether all of them have ended.
-    pub(super) fn reap(&mut self, which: impl Fn(Role) -> bool) -> bool {
-        let mut all = true;
-        for child in self.children.iter_mut().filter(|child| which(child.instance.role)) {
-            let Some(process) = &mut child.process else { continue };
-            match process.exit_status() {
-                Some(status) => {
-                    child.process = None;
-                    if child.instance.role == Role::Learner && !status.success() {
-                        self.unsaved_learner = Some(ending(status));
-                    }
-                }
-                None => all = false,
-            }
-        }
-        all
-    }
-
-    /// Kills the processes of some roles that did not end when they were asked to.
-    pub(super) fn kill(&mut self, which: impl Fn(Role) -> bool) {
-        for child in self.children.iter_mut().filter(|child| which(child.instance.role)) {
-            if child.process.take().is_some() {
-                let name = name(child.instance);
-                self.log.note(&name, "did not end when asked to, and was killed");
-                let detail = "did not end when asked to".into();
-                self.incidents
-                    .push(Incident::of(child.instance, IncidentKind::Killed, detail));
-                if child.instance.role == Role::Learner {
-                    self.unsaved_learner = Some("it did not end when asked to, and was killed".into());
-                }
-            }
-        }
-    }
-
-    /// Logs that every role has ended.
-    ///
-    /// # Errors
-    /// When the learner did not save its state before it ended.
-    pub(super) fn check_saved(&self) -> anyhow::Result<()> {
-        self.log.note("launcher", ALL_ENDED);
-        let Some(how) = &self.unsaved_learner else {
-            return Ok(());
-        };
-        let learner = self.learner().map(|learner| name(learner.instance));
-        let lines = learner.map_or_else(Vec::new, |learner| self.log.last_lines(&learner));
-        let message = lines.last().map_or_else(String::new, |line| format!(": {line}"));
-        bail!(
-            "the learner did not save its last state ({how}){message}; `shoal resume {}` continues from the newest \
-             checkpoint",
-            self.run.display()
-        );
-    }
-}
-
-fn ending(status: ExitStatus) -> String {
-    match (status.signal(), status.code()) {
-        (Some(signal), _) => format!("killed by signal {signal}"),
-        (_, Some(code)) => format!("ended with exit code {code}"),
-        _ => "ended".into(),
     }
 }
