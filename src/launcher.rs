@@ -2,13 +2,14 @@
 
 mod child;
 mod cleaner;
-mod hosts;
+mod end_roles;
 mod incarnations;
 #[cfg_attr(
     not(feature = "remote"),
     expect(dead_code, reason = "only `join` uses it, which is not built")
 )]
 pub(crate) mod joined;
+mod joined_hosts;
 mod log;
 mod process;
 mod progress;
@@ -16,7 +17,6 @@ mod requests;
 mod stall;
 mod supervisor;
 
-use std::os::fd::AsFd;
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
@@ -28,7 +28,6 @@ use shoal_common::report::{EpisodeReport, EvaluationReport, Heartbeat, LearnerRe
 use shoal_common::role::Role;
 use shoal_common::run_dir::{RunDir, RunLock};
 use shoal_common::stop::GRACE;
-use shoal_run::child_process::wait_for_any;
 use shoal_run::external_environment::server_iceoryx2_config;
 use shoal_run::records::outcome::{RunOutcome, RunState, STARTING};
 use shoal_run::records::recorder::Recorder;
@@ -36,11 +35,12 @@ use shoal_run::signals::Signals;
 use shoal_run::{preflight, signals, status};
 
 pub(crate) use self::cleaner::work as clean_up;
+use self::end_roles::EndRoles;
 use self::log::Log;
 pub(crate) use self::log::{ALL_ENDED, FAILED, note};
 use self::progress::ProgressLine;
 use self::stall::StallDetector;
-use self::supervisor::{HostRoles, Supervisor};
+use self::supervisor::{SupervisedHost, Supervisor};
 
 /// How often the launcher reads reports and checks its children if nothing wakes it. Ticks start short and become
 /// longer while reports arrive slowly: a full buffer loses its oldest reports.
@@ -225,7 +225,7 @@ impl<'a> Launcher<'a> {
         let initial = status::saved_status(&config, run)?;
         RunOutcome::new(RunState::Running, initial.env_steps, initial.episodes).write(run)?;
         // Creates the services that are opened below.
-        let supervisor = Supervisor::new(&config, run, domain, log.clone(), HostRoles::LearnerHost { gate })?;
+        let supervisor = Supervisor::new(&config, run, domain, log.clone(), SupervisedHost::OfLearner { gate })?;
         Ok(Self {
             control: ControlPort::open(domain)?,
             initial,
@@ -346,9 +346,7 @@ impl<'a> Launcher<'a> {
                 self.log.note("launcher", &stalled);
                 self.progress.print(&stalled);
             }
-            let start_limit =
-                (!self.config.environment.server.is_empty()).then(|| self.config.environment.start_limit());
-            for slow in self.supervisor.report_slow(&self.stalls, start_limit) {
+            for slow in self.supervisor.report_slow(&self.stalls) {
                 self.log.note("launcher", &slow);
                 self.progress.print(&slow);
             }
@@ -368,69 +366,6 @@ impl<'a> Launcher<'a> {
         self.log.note("launcher", &why);
         self.progress.print(&why);
         RunEnd::Renewed
-    }
-
-    /// Sleeps at most `most`, until a process ends, a signal arrives or a request comes.
-    fn sleep(&mut self, most: Duration) {
-        let mut wakers: Vec<_> = self.supervisor.exit_descriptors().collect();
-        wakers.extend([self.signals.as_fd(), self.control.as_fd()]);
-        if wait_for_any(&wakers, most) {
-            self.tick = SHORTEST_TICK;
-        }
-        // So that the same events do not wake it again.
-        self.signals.received();
-        self.supervisor.collect_exits();
-    }
-
-    /// Answers requests from other terminals. A request to stop is answered when the run has ended.
-    fn answer_requests(&mut self) -> anyhow::Result<()> {
-        let now = self.recorder.moment(self.started_at.elapsed());
-        let Self {
-            config,
-            run,
-            control,
-            supervisor,
-            progress,
-            initial,
-            ending,
-            stop_requested_at,
-            log,
-            domain,
-            ..
-        } = self;
-        control.answer_requests(
-            run.key()?,
-            run.path(),
-            |request| -> anyhow::Result<Option<ControlResponse>> {
-                match request {
-                    ControlRequest::Status => Ok(Some(
-                        match requests::status(config, run, supervisor, progress, initial) {
-                            Ok(status) => ControlResponse::Status(status),
-                            Err(error) => ControlResponse::Refused(error.to_string()),
-                        },
-                    )),
-                    ControlRequest::Scale { .. } if *ending => {
-                        Ok(Some(ControlResponse::Refused("the run is ending".into())))
-                    }
-                    ControlRequest::Scale { actors } => requests::scale(config, run, supervisor, actors, now).map(Some),
-                    ControlRequest::Admit(_) if *ending || stop_requested_at.is_some() => {
-                        Ok(Some(ControlResponse::Refused("the run is ending".into())))
-                    }
-                    ControlRequest::Admit(request) => supervisor.admit(domain, request).map(Some),
-                    ControlRequest::Hosts(statuses) => Ok(Some(supervisor.update_hosts(statuses))),
-                    ControlRequest::Replace { .. } => {
-                        Ok(Some(ControlResponse::Refused("this is the learner's host".into())))
-                    }
-                    ControlRequest::Stop => {
-                        if stop_requested_at.is_none() {
-                            log.note("launcher", "`shoal stop` ends the run");
-                        }
-                        stop_requested_at.get_or_insert_with(Instant::now);
-                        Ok(None)
-                    }
-                }
-            },
-        )
     }
 
     /// Waits for the report on the last period's policy.
@@ -470,19 +405,6 @@ impl<'a> Launcher<'a> {
         self.await_end(which, patience);
     }
 
-    /// Waits until processes have ended that were asked to, and kills them after a while.
-    fn await_end(&mut self, which: impl Fn(Role) -> bool + Copy, patience: Duration) {
-        let deadline = Instant::now() + patience;
-        while !self.supervisor.reap(which) {
-            if Instant::now() >= deadline {
-                self.supervisor.kill(which);
-            }
-            // An error here must not prevent the end.
-            let _ = self.answer_requests();
-            self.sleep(deadline.saturating_duration_since(Instant::now()).min(TICK));
-        }
-    }
-
     fn read_reports(&mut self) -> anyhow::Result<()> {
         let wall = self.started_at.elapsed();
         while let Some(heartbeat) = self.heartbeats.receive()? {
@@ -491,7 +413,7 @@ impl<'a> Launcher<'a> {
         for incident in self.supervisor.take_incidents() {
             self.recorder.incident(&incident, wall)?;
         }
-        self.recorder.hosts(&self.supervisor.hosts(), wall)?;
+        self.recorder.hosts(&self.supervisor.joined_hosts(), wall)?;
         self.supervisor.check_faults()?;
         let fills = [
             each(&self.episode_reports, |report| {
@@ -513,6 +435,69 @@ impl<'a> Launcher<'a> {
             fill => self.tick.mul_f64(LOW_FILL / fill).max(SHORTEST_TICK),
         };
         Ok(())
+    }
+}
+
+impl EndRoles for Launcher<'_> {
+    fn supervisor(&mut self) -> &mut Supervisor {
+        &mut self.supervisor
+    }
+
+    /// A request to stop is answered when the run has ended.
+    fn answer_requests(&mut self) -> anyhow::Result<()> {
+        let now = self.recorder.moment(self.started_at.elapsed());
+        let Self {
+            config,
+            run,
+            control,
+            supervisor,
+            progress,
+            initial,
+            ending,
+            stop_requested_at,
+            log,
+            domain,
+            ..
+        } = self;
+        control.answer_requests(
+            run.key()?,
+            run.path(),
+            |request| -> anyhow::Result<Option<ControlResponse>> {
+                match request {
+                    ControlRequest::Status => Ok(Some(
+                        match requests::status(config, run, supervisor, progress, initial) {
+                            Ok(status) => ControlResponse::Status(status),
+                            Err(error) => ControlResponse::Refused(error.to_string()),
+                        },
+                    )),
+                    ControlRequest::Scale { .. } if *ending => {
+                        Ok(Some(ControlResponse::Refused("the run is ending".into())))
+                    }
+                    ControlRequest::Scale { actors } => requests::scale(config, run, supervisor, actors, now).map(Some),
+                    ControlRequest::Admit(_) if *ending || stop_requested_at.is_some() => {
+                        Ok(Some(ControlResponse::Refused("the run is ending".into())))
+                    }
+                    ControlRequest::Admit(request) => supervisor.admit(domain, request).map(Some),
+                    ControlRequest::Hosts(statuses) => Ok(Some(supervisor.update_joined_hosts(statuses))),
+                    ControlRequest::Replace { .. } => {
+                        Ok(Some(ControlResponse::Refused("this is the learner's host".into())))
+                    }
+                    ControlRequest::Stop => {
+                        if stop_requested_at.is_none() {
+                            log.note("launcher", "`shoal stop` ends the run");
+                        }
+                        stop_requested_at.get_or_insert_with(Instant::now);
+                        Ok(None)
+                    }
+                }
+            },
+        )
+    }
+
+    fn sleep(&mut self, most: Duration) {
+        if self.supervisor.sleep(self.signals, &self.control, most) {
+            self.tick = SHORTEST_TICK;
+        }
     }
 }
 

@@ -247,7 +247,7 @@ fn counts_are_taken_as_people_write_them_and_a_run_without_learning_is_warned_of
 }
 
 #[test]
-fn what_a_method_fixes_need_not_be_in_a_file() {
+fn what_an_algorithm_fixes_need_not_be_in_a_file() {
     let place = Workplace::new();
     let table = "[environment]\nname = \"frozen-lake\"\n[sarsa]\nalpha = 0.5\n";
     std::fs::write(place.path().join("table.toml"), table).unwrap();

@@ -16,7 +16,7 @@ use shoal_common::transition::Transition;
 use shoal_env_server::vector::{Reset, VectorEnvironment};
 use shoal_learner::algorithms::ddpg::Ddpg;
 use shoal_learner::algorithms::minibatch::Minibatch;
-use shoal_learner::algorithms::minibatch_algorithm::MinibatchLearner;
+use shoal_learner::algorithms::minibatch_algorithm::MinibatchAlgorithm;
 use shoal_learner::algorithms::sampling::Sampler;
 use support::{QUICK, Running, Workplace, final_result, json, until, wait_for_rows};
 

@@ -125,13 +125,17 @@ impl Default for AlgorithmConfig {
 }
 
 impl AlgorithmConfig {
-    /// The name of the algorithm whose section is among these. Only DDPG has a second section, `[exploration]`.
-    pub fn named_in(sections: &toml::Table) -> Option<&'static str> {
-        let all = Self::all().into_iter().map(|algorithm| algorithm.name());
-        let mut named = all.filter(|name| sections.contains_key(*name));
-        named
-            .next()
-            .or_else(|| sections.contains_key("exploration").then_some(ddpg::PROPERTIES.name))
+    /// The algorithms whose own sections are among these.
+    pub fn all_in(sections: &toml::Table) -> Vec<AlgorithmProperties> {
+        let all = Self::all().into_iter().map(|algorithm| algorithm.properties());
+        all.filter(|algorithm| sections.contains_key(algorithm.name)).collect()
+    }
+
+    /// The algorithm of a configuration with these sections, if they name one. Only DDPG has a second section,
+    /// `[exploration]`.
+    pub fn named_in(sections: &toml::Table) -> Option<AlgorithmProperties> {
+        let named = Self::all_in(sections).into_iter().next();
+        named.or_else(|| sections.contains_key("exploration").then_some(ddpg::PROPERTIES))
     }
 
     /// The name of the algorithm that suits an environment, for a user who has chosen none.
@@ -204,18 +208,18 @@ mod tests {
     fn each_algorithm_accepts_the_spaces_that_it_can_control() {
         let real = || Space::boxed(&[(-1.0, 1.0); 4]);
         let counted = || Space::discrete(3);
-        let takes = |observation: fn() -> Space, action: fn() -> Space| -> Vec<bool> {
+        let fitting = |observation: fn() -> Space, action: fn() -> Space| -> Vec<&str> {
             let spec = spec(observation(), action());
             let all = AlgorithmConfig::all().into_iter();
-            all.map(|algorithm| algorithm.check_spaces(&spec).is_ok()).collect()
+            all.filter(|algorithm| algorithm.check_spaces(&spec).is_ok())
+                .map(|algorithm| algorithm.name())
+                .collect()
         };
-        let (yes, no) = (true, false);
-        // DDPG, TD3, SAC, DQN, REINFORCE, Q-learning, SARSA.
-        assert_eq!(takes(real, real), [yes, yes, yes, no, no, no, no]);
+        assert_eq!(fitting(real, real), ["ddpg", "td3", "sac"]);
         // DDPG's networks take an index as a number, as in earlier versions.
-        assert_eq!(takes(counted, real), [yes, no, no, no, no, no, no]);
-        assert_eq!(takes(real, counted), [no, no, no, yes, yes, no, no]);
-        assert_eq!(takes(counted, counted), [no, no, no, no, no, yes, yes]);
+        assert_eq!(fitting(counted, real), ["ddpg"]);
+        assert_eq!(fitting(real, counted), ["dqn", "reinforce"]);
+        assert_eq!(fitting(counted, counted), ["q-learning", "sarsa"]);
     }
 
     #[test]

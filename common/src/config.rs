@@ -34,11 +34,7 @@ use shoal_base::space::EnvironmentSpec;
 use shoal_base::transition::{ChunkLayout, RowLayout};
 use shoal_policy::{Policy, PolicyError, PolicyLayout};
 
-pub use crate::algorithms::{
-    AlgorithmConfig, DdpgConfig, DqnConfig, ExplorationConfig, ObservationConfig, ReinforceConfig, ReturnWeighting,
-    RewardConfig, SacConfig, TabularConfig, Td3Config, Warmup,
-};
-use crate::algorithms::{Behaviour, LearnedShapes, TransitionUse};
+pub use crate::algorithms::*;
 
 /// The complete configuration of a run.
 #[derive(Clone, Debug, PartialEq)]

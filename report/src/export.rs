@@ -257,10 +257,10 @@ mod tests {
 
 #[cfg(test)]
 mod tests_support {
-    //! Configurations of every algorithm, with policies that are no special case.
+    //! Configurations of every algorithm and of some variants, with policies that are no special case.
 
-    use shoal_common::config::AlgorithmConfig;
     use shoal_env_server::environment::make;
+    use shoal_run::plan::{RunOverrides, algorithm, resolve};
 
     use super::*;
 
@@ -275,34 +275,37 @@ mod tests_support {
             "[environment]\nname = \"point-mass\"\n[ddpg]\nhidden = [9, 8, 7]\nactivation = \"tanh\"\n",
             "mode = \"lockstep\"\n[environment]\nname = \"cart-pole\"\n[actors]\nchunk_steps = 200\n\
              [reinforce]\nhidden = [6, 5, 4]\nactivation = \"tanh\"\n[replay]\nwarmup = 0\n",
-            "mode = \"lockstep\"\n[environment]\nname = \"cart-pole\"\n[actors]\nchunk_steps = 200\n\
-             [reinforce]\n[replay]\nwarmup = 0\n",
-            "[environment]\nname = \"point-mass\"\n[td3]\nhidden = [9, 8]\n",
-            "[environment]\nname = \"point-mass\"\n[sac]\nhidden = [9, 8]\n",
             "[environment]\nname = \"point-mass\"\n[sac]\nhidden = [9]\n[observation]\nnormalise = true\n",
             "[environment]\nname = \"pendulum\"\n[ddpg]\nhidden = [9]\n[observation]\nnormalise = true\n",
-            "[environment]\nname = \"cart-pole\"\n[dqn]\nhidden = [9, 8]\n",
             "[environment]\nname = \"cart-pole\"\n[dqn]\nhidden = [9]\nactivation = \"tanh\"\ndueling = true\n",
-            "[environment]\nname = \"frozen-lake\"\n[q-learning]\n[replay]\nwarmup = 0\n",
-            "mode = \"lockstep\"\n[environment]\nname = \"frozen-lake\"\n[sarsa]\n[replay]\nwarmup = 0\n",
         ];
-        let policies = tasks.map(|task| with_policy(&format!("[run]\nid = \"1a\"\n{task}")));
-        for algorithm in AlgorithmConfig::all() {
-            let name = algorithm.name();
-            let there = policies.iter().any(|(config, _)| config.algorithm.name() == name);
-            assert!(there, "report/src/export.rs: `policies` has none of {name}");
-        }
-        policies.into()
+        let variants = tasks.map(|task| of_text(&format!("[run]\nid = \"1a\"\n{task}")));
+        let defaults = algorithm::names().map(with_defaults);
+        variants.into_iter().chain(defaults).map(with_policy).collect()
     }
 
-    fn with_policy(text: &str) -> (Config, PolicyFile) {
+    /// An algorithm with its defaults, for the first of these tasks that it can control.
+    fn with_defaults(algorithm: &str) -> Config {
+        let overrides = RunOverrides {
+            algorithm: Some(algorithm.into()),
+            ..RunOverrides::default()
+        };
+        let mut tasks = ["pendulum", "cart-pole", "frozen-lake"].into_iter();
+        let (_, config) = tasks.find_map(|task| resolve(task, &overrides).ok()).unwrap();
+        config
+    }
+
+    fn of_text(text: &str) -> Config {
         let mut table: toml::Table = text.parse().unwrap();
         let name = table["environment"]["name"].as_str().unwrap().to_owned();
         let mut parameters = table["environment"].as_table().unwrap().clone();
         parameters.remove("name");
         let spec = make(&name, &parameters).unwrap().spec();
         table.insert("spec".into(), toml::Value::try_from(spec).unwrap());
-        let config = Config::from_table(table, "test").unwrap();
+        Config::from_table(table, "test").unwrap()
+    }
+
+    fn with_policy(config: Config) -> (Config, PolicyFile) {
         let layout = policy_layout(&config).unwrap();
         let policy = PolicyFile {
             fingerprint: layout.fingerprint(),
@@ -318,9 +321,7 @@ mod tests_support {
 
     /// A task whose environment numbers its observations from 1 and its actions from 5, and a policy for it.
     pub(super) fn with_starts() -> (Config, PolicyFile) {
-        let (mut config, policy) = with_policy(
-            "[run]\nid = \"1a\"\n[environment]\nname = \"frozen-lake\"\n[q-learning]\n[replay]\nwarmup = 0\n",
-        );
+        let (mut config, policy) = with_policy(with_defaults("q-learning"));
         for (space, first) in [(&mut config.spec.observation, 1), (&mut config.spec.action, 5)] {
             if let Space::Discrete { start, .. } = space {
                 *start = first;

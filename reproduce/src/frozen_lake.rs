@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use shoal_common::policy_file::PolicyFile;
 use shoal_env_server::environment::frozen_lake::{ACTIONS, STATES};
 use shoal_report::figure::{self, CurvesOfSetting, Frame};
-use shoal_run::evaluation::analysis::lake::{LIMIT, Walk, greedy, optimal};
+use shoal_run::evaluation::analysis::lake::{ExpectedResult, LIMIT, greedy, optimal};
 use shoal_run::evaluation::rollout::policy_layout;
 use shoal_run::records::recorder::read_evaluations;
 
@@ -109,7 +109,7 @@ struct EvaluatedPolicy {
     /// Number of training episodes before it.
     episodes: u64,
     /// Its exact performance, by the lake's transition table.
-    exact: Walk,
+    exact: ExpectedResult,
 }
 
 impl Tests {
@@ -163,7 +163,7 @@ impl Family for FrozenLake {
             let policy = PolicyFile::read(&path, &layout).context("cannot read a policy that was evaluated")?;
             Ok(EvaluatedPolicy {
                 episodes: ends.partition_point(|end| *end <= evaluation.env_steps) as u64,
-                exact: Walk::of(&greedy(&policy.parameters)).rounded(),
+                exact: ExpectedResult::of(&greedy(&policy.parameters)).rounded(),
             })
         });
         Ok(Tests {
@@ -176,7 +176,7 @@ impl Family for FrozenLake {
         let good = results.of(GOOD, "");
         let q_star = optimal(GAMMA);
         let best: Vec<f32> = q_star.iter().flatten().map(|q| *q as f32).collect();
-        let walk = Walk::of(&greedy(&best));
+        let best_result = ExpectedResult::of(&greedy(&best));
         let epsilon = EPSILON.map(|(name, label)| (label, results.of(name, "")));
         let alpha = ALPHA.map(|(name, label)| (label, results.of(name, "")));
         let mut figures = Vec::new();
@@ -184,7 +184,7 @@ impl Family for FrozenLake {
             ("epsilon", &epsilon[..], "exploration rates, α = 0.03", "a"),
             ("alpha", &alpha[..], "learning rates, ε = 0.4", "b"),
         ] {
-            figures.extend(of_sweep(writer, file, sweep, what, number, walk)?);
+            figures.extend(of_sweep(writer, file, sweep, what, number, best_result)?);
         }
         if let Some(middle) = representative(good) {
             figures.push(writer.add(
@@ -204,8 +204,8 @@ impl Family for FrozenLake {
         Ok(vec![ReportSection {
             title: "FrozenLake with Q-learning (section 4.1)",
             from: EXPERIMENTS.iter().map(|experiment| (experiment.name, "")).collect(),
-            remark: remark(walk.reached),
-            claims: claims::all(&epsilon, &alpha, results.of(SARSA, ""), &q_star, walk),
+            remark: remark(best_result.reached),
+            claims: claims::all(&epsilon, &alpha, results.of(SARSA, ""), &q_star, best_result),
             figures,
         }])
     }
@@ -233,15 +233,15 @@ The optimal policy reaches the goal with probability {optimal:.3}."
 }
 
 /// A setting's label, with its results.
-type Sweep<'a> = (&'static str, &'a [SeedResult<Tests>]);
+type SettingResults<'a> = (&'static str, &'a [SeedResult<Tests>]);
 
 fn of_sweep(
     writer: &FigureWriter,
     file: &str,
-    sweep: &[Sweep<'_>],
+    sweep: &[SettingResults<'_>],
     what: &str,
     number: &str,
-    best: Walk,
+    best: ExpectedResult,
 ) -> anyhow::Result<Vec<Figure>> {
     let settings = |of: fn(&EvaluatedPolicy) -> f64| -> Vec<CurvesOfSetting> {
         let curves = sweep.iter().map(|(label, seeds)| {

@@ -4,7 +4,7 @@ mod claims;
 mod figures;
 
 use serde::{Deserialize, Serialize};
-use shoal_run::evaluation::analysis::point_mass::{Drive, FAR_STARTS, Measures, NEAR_STARTS};
+use shoal_run::evaluation::analysis::point_mass::{FAR_STARTS, Measures, NEAR_STARTS, TestRun};
 use shoal_run::evaluation::rollout::Rollout;
 
 use super::experiment::{Experiment, Length, Stage};
@@ -68,9 +68,11 @@ pub(super) struct Tests {
     best: Vec<Measures>,
     last: Vec<Measures>,
     /// Test runs of the best policy.
-    drives: Vec<Drive>,
+    #[serde(rename = "drives")]
+    test_runs: Vec<TestRun>,
     /// Test runs of the last policy from the starts of section 5.3, if the thesis shows that policy (appendix A.1).
-    last_drives: Vec<Drive>,
+    #[serde(rename = "last_drives")]
+    last_test_runs: Vec<TestRun>,
 }
 
 /// See [`EXPERIMENTS`].
@@ -82,15 +84,15 @@ impl Family for PointMass {
 
     fn test(policies: &Policies, stage: &Stage) -> anyhow::Result<Tests> {
         let starts = [&NEAR_STARTS[..], &FAR_STARTS[..]].concat();
-        let run = |parameters| Drive::run_from(&mut Rollout::new(&policies.config, parameters)?, &starts);
+        let run = |parameters| TestRun::from_starts(&mut Rollout::new(&policies.config, parameters)?, &starts);
         let best = run(&policies.best.parameters)?;
         let last = run(&policies.last.parameters)?;
         let shown = if stage.suffix == LONGER { NEAR_STARTS.len() } else { 0 };
         Ok(Tests {
-            best: best.iter().map(Drive::measures).collect(),
-            last: last.iter().map(Drive::measures).collect(),
-            drives: best.into_iter().map(Drive::rounded).collect(),
-            last_drives: last.into_iter().take(shown).map(Drive::rounded).collect(),
+            best: best.iter().map(TestRun::measures).collect(),
+            last: last.iter().map(TestRun::measures).collect(),
+            test_runs: best.into_iter().map(TestRun::rounded).collect(),
+            last_test_runs: last.into_iter().take(shown).map(TestRun::rounded).collect(),
         })
     }
 
@@ -149,21 +151,21 @@ mod tests {
     use super::super::result::SeedResult;
     use super::super::result::tests::result;
     use super::*;
-    use shoal_run::testing::drive;
+    use shoal_run::testing::test_run;
 
-    /// A seed whose test runs are made by [`drive`] with these arguments.
+    /// A seed whose test runs are made by [`test_run`] with these arguments.
     pub(super) fn seed(number: u64, rest: f64, shake: f64, force: f64, held: f64) -> SeedResult<Tests> {
         let starts = [&NEAR_STARTS[..], &FAR_STARTS[..]].concat();
-        let drives: Vec<_> = starts
+        let test_runs: Vec<_> = starts
             .iter()
-            .map(|start| drive(*start, rest, shake, force, held))
+            .map(|start| test_run(*start, rest, shake, force, held))
             .collect();
-        let measures: Vec<_> = drives.iter().map(Drive::measures).collect();
+        let measures: Vec<_> = test_runs.iter().map(TestRun::measures).collect();
         let tests = Tests {
             best: measures.clone(),
             last: measures,
-            last_drives: drives[..4].iter().cloned().map(Drive::rounded).collect(),
-            drives: drives.into_iter().map(Drive::rounded).collect(),
+            last_test_runs: test_runs[..4].iter().cloned().map(TestRun::rounded).collect(),
+            test_runs: test_runs.into_iter().map(TestRun::rounded).collect(),
         };
         result(&EXPERIMENTS[1], number, 100.0, tests)
     }
@@ -192,8 +194,10 @@ mod tests {
     }
 
     #[test]
-    fn a_result_is_small() {
+    fn a_result_is_small_and_keeps_the_names_of_its_fields() {
         let text = serde_json::to_string(&seed(1, 0.0123, 0.1234, 1.234, 0.1234).tests).unwrap();
+        let fields = ["\"best\":", "\"last\":", "\"drives\":", "\"last_drives\":"];
+        assert!(fields.iter().all(|field| text.contains(field)));
         assert!(text.len() < 130_000, "{}", text.len());
     }
 }

@@ -1,4 +1,4 @@
-//! The directory of a host that has joined a run of another host.
+//! The directory of a joined host.
 
 use std::path::Path;
 

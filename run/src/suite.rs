@@ -1,6 +1,10 @@
 //! A suite: several runs in one directory that differ in their seed and in the values of some keys. `suite.json` says
 //! what they are, so that a suite can be continued from any directory.
 
+pub mod configuration;
+pub mod measure;
+pub mod schedule;
+
 use std::collections::BTreeSet;
 use std::fs::File;
 use std::io::ErrorKind;
@@ -230,6 +234,15 @@ impl Suite {
             bail!("{here} is damaged: {:?} is no name of a run", trial.name);
         }
         Ok(Some(suite))
+    }
+
+    /// As [`read`](Self::read), for a directory that had a suite before it was [locked](lock): until then another process
+    /// may have removed it.
+    ///
+    /// # Errors
+    /// When its file is missing or cannot be read.
+    pub fn open(directory: &Path) -> anyhow::Result<Self> {
+        Self::read(directory)?.with_context(|| format!("{} is no suite any more", directory.display()))
     }
 
     /// Adds changes of all runs, each as `SECTION.KEY=VALUE`. A later value of a key replaces an earlier one.

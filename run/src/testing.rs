@@ -9,7 +9,7 @@ use shoal_env_server::environment::angle::wrap;
 use shoal_env_server::environment::make;
 
 use crate::evaluation::analysis::pendulum::SwingUp;
-use crate::evaluation::analysis::point_mass::Drive;
+use crate::evaluation::analysis::point_mass::TestRun;
 use crate::evaluation::rollout::policy_layout;
 
 /// A small configuration for tests, and a policy for it that always takes the action in the middle of its range.
@@ -25,11 +25,11 @@ pub fn small(environment: &str) -> (Config, Vec<f32>) {
     (config, parameters)
 }
 
-/// A drive that comes to rest `rest` m from the goal. It turns back and forth by `shake` rad each step. The force is
+/// A test run that comes to rest `rest` m from the goal. It turns back and forth by `shake` rad each step. The force is
 /// `force` on the way and `held` at rest, in N.
-pub fn drive(start: [f64; 2], rest: f64, shake: f64, force: f64, held: f64) -> Drive {
+pub fn test_run(start: [f64; 2], rest: f64, shake: f64, force: f64, held: f64) -> TestRun {
     let left = |t: u32| rest / start[0].hypot(start[1]) + (1.0 - f64::from(t.min(80)) / 80.0);
-    Drive {
+    TestRun {
         start,
         x: (0..=200).map(|t| start[0] * left(t)).collect(),
         y: (0..=200).map(|t| start[1] * left(t)).collect(),

@@ -18,7 +18,7 @@ use shoal_run::plan::{RequestedChanges, Revision, warning};
 use shoal_run::records::recorder::{ChangeRecord, Moment};
 use shoal_run::signals::{Signals, exit_code};
 use shoal_run::status;
-use shoal_run::suite::Suite;
+use shoal_run::suite::{Suite, configuration};
 use shoal_run::usage::UsageError;
 
 use super::listen::ListenArgs;
@@ -156,7 +156,7 @@ fn resume_suite(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
     let number = |key: &str, value: Option<u64>| value.map(|value| format!("{key}={value}"));
     let numbers = [number("run.steps", args.steps), number("run.episodes", args.episodes)];
     let changes: Vec<String> = args.set.iter().cloned().chain(numbers.into_iter().flatten()).collect();
-    suite::change(&args.run, &changes)?;
+    configuration::change(&args.run, &changes)?;
     if args.output.detach {
         return detach::resume_suite(&args.run, &args.for_another_process(), &args.output);
     }

@@ -30,7 +30,7 @@ pub(crate) struct RmArgs {
 }
 
 /// A run to be removed. The lock keeps it from being started meanwhile.
-struct Condemned {
+struct Removal {
     run: RunDir,
     lock: RunLock,
     bytes: u64,
@@ -38,7 +38,7 @@ struct Condemned {
 
 /// Removes the runs after asking. Nothing is removed if one of them cannot be.
 pub(crate) fn run(args: &RmArgs) -> anyhow::Result<ExitCode> {
-    let (mut runs, mut suites): (Vec<Condemned>, Vec<(&PathBuf, File)>) = (Vec::new(), Vec::new());
+    let (mut runs, mut suites): (Vec<Removal>, Vec<(&PathBuf, File)>) = (Vec::new(), Vec::new());
     for path in &args.runs {
         let mut paths = vec![path.clone()];
         if let Some(suite) = Suite::read(path)? {
@@ -50,14 +50,14 @@ pub(crate) fn run(args: &RmArgs) -> anyhow::Result<ExitCode> {
             if runs.iter().any(|other| other.run == run) {
                 bail!("{} is named twice: name each run once", path.display());
             }
-            runs.push(condemn(run, args.replay)?);
+            runs.push(prepare_removal(run, args.replay)?);
         }
     }
     if !args.yes && !confirmed(&runs, args.replay)? {
         writeln!(std::io::stderr(), "nothing is removed")?;
         return Ok(ExitCode::FAILURE);
     }
-    for Condemned { run, lock, bytes: size } in &runs {
+    for Removal { run, lock, bytes: size } in &runs {
         lock.check(run)?;
         let here = run.path().display();
         if args.replay {
@@ -78,8 +78,8 @@ pub(crate) fn run(args: &RmArgs) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// Checks that this can be removed.
-fn condemn(run: RunDir, replay: bool) -> anyhow::Result<Condemned> {
+/// Locks a run to be removed, and checks that it can be.
+fn prepare_removal(run: RunDir, replay: bool) -> anyhow::Result<Removal> {
     let here = run.path().display();
     let lock = run.lock().map_err(|error| match error {
         RunDirError::Busy(_) => anyhow::anyhow!("{here} is running: end it first, with `shoal stop {here}`"),
@@ -98,17 +98,17 @@ fn condemn(run: RunDir, replay: bool) -> anyhow::Result<Condemned> {
     } else {
         size(run.path()).with_context(|| format!("cannot read {here}"))?
     };
-    Ok(Condemned { run, lock, bytes })
+    Ok(Removal { run, lock, bytes })
 }
 
 /// Asks on the terminal whether to go on.
-fn confirmed(runs: &[Condemned], replay: bool) -> anyhow::Result<bool> {
+fn confirmed(runs: &[Removal], replay: bool) -> anyhow::Result<bool> {
     if !std::io::stdin().is_terminal() {
         return Err(UsageError("there is no terminal to ask on: add --yes".into()).into());
     }
     let mut stderr = std::io::stderr().lock();
     let what = if replay { "the replay of " } else { "" };
-    for Condemned { run, bytes: size, .. } in runs {
+    for Removal { run, bytes: size, .. } in runs {
         writeln!(stderr, "{what}{} ({})", run.path().display(), mebibytes(*size))?;
     }
     write!(stderr, "Remove {}? [y/N] ", if runs.len() == 1 { "it" } else { "them" })?;

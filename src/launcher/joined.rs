@@ -1,6 +1,5 @@
-//! The launcher of a host that has joined a run: starts a relay, actors and environment servers, and watches them.
+//! The launcher of a joined host: starts a relay, actors and environment servers, and watches them.
 
-use std::os::fd::AsFd;
 use std::time::{Duration, Instant};
 
 use anyhow::bail;
@@ -11,13 +10,13 @@ use shoal_common::config::Config;
 use shoal_common::report::Heartbeat;
 use shoal_common::role::{Activity, Role};
 use shoal_common::run_dir::{RunDir, RunLock};
-use shoal_run::child_process::wait_for_any;
 use shoal_run::preflight;
 use shoal_run::signals::{self, Signals};
 
+use super::end_roles::EndRoles;
 use super::log::Log;
 use super::stall::StallDetector;
-use super::supervisor::{HostRoles, RunCondition, Supervisor};
+use super::supervisor::{RunCondition, SupervisedHost, Supervisor};
 use super::{OTHERS_END, write_iox_config};
 
 /// How often heartbeats are read if nothing wakes the launcher.
@@ -50,8 +49,8 @@ pub(crate) fn run(
     Domain::remove_abandoned()?;
     let domain = Domain::join(&config.run.id, config.actors.max)?;
     let ending = preflight::reserve_for_host(&config, &domain)
-        .and_then(|()| Host::new(config, (run, lock), &domain, signals, actors))
-        .and_then(|host| host.run(give_up));
+        .and_then(|()| JoinedLauncher::new(config, (run, lock), &domain, signals, actors))
+        .and_then(|launcher| launcher.run(give_up));
     // Also after an error: no role is left by now.
     let left = domain.leave();
     let ending = ending?;
@@ -59,7 +58,7 @@ pub(crate) fn run(
     Ok(ending)
 }
 
-struct Host<'a> {
+struct JoinedLauncher<'a> {
     config: Config,
     run: &'a RunDir,
     lock: &'a RunLock,
@@ -75,7 +74,7 @@ struct Host<'a> {
     cut_off_since: Option<Instant>,
 }
 
-impl<'a> Host<'a> {
+impl<'a> JoinedLauncher<'a> {
     fn new(
         config: Config,
         (run, lock): (&'a RunDir, &'a RunLock),
@@ -86,11 +85,11 @@ impl<'a> Host<'a> {
         let log = Log::open(&run.log())?;
         write_iox_config(domain, run)?;
         // Creates the services that are opened below.
-        let supervisor = Supervisor::new(&config, run, domain, log.clone(), HostRoles::RemoteHost { actors })?;
+        let supervisor = Supervisor::new(&config, run, domain, log.clone(), SupervisedHost::Joined { actors })?;
         Ok(Self {
             control: ControlPort::open(domain)?,
             heartbeats: Reports::open(domain)?,
-            stalls: StallDetector::of_remote_host(Duration::from_secs(config.run.stall_seconds)),
+            stalls: StallDetector::of_joined_host(Duration::from_secs(config.run.stall_seconds)),
             supervisor,
             run,
             lock,
@@ -144,9 +143,7 @@ impl<'a> Host<'a> {
             for stalled in self.supervisor.replace_stalled(&mut self.stalls) {
                 self.log.note("launcher", &stalled);
             }
-            let start_limit =
-                (!self.config.environment.server.is_empty()).then(|| self.config.environment.start_limit());
-            for slow in self.supervisor.report_slow(&self.stalls, start_limit) {
+            for slow in self.supervisor.report_slow(&self.stalls) {
                 self.log.note("launcher", &slow);
             }
             if self.stop_requested {
@@ -173,6 +170,12 @@ impl<'a> Host<'a> {
         // The learner's host keeps the records.
         self.supervisor.take_incidents();
         self.supervisor.check_faults()
+    }
+}
+
+impl EndRoles for JoinedLauncher<'_> {
+    fn supervisor(&mut self) -> &mut Supervisor {
+        &mut self.supervisor
     }
 
     fn answer_requests(&mut self) -> anyhow::Result<()> {
@@ -201,32 +204,14 @@ impl<'a> Host<'a> {
                     Some(ControlResponse::Accepted)
                 }
                 ControlRequest::Scale { .. } | ControlRequest::Admit(_) | ControlRequest::Hosts(_) => {
-                    let why = "this is a host that has joined a run: ask on the learner's host";
+                    let why = "this is a joined host: ask on the learner's host";
                     Some(ControlResponse::Refused(why.into()))
                 }
             })
         })
     }
 
-    fn await_end(&mut self, which: impl Fn(Role) -> bool + Copy, patience: Duration) {
-        let deadline = Instant::now() + patience;
-        while !self.supervisor.reap(which) {
-            if Instant::now() >= deadline {
-                self.supervisor.kill(which);
-            }
-            // An error here must not prevent the end.
-            let _ = self.answer_requests();
-            self.sleep(deadline.saturating_duration_since(Instant::now()).min(TICK));
-        }
-    }
-
-    /// Sleeps at most `most`, until a process ends, a signal arrives or a request comes.
     fn sleep(&mut self, most: Duration) {
-        let mut wakers: Vec<_> = self.supervisor.exit_descriptors().collect();
-        wakers.extend([self.signals.as_fd(), self.control.as_fd()]);
-        wait_for_any(&wakers, most);
-        // So that the same events do not wake it again.
-        self.signals.received();
-        self.supervisor.collect_exits();
+        self.supervisor.sleep(self.signals, &self.control, most);
     }
 }

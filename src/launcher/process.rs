@@ -2,6 +2,7 @@
 
 use std::io::Write;
 use std::os::fd::{AsFd, BorrowedFd};
+use std::os::unix::process::ExitStatusExt;
 use std::path::Path;
 use std::process::{ChildStdin, ExitStatus};
 
@@ -72,4 +73,13 @@ impl Process {
 /// The name of a process in the log and in messages.
 pub(super) fn name(instance: RoleInstance) -> String {
     format!("{}-{}", instance.role.name(), instance.index)
+}
+
+/// How a process has ended.
+pub(super) fn ending(status: ExitStatus) -> String {
+    match (status.signal(), status.code()) {
+        (Some(signal), _) => format!("killed by signal {signal}"),
+        (_, Some(code)) => format!("ended with exit code {code}"),
+        _ => "ended".into(),
+    }
 }

@@ -36,7 +36,7 @@ pub(super) fn status(
         status.eval_return_mean = Some(report.return_mean);
     }
     status.roles = supervisor.status(status.policy_version);
-    status.hosts = supervisor.hosts();
+    status.hosts = supervisor.joined_hosts();
     status.waiting = waiting(supervisor).map(|who| {
         let (ratio, agreed) = (status.ratio, status.updates_per_step);
         format!("{who}: ratio {ratio:.2} of {agreed:.2}")

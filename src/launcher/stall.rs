@@ -20,7 +20,7 @@ const WORKING_FACTOR: u32 = 3;
 #[derive(Debug)]
 pub(super) struct StallDetector {
     patience: Duration,
-    /// Whether it sees all processes of the run, and not only those of a host that has joined.
+    /// Whether it sees all processes of the run, and not only those of a joined host.
     sees_whole_run: bool,
     checked_at: Instant,
 }
@@ -35,8 +35,8 @@ impl StallDetector {
         }
     }
 
-    /// For the processes of a host that has joined a run. All of them may wait for the learner's host.
-    pub(super) fn of_remote_host(patience: Duration) -> Self {
+    /// For the processes of a joined host. All of them may wait for the learner's host.
+    pub(super) fn of_joined_host(patience: Duration) -> Self {
         Self {
             sees_whole_run: false,
             ..Self::new(patience)

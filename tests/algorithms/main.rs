@@ -170,10 +170,10 @@ fn td3_gives_the_bits_of_its_algorithm_in_a_single_process() {
         let AlgorithmConfig::Td3(settings) = &config.algorithm else {
             panic!("{:?}", config.algorithm)
         };
-        let learner = Td3::new(&config.spec, settings, 11).unwrap();
+        let algorithm = Td3::new(&config.spec, settings, 11).unwrap();
         assert_eq!(
             result["weights_sha256"],
-            twin::of_minibatches(&config, learner),
+            twin::of_minibatches(&config, algorithm),
             "{threads}"
         );
     }
@@ -188,10 +188,10 @@ fn sac_gives_the_bits_of_its_algorithm_in_a_single_process() {
         let AlgorithmConfig::Sac(settings) = &config.algorithm else {
             panic!("{:?}", config.algorithm)
         };
-        let learner = Sac::new(&config.spec, settings, 11).unwrap();
+        let algorithm = Sac::new(&config.spec, settings, 11).unwrap();
         assert_eq!(
             result["weights_sha256"],
-            twin::of_minibatches(&config, learner),
+            twin::of_minibatches(&config, algorithm),
             "{threads}"
         );
     }
@@ -211,10 +211,10 @@ fn dqn_gives_the_bits_of_its_algorithm_in_a_single_process() {
         let AlgorithmConfig::Dqn(settings) = &config.algorithm else {
             panic!("{:?}", config.algorithm)
         };
-        let learner = Dqn::new(&config.spec, settings, 11).unwrap();
+        let algorithm = Dqn::new(&config.spec, settings, 11).unwrap();
         assert_eq!(
             result["weights_sha256"],
-            twin::of_minibatches(&config, learner),
+            twin::of_minibatches(&config, algorithm),
             "{variant}"
         );
     }

@@ -8,7 +8,7 @@ use shoal_common::transition::Transition;
 use shoal_env_server::environment::frozen_lake::{ACTIONS, STATES};
 use shoal_env_server::vector::{Reset, VectorEnvironment};
 use shoal_learner::algorithms::minibatch::Minibatch;
-use shoal_learner::algorithms::minibatch_algorithm::MinibatchLearner;
+use shoal_learner::algorithms::minibatch_algorithm::MinibatchAlgorithm;
 use shoal_learner::algorithms::registry;
 use shoal_learner::algorithms::sampling::Sampler;
 use shoal_learner::networks::digest::sha256;
@@ -137,7 +137,7 @@ pub(crate) fn tabular(config: &Config) -> (String, u64, usize) {
 pub(crate) fn reinforce(config: &Config) -> String {
     let place = tempfile::tempdir().unwrap();
     let chunk = config.chunk_layout();
-    let mut learner = registry::new(config).unwrap();
+    let mut algorithm = registry::new(config).unwrap();
     let layout = ReplayLayout {
         row: chunk.row,
         ring: config.replay.capacity,
@@ -150,7 +150,7 @@ pub(crate) fn reinforce(config: &Config) -> String {
     for number in 0..config.run.episodes.unwrap() {
         let (mut episode, mut over) = (Vec::new(), false);
         while !over {
-            let a = world.choose(&learner.policy());
+            let a = world.choose(&algorithm.policy());
             let step = world.step(a);
             over = step.terminated || step.truncated;
             let mut row = vec![0.0; chunk.row.width()];
@@ -175,17 +175,17 @@ pub(crate) fn reinforce(config: &Config) -> String {
             sequence: number + 1,
         };
         replay.append_and_commit(0, id, &episode).unwrap();
-        learner.update(&replay, replay.head());
+        algorithm.update(&replay, replay.head());
     }
     let weights = registry::weights(config);
-    let state = learner.state();
+    let state = algorithm.state();
     let learned = state.iter().filter(|(name, _)| weights.contains(name));
     sha256(&learned.map(|(_, numbers)| *numbers).collect::<Vec<_>>())
 }
 
 /// An algorithm that learns from minibatches: a step, then the updates that it allows. Returns the SHA-256 of the final
 /// weights.
-pub(crate) fn of_minibatches<L: MinibatchLearner>(config: &Config, mut learner: L) -> String {
+pub(crate) fn of_minibatches<A: MinibatchAlgorithm>(config: &Config, mut algorithm: A) -> String {
     let row = config.row_layout();
     let size = config.algorithm.settings().batch();
     let (sampler, mut batch, mut indices) = (Sampler::new(config.run.seed), Minibatch::new(row, size), vec![0; size]);
@@ -196,12 +196,12 @@ pub(crate) fn of_minibatches<L: MinibatchLearner>(config: &Config, mut learner: 
     let (mut episode, mut begun) = (Vec::new(), 0);
     let n = config.replay.n_step as usize;
     while (rows.len() as u64) < config.run.steps {
-        let act: Act = if learner.updates() == 0 {
+        let act: Act = if algorithm.updates() == 0 {
             Exploration::warm_up
         } else {
             Exploration::act
         };
-        world.choose_all(act, rows.len() as u64, learner.policy(), &mut a);
+        world.choose_all(act, rows.len() as u64, algorithm.policy(), &mut a);
         episode.push(world.step_all(&a));
         let over = episode.last().is_some_and(|step| step.terminated || step.truncated);
         // A row follows as soon as n steps are known, or the episode is over.
@@ -211,13 +211,13 @@ pub(crate) fn of_minibatches<L: MinibatchLearner>(config: &Config, mut learner: 
             let t = rows.len() as u64;
             let beyond_warmup = t.saturating_sub(config.replay.warmup);
             let allowed = (beyond_warmup as f64 * config.replay.updates_per_step).floor() as u64;
-            while learner.updates() < allowed {
+            while algorithm.updates() < allowed {
                 let window = t.saturating_sub(config.replay.capacity)..t;
-                sampler.indices(learner.updates(), window, &mut indices);
+                sampler.indices(algorithm.updates(), window, &mut indices);
                 for (column, index) in indices.iter().enumerate() {
                     batch.set(column, &row.read(&rows[*index as usize]));
                 }
-                learner.learn(&batch);
+                algorithm.learn(&batch);
             }
         }
         if over {
@@ -226,7 +226,7 @@ pub(crate) fn of_minibatches<L: MinibatchLearner>(config: &Config, mut learner: 
         }
     }
     let weights = registry::weights(config);
-    let state = learner.state();
+    let state = algorithm.state();
     let learned = state.iter().filter(|(name, _)| weights.contains(name));
     sha256(&learned.map(|(_, numbers)| *numbers).collect::<Vec<_>>())
 }

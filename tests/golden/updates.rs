@@ -13,7 +13,7 @@ use shoal_learner::algorithms::algorithm::Losses;
 use shoal_learner::algorithms::ddpg::Ddpg;
 use shoal_learner::algorithms::dqn::Dqn;
 use shoal_learner::algorithms::minibatch::Minibatch;
-use shoal_learner::algorithms::minibatch_algorithm::MinibatchLearner;
+use shoal_learner::algorithms::minibatch_algorithm::MinibatchAlgorithm;
 use shoal_learner::algorithms::sac::Sac;
 use shoal_learner::algorithms::td3::Td3;
 
@@ -23,7 +23,7 @@ use super::{FLAGS, Failure, VALUES, close, read};
 pub(super) fn check(file: &Value) -> Result<(), Failure> {
     let constants = serde_json::json!({"beta1": 0.9, "beta2": 0.999, "eps": 1e-8});
     if file["adam"] != constants {
-        return Err(format!("Adam's constants are not the learner's: {}", file["adam"]));
+        return Err(format!("Adam's constants are not the algorithm's: {}", file["adam"]));
     }
     let batches = Batches::read(file)?;
     match file.get("method").and_then(Value::as_str) {
@@ -137,7 +137,7 @@ fn dqn(file: &Value, batches: &Batches) -> Result<(), Failure> {
     })
 }
 
-/// Names of networks in a file, and of their arrays in the learner's state.
+/// Names of networks in a file, and of their arrays in the algorithm's state.
 const TWIN_CRITICS: [(&str, &str); 4] = [
     ("critic1", "critic 1"),
     ("critic2", "critic 2"),
@@ -145,7 +145,7 @@ const TWIN_CRITICS: [(&str, &str); 4] = [
     ("target_critic2", "target critic 2"),
 ];
 
-/// A network in a file, its array in the learner's state, and the name of the learned network of the same shape.
+/// A network in a file, its array in the algorithm's state, and the name of the learned network of the same shape.
 struct Recorded {
     name: &'static str,
     array: &'static str,
@@ -163,24 +163,24 @@ fn recorded(networks: &[(&'static str, &'static str)]) -> Vec<Recorded> {
         .collect()
 }
 
-/// Starts `learner` from the initial networks and takes a step for each batch. `update` takes one and returns the
+/// Starts `algorithm` from the initial networks and takes a step for each batch. `update` takes one and returns the
 /// losses, which are compared with those of the same name that the file has.
-fn repeat<L: MinibatchLearner>(
+fn repeat<A: MinibatchAlgorithm>(
     file: &Value,
     batches: &Batches,
-    learner: &mut L,
+    algorithm: &mut A,
     learned: &LearnedShapes,
     networks: &[Recorded],
-    mut update: impl FnMut(&mut L, &Value, &Minibatch) -> Result<Vec<(&'static str, f32)>, Failure>,
+    mut update: impl FnMut(&mut A, &Value, &Minibatch) -> Result<Vec<(&'static str, f32)>, Failure>,
 ) -> Result<(), Failure> {
     for (network, numbers) in parameters(&file["initial"], learned, networks)? {
-        let mut state = learner.state_mut(0);
+        let mut state = algorithm.state_mut(0);
         let array = state.iter_mut().find(|(name, _)| *name == network.array);
-        let (_, array) = array.ok_or_else(|| format!("the learner has no {}", network.array))?;
+        let (_, array) = array.ok_or_else(|| format!("the algorithm has no {}", network.array))?;
         array.copy_from_slice(&numbers);
     }
     for (i, (recorded, batch, expected)) in batches.iter().enumerate() {
-        let losses = update(learner, recorded, batch).map_err(|e| format!("batch {i}: {e}"))?;
+        let losses = update(algorithm, recorded, batch).map_err(|e| format!("batch {i}: {e}"))?;
         let mut compared = 0;
         for (name, ours) in losses.into_iter().filter(|(name, _)| expected.get(name).is_some()) {
             close(&[ours.into()], &[number(expected, name)?]).map_err(|e| format!("update {i}: {name} {e}"))?;
@@ -189,7 +189,7 @@ fn repeat<L: MinibatchLearner>(
         if compared == 0 {
             return Err(format!("update {i}: no loss is recorded"));
         }
-        let state = learner.state();
+        let state = algorithm.state();
         for (network, numbers) in parameters(expected, learned, networks)? {
             let (_, ours) = state
                 .iter()
@@ -204,7 +204,7 @@ fn repeat<L: MinibatchLearner>(
     Ok(())
 }
 
-/// Every network's parameters in the learner's order.
+/// Every network's parameters in the algorithm's order.
 fn parameters<'a>(
     recorded: &Value,
     learned: &LearnedShapes,
@@ -213,7 +213,7 @@ fn parameters<'a>(
     let of = |network: &'a Recorded| {
         let shape = learned.iter().find(|(name, _)| *name == network.shape_of);
         let Some((_, Shape::Network(layout))) = shape else {
-            return Err(format!("the learner has no network {}", network.shape_of));
+            return Err(format!("the algorithm has no network {}", network.shape_of));
         };
         let numbers = flat(&recorded[network.name], &layout).map_err(|e| format!("{}: {e}", network.name))?;
         Ok((network, numbers))
@@ -221,7 +221,7 @@ fn parameters<'a>(
     networks.iter().map(of).collect()
 }
 
-/// A recorded network's parameters in the learner's order. The recorded weights are lists of rows, one row per output.
+/// A recorded network's parameters in the algorithm's order. The recorded weights are lists of rows, one per output.
 fn flat(network: &Value, layout: &NetworkLayout) -> Result<Vec<f32>, Failure> {
     let mut parameters = Vec::with_capacity(layout.parameters());
     for (layer, (inputs, outputs)) in layout.layer_sizes().enumerate() {

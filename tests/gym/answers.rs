@@ -9,7 +9,7 @@ use crate::{SHORT, layout_of, place, server_of};
 
 /// Something that a server does to its answers now and then.
 #[derive(Clone, Debug, serde::Serialize)]
-struct Deed {
+struct Fault {
     what: &'static str,
     chance: f64,
     /// How often all servers of a run together do it at most.
@@ -18,7 +18,7 @@ struct Deed {
     count: u32,
 }
 
-fn any_deed() -> impl Strategy<Value = Deed> {
+fn any_fault() -> impl Strategy<Value = Fault> {
     let what = [
         "number", "numbers", "status", "length", "header", "none", "late", "exit", "refused", "twice",
     ];
@@ -29,7 +29,7 @@ fn any_deed() -> impl Strategy<Value = Deed> {
         prop::sample::select(number.to_vec()),
     );
     let times = prop_oneof![1_u32..4, Just(1000)];
-    (what, chance, times, number, 0_u32..40).prop_map(|(what, chance, times, number, count)| Deed {
+    (what, chance, times, number, 0_u32..40).prop_map(|(what, chance, times, number, count)| Fault {
         what,
         chance,
         // Each of these costs the run some seconds.
@@ -109,9 +109,9 @@ pub(crate) fn arbitrary_answers_are_survived_or_named_in_one_line() {
         None => TestRunner::new_with_rng(config, TestRng::deterministic_rng(RngAlgorithm::ChaCha)),
     };
     let client = prop::sample::select(vec!["actor", "evaluator", ""]);
-    let plans = (any::<u32>(), client, prop::collection::vec(any_deed(), 1..4));
-    let plans = plans.prop_map(|(seed, client, deeds)| {
-        serde_json::json!({ "seed": seed, "client": client, "deeds": deeds }).to_string()
+    let plans = (any::<u32>(), client, prop::collection::vec(any_fault(), 1..4));
+    let plans = plans.prop_map(|(seed, client, faults)| {
+        serde_json::json!({ "seed": seed, "client": client, "faults": faults }).to_string()
     });
     runner.run(&plans, |plan| survives_or_names(&plan)).unwrap();
 }

@@ -326,70 +326,70 @@ def holding_server(episodes):
 def scripted_server(plan):
     """An environment server that spoils its answers to one client by a plan, and does not check them.
 
-    Each deed is done with its chance, and at most ``times`` times by all servers in this directory together.
+    Each fault is done with its chance, and at most ``times`` times by all servers in this directory together.
     """
     from shoal_gym import server
 
     plan = json.loads(plan)
     luck = np.random.default_rng(plan["seed"])
     if not sys.argv[sys.argv.index("--client") + 1].startswith(plan["client"]):
-        plan["deeds"] = []
+        plan["faults"] = []
 
-    def is_due(deed):
-        if luck.random() >= deed["chance"]:
+    def is_due(fault):
+        if luck.random() >= fault["chance"]:
             return False
-        for time_of in range(deed["times"]):
+        for time_of in range(fault["times"]):
             try:
-                os.close(os.open(f"{deed['what']}-{time_of}", os.O_CREAT | os.O_EXCL))
+                os.close(os.open(f"{fault['what']}-{time_of}", os.O_CREAT | os.O_EXCL))
                 return True
             except FileExistsError:
                 pass
         return False
 
     def due(*kinds):
-        return [deed for deed in plan["deeds"] if deed["what"] in kinds and is_due(deed)]
+        return [fault for fault in plan["faults"] if fault["what"] in kinds and is_due(fault)]
 
     send, loan_blocks, answer = server.Server._send, server.Server._loan_blocks, server.Server.answer
     header = server.ResponseHeader
 
     def spoiled(self, response, status):
         numbers = server._numbers(response.payload())
-        for deed in due("number", "numbers", "status"):
-            match deed["what"]:
+        for fault in due("number", "numbers", "status"):
+            match fault["what"]:
                 case "number" if len(numbers) > 0:
-                    numbers[luck.integers(len(numbers))] = deed["number"]
+                    numbers[luck.integers(len(numbers))] = fault["number"]
                 case "numbers":
-                    numbers[:] = deed["number"]
+                    numbers[:] = fault["number"]
                 case "status":
-                    status = deed["count"]
+                    status = fault["count"]
         send(self, response, status)
 
     def another_length(self, request):
         response, blocks = loan_blocks(self, request)
-        for deed in due("length"):
-            return self._loan(request, deed["count"]), blocks
+        for fault in due("length"):
+            return self._loan(request, fault["count"]), blocks
         return response, blocks
 
     def another_header(**fields):
-        for deed in due("header"):
-            fields[list(fields)[1 + deed["count"] % 7]] = deed["count"]
+        for fault in due("header"):
+            fields[list(fields)[1 + fault["count"] % 7]] = fault["count"]
         return header(**fields)
 
     def answered(self, request):
-        for deed in due("none", "late", "exit", "refused"):
-            match deed["what"]:
+        for fault in due("none", "late", "exit", "refused"):
+            match fault["what"]:
                 case "none":
                     return
                 case "late":
-                    time.sleep(deed["count"] / 10)
+                    time.sleep(fault["count"] / 10)
                 case "exit":
-                    os._exit(deed["count"])
+                    os._exit(fault["count"])
                 case "refused":
                     self._refuse(request, "it does not like it")
                     return
         answer(self, request)
-        for deed in due("twice"):
-            self._send(self._loan(request, deed["count"]), server.ResponseStatus.ANSWERED)
+        for fault in due("twice"):
+            self._send(self._loan(request, fault["count"]), server.ResponseStatus.ANSWERED)
 
     server.Server._send, server.Server._loan_blocks, server.Server.answer = spoiled, another_length, answered
     server.ResponseHeader = another_header

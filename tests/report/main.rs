@@ -318,7 +318,7 @@ fn the_report_of_one_run_begins_with_its_result() {
             .find(|(known, _)| known == name)
             .map(|(_, value)| value.as_str())
     };
-    assert_eq!(of("Method"), Some("ddpg (lockstep)"));
+    assert_eq!(of("Algorithm"), Some("ddpg (lockstep)"));
     assert_eq!(of("Environment"), Some("pendulum"));
     let command = of("Command").unwrap();
     assert!(
@@ -336,7 +336,7 @@ fn the_report_of_one_run_begins_with_its_result() {
     report(&place, &["swing"]);
     browser.open(&page, 1200, false);
     let names: Vec<String> = facts(&mut browser).into_iter().map(|(name, _)| name).collect();
-    assert_eq!(names, ["Method", "Environment", "Seed", "Duration"]);
+    assert_eq!(names, ["Algorithm", "Environment", "Seed", "Duration"]);
     assert_eq!(browser.problems(), [""; 0]);
 }
 
@@ -422,7 +422,7 @@ fn check_player(browser: &mut Browser, run: &str) {
     browser.click(".player input[type=range]", 0.5);
     let middle = frame(browser);
     assert!(middle > 0, "{run}: the slider was moved");
-    // Several positions, because the lake's walker is back at its start half-way.
+    // Several positions, because the lake's agent is back at its start half-way.
     let mut places = vec![start, moving_part(browser)];
     browser.value("document.querySelector('.player').focus()");
     browser.key("Home");

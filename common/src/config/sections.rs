@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer, de};
 use shoal_base::space::EnvironmentSpec;
-use toml::{Table, Value};
+use toml::Table;
 
 use super::{
     ActorsConfig, AlgorithmConfig, CheckpointConfig, Config, EnvironmentConfig, EvaluationConfig, ExplorationConfig,
@@ -129,9 +129,9 @@ pub(super) fn first_unreadable(sections: &Table) -> Option<String> {
 
 /// The algorithm that has a section, or the default algorithm if none has one.
 fn one_algorithm(mut sections: Table) -> Result<AlgorithmConfig, String> {
-    let names = AlgorithmConfig::all().into_iter().map(|algorithm| algorithm.name());
-    let named: Vec<(&str, Value)> = names.filter_map(|name| Some((name, sections.remove(name)?))).collect();
-    if let Some(unknown) = sections.keys().next() {
+    let named = AlgorithmConfig::all_in(&sections);
+    let is_unknown = |section: &&String| !named.iter().any(|algorithm| algorithm.name == section.as_str());
+    if let Some(unknown) = sections.keys().find(is_unknown) {
         let known = explanation::sections().into_iter().map(|section| section.name);
         let known: Vec<String> = known.chain(["spec"]).map(|name| format!("`{name}`")).collect();
         return Err(format!(
@@ -139,14 +139,15 @@ fn one_algorithm(mut sections: Table) -> Result<AlgorithmConfig, String> {
             known.join(", ")
         ));
     }
-    if let [(one, _), (other, _), ..] = named.as_slice() {
+    if let [one, other, ..] = named.as_slice() {
         return Err(format!(
-            "there are sections for two algorithms, [{one}] and [{other}]: keep one"
+            "there are sections for two algorithms, [{}] and [{}]: keep one",
+            one.name, other.name
         ));
     }
     let read = named
         .into_iter()
-        .find_map(|(name, section)| AlgorithmConfig::read(name, section));
+        .find_map(|algorithm| AlgorithmConfig::read(algorithm.name, sections.remove(algorithm.name)?));
     read.unwrap_or_else(|| Ok(AlgorithmConfig::default()))
         .map_err(|error| error.message().to_owned())
 }

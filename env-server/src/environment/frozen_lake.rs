@@ -51,7 +51,7 @@ pub struct LakeTransition {
 }
 
 /// The outcomes of `action` in `state` (equation 4.1), in Gymnasium's order: the intended direction lies between the
-/// two that the walker may slip to. Holes and the goal are never left: they have one outcome, without reward.
+/// two that the agent may slip to. Holes and the goal are never left: they have one outcome, without reward.
 ///
 /// Panics unless `state < STATES` and `action < ACTIONS`.
 pub fn transitions(state: usize, action: usize) -> impl Iterator<Item = LakeTransition> {
@@ -101,7 +101,7 @@ fn neighbour(state: usize, direction: usize) -> usize {
     row * SIDE + column
 }
 
-/// A walk over ice. Observation and action are indices. It terminates at the goal, with reward 1, and in a hole,
+/// A grid of slippery ice. Observation and action are indices. It terminates at the goal, with reward 1, and in a hole,
 /// without reward.
 #[derive(Clone, Debug)]
 pub struct FrozenLake {
@@ -171,7 +171,7 @@ impl Environment for FrozenLake {
         ]
     }
 
-    /// The lake from above, its first row at the top; the arrow is the action, and the walker may slip.
+    /// The lake from above, its first row at the top; the arrow is the action, and the agent may slip.
     fn draw(&self, action: &[f64]) -> Option<Drawing> {
         let corner = |cell: usize| [(cell % SIDE) as f64, (SIDE - 1 - cell / SIDE) as f64];
         let side = SIDE as f64;

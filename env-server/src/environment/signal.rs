@@ -129,8 +129,8 @@ pub enum Picture {
         /// The pole's length, in m.
         pole: f64,
     },
-    /// A walk over a square grid. `field` is the number of the cell, row by row; `direction` is 0 left, 1 down, 2
-    /// right, 3 up.
+    /// An agent on a square grid. `field` is the number of the cell, row by row; `direction` is 0 left, 1 down, 2 right,
+    /// 3 up.
     Grid {
         /// A letter for each cell, row by row: S the start, F free, H a hole, G the goal.
         map: String,

@@ -200,20 +200,20 @@ fn evaluation_does_not_disturb_training_episodes() {
 
 #[test]
 fn a_repeated_frozen_lake_episode_slips_the_same_way() {
-    let walk = |fixture: &mut Fixture| -> Vec<f32> {
-        let slide = |_| {
+    let states = |fixture: &mut Fixture| -> Vec<f32> {
+        let step = |_| {
             fixture.step(&[2.0]).unwrap();
             fixture.next_observations[0]
         };
-        (0..20).map(slide).collect()
+        (0..20).map(step).collect()
     };
     let mut fixture = Fixture::new("frozen-lake", "", 1);
     fixture.reset(Reset::Next);
-    let first = walk(&mut fixture);
+    let first = states(&mut fixture);
     fixture.reset(Reset::Episodes(&[0]));
-    assert_eq!(walk(&mut fixture), first);
+    assert_eq!(states(&mut fixture), first);
     fixture.reset(Reset::Episodes(&[100]));
-    assert_ne!(walk(&mut fixture), first);
+    assert_ne!(states(&mut fixture), first);
 }
 
 #[test]

@@ -10,9 +10,9 @@ use crate::networks::product::Products;
 use crate::networks::threads::Threads;
 use crate::replay::Replay;
 
-/// The settings of a learning algorithm, and how to create the algorithm from them.
-pub trait AlgorithmFactory {
-    /// The learner of a run with this configuration, before its first update.
+/// How an algorithm with certain settings learns: creates it, and says beforehand what its state and its work will be.
+pub trait AlgorithmDefinition {
+    /// The algorithm of a run with this configuration, before its first update.
     ///
     /// # Errors
     /// When the algorithm cannot control the environment.
@@ -24,13 +24,16 @@ pub trait AlgorithmFactory {
 
     /// The matrix products of one or a few updates in an environment like `spec`; none if the algorithm has no
     /// networks, or if its updates have no fixed size.
-    fn products(&self, spec: &EnvironmentSpec) -> Products;
+    fn products(&self, _spec: &EnvironmentSpec) -> Products {
+        Products::default()
+    }
 
-    /// The total length of all arrays of the learner's state, without the statistics of normalised observations.
+    /// The total length of all arrays of the algorithm's state, without the statistics of normalised observations.
     fn state_numbers(&self, spec: &EnvironmentSpec, sizes: RunSizes) -> usize;
 }
 
-/// A running learner: its updates from rows of the replay, its policy for the actors, and its state for checkpoints.
+/// An algorithm that is learning: its updates from rows of the replay, its policy for the actors, and its state for
+/// checkpoints.
 pub trait Algorithm {
     /// The policy's parameters.
     fn policy(&self) -> Cow<'_, [f32]>;

@@ -11,9 +11,9 @@ use shoal_common::network::{ActionRange, NetworkLayout};
 use shoal_common::policy::PolicyError;
 use shoal_common::space::EnvironmentSpec;
 
-use super::algorithm::{Algorithm, AlgorithmFactory, Losses, RunSizes, StateArray, StateArrayMut};
+use super::algorithm::{Algorithm, AlgorithmDefinition, Losses, RunSizes, StateArray, StateArrayMut};
 use super::minibatch::Minibatch;
-use super::minibatch_algorithm::{MinibatchAlgorithm, MinibatchLearner, mean, targets};
+use super::minibatch_algorithm::{MinibatchAlgorithm, ReplaySampling, mean, targets};
 use crate::networks::digest::sha256;
 use crate::networks::initialise::initialise;
 use crate::networks::pass::{Pass, Samples};
@@ -21,7 +21,7 @@ use crate::networks::product::{self, Products};
 use crate::networks::threads::Threads;
 use crate::networks::trainable::{NetworkWithTarget, threads_for};
 
-/// The parts of the learner's state, as named in a checkpoint.
+/// The parts of the algorithm's state, as named in a checkpoint.
 const PARTS: [&str; 8] = [
     "actor",
     "critic",
@@ -33,7 +33,7 @@ const PARTS: [&str; 8] = [
     "critic's second moment",
 ];
 
-/// The learner of DDPG: both networks, their targets, both optimisers.
+/// The state of DDPG: both networks, their targets, both optimisers.
 #[derive(Clone, Debug)]
 pub struct Ddpg {
     range: ActionRange,
@@ -202,7 +202,7 @@ impl Ddpg {
     }
 }
 
-impl MinibatchLearner for Ddpg {
+impl MinibatchAlgorithm for Ddpg {
     fn policy(&self) -> &[f32] {
         &self.actor.online.parameters
     }
@@ -240,10 +240,10 @@ impl MinibatchLearner for Ddpg {
     }
 }
 
-impl AlgorithmFactory for &config::DdpgConfig {
+impl AlgorithmDefinition for &config::DdpgConfig {
     fn create(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
         let ddpg = Ddpg::new(&config.spec, self, config.run.seed)?;
-        Ok(Box::new(MinibatchAlgorithm::new(ddpg, config)?))
+        Ok(Box::new(ReplaySampling::new(ddpg, config)?))
     }
 
     fn weights(&self) -> &'static [&'static str] {

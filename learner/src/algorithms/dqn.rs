@@ -8,9 +8,9 @@ use shoal_common::config::{self, Config};
 use shoal_common::policy::{self, PolicyError, argmax};
 use shoal_common::space::EnvironmentSpec;
 
-use super::algorithm::{Algorithm, AlgorithmFactory, Losses, RunSizes, StateArray, StateArrayMut};
+use super::algorithm::{Algorithm, AlgorithmDefinition, Losses, RunSizes, StateArray, StateArrayMut};
 use super::minibatch::Minibatch;
-use super::minibatch_algorithm::{MinibatchAlgorithm, MinibatchLearner, targets};
+use super::minibatch_algorithm::{MinibatchAlgorithm, ReplaySampling, targets};
 use crate::networks::initialise::fan_in;
 use crate::networks::pass::Pass;
 use crate::networks::product::{self, Products};
@@ -25,7 +25,7 @@ const PARTS: [&str; 4] = [
     "action-values' second moment",
 ];
 
-/// The learner of DQN.
+/// The state of DQN.
 #[derive(Clone, Debug)]
 pub struct Dqn {
     settings: config::DqnConfig,
@@ -161,7 +161,7 @@ fn spread(d: &mut [f32]) {
     }
 }
 
-impl MinibatchLearner for Dqn {
+impl MinibatchAlgorithm for Dqn {
     fn policy(&self) -> &[f32] {
         &self.network.online.parameters
     }
@@ -194,10 +194,10 @@ impl MinibatchLearner for Dqn {
     }
 }
 
-impl AlgorithmFactory for &config::DqnConfig {
+impl AlgorithmDefinition for &config::DqnConfig {
     fn create(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
         let dqn = Dqn::new(&config.spec, self, config.run.seed)?;
-        Ok(Box::new(MinibatchAlgorithm::new(dqn, config)?))
+        Ok(Box::new(ReplaySampling::new(dqn, config)?))
     }
 
     fn weights(&self) -> &'static [&'static str] {

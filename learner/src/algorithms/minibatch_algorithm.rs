@@ -13,8 +13,8 @@ use super::sampling::Sampler;
 use crate::networks::threads::Threads;
 use crate::replay::Replay;
 
-/// A learner that takes gradient steps with minibatches, wherever those come from.
-pub trait MinibatchLearner {
+/// An algorithm that takes gradient steps with minibatches, wherever those come from.
+pub trait MinibatchAlgorithm {
     /// The policy's parameters, without those that normalise observations.
     fn policy(&self) -> &[f32];
 
@@ -32,14 +32,14 @@ pub trait MinibatchLearner {
     /// Everything that the next gradient step depends on besides the batch, by name.
     fn state(&self) -> Vec<StateArray<'_>>;
 
-    /// The same numbers, to be overwritten with those of a learner after `updates` gradient steps.
+    /// The same numbers, to be overwritten with those after `updates` gradient steps.
     fn state_mut(&mut self, updates: u64) -> Vec<StateArrayMut<'_>>;
 }
 
-/// A learner with its sampling from the replay.
+/// An algorithm with its sampling from the replay.
 #[derive(Debug)]
-pub struct MinibatchAlgorithm<L> {
-    learner: L,
+pub struct ReplaySampling<A> {
+    algorithm: A,
     sampler: Sampler,
     batch: Minibatch,
     indices: Vec<u64>,
@@ -49,16 +49,16 @@ pub struct MinibatchAlgorithm<L> {
     reward_scale: f32,
 }
 
-impl<L: MinibatchLearner> MinibatchAlgorithm<L> {
-    /// Samples minibatches for the `learner` of a run with this configuration.
+impl<A: MinibatchAlgorithm> ReplaySampling<A> {
+    /// Samples minibatches for the `algorithm` of a run with this configuration.
     ///
     /// # Errors
     /// When the algorithm cannot control the environment.
-    pub fn new(learner: L, config: &Config) -> Result<Self, PolicyError> {
+    pub fn new(algorithm: A, config: &Config) -> Result<Self, PolicyError> {
         let (row, batch) = (config.row_layout(), config.algorithm.settings().batch());
         let normalise = config.observation.normalise;
         Ok(Self {
-            learner,
+            algorithm,
             sampler: Sampler::new(config.run.seed),
             batch: Minibatch::new(row, batch),
             indices: vec![0; batch],
@@ -70,11 +70,11 @@ impl<L: MinibatchLearner> MinibatchAlgorithm<L> {
     }
 }
 
-impl<L: MinibatchLearner> Algorithm for MinibatchAlgorithm<L> {
+impl<A: MinibatchAlgorithm> Algorithm for ReplaySampling<A> {
     fn policy(&self) -> Cow<'_, [f32]> {
         match &self.normaliser {
-            None => self.learner.policy().into(),
-            Some(normaliser) => [self.learner.policy(), normaliser.published()].concat().into(),
+            None => self.algorithm.policy().into(),
+            Some(normaliser) => [self.algorithm.policy(), normaliser.published()].concat().into(),
         }
     }
 
@@ -83,13 +83,13 @@ impl<L: MinibatchLearner> Algorithm for MinibatchAlgorithm<L> {
     }
 
     fn updates(&self) -> u64 {
-        self.learner.updates()
+        self.algorithm.updates()
     }
 
     fn update(&mut self, replay: &Replay, rows: u64) -> Losses {
         let range = replay.sampling_range(rows, self.capacity);
         self.sampler
-            .indices(self.learner.updates(), range.clone(), &mut self.indices);
+            .indices(self.algorithm.updates(), range.clone(), &mut self.indices);
         self.batch.gather(replay, &self.indices, &range);
         if let Some(normaliser) = &mut self.normaliser {
             normaliser.count(replay, rows);
@@ -98,21 +98,21 @@ impl<L: MinibatchLearner> Algorithm for MinibatchAlgorithm<L> {
         if self.reward_scale != 1.0 {
             self.batch.r *= self.reward_scale;
         }
-        self.learner.learn(&self.batch)
+        self.algorithm.learn(&self.batch)
     }
 
     fn set_threads(&mut self, threads: Threads) {
-        self.learner.set_threads(threads);
+        self.algorithm.set_threads(threads);
     }
 
     fn state(&self) -> Vec<StateArray<'_>> {
-        let mut arrays = self.learner.state();
+        let mut arrays = self.algorithm.state();
         arrays.extend(self.normaliser.as_ref().map(Normaliser::state));
         arrays
     }
 
     fn restore(&mut self, updates: u64, saved: &mut SavedState) -> Result<(), StateArrayError> {
-        let mut arrays = self.learner.state_mut(updates);
+        let mut arrays = self.algorithm.state_mut(updates);
         arrays.extend(self.normaliser.as_mut().map(Normaliser::state_mut));
         for (name, numbers) in arrays {
             numbers.copy_from_slice(&saved.take(name, numbers.len())?);

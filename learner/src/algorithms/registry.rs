@@ -3,13 +3,13 @@
 use shoal_common::config::{self, Config};
 use shoal_common::policy::PolicyError;
 
-use super::algorithm::{Algorithm, AlgorithmFactory, RunSizes, SavedState, StateArrayError};
+use super::algorithm::{Algorithm, AlgorithmDefinition, RunSizes, SavedState, StateArrayError};
 use super::normaliser::{self, Normaliser};
 use super::tabular;
 use crate::networks::product::Products;
 
-/// The factory for the settings of a configuration.
-fn factory(algorithm: &config::AlgorithmConfig) -> Box<dyn AlgorithmFactory + '_> {
+/// The definition of the algorithm with these settings.
+fn definition(algorithm: &config::AlgorithmConfig) -> Box<dyn AlgorithmDefinition + '_> {
     match algorithm {
         config::AlgorithmConfig::Ddpg(settings) => Box::new(settings),
         config::AlgorithmConfig::Td3(settings) => Box::new(settings),
@@ -21,22 +21,22 @@ fn factory(algorithm: &config::AlgorithmConfig) -> Box<dyn AlgorithmFactory + '_
     }
 }
 
-/// The learner of a configuration, before its first update.
+/// The algorithm of a configuration, before its first update.
 ///
 /// # Errors
 /// When the algorithm cannot control the environment.
 pub fn new(config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
-    factory(&config.algorithm).create(config)
+    definition(&config.algorithm).create(config)
 }
 
 /// Names of the arrays of a checkpoint that hold what was learned, as opposed to the state of the optimiser.
 pub fn weights(config: &Config) -> Vec<&'static str> {
     let statistics = config.observation.normalise.then_some(Normaliser::ARRAY);
-    let learned = factory(&config.algorithm).weights().iter().copied();
+    let learned = definition(&config.algorithm).weights().iter().copied();
     learned.chain(statistics).collect()
 }
 
-/// The state of a learner that is `fresh`, except that it has the arrays `weights` of another one's state `saved`. The
+/// The state of the algorithm `fresh`, except that the arrays `weights` are those of another one's state `saved`. The
 /// optimisers begin anew. `rows` rows of its own replay are part of the statistics of observations already.
 ///
 /// # Errors
@@ -60,90 +60,97 @@ pub fn inherited(
     fresh.state().into_iter().map(array).collect()
 }
 
-/// The matrix products of one or a few updates of that learner; none if its algorithm has no networks, or if its
-/// updates have no fixed size.
+/// The matrix products of one or a few updates of that algorithm; none if it has no networks, or if its updates
+/// have no fixed size.
 pub fn products(config: &Config) -> Products {
-    factory(&config.algorithm).products(&config.spec)
+    definition(&config.algorithm).products(&config.spec)
 }
 
-/// The total length of that learner's state, computed without creating the learner.
+/// The total length of that algorithm's state, computed without creating the algorithm.
 pub fn state_numbers(config: &Config) -> usize {
     let statistics = if config.observation.normalise {
         Normaliser::state_numbers(config.spec.observation.width())
     } else {
         0
     };
-    factory(&config.algorithm).state_numbers(&config.spec, RunSizes::from(config)) + statistics
+    definition(&config.algorithm).state_numbers(&config.spec, RunSizes::from(config)) + statistics
 }
 
 #[cfg(test)]
 mod tests {
+    use shoal_common::algorithms::TransitionUse;
+    use shoal_common::config::AlgorithmConfig;
+
     use super::*;
 
-    fn config(rest: &str) -> Config {
-        let text = format!("[run]\nid = \"1a\"\nmode = \"lockstep\"\n[environment]\nname = \"x\"\n{rest}");
-        Config::from_table(text.parse().unwrap(), "test").unwrap()
+    const REAL: &str = "box = { low = [-1.0, -1.0], high = [1.0, 1.0] }";
+    const COUNTED: &str = "discrete.n = 5";
+
+    fn config(sections: &str, observation: &str, action: &str) -> Option<Config> {
+        let text = format!(
+            "[run]\nid = \"1a\"\nmode = \"lockstep\"\n[environment]\nname = \"x\"\n{sections}\n\
+             [spec]\ntime_limit = 8\nobservation.{observation}\naction.{action}\n"
+        );
+        Config::from_table(text.parse().unwrap(), "test").ok()
+    }
+
+    /// Each algorithm with its defaults, in an environment that it can control.
+    fn defaults() -> impl Iterator<Item = (String, Config)> {
+        AlgorithmConfig::all().into_iter().map(|algorithm| {
+            let once = algorithm.properties().transition_use != TransitionUse::Minibatches;
+            let replay = if once { "[replay]\nwarmup = 0" } else { "" };
+            let sections = format!("[{}]\n{replay}", algorithm.name());
+            let spaces = [(REAL, REAL), (REAL, COUNTED), (COUNTED, COUNTED)];
+            let mut fitting = spaces.iter().filter_map(|(s, a)| config(&sections, s, a));
+            let config = fitting.next().unwrap();
+            (sections, config)
+        })
+    }
+
+    /// Settings that change what the state consists of.
+    fn variants() -> impl Iterator<Item = (String, Config)> {
+        let variants = [
+            ("[ddpg]\nhidden = [7]", REAL, REAL),
+            ("[ddpg]\nhidden = [7, 5, 6]", REAL, REAL),
+            ("[ddpg]\n[observation]\nnormalise = true", REAL, REAL),
+            ("[sac]\n[observation]\nnormalise = true", REAL, REAL),
+            ("[dqn]\ndueling = true\nhidden = [7]", REAL, COUNTED),
+            (
+                "[reinforce]\nweight = \"baseline\"\n[replay]\nwarmup = 0",
+                REAL,
+                COUNTED,
+            ),
+            (
+                "[q-learning]\n[replay]\nwarmup = 0\n[actors]\nenvs = 3",
+                COUNTED,
+                COUNTED,
+            ),
+        ];
+        variants
+            .into_iter()
+            .map(|(sections, s, a)| (sections.to_owned(), config(sections, s, a).unwrap()))
     }
 
     #[test]
     fn the_size_and_the_weights_of_a_state_are_known_before_it_exists() {
-        let real = "box = { low = [-1.0, -1.0], high = [1.0, 1.0] }";
-        let in_order = "[replay]\nwarmup = 0\n[spec]\ntime_limit = 8";
-        let mut tested = Vec::new();
-        for (rest, observation, action) in [
-            ("[ddpg]\nhidden = [7, 5]\n[spec]\ntime_limit = 8", real, real),
-            ("[ddpg]\nhidden = [7]\n[spec]\ntime_limit = 8", real, real),
-            ("[ddpg]\nhidden = [7, 5, 6]\n[spec]\ntime_limit = 8", real, real),
-            ("[td3]\nhidden = [7, 5]\n[spec]\ntime_limit = 8", real, real),
-            ("[sac]\nhidden = [7, 5]\n[spec]\ntime_limit = 8", real, real),
-            ("[dqn]\nhidden = [7, 5]\n[spec]\ntime_limit = 8", real, "discrete.n = 3"),
-            (
-                "[dqn]\ndueling = true\nhidden = [7]\n[spec]\ntime_limit = 8",
-                real,
-                "discrete.n = 3",
-            ),
-            (
-                "[ddpg]\n[observation]\nnormalise = true\n[spec]\ntime_limit = 8",
-                real,
-                real,
-            ),
-            (
-                "[sac]\n[observation]\nnormalise = true\n[spec]\ntime_limit = 8",
-                real,
-                real,
-            ),
-            (&format!("[reinforce]\n{in_order}"), real, "discrete.n = 3"),
-            (
-                &format!("[reinforce]\nweight = \"baseline\"\n{in_order}"),
-                real,
-                "discrete.n = 3",
-            ),
-            (
-                &format!("[actors]\nenvs = 3\n[q-learning]\n{in_order}"),
-                "discrete.n = 5",
-                "discrete.n = 3",
-            ),
-            (&format!("[sarsa]\n{in_order}"), "discrete.n = 5", "discrete.n = 3"),
-        ] {
-            let config = config(&format!("{rest}\nobservation.{observation}\naction.{action}\n"));
-            tested.push(config.algorithm.name());
-            let learner = new(&config).unwrap();
-            let state = learner.state();
+        for (sections, config) in defaults().chain(variants()) {
+            let algorithm = new(&config).unwrap();
+            let state = algorithm.state();
             let numbers: usize = state.iter().map(|(_, numbers)| numbers.len()).sum();
-            assert_eq!(state_numbers(&config), numbers, "{rest}");
+            assert_eq!(state_numbers(&config), numbers, "{sections}");
             let named = |name: &&str| state.iter().any(|(array, _)| array == name);
             let weights = weights(&config);
             assert_eq!(
                 weights.contains(&"observations"),
-                rest.contains("normalise = true"),
-                "{rest}"
+                sections.contains("normalise = true"),
+                "{sections}"
             );
-            // A learner inherits its weights, and nothing of the optimiser.
+            // An algorithm inherits its weights, and nothing of the optimiser.
             let other: Vec<(String, Vec<f32>)> = state
                 .iter()
                 .map(|(name, numbers)| ((*name).to_owned(), vec![0.5; numbers.len()]))
                 .collect();
-            let begun = inherited(&*learner, &weights, SavedState::from(other), 3).unwrap();
+            let begun = inherited(&*algorithm, &weights, SavedState::from(other), 3).unwrap();
             for ((name, numbers), (_, fresh)) in begun.iter().zip(&state) {
                 match *name {
                     name if weights.contains(&name) && name != Normaliser::ARRAY => {
@@ -153,14 +160,10 @@ mod tests {
                     name => assert_eq!(numbers, fresh, "{name}"),
                 }
             }
-            // Only some learners have a baseline.
-            assert!(weights.iter().filter(|name| **name != "baseline").all(named), "{rest}");
-        }
-        for algorithm in config::AlgorithmConfig::all() {
-            let name = algorithm.name();
+            // Only some algorithms have a baseline.
             assert!(
-                tested.contains(&name),
-                "learner/src/algorithms/registry.rs: no case for {name}"
+                weights.iter().filter(|name| **name != "baseline").all(named),
+                "{sections}"
             );
         }
     }

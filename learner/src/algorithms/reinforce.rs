@@ -17,12 +17,11 @@ use shoal_common::policy::{self, PolicyError, PolicyLayout};
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::transition::Transition;
 
-use super::algorithm::{Algorithm, AlgorithmFactory, Losses, RunSizes, SavedState, StateArray, StateArrayError};
+use super::algorithm::{Algorithm, AlgorithmDefinition, Losses, RunSizes, SavedState, StateArray, StateArrayError};
 use crate::networks::adam::Adam;
 use crate::networks::aligned::Aligned;
 use crate::networks::initialise::glorot;
 use crate::networks::pass::Pass;
-use crate::networks::product::Products;
 use crate::networks::threads::Threads;
 use crate::replay::{Replay, are_finite};
 
@@ -73,7 +72,7 @@ impl TrainableNetworkWithPass {
     }
 }
 
-/// The learner of REINFORCE.
+/// The state of REINFORCE.
 #[derive(Clone, Debug)]
 pub struct Reinforce {
     settings: config::ReinforceConfig,
@@ -188,7 +187,7 @@ impl Reinforce {
         episode
             .last()
             .is_some_and(|end| end.last && (self.settings.learn_at_limit || end.discount == 0.0))
-            // Learners of earlier versions did not check their rows.
+            // Earlier versions did not check their rows.
             && episode.iter().all(is_finite)
     }
 
@@ -224,7 +223,7 @@ fn ln_sum_exp(logits: &[f32]) -> f32 {
     greatest + logits.iter().map(|logit| (logit - greatest).exp()).sum::<f32>().ln()
 }
 
-impl AlgorithmFactory for &config::ReinforceConfig {
+impl AlgorithmDefinition for &config::ReinforceConfig {
     fn create(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
         let (spec, seed) = (&config.spec, config.run.seed);
         Ok(Box::new(Reinforce::new(self, spec, seed, RunSizes::from(config))?))
@@ -232,10 +231,6 @@ impl AlgorithmFactory for &config::ReinforceConfig {
 
     fn weights(&self) -> &'static [&'static str] {
         &Reinforce::WEIGHTS
-    }
-
-    fn products(&self, _: &EnvironmentSpec) -> Products {
-        Products::default()
     }
 
     fn state_numbers(&self, spec: &EnvironmentSpec, _: RunSizes) -> usize {

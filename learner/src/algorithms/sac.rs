@@ -17,9 +17,9 @@ use shoal_common::policy::PolicyError;
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::stream::{Purpose, Stream, seek, stream};
 
-use super::algorithm::{Algorithm, AlgorithmFactory, Losses, RunSizes, StateArray, StateArrayMut};
+use super::algorithm::{Algorithm, AlgorithmDefinition, Losses, RunSizes, StateArray, StateArrayMut};
 use super::minibatch::Minibatch;
-use super::minibatch_algorithm::{MinibatchAlgorithm, MinibatchLearner, mean};
+use super::minibatch_algorithm::{MinibatchAlgorithm, ReplaySampling, mean};
 use super::twin_critics::{self, CriticLosses, CriticPart, TwinCritics};
 use crate::networks::adam::Adam;
 use crate::networks::initialise::fan_in;
@@ -179,7 +179,7 @@ impl Temperature {
     }
 }
 
-/// The learner of SAC.
+/// The state of SAC.
 #[derive(Clone, Debug)]
 pub struct Sac {
     range: ActionRange,
@@ -331,7 +331,7 @@ impl Sac {
     }
 }
 
-impl MinibatchLearner for Sac {
+impl MinibatchAlgorithm for Sac {
     fn policy(&self) -> &[f32] {
         &self.actor.parameters
     }
@@ -382,10 +382,10 @@ fn names() -> impl Iterator<Item = &'static str> {
     ACTOR.into_iter().chain(critics).chain(TEMPERATURE)
 }
 
-impl AlgorithmFactory for &config::SacConfig {
+impl AlgorithmDefinition for &config::SacConfig {
     fn create(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
         let sac = Sac::new(&config.spec, self, config.run.seed)?;
-        Ok(Box::new(MinibatchAlgorithm::new(sac, config)?))
+        Ok(Box::new(ReplaySampling::new(sac, config)?))
     }
 
     fn weights(&self) -> &'static [&'static str] {

@@ -8,8 +8,7 @@ use shoal_common::policy::{self, PolicyError, PolicyLayout};
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::transition::Transition;
 
-use super::algorithm::{Algorithm, AlgorithmFactory, Losses, RunSizes, SavedState, StateArray, StateArrayError};
-use crate::networks::product::Products;
+use super::algorithm::{Algorithm, AlgorithmDefinition, Losses, RunSizes, SavedState, StateArray, StateArrayError};
 use crate::replay::{Replay, are_finite};
 
 /// Which value of s' an update bootstraps from.
@@ -29,7 +28,7 @@ pub struct QLearning<'a>(pub &'a config::TabularConfig);
 #[derive(Debug)]
 pub struct Sarsa<'a>(pub &'a config::TabularConfig);
 
-impl AlgorithmFactory for QLearning<'_> {
+impl AlgorithmDefinition for QLearning<'_> {
     fn create(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
         let sizes = RunSizes::from(config);
         Ok(Box::new(Tabular::new(Bootstrap::Max, self.0, &config.spec, sizes)?))
@@ -39,16 +38,12 @@ impl AlgorithmFactory for QLearning<'_> {
         &Tabular::WEIGHTS
     }
 
-    fn products(&self, _: &EnvironmentSpec) -> Products {
-        Products::default()
-    }
-
     fn state_numbers(&self, spec: &EnvironmentSpec, sizes: RunSizes) -> usize {
         state_numbers(self.0, spec, sizes)
     }
 }
 
-impl AlgorithmFactory for Sarsa<'_> {
+impl AlgorithmDefinition for Sarsa<'_> {
     fn create(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
         let sizes = RunSizes::from(config);
         Ok(Box::new(Tabular::new(
@@ -61,10 +56,6 @@ impl AlgorithmFactory for Sarsa<'_> {
 
     fn weights(&self) -> &'static [&'static str] {
         &Tabular::WEIGHTS
-    }
-
-    fn products(&self, _: &EnvironmentSpec) -> Products {
-        Products::default()
     }
 
     fn state_numbers(&self, spec: &EnvironmentSpec, sizes: RunSizes) -> usize {
@@ -251,7 +242,7 @@ impl Algorithm for Tabular {
         let slot = self.slot(row);
         let numbers = replay.row(row);
         if !are_finite(numbers) {
-            // From a learner of an earlier version, which did not check its rows. The step before has lost its
+            // From an earlier version, which did not check its rows. The step before has lost its
             // successor.
             self.take_pending(slot);
             return Losses::default();

@@ -13,9 +13,9 @@ use shoal_common::policy::PolicyError;
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::stream::{Purpose, Stream, seek, stream};
 
-use super::algorithm::{Algorithm, AlgorithmFactory, Losses, RunSizes, StateArray, StateArrayMut};
+use super::algorithm::{Algorithm, AlgorithmDefinition, Losses, RunSizes, StateArray, StateArrayMut};
 use super::minibatch::Minibatch;
-use super::minibatch_algorithm::{MinibatchAlgorithm, MinibatchLearner, mean};
+use super::minibatch_algorithm::{MinibatchAlgorithm, ReplaySampling, mean};
 use super::twin_critics::{self, CriticLosses, CriticPart, TwinCritics};
 use crate::networks::initialise::fan_in;
 use crate::networks::pass::{Pass, Samples};
@@ -36,7 +36,7 @@ const WEIGHTS: [&str; 6] = [
     "target critic 2",
 ];
 
-/// The learner of TD3.
+/// The state of TD3.
 #[derive(Clone, Debug)]
 pub struct Td3 {
     settings: config::Td3Config,
@@ -170,7 +170,7 @@ impl Td3 {
     }
 }
 
-impl MinibatchLearner for Td3 {
+impl MinibatchAlgorithm for Td3 {
     fn policy(&self) -> &[f32] {
         &self.actor.online.parameters
     }
@@ -216,10 +216,10 @@ impl MinibatchLearner for Td3 {
     }
 }
 
-impl AlgorithmFactory for &config::Td3Config {
+impl AlgorithmDefinition for &config::Td3Config {
     fn create(&self, config: &Config) -> Result<Box<dyn Algorithm>, PolicyError> {
         let td3 = Td3::new(&config.spec, self, config.run.seed)?;
-        Ok(Box::new(MinibatchAlgorithm::new(td3, config)?))
+        Ok(Box::new(ReplaySampling::new(td3, config)?))
     }
 
     fn weights(&self) -> &'static [&'static str] {

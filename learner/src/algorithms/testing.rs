@@ -6,7 +6,7 @@ use shoal_common::stream::{Purpose, Stream, stream};
 use shoal_common::transition::{RowLayout, Transition};
 
 use super::minibatch::Minibatch;
-use super::minibatch_algorithm::MinibatchLearner;
+use super::minibatch_algorithm::MinibatchAlgorithm;
 use crate::networks::digest::sha256;
 use crate::networks::threads::Threads;
 
@@ -91,7 +91,7 @@ pub(super) fn assert_is_gradient_of(
 }
 
 /// Gives `to` the whole state of `from`.
-pub(super) fn copy_state<L: MinibatchLearner>(from: &L, to: &mut L) {
+pub(super) fn copy_state<A: MinibatchAlgorithm>(from: &A, to: &mut A) {
     let names: Vec<_> = from.state().iter().map(|(name, _)| *name).collect();
     let arrays = to.state_mut(from.updates());
     assert_eq!(arrays.iter().map(|(name, _)| *name).collect::<Vec<_>>(), names);
@@ -100,20 +100,20 @@ pub(super) fn copy_state<L: MinibatchLearner>(from: &L, to: &mut L) {
     }
 }
 
-/// Asserts that a learner, made anew by `new`, ends with the same numbers on two threads as on one.
-pub(super) fn assert_threads_do_not_change_the_bits<L: MinibatchLearner>(
-    new: impl Fn() -> L + Sync,
+/// Asserts that an algorithm, made anew by `new`, ends with the same numbers on two threads as on one.
+pub(super) fn assert_threads_do_not_change_the_bits<A: MinibatchAlgorithm>(
+    new: impl Fn() -> A + Sync,
     row: RowLayout,
     size: usize,
     what: &str,
 ) {
     let run = |threads: Threads| {
-        let mut learner = new();
-        learner.set_threads(threads);
+        let mut algorithm = new();
+        algorithm.set_threads(threads);
         for seed in 0..6 {
-            learner.learn(&minibatch(seed, row, size));
+            algorithm.learn(&minibatch(seed, row, size));
         }
-        let state = learner.state().into_iter();
+        let state = algorithm.state().into_iter();
         state
             .map(|(name, numbers)| (name, sha256(&[numbers])))
             .collect::<Vec<_>>()

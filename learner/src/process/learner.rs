@@ -1,4 +1,4 @@
-//! The learner that free and lockstep runs share, with its replay, algorithm, channels and checkpoints.
+//! The learner's process in free and lockstep runs, with its replay, algorithm, channels and checkpoints.
 
 use std::io;
 use std::ops::Range;
@@ -33,7 +33,7 @@ const QUIET_TIME: Duration = Duration::from_millis(200);
 /// At the end, the learner takes chunks for no longer than this.
 const LAST_CHUNKS_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// A running learner.
+/// The state of the learner's process.
 pub(crate) struct Learner<'a> {
     pub(crate) domain: &'a Domain,
     pub(crate) settings: &'a LearnerSettings,

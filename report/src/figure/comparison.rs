@@ -2,35 +2,35 @@
 
 use std::path::Path;
 
-use shoal_run::evaluation::analysis::point_mass::Drive;
+use shoal_run::evaluation::analysis::point_mass::TestRun;
 
 use super::canvas::{BLUE, save};
 use super::panel::{Axis, Panel, Series};
 use super::point_mass::{CELL, draw_actions, draw_distance, extent, goal, starts};
 
-/// An agent and its episodes.
+/// An agent and its test runs.
 pub struct Agent<'a> {
     /// Its name in the diagram's title.
     pub name: String,
     /// Its episodes, one from each start position.
-    pub drives: Vec<&'a Drive>,
+    pub test_runs: Vec<&'a TestRun>,
 }
 
 /// Draws one diagram for each agent, with the paths of all its episodes.
 pub fn compare_paths(agents: &[Agent<'_>], path: &Path) -> anyhow::Result<()> {
     let points = agents
         .iter()
-        .flat_map(|agent| &agent.drives)
-        .flat_map(|drive| drive.path());
+        .flat_map(|agent| &agent.test_runs)
+        .flat_map(|run| run.path());
     let range = extent(points);
     let size = (agents.len().max(1) as u32 * 420, 450);
     save(path, size, |sheet| {
         for (agent, cell) in agents.iter().zip(sheet.split_evenly((1, agents.len().max(1)))) {
-            let paths = agent.drives.iter().map(|drive| Series {
+            let paths = agent.test_runs.iter().map(|run| Series {
                 width: 1.5,
-                ..Series::line("", BLUE, drive.path().collect())
+                ..Series::line("", BLUE, run.path().collect())
             });
-            let start_points = agent.drives.iter().map(|drive| (drive.start[0], drive.start[1]));
+            let start_points = agent.test_runs.iter().map(|run| (run.start[0], run.start[1]));
             Panel {
                 title: &agent.name,
                 note: "",
@@ -53,19 +53,16 @@ pub fn compare_paths(agents: &[Agent<'_>], path: &Path) -> anyhow::Result<()> {
 
 /// Draws one row for each agent, with the actions and the distance to the goal in its first episode.
 pub fn compare_actions(agents: &[Agent<'_>], path: &Path) -> anyhow::Result<()> {
-    let firsts: Vec<(&str, &Drive)> = agents
+    let firsts: Vec<(&str, &TestRun)> = agents
         .iter()
-        .filter_map(|agent| Some((agent.name.as_str(), *agent.drives.first()?)))
+        .filter_map(|agent| Some((agent.name.as_str(), *agent.test_runs.first()?)))
         .collect();
-    let farthest = firsts
-        .iter()
-        .flat_map(|(_, drive)| drive.distances())
-        .fold(1.0, f64::max);
+    let farthest = firsts.iter().flat_map(|(_, run)| run.distances()).fold(1.0, f64::max);
     let rows = firsts.len().max(1);
     save(path, (1160, rows as u32 * CELL.1), |sheet| {
-        for ((name, drive), row) in firsts.iter().zip(sheet.split_evenly((rows, 2)).chunks_exact(2)) {
-            draw_actions(&format!("{name}: control actions"), drive, &row[0])?;
-            draw_distance(&format!("{name}: distance to goal"), drive, farthest, &row[1])?;
+        for ((name, run), row) in firsts.iter().zip(sheet.split_evenly((rows, 2)).chunks_exact(2)) {
+            draw_actions(&format!("{name}: control actions"), run, &row[0])?;
+            draw_distance(&format!("{name}: distance to goal"), run, farthest, &row[1])?;
         }
         Ok(())
     })
@@ -74,19 +71,19 @@ pub fn compare_actions(agents: &[Agent<'_>], path: &Path) -> anyhow::Result<()> 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use shoal_run::testing::drive;
+    use shoal_run::testing::test_run;
 
     #[test]
     fn agents_are_drawn_side_by_side() {
         let dir = tempfile::tempdir().unwrap();
-        let drives = [
-            drive([2.0, -2.0], 0.0, 1.0, 2.0, 1.0),
-            drive([-2.0, 2.0], 0.1, 0.1, 1.0, 0.0),
+        let test_runs = [
+            test_run([2.0, -2.0], 0.0, 1.0, 2.0, 1.0),
+            test_run([-2.0, 2.0], 0.1, 0.1, 1.0, 0.0),
         ];
         let agents: Vec<_> = ["r1", "r2", "r3"]
             .map(|name| Agent {
                 name: name.into(),
-                drives: drives.iter().collect(),
+                test_runs: test_runs.iter().collect(),
             })
             .into();
         for agents in [&agents[..], &[]] {

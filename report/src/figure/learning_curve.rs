@@ -13,14 +13,14 @@ const SIZE: (u32, u32) = (860, 470);
 /// Most characters of a run's name in the title.
 const NAME: usize = 48;
 
-/// Draws the evaluations of `run`, which is trained by `method`, as a thin line and their moving average as a thick
+/// Draws the evaluations of `run`, which is trained by `algorithm`, as a thin line and their moving average as a thick
 /// one.
 pub fn learning_curve(
-    (run, method): (&str, &str),
+    (run, algorithm): (&str, &str),
     evaluations: &[EvaluationRecord],
     path: &Path,
 ) -> anyhow::Result<()> {
-    let title = title(run, method);
+    let title = title(run, algorithm);
     let mut evaluations: Vec<&EvaluationRecord> = evaluations.iter().collect();
     evaluations.sort_by_key(|evaluation| evaluation.env_steps);
     let last = evaluations
@@ -90,7 +90,7 @@ pub fn learning_curve(
 
 /// The title of a run's curve. A long name is cut in its middle, and control characters, which SVG cannot have, become
 /// spaces.
-fn title(run: &str, method: &str) -> String {
+fn title(run: &str, algorithm: &str) -> String {
     let run: Vec<char> = run.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
     let name: String = match run.len() {
         0..=NAME => run.iter().collect(),
@@ -99,7 +99,7 @@ fn title(run: &str, method: &str) -> String {
             start.iter().chain(&['…']).chain(end).collect()
         }
     };
-    format!("{name}: learning curve of {method}")
+    format!("{name}: learning curve of {algorithm}")
 }
 
 /// The divisor and the label of an axis of environment steps that ends at `last`.
@@ -168,7 +168,7 @@ mod tests {
     }
 
     #[test]
-    fn the_title_names_run_and_method() {
+    fn the_title_names_run_and_algorithm() {
         assert_eq!(title("pendulum-1", "sac"), "pendulum-1: learning curve of sac");
         let long = title(&format!("{}\n{}", "a".repeat(60), "b".repeat(60)), "sac");
         assert_eq!(

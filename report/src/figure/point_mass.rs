@@ -5,7 +5,7 @@ use std::f64::consts::PI;
 use std::ops::Range;
 use std::path::Path;
 
-use shoal_run::evaluation::analysis::point_mass::Drive;
+use shoal_run::evaluation::analysis::point_mass::TestRun;
 
 use super::canvas::{Area, BLUE, GREEN, INK, VERMILION, save};
 use super::panel::{Axis, Panel, Series, SeriesStyle, range_of};
@@ -13,12 +13,12 @@ use super::panel::{Axis, Panel, Series, SeriesStyle, range_of};
 /// Width and height of a diagram, in pixels.
 pub(super) const CELL: (u32, u32) = (400, 330);
 
-pub(super) fn distances(run: &Drive) -> Vec<(f64, f64)> {
+pub(super) fn distances(run: &TestRun) -> Vec<(f64, f64)> {
     over_steps(run.distances())
 }
 
 /// Draws one row of diagrams for each run: path, distance, actions, rewards.
-pub fn test_runs(runs: &[Drive], path: &Path) -> anyhow::Result<()> {
+pub fn test_runs(runs: &[TestRun], path: &Path) -> anyhow::Result<()> {
     let rewards = range_of(
         runs.iter()
             .flat_map(|run| run.rewards.iter().copied())
@@ -39,8 +39,8 @@ pub fn test_runs(runs: &[Drive], path: &Path) -> anyhow::Result<()> {
 }
 
 /// Draws the paths of all runs in one diagram and their distances to the goal in another.
-pub fn trajectories(runs: &[Drive], path: &Path) -> anyhow::Result<()> {
-    let extent = extent(runs.iter().flat_map(Drive::path));
+pub fn trajectories(runs: &[TestRun], path: &Path) -> anyhow::Result<()> {
+    let extent = extent(runs.iter().flat_map(TestRun::path));
     let thin = |points| Series {
         opacity: 0.75,
         width: 1.4,
@@ -50,7 +50,7 @@ pub fn trajectories(runs: &[Drive], path: &Path) -> anyhow::Result<()> {
     lines.push(starts(runs.iter().map(|run| (run.start[0], run.start[1])).collect()));
     lines.push(goal());
     let farthest = runs.iter().flat_map(distances).map(|(_, d)| d).fold(1.0, f64::max);
-    let mean = runs.iter().map(Drive::final_distance).sum::<f64>() / runs.len().max(1) as f64;
+    let mean = runs.iter().map(TestRun::final_distance).sum::<f64>() / runs.len().max(1) as f64;
     let note = format!("mean at the end: {mean:.3} m");
     let paths = Panel {
         title: "Trajectories",
@@ -84,7 +84,7 @@ pub fn trajectories(runs: &[Drive], path: &Path) -> anyhow::Result<()> {
     })
 }
 
-pub(super) fn draw_path(run: &Drive, area: &Area<'_>) -> anyhow::Result<()> {
+pub(super) fn draw_path(run: &TestRun, area: &Area<'_>) -> anyhow::Result<()> {
     let [x, y] = run.start;
     let extent = extent(run.path());
     let panel = Panel {
@@ -108,7 +108,7 @@ pub(super) fn draw_path(run: &Drive, area: &Area<'_>) -> anyhow::Result<()> {
     panel.draw(area)
 }
 
-pub(super) fn draw_distance(title: &str, run: &Drive, farthest: f64, area: &Area<'_>) -> anyhow::Result<()> {
+pub(super) fn draw_distance(title: &str, run: &TestRun, farthest: f64, area: &Area<'_>) -> anyhow::Result<()> {
     let panel = Panel {
         title,
         note: &format!("{:.3} m at the end", run.final_distance()),
@@ -123,7 +123,7 @@ pub(super) fn draw_distance(title: &str, run: &Drive, farthest: f64, area: &Area
     panel.draw(area)
 }
 
-pub(super) fn draw_actions(title: &str, run: &Drive, area: &Area<'_>) -> anyhow::Result<()> {
+pub(super) fn draw_actions(title: &str, run: &TestRun, area: &Area<'_>) -> anyhow::Result<()> {
     let direction = over_steps(run.direction.iter().map(|theta| theta / PI));
     let force = over_steps(run.force.iter().copied());
     let panel = Panel {
@@ -149,7 +149,7 @@ pub(super) fn draw_actions(title: &str, run: &Drive, area: &Area<'_>) -> anyhow:
     panel.draw(area)
 }
 
-fn draw_rewards(run: &Drive, range: Range<f64>, area: &Area<'_>) -> anyhow::Result<()> {
+fn draw_rewards(run: &TestRun, range: Range<f64>, area: &Area<'_>) -> anyhow::Result<()> {
     let panel = Panel {
         title: "Rewards",
         note: &format!("return {:.1}", run.episode_return()).replace('-', "\u{2212}"),
@@ -199,10 +199,10 @@ pub(super) fn extent(points: impl Iterator<Item = (f64, f64)>) -> Range<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use shoal_run::testing::drive;
+    use shoal_run::testing::test_run;
 
-    fn run(start: [f64; 2]) -> Drive {
-        drive(start, 0.01, 0.3, 1.5, 0.1)
+    fn run(start: [f64; 2]) -> TestRun {
+        test_run(start, 0.01, 0.3, 1.5, 0.1)
     }
 
     #[test]

@@ -31,7 +31,7 @@ function headFacts({ runs, suite }) {
   const times = runs.map((run) => run.wall_seconds).filter((seconds) => seconds > 0);
   const command = suite?.command ?? (runs.length === 1 ? runs[0].start?.command : null);
   const facts = [
-    ["Method", ofAll(runs, (run) => `${run.algorithm} (${run.mode})`)],
+    ["Algorithm", ofAll(runs, (run) => `${run.algorithm} (${run.mode})`)],
     ["Environment", ofAll(runs, (run) => run.environment)],
     [runs.length > 1 ? "Seeds" : "Seed", ofAll(runs, (run) => String(run.seed))],
     ["Start", suite ? date(suite.started) : range(starts, date)],

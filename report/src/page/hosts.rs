@@ -1,4 +1,4 @@
-//! The other hosts of a run, each in a line of the page.
+//! The joined hosts of a run, each in a line of the page.
 
 use serde::Serialize;
 use shoal_run::records::recorder::{HostRecord, RecordedHostState};
@@ -8,7 +8,7 @@ use crate::figure::quantile;
 
 /// How a host of the run did, by its records.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub(super) struct Host {
+pub(super) struct JoinedHost {
     name: String,
     actors: u32,
     /// When it was first recorded, in s.
@@ -26,7 +26,7 @@ pub(super) struct Host {
     cut_offs: usize,
 }
 
-impl Host {
+impl JoinedHost {
     /// The hosts of these records, in the order of their joining.
     pub(super) fn all(records: &[HostRecord]) -> Vec<Self> {
         let mut hosts: Vec<Vec<&HostRecord>> = Vec::new();
@@ -94,7 +94,7 @@ mod tests {
             record(9.0, "a", Connected, 300.0, 7),
             record(14.0, "a", Connected, 200.0, 7),
         ];
-        let [a, b] = Host::all(&records).try_into().unwrap();
+        let [a, b] = JoinedHost::all(&records).try_into().unwrap();
         assert_eq!(
             (a.name.as_str(), a.joined, a.gone, a.cut_offs),
             ("node-a", 1.0, None, 1)
@@ -104,6 +104,6 @@ mod tests {
             (Some(200.0), Some(0.5), 7)
         );
         assert_eq!((b.gone, b.rows_per_second, b.cut_offs), (Some(8.0), None, 0));
-        assert_eq!(Host::all(&[]), []);
+        assert_eq!(JoinedHost::all(&[]), []);
     }
 }

@@ -13,7 +13,7 @@ use shoal_run::records::recorder::{
 };
 use shoal_run::records::start::StartRecord;
 
-use super::hosts::Host;
+use super::hosts::JoinedHost;
 use super::numbers::{PageLimits, downsample, mean, parts, short};
 use super::played::Played;
 use super::settings::{self, Setting};
@@ -49,8 +49,8 @@ pub(super) struct Run {
     exploration: Curve,
     learner: Rates,
     incidents: Option<Incidents>,
-    /// The other hosts that have joined.
-    hosts: Vec<Host>,
+    /// The hosts that have joined.
+    hosts: Vec<JoinedHost>,
     /// How, when and where it was started; `None` in runs of earlier versions.
     start: Option<StartRecord>,
     /// What it began with, in words.
@@ -177,7 +177,7 @@ impl Run {
             exploration: Curve::of_episodes(&explored, limits.points),
             learner: Rates::of(learner, limits.points),
             incidents: read_incidents(&run.incidents())?.map(Incidents::of),
-            hosts: Host::all(&read_hosts(&run.hosts())?),
+            hosts: JoinedHost::all(&read_hosts(&run.hosts())?),
             start: StartRecord::read(run.path())?,
             origin: Origin::read(run)?.map(|origin| origin.in_words()),
             changes: read_changes(&run.changes())?,

@@ -157,15 +157,15 @@ const SCENES = {
       ];
     });
     const trail = svg("path", { class: "trail" });
-    const walker = svg("circle", { class: "body", r: 0.16, "data-part": "moves" });
+    const agent = svg("circle", { class: "body", r: 0.16, "data-part": "moves" });
     const intended = svg("path", { class: "force" });
     const caption = svg("text", { class: "note", x: 0, y: side + 0.28 });
     const label = "The lake from above; the dot is the agent, the arrow its action, and it may slip";
-    const element = drawing(`-0.05 -0.05 ${side + 0.1} ${side + 0.45}`, label, lake, trail, walker, intended, caption);
+    const element = drawing(`-0.05 -0.05 ${side + 0.1} ${side + 0.45}`, label, lake, trail, agent, intended, caption);
     const ways = [[-1, 0, "left"], [0, 1, "down"], [1, 0, "right"], [0, -1, "up"]];
     const draw = (i) => {
       const [x, y] = middle(fields[i]);
-      set(walker, { cx: x, cy: y });
+      set(agent, { cx: x, cy: y });
       set(trail, { d: line(fields.slice(0, i + 1).map(middle)) });
       const [dx, dy, word] = ways[directions[i]] ?? [0, 0, ""];
       arrow(intended, x + dx * 0.2, y + dy * 0.2, dx * 0.3, dy * 0.3, 0.12);

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use shoal_common::config::Config;
 use shoal_run::evaluation::analysis::pendulum::SwingUp;
-use shoal_run::evaluation::analysis::point_mass::{Drive, FAR_STARTS, NEAR_STARTS};
+use shoal_run::evaluation::analysis::point_mass::{FAR_STARTS, NEAR_STARTS, TestRun};
 use shoal_run::evaluation::rollout::Rollout;
 
 use crate::figure;
@@ -19,7 +19,7 @@ pub(super) fn behaviour(
 ) -> anyhow::Result<Option<Vec<PathBuf>>> {
     Ok(match config.environment.name.as_str() {
         "pendulum" => Some(swing_up(rollout, out)?),
-        "point-mass" => Some(drives(config, rollout, out)?),
+        "point-mass" => Some(test_runs(config, rollout, out)?),
         _ => None,
     })
 }
@@ -30,12 +30,12 @@ fn swing_up(rollout: &mut Rollout<'_>, out: &Path) -> anyhow::Result<Vec<PathBuf
     Ok(vec![path])
 }
 
-fn drives(config: &Config, rollout: &mut Rollout<'_>, out: &Path) -> anyhow::Result<Vec<PathBuf>> {
+fn test_runs(config: &Config, rollout: &mut Rollout<'_>, out: &Path) -> anyhow::Result<Vec<PathBuf>> {
     let files = ["test-runs.svg", "test-runs-far.svg", "trajectories.svg"].map(|file| out.join(file));
-    figure::test_runs(&Drive::run_from(rollout, starts_shown(config))?, &files[0])?;
-    let mut runs = Drive::run_from(rollout, &FAR_STARTS)?;
+    figure::test_runs(&TestRun::from_starts(rollout, starts_shown(config))?, &files[0])?;
+    let mut runs = TestRun::from_starts(rollout, &FAR_STARTS)?;
     figure::test_runs(&runs, &files[1])?;
-    runs.extend(Drive::run_from(rollout, &NEAR_STARTS)?);
+    runs.extend(TestRun::from_starts(rollout, &NEAR_STARTS)?);
     figure::trajectories(&runs, &files[2])?;
     Ok(files.into())
 }

@@ -1,20 +1,20 @@
 //! The claims of section 4.1.
 
-use shoal_run::evaluation::analysis::lake::{Values, Walk, greedy, risky_states, suboptimal_states};
+use shoal_run::evaluation::analysis::lake::{ExpectedResult, Values, greedy, risky_states, suboptimal_states};
 
 use super::super::claim::{Claim, Scope, spread};
 use super::super::result::SeedResult;
-use super::{EPISODES, Sweep, Tests};
+use super::{EPISODES, SettingResults, Tests};
 
 /// Probabilities of reaching the goal count as equal if they differ by less than this.
 const SAME: f64 = 0.05;
 
 pub(super) fn all(
-    epsilon: &[Sweep<'_>; 3],
-    alpha: &[Sweep<'_>; 4],
+    epsilon: &[SettingResults<'_>; 3],
+    alpha: &[SettingResults<'_>; 4],
     sarsa: &[SeedResult<Tests>],
     q_star: &Values,
-    best: Walk,
+    best: ExpectedResult,
 ) -> Vec<Claim> {
     let [low, (_, good), high] = *epsilon;
     vec![
@@ -81,7 +81,7 @@ fn optimal(good: &[SeedResult<Tests>], q_star: &Values) -> Claim {
     )
 }
 
-fn slow(epsilon: &[Sweep<'_>; 3], best: Walk) -> Claim {
+fn slow(epsilon: &[SettingResults<'_>; 3], best: ExpectedResult) -> Claim {
     let ends = epsilon.map(|(label, seeds)| (label, at_end(seeds)));
     let there = epsilon.iter().all(|(_, seeds)| !seeds.is_empty());
     together(
@@ -182,7 +182,7 @@ fn alike(good: &[SeedResult<Tests>], q_star: &Values) -> Claim {
     )
 }
 
-fn learning_rates(alpha: &[Sweep<'_>; 4]) -> Claim {
+fn learning_rates(alpha: &[SettingResults<'_>; 4]) -> Claim {
     let ends = alpha.map(|(label, seeds)| (label, at_end(seeds)));
     let there = alpha.iter().all(|(_, seeds)| !seeds.is_empty());
     together(
@@ -227,7 +227,7 @@ mod tests {
     fn seed(number: u64, rises: &[(u64, f64)], q: &Values) -> SeedResult<Tests> {
         let evaluated = rises.iter().map(|(episodes, reached)| EvaluatedPolicy {
             episodes: *episodes,
-            exact: Walk {
+            exact: ExpectedResult {
                 reached: *reached,
                 steps: 50.0,
             },
@@ -242,7 +242,7 @@ mod tests {
     #[test]
     fn claims_hold_for_results_like_the_thesis_and_fail_for_the_opposite() {
         let q_star = lake::optimal(0.999);
-        let best = Walk {
+        let best = ExpectedResult {
             reached: 0.74,
             steps: 50.0,
         };

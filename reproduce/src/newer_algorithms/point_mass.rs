@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 
 use serde::{Deserialize, Serialize};
-use shoal_run::evaluation::analysis::point_mass::{Drive, FAR_STARTS, Measures, NEAR_STARTS, REACHED};
+use shoal_run::evaluation::analysis::point_mass::{FAR_STARTS, Measures, NEAR_STARTS, REACHED, TestRun};
 use shoal_run::evaluation::rollout::Rollout;
 
 use super::super::claim::{Claim, Scope, spread};
@@ -81,9 +81,9 @@ impl Family for PointMassAlgorithms {
 
     fn test(policies: &Policies, _: &Stage) -> anyhow::Result<Tests> {
         let starts = [&NEAR_STARTS[..], &FAR_STARTS[..]].concat();
-        let drives = Drive::run_from(&mut Rollout::new(&policies.config, &policies.best.parameters)?, &starts)?;
+        let test_runs = TestRun::from_starts(&mut Rollout::new(&policies.config, &policies.best.parameters)?, &starts)?;
         Ok(Tests {
-            best: drives.iter().map(Drive::measures).collect(),
+            best: test_runs.iter().map(TestRun::measures).collect(),
         })
     }
 
@@ -167,12 +167,12 @@ fn table(experiments: &[(&str, &[Seed])]) -> String {
 mod tests {
     use super::super::super::result::tests::result;
     use super::*;
-    use shoal_run::testing::drive;
+    use shoal_run::testing::test_run;
 
     fn seed(number: u64, rest: f64, shake: f64, force: f64) -> Seed {
         let starts = [&NEAR_STARTS[..], &FAR_STARTS[..]].concat();
-        let drives = starts.iter().map(|start| drive(*start, rest, shake, force, 0.0));
-        let best = drives.map(|drive| drive.measures()).collect();
+        let test_runs = starts.iter().map(|start| test_run(*start, rest, shake, force, 0.0));
+        let best = test_runs.map(|run| run.measures()).collect();
         result(&EXPERIMENTS[0], number, 100.0, Tests { best })
     }
 

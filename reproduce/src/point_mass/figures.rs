@@ -68,7 +68,7 @@ pub(super) fn of_reward(
                 "Two test runs with {name}, seed {} (figure {tests})",
                 middle.header.seed
             ),
-            |path| figure::test_runs(&middle.tests.drives[shown.clone()], path),
+            |path| figure::test_runs(&middle.tests.test_runs[shown.clone()], path),
         )?,
     ])
 }
@@ -83,7 +83,7 @@ pub(super) fn of_r3(writer: &FigureWriter, seeds: &[SeedResult<Tests>]) -> anyho
                 middle.header.seed
             );
             figures.push(writer.add(&format!("point-mass-r3-{file}"), caption, |path| {
-                figure::test_runs(&middle.tests.drives[range], path)
+                figure::test_runs(&middle.tests.test_runs[range], path)
             })?);
         }
     }
@@ -98,7 +98,7 @@ pub(super) fn of_comparison(writer: &FigureWriter, rewards: [&[SeedResult<Tests>
             let middle = representative(seeds)?;
             Some(Agent {
                 name: format!("{name} (seed {})", middle.header.seed),
-                drives: middle.tests.drives[NEAR].iter().collect(),
+                test_runs: middle.tests.test_runs[NEAR].iter().collect(),
             })
         })
         .collect();
@@ -135,7 +135,7 @@ pub(super) fn of_longer(writer: &FigureWriter, seeds: &[SeedResult<Tests>]) -> a
                 "Two test runs of the last policy after additional training with r2, seed {} (figures A.1 and A.2)",
                 middle.header.seed
             ),
-            |path| figure::test_runs(&middle.tests.last_drives[R2.shown.clone()], path),
+            |path| figure::test_runs(&middle.tests.last_test_runs[R2.shown.clone()], path),
         )?,
         writer.add(
             "point-mass-r2-longer-learning-curve",

@@ -61,7 +61,7 @@ impl Trajectory {
 /// A policy and a single environment to run it in.
 pub struct Rollout<'a> {
     config: &'a Config,
-    host: Host,
+    environment: RolloutEnvironment,
     policy: Policy,
     parameters: &'a [f32],
     surroundings: ServerSurroundings,
@@ -69,7 +69,7 @@ pub struct Rollout<'a> {
 }
 
 /// Where the environment runs.
-enum Host {
+enum RolloutEnvironment {
     /// In this process.
     Builtin(Box<VectorEnvironment>),
     /// In another program, which is started with the first episode. The number is the seed of its evaluation episodes.
@@ -99,7 +99,7 @@ impl<'a> Rollout<'a> {
         );
         Ok(Self {
             config,
-            host: Host::new(config)?,
+            environment: RolloutEnvironment::new(config)?,
             policy,
             parameters,
             surroundings: ServerSurroundings::default(),
@@ -167,7 +167,7 @@ impl<'a> Rollout<'a> {
         loop {
             let mut recorder = frames.map(|(most, stride)| Recorder::new(most, stride));
             match self.try_episode(reset, progress, &mut recorder) {
-                Err(_) if tries < TRIES && self.interrupt.signal().is_none() && self.host.can_be_restarted() => {
+                Err(_) if tries < TRIES && self.interrupt.signal().is_none() && self.environment.can_be_restarted() => {
                     tries += 1;
                 }
                 Err(error) if tries > 1 => bail!("{error:#} (the episode was begun {tries} times)"),
@@ -186,9 +186,9 @@ impl<'a> Rollout<'a> {
         progress: &mut dyn FnMut(usize),
         recorder: &mut Option<Recorder>,
     ) -> anyhow::Result<Trajectory> {
-        self.host.ask_for_picture()?;
+        self.environment.ask_for_picture()?;
         let mut observation = self
-            .host
+            .environment
             .begin(self.config, &self.surroundings, reset, &self.interrupt)?;
         let mut action = vec![0.0; self.config.spec.action.width()];
         let mut trajectory = Trajectory {
@@ -202,21 +202,21 @@ impl<'a> Rollout<'a> {
             progress(steps);
             self.policy.act(self.parameters, &observation, &mut action);
             if let Some(recorder) = recorder.as_mut().filter(|recorder| recorder.wants(steps)) {
-                recorder.add(self.host.see(&action)?);
+                recorder.add(self.environment.see(&action)?);
             }
             let last = steps + 1 == self.config.spec.time_limit as usize;
             let wants_next = recorder.as_ref().is_some_and(|it| last || it.wants(steps + 1));
             if wants_next {
-                self.host.ask_for_picture()?;
+                self.environment.ask_for_picture()?;
             }
-            let step = self.host.step(&action)?;
+            let step = self.environment.step(&action)?;
             observation.clone_from(&step.s_next);
             trajectory.observations.push(step.s_next);
             trajectory.actions.push(action.clone());
             trajectory.rewards.push(step.reward);
             if step.terminated || step.truncated {
-                if let (Some(recorder), true) = (recorder, wants_next || self.host.is_builtin()) {
-                    recorder.add_last(self.host.see(&[])?.and_then(|written| written.frame.ok()));
+                if let (Some(recorder), true) = (recorder, wants_next || self.environment.is_builtin()) {
+                    recorder.add_last(self.environment.see(&[])?.and_then(|written| written.frame.ok()));
                 }
                 trajectory.terminated = step.terminated;
                 break;
@@ -235,7 +235,7 @@ fn evaluation(seed: u64, number: u64) -> Reset<'static> {
     }
 }
 
-impl Host {
+impl RolloutEnvironment {
     fn new(config: &Config) -> anyhow::Result<Self> {
         if !config.environment.server.is_empty() {
             return Ok(Self::External(None));

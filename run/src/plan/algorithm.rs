@@ -1,21 +1,28 @@
 //! The algorithm that the user asks for, and its defaults.
 
 use anyhow::Context;
-use shoal_common::config::AlgorithmConfig;
+use shoal_common::algorithms::{AlgorithmConfig, AlgorithmProperties};
 use toml::{Table, Value};
 
 use crate::usage::UsageError;
 
-/// Settings for single Gymnasium environments, `[ID.METHOD]`, which replace the algorithm's defaults; and in `[ID]`,
+/// Settings for single Gymnasium environments, `[ID.ALGORITHM]`, which replace the algorithm's defaults; and in `[ID]`,
 /// where there is one, the algorithm that suits the environment best.
 const OF_ENVIRONMENTS: &str = include_str!("../../../presets/method/environments.toml");
 
 /// The key of an environment's best algorithm there.
-const METHOD: &str = "method";
+const BEST: &str = "method";
 
 /// The algorithms' names.
 pub fn names() -> impl Iterator<Item = &'static str> {
     AlgorithmConfig::all().into_iter().map(|algorithm| algorithm.name())
+}
+
+/// The algorithm of this name.
+pub(super) fn of_name(name: &str) -> Option<AlgorithmProperties> {
+    let all = AlgorithmConfig::all().into_iter();
+    all.map(|algorithm| algorithm.properties())
+        .find(|known| known.name == name)
 }
 
 /// The algorithm that the user asks for: by its name, or by a key of its section.
@@ -23,7 +30,7 @@ pub fn names() -> impl Iterator<Item = &'static str> {
 /// # Errors
 /// When there is no such algorithm, or two are asked for.
 pub(crate) fn asked_for(algorithm: Option<&str>, set: &[String]) -> anyhow::Result<Option<&'static str>> {
-    let known = |name: &str| names().find(|known| *known == name);
+    let known = |name: &str| of_name(name).map(|algorithm| algorithm.name);
     let by_name = match algorithm {
         None => None,
         Some(name) => Some(known(name).ok_or_else(|| {
@@ -73,8 +80,8 @@ pub(crate) fn replace(preset: &mut Table, algorithm: &'static str) -> anyhow::Re
 /// The algorithm that suits the Gymnasium environment `name` best, if its spaces do not tell.
 pub(crate) fn best_for(name: &str) -> anyhow::Result<Option<&'static str>> {
     let of_environments: Table = OF_ENVIRONMENTS.parse()?;
-    let method = of_environments.get(name).and_then(|own| own.get(METHOD)?.as_str());
-    Ok(method.and_then(|method| names().find(|known| *known == method)))
+    let best = of_environments.get(name).and_then(|own| own.get(BEST)?.as_str());
+    Ok(best.and_then(of_name).map(|best| best.name))
 }
 
 /// Adds the defaults of an algorithm, and those for the environment `name`, to a table. Existing settings are kept.
@@ -91,10 +98,8 @@ pub(crate) fn add_defaults(table: &mut Table, name: &str, algorithm: &'static st
 }
 
 fn defaults(algorithm: &str) -> anyhow::Result<Table> {
-    let all = AlgorithmConfig::all();
-    let found = all.iter().find(|known| known.name() == algorithm);
-    let found = found.with_context(|| format!("there is no algorithm {algorithm}"))?;
-    Ok(found.properties().defaults.parse()?)
+    let found = of_name(algorithm).with_context(|| format!("there is no algorithm {algorithm}"))?;
+    Ok(found.defaults.parse()?)
 }
 
 /// Adds the keys of `defaults` that the table does not have.
@@ -128,7 +133,7 @@ mod tests {
     }
 
     #[test]
-    fn every_method_has_defaults_that_are_read_and_environments_name_methods() {
+    fn every_algorithm_has_defaults_that_are_read_and_environments_name_algorithms() {
         for name in names() {
             assert!(defaults(name).unwrap().contains_key(name), "{name}");
         }
@@ -140,12 +145,12 @@ mod tests {
         let of_environments: Table = OF_ENVIRONMENTS.parse().unwrap();
         for (environment, algorithms) in of_environments {
             for (algorithm, settings) in algorithms.as_table().unwrap() {
-                if algorithm == METHOD {
+                if algorithm == BEST {
                     let best = best_for(&environment).unwrap();
                     assert!(algorithms.get(best.unwrap()).is_some(), "{environment}: {settings}");
                     continue;
                 }
-                assert!(names().any(|name| name == algorithm), "{environment}: {algorithm}");
+                assert!(of_name(algorithm).is_some(), "{environment}: {algorithm}");
                 for (section, values) in settings.as_table().unwrap() {
                     for key in values.as_table().unwrap().keys() {
                         assert!(is_key(section, key), "{environment}.{algorithm}: {section}.{key}");

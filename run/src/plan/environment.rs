@@ -62,7 +62,7 @@ pub(super) fn describe_environment(table: &mut Table) -> anyhow::Result<()> {
     let named = AlgorithmConfig::named_in(table);
     if environment.name.starts_with(GYMNASIUM) {
         let algorithm = match named {
-            Some(named) => named,
+            Some(named) => named.name,
             None => algorithm::best_for(&environment.name)?.unwrap_or_else(|| AlgorithmConfig::suitable(&spec)),
         };
         algorithm::add_defaults(table, &environment.name, algorithm)?;

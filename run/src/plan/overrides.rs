@@ -24,7 +24,7 @@ pub struct RunOverrides {
     #[arg(long, value_name = "DIR")]
     pub run: Option<PathBuf>,
     /// The algorithm [default: the preset's; for gym: the one that suits the spaces].
-    #[arg(long = "method", visible_alias = "algorithm", value_name = "METHOD", value_parser = PossibleValuesParser::new(algorithm::names()))]
+    #[arg(long = "method", visible_alias = "algorithm", value_name = "ALGORITHM", value_parser = PossibleValuesParser::new(algorithm::names()))]
     pub algorithm: Option<String>,
     /// Seed of every random stream.
     #[arg(long)]

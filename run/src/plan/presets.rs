@@ -72,7 +72,7 @@ fn task(name: &str) -> &str {
 /// The algorithm of a preset with this text.
 fn algorithm_in(text: &str) -> &'static str {
     let table = text.parse::<Table>().unwrap_or_default();
-    AlgorithmConfig::named_in(&table).unwrap_or(AlgorithmConfig::default().name())
+    AlgorithmConfig::named_in(&table).map_or(AlgorithmConfig::default().name(), |named| named.name)
 }
 
 /// The preset of this name, with its text.

@@ -106,15 +106,13 @@ pub(super) fn set_from_length(config: &mut Config, sources: &mut SettingSources)
 /// one.
 fn set_from_algorithm(table: &mut Table, sources: &mut SettingSources) -> anyhow::Result<()> {
     let limit = integer(table, "spec", "time_limit");
-    let algorithms = AlgorithmConfig::all();
-    let Some(algorithm) = algorithms.iter().find(|one| table.contains_key(one.name())) else {
+    let Some(algorithm) = AlgorithmConfig::named_in(table) else {
         return Ok(());
     };
-    let properties = algorithm.properties();
-    let once = properties.transition_use != TransitionUse::Minibatches;
-    let episodes = properties.transition_use == TransitionUse::Episodes;
+    let once = algorithm.transition_use != TransitionUse::Minibatches;
+    let episodes = algorithm.transition_use == TransitionUse::Episodes;
     for (section, key, value) in [
-        ("run", "mode", (!properties.off_policy).then(|| Value::from("lockstep"))),
+        ("run", "mode", (!algorithm.off_policy).then(|| Value::from("lockstep"))),
         ("replay", "warmup", once.then(|| 0.into())),
         ("replay", "updates_per_step", once.then(|| 1.0.into())),
         ("actors", "chunk_steps", limit.filter(|_| episodes).map(Value::from)),
@@ -125,7 +123,7 @@ fn set_from_algorithm(table: &mut Table, sources: &mut SettingSources) -> anyhow
             continue;
         };
         put(table, &[section, key], value)?;
-        sources.set(name, SettingSource::Follows(algorithm.name().into()));
+        sources.set(name, SettingSource::Follows(algorithm.name.into()));
     }
     Ok(())
 }

@@ -218,7 +218,7 @@ pub(super) fn as_written(config: &Config) -> Config {
 fn check_algorithm(assignment: &str, used: &Config) -> Result<(), UsageError> {
     let section = assignment.split('.').next().unwrap_or_default();
     let own = used.algorithm.name();
-    if section != own && algorithm::names().any(|name| name == section) {
+    if section != own && algorithm::of_name(section).is_some() {
         return Err(UsageError(format!(
             "--set {assignment}: this run learns with {own}, and the algorithm of a run cannot change"
         )));

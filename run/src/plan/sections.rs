@@ -31,7 +31,7 @@ pub(super) fn sections_for_algorithm(
     if let Some(own) = with_algorithm(what, algorithm) {
         (name, table, sources) = sections(own)?;
     }
-    let named = AlgorithmConfig::named_in(&table);
+    let named = AlgorithmConfig::named_in(&table).map(|named| named.name);
     let default = AlgorithmConfig::default().name();
     let defaults = SettingSource::Algorithm(algorithm);
     if preset(what).is_some() {
@@ -110,7 +110,7 @@ mod tests {
     use shoal_common::config::Mode;
 
     #[test]
-    fn a_method_has_its_preset_for_the_task_or_its_own_defaults() {
+    fn an_algorithm_has_its_preset_for_the_task_or_its_own_defaults() {
         let with = |what: &str, algorithm: &str, set: &[&str]| {
             let overrides = RunOverrides {
                 algorithm: (!algorithm.is_empty()).then(|| algorithm.into()),

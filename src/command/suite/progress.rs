@@ -8,22 +8,67 @@ use std::time::{Duration, Instant};
 use indicatif::{HumanDuration, ProgressBar, ProgressDrawTarget, ProgressStyle};
 use shoal_run::numbers::thousands;
 use shoal_run::suite::Suite;
+use shoal_run::suite::measure::{best_return, distance, final_return};
+use shoal_run::suite::schedule::{Event, Observer};
 
-use super::measure::{best_return, distance, final_return};
-
-/// A message from a worker: the number of the trial, and what has happened to it.
-pub(super) enum Event {
-    Started(usize),
-    Finished(usize),
-    Interrupted(usize),
-    /// It has done its share of a round.
-    Paused(usize),
-    Failed(usize, String),
+/// Prints how the training of a suite goes.
+pub(super) struct SuiteProgress<'a> {
+    directory: &'a Path,
+    quiet: bool,
+    /// The runs that are being trained.
+    training: Option<TrainingProgress>,
 }
 
-pub(super) struct SuiteProgress<'a> {
-    suite: &'a Suite,
-    directory: &'a Path,
+impl<'a> SuiteProgress<'a> {
+    pub(super) fn new(directory: &'a Path, quiet: bool) -> Self {
+        Self {
+            directory,
+            quiet,
+            training: None,
+        }
+    }
+
+    fn print(&self, line: &str) {
+        if !self.quiet {
+            // A closed standard error is no reason to fail.
+            let _ = writeln!(std::io::stderr(), "{line}");
+        }
+    }
+}
+
+impl Observer for SuiteProgress<'_> {
+    fn begin(&mut self, suite: &Suite, due: &VecDeque<usize>, until: Option<f64>) {
+        let until_then = until.map_or_else(String::new, |share| {
+            format!("until each has done {:.0} % of its steps: ", 100.0 * share)
+        });
+        let (due_runs, all) = (due.len(), suite.trials.len());
+        self.print(&format!("{until_then}{due_runs} of {all} runs to train"));
+        self.training = Some(TrainingProgress::new(suite, self.directory, due, until, self.quiet));
+    }
+
+    fn observe(&mut self, event: Option<Event>) {
+        if let Some(training) = &mut self.training {
+            training.observe(event);
+        }
+    }
+
+    fn end(&mut self) {
+        if let Some(training) = self.training.take() {
+            training.bar.finish_and_clear();
+        }
+    }
+
+    fn end_round(&mut self, share: f64, ended: &[String]) {
+        self.print(&format!("ended early at {:.0} %: {}", 100.0 * share, ended.join("; ")));
+    }
+}
+
+/// The progress of some runs of a suite.
+struct TrainingProgress {
+    /// The directories of all runs of the suite, by the numbers of their trials.
+    runs: Vec<PathBuf>,
+    /// Their names.
+    names: Vec<String>,
     bar: ProgressBar,
     live: bool,
     quiet: bool,
@@ -51,38 +96,33 @@ struct RunLength {
     goal: u64,
 }
 
-impl<'a> SuiteProgress<'a> {
+impl TrainingProgress {
     /// The progress of the trials with the numbers `due`, each until it has done the share `until` of its steps.
-    pub(super) fn new(
-        suite: &'a Suite,
-        directory: &'a Path,
-        due: &VecDeque<usize>,
-        until: Option<f64>,
-        quiet: bool,
-    ) -> Self {
+    fn new(suite: &Suite, directory: &Path, due: &VecDeque<usize>, until: Option<f64>, quiet: bool) -> Self {
+        let names: Vec<String> = suite.trials.iter().map(|trial| trial.name.clone()).collect();
+        let runs: Vec<PathBuf> = names.iter().map(|name| directory.join(name)).collect();
         let live = !quiet && std::io::stderr().is_terminal();
         let target = if live {
             ProgressDrawTarget::stderr()
         } else {
             ProgressDrawTarget::hidden()
         };
-        let bar = ProgressBar::with_draw_target(Some(suite.trials.len() as u64), target);
+        let bar = ProgressBar::with_draw_target(Some(runs.len() as u64), target);
         if let Ok(style) = ProgressStyle::with_template("{bar:16.cyan/dim} {msg}") {
             bar.set_style(style.progress_chars("━━─"));
         }
         let due_run = |number: &usize| {
-            let run = directory.join(&suite.trials[*number].name);
-            let begin = distance(&run).map_or(0, |(done, _)| done);
+            let begin = distance(&runs[*number]).map_or(0, |(done, _)| done);
             (*number, DueRun { begin, ended: false })
         };
         Self {
-            suite,
-            directory,
+            due: due.iter().map(due_run).collect(),
+            runs,
+            names,
             bar,
             live,
             quiet,
             until: until.unwrap_or(1.0),
-            due: due.iter().map(due_run).collect(),
             running: Vec::new(),
             failed: BTreeSet::new(),
             started_at: Instant::now(),
@@ -90,13 +130,13 @@ impl<'a> SuiteProgress<'a> {
     }
 
     /// Prints what the event says and draws the live line again; `None` only draws it.
-    pub(super) fn observe(&mut self, event: Option<Event>) {
+    fn observe(&mut self, event: Option<Event>) {
         match event {
             None => {}
             Some(Event::Started(number)) => {
                 self.running.push(number);
                 if !self.live {
-                    self.print(&format!("{}: started", self.suite.trials[number].name));
+                    self.print(&format!("{}: started", self.names[number]));
                 }
             }
             Some(Event::Finished(number)) => {
@@ -105,35 +145,22 @@ impl<'a> SuiteProgress<'a> {
                     .time_left()
                     .map_or_else(String::new, |left| format!(", about {left} left"));
                 let result =
-                    final_return(&self.run(number)).map_or_else(String::new, |mean| format!(", return {mean:.2}"));
-                self.print(&format!(
-                    "{}: done{result}, {}{left}",
-                    self.suite.trials[number].name,
-                    self.count()
-                ));
+                    final_return(&self.runs[number]).map_or_else(String::new, |mean| format!(", return {mean:.2}"));
+                self.print(&format!("{}: done{result}, {}{left}", self.names[number], self.count()));
             }
             Some(Event::Interrupted(number)) => self.running.retain(|other| *other != number),
             Some(Event::Paused(number)) => {
                 self.end_run(number);
-                let best = best_return(&self.run(number));
-                self.print(&format!(
-                    "{}: best return so far {best:.2}",
-                    self.suite.trials[number].name
-                ));
+                let best = best_return(&self.runs[number]);
+                self.print(&format!("{}: best return so far {best:.2}", self.names[number]));
             }
             Some(Event::Failed(number, why)) => {
                 self.end_run(number);
                 self.failed.insert(number);
-                self.print(&format!("{}: failed: {why}", self.suite.trials[number].name));
+                self.print(&format!("{}: failed: {why}", self.names[number]));
             }
         }
         self.draw();
-    }
-
-    /// Ends the live line. Returns the numbers of the trials that have failed.
-    pub(super) fn end(self) -> BTreeSet<usize> {
-        self.bar.finish_and_clear();
-        self.failed
     }
 
     fn end_run(&mut self, number: usize) {
@@ -143,26 +170,18 @@ impl<'a> SuiteProgress<'a> {
         }
     }
 
-    fn run(&self, number: usize) -> PathBuf {
-        self.directory.join(&self.suite.trials[number].name)
-    }
-
     /// How many runs have nothing left to do, failed ones included.
     fn ended(&self) -> usize {
-        self.suite.trials.len() - self.due.values().filter(|run| !run.ended).count()
+        self.runs.len() - self.due.values().filter(|run| !run.ended).count()
     }
 
     fn count(&self) -> String {
-        format!(
-            "{} of {} runs",
-            self.ended() - self.failed.len(),
-            self.suite.trials.len()
-        )
+        format!("{} of {} runs", self.ended() - self.failed.len(), self.runs.len())
     }
 
     fn time_left(&self) -> Option<String> {
         let length = |(number, run): (&usize, &DueRun)| {
-            let Some((done, all)) = distance(&self.run(*number)) else {
+            let Some((done, all)) = distance(&self.runs[*number]) else {
                 let nothing = RunLength {
                     made: 0,
                     left: 0,
@@ -191,8 +210,8 @@ impl<'a> SuiteProgress<'a> {
             lines[0] += &format!(" · {left} left");
         }
         for number in &self.running {
-            if let Some((done, all)) = distance(&self.run(*number)) {
-                let name: String = self.suite.trials[*number].name.chars().take(50).collect();
+            if let Some((done, all)) = distance(&self.runs[*number]) {
+                let name: String = self.names[*number].chars().take(50).collect();
                 lines.push(format!("{name}: {} of {}", thousands(done), thousands(all)));
             }
         }

@@ -8,7 +8,7 @@ use shoal_common::config::ActorsConfig;
 use shoal_common::role::Role;
 
 use super::Supervisor;
-use crate::launcher::hosts::INCARNATIONS;
+use crate::launcher::joined_hosts::INCARNATIONS;
 
 impl Supervisor {
     /// Gives actors and incarnations to another host. One that an earlier launcher has given actors gets them again, if
@@ -23,7 +23,7 @@ impl Supervisor {
             actors: requested,
             held,
         } = request;
-        if let Some(lease) = self.hosts.lease(host) {
+        if let Some(lease) = self.joined_hosts.lease(host) {
             return Ok(ControlResponse::Admitted(lease.clone()));
         }
         if requested > ActorsConfig::GREATEST_COUNT {
@@ -72,37 +72,37 @@ impl Supervisor {
         let lease = HostLease {
             host,
             name,
-            epoch: self.hosts.epoch(),
+            epoch: self.joined_hosts.epoch(),
             actors,
             first_incarnation,
             limit: self.processes_started + 1,
         };
-        self.hosts.admit(lease.clone());
+        self.joined_hosts.admit(lease.clone());
         self.share_lockstep_actors();
         Ok(ControlResponse::Admitted(lease))
     }
 
-    /// Updates the status of the other hosts. The answer tells which of them are admitted.
-    pub(crate) fn update_hosts(&mut self, statuses: Vec<HostStatus>) -> ControlResponse {
-        for message in self.hosts.update(statuses) {
+    /// Updates the status of the joined hosts. The answer tells which of them are admitted.
+    pub(crate) fn update_joined_hosts(&mut self, statuses: Vec<HostStatus>) -> ControlResponse {
+        for message in self.joined_hosts.update(statuses) {
             self.log.note("launcher", &message);
         }
         self.share_lockstep_actors();
         ControlResponse::Leases {
-            epoch: self.hosts.epoch(),
-            leases: self.hosts.leases(),
+            epoch: self.joined_hosts.epoch(),
+            leases: self.joined_hosts.leases(),
         }
     }
 
     /// In a lockstep run this host has all actors that no other has.
     fn share_lockstep_actors(&mut self) {
         if let Some(count) = self.lockstep_actors {
-            self.actors = (0..count).filter(|index| !self.hosts.has(*index)).collect();
+            self.actors = (0..count).filter(|index| !self.joined_hosts.has(*index)).collect();
         }
     }
 
-    /// The status of the other hosts.
-    pub(crate) fn hosts(&self) -> Vec<HostStatus> {
-        self.hosts.statuses()
+    /// The status of the joined hosts.
+    pub(crate) fn joined_hosts(&self) -> Vec<HostStatus> {
+        self.joined_hosts.statuses()
     }
 }

@@ -41,12 +41,12 @@ fn lists() -> Vec<Hidden> {
     both.concat()
 }
 
-fn learner(seed: u64) -> Ddpg {
-    learner_of(Hidden::relu([9, 7]), seed)
+fn algorithm(seed: u64) -> Ddpg {
+    algorithm_of(Hidden::relu([9, 7]), seed)
 }
 
-/// A learner whose output layers are as large as the others, so that every gradient is well above rounding errors.
-fn learner_of(hidden: Hidden, seed: u64) -> Ddpg {
+/// An algorithm whose output layers are as large as the others, so that every gradient is well above rounding errors.
+fn algorithm_of(hidden: Hidden, seed: u64) -> Ddpg {
     let settings = config::DdpgConfig {
         hidden: hidden.layers,
         activation: hidden.activation,
@@ -116,7 +116,7 @@ fn assert_enough(hidden: Hidden, shares: &[f64]) {
 fn the_critics_gradient_is_that_of_its_loss() {
     for hidden in lists() {
         let shares = (0..10).map(|seed| {
-            let (mut ddpg, batch) = (learner_of(hidden, seed), minibatch(seed));
+            let (mut ddpg, batch) = (algorithm_of(hidden, seed), minibatch(seed));
             ddpg.evaluate(&batch);
             let (loss, _) = ddpg.critic_gradient(&batch);
             let theta = &ddpg.critic.online.parameters;
@@ -137,7 +137,7 @@ fn the_critics_gradient_is_that_of_its_loss() {
 fn the_actors_gradient_is_that_of_its_loss() {
     for hidden in lists() {
         let shares = (0..10).map(|seed| {
-            let (mut ddpg, batch) = (learner_of(hidden, seed), minibatch(seed));
+            let (mut ddpg, batch) = (algorithm_of(hidden, seed), minibatch(seed));
             ddpg.evaluate(&batch);
             let loss = ddpg.actor_gradient(&batch.s);
             let theta = &ddpg.actor.online.parameters;
@@ -156,7 +156,7 @@ fn the_actors_gradient_is_that_of_its_loss() {
 
 #[test]
 fn the_value_of_a_terminal_state_is_not_used() {
-    let (mut one, mut other) = (learner(1), learner(1));
+    let (mut one, mut other) = (algorithm(1), algorithm(1));
     let (batch, mut changed) = (minibatch(1), minibatch(1));
     assert_eq!(batch.discount[2], 0.0);
     changed.s_next.column_mut(2).fill(f32::NAN);
@@ -248,8 +248,8 @@ fn targets_start_as_copies_and_follow_their_networks() {
 }
 
 #[test]
-fn a_restored_learner_continues_with_the_same_bits() {
-    let mut ddpg = learner(1);
+fn a_restored_algorithm_continues_with_the_same_bits() {
+    let mut ddpg = algorithm(1);
     for t in 0..3 {
         ddpg.update(&minibatch(t));
     }
@@ -263,7 +263,7 @@ fn a_restored_learner_continues_with_the_same_bits() {
 #[test]
 fn actors_compute_the_same_bits_as_the_learner() {
     for hidden in lists() {
-        let mut ddpg = learner_of(hidden, 1);
+        let mut ddpg = algorithm_of(hidden, 1);
         let batch = minibatch(1);
         let range = ActionRange::new(&spec().action).unwrap();
         let mut network = DeterministicPolicy::new(*ddpg.layouts().0, range, BATCH);

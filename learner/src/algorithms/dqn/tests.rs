@@ -31,7 +31,7 @@ fn settings(double: bool, dueling: bool) -> config::DqnConfig {
     }
 }
 
-fn learner_of(settings: &config::DqnConfig, seed: u64) -> Dqn {
+fn algorithm_of(settings: &config::DqnConfig, seed: u64) -> Dqn {
     let mut dqn = Dqn::new(&spec(), settings, seed).unwrap();
     let mut numbers = stream(seed, Purpose::Sampling, 0, 0);
     for (_, parameters) in dqn.state_mut(0).into_iter().take(2) {
@@ -88,7 +88,7 @@ fn loss(dqn: &Dqn, theta: &[f64], batch: &Minibatch) -> f64 {
 fn the_gradient_is_that_of_hubers_loss() {
     for (double, dueling) in [(true, false), (false, false), (true, true), (false, true)] {
         for seed in 0..10 {
-            let (mut dqn, batch) = (learner_of(&settings(double, dueling), seed), minibatch(seed, BATCH));
+            let (mut dqn, batch) = (algorithm_of(&settings(double, dueling), seed), minibatch(seed, BATCH));
             dqn.evaluate(&batch);
             let (found, _) = dqn.gradient(&batch);
             let theta = &dqn.network.online.parameters;
@@ -106,7 +106,7 @@ fn the_gradient_is_that_of_hubers_loss() {
 
 #[test]
 fn the_target_network_is_copied_after_every_third_update() {
-    let mut dqn = learner_of(&settings(true, false), 1);
+    let mut dqn = algorithm_of(&settings(true, false), 1);
     for t in 1..=7 {
         let before = dqn.network.target.clone();
         dqn.learn(&minibatch(t, BATCH));
@@ -119,16 +119,16 @@ fn the_target_network_is_copied_after_every_third_update() {
 }
 
 #[test]
-fn a_restored_learner_continues_with_the_same_bits() {
+fn a_restored_algorithm_continues_with_the_same_bits() {
     let settings = settings(true, true);
-    let mut dqn = learner_of(&settings, 1);
+    let mut dqn = algorithm_of(&settings, 1);
     (0..2).for_each(|seed| {
         dqn.learn(&minibatch(seed, BATCH));
     });
     let mut restored = Dqn::new(&spec(), &settings, 99).unwrap();
     copy_state(&dqn, &mut restored);
-    for learner in [&mut dqn, &mut restored] {
-        learner.learn(&minibatch(7, BATCH));
+    for algorithm in [&mut dqn, &mut restored] {
+        algorithm.learn(&minibatch(7, BATCH));
     }
     assert_eq!(restored.state(), dqn.state());
 }

@@ -30,17 +30,17 @@ fn settings(weight: ReturnWeighting) -> config::ReinforceConfig {
     }
 }
 
-/// A learner whose output layers are as large as the others, so that every gradient is well above rounding errors.
-fn learner(settings: &config::ReinforceConfig) -> Reinforce {
-    let mut learner = Reinforce::new(settings, &spec(), 1, SIZES).unwrap();
+/// An algorithm whose output layers are as large as the others, so that every gradient is well above rounding errors.
+fn algorithm(settings: &config::ReinforceConfig) -> Reinforce {
+    let mut algorithm = Reinforce::new(settings, &spec(), 1, SIZES).unwrap();
     let mut numbers = stream(1, Purpose::Sampling, 0, 0);
-    for network in std::iter::once(&mut learner.policy).chain(&mut learner.baseline) {
+    for network in std::iter::once(&mut algorithm.policy).chain(&mut algorithm.baseline) {
         network
             .parameters
             .iter_mut()
             .for_each(|x| *x = numbers.random_range(-0.7..0.7));
     }
-    learner
+    algorithm
 }
 
 /// An episode of distinct numbers, terminated or ended by the time limit.
@@ -171,9 +171,9 @@ fn the_gradient_is_that_of_the_objective() {
             activation,
             ..settings(weight)
         };
-        let mut learner = learner(&settings);
-        let before = learner.policy.parameters.to_vec();
-        learner.learn(&steps);
+        let mut algorithm = algorithm(&settings);
+        let before = algorithm.policy.parameters.to_vec();
+        algorithm.learn(&steps);
         let weights = |episode: &Episode| -> Vec<f64> {
             let returns = episode.returns();
             let n = returns.len() as f64;
@@ -187,8 +187,8 @@ fn the_gradient_is_that_of_the_objective() {
             returns.iter().enumerate().map(weight_of).collect()
         };
         let episodes = [(&long, weights(&long)), (&short, weights(&short))];
-        let descended = learner.policy.gradient.to_vec();
-        assert_finite_differences(&learner.policy.layout, &before, &descended, |layout, parameters| {
+        let descended = algorithm.policy.gradient.to_vec();
+        assert_finite_differences(&algorithm.policy.layout, &before, &descended, |layout, parameters| {
             -objective(layout, parameters, &episodes)
         });
     }
@@ -197,22 +197,22 @@ fn the_gradient_is_that_of_the_objective() {
 #[test]
 fn the_baseline_is_subtracted_from_the_return_and_learns_it() {
     let episode = Episode::random(3, 12, true);
-    let mut learner = learner(&settings(ReturnWeighting::Baseline));
-    let before = learner.policy.parameters.to_vec();
-    let baseline = learner.baseline.as_ref().unwrap();
+    let mut algorithm = algorithm(&settings(ReturnWeighting::Baseline));
+    let before = algorithm.policy.parameters.to_vec();
+    let baseline = algorithm.baseline.as_ref().unwrap();
     let (layout, values) = (baseline.layout, baseline.parameters.to_vec());
-    learner.learn(&episode.steps());
+    algorithm.learn(&episode.steps());
     let deltas = |values: &[f32]| -> Vec<f64> {
         let steps = episode.steps();
         let each = steps.iter().zip(episode.returns());
         each.map(|(step, g)| g - output(&layout, values, step.s)[0]).collect()
     };
     let weights = [(&episode, deltas(&values))];
-    let descended = learner.policy.gradient.to_vec();
-    assert_finite_differences(&learner.policy.layout, &before, &descended, |layout, parameters| {
+    let descended = algorithm.policy.gradient.to_vec();
+    assert_finite_differences(&algorithm.policy.layout, &before, &descended, |layout, parameters| {
         -objective(layout, parameters, &weights)
     });
-    let descended = learner.baseline.as_ref().unwrap().gradient.to_vec();
+    let descended = algorithm.baseline.as_ref().unwrap().gradient.to_vec();
     assert_finite_differences(&layout, &values, &descended, |_, values| {
         deltas(values).iter().map(|delta| delta * delta / 2.0).sum::<f64>() / 12.0
     });
@@ -221,7 +221,7 @@ fn the_baseline_is_subtracted_from_the_return_and_learns_it() {
 #[test]
 fn only_complete_episodes_are_learned_from_and_those_at_the_limit_only_if_configured() {
     let (cut, over) = (Episode::random(1, 12, false), Episode::random(2, 5, true));
-    let mut skips = learner(&config::ReinforceConfig {
+    let mut skips = algorithm(&config::ReinforceConfig {
         learn_at_limit: false,
         ..settings(ReturnWeighting::Return)
     });
@@ -230,7 +230,7 @@ fn only_complete_episodes_are_learned_from_and_those_at_the_limit_only_if_config
     assert_eq!(*skips.policy.parameters, before);
     assert_eq!(skips.steps, [0.0]);
 
-    let mut learns = learner(&settings(ReturnWeighting::Return));
+    let mut learns = algorithm(&settings(ReturnWeighting::Return));
     learns.learn(&cut.steps());
     assert_ne!(*learns.policy.parameters, before);
 
@@ -246,16 +246,16 @@ fn only_complete_episodes_are_learned_from_and_those_at_the_limit_only_if_config
 
 #[test]
 fn an_episode_of_equal_returns_changes_nothing_when_normalised() {
-    let mut learner = learner(&settings(ReturnWeighting::Normalised));
-    let before = learner.policy.parameters.to_vec();
-    learner.learn(&Episode::random(4, 1, true).steps());
-    assert_eq!(*learner.policy.parameters, before);
+    let mut algorithm = algorithm(&settings(ReturnWeighting::Normalised));
+    let before = algorithm.policy.parameters.to_vec();
+    algorithm.learn(&Episode::random(4, 1, true).steps());
+    assert_eq!(*algorithm.policy.parameters, before);
 }
 
 #[test]
 fn a_restored_state_continues_with_the_same_bits() {
     let rounds: Vec<Episode> = (0..4).map(|seed| Episode::random(seed, 9, true)).collect();
-    let mut straight = learner(&settings(ReturnWeighting::Baseline));
+    let mut straight = algorithm(&settings(ReturnWeighting::Baseline));
     for round in &rounds[..2] {
         straight.learn(&round.steps());
     }
@@ -266,9 +266,9 @@ fn a_restored_state_continues_with_the_same_bits() {
     let mut saved = SavedState::from(arrays.collect::<Vec<_>>());
     let mut resumed = Reinforce::new(&settings(ReturnWeighting::Baseline), &spec(), 2, SIZES).unwrap();
     resumed.restore(18, &mut saved).unwrap();
-    for learner in [&mut straight, &mut resumed] {
+    for algorithm in [&mut straight, &mut resumed] {
         for round in &rounds[2..] {
-            learner.learn(&round.steps());
+            algorithm.learn(&round.steps());
         }
     }
     assert_eq!(straight.state(), resumed.state());

@@ -34,7 +34,7 @@ fn settings(hidden: Hidden) -> config::SacConfig {
     }
 }
 
-fn learner_of(hidden: Hidden, seed: u64) -> Sac {
+fn algorithm_of(hidden: Hidden, seed: u64) -> Sac {
     let mut sac = Sac::new(&spec(), &settings(hidden), seed).unwrap();
     let mut numbers = stream(seed, Purpose::Sampling, 0, 0);
     let [first, second] = &mut sac.critics.critics;
@@ -82,7 +82,7 @@ fn the_actors_gradient_is_that_of_its_loss() {
     for hidden in lists() {
         let shares: Vec<f64> = (0..10)
             .map(|seed| {
-                let (mut sac, batch) = (learner_of(hidden, seed), minibatch(seed, row(), BATCH));
+                let (mut sac, batch) = (algorithm_of(hidden, seed), minibatch(seed, row(), BATCH));
                 sac.draw(&batch);
                 let loss = sac.actor_gradient(&batch.s, ALPHA as f32);
                 let phi = &sac.actor.parameters;
@@ -100,7 +100,7 @@ fn the_actors_gradient_is_that_of_its_loss() {
 
 #[test]
 fn a_clamped_standard_deviation_gets_no_gradient() {
-    let mut sac = learner_of(Hidden::relu([9, 7]), 1);
+    let mut sac = algorithm_of(Hidden::relu([9, 7]), 1);
     // The biases of both ln σ.
     let end = sac.actor.parameters.len();
     sac.actor.parameters[end - 2..].copy_from_slice(&[50.0, -50.0]);
@@ -128,7 +128,7 @@ fn the_density_is_finite_for_actions_at_the_bounds() {
 #[test]
 fn the_temperature_moves_towards_the_target_entropy() {
     let temperature = |log_pi: f32| {
-        let mut sac = learner_of(Hidden::relu([9, 7]), 1);
+        let mut sac = algorithm_of(Hidden::relu([9, 7]), 1);
         let before = sac.temperature();
         sac.temperature.descend(1, &DVector::from_element(BATCH, log_pi));
         sac.temperature() - before
@@ -140,7 +140,10 @@ fn the_temperature_moves_towards_the_target_entropy() {
 
 #[test]
 fn the_value_of_s_next_includes_the_entropy_and_that_of_a_terminal_state_is_not_used() {
-    let (mut one, mut other) = (learner_of(Hidden::relu([9, 7]), 1), learner_of(Hidden::relu([9, 7]), 1));
+    let (mut one, mut other) = (
+        algorithm_of(Hidden::relu([9, 7]), 1),
+        algorithm_of(Hidden::relu([9, 7]), 1),
+    );
     let (batch, mut changed) = (minibatch(1, row(), BATCH), minibatch(1, row(), BATCH));
     assert_eq!(batch.discount[2], 0.0);
     changed.s_next.column_mut(2).fill(f32::NAN);
@@ -151,15 +154,15 @@ fn the_value_of_s_next_includes_the_entropy_and_that_of_a_terminal_state_is_not_
 }
 
 #[test]
-fn a_restored_learner_continues_with_the_same_bits() {
-    let mut sac = learner_of(Hidden::relu([9, 7]), 1);
+fn a_restored_algorithm_continues_with_the_same_bits() {
+    let mut sac = algorithm_of(Hidden::relu([9, 7]), 1);
     (0..3).for_each(|seed| {
         sac.learn(&minibatch(seed, row(), BATCH));
     });
     let mut restored = Sac::new(&spec(), &settings(Hidden::relu([9, 7])), 1).unwrap();
     copy_state(&sac, &mut restored);
-    for learner in [&mut sac, &mut restored] {
-        learner.learn(&minibatch(7, row(), BATCH));
+    for algorithm in [&mut sac, &mut restored] {
+        algorithm.learn(&minibatch(7, row(), BATCH));
     }
     assert_eq!(restored.state(), sac.state());
     assert!(sac.temperature() != 1.0 && sac.temperature().is_finite());
@@ -188,7 +191,7 @@ fn two_threads_compute_the_same_bits_as_one() {
 #[test]
 fn actors_compute_the_same_bits_as_the_learner() {
     for hidden in lists() {
-        let (mut sac, batch) = (learner_of(hidden, 1), minibatch(1, row(), BATCH));
+        let (mut sac, batch) = (algorithm_of(hidden, 1), minibatch(1, row(), BATCH));
         sac.draw(&batch);
         let mut policy = GaussianPolicy::new(sac.actor.layout, sac.range.clone(), BATCH);
         let mut actions = vec![0.0; ROW.1 * BATCH];

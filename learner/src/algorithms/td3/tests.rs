@@ -32,7 +32,7 @@ fn settings(hidden: Hidden) -> config::Td3Config {
     }
 }
 
-fn learner_of(hidden: Hidden, seed: u64) -> Td3 {
+fn algorithm_of(hidden: Hidden, seed: u64) -> Td3 {
     let mut td3 = Td3::new(&spec(), &settings(hidden), seed).unwrap();
     let mut numbers = stream(seed, Purpose::Sampling, 0, 0);
     for (_, parameters) in td3.state_mut(0).into_iter().filter(|(name, _)| WEIGHTS.contains(name)) {
@@ -54,7 +54,7 @@ fn value(td3: &Td3, theta: &[f64], s: &[f64], a: &[f64]) -> f64 {
 fn the_actors_gradient_is_that_of_its_loss() {
     for hidden in [Hidden::relu([9, 7]), Hidden::tanh([9]), Hidden::relu([8, 9, 7])] {
         for seed in 0..10 {
-            let (mut td3, batch) = (learner_of(hidden, seed), minibatch(seed, row(), BATCH));
+            let (mut td3, batch) = (algorithm_of(hidden, seed), minibatch(seed, row(), BATCH));
             let loss = td3.actor_gradient(&batch.s);
             let theta = wide(&td3.critics.critics[0].network.online.parameters);
             let by_definition = |phi: &[f64]| {
@@ -74,7 +74,7 @@ fn the_actors_gradient_is_that_of_its_loss() {
 
 #[test]
 fn the_target_is_the_smaller_value_of_a_clipped_noisy_action() {
-    let (mut td3, batch) = (learner_of(Hidden::relu([9, 7]), 1), minibatch(1, row(), BATCH));
+    let (mut td3, batch) = (algorithm_of(Hidden::relu([9, 7]), 1), minibatch(1, row(), BATCH));
     // Beyond the clip, within it, and none.
     let noise = DMatrix::from_fn(2, BATCH, |element, sample| {
         [9.0, -9.0, 1.0, -0.5, 0.0][sample] * (1.0 + element as f32)
@@ -109,7 +109,7 @@ fn the_target_is_the_smaller_value_of_a_clipped_noisy_action() {
 
 #[test]
 fn policy_and_targets_move_at_every_second_update() {
-    let mut td3 = learner_of(Hidden::relu([9, 7]), 1);
+    let mut td3 = algorithm_of(Hidden::relu([9, 7]), 1);
     let moved = |td3: &mut Td3, seed| {
         let before = td3.clone();
         td3.learn(&minibatch(seed, row(), BATCH));
@@ -126,15 +126,15 @@ fn policy_and_targets_move_at_every_second_update() {
 }
 
 #[test]
-fn a_restored_learner_continues_with_the_same_bits() {
-    let mut td3 = learner_of(Hidden::relu([9, 7]), 1);
+fn a_restored_algorithm_continues_with_the_same_bits() {
+    let mut td3 = algorithm_of(Hidden::relu([9, 7]), 1);
     (0..3).for_each(|seed| {
         td3.learn(&minibatch(seed, row(), BATCH));
     });
     let mut restored = Td3::new(&spec(), &settings(Hidden::relu([9, 7])), 1).unwrap();
     copy_state(&td3, &mut restored);
-    for learner in [&mut td3, &mut restored] {
-        learner.learn(&minibatch(7, row(), BATCH));
+    for algorithm in [&mut td3, &mut restored] {
+        algorithm.learn(&minibatch(7, row(), BATCH));
     }
     assert_eq!(restored.state(), td3.state());
 }

@@ -15,14 +15,14 @@ pub type Values = [[f64; ACTIONS]; STATES];
 
 /// The expected result of an episode of at most [`LIMIT`] steps from the start.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Walk {
+pub struct ExpectedResult {
     /// Probability of reaching the goal.
     pub reached: f64,
     /// Expected number of steps to the goal, where an episode that does not reach it counts as [`LIMIT`].
     pub steps: f64,
 }
 
-impl Walk {
+impl ExpectedResult {
     /// Of the policy that takes this action in each state.
     pub fn of(policy: &[usize; STATES]) -> Self {
         let mut here = [0.0; STATES];
@@ -50,7 +50,7 @@ impl Walk {
     }
 }
 
-impl Walk {
+impl ExpectedResult {
     /// Rounded to four decimals, enough for a figure.
     pub fn rounded(self) -> Self {
         let round = |value: f64| (1e4 * value).round() / 1e4;
@@ -124,9 +124,9 @@ mod tests {
         assert!((q_star[0].iter().copied().fold(0.0, f64::max) - 0.785_53).abs() < 1e-4);
         let policy = best();
         assert!(suboptimal_states(&policy, &q_star).is_empty());
-        let walk = Walk::of(&policy);
-        assert!((walk.reached - 0.74).abs() < 0.01, "{walk:?}");
-        assert!((40.0..60.0).contains(&walk.steps), "{walk:?}");
+        let result = ExpectedResult::of(&policy);
+        assert!((result.reached - 0.74).abs() < 0.01, "{result:?}");
+        assert!((40.0..60.0).contains(&result.steps), "{result:?}");
         assert_eq!(risky_states(&policy), [6], "as the thesis has it");
     }
 
@@ -134,8 +134,8 @@ mod tests {
     fn a_bad_policy_has_suboptimal_and_risky_states() {
         let left = [0; STATES];
         assert_eq!(
-            Walk::of(&left),
-            Walk {
+            ExpectedResult::of(&left),
+            ExpectedResult {
                 reached: 0.0,
                 steps: 100.0
             }

@@ -1,4 +1,4 @@
-//! The vehicle's drive to the goal.
+//! The vehicle's test runs: episodes from chosen positions to the goal.
 
 use serde::{Deserialize, Serialize};
 use shoal_env_server::environment::angle::wrap;
@@ -21,9 +21,9 @@ pub const FAR_STARTS: [[f64; 2]; 8] = [
     [0.0, 3.0],
 ];
 
-/// An episode of T steps from rest at a chosen position.
+/// A test run: an episode of T steps from rest at a chosen position.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Drive {
+pub struct TestRun {
     /// (x, y) in m; the goal is the origin.
     pub start: [f64; 2],
     /// x in m, T + 1 values.
@@ -38,7 +38,7 @@ pub struct Drive {
     pub rewards: Vec<f64>,
 }
 
-/// The measured quantities of a drive.
+/// The measured quantities of a test run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Measures {
     /// (x, y) in m; the goal is the origin.
@@ -61,9 +61,9 @@ pub struct Measures {
     pub force_at_rest: f64,
 }
 
-impl Drive {
-    /// Runs the policy from rest at each of these positions.
-    pub fn run_from(rollout: &mut Rollout<'_>, starts: &[[f64; 2]]) -> anyhow::Result<Vec<Self>> {
+impl TestRun {
+    /// Test runs of the policy, one from rest at each of these positions.
+    pub fn from_starts(rollout: &mut Rollout<'_>, starts: &[[f64; 2]]) -> anyhow::Result<Vec<Self>> {
         let run = |&[x, y]: &[f64; 2]| Ok(Self::of([x, y], &rollout.episode_from(&[x, y, 0.0, 0.0])?));
         starts.iter().map(run).collect()
     }
@@ -149,11 +149,11 @@ impl Drive {
 
 #[cfg(test)]
 mod tests {
-    use crate::testing::drive;
+    use crate::testing::test_run;
 
     #[test]
-    fn the_quantities_of_a_drive_are_measured() {
-        let measures = drive([2.0, -2.0], 0.03, 0.25, 1.5, 0.5).measures();
+    fn the_quantities_of_a_test_run_are_measured() {
+        let measures = test_run([2.0, -2.0], 0.03, 0.25, 1.5, 0.5).measures();
         assert!((measures.final_distance - 0.03).abs() < 1e-9, "{measures:?}");
         // A turn across the jump from π to −π still counts as small.
         assert!((measures.turning - 199.0 * 0.25).abs() < 1e-9, "{measures:?}");
@@ -167,8 +167,8 @@ mod tests {
     }
 
     #[test]
-    fn a_drive_that_never_reaches_the_goal_is_on_the_way_throughout() {
-        let measures = drive([3.0, 0.0], 1.0, 0.0, 2.0, 1.0).measures();
+    fn a_test_run_that_never_reaches_the_goal_is_on_the_way_throughout() {
+        let measures = test_run([3.0, 0.0], 1.0, 0.0, 2.0, 1.0).measures();
         assert!((measures.force_on_the_way - (80.0 * 2.0 + 120.0) / 200.0).abs() < 1e-9);
     }
 }

@@ -2,17 +2,17 @@
 
 use std::path::Path;
 
+use crate::evaluation::SavedPolicy;
+use crate::evaluation::final_evaluation::FinalEvaluation;
+use crate::origin::Origin;
+use crate::records::recorder::{read_evaluations, recorded};
+use crate::status::replay_rows;
 use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
-use shoal_run::evaluation::SavedPolicy;
-use shoal_run::evaluation::final_evaluation::FinalEvaluation;
-use shoal_run::origin::Origin;
-use shoal_run::records::recorder::{read_evaluations, recorded};
-use shoal_run::status::replay_rows;
 
 /// The share of its steps, or of its episodes, that a run has done. Steps are those in the replay: the records are half a
 /// second behind, and take longer to read. Rows that it began with do not count.
-pub(super) fn share_done(run: &Path) -> f64 {
+pub fn share_done(run: &Path) -> f64 {
     let of_steps = || {
         let run = RunDir::open(run).ok()?;
         let limits = run.config().ok()?.run;
@@ -34,12 +34,12 @@ pub(super) fn share_done(run: &Path) -> f64 {
 }
 
 /// Whether a policy of the run that has learned something was evaluated.
-pub(super) fn is_evaluated(run: &Path) -> bool {
+pub fn is_evaluated(run: &Path) -> bool {
     returns(run).next().is_some()
 }
 
 /// The best return of a run's evaluations so far; −∞ if there is none.
-pub(super) fn best_return(run: &Path) -> f64 {
+pub fn best_return(run: &Path) -> f64 {
     returns(run)
         .filter(|mean| mean.is_finite())
         .fold(f64::NEG_INFINITY, f64::max)
@@ -59,7 +59,7 @@ fn returns(run: &Path) -> impl Iterator<Item = f64> {
 }
 
 /// How far a run is, and how far it goes: in episodes if they limit it, otherwise in environment steps.
-pub(super) fn distance(run: &Path) -> Option<(u64, u64)> {
+pub fn distance(run: &Path) -> Option<(u64, u64)> {
     let run = RunDir::open(run).ok()?;
     let config: Config = run.config().ok()?;
     let (steps, episodes) = recorded(&run).ok()?.unwrap_or_default();
@@ -70,7 +70,7 @@ pub(super) fn distance(run: &Path) -> Option<(u64, u64)> {
 }
 
 /// The mean return of a finished run's best policy in its final evaluation.
-pub(super) fn final_return(run: &Path) -> Option<f64> {
+pub fn final_return(run: &Path) -> Option<f64> {
     let run = RunDir::open(run).ok()?;
     let (steps, _) = recorded(&run).ok()?.unwrap_or_default();
     FinalEvaluation::read(&run, steps)

@@ -1,4 +1,4 @@
-//! The other hosts of a run: which actors and incarnations each has.
+//! The hosts that have joined a run: which actors and incarnations each has.
 
 use std::time::{Duration, Instant};
 
@@ -7,9 +7,9 @@ use shoal_common::channel::control::{HostLease, HostState, HostStatus};
 /// Incarnations that a host gets at once: more than it will ever need.
 pub(super) const INCARNATIONS: u64 = 1 << 20;
 
-/// The admitted hosts.
+/// The hosts that have joined.
 #[derive(Debug)]
-pub(super) struct Hosts {
+pub(super) struct JoinedHosts {
     epoch: u64,
     /// A host that is silent for this long loses its actors, so that another host may have them.
     lost_after: Duration,
@@ -23,7 +23,7 @@ struct Admitted {
     status: Option<HostStatus>,
 }
 
-impl Hosts {
+impl JoinedHosts {
     /// No hosts. `epoch` is greater for each start of the launcher; a host that is silent for `lost_after` loses its
     /// actors.
     pub(super) fn new(epoch: u64, lost_after: Duration) -> Self {

@@ -1,0 +1,132 @@
+//! The actors of this host: which are wanted, and their services, start and retirement.
+
+use shoal_common::channel::Domain;
+use shoal_common::config::ActorsConfig;
+use shoal_common::role::{Role, RoleInstance};
+use shoal_run::records::recorder::{Incident, IncidentKind};
+
+use super::Supervisor;
+use crate::launcher::child::Child;
+use crate::launcher::process::name;
+
+impl Supervisor {
+    /// Changes the wanted number of actors. [`maintain`](Self::maintain) starts or retires them.
+    pub(crate) fn scale(&mut self, actors: u32) {
+        let before = self.actors.len();
+        self.log
+            .note("launcher", &format!("scaled from {before} to {actors} actors"));
+        let detail = format!("{before} to {actors} actors");
+        self.incidents.push(Incident::of_launcher(IncidentKind::Scaled, detail));
+        self.actors.truncate(actors as usize);
+        let missing = actors as usize - self.actors.len();
+        let more: Vec<u32> = self.free_actors().take(missing).collect();
+        self.actors.extend(more);
+        self.actors.sort_unstable();
+    }
+
+    /// The wanted number of actors on this host.
+    pub(crate) fn actor_count(&self) -> u32 {
+        self.actors.len() as u32
+    }
+
+    /// The most actors that this host may have now.
+    pub(crate) fn max_actors_now(&self) -> u32 {
+        let all = self.actor_count() + self.free_actors().count() as u32;
+        all.min(ActorsConfig::GREATEST_COUNT)
+    }
+
+    /// Indices that neither this host nor another has.
+    pub(super) fn free_actors(&self) -> impl Iterator<Item = u32> {
+        (0..self.max_actors).filter(|index| !self.actors.contains(index) && !self.joined_hosts.has(*index))
+    }
+
+    /// Kills an actor of this incarnation or an earlier one, so that it is started again.
+    pub(crate) fn replace_actor(&mut self, index: u32, incarnation: u64) {
+        let actor = self.children.iter_mut().find(|child| child.is(Role::Actor, index));
+        if let Some(actor) = actor.filter(|actor| actor.instance.incarnation <= incarnation)
+            && let Some(process) = &mut actor.process
+        {
+            process.kill();
+        }
+    }
+
+    /// Creates the services for the transitions of these actors.
+    pub(super) fn create_transitions(
+        &mut self,
+        domain: &Domain,
+        actors: impl IntoIterator<Item = u32>,
+    ) -> anyhow::Result<()> {
+        for actor in actors {
+            if !self.actors_with_services.contains(&actor) {
+                self.services.create_transitions(domain, actor, self.window)?;
+                self.actors_with_services.insert(actor);
+            }
+        }
+        Ok(())
+    }
+
+    /// Creates the services of all wanted actors and their environment servers.
+    pub(super) fn create_wanted_services(&mut self, domain: &Domain) -> anyhow::Result<()> {
+        for actor in &self.actors {
+            if !self.servers_with_services.contains(actor) {
+                self.services.create_environment(domain, *actor)?;
+                self.servers_with_services.insert(*actor);
+            }
+        }
+        match self.actors.iter().max().copied() {
+            // The learner opens those of all actors up to the last one.
+            Some(last) if self.has_learner => self.create_transitions(domain, 0..=last),
+            _ => self.create_transitions(domain, self.actors.clone()),
+        }
+    }
+
+    /// Adds and starts the wanted actors that do not exist, each with its environment server.
+    pub(super) fn start_missing(&mut self, domain: &Domain) -> anyhow::Result<()> {
+        self.create_wanted_services(domain)?;
+        for index in self.actors.clone() {
+            for role in [Role::EnvServer, Role::Actor] {
+                if !self.children.iter().any(|child| child.is(role, index)) {
+                    self.children.push(Child::new(role, index));
+                    self.start(self.children.len() - 1)?;
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Retires surplus actors and then their environment servers.
+    pub(super) fn retire_surplus(&mut self) {
+        let has_no_client = |children: &[Child], child: &Child| {
+            child.instance.role == Role::EnvServer
+                && !children.iter().any(|actor| actor.is(Role::Actor, child.instance.index))
+        };
+        let mut children = std::mem::take(&mut self.children);
+        children.retain(|child| {
+            let stays = child.process.is_some() || self.is_wanted(child);
+            if !stays {
+                self.log.note(&name(child.instance), "no longer needed");
+            }
+            stays
+        });
+        self.children = children;
+        for i in 0..self.children.len() {
+            if self.is_wanted(&self.children[i]) || self.children[i].is_retiring {
+                continue;
+            }
+            let may_end =
+                self.children[i].instance.role == Role::Actor || has_no_client(&self.children, &self.children[i]);
+            let child = &mut self.children[i];
+            if let Some(process) = child.process.as_mut().filter(|_| may_end) {
+                child.is_retiring = true;
+                process.ask_to_retire();
+            }
+        }
+    }
+
+    /// Whether the child should run: not a surplus actor, and not the environment server of one.
+    pub(super) fn is_wanted(&self, child: &Child) -> bool {
+        let RoleInstance { role, index, .. } = child.instance;
+        // The index of the evaluator's server is the maximum number of actors.
+        !matches!(role, Role::Actor | Role::EnvServer) || index >= self.max_actors || self.actors.contains(&index)
+    }
+}

@@ -1,0 +1,90 @@
+//! The end of the processes, at the end of a run.
+
+use anyhow::bail;
+use shoal_common::role::Role;
+use shoal_run::records::recorder::{Incident, IncidentKind};
+
+use super::Supervisor;
+use crate::launcher::log::ALL_ENDED;
+use crate::launcher::process::{ending, name};
+
+impl Supervisor {
+    /// Asks the processes of a role to hand over what they have and then to end.
+    pub(crate) fn ask_to_retire(&mut self, role: Role) {
+        for child in self.children.iter_mut().filter(|child| child.instance.role == role) {
+            if let Some(process) = &mut child.process {
+                child.is_asked_to_end = true;
+                process.ask_to_retire();
+            }
+        }
+    }
+
+    /// Asks the processes of some roles to end.
+    pub(crate) fn ask_to_end(&mut self, which: impl Fn(Role) -> bool) {
+        for child in self.children.iter_mut().filter(|child| which(child.instance.role)) {
+            match &mut child.process {
+                Some(process) => {
+                    child.is_asked_to_end = true;
+                    process.ask_to_end();
+                }
+                None if child.instance.role == Role::Learner && !self.learner_done => {
+                    self.unsaved_learner = Some("it had died and was not restarted yet".into());
+                }
+                None => {}
+            }
+        }
+    }
+
+    /// Collects the exit statuses of some roles' processes. Returns whether all of them have ended.
+    pub(crate) fn reap(&mut self, which: impl Fn(Role) -> bool) -> bool {
+        let mut all = true;
+        for child in self.children.iter_mut().filter(|child| which(child.instance.role)) {
+            let Some(process) = &mut child.process else { continue };
+            match process.exit_status() {
+                Some(status) => {
+                    child.process = None;
+                    if child.instance.role == Role::Learner && !status.success() {
+                        self.unsaved_learner = Some(ending(status));
+                    }
+                }
+                None => all = false,
+            }
+        }
+        all
+    }
+
+    /// Kills the processes of some roles that did not end when they were asked to.
+    pub(crate) fn kill(&mut self, which: impl Fn(Role) -> bool) {
+        for child in self.children.iter_mut().filter(|child| which(child.instance.role)) {
+            if child.process.take().is_some() {
+                let name = name(child.instance);
+                self.log.note(&name, "did not end when asked to, and was killed");
+                let detail = "did not end when asked to".into();
+                self.incidents
+                    .push(Incident::of(child.instance, IncidentKind::Killed, detail));
+                if child.instance.role == Role::Learner {
+                    self.unsaved_learner = Some("it did not end when asked to, and was killed".into());
+                }
+            }
+        }
+    }
+
+    /// Logs that every role has ended.
+    ///
+    /// # Errors
+    /// When the learner did not save its state before it ended.
+    pub(crate) fn check_saved(&self) -> anyhow::Result<()> {
+        self.log.note("launcher", ALL_ENDED);
+        let Some(how) = &self.unsaved_learner else {
+            return Ok(());
+        };
+        let learner = self.learner().map(|learner| name(learner.instance));
+        let lines = learner.map_or_else(Vec::new, |learner| self.log.last_lines(&learner));
+        let message = lines.last().map_or_else(String::new, |line| format!(": {line}"));
+        bail!(
+            "the learner did not save its last state ({how}){message}; `shoal resume {}` continues from the newest \
+             checkpoint",
+            self.run.display()
+        );
+    }
+}
