@@ -18,7 +18,7 @@ fn every_algorithm_is_in_the_lists_outside_rust() {
             // A run of it in `numpy_policies_act_as_those_of_the_program`, which tests that line.
             ("tests/python/main.rs", format!("\n        (\"{name}\", ")),
             // What it is for, and its name on the command line.
-            ("docs/ALGORITHMS.md", format!("`{name}`")),
+            ("docs/METHODS.md", format!("`{name}`")),
         ] {
             assert!(
                 text(file).contains(&line),
