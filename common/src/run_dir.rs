@@ -386,6 +386,11 @@ impl RunDir {
         self.path.join("server.json")
     }
 
+    /// `description.json`: what the numbers of the run's environment mean, if another program serves it and says so.
+    pub fn description(&self) -> PathBuf {
+        self.path.join("description.json")
+    }
+
     /// `final-evaluation.json`: the results of the evaluation at the end of the run.
     pub fn final_evaluation(&self) -> PathBuf {
         self.path.join("final-evaluation.json")

@@ -86,6 +86,7 @@ mod names_elsewhere;
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::description::Description;
     use shoal_base::space::Space;
     use shoal_base::stream::{Purpose, stream};
 
@@ -127,46 +128,21 @@ mod tests {
     }
 
     #[test]
-    fn every_signal_has_a_unique_key_and_a_valid_source() {
+    fn every_environment_is_described_correctly() {
         for name in names() {
             let environment = make(name, &toml::Table::new()).unwrap();
-            let spec = environment.spec();
-            let signals = environment.signals();
-            let (observation, action) = (spec.observation.width(), spec.action.width());
-            for (i, Signal { key, label, source, .. }) in signals.iter().enumerate() {
-                assert!(!key.is_empty() && !label.is_empty(), "{name}");
+            let description = Description::of(&*environment);
+            assert_eq!(description.check(&environment.spec()), Ok(()), "{name}");
+            for Signal { key, .. } in &description.signals {
                 assert!(
                     key.chars()
                         .all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '-'),
                     "{name}: {key}"
                 );
-                assert!(
-                    !["reward", "return"].contains(&key.as_str()),
-                    "{name}: {key} is reserved"
-                );
-                assert!(signals[..i].iter().all(|other| other.key != *key), "{name}: {key}");
-                assert!(
-                    match *source {
-                        SignalSource::Observation(i) => i < observation,
-                        SignalSource::Action(i) => i < action,
-                        SignalSource::Angle { cos, sin } => cos < observation && sin < observation,
-                    },
-                    "{name}: {key}"
-                );
             }
-            for key in environment.picture().keys() {
-                let signal = signals.iter().find(|signal| signal.key == *key);
-                assert!(signal.is_some(), "{name}: its picture needs a signal `{key}`");
-                let needs_range = environment.picture().scales().contains(key);
-                assert!(
-                    !needs_range || signal.unwrap().range(&spec).is_some(),
-                    "{name}: its picture needs a range of `{key}`"
-                );
+            if let Some(goal) = description.goal {
+                assert!(description.signals.contains(&goal.distance), "{name}");
             }
-            if let Some(goal) = environment.goal() {
-                assert!(goal.within > 0.0 && signals.contains(&goal.distance), "{name}");
-            }
-            assert!(environment.time_step().is_none_or(|seconds| seconds > 0.0), "{name}");
         }
     }
 

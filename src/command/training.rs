@@ -120,10 +120,17 @@ fn train_and_report(
             }
         }
     }
-    if let Err(error) = plots::draw(run, &config, run.path()) {
-        lock.check(run)?;
-        let why = format!("{error:#}").replace('\n', " ");
-        say(&format!("the figures could not be drawn: {why}"));
+    match plots::draw(run, &config, run.path(), &signals.interrupt()) {
+        Ok(drawn) => {
+            if let Some(why) = drawn.no_episode.filter(|_| signals.interrupt().signal().is_none()) {
+                say(&format!("no episode was drawn: {why}"));
+            }
+        }
+        Err(error) => {
+            lock.check(run)?;
+            let why = format!("{error:#}").replace('\n', " ");
+            say(&format!("the figures could not be drawn: {why}"));
+        }
     }
     if outcome.ending == RunEnd::Finished {
         finished.write(run)?;
