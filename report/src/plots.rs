@@ -25,12 +25,12 @@ pub struct Drawn {
     pub no_episode: Option<String>,
 }
 
-/// Draws the learning curve of a run so far and, if it has a best policy, that policy's behaviour. A signal ends an
-/// episode of a program that serves the environment.
+/// Draws the learning curve of a run so far and, if it has a best policy, that policy's behaviour. A program that serves
+/// the environment is started only if there is an `interrupt`, which ends its episode.
 ///
 /// # Errors
 /// When a file cannot be read or written, or the policy does not fit the run.
-pub fn draw(run: &RunDir, config: &Config, out: &Path, interrupt: &Interrupt) -> anyhow::Result<Drawn> {
+pub fn draw(run: &RunDir, config: &Config, out: &Path, interrupt: Option<&Interrupt>) -> anyhow::Result<Drawn> {
     let mut drawn = Drawn {
         files: vec![out.join("learning-curve.svg")],
         no_episode: None,
@@ -42,8 +42,8 @@ pub fn draw(run: &RunDir, config: &Config, out: &Path, interrupt: &Interrupt) ->
     }
     if config.environment.server.is_empty() {
         drawn.files.extend(behaviour(run, config, out)?);
-    } else if let Some(description) = description::kept(run, config)?
-        && interrupt.signal().is_none()
+    } else if let Some(interrupt) = interrupt
+        && let Some(description) = description::kept(run, config)?
     {
         match episode_of_server(run, config, interrupt) {
             Ok(trajectory) => drawn.files.push(episode(&description, &trajectory, out)?),
@@ -112,7 +112,9 @@ mod tests {
         if let Some(said) = said {
             said.store(&run_dir.description()).unwrap();
         }
-        let no_episode = draw(&run_dir, &config, &out, &Interrupt::default()).unwrap().no_episode;
+        let no_episode = draw(&run_dir, &config, &out, Some(&Interrupt::default()))
+            .unwrap()
+            .no_episode;
         let entries = std::fs::read_dir(out).unwrap();
         let mut files: Vec<_> = entries.map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
         files.sort();

@@ -120,9 +120,12 @@ fn train_and_report(
             }
         }
     }
-    match plots::draw(run, &config, run.path(), &signals.interrupt()) {
+    let interrupt = signals.interrupt();
+    // A run that is stopped should end soon, so that no environment is started for a figure.
+    let may_start = !evaluated.is_empty() && interrupt.signal().is_none();
+    match plots::draw(run, &config, run.path(), may_start.then_some(&interrupt)) {
         Ok(drawn) => {
-            if let Some(why) = drawn.no_episode.filter(|_| signals.interrupt().signal().is_none()) {
+            if let Some(why) = drawn.no_episode.filter(|_| interrupt.signal().is_none()) {
                 say(&format!("no episode was drawn: {why}"));
             }
         }
