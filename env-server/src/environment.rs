@@ -70,7 +70,10 @@ fn build<P: Serialize + DeserializeOwned + JsonSchema, E: Environment + 'static>
     parameters: &toml::Table,
     new: impl FnOnce(P) -> Result<E, OutOfRange>,
 ) -> Result<Built, String> {
-    let read: P = parameters.clone().try_into().map_err(|e| error::one_line(&e))?;
+    let read: P = section::read("environment", parameters.clone().into()).map_err(|error| {
+        let reason = section::in_user_words(error.message());
+        reason.strip_prefix("environment.").unwrap_or(&reason).to_owned()
+    })?;
     let parameters = toml::Table::try_from(&read).map_err(|e| e.to_string())?;
     let environment = Box::new(new(read).map_err(|e| e.to_string())?);
     Ok(Built {
@@ -174,12 +177,12 @@ mod tests {
         assert!(unknown.contains("pendulum") && unknown.contains("star_speed") && unknown.contains("start_speed"));
         let wrong_type = refusal("point-mass", "friction = \"much\"");
         assert!(
-            wrong_type.contains("`friction`") && wrong_type.contains("expected a number"),
+            wrong_type.ends_with("friction = \"much\": must be a number, such as 0.5"),
             "{wrong_type}"
         );
         let negative = refusal("cart-pole", "time_limit = -1");
         assert!(
-            negative.contains("`time_limit`") && negative.contains("whole number"),
+            negative.contains("time_limit = -1: must be a whole number from 0 on"),
             "{negative}"
         );
         assert_eq!(

@@ -12,7 +12,7 @@ use shoal_common::run_dir::RunDir;
 use shoal_env_server::environment::Goal;
 use shoal_run::description;
 use shoal_run::evaluation::{EvaluationSummary, SavedPolicy, evaluate_policy};
-use shoal_run::numbers::from_one;
+use shoal_run::numbers::{count, from_one};
 use shoal_run::signals::{Signals, exit_code};
 
 #[derive(Args, Clone, Debug)]
@@ -26,7 +26,7 @@ pub(crate) struct EvalArgs {
     #[arg(long, default_value_t = 100, value_parser = from_one)]
     pub(crate) episodes: u32,
     /// Seed of the start states [default: the run's seed].
-    #[arg(long)]
+    #[arg(long, value_parser = count)]
     pub(crate) seed: Option<u64>,
     /// Print one JSON object on standard output.
     #[arg(long)]

@@ -94,10 +94,3 @@ pub(super) fn check(key: &'static str, value: f64, range: RangeInclusive<f64>) -
 pub(super) fn check_time_limit(time_limit: u32) -> Result<(), OutOfRange> {
     check("time_limit", time_limit.into(), 1.0..=1e6)
 }
-
-/// A TOML error as one line, without names of Rust types.
-pub(super) fn one_line(error: &toml::de::Error) -> String {
-    let line = error.to_string().split_whitespace().collect::<Vec<_>>().join(" ");
-    line.replace("expected f64", "expected a number")
-        .replace("expected u32", "expected a positive whole number")
-}

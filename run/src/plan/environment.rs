@@ -3,6 +3,7 @@
 use anyhow::bail;
 use serde::de::DeserializeOwned;
 use shoal_common::config::{AlgorithmConfig, EnvironmentConfig, Mode, RunConfig};
+use shoal_common::section;
 use shoal_env_server::description::Description;
 use shoal_env_server::environment::{self, EnvironmentError};
 use toml::{Table, Value};
@@ -87,7 +88,8 @@ pub(super) fn about_environment(error: anyhow::Error, sources: &SettingSources) 
             ("name", format!("{of_environment}{hint}"))
         }
         EnvironmentError::Parameters { reason, .. } => {
-            let key = reason.split('`').nth(1).unwrap_or_default();
+            let before_value = reason.split_once(" = ").map(|(key, _)| key);
+            let key = before_value.or_else(|| reason.split('`').nth(1)).unwrap_or_default();
             (key, with_suggestion(of_environment.to_string()))
         }
     };
@@ -96,10 +98,12 @@ pub(super) fn about_environment(error: anyhow::Error, sources: &SettingSources) 
 
 /// Takes a key of `[environment]` that is no parameter of the environment.
 fn take<T: DeserializeOwned>(section: &mut Table, key: &str) -> anyhow::Result<Option<T>> {
-    let value = section.remove(key).map(Value::try_into).transpose();
-    value.map_err(|error| anyhow::anyhow!("environment.{key}: {}", one_line(&error)))
-}
-
-fn one_line(error: &toml::de::Error) -> String {
-    error.message().replace('\n', " ")
+    let Some(value) = section.remove(key) else {
+        return Ok(None);
+    };
+    let wrong = |error: toml::de::Error| {
+        let reason = section::in_user_words(error.message());
+        anyhow::anyhow!("environment.{key} = {value}: {reason}")
+    };
+    value.clone().try_into().map(Some).map_err(wrong)
 }
