@@ -70,10 +70,10 @@ fn build<P: Serialize + DeserializeOwned + JsonSchema, E: Environment + 'static>
     parameters: &toml::Table,
     new: impl FnOnce(P) -> Result<E, OutOfRange>,
 ) -> Result<Built, String> {
-    let read: P = section::read("environment", parameters.clone().into()).map_err(|error| {
-        let reason = section::in_user_words(error.message());
-        reason.strip_prefix("environment.").unwrap_or(&reason).to_owned()
-    })?;
+    let read: P = parameters
+        .clone()
+        .try_into()
+        .map_err(|error| error::wrong_parameter(parameters, &error))?;
     let parameters = toml::Table::try_from(&read).map_err(|e| e.to_string())?;
     let environment = Box::new(new(read).map_err(|e| e.to_string())?);
     Ok(Built {
