@@ -164,6 +164,7 @@ fn launch_spec<'a>(config: &'a Config, run: &RunDir, instance: RoleInstance) -> 
         },
         surroundings: ServerSurroundings::of_run(run, config)?,
         pictures: None,
+        description: None,
     })
 }
 

@@ -61,6 +61,35 @@ fn invalid_training_arguments_are_refused_before_anything_is_created() {
             &["pendulum", "--set", "environment.name=Ant-v5"],
             "did you mean gym:Ant-v5?",
         ),
+        (
+            &["pendulum", "--set", "ddpg.tau="],
+            "error: ddpg.tau = \"\": must be a number, such as 0.5",
+        ),
+        (
+            &["pendulum", "--set", "tau="],
+            "--set tau=: must look like SECTION.KEY=VALUE; did you mean ddpg.tau",
+        ),
+        (
+            &["pendulum", "--set", "ddpg.=3"],
+            "--set ddpg.=3: must look like SECTION.KEY=VALUE",
+        ),
+        (
+            &["pendulum", "--set", "run.steps=1.5"],
+            "error: run.steps = 1.5: must be a whole number, such as 1000",
+        ),
+        (
+            &["pendulum", "--set", "evaluation.keep_policies=yes"],
+            "error: evaluation.keep_policies = \"yes\": must be true or false",
+        ),
+        (
+            &["pendulum", "--set", "environment.start_speed=fast"],
+            "environment pendulum: start_speed = \"fast\": must be a number, such as 0.5",
+        ),
+        (
+            &["runs/first"],
+            "there is no preset, directory or file `runs/first`: choose pendulum, ",
+        ),
+        (&["pendulum", "--seed", "x"], "x is not a whole number"),
         (&["pendulum", "--steps", "1.5"], "1.5 is not a whole number"),
         (&["pendulum", "--episodes", "1e-3"], "1e-3 is not a whole number"),
         (&["pendulum", "--actors", "1e10"], "1e10 is too large"),
@@ -114,7 +143,7 @@ fn invalid_training_arguments_are_refused_before_anything_is_created() {
         ),
         (
             &["pendulum", "--set", "ddpg.hidden=64"],
-            "ddpg.hidden = 64: invalid type: integer `64`",
+            "ddpg.hidden = 64: must be a list, such as [64, 48]",
         ),
         (
             &["cart-pole", "--set", "reinforce.baseline_hidden=[]"],

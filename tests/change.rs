@@ -164,7 +164,7 @@ fn what_cannot_change_is_refused_by_the_name_of_its_key() {
         ),
         ("ddpg.tau=nan", "ddpg.tau = NaN: must be above 0 and at most 1"),
         ("ddpg.tau=-1", "ddpg.tau = -1: must be above 0"),
-        ("ddpg.tau=quickly", "ddpg.tau = \"quickly\": invalid type"),
+        ("ddpg.tau=quickly", "ddpg.tau = \"quickly\": must be a number"),
         ("ddpg.ta=0.1", "unknown field `ta`"),
         ("evaluation.every=0", "evaluation.every = 0: must be from 1"),
         (

@@ -19,6 +19,7 @@ use support::{Workplace, error_line, json, until};
 fn main() -> ExitCode {
     suite::run(vec![
         test!(the_template_trains_and_is_evaluated, RAIL),
+        test!(a_run_without_a_description_or_a_program_has_a_learning_curve, RAIL),
         test!(its_lockstep_run_has_the_same_bits_after_kills, RAIL),
         test!(its_drawings_are_played_in_the_report, RAIL, CHROMIUM),
         test!(its_errors_are_one_line, RAIL),
@@ -72,6 +73,40 @@ fn the_template_trains_and_is_evaluated() {
     let page = std::fs::read_to_string(place.path().join("page.html")).unwrap();
     // Two episodes of 100 steps.
     assert_eq!(page.matches("\"class\":\"body\"").count(), 2 * 101);
+    // What `Rail::signals` and `Rail::time_step` say.
+    assert!(page.contains("\"label\":\"velocity\",\"unit\":\"m/s\"") && page.contains("\"time_step\":0.05"));
+    let figure = std::fs::read_to_string(place.path().join("runs/rail-1/episode.svg")).unwrap();
+    for label in ["position", "velocity", "force", "time (s)", "m/s"] {
+        assert!(figure.lines().any(|line| line.trim() == label), "{label}");
+    }
+}
+
+/// A run that began before its program could describe itself, or whose program is gone.
+fn a_run_without_a_description_or_a_program_has_a_learning_curve() {
+    let place = copy();
+    let options = ["--steps", "1000", "--quiet", "--set", "evaluation.final_episodes=1"];
+    let trained = place.output(&[&["train", "rail.toml"], &options[..]].concat());
+    assert!(trained.status.success(), "{}", String::from_utf8_lossy(&trained.stderr));
+    let run = place.path().join("runs/rail-1");
+    std::fs::remove_file(run.join("episode.svg")).unwrap();
+    let plotted = || {
+        let output = place.output(&["plot", "runs/rail-1"]);
+        assert!(output.status.success());
+        assert!(!run.join("episode.svg").exists());
+        assert_eq!(
+            String::from_utf8_lossy(&output.stdout).trim(),
+            "runs/rail-1/learning-curve.svg"
+        );
+        String::from_utf8(output.stderr).unwrap()
+    };
+    std::fs::rename(place.path().join("target/release/rail"), place.path().join("moved")).unwrap();
+    let said = plotted();
+    assert!(
+        said.starts_with("no episode was drawn: ") && said.lines().count() == 1,
+        "{said}"
+    );
+    std::fs::remove_file(run.join("description.json")).unwrap();
+    assert_eq!(plotted(), "");
 }
 
 fn its_lockstep_run_has_the_same_bits_after_kills() {

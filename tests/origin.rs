@@ -5,14 +5,13 @@
 
 mod support;
 
-use std::io::Write;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::process::Output;
 
 use serde_json::Value;
 use shoal_common::config::Config;
-use shoal_common::durable::{FileKind, seal};
+use shoal_run::testing::dataset;
 use support::{Workplace, error_line, json};
 
 /// A short lockstep run in `old`. Returns its result.
@@ -259,21 +258,7 @@ fn python(place: &Workplace, rows: &[[f32; 10]]) {
          action = {{ box = {{ low = [-2.0], high = [2.0] }} }}\n",
         rows.len()
     );
-    let kind = FileKind {
-        magic: *b"SHOALDEM",
-        version: 1,
-        name: "",
-    };
-    let mut file = Vec::new();
-    let written = seal(kind, &mut file, |body| {
-        body.write_all(&(header.len() as u64).to_le_bytes())?;
-        body.write_all(header.as_bytes())?;
-        rows.iter()
-            .flatten()
-            .try_for_each(|number| body.write_all(&number.to_le_bytes()))
-    });
-    written.unwrap();
-    std::fs::write(place.path().join("rows"), file).unwrap();
+    std::fs::write(place.path().join("rows"), dataset(&header, rows)).unwrap();
     std::fs::create_dir_all(place.path().join("bin")).unwrap();
     let program = place.path().join("bin/python3");
     let here = place.path().display();

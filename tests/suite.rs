@@ -82,6 +82,26 @@ fn a_suite_trains_each_combination_with_each_seed_and_is_compared() {
     let message = error_line(&place.output(&other));
     assert!(message.contains("suite is a suite of other runs"), "{message}");
 
+    // What takes one run names those of the suite.
+    for command in [
+        &["eval"][..],
+        &["film"],
+        &["status"],
+        &["plot"],
+        &["top"],
+        &["stop"],
+        &["scale", "--actors", "2"],
+        &["export", "--format", "onnx"],
+        &["export", "--minari", "x/y-v0"],
+    ] {
+        let message = error_line(&place.output(&[command, &["suite"]].concat()));
+        assert!(
+            message.contains("a suite of runs (tau=0.01,seed=1, tau=0.01,seed=2, tau=0.001,seed=1, and 1 more")
+                && message.ends_with("name one of them, as in suite/tau=0.01,seed=1"),
+            "{command:?}: {message}"
+        );
+    }
+
     let listed = json(&place.output(&["list", "suite", "--json"]));
     assert_eq!(listed["runs"].as_array().unwrap().len(), 4);
     let above = json(&place.output(&["list", ".", "--json"]));

@@ -343,11 +343,27 @@ mod tests {
     #[test]
     fn a_key_of_the_wrong_type_is_named() {
         for (text, part) in [
-            ("[actors]\nenvs = true\n", "test: actors.envs = true: invalid type"),
-            ("[replay]\nwarmup = -1\n", "test: replay.warmup = -1: invalid value"),
+            (
+                "[actors]\nenvs = true\n",
+                "test: actors.envs = true: must be a whole number",
+            ),
+            (
+                "[replay]\nwarmup = -1\n",
+                "test: replay.warmup = -1: must be a whole number from 0 on",
+            ),
             (
                 "[learner]\nthread = 1\n",
                 "test: learner.thread = 1: unknown field `thread`",
+            ),
+            ("[ddpg]\ntau = \"\"\n", "test: ddpg.tau = \"\": must be a number"),
+            ("[ddpg]\nhidden = 5\n", "test: ddpg.hidden = 5: must be a list"),
+            (
+                "[ddpg]\nhidden = [5, \"a\"]\n",
+                "test: ddpg.hidden = [5, \"a\"]: each must be a whole number",
+            ),
+            (
+                "[evaluation]\nkeep_policies = 1\n",
+                "test: evaluation.keep_policies = 1: must be true or false",
             ),
         ] {
             let message = parse(&format!("{MINIMAL}{text}")).unwrap_err().to_string();

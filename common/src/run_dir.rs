@@ -48,17 +48,45 @@ pub enum RunDirError {
     },
 }
 
-/// A hint for a bare name that is a run in `runs`, where `shoal train` makes its runs; otherwise empty.
 fn what_it_is(path: &Path) -> String {
     if !path.exists() {
         "there is no such directory".into()
     } else if path.join("suite.json").is_file() {
-        format!("it is a suite of runs; `shoal list {}` shows them", path.display())
+        suite(path)
     } else {
         "it has no config.toml".into()
     }
 }
 
+/// A suite in words: its runs that have begun, and how to name one.
+fn suite(path: &Path) -> String {
+    let entries = std::fs::read_dir(path).into_iter().flatten().flatten();
+    let begun = entries.filter(|entry| entry.path().join("config.toml").is_file());
+    let mut runs: Vec<String> = begun
+        .map(|run| run.file_name().to_string_lossy().into_owned())
+        .collect();
+    // seed=2 before seed=10.
+    runs.sort_by(|a, b| (a.len(), a).cmp(&(b.len(), b)));
+    let here = path.display();
+    let Some(first) = runs.first() else {
+        return format!("it is a suite of runs, of which none has begun: shoal resume {here}");
+    };
+    let shown = runs.iter().take(SHOWN).cloned().collect::<Vec<_>>().join(", ");
+    let others = match runs.len().saturating_sub(SHOWN) {
+        0 => String::new(),
+        others => format!(", and {others} more, which `shoal list {here}` shows"),
+    };
+    let one = path.join(first);
+    format!(
+        "it is a suite of runs ({shown}{others}); name one of them, as in {}",
+        one.display()
+    )
+}
+
+/// At most this many runs of a suite are named in an error.
+const SHOWN: usize = 3;
+
+/// A hint for a bare name that is a run in `runs`, where `shoal train` makes its runs; otherwise empty.
 fn did_you_mean(path: &Path) -> String {
     let there = Path::new("runs").join(path);
     if path.components().count() == 1 && there.join("config.toml").is_file() {
@@ -386,6 +414,11 @@ impl RunDir {
         self.path.join("server.json")
     }
 
+    /// `description.json`: what the numbers of the run's environment mean, if another program serves it and says so.
+    pub fn description(&self) -> PathBuf {
+        self.path.join("description.json")
+    }
+
     /// `final-evaluation.json`: the results of the evaluation at the end of the run.
     pub fn final_evaluation(&self) -> PathBuf {
         self.path.join("final-evaluation.json")
@@ -410,6 +443,28 @@ impl RunDir {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_suite_that_is_taken_for_a_run_names_its_runs() {
+        let parent = tempfile::tempdir().unwrap();
+        let suite = parent.path().join("s");
+        std::fs::create_dir(&suite).unwrap();
+        std::fs::write(suite.join("suite.json"), "").unwrap();
+        let refused = || RunDir::open(&suite).unwrap_err().to_string();
+        assert!(refused().contains("none has begun: shoal resume "), "{}", refused());
+        for seed in [10, 2, 1, 3, 4] {
+            let run = suite.join(format!("seed={seed}"));
+            std::fs::create_dir(&run).unwrap();
+            std::fs::write(run.join("config.toml"), "").unwrap();
+        }
+        std::fs::create_dir(suite.join("notes")).unwrap();
+        let here = suite.display();
+        let expected = format!(
+            "{here} is not a run directory: it is a suite of runs (seed=1, seed=2, seed=3, and 2 more, which \
+             `shoal list {here}` shows); name one of them, as in {here}/seed=1"
+        );
+        assert_eq!(refused(), expected);
+    }
 
     #[test]
     fn a_run_directory_is_never_overwritten_and_has_only_one_launcher() {

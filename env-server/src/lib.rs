@@ -1,5 +1,6 @@
 //! The environments, and the server that steps a vector of them. It does not depend on how anything is learned.
 
+pub mod description;
 pub mod environment;
 pub mod frame;
 pub mod program;

@@ -21,9 +21,11 @@ use clap::Parser;
 use serde::de::DeserializeOwned;
 use shoal_base::role::{Role, RoleInstance};
 use shoal_base::stop::Stop;
+use shoal_base::versioned_file::VersionedFile;
 use shoal_channel::environment::EnvironmentPort;
 use shoal_channel::{Domain, EventName, HeartbeatSender};
 
+use crate::description::Description;
 use crate::environment::{Environment, OutOfRange};
 use crate::frame::FrameFile;
 use crate::server;
@@ -110,6 +112,12 @@ fn serve_until_stopped(
     } = arguments;
     let environments = VectorEnvironment::of(make, *count, (*seed, (*index).into(), *stream))?;
     let mut environments = environments.drawn_into(FrameFile::wanted());
+    // Before the first answer: the client reads it then.
+    if let Some(file) = Description::wanted()
+        && let Err(error) = environments.describe().store(&file)
+    {
+        tracing::error!("the environment is not described: {error}");
+    }
     let stop = Stop::when_stdin_closes().map_err(|error| format!("cannot watch standard input: {error}"))?;
     // A server opens services that the launcher has made, so the number of actors is not needed.
     let domain = Domain::join(run, 1).map_err(in_words)?;

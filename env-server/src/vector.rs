@@ -7,6 +7,7 @@ use shoal_base::space::{EnvironmentSpec, Space};
 use shoal_base::stream::{Purpose, Stream, stream};
 use shoal_channel::environment::StepBlocks;
 
+use crate::description::Description;
 use crate::environment::{Drawing, Environment, EnvironmentError, RequestError, make};
 use crate::frame::FrameFile;
 
@@ -129,6 +130,11 @@ impl VectorEnvironment {
     pub fn draw(&self, action: &[f32]) -> Option<Drawing> {
         let action: Vec<f64> = action.iter().map(|a| f64::from(*a)).collect();
         self.running.first()?.environment.draw(&action)
+    }
+
+    /// The meaning of each environment's numbers.
+    pub fn describe(&self) -> Description {
+        Description::of(&*self.scratch)
     }
 
     /// Spaces and time limit of each environment.

@@ -15,8 +15,9 @@ program.
 
 from .errors import ShoalError
 from .policy import Policy
-from .program import train
+from .program import train, train_suite
 from .run import Run
+from .suite import Suite
 from .transitions import Transitions
 
-__all__ = ["Policy", "Run", "ShoalError", "Transitions", "train"]
+__all__ = ["Policy", "Run", "ShoalError", "Suite", "Transitions", "train", "train_suite"]

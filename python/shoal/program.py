@@ -10,14 +10,17 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from .errors import ShoalError
 
 if TYPE_CHECKING:
     from .run import Run
+    from .suite import Suite
 
 #: Lines of the program's messages that are kept for an error.
 KEPT_LINES = 20
@@ -52,8 +55,11 @@ def installed() -> str | None:
 
 def text_of(value: Any) -> str:
     """A value of a setting as the option ``--set`` takes it."""
-    if isinstance(value, bool):
+    if isinstance(value, bool | np.bool_):
         return "true" if value else "false"
+    if isinstance(value, np.ndarray):
+        # The shortest text of each number in its own precision: 0.1 for float32(0.1).
+        return text_of(value[()] if value.ndim == 0 else list(value))
     if isinstance(value, str):
         return value
     if isinstance(value, Mapping):
@@ -75,6 +81,9 @@ def settings(values: Mapping[str, Any] | None) -> list[str]:
 
 #: The exit code of `shoal status` for a run that is not running.
 NOT_RUNNING = 3
+
+#: How the message of `shoal stop` begins for such a run.
+NOTHING_RUNS = "nothing runs in "
 
 
 def call(arguments: Sequence[str | os.PathLike[str]], accepted: Sequence[int] = (0,)) -> str:
@@ -156,6 +165,78 @@ def train(
     """
     from .run import Run
 
+    arguments = _arguments(
+        what,
+        run=run,
+        steps=steps,
+        episodes=episodes,
+        seed=seed,
+        actors=actors,
+        envs=envs,
+        method=method,
+        lockstep=lockstep,
+        set=set,
+        from_run=from_run,
+        with_replay=with_replay,
+        demonstrations=demonstrations,
+    )
+    printed = follow([program(), *arguments], quiet) if wait else call([*arguments, "--detach", "--quiet"])
+    return Run(json.loads(printed)["run"])
+
+
+def train_suite(
+    what: str,
+    *,
+    seeds: Iterable[int] | None = None,
+    sweep: Mapping[str, Iterable[Any]] | None = None,
+    halving: bool = False,
+    jobs: int | None = None,
+    quiet: bool = False,
+    **options: Any,
+) -> Suite:
+    """Trains a suite: a run for each of these ``seeds``, with each combination of the values of the keys in ``sweep``,
+    as in ``{"ddpg.tau": [0.001, 0.005]}``. Returns it when all its runs have been trained.
+
+    ``halving`` ends bad settings early. ``jobs`` is the number of runs at a time, by default what the machine allows.
+    The other ``options`` are those of :func:`train`, except ``seed`` and ``wait``, and all runs have them. ``run`` is
+    the directory of the suite. Called again with the same options, this continues a suite that was interrupted.
+
+    Raises :class:`ShoalError` if the program refuses, or a run fails.
+    """
+    from .suite import Suite
+
+    arguments = _arguments(what, **options)
+    if seeds is not None:
+        arguments += ["--seeds", ",".join(str(seed) for seed in seeds)]
+    for key, values in (sweep or {}).items():
+        arguments += ["--sweep", f"{key}={','.join(_item(value) for value in values)}"]
+    arguments += ["--halving"] if halving else []
+    arguments += ["--jobs", str(jobs)] if jobs is not None else []
+    return Suite(json.loads(follow([program(), *arguments], quiet))["suite"])
+
+
+def _item(value: Any) -> str:
+    """A value in the list of ``--sweep``, in which commas separate values."""
+    return json.dumps(value) if isinstance(value, str) and "," in value else text_of(value)
+
+
+def _arguments(
+    what: str,
+    *,
+    run: str | os.PathLike[str] | None = None,
+    steps: int | None = None,
+    episodes: int | None = None,
+    seed: int | None = None,
+    actors: int | None = None,
+    envs: int | None = None,
+    method: str | None = None,
+    lockstep: bool = False,
+    set: Mapping[str, Any] | None = None,
+    from_run: str | os.PathLike[str] | Run | None = None,
+    with_replay: bool = False,
+    demonstrations: str | None = None,
+) -> list[str]:
+    """The arguments of the program for these arguments of :func:`train`."""
     options: list[tuple[str, object]] = [
         ("--run", run),
         ("--steps", steps),
@@ -171,6 +252,4 @@ def train(
     arguments += [str(part) for option, value in options if value is not None for part in (option, value)]
     arguments += ["--lockstep"] if lockstep else []
     arguments += ["--with-replay"] if with_replay else []
-    arguments += settings(set)
-    printed = follow([program(), *arguments], quiet) if wait else call([*arguments, "--detach", "--quiet"])
-    return Run(json.loads(printed)["run"])
+    return arguments + settings(set)

@@ -35,6 +35,8 @@ class Run:
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path).absolute()
+        if (self.path / "suite.json").is_file():
+            raise ShoalError(f"{self.path} is a suite of runs: shoal.Suite(…).runs has them")
         if not (self.path / "config.toml").is_file():
             raise ShoalError(f"{self.path} is not a run directory: it has no config.toml")
 
@@ -135,8 +137,16 @@ class Run:
         program.call(["scale", self.path, "--actors", str(actors)])
 
     def stop(self) -> None:
-        """Ends the run in order: all that was sent is committed and saved. :meth:`resume` continues it."""
-        program.call(["stop", self.path])
+        """Ends the run in order: all that was sent is committed and saved. :meth:`resume` continues it.
+
+        Does nothing if the run is not running, as when it has just ended. Raises :class:`ShoalError` if the training is
+        finished and the final evaluation is under way; :meth:`wait` waits for that.
+        """
+        try:
+            program.call(["stop", self.path])
+        except ShoalError as error:
+            if not str(error).startswith(program.NOTHING_RUNS):
+                raise
 
     def wait(self, timeout: float | None = None) -> Run:
         """Waits until the run is no longer running, for at most ``timeout`` seconds. Returns the run.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +27,14 @@ def read(path: Path) -> np.ndarray:
     if not rows:
         raise ShoalError(f"{path} has no header")
     names, rows = rows[0], [row for row in rows[1:] if len(row) == len(rows[0])]
-    columns = [column([row[index] for row in rows]) for index in range(len(names))]
-    table = np.empty(len(rows), dtype=[(name, values.dtype) for name, values in zip(names, columns)])
-    for name, values in zip(names, columns):
+    return of_columns({name: column([row[index] for row in rows]) for index, name in enumerate(names)})
+
+
+def of_columns(columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Columns of one length as a structured array, a field for each."""
+    length = max((len(values) for values in columns.values()), default=0)
+    table = np.empty(length, dtype=[(name, values.dtype) for name, values in columns.items()])
+    for name, values in columns.items():
         table[name] = values
     return table
 

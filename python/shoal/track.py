@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import fcntl
 import json
 import os
 import sys
@@ -22,6 +21,7 @@ import numpy as np
 
 from .errors import ShoalError
 from .run import Run
+from .suite import Suite, is_worked_on
 
 #: The files that are followed, and what their metrics are called.
 FOLLOWED = {"evaluations": "evaluation", "learner": "learner", "episodes": "episode"}
@@ -187,28 +187,7 @@ def track(path: str | os.PathLike[str], to: str, *, project: str = "shoal", foll
 
 def runs(path: Path) -> list[Run]:
     """The run of this directory, or those of this suite that have begun."""
-    if not (path / "suite.json").is_file():
-        return [Run(path)]
-    return [Run(path / name) for name in trials(path) if (path / name / "config.toml").is_file()]
-
-
-def trials(suite: Path) -> list[str]:
-    try:
-        return [trial["name"] for trial in json.loads((suite / "suite.json").read_text(encoding="utf-8"))["trials"]]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ShoalError(f"{suite / 'suite.json'} cannot be read: {error}") from error
-
-
-def is_worked_on(directory: Path) -> bool:
-    """Whether a process holds the lock of this run or suite, as the launcher of a running run does."""
-    descriptor = os.open(directory, os.O_RDONLY)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    finally:
-        os.close(descriptor)
-    return False
+    return Suite(path).runs if (path / "suite.json").is_file() else [Run(path)]
 
 
 class Copy:

@@ -1,8 +1,10 @@
 """Tests of ``shoal`` that need no run: files that are damaged or foreign, and values of settings."""
 
+import json
 import struct
 import tempfile
 import unittest
+import unittest.mock
 import zlib
 from pathlib import Path
 
@@ -107,12 +109,81 @@ class Files(unittest.TestCase):
         with self.assertRaisesRegex(shoal.ShoalError, "not a run directory"):
             shoal.Run(self.path.parent)
 
+    def test_a_run_that_has_ended_is_not_stopped_again(self) -> None:
+        self.path.with_name("config.toml").touch()
+        run = shoal.Run(self.path.parent)
+        ended = shoal.ShoalError(f"nothing runs in {run.path}: it is finished", 1)
+        with unittest.mock.patch.object(program, "call", side_effect=ended):
+            run.stop()
+        failed = shoal.ShoalError("the learner could not save", 1)
+        with unittest.mock.patch.object(program, "call", side_effect=failed):
+            with self.assertRaisesRegex(shoal.ShoalError, "could not save"):
+                run.stop()
+
+    def test_the_results_are_a_table(self) -> None:
+        suite = self.path.parent / "suite"
+        trials = [
+            {"name": f"tau={tau},seed={seed}", "seed": seed, "set": [f"ddpg.tau={tau}", f"ddpg.activation={word}"]}
+            for tau, word in ((0.1, "relu"), (0.5, "tanh"))
+            for seed in (1, 2)
+        ]
+        for trial, mean in zip(trials[:2], (-3.5, None)):
+            (suite / trial["name"]).mkdir(parents=True)
+            (suite / trial["name"] / "config.toml").touch()
+            best = {"policy": "best", "return_mean": -9.0, "return_std": 0.0}
+            last = {"policy": "last", "return_mean": mean, "return_std": 0.0}
+            result = {"format": 1, "policies": [best, last], "kept": "last"}
+            (suite / trial["name"] / "final-evaluation.json").write_text(json.dumps(result))
+        with self.assertRaisesRegex(shoal.ShoalError, "no suite.json"):
+            shoal.Suite(suite)
+        (suite / "suite.json").write_text(json.dumps({"format": 1, "what": "pendulum", "trials": trials}))
+        with self.assertRaisesRegex(shoal.ShoalError, "is a suite of runs"):
+            shoal.Run(suite)
+        read = shoal.Suite(suite)
+        self.assertEqual(read.trials, trials)
+        self.assertEqual([run.path.name for run in read.runs], ["tau=0.1,seed=1", "tau=0.1,seed=2"])
+        table = read.results
+        names = ("run", "seed", "ddpg.tau", "ddpg.activation", "return_mean", "return_std")
+        self.assertEqual(table.dtype.names, names)
+        self.assertEqual(table["ddpg.tau"].tolist(), [0.1, 0.1, 0.5, 0.5])
+        self.assertEqual(table["ddpg.activation"].tolist(), ["relu", "relu", "tanh", "tanh"])
+        self.assertEqual(table["seed"].tolist(), [1, 2, 1, 2])
+        np.testing.assert_array_equal(table["return_mean"], [-3.5, np.nan, np.nan, np.nan])
+        np.testing.assert_array_equal(table["return_std"], [0.0, 0.0, np.nan, np.nan])
+        self.assertIs(read.wait(timeout=0), read)
+
 
 class Settings(unittest.TestCase):
     def test_values_become_the_texts_that_the_option_takes(self) -> None:
         values = {"a.b": True, "a.c": 0.5, "a.d": [400, 300], "a.e": ["x", 1], "a.f": "tanh", "a.g": {"k": "v"}}
         texts = ["a.b=true", "a.c=0.5", "a.d=[400, 300]", 'a.e=["x", 1]', "a.f=tanh", 'a.g={"k" = "v"}']
         self.assertEqual(program.settings(values)[1::2], texts)
+
+    def test_values_of_numpy_are_taken_as_their_numbers(self) -> None:
+        values = {
+            "a.b": np.bool_(False),
+            "a.c": np.float32(0.1),
+            "a.d": np.array([400, 300]),
+            "a.e": np.array(0.25),
+            "a.f": np.int64(7),
+            "a.g": [np.float64(0.5), np.array([True])],
+            "a.h": np.array(["x", "y"]),
+            "a.i": np.str_("tanh"),
+        }
+        texts = ["false", "0.1", "[400, 300]", "0.25", "7", "[0.5, [true]]", '["x", "y"]', "tanh"]
+        self.assertEqual([text.split("=", 1)[1] for text in program.settings(values)[1::2]], texts)
+
+    def test_a_suite_is_asked_for_by_its_seeds_and_values(self) -> None:
+        with unittest.mock.patch.object(program, "follow", return_value='{"suite": "/nowhere"}') as follow:
+            with unittest.mock.patch.object(program, "program", return_value="shoal"):
+                with self.assertRaisesRegex(shoal.ShoalError, "no suite.json"):
+                    sweep = {"ddpg.hidden": [[8, 8], np.array([4])], "a.b": ["x", "y,z"]}
+                    shoal.train_suite("pendulum", seeds=range(1, 3), sweep=sweep, steps=5, jobs=2)
+        line = "shoal train pendulum --json --steps 5 --seeds 1,2 --sweep"
+        expected = [*line.split(), "ddpg.hidden=[8, 8],[4]", "--sweep", 'a.b=x,"y,z"', "--jobs", "2"]
+        self.assertEqual(follow.call_args.args[0], expected)
+        with self.assertRaises(TypeError):
+            shoal.train_suite("pendulum", stepps=5)
 
     def test_an_error_is_the_programs_own_line(self) -> None:
         error = program.failure("pendulum: step 1\nerror: no such key\n\n", 2)

@@ -14,7 +14,7 @@ use shoal_common::durable::write_atomically;
 use shoal_common::run_dir::RunDir;
 use shoal_common::space::Space;
 use shoal_env_server::frame::{Frame, Image};
-use shoal_run::description::Description;
+use shoal_run::description;
 use shoal_run::evaluation::frames::Frames;
 use shoal_run::evaluation::rollout::Rollout;
 use shoal_run::signals::Interrupt;
@@ -112,7 +112,7 @@ pub fn film(
 ) -> anyhow::Result<Shown> {
     let rollout = Rollout::of_run(run, config, request.parameters)?;
     let mut rollout = rollout.until(interrupt.clone()).seen(request.height);
-    let time_step = Description::of(config)?.time_step;
+    let time_step = description::of_run(run, config)?.time_step;
     let pictures = match format {
         Format::Gif => PICTURES_OF_GIF,
         Format::Mp4 => PICTURES_OF_MP4,

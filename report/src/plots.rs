@@ -6,54 +6,92 @@ use std::path::{Path, PathBuf};
 
 use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
-use shoal_run::description::Description;
+use shoal_env_server::description::Description;
+use shoal_run::description;
 use shoal_run::evaluation::SavedPolicy;
-use shoal_run::evaluation::rollout::Rollout;
+use shoal_run::evaluation::rollout::{Rollout, Trajectory};
 use shoal_run::records::recorder::read_evaluations;
+use shoal_run::signals::Interrupt;
 
 use crate::figure;
 
-/// Draws the learning curve of a run so far and, if it has a best policy, that policy's behaviour. Returns the files.
-pub fn draw(run: &RunDir, config: &Config, out: &Path) -> anyhow::Result<Vec<PathBuf>> {
-    let mut pictures = vec![out.join("learning-curve.svg")];
-    let evaluations = read_evaluations(&run.evaluations())?;
-    figure::learning_curve((&run.name(), config.algorithm.name()), &evaluations, &pictures[0])?;
-    if run.best_policy().exists() {
-        pictures.extend(behaviour(run, config, out)?);
-    }
-    Ok(pictures)
+/// The figures of a run.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Drawn {
+    /// Their files.
+    pub files: Vec<PathBuf>,
+    /// Why an episode is missing among them: a sentence without its full stop. The program that serves the environment
+    /// has failed.
+    pub no_episode: Option<String>,
 }
 
-/// Draws the behaviour of the best policy and returns the files: the thesis's figures, or the signals of the first
-/// evaluation episode of the run's seed. Draws nothing if another program serves the environment, because that program
-/// would have to be started only for this.
-fn behaviour(run: &RunDir, config: &Config, out: &Path) -> anyhow::Result<Vec<PathBuf>> {
-    if !config.environment.server.is_empty() {
-        return Ok(Vec::new());
+/// Draws the learning curve of a run so far and, if it has a best policy, that policy's behaviour. A program that serves
+/// the environment is started only if there is an `interrupt`, which ends its episode.
+///
+/// # Errors
+/// When a file cannot be read or written, or the policy does not fit the run.
+pub fn draw(run: &RunDir, config: &Config, out: &Path, interrupt: Option<&Interrupt>) -> anyhow::Result<Drawn> {
+    let mut drawn = Drawn {
+        files: vec![out.join("learning-curve.svg")],
+        no_episode: None,
+    };
+    let evaluations = read_evaluations(&run.evaluations())?;
+    figure::learning_curve((&run.name(), config.algorithm.name()), &evaluations, &drawn.files[0])?;
+    if !run.best_policy().exists() {
+        return Ok(drawn);
     }
+    if config.environment.server.is_empty() {
+        drawn.files.extend(behaviour(run, config, out)?);
+    } else if let Some(interrupt) = interrupt
+        && let Some(description) = description::kept(run, config)?
+    {
+        match episode_of_server(run, config, interrupt) {
+            Ok(trajectory) => drawn.files.push(episode(&description, &trajectory, out)?),
+            Err(error) => drawn.no_episode = Some(format!("{error:#}").replace('\n', " ")),
+        }
+    }
+    Ok(drawn)
+}
+
+/// Draws the behaviour of the best policy in a built-in environment and returns the files: the thesis's figures, or the
+/// signals of the first evaluation episode of the run's seed.
+fn behaviour(run: &RunDir, config: &Config, out: &Path) -> anyhow::Result<Vec<PathBuf>> {
     let policy = SavedPolicy::Best.read(run, config)?;
     let mut rollout = Rollout::new(config, &policy.parameters)?;
     if let Some(files) = thesis::behaviour(config, &mut rollout, out)? {
         return Ok(files);
     }
-    let path = out.join("episode.svg");
-    let Description { signals, time_step, .. } = Description::of(config)?;
     let trajectory = rollout.evaluation_episode(config.run.seed, 0)?;
-    figure::episode(&signals, time_step, &trajectory, &path)?;
-    Ok(vec![path])
+    Ok(vec![episode(&description::of(config)?, &trajectory, out)?])
+}
+
+/// The first evaluation episode of the run's seed, in an environment that another program serves. It is drawn only if
+/// that program names its signals, because the program is started only for this.
+fn episode_of_server(run: &RunDir, config: &Config, interrupt: &Interrupt) -> anyhow::Result<Trajectory> {
+    let policy = SavedPolicy::Best.read(run, config)?;
+    let rollout = Rollout::of_run(run, config, &policy.parameters)?;
+    rollout.until(interrupt.clone()).evaluation_episode(config.run.seed, 0)
+}
+
+/// Draws the signals of an episode and returns the file.
+fn episode(description: &Description, trajectory: &Trajectory, out: &Path) -> anyhow::Result<PathBuf> {
+    let path = out.join("episode.svg");
+    figure::episode(&description.signals, description.time_step, trajectory, &path)?;
+    Ok(path)
 }
 
 #[cfg(test)]
 mod tests {
     use shoal_common::policy_file::PolicyFile;
+    use shoal_common::versioned_file::VersionedFile;
 
     use super::*;
     use shoal_run::evaluation::rollout::policy_layout;
     use shoal_run::plan::resolve_preset;
     use shoal_run::testing::small;
 
-    /// The figures of a run with a policy, by name.
-    fn files_of((config, parameters): (Config, Vec<f32>)) -> Vec<String> {
+    /// The figures of a run with a policy, by name, and why there is no episode among them.
+    fn drawn((config, parameters): (Config, Vec<f32>), said: Option<&Description>) -> (Vec<String>, Option<String>) {
         let parent = tempfile::tempdir().unwrap();
         let run_dir = RunDir::create(&parent.path().join("run")).unwrap();
         std::fs::write(run_dir.config_file(), config.to_toml().unwrap()).unwrap();
@@ -71,10 +109,21 @@ mod tests {
         policy.write(&run_dir.best_policy()).unwrap();
         let out = parent.path().join("pictures");
         std::fs::create_dir(&out).unwrap();
-        draw(&run_dir, &config, &out).unwrap();
+        if let Some(said) = said {
+            said.store(&run_dir.description()).unwrap();
+        }
+        let no_episode = draw(&run_dir, &config, &out, Some(&Interrupt::default()))
+            .unwrap()
+            .no_episode;
         let entries = std::fs::read_dir(out).unwrap();
         let mut files: Vec<_> = entries.map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
         files.sort();
+        (files, no_episode)
+    }
+
+    fn files_of(run: (Config, Vec<f32>)) -> Vec<String> {
+        let (files, no_episode) = drawn(run, None);
+        assert_eq!(no_episode, None);
         files
     }
 
@@ -106,9 +155,14 @@ mod tests {
     }
 
     #[test]
-    fn an_environment_served_by_another_program_has_only_a_learning_curve() {
+    fn a_program_that_serves_the_environment_is_started_only_if_it_names_its_signals() {
         let (mut config, parameters) = small("name = \"pendulum\"");
         config.environment.server = vec!["no-such-program".into()];
-        assert_eq!(files_of((config, parameters)), ["learning-curve.svg"]);
+        let of = |said| drawn((config.clone(), parameters.clone()), said);
+        assert_eq!(of(None), (vec!["learning-curve.svg".into()], None));
+        let (files, no_episode) = of(Some(&Description::by_number(&config.spec)));
+        assert_eq!(files, ["learning-curve.svg"]);
+        let why = no_episode.unwrap();
+        assert!(why.contains("no-such-program") && !why.contains('\n'), "{why}");
     }
 }

@@ -23,7 +23,7 @@ use crate::origin::DatasetOrigin;
 use crate::python;
 use crate::usage::UsageError;
 
-const KIND: FileKind = FileKind {
+pub(crate) const KIND: FileKind = FileKind {
     magic: *b"SHOALDEM",
     version: 1,
     name: "a dataset's rows",
@@ -225,10 +225,9 @@ fn check_use(config: &Config) -> Result<(), UsageError> {
 
 #[cfg(test)]
 mod tests {
-    use shoal_common::durable::seal;
-
     use super::*;
     use crate::plan::resolve_preset;
+    use crate::testing::dataset;
 
     /// The file for these rows of a pendulum, with a header that ends so.
     fn file(rows: &[[f32; 10]], count: usize, header: &str) -> Vec<u8> {
@@ -236,17 +235,7 @@ mod tests {
             "dataset = \"pendulum/x-v0\"\nepisodes = 1\nrows = {count}\n{header}\n\
              observation = {{ box = {{ low = [-1.0, -1.0, -8.0], high = [1.0, 1.0, 8.0] }} }}\n"
         );
-        let mut file = Vec::new();
-        let written = seal(KIND, &mut file, |body| {
-            use std::io::Write;
-            body.write_all(&(header.len() as u64).to_le_bytes())?;
-            body.write_all(header.as_bytes())?;
-            rows.iter()
-                .flatten()
-                .try_for_each(|number| body.write_all(&number.to_le_bytes()))
-        });
-        written.unwrap();
-        file
+        dataset(&header, rows)
     }
 
     const ACTIONS: &str = "action = { box = { low = [-2.0], high = [2.0] } }";

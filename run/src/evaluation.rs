@@ -15,7 +15,7 @@ use shoal_common::run_dir::RunDir;
 use shoal_env_server::environment::Goal;
 
 use self::rollout::{Rollout, policy_layout};
-use crate::description::Description;
+use crate::description;
 use crate::signals::Interrupt;
 
 /// One of the two policies that a run saves.
@@ -59,11 +59,12 @@ pub struct EvaluationSummary {
 
 /// Runs the evaluation episodes 0 … `episodes` − 1 of `seed`. They start in the same states every time.
 pub fn evaluate(config: &Config, parameters: &[f32], episodes: u32, seed: u64) -> anyhow::Result<EvaluationSummary> {
-    evaluate_by(Rollout::new(config, parameters)?, config, episodes, seed, |_| ())
+    let goal = description::of(config)?.goal;
+    evaluate_by(Rollout::new(config, parameters)?, goal, (episodes, seed), |_| ())
 }
 
 /// As [`evaluate`], for a run: an environment that another program serves is started as in training. Calls `progress`
-/// with the number of finished episodes.
+/// with the number of finished episodes. `amount` is the number of episodes and the seed.
 ///
 /// # Errors
 /// When the environment fails, or a signal has arrived.
@@ -71,22 +72,20 @@ pub fn evaluate_policy(
     run: &RunDir,
     config: &Config,
     parameters: &[f32],
-    (episodes, seed): (u32, u64),
+    amount: (u32, u64),
     interrupt: &Interrupt,
     progress: impl FnMut(u32),
 ) -> anyhow::Result<EvaluationSummary> {
     let rollout = Rollout::of_run(run, config, parameters)?.until(interrupt.clone());
-    evaluate_by(rollout, config, episodes, seed, progress)
+    evaluate_by(rollout, description::of_run(run, config)?.goal, amount, progress)
 }
 
 fn evaluate_by(
     mut rollout: Rollout<'_>,
-    config: &Config,
-    episodes: u32,
-    seed: u64,
+    goal: Option<Goal>,
+    (episodes, seed): (u32, u64),
     mut progress: impl FnMut(u32),
 ) -> anyhow::Result<EvaluationSummary> {
-    let goal = Description::of(config)?.goal;
     let (mut returns, mut distances) = (Vec::new(), Vec::new());
     for number in 0..episodes {
         let trajectory = rollout.evaluation_episode(seed, number.into())?;

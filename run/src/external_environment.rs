@@ -29,6 +29,8 @@ use shoal_common::exit::Exit;
 use shoal_common::role::Role;
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::stop::{GRACE, Stop};
+use shoal_common::versioned_file::{VersionedFile, VersionedFileError};
+use shoal_env_server::description::{self, Description};
 use shoal_env_server::frame::{self, Written};
 
 use crate::child_process::{ChildProcess, wait_for_any};
@@ -80,6 +82,8 @@ pub struct LaunchSpec<'a> {
     pub surroundings: ServerSurroundings,
     /// The file into which it is asked to write pictures, and their greatest height in pixels.
     pub pictures: Option<(PathBuf, u32)>,
+    /// The file into which it is asked to write what its numbers mean.
+    pub description: Option<PathBuf>,
 }
 
 impl LaunchSpec<'_> {
@@ -107,6 +111,10 @@ impl LaunchSpec<'_> {
                 .env(frame::FILE_VARIABLE, file)
                 .env(frame::HEIGHT_VARIABLE, height.to_string()),
             None => command.env_remove(frame::FILE_VARIABLE),
+        };
+        match &self.description {
+            Some(file) => command.env(description::FILE_VARIABLE, file),
+            None => command.env_remove(description::FILE_VARIABLE),
         };
         command
             .args(arguments)
@@ -247,6 +255,8 @@ pub struct ExternalEnvironment {
     program: ChildProcess,
     /// Where it writes pictures, if it is asked for them.
     pictures: Option<PathBuf>,
+    /// Where it has written what its numbers mean, if it does.
+    description: PathBuf,
     /// Ends every wait for an answer.
     stop: Stop,
     interrupt: Interrupt,
@@ -302,8 +312,10 @@ impl ExternalEnvironment {
         let domain = Domain::join(&run_id, 1)?;
         let picture_file = domain.directory()?.join("picture");
         let pictures = surroundings.picture_height.map(|height| (picture_file, height));
+        let description = domain.directory()?.join("description");
         let launch = LaunchSpec {
             pictures: pictures.clone(),
+            description: Some(description.clone()),
             // In the domain's directory, so that it is cleaned up with it if all processes are killed.
             iceoryx2: domain.directory()?.join("iceoryx2.toml"),
             run_id: &run_id,
@@ -322,6 +334,7 @@ impl ExternalEnvironment {
                 spec,
                 program,
                 pictures: pictures.map(|(file, _)| file),
+                description,
                 stop,
                 interrupt,
                 silent: Cell::new(false),
@@ -336,9 +349,25 @@ impl ExternalEnvironment {
         }
     }
 
-    /// The server's description of its environments.
+    /// The server's spaces.
     pub fn spec(&self) -> &EnvironmentSpec {
         &self.spec
+    }
+
+    /// What the server says that its numbers mean; `None` if it says nothing.
+    ///
+    /// # Errors
+    /// When what it says does not fit its spaces, or cannot be read.
+    pub fn description(&self) -> anyhow::Result<Option<Description>> {
+        let wrong = |what: String| anyhow::anyhow!("the environment server's description is wrong: {what}");
+        let described = Description::load_if_any(&self.description).map_err(|error| match error {
+            VersionedFileError::Damaged { cause, .. } => wrong(cause),
+            other => other.into(),
+        })?;
+        if let Some(description) = &described {
+            description.check(&self.spec).map_err(wrong)?;
+        }
+        Ok(described)
     }
 
     /// Begins evaluation episode `number`.

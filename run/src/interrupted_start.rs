@@ -8,7 +8,7 @@ use shoal_common::run_dir::RunDir;
 use crate::origin::Origin;
 
 /// The names, or beginnings of names, of the files that exist before `config.toml`.
-const FIRST_FILES: [&str; 2] = ["server.json", "config.toml."];
+const FIRST_FILES: [&str; 3] = ["server.json", "description.json", "config.toml."];
 
 /// Removes the directory at `path` if the start of a run in it was interrupted. Returns whether nothing is at `path` now.
 /// A directory with anything else in it is left alone.
@@ -68,7 +68,7 @@ mod tests {
             remove_interrupted_start(&path).unwrap()
         };
         assert!(with(&[]) && !path.exists());
-        assert!(with(&["server.json", "config.toml.new"]) && !path.exists());
+        assert!(with(&["server.json", "description.json", "config.toml.new"]) && !path.exists());
         assert!(!with(&["server.json", "notes"]) && path.join("notes").exists());
         assert!(!with(&["config.toml.new", "incarnations"]));
 

@@ -16,9 +16,12 @@ use std::path::Path;
 
 use shoal_common::config::Config;
 use shoal_common::run_dir::{RunDir, RunLock};
+use shoal_common::versioned_file::VersionedFile;
+use shoal_env_server::description::Description;
 
 pub use self::overrides::RunOverrides;
 pub use self::presets::{preset_names, preset_patterns};
+use self::resolve::{Resolved, resolve_all};
 pub use self::resolve::{resolve, resolve_preset, resolve_with_sources};
 use self::revision::as_written;
 pub use self::revision::{RequestedChanges, Revision, edited, store_actors};
@@ -63,7 +66,12 @@ impl Plan {
     /// When the configuration is invalid, the machine lacks resources, or the directory cannot be created. No run
     /// directory remains.
     pub fn new(what: &str, overrides: &RunOverrides) -> anyhow::Result<Self> {
-        let (name, mut config) = resolve(what, overrides)?;
+        let Resolved {
+            name,
+            mut config,
+            description,
+            ..
+        } = resolve_all(what, overrides)?;
         let beginning = match (&overrides.from, &overrides.demonstrations) {
             (Some(from), _) => {
                 let predecessor = Predecessor::open(from, overrides.with_replay)?;
@@ -83,7 +91,7 @@ impl Plan {
         };
         let begin = || {
             let lock = run.lock()?;
-            let config = fill(&run, &config)?;
+            let config = fill(&run, &config, description.as_ref())?;
             StartRecord::of_this_process().write(run.path())?;
             let origin = beginning.as_ref().map(|beginning| beginning.begin(&run, &config));
             Ok((lock, config, origin.transpose()?))
@@ -105,9 +113,12 @@ impl Plan {
 
 /// Writes the first files of a new run directory and returns the configuration as the roles read it: a date among the
 /// environment's parameters is a string there, and all processes must compute the same identity.
-fn fill(run: &RunDir, config: &Config) -> anyhow::Result<Config> {
+fn fill(run: &RunDir, config: &Config, description: Option<&Description>) -> anyhow::Result<Config> {
     if let Some(location) = ServerLocation::here(&config.environment.server)? {
         location.write(run)?;
+    }
+    if let Some(description) = description {
+        description.store(&run.description())?;
     }
     run.write_config(&as_written(config))?;
     let mut read = run.config()?;
@@ -128,7 +139,7 @@ mod tests {
         // Parameters that other programs may take.
         let parameters = "day = 1979-05-27\nx = [nan, -inf, 1e300]\n[parameters]\nname = \"x\"";
         config.environment.parameters = parameters.parse().unwrap();
-        let filled = fill(&run, &config).unwrap();
+        let filled = fill(&run, &config, None).unwrap();
         let read = run.config().unwrap();
         assert_eq!(filled.identity(), read.identity());
         run.write_config(&read).unwrap();

@@ -3,11 +3,14 @@
 #![allow(clippy::unwrap_used, reason = "a test that panics has failed")]
 
 use std::f64::consts::PI;
+use std::io::Write;
 
 use shoal_common::config::Config;
+use shoal_common::durable::seal;
 use shoal_env_server::environment::angle::wrap;
 use shoal_env_server::environment::make;
 
+use crate::demonstrations::KIND;
 use crate::evaluation::analysis::pendulum::SwingUp;
 use crate::evaluation::analysis::point_mass::TestRun;
 use crate::evaluation::rollout::policy_layout;
@@ -23,6 +26,20 @@ pub fn small(environment: &str) -> (Config, Vec<f32>) {
     let config = Config::from_table(table, "test").unwrap();
     let parameters = vec![0.0; policy_layout(&config).unwrap().parameters()];
     (config, parameters)
+}
+
+/// The file that the package `shoal` writes of a dataset with these rows: s, a, r, whether it was terminated, s', last.
+pub fn dataset(header: &str, rows: &[[f32; 10]]) -> Vec<u8> {
+    let mut file = Vec::new();
+    let written = seal(KIND, &mut file, |body| {
+        body.write_all(&(header.len() as u64).to_le_bytes())?;
+        body.write_all(header.as_bytes())?;
+        rows.iter()
+            .flatten()
+            .try_for_each(|number| body.write_all(&number.to_le_bytes()))
+    });
+    written.unwrap();
+    file
 }
 
 /// A test run that comes to rest `rest` m from the goal. It turns back and forth by `shake` rad each step. The force is

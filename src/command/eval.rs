@@ -10,9 +10,9 @@ use comfy_table::presets::UTF8_BORDERS_ONLY;
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::run_dir::RunDir;
 use shoal_env_server::environment::Goal;
-use shoal_run::description::Description;
+use shoal_run::description;
 use shoal_run::evaluation::{EvaluationSummary, SavedPolicy, evaluate_policy};
-use shoal_run::numbers::from_one;
+use shoal_run::numbers::{count, from_one};
 use shoal_run::signals::{Signals, exit_code};
 
 #[derive(Args, Clone, Debug)]
@@ -26,7 +26,7 @@ pub(crate) struct EvalArgs {
     #[arg(long, default_value_t = 100, value_parser = from_one)]
     pub(crate) episodes: u32,
     /// Seed of the start states [default: the run's seed].
-    #[arg(long)]
+    #[arg(long, value_parser = count)]
     pub(crate) seed: Option<u64>,
     /// Print one JSON object on standard output.
     #[arg(long)]
@@ -51,7 +51,7 @@ pub(crate) fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
         return Ok(exit_code(signal));
     }
     let summary = evaluated?;
-    let goal = Description::of(&config)?.goal;
+    let goal = description::of_run(&run, &config)?.goal;
     let table = table(&summary, &policy, seed, goal.as_ref());
     if args.json {
         writeln!(std::io::stderr().lock(), "{table}")?;
@@ -87,7 +87,7 @@ fn table(summary: &EvaluationSummary, policy: &PolicyFile, seed: u64, goal: Opti
         ),
     );
     if let Some(goal) = goal {
-        let unit = goal.distance.unit;
+        let unit = &goal.distance.unit;
         if let Some(distance) = summary.final_distance_mean {
             row("distance at the end", format!("{distance:.4} {unit} on average"));
         }

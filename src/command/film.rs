@@ -12,7 +12,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use shoal_common::run_dir::RunDir;
 use shoal_report::film::{Format, Request, Shown, film};
 use shoal_run::evaluation::SavedPolicy;
-use shoal_run::numbers::thousands;
+use shoal_run::numbers::{count, thousands};
 use shoal_run::signals::{Signals, describe, exit_code};
 
 #[derive(Args, Clone, Debug)]
@@ -26,7 +26,7 @@ pub(crate) struct FilmArgs {
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=50))]
     pub(crate) episodes: u32,
     /// Seed of the start states [default: the run's seed].
-    #[arg(long)]
+    #[arg(long, value_parser = count)]
     pub(crate) seed: Option<u64>,
     /// The file to write; its name ends in .gif or, for a video made by the program ffmpeg, in .mp4 [default: film.gif
     /// in the run directory].

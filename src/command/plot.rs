@@ -7,6 +7,7 @@ use anyhow::Context;
 use clap::Args;
 use shoal_common::run_dir::RunDir;
 use shoal_report::plots;
+use shoal_run::signals::Interrupt;
 
 #[derive(Args, Clone, Debug)]
 pub(crate) struct PlotArgs {
@@ -24,8 +25,12 @@ pub(crate) fn run(args: &PlotArgs) -> anyhow::Result<()> {
     let out = args.out.as_deref().unwrap_or(run.path());
     std::fs::create_dir_all(out).with_context(|| format!("cannot create {}", out.display()))?;
     let mut stdout = std::io::stdout().lock();
-    for figure in plots::draw(&run, &config, out)? {
+    let drawn = plots::draw(&run, &config, out, Some(&Interrupt::default()))?;
+    for figure in drawn.files {
         writeln!(stdout, "{}", figure.display())?;
+    }
+    if let Some(why) = drawn.no_episode {
+        writeln!(std::io::stderr(), "no episode was drawn: {why}")?;
     }
     Ok(())
 }

@@ -120,10 +120,20 @@ fn train_and_report(
             }
         }
     }
-    if let Err(error) = plots::draw(run, &config, run.path()) {
-        lock.check(run)?;
-        let why = format!("{error:#}").replace('\n', " ");
-        say(&format!("the figures could not be drawn: {why}"));
+    let interrupt = signals.interrupt();
+    // A run that is stopped should end soon, so that no environment is started for a figure.
+    let may_start = !evaluated.is_empty() && interrupt.signal().is_none();
+    match plots::draw(run, &config, run.path(), may_start.then_some(&interrupt)) {
+        Ok(drawn) => {
+            if let Some(why) = drawn.no_episode.filter(|_| interrupt.signal().is_none()) {
+                say(&format!("no episode was drawn: {why}"));
+            }
+        }
+        Err(error) => {
+            lock.check(run)?;
+            let why = format!("{error:#}").replace('\n', " ");
+            say(&format!("the figures could not be drawn: {why}"));
+        }
     }
     if outcome.ending == RunEnd::Finished {
         finished.write(run)?;

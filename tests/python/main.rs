@@ -32,6 +32,7 @@ fn main() -> ExitCode {
     suite::run(vec![
         test!(numpy_policies_act_as_those_of_the_program, PYTHON),
         test!(runs_are_started_read_changed_and_stopped_from_python, PYTHON),
+        test!(suites_are_trained_and_read_from_python, PYTHON),
         test!(the_tutorials_python_works, PYTHON),
         test!(the_notebook_works, PYTHON, MATPLOTLIB),
         test!(a_run_is_tracked_while_it_runs, PYTHON, MLFLOW, WANDB),
@@ -129,6 +130,10 @@ fn numpy_policies_act_as_those_of_the_program() {
 
 fn runs_are_started_read_changed_and_stopped_from_python() {
     python(&Workplace::new(), &[&script("every_day.py")]);
+}
+
+fn suites_are_trained_and_read_from_python() {
+    python(&Workplace::new(), &[&script("suites.py")]);
 }
 
 fn the_tutorials_python_works() {

@@ -25,12 +25,35 @@ pub fn read<T: DeserializeOwned>(name: &str, section: Value) -> Result<T, toml::
     let alone = |(key, value): (&String, &Value)| {
         let only = Table::from_iter([(key.clone(), value.clone())]);
         let error = T::deserialize(only).err()?;
-        Some(Error::custom(format!("{name}.{key} = {value}: {}", error.message())))
+        let reason = in_user_words(error.message());
+        // Of a list, one item is at fault.
+        let each = value.is_array() && reason.starts_with("must be ");
+        let each = if each { "each " } else { "" };
+        Some(Error::custom(format!("{name}.{key} = {value}: {each}{reason}")))
     };
     T::deserialize(section.clone()).map_err(|error| {
         let mut keys = section.as_table().into_iter().flatten();
         keys.find_map(alone).unwrap_or(error)
     })
+}
+
+/// What a value must be, if this is serde's message about a value of another type, which names types of Rust. Otherwise
+/// the message itself, on one line.
+pub fn in_user_words(message: &str) -> String {
+    let message = message.replace('\n', " ");
+    let of_type = message.starts_with("invalid type: ") || message.starts_with("invalid value: ");
+    let Some((_, expected)) = message.rsplit_once(", expected ").filter(|_| of_type) else {
+        return message;
+    };
+    let expected = match expected.trim() {
+        "f64" | "f32" => "a number, such as 0.5",
+        "u8" | "u16" | "u32" | "u64" | "usize" => "a whole number from 0 on, such as 100",
+        "a boolean" => "true or false",
+        "a sequence" => "a list, such as [64, 48] or [\"a\", \"b\"]",
+        "a string" | "string or table" => "text",
+        other => other,
+    };
+    format!("must be {expected}")
 }
 
 /// What is wrong with a TOML text, on one line: where the text came from, the number and the text of the line, and the

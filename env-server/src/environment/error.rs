@@ -2,6 +2,8 @@
 
 use std::ops::RangeInclusive;
 
+use shoal_base::section::in_user_words;
+
 /// Why an environment cannot be made. Each message is one line for the user.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum EnvironmentError {
@@ -95,9 +97,16 @@ pub(super) fn check_time_limit(time_limit: u32) -> Result<(), OutOfRange> {
     check("time_limit", time_limit.into(), 1.0..=1e6)
 }
 
-/// A TOML error as one line, without names of Rust types.
-pub(super) fn one_line(error: &toml::de::Error) -> String {
-    let line = error.to_string().split_whitespace().collect::<Vec<_>>().join(" ");
-    line.replace("expected f64", "expected a number")
-        .replace("expected u32", "expected a positive whole number")
+/// An error about one of these parameters, as one line with the parameter's value.
+pub(super) fn wrong_parameter(parameters: &toml::Table, error: &toml::de::Error) -> String {
+    let reason = in_user_words(error.message());
+    // The key stands only in the whole text.
+    let text = error.to_string();
+    let place = text
+        .lines()
+        .find_map(|line| line.strip_prefix("in `")?.strip_suffix('`'));
+    match place.and_then(|key| parameters.get_key_value(key)) {
+        Some((key, value)) => format!("{key} = {value}: {reason}"),
+        None => reason,
+    }
 }

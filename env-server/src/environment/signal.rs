@@ -1,26 +1,29 @@
 //! The meaning of an environment's numbers: its signals, its goal, and its picture.
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use shoal_base::space::{EnvironmentSpec, Space};
 
 /// If an environment names no signals, at most this many numbers of its observation, and of its action, become signals.
 const MAX_UNNAMED: usize = 8;
 
 /// A number that changes from step to step, with its meaning.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Signal {
     /// Identifies the signal to programs. It never changes and is unique within an environment.
     pub key: String,
     /// Shown to the user.
     pub label: String,
     /// Empty for counts and indices.
-    pub unit: &'static str,
+    #[serde(default)]
+    pub unit: String,
     /// Where its values come from.
+    #[serde(flatten)]
     pub source: SignalSource,
 }
 
 /// Where a signal's values come from. Indices count from 0.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
 pub enum SignalSource {
     /// A number of the observation.
     Observation(usize),
@@ -38,12 +41,12 @@ pub enum SignalSource {
 
 impl Signal {
     /// Number `index` of the observation. The label is the key unless `label` sets another.
-    pub fn observation(index: usize, key: &str, unit: &'static str) -> Self {
+    pub fn observation(index: usize, key: &str, unit: &str) -> Self {
         Self::new(key, unit, SignalSource::Observation(index))
     }
 
     /// Number `index` of the action, in environment units.
-    pub fn action(index: usize, key: &str, unit: &'static str) -> Self {
+    pub fn action(index: usize, key: &str, unit: &str) -> Self {
         Self::new(key, unit, SignalSource::Action(index))
     }
 
@@ -52,11 +55,11 @@ impl Signal {
         Self::new(key, "rad", SignalSource::Angle { cos, sin })
     }
 
-    fn new(key: &str, unit: &'static str, source: SignalSource) -> Self {
+    fn new(key: &str, unit: &str, source: SignalSource) -> Self {
         Self {
             key: key.into(),
             label: key.into(),
-            unit,
+            unit: unit.into(),
             source,
         }
     }
@@ -101,7 +104,7 @@ impl Signal {
 }
 
 /// The criterion of success at an episode's end: a distance below a bound.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Goal {
     /// The distance to the goal.
     pub distance: Signal,
@@ -110,7 +113,7 @@ pub struct Goal {
 }
 
 /// What the report draws of an episode, from the signals in `keys` and the ranges of those in `scales`.
-#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "kebab-case")]
 pub enum Picture {
     /// Nothing; the signals are shown as lines.

@@ -28,7 +28,7 @@ pub fn episode(signals: &[Signal], time_step: Option<f64>, trajectory: &Trajecto
                 note: "",
                 x: Axis { label, range: 0.0..end },
                 y: Axis {
-                    label: signal.unit,
+                    label: &signal.unit,
                     range: range_of(values.iter().copied()),
                 },
                 series: vec![Series::line(

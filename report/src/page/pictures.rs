@@ -6,7 +6,7 @@ use jpeg_encoder::{ColorType, Encoder};
 use serde::Serialize;
 use serde_json::{Number, Value};
 use shoal_env_server::frame::{Frame, Image};
-use shoal_run::evaluation::frames::Frames;
+use shoal_run::evaluation::frames::{Frames, keep_every_second};
 
 use super::numbers::short;
 
@@ -52,8 +52,8 @@ impl Pictures {
             if pictures.count() <= 2 {
                 return Err("its pictures are too large for a page".into());
             }
-            every_second(&mut pictures.images);
-            every_second(&mut pictures.drawings);
+            keep_every_second(&mut pictures.images);
+            keep_every_second(&mut pictures.drawings);
             pictures.stride *= 2;
         }
         Ok(pictures)
@@ -68,14 +68,6 @@ impl Pictures {
         let drawn = self.drawings.iter().map(|drawing| drawing.to_string().len());
         drawn.chain(self.images.iter().map(String::len)).sum()
     }
-}
-
-fn every_second<T>(items: &mut Vec<T>) {
-    let mut number = 0;
-    items.retain(|_| {
-        number += 1;
-        number % 2 == 1
-    });
 }
 
 fn uri(image: &Image) -> Result<String, String> {

@@ -3,8 +3,9 @@
 use serde::Serialize;
 use shoal_common::config::Config;
 use shoal_common::run_dir::RunDir;
+use shoal_env_server::description::Description;
 use shoal_env_server::environment::Picture;
-use shoal_run::description::Description;
+use shoal_run::description;
 use shoal_run::evaluation::SavedPolicy;
 use shoal_run::evaluation::rollout::{Rollout, Trajectory};
 use shoal_run::numbers::thousands;
@@ -81,7 +82,7 @@ impl Played {
             time_step,
             picture,
             ..
-        } = Description::of(config)?;
+        } = description::of_run(run, config)?;
         // Built-in environments are drawn by the page, from their signals.
         let is_external = !config.environment.server.is_empty();
         let mut rollout = Rollout::of_run(run, config, &policy.parameters)?;

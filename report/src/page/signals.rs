@@ -14,7 +14,7 @@ pub(super) struct Trace {
     pub(super) key: String,
     pub(super) label: String,
     /// Empty for counts.
-    pub(super) unit: &'static str,
+    pub(super) unit: String,
     /// Its bounds, if the environment's spaces have any.
     pub(super) range: Option<[f64; 2]>,
     pub(super) values: Vec<f64>,
@@ -36,7 +36,7 @@ pub(super) fn traces(
     let stated = signals.iter().map(|signal| Trace {
         key: signal.key.clone(),
         label: signal.label.clone(),
-        unit: signal.unit,
+        unit: signal.unit.clone(),
         range: signal.range(spec),
         values: at_frames(&trajectory.values(signal.source)),
     });
@@ -49,7 +49,7 @@ pub(super) fn traces(
     let every = [("reward", "reward", reward), ("return", "return so far", so_far)].map(|(key, label, values)| Trace {
         key: key.into(),
         label: label.into(),
-        unit: "",
+        unit: String::new(),
         range: None,
         values: at_frames(&values),
     });
@@ -61,7 +61,7 @@ mod tests {
     use super::*;
     use shoal_common::config::Config;
     use shoal_common::space::Space;
-    use shoal_run::description::Description;
+    use shoal_run::description;
     use shoal_run::evaluation::rollout::Rollout;
     use shoal_run::testing::small;
 
@@ -70,7 +70,7 @@ mod tests {
         let mut rollout = Rollout::new(config, parameters).unwrap();
         let trajectory = rollout.episode_from(state).unwrap();
         traces(
-            &Description::of(config).unwrap().signals,
+            &description::of(config).unwrap().signals,
             &config.spec,
             &trajectory,
             frames,

@@ -62,11 +62,7 @@ impl Recorder {
     fn push(&mut self, frame: Frame) {
         self.frames.push(frame);
         if self.frames.len() > self.most {
-            let mut number = 0;
-            self.frames.retain(|_| {
-                number += 1;
-                number % 2 == 1
-            });
+            keep_every_second(&mut self.frames);
             self.stride *= 2;
         }
     }
@@ -82,6 +78,15 @@ impl Recorder {
             }),
         }
     }
+}
+
+/// Keeps the first, third, fifth, … item.
+pub fn keep_every_second<T>(items: &mut Vec<T>) {
+    let mut number = 0;
+    items.retain(|_| {
+        number += 1;
+        number % 2 == 1
+    });
 }
 
 #[cfg(test)]

@@ -3,6 +3,8 @@
 use anyhow::bail;
 use serde::de::DeserializeOwned;
 use shoal_common::config::{AlgorithmConfig, EnvironmentConfig, Mode, RunConfig};
+use shoal_common::section;
+use shoal_env_server::description::Description;
 use shoal_env_server::environment::{self, EnvironmentError};
 use toml::{Table, Value};
 
@@ -15,8 +17,9 @@ use crate::plan::algorithm;
 use crate::signals::Interrupt;
 
 /// Fills in `[spec]` from the environment. Adds every parameter of a built-in environment, and for a Gymnasium
-/// environment the settings of a suitable algorithm if the configuration names none.
-pub(super) fn describe_environment(table: &mut Table) -> anyhow::Result<()> {
+/// environment the settings of a suitable algorithm if the configuration names none. Returns what another program that
+/// serves the environment says of it.
+pub(super) fn describe_environment(table: &mut Table) -> anyhow::Result<Option<Description>> {
     let run = table.get("run");
     let mode = run.and_then(|run| run.get("mode")).and_then(Value::as_str);
     let mode = if mode == Some("lockstep") {
@@ -43,21 +46,19 @@ pub(super) fn describe_environment(table: &mut Table) -> anyhow::Result<()> {
         environment.start_seconds = start_seconds.unwrap_or(environment.start_seconds);
         environment
     };
-    let (environment, spec) = if let Some(server) = server {
+    let (environment, spec, description) = if let Some(server) = server {
         let environment = configured(name, server, section.clone());
         let surroundings = ServerSurroundings {
             location: ServerLocation::here(&environment.server)?,
             hash_seed: hash_seed(mode, seed),
             picture_height: None,
         };
-        let spec = ExternalEnvironment::begin_in(&environment, 1, 0, surroundings, Interrupt::default())?
-            .spec()
-            .clone();
-        (environment, spec)
+        let served = ExternalEnvironment::begin_in(&environment, 1, 0, surroundings, Interrupt::default())?;
+        (environment, served.spec().clone(), served.description()?)
     } else {
         let parameters = environment::resolve(&name, section)?;
         let spec = environment::make(&name, &parameters)?.spec();
-        (configured(name, Vec::new(), parameters), spec)
+        (configured(name, Vec::new(), parameters), spec, None)
     };
     let named = AlgorithmConfig::named_in(table);
     if environment.name.starts_with(GYMNASIUM) {
@@ -69,7 +70,7 @@ pub(super) fn describe_environment(table: &mut Table) -> anyhow::Result<()> {
     }
     table.insert("environment".into(), Value::try_from(environment)?);
     table.insert("spec".into(), Value::try_from(spec)?);
-    Ok(())
+    Ok(description)
 }
 
 /// The error about an environment's own parameters, with the place where the user has set the one at fault.
@@ -87,7 +88,8 @@ pub(super) fn about_environment(error: anyhow::Error, sources: &SettingSources) 
             ("name", format!("{of_environment}{hint}"))
         }
         EnvironmentError::Parameters { reason, .. } => {
-            let key = reason.split('`').nth(1).unwrap_or_default();
+            let before_value = reason.split_once(" = ").map(|(key, _)| key);
+            let key = before_value.or_else(|| reason.split('`').nth(1)).unwrap_or_default();
             (key, with_suggestion(of_environment.to_string()))
         }
     };
@@ -96,10 +98,12 @@ pub(super) fn about_environment(error: anyhow::Error, sources: &SettingSources) 
 
 /// Takes a key of `[environment]` that is no parameter of the environment.
 fn take<T: DeserializeOwned>(section: &mut Table, key: &str) -> anyhow::Result<Option<T>> {
-    let value = section.remove(key).map(Value::try_into).transpose();
-    value.map_err(|error| anyhow::anyhow!("environment.{key}: {}", one_line(&error)))
-}
-
-fn one_line(error: &toml::de::Error) -> String {
-    error.message().replace('\n', " ")
+    let Some(value) = section.remove(key) else {
+        return Ok(None);
+    };
+    let wrong = |error: toml::de::Error| {
+        let reason = section::in_user_words(error.message());
+        anyhow::anyhow!("environment.{key} = {value}: {reason}")
+    };
+    value.clone().try_into().map(Some).map_err(wrong)
 }

@@ -27,7 +27,7 @@ pub struct RunOverrides {
     #[arg(long = "method", visible_alias = "algorithm", value_name = "ALGORITHM", value_parser = PossibleValuesParser::new(algorithm::names()))]
     pub algorithm: Option<String>,
     /// Seed of every random stream.
-    #[arg(long)]
+    #[arg(long, value_parser = count)]
     pub seed: Option<u64>,
     /// Actor processes.
     #[arg(long, value_name = "N", value_parser = small_count)]
@@ -176,11 +176,12 @@ pub(super) fn set_options(
 /// Sets a key as `--set` says.
 pub(super) fn set_key(table: &mut Table, sources: &mut SettingSources, assignment: &str) -> anyhow::Result<()> {
     let wrong = |why: String| UsageError(format!("--set {assignment}: {why}"));
-    let (key, value) = assignment
-        .split_once('=')
-        .filter(|(key, _)| key.contains('.'))
-        .ok_or_else(|| wrong("must look like SECTION.KEY=VALUE".into()))?;
+    let (key, value) = assignment.split_once('=').unwrap_or((assignment, ""));
     let path: Vec<&str> = key.split('.').collect();
+    if !assignment.contains('=') || path.len() < 2 || path.contains(&"") {
+        let hint = did_you_mean(key, table);
+        return Err(wrong(format!("must look like SECTION.KEY=VALUE{hint}")).into());
+    }
     if path[0] == "spec" || explanation::set_by_program().iter().any(|own| own == key) {
         return Err(wrong(format!("{key} cannot be set: the program sets it")).into());
     }
@@ -190,6 +191,22 @@ pub(super) fn set_key(table: &mut Table, sources: &mut SettingSources, assignmen
         SettingSource::Set,
     );
     Ok(())
+}
+
+/// A hint for a key without its section: the sections that have it, if there are any.
+fn did_you_mean(key: &str, table: &Table) -> String {
+    let sections = explanation::sections();
+    let having = sections.iter().filter(|of| of.keys.iter().any(|own| own.name == key));
+    let all: Vec<&str> = having.map(|section| section.name).collect();
+    let mut likely: Vec<&str> = all.iter().copied().filter(|name| table.contains_key(*name)).collect();
+    if likely.is_empty() {
+        likely = all;
+    }
+    let keys: Vec<String> = likely.iter().map(|section| format!("{section}.{key}")).collect();
+    match keys.is_empty() {
+        true => String::new(),
+        false => format!("; did you mean {}?", keys.join(" or ")),
+    }
 }
 
 /// Makes whole numbers of `1e5` and `30k` where a key takes whole numbers.
@@ -270,6 +287,36 @@ mod tests {
             CommandLine::try_parse_from(both).is_err(),
             "the rows are of one or of the other"
         );
+    }
+
+    #[test]
+    fn a_key_without_its_section_is_found() {
+        let refused = |what: &str, assignment: &str| {
+            let set = vec![assignment.to_owned()];
+            let overrides = RunOverrides {
+                set,
+                ..RunOverrides::default()
+            };
+            resolve(what, &overrides).unwrap_err().to_string()
+        };
+        let form = "must look like SECTION.KEY=VALUE";
+        for (what, assignment, expected) in [
+            (
+                "pendulum",
+                "tau=",
+                format!("--set tau=: {form}; did you mean ddpg.tau?"),
+            ),
+            (
+                "pendulum",
+                "warmup",
+                format!("--set warmup: {form}; did you mean replay.warmup?"),
+            ),
+            ("pendulum", "nothing=1", format!("--set nothing=1: {form}")),
+            ("pendulum", ".=1", format!("--set .=1: {form}")),
+            ("pendulum", "ddpg.=1", format!("--set ddpg.=1: {form}")),
+        ] {
+            assert_eq!(refused(what, assignment), expected);
+        }
     }
 
     #[test]

@@ -3,6 +3,7 @@
 
 use shoal_common::algorithms::TransitionUse;
 use shoal_common::config::{ActorsConfig, AlgorithmConfig, Config, IdentityFormat, explanation};
+use shoal_env_server::description::Description;
 use toml::{Table, Value};
 
 use super::environment::{about_environment, describe_environment};
@@ -20,28 +21,34 @@ pub fn resolve_preset(what: &str) -> anyhow::Result<Config> {
 
 /// The resolved configuration of a preset or a file with these overrides, and where each value comes from.
 pub fn resolve_with_sources(what: &str, overrides: &RunOverrides) -> anyhow::Result<(Config, SettingSources)> {
-    let (_, table, sources) = sections_for_algorithm(what, overrides)?;
-    resolve_table(table, sources, overrides, what)
+    let resolved = resolve_all(what, overrides)?;
+    Ok((resolved.config, resolved.sources))
 }
 
 /// The configuration of a preset or a file with these overrides, and the default name of its run. Creates nothing.
 pub fn resolve(what: &str, overrides: &RunOverrides) -> anyhow::Result<(String, Config)> {
-    let (name, table, sources) = sections_for_algorithm(what, overrides)?;
-    let (config, _) = resolve_table(table, sources, overrides, what)?;
-    Ok((name, config))
+    let resolved = resolve_all(what, overrides)?;
+    Ok((resolved.name, resolved.config))
 }
 
-fn resolve_table(
-    mut table: Table,
-    mut sources: SettingSources,
-    overrides: &RunOverrides,
-    origin: &str,
-) -> anyhow::Result<(Config, SettingSources)> {
+/// A resolved configuration, with what was found out on the way.
+pub(super) struct Resolved {
+    /// The default name of its run.
+    pub(super) name: String,
+    pub(super) config: Config,
+    sources: SettingSources,
+    /// What another program that serves the environment says of it.
+    pub(super) description: Option<Description>,
+}
+
+/// Resolves a preset or a file with these overrides. Creates nothing.
+pub(super) fn resolve_all(what: &str, overrides: &RunOverrides) -> anyhow::Result<Resolved> {
+    let (name, mut table, mut sources) = sections_for_algorithm(what, overrides)?;
     set_options(&mut table, &mut sources, overrides)?;
     for assignment in &overrides.set {
         set_key(&mut table, &mut sources, assignment)?;
     }
-    let mistaken = |error: UsageError, sources: &SettingSources, table: &Table| sources.explain(error.0, origin, table);
+    let mistaken = |error: UsageError, sources: &SettingSources, table: &Table| sources.explain(error.0, what, table);
     read_counts(&mut table).map_err(|error| mistaken(error, &sources, &table))?;
     // For more actors than the default of `actors.max`, raise it, but not beyond its bounds.
     if let Some(count) = integer(&table, "actors", "count")
@@ -72,7 +79,7 @@ fn resolve_table(
     let format = i64::from(u32::from(IdentityFormat::NEWEST));
     put(&mut table, &["run", "identity_format"], format.into())?;
     let chosen = table.clone();
-    describe_environment(&mut table).map_err(|error| about_environment(error, &sources))?;
+    let description = describe_environment(&mut table).map_err(|error| about_environment(error, &sources))?;
     // That has added an algorithm's settings for a Gymnasium environment, and the environment's own defaults.
     sources.add_new(&chosen, &table, &SettingSource::Gymnasium);
     set_from_algorithm(&mut table, &mut sources)?;
@@ -83,7 +90,7 @@ fn resolve_table(
     let mut config = Config::from_table(table.clone(), "").map_err(|error| {
         let message = error.to_string();
         let message = message.strip_prefix(": ").unwrap_or(&message);
-        sources.explain(message.into(), origin, &table)
+        sources.explain(message.into(), what, &table)
     })?;
     // A short run must end with an evaluation too.
     if config.run.steps < config.evaluation.every {
@@ -91,7 +98,12 @@ fn resolve_table(
         sources.set("evaluation.every".into(), SettingSource::Follows("run.steps".into()));
     }
     set_from_length(&mut config, &mut sources);
-    Ok((config, sources))
+    Ok(Resolved {
+        name,
+        config,
+        sources,
+        description,
+    })
 }
 
 /// Sets what follows from the run's length if it is left open.

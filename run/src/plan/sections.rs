@@ -1,7 +1,7 @@
 //! The sections that a configuration begins with: those of a preset, a file or a Gymnasium environment, for the
 //! algorithm that is asked for.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 use shoal_common::config::AlgorithmConfig;
@@ -81,13 +81,38 @@ fn sections(what: &str) -> anyhow::Result<(String, Table, SettingSources)> {
     Ok((name, table, sources))
 }
 
-/// The error for a name that is neither a preset nor a file.
+/// The error for a name that is neither a preset nor a file with settings.
 fn no_preset(what: &str) -> String {
+    let path = Path::new(what);
+    let usual = Path::new("runs").join(what);
+    if path.join("config.toml").is_file() {
+        return format!(
+            "{what} is a run: to continue it, `shoal resume {what}`; to begin another one with its settings, `shoal \
+             train {}`",
+            path.join("config.toml").display()
+        );
+    }
+    if path.join("suite.json").is_file() {
+        return format!("{what} is a suite of runs: to continue it, `shoal resume {what}`");
+    }
     let known: Vec<&str> = preset_names().collect();
     let all = format!(
         "choose {}, a file that ends in .toml, or gym: with a Gymnasium environment",
         known.join(", ")
     );
+    if path.is_dir() {
+        return format!("{what} is a directory without a run: {all}");
+    }
+    if path.is_file() {
+        return format!("{what} is a file whose name does not end in .toml: {all}");
+    }
+    if usual.join("config.toml").is_file() {
+        let usual = usual.display();
+        return format!("there is no preset `{what}`, but a run: to continue it, `shoal resume {usual}`");
+    }
+    if what.contains('/') {
+        return format!("there is no preset, directory or file `{what}`: {all}");
+    }
     if is_gymnasium(what) {
         return format!("there is no preset `{what}`; did you mean {GYMNASIUM}{what}? Otherwise {all}");
     }
@@ -108,6 +133,46 @@ mod tests {
     use super::super::resolve::{resolve, resolve_preset};
     use super::*;
     use shoal_common::config::Mode;
+
+    #[test]
+    fn a_path_in_place_of_a_preset_is_told_what_it_is() {
+        let place = tempfile::tempdir().unwrap();
+        let refused = |name: &str| {
+            let error = resolve_preset(place.path().join(name).to_str().unwrap()).unwrap_err();
+            assert!(error.is::<UsageError>());
+            let message = error.to_string();
+            assert!(!message.contains('\n'), "{message}");
+            message.replace(&format!("{}/", place.path().display()), "")
+        };
+        for directory in ["run", "suite", "other"] {
+            std::fs::create_dir(place.path().join(directory)).unwrap();
+        }
+        for file in ["run/config.toml", "suite/suite.json", "x.json"] {
+            std::fs::write(place.path().join(file), "").unwrap();
+        }
+        assert_eq!(
+            refused("run"),
+            "run is a run: to continue it, `shoal resume run`; to begin another one with its settings, `shoal train \
+             run/config.toml`"
+        );
+        assert_eq!(
+            refused("suite"),
+            "suite is a suite of runs: to continue it, `shoal resume suite`"
+        );
+        for (name, start) in [
+            ("other", "other is a directory without a run: choose pendulum, "),
+            (
+                "x.json",
+                "x.json is a file whose name does not end in .toml: choose pendulum, ",
+            ),
+            (
+                "none",
+                "there is no preset, directory or file `none`: choose pendulum, ",
+            ),
+        ] {
+            assert!(refused(name).starts_with(start), "{}", refused(name));
+        }
+    }
 
     #[test]
     fn an_algorithm_has_its_preset_for_the_task_or_its_own_defaults() {

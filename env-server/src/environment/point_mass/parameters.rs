@@ -352,7 +352,7 @@ mod tests {
         );
         let unknown = refusal("reward = 'r4'");
         assert!(
-            unknown.contains("r4") && unknown.contains("r3") && unknown.contains("`reward`"),
+            unknown.contains("reward = \"r4\": unknown variant `r4`") && unknown.contains("`r3`"),
             "{unknown}"
         );
         for key in [
