@@ -226,9 +226,20 @@ impl Running {
 
     /// Kills the newest process of a role, if it is alive.
     pub(crate) fn kill_if_alive(&self, who: &str) {
+        self.signal_if_alive(who, Signal::KILL);
+    }
+
+    /// Stops the newest process of a role for this long, if it is alive.
+    pub(crate) fn pause_if_alive(&self, who: &str, length: Duration) {
+        self.signal_if_alive(who, Signal::STOP);
+        std::thread::sleep(length);
+        self.signal_if_alive(who, Signal::CONT);
+    }
+
+    fn signal_if_alive(&self, who: &str, signal: Signal) {
         if let Some(pid) = self.pids(who).last().copied().filter(|pid| is_ours(*pid, &self.run)) {
             // It may end in between.
-            let _ = kill_process(Pid::from_raw(pid).unwrap(), Signal::KILL);
+            let _ = kill_process(Pid::from_raw(pid).unwrap(), signal);
         }
     }
 

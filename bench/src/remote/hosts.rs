@@ -366,6 +366,7 @@ impl<'a> RemoteRun<'a> {
 
     fn end(mut self) -> anyhow::Result<()> {
         let mut ended = Ok(());
+        self.hosts.iter_mut().for_each(|host| host.relay.ask_to_end());
         for host in self.hosts.drain(..) {
             ended = ended.and(host.end());
         }
@@ -395,7 +396,6 @@ impl JoinedHost {
         key.write(&directory.path().join(KeyFile::JOIN))?;
         HostFile::new(endpoint, key.run_id.clone(), (lease.host, lease.name.clone()), &wire).write(&directory)?;
         let domain = Domain::join(&config.run.id, config.actors.max)?;
-        preflight::reserve_for_host(&config, &domain)?;
         let mut services = Services::new(&domain)?;
         services.create_common(&domain)?;
         for actor in &lease.actors {
@@ -432,13 +432,21 @@ impl JoinedHost {
         launcher: &mut Launcher<'_>,
         budget: &TimeBudget,
     ) -> anyhow::Result<()> {
-        let (begun, actors) = (Instant::now(), &self.config.actors);
-        for actor in &lease.actors {
+        let (begun, config) = (Instant::now(), &self.config);
+        let incarnation = lease.first_incarnation + 1;
+        let open = |actor: &u32| {
+            let (layout, window) = (config.chunk_layout(), config.actors.window);
             let listener = Listener::bind(&self.domain, EventName(Role::Actor, *actor))?;
-            let incarnation = lease.first_incarnation + 1;
-            let chunk = self.config.chunk_layout();
-            let handshake = ChunkSender::open(&self.domain, *actor, incarnation, chunk, actors.window)?;
-            self.notifier.notify();
+            let handshake = ChunkSender::open(&self.domain, *actor, incarnation, layout, window)?;
+            Ok((*actor, listener, handshake))
+        };
+        let opened = lease
+            .actors
+            .iter()
+            .map(open)
+            .collect::<Result<Vec<_>, ChannelError>>()?;
+        self.notifier.notify();
+        for (actor, listener, handshake) in opened {
             let mut answered = Ok(());
             let sender = handshake.wait(&self.commits, &listener, &budget.stop, || {
                 answered = launcher.answer();
@@ -454,7 +462,7 @@ impl JoinedHost {
                 );
             }
             self.senders.push(PacedSender {
-                actor: *actor as usize,
+                actor: actor as usize,
                 sender: sender.map_err(interrupted)?,
                 ready_at: Instant::now(),
             });
