@@ -284,14 +284,21 @@ mod tests_support {
         variants.into_iter().chain(defaults).map(with_policy).collect()
     }
 
-    /// An algorithm with its defaults, for the first of these tasks that it can control.
+    /// An algorithm with its defaults, but a small network, for the first of these tasks that it can control.
     fn with_defaults(algorithm: &str) -> Config {
-        let overrides = RunOverrides {
-            algorithm: Some(algorithm.into()),
-            ..RunOverrides::default()
+        let resolved = |task: &str, set: Vec<String>| {
+            let overrides = RunOverrides {
+                algorithm: Some(algorithm.into()),
+                set,
+                ..RunOverrides::default()
+            };
+            resolve(task, &overrides).ok()
         };
+        let hidden = format!("{algorithm}.hidden=[9, 8]");
         let mut tasks = ["pendulum", "cart-pole", "frozen-lake"].into_iter();
-        let (_, config) = tasks.find_map(|task| resolve(task, &overrides).ok()).unwrap();
+        // A table has no such key.
+        let found = tasks.find_map(|task| resolved(task, vec![hidden.clone()]).or_else(|| resolved(task, Vec::new())));
+        let (_, config) = found.unwrap();
         config
     }
 
