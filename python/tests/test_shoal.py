@@ -137,7 +137,7 @@ class Files(unittest.TestCase):
         with self.assertRaisesRegex(shoal.ShoalError, "no suite.json"):
             shoal.Suite(suite)
         (suite / "suite.json").write_text(json.dumps({"format": 1, "what": "pendulum", "trials": trials}))
-        with self.assertRaisesRegex(shoal.ShoalError, "is a suite of runs"):
+        with self.assertRaisesRegex(shoal.ShoalError, "a suite of runs"):
             shoal.Run(suite)
         read = shoal.Suite(suite)
         self.assertEqual(read.trials, trials)
