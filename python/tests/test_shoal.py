@@ -183,7 +183,9 @@ class Settings(unittest.TestCase):
         expected = [*line.split(), "ddpg.hidden=[8, 8],[4]", "--sweep", 'a.b=x,"y,z"', "--jobs", "2"]
         self.assertEqual(follow.call_args.args[0], expected)
         with self.assertRaises(TypeError):
-            shoal.train_suite("pendulum", stepps=5)
+            shoal.train_suite("pendulum", seeds=[1], stepps=5)
+        with self.assertRaisesRegex(shoal.ShoalError, "needs several seeds or values"):
+            shoal.train_suite("pendulum", steps=5)
 
     def test_an_error_is_the_programs_own_line(self) -> None:
         error = program.failure("pendulum: step 1\nerror: no such key\n\n", 2)
