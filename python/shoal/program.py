@@ -156,7 +156,8 @@ def train(
     """Trains ``what``: a preset (``"pendulum"``), an environment (``"gym:Pendulum-v1"``) or a configuration file.
 
     ``set`` has settings by their keys, as in ``{"ddpg.tau": 0.005}``; ``shoal train --help-config`` lists them. Values
-    may be numpy's. The other arguments are those of ``shoal train``. ``run`` is the directory to create, by default ``runs/<what>-<n>``.
+    may be numpy's. The other arguments are those of ``shoal train``. ``run`` is the directory to create, by default
+    ``runs/<what>-<n>``.
 
     With ``wait``, this returns when the training has finished, and shows its lines unless ``quiet``. Without, it
     returns as soon as all actors work. The training then continues even if this Python ends; :meth:`Run.stop` ends it.
