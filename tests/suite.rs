@@ -97,7 +97,9 @@ fn a_suite_trains_each_combination_with_each_seed_and_is_compared() {
         let message = error_line(&place.output(&[command, &["suite"]].concat()));
         assert!(
             message.contains("a suite of runs (tau=0.01,seed=1, tau=0.01,seed=2, tau=0.001,seed=1, and 1 more")
-                && message.ends_with("name one of them, as in suite/tau=0.01,seed=1"),
+                && message
+                    .trim_end()
+                    .ends_with("name one of them, as in suite/tau=0.01,seed=1"),
             "{command:?}: {message}"
         );
     }

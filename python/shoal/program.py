@@ -155,8 +155,9 @@ def train(
 ) -> Run:
     """Trains ``what``: a preset (``"pendulum"``), an environment (``"gym:Pendulum-v1"``) or a configuration file.
 
-    ``set`` has settings by their keys, as in ``{"ddpg.tau": 0.005}``; ``shoal train --help-config`` lists them. The
-    other arguments are those of ``shoal train``. ``run`` is the directory to create, by default ``runs/<what>-<n>``.
+    ``set`` has settings by their keys, as in ``{"ddpg.tau": 0.005}``; ``shoal train --help-config`` lists them. Values
+    may be numpy's. The other arguments are those of ``shoal train``. ``run`` is the directory to create, by default
+    ``runs/<what>-<n>``.
 
     With ``wait``, this returns when the training has finished, and shows its lines unless ``quiet``. Without, it
     returns as soon as all actors work. The training then continues even if this Python ends; :meth:`Run.stop` ends it.
@@ -205,6 +206,8 @@ def train_suite(
     """
     from .suite import Suite
 
+    if seeds is None and not sweep:
+        raise ShoalError("a suite needs several seeds or values: give seeds or sweep, or call train() for one run")
     arguments = _arguments(what, **options)
     if seeds is not None:
         arguments += ["--seeds", ",".join(str(seed) for seed in seeds)]

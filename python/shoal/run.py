@@ -35,10 +35,10 @@ class Run:
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path).absolute()
-        if (self.path / "suite.json").is_file():
-            raise ShoalError(f"{self.path} is a suite of runs: shoal.Suite(…).runs has them")
         if not (self.path / "config.toml").is_file():
-            raise ShoalError(f"{self.path} is not a run directory: it has no config.toml")
+            is_suite = (self.path / "suite.json").is_file()
+            why = "it is a suite of runs, and shoal.Suite(…).runs has them" if is_suite else "it has no config.toml"
+            raise ShoalError(f"{self.path} is not a run directory: {why}")
 
     def __repr__(self) -> str:
         return f"shoal.Run({str(self.path)!r})"

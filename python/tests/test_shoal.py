@@ -137,7 +137,7 @@ class Files(unittest.TestCase):
         with self.assertRaisesRegex(shoal.ShoalError, "no suite.json"):
             shoal.Suite(suite)
         (suite / "suite.json").write_text(json.dumps({"format": 1, "what": "pendulum", "trials": trials}))
-        with self.assertRaisesRegex(shoal.ShoalError, "is a suite of runs"):
+        with self.assertRaisesRegex(shoal.ShoalError, "a suite of runs"):
             shoal.Run(suite)
         read = shoal.Suite(suite)
         self.assertEqual(read.trials, trials)
@@ -183,7 +183,9 @@ class Settings(unittest.TestCase):
         expected = [*line.split(), "ddpg.hidden=[8, 8],[4]", "--sweep", 'a.b=x,"y,z"', "--jobs", "2"]
         self.assertEqual(follow.call_args.args[0], expected)
         with self.assertRaises(TypeError):
-            shoal.train_suite("pendulum", stepps=5)
+            shoal.train_suite("pendulum", seeds=[1], stepps=5)
+        with self.assertRaisesRegex(shoal.ShoalError, "needs several seeds or values"):
+            shoal.train_suite("pendulum", steps=5)
 
     def test_an_error_is_the_programs_own_line(self) -> None:
         error = program.failure("pendulum: step 1\nerror: no such key\n\n", 2)

@@ -85,7 +85,8 @@ class Track(unittest.TestCase):
     def test_a_suite_is_followed_until_nobody_works_on_it(self) -> None:
         suite = self.place / "suite"
         suite.mkdir()
-        (suite / "suite.json").write_text(json.dumps({"trials": [{"name": name, "seed": None, "set": []} for name in ("a", "b", "never")]}))
+        trials = [{"name": name, "seed": None, "set": []} for name in ("a", "b", "never")]
+        (suite / "suite.json").write_text(json.dumps({"trials": trials}))
         lock = os.open(suite, os.O_RDONLY)
         fcntl.flock(lock, fcntl.LOCK_EX)
         self.make("suite/a")

@@ -29,7 +29,7 @@ for run in suite.runs:
     # It has ended: nothing is left to stop.
     run.stop()
 for attempt, message in [
-    (lambda: shoal.Run("suite"), "is a suite of runs"),
+    (lambda: shoal.Run("suite"), "a suite of runs"),
     (lambda: shoal.Suite("suite/tau=0.01,seed=1"), "no suite.json"),
     (lambda: shoal.train_suite("pendulum", run="other", sweep={"ddpg.tao": [1, 2]}), "did you mean `tau`"),
     (lambda: shoal.train_suite("pendulum", run="other", seeds=[1, 1]), "names a seed twice"),

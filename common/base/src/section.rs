@@ -29,7 +29,11 @@ pub fn read<T: DeserializeOwned>(name: &str, section: Value) -> Result<T, toml::
         // Of a list, one item is at fault.
         let each = value.is_array() && reason.starts_with("must be ");
         let each = if each { "each " } else { "" };
-        Some(Error::custom(format!("{name}.{key} = {value}: {each}{reason}")))
+        Some(Error::custom(refusal(
+            format!("{name}.{key}"),
+            value,
+            &format!("{each}{reason}"),
+        )))
     };
     T::deserialize(section.clone()).map_err(|error| {
         let mut keys = section.as_table().into_iter().flatten();
@@ -54,6 +58,11 @@ pub fn in_user_words(message: &str) -> String {
         other => other,
     };
     format!("must be {expected}")
+}
+
+/// A key with its value and what is wrong with it, on one line, whatever the value is.
+pub fn refusal(key: impl Display, value: &Value, reason: &str) -> String {
+    format!("{key} = {value}: {reason}").replace(['\n', '\r'], " ")
 }
 
 /// What is wrong with a TOML text, on one line: where the text came from, the number and the text of the line, and the

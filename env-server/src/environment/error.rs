@@ -2,7 +2,7 @@
 
 use std::ops::RangeInclusive;
 
-use shoal_base::section::in_user_words;
+use shoal_base::section::{in_user_words, refusal};
 
 /// Why an environment cannot be made. Each message is one line for the user.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -106,7 +106,7 @@ pub(super) fn wrong_parameter(parameters: &toml::Table, error: &toml::de::Error)
         .lines()
         .find_map(|line| line.strip_prefix("in `")?.strip_suffix('`'));
     match place.and_then(|key| parameters.get_key_value(key)) {
-        Some((key, value)) => format!("{key} = {value}: {reason}"),
+        Some((key, value)) => refusal(key, value, &reason),
         None => reason,
     }
 }

@@ -103,7 +103,7 @@ fn take<T: DeserializeOwned>(section: &mut Table, key: &str) -> anyhow::Result<O
     };
     let wrong = |error: toml::de::Error| {
         let reason = section::in_user_words(error.message());
-        anyhow::anyhow!("environment.{key} = {value}: {reason}")
+        anyhow::anyhow!(section::refusal(format!("environment.{key}"), &value, &reason))
     };
     value.clone().try_into().map(Some).map_err(wrong)
 }

@@ -5,14 +5,15 @@ use std::path::{Path, PathBuf};
 use anyhow::Context;
 use clap::builder::PossibleValuesParser;
 use clap::{Args, Parser};
-use shoal_common::config::Config;
 use shoal_common::config::explanation::{self, Key};
+use shoal_common::config::{AlgorithmConfig, Config};
 use shoal_common::run_dir::RunDir;
 use shoal_env_server::environment;
 use toml::{Table, Value};
 
 use super::source::{SettingSource, SettingSources};
 use super::table::put;
+use crate::external_environment::GYMNASIUM;
 use crate::numbers::{count, small_count};
 use crate::plan::algorithm;
 use crate::usage::UsageError;
@@ -198,7 +199,15 @@ fn did_you_mean(key: &str, table: &Table) -> String {
     let sections = explanation::sections();
     let having = sections.iter().filter(|of| of.keys.iter().any(|own| own.name == key));
     let all: Vec<&str> = having.map(|section| section.name).collect();
-    let mut likely: Vec<&str> = all.iter().copied().filter(|name| table.contains_key(*name)).collect();
+    // That of a Gymnasium environment is not known yet.
+    let name = table.get("environment").and_then(|section| section.get("name"));
+    let is_known = !name
+        .and_then(Value::as_str)
+        .is_some_and(|name| name.starts_with(GYMNASIUM));
+    let default = is_known.then(|| AlgorithmConfig::default().name());
+    let algorithm = AlgorithmConfig::named_in(table).or(default);
+    let is_likely = |name: &&str| table.contains_key(*name) || algorithm == Some(*name);
+    let mut likely: Vec<&str> = all.iter().copied().filter(is_likely).collect();
     if likely.is_empty() {
         likely = all;
     }
@@ -301,6 +310,11 @@ mod tests {
         };
         let form = "must look like SECTION.KEY=VALUE";
         for (what, assignment, expected) in [
+            (
+                "pendulum-sac",
+                "tau=1",
+                format!("--set tau=1: {form}; did you mean sac.tau?"),
+            ),
             (
                 "pendulum",
                 "tau=",
