@@ -479,7 +479,7 @@ impl EndRoles for Launcher<'_> {
                     }
                     ControlRequest::Admit(request) => supervisor.admit(domain, request).map(Some),
                     ControlRequest::Hosts(statuses) => Ok(Some(supervisor.update_joined_hosts(statuses))),
-                    ControlRequest::Replace { .. } => {
+                    ControlRequest::Replace { .. } | ControlRequest::JoinAgain => {
                         Ok(Some(ControlResponse::Refused("this is the learner's host".into())))
                     }
                     ControlRequest::Stop => {

@@ -661,7 +661,9 @@ impl<'a> Gate<'a> {
         self.sleep = match (waits, progress) {
             (true, true) => SHORTEST_SLEEP,
             (true, false) => (2 * self.sleep).min(LONGEST_SLEEP),
-            (false, _) => LONGEST_SLEEP,
+            // The acknowledgement of this progress may have to wait for that long.
+            (false, true) => SHORTEST_ACKNOWLEDGEMENT_INTERVAL,
+            (false, false) => LONGEST_SLEEP,
         };
     }
 }

@@ -88,9 +88,6 @@ pub enum RelayError {
     /// A file of the host cannot be used.
     #[error(transparent)]
     File(#[from] FileError),
-    /// Its actors belong to others now.
-    #[error("the run has given the actors of this host to others: join again")]
-    OtherActors,
     /// A message cannot be encoded.
     #[error(transparent)]
     Wire(#[from] WireError),
@@ -168,6 +165,10 @@ struct Relay<'a> {
     /// When this host last asked to be admitted again, and whether an answer is still to come.
     rejoin_request: Option<(Instant, bool)>,
     run_is_over: bool,
+    /// The gate has refused to admit this host again.
+    is_refused: bool,
+    /// When the launcher of this host was last told that its actors belong to others.
+    lost_actors_at: Option<Instant>,
     /// When a request to stop was first seen.
     stop_seen_at: Option<Instant>,
 }
@@ -259,6 +260,8 @@ impl<'a> Relay<'a> {
             connections_refreshed_at: now,
             rejoin_request: None,
             run_is_over: false,
+            is_refused: false,
+            lost_actors_at: None,
             stop_seen_at: None,
         })
     }
@@ -292,7 +295,7 @@ impl<'a> Relay<'a> {
         }
         let since = *self.stop_seen_at.get_or_insert_with(Instant::now);
         let handed_over = self.actors.values().all(|actor| actor.uncommitted.all_forwarded());
-        handed_over || self.is_cut_off() || since.elapsed() >= HAND_OVER_TIMEOUT
+        handed_over || self.lost_actors_at.is_some() || self.is_cut_off() || since.elapsed() >= HAND_OVER_TIMEOUT
     }
 
     fn is_cut_off(&self) -> bool {
@@ -352,7 +355,7 @@ impl<'a> Relay<'a> {
             return Ok(());
         }
         let now = self.now();
-        let mut changed = Vec::new();
+        let (mut changed, mut lost) = (Vec::new(), false);
         for of_actor in &acknowledgement.actors {
             let Some(actor) = self.actors.get_mut(&of_actor.actor) else {
                 continue;
@@ -373,7 +376,11 @@ impl<'a> Relay<'a> {
                 actor.commit = commit;
                 changed.push(of_actor.actor);
             }
-            follow_up_on(&self.requests, of_actor.actor, follow_up);
+            lost |= follow_up == ActorFollowUp::TakenOver;
+            start_again(&self.requests, of_actor.actor, follow_up);
+        }
+        if lost {
+            self.lose_actors();
         }
         if other_gate || !changed.is_empty() {
             let of_host = acknowledgement.actors.iter();
@@ -387,9 +394,21 @@ impl<'a> Relay<'a> {
         Ok(())
     }
 
+    /// Tells the launcher of this host that its actors belong to others now, so that the host joins again.
+    fn lose_actors(&mut self) {
+        if self.lost_actors_at.is_none_or(|told| told.elapsed() >= REJOIN_INTERVAL) {
+            tracing::warn!("the run has given the actors of this host to others");
+            self.lost_actors_at = Some(Instant::now());
+            self.requests.ask(ControlRequest::JoinAgain, ());
+        }
+    }
+
     /// Asks whether this host is still admitted: the launcher of the run is another process, or has given its actors
     /// away.
     fn ask_to_rejoin(&mut self) {
+        if self.lost_actors_at.is_some() {
+            return;
+        }
         let waits = self
             .rejoin_request
             .is_some_and(|(then, open)| open || then.elapsed() < REJOIN_INTERVAL);
@@ -424,12 +443,16 @@ impl<'a> Relay<'a> {
             Ok(Admission::Admitted(lease)) if lease.actors == host.actors => {
                 tracing::info!("admitted again");
                 self.epoch = lease.epoch;
+                self.is_refused = false;
                 let mut host = host.clone();
                 host.epoch = lease.epoch;
                 host.write(&self.settings.run)?;
             }
-            Ok(Admission::Admitted(_)) => return Err(RelayError::OtherActors),
-            Ok(Admission::Refused(why)) => tracing::warn!("not admitted again: {why}"),
+            Ok(Admission::Admitted(_)) => self.lose_actors(),
+            Ok(Admission::Refused(why)) => {
+                tracing::warn!("not admitted again: {why}");
+                self.is_refused = true;
+            }
             Err(why) => tracing::debug!("no answer: {why}"),
         }
         Ok(())
@@ -461,7 +484,7 @@ impl<'a> Relay<'a> {
                 let (rows, snapshot) = chunk.parts();
                 let bytes = WireChunk::encode(self.settings.host.host, chunk.header(), rows, snapshot);
                 let follow_up = actor.uncommitted.add(id_of(chunk.header()), bytes.into(), now);
-                follow_up_on(&self.requests, *index, follow_up);
+                start_again(&self.requests, *index, follow_up);
                 self.heartbeat.count(chunk.header().rows.into());
             }
         }
@@ -542,10 +565,14 @@ impl<'a> Relay<'a> {
             return Ok(());
         }
         self.connections_refreshed_at = Instant::now();
+        if self.lost_actors_at.is_some() {
+            // The launcher may not have got the first message.
+            self.lose_actors();
+        }
         if let Some(publisher) = &self.policy_publisher {
             publisher.refresh_connections()?;
         }
-        let activity = match (self.run_is_over, self.is_cut_off()) {
+        let activity = match (self.run_is_over, self.is_cut_off() || self.is_refused) {
             (true, _) => Activity::Done,
             (false, true) => Activity::WaitingForPeer,
             (false, false) => Activity::Working,
@@ -573,15 +600,11 @@ impl<'a> Relay<'a> {
     }
 }
 
-fn follow_up_on(requests: &LauncherRequests<()>, actor: u32, follow_up: ActorFollowUp) {
-    match follow_up {
-        ActorFollowUp::Continue => {}
-        ActorFollowUp::StartAgain(incarnation) => {
-            tracing::warn!("the replay has lost chunks of actor {actor}; the actor is started again");
-            requests.ask(ControlRequest::Replace { actor, incarnation }, ());
-        }
-        // The gate's next acknowledgement no longer names the actor.
-        ActorFollowUp::TakenOver => tracing::warn!("actor {actor} now belongs to another host"),
+/// Has an actor started again whose chunks the replay has lost.
+fn start_again(requests: &LauncherRequests<()>, actor: u32, follow_up: ActorFollowUp) {
+    if let ActorFollowUp::StartAgain(incarnation) = follow_up {
+        tracing::warn!("the replay has lost chunks of actor {actor}; the actor is started again");
+        requests.ask(ControlRequest::Replace { actor, incarnation }, ());
     }
 }
 

@@ -17,7 +17,7 @@ pub enum ActorFollowUp {
     /// The replay has lost chunks that were committed, and the next chunks of the actor do not follow on what it has.
     /// End the actor unless it has a later incarnation than this; its successor begins with a handshake.
     StartAgain(u64),
-    /// Another host has the actor's index now: end the actor and do not replace it.
+    /// A process of another host has committed chunks with the actor's index: this host has lost its actors.
     TakenOver,
 }
 

@@ -12,8 +12,11 @@ use shoal_common::run_dir::RunDir;
 use crate::records::outcome::{FINAL_EVALUATION, RunOutcome, RunState, STARTING};
 use crate::status::saved_status;
 
-/// How long a launcher may take to answer. One that is starting does not answer at once.
-const PATIENCE: Duration = Duration::from_secs(5);
+/// How long a launcher may take to answer. One that is starting, or writes to a busy disk, does not answer at once.
+const PATIENCE: Duration = Duration::from_secs(10);
+
+/// How long it may take to change the number of actors: it writes the change to the disk, in several files.
+const SCALE_PATIENCE: Duration = Duration::from_secs(60);
 
 /// How long a run may take to end. Its roles are given less.
 const STOP_PATIENCE: Duration = Duration::from_secs(60);
@@ -136,7 +139,7 @@ impl RunClient {
 
     /// Changes the number of actors.
     pub fn scale(&self, actors: u32) -> anyhow::Result<()> {
-        match self.ask(ControlRequest::Scale { actors }, PATIENCE)? {
+        match self.ask(ControlRequest::Scale { actors }, SCALE_PATIENCE)? {
             None => bail!("{}", self.not_running()),
             Some(answer) => accepted(answer),
         }

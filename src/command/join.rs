@@ -26,7 +26,8 @@ pub(crate) struct JoinArgs {
     /// The host's name in `status` [default: the machine's].
     #[arg(long, value_name = "NAME")]
     pub(crate) name: Option<String>,
-    /// Directory for this host's log and other files; it is kept [default: a temporary one].
+    /// Directory DIR for this host's log and other files; it is kept. If the host joins again: DIR-2, and so on [default:
+    /// a temporary one].
     #[arg(long, value_name = "DIR")]
     pub(crate) local: Option<PathBuf>,
     /// Print a script or manifest that starts hosts, to be edited, and join nothing.
@@ -112,11 +113,30 @@ mod with_network {
     /// The exit code if the run could not be reached for too long.
     const GAVE_UP: u8 = 4;
 
-    /// Joins the run, and works for it until it is over.
+    /// Joins the run, and works for it until it is over. A host that has lost its actors joins again.
     pub(super) fn join(args: &JoinArgs, run: &str, actors: u32) -> anyhow::Result<ExitCode> {
         restart_with_one_thread()?;
         let (endpoint, key) = endpoint(args, run)?;
         let signals = Signals::register()?;
+        for time in 1_u32.. {
+            let ended = join_once(args, run, actors, (endpoint.clone(), key.clone()), &signals, time)?;
+            if let Some(code) = ended {
+                return Ok(code);
+            }
+            say("the run has given the actors of this host to others; joining again");
+        }
+        bail!("joined too often")
+    }
+
+    /// Joins the run for the `time`-th time; `None` if the host has lost its actors.
+    fn join_once(
+        args: &JoinArgs,
+        run: &str,
+        actors: u32,
+        (endpoint, key): (Endpoint, Option<KeyFile>),
+        signals: &Signals,
+        time: u32,
+    ) -> anyhow::Result<Option<ExitCode>> {
         let interrupt = signals.interrupt();
         let host = host_number()?;
         let name = match &args.name {
@@ -134,24 +154,29 @@ mod with_network {
         let ends = || interrupt.signal().is_some() || is_finished(run);
         let admission = ask(&endpoint, key.as_ref(), &hello, args.give_up, ends);
         if let Some(signal) = interrupt.signal() {
-            return Ok(exit_code(signal));
+            return Ok(Some(exit_code(signal)));
         }
         let (lease, connection) = match admission {
             Ok((Admission::Admitted(lease), connection)) => (lease, connection),
             Ok((Admission::Refused(why), _)) => bail!("{endpoint} does not admit this host: {why}"),
             Err(JoinError::Silence { .. }) if is_finished(run) => {
                 say("the run is over");
-                return Ok(ExitCode::SUCCESS);
+                return Ok(Some(ExitCode::SUCCESS));
             }
             Err(error @ JoinError::Silence { .. }) => {
                 say(&format!("error: {error}"));
-                return Ok(GAVE_UP.into());
+                return Ok(Some(GAVE_UP.into()));
             }
             Err(error) => return Err(error.into()),
         };
         let temporary = std::env::temp_dir().join(format!("shoal-join-{host:016x}"));
-        let path = args.local.as_deref().unwrap_or(&temporary);
-        let worked = work(args, (endpoint, key, host, name), (lease, connection), path, &signals);
+        let path = match (&args.local, time) {
+            (None, _) => temporary,
+            (Some(local), 1) => local.clone(),
+            (Some(local), _) => PathBuf::from(format!("{}-{time}", local.display())),
+        };
+        let path = path.as_path();
+        let worked = work(args, (endpoint, key, host, name), (lease, connection), path, signals);
         if args.local.is_none() {
             match &worked {
                 Ok(_) => drop(std::fs::remove_dir_all(path)),
@@ -167,7 +192,7 @@ mod with_network {
         (lease, connection): (WireLease, GateConnection),
         path: &Path,
         signals: &Signals,
-    ) -> anyhow::Result<ExitCode> {
+    ) -> anyhow::Result<Option<ExitCode>> {
         // The name of the run in its messages is that of its own configuration.
         let run_id = joined_run_id(&lease.config)?;
         // The environment may take minutes to start, and it may not be usable here.
@@ -187,11 +212,12 @@ mod with_network {
         let actors = lease.actors.clone();
         say(&format!("joined {endpoint} with {} actors: {actors:?}", actors.len()));
         let ending = joined::run(config, (&run, &lock), signals, actors, args.give_up)?;
-        Ok(match ending {
+        Ok(Some(match ending {
             JoinEnd::Over => {
                 say("the run is over");
                 ExitCode::SUCCESS
             }
+            JoinEnd::LostActors => return Ok(None),
             JoinEnd::Stopped => ExitCode::SUCCESS,
             JoinEnd::Interrupted(signal) => exit_code(signal),
             JoinEnd::GaveUp => {
@@ -201,7 +227,7 @@ mod with_network {
                 ));
                 GAVE_UP.into()
             }
-        })
+        }))
     }
 
     fn say(line: &str) {

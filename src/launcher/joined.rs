@@ -32,6 +32,8 @@ pub(crate) enum JoinEnd {
     Over,
     /// The run could not be reached for too long.
     GaveUp,
+    /// The run has given the actors of this host to others.
+    LostActors,
     /// `shoal stop` ended it.
     Stopped,
     /// This signal ended it.
@@ -70,6 +72,7 @@ struct JoinedLauncher<'a> {
     log: Log,
     heartbeats: Reports<Heartbeat>,
     stop_requested: bool,
+    has_lost_actors: bool,
     /// Since when the relay has had no connection.
     cut_off_since: Option<Instant>,
 }
@@ -98,6 +101,7 @@ impl<'a> JoinedLauncher<'a> {
             log,
             config,
             stop_requested: false,
+            has_lost_actors: false,
             cut_off_since: None,
         })
     }
@@ -107,7 +111,9 @@ impl<'a> JoinedLauncher<'a> {
         // The roles are ended in every case, also after an error. The relay stays while actors hand over what they
         // have. If the run is over, they try that only for a moment: its learner takes no more than it needs.
         match ending {
-            Ok(JoinEnd::Over | JoinEnd::GaveUp) => self.supervisor.ask_to_end(|role| role == Role::Actor),
+            Ok(JoinEnd::Over | JoinEnd::GaveUp | JoinEnd::LostActors) => {
+                self.supervisor.ask_to_end(|role| role == Role::Actor)
+            }
             _ => self.supervisor.ask_to_retire(Role::Actor),
         }
         self.await_end(|role| role == Role::Actor, HAND_OVER);
@@ -149,6 +155,9 @@ impl<'a> JoinedLauncher<'a> {
             if self.stop_requested {
                 return Ok(JoinEnd::Stopped);
             }
+            if self.has_lost_actors {
+                return Ok(JoinEnd::LostActors);
+            }
             match self.supervisor.activity(Role::Relay) {
                 Some(Activity::Done) => return Ok(JoinEnd::Over),
                 Some(Activity::Working) => self.cut_off_since = None,
@@ -184,6 +193,7 @@ impl EndRoles for JoinedLauncher<'_> {
             run,
             supervisor,
             stop_requested,
+            has_lost_actors,
             config,
             ..
         } = self;
@@ -201,6 +211,10 @@ impl EndRoles for JoinedLauncher<'_> {
                 }
                 ControlRequest::Replace { actor, incarnation } => {
                     supervisor.replace_actor(actor, incarnation);
+                    Some(ControlResponse::Accepted)
+                }
+                ControlRequest::JoinAgain => {
+                    *has_lost_actors = true;
                     Some(ControlResponse::Accepted)
                 }
                 ControlRequest::Scale { .. } | ControlRequest::Admit(_) | ControlRequest::Hosts(_) => {

@@ -2,7 +2,7 @@
 
 use shoal_common::channel::control::{ControlResponse, RunStatus};
 use shoal_common::commit::OpenError;
-use shoal_common::config::{ActorsConfig, Config, Mode};
+use shoal_common::config::{Config, Mode};
 use shoal_common::role::{Activity, Role};
 use shoal_common::run_dir::RunDir;
 use shoal_run::records::recorder::Moment;
@@ -60,8 +60,6 @@ pub(super) fn scale(
     if !(1..=most).contains(&actors) {
         let reason = if most == max {
             format!("this run can have 1 to {max} actors (actors.max, fixed when it was created)")
-        } else if most == ActorsConfig::GREATEST_COUNT {
-            format!("a host can have 1 to {most} actors")
         } else {
             format!(
                 "this host can have 1 to {most} actors: the run may have {max} (actors.max, fixed when it was created), \

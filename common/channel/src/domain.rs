@@ -21,9 +21,6 @@ use super::presence::{self, Claim, Presence};
 /// How long to wait for a run's lock. Each process holds it for some milliseconds.
 const LOCK_PATIENCE: Duration = Duration::from_secs(10);
 
-/// The most actors on one host. A run with remote actors may have more.
-pub const MAX_LOCAL_ACTORS: usize = 256;
-
 /// The node name of processes that join a run only to ask its launcher something.
 const VISITOR: &str = "visitor";
 
@@ -82,11 +79,6 @@ pub enum DomainError {
     },
 }
 
-/// How many of a run's `max_actors` actors may be on one host.
-pub(super) fn local_actors(max_actors: usize) -> usize {
-    max_actors.min(MAX_LOCAL_ACTORS)
-}
-
 impl Domain {
     /// Joins the run `run_id`, whose channels are sized for up to `max_actors` actors.
     ///
@@ -143,14 +135,9 @@ impl Domain {
         &self.run_id
     }
 
-    /// The most actors that the run may have, on all hosts together.
+    /// The most actors that the run's channels are sized for.
     pub fn max_actors(&self) -> usize {
         self.max_actors
-    }
-
-    /// The most actors that may be on this host: what its processes share is sized for them.
-    pub(super) fn max_local_actors(&self) -> usize {
-        local_actors(self.max_actors)
     }
 
     /// The directory of the run's files outside `/dev/shm`. It is removed with the run, and so are all files in it.

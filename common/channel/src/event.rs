@@ -18,7 +18,7 @@ use shoal_base::exit::Exit;
 use shoal_base::role::Role;
 use shoal_base::stop::Stop;
 
-use super::domain::{Domain, local_actors};
+use super::domain::Domain;
 use super::error::{Cause, ChannelError};
 use super::service::{HeldService, OpenMode, claim, service_name};
 use super::{descriptor, memory};
@@ -98,7 +98,7 @@ impl Listener {
     /// Bytes of shared memory that an event service reserves in a run of up to `max_actors` actors.
     pub fn reserved(max_actors: usize) -> u64 {
         // The second file holds pending notifications: iceoryx2 has one of 2103 bytes for each listener.
-        memory::service(2 * participants(local_actors(max_actors))) + memory::pages(2103)
+        memory::service(2 * participants(max_actors)) + memory::pages(2103)
     }
 
     /// Opens the listener of the event service `name`.
@@ -255,12 +255,12 @@ fn create_on(domain: &Domain, channel: &str) -> Result<HeldService, ChannelError
     }))
 }
 
-fn participants(local_actors: usize) -> usize {
-    2 * local_actors + 8
+fn participants(max_actors: usize) -> usize {
+    2 * max_actors + 8
 }
 
 fn service(domain: &Domain, channel: &str, mode: OpenMode) -> Result<PortFactory<ipc::Service>, ChannelError> {
-    let participants = participants(domain.max_local_actors());
+    let participants = participants(domain.max_actors());
     let builder = domain
         .node()
         .service_builder(&service_name(domain, channel)?)

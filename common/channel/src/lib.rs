@@ -20,7 +20,7 @@ mod services;
 pub mod transitions;
 
 pub use cleanup::Sweeper;
-pub use domain::{Domain, DomainError, MAX_LOCAL_ACTORS};
+pub use domain::{Domain, DomainError};
 pub use error::{ChannelError, ChannelErrorKind, PeerError};
 pub use event::{EventName, Listener, Notifier, wait_for};
 pub use heartbeat::HeartbeatSender;

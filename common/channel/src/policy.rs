@@ -40,7 +40,7 @@ use iceoryx2::service::header::publish_subscribe::Header;
 use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 
-use super::domain::{Domain, local_actors};
+use super::domain::Domain;
 use super::error::{ChannelError, PeerError};
 use super::memory;
 use super::service::{HeldService, OpenMode, claim, service_name};
@@ -97,7 +97,7 @@ impl PolicyPublisher {
     /// # Errors
     /// When shared memory is unavailable, or another learner is alive.
     pub fn open(domain: &Domain, parameters: usize) -> Result<Self, ChannelError> {
-        let samples = samples(domain.max_local_actors());
+        let samples = samples(domain.max_actors());
         let publisher = claim(|| {
             service(domain, OpenMode::Open)?
                 .publisher_builder()
@@ -192,27 +192,26 @@ impl PublishedPolicy {
 /// Bytes of shared memory that policies with this many parameters reserve in a run of up to `max_actors` actors. This
 /// is twice what one learner needs, because the memory of a killed learner stays until the readers have a newer policy.
 pub fn reserved(max_actors: usize, parameters: usize) -> u64 {
-    let local = local_actors(max_actors);
-    let (samples, readers) = (samples(local), readers(local));
+    let (samples, readers) = (samples(max_actors), readers(max_actors));
     let learner = memory::segment::<Header, PolicyHeader>(samples, size_of::<f32>() * parameters)
         + readers as u64 * memory::connection(1, BUFFER, BORROWED, samples);
-    memory::service(readers + nodes(local)) + 2 * learner
+    memory::service(readers + nodes(max_actors)) + 2 * learner
 }
 
 /// The evaluator, the actors, and one spare reader.
-fn readers(local_actors: usize) -> usize {
-    local_actors + 2
+fn readers(max_actors: usize) -> usize {
+    max_actors + 2
 }
 
-fn nodes(local_actors: usize) -> usize {
-    local_actors + 4
+fn nodes(max_actors: usize) -> usize {
+    max_actors + 4
 }
 
 /// Policies that can be in use at once: those that readers hold, the newest one, its replacement while that is being
 /// published, and one being written. All readers share the newest; iceoryx2 alone would reserve one for each.
-fn samples(local_actors: usize) -> usize {
+fn samples(max_actors: usize) -> usize {
     let (waiting, being_written) = (2, 1);
-    readers(local_actors) * BORROWED + waiting + being_written
+    readers(max_actors) * BORROWED + waiting + being_written
 }
 
 /// Creates the service.
@@ -232,8 +231,8 @@ fn service(domain: &Domain, mode: OpenMode) -> Result<PortFactory<ipc::Service, 
         .publish_subscribe::<[f32]>()
         .user_header::<PolicyHeader>()
         .max_publishers(1)
-        .max_subscribers(readers(domain.max_local_actors()))
-        .max_nodes(nodes(domain.max_local_actors()))
+        .max_subscribers(readers(domain.max_actors()))
+        .max_nodes(nodes(domain.max_actors()))
         .enable_safe_overflow(true)
         .history_size(1)
         .subscriber_max_buffer_size(BUFFER)

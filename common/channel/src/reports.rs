@@ -11,7 +11,7 @@ use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 use shoal_base::report::{EpisodeReport, EvaluatedPeriod, EvaluationReport, Heartbeat, LearnerReport};
 
-use super::domain::{Domain, local_actors};
+use super::domain::Domain;
 use super::error::ChannelError;
 use super::memory;
 use super::service::{HeldService, OpenMode, claim, service_name};
@@ -196,16 +196,16 @@ fn subscriber<R: Report>(domain: &Domain) -> Result<Subscriber<ipc::Service, R, 
 }
 
 /// Bytes of shared memory that reports of kind `R` reserve with `senders` senders, in a run of up to `max_actors`
-/// actors on all hosts.
+/// actors.
 pub fn reserved<R: Report>(max_actors: usize, senders: usize) -> u64 {
     let samples = R::READERS * (R::BUFFER + BORROWED) + R::HISTORY + LOANED;
     let sender = memory::segment::<Header, ()>(samples, size_of::<R>())
         + R::READERS as u64 * memory::connection(1, R::BUFFER, BORROWED, samples);
-    memory::service(2 * participants(local_actors(max_actors))) + senders as u64 * sender
+    memory::service(2 * participants(max_actors)) + senders as u64 * sender
 }
 
-fn participants(local_actors: usize) -> usize {
-    2 * local_actors + 8
+fn participants(max_actors: usize) -> usize {
+    2 * max_actors + 8
 }
 
 /// Creates the service of reports of kind `R`.
@@ -219,7 +219,7 @@ pub(super) fn create<R: Report>(domain: &Domain) -> Result<HeldService, ChannelE
 }
 
 fn service<R: Report>(domain: &Domain, mode: OpenMode) -> Result<PortFactory<ipc::Service, R, ()>, ChannelError> {
-    let participants = participants(domain.max_local_actors());
+    let participants = participants(domain.max_actors());
     let builder = domain
         .node()
         .service_builder(&service_name(domain, R::CHANNEL)?)

@@ -2,13 +2,12 @@
 
 use shoal_base::section;
 use shoal_base::section::{Change, OutOfRange, from, in_free_runs, never};
-use shoal_channel::MAX_LOCAL_ACTORS;
 
 section! {
     /// The actors, and the size of their chunks.
     #[derive(Eq)]
     pub struct ActorsConfig {
-        /// Actor processes of this host, each with its own environment server; at most `actors.max` and 256.
+        /// Actor processes, each with its own environment server; at most `actors.max`.
         count: u32 = 2, unit: "processes", source: "ours", change: in_free_runs("its results depend on it");
         /// Environments that an actor steps at once.
         envs: u32 = 1, bounds: from(1, 4_096), unit: "environments", source: "ours",
@@ -18,7 +17,7 @@ section! {
             change: in_free_runs("the length of a round depends on it");
         /// Chunks that an actor may have sent and the learner has not committed yet.
         window: u32 = 8, bounds: from(1, 64), unit: "chunks", source: "ours", change: Change::Anytime;
-        /// The most actors that the run can be scaled to, on all hosts together.
+        /// The most actors that the run can be scaled to.
         max: u32 = 16, bounds: from(1, ActorsConfig::GREATEST_MAX), unit: "processes", source: "ours",
             change: never("the replay has a place for each of them");
     }
@@ -26,10 +25,7 @@ section! {
 
 impl ActorsConfig {
     /// The upper bound of `max`.
-    pub const GREATEST_MAX: u32 = 1_024;
-
-    /// The upper bound of `count`.
-    pub const GREATEST_COUNT: u32 = MAX_LOCAL_ACTORS as u32;
+    pub const GREATEST_MAX: u32 = 256;
 
     /// Checks every number.
     ///
@@ -37,6 +33,6 @@ impl ActorsConfig {
     /// For the first invalid number.
     pub fn check(&self) -> Result<(), OutOfRange> {
         self.check_bounds("actors")?;
-        from(1, self.max.min(Self::GREATEST_COUNT)).check("actors.count", &self.count)
+        from(1, self.max).check("actors.count", &self.count)
     }
 }

@@ -205,7 +205,7 @@ fn did_you_mean(key: &str, table: &Table) -> String {
         .and_then(Value::as_str)
         .is_some_and(|name| name.starts_with(GYMNASIUM));
     let default = is_known.then(|| AlgorithmConfig::default().name());
-    let algorithm = AlgorithmConfig::named_in(table).or(default);
+    let algorithm = AlgorithmConfig::named_in(table).map(|named| named.name).or(default);
     let is_likely = |name: &&str| table.contains_key(*name) || algorithm == Some(*name);
     let mut likely: Vec<&str> = all.iter().copied().filter(is_likely).collect();
     if likely.is_empty() {

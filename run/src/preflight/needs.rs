@@ -2,7 +2,7 @@
 //! to.
 
 use shoal_common::channel::{Listener, control, environment, policy, reports, transitions};
-use shoal_common::config::{ActorsConfig, Config};
+use shoal_common::config::Config;
 use shoal_common::report::{EpisodeReport, EvaluatedPeriod, EvaluationReport, Heartbeat, LearnerReport};
 use shoal_common::run_dir::RunDir;
 use shoal_learner::process::{self, SizeError};
@@ -22,25 +22,23 @@ const FILES_PER_ACTOR: u64 = 22;
 /// Bytes of shared memory that the run may come to use with `actors.max` actors.
 pub(super) fn shared_memory(config: &Config) -> u64 {
     let max = config.actors.max as usize;
-    let local = max.min(ActorsConfig::GREATEST_COUNT as usize);
-    let spec = &config.spec;
+    let (spec, actors) = (&config.spec, max as u64);
     let parameters = parameters(config);
-    let of_a_server = environment::reserved(spec, config.actors.envs as usize);
-    let of_an_actor = transitions::reserved(&config.chunk_layout(), config.actors.window);
+    let of_an_actor = environment::reserved(spec, config.actors.envs as usize)
+        + transitions::reserved(&config.chunk_layout(), config.actors.window);
     // The actors and the evaluator, an environment server for each, and the learner.
-    let roles = 2 * (local + 1) + 1;
-    max as u64 * of_an_actor
-        + local as u64 * of_a_server
+    let roles = 2 * (max + 1) + 1;
+    actors * of_an_actor
         + environment::reserved(spec, config.evaluation_envs() as usize)
         + control::reserved(max)
         + policy::reserved(max, parameters)
         + reports::reserved::<Heartbeat>(max, roles)
-        + reports::reserved::<EpisodeReport>(max, local)
+        + reports::reserved::<EpisodeReport>(max, max)
         + reports::reserved::<EvaluationReport>(max, 1)
         + reports::reserved::<EvaluatedPeriod>(max, 1)
         + reports::reserved::<LearnerReport>(max, 1)
-        // One for each process, one for each actor of another host, and one for the launcher.
-        + (roles + max - local + 1) as u64 * Listener::reserved(max)
+        // One for each process, and one for the launcher.
+        + (roles as u64 + 1) * Listener::reserved(max)
 }
 
 /// Bytes of disk that the run's directory may come to need beyond what it holds now.

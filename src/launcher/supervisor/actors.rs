@@ -1,7 +1,6 @@
 //! The actors of this host: which are wanted, and their services, start and retirement.
 
 use shoal_common::channel::Domain;
-use shoal_common::config::ActorsConfig;
 use shoal_common::role::{Role, RoleInstance};
 use shoal_run::records::recorder::{Incident, IncidentKind};
 
@@ -31,8 +30,7 @@ impl Supervisor {
 
     /// The most actors that this host may have now.
     pub(crate) fn max_actors_now(&self) -> u32 {
-        let all = self.actor_count() + self.free_actors().count() as u32;
-        all.min(ActorsConfig::GREATEST_COUNT)
+        self.actor_count() + self.free_actors().count() as u32
     }
 
     /// Indices that neither this host nor another has.

@@ -4,7 +4,6 @@ use std::collections::HashSet;
 
 use shoal_common::channel::Domain;
 use shoal_common::channel::control::{ControlResponse, HostLease, HostRequest, HostStatus};
-use shoal_common::config::ActorsConfig;
 use shoal_common::role::Role;
 
 use super::Supervisor;
@@ -25,10 +24,6 @@ impl Supervisor {
         } = request;
         if let Some(lease) = self.joined_hosts.lease(host) {
             return Ok(ControlResponse::Admitted(lease.clone()));
-        }
-        if requested > ActorsConfig::GREATEST_COUNT {
-            let why = format!("a host can have at most {} actors", ActorsConfig::GREATEST_COUNT);
-            return Ok(ControlResponse::Refused(why));
         }
         let free: Vec<u32> = match self.lockstep_actors {
             // Processes for these actors end here; those of the other host continue from the same snapshots.

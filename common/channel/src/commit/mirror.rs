@@ -26,15 +26,14 @@ impl CommitMirror {
     pub fn open(path: &Path, layout: &ReplayLayout) -> io::Result<Self> {
         let impossible = || io::Error::new(io::ErrorKind::InvalidInput, "the layout of the replay is impossible");
         let offsets = layout.offsets().ok_or_else(impossible)?;
-        let file = OpenOptions::new()
-            .read(true)
-            .write(true)
-            .create(true)
-            .truncate(false)
-            .mode(0o600)
-            .open(path)?;
-        let whole = file.metadata()?.len() == offsets.end as u64;
-        if whole {
+        let earlier = match OpenOptions::new().read(true).write(true).open(path) {
+            Ok(file) => Some(file),
+            Err(cause) if cause.kind() == io::ErrorKind::NotFound => None,
+            Err(cause) => return Err(cause),
+        };
+        if let Some(file) = earlier
+            && file.metadata()?.len() == offsets.end as u64
+        {
             let words = WritableWords::map(&file, offsets.header)?;
             let same = ReplayLayout::read(words.read()).is_ok_and(|found| found == *layout);
             let slot = offsets.slots[(words.read().load(offsets.published) % 2) as usize];
@@ -102,7 +101,7 @@ impl CommitMirror {
 mod tests {
     use shoal_base::transition::RowLayout;
 
-    use super::super::reader::CommitReader;
+    use super::super::reader::{CommitReader, OpenError};
     use super::super::record::ChunkId;
     use super::*;
 
@@ -142,6 +141,22 @@ mod tests {
         use std::os::unix::fs::MetadataExt;
         let taken = std::fs::metadata(&path).unwrap().blocks() * 512;
         assert!(taken < 1 << 20, "the file takes {taken} bytes");
+    }
+
+    #[test]
+    fn nobody_sees_half_a_file() {
+        for _ in 0..200 {
+            let directory = tempfile::tempdir().unwrap();
+            let path = directory.path().join("replay.bin");
+            std::thread::scope(|scope| {
+                scope.spawn(|| {
+                    while let Err(error) = CommitReader::open(&path) {
+                        assert!(matches!(error, OpenError::NotYet { .. }), "{error}");
+                    }
+                });
+                CommitMirror::open(&path, &layout()).unwrap();
+            });
+        }
     }
 
     #[test]

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use shoal_base::role::Role;
 
 /// The format version of the messages. Increase it with every change: launcher and client may be of different builds.
-pub(super) const VERSION: u32 = 4;
+pub(super) const VERSION: u32 = 5;
 
 /// A request to a launcher.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -32,6 +32,8 @@ pub enum ControlRequest {
         /// Its incarnation.
         incarnation: u64,
     },
+    /// From a relay: the actors of this host belong to others now, so the host must join again.
+    JoinAgain,
 }
 
 /// What another host asks for.
