@@ -26,8 +26,8 @@ pub fn read<T: DeserializeOwned>(name: &str, section: Value) -> Result<T, toml::
         let only = Table::from_iter([(key.clone(), value.clone())]);
         let error = T::deserialize(only).err()?;
         let reason = in_user_words(error.message());
-        // Of a list, one item is at fault.
-        let each = value.is_array() && reason.starts_with("must be ");
+        // In a list, an item is of another type.
+        let each = value.is_array() && reason != error.message();
         let each = if each { "each " } else { "" };
         Some(Error::custom(refusal(
             format!("{name}.{key}"),

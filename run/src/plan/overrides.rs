@@ -323,7 +323,7 @@ mod tests {
             (
                 "pendulum",
                 "warmup",
-                format!("--set warmup: {form}; did you mean replay.warmup?"),
+                format!("--set warmup: {form}; did you mean exploration.warmup or replay.warmup?"),
             ),
             ("pendulum", "nothing=1", format!("--set nothing=1: {form}")),
             ("pendulum", ".=1", format!("--set .=1: {form}")),
