@@ -240,8 +240,8 @@ fn a_stopped_run_resumes_where_it_stopped() {
     assert!(after["episodes"].as_u64() > before["episodes"].as_u64());
 
     for (arguments, part) in [
-        (&["resume", "run"][..], "give it more with --steps"),
-        (&["resume", "run", "--steps", "10"], "give it more with --steps"),
+        (&["resume", "run"][..], "raise the limit with --steps"),
+        (&["resume", "run", "--steps", "10"], "raise the limit with --steps"),
         (&["resume", "nowhere"], "nowhere is not a run directory"),
         (&["status", "nowhere"], "nowhere is not a run directory"),
         (&["scale", "run", "--actors", "2"], "nothing runs"),

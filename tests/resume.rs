@@ -380,7 +380,7 @@ fn is_interrupted_in_time_and_finished(stopped: bool) -> bool {
 
     assert_eq!(status_at_rest()["finished"], true);
     let message = error_line(&place.output(&["resume", "run"]));
-    assert!(message.contains("1500 of 1500 steps already"), "{message}");
+    assert!(message.contains("already taken 1500 of 1500 steps"), "{message}");
     true
 }
 
