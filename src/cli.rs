@@ -25,7 +25,7 @@ use crate::command::top::TopArgs;
 use crate::command::track::TrackArgs;
 use crate::command::train::TrainArgs;
 
-/// Shared-memory off-policy actor-learner: distributed reinforcement learning on one machine.
+/// Reinforcement learning with many processes and shared memory.
 #[derive(Debug, Parser)]
 #[command(name = "shoal", version, propagate_version = true)]
 pub(crate) struct Cli {
@@ -41,7 +41,7 @@ pub(crate) enum Command {
     Resume(ResumeArgs),
     /// Work for a run of another host: start actors and environment servers here.
     Join(JoinArgs),
-    /// Show the status of a run: its progress, every process with its rate and restarts, and who waits for whom.
+    /// Show the status of a run: its progress, every process with its rate and restarts, and which role waits for what.
     Status(StatusArgs),
     /// Change the number of actors during training.
     Scale(ScaleArgs),

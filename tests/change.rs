@@ -178,7 +178,7 @@ fn what_cannot_change_is_refused_by_the_name_of_its_key() {
         assert_eq!(files(run), before, "{set}: nothing has changed");
     }
     let (message, _) = refused(&place, &["--set", "ddpg.tau=0.5"]);
-    assert!(message.contains("300 of 300 steps already"), "{message}");
+    assert!(message.contains("already taken 300 of 300 steps"), "{message}");
     assert_eq!(
         files(run),
         before,
@@ -391,7 +391,7 @@ fn the_best_policy_is_evaluated_with_the_new_number_of_episodes() {
     place.train(&["pendulum", "--steps", "300", "--run", "run"]);
     let (_, said) = resume(&place, &["--steps", "400", "--set", "evaluation.episodes=4"]);
     assert!(
-        said.contains("the best policy is evaluated anew, for it has another number of episodes now"),
+        said.contains("the best policy is re-evaluated, because the number of episodes has changed"),
         "{said}"
     );
     // A finished run keeps its last policy as the best one with the mean of its final evaluation.
@@ -402,7 +402,7 @@ fn the_best_policy_is_evaluated_with_the_new_number_of_episodes() {
     best.write(&run.best_policy()).unwrap();
     let (_, said) = resume(&place, &["--steps", "500"]);
     assert!(
-        said.contains("evaluated anew, for the final evaluation had another number of episodes"),
+        said.contains("re-evaluated, because the final evaluation had another number of episodes"),
         "{said}"
     );
 }

@@ -240,8 +240,8 @@ fn a_stopped_run_resumes_where_it_stopped() {
     assert!(after["episodes"].as_u64() > before["episodes"].as_u64());
 
     for (arguments, part) in [
-        (&["resume", "run"][..], "give it more with --steps"),
-        (&["resume", "run", "--steps", "10"], "give it more with --steps"),
+        (&["resume", "run"][..], "raise the limit with --steps"),
+        (&["resume", "run", "--steps", "10"], "raise the limit with --steps"),
         (&["resume", "nowhere"], "nowhere is not a run directory"),
         (&["status", "nowhere"], "nowhere is not a run directory"),
         (&["scale", "run", "--actors", "2"], "nothing runs"),
@@ -371,8 +371,26 @@ fn a_detached_suite_is_trained_to_its_end() {
     ];
     let output = place.output(&[&begin[..], &support::QUICK].concat());
     assert!(output.status.success(), "{}", stderr(&output));
-    until("both runs are finished", || {
-        let listed = place.output(&["list", "suite", "--json"]);
-        String::from_utf8_lossy(&listed.stdout).matches("\"finished\"").count() == 2
+    let are_finished = |steps: u64| {
+        let listed = json(&place.output(&["list", "suite", "--json"]));
+        let runs = listed["runs"].as_array().unwrap().clone();
+        let is_finished = |run: &Value| run["state"] == "finished" && run["steps"] == steps;
+        runs.len() == 2 && runs.iter().all(is_finished)
+    };
+    until("both runs are finished", || are_finished(200));
+
+    // The process that has trained them may work on the suite for a moment longer.
+    until("the suite is resumed", || {
+        let resumed = place.output(&["resume", "suite", "--steps", "400", "--detach"]);
+        resumed.status.success()
+    });
+    until("both runs are finished again", || are_finished(400));
+    for run in ["suite/seed=1", "suite/seed=2"] {
+        let changes = std::fs::read_to_string(place.path().join(run).join("changes.csv")).unwrap();
+        assert_eq!(changes.matches("run.steps,200,400").count(), 1, "{changes}");
+    }
+    until("a change that cannot be made is refused in the terminal", || {
+        let refused = place.output(&["resume", "suite", "--set", "run.seed=3", "--detach"]);
+        refused.status.code() == Some(2) && stderr(&refused).contains("the runs of this suite differ in it")
     });
 }

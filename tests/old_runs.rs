@@ -209,7 +209,7 @@ fn its_best_policy_is_not_evaluated_anew_again(place: &Workplace) {
         .unwrap();
     let output = place.output(&["resume", "run", "--json", "--steps", &(steps + 500).to_string()]);
     let said = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert!(output.status.success() && !said.contains("evaluated anew"), "{said}");
+    assert!(output.status.success() && !said.contains("re-evaluated"), "{said}");
 }
 
 /// Resumes a stopped run to its planned end, or a finished one to a later end. It keeps what it learned and collected.
@@ -233,7 +233,7 @@ fn is_resumed(place: &Workplace, ended: Ended) {
     let config = Config::load(&run.join("config.toml")).unwrap();
     let is_served = config.environment.name.starts_with("gym:");
     let said = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert_eq!(said.contains("the best policy is evaluated anew"), is_served, "{said}");
+    assert_eq!(said.contains("the best policy is re-evaluated"), is_served, "{said}");
     assert_eq!(run.join("server.json").exists(), is_served);
     let log = std::fs::read_to_string(run.join("shoal.log")).unwrap();
     let message = String::from_utf8_lossy(&output.stderr);

@@ -238,7 +238,7 @@ fn files_that_do_not_belong_to_the_run_are_refused_and_left_unchanged() {
     file.write_all_at(&99_u64.to_le_bytes(), 8).unwrap();
     let message = error_line(&place.output(&["resume", "run"]));
     assert!(
-        message.contains("replay.bin") && message.contains("version is 99"),
+        message.contains("replay.bin") && message.contains("has format 99"),
         "{message}"
     );
     file.write_all_at(&replay[8..16], 8).unwrap();
@@ -380,7 +380,7 @@ fn is_interrupted_in_time_and_finished(stopped: bool) -> bool {
 
     assert_eq!(status_at_rest()["finished"], true);
     let message = error_line(&place.output(&["resume", "run"]));
-    assert!(message.contains("1500 of 1500 steps already"), "{message}");
+    assert!(message.contains("already taken 1500 of 1500 steps"), "{message}");
     true
 }
 

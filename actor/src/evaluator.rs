@@ -64,7 +64,8 @@ fn challenge<E>(
     if !candidate.mean.is_finite() {
         return Ok((best, false));
     }
-    // A previous evaluator may have died after it wrote this policy and before it reported that.
+    // A previous evaluator may have died after it wrote this policy and before it reported that. The policy is then
+    // the best one already, and is reported now.
     let Some(mut best) = best.filter(|best| !best.is_same_policy(&candidate)) else {
         return Ok((Some(candidate), true));
     };

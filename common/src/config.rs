@@ -39,7 +39,7 @@ pub use crate::algorithms::*;
 /// The complete configuration of a run.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Config {
-    /// Id and length of the run.
+    /// The run itself: id, seed, mode, length, origin, and patience with its processes.
     pub run: RunConfig,
     /// The environment.
     pub environment: EnvironmentConfig,
@@ -57,7 +57,7 @@ pub struct Config {
     pub learner: LearnerConfig,
     /// The replay, and the ratio of updates to environment steps.
     pub replay: ReplayConfig,
-    /// How often the policy is evaluated.
+    /// How often, how and on how many episodes policies are evaluated.
     pub evaluation: EvaluationConfig,
     /// How often the learner's state is saved.
     pub checkpoint: CheckpointConfig,

@@ -30,10 +30,10 @@ pub enum RunDirError {
     /// Another launcher is running the run.
     #[error("the run in {0} is already running: a launcher holds its lock; end that one first")]
     Busy(PathBuf),
-    /// Somebody has removed or renamed it.
+    /// Somebody has removed or renamed it, or deleted its `config.toml`.
     #[error(
-        "the run directory {0} was removed or renamed while the run was running; the run has ended, and what it had not \
-         written is lost"
+        "the run directory {0} was removed or renamed, or its config.toml was deleted, while the run was running; the \
+         run has ended, and what it had not written is lost"
     )]
     Gone(PathBuf),
     /// The system refused.
@@ -123,7 +123,7 @@ impl RunLock {
     /// Checks that the run is still where it was when it was locked.
     ///
     /// # Errors
-    /// When its directory was removed or renamed, even if there is another one now.
+    /// When its directory was removed or renamed, even if there is another one now, or its `config.toml` was deleted.
     pub fn check(&self, run: &RunDir) -> Result<(), RunDirError> {
         let number = |metadata: io::Result<std::fs::Metadata>| metadata.map(|it| (it.dev(), it.ino())).ok();
         let is_same = || number(self.directory.metadata()) == number(std::fs::metadata(&run.path));
@@ -384,7 +384,8 @@ impl RunDir {
         self.path.join("hosts.csv")
     }
 
-    /// `incidents.csv`: starts, ends and failures of processes.
+    /// `incidents.csv`: processes that were killed, failed, stalled, started again, given up or retired, invalid
+    /// answers of environments, and when the run was scaled or resumed.
     pub fn incidents(&self) -> PathBuf {
         self.path.join("incidents.csv")
     }
@@ -399,7 +400,7 @@ impl RunDir {
         self.path.join("incarnations")
     }
 
-    /// `origin.json`: the run whose networks this one began with.
+    /// `origin.json`: the run or the dataset that this one began with.
     pub fn origin(&self) -> PathBuf {
         self.path.join("origin.json")
     }

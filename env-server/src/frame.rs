@@ -137,7 +137,9 @@ fn parse(bytes: &[u8]) -> io::Result<Written> {
     let header: serde_json::Value = serde_json::from_slice(header)?;
     if header["format"] != FORMAT {
         let found = &header["format"];
-        return Err(wrong(&format!("it has format {found}, this program reads {FORMAT}")));
+        return Err(wrong(&format!(
+            "it has format {found}; this program reads format {FORMAT}"
+        )));
     }
     let Header { kind, fps, .. } = serde_json::from_value(header)?;
     let frame = match kind {

@@ -62,6 +62,7 @@ pub fn serve(
             }
             Some(RequestKind::Restore) => {
                 let words = request.words();
+                heartbeat.begin_work();
                 let refused = request
                     .respond(|_, blocks| environments.restore(&words, blocks.observations))?
                     .err();
@@ -76,5 +77,81 @@ pub fn serve(
         if let Some(error) = refused {
             tracing::error!("a request was refused: {error}");
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use shoal_base::report::{Heartbeat, PROVEN_STEPS};
+    use shoal_base::role::{Role, RoleInstance};
+    use shoal_channel::environment::{EnvironmentClient, StepResult};
+    use shoal_channel::reports::Reports;
+    use shoal_channel::{Domain, EventName, Listener, Services};
+
+    use super::*;
+
+    const ENVS: u32 = 250;
+
+    fn pendulums() -> VectorEnvironment {
+        VectorEnvironment::new("pendulum", &toml::Table::new(), ENVS, 1, 0, 0).unwrap()
+    }
+
+    /// Serves in a thread of its own.
+    fn start(run_id: &str, client: EventName, stop: &Stop) -> std::thread::JoinHandle<()> {
+        let (run_id, stop) = (run_id.to_owned(), stop.clone());
+        std::thread::spawn(move || {
+            let domain = Domain::join(&run_id, 1).unwrap();
+            let mut environments = pendulums();
+            let port = EnvironmentPort::open(&domain, 0, environments.spec().clone(), ENVS as usize, client).unwrap();
+            let instance = RoleInstance {
+                role: Role::EnvServer,
+                index: 0,
+                incarnation: 0,
+            };
+            let heartbeat = HeartbeatSender::new(&domain, instance).unwrap();
+            serve(&mut environments, &port, 1, heartbeat, &stop).unwrap();
+            drop(port);
+            domain.leave().unwrap();
+        })
+    }
+
+    #[test]
+    fn heartbeats_come_at_once_before_a_restore_at_the_first_step_and_when_the_server_is_able_to_work() {
+        let run_id = format!("{:x}", std::process::id());
+        let domain = Domain::join(&run_id, 1).unwrap();
+        let mut services = Services::new(&domain).unwrap();
+        services.create_common(&domain).unwrap();
+        services.create_environment(&domain, 0).unwrap();
+        let (own, stop) = (EventName(Role::Evaluator, 0), Stop::default());
+        let listener = Listener::bind(&domain, own).unwrap();
+        let heartbeats = Reports::<Heartbeat>::open(&domain).unwrap();
+        let server = start(&run_id, own, &stop);
+        let mut vector = pendulums();
+        let client = EnvironmentClient::open(&domain, 0, vector.spec(), ENVS as usize, stop.clone()).unwrap();
+
+        let mut words = vec![0; vector.snapshot_words()];
+        let mut observations = vec![0.0; ENVS as usize * vector.spec().observation.width()];
+        vector.reset(Reset::Next, &mut observations).unwrap();
+        vector.snapshot(&mut words).unwrap();
+        client.restore(&listener, &words, || ()).unwrap();
+        let working = || -> Vec<u64> {
+            std::iter::from_fn(|| heartbeats.receive().unwrap())
+                .filter(|heartbeat| heartbeat.activity() == Some(Activity::Working))
+                .map(|heartbeat| heartbeat.steps)
+                .collect()
+        };
+        let before_the_first_step = working();
+        for _ in 0..PROVEN_STEPS / u64::from(ENVS) {
+            let taken = client.step(&listener, &vec![0.0; ENVS as usize], || ()).unwrap();
+            assert!(matches!(taken, StepResult::Taken(_)));
+        }
+        stop.request();
+        server.join().unwrap();
+        let of_steps = working();
+        drop((client, heartbeats, listener, services));
+        domain.leave().unwrap();
+        assert_eq!(before_the_first_step, [0]);
+        assert!(of_steps.contains(&ENVS.into()), "{of_steps:?}");
+        assert!(of_steps.contains(&PROVEN_STEPS), "{of_steps:?}");
     }
 }

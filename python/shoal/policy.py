@@ -170,5 +170,5 @@ def unseal(path: Path) -> bytes:
         raise ShoalError(f"{path} is damaged or cut short (checksum)")
     version = int.from_bytes(data[8:12], "little")
     if version != VERSION:
-        raise ShoalError(f"{path} has format version {version}, this package reads version {VERSION}")
+        raise ShoalError(f"{path} has format {version}; this package reads format {VERSION}")
     return data[12:-4]

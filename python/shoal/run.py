@@ -70,8 +70,8 @@ class Run:
         return self.table("learner")
 
     def table(self, name: str) -> np.ndarray:
-        """``<name>.csv`` of the run as a structured array: ``evaluations``, ``episodes``, ``learner``, ``incidents`` or
-        ``changes``."""
+        """``<name>.csv`` of the run as a structured array: ``evaluations``, ``episodes``, ``learner``, ``incidents``,
+        ``changes`` or ``hosts``."""
         return tables.read(self.path / f"{name}.csv")
 
     def frame(self, name: str = "evaluations") -> pandas.DataFrame:
@@ -114,7 +114,7 @@ class Run:
         run began (``with_replay``, demonstrations) are left out. An episode whose beginning was overwritten begins
         later. One that was cut ends neither terminated nor truncated.
 
-        This needs minari and h5py. Raises :class:`ShoalError` for a replay that has no steps of the environment
+        This needs minari, h5py and pillow. Raises :class:`ShoalError` for a replay that has no steps of the environment
         (``replay.n_step``, a γ of 0), and where episodes of several actors cannot be told apart.
         """
         from . import datasets

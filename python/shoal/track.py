@@ -32,8 +32,8 @@ NOT_METRICS = {"wall_seconds", "env_steps", "actor", "environment", "best", "ter
 #: Lines that are sent together.
 TOGETHER = 500
 
-#: Files of a run that a tracker keeps.
-ARTIFACTS = ("config.toml", "config/used.toml", "learning-curve.svg", "swing-up.svg", "changes.csv", "report.html")
+#: Files of a run that a tracker keeps, beside its figures.
+ARTIFACTS = ("config.toml", "config/used.toml", "changes.csv", "report.html")
 
 #: Seconds between two looks at a run.
 PAUSE = 2.0
@@ -223,7 +223,7 @@ class Copy:
                 self._tracker.result({key: value for key, value in values.items() if value is not None})
             self._result = result
             self._save()
-        files = [self.run.path / name for name in ARTIFACTS]
+        files = [self.run.path / name for name in ARTIFACTS] + sorted(self.run.path.glob("*.svg"))
         self._tracker.files(self.run, [path for path in files if path.is_file()])
         outcome = self.run.path / "outcome.json"
         finished = outcome.is_file() and json.loads(outcome.read_text(encoding="utf-8"))["state"] == "finished"

@@ -62,7 +62,7 @@ class Transitions:
             raise ShoalError(f"{path} is not a replay file")
         identity = [int(word) for word in self._words[:10]]
         if identity[1] != VERSION:
-            raise ShoalError(f"{path} has format version {identity[1]}, this package reads version {VERSION}")
+            raise ShoalError(f"{path} has format {identity[1]}; this package reads format {VERSION}")
         if zlib.crc32(self._words[:9].tobytes()) != identity[9]:
             raise ShoalError(f"the header of {path} is damaged (checksum)")
         self._observation, self._action, width, self.ring, actors, snapshot = identity[2:8]

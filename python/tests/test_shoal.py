@@ -79,7 +79,7 @@ class Files(unittest.TestCase):
         wrong = {
             "not a policy file": b"hello, world" * 9,
             "damaged or cut short": whole[:-1],
-            "format version 2": policy_file([1.0] * 5, version=2),
+            "has format 2": policy_file([1.0] * 5, version=2),
             "its network has 5": policy_file([1.0] * 4),
         }
         for message, data in wrong.items():

@@ -76,11 +76,15 @@ class Track(unittest.TestCase):
         policy = {"policy": "best", "return_mean": -2.5, "return_std": None, "episodes": 100}
         (run / "final-evaluation.json").write_text(json.dumps({"policies": [policy]}))
         (run / "outcome.json").write_text(json.dumps({"state": "finished"}))
+        figures = ["episode.svg", "learning-curve.svg", "test-runs-far.svg", "trajectories.svg"]
+        for figure in figures:
+            (run / figure).write_text("<svg/>")
         track.track(run, "recorder")
         track.track(run, "recorder")
         self.assertEqual(told["metrics"], [*first, (1.5, 20, {"evaluation/return_mean": -3.0})])
         self.assertEqual(told["results"], [{"final/best_return_mean": -2.5, "final/best_episodes": 100}])
         self.assertEqual(told["states"][2:], ["finished"] * 2)
+        self.assertEqual(told["files"], ["config.toml", *figures])
 
     def test_a_suite_is_followed_until_nobody_works_on_it(self) -> None:
         suite = self.place / "suite"

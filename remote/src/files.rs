@@ -116,7 +116,7 @@ pub enum FileError {
     #[error("{0} is damaged: {1}")]
     Damaged(String, String),
     /// Another version wrote it.
-    #[error("{0} is of form {1}, this program's is {2}")]
+    #[error("{0} has format {1}; this program reads format {2}")]
     Format(String, u32, u32),
 }
 
@@ -243,7 +243,7 @@ mod tests {
             JoinFile::read(run.path())
                 .unwrap_err()
                 .to_string()
-                .contains("is of form 2")
+                .contains("has format 2")
         );
         std::fs::write(
             &path,

@@ -112,7 +112,9 @@ impl ResultsFile {
         let head = lines.next().unwrap_or_default();
         let Versioned { format } = serde_json::from_str(head).with_context(damaged)?;
         if format != FORMAT {
-            bail!("{here} has format {format}, this program reads {FORMAT}: choose another directory with --out");
+            bail!(
+                "{here} has format {format}; this program reads format {FORMAT}: choose another directory with --out"
+            );
         }
         let head: Head = serde_json::from_str(head).with_context(damaged)?;
         if head.experiment != self.head.experiment {

@@ -29,7 +29,7 @@ const FIGURES_PATIENCE: Duration = Duration::from_secs(60);
 pub struct RunClient {
     /// The run's directory.
     pub run: RunDir,
-    /// The contents of its `config.toml`.
+    /// The configuration that it was last used with, `config/used.toml`.
     pub config: Config,
 }
 
@@ -124,7 +124,7 @@ impl RunClient {
 
     /// The run's status; `None` if it is not running.
     pub fn status(&self) -> anyhow::Result<Option<RunStatus>> {
-        // A launcher that leaves its start may remove the shared memory in which it was asked.
+        // A launcher that fails while it starts removes its shared memory, and this request with it.
         let starts = self.reason_for_no_roles()? == Some(STARTING);
         let answer = match self.ask(ControlRequest::Status, PATIENCE) {
             Err(_) if starts => Some(ControlResponse::Status(self.saved(STARTING)?)),

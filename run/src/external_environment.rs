@@ -35,7 +35,7 @@ use shoal_env_server::frame::{self, Written};
 
 use crate::child_process::{ChildProcess, wait_for_any};
 use crate::external_environment::server_location::ServerSurroundings;
-use crate::signals::Interrupt;
+use crate::signals::{Interrupt, describe as describe_signal};
 
 /// The prefix of the names of Gymnasium environments.
 pub const GYMNASIUM: &str = "gym:";
@@ -441,7 +441,7 @@ impl ExternalEnvironment {
 
     fn unanswered<T>(&self, asked: Instant) -> anyhow::Result<T> {
         if let Some(signal) = self.interrupt.signal() {
-            bail!("ended by signal {signal}");
+            bail!("ended by {}", describe_signal(signal));
         }
         if asked.elapsed() >= self.limit {
             bail!(
@@ -495,13 +495,16 @@ fn open(
     has_answered.request();
     let (spec, environments) = match checked(described, &mut program).map_err(with_advice)? {
         Some(described) => described,
-        None if interrupt.signal().is_some() => bail!("ended by a signal"),
-        None => bail!(
-            "{} did not describe itself within {} s; if it takes longer to start: --set environment.start_seconds={}",
-            environment.name,
-            environment.start_seconds,
-            environment.start_seconds.saturating_mul(5)
-        ),
+        None => match interrupt.signal() {
+            Some(signal) => bail!("ended by {}", describe_signal(signal)),
+            None => bail!(
+                "{} did not describe itself within {} s; if it takes longer to start: --set \
+                 environment.start_seconds={}",
+                environment.name,
+                environment.start_seconds,
+                environment.start_seconds.saturating_mul(5)
+            ),
+        },
     };
     let opened = EnvironmentClient::open(domain, launch.index, &spec, environments, stop.clone());
     let client = checked(opened.map_err(Exit::from), &mut program)?.context("the environment server has ended")?;

@@ -1,4 +1,4 @@
-//! Several trainings, each a child process, some of them at a time.
+//! Runs several trainings as child processes, a limited number at a time.
 
 use std::collections::VecDeque;
 use std::process::Command;

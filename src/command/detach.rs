@@ -46,7 +46,7 @@ struct Printed<'a> {
 /// # Errors
 /// When the run is running already, or does not start in time.
 pub(crate) fn resume_run(path: &Path, arguments: &[OsString], output: &OutputMode) -> anyhow::Result<ExitCode> {
-    // Otherwise a run that is running already would be taken for the one that is started here.
+    // A run that is running already is refused here. Later it would look like the one that is started here.
     drop(RunDir::open(path)?.lock()?);
     let of_environment = RunClient::open(path)?.config.environment.start_seconds;
     let patience = PATIENCE + Duration::from_secs(of_environment.into());
@@ -117,7 +117,7 @@ fn resume(
             write_messages(&mut messages)?;
             end(child);
             bail!(
-                "{here} did not start within {} s, and is being ended; its log is shoal.log there",
+                "{here} did not start within {} s and is being stopped; see shoal.log in that directory",
                 patience.as_secs()
             );
         }

@@ -13,7 +13,7 @@ use shoal_env_server::environment::Goal;
 use shoal_run::description;
 use shoal_run::evaluation::{EvaluationSummary, SavedPolicy, evaluate_policy};
 use shoal_run::numbers::{count, from_one};
-use shoal_run::signals::{Signals, exit_code};
+use shoal_run::signals::{Signals, describe, exit_code};
 
 #[derive(Args, Clone, Debug)]
 pub(crate) struct EvalArgs {
@@ -46,7 +46,8 @@ pub(crate) fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
     if let (Err(_), Some(signal)) = (&evaluated, interrupt.signal()) {
         writeln!(
             std::io::stderr(),
-            "the evaluation was ended by signal {signal}; nothing of it is kept"
+            "the evaluation was ended by {}; nothing of it is kept",
+            describe(signal)
         )?;
         return Ok(exit_code(signal));
     }

@@ -16,7 +16,7 @@ use shoal_run::numbers::count;
 use shoal_run::origin::Origin;
 use shoal_run::plan::{RequestedChanges, Revision, warning};
 use shoal_run::records::recorder::{ChangeRecord, Moment};
-use shoal_run::signals::{Signals, exit_code};
+use shoal_run::signals::{Signals, describe, exit_code};
 use shoal_run::status;
 use shoal_run::suite::{Suite, configuration};
 use shoal_run::usage::UsageError;
@@ -112,12 +112,12 @@ pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
     // A run with all its steps may still lack updates or the last evaluation.
     if saved.finished || (steps, episodes) != (used.run.steps, used.run.episodes) {
         if steps_taken >= steps {
-            bail!(
-                "{here} has taken {steps_taken} of {steps} steps already, and nothing has changed: give it more with --steps"
-            );
+            bail!("{here} has already taken {steps_taken} of {steps} steps; raise the limit with --steps");
         }
         if let Some(episodes) = episodes.filter(|episodes| episodes_ended >= *episodes) {
-            bail!("{here} has finished {episodes_ended} of {episodes} episodes already: give it more with --episodes");
+            bail!(
+                "{here} has already finished {episodes_ended} of {episodes} episodes; raise the limit with --episodes"
+            );
         }
     }
     // Checked here, so that a missing program is one error of this command and not repeated failures of the roles.
@@ -153,13 +153,14 @@ fn resume_suite(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
     if args.listen.listen.is_some() {
         return Err(UsageError("--listen: other hosts join a single run, and this is a suite".into()).into());
     }
+    if args.output.detach {
+        // The process that it starts makes the changes.
+        return detach::resume_suite(&args.run, &args.for_another_process(), &args.output);
+    }
     let number = |key: &str, value: Option<u64>| value.map(|value| format!("{key}={value}"));
     let numbers = [number("run.steps", args.steps), number("run.episodes", args.episodes)];
     let changes: Vec<String> = args.set.iter().cloned().chain(numbers.into_iter().flatten()).collect();
     configuration::change(&args.run, &changes)?;
-    if args.output.detach {
-        return detach::resume_suite(&args.run, &args.for_another_process(), &args.output);
-    }
     let options = suite::SuiteOptions {
         jobs: args.jobs,
         output: &args.output,
@@ -182,7 +183,7 @@ fn reevaluate_best_policy(run: &RunDir, revision: &Revision) -> anyhow::Result<O
     let (evaluated, why) = if revision.changes("evaluation.episodes") {
         (
             reevaluate_best(run, config, &interrupt),
-            "it has another number of episodes now",
+            "the number of episodes has changed",
         )
     } else if has_other_episodes {
         (
@@ -199,7 +200,8 @@ fn reevaluate_best_policy(run: &RunDir, revision: &Revision) -> anyhow::Result<O
         (Err(_), Some(signal)) => {
             let _ = writeln!(
                 std::io::stderr(),
-                "ended by signal {signal}; nothing has changed in {here}"
+                "ended by {}; nothing has changed in {here}",
+                describe(signal)
             );
             Ok(Some(signal))
         }
@@ -208,7 +210,7 @@ fn reevaluate_best_policy(run: &RunDir, revision: &Revision) -> anyhow::Result<O
             if let Some(ReevaluatedPolicy { before, now }) = evaluated {
                 let _ = writeln!(
                     std::io::stderr(),
-                    "the best policy is evaluated anew, for {why}: {:.2} instead of {before:.2}",
+                    "the best policy is re-evaluated, because {why}: {:.2} instead of {before:.2}",
                     now.return_mean
                 );
             }

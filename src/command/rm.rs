@@ -53,7 +53,12 @@ pub(crate) fn run(args: &RmArgs) -> anyhow::Result<ExitCode> {
             runs.push(prepare_removal(run, args.replay)?);
         }
     }
-    if !args.yes && !confirmed(&runs, args.replay)? {
+    if runs.is_empty() && args.replay {
+        let named: Vec<_> = args.runs.iter().map(|path| path.display().to_string()).collect();
+        bail!("{} has no runs, so there is no replay to remove", named.join(", "));
+    }
+    let suites_to_go = if args.replay { &[][..] } else { &suites[..] };
+    if !args.yes && !confirmed(&runs, suites_to_go, args.replay)? {
         writeln!(std::io::stderr(), "nothing is removed")?;
         return Ok(ExitCode::FAILURE);
     }
@@ -68,10 +73,10 @@ pub(crate) fn run(args: &RmArgs) -> anyhow::Result<ExitCode> {
             writeln!(std::io::stdout(), "removed {here} ({})", mebibytes(*size))?;
         }
     }
-    if !args.replay {
-        for (path, _lock) in &suites {
-            suite::remove(path).with_context(|| format!("cannot remove the suite {}", path.display()))?;
-        }
+    for (path, _lock) in suites_to_go {
+        let here = path.display();
+        suite::remove(path).with_context(|| format!("cannot remove the suite {here}"))?;
+        writeln!(std::io::stdout(), "removed the suite {here}")?;
     }
     // What the runs may have left in shared memory when they were killed.
     Domain::remove_abandoned()?;
@@ -102,7 +107,7 @@ fn prepare_removal(run: RunDir, replay: bool) -> anyhow::Result<Removal> {
 }
 
 /// Asks on the terminal whether to go on.
-fn confirmed(runs: &[Removal], replay: bool) -> anyhow::Result<bool> {
+fn confirmed(runs: &[Removal], suites: &[(&PathBuf, File)], replay: bool) -> anyhow::Result<bool> {
     if !std::io::stdin().is_terminal() {
         return Err(UsageError("there is no terminal to ask on: add --yes".into()).into());
     }
@@ -111,7 +116,11 @@ fn confirmed(runs: &[Removal], replay: bool) -> anyhow::Result<bool> {
     for Removal { run, bytes: size, .. } in runs {
         writeln!(stderr, "{what}{} ({})", run.path().display(), mebibytes(*size))?;
     }
-    write!(stderr, "Remove {}? [y/N] ", if runs.len() == 1 { "it" } else { "them" })?;
+    for (path, _) in suites {
+        writeln!(stderr, "the suite {}", path.display())?;
+    }
+    let one = runs.len() + suites.len() == 1;
+    write!(stderr, "Remove {}? [y/N] ", if one { "it" } else { "them" })?;
     stderr.flush()?;
     let mut answer = String::new();
     std::io::stdin().lock().read_line(&mut answer)?;

@@ -206,7 +206,7 @@ fn table_of_hosts(hosts: &[HostStatus]) -> Table {
     table
 }
 
-/// Who waits for whom, in words.
+/// Which role waits, and for what, in words.
 pub(crate) fn waiting(status: &RunStatus) -> &str {
     let waiting = status.waiting.as_deref();
     waiting.map_or("nobody waits", |waiting| waiting.split(':').next().unwrap_or(waiting))

@@ -11,8 +11,10 @@ use serde::Serialize;
 use shoal_common::channel::control::RunStatus;
 use shoal_common::config::Config;
 use shoal_common::run_dir::{RunDir, RunLock};
+use shoal_env_server::environment::Goal;
 use shoal_learner::process::checkpoint::Checkpoints;
 use shoal_report::plots;
+use shoal_run::description;
 use shoal_run::evaluation::best_policy::{self, EvaluatedPolicy};
 use shoal_run::evaluation::final_evaluation::FinalEvaluation;
 use shoal_run::evaluation::{EvaluationSummary, SavedPolicy};
@@ -71,7 +73,7 @@ pub(crate) fn run_training(
         gate,
     };
     let trained = train_and_report(config, run, lock, output, options);
-    // Whatever else has failed follows from it.
+    // If the directory is gone, that explains every other error.
     lock.check(run)?;
     trained
 }
@@ -140,8 +142,9 @@ fn train_and_report(
     }
     let summary = Summary::new(&config, run, &outcome, evaluated.first().map(|first| &first.summary))?;
     if !output.quiet {
+        let results = results(&config, run, &evaluated)?;
         // As in `say`.
-        let _ = write_summary(&mut std::io::stderr().lock(), run, &outcome, &summary, &evaluated);
+        let _ = write_summary(&mut std::io::stderr().lock(), run, &outcome, &summary, &results);
     }
     if output.json {
         writeln!(std::io::stdout().lock(), "{}", serde_json::to_string(&summary)?)?;
@@ -227,12 +230,45 @@ impl Summary {
     }
 }
 
+/// The name of each evaluated policy and its result in words.
+fn results(
+    config: &Config,
+    run: &RunDir,
+    evaluated: &[EvaluatedPolicy],
+) -> anyhow::Result<Vec<(&'static str, String)>> {
+    if evaluated.is_empty() {
+        return Ok(Vec::new());
+    }
+    let goal = description::of_run(run, config)?.goal;
+    let result = |it: &EvaluatedPolicy| (name(it.policy), in_words(&it.summary, goal.as_ref()));
+    Ok(evaluated.iter().map(result).collect())
+}
+
+/// The result of an evaluation in an environment with this goal.
+fn in_words(evaluated: &EvaluationSummary, goal: Option<&Goal>) -> String {
+    let mut text = format!(
+        "return {:.2} ± {:.2} over {} episodes",
+        evaluated.return_mean, evaluated.return_std, evaluated.episodes
+    );
+    if let (Some(goal), Some(distance), Some(reached)) =
+        (goal, evaluated.final_distance_mean, evaluated.reached_fraction)
+    {
+        let distance = format!("{distance:.3} {}", goal.distance.unit);
+        text += &format!(
+            "; ends {} from the goal, at the goal in {:.0} %",
+            distance.trim_end(),
+            100.0 * reached
+        );
+    }
+    text
+}
+
 fn write_summary(
     to: &mut impl Write,
     run: &RunDir,
     outcome: &TrainingOutcome,
     summary: &Summary,
-    evaluated: &[EvaluatedPolicy],
+    results: &[(&str, String)],
 ) -> std::io::Result<()> {
     let mut table = Table::new();
     table.load_style(UTF8_BORDERS_ONLY);
@@ -247,22 +283,8 @@ fn write_summary(
             summary.updates_per_second, summary.env_steps_per_second
         ),
     ]);
-    for EvaluatedPolicy {
-        policy,
-        summary: evaluated,
-    } in evaluated
-    {
-        let mut text = format!(
-            "return {:.2} ± {:.2} over {} episodes",
-            evaluated.return_mean, evaluated.return_std, evaluated.episodes
-        );
-        if let (Some(distance), Some(reached)) = (evaluated.final_distance_mean, evaluated.reached_fraction) {
-            text += &format!(
-                "; ends {distance:.3} m from the goal, at the goal in {:.0} %",
-                100.0 * reached
-            );
-        }
-        table.add_row([name(*policy), &text]);
+    for (policy, result) in results {
+        table.add_row([policy, result.as_str()]);
     }
     writeln!(to, "{table}")?;
     let here = run.path().display();
@@ -275,4 +297,29 @@ fn write_summary(
         "  learning-curve.svg, evaluations.csv, episodes.csv, learner.csv, tensorboard/, checkpoints/, shoal.log"
     )?;
     writeln!(to, "  figures: shoal plot {here}    evaluate again: shoal eval {here}")
+}
+
+#[cfg(test)]
+mod tests {
+    use shoal_env_server::environment::Signal;
+
+    use super::*;
+
+    #[test]
+    fn the_distance_to_the_goal_has_the_unit_of_the_environment() {
+        let evaluated = EvaluationSummary {
+            return_mean: -1.0,
+            return_std: 0.5,
+            episodes: 10,
+            final_distance_mean: Some(0.25),
+            reached_fraction: Some(0.9),
+        };
+        let result = |unit| {
+            let distance = Signal::observation(0, "distance", unit);
+            in_words(&evaluated, Some(&Goal { distance, within: 0.5 }))
+        };
+        let expected = "return -1.00 ± 0.50 over 10 episodes; ends 0.250 rad from the goal, at the goal in 90 %";
+        assert_eq!(result("rad"), expected);
+        assert_eq!(result(""), expected.replace(" rad", ""));
+    }
 }

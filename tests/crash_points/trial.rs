@@ -321,7 +321,7 @@ impl Case<'_> {
         match place.run("resume", &["resume", "run", "--quiet", "--json"], limit())? {
             0 => Ok("run"),
             // The run had completed. The next start removes its leftovers.
-            1 if place.read("resume.err").contains("steps already") => another().map(|_| "run"),
+            1 if place.read("resume.err").contains("raise the limit with --steps") => another().map(|_| "run"),
             code => Err(format!("the resumed run ended with {code}")),
         }
     }

@@ -43,6 +43,24 @@ fn runs_are_removed_after_a_question_and_a_running_one_is_not() {
 }
 
 #[test]
+fn a_suite_is_named_before_it_is_removed() {
+    let place = Workplace::new();
+    let suite = place.path().join("suite");
+    std::fs::create_dir(&suite).unwrap();
+    let trial = r#"{"name": "seed=1", "seed": 1, "set": []}"#;
+    let written = format!(r#"{{"format": 1, "what": "pendulum", "arguments": [], "trials": [{trial}]}}"#);
+    std::fs::write(suite.join("suite.json"), written).unwrap();
+    let no_replays = error_line(&place.output(&["rm", "--replay", "--yes", "suite"]));
+    assert!(no_replays.contains("suite has no runs, so"), "{no_replays}");
+    let mut terminal = Terminal::start(&place, &["rm", "suite"], true);
+    terminal.shows("Remove it? [y/N]");
+    assert!(terminal.text().contains("the suite suite"), "{}", terminal.text());
+    terminal.press("y\n");
+    assert_eq!(terminal.end(), Some(0));
+    assert!(!suite.exists());
+}
+
+#[test]
 fn what_may_not_be_a_run_is_left_alone() {
     let place = Workplace::new();
     std::fs::create_dir(place.path().join("mine")).unwrap();

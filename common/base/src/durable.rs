@@ -156,7 +156,7 @@ pub enum SealError {
     #[error("is not {0}")]
     Kind(&'static str),
     /// Another format of the same kind.
-    #[error("has format version {found}, this program reads version {expected}")]
+    #[error("has format {found}; this program reads format {expected}")]
     Version {
         /// The file's.
         found: u32,

@@ -5,6 +5,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::role::{Activity, Role, RoleInstance};
 
+/// An environment server that has taken this many steps is able to work: it is restarted whenever it fails.
+pub const PROVEN_STEPS: u64 = 1000;
+
 /// A sign of life of a role: sent when it is ready, when a lasting activity begins, and about twice a second.
 ///
 /// Role and activity are sent as numbers, because a sender in another language may know more of them than this build.
@@ -98,7 +101,7 @@ pub struct EvaluationReport {
     pub return_std: f64,
     /// Episodes run.
     pub episodes: u32,
-    /// 1 if no earlier evaluation of the run was as good.
+    /// 1 if this policy became the best one.
     pub best: u32,
 }
 

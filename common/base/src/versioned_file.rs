@@ -123,7 +123,7 @@ pub enum VersionedFileError {
         cause: String,
     },
     /// Another version of the program wrote it.
-    #[error("{path} has format {found}, and this program reads format {expected}")]
+    #[error("{path} has format {found}; this program reads format {expected}")]
     Format {
         /// The file.
         path: String,
@@ -211,7 +211,7 @@ mod tests {
         let refused = |text: &str| Json::parse("x.json", text.as_bytes()).unwrap_err().to_string();
         assert_eq!(
             refused("{\"format\":4}"),
-            "x.json has format 4, and this program reads format 3"
+            "x.json has format 4; this program reads format 3"
         );
         for damaged in ["", "{", "{\"large\":1}", "{\"format\":3,\"large\":-1}", "\u{fffd}"] {
             let message = refused(damaged);

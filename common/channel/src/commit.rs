@@ -1,8 +1,9 @@
 //! What the learner has committed to the replay: the header of the replay file.
 //!
-//! The learner is the only writer. Actors and `status` map the header read-only and follow the commit record with a
-//! [`CommitReader`]. Both sides take the layout from [`ReplayLayout::offsets`]. `docs/REPLAY_FORMAT.md` describes the
-//! format.
+//! The learner is the only writer, except that the launcher makes the first replay of a run that begins with another
+//! run or a dataset. On another host the relay writes a copy of the header with a [`CommitMirror`]. Actors and `status`
+//! map the header read-only and follow the commit record with a [`CommitReader`]. All of them take the layout from
+//! [`ReplayLayout::offsets`]. `docs/REPLAY_FORMAT.md` describes the format.
 
 mod layout;
 mod mirror;

@@ -200,7 +200,7 @@ pub fn ask(
 ) -> Result<ControlResponse, ControlError> {
     let asked = Instant::now();
     let deadline = asked + patience;
-    // Who only wants to know how the run is need not wait until it is able to answer.
+    // A status request gives up sooner: it need not wait until the launcher can answer.
     let missing_until = match request {
         ControlRequest::Status => deadline.min(asked + MISSING_PATIENCE),
         _ => deadline,

@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use shoal_base::report::Heartbeat;
+use shoal_base::report::{Heartbeat, PROVEN_STEPS};
 use shoal_base::role::{Activity, RoleInstance};
 
 use super::domain::Domain;
@@ -41,12 +41,13 @@ impl HeartbeatSender {
         }
     }
 
-    /// Counts `steps` more steps of the role's work. The first count is sent at once: it shows that the process can
-    /// work.
+    /// Counts `steps` more steps of the role's work. The first count is sent at once, and so is the one that reaches
+    /// [`PROVEN_STEPS`]: the process may fail before its next heartbeat is due.
     pub fn count(&mut self, steps: u64) {
-        let first = self.heartbeat.steps == 0;
+        let before = self.heartbeat.steps;
         self.heartbeat.steps += steps;
-        if first {
+        let is_proven = (before..self.heartbeat.steps).contains(&(PROVEN_STEPS - 1));
+        if before == 0 || is_proven {
             self.beat_now(Activity::Working);
         }
     }

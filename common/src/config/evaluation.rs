@@ -4,10 +4,11 @@ use shoal_base::section;
 use shoal_base::section::{Change, from};
 
 section! {
-    /// How often the policy is evaluated.
+    /// How often, how and on how many episodes policies are evaluated.
     #[derive(Eq)]
     pub struct EvaluationConfig {
-        /// Environment steps from one evaluation to the next; at most `run.steps`, so that a short run is evaluated once.
+        /// Environment steps from one evaluation to the next. A new run with fewer steps gets `run.steps` instead, so
+        /// that it is evaluated once.
         every: u64 = 2_000, bounds: from(1, u64::MAX), unit: "environment steps", source: "ours",
             change: Change::Anytime;
         /// Episodes of an evaluation. Their start states are always the same.

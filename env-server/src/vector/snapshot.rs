@@ -76,6 +76,7 @@ impl VectorEnvironment {
             running.rng.set_word_pos(counters.position.into());
             running.next_training = counters.episode + 1;
             running.steps = counters.steps;
+            running.done = false;
             running
                 .environment
                 .observe(&mut observations[e * observed..][..observed]);

@@ -55,7 +55,7 @@ fn a_file_of_another_run_is_refused_by_name_and_left_as_it_is() {
     refused(
         &patched(8, &[9]),
         &right,
-        "format version is 9, this program reads version 2",
+        "it has format 9; this program reads format 2",
     );
     refused(&patched(40, &[9]), &right, "header is damaged");
     refused(&[], &right, "cut short: 0 bytes");

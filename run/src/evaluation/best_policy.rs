@@ -13,7 +13,7 @@ use crate::signals::Interrupt;
 /// A policy with its final evaluation.
 #[derive(Clone, Debug, PartialEq)]
 pub struct EvaluatedPolicy {
-    /// Its role after the choice: best or last.
+    /// Which of the two it is now.
     pub policy: SavedPolicy,
     /// How it did.
     pub summary: EvaluationSummary,

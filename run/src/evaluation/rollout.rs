@@ -15,7 +15,7 @@ use shoal_env_server::vector::{Reset, VectorEnvironment};
 use crate::evaluation::frames::{Frames, Recorder};
 use crate::external_environment::ExternalEnvironment;
 use crate::external_environment::server_location::ServerSurroundings;
-use crate::signals::Interrupt;
+use crate::signals::{Interrupt, describe};
 
 /// How often an episode is begun if the environment's server fails in it, each time with a new server.
 const TRIES: u32 = 5;
@@ -197,7 +197,7 @@ impl<'a> Rollout<'a> {
         };
         for steps in 0.. {
             if let Some(signal) = self.interrupt.signal() {
-                bail!("ended by signal {signal}");
+                bail!("ended by {}", describe(signal));
             }
             progress(steps);
             self.policy.act(self.parameters, &observation, &mut action);

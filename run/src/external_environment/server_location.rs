@@ -11,7 +11,7 @@ use anyhow::{Context, bail};
 use serde::{Deserialize, Serialize};
 use shoal_common::config::{Config, Mode};
 use shoal_common::run_dir::RunDir;
-use shoal_common::versioned_file::{VersionedFile, VersionedFileError};
+use shoal_common::versioned_file::VersionedFile;
 
 /// A directory and a program, both absolute. Symbolic links are kept: Python finds its virtual environment by them.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -80,13 +80,9 @@ impl ServerLocation {
     /// exists.
     pub fn of_run(run: &RunDir) -> anyhow::Result<Option<Self>> {
         let file = run.server_file();
-        let location = Self::load_if_any(&file).map_err(|error| match error {
-            VersionedFileError::Format { path, found, expected } => {
-                anyhow::anyhow!("{path} is of form {found}, this program's is {expected}")
-            }
-            other => other.into(),
-        })?;
-        let Some(location) = location else { return Ok(None) };
+        let Some(location) = Self::load_if_any(&file)? else {
+            return Ok(None);
+        };
         let location = Self {
             file: Some(file),
             ..location
@@ -241,7 +237,7 @@ mod tests {
         }
         std::fs::write(run.server_file(), r#"{"format":2,"directory":"/","program":"/bin/sh"}"#).unwrap();
         let said = ServerLocation::of_run(&run).unwrap_err().to_string();
-        assert!(said.contains("form 2"), "{said}");
+        assert!(said.contains("has format 2"), "{said}");
     }
 
     #[test]

@@ -66,7 +66,7 @@ pub struct EvaluationRecord {
     pub return_std: f64,
     /// Number of episodes.
     pub episodes: u32,
-    /// 1 if no earlier evaluation was as good.
+    /// 1 if this policy became the best one.
     pub best: u32,
 }
 

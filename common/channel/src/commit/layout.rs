@@ -80,7 +80,7 @@ pub enum PreambleError {
     #[error("it is not a replay file")]
     Magic,
     /// A replay file of another format.
-    #[error("its format version is {0}, this program reads version {VERSION}")]
+    #[error("it has format {0}; this program reads format {VERSION}")]
     Version(u64),
     /// The preamble's checksum does not match.
     #[error("its header is damaged (checksum)")]

@@ -251,7 +251,7 @@ pub(super) fn encode(message: &impl Serialize) -> Result<Vec<u8>, EncodeError> {
 /// Decodes a message; the error describes what is wrong with the bytes.
 pub(super) fn decode<T: DeserializeOwned>(version: u32, bytes: &[u8]) -> Result<T, String> {
     if version != VERSION {
-        return Err(format!("it has format {version}, this program uses format {VERSION}"));
+        return Err(format!("it has format {version}; this program uses format {VERSION}"));
     }
     match bincode::serde::decode_from_slice(bytes, encoding()) {
         Ok((message, used)) if used == bytes.len() => Ok(message),

@@ -195,6 +195,23 @@ fn only_training_has_snapshots_and_a_restore_returns_to_it() {
     assert_eq!(snapshot(&fixture), training);
 }
 
+#[test]
+fn a_restored_environment_continues_even_if_it_had_run_all_its_evaluation_episodes() {
+    let mut fixture = Fixture::new("pendulum", "", 2);
+    fixture.reset(Reset::Next);
+    let training = snapshot(&fixture);
+    let mut undisturbed = Fixture::new("pendulum", "", 2);
+    restore(&mut undisturbed, &training).unwrap();
+    fixture.reset(Reset::Evaluation {
+        seed: 1,
+        first: 0,
+        episodes: Some(1),
+    });
+    restore(&mut fixture, &training).unwrap();
+    let mut rng = stream(5, Purpose::Exploration, 0, 0);
+    assert_same_future(&mut undisturbed, &mut fixture, &mut rng);
+}
+
 /// An environment that cannot save its state, as an external one may be.
 struct Unsaved(Box<dyn Environment>);
 

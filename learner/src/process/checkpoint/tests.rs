@@ -186,10 +186,7 @@ fn a_checkpoint_of_another_version_is_refused() {
     })
     .unwrap();
     let error = load(&directory).unwrap_err().to_string();
-    assert!(
-        error.contains("format version 1, this program reads version 2"),
-        "{error}"
-    );
+    assert!(error.contains("has format 1; this program reads format 2"), "{error}");
 }
 
 #[test]
