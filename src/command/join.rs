@@ -95,6 +95,7 @@ mod with_network {
     use std::path::Path;
 
     use anyhow::{Context, bail};
+    use shoal_common::message::say;
     use shoal_common::run_dir::RunDir;
     use shoal_remote::endpoint::Endpoint;
     use shoal_remote::files::{HostFile, JoinFile, KeyFile};
@@ -144,7 +145,7 @@ mod with_network {
                 return Ok(ExitCode::SUCCESS);
             }
             Err(error @ JoinError::Silence { .. }) => {
-                say(&format!("error: {error}"));
+                say(format!("error: {error}"));
                 return Ok(GAVE_UP.into());
             }
             Err(error) => return Err(error.into()),
@@ -155,7 +156,7 @@ mod with_network {
         if args.local.is_none() {
             match &worked {
                 Ok(_) => drop(std::fs::remove_dir_all(path)),
-                Err(_) => say(&format!("the log of this host is {}", path.join("shoal.log").display())),
+                Err(_) => say(format!("the log of this host is {}", path.join("shoal.log").display())),
             }
         }
         worked
@@ -185,7 +186,7 @@ mod with_network {
         keeper.end(prepared.is_err());
         let (config, run, lock) = prepared?;
         let actors = lease.actors.clone();
-        say(&format!("joined {endpoint} with {} actors: {actors:?}", actors.len()));
+        say(format!("joined {endpoint} with {} actors: {actors:?}", actors.len()));
         let ending = joined::run(config, (&run, &lock), signals, actors, args.give_up)?;
         Ok(match ending {
             JoinEnd::Over => {
@@ -195,18 +196,13 @@ mod with_network {
             JoinEnd::Stopped => ExitCode::SUCCESS,
             JoinEnd::Interrupted(signal) => exit_code(signal),
             JoinEnd::GaveUp => {
-                say(&format!(
+                say(format!(
                     "error: {endpoint} could not be reached for {} s",
                     args.give_up.as_secs()
                 ));
                 GAVE_UP.into()
             }
         })
-    }
-
-    fn say(line: &str) {
-        // A terminal that is gone must not make the work a failure.
-        let _ = writeln!(std::io::stderr(), "{line}");
     }
 
     /// Whether this is the directory of a run that has done everything: a host that comes late has nothing to wait for.

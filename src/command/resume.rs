@@ -1,13 +1,13 @@
 //! `shoal resume`: continues a run that was stopped or killed.
 
 use std::ffi::OsString;
-use std::io::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::{Context, bail};
 use clap::Args;
 use clap_complete::engine::ArgValueCompleter;
+use shoal_common::message::say;
 use shoal_common::run_dir::RunDir;
 use shoal_run::evaluation::SavedPolicy;
 use shoal_run::evaluation::earlier_best::{ReevaluatedPolicy, reevaluate_best, reevaluate_if_needed};
@@ -140,11 +140,11 @@ pub(crate) fn run(args: &ResumeArgs) -> anyhow::Result<ExitCode> {
         let line = format!("{key} changes from {before} to {after} at step {env_steps} ({source})");
         launcher::note(&run, &line);
         if !args.output.quiet {
-            let _ = writeln!(std::io::stderr(), "{line}");
+            say(line);
         }
     }
     if let Some(warning) = warning(config) {
-        let _ = writeln!(std::io::stderr(), "warning: {warning}");
+        say(format!("warning: {warning}"));
     }
     run_training(revision.config, &run, &lock, &args.output, &args.listen)
 }
@@ -197,20 +197,16 @@ fn reevaluate_best_policy(run: &RunDir, revision: &Revision) -> anyhow::Result<O
     };
     match (evaluated, interrupt.signal()) {
         (Err(_), Some(signal)) => {
-            let _ = writeln!(
-                std::io::stderr(),
-                "ended by signal {signal}; nothing has changed in {here}"
-            );
+            say(format!("ended by signal {signal}; nothing has changed in {here}"));
             Ok(Some(signal))
         }
         (evaluated, signal) => {
             let evaluated = evaluated.with_context(|| format!("cannot resume {here}: its best policy"))?;
             if let Some(ReevaluatedPolicy { before, now }) = evaluated {
-                let _ = writeln!(
-                    std::io::stderr(),
+                say(format!(
                     "the best policy is evaluated anew, for {why}: {:.2} instead of {before:.2}",
                     now.return_mean
-                );
+                ));
             }
             Ok(signal)
         }

@@ -9,6 +9,7 @@ use std::process::ExitCode;
 use anyhow::{Context, bail};
 use progress::SuiteProgress;
 use serde::Serialize;
+use shoal_common::message::say;
 use shoal_common::run_dir::RunDir;
 use shoal_report::page;
 use shoal_run::evaluation::SavedPolicy;
@@ -130,7 +131,7 @@ pub(crate) fn resume(directory: &Path, options: SuiteOptions<'_>) -> anyhow::Res
         (None, 0) => Ok(ExitCode::SUCCESS),
         (None, failed) => bail!("{failed} of the runs failed; to continue with them: shoal resume {here}"),
         (Some(signal), _) => {
-            let _ = writeln!(std::io::stderr(), "interrupted; to continue: shoal resume {here}");
+            say(format!("interrupted; to continue: shoal resume {here}"));
             Ok(exit_code(signal))
         }
     }
@@ -145,11 +146,8 @@ fn report(suite: &Suite, directory: &Path, output: &OutputMode) -> anyhow::Resul
             .iter()
             .map(|run| RunDir::open(run))
             .collect::<Result<Vec<_>, _>>()?;
-        let mut stderr = std::io::stderr().lock();
-        for line in page::ranking(&runs)? {
-            let _ = writeln!(stderr, "{line}");
-        }
-        let _ = writeln!(stderr, "{here}\n  compare the runs: shoal report {here}");
+        page::ranking(&runs)?.iter().for_each(say);
+        say(format!("{here}\n  compare the runs: shoal report {here}"));
     }
     if output.json {
         let mut runs = Vec::new();

@@ -6,13 +6,14 @@ use std::process::Command;
 use std::sync::mpsc::Sender;
 
 use anyhow::bail;
+use shoal_common::message::one_line;
 use shoal_common::run_dir::RunDir;
 use signal_hook::consts::SIGTERM;
 
 use super::configuration::{overrides_of, requested};
 use super::measure::{best_return, is_evaluated, share_done};
 use super::{Suite, Trial};
-use crate::external_environment::tied;
+use crate::child_process::tied;
 use crate::interrupted_start::remove_interrupted_start;
 use crate::jobs::{TrainingEnd, run_jobs, run_training};
 use crate::plan::{self, Revision, RunOverrides};
@@ -160,7 +161,7 @@ impl<'a> Due<'a> {
                 Ok(TrainingEnd::Finished) => Event::Finished(number),
                 Ok(TrainingEnd::Interrupted) if signals.received().is_none() => Event::Paused(number),
                 Ok(TrainingEnd::Interrupted) => Event::Interrupted(number),
-                Err(error) => Event::Failed(number, format!("{error:#}").replace('\n', " ")),
+                Err(error) => Event::Failed(number, one_line(error)),
             });
         };
         run_jobs(numbers, jobs, signals, work, |event| {
