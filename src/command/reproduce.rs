@@ -9,6 +9,7 @@ use clap::Args;
 use clap::builder::PossibleValuesParser;
 use shoal_report::figure::CAN_RASTERISE;
 use shoal_reproduce::{Effort, ReproductionEnd, Request};
+use shoal_run::jobs::trainings_for_all_cores;
 use shoal_run::numbers::from_one;
 use shoal_run::signals::exit_code;
 
@@ -46,12 +47,6 @@ pub(crate) fn choices() -> Vec<&'static str> {
     shoal_reproduce::names().chain([ALL]).collect()
 }
 
-/// The number of trainings that keep this machine busy; each takes about two cores.
-fn usual_jobs() -> usize {
-    let cores = std::thread::available_parallelism().map_or(1, usize::from);
-    (cores / 2).max(1)
-}
-
 /// Runs the chosen experiments and prints the path of the report.
 pub(crate) fn run(args: &ReproduceArgs) -> anyhow::Result<ExitCode> {
     if args.png && !CAN_RASTERISE {
@@ -68,7 +63,7 @@ pub(crate) fn run(args: &ReproduceArgs) -> anyhow::Result<ExitCode> {
     let request = Request {
         experiments: if all { Vec::new() } else { args.experiments.clone() },
         seeds: args.seeds,
-        jobs: args.jobs.map_or_else(usual_jobs, usize::from),
+        jobs: args.jobs.map_or_else(trainings_for_all_cores, usize::from),
         effort,
         folder,
         png: args.png,

@@ -14,7 +14,7 @@ use shoal_common::run_dir::RunDir;
 use shoal_report::page;
 use shoal_run::evaluation::SavedPolicy;
 use shoal_run::evaluation::final_evaluation::FinalEvaluation;
-use shoal_run::plan::RunOverrides;
+use shoal_run::plan::{RunOverrides, is_configuration_file};
 use shoal_run::records::start::StartRecord;
 use shoal_run::signals::{Signals, exit_code};
 use shoal_run::status::saved_status;
@@ -64,7 +64,7 @@ pub(crate) fn train(args: &TrainArgs, what: &str, overrides: &RunOverrides) -> a
     // The suite may be continued from another directory.
     let absolute =
         |path: &Path| std::path::absolute(path).with_context(|| format!("cannot resolve {}", path.display()));
-    let what = if Path::new(what).extension().is_some_and(|extension| extension == "toml") {
+    let what = if is_configuration_file(Path::new(what)) {
         absolute(Path::new(what))?.display().to_string()
     } else {
         what.to_owned()

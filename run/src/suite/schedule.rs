@@ -15,7 +15,7 @@ use super::measure::{best_return, is_evaluated, share_done};
 use super::{Suite, Trial};
 use crate::child_process::tied;
 use crate::interrupted_start::remove_interrupted_start;
-use crate::jobs::{TrainingEnd, run_jobs, run_training};
+use crate::jobs::{TrainingEnd, run_jobs, run_training, trainings_for_all_cores};
 use crate::plan::{self, Revision, RunOverrides};
 use crate::preflight;
 use crate::signals::Signals;
@@ -174,7 +174,7 @@ impl<'a> Due<'a> {
     }
 }
 
-/// What cores and shared memory allow; each run keeps about two cores busy.
+/// The number of runs at a time that cores and shared memory allow.
 fn usual_jobs(suite: &Suite, directory: &Path, first: usize) -> anyhow::Result<usize> {
     let trial = &suite.trials[first];
     let overrides = overrides_of(suite, trial)?;
@@ -186,8 +186,7 @@ fn usual_jobs(suite: &Suite, directory: &Path, first: usize) -> anyhow::Result<u
     let fit = config
         .and_then(|config| preflight::side_by_side(&config).ok())
         .unwrap_or(1);
-    let cores = std::thread::available_parallelism().map_or(1, usize::from);
-    Ok((cores / 2).clamp(1, fit.max(1)))
+    Ok(trainings_for_all_cores().min(fit.max(1)))
 }
 
 /// Whether nothing is left to do in this run directory.
