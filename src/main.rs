@@ -7,6 +7,7 @@ mod launcher;
 mod listing;
 mod log_level;
 mod role;
+mod status_table;
 mod top;
 
 use std::process::ExitCode;
