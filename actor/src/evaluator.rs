@@ -10,6 +10,7 @@ use shoal_common::channel::{ChannelError, Domain, EventName, HeartbeatSender, Li
 use shoal_common::config::Config;
 use shoal_common::evaluator_state::EvaluatorState;
 use shoal_common::exit::Exit;
+use shoal_common::numbers::mean_and_std;
 use shoal_common::policy::Policy;
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::report::{EvaluatedPeriod, EvaluationReport};
@@ -81,21 +82,6 @@ fn challenge<E>(
         }
     }
     Ok((Some(if better { candidate } else { best }), better))
-}
-
-/// Mean and sample standard deviation of returns; the latter is 0 for fewer than two.
-pub fn mean_and_std(returns: &[f64]) -> (f64, f64) {
-    let n = returns.len() as f64;
-    let mean = returns.iter().sum::<f64>() / n;
-    let squares: f64 = returns.iter().map(|r| (r - mean).powi(2)).sum();
-    (
-        mean,
-        if returns.len() < 2 {
-            0.0
-        } else {
-            (squares / (n - 1.0)).sqrt()
-        },
-    )
 }
 
 /// Evaluates policies until `stop`.

@@ -8,8 +8,8 @@ pub mod frames;
 pub mod rollout;
 
 use serde::{Deserialize, Serialize};
-use shoal_actor::evaluator::mean_and_std;
 use shoal_common::config::Config;
+use shoal_common::numbers::mean_and_std;
 use shoal_common::policy_file::PolicyFile;
 use shoal_common::run_dir::RunDir;
 use shoal_env_server::environment::Goal;

@@ -13,6 +13,7 @@ use nalgebra::DMatrix;
 use shoal_common::algorithms::{AlgorithmSettings, ReinforceNetworks};
 use shoal_common::config::{self, Config, ReturnWeighting};
 use shoal_common::network::NetworkLayout;
+use shoal_common::numbers::are_finite;
 use shoal_common::policy::{self, PolicyError, PolicyLayout};
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::transition::Transition;
@@ -22,7 +23,7 @@ use crate::networks::initialise::glorot;
 use crate::networks::pass::Pass;
 use crate::networks::threads::Threads;
 use crate::networks::trainable::TrainableNetwork;
-use crate::replay::{Replay, are_finite};
+use crate::replay::Replay;
 
 /// Added to a standard deviation before dividing by it. An episode whose returns are all equal then has no weight.
 const SPREAD_FLOOR: f32 = 1e-8;

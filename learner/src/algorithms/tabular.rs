@@ -4,12 +4,13 @@ use std::borrow::Cow;
 
 use shoal_common::algorithms::AlgorithmSettings;
 use shoal_common::config::{self, Config};
+use shoal_common::numbers::are_finite;
 use shoal_common::policy::{self, PolicyError, PolicyLayout};
 use shoal_common::space::EnvironmentSpec;
 use shoal_common::transition::Transition;
 
 use super::algorithm::{Algorithm, AlgorithmDefinition, Losses, RunSizes, SavedState, StateArray, StateArrayError};
-use crate::replay::{Replay, are_finite};
+use crate::replay::Replay;
 
 /// Which value of s' an update bootstraps from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
