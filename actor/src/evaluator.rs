@@ -196,7 +196,7 @@ impl<'a> Evaluator<'a> {
         let header = published.header();
         let returns = self.returns(published.parameters(), 0, self.settings.config.evaluation.episodes)?;
         let (return_mean, return_std) = mean_and_std(&returns);
-        let best = self.becomes_best(&published, return_mean)?;
+        let best = self.challenge_best(&published, return_mean)?;
         if best {
             self.write_policy(&published, return_mean, return_std, &self.settings.run.best_policy())?;
         }
@@ -225,8 +225,9 @@ impl<'a> Evaluator<'a> {
         Ok(())
     }
 
-    /// Compares this policy with the best one and remembers the better one. Returns whether it is this policy.
-    fn becomes_best(&mut self, published: &policy::PublishedPolicy, mean: f64) -> Result<bool, Exit<ActorError>> {
+    /// Compares this policy with the best one, with further episodes of both if it seems better, and keeps the better
+    /// one. Returns whether that is this policy.
+    fn challenge_best(&mut self, published: &policy::PublishedPolicy, mean: f64) -> Result<bool, Exit<ActorError>> {
         let candidate = Best {
             version: published.header().version,
             mean,

@@ -71,7 +71,9 @@ fn behaviour(run: &RunDir, config: &Config, out: &Path) -> anyhow::Result<Vec<Pa
 fn episode_of_server(run: &RunDir, config: &Config, interrupt: &Interrupt) -> anyhow::Result<Trajectory> {
     let policy = SavedPolicy::Best.read(run, config)?;
     let rollout = Rollout::of_run(run, config, &policy.parameters)?;
-    rollout.until(interrupt.clone()).evaluation_episode(config.run.seed, 0)
+    rollout
+        .interruptible_by(interrupt.clone())
+        .evaluation_episode(config.run.seed, 0)
 }
 
 /// Draws the signals of an episode and returns the file.

@@ -76,7 +76,7 @@ pub fn evaluate_policy(
     interrupt: &Interrupt,
     progress: impl FnMut(u32),
 ) -> anyhow::Result<EvaluationSummary> {
-    let rollout = Rollout::of_run(run, config, parameters)?.until(interrupt.clone());
+    let rollout = Rollout::of_run(run, config, parameters)?.interruptible_by(interrupt.clone());
     evaluate_by(rollout, description::of_run(run, config)?.goal, amount, progress)
 }
 

@@ -470,7 +470,7 @@ fn stop_when_it_ends(
     std::thread::Builder::new()
         .name("watch".into())
         .spawn(move || {
-            let ended = |most| wait_for_any(&[process.as_fd()], most);
+            let ended = |timeout| wait_for_any(&[process.as_fd()], timeout);
             if !ended(SLOW.min(limit)) && !has_answered.requested() {
                 say(format!(
                     "waiting for {name} to start, for at most {} s",

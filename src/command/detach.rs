@@ -57,7 +57,7 @@ pub(crate) fn resume_run(path: &Path, arguments: &[OsString], output: &OutputMod
         Ok(works && RunDir::open(path)?.replay_file().exists())
     };
     let how_to_end = |path: &str, _| format!("look: shoal top {path}; end: shoal stop {path}");
-    resume(path, (arguments, patience), output, is_at_work, how_to_end)
+    start_detached(path, (arguments, patience), output, is_at_work, how_to_end)
 }
 
 /// As [`resume_run`] for a suite. Returns when a process trains one of its runs.
@@ -72,10 +72,10 @@ pub(crate) fn resume_suite(path: &Path, arguments: &[OsString], output: &OutputM
         Ok(file_lock::is_locked(&File::open(path)?)? && runs.any(|run| run.is_running().unwrap_or(false)))
     };
     let how_to_end = |path: &str, pid| format!("look: shoal list {path}; end: kill {pid}");
-    resume(path, (arguments, PATIENCE), output, is_at_work, how_to_end)
+    start_detached(path, (arguments, PATIENCE), output, is_at_work, how_to_end)
 }
 
-fn resume(
+fn start_detached(
     path: &Path,
     (arguments, patience): (&[OsString], Duration),
     output: &OutputMode,

@@ -10,7 +10,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use shoal_common::run_dir::RunDir;
 use shoal_report::film::{Format, Request, Shown, film};
 use shoal_run::evaluation::SavedPolicy;
-use shoal_run::numbers::{count, thousands};
+use shoal_run::numbers::{parse_count, thousands};
 use shoal_run::signals::{Signals, describe, exit_code};
 
 use super::output_file::check_replaceable;
@@ -26,7 +26,7 @@ pub(crate) struct FilmArgs {
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=50))]
     pub(crate) episodes: u32,
     /// Seed of the start states [default: the run's seed].
-    #[arg(long, value_parser = count)]
+    #[arg(long, value_parser = parse_count)]
     pub(crate) seed: Option<u64>,
     /// The file to write; its name ends in .gif or, for a video made by the program ffmpeg, in .mp4 [default: film.gif
     /// in the run directory].
@@ -36,7 +36,7 @@ pub(crate) struct FilmArgs {
     #[arg(long, value_name = "PIXELS", default_value_t = 320, value_parser = clap::value_parser!(u32).range(32..=2048))]
     pub(crate) size: u32,
     /// Steps shown in a second [default: as many as the environment's time says].
-    #[arg(long, value_name = "STEPS", value_parser = positive)]
+    #[arg(long, value_name = "STEPS", value_parser = parse_steps_per_second)]
     pub(crate) fps: Option<f64>,
 }
 
@@ -44,7 +44,7 @@ pub(crate) struct FilmArgs {
 const NAME: &str = "film.gif";
 
 /// Steps in a second, from 0.1 to 1,000.
-fn positive(text: &str) -> Result<f64, String> {
+fn parse_steps_per_second(text: &str) -> Result<f64, String> {
     let fps = text.parse().ok().filter(|fps| (0.1..=1_000.0).contains(fps));
     fps.ok_or_else(|| "give a number from 0.1 to 1000".into())
 }

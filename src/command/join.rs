@@ -6,7 +6,7 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::{Args, ValueEnum};
-use shoal_run::numbers::small_count;
+use shoal_run::numbers::parse_small_count;
 
 #[derive(Args, Clone, Debug)]
 pub(crate) struct JoinArgs {
@@ -18,10 +18,10 @@ pub(crate) struct JoinArgs {
     #[arg(long, value_name = "FILE")]
     pub(crate) key: Option<PathBuf>,
     /// Actor processes on this host, each with its environment server.
-    #[arg(long, value_name = "N", value_parser = small_count, required_unless_present = "template")]
+    #[arg(long, value_name = "N", value_parser = parse_small_count, required_unless_present = "template")]
     pub(crate) actors: Option<u32>,
     /// End, with exit code 4, if the run cannot be reached for this long, as in 90s, 10min or 2h.
-    #[arg(long, value_name = "TIME", default_value = "10min", value_parser = time)]
+    #[arg(long, value_name = "TIME", default_value = "10min", value_parser = parse_duration)]
     pub(crate) give_up: Duration,
     /// The host's name in `status` [default: the machine's].
     #[arg(long, value_name = "NAME")]
@@ -68,7 +68,7 @@ pub(crate) fn run(args: &JoinArgs) -> anyhow::Result<ExitCode> {
 }
 
 /// Reads a time such as `90s`, `10min` or `2h`.
-fn time(text: &str) -> Result<Duration, String> {
+fn parse_duration(text: &str) -> Result<Duration, String> {
     let digits = text.find(|c: char| !c.is_ascii_digit()).unwrap_or(text.len());
     let (number, unit) = text.split_at(digits);
     let seconds = match unit {
@@ -261,11 +261,11 @@ mod tests {
 
     #[test]
     fn a_time_has_a_number_and_a_unit() {
-        assert_eq!(time("90s"), Ok(Duration::from_secs(90)));
-        assert_eq!(time("10min"), Ok(Duration::from_secs(600)));
-        assert_eq!(time("2h"), Ok(Duration::from_secs(7200)));
+        assert_eq!(parse_duration("90s"), Ok(Duration::from_secs(90)));
+        assert_eq!(parse_duration("10min"), Ok(Duration::from_secs(600)));
+        assert_eq!(parse_duration("2h"), Ok(Duration::from_secs(7200)));
         for wrong in ["", "10", "s", "-1s", "1.5h", "1d", "99999999999s"] {
-            assert!(time(wrong).is_err(), "{wrong}");
+            assert!(parse_duration(wrong).is_err(), "{wrong}");
         }
     }
 }

@@ -12,7 +12,7 @@ use shoal_common::run_dir::RunDir;
 use shoal_run::evaluation::SavedPolicy;
 use shoal_run::evaluation::earlier_best::{ReevaluatedPolicy, reevaluate_best, reevaluate_if_needed};
 use shoal_run::external_environment::server_location::ServerLocation;
-use shoal_run::numbers::count;
+use shoal_run::numbers::parse_count;
 use shoal_run::origin::Origin;
 use shoal_run::plan::{RequestedChanges, Revision, warning};
 use shoal_run::records::recorder::{ChangeRecord, Moment};
@@ -32,10 +32,10 @@ pub(crate) struct ResumeArgs {
     /// Run directory, or the directory of a suite.
     pub(crate) run: PathBuf,
     /// Environment steps of all actors together, including those already taken [default: as before].
-    #[arg(long, value_name = "N", value_parser = count)]
+    #[arg(long, value_name = "N", value_parser = parse_count)]
     pub(crate) steps: Option<u64>,
     /// Episodes of all actors together, including those already finished [default: as before].
-    #[arg(long, value_name = "M", value_parser = count)]
+    #[arg(long, value_name = "M", value_parser = parse_count)]
     pub(crate) episodes: Option<u64>,
     /// Change a key that may change in a run, as in --set ddpg.tau=0.005. May be repeated.
     #[arg(long, value_name = "SECTION.KEY=VALUE", add = ArgValueCompleter::new(completion::settings))]
@@ -179,7 +179,7 @@ fn reevaluate_best_policy(run: &RunDir, revision: &Revision) -> anyhow::Result<O
     let has_other_episodes = SavedPolicy::Best
         .read(run, config)
         .is_ok_and(|best| ![0, episodes].contains(&best.episodes));
-    let (evaluated, why) = if revision.changes("evaluation.episodes") {
+    let (evaluated, why) = if revision.changes_key("evaluation.episodes") {
         (
             reevaluate_best(run, config, &interrupt),
             "it has another number of episodes now",

@@ -167,7 +167,7 @@ fn run_json<'a>(suite: &Suite, trial: &'a Trial, path: &Path) -> anyhow::Result<
     let mut json = RunJson {
         run: &trial.name,
         finished: false,
-        ended_early: suite.has_ended(trial),
+        ended_early: suite.was_ended_early(trial),
         env_steps: 0,
         eval_return_mean: None,
     };

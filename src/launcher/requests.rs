@@ -60,7 +60,7 @@ pub(super) fn scale(
     if !(1..=most).contains(&actors) {
         let reason = if most == max {
             format!("this run can have 1 to {max} actors (actors.max, fixed when it was created)")
-        } else if most == ActorsConfig::GREATEST_COUNT {
+        } else if most == ActorsConfig::MAX_COUNT {
             format!("a host can have 1 to {most} actors")
         } else {
             format!(

@@ -19,17 +19,17 @@ section! {
         /// Chunks that an actor may have sent and the learner has not committed yet.
         window: u32 = 8, bounds: from(1, 64), unit: "chunks", source: "ours", change: Change::Anytime;
         /// The most actors that the run can be scaled to, on all hosts together.
-        max: u32 = 16, bounds: from(1, ActorsConfig::GREATEST_MAX), unit: "processes", source: "ours",
+        max: u32 = 16, bounds: from(1, ActorsConfig::MAX_ACTORS), unit: "processes", source: "ours",
             change: never("the replay has a place for each of them");
     }
 }
 
 impl ActorsConfig {
     /// The upper bound of `max`.
-    pub const GREATEST_MAX: u32 = 1_024;
+    pub const MAX_ACTORS: u32 = 1_024;
 
     /// The upper bound of `count`.
-    pub const GREATEST_COUNT: u32 = MAX_LOCAL_ACTORS as u32;
+    pub const MAX_COUNT: u32 = MAX_LOCAL_ACTORS as u32;
 
     /// Checks every number.
     ///
@@ -37,6 +37,6 @@ impl ActorsConfig {
     /// For the first invalid number.
     pub fn check(&self) -> Result<(), OutOfRange> {
         self.check_bounds("actors")?;
-        from(1, self.max.min(Self::GREATEST_COUNT)).check("actors.count", &self.count)
+        from(1, self.max.min(Self::MAX_COUNT)).check("actors.count", &self.count)
     }
 }

@@ -113,7 +113,7 @@ impl Revision {
     }
 
     /// Whether it changes this key.
-    pub fn changes(&self, key: &str) -> bool {
+    pub fn changes_key(&self, key: &str) -> bool {
         self.changes.iter().any(|(change, _)| change.key == key)
     }
 

@@ -22,7 +22,7 @@ const FILES_PER_ACTOR: u64 = 22;
 /// Bytes of shared memory that the run may come to use with `actors.max` actors.
 pub(super) fn shared_memory(config: &Config) -> u64 {
     let max = config.actors.max as usize;
-    let local = max.min(ActorsConfig::GREATEST_COUNT as usize);
+    let local = max.min(ActorsConfig::MAX_COUNT as usize);
     let spec = &config.spec;
     let parameters = parameters(config);
     let of_a_server = environment::reserved(spec, config.actors.envs as usize);

@@ -93,10 +93,10 @@ pub fn train(
     }
     if signals.received().is_none() {
         let is_due =
-            |trial: &Trial| Ok(!suite.has_ended(trial) && !check_finished(suite, &directory.join(&trial.name))?);
+            |trial: &Trial| Ok(!suite.was_ended_early(trial) && !check_finished(suite, &directory.join(&trial.name))?);
         Due::new(suite, directory, is_due, jobs)?.train(signals, None, observer, &mut failed);
     }
-    failed.retain(|number| !suite.has_ended(&suite.trials[*number]));
+    failed.retain(|number| !suite.was_ended_early(&suite.trials[*number]));
     Ok(failed.len())
 }
 

@@ -32,7 +32,7 @@ impl Supervisor {
     /// The most actors that this host may have now.
     pub(crate) fn max_actors_now(&self) -> u32 {
         let all = self.actor_count() + self.free_actors().count() as u32;
-        all.min(ActorsConfig::GREATEST_COUNT)
+        all.min(ActorsConfig::MAX_COUNT)
     }
 
     /// Indices that neither this host nor another has.

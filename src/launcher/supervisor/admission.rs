@@ -26,8 +26,8 @@ impl Supervisor {
         if let Some(lease) = self.joined_hosts.lease(host) {
             return Ok(ControlResponse::Admitted(lease.clone()));
         }
-        if requested > ActorsConfig::GREATEST_COUNT {
-            let why = format!("a host can have at most {} actors", ActorsConfig::GREATEST_COUNT);
+        if requested > ActorsConfig::MAX_COUNT {
+            let why = format!("a host can have at most {} actors", ActorsConfig::MAX_COUNT);
             return Ok(ControlResponse::Refused(why));
         }
         let free: Vec<u32> = match self.lockstep_actors {
