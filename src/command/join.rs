@@ -113,20 +113,29 @@ mod with_network {
     /// The exit code if the run could not be reached for too long.
     const GAVE_UP: u8 = 4;
 
+    /// This host, as the run knows it, and how it reaches the run.
+    struct JoiningHost {
+        number: u64,
+        name: String,
+        endpoint: Endpoint,
+        /// `None` if the connection is not encrypted.
+        key: Option<KeyFile>,
+    }
+
     /// Joins the run, and works for it until it is over.
     pub(super) fn join(args: &JoinArgs, run: &str, actors: u32) -> anyhow::Result<ExitCode> {
         restart_with_one_thread()?;
         let (endpoint, key) = endpoint(args, run)?;
         let signals = Signals::register()?;
         let interrupt = signals.interrupt();
-        let host = host_number()?;
+        let number = host_number()?;
         let name = match &args.name {
             Some(name) => name.clone(),
             None => rustix::system::uname().nodename().to_string_lossy().into_owned(),
         };
         let hello = Hello {
             program: env!("CARGO_PKG_VERSION").into(),
-            host,
+            host: number,
             name: name.clone(),
             instructions: vector_instructions(),
             actors,
@@ -150,9 +159,15 @@ mod with_network {
             }
             Err(error) => return Err(error.into()),
         };
-        let temporary = std::env::temp_dir().join(format!("shoal-join-{host:016x}"));
+        let temporary = std::env::temp_dir().join(format!("shoal-join-{number:016x}"));
         let path = args.local.as_deref().unwrap_or(&temporary);
-        let worked = work(args, (endpoint, key, host, name), (lease, connection), path, &signals);
+        let host = JoiningHost {
+            number,
+            name,
+            endpoint,
+            key,
+        };
+        let worked = work(args, host, (lease, connection), path, &signals);
         if args.local.is_none() {
             match &worked {
                 Ok(_) => drop(std::fs::remove_dir_all(path)),
@@ -164,22 +179,28 @@ mod with_network {
 
     fn work(
         args: &JoinArgs,
-        (endpoint, key, host, name): (Endpoint, Option<KeyFile>, u64, String),
+        host: JoiningHost,
         (lease, connection): (WireLease, GateConnection),
         path: &Path,
         signals: &Signals,
     ) -> anyhow::Result<ExitCode> {
+        let JoiningHost {
+            number,
+            name,
+            endpoint,
+            key,
+        } = host;
         // The name of the run in its messages is that of its own configuration.
         let run_id = joined_run_id(&lease.config)?;
         // The environment may take minutes to start, and it may not be usable here.
-        let keeper = LeaseKeeper::start(connection, run_id.clone(), host)?;
+        let keeper = LeaseKeeper::start(connection, run_id.clone(), number)?;
         let prepare = || {
             let interrupt = signals.interrupt();
             let made = make_host_directory(path, &lease.config, lease.first_incarnation, interrupt)?;
             if let Some(key) = key {
                 key.write(&made.1.path().join(KeyFile::JOIN))?;
             }
-            HostFile::new(endpoint.clone(), run_id, (host, name), &lease).write(&made.1)?;
+            HostFile::new(endpoint.clone(), run_id, (number, name), &lease).write(&made.1)?;
             anyhow::Ok(made)
         };
         let prepared = prepare();
