@@ -99,7 +99,7 @@ impl Reinforce {
         sizes: RunSizes,
     ) -> Result<Self, PolicyError> {
         let ReinforceNetworks { policy, baseline } = settings.networks(spec);
-        policy::softmax("reinforce", policy, spec, 0)?;
+        policy::softmax(policy, spec, 0)?;
         let steps = sizes.chunk_rows * sizes.actors as usize;
         Ok(Self {
             policy: NetworkWithPass::new(policy, settings.learning_rate, seed, 0, steps),

@@ -99,11 +99,7 @@ impl Tabular {
         spec: &EnvironmentSpec,
         sizes: RunSizes,
     ) -> Result<Self, PolicyError> {
-        let name = match bootstrap {
-            Bootstrap::Max => "q-learning",
-            Bootstrap::NextAction => "sarsa",
-        };
-        let scores = policy::table(name, spec, 0)?;
+        let scores = policy::table(spec, 0)?;
         Ok(Self {
             bootstrap,
             alpha: settings.alpha as f32,
